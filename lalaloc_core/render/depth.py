@@ -1,0 +1,49 @@
+"""Layout depth and its back-projection, in closed form from a wall profile (array API: numpy and torch)."""
+
+from __future__ import annotations
+
+import numpy as np
+from array_api_compat import array_namespace, device
+from jaxtyping import Float
+
+from lalaloc_core.conventions import Array, column_azimuths, row_elevations
+
+
+def layout_depth(
+    profile_m: Float[Array, "b w"],
+    camera_height_m: Float[Array, "b"],
+    ceiling_height_m: Float[Array, "b"],
+    rows: int,
+) -> Float[Array, "b {rows} w"]:
+    """Range (m) along each pixel's ray to wall, floor or ceiling, whichever comes first.
+
+    `range = min(wall / cos e, camera / -sin e below the horizon, (ceiling - camera) / sin e above it)`.
+
+    Args:
+        profile_m: wall profile, see `render.profile`.
+        camera_height_m: height of the camera over the floor.
+        ceiling_height_m: height of the ceiling over the floor, above the camera.
+        rows: height of the depth image; its rows cover elevation +90° to -90°.
+    """
+    xp = array_namespace(profile_m, camera_height_m, ceiling_height_m)
+    elevation = row_elevations(rows)
+    like = {"dtype": profile_m.dtype, "device": device(profile_m)}
+    inverse_cosine = xp.asarray(1.0 / np.cos(elevation), **like)
+    inverse_sine = xp.asarray(1.0 / np.abs(np.sin(elevation)), **like)
+    above = xp.asarray(elevation > 0.0, device=device(profile_m))
+    clearance = xp.where(above[None, :], (ceiling_height_m - camera_height_m)[:, None], camera_height_m[:, None])
+    horizontal = clearance * inverse_sine[None, :]
+    return xp.minimum(profile_m[:, None, :] * inverse_cosine[None, :, None], horizontal[:, :, None])
+
+
+def back_project(depth_m: Float[Array, "b h w"]) -> Float[Array, "b h*w 3"]:
+    """Point cloud (m) of each depth image in the camera's frame: x right, y forward (centre column), z up."""
+    xp = array_namespace(depth_m)
+    batch, rows, columns = depth_m.shape
+    azimuth, elevation = column_azimuths(columns)[None, :], row_elevations(rows)[:, None]
+    rays = np.stack(
+        np.broadcast_arrays(np.cos(elevation) * np.sin(azimuth), np.cos(elevation) * np.cos(azimuth), np.sin(elevation)),
+        axis=-1,
+    )
+    rays = xp.asarray(rays, dtype=depth_m.dtype, device=device(depth_m))
+    return xp.reshape(depth_m[..., None] * rays[None], (batch, rows * columns, 3))

@@ -1,0 +1,69 @@
+"""Wall profile: the horizontal distance from the camera to the nearest wall of its room, in closed form.
+
+A floor plan is an extrusion, so all that a camera sees of the bare layout follows from casting one ray per
+azimuth column against the room's wall segments in 2-D. The code is written against the array API: the same
+lines run on numpy arrays (service) and on torch tensors (training and LPO), where the result is differentiable
+in position and heading almost everywhere.
+"""
+
+from __future__ import annotations
+
+from array_api_compat import array_namespace, device
+from jaxtyping import Float
+
+from lalaloc_core.conventions import Array, column_azimuths
+
+# A ray may miss both of two adjoining walls at their common corner by rounding; widen each wall by this share.
+_CORNER_TOLERANCE = 1e-5
+_PARALLEL = 1e-12
+
+
+def cast_rays(
+    origin_m: Float[Array, "b 2"], azimuth: Float[Array, "b c"], walls_m: Float[Array, "b n 4"]
+) -> Float[Array, "b c"]:
+    """Distance (m) from each origin along each azimuth (radians) to the nearest of its wall segments.
+
+    Args:
+        origin_m: ray origins in the plan frame.
+        azimuth: directions, clockwise from +y.
+        walls_m: per origin, segments (x0, y0, x1, y1); repeat a segment to pad.
+
+    Returns:
+        distances; inf where a ray hits nothing, which happens only outside a closed room.
+    """
+    xp = array_namespace(origin_m, azimuth, walls_m)
+    direction_x = xp.sin(azimuth)[:, :, None]
+    direction_y = xp.cos(azimuth)[:, :, None]
+    start_x = walls_m[:, None, :, 0] - origin_m[:, 0][:, None, None]
+    start_y = walls_m[:, None, :, 1] - origin_m[:, 1][:, None, None]
+    edge_x = walls_m[:, None, :, 2] - walls_m[:, None, :, 0]
+    edge_y = walls_m[:, None, :, 3] - walls_m[:, None, :, 1]
+
+    # Solve origin + t * direction = start + s * edge by Cramer's rule.
+    determinant = direction_x * edge_y - direction_y * edge_x
+    parallel = xp.abs(determinant) < _PARALLEL
+    # Not dividing by zero in the unused branch keeps NaN out of the gradients.
+    determinant = xp.where(parallel, xp.ones_like(determinant), determinant)
+    t = (start_x * edge_y - start_y * edge_x) / determinant
+    s = (start_x * direction_y - start_y * direction_x) / determinant
+    hit = ~parallel & (t > 0.0) & (s >= -_CORNER_TOLERANCE) & (s <= 1.0 + _CORNER_TOLERANCE)
+    return xp.min(xp.where(hit, t, xp.full_like(t, xp.inf)), axis=2)
+
+
+def wall_profile(
+    position_m: Float[Array, "b 2"],
+    heading: Float[Array, "b"],
+    walls_m: Float[Array, "b n 4"],
+    columns: int,
+) -> Float[Array, "b {columns}"]:
+    """Wall profile (m) of each pose, one value per azimuth column of a panorama with that heading.
+
+    Args:
+        position_m: camera positions, inside the room that `walls_m` closes.
+        heading: azimuth of the centre column, radians.
+        walls_m: wall segments of each pose's own room.
+        columns: number of azimuth columns.
+    """
+    xp = array_namespace(position_m, heading, walls_m)
+    relative = xp.asarray(column_azimuths(columns), dtype=position_m.dtype, device=device(position_m))
+    return cast_rays(position_m, heading[:, None] + relative[None, :], walls_m)

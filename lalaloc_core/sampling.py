@@ -1,0 +1,142 @@
+"""Camera poses in a plan: the regular grid of retrieval, and training triplets (paper, sections 5 and A.1.3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from jaxtyping import Float, Int
+
+from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.floorplan import FloorPlan
+
+# Cameras do not stand in walls; grid poses keep this distance where the room allows it.
+WALL_MARGIN_M = 0.15
+
+
+@dataclass(frozen=True, eq=False)
+class PoseSet:
+    """Camera positions of one plan and the room each lies in."""
+
+    position_m: Float[np.ndarray, "n 2"]
+    room_index: Int[np.ndarray, "n"]
+
+    def __len__(self) -> int:
+        return len(self.position_m)
+
+
+def grid_size(plan: FloorPlan, step_m: float) -> int:
+    """An upper estimate of the number of poses `pose_grid` would return, without sampling them."""
+    return len(plan.rooms) + int(plan.area_m2 / step_m**2)
+
+
+def pose_grid(plan: FloorPlan, step_m: float) -> PoseSet:
+    """Poses on the lattice of multiples of `step_m`, clipped to the rooms.
+
+    A room too small or narrow for any lattice point gets one pose well inside it, so that no room is missing.
+
+    Raises:
+        InvalidInputError: `step_m` is not positive.
+    """
+    if not step_m > 0.0:
+        raise InvalidInputError(f"the grid step is {step_m} m, it must be positive")
+    positions, rooms = [], []
+    for index, room in enumerate(plan.rooms):
+        x_min, y_min, x_max, y_max = room.shape.bounds
+        xs = np.arange(np.ceil(x_min / step_m), np.floor(x_max / step_m) + 1) * step_m
+        ys = np.arange(np.ceil(y_min / step_m), np.floor(y_max / step_m) + 1) * step_m
+        lattice = np.stack(np.meshgrid(xs, ys, indexing="ij"), axis=-1).reshape(-1, 2)
+        inside = shapely.contains_xy(room.shape.buffer(-WALL_MARGIN_M), lattice[:, 0], lattice[:, 1])
+        chosen = lattice[inside]
+        if len(chosen) == 0:
+            chosen = np.array(shapely.maximum_inscribed_circle(room.shape, 0.01).coords[:1])
+        positions.append(chosen)
+        rooms.append(np.full(len(chosen), index))
+    return PoseSet(np.concatenate(positions), np.concatenate(rooms))
+
+
+def random_poses(plan: FloorPlan, count: int, rng: np.random.Generator, margin_m: float = WALL_MARGIN_M) -> PoseSet:
+    """Poses uniform over the plan's floor, at least `margin_m` from their room's walls.
+
+    Raises:
+        InvalidInputError: no room is wide enough for the margin.
+    """
+    inner = [room.shape.buffer(-margin_m) for room in plan.rooms]
+    areas = np.array([shape.area for shape in inner])
+    if not areas.sum() > 0.0:
+        raise InvalidInputError(f"no room leaves a margin of {margin_m:g} m to its walls")
+    shares = rng.multinomial(count, areas / areas.sum())
+    positions, rooms = [np.empty((0, 2))], [np.empty(0, dtype=int)]
+    for index, (shape, wanted) in enumerate(zip(inner, shares, strict=True)):
+        x_min, y_min, x_max, y_max = shape.bounds if wanted else (0.0, 0.0, 1.0, 1.0)
+        while wanted > 0:
+            drawn = rng.uniform((x_min, y_min), (x_max, y_max), size=(4 * wanted + 8, 2))
+            drawn = drawn[shapely.contains_xy(shape, drawn[:, 0], drawn[:, 1])][:wanted]
+            positions.append(drawn)
+            rooms.append(np.full(len(drawn), index))
+            wanted -= len(drawn)
+    order = rng.permutation(count)
+    return PoseSet(np.concatenate(positions)[order], np.concatenate(rooms)[order])
+
+
+@dataclass(frozen=True, kw_only=True)
+class TripletSampling:
+    """How training draws the neighbours of an anchor (paper, A.1.3: 1 positive to 20 negatives)."""
+
+    positives: int = 1
+    negatives: int = 20
+    positive_radius_m: float = 0.5
+    negative_radius_m: float = 2.0
+
+
+def sample_triplets(
+    plan: FloorPlan, anchors: int, sampling: TripletSampling, rng: np.random.Generator
+) -> tuple[PoseSet, Int[np.ndarray, "anchors 1+positives+negatives"]] | None:
+    """Draw anchors with their positives and negatives.
+
+    Returns:
+        the poses, and per anchor a row of indices into them: the anchor, its positives (closer than
+        `positive_radius_m`), its negatives (farther than `negative_radius_m`); None when the plan is too small to
+        hold an anchor's negatives.
+    """
+    pool = random_poses(plan, 4 * (anchors + sampling.negatives), rng)
+    distance = np.linalg.norm(pool.position_m[:, None] - pool.position_m[None], axis=-1)
+    usable = np.flatnonzero((distance > sampling.negative_radius_m).sum(axis=1) >= sampling.negatives)
+    if len(usable) < anchors:
+        return None
+    chosen = rng.choice(usable, anchors, replace=False)
+    positives = _sample_near(plan, pool, chosen, sampling, rng)
+    rows = []
+    for k, anchor in enumerate(chosen):
+        far = np.flatnonzero(distance[anchor] > sampling.negative_radius_m)
+        negatives = rng.choice(far, sampling.negatives, replace=False)
+        near = len(pool) + k * sampling.positives + np.arange(sampling.positives)
+        rows.append(np.concatenate([[anchor], near, negatives]))
+    merged = PoseSet(
+        np.concatenate([pool.position_m, positives.position_m]),
+        np.concatenate([pool.room_index, positives.room_index]),
+    )
+    return merged, np.stack(rows)
+
+
+def _sample_near(
+    plan: FloorPlan, pool: PoseSet, anchors: Int[np.ndarray, "k"], sampling: TripletSampling, rng: np.random.Generator
+) -> PoseSet:
+    """Positions uniform on the disc around each anchor that lie in some room; anchors in tight corners shrink it."""
+    count = len(anchors) * sampling.positives
+    centre = np.repeat(pool.position_m[anchors], sampling.positives, axis=0)
+    result = PoseSet(np.empty((count, 2)), np.full(count, -1))
+    radius = np.full(count, sampling.positive_radius_m)
+    missing = np.arange(count)
+    while len(missing):
+        angle = rng.uniform(0.0, 2.0 * np.pi, len(missing))
+        length = radius[missing] * np.sqrt(rng.uniform(0.0, 1.0, len(missing)))
+        drawn = centre[missing] + length[:, None] * np.stack([np.sin(angle), np.cos(angle)], axis=-1)
+        room = plan.room_index_at(drawn)
+        found = room >= 0
+        result.position_m[missing[found]] = drawn[found]
+        result.room_index[missing[found]] = room[found]
+        missing = missing[~found]
+        radius[missing] *= 0.7
+    return result
