@@ -1,0 +1,171 @@
+"""The model bundle: a folder with a manifest, ONNX files for the service and safetensors for LPO.
+
+`manifest.json` names every file with its size and SHA-256; nothing is read that does not match. Reading a bundle
+needs neither torch nor onnxruntime.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from lalaloc_core.errors import BundleError
+
+MANIFEST_NAME = "manifest.json"
+FORMAT_VERSION = 1
+
+LAYOUT_ONNX = "layout_encoder.onnx"
+IMAGE_ONNX = "image_encoder.onnx"
+HEAD_ONNX = "head.onnx"
+LAYOUT_WEIGHTS = "layout_encoder.safetensors"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConfidenceModel:
+    """Logistic model of "the answer is within 1 m", fitted on validation queries.
+
+    The probability is `sigmoid(bias + distance * d + margin * m)` with d the latent distance of the best candidate
+    and m by how much the second, distinct candidate is farther (`no_rival_margin` when there is none).
+    """
+
+    bias: float
+    distance: float
+    margin: float
+    no_rival_margin: float
+
+    def probability(self, distances: list[float]) -> float:
+        """Confidence of an answer whose distinct candidates have these latent distances, best first."""
+        margin = distances[1] - distances[0] if len(distances) > 1 else self.no_rival_margin
+        logit = self.bias + self.distance * distances[0] + self.margin * min(margin, self.no_rival_margin)
+        return 1.0 / (1.0 + math.exp(-max(-30.0, min(30.0, logit))))
+
+
+@dataclass(frozen=True, kw_only=True)
+class FileEntry:
+    """Size and digest of one file of the bundle."""
+
+    bytes: int
+    sha256: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Manifest:
+    """What a bundle is and how it came to be.
+
+    Attributes:
+        architecture: "ring" or "paper".
+        layout_config: arguments that rebuild the layout encoder in torch (for LPO).
+        profile_columns: azimuth columns the layout encoder expects.
+        image_height, image_width: pixels the image encoder expects; pixel values are raw uint8 RGB and the
+            normalisation stated in `image_mean` and `image_std` happens inside the network.
+        ring_sectors: azimuth sectors of the ring, 0 for an architecture without one.
+        confidence: fitted on validation queries; None leaves answers without a trained confidence.
+        training: commands, seeds, hardware, counts of how the model was trained.
+        metrics: validation figures with their n.
+    """
+
+    name: str
+    version: str
+    architecture: str
+    layout_config: dict[str, Any]
+    profile_columns: int
+    image_height: int
+    image_width: int
+    image_mean: list[float]
+    image_std: list[float]
+    latent_size: int
+    ring_sectors: int
+    confidence: ConfidenceModel | None = None
+    training: dict[str, Any] = field(default_factory=dict)
+    metrics: dict[str, Any] = field(default_factory=dict)
+    files: dict[str, FileEntry] = field(default_factory=dict)
+    format_version: int = FORMAT_VERSION
+
+    def to_json(self) -> str:
+        """The manifest as indented JSON text."""
+        return json.dumps(dataclasses.asdict(self), indent=2, sort_keys=True) + "\n"
+
+    @classmethod
+    def from_json(cls, text: str) -> Manifest:
+        """Parse strictly: unknown or missing keys are errors.
+
+        Raises:
+            BundleError: not a manifest of this format version.
+        """
+        try:
+            raw = json.loads(text)
+            if raw.get("format_version") != FORMAT_VERSION:
+                raise BundleError(f"manifest format {raw.get('format_version')!r}, this code reads {FORMAT_VERSION}")
+            raw["files"] = {name: FileEntry(**entry) for name, entry in raw["files"].items()}
+            if raw["confidence"] is not None:
+                raw["confidence"] = ConfidenceModel(**raw["confidence"])
+            return cls(**raw)
+        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            raise BundleError(f"not a valid {MANIFEST_NAME}: {error}") from error
+
+
+@dataclass(frozen=True)
+class Bundle:
+    """A model bundle on disk, its manifest parsed."""
+
+    folder: Path
+    manifest: Manifest
+    sha256: str
+
+    @classmethod
+    def open(cls, folder: Path) -> Bundle:
+        """Read the manifest of a bundle; files are checked when they are read.
+
+        Raises:
+            BundleError: no manifest there, or not a valid one.
+        """
+        path = folder / MANIFEST_NAME
+        try:
+            text = path.read_text(encoding="utf-8")
+        except OSError as error:
+            raise BundleError(f"no model bundle at '{folder}': {error.strerror} ({MANIFEST_NAME})") from error
+        manifest = Manifest.from_json(text)
+        return cls(folder, manifest, _digest_of(manifest))
+
+    def read(self, name: str) -> bytes:
+        """The bytes of one file, checked against the manifest.
+
+        Raises:
+            BundleError: the file is not listed, missing, or altered.
+        """
+        entry = self.manifest.files.get(name)
+        if entry is None:
+            raise BundleError(f"bundle '{self.folder}' lists no file '{name}'")
+        try:
+            content = (self.folder / name).read_bytes()
+        except OSError as error:
+            raise BundleError(f"bundle '{self.folder}': cannot read '{name}': {error.strerror}") from error
+        digest = hashlib.sha256(content).hexdigest()
+        if digest != entry.sha256:
+            raise BundleError(f"bundle '{self.folder}': '{name}' has SHA-256 {digest}, expected {entry.sha256}")
+        return content
+
+
+def write_manifest(folder: Path, manifest: Manifest) -> Bundle:
+    """Write the manifest over the files that lie in `folder`, recording their sizes and digests."""
+    files = {}
+    for path in sorted(folder.iterdir()):
+        if path.name != MANIFEST_NAME:
+            content = path.read_bytes()
+            files[path.name] = FileEntry(bytes=len(content), sha256=hashlib.sha256(content).hexdigest())
+    complete = dataclasses.replace(manifest, files=files)
+    temporary = folder / (MANIFEST_NAME + ".part")
+    temporary.write_text(complete.to_json(), encoding="utf-8")
+    temporary.replace(folder / MANIFEST_NAME)
+    return Bundle(folder, complete, _digest_of(complete))
+
+
+def _digest_of(manifest: Manifest) -> str:
+    """Identity of the model: a digest over its files, so that re-scoring or renaming does not change it."""
+    listing = "\n".join(f"{name} {entry.sha256}" for name, entry in sorted(manifest.files.items()))
+    return hashlib.sha256(listing.encode()).hexdigest()

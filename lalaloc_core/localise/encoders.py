@@ -1,0 +1,126 @@
+"""The exported encoders on onnxruntime: layouts and panoramas to latents. Never imports torch."""
+
+from __future__ import annotations
+
+import numpy as np
+import onnxruntime
+from jaxtyping import Float, UInt8
+
+from lalaloc_core.bundle import HEAD_ONNX, IMAGE_ONNX, LAYOUT_ONNX, Bundle
+from lalaloc_core.conventions import TWO_PI, wrap_angle
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.poses import Query
+from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.sampling import PoseSet
+
+# Larger batches fall out of the cache and gain nothing.
+_LAYOUT_BATCH = 256
+# An architecture without a ring has to see the panorama turned, once per heading.
+_HEADINGS_WITHOUT_RING = 32
+
+
+class Encoders:
+    """Both branches of one bundle, ready to run; safe to share between threads."""
+
+    def __init__(self, bundle: Bundle, *, threads: int = 0) -> None:
+        """Create the onnxruntime sessions.
+
+        Args:
+            threads: intra-op threads per session, 0 for one per core.
+
+        Raises:
+            BundleError: a file is missing or altered.
+        """
+        self.manifest = bundle.manifest
+        self._layout = _session(bundle.read(LAYOUT_ONNX), threads)
+        self._image = _session(bundle.read(IMAGE_ONNX), threads)
+        self._head = _session(bundle.read(HEAD_ONNX), threads) if self.manifest.ring_sectors else None
+
+    def layouts(
+        self,
+        profile_m: Float[np.ndarray, "b c"],
+        camera_height_m: Float[np.ndarray, "b"],
+        ceiling_height_m: Float[np.ndarray, "b"],
+    ) -> Float[np.ndarray, "b d"]:
+        """Latents of layouts given by their wall profiles and heights (m)."""
+        inputs = {
+            "profile_m": np.ascontiguousarray(profile_m, dtype=np.float32),
+            "camera_height_m": np.asarray(camera_height_m, dtype=np.float32),
+            "ceiling_height_m": np.asarray(ceiling_height_m, dtype=np.float32),
+        }
+        parts = []
+        for first in range(0, len(profile_m), _LAYOUT_BATCH):
+            batch = {name: value[first : first + _LAYOUT_BATCH] for name, value in inputs.items()}
+            parts.append(self._layout.run(["latent"], batch)[0])
+        return np.concatenate(parts) if parts else np.empty((0, self.manifest.latent_size), np.float32)
+
+    def poses(
+        self, plan: FloorPlan, poses: PoseSet, heading: Float[np.ndarray, "b"], camera_height_m: float
+    ) -> Float[np.ndarray, "b d"]:
+        """Render the layout of every pose of a plan and embed it."""
+        profile = wall_profile(
+            poses.position_m.astype(np.float32),
+            heading.astype(np.float32),
+            plan.walls_m[poses.room_index].astype(np.float32),
+            self.manifest.profile_columns,
+        )
+        return self.layouts(
+            profile, np.full(len(poses), camera_height_m), plan.ceiling_heights_m[poses.room_index]
+        )
+
+    def query(self, image: UInt8[np.ndarray, "h w 3"], heading: float | None) -> Query:
+        """Encode a panorama of the bundle's input size.
+
+        Args:
+            heading: azimuth of the centre column (radians); None when unknown, then there is one hypothesis per
+                sector of the ring.
+        """
+        if heading is not None:
+            return self._query_turned(image, heading)
+        if self._head is not None:
+            return self._query_any_heading(image)
+        return self._query_by_turning(image)
+
+    def _query_turned(self, image: UInt8[np.ndarray, "h w 3"], heading: float) -> Query:
+        """Undo a known heading by rolling whole pixels; what is left over stays as the frame's heading."""
+        pixel = TWO_PI / image.shape[1]
+        shift = round(heading / pixel)
+        # Column j of the result is column j - shift of the input, which looks `shift` pixels more to the left.
+        turned = np.roll(image, shift, axis=1)
+        encoded = self._run_image(turned[None])
+        latents = encoded if self._head is None else self._run_head(encoded)
+        frame_heading = float(wrap_angle(heading - shift * pixel))
+        return Query(latents, np.array([shift * pixel]), frame_heading, heading_known=True)
+
+    def _query_any_heading(self, image: UInt8[np.ndarray, "h w 3"]) -> Query:
+        """One forward of the image, then roll its ring: rolling a ring is turning the camera."""
+        ring = self._run_image(image[None])
+        sectors = ring.shape[-1]
+        shifts = np.arange(sectors)
+        source = (np.arange(sectors)[None, :] - shifts[:, None]) % sectors
+        rolled = np.ascontiguousarray(np.moveaxis(ring[0][:, source], 0, 1))
+        return Query(self._run_head(rolled), shifts * (TWO_PI / sectors), 0.0, heading_known=False)
+
+    def _query_by_turning(self, image: UInt8[np.ndarray, "h w 3"]) -> Query:
+        width = image.shape[1]
+        shifts = np.arange(_HEADINGS_WITHOUT_RING) * width // _HEADINGS_WITHOUT_RING
+        latents = np.concatenate([self._run_image(np.roll(image, int(shift), axis=1)[None]) for shift in shifts])
+        return Query(latents, shifts * (TWO_PI / width), 0.0, heading_known=False)
+
+    def _run_image(self, images: UInt8[np.ndarray, "b h w 3"]) -> np.ndarray:
+        """Rings (b, c, s) of an architecture that has them, else latents (b, d)."""
+        name = "ring" if self._head is not None else "latent"
+        return self._image.run([name], {"image": np.ascontiguousarray(images)})[0]
+
+    def _run_head(self, ring: Float[np.ndarray, "b c s"]) -> Float[np.ndarray, "b d"]:
+        assert self._head is not None
+        return self._head.run(["latent"], {"ring": ring})[0]
+
+
+def _session(model: bytes, threads: int) -> onnxruntime.InferenceSession:
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads
+    options.log_severity_level = 3
+    # Idle threads that spin would steal the cores from the LPO workers.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])

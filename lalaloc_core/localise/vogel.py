@@ -1,0 +1,69 @@
+"""Vogel disc re-sampling (VDR): denser poses around a candidate, again by retrieval (paper, sections 4.2 and A.2)."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from lalaloc_core.conventions import TWO_PI
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.poses import Candidate, Query
+from lalaloc_core.localise.retrieval import latent_distances
+from lalaloc_core.sampling import PoseSet
+
+_GOLDEN_RATIO = (1.0 + math.sqrt(5.0)) / 2.0
+
+
+def vogel_disc(samples: int) -> Float[np.ndarray, "samples 2"]:
+    """Nearly even points on the unit disc: `r_i = sqrt(i / N)`, `θ_i = i 2π (1 - 1/φ)`.
+
+    The paper's appendix prints the angle without its index i, which would put all points on one ray.
+    """
+    index = np.arange(samples)
+    radius = np.sqrt(index / samples)
+    angle = index * (TWO_PI * (1.0 - 1.0 / _GOLDEN_RATIO))
+    return radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+
+
+def resample(
+    plan: FloorPlan,
+    encoders: Encoders,
+    query: Query,
+    candidate: Candidate,
+    *,
+    camera_height_m: float,
+    samples: int,
+    radius_m: float,
+) -> Candidate:
+    """The best pose of a Vogel disc around `candidate`, clipped to the rooms; the candidate itself if none is better.
+
+    With an unknown heading the samples also cover the sector of headings that the hypothesis stands for.
+    """
+    position = candidate.position_m + radius_m * vogel_disc(samples)
+    room_index = plan.room_index_at(position)
+    inside = room_index >= 0
+    poses = PoseSet(position[inside], room_index[inside])
+    if len(poses) == 0:
+        return candidate
+    heading = np.full(len(poses), candidate.frame_heading)
+    if not query.heading_known:
+        # A second low-discrepancy sequence, so that headings and positions are covered together.
+        sequence = (np.arange(samples)[inside] * (math.sqrt(2.0) - 1.0)) % 1.0
+        heading += (sequence - 0.5) * (TWO_PI / len(query.roll))
+    latents = encoders.poses(plan, poses, heading, camera_height_m)
+    distance = latent_distances(latents, query.latents[candidate.hypothesis][None])[0]
+    best = int(distance.argmin())
+    if distance[best] >= candidate.latent_distance:
+        return candidate
+    return replace(
+        candidate,
+        x_m=float(poses.position_m[best, 0]),
+        y_m=float(poses.position_m[best, 1]),
+        room_index=int(poses.room_index[best]),
+        frame_heading=float(heading[best]),
+        latent_distance=float(distance[best]),
+    )
