@@ -34,6 +34,7 @@ class Encoders:
         self.manifest = bundle.manifest
         self._layout = _session(bundle.read(LAYOUT_ONNX), threads)
         self._image = _session(bundle.read(IMAGE_ONNX), threads)
+        self._image_takes_height = any(node.name == "camera_height_m" for node in self._image.get_inputs())
         self._head = _session(bundle.read(HEAD_ONNX), threads) if self.manifest.ring_sectors else None
 
     def layouts(
@@ -64,53 +65,56 @@ class Encoders:
             plan.walls_m[poses.room_index].astype(np.float32),
             self.manifest.profile_columns,
         )
-        return self.layouts(
-            profile, np.full(len(poses), camera_height_m), plan.ceiling_heights_m[poses.room_index]
-        )
+        return self.layouts(profile, np.full(len(poses), camera_height_m), plan.ceiling_heights_m[poses.room_index])
 
-    def query(self, image: UInt8[np.ndarray, "h w 3"], heading: float | None) -> Query:
+    def query(self, image: UInt8[np.ndarray, "h w 3"], heading: float | None, camera_height_m: float) -> Query:
         """Encode a panorama of the bundle's input size.
 
         Args:
+            camera_height_m: gives the picture its metric scale.
             heading: azimuth of the centre column (radians); None when unknown, then there is one hypothesis per
                 sector of the ring.
         """
         if heading is not None:
-            return self._query_turned(image, heading)
+            return self._query_turned(image, heading, camera_height_m)
         if self._head is not None:
-            return self._query_any_heading(image)
-        return self._query_by_turning(image)
+            return self._query_any_heading(image, camera_height_m)
+        return self._query_by_turning(image, camera_height_m)
 
-    def _query_turned(self, image: UInt8[np.ndarray, "h w 3"], heading: float) -> Query:
+    def _query_turned(self, image: UInt8[np.ndarray, "h w 3"], heading: float, camera_height_m: float) -> Query:
         """Undo a known heading by rolling whole pixels; what is left over stays as the frame's heading."""
         pixel = TWO_PI / image.shape[1]
         shift = round(heading / pixel)
         # Column j of the result is column j - shift of the input, which looks `shift` pixels more to the left.
         turned = np.roll(image, shift, axis=1)
-        encoded = self._run_image(turned[None])
+        encoded = self._run_image(turned, camera_height_m)
         latents = encoded if self._head is None else self._run_head(encoded)
         frame_heading = float(wrap_angle(heading - shift * pixel))
         return Query(latents, np.array([shift * pixel]), frame_heading, heading_known=True)
 
-    def _query_any_heading(self, image: UInt8[np.ndarray, "h w 3"]) -> Query:
+    def _query_any_heading(self, image: UInt8[np.ndarray, "h w 3"], camera_height_m: float) -> Query:
         """One forward of the image, then roll its ring: rolling a ring is turning the camera."""
-        ring = self._run_image(image[None])
+        ring = self._run_image(image, camera_height_m)
         sectors = ring.shape[-1]
         shifts = np.arange(sectors)
         source = (np.arange(sectors)[None, :] - shifts[:, None]) % sectors
         rolled = np.ascontiguousarray(np.moveaxis(ring[0][:, source], 0, 1))
         return Query(self._run_head(rolled), shifts * (TWO_PI / sectors), 0.0, heading_known=False)
 
-    def _query_by_turning(self, image: UInt8[np.ndarray, "h w 3"]) -> Query:
+    def _query_by_turning(self, image: UInt8[np.ndarray, "h w 3"], camera_height_m: float) -> Query:
         width = image.shape[1]
         shifts = np.arange(_HEADINGS_WITHOUT_RING) * width // _HEADINGS_WITHOUT_RING
-        latents = np.concatenate([self._run_image(np.roll(image, int(shift), axis=1)[None]) for shift in shifts])
+        turned = (np.roll(image, int(shift), axis=1) for shift in shifts)
+        latents = np.concatenate([self._run_image(view, camera_height_m) for view in turned])
         return Query(latents, shifts * (TWO_PI / width), 0.0, heading_known=False)
 
-    def _run_image(self, images: UInt8[np.ndarray, "b h w 3"]) -> np.ndarray:
-        """Rings (b, c, s) of an architecture that has them, else latents (b, d)."""
-        name = "ring" if self._head is not None else "latent"
-        return self._image.run([name], {"image": np.ascontiguousarray(images)})[0]
+    def _run_image(self, image: UInt8[np.ndarray, "h w 3"], camera_height_m: float) -> np.ndarray:
+        """The ring (1, c, s) of an architecture that has them, else the latent (1, d)."""
+        output = "ring" if self._head is not None else "latent"
+        inputs = {"image": np.ascontiguousarray(image[None])}
+        if self._image_takes_height:
+            inputs["camera_height_m"] = np.array([camera_height_m], dtype=np.float32)
+        return self._image.run([output], inputs)[0]
 
     def _run_head(self, ring: Float[np.ndarray, "b c s"]) -> Float[np.ndarray, "b d"]:
         assert self._head is not None

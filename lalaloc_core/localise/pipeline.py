@@ -115,9 +115,7 @@ def panorama_heading(query: Query, candidate: Candidate) -> float:
     return float(wrap_angle(query.roll[candidate.hypothesis] + candidate.frame_heading))
 
 
-def refinement_job(
-    plan: FloorPlan, query: Query, candidates: list[Candidate], camera_height_m: float
-) -> RefinementJob:
+def refinement_job(plan: FloorPlan, query: Query, candidates: list[Candidate], camera_height_m: float) -> RefinementJob:
     """What the optimiser needs to refine these candidates, each within its own room."""
     rooms = np.array([candidate.room_index for candidate in candidates])
     return RefinementJob(

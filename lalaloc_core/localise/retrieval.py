@@ -18,9 +18,7 @@ def build_grid(plan: FloorPlan, encoders: Encoders, *, step_m: float, camera_hei
     return LatentGrid(poses, latents, step_m, camera_height_m)
 
 
-def latent_distances(
-    latents: Float[np.ndarray, "n d"], targets: Float[np.ndarray, "k d"]
-) -> Float[np.ndarray, "k n"]:
+def latent_distances(latents: Float[np.ndarray, "n d"], targets: Float[np.ndarray, "k d"]) -> Float[np.ndarray, "k n"]:
     """Euclidean distance of each target to each latent, both of unit length."""
     return np.sqrt(np.maximum(2.0 - 2.0 * (targets @ latents.T), 0.0))
 

@@ -1,0 +1,233 @@
+"""Latent pose optimisation (LPO): move a pose until the latent of its layout meets the query's (paper, section 4.2.1).
+
+`min over pose of | Φ_layout(Ω(pose, plan)) - f |₂`, with the closed-form renderer Ω. Two optimisers share one
+evaluation (residuals and their derivatives by forward-mode differentiation, 2 or 3 unknowns against 128 residuals):
+
+* Levenberg-Marquardt (default): under 15 evaluations, and more exact.
+* Adam with the paper's schedule (section A.3): the reference.
+
+Several starting poses are refined as one batch; every pose stays inside the room it started in.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from lalaloc_core.bundle import LAYOUT_WEIGHTS, Bundle
+from lalaloc_core.errors import BundleError
+from lalaloc_core.localise.poses import RefinementJob, RefinementResult
+from lalaloc_core.nets import load_layout_encoder
+from lalaloc_core.render.profile import cast_rays, wall_profile
+
+
+@dataclass(frozen=True, kw_only=True)
+class LpoConfig:
+    """Settings of both optimisers.
+
+    Attributes:
+        margin_m: poses keep this distance to walls, so that none ends on the other side of one.
+        tolerance_m: a Levenberg-Marquardt step shorter than this ends the search.
+        max_step_m, max_turn: longest step (m) and turn (radians) per iteration.
+        adam_*: the paper's schedule.
+    """
+
+    method: Literal["levenberg-marquardt", "adam"] = "levenberg-marquardt"
+    margin_m: float = 0.03
+    max_iterations: int = 15
+    tolerance_m: float = 2e-4
+    initial_damping: float = 1e-2
+    max_step_m: float = 0.5
+    max_turn: float = 0.2
+    adam_learning_rate: float = 0.01
+    adam_steps: int = 150
+    adam_plateau_threshold: float = 0.05
+    adam_plateau_patience: int = 10
+    adam_stop_threshold: float = 0.001
+    adam_stop_patience: int = 20
+
+
+@dataclass(frozen=True)
+class _Evaluation:
+    """Residuals at a pose and their derivatives by its unknowns; `cost` is half the squared latent distance."""
+
+    residual: Float[Tensor, "k d"]
+    jacobian: Float[Tensor, "k d p"]
+
+    @property
+    def cost(self) -> Float[Tensor, "k"]:
+        return 0.5 * self.residual.square().sum(dim=1)
+
+    @property
+    def distance(self) -> Float[Tensor, "k"]:
+        return torch.linalg.vector_norm(self.residual, dim=1)
+
+    def where(self, chosen: Tensor, other: _Evaluation) -> _Evaluation:
+        """This evaluation for the chosen poses, `other` for the rest."""
+        return _Evaluation(
+            torch.where(chosen[:, None], self.residual, other.residual),
+            torch.where(chosen[:, None, None], self.jacobian, other.jacobian),
+        )
+
+
+class LatentPoseOptimiser:
+    """Refines poses with one layout encoder."""
+
+    def __init__(self, layout_encoder: nn.Module, config: LpoConfig | None = None) -> None:
+        self.encoder = layout_encoder.eval().requires_grad_(False)
+        self.config = config or LpoConfig()
+        self.device = next(layout_encoder.parameters()).device
+
+    @classmethod
+    def from_bundle(cls, bundle: Bundle, config: LpoConfig | None = None) -> LatentPoseOptimiser:
+        """Load the layout encoder of a bundle.
+
+        Raises:
+            BundleError: weights are missing, altered, or do not fit the manifest's configuration.
+        """
+        manifest = bundle.manifest
+        try:
+            encoder = load_layout_encoder(manifest.architecture, manifest.layout_config, bundle.read(LAYOUT_WEIGHTS))
+        except (RuntimeError, ValueError, TypeError) as error:
+            raise BundleError(f"bundle '{bundle.folder}': layout encoder does not load: {error}") from error
+        return cls(encoder, config)
+
+    def refine(self, job: RefinementJob) -> RefinementResult:
+        """Refine every starting pose of a job within its own room."""
+        problem = _Problem(self.encoder, job, self.device)
+        adam = self.config.method == "adam"
+        with torch.no_grad():
+            pose, distance, converged, evaluations = (_adam if adam else _levenberg_marquardt)(problem, self.config)
+        position, heading = problem.unpack(pose)
+        return RefinementResult(
+            position_m=position.cpu().numpy().astype(np.float64) + problem.origin,
+            heading=heading.cpu().numpy().astype(np.float64),
+            latent_distance=distance.cpu().numpy(),
+            converged=converged.cpu().numpy(),
+            evaluations=np.full(len(distance), evaluations),
+        )
+
+
+class _Problem:
+    """The residuals of one job as a function of the unknowns: x, y and, when it is to be found, the heading.
+
+    Positions are relative to each starting pose, so that single precision does not lose millimetres in large plans.
+    """
+
+    def __init__(self, encoder: nn.Module, job: RefinementJob, device: torch.device) -> None:
+        def tensor(array: np.ndarray) -> Tensor:
+            return torch.tensor(array, dtype=torch.float32, device=device)
+
+        self.encoder = encoder
+        self.origin = job.position_m
+        self.walls_m = tensor(job.walls_m - np.tile(job.position_m, 2)[:, None, :])
+        self.heading = tensor(job.heading)
+        self.camera_height_m = tensor(job.camera_height_m)
+        self.ceiling_height_m = tensor(job.ceiling_height_m)
+        self.targets = tensor(job.targets)
+        self.columns = int(encoder.config.profile_columns)
+        self.unknowns = 3 if job.optimise_heading else 2
+        self.start = torch.zeros(len(job.targets), self.unknowns, device=device)
+
+    def unpack(self, pose: Float[Tensor, "k p"]) -> tuple[Float[Tensor, "k 2"], Float[Tensor, "k"]]:
+        """Position (m, relative to the start) and heading (radians)."""
+        turned = self.heading + pose[:, 2] if self.unknowns == 3 else self.heading
+        return pose[:, :2], turned
+
+    def evaluate(self, pose: Float[Tensor, "k p"]) -> _Evaluation:
+        """Residuals and Jacobian, all unknowns at once: the batch is repeated once per unknown."""
+        count = len(pose)
+
+        def repeat(value: Tensor) -> Tensor:
+            return value.repeat_interleave(self.unknowns, dim=0)
+
+        walls, camera, ceiling = map(repeat, (self.walls_m, self.camera_height_m, self.ceiling_height_m))
+        start_heading = repeat(self.heading)
+
+        def latents(unknowns: Tensor) -> Tensor:
+            heading = start_heading + unknowns[:, 2] if self.unknowns == 3 else start_heading
+            profile = wall_profile(unknowns[:, :2], heading, walls, self.columns)
+            return self.encoder(profile, camera, ceiling)
+
+        tangent = torch.eye(self.unknowns, device=pose.device).repeat(count, 1)
+        value, derivative = torch.func.jvp(latents, (repeat(pose),), (tangent,))
+        residual = value[:: self.unknowns] - self.targets
+        return _Evaluation(residual, derivative.reshape(count, self.unknowns, -1).transpose(1, 2))
+
+    def stay_inside(self, pose: Float[Tensor, "k p"], step: Float[Tensor, "k p"], config: LpoConfig) -> Tensor:
+        """The step, shortened where it is too long or would come closer to a wall than the margin."""
+        length = torch.linalg.vector_norm(step[:, :2], dim=1)
+        azimuth = torch.atan2(step[:, 0], step[:, 1])
+        free = cast_rays(pose[:, :2], azimuth[:, None], self.walls_m)[:, 0] - config.margin_m
+        allowed = free.clamp(0.0, config.max_step_m)
+        scale = torch.where(length > allowed, allowed / length.clamp_min(1e-9), torch.ones_like(length))
+        turn = step[:, 2:].clamp(-config.max_turn, config.max_turn)
+        return torch.cat([step[:, :2] * scale[:, None], turn], dim=1)
+
+
+_Outcome = tuple[Tensor, Tensor, Tensor, int]
+
+
+def _levenberg_marquardt(problem: _Problem, config: LpoConfig) -> _Outcome:
+    """Damped Gauss-Newton with Marquardt's scaling; each pose has its own damping."""
+    pose = problem.start
+    here = problem.evaluate(pose)
+    damping = torch.full((len(pose),), config.initial_damping, device=pose.device)
+    converged = torch.zeros(len(pose), dtype=torch.bool, device=pose.device)
+    evaluations = 1
+    while evaluations < config.max_iterations and not bool(converged.all()):
+        gradient = torch.einsum("kdp,kd->kp", here.jacobian, here.residual)
+        hessian = torch.einsum("kdp,kdq->kpq", here.jacobian, here.jacobian)
+        scaling = torch.diagonal(hessian, dim1=1, dim2=2) * damping[:, None] + 1e-8
+        step = -torch.linalg.solve(hessian + torch.diag_embed(scaling), gradient)
+        step = problem.stay_inside(pose, step, config)
+        there = problem.evaluate(pose + step)
+        evaluations += 1
+        better = (there.cost < here.cost) & ~converged
+        # A step that short cannot matter, whether it was good or not.
+        converged = converged | (torch.linalg.vector_norm(step, dim=1) < config.tolerance_m)
+        pose = torch.where(better[:, None], pose + step, pose)
+        here = there.where(better, here)
+        damping = torch.where(better, damping * 0.2, damping * 6.0).clamp(1e-6, 1e8)
+    return pose, here.distance, converged, evaluations
+
+
+def _adam(problem: _Problem, config: LpoConfig) -> _Outcome:
+    """Adam, its rate halved on plateaus, stopped when the cost no longer falls (paper, section A.3)."""
+    pose = problem.start
+    count = len(pose)
+    first, second = torch.zeros_like(pose), torch.zeros_like(pose)
+    rate = torch.full((count,), config.adam_learning_rate, device=pose.device)
+    plateau_best = stop_best = best = torch.full((count,), math.inf, device=pose.device)
+    plateau_age = torch.zeros(count, device=pose.device)
+    stop_age = torch.zeros(count, device=pose.device)
+    best_pose = pose
+    step_number = 0
+    while step_number < config.adam_steps and not bool((stop_age >= config.adam_stop_patience).all()):
+        step_number += 1
+        here = problem.evaluate(pose)
+        cost = here.distance
+        best_pose = torch.where((cost < best)[:, None], pose, best_pose)
+        best = torch.minimum(cost, best)
+        improved = cost < plateau_best * (1.0 - config.adam_plateau_threshold)
+        plateau_best = torch.where(improved, cost, plateau_best)
+        plateau_age = torch.where(improved, torch.zeros_like(plateau_age), plateau_age + 1)
+        stale = plateau_age > config.adam_plateau_patience
+        rate = torch.where(stale, 0.5 * rate, rate)
+        plateau_age = torch.where(stale, torch.zeros_like(plateau_age), plateau_age)
+        fell = cost < stop_best - config.adam_stop_threshold
+        stop_best = torch.where(fell, cost, stop_best)
+        stop_age = torch.where(fell, torch.zeros_like(stop_age), stop_age + 1)
+
+        gradient = torch.einsum("kdp,kd->kp", here.jacobian, here.residual) / cost.clamp_min(1e-9)[:, None]
+        first = 0.9 * first + 0.1 * gradient
+        second = 0.999 * second + 0.001 * gradient.square()
+        direction = first / (1.0 - 0.9**step_number) / ((second / (1.0 - 0.999**step_number)).sqrt() + 1e-8)
+        pose = pose + problem.stay_inside(pose, -rate[:, None] * direction, config)
+    return best_pose, best, stop_age >= config.adam_stop_patience, step_number

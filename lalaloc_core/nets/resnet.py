@@ -1,0 +1,145 @@
+"""Architecture `paper`: ResNet-18 on layout depth, ResNet-50 on RGB, average pool, one FC to 128 (section A.1.1).
+
+Parameter names are torchvision's, so that its ImageNet weights load into `backbone` as they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn import functional
+
+from lalaloc_core.render.depth import layout_depth
+
+# ImageNet statistics, for users who start from its weights.
+IMAGE_MEAN = (0.485, 0.456, 0.406)
+IMAGE_STD = (0.229, 0.224, 0.225)
+
+
+@dataclass(frozen=True, kw_only=True)
+class PaperConfig:
+    """Sizes of the `paper` architecture; depths are (18 or 50)."""
+
+    layout_depth: int = 18
+    image_depth: int = 50
+    latent_size: int = 128
+    layout_height: int = 128
+    profile_columns: int = 256
+    image_height: int = 256
+    image_width: int = 512
+
+
+class BasicBlock(nn.Module):
+    """Two 3x3 convolutions with a shortcut (ResNet-18)."""
+
+    expansion = 1
+
+    def __init__(self, inputs: int, width: int, stride: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(inputs, width, 3, stride, 1, bias=False)
+        self.bn1 = nn.BatchNorm2d(width)
+        self.conv2 = nn.Conv2d(width, width, 3, 1, 1, bias=False)
+        self.bn2 = nn.BatchNorm2d(width)
+        self.downsample = _shortcut(inputs, width, stride)
+
+    def forward(self, x: Float[Tensor, "b i h w"]) -> Float[Tensor, "b o g v"]:
+        y = functional.relu(self.bn1(self.conv1(x)))
+        y = self.bn2(self.conv2(y))
+        return functional.relu(y + (x if self.downsample is None else self.downsample(x)))
+
+
+class Bottleneck(nn.Module):
+    """1x1, 3x3, 1x1 convolutions with a shortcut (ResNet-50)."""
+
+    expansion = 4
+
+    def __init__(self, inputs: int, width: int, stride: int) -> None:
+        super().__init__()
+        self.conv1 = nn.Conv2d(inputs, width, 1, bias=False)
+        self.bn1 = nn.BatchNorm2d(width)
+        self.conv2 = nn.Conv2d(width, width, 3, stride, 1, bias=False)
+        self.bn2 = nn.BatchNorm2d(width)
+        self.conv3 = nn.Conv2d(width, 4 * width, 1, bias=False)
+        self.bn3 = nn.BatchNorm2d(4 * width)
+        self.downsample = _shortcut(inputs, 4 * width, stride)
+
+    def forward(self, x: Float[Tensor, "b i h w"]) -> Float[Tensor, "b o g v"]:
+        y = functional.relu(self.bn1(self.conv1(x)))
+        y = functional.relu(self.bn2(self.conv2(y)))
+        y = self.bn3(self.conv3(y))
+        return functional.relu(y + (x if self.downsample is None else self.downsample(x)))
+
+
+def _shortcut(inputs: int, outputs: int, stride: int) -> nn.Sequential | None:
+    if inputs == outputs and stride == 1:
+        return None
+    return nn.Sequential(nn.Conv2d(inputs, outputs, 1, stride, bias=False), nn.BatchNorm2d(outputs))
+
+
+class ResNet(nn.Module):
+    """ResNet-18 or ResNet-50 up to and with its pooled features; `channels` of them."""
+
+    def __init__(self, depth: int, *, inputs: int = 3) -> None:
+        super().__init__()
+        block, counts = {18: (BasicBlock, (2, 2, 2, 2)), 50: (Bottleneck, (3, 4, 6, 3))}[depth]
+        self.conv1 = nn.Conv2d(inputs, 64, 7, 2, 3, bias=False)
+        self.bn1 = nn.BatchNorm2d(64)
+        self.maxpool = nn.MaxPool2d(3, 2, 1)
+        self.channels = 64
+        self.layer1 = self._stage(block, 64, counts[0], 1)
+        self.layer2 = self._stage(block, 128, counts[1], 2)
+        self.layer3 = self._stage(block, 256, counts[2], 2)
+        self.layer4 = self._stage(block, 512, counts[3], 2)
+
+    def _stage(self, block: type[BasicBlock | Bottleneck], width: int, count: int, stride: int) -> nn.Sequential:
+        layers = []
+        for index in range(count):
+            layers.append(block(self.channels, width, stride if index == 0 else 1))
+            self.channels = width * block.expansion
+        return nn.Sequential(*layers)
+
+    def forward(self, x: Float[Tensor, "b i h w"]) -> Float[Tensor, "b c"]:
+        x = self.maxpool(functional.relu(self.bn1(self.conv1(x))))
+        x = self.layer4(self.layer3(self.layer2(self.layer1(x))))
+        return x.mean(dim=(2, 3))
+
+
+class PaperLayoutEncoder(nn.Module):
+    """Layout depth, rendered from the wall profile, to a latent."""
+
+    def __init__(self, config: PaperConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.backbone = ResNet(config.layout_depth, inputs=1)
+        self.fc = nn.Linear(self.backbone.channels, config.latent_size)
+
+    def forward(
+        self,
+        profile_m: Float[Tensor, "b w"],
+        camera_height_m: Float[Tensor, "b"],
+        ceiling_height_m: Float[Tensor, "b"],
+    ) -> Float[Tensor, "b d"]:
+        depth = layout_depth(profile_m, camera_height_m, ceiling_height_m, self.config.layout_height)
+        return functional.normalize(self.fc(self.backbone(depth[:, None])), dim=1)
+
+
+class PaperImageEncoder(nn.Module):
+    """RGB panorama to a latent."""
+
+    def __init__(self, config: PaperConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.backbone = ResNet(config.image_depth)
+        self.fc = nn.Linear(self.backbone.channels, config.latent_size)
+        self.register_buffer("mean", 255.0 * torch.tensor(IMAGE_MEAN)[None, :, None, None], persistent=False)
+        self.register_buffer("std", 255.0 * torch.tensor(IMAGE_STD)[None, :, None, None], persistent=False)
+        self.mean: Tensor
+        self.std: Tensor
+
+    def forward(self, image: Tensor) -> Float[Tensor, "b d"]:
+        """Encode `image`, (b, h, w, 3), values 0 to 255 of any type."""
+        pixels = (image.permute(0, 3, 1, 2).to(self.mean.dtype) - self.mean) / self.std
+        return functional.normalize(self.fc(self.backbone(pixels)), dim=1)

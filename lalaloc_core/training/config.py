@@ -1,0 +1,220 @@
+"""Training configuration: frozen, typed, strict about unknown keys; it travels inside every checkpoint."""
+
+from __future__ import annotations
+
+import dataclasses
+import types
+from dataclasses import dataclass, field
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from lalaloc_core.errors import ConfigError
+from lalaloc_core.nets.resnet import PaperConfig
+from lalaloc_core.nets.ring import RingConfig
+from lalaloc_core.sampling import TripletSampling
+
+Architecture = Literal["ring", "paper"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class OptimiserConfig:
+    """Optimiser and learning-rate schedule; fractions are of the whole stage."""
+
+    kind: Literal["adamw", "sgd"] = "adamw"
+    learning_rate: float = 1e-3
+    weight_decay: float = 1e-4
+    momentum: float = 0.9
+    schedule: Literal["cosine", "steps"] = "cosine"
+    warmup: float = 0.02
+    milestones: tuple[float, ...] = (0.5, 0.75)
+    gamma: float = 0.1
+    clip_norm: float = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class LayoutStageConfig:
+    """Stage 1: the layout encoder alone, log-ratio and decoding losses (paper, section 3.1).
+
+    Attributes:
+        minutes: wall-clock budget; when given, it and not `steps` sets the pace of the schedule.
+        all_pairs: compare every two neighbours of an anchor instead of positives with negatives only.
+        turned_share: share of the negatives replaced by positives' places seen at another heading.
+        decode_anchors_only: decode the anchors' latents alone; the decoder costs more than a small encoder.
+        cloud_rows, cloud_columns: sub-sampling of the layouts whose Chamfer distances are taken.
+        scale_weight: weight of the loss that fixes the global scale of latent distances, which the log-ratio
+            leaves free and which otherwise shrinks.
+        latent_per_metre: the latent distance that one metre of Chamfer distance should be worth.
+    """
+
+    steps: int = 6000
+    minutes: float | None = None
+    homes_per_step: int = 4
+    anchors_per_home: int = 4
+    triplets: TripletSampling = field(default_factory=TripletSampling)
+    all_pairs: bool = False
+    turned_share: float = 0.0
+    decode_weight: float = 1.0
+    decode_anchors_only: bool = False
+    scale_weight: float = 0.0
+    latent_per_metre: float = 0.5
+    cloud_rows: int = 16
+    cloud_columns: int = 32
+    optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImageStageConfig:
+    """Stage 2: the image encoder against the frozen layout encoder (paper, section 3.2).
+
+    Attributes:
+        minutes: wall-clock budget; when given, it and not `steps` sets the pace of the schedule.
+        l2_weight: weight of the latent distance, the paper's only loss.
+        ring_weight: weight of distilling ring features (architecture `ring`).
+        profile_weight: weight of the Laplace likelihood of the wall profile (architecture `ring`).
+        ema_decay: decay per step of the averaged weights that are validated and shipped; 0 turns it off.
+    """
+
+    steps: int = 20000
+    minutes: float | None = None
+    batch: int = 32
+    shots_per_home: int = 4
+    l2_weight: float = 1.0
+    ring_weight: float = 0.0
+    profile_weight: float = 0.0
+    ema_decay: float = 0.0
+    optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainConfig:
+    """Everything that decides what is trained."""
+
+    name: str
+    architecture: Architecture = "ring"
+    seed: int = 0
+    ring: RingConfig = field(default_factory=RingConfig)
+    paper: PaperConfig = field(default_factory=PaperConfig)
+    layout: LayoutStageConfig = field(default_factory=LayoutStageConfig)
+    image: ImageStageConfig = field(default_factory=ImageStageConfig)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data, for checkpoints and manifests."""
+        return dataclasses.asdict(self)
+
+    @classmethod
+    def from_dict(cls, raw: dict[str, Any]) -> TrainConfig:
+        """Rebuild strictly.
+
+        Raises:
+            ConfigError: an unknown key or a value of the wrong type, named with its path.
+        """
+        return build_config(cls, raw, path="config")
+
+    @property
+    def profile_columns(self) -> int:
+        """Azimuth columns that the layout encoder expects."""
+        return self.ring.profile_columns if self.architecture == "ring" else self.paper.profile_columns
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """(height, width) that the image encoder expects."""
+        sizes = self.ring if self.architecture == "ring" else self.paper
+        return sizes.image_height, sizes.image_width
+
+
+def build_config(kind: type[Any], raw: Any, *, path: str = "config") -> Any:
+    """Build a frozen dataclass from plain data, refusing unknown keys and wrong types.
+
+    Raises:
+        ConfigError: names the path of the offending key.
+    """
+    if not isinstance(raw, dict):
+        raise ConfigError(f"{path} must be a mapping, not {type(raw).__name__}")
+    hints = get_type_hints(kind)
+    unknown = sorted(set(raw) - set(hints))
+    if unknown:
+        raise ConfigError(f"{path} has no key '{unknown[0]}', known are {', '.join(sorted(hints))}")
+    try:
+        return kind(**{name: _convert(hints[name], value, f"{path}.{name}") for name, value in raw.items()})
+    except TypeError as error:
+        raise ConfigError(f"{path}: {error}") from error
+
+
+def _convert(hint: Any, value: Any, path: str) -> Any:
+    if dataclasses.is_dataclass(hint):
+        return build_config(hint, value, path=path)  # type: ignore[arg-type]
+    origin = get_origin(hint)
+    if origin is Literal:
+        if value in get_args(hint):
+            return value
+        raise ConfigError(f"{path} is {value!r}, it must be one of {', '.join(map(repr, get_args(hint)))}")
+    if origin in (Union, types.UnionType):
+        return None if value is None else _convert(next(a for a in get_args(hint) if a is not type(None)), value, path)
+    if origin is tuple and isinstance(value, list | tuple):
+        return tuple(_convert(get_args(hint)[0], item, path) for item in value)
+    if hint is float and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if isinstance(hint, type) and isinstance(value, hint) and not (hint is int and isinstance(value, bool)):
+        return value
+    raise ConfigError(f"{path} is {value!r}, it must be of type {getattr(hint, '__name__', hint)}")
+
+
+_PAPER_SGD = OptimiserConfig(kind="sgd", learning_rate=0.01, schedule="steps", warmup=0.0, clip_norm=0.0)
+
+# The paper counts epochs over Structured3D; its 18,000 or so training panoramas give these numbers of steps.
+PRESETS: dict[str, TrainConfig] = {
+    "paper": TrainConfig(
+        name="paper",
+        architecture="paper",
+        layout=LayoutStageConfig(steps=90_000, homes_per_step=4, anchors_per_home=1, optimiser=_PAPER_SGD),
+        image=ImageStageConfig(
+            steps=56_000,
+            batch=64,
+            shots_per_home=1,
+            optimiser=dataclasses.replace(_PAPER_SGD, learning_rate=0.1),
+        ),
+    ),
+    "ring": TrainConfig(
+        name="ring",
+        layout=LayoutStageConfig(
+            triplets=TripletSampling(positives=4, negatives=8),
+            all_pairs=True,
+            turned_share=0.25,
+            decode_weight=0.3,
+            decode_anchors_only=True,
+            cloud_rows=8,
+            cloud_columns=32,
+            scale_weight=0.1,
+            optimiser=OptimiserConfig(learning_rate=2e-3),
+        ),
+        image=ImageStageConfig(
+            ring_weight=1.0, profile_weight=0.5, ema_decay=0.999, optimiser=OptimiserConfig(learning_rate=1.5e-3)
+        ),
+    ),
+    "tiny": TrainConfig(
+        name="tiny",
+        ring=RingConfig(
+            sectors=16,
+            channels=8,
+            profile_columns=32,
+            layout_width=16,
+            layout_dilations=(1,),
+            image_height=32,
+            image_width=64,
+            image_stem=8,
+            image_widths=(8, 12),
+            image_blocks=(1, 1),
+            mixer_width=16,
+            mixer_blocks=1,
+            mixer_heads=2,
+        ),
+        layout=LayoutStageConfig(
+            steps=40,
+            homes_per_step=2,
+            anchors_per_home=2,
+            triplets=TripletSampling(positives=2, negatives=4),
+            all_pairs=True,
+            scale_weight=0.1,
+        ),
+        image=ImageStageConfig(steps=12, batch=8, ring_weight=1.0, profile_weight=0.5, ema_decay=0.9),
+    ),
+}

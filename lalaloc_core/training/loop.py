@@ -1,0 +1,194 @@
+"""The training loop both stages share: schedule, mixed precision, averaging, log, checkpoints, resuming."""
+
+from __future__ import annotations
+
+import copy
+import csv
+import logging
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from lalaloc_core.errors import CheckpointError
+from lalaloc_core.training.checkpoint import Checkpoint
+from lalaloc_core.training.config import OptimiserConfig
+from lalaloc_core.training.stages import Stage, build_optimiser
+from lalaloc_core.training.stream import Batch
+
+_LOG = logging.getLogger(__name__)
+_LOG_EVERY = 20
+
+Validate = Callable[[dict[str, nn.Module]], dict[str, float]]
+
+
+def run_stage(
+    stage: Stage,
+    folder: Path,
+    *,
+    device: torch.device,
+    workers: int = 1,
+    resume: bool = False,
+    checkpoint_minutes: float = 5.0,
+    validate: Validate | None = None,
+) -> Checkpoint:
+    """Train a stage to the end of its schedule, or resume one that was interrupted.
+
+    Writes `<stage>.pt` (checkpoint) and `<stage>.csv` (losses and validation by step) into `folder`.
+
+    Args:
+        workers: processes that make batches.
+        validate: called with the modules (averaged where averaging is on) whenever a checkpoint is written.
+
+    Raises:
+        CheckpointError: `resume` without a checkpoint, or of another configuration.
+    """
+    path = folder / f"{stage.name}.pt"
+    trainer = _Trainer(stage, device)
+    if resume:
+        trainer.restore(Checkpoint.load(path, stage=stage.name))
+    batches = stage.batches(trainer.step, workers)
+    last_saved = time.monotonic()
+    with (
+        _CsvLog(folder / f"{stage.name}.csv", append=resume) as log,
+        tqdm(total=stage.settings.steps, initial=trainer.step, desc=stage.name, mininterval=10.0) as bar,
+    ):
+        while trainer.progress < 1.0:
+            begin = time.monotonic()
+            terms = trainer.train_step(next(batches))
+            trainer.seconds += time.monotonic() - begin
+            bar.update()
+            if trainer.step % _LOG_EVERY == 0:
+                log.write(trainer.step, trainer.seconds, terms)
+                bar.set_postfix({name: f"{value:.3f}" for name, value in terms.items()}, refresh=False)
+            finished = trainer.progress >= 1.0
+            if finished or time.monotonic() - last_saved > 60.0 * checkpoint_minutes:
+                if validate is not None:
+                    trainer.metrics = validate(trainer.averaged or stage.modules)
+                    log.write(trainer.step, trainer.seconds, trainer.metrics)
+                    _LOG.info("step %d: %s", trainer.step, trainer.metrics)
+                trainer.checkpoint().save(path)
+                last_saved = time.monotonic()
+    return trainer.checkpoint()
+
+
+class _Trainer:
+    """Parameters, optimiser, averages and progress of one stage."""
+
+    def __init__(self, stage: Stage, device: torch.device) -> None:
+        self.stage = stage
+        self.device = device
+        self.settings = stage.settings
+        for module in stage.modules.values():
+            module.to(device).train()
+        if isinstance(teacher := getattr(stage, "teacher", None), nn.Module):
+            teacher.to(device)
+        self.optimiser = build_optimiser(stage.modules, self.settings.optimiser)
+        self.decay = getattr(self.settings, "ema_decay", 0.0)
+        self.averaged = {k: copy.deepcopy(m).eval() for k, m in stage.modules.items()} if self.decay else {}
+        self.step = 0
+        self.seconds = 0.0
+        self.metrics: dict[str, float] = {}
+
+    @property
+    def progress(self) -> float:
+        """Share of the schedule done, by time where a time budget is set, else by steps."""
+        if self.settings.minutes is not None:
+            return self.seconds / (60.0 * self.settings.minutes)
+        return self.step / self.settings.steps
+
+    def train_step(self, batch: Batch) -> dict[str, float]:
+        """One update; returns the losses by name.
+
+        Raises:
+            FloatingPointError: the loss is not finite; the last checkpoint is still good.
+        """
+        for group in self.optimiser.param_groups:
+            group["lr"] = learning_rate(self.settings.optimiser, min(self.progress, 1.0))
+        batch = {key: value.to(self.device, non_blocking=True) for key, value in batch.items()}
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.device.type == "cuda"):
+            terms = self.stage.losses(batch)
+        total: Tensor = torch.stack(list(terms.values())).sum()
+        if not torch.isfinite(total):
+            raise FloatingPointError(f"loss at step {self.step} is {total.item()}: {terms}")
+        self.optimiser.zero_grad(set_to_none=True)
+        total.backward()
+        if self.settings.optimiser.clip_norm:
+            parameters = [p for module in self.stage.modules.values() for p in module.parameters()]
+            nn.utils.clip_grad_norm_(parameters, self.settings.optimiser.clip_norm)
+        self.optimiser.step()
+        self.step += 1
+        self._average()
+        return {name: term.item() for name, term in terms.items()}
+
+    @torch.no_grad()
+    def _average(self) -> None:
+        # Early steps would weigh too long at full decay.
+        decay = min(self.decay, (1.0 + self.step) / (10.0 + self.step))
+        for name, average in self.averaged.items():
+            source = self.stage.modules[name].state_dict()
+            for key, value in average.state_dict().items():
+                if value.is_floating_point():
+                    value.lerp_(source[key], 1.0 - decay)
+                else:
+                    value.copy_(source[key])
+
+    def checkpoint(self) -> Checkpoint:
+        """The present state."""
+        return Checkpoint(
+            stage=self.stage.name,
+            config=self.stage.config,
+            weights={name: module.state_dict() for name, module in self.stage.modules.items()},
+            averaged={name: module.state_dict() for name, module in self.averaged.items()},
+            optimiser=self.optimiser.state_dict(),
+            step=self.step,
+            seconds=self.seconds,
+            metrics=self.metrics,
+        )
+
+    def restore(self, checkpoint: Checkpoint) -> None:
+        """Go on from a checkpoint of the same configuration."""
+        if checkpoint.config != self.stage.config:
+            raise CheckpointError(f"the checkpoint of stage '{checkpoint.stage}' has another configuration")
+        for name, module in self.stage.modules.items():
+            module.load_state_dict(checkpoint.weights[name])
+        for name, module in self.averaged.items():
+            module.load_state_dict(checkpoint.averaged[name])
+        self.optimiser.load_state_dict(checkpoint.optimiser)
+        self.step, self.seconds, self.metrics = checkpoint.step, checkpoint.seconds, checkpoint.metrics
+
+
+def learning_rate(config: OptimiserConfig, progress: float) -> float:
+    """Learning rate at a share (0 to 1) of the schedule."""
+    if config.warmup and progress < config.warmup:
+        return config.learning_rate * (0.05 + 0.95 * progress / config.warmup)
+    if config.schedule == "steps":
+        return config.learning_rate * config.gamma ** sum(progress >= milestone for milestone in config.milestones)
+    return config.learning_rate * (0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * progress)))
+
+
+class _CsvLog:
+    """Long-format log: one row per step and value, so that any tool can plot it."""
+
+    def __init__(self, path: Path, *, append: bool) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        fresh = not (append and path.exists())
+        self._file = path.open("w" if fresh else "a", newline="", encoding="utf-8")
+        self._writer = csv.writer(self._file)
+        if fresh:
+            self._writer.writerow(["step", "seconds", "name", "value"])
+
+    def __enter__(self) -> _CsvLog:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def write(self, step: int, seconds: float, values: dict[str, float]) -> None:
+        """Append one row per value."""
+        self._writer.writerows([step, f"{seconds:.1f}", name, f"{value:.6g}"] for name, value in values.items())
+        self._file.flush()

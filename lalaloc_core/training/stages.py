@@ -1,0 +1,56 @@
+"""What the training loop needs to know of a stage, and what the two stages share."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Protocol
+
+import torch
+from torch import Tensor, nn
+
+from lalaloc_core.nets.resnet import PaperImageEncoder, PaperLayoutEncoder
+from lalaloc_core.nets.ring import RingImageEncoder, RingLayoutEncoder
+from lalaloc_core.training.config import ImageStageConfig, LayoutStageConfig, OptimiserConfig, TrainConfig
+from lalaloc_core.training.stream import Batch
+
+LayoutEncoder = RingLayoutEncoder | PaperLayoutEncoder
+ImageEncoder = RingImageEncoder | PaperImageEncoder
+
+
+class Stage(Protocol):
+    """What the training loop needs to know of a stage."""
+
+    name: str
+    config: TrainConfig
+    modules: dict[str, nn.Module]
+
+    @property
+    def settings(self) -> LayoutStageConfig | ImageStageConfig: ...
+
+    def batches(self, first_step: int, workers: int) -> Iterator[Batch]: ...
+
+    def losses(self, batch: Batch) -> dict[str, Tensor]: ...
+
+
+def build_layout_encoder(config: TrainConfig) -> LayoutEncoder:
+    """A fresh layout encoder of the configured architecture."""
+    return RingLayoutEncoder(config.ring) if config.architecture == "ring" else PaperLayoutEncoder(config.paper)
+
+
+def build_image_encoder(config: TrainConfig) -> ImageEncoder:
+    """A fresh image encoder of the configured architecture."""
+    return RingImageEncoder(config.ring) if config.architecture == "ring" else PaperImageEncoder(config.paper)
+
+
+def build_optimiser(modules: dict[str, nn.Module], config: OptimiserConfig) -> torch.optim.Optimizer:
+    """The optimiser over all parameters; AdamW decays matrices only."""
+    parameters = [p for module in modules.values() for p in module.parameters()]
+    if config.kind == "sgd":
+        return torch.optim.SGD(
+            parameters, config.learning_rate, momentum=config.momentum, weight_decay=config.weight_decay
+        )
+    groups = [
+        {"params": [p for p in parameters if p.ndim > 1], "weight_decay": config.weight_decay},
+        {"params": [p for p in parameters if p.ndim <= 1], "weight_decay": 0.0},
+    ]
+    return torch.optim.AdamW(groups, config.learning_rate)
