@@ -1,0 +1,308 @@
+"""Building a shot's scene: dressing the walls, hanging doors and curtains, furnishing, lighting."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import shapely
+
+from lalaloc_core.floorplan import Room
+from lalaloc_core.synth.furniture import CAMERA_CLEARANCE_M, FurnitureLevel, Prism, furnish, rectangle, wall_frame
+from lalaloc_core.synth.lighting import Lighting, draw_backdrop, draw_exposure, light_room
+from lalaloc_core.synth.materials import MaterialLibrary
+from lalaloc_core.synth.openings import Opening
+from lalaloc_core.synth.scene import Scene
+from lalaloc_core.synth.shots import Shot
+from lalaloc_core.synth.surfaces import SurfaceTable, bright, paint, vivid, wood_tone
+
+_DEFAULT_WALL_DEPTH_M = 0.12
+
+
+def build_scene(shot: Shot, materials: MaterialLibrary) -> Scene:
+    """The scene that a shot sees, everything that is random about it drawn from the shot's seed."""
+    return _Builder(shot, materials, np.random.default_rng(shot.seed)).build()
+
+
+class _Builder:
+    """Collects the tables of one scene."""
+
+    def __init__(self, shot: Shot, materials: MaterialLibrary, rng: np.random.Generator) -> None:
+        home, room_index = shot.home, shot.room_index
+        self.shot, self.home, self.rng = shot, home, rng
+        self.level: FurnitureLevel = shot.furniture
+        self.position = shot.position_m
+        self.room = home.plan.rooms[room_index]
+        self.openings = [opening for opening in home.openings if opening.room == room_index]
+        see_through = [o.neighbour for o in self.openings if o.kind in ("door_open", "opening") and o.neighbour >= 0]
+        self.slot_rooms = [room_index, *dict.fromkeys(see_through)]
+        self.table = SurfaceTable(materials, materials.mean_colours, rng)
+        self.walls: list[np.ndarray] = []
+        self.owner: list[int] = []
+        self.wall_surface: list[int] = []
+        self.decals: list[tuple[float, ...]] = []
+        self.prisms: list[tuple[float, ...]] = []
+        self.slots: list[list[float]] = []
+        # One house style: all doors and trims look alike.
+        self.trim = self.table.add_plain(bright(rng) if rng.random() < 0.7 else wood_tone(rng))
+        colour = self._door_colour()
+        plain = rng.random() < 0.6
+        self.door = self.table.add_plain(colour) if plain else self.table.add("furniture", colour, scale=0.8)
+        self.door_panel = self.table.add_plain(np.clip(colour * rng.uniform(0.75, 1.15), 0.01, 0.92))
+        self.handle = self.table.add_finish("metal")
+        self.outdoors = self.table.add_outdoors(math.exp(rng.uniform(0.3, 2.3)))
+        self.gloom = self.table.add_plain(paint(rng) * 0.3)
+        self.baseboard_m = rng.uniform(0.04, 0.14) if rng.random() < 0.8 else 0.0
+        self.crown_m = rng.uniform(0.03, 0.12) if rng.random() < 0.2 else 0.0
+        self.floor_surface = -1
+
+    def build(self) -> Scene:
+        lighting = Lighting(self.rng)
+        for slot, room_index in enumerate(self.slot_rooms):
+            self._add_room(slot, room_index, lighting)
+        self._add_jambs()
+        lights, lamps, sun = light_room(self.room, self.openings, self.position, lighting, self.rng)
+        for prism in lamps:
+            self._add_prism(prism, opaque=False)
+        return Scene(
+            camera_height_m=self.shot.camera_height_m,
+            heading=self.shot.heading,
+            walls_m=np.array(self.walls) - np.tile(self.position, 2),
+            wall_owner=np.array(self.owner),
+            wall_surface=np.array(self.wall_surface),
+            decals=np.array(self.decals, dtype=float).reshape(-1, 8),
+            prisms=np.array(self.prisms, dtype=float).reshape(-1, 11),
+            surfaces=np.array(self.table.rows),
+            slots=np.array(self.slots),
+            lights=lights,
+            sun=sun,
+            backdrop=draw_backdrop(self.rng),
+            exposure=draw_exposure(self.rng),
+        )
+
+    def _door_colour(self) -> np.ndarray:
+        kind = self.rng.random()
+        if kind < 0.55:
+            return bright(self.rng)
+        return wood_tone(self.rng) if kind < 0.9 else vivid(self.rng)
+
+    def _add_room(self, slot: int, room_index: int, lighting: Lighting) -> None:
+        rng, room = self.rng, self.home.plan.rooms[room_index]
+        colour = paint(rng)
+        wall = self.table.add_wall(colour)
+        accent = self.table.add_wall(paint(rng)) if rng.random() < 0.25 else wall
+        ceiling_colour = colour * rng.uniform(0.85, 1.1) if rng.random() < 0.2 else bright(rng)
+        ceiling = self.table.add_ceiling(np.clip(ceiling_colour, 0.01, 0.92))
+        _, along, _ = wall_frame(room, 0)
+        if self.floor_surface < 0 or rng.random() < 0.4:
+            self.floor_surface = self.table.add_floor(colour, math.atan2(along[1], along[0]))
+        self.slots.append(
+            [room.ceiling_height_m, self.floor_surface, ceiling, *lighting.of_room_beyond(room, self.position)]
+        )
+        accented = int(rng.integers(len(room.walls_m)))
+        first = len(self.walls)
+        for edge, ends in enumerate(room.walls_m):
+            self.walls.append(ends)
+            self.owner.append(slot)
+            self.wall_surface.append(accent if edge == accented else wall)
+            self._add_wall_trim(first + edge, ends, room)
+        openings = [opening for opening in self.home.openings if opening.room == room_index]
+        for opening in openings:
+            self._add_opening(first + opening.wall, room, opening, is_own=slot == 0)
+        level: FurnitureLevel = self.level if slot == 0 or self.level == "empty" else "simple"
+        camera = self.position if slot == 0 else None
+        pieces = furnish(room, openings, level, rng, camera)
+        self._add_pieces(pieces)
+
+    def _add_pieces(self, prisms: list[Prism]) -> None:
+        known: dict[tuple[int, str], int] = {}
+        for prism in prisms:
+            key = (prism.piece, prism.finish)
+            if key not in known:
+                known[key] = self.table.add_finish(prism.finish)
+            self._add_prism(prism, opaque=prism.finish != "glow", surface=known[key])
+
+    def _add_prism(self, prism: Prism, *, opaque: bool = True, surface: int | None = None) -> None:
+        row = self.table.add_finish(prism.finish) if surface is None else surface
+        self.prisms.append(
+            (
+                prism.x - self.position[0],
+                prism.y - self.position[1],
+                prism.axis_x,
+                prism.axis_y,
+                prism.half_a,
+                prism.half_b,
+                prism.z0,
+                prism.z1,
+                float(prism.round),
+                float(row),
+                float(opaque),
+            )
+        )
+
+    def _decal(
+        self, wall: int, s0: float, s1: float, z0: float, z1: float, surface: int, slot: int = -1, depth: float = 0.0
+    ) -> None:
+        self.decals.append((wall, s0, s1, z0, z1, surface, slot, depth))
+
+    def _add_wall_trim(self, wall: int, ends: np.ndarray, room: Room) -> None:
+        """Baseboard, crown moulding, pictures and switches."""
+        rng, ceiling = self.rng, room.ceiling_height_m
+        length = float(np.hypot(*(ends[2:] - ends[:2])))
+        if self.baseboard_m > 0.0:
+            self._decal(wall, -1.0, length + 1.0, -1.0, self.baseboard_m, self.trim)
+        if self.crown_m > 0.0:
+            self._decal(wall, -1.0, length + 1.0, ceiling - self.crown_m, ceiling + 1.0, self.trim)
+        if self.level == "empty" and rng.random() < 0.8:
+            return
+        if length > 1.0 and rng.random() < 0.45:
+            half_width, half_height = rng.uniform(0.12, 0.6), rng.uniform(0.12, 0.5)
+            if 2 * half_width < length - 0.2:
+                s = rng.uniform(half_width + 0.1, length - half_width - 0.1)
+                z = rng.uniform(1.35, 1.7)
+                frame, picture = self.table.add_finish("dark"), self.table.add("furniture", vivid(rng), scale=0.7)
+                self._decal(wall, s - half_width, s + half_width, z - half_height, z + half_height, frame)
+                inset = rng.uniform(0.015, 0.05)
+                self._decal(
+                    wall,
+                    s - half_width + inset,
+                    s + half_width - inset,
+                    z - half_height + inset,
+                    z + half_height - inset,
+                    picture,
+                )
+        if length > 0.5 and rng.random() < 0.5:
+            s, z = rng.uniform(0.1, length - 0.1), float(rng.choice([0.25, 1.1]))
+            self._decal(wall, s - 0.04, s + 0.04, z - 0.04, z + 0.04, self.trim)
+
+    def _add_opening(self, wall: int, room: Room, opening: Opening, is_own: bool) -> None:
+        s0, s1, z0, z1 = opening.start_m, opening.end_m, opening.sill_m, opening.head_m
+        if opening.kind == "window":
+            self._add_window(wall, s0, s1, z0, z1)
+            if is_own:
+                self._add_curtains(room, opening)
+            return
+        framed = opening.kind != "opening" or (z1 < room.ceiling_height_m - 0.15 and self.rng.random() < 0.3)
+        if framed:
+            border = self.rng.uniform(0.04, 0.1)
+            self._decal(wall, s0 - border, s1 + border, 0.0, z1 + border, self.trim)
+        see_through = is_own and opening.kind in ("door_open", "opening") and opening.neighbour >= 0
+        if see_through:
+            slot = self.slot_rooms.index(opening.neighbour)
+            depth = self._hole_depth(opening)
+            surface = self.trim if framed else self.wall_surface[wall]
+            self._decal(wall, s0, s1, -1.0, z1, surface, slot, depth)
+            if opening.kind == "door_open":
+                self._add_door_leaf(room, opening, depth)
+        elif opening.kind == "door_shut" or (opening.kind == "door_open" and self.rng.random() < 0.5):
+            self._add_shut_door(wall, s0, s1, z1)
+        else:
+            self._decal(wall, s0, s1, -1.0, z1, self.gloom)
+
+    def _hole_depth(self, opening: Opening) -> float:
+        """Distance to the facing wall of the room behind."""
+        start, along, inwards = wall_frame(self.room, opening.wall)
+        middle = start + along * 0.5 * (opening.start_m + opening.end_m)
+        ray = shapely.LineString([middle, middle - inwards])
+        shape = self.home.plan.rooms[opening.neighbour].shape
+        depth = float(shapely.distance(shapely.Point(middle), shapely.intersection(ray, shape)))
+        return depth if 0.0 < depth < 0.6 else _DEFAULT_WALL_DEPTH_M
+
+    def _add_window(self, wall: int, s0: float, s1: float, z0: float, z1: float) -> None:
+        rng, border = self.rng, self.rng.uniform(0.04, 0.09)
+        self._decal(wall, s0 - 0.03, s1 + 0.03, z0 - 0.03, z1 + 0.03, self.trim)
+        self._decal(wall, s0 + border, s1 - border, z0 + border, z1 - border, self.outdoors)
+        sashes = max(1, round((s1 - s0) / rng.uniform(0.6, 1.4)))
+        for k in range(1, sashes):
+            s = s0 + (s1 - s0) * k / sashes
+            self._decal(wall, s - 0.6 * border, s + 0.6 * border, z0, z1, self.trim)
+        if rng.random() < 0.2:
+            z = rng.uniform(0.4, 0.7) * (z1 - z0) + z0
+            self._decal(wall, s0, s1, z - 0.02, z + 0.02, self.trim)
+        if rng.random() < 0.15:
+            # A roller blind.
+            blind = self.table.add("furniture", bright(rng), glow=rng.uniform(0.4, 1.2))
+            self._decal(wall, s0, s1, z1 - rng.uniform(0.2, 0.9) * (z1 - z0), z1, blind)
+
+    def _add_shut_door(self, wall: int, s0: float, s1: float, z1: float) -> None:
+        rng, double = self.rng, s1 - s0 > 1.15
+        self._decal(wall, s0, s1, -1.0, z1, self.door)
+        leaves = [(s0, 0.5 * (s0 + s1)), (0.5 * (s0 + s1), s1)] if double else [(s0, s1)]
+        panels = int(rng.integers(0, 4))
+        for a, b in leaves:
+            for k in range(panels):
+                low, high = 0.15 + k * (z1 - 0.25) / panels, 0.05 + (k + 1) * (z1 - 0.25) / panels
+                self._decal(wall, a + 0.12, b - 0.12, low, high, self.door_panel)
+        s = 0.5 * (s0 + s1) - 0.08 if double else (s1 - 0.08 if rng.random() < 0.5 else s0 + 0.08)
+        self._decal(wall, s - 0.05, s + 0.05, 1.0, 1.04, self.handle)
+        if double:
+            self._decal(wall, 0.5 * (s0 + s1) - 0.006, 0.5 * (s0 + s1) + 0.006, 0.0, z1, self.gloom)
+
+    def _add_door_leaf(self, room: Room, opening: Opening, depth: float) -> None:
+        """An open door's leaf, hinged at one end, standing in one of the two rooms; none if there is no space."""
+        rng = self.rng
+        start, along, inwards = wall_frame(room, opening.wall)
+        width = opening.end_m - opening.start_m
+        angle = math.radians(rng.uniform(55.0, 110.0))
+        for into_own in (True, False) if rng.random() < 0.5 else (False, True):
+            outward = inwards if into_own else -inwards
+            at_start = rng.random() < 0.5
+            hinge = start + along * (opening.start_m if at_start else opening.end_m)
+            hinge = hinge if into_own else hinge - inwards * depth
+            leaf = (along if at_start else -along) * math.cos(angle) + outward * math.sin(angle)
+            centre = hinge + leaf * 0.5 * width + outward * 0.03
+            footprint = rectangle(centre, leaf, 0.49 * width, 0.018)
+            target = room if into_own else self.home.plan.rooms[opening.neighbour]
+            clear = shapely.distance(footprint, shapely.Point(self.position)) > CAMERA_CLEARANCE_M
+            if clear and target.shape.contains(footprint):
+                self._add_box(centre, leaf, 0.49 * width, 0.018, 0.01, opening.head_m - 0.01, self.door)
+                knob = centre + leaf * 0.4 * width
+                self._add_box(knob, leaf, 0.06, 0.06, 1.0, 1.03, self.handle)
+                return
+
+    def _add_box(
+        self, centre: np.ndarray, axis: np.ndarray, a: float, b: float, z0: float, z1: float, surface: int
+    ) -> None:
+        x, y = float(centre[0]), float(centre[1])
+        prism = Prism(x, y, float(axis[0]), float(axis[1]), a, b, z0, z1, "wood", -1, False)
+        self._add_prism(prism, surface=surface)
+
+    def _add_curtains(self, room: Room, opening: Opening) -> None:
+        """Curtains beside a window, and a radiator below it."""
+        rng = self.rng
+        start, along, inwards = wall_frame(room, opening.wall)
+        length = float(np.hypot(*(room.walls_m[opening.wall, 2:] - room.walls_m[opening.wall, :2])))
+        boxes = []
+        if rng.random() < (0.1 if self.level == "empty" else 0.45):
+            cloth = self.table.add("furniture", np.clip(paint(rng), 0.03, 0.85), scale=rng.uniform(1.5, 4.0))
+            width, top = rng.uniform(0.15, 0.6), min(opening.head_m + 0.15, room.ceiling_height_m - 0.01)
+            bottom = 0.03 if rng.random() < 0.7 else max(0.03, opening.sill_m - 0.1)
+            for s in (opening.start_m, opening.end_m):
+                boxes.append((s, 0.5 * width, 0.05, 0.07, bottom, top, cloth))
+        if opening.sill_m > 0.45 and rng.random() < 0.35:
+            middle, half = 0.5 * (opening.start_m + opening.end_m), 0.4 * (opening.end_m - opening.start_m)
+            boxes.append((middle, half, 0.05, 0.06, 0.1, min(0.7, opening.sill_m - 0.05), self.trim))
+        for s, half, depth, away, z0, z1, surface in boxes:
+            half = min(half, s, length - s)
+            centre = start + along * s + inwards * away
+            footprint = rectangle(centre, along, half, depth) if half > 0.02 else None
+            if footprint is None or not room.shape.contains(footprint):
+                continue
+            if shapely.distance(footprint, shapely.Point(self.position)) > CAMERA_CLEARANCE_M:
+                self._add_box(centre, along, half, depth, z0, z1, surface)
+
+    def _add_jambs(self) -> None:
+        """The cheeks of every hole: walls from one room to the next."""
+        for index, decal in enumerate(self.decals):
+            wall, s0, s1, _, _, surface, slot, depth = decal
+            if slot < 0:
+                continue
+            ends = self.walls[int(wall)]
+            along = (ends[2:] - ends[:2]) / np.hypot(*(ends[2:] - ends[:2]))
+            outward = np.array([along[1], -along[0]])
+            for s in (s0, s1):
+                near = ends[:2] + along * s
+                # Reaching back into the room a little closes the gap that rounding may leave.
+                self.walls.append(np.concatenate([near - outward * 1e-4, near + outward * (depth + 1e-4)]))
+                self.owner.append(-1 - index)
+                self.wall_surface.append(int(surface))

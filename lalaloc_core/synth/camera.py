@@ -1,0 +1,68 @@
+"""From radiance to an 8-bit picture: exposure, white balance, tone curve, blur, noise and the tripod's patch."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from lalaloc_core.synth import lighting as L
+
+_LUMA = (0.2126, 0.7152, 0.0722)
+_MIDDLE_GREY = 0.6
+
+
+def develop(
+    radiance: Float[Tensor, "b h w 3"], exposure: Float[Tensor, "b 12"], noise: Float[Tensor, "bh bw 3"]
+) -> UInt8[Tensor, "b h w 3"]:
+    """Expose linear radiance and encode it as sRGB-like bytes.
+
+    Args:
+        radiance: linear light.
+        exposure: camera settings per picture, see `lighting.draw_exposure`.
+        noise: unit noise, at least as large as a picture; every picture takes its own rolled part of it.
+    """
+    luma = radiance @ radiance.new_tensor(_LUMA)
+    # The mean of the logarithm weighs a dark room more than the bright window in it, as a light meter does.
+    level = luma.clamp_(1e-3, 20.0).log_().mean(dim=(1, 2)).exp()
+    gains = torch.stack([exposure[:, L.RED_GAIN], exposure[:, L.TINT], exposure[:, L.BLUE_GAIN]], dim=-1)
+    gains = gains * (_MIDDLE_GREY * exposure[:, L.TARGET] / level)[:, None]
+    picture = _blur(radiance * gains[:, None, None], exposure[:, L.BLUR])
+    column = exposure[:, None, None, None, :]
+    # Highlights roll off instead of clipping hard; how softly differs between cameras.
+    shoulder = column[..., L.SHOULDER]
+    picture = (picture * (0.25 * shoulder)).add_(1.0).mul_(picture).div_((picture * shoulder).add_(1.0))
+    picture = picture.clamp_(0.0, 1.0).pow_(1.0 / 2.2)
+    grey = picture.mean(dim=-1, keepdim=True)
+    contrast, saturation = column[..., L.CONTRAST], column[..., L.SATURATION]
+    # Saturation scales the distance to grey, contrast the distance to one half.
+    picture = picture.mul_(contrast * saturation).add_(grey * (contrast * (1.0 - saturation)) + 0.5 * (1.0 - contrast))
+    picture.add_(_own_noise(noise, exposure, picture.shape[1], picture.shape[2]).mul_(column[..., L.NOISE]))
+    return _nadir(picture, exposure).clamp_(0.0, 1.0).mul_(255.0).round_().to(torch.uint8)
+
+
+def _blur(picture: Float[Tensor, "b h w 3"], sigma: Float[Tensor, "b"]) -> Float[Tensor, "b h w 3"]:
+    """A separable three-tap blur, around the seam too."""
+    side = (0.5 * sigma**2 / (1.0 + sigma**2))[:, None, None, None]
+    across = picture.roll(1, 2).add_(picture.roll(-1, 2)).mul_(side)
+    picture = across.add_(picture * (1.0 - 2.0 * side))
+    above, below = picture[:, :-2], picture[:, 2:]
+    inner = (above + below).mul_(side).add_(picture[:, 1:-1] * (1.0 - 2.0 * side))
+    return torch.cat([picture[:, :1], inner, picture[:, -1:]], dim=1)
+
+
+def _own_noise(noise: Tensor, exposure: Tensor, rows: int, columns: int) -> Float[Tensor, "b h w 3"]:
+    parts = []
+    for seed in exposure[:, L.NOISE_SEED].long().tolist():
+        top, left = seed % (noise.shape[0] - rows + 1), (seed // 7) % (noise.shape[1] - columns + 1)
+        parts.append(noise[top : top + rows, left : left + columns])
+    return torch.stack(parts)
+
+
+def _nadir(picture: Float[Tensor, "b h w 3"], exposure: Tensor) -> Float[Tensor, "b h w 3"]:
+    rows = picture.shape[1]
+    angle = (torch.arange(rows, device=picture.device) + 0.5) / rows * math.pi
+    patch = (math.pi - angle)[None] < exposure[:, L.NADIR, None]
+    return torch.where(patch[:, :, None, None], exposure[:, L.NADIR_TONE, None, None, None], picture)

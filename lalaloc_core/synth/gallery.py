@@ -1,0 +1,48 @@
+"""A contact sheet of synthetic panoramas, to look at."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+from lalaloc_core.synth.furniture import FurnitureLevel
+from lalaloc_core.synth.materials import MaterialLibrary
+from lalaloc_core.synth.panorama import PanoramaRenderer, sample_shots
+from lalaloc_core.synth.plans import generate_home
+
+_COLUMNS, _ROWS = 4, 4
+
+
+def contact_sheet(path: Path, rng: np.random.Generator, textures: Path | None = None, *, height: int = 256) -> None:
+    """Write a sheet of 16 panoramas of as many homes, from empty to full.
+
+    Args:
+        path: where to write it; the suffix decides the format.
+        rng: source of randomness.
+        textures: optional folder of pictures of materials.
+        height: of one panorama in pixels.
+    """
+    renderer = PanoramaRenderer(MaterialLibrary.create(rng, textures), height=height, width=2 * height, supersample=2)
+    levels: list[FurnitureLevel] = ["empty", "simple", "full", "full"] * _ROWS
+    shots = [sample_shots(generate_home(rng), 1, rng, level)[0] for level in levels]
+    pictures = renderer.render(shots).numpy()
+    rows = pictures.reshape(_ROWS, _COLUMNS, height, 2 * height, 3).swapaxes(1, 2)
+    Image.fromarray(rows.reshape(_ROWS * height, _COLUMNS * 2 * height, 3)).save(path, quality=85)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """`python -m lalaloc_core.synth.gallery SHEET [--seed N] [--textures FOLDER] [--height PIXELS]`."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("path", type=Path, help="where to write the sheet")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--textures", type=Path, help="folder of pictures: <category>/<material>/*.jpg")
+    parser.add_argument("--height", type=int, default=256, help="rows of one panorama")
+    options = parser.parse_args(arguments)
+    contact_sheet(options.path, np.random.default_rng(options.seed), options.textures, height=options.height)
+
+
+if __name__ == "__main__":
+    main()

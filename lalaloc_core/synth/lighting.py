@@ -1,0 +1,137 @@
+"""Drawing the light of a scene and the settings of the camera."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import shapely
+
+from lalaloc_core.floorplan import Room
+from lalaloc_core.synth.furniture import Prism, wall_frame
+from lalaloc_core.synth.openings import Opening
+
+_MAX_WINDOWS = 2
+
+# Columns of an exposure row.
+TARGET, RED_GAIN, BLUE_GAIN, CONTRAST, SATURATION, NOISE, BLUR, NADIR, NADIR_TONE, NOISE_SEED, SHOULDER, TINT = range(
+    12
+)
+
+
+class Lighting:
+    """The mood shared by all lights of a scene: daylight or evening, warm or cold lamps."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.rng = rng
+        self.lamp_colour = np.array([1.0, rng.uniform(0.75, 1.0), rng.uniform(0.45, 1.0)])
+        self.sky_colour = np.array([rng.uniform(0.85, 1.05), 1.0, rng.uniform(0.95, 1.2)])
+        self.daylight = float(rng.uniform(0.4, 3.0) if rng.random() < 0.85 else 0.0)
+        self.lamps_on = bool(rng.random() < 0.65 or self.daylight == 0.0)
+        self.ambient = math.exp(rng.uniform(math.log(0.12), math.log(0.7)))
+
+    def of_room_beyond(self, room: Room, origin_m: np.ndarray) -> list[float]:
+        """Position and colour of the one lamp of a neighbouring room, and its ambient light."""
+        rng = self.rng
+        centre = np.array(room.shape.representative_point().coords[0]) - origin_m
+        strength = math.exp(rng.uniform(math.log(0.1), math.log(3.5)))
+        tint = self.lamp_colour if rng.random() < 0.5 else self.sky_colour
+        ambient = self.ambient * math.exp(rng.uniform(-1.8, 0.6)) * (0.5 + 0.5 * tint)
+        return [*centre, room.ceiling_height_m - 0.3, *(strength * tint), *ambient]
+
+
+def light_room(
+    room: Room, openings: Sequence[Opening], origin_m: np.ndarray, lighting: Lighting, rng: np.random.Generator
+) -> tuple[np.ndarray, list[Prism], np.ndarray]:
+    """Lamps and windows of the camera's room.
+
+    Returns:
+        the scene's lights (l, 8), the lamps as prisms, and the sun (14,).
+    """
+    windows = sorted(
+        (opening for opening in openings if opening.kind == "window"),
+        key=lambda window: -(window.end_m - window.start_m) * (window.head_m - window.sill_m),
+    )[:_MAX_WINDOWS]
+    lights = [_window_light(room, window, origin_m, lighting) for window in windows if lighting.daylight > 0.0]
+    rows, prisms = _lamps(room, origin_m, lighting, lit=lighting.lamps_on or not lights, rng=rng)
+    sun = np.zeros(14)
+    if windows and lighting.daylight > 0.0 and rng.random() < 0.5:
+        sun = _sun(room, windows[int(rng.integers(len(windows)))], origin_m, rng)
+    return np.array(lights + rows).reshape(-1, 8), prisms, sun
+
+
+def _window_light(room: Room, window: Opening, origin_m: np.ndarray, lighting: Lighting) -> list[float]:
+    start, along, inwards = wall_frame(room, window.wall)
+    centre = start + along * 0.5 * (window.start_m + window.end_m) + inwards * 0.05 - origin_m
+    area = (window.end_m - window.start_m) * (window.head_m - window.sill_m)
+    power = 0.9 * lighting.daylight * area * lighting.sky_colour
+    return [*centre, 0.5 * (window.sill_m + window.head_m), *power, *inwards]
+
+
+def _lamps(
+    room: Room, origin_m: np.ndarray, lighting: Lighting, lit: bool, rng: np.random.Generator
+) -> tuple[list[list[float]], list[Prism]]:
+    """One lamp in the middle of the room, a second one in a large room."""
+    spots = [np.array(room.shape.representative_point().coords[0])]
+    if room.area_m2 > 18.0:
+        x_min, y_min, x_max, y_max = room.shape.bounds
+        other = rng.uniform((x_min, y_min), (x_max, y_max))
+        if shapely.contains_xy(room.shape.buffer(-0.5), *other):
+            spots.append(other)
+    rows, prisms = [], []
+    power = math.exp(rng.uniform(math.log(0.8), math.log(4.0))) * (0.5 + room.area_m2 / 15.0) / len(spots)
+    ceiling = room.ceiling_height_m
+    style = int(rng.integers(4))
+    for spot in spots:
+        drop = rng.uniform(0.3, 0.9) if style == 0 and np.hypot(*(spot - origin_m)) > 0.6 else 0.0
+        radius = rng.uniform(0.1, 0.3)
+        finish = "glow" if lit else "white"
+        thickness = rng.uniform(0.02, 0.12) if style != 3 else 0.01
+        at = (float(spot[0]), float(spot[1]), 1.0, 0.0)
+        clear = shapely.contains_xy(room.shape.buffer(-radius - 0.02), *spot)
+        if clear:
+            if drop:
+                prisms.append(Prism(*at, 0.008, 0.008, ceiling - drop, ceiling - 1e-3, "dark", -2, True))
+            z1 = ceiling - drop - 1e-3
+            z0 = z1 - (rng.uniform(0.12, 0.3) if drop else thickness)
+            prisms.append(Prism(*at, radius, radius, z0, z1, finish, -2, style != 2))
+        if lit:
+            rows.append([*(spot - origin_m), ceiling - drop - 0.2, *(power * lighting.lamp_colour), 0.0, 0.0])
+    return rows, prisms
+
+
+def _sun(room: Room, window: Opening, origin_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Sunlight falling through a window."""
+    start, along, inwards = wall_frame(room, window.wall)
+    side, elevation = rng.uniform(-1.0, 1.0), math.radians(rng.uniform(15.0, 55.0))
+    toward = math.cos(side) * -inwards + math.sin(side) * along
+    direction = [*(toward * math.cos(elevation)), math.sin(elevation)]
+    colour = math.exp(rng.uniform(math.log(1.0), math.log(10.0))) * np.array([1.0, 0.93, 0.8])
+    rectangle = [window.start_m + 0.06, window.end_m - 0.06, window.sill_m + 0.06, window.head_m - 0.06]
+    return np.array([*direction, *(start - origin_m), *along, *rectangle, *colour])
+
+
+def draw_backdrop(rng: np.random.Generator) -> np.ndarray:
+    """The outdoors: sky, ground or foliage, the height of what stands before the sky, and its outline."""
+    sky = rng.uniform(0.7, 1.0) * np.array([rng.uniform(0.7, 1.0), rng.uniform(0.85, 1.0), 1.0])
+    ground = rng.uniform(0.05, 0.5) * np.array([rng.uniform(0.6, 1.1), 1.0, rng.uniform(0.4, 1.0)])
+    return np.array([*sky, *ground, rng.uniform(-0.15, 0.6), rng.uniform(0.02, 0.25), *rng.uniform(0.0, 1.0, 2)])
+
+
+def draw_exposure(rng: np.random.Generator) -> np.ndarray:
+    """How the camera turns light into a picture; see the column names above."""
+    row = np.zeros(12)
+    row[TARGET] = math.exp(rng.normal(math.log(0.42), 0.38))
+    row[RED_GAIN], row[BLUE_GAIN] = np.exp(rng.normal(0.0, 0.09, 2))
+    row[TINT] = math.exp(rng.normal(0.0, 0.02))
+    row[CONTRAST] = rng.uniform(0.85, 1.25)
+    row[SATURATION] = rng.uniform(0.5, 1.25)
+    row[NOISE] = 0.03 * rng.random() ** 3
+    row[BLUR] = rng.uniform(0.0, 0.9)
+    if rng.random() < 0.25:
+        row[NADIR] = math.radians(rng.uniform(6.0, 24.0))
+        row[NADIR_TONE] = 0.0 if rng.random() < 0.6 else rng.uniform(0.0, 0.9)
+    row[NOISE_SEED] = rng.integers(1 << 20)
+    row[SHOULDER] = rng.uniform(0.2, 1.0)
+    return row

@@ -1,0 +1,155 @@
+"""Photographs of procedural homes: the renderer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from lalaloc_core.conventions import column_azimuths, row_elevations
+from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.synth.build import build_scene
+from lalaloc_core.synth.camera import develop
+from lalaloc_core.synth.cast import Hits, SceneBatch, trace
+from lalaloc_core.synth.materials import MaterialLibrary
+from lalaloc_core.synth.outdoors import Outdoors
+from lalaloc_core.synth.scene import DECAL_WALL, PRISM_A, PRISM_AX, PRISM_B, PRISM_X, Scene
+from lalaloc_core.synth.shading import Atlas, shade
+from lalaloc_core.synth.shots import Shot, sample_shots
+
+__all__ = ["PanoramaRenderer", "Shot", "sample_shots"]
+
+# Small batches stay in a CPU's caches, large ones fill a GPU.
+_PIXELS_AT_ONCE = {"cpu": 1 << 17}
+_PIXELS_AT_ONCE_ELSEWHERE = 1 << 21
+
+
+class PanoramaRenderer:
+    """Renders shots as equirectangular panoramas of one size on one device.
+
+    Args:
+        materials: pictures of materials.
+        height: rows of a panorama, even.
+        width: columns.
+        device: where to render.
+        supersample: rays per pixel along either axis; 2 smooths edges at four times the cost.
+    """
+
+    def __init__(
+        self,
+        materials: MaterialLibrary,
+        *,
+        height: int = 128,
+        width: int = 256,
+        device: str | torch.device = "cpu",
+        supersample: int = 1,
+    ) -> None:
+        if height % 2:
+            raise InvalidInputError(f"a panorama of {height} rows has a row on the horizon; the height must be even")
+        self._materials = materials
+        self._device = torch.device(device)
+        self._atlas = Atlas(materials, self._device)
+        self._outdoors = Outdoors(self._device)
+        self._supersample = supersample
+        rows, columns = height * supersample, width * supersample
+        at_once = _PIXELS_AT_ONCE.get(self._device.type, _PIXELS_AT_ONCE_ELSEWHERE)
+        self._scenes_at_once = max(1, at_once // (rows * columns))
+        self._slope = self._tensor(np.tan(row_elevations(rows)))
+        self._azimuth = self._tensor(column_azimuths(columns))
+        # Pictures take differently rolled parts of one field of noise: drawing new noise would cost more than the rays.
+        self._noise = self._tensor(np.random.default_rng(0).normal(size=(height + 64, width + 64, 3)))
+
+    def render(self, shots: Sequence[Shot]) -> UInt8[Tensor, "b h w 3"]:
+        """Photograph `shots`; each picture depends on its shot and the materials only."""
+        step = self._scenes_at_once
+        return torch.cat(
+            [
+                self.render_scenes([build_scene(shot, self._materials) for shot in shots[k : k + step]])
+                for k in range(0, len(shots), step)
+            ]
+        )
+
+    @torch.no_grad()
+    def render_scenes(self, scenes: Sequence[Scene]) -> UInt8[Tensor, "b h w 3"]:
+        """Photograph scenes that were built elsewhere, such as in worker processes; all at once."""
+        batch = stack_scenes(scenes, self._device)
+        direction = self._directions(batch)
+        hits = trace(batch, direction, self._slope)
+        radiance = shade(batch, hits, direction, self._slope, self._atlas, self._outdoors).transpose(1, 2)
+        if self._supersample > 1:
+            radiance = _shrink(radiance, self._supersample)
+        return develop(radiance, batch.exposure, self._noise)
+
+    @torch.no_grad()
+    def hits(self, shots: Sequence[Shot]) -> Hits:
+        """What every ray hits, laid out (b, w, h): distances, surfaces, normals."""
+        batch = stack_scenes([build_scene(shot, self._materials) for shot in shots], self._device)
+        return trace(batch, self._directions(batch), self._slope)
+
+    def _directions(self, batch: SceneBatch) -> Float[Tensor, "b c 2"]:
+        azimuth = batch.heading[:, None] + self._azimuth
+        return torch.stack([azimuth.sin(), azimuth.cos()], dim=-1)
+
+    def _tensor(self, array: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.asarray(array, dtype=np.float32)).to(self._device)
+
+
+def _shrink(radiance: Float[Tensor, "b h w 3"], factor: int) -> Float[Tensor, "b h2 w2 3"]:
+    """Average blocks of rays; what is much brighter than the rest is clipped first, as on a sensor."""
+    planes = radiance.clamp(max=8.0).permute(0, 3, 1, 2)
+    return torch.nn.functional.avg_pool2d(planes, factor).permute(0, 2, 3, 1)
+
+
+def stack_scenes(scenes: Sequence[Scene], device: torch.device) -> SceneBatch:
+    """Pad the tables of scenes to one length and stack them."""
+
+    def stack(name: str, dtype: torch.dtype = torch.float32) -> Tensor:
+        rows = [np.asarray(getattr(scene, name)) for scene in scenes]
+        padded = np.zeros((len(rows), max(1, *(len(row) for row in rows)), *rows[0].shape[1:]))
+        padded[:] = _PADDING.get(name, np.zeros(1))
+        for target, row in zip(padded, rows, strict=True):
+            target[: len(row)] = row
+        return torch.from_numpy(padded).to(device=device, dtype=dtype)
+
+    def scalars(name: str) -> Tensor:
+        return torch.tensor([getattr(scene, name) for scene in scenes], dtype=torch.float32, device=device)
+
+    return SceneBatch(
+        camera_height_m=scalars("camera_height_m"),
+        heading=scalars("heading"),
+        walls_m=stack("walls_m"),
+        wall_owner=stack("wall_owner", torch.long),
+        wall_surface=stack("wall_surface", torch.long),
+        decals=stack("decals"),
+        prisms=stack("prisms"),
+        surfaces=stack("surfaces"),
+        slots=stack("slots"),
+        lights=stack("lights"),
+        sun=stack("sun"),
+        backdrop=stack("backdrop"),
+        exposure=stack("exposure"),
+    )
+
+
+def _padding_prism() -> np.ndarray:
+    """A small box far away."""
+    row = np.zeros(11)
+    row[[PRISM_X, PRISM_AX, PRISM_A, PRISM_B]] = 1e6, 1.0, 1.0, 1.0
+    return row
+
+
+def _padding_decal() -> np.ndarray:
+    """A decal on no wall."""
+    row = np.zeros(8)
+    row[DECAL_WALL] = -1.0
+    return row
+
+
+_PADDING = {
+    "wall_owner": np.array([-(10**6)]),
+    "prisms": _padding_prism(),
+    "decals": _padding_decal(),
+}

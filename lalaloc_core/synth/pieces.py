@@ -1,0 +1,54 @@
+"""What a piece of furniture is: textured boxes and cylinders in a frame of their own.
+
+Frame of a piece: x along its width, y from its back (negative, the wall's side) to its front, z up; the origin lies
+on the floor in the middle of its footprint. A part is given by centre, half extents and z-range.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+Finish = Literal["wood", "fabric", "paint", "white", "metal", "dark", "leaf", "accent", "ceramic", "stone", "glow"]
+
+
+class Part(NamedTuple):
+    """A vertical box, or an elliptic cylinder when `round`; metres."""
+
+    x: float
+    y: float
+    half_x: float
+    half_y: float
+    z0: float
+    z1: float
+    finish: Finish
+    round: bool = False
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A piece of furniture with its footprint (width, depth) in metres."""
+
+    width_m: float
+    depth_m: float
+    parts: tuple[Part, ...]
+    against_wall: bool = True
+
+    @property
+    def height_m(self) -> float:
+        """Height of its highest part."""
+        return max(part.z1 for part in self.parts)
+
+
+Maker = Callable[[np.random.Generator], Piece]
+
+
+def square_legs(hx: float, hy: float, thickness: float, height: float, finish: Finish) -> list[Part]:
+    """Four square legs under a rectangle of half extents (hx, hy)."""
+    half = 0.5 * thickness
+    return [
+        Part(sx * (hx - half), sy * (hy - half), half, half, 0.0, height, finish) for sx in (-1, 1) for sy in (-1, 1)
+    ]

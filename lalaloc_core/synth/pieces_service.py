@@ -1,0 +1,120 @@
+"""Furniture of kitchens and bathrooms; see `pieces` for the frame."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lalaloc_core.synth.pieces import Finish, Part, Piece
+
+
+def counter(rng: np.random.Generator) -> Piece:
+    """A run of kitchen units: base units, worktop, backsplash, hob, sink and wall units."""
+    units = int(rng.integers(2, 7))
+    width, depth, height = 0.6 * units, 0.62, rng.uniform(0.85, 0.95)
+    hx, hy = 0.5 * width, 0.5 * depth
+    body: Finish = ("white", "wood", "paint")[int(rng.integers(3))]
+    parts = [
+        Part(0, -0.03, hx, hy - 0.06, 0.0, 0.1, "dark"),
+        Part(0, -0.01, hx, hy - 0.03, 0.1, height - 0.04, body),
+        Part(0, 0, hx, hy, height - 0.04, height, "stone"),
+        Part(0, -hy + 0.01, hx, 0.01, height, height + rng.uniform(0.1, 0.55), "ceramic"),
+        Part(rng.uniform(-0.3, 0.0) * width, 0, 0.25, 0.22, height, height + 0.01, "dark"),
+        Part(rng.uniform(0.1, 0.3) * width, -0.1, 0.02, 0.02, height, height + 0.3, "metal", True),
+    ]
+    for k in range(units):
+        x = -hx + 0.6 * (k + 0.5)
+        oven = rng.random() < 0.15
+        parts.append(Part(x, hy - 0.03, 0.294, 0.01, 0.11, height - 0.06, "dark" if oven else body))
+        parts.append(Part(x, hy - 0.01, 0.15, 0.01, height - 0.14, height - 0.12, "metal"))
+    if rng.random() < 0.75:
+        bottom, top = rng.uniform(1.35, 1.5), rng.uniform(1.95, 2.35)
+        for k in range(units):
+            if rng.random() < 0.85:
+                x = -hx + 0.6 * (k + 0.5)
+                parts.append(Part(x, -hy + 0.17, 0.297, 0.17, bottom, top, body))
+    return Piece(width, depth, tuple(parts))
+
+
+def island(rng: np.random.Generator) -> Piece:
+    """A kitchen island with stools, or half a wall with a worktop."""
+    width, depth, height = rng.uniform(1.0, 2.6), rng.uniform(0.5, 1.1), rng.uniform(0.88, 1.1)
+    body: Finish = ("white", "wood", "paint")[int(rng.integers(3))]
+    hx, hy = 0.5 * width, 0.5 * depth
+    parts = [
+        Part(0, 0, hx - 0.03, hy - 0.05, 0.0, height - 0.04, body),
+        Part(0, 0, hx, hy, height - 0.04, height, "stone"),
+    ]
+    for x in np.arange(-hx + 0.3, hx - 0.2, 0.6):
+        if rng.random() < 0.5:
+            parts.append(Part(float(x), hy + 0.25, 0.17, 0.17, 0.62, 0.67, "wood", True))
+            parts.append(Part(float(x), hy + 0.25, 0.03, 0.03, 0.0, 0.62, "metal", True))
+    return Piece(width, depth + 0.9, tuple(parts), against_wall=False)
+
+
+def fridge(rng: np.random.Generator) -> Piece:
+    """A tall box with two doors."""
+    width, height, split = rng.uniform(0.55, 0.9), rng.uniform(1.5, 2.05), rng.uniform(0.5, 1.3)
+    finish: Finish = "white" if rng.random() < 0.5 else "metal"
+    parts = (
+        Part(0, -0.02, 0.5 * width, 0.31, 0.02, height, finish),
+        Part(0, 0.3, 0.5 * width - 0.005, 0.02, 0.05, split, finish),
+        Part(0, 0.3, 0.5 * width - 0.005, 0.02, split + 0.015, height, finish),
+        Part(0.5 * width - 0.05, 0.33, 0.012, 0.012, split + 0.05, split + 0.4, "dark"),
+    )
+    return Piece(width, 0.7, parts)
+
+
+def bathtub(rng: np.random.Generator) -> Piece:
+    """A tub with a dark-rimmed hollow that reads as one from above."""
+    width, depth, height = rng.uniform(1.4, 1.8), rng.uniform(0.7, 0.8), rng.uniform(0.5, 0.62)
+    hx, hy, rim = 0.5 * width, 0.5 * depth, 0.06
+    parts = [
+        Part(0, 0, hx - rim, hy - rim, 0.0, 0.2, "ceramic"),
+        Part(0, -hy + 0.5 * rim, hx, 0.5 * rim, 0.0, height, "ceramic"),
+        Part(0, hy - 0.5 * rim, hx, 0.5 * rim, 0.0, height, "ceramic"),
+        Part(-hx + 0.5 * rim, 0, 0.5 * rim, hy, 0.0, height, "ceramic"),
+        Part(hx - 0.5 * rim, 0, 0.5 * rim, hy, 0.0, height, "ceramic"),
+    ]
+    if rng.random() < 0.4:
+        parts.append(Part(0.2 * width, hy - 0.02, 0.3 * width, 0.02, 0.3, 1.95, "fabric"))
+    return Piece(width, depth, tuple(parts))
+
+
+def toilet(rng: np.random.Generator) -> Piece:
+    """Bowl, seat and cistern."""
+    parts = (
+        Part(0, 0.1, 0.13, 0.2, 0.0, 0.36, "ceramic", True),
+        Part(0, 0.08, 0.19, 0.25, 0.36, 0.41, "white", True),
+        Part(0, -0.24, 0.19, 0.09, 0.36 * rng.integers(0, 2), rng.uniform(0.7, 0.85), "ceramic"),
+    )
+    return Piece(0.4, 0.66, parts)
+
+
+def washbasin(rng: np.random.Generator) -> Piece:
+    """A basin on a cabinet or a pedestal, with a mirror above."""
+    width = rng.uniform(0.45, 1.3)
+    hx = 0.5 * width
+    below = (
+        Part(0, 0, hx, 0.22, 0.25 * rng.random(), 0.78, "wood")
+        if rng.random() < 0.6
+        else Part(0, 0, 0.09, 0.09, 0, 0.78, "ceramic", True)
+    )
+    parts = (
+        below,
+        Part(0, 0, hx, 0.24, 0.78, 0.86, "ceramic"),
+        Part(0, -0.23, 0.9 * hx, 0.01, 1.15, rng.uniform(1.7, 2.0), "metal"),
+        Part(0, -0.15, 0.02, 0.02, 0.86, 1.0, "metal", True),
+    )
+    return Piece(width, 0.48, parts)
+
+
+def shower(rng: np.random.Generator) -> Piece:
+    """A tray with one or two screens."""
+    side = rng.uniform(0.75, 1.1)
+    half = 0.5 * side
+    parts = [
+        Part(0, 0, half, half, 0.0, rng.uniform(0.02, 0.15), "ceramic"),
+        Part(half - 0.01, 0, 0.01, half, 0.1, 2.0, "metal"),
+        Part(-0.2, -half + 0.03, 0.015, 0.015, 0.9, 2.05, "metal", True),
+    ]
+    return Piece(side, side, tuple(parts))

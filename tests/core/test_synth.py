@@ -1,0 +1,287 @@
+"""Procedural homes and their photographs."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.render.depth import layout_depth
+from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.synth.build import build_scene
+from lalaloc_core.synth.catalogue import ROOM_PIECES
+from lalaloc_core.synth.furniture import CAMERA_CLEARANCE_M, FURNITURE_LEVELS, furnish, rectangle
+from lalaloc_core.synth.gallery import contact_sheet
+from lalaloc_core.synth.materials import MaterialLibrary
+from lalaloc_core.synth.panorama import PanoramaRenderer, sample_shots
+from lalaloc_core.synth.plans import Home, generate_home
+
+ROWS, COLUMNS = 64, 128
+seeds = st.integers(0, 2**32 - 1)
+
+
+@pytest.fixture(scope="module")
+def materials() -> MaterialLibrary:
+    return MaterialLibrary.create(np.random.default_rng(0))
+
+
+@pytest.fixture(scope="module")
+def renderer(materials: MaterialLibrary) -> PanoramaRenderer:
+    return PanoramaRenderer(materials, height=ROWS, width=COLUMNS)
+
+
+def home_of(seed: int) -> Home:
+    return generate_home(np.random.default_rng(seed))
+
+
+def shut(home: Home) -> Home:
+    """The same home with every door and wide opening shut."""
+    openings = tuple(
+        opening if opening.kind == "window" else dataclasses.replace(opening, kind="door_shut")
+        for opening in home.openings
+    )
+    return Home(home.plan, openings)
+
+
+@given(seed=seeds)
+@settings(max_examples=40, deadline=None)
+def test_homes_are_valid_plans_of_the_promised_size(seed: int) -> None:
+    plan = home_of(seed).plan
+    assert plan.warnings == ()
+    assert 3 <= len(plan.rooms) <= 10
+    assert 15.0 < plan.area_m2 <= 180.0
+    assert all(2.2 <= room.ceiling_height_m <= 3.5 for room in plan.rooms)
+    assert len({room.name for room in plan.rooms}) == len(plan.rooms)
+    assert FloorPlan.from_dict(plan.to_dict()).to_dict() == plan.to_dict()
+
+
+@given(seed=seeds)
+@settings(max_examples=40, deadline=None)
+def test_openings_lie_in_their_walls_apart_from_each_other(seed: int) -> None:
+    home = home_of(seed)
+    taken: dict[tuple[int, int], list[tuple[float, float]]] = {}
+    for opening in home.openings:
+        room = home.plan.rooms[opening.room]
+        x0, y0, x1, y1 = room.walls_m[opening.wall]
+        assert 0.0 <= opening.start_m < opening.end_m <= np.hypot(x1 - x0, y1 - y0)
+        assert 0.0 <= opening.sill_m < opening.head_m <= room.ceiling_height_m
+        taken.setdefault((opening.room, opening.wall), []).append((opening.start_m, opening.end_m))
+    for intervals in taken.values():
+        intervals.sort()
+        assert all(before[1] < after[0] for before, after in itertools.pairwise(intervals))
+
+
+@given(seed=seeds)
+@settings(max_examples=20, deadline=None)
+def test_a_door_is_at_the_same_place_from_both_of_its_rooms(seed: int) -> None:
+    home = home_of(seed)
+
+    def middle(opening):
+        x0, y0, x1, y1 = home.plan.rooms[opening.room].walls_m[opening.wall]
+        share = 0.5 * (opening.start_m + opening.end_m) / np.hypot(x1 - x0, y1 - y0)
+        return np.array([x0 + share * (x1 - x0), y0 + share * (y1 - y0)])
+
+    for opening in home.openings:
+        if opening.neighbour < 0:
+            continue
+        others = [
+            other for other in home.openings if (other.room, other.neighbour) == (opening.neighbour, opening.room)
+        ]
+        nearest = min(others, key=lambda other: float(np.linalg.norm(middle(other) - middle(opening))))
+        assert np.linalg.norm(middle(nearest) - middle(opening)) < 0.3
+        assert nearest.kind == opening.kind
+
+
+def test_the_same_seed_gives_the_same_home_and_others_differ() -> None:
+    first, again, other = home_of(1), home_of(1), home_of(2)
+    assert first.plan.to_dict() == again.plan.to_dict()
+    assert first.openings == again.openings
+    assert first.plan.to_dict() != other.plan.to_dict()
+
+
+def test_homes_are_varied() -> None:
+    homes = [home_of(seed) for seed in range(150)]
+    rooms = [room for home in homes for room in home.plan.rooms]
+    assert {opening.kind for home in homes for opening in home.openings} == {
+        "door_shut",
+        "door_open",
+        "opening",
+        "window",
+    }
+    assert min(room.area_m2 for room in rooms) < 2.5
+    assert max(room.area_m2 for room in rooms) > 45.0
+    assert {4, 5, 6, 8} <= {len(room.polygon_m) for room in rooms}
+    turned = sum(
+        np.abs(home.plan.rooms[0].walls_m[0, :2] - home.plan.rooms[0].walls_m[0, 2:]).min() > 0.05 for home in homes
+    )
+    assert 0.1 < turned / len(homes) < 0.7
+
+
+@given(seed=seeds)
+@settings(max_examples=25, deadline=None)
+def test_an_empty_shut_room_shows_exactly_its_layout(renderer: PanoramaRenderer, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    home = shut(generate_home(rng))
+    shots = sample_shots(home, 3, rng, "empty")
+    hits = renderer.hits(shots)
+    elevation_cosine = np.cos((0.5 - (np.arange(ROWS) + 0.5) / ROWS) * np.pi)
+    depth = hits.distance_m.numpy().transpose(0, 2, 1) / elevation_cosine[None, :, None]
+    for index, shot in enumerate(shots):
+        room = home.plan.rooms[shot.room_index]
+        profile = wall_profile(shot.position_m[None], np.array([shot.heading]), room.walls_m[None], COLUMNS)
+        expected = layout_depth(profile, np.array([shot.camera_height_m]), np.array([room.ceiling_height_m]), ROWS)[0]
+        bare = ~hits.furniture[index].numpy().T
+        assert bare.mean() > 0.5
+        np.testing.assert_allclose(depth[index][bare], expected[bare], atol=1e-3)
+
+
+@given(seed=seeds)
+@settings(max_examples=10, deadline=None)
+def test_one_sees_no_further_than_the_walls_unless_through_an_opening(renderer: PanoramaRenderer, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    home = generate_home(rng)
+    (shot,) = sample_shots(home, 1, rng, "empty")
+    hits = renderer.hits([shot])
+    walls = home.plan.rooms[shot.room_index].walls_m
+    profile = wall_profile(shot.position_m[None], np.array([shot.heading]), walls[None], COLUMNS)[0]
+    through = hits.distance_m[0].numpy().max(axis=1) > profile + 1e-3
+    kinds = {opening.kind for opening in home.openings if opening.room == shot.room_index}
+    assert not through.any() or kinds & {"door_open", "opening"}
+    assert hits.distance_m.isfinite().all()
+
+
+def test_same_seed_same_picture_in_any_batch(renderer: PanoramaRenderer) -> None:
+    rng = np.random.default_rng(3)
+    shots = [shot for seed in range(4) for shot in sample_shots(home_of(seed), 2, rng)]
+    together = renderer.render(shots)
+    assert together.shape == (8, ROWS, COLUMNS, 3)
+    assert together.dtype == torch.uint8
+    assert torch.equal(together, renderer.render(shots))
+    alone = torch.cat([renderer.render([shot]) for shot in shots])
+    assert (together.int() - alone.int()).abs().max() <= 1
+    reseeded = renderer.render([dataclasses.replace(shots[0], seed=shots[0].seed + 1)])
+    assert not torch.equal(together[:1], reseeded)
+
+
+def test_pictures_are_exposed_neither_black_nor_white(renderer: PanoramaRenderer) -> None:
+    rng = np.random.default_rng(4)
+    shots = [shot for seed in range(20) for shot in sample_shots(home_of(seed), 2, rng)]
+    mean = renderer.render(shots).float().mean(dim=(1, 2, 3))
+    assert 60.0 < float(mean.mean()) < 190.0
+    assert float(mean.min()) > 12.0
+    assert float(mean.std()) > 10.0
+
+
+def test_turning_the_camera_rolls_what_it_sees(renderer: PanoramaRenderer) -> None:
+    (shot,) = sample_shots(home_of(5), 1, np.random.default_rng(5), "full")
+    turned = dataclasses.replace(shot, heading=shot.heading + 2.0 * np.pi * 32 / COLUMNS)
+    hits = renderer.hits([shot, turned])
+    rolled = hits.distance_m[0].roll(-32, dims=0)
+    assert ((rolled - hits.distance_m[1]).abs() < 1e-2).float().mean() > 0.99
+
+
+def test_fuller_rooms_hide_more_of_the_layout(renderer: PanoramaRenderer) -> None:
+    shares = []
+    for level in FURNITURE_LEVELS:
+        rng = np.random.default_rng(6)
+        shots = [shot for seed in range(20) for shot in sample_shots(home_of(seed), 1, rng, level)]
+        shares.append(float(renderer.hits(shots).furniture.float().mean()))
+    assert shares[0] < 0.05
+    assert shares[0] + 0.03 < shares[1] < shares[2] - 0.03
+
+
+@given(seed=seeds)
+@settings(max_examples=20, deadline=None)
+def test_pieces_keep_to_their_footprints(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    for makers in ROOM_PIECES.values():
+        for maker, _ in makers:
+            piece = maker(rng)
+            for part in piece.parts:
+                assert abs(part.x) + part.half_x <= 0.5 * piece.width_m + 0.06, maker.__name__
+                assert abs(part.y) + part.half_y <= 0.5 * piece.depth_m + 0.06, maker.__name__
+
+
+@given(seed=seeds)
+@settings(max_examples=25, deadline=None)
+def test_furniture_stands_in_its_room_clear_of_the_camera(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    home = generate_home(rng)
+    for shot in sample_shots(home, 2, rng, "full"):
+        room = home.plan.rooms[shot.room_index]
+        openings = [opening for opening in home.openings if opening.room == shot.room_index]
+        roomy = room.shape.buffer(0.05)
+        for prism in furnish(room, openings, "full", rng, shot.position_m):
+            assert shapely.contains_xy(roomy, prism.x, prism.y)
+            assert prism.z0 < prism.z1 < room.ceiling_height_m
+            if prism.z1 < 0.05:
+                continue
+            axis = np.array([prism.axis_x, prism.axis_y])
+            footprint = rectangle(np.array([prism.x, prism.y]), axis, prism.half_a, prism.half_b)
+            assert shapely.distance(footprint, shapely.Point(shot.position_m)) > CAMERA_CLEARANCE_M - 0.1
+
+
+@given(seed=seeds)
+@settings(max_examples=25, deadline=None)
+def test_the_camera_is_inside_nothing(materials: MaterialLibrary, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    for shot in sample_shots(generate_home(rng), 2, rng, "full"):
+        scene = build_scene(shot, materials)
+        x, y, ax, ay, a, b, z0, z1, *_ = scene.prisms.T
+        inside = (np.abs(x * ax + y * ay) <= a) & (np.abs(y * ax - x * ay) <= b)
+        inside &= (z0 <= shot.camera_height_m) & (shot.camera_height_m <= z1)
+        assert not inside.any()
+
+
+def test_shots_keep_their_distance_to_walls_and_ceiling() -> None:
+    rng = np.random.default_rng(7)
+    home = home_of(7)
+    shots = sample_shots(home, 200, rng, by_room_share=0.5)
+    for shot in shots:
+        room = home.plan.rooms[shot.room_index]
+        assert room.shape.contains(shapely.Point(shot.position_m))
+        assert room.shape.exterior.distance(shapely.Point(shot.position_m)) >= 0.199
+        assert 1.0 <= shot.camera_height_m <= min(1.9, room.ceiling_height_m - 0.2)
+    assert {shot.furniture for shot in shots} == set(FURNITURE_LEVELS)
+
+
+def test_materials_work_without_and_with_a_folder_of_pictures(tmp_path: Path, materials: MaterialLibrary) -> None:
+    assert materials.pictures.shape[1:] == (128, 128, 3)
+    assert float(materials.pictures.min()) >= 0.0
+    assert float(materials.pictures.max()) <= 1.0
+    folder = tmp_path / "floor" / "tiles"
+    folder.mkdir(parents=True)
+    Image.new("RGB", (100, 128), (255, 0, 0)).save(folder / "red.jpg")
+    library = MaterialLibrary.create(np.random.default_rng(0), tmp_path)
+    drawn = {library.draw("floor", rng) for rng in [np.random.default_rng(8)] for _ in range(50)}
+    photographs = set(np.concatenate(library.photographs["floor"]).tolist())
+    assert drawn & photographs
+    assert drawn - photographs
+    np.testing.assert_allclose(library.mean_colours[min(photographs)], [1.0, 0.0, 0.0], atol=0.02)
+
+
+def test_a_folder_without_pictures_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match="no <category>"):
+        MaterialLibrary.create(np.random.default_rng(0), tmp_path)
+
+
+def test_an_odd_number_of_rows_is_refused(materials: MaterialLibrary) -> None:
+    with pytest.raises(InvalidInputError, match="even"):
+        PanoramaRenderer(materials, height=63, width=128)
+
+
+def test_the_contact_sheet_shows_sixteen_panoramas(tmp_path: Path) -> None:
+    path = tmp_path / "sheet.png"
+    contact_sheet(path, np.random.default_rng(0), height=16)
+    with Image.open(path) as sheet:
+        assert sheet.size == (4 * 32, 4 * 16)
