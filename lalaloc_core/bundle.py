@@ -23,6 +23,7 @@ LAYOUT_ONNX = "layout_encoder.onnx"
 IMAGE_ONNX = "image_encoder.onnx"
 HEAD_ONNX = "head.onnx"
 LAYOUT_WEIGHTS = "layout_encoder.safetensors"
+IMAGE_WEIGHTS = "image_encoder.safetensors"
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,7 +7,8 @@ extruded from the floor to its own ceiling; doors count as wall.
 from __future__ import annotations
 
 import json
-import math
+import sys
+import unicodedata
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -37,6 +38,8 @@ class PlanLimits:
 
 DEFAULT_LIMITS = PlanLimits()
 DEFAULT_CAMERA_HEIGHT_M = 1.5
+# Unicode categories that neither files nor drawings can hold: control characters and lone surrogates.
+_NOT_TEXT = {"Cc", "Cs"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +110,8 @@ class FloorPlan:
         _known_keys(document, {"name", "rooms", "ceiling_height_m", "camera_height_m"}, room=None)
         name = _name(document.get("name", "floor plan"), limits, what="the plan's name")
         default_ceiling = document.get("ceiling_height_m")
+        if default_ceiling is not None:
+            default_ceiling = _ceiling_height(default_ceiling, None, limits)
         raw_rooms = document.get("rooms")
         if not isinstance(raw_rooms, list) or not raw_rooms:
             raise InvalidFloorPlanError("'rooms' must be a list of at least one room")
@@ -193,14 +198,21 @@ def _name(value: Any, limits: PlanLimits, what: str) -> str:
         raise InvalidFloorPlanError(f"{what} must be a non-empty string")
     if len(value) > limits.max_name_length:
         raise InvalidFloorPlanError(f"{what} has {len(value)} characters, at most {limits.max_name_length} are allowed")
+    if any(unicodedata.category(character) in _NOT_TEXT for character in value):
+        raise InvalidFloorPlanError(f"{what} has control characters or lone surrogates")
     return value
+
+
+def _is_finite(value: int | float) -> bool:
+    """Whether a number of any size is finite as a float; JSON integers have no bounds."""
+    return -sys.float_info.max <= value <= sys.float_info.max
 
 
 def _number(value: Any, what: str, room: str | None, *, above: float) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float):
         raise InvalidFloorPlanError(f"{what} must be a number, not {type(value).__name__}", room=room)
-    if not math.isfinite(value) or value <= above:
-        raise InvalidFloorPlanError(f"{what} is {value}, it must be finite and above {above:g}", room=room)
+    if not _is_finite(value) or value <= above:
+        raise InvalidFloorPlanError(f"{what} is {str(value)[:50]}, it must be finite and above {above:g}", room=room)
     return float(value)
 
 
@@ -212,14 +224,19 @@ def _parse_room(raw: Any, fallback_name: str, default_ceiling: Any, limits: Plan
     ceiling = raw.get("ceiling_height_m", default_ceiling)
     if ceiling is None:
         raise InvalidFloorPlanError("no ceiling_height_m, neither here nor for the plan", room=name)
-    ceiling_height = _number(ceiling, "ceiling_height_m", name, above=0.0)
-    if not limits.min_ceiling_height_m <= ceiling_height <= limits.max_ceiling_height_m:
-        raise InvalidFloorPlanError(
-            f"ceiling_height_m is {ceiling_height:g}, it must lie between {limits.min_ceiling_height_m:g} "
-            f"and {limits.max_ceiling_height_m:g} m",
-            room=name,
-        )
+    ceiling_height = _ceiling_height(ceiling, name, limits)
     return Room(name, _parse_polygon(raw.get("polygon"), name, limits), ceiling_height)
+
+
+def _ceiling_height(value: Any, room: str | None, limits: PlanLimits) -> float:
+    height = _number(value, "ceiling_height_m", room, above=0.0)
+    if not limits.min_ceiling_height_m <= height <= limits.max_ceiling_height_m:
+        raise InvalidFloorPlanError(
+            f"ceiling_height_m is {height:g}, it must lie between {limits.min_ceiling_height_m:g} "
+            f"and {limits.max_ceiling_height_m:g} m",
+            room=room,
+        )
+    return height
 
 
 def _parse_polygon(raw: Any, room: str, limits: PlanLimits) -> Float[np.ndarray, "n 2"]:
@@ -236,8 +253,9 @@ def _parse_polygon(raw: Any, room: str, limits: PlanLimits) -> Float[np.ndarray,
             and all(isinstance(value, int | float) and not isinstance(value, bool) for value in vertex)
         ):
             raise InvalidFloorPlanError(f"vertex {index} must be two numbers [x, y]", room=room)
-        if not all(math.isfinite(value) and abs(value) < 1e9 for value in vertex):
-            raise InvalidFloorPlanError(f"vertex {index} is {list(vertex)}, coordinates must be finite", room=room)
+        if not all(_is_finite(value) and abs(value) < 1e9 for value in vertex):
+            shown = ", ".join(str(value)[:50] for value in vertex)
+            raise InvalidFloorPlanError(f"vertex {index} is [{shown}], coordinates must be finite", room=room)
     polygon = np.array(raw, dtype=np.float64)
     # Drop repeated vertices, the closing one of a closed ring among them: they would be walls of no length.
     polygon = polygon[np.any(polygon != np.roll(polygon, -1, axis=0), axis=1)]

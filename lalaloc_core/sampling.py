@@ -27,7 +27,7 @@ class PoseSet:
 
 
 def grid_size(plan: FloorPlan, step_m: float) -> int:
-    """An upper estimate of the number of poses `pose_grid` would return, without sampling them."""
+    """About how many poses `pose_grid` would return, from areas alone; many narrow rooms may hold twice as many."""
     return len(plan.rooms) + int(plan.area_m2 / step_m**2)
 
 
@@ -92,7 +92,7 @@ class TripletSampling:
 
 def sample_triplets(
     plan: FloorPlan, anchors: int, sampling: TripletSampling, rng: np.random.Generator
-) -> tuple[PoseSet, Int[np.ndarray, "anchors 1+positives+negatives"]] | None:
+) -> tuple[PoseSet, Int[np.ndarray, "{anchors} 1+{sampling.positives}+{sampling.negatives}"]] | None:
     """Draw anchors with their positives and negatives.
 
     Returns:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image, ImageOps, UnidentifiedImageError
+from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
 
 from lalaloc_core.errors import InvalidPanoramaError
 
@@ -42,10 +42,10 @@ def read_panorama(
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             with Image.open(io.BytesIO(content), formats=FORMATS) as image:
                 _check_header(image, limits)
+                _check_aspect(*_upright_size(image), limits)
                 # A JPEG can be decoded straight to a size near the wanted one.
                 image.draft("RGB", (2 * width, 2 * height))
                 upright = ImageOps.exif_transpose(image)
-                _check_aspect(upright.width, upright.height, limits)
                 rgb = upright.convert("RGB").resize((width, height), Image.Resampling.BOX)
     except UnidentifiedImageError as error:
         raise InvalidPanoramaError(f"the panorama is not a readable {', '.join(FORMATS)} picture") from error
@@ -64,6 +64,13 @@ def _check_header(image: Image.Image, limits: PanoramaLimits) -> None:
         raise InvalidPanoramaError(
             f"the panorama has {width} x {height} = {width * height} pixels, at most {limits.max_pixels} are allowed"
         )
+
+
+def _upright_size(image: Image.Image) -> tuple[int, int]:
+    """(width, height) once turned as its EXIF orientation says; must be asked before `draft` scales the picture."""
+    width, height = image.size
+    turned = image.getexif().get(ExifTags.Base.Orientation) in (5, 6, 7, 8)
+    return (height, width) if turned else (width, height)
 
 
 def _check_aspect(width: int, height: int, limits: PanoramaLimits) -> None:

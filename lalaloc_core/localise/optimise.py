@@ -24,6 +24,7 @@ from lalaloc_core.bundle import LAYOUT_WEIGHTS, Bundle
 from lalaloc_core.errors import BundleError
 from lalaloc_core.localise.poses import RefinementJob, RefinementResult
 from lalaloc_core.nets import load_layout_encoder
+from lalaloc_core.nets.ring import RingLayoutEncoder
 from lalaloc_core.render.profile import cast_rays, wall_profile
 
 
@@ -35,6 +36,8 @@ class LpoConfig:
         margin_m: poses keep this distance to walls, so that none ends on the other side of one.
         tolerance_m: a Levenberg-Marquardt step shorter than this ends the search.
         max_step_m, max_turn: longest step (m) and turn (radians) per iteration.
+        prune_after, prune_ratio: after so many evaluations, starts farther than the best by this factor are left
+            where they are: they will not become the answer.
         adam_*: the paper's schedule.
     """
 
@@ -45,6 +48,8 @@ class LpoConfig:
     initial_damping: float = 1e-2
     max_step_m: float = 0.5
     max_turn: float = 0.2
+    prune_after: int = 5
+    prune_ratio: float = 2.0
     adam_learning_rate: float = 0.01
     adam_steps: int = 150
     adam_plateau_threshold: float = 0.05
@@ -68,19 +73,18 @@ class _Evaluation:
     def distance(self) -> Float[Tensor, "k"]:
         return torch.linalg.vector_norm(self.residual, dim=1)
 
-    def where(self, chosen: Tensor, other: _Evaluation) -> _Evaluation:
-        """This evaluation for the chosen poses, `other` for the rest."""
-        return _Evaluation(
-            torch.where(chosen[:, None], self.residual, other.residual),
-            torch.where(chosen[:, None, None], self.jacobian, other.jacobian),
-        )
+    def replace(self, rows: Tensor, other: _Evaluation, chosen: Tensor) -> None:
+        """Take over those rows of `other`, which holds `rows` of this one, that are `chosen`."""
+        self.residual[rows[chosen]] = other.residual[chosen]
+        self.jacobian[rows[chosen]] = other.jacobian[chosen]
 
 
 class LatentPoseOptimiser:
     """Refines poses with one layout encoder."""
 
     def __init__(self, layout_encoder: nn.Module, config: LpoConfig | None = None) -> None:
-        self.encoder = layout_encoder.eval().requires_grad_(False)
+        layout_encoder = layout_encoder.eval().requires_grad_(False)
+        self.encoder = layout_encoder.fused() if isinstance(layout_encoder, RingLayoutEncoder) else layout_encoder
         self.config = config or LpoConfig()
         self.device = next(layout_encoder.parameters()).device
 
@@ -140,12 +144,12 @@ class _Problem:
         turned = self.heading + pose[:, 2] if self.unknowns == 3 else self.heading
         return pose[:, :2], turned
 
-    def evaluate(self, pose: Float[Tensor, "k p"]) -> _Evaluation:
-        """Residuals and Jacobian, all unknowns at once: the batch is repeated once per unknown."""
+    def evaluate(self, pose: Float[Tensor, "m p"], rows: Tensor) -> _Evaluation:
+        """Residuals and Jacobian of these rows of the job, all unknowns at once: each row repeated per unknown."""
         count = len(pose)
 
         def repeat(value: Tensor) -> Tensor:
-            return value.repeat_interleave(self.unknowns, dim=0)
+            return value[rows].repeat_interleave(self.unknowns, dim=0)
 
         walls, camera, ceiling = map(repeat, (self.walls_m, self.camera_height_m, self.ceiling_height_m))
         start_heading = repeat(self.heading)
@@ -156,15 +160,18 @@ class _Problem:
             return self.encoder(profile, camera, ceiling)
 
         tangent = torch.eye(self.unknowns, device=pose.device).repeat(count, 1)
-        value, derivative = torch.func.jvp(latents, (repeat(pose),), (tangent,))
-        residual = value[:: self.unknowns] - self.targets
+        repeated = pose.repeat_interleave(self.unknowns, dim=0)
+        value, derivative = torch.func.jvp(latents, (repeated,), (tangent,))
+        residual = value[:: self.unknowns] - self.targets[rows]
         return _Evaluation(residual, derivative.reshape(count, self.unknowns, -1).transpose(1, 2))
 
-    def stay_inside(self, pose: Float[Tensor, "k p"], step: Float[Tensor, "k p"], config: LpoConfig) -> Tensor:
+    def stay_inside(
+        self, pose: Float[Tensor, "m p"], step: Float[Tensor, "m p"], rows: Tensor, config: LpoConfig
+    ) -> Float[Tensor, "m p"]:
         """The step, shortened where it is too long or would come closer to a wall than the margin."""
         length = torch.linalg.vector_norm(step[:, :2], dim=1)
         azimuth = torch.atan2(step[:, 0], step[:, 1])
-        free = cast_rays(pose[:, :2], azimuth[:, None], self.walls_m)[:, 0] - config.margin_m
+        free = cast_rays(pose[:, :2], azimuth[:, None], self.walls_m[rows])[:, 0] - config.margin_m
         allowed = free.clamp(0.0, config.max_step_m)
         scale = torch.where(length > allowed, allowed / length.clamp_min(1e-9), torch.ones_like(length))
         turn = step[:, 2:].clamp(-config.max_turn, config.max_turn)
@@ -175,26 +182,34 @@ _Outcome = tuple[Tensor, Tensor, Tensor, int]
 
 
 def _levenberg_marquardt(problem: _Problem, config: LpoConfig) -> _Outcome:
-    """Damped Gauss-Newton with Marquardt's scaling; each pose has its own damping."""
-    pose = problem.start
-    here = problem.evaluate(pose)
+    """Damped Gauss-Newton with Marquardt's scaling; each pose has its own damping and stops on its own."""
+    pose = problem.start.clone()
+    rows = torch.arange(len(pose), device=pose.device)
+    here = problem.evaluate(pose, rows)
     damping = torch.full((len(pose),), config.initial_damping, device=pose.device)
     converged = torch.zeros(len(pose), dtype=torch.bool, device=pose.device)
     evaluations = 1
-    while evaluations < config.max_iterations and not bool(converged.all()):
-        gradient = torch.einsum("kdp,kd->kp", here.jacobian, here.residual)
-        hessian = torch.einsum("kdp,kdq->kpq", here.jacobian, here.jacobian)
-        scaling = torch.diagonal(hessian, dim1=1, dim2=2) * damping[:, None] + 1e-8
+    while evaluations < config.max_iterations:
+        active = ~converged
+        if evaluations >= config.prune_after:
+            active &= here.distance <= config.prune_ratio * here.distance.min()
+        rows = active.nonzero()[:, 0]
+        if len(rows) == 0:
+            break
+        jacobian, residual = here.jacobian[rows], here.residual[rows]
+        gradient = torch.einsum("kdp,kd->kp", jacobian, residual)
+        hessian = torch.einsum("kdp,kdq->kpq", jacobian, jacobian)
+        scaling = torch.diagonal(hessian, dim1=1, dim2=2) * damping[rows, None] + 1e-8
         step = -torch.linalg.solve(hessian + torch.diag_embed(scaling), gradient)
-        step = problem.stay_inside(pose, step, config)
-        there = problem.evaluate(pose + step)
+        step = problem.stay_inside(pose[rows], step, rows, config)
+        there = problem.evaluate(pose[rows] + step, rows)
         evaluations += 1
-        better = (there.cost < here.cost) & ~converged
+        better = there.cost < here.cost[rows]
         # A step that short cannot matter, whether it was good or not.
-        converged = converged | (torch.linalg.vector_norm(step, dim=1) < config.tolerance_m)
-        pose = torch.where(better[:, None], pose + step, pose)
-        here = there.where(better, here)
-        damping = torch.where(better, damping * 0.2, damping * 6.0).clamp(1e-6, 1e8)
+        converged[rows] = torch.linalg.vector_norm(step, dim=1) < config.tolerance_m
+        pose[rows[better]] += step[better]
+        here.replace(rows, there, better)
+        damping[rows] = (damping[rows] * torch.where(better, 0.2, 6.0)).clamp(1e-6, 1e8)
     return pose, here.distance, converged, evaluations
 
 
@@ -208,10 +223,11 @@ def _adam(problem: _Problem, config: LpoConfig) -> _Outcome:
     plateau_age = torch.zeros(count, device=pose.device)
     stop_age = torch.zeros(count, device=pose.device)
     best_pose = pose
+    rows = torch.arange(count, device=pose.device)
     step_number = 0
     while step_number < config.adam_steps and not bool((stop_age >= config.adam_stop_patience).all()):
         step_number += 1
-        here = problem.evaluate(pose)
+        here = problem.evaluate(pose, rows)
         cost = here.distance
         best_pose = torch.where((cost < best)[:, None], pose, best_pose)
         best = torch.minimum(cost, best)
@@ -229,5 +245,5 @@ def _adam(problem: _Problem, config: LpoConfig) -> _Outcome:
         first = 0.9 * first + 0.1 * gradient
         second = 0.999 * second + 0.001 * gradient.square()
         direction = first / (1.0 - 0.9**step_number) / ((second / (1.0 - 0.999**step_number)).sqrt() + 1e-8)
-        pose = pose + problem.stay_inside(pose, -rate[:, None] * direction, config)
+        pose = pose + problem.stay_inside(pose, -rate[:, None] * direction, rows, config)
     return best_pose, best, stop_age >= config.adam_stop_patience, step_number

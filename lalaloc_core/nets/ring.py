@@ -7,12 +7,14 @@ into the same ring. One shared head (flatten, fully connected, L2 norm) turns a 
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 # Distances outside are clamped before they become features: no camera stands nearer, no room is larger.
 _NEAREST_M = 0.05
@@ -34,14 +36,14 @@ class RingConfig:
     image_height: int = 128
     image_width: int = 256
     image_stem: int = 24
-    image_widths: tuple[int, ...] = (32, 64, 112, 160)
+    image_widths: tuple[int, ...] = (32, 56, 88, 112)
     image_blocks: tuple[int, ...] = (1, 2, 2, 2)
     mixer_width: int = 192
     mixer_blocks: int = 2
     mixer_heads: int = 4
 
 
-def pad_around(x: Float[Tensor, "*batch w"], padding: int) -> Float[Tensor, "*batch w+2*padding"]:
+def pad_around(x: Float[Tensor, "*batch w"], padding: int) -> Float[Tensor, "*batch w+2*{padding}"]:
     """Pad the last axis, azimuth, with what lies on its other end: a panorama has no border there."""
     return torch.cat([x[..., -padding:], x, x[..., :padding]], dim=-1) if padding else x
 
@@ -53,10 +55,15 @@ class RingConv1d(nn.Module):
         super().__init__()
         self.padding = (kernel - 1) // 2 * dilation
         self.conv = nn.Conv1d(inputs, outputs, kernel, stride=stride, dilation=dilation, bias=False)
-        self.norm = nn.BatchNorm1d(outputs)
+        self.norm: nn.Module = nn.BatchNorm1d(outputs)
 
     def forward(self, x: Float[Tensor, "b i w"]) -> Float[Tensor, "b o v"]:
         return self.norm(self.conv(pad_around(x, self.padding)))
+
+    def fuse(self) -> None:
+        """Fold the normalisation into the convolution; for evaluation only."""
+        self.conv = fuse_conv_bn_eval(self.conv, self.norm)
+        self.norm = nn.Identity()
 
 
 class RingHead(nn.Module):
@@ -115,6 +122,14 @@ class RingLayoutEncoder(nn.Module):
         ceiling_height_m: Float[Tensor, "b"],
     ) -> Float[Tensor, "b d"]:
         return self.head(self.ring(profile_m, camera_height_m, ceiling_height_m))
+
+    def fused(self) -> RingLayoutEncoder:
+        """A copy for evaluation with every normalisation folded away: the same function in half the time."""
+        copied = copy.deepcopy(self).eval()
+        for module in copied.modules():
+            if isinstance(module, RingConv1d):
+                module.fuse()
+        return copied.requires_grad_(False)
 
 
 class _RingConv2d(nn.Module):

@@ -42,7 +42,9 @@ def back_project(depth_m: Float[Array, "b h w"]) -> Float[Array, "b h*w 3"]:
     batch, rows, columns = depth_m.shape
     azimuth, elevation = column_azimuths(columns)[None, :], row_elevations(rows)[:, None]
     rays = np.stack(
-        np.broadcast_arrays(np.cos(elevation) * np.sin(azimuth), np.cos(elevation) * np.cos(azimuth), np.sin(elevation)),
+        np.broadcast_arrays(
+            np.cos(elevation) * np.sin(azimuth), np.cos(elevation) * np.cos(azimuth), np.sin(elevation)
+        ),
         axis=-1,
     )
     rays = xp.asarray(rays, dtype=depth_m.dtype, device=device(depth_m))

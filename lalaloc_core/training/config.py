@@ -67,6 +67,8 @@ class ImageStageConfig:
 
     Attributes:
         minutes: wall-clock budget; when given, it and not `steps` sets the pace of the schedule.
+        by_room_share: share of the panoramas drawn evenly over rooms instead of over the floor, so that closets and
+            corridors are seen often enough.
         l2_weight: weight of the latent distance, the paper's only loss.
         ring_weight: weight of distilling ring features (architecture `ring`).
         profile_weight: weight of the Laplace likelihood of the wall profile (architecture `ring`).
@@ -77,6 +79,7 @@ class ImageStageConfig:
     minutes: float | None = None
     batch: int = 32
     shots_per_home: int = 4
+    by_room_share: float = 0.25
     l2_weight: float = 1.0
     ring_weight: float = 0.0
     profile_weight: float = 0.0

@@ -44,7 +44,7 @@ class PanoramaBatches(IterableDataset[Batch]):
             while len(shots) < min(_RENDER_BATCH, stage.batch):
                 home, rng = home_of(TRAIN, self.config.seed, index)
                 index += workers
-                shots += sample_shots(home, stage.shots_per_home, rng)
+                shots += sample_shots(home, stage.shots_per_home, rng, by_room_share=stage.by_room_share)
             parts.append(self._render(renderer, shots, np.random.default_rng([3, self.config.seed, index])))
             if sum(len(part["image"]) for part in parts) >= stage.batch:
                 yield {key: torch.cat([part[key] for part in parts])[: stage.batch] for key in parts[0]}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
@@ -17,6 +17,7 @@ LayoutEncoder = RingLayoutEncoder | PaperLayoutEncoder
 ImageEncoder = RingImageEncoder | PaperImageEncoder
 
 
+@runtime_checkable
 class Stage(Protocol):
     """What the training loop needs to know of a stage."""
 

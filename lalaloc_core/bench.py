@@ -1,0 +1,221 @@
+"""`lalaloc bench`: measure the figures of docs/results.md. Each group prints what it measured, with its n."""
+
+from __future__ import annotations
+
+import io
+import os
+import socket
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import torch
+from PIL import Image
+
+from lalaloc_core.bundle import Bundle
+from lalaloc_core.evaluate import GRID_STEP_M, QuerySet, evaluate, summarise
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.optimise import LatentPoseOptimiser
+from lalaloc_core.localise.retrieval import build_grid
+from lalaloc_core.render.depth import layout_depth
+from lalaloc_core.render.oracle import oracle_depth
+from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.sampling import random_poses
+from lalaloc_core.synth.materials import MaterialLibrary
+from lalaloc_core.synth.panorama import PanoramaRenderer, sample_shots
+from lalaloc_core.synth.plans import Home
+from lalaloc_core.training.stream import TEST, home_of
+
+_REQUESTS = 40
+_STARTUP_SECONDS = 60.0
+
+
+def run_bench(bundle_folder: Path, groups: tuple[str, ...], *, homes: int, textures: Path | None) -> dict[str, Any]:
+    """Measure the named groups of figures ("rendering", "service", "accuracy") with one bundle."""
+    bundle = Bundle.open(bundle_folder)
+    report: dict[str, Any] = {
+        "bundle": bundle.manifest.name,
+        "version": bundle.manifest.version,
+        "cores": os.cpu_count(),
+    }
+    if "rendering" in groups:
+        report["rendering"] = bench_rendering(bundle)
+    if "service" in groups:
+        report["service"] = bench_service(bundle, textures)
+    if "accuracy" in groups:
+        report["accuracy"] = bench_accuracy(bundle, homes, textures)
+    return report
+
+
+def bench_rendering(bundle: Bundle, poses: int = 200) -> dict[str, float]:
+    """Closed-form layout depth against the ray-casting oracle in the same run, and the grid of a 100 m² home."""
+    home = home_of_area(100.0)
+    plan = home.plan
+    drawn = random_poses(plan, poses, np.random.default_rng(0))
+    camera, ceiling = np.full(poses, 1.5), plan.ceiling_heights_m[drawn.room_index]
+    arrays = (drawn.position_m, np.zeros(poses), plan.walls_m[drawn.room_index], camera, ceiling)
+    position, heading, walls, cameras, ceilings = (torch.tensor(a, dtype=torch.float32) for a in arrays)
+
+    def closed_form() -> None:
+        layout_depth(wall_profile(position, heading, walls, 256), cameras, ceilings, 128)
+
+    sample = range(0, poses, poses // 10)
+
+    def oracle() -> None:
+        for index in sample:
+            room = plan.rooms[drawn.room_index[index]]
+            oracle_depth(room, drawn.position_m[index], 0.0, 1.5, 128, 256)
+
+    encoders = Encoders(bundle)
+    closed_form_ms = _median_ms(closed_form) / poses
+    oracle_ms = _median_ms(oracle, repeats=3) / len(sample)
+    grid = build_grid(plan, encoders, step_m=GRID_STEP_M, camera_height_m=1.5)
+    return {
+        "layout_depth_128x256_ms_per_pose": closed_form_ms,
+        "oracle_128x256_ms_per_pose": oracle_ms,
+        "oracle_to_closed_form_ratio": oracle_ms / closed_form_ms,
+        "grid_area_m2": plan.area_m2,
+        "grid_poses": len(grid.poses),
+        "grid_seconds": _median_ms(lambda: build_grid(plan, encoders, step_m=GRID_STEP_M, camera_height_m=1.5)) / 1e3,
+    }
+
+
+def bench_service(bundle: Bundle, textures: Path | None) -> dict[str, Any]:
+    """Latency of `POST /localise` from one client over real HTTP, and memory of the service's processes."""
+    home = home_of_area(100.0)
+    shots = sample_shots(home, _REQUESTS, np.random.default_rng(1), "full")
+    materials = MaterialLibrary.create(np.random.default_rng(1), textures)
+    pictures = [_jpeg(image) for image in PanoramaRenderer(materials, height=512, width=1024).render(shots).numpy()]
+    with running_service(bundle.folder) as (client, process):
+        plan_id = _upload(client, home.plan)
+        report: dict[str, Any] = {"requests": _REQUESTS, "panorama": "1024x512 JPEG"}
+        for name, known in (("known_heading", True), ("unknown_heading", False)):
+            answers = []
+            for index, (shot, picture) in enumerate([(shots[0], pictures[0]), *zip(shots, pictures, strict=True)]):
+                data = {"floorplan_id": plan_id, "camera_height_m": f"{shot.home.plan.camera_height_m}"}
+                if known:
+                    data["heading_deg"] = f"{np.degrees(shot.heading):.3f}"
+                begin = time.perf_counter()
+                answer = client.post("/localise", data=data, files={"panorama": ("p.jpg", picture, "image/jpeg")})
+                answer.raise_for_status()
+                # The first request warms up and is not counted.
+                if index:
+                    answers.append(((time.perf_counter() - begin) * 1e3, answer.json()))
+            times = [milliseconds for milliseconds, _ in answers]
+            report[name] = {
+                "p50_ms": statistics.median(times),
+                "p95_ms": float(np.quantile(times, 0.95)),
+                "stages": sorted({answer["stage"] for _, answer in answers}),
+                "median_stage_ms": {
+                    stage: statistics.median(answer["timings_ms"][stage] for _, answer in answers)
+                    for stage in answers[0][1]["timings_ms"]
+                },
+            }
+        report["service_resident_mb"] = resident_mb(process.pid)
+        report["workers_resident_mb"] = [resident_mb(pid) for pid in children_of(process.pid)]
+    return report
+
+
+def bench_accuracy(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
+    """Accuracy on test homes: layout queries, then furnished, empty and unknown-heading panoramas."""
+    encoders = Encoders(bundle)
+    refiner = LatentPoseOptimiser.from_bundle(bundle).refine
+
+    def score(**changes: Any) -> dict[str, object]:
+        options = {"kind": "panorama", "heading_known": True, "furniture": "full"} | changes
+        queries = QuerySet(split=TEST, homes=homes, furniture=options.pop("furniture"), textures=textures)
+        return summarise(evaluate(encoders, queries, refiner=refiner, **options))
+
+    return {
+        "layout": score(kind="layout"),
+        "panorama_full": score(),
+        "panorama_empty": score(furniture="empty"),
+        "panorama_full_unknown_heading": score(heading_known=False),
+    }
+
+
+def home_of_area(area_m2: float) -> Home:
+    """The test home whose area comes nearest, among the first hundred."""
+    homes = (home_of(TEST, 0, index)[0] for index in range(100))
+    return min(homes, key=lambda home: abs(home.plan.area_m2 - area_m2))
+
+
+@contextmanager
+def running_service(bundle_folder: Path) -> Iterator[tuple[httpx.Client, subprocess.Popen[bytes]]]:
+    """The production service on a free port with a temporary data folder; stopped at the end."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    command = [sys.executable, "-m", "uvicorn", "service.app:app", "--port", str(port), "--log-level", "warning"]
+    with tempfile.TemporaryDirectory(prefix="lalaloc-bench-") as data:
+        environment = {**os.environ, "LALALOC_DATA_DIR": data, "LALALOC_BUNDLE": str(bundle_folder.resolve())}
+        process = subprocess.Popen(command, env=environment)
+        try:
+            with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=60.0) as client:
+                _wait_until(lambda: _is_ready(client), "the service did not become ready")
+                yield client, process
+        finally:
+            process.terminate()
+            process.wait(timeout=30)
+
+
+def resident_mb(pid: int) -> float:
+    """Resident memory of a process in MB, as Linux reports it."""
+    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+        if line.startswith("VmRSS:"):
+            return int(line.split()[1]) / 1024.0
+    return float("nan")
+
+
+def children_of(pid: int) -> list[int]:
+    """Process ids of the direct children of a process (Linux)."""
+    listing = Path(f"/proc/{pid}/task/{pid}/children").read_text()
+    return [int(child) for child in listing.split()]
+
+
+def _upload(client: httpx.Client, plan: FloorPlan) -> str:
+    answer = client.post("/floorplans", json=plan.to_dict())
+    answer.raise_for_status()
+    plan_id = answer.json()["id"]
+    _wait_until(lambda: client.get(f"/floorplans/{plan_id}").json()["status"] == "ready", "the plan did not get ready")
+    return plan_id
+
+
+def _is_ready(client: httpx.Client) -> bool:
+    try:
+        return client.get("/readyz").status_code == 200
+    except httpx.TransportError:
+        return False
+
+
+def _wait_until(condition: Callable[[], bool], complaint: str) -> None:
+    deadline = time.monotonic() + _STARTUP_SECONDS
+    while not condition():
+        if time.monotonic() > deadline:
+            raise TimeoutError(complaint)
+        time.sleep(0.1)
+
+
+def _jpeg(image: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "JPEG", quality=90)
+    return buffer.getvalue()
+
+
+def _median_ms(call: Callable[[], object], repeats: int = 9) -> float:
+    call()
+    times = []
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        call()
+        times.append((time.perf_counter() - begin) * 1e3)
+    return statistics.median(times)

@@ -1,0 +1,36 @@
+"""Slow oracle of the closed form: trimesh casts every pixel's ray against the extruded mesh of the room.
+
+Shares no formula with `render.profile` and `render.depth`. Needs the extra `ray` (embree).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float
+from trimesh.ray.ray_pyembree import RayMeshIntersector
+
+from lalaloc_core.floorplan import Room
+from lalaloc_core.render.mesh import room_mesh
+
+
+def oracle_depth(
+    room: Room,
+    position_m: Float[np.ndarray, "2"],
+    heading: float,
+    camera_height_m: float,
+    rows: int,
+    columns: int,
+) -> Float[np.ndarray, "{rows} {columns}"]:
+    """Layout depth (m) of one pose by ray casting; inf where a ray escapes through a seam of the mesh."""
+    j, i = np.meshgrid(np.arange(columns), np.arange(rows))
+    azimuth = heading + ((j + 0.5) / columns - 0.5) * 2.0 * np.pi
+    elevation = (0.5 - (i + 0.5) / rows) * np.pi
+    x = np.sin(azimuth) * np.cos(elevation)
+    y = np.cos(azimuth) * np.cos(elevation)
+    directions = np.stack([x, y, np.sin(elevation)], axis=-1).reshape(-1, 3)
+    origins = np.broadcast_to([*position_m, camera_height_m], directions.shape)
+    mesh = room_mesh(room)
+    hits, ray, _ = RayMeshIntersector(mesh).intersects_location(origins, directions, multiple_hits=False)
+    depth = np.full(rows * columns, np.inf)
+    depth[ray] = np.linalg.norm(hits - origins[ray], axis=1)
+    return depth.reshape(rows, columns)
