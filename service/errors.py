@@ -1,0 +1,214 @@
+"""Errors of the service, and the one table that says what every error means over HTTP.
+
+LaLaLocError
+└── ServiceError
+    ├── MalformedRequestError       a body that does not follow its media type
+    ├── InvalidRequestError         a field that is missing, unknown or outside its limits
+    ├── UnknownFloorPlanError       no floor plan with this id
+    ├── UploadTooLargeError         more bytes than allowed
+    ├── UploadTimeoutError          the upload took too long
+    ├── UnsupportedMediaError       a body of a type that is not read here
+    ├── PlanTooLargeError           the latent grid would have more poses than allowed
+    ├── PlanFailedError             the plan's latent grid could not be computed
+    ├── PlanNotReadyError           still preparing at the request's deadline
+    ├── TooManyFloorPlansError      the store is full
+    ├── OverloadedError             more requests in flight than allowed
+    ├── DeadlineExceededError       the query could not be computed in time
+    └── StoppingError               the service is shutting down
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from lalaloc_core.errors import (
+    BundleError,
+    CheckpointError,
+    ConfigError,
+    ExportError,
+    InvalidFloorPlanError,
+    InvalidInputError,
+    InvalidPanoramaError,
+    InvalidPoseError,
+    LaLaLocError,
+)
+
+URN = "urn:lalaloc:problem:"
+
+
+class ServiceError(LaLaLocError):
+    """Base of the errors that only the service raises.
+
+    Attributes:
+        retry_after_s: whole seconds after which trying again makes sense, None when it does not.
+    """
+
+    retry_after_s: int | None = None
+
+
+class MalformedRequestError(ServiceError):
+    """The body does not follow its media type."""
+
+
+class InvalidRequestError(ServiceError):
+    """A field is missing, unknown, or outside its limits.
+
+    Attributes:
+        faults: one (field, message) for each fault.
+    """
+
+    def __init__(self, faults: list[tuple[str, str]]) -> None:
+        self.faults = faults
+        super().__init__("; ".join(f"{field}: {message}" for field, message in faults))
+
+
+class UnknownFloorPlanError(ServiceError):
+    """No floor plan has this id."""
+
+    def __init__(self, plan_id: str) -> None:
+        super().__init__(f"there is no floor plan '{plan_id[:64]}'")
+
+
+class UploadTooLargeError(ServiceError):
+    """The body has more bytes than allowed."""
+
+    def __init__(self, limit: int, stated: int | None = None) -> None:
+        size = f"{stated} bytes" if stated is not None else "too large"
+        super().__init__(f"the body is {size}, at most {limit} bytes are allowed")
+
+
+class UploadTimeoutError(ServiceError):
+    """The upload did not finish in time."""
+
+    def __init__(self, limit_s: float) -> None:
+        super().__init__(f"the upload took longer than {limit_s:g} s")
+
+
+class UnsupportedMediaError(ServiceError):
+    """The body is of a type that is not read here."""
+
+    def __init__(self, given: str, accepted: tuple[str, ...]) -> None:
+        self.accepted = accepted
+        stated = f"content type '{given[:100]}'" if given else "a body without content type"
+        super().__init__(f"{stated} is not read here, send {' or '.join(accepted)}")
+
+
+class PlanTooLargeError(ServiceError):
+    """The plan's latent grid would have more poses than allowed."""
+
+    def __init__(self, estimate: int, limit: int, step_m: float) -> None:
+        super().__init__(
+            f"the plan needs about {estimate} grid poses at a step of {step_m:g} m, at most {limit} are allowed; "
+            "are the coordinates in metres?"
+        )
+
+
+class PlanFailedError(ServiceError):
+    """The plan's latent grid could not be computed."""
+
+    def __init__(self, plan_id: str, reason: str) -> None:
+        super().__init__(f"floor plan '{plan_id}' could not be prepared: {reason}")
+
+
+class PlanNotReadyError(ServiceError):
+    """The latent grid was not finished within the request's deadline."""
+
+    retry_after_s = 5
+
+    def __init__(self, plan_id: str, waited_s: float, progress: float) -> None:
+        super().__init__(
+            f"floor plan '{plan_id}' is still preparing ({progress:.0%} done after waiting {waited_s:.1f} s)"
+        )
+
+
+class TooManyFloorPlansError(ServiceError):
+    """The store holds as many plans as allowed."""
+
+    def __init__(self, limit: int) -> None:
+        super().__init__(f"{limit} floor plans are stored, no more are allowed; delete some")
+
+
+class OverloadedError(ServiceError):
+    """More requests are in flight, or more grids asked for, than allowed."""
+
+    retry_after_s = 1
+
+    def __init__(self, limit: int) -> None:
+        super().__init__(f"{limit} others are waiting to be answered, no more are taken")
+
+
+class DeadlineExceededError(ServiceError):
+    """The query could not be computed within its deadline."""
+
+    retry_after_s = 1
+
+    def __init__(self, limit_s: float) -> None:
+        super().__init__(f"the query was not answered within {limit_s:g} s")
+
+
+class StoppingError(ServiceError):
+    """The service is shutting down."""
+
+    retry_after_s = 5
+
+    def __init__(self) -> None:
+        super().__init__("the service is shutting down")
+
+
+@dataclass(frozen=True)
+class ProblemKind:
+    """What an error means over HTTP: status, stable type, title, and whether its text may leave the service."""
+
+    status: int
+    slug: str
+    title: str
+    public: bool = True
+
+    @property
+    def type(self) -> str:
+        """The stable URN of RFC 9457's `type`."""
+        return URN + self.slug
+
+
+INTERNAL = ProblemKind(500, "internal", "Internal error", public=False)
+
+PROBLEMS: dict[type[Exception], ProblemKind] = {
+    InvalidFloorPlanError: ProblemKind(422, "invalid-floorplan", "Invalid floor plan"),
+    InvalidPanoramaError: ProblemKind(422, "invalid-panorama", "Invalid panorama"),
+    InvalidPoseError: ProblemKind(422, "invalid-pose", "Invalid position, heading or height"),
+    InvalidInputError: ProblemKind(422, "invalid-request", "Invalid request"),
+    MalformedRequestError: ProblemKind(400, "malformed-request", "Malformed request"),
+    InvalidRequestError: ProblemKind(422, "invalid-request", "Invalid request"),
+    UnknownFloorPlanError: ProblemKind(404, "unknown-floorplan", "Unknown floor plan"),
+    UploadTooLargeError: ProblemKind(413, "upload-too-large", "Upload too large"),
+    UploadTimeoutError: ProblemKind(408, "upload-timeout", "Upload took too long"),
+    UnsupportedMediaError: ProblemKind(415, "unsupported-media", "Unsupported media type"),
+    PlanTooLargeError: ProblemKind(422, "floorplan-too-large", "Floor plan too large"),
+    PlanFailedError: ProblemKind(409, "floorplan-failed", "Floor plan could not be prepared"),
+    PlanNotReadyError: ProblemKind(503, "floorplan-not-ready", "Floor plan still preparing"),
+    TooManyFloorPlansError: ProblemKind(507, "too-many-floorplans", "Too many floor plans"),
+    OverloadedError: ProblemKind(503, "overloaded", "Overloaded"),
+    DeadlineExceededError: ProblemKind(504, "deadline-exceeded", "Deadline exceeded"),
+    StoppingError: ProblemKind(503, "stopping", "Shutting down"),
+    ServiceError: INTERNAL,
+    LaLaLocError: INTERNAL,
+    ConfigError: INTERNAL,
+    BundleError: INTERNAL,
+    CheckpointError: INTERNAL,
+    ExportError: INTERNAL,
+}
+
+# What the framework itself answers: no such route, method not allowed, and so on.
+HTTP_PROBLEMS: dict[int, ProblemKind] = {
+    400: ProblemKind(400, "malformed-request", "Malformed request"),
+    404: ProblemKind(404, "not-found", "Not found"),
+    405: ProblemKind(405, "method-not-allowed", "Method not allowed"),
+}
+
+
+def problem_kind(error: Exception) -> ProblemKind:
+    """The table's entry for an error: that of its class, else of its nearest base class."""
+    for cls in type(error).__mro__:
+        if cls in PROBLEMS:
+            return PROBLEMS[cls]
+    return INTERNAL

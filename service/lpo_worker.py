@@ -1,0 +1,102 @@
+"""The body of an LPO worker process: the only place of the service that imports torch.
+
+The parent sends `RefinementJob`s through the pipe and gets, for each, a `RefinementResult` or the text of what went
+wrong. The worker ends when the parent closes the pipe or dies.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from lalaloc_core.bundle import Bundle
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.poses import RefinementJob
+
+if TYPE_CHECKING:
+    from lalaloc_core.localise.optimise import LatentPoseOptimiser
+
+
+@dataclass(frozen=True)
+class WorkerFault:
+    """What a worker says instead of a result."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class WorkerReady:
+    """What a worker says once it is warm."""
+
+
+def run_worker(connection: Connection, bundle_folder: str, model_sha256: str, threads: int) -> None:
+    """Load the optimiser, warm it up, then answer jobs until the pipe closes."""
+    # Ctrl-C reaches the whole process group; the parent decides when its workers end.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ[variable] = str(threads)
+    try:
+        optimiser = _load(Path(bundle_folder), model_sha256, threads)
+    except Exception as error:
+        _send(connection, WorkerFault(f"{type(error).__name__}: {error}"))
+        return
+    if not _send(connection, WorkerReady()):
+        return
+    while True:
+        try:
+            job = connection.recv()
+        except (EOFError, OSError):
+            return
+        try:
+            answer = optimiser.refine(job)
+        except Exception as error:
+            answer = WorkerFault(f"{type(error).__name__}: {error}")
+        if not _send(connection, answer):
+            return
+
+
+def _load(bundle_folder: Path, model_sha256: str, threads: int) -> LatentPoseOptimiser:
+    import torch
+
+    from lalaloc_core.localise.optimise import LatentPoseOptimiser
+
+    torch.set_num_threads(threads)
+    bundle = Bundle.open(bundle_folder)
+    if bundle.sha256 != model_sha256:
+        raise RuntimeError("the bundle on disk is no longer the one the service runs")
+    optimiser = LatentPoseOptimiser.from_bundle(bundle)
+    for optimise_heading in (False, True):
+        optimiser.refine(warm_up_job(bundle.manifest.latent_size, optimise_heading=optimise_heading))
+    return optimiser
+
+
+def warm_up_job(latent_size: int, *, optimise_heading: bool) -> RefinementJob:
+    """A small job, so that the first real one does not pay for what is built on first use."""
+    plan = FloorPlan.from_dict(
+        {"ceiling_height_m": 2.5, "rooms": [{"polygon": [[0.0, 0.0], [4.0, 0.0], [4.0, 3.0], [0.0, 3.0]]}]}
+    )
+    target = np.ones((2, latent_size), np.float32) / np.sqrt(np.float32(latent_size))
+    return RefinementJob(
+        targets=target,
+        position_m=np.array([[1.0, 1.0], [2.5, 2.0]]),
+        heading=np.zeros(2),
+        walls_m=plan.walls_m[[0, 0]],
+        camera_height_m=np.full(2, plan.camera_height_m),
+        ceiling_height_m=plan.ceiling_heights_m[[0, 0]],
+        optimise_heading=optimise_heading,
+    )
+
+
+def _send(connection: Connection, message: object) -> bool:
+    """False when the parent is gone."""
+    try:
+        connection.send(message)
+    except (BrokenPipeError, OSError):
+        return False
+    return True

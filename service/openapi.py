@@ -1,0 +1,32 @@
+"""Write the API description: `python -m service.openapi [FILE]` (default: standard output)."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+import yaml
+
+from service.app import create_app
+
+
+def openapi_text() -> str:
+    """The API description as YAML; the same for the same code."""
+    header = "# Written by `python -m service.openapi openapi.yaml`; do not edit.\n"
+    return header + yaml.safe_dump(create_app().openapi(), sort_keys=False, allow_unicode=True, width=120)
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("file", nargs="?", type=Path, help="where to write; standard output when left out")
+    file = parser.parse_args().file
+    if file is None:
+        sys.stdout.write(openapi_text())
+    else:
+        file.write_text(openapi_text(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Pictures of a stored plan: an SVG drawing and a GLB mesh."""

@@ -1,0 +1,102 @@
+"""A floor plan as an SVG drawing, y up as in the plan frame."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from html import escape
+
+import shapely
+
+from lalaloc_core.floorplan import FloorPlan, Room
+
+_MARGIN_M = 0.5
+_FILLS = ("#eef4fb", "#f7f1e6", "#eef7ee", "#f8eef4", "#f2f0fa", "#f4f6ea")
+# A scale bar of a round length, about this share of the drawing's width.
+_BAR_SHARE = 0.2
+
+
+@dataclass(frozen=True, kw_only=True)
+class Marker:
+    """A camera to draw: position (m) and, when known, heading (degrees)."""
+
+    x_m: float
+    y_m: float
+    heading_deg: float | None = None
+
+
+def plan_svg(plan: FloorPlan, marker: Marker | None = None) -> str:
+    """The plan with the names and areas of its rooms and a scale bar; one SVG unit is one metre.
+
+    The view box is the plan's bounds with a margin, its y axis pointing down: plan point (x, y) is drawn at (x, -y).
+    """
+    x_min, y_min, x_max, y_max = plan.bounds_m
+    width, height = x_max - x_min + 2 * _MARGIN_M, y_max - y_min + 3 * _MARGIN_M
+    extent = max(width, height)
+    scale = 1000.0 / extent
+    lines = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width * scale:.0f}" height="{height * scale:.0f}" '
+        f'viewBox="{x_min - _MARGIN_M:.3f} {-y_max - _MARGIN_M:.3f} {width:.3f} {height:.3f}" '
+        'font-family="sans-serif" text-anchor="middle">',
+        f"<title>{_text(plan.name)}</title>",
+        '<g stroke="#333" stroke-linejoin="round">',
+        *(_outline(room, _FILLS[index % len(_FILLS)], extent) for index, room in enumerate(plan.rooms)),
+        "</g>",
+        '<g fill="#222">',
+        *(_label(room, extent) for room in plan.rooms),
+        "</g>",
+        _scale_bar(x_min, y_min, width, extent),
+    ]
+    if marker is not None:
+        lines.append(_camera(marker, extent))
+    lines.append("</svg>\n")
+    return "\n".join(lines)
+
+
+def _outline(room: Room, fill: str, extent_m: float) -> str:
+    points = " ".join(f"{x:.3f},{-y:.3f}" for x, y in room.polygon_m)
+    return f'<polygon points="{points}" fill="{fill}" stroke-width="{extent_m / 250:.4f}"/>'
+
+
+def _label(room: Room, extent_m: float) -> str:
+    """Name and area at the middle of the largest circle in the room, small enough to fit."""
+    circle = shapely.maximum_inscribed_circle(room.shape, tolerance=0.05)
+    (x, y), _ = circle.coords
+    size = min(extent_m / 40.0, 2.6 * circle.length / max(len(room.name), 6))
+    return (
+        f'<text x="{x:.3f}" y="{-y:.3f}" font-size="{size:.4f}">{_text(room.name)}'
+        f'<tspan x="{x:.3f}" dy="1.2em" font-size="{0.8 * size:.4f}" fill="#666">{room.area_m2:.1f} m²</tspan></text>'
+    )
+
+
+def _scale_bar(x_min: float, y_min: float, width_m: float, extent_m: float) -> str:
+    length = 10.0 ** math.floor(math.log10(_BAR_SHARE * width_m))
+    length *= max(factor for factor in (1, 2, 5) if factor == 1 or factor * length <= _BAR_SHARE * width_m)
+    y = -y_min + _MARGIN_M
+    return (
+        f'<g class="scale"><path d="M{x_min:.3f} {y:.3f}h{length:g}" stroke="#333" '
+        f'stroke-width="{extent_m / 200:.4f}"/>'
+        f'<text x="{x_min + length / 2:.3f}" y="{y + extent_m / 40:.3f}" font-size="{extent_m / 50:.4f}">{length:g} m'
+        "</text></g>"
+    )
+
+
+def _text(name: str) -> str:
+    """A name as XML text; the two characters that XML cannot hold, and plans may, are replaced."""
+    return escape(name.replace("\ufffe", "\ufffd").replace("\uffff", "\ufffd"))
+
+
+def _camera(marker: Marker, extent_m: float) -> str:
+    """A dot, and a wedge that opens towards the heading."""
+    radius = extent_m / 80.0
+    wedge = ""
+    if marker.heading_deg is not None:
+        # SVG turns clockwise, as azimuths do; the wedge is drawn looking up, along the plan's +y.
+        wedge = (
+            f'<path d="M0 0L{-2 * radius:.4f} {-4 * radius:.4f}L{2 * radius:.4f} {-4 * radius:.4f}Z" '
+            f'transform="rotate({marker.heading_deg:.3f})" fill-opacity="0.35"/>'
+        )
+    return (
+        f'<g class="camera" transform="translate({marker.x_m:.4f} {-marker.y_m:.4f})" fill="#c0392b">{wedge}'
+        f'<circle r="{radius:.4f}"/></g>'
+    )

@@ -1,0 +1,114 @@
+"""Every error answer is `application/problem+json` as of RFC 9457; no stack trace leaves the service."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from fastapi import FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from starlette.exceptions import HTTPException
+
+from lalaloc_core.errors import InvalidFloorPlanError, LaLaLocError
+from service.errors import (
+    HTTP_PROBLEMS,
+    INTERNAL,
+    PROBLEMS,
+    InvalidRequestError,
+    ProblemKind,
+    ServiceError,
+    UnsupportedMediaError,
+    problem_kind,
+)
+from service.schemas import Fault, Problem
+from service.telemetry import request_id_of
+from service.uploads import describe_fault
+
+PROBLEM_JSON = "application/problem+json"
+_HIDDEN = "something went wrong in the service; its log has the details under this request_id"
+
+
+def install_problem_handlers(app: FastAPI) -> None:
+    """Answer every error, expected or not, with a problem document."""
+    app.add_exception_handler(LaLaLocError, _on_known_error)
+    app.add_exception_handler(RequestValidationError, _on_invalid_request)
+    app.add_exception_handler(HTTPException, _on_http_error)
+    app.add_exception_handler(Exception, _on_unexpected_error)
+
+
+def problem_responses(*errors: type[Exception]) -> dict[int | str, dict[str, Any]]:
+    """OpenAPI descriptions of the problems that a route answers with."""
+    titles: dict[int, list[str]] = {}
+    for kind in (*(PROBLEMS[error] for error in errors), INTERNAL):
+        line = f"{kind.title} (`{kind.type}`)"
+        if line not in titles.setdefault(kind.status, []):
+            titles[kind.status].append(line)
+    schema = {"schema": {"$ref": "#/components/schemas/Problem"}}
+    return {
+        status: {"description": "; ".join(lines), "content": {PROBLEM_JSON: schema}}
+        for status, lines in sorted(titles.items())
+    }
+
+
+def _on_known_error(request: Request, error: Exception) -> JSONResponse:
+    kind = problem_kind(error)
+    headers = {}
+    if isinstance(error, ServiceError) and error.retry_after_s is not None:
+        headers["Retry-After"] = str(error.retry_after_s)
+    if isinstance(error, UnsupportedMediaError):
+        headers["Accept-Post"] = ", ".join(error.accepted)
+    return _answer(
+        request,
+        kind,
+        str(error) if kind.public else _HIDDEN,
+        headers=headers,
+        room=error.room if isinstance(error, InvalidFloorPlanError) else None,
+        faults=error.faults if isinstance(error, InvalidRequestError) else None,
+    )
+
+
+def _on_invalid_request(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, RequestValidationError)
+    return _on_known_error(request, InvalidRequestError([describe_fault(fault) for fault in error.errors()]))
+
+
+def _on_http_error(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, HTTPException)
+    kind = HTTP_PROBLEMS.get(error.status_code, ProblemKind(error.status_code, "http-error", "HTTP error"))
+    detail = f"{request.method} {request.url.path[:200]}: {error.detail}"
+    return _answer(request, kind, detail, headers=dict(error.headers or {}))
+
+
+def _on_unexpected_error(request: Request, _error: Exception) -> JSONResponse:
+    return _answer(request, INTERNAL, _HIDDEN)
+
+
+def _answer(
+    request: Request,
+    kind: ProblemKind,
+    detail: str,
+    *,
+    headers: dict[str, str] | None = None,
+    room: str | None = None,
+    faults: list[tuple[str, str]] | None = None,
+) -> JSONResponse:
+    problem = Problem(
+        type=kind.type,
+        title=kind.title,
+        status=kind.status,
+        detail=detail,
+        request_id=request_id_of(request.scope),
+        room=room,
+        errors=None if faults is None else [Fault(field=field, message=message) for field, message in faults],
+    )
+    return _ProblemResponse(problem.model_dump(exclude_none=True), status_code=kind.status, headers=headers)
+
+
+class _ProblemResponse(JSONResponse):
+    """Plain ASCII JSON: details quote what callers sent, and not all of that is encodable as UTF-8."""
+
+    media_type = PROBLEM_JSON
+
+    def render(self, content: Any) -> bytes:
+        return json.dumps(content).encode("ascii")

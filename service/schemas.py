@@ -1,0 +1,231 @@
+"""Requests and answers of the HTTP API. Units stand in the names: `_m` metres, `_m2` m², `_deg` degrees, `_ms` ms."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator
+
+PlanStatus = Literal["preparing", "ready", "failed"]
+Finite = Field(allow_inf_nan=False)
+
+HEADING_MEANING = "azimuth of the panorama's centre column, clockwise from the plan's +y seen from above"
+
+
+class Answer(BaseModel):
+    """Base of all answers."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class RoomDocument(BaseModel):
+    """One room of an uploaded plan."""
+
+    name: str = Field("", description="Name of the room; by default its number.")
+    polygon: list[Annotated[list[float], Field(min_length=2, max_length=2)]] = Field(
+        min_length=3, description="Corners [x, y] in metres, in either order, x to the right and y up on the drawing."
+    )
+    ceiling_height_m: float | None = Field(None, gt=0, description="Height of this room's ceiling over its floor.")
+
+
+class FloorPlanDocument(BaseModel):
+    """An uploaded floor plan in the native format; coordinates in metres."""
+
+    model_config = ConfigDict(
+        json_schema_extra={
+            "example": {
+                "name": "Flat 3",
+                "ceiling_height_m": 2.5,
+                "camera_height_m": 1.5,
+                "rooms": [{"name": "kitchen", "polygon": [[0, 0], [4, 0], [4, 3], [0, 3]], "ceiling_height_m": 2.5}],
+            }
+        }
+    )
+
+    name: str = Field("floor plan", description="What to call the plan.")
+    ceiling_height_m: float | None = Field(None, gt=0, description="Ceiling of rooms without their own.")
+    camera_height_m: float = Field(1.5, gt=0, description="Height of the camera assumed for panoramas of this plan.")
+    rooms: list[RoomDocument] = Field(min_length=1, description="Closed rooms; doors count as wall.")
+
+
+class RoomAnswer(Answer):
+    """One room of a stored plan."""
+
+    name: str
+    area_m2: float = Field(description="Floor area.")
+    ceiling_height_m: float = Field(description="Height of the ceiling over the floor.")
+    vertices: int = Field(description="Corners of the polygon.")
+
+
+class GridAnswer(Answer):
+    """The plan's latent grid."""
+
+    step_m: float = Field(description="Distance of neighbouring poses.")
+    poses: int = Field(description="Number of poses; an upper estimate until the plan is ready.")
+
+
+class BoundsAnswer(Answer):
+    """Smallest axis-parallel box around the plan."""
+
+    x_min_m: float
+    y_min_m: float
+    x_max_m: float
+    y_max_m: float
+
+
+class FloorPlanAnswer(Answer):
+    """A stored floor plan."""
+
+    id: str = Field(description="Identifier for later requests.")
+    name: str
+    status: PlanStatus = Field(description="`preparing` while the latent grid is computed, then `ready` or `failed`.")
+    progress: float = Field(ge=0, le=1, description="Share of the latent grid that is computed.")
+    reason: str | None = Field(description="Why the plan failed, null unless it did.")
+    rooms: list[RoomAnswer]
+    area_m2: float = Field(description="Sum of the rooms' floor areas.")
+    bounds: BoundsAnswer
+    camera_height_m: float = Field(description="Camera height assumed for panoramas of this plan.")
+    grid: GridAnswer
+    warnings: list[str] = Field(description="What is odd about the plan but usable, such as overlapping rooms.")
+    created_at: datetime = Field(description="When the plan was uploaded, UTC.")
+
+
+class FloorPlanSummary(Answer):
+    """A stored floor plan in a listing."""
+
+    id: str
+    name: str
+    status: PlanStatus
+    progress: float = Field(ge=0, le=1)
+    rooms: int = Field(description="Number of rooms.")
+    area_m2: float
+    created_at: datetime
+
+
+class FloorPlanList(Answer):
+    """Stored floor plans, newest first."""
+
+    floorplans: list[FloorPlanSummary]
+    total: int = Field(description="Number of stored plans, those on other pages included.")
+
+
+class LocaliseForm(BaseModel):
+    """Fields of a query besides the panorama itself; an empty field counts as left out."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    floorplan_id: str = Field(min_length=1, description="Id of the floor plan the panorama was taken in.")
+    heading_deg: Annotated[float, Finite] | None = Field(
+        None, ge=-360, le=360, description=f"The {HEADING_MEANING}; left out: unknown, searched over."
+    )
+    camera_height_m: Annotated[float, Finite] | None = Field(
+        None, gt=0, description="Height of the camera over the floor; left out: the plan's. Rounded to 2 cm."
+    )
+    refine: Literal["none", "vdr", "lpo"] = Field(
+        "lpo", description="How far to refine: nearest grid pose, denser poses around it, or optimised pose."
+    )
+    top_k: int = Field(5, ge=1, le=10, description="How many distinct candidates to return.")
+
+    @field_validator("heading_deg", "camera_height_m", "top_k", mode="before")
+    @classmethod
+    def _plain_number(cls, value: object) -> object:
+        if isinstance(value, str) and "_" in value:
+            raise ValueError("not a number")
+        return value
+
+
+class Position(Answer):
+    """A point of the plan frame."""
+
+    x_m: float = Field(description="To the right on the drawing.")
+    y_m: float = Field(description="Up on the drawing.")
+
+
+class CandidateAnswer(Answer):
+    """One possible pose; no two candidates are closer than 1 m."""
+
+    position: Position
+    heading_deg: float = Field(ge=0, lt=360, description=f"The {HEADING_MEANING}.")
+    room: str = Field(description="Name of the room the position lies in.")
+    latent_distance: float = Field(ge=0, le=2, description="Distance of the pose's layout to the panorama's latent.")
+
+
+class TimingsAnswer(Answer):
+    """Milliseconds per stage, 0 where a stage did not run."""
+
+    decode: float
+    encode: float
+    retrieve: float
+    vdr: float
+    lpo: float
+    total: float = Field(description="From the complete upload to the answer, waits included.")
+
+
+class ModelAnswer(Answer):
+    """The model that answered."""
+
+    name: str
+    version: str
+    sha256: str = Field(description="Digest over the model's files.")
+
+
+class LocaliseAnswer(Answer):
+    """Where the panorama was taken."""
+
+    floorplan_id: str
+    position: Position
+    heading_deg: float = Field(ge=0, lt=360, description=f"The {HEADING_MEANING}.")
+    room: str
+    confidence: float | None = Field(
+        ge=0, le=1, description="Probability that the position is right within 1 m; null for a model without it."
+    )
+    stage: Literal["retrieval", "vdr", "lpo"] = Field(description="The last stage that produced the position.")
+    latent_distance: float = Field(ge=0, le=2)
+    camera_height_m: float = Field(description="Camera height the panorama was compared at.")
+    candidates: list[CandidateAnswer] = Field(description="Best first; the first one is the answer.")
+    timings_ms: TimingsAnswer
+    model: ModelAnswer
+
+
+class HealthAnswer(Answer):
+    """The process is alive."""
+
+    status: Literal["ok"]
+
+
+class PoolAnswer(Answer):
+    """State of the LPO worker pool."""
+
+    workers: int = Field(description="Worker processes wanted.")
+    ready: int = Field(description="Worker processes that are warm now.")
+    warmed_up: bool = Field(description="Whether every worker has been warm once.")
+    fault: str | None = Field(description="Why a worker could not start last time, null when all is well.")
+
+
+class ReadyAnswer(Answer):
+    """Whether the service can answer at full quality."""
+
+    ready: bool
+    model: ModelAnswer
+    lpo_pool: PoolAnswer
+    plans_preparing: int = Field(description="Latent grids being computed or waiting for it.")
+
+
+class Fault(Answer):
+    """One field at fault."""
+
+    field: str
+    message: str
+
+
+class Problem(BaseModel):
+    """An error as of RFC 9457."""
+
+    type: str = Field(description="Stable identifier of the kind of error.")
+    title: str
+    status: int
+    detail: str = Field(description="What is wrong with this request, with value and limit.")
+    request_id: str | None = Field(None, description="Names this request in the service's log.")
+    room: str | None = Field(None, description="The room at fault, for an invalid floor plan.")
+    errors: list[Fault] | None = Field(None, description="Every field at fault, for an invalid request.")

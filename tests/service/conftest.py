@@ -1,0 +1,133 @@
+"""Fixtures of the service's tests: the production app on a real bundle, and data to send to it."""
+
+from __future__ import annotations
+
+import io
+import os
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+from time import monotonic, sleep
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+import uvicorn
+from fastapi import FastAPI
+from PIL import Image
+
+from service.app import create_app
+from service.settings import Settings
+
+FLAT: dict[str, Any] = {
+    "name": "Flat 3",
+    "ceiling_height_m": 2.5,
+    "camera_height_m": 1.5,
+    "rooms": [
+        {"name": "kitchen", "polygon": [[0, 0], [4, 0], [4, 3], [0, 3]], "ceiling_height_m": 2.4},
+        {"name": "living room", "polygon": [[4, 0], [9, 0], [9, 6], [6, 6], [6, 3], [4, 3]]},
+    ],
+}
+
+StartApp = Callable[..., AbstractContextManager[httpx.Client]]
+
+
+@pytest.fixture(autouse=True)
+def _no_settings_from_outside(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in os.environ:
+        if name.upper().startswith("LALALOC_"):
+            monkeypatch.delenv(name)
+
+
+@pytest.fixture(scope="session")
+def panorama() -> bytes:
+    """A picture that is a valid panorama, if of nothing: smooth colours, 512 x 256."""
+    return encode_picture(512, 256, "JPEG")
+
+
+@pytest.fixture(scope="session")
+def start_app(tiny_bundle: Path) -> StartApp:
+    """Starts the production app in this process; without LPO workers unless asked for."""
+
+    @contextmanager
+    def start(data_dir: Path, **overrides: Any) -> Iterator[httpx.Client]:
+        values = {"data_dir": data_dir, "bundle": tiny_bundle, "workers": 0, "onnx_threads": 1, "log_level": "error"}
+        app = create_app(Settings(**(values | overrides)))
+        with serve(app) as base_url, httpx.Client(base_url=base_url, timeout=30.0) as client:
+            yield client
+
+    return start
+
+
+@pytest.fixture(scope="module")
+def client(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+    """One app for the tests of a module that leave nothing behind which others could trip over."""
+    with start_app(tmp_path_factory.mktemp("data")) as started:
+        yield started
+
+
+@contextmanager
+def serve(app: FastAPI) -> Iterator[str]:
+    """Run an app on a real server, on a thread and a free port; gives its address."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        server = uvicorn.Server(uvicorn.Config(app, log_level="critical"))
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+        thread.start()
+        try:
+            wait_for(lambda: server.started or not thread.is_alive())
+            assert server.started, "the app did not start"
+            yield f"http://127.0.0.1:{listener.getsockname()[1]}"
+        finally:
+            server.should_exit = True
+            thread.join(30.0)
+            assert not thread.is_alive(), "the app did not stop"
+
+
+def encode_picture(width: int, height: int, picture_format: str) -> bytes:
+    """A smooth picture as encoded bytes."""
+    x, y = np.meshgrid(np.linspace(0.0, 6.28, width), np.linspace(0.0, 3.14, height))
+    channels = [127.0 + 120.0 * np.sin(x + phase) * np.sin(y) for phase in (0.0, 2.0, 4.0)]
+    buffer = io.BytesIO()
+    Image.fromarray(np.stack(channels, axis=-1).astype(np.uint8)).save(buffer, picture_format)
+    return buffer.getvalue()
+
+
+def upload(client: httpx.Client, plan: dict[str, Any] | None = None, *, wait: bool = True) -> str:
+    """Upload a plan, wait until it is ready, return its id."""
+    response = client.post("/floorplans", json=plan or FLAT)
+    assert response.status_code == 201, response.text
+    plan_id = response.json()["id"]
+    if wait:
+        wait_for(lambda: client.get(f"/floorplans/{plan_id}").json()["status"] == "ready")
+    return plan_id
+
+
+def localise(client: httpx.Client, plan_id: str, picture: bytes, **fields: Any) -> httpx.Response:
+    """Send a query."""
+    data = {"floorplan_id": plan_id} | {name: str(value) for name, value in fields.items()}
+    return client.post("/localise", data=data, files={"panorama": ("p.jpg", picture, "image/jpeg")})
+
+
+def wait_for(condition: Callable[[], bool], timeout_s: float = 60.0) -> None:
+    """Poll until something holds."""
+    deadline = monotonic() + timeout_s
+    while not condition():
+        assert monotonic() < deadline, "timed out waiting"
+        sleep(0.05)
+
+
+def assert_problem(response: httpx.Response, status: int, slug: str) -> dict[str, Any]:
+    """Check that an answer is a complete problem document and return it."""
+    assert response.status_code == status, response.text
+    assert response.headers["content-type"] == "application/problem+json"
+    problem = response.json()
+    assert problem["type"] == f"urn:lalaloc:problem:{slug}"
+    assert problem["status"] == status
+    assert problem["title"]
+    assert problem["detail"]
+    assert problem["request_id"] == response.headers["x-request-id"]
+    assert "Traceback" not in response.text
+    return problem

@@ -1,0 +1,220 @@
+"""Uploading, listing and deleting floor plans; what is refused leaves nothing behind."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import httpx
+import pytest
+import trimesh
+
+from tests.service.conftest import FLAT, StartApp, assert_problem, upload, wait_for
+
+
+def _room(polygon: Any, **more: Any) -> dict[str, Any]:
+    return {"ceiling_height_m": 2.5, "rooms": [{"name": "bath", "polygon": polygon, **more}]}
+
+
+SQUARE = [[0, 0], [4, 0], [4, 4], [0, 4]]
+
+BAD_PLANS = {
+    "crosses itself": (_room([[0, 0], [4, 4], [4, 0], [0, 4]]), "crosses itself"),
+    "two vertices": (_room([[0, 0], [4, 0]]), "at least three"),
+    "no area": (_room([[0, 0], [1, 0], [2, 0]]), ""),
+    "a word for a number": (_room([[0, 0], [4, "x"], [4, 4]]), "vertex 1"),
+    "three coordinates": (_room([[0, 0, 0], [4, 0, 0], [4, 4, 0]]), "vertex 0"),
+    "an integer beyond floats": (_room([[0, 0], [4, 0], [4, 10**400]]), "vertex 2"),
+    "a ceiling beyond floats": (_room(SQUARE, ceiling_height_m=10**400), "ceiling_height_m"),
+    "no ceiling": ({"rooms": [{"polygon": SQUARE}]}, "no ceiling_height_m"),
+    "no rooms": ({"name": "x", "rooms": []}, "at least one room"),
+    "a list": ([1, 2], "must be an object"),
+    "an unknown key": ({**FLAT, "scale": 2}, "'scale'"),
+    "camera above the ceiling": ({**FLAT, "camera_height_m": 2.45}, "2.4"),
+    "a lone surrogate": ({**FLAT, "name": "\ud800"}, "surrogates"),
+    "a control character": (_room(SQUARE, name="a\0b"), "control characters"),
+    "too wide": (_room([[0, 0], [600, 0], [600, 1]]), "at most 500 m"),
+}
+
+
+@pytest.mark.parametrize(("plan", "message"), BAD_PLANS.values(), ids=BAD_PLANS.keys())
+def test_a_bad_plan_is_refused_by_what_is_wrong_and_nothing_is_stored(
+    client: httpx.Client, plan: Any, message: str
+) -> None:
+    before = client.get("/floorplans").json()["total"]
+    response = client.post("/floorplans", content=json.dumps(plan), headers={"content-type": "application/json"})
+    assert message in assert_problem(response, 422, "invalid-floorplan")["detail"]
+    assert client.get("/floorplans").json()["total"] == before
+
+
+@pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999"])
+def test_coordinates_that_are_not_finite_are_refused(client: httpx.Client, number: str) -> None:
+    body = json.dumps(_room([[0, 0], [4, 0], [4, "HERE"]])).replace('"HERE"', number)
+    response = client.post("/floorplans", content=body, headers={"content-type": "application/json"})
+    problem = assert_problem(response, 422, "invalid-floorplan")
+    assert "finite" in problem["detail"]
+    assert problem["room"] == "bath"
+
+
+@pytest.mark.parametrize("body", [b"", b"  ", b"{", b"\xff\xfe\xfd", b"[" * 100_000], ids=repr)
+def test_a_body_that_is_not_json_is_refused(client: httpx.Client, body: bytes) -> None:
+    response = client.post("/floorplans", content=body, headers={"content-type": "application/json"})
+    assert_problem(response, 422, "invalid-floorplan")
+
+
+@pytest.mark.parametrize("content_type", ["text/plain", "application/x-www-form-urlencoded", None])
+def test_other_content_types_are_refused(client: httpx.Client, content_type: str | None) -> None:
+    headers = {} if content_type is None else {"content-type": content_type}
+    response = client.post("/floorplans", content=json.dumps(FLAT).encode(), headers=headers)
+    assert "application/json" in assert_problem(response, 415, "unsupported-media")["detail"]
+
+
+def test_a_plan_is_answered_with_what_was_understood(client: httpx.Client) -> None:
+    response = client.post("/floorplans", json=FLAT)
+    assert response.status_code == 201
+    plan = response.json()
+    assert response.headers["location"] == f"/floorplans/{plan['id']}"
+    assert plan["name"] == "Flat 3"
+    assert plan["status"] in ("preparing", "ready")
+    assert [room["name"] for room in plan["rooms"]] == ["kitchen", "living room"]
+    assert [room["area_m2"] for room in plan["rooms"]] == [12.0, 24.0]
+    assert [room["ceiling_height_m"] for room in plan["rooms"]] == [2.4, 2.5]
+    assert plan["area_m2"] == 36.0
+    assert plan["grid"]["step_m"] == 0.5
+    assert plan["bounds"] == {"x_min_m": 0.0, "y_min_m": 0.0, "x_max_m": 9.0, "y_max_m": 6.0}
+
+
+def test_the_grid_is_computed_in_the_background(client: httpx.Client) -> None:
+    plan_id = upload(client)
+    plan = client.get(f"/floorplans/{plan_id}").json()
+    assert plan["status"] == "ready"
+    assert plan["progress"] == 1.0
+    assert plan["grid"]["poses"] == 110
+
+
+def test_json_as_a_file_is_the_same_as_json_as_the_body(client: httpx.Client) -> None:
+    content = json.dumps(FLAT).encode()
+    response = client.post("/floorplans", files={"file": ("flat.json", content, "application/octet-stream")})
+    assert response.status_code == 201
+    plan_id = response.json()["id"]
+    assert client.get(f"/floorplans/{plan_id}/original").content == content
+    assert response.json()["rooms"] == client.post("/floorplans", json=FLAT).json()["rooms"]
+
+
+def test_every_part_of_a_form_is_accounted_for(client: httpx.Client) -> None:
+    file = ("flat.json", json.dumps(FLAT).encode())
+    extra = assert_problem(
+        client.post("/floorplans", files={"file": file}, data={"scale": "2"}), 422, "invalid-request"
+    )
+    assert extra["errors"] == [{"field": "scale", "message": "unknown part, known are file"}]
+    missing = assert_problem(client.post("/floorplans", files={"plan": file}), 422, "invalid-request")
+    assert {"field": "file", "message": "is missing"} in missing["errors"]
+    twice = client.post("/floorplans", files=[("file", file), ("file", file)])
+    assert "more than once" in assert_problem(twice, 422, "invalid-request")["detail"]
+
+
+@pytest.mark.parametrize("content_type", ["multipart/form-data", "multipart/form-data; boundary=x"])
+def test_a_form_that_is_no_form_is_refused(client: httpx.Client, content_type: str) -> None:
+    response = client.post("/floorplans", content=b"no form", headers={"content-type": content_type})
+    assert_problem(response, 400, "malformed-request")
+
+
+def test_a_deleted_plan_is_gone(client: httpx.Client) -> None:
+    plan_id = upload(client)
+    assert client.delete(f"/floorplans/{plan_id}").status_code == 204
+    assert_problem(client.delete(f"/floorplans/{plan_id}"), 404, "unknown-floorplan")
+    for path in ("", "/original", "/preview.svg", "/mesh.glb"):
+        assert_problem(client.get(f"/floorplans/{plan_id}{path}"), 404, "unknown-floorplan")
+
+
+def test_the_list_is_newest_first_and_paged(start_app: StartApp, tmp_path: Path) -> None:
+    with start_app(tmp_path) as client:
+        ids = [upload(client, {**FLAT, "name": f"flat {index}"}, wait=False) for index in range(3)]
+        everything = client.get("/floorplans").json()
+        assert [plan["id"] for plan in everything["floorplans"]] == ids[::-1]
+        page = client.get("/floorplans", params={"offset": 1, "limit": 1}).json()
+        assert [plan["id"] for plan in page["floorplans"]] == [ids[1]]
+        assert page["total"] == 3
+        assert_problem(client.get("/floorplans", params={"limit": 0}), 422, "invalid-request")
+
+
+def test_preview_and_mesh_are_served_as_what_they_are(client: httpx.Client) -> None:
+    plan_id = upload(client, wait=False)
+    drawing = client.get(f"/floorplans/{plan_id}/preview.svg", params={"x_m": 1, "y_m": 2, "heading_deg": 30})
+    assert drawing.headers["content-type"].startswith("image/svg+xml")
+    assert ElementTree.fromstring(drawing.content).tag.endswith("svg")
+    assert 'class="camera"' in drawing.text
+    mesh = client.get(f"/floorplans/{plan_id}/mesh.glb")
+    assert mesh.headers["content-type"] == "model/gltf-binary"
+    assert trimesh.load(io.BytesIO(mesh.content), file_type="glb")
+    half = client.get(f"/floorplans/{plan_id}/preview.svg", params={"x_m": 1})
+    assert_problem(half, 422, "invalid-request")
+
+
+def test_a_plan_whose_grid_would_be_too_large_is_refused_by_estimate_and_limit(
+    start_app: StartApp, tmp_path: Path
+) -> None:
+    with start_app(tmp_path, max_grid_poses=100) as client:
+        detail = assert_problem(client.post("/floorplans", json=FLAT), 422, "floorplan-too-large")["detail"]
+        assert "146" in detail
+        assert "100" in detail
+        assert client.get("/floorplans").json()["total"] == 0
+
+
+def test_an_upload_is_cut_off_at_its_limit_stated_or_streamed(start_app: StartApp, tmp_path: Path) -> None:
+    with start_app(tmp_path, max_plan_bytes=2000) as client:
+        headers = {"content-type": "application/json"}
+        stated = client.post("/floorplans", content=b" " * 2001, headers=headers)
+        assert "at most 2000 bytes" in assert_problem(stated, 413, "upload-too-large")["detail"]
+        streamed = client.post("/floorplans", content=(b" " * 500 for _ in range(5)), headers=headers)
+        assert_problem(streamed, 413, "upload-too-large")
+        as_file = client.post("/floorplans", files={"file": ("plan.json", b" " * 2001)})
+        assert_problem(as_file, 413, "upload-too-large")
+        assert client.get("/floorplans").json()["total"] == 0
+
+
+def test_limits_come_from_the_settings(start_app: StartApp, tmp_path: Path) -> None:
+    with start_app(tmp_path, max_rooms=1, max_vertices=4, max_floorplans=1) as client:
+        assert "at most 1" in assert_problem(client.post("/floorplans", json=FLAT), 422, "invalid-floorplan")["detail"]
+        hexagon = _room([[0, 0], [2, 0], [3, 2], [2, 4], [0, 4], [-1, 2]])
+        response = client.post("/floorplans", json=hexagon)
+        assert "at most 4" in assert_problem(response, 422, "invalid-floorplan")["detail"]
+        upload(client, _room(SQUARE), wait=False)
+        assert_problem(client.post("/floorplans", json=_room(SQUARE)), 507, "too-many-floorplans")
+
+
+def test_an_upload_that_stalls_is_ended(start_app: StartApp, tmp_path: Path) -> None:
+    import socket
+
+    with start_app(tmp_path, upload_deadline_s=0.3) as client:
+        address = (client.base_url.host, client.base_url.port)
+        with socket.create_connection(address, timeout=10.0) as connection:
+            connection.sendall(
+                b"POST /floorplans HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: 50\r\n\r\n{"
+            )
+            assert b"408" in connection.recv(4096).split(b"\r\n")[0]
+
+
+def test_a_grid_that_fails_is_told_and_tried_again_at_the_next_start(start_app: StartApp, tmp_path: Path) -> None:
+    with start_app(tmp_path) as client:
+        plan_id = upload(client)
+    # With a finer grid the stored plan no longer fits the limit: its grid cannot be computed any more.
+    with start_app(tmp_path, grid_step_m=0.25, max_grid_poses=146) as client:
+        wait_for(lambda: client.get(f"/floorplans/{plan_id}").json()["status"] == "failed")
+        assert "at most 146" in client.get(f"/floorplans/{plan_id}").json()["reason"]
+        response = client.post(
+            "/localise", data={"floorplan_id": plan_id}, files={"panorama": ("p.jpg", _panorama(), "image/jpeg")}
+        )
+        assert_problem(response, 409, "floorplan-failed")
+    with start_app(tmp_path, grid_step_m=0.25) as client:
+        wait_for(lambda: client.get(f"/floorplans/{plan_id}").json()["status"] == "ready")
+        assert client.get(f"/floorplans/{plan_id}").json()["reason"] is None
+
+
+def _panorama() -> bytes:
+    from tests.service.conftest import encode_picture
+
+    return encode_picture(256, 128, "JPEG")

@@ -1,0 +1,100 @@
+"""What holds for every answer: problem documents, request ids, metrics, documentation, pages."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import httpx
+import pytest
+import yaml
+
+from service.app import create_app
+from service.openapi import openapi_text
+from service.runtime import Runtime, runtime_of
+from tests.service.conftest import assert_problem, localise, serve, upload
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_unknown_routes_and_methods_are_problems_too(client: httpx.Client) -> None:
+    assert_problem(client.get("/no/such/route"), 404, "not-found")
+    response = client.put("/localise")
+    assert_problem(response, 405, "method-not-allowed")
+    assert response.headers["allow"] == "POST"
+
+
+def test_an_unexpected_error_tells_nothing_but_the_request_id() -> None:
+    app = create_app()
+
+    def broken() -> Runtime:
+        raise RuntimeError("secret detail")
+
+    # The app is never started: nothing is there to answer with, as after a programming error.
+    app.dependency_overrides[runtime_of] = broken
+    app.router.lifespan_context = _no_lifespan
+    with serve(app) as base_url:
+        response = httpx.get(f"{base_url}/floorplans", headers={"x-request-id": "r-1"})
+    assert response.status_code == 500
+    assert response.headers["content-type"] == "application/problem+json"
+    assert response.json()["request_id"] == "r-1"
+    assert "secret" not in response.text
+    assert "Traceback" not in response.text
+
+
+class _no_lifespan:
+    def __init__(self, _app: object) -> None: ...
+
+    async def __aenter__(self) -> None: ...
+
+    async def __aexit__(self, *_error: object) -> None: ...
+
+
+@pytest.mark.parametrize(("given", "kept"), [("abc-123", True), ("a b", False), ("x" * 65, False)])
+def test_a_sane_request_id_is_kept(client: httpx.Client, given: str, kept: bool) -> None:
+    answered = client.get("/healthz", headers={"x-request-id": given}).headers["x-request-id"]
+    assert (answered == given) == kept
+    assert re.fullmatch(r"[A-Za-z0-9._-]{1,64}", answered)
+
+
+def test_without_workers_the_service_is_ready_when_it_is_up(client: httpx.Client) -> None:
+    assert client.get("/healthz").json() == {"status": "ok"}
+    response = client.get("/readyz")
+    assert response.status_code == 200
+    assert response.json()["ready"] is True
+    assert response.json()["lpo_pool"]["workers"] == 0
+
+
+def test_metrics_count_requests_by_route_and_queries_by_stage(client: httpx.Client, panorama: bytes) -> None:
+    plan_id = upload(client)
+    localise(client, plan_id, panorama, refine="vdr")
+    client.get("/no/such/route")
+    text = client.get("/metrics").text
+    assert 'lalaloc_http_requests_total{method="GET",route="/floorplans/{floorplan_id}",status="200"}' in text
+    assert 'route="unmatched",status="404"' in text
+    assert 'lalaloc_localise_answers_total{stage="vdr"}' in text
+    for stage in ("decode", "encode", "retrieve", "vdr", "total"):
+        assert f'lalaloc_stage_seconds_count{{stage="{stage}"}}' in text
+    assert plan_id not in text
+
+
+def test_the_written_api_description_is_up_to_date() -> None:
+    written = (ROOT / "openapi.yaml").read_text(encoding="utf-8")
+    assert yaml.safe_load(written) == yaml.safe_load(openapi_text()), (
+        "openapi.yaml is stale: run `python -m service.openapi openapi.yaml`"
+    )
+
+
+def test_the_api_description_refers_to_nothing_that_is_missing(client: httpx.Client) -> None:
+    document = client.get("/openapi.json").text
+    references = set(re.findall(r'"#/components/schemas/([^"]+)"', document))
+    assert {"FloorPlanDocument", "Problem", "LocaliseAnswer"} <= references
+    assert references <= set(client.get("/openapi.json").json()["components"]["schemas"])
+
+
+@pytest.mark.parametrize("path", ["/", "/docs", "/web/try.js", "/web/docs.js", "/web/style.css"])
+def test_pages_load_nothing_from_elsewhere(client: httpx.Client, path: str) -> None:
+    response = client.get(path)
+    assert response.status_code == 200
+    assert "default-src 'none'" in response.headers["content-security-policy"]
+    assert not re.search(r"https?://|//cdn", response.text)

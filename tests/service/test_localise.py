@@ -1,0 +1,281 @@
+"""Queries: every input is checked, every stage can be asked for, and waiting has an end."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+import struct
+import threading
+import zlib
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from shapely import Point
+
+from lalaloc_core.bundle import Bundle, ConfidenceModel, write_manifest
+from lalaloc_core.floorplan import FloorPlan
+from service.schemas import TimingsAnswer
+from tests.service.conftest import FLAT, StartApp, assert_problem, encode_picture, localise, upload, wait_for
+
+# Large enough that its grid takes a while, small enough for the default limits.
+HALL: dict[str, Any] = {
+    "name": "hall",
+    "ceiling_height_m": 6.0,
+    "rooms": [{"name": "hall", "polygon": [[0, 0], [98, 0], [98, 98], [0, 98]]}],
+}
+
+
+@pytest.fixture(scope="module")
+def flat(client: httpx.Client) -> str:
+    """A plan that is ready; returns its id."""
+    return upload(client)
+
+
+@pytest.mark.parametrize("heading", [None, 0.0, 90.0, -360.0, 360.0, 123.456])
+@pytest.mark.parametrize(("refine", "stage"), [("none", "retrieval"), ("vdr", "vdr"), ("lpo", "vdr")])
+def test_an_answer_is_a_place_in_the_plan_by_the_stage_asked_for(
+    client: httpx.Client, flat: str, panorama: bytes, heading: float | None, refine: str, stage: str
+) -> None:
+    fields = {} if heading is None else {"heading_deg": heading}
+    response = localise(client, flat, panorama, refine=refine, **fields)
+    assert response.status_code == 200, response.text
+    answer = response.json()
+    # This app runs without LPO workers, so the best it can do is VDR.
+    assert answer["stage"] == stage
+    assert answer["floorplan_id"] == flat
+    plan = FloorPlan.from_dict(FLAT)
+    for candidate in answer["candidates"]:
+        point = Point(candidate["position"]["x_m"], candidate["position"]["y_m"])
+        room = next(room for room in plan.rooms if room.name == candidate["room"])
+        assert room.shape.distance(point) < 1e-3
+    assert 0.0 <= answer["heading_deg"] < 360.0
+    if heading is not None:
+        assert abs((answer["heading_deg"] - heading + 180.0) % 360.0 - 180.0) < 1e-2
+
+
+def test_candidates_are_distinct_best_first_and_the_first_is_the_answer(
+    client: httpx.Client, flat: str, panorama: bytes
+) -> None:
+    answer = localise(client, flat, panorama, refine="vdr", top_k=10).json()
+    candidates = answer["candidates"]
+    assert 2 <= len(candidates) <= 10
+    distances = [candidate["latent_distance"] for candidate in candidates]
+    assert distances == sorted(distances)
+    positions = np.array([[c["position"]["x_m"], c["position"]["y_m"]] for c in candidates])
+    gaps = np.linalg.norm(positions[:, None] - positions[None], axis=-1) + 10.0 * np.eye(len(positions))
+    assert gaps.min() >= 1.0 - 1e-3
+    assert {key: answer[key] for key in candidates[0]} == candidates[0]
+
+
+@pytest.mark.parametrize("top_k", [1, 3, 10])
+def test_no_more_candidates_than_asked_for(client: httpx.Client, flat: str, panorama: bytes, top_k: int) -> None:
+    candidates = localise(client, flat, panorama, refine="none", top_k=top_k).json()["candidates"]
+    everything = localise(client, flat, panorama, refine="none", top_k=10).json()["candidates"]
+    assert candidates == everything[:top_k]
+
+
+def test_timings_and_model_are_told(client: httpx.Client, flat: str, panorama: bytes, tiny_bundle: Path) -> None:
+    answer = localise(client, flat, panorama, refine="vdr").json()
+    timings = answer["timings_ms"]
+    assert set(timings) == set(TimingsAnswer.model_fields)
+    assert timings["lpo"] == 0.0
+    assert all(timings[name] > 0.0 for name in ("decode", "encode", "retrieve", "vdr"))
+    assert timings["total"] >= sum(value for name, value in timings.items() if name != "total")
+    bundle = Bundle.open(tiny_bundle)
+    assert answer["model"]["sha256"] == bundle.sha256
+    assert answer["model"]["name"] == bundle.manifest.name
+
+
+def test_the_same_query_has_the_same_answer(client: httpx.Client, flat: str, panorama: bytes) -> None:
+    first, second = (localise(client, flat, panorama, refine="vdr").json() for _ in range(2))
+    assert first["candidates"] == second["candidates"]
+
+
+@pytest.mark.parametrize("picture_format", ["JPEG", "PNG", "WEBP"])
+def test_every_format_is_read(client: httpx.Client, flat: str, picture_format: str) -> None:
+    assert localise(client, flat, encode_picture(256, 128, picture_format), refine="none").status_code == 200
+
+
+BAD_FIELDS = {
+    "heading not a number": ({"heading_deg": "nan"}, "heading_deg", "finite"),
+    "heading infinite": ({"heading_deg": "-inf"}, "heading_deg", "finite"),
+    "heading too large": ({"heading_deg": "360.1"}, "heading_deg", "360"),
+    "heading a word": ({"heading_deg": "north"}, "heading_deg", "north"),
+    "heading with underscore": ({"heading_deg": "1_0"}, "heading_deg", "1_0"),
+    "no candidates": ({"top_k": "0"}, "top_k", "1"),
+    "too many candidates": ({"top_k": "11"}, "top_k", "10"),
+    "half a candidate": ({"top_k": "2.5"}, "top_k", "2.5"),
+    "unknown stage": ({"refine": "magic"}, "refine", "'lpo'"),
+    "camera in the floor": ({"camera_height_m": "0"}, "camera_height_m", "greater than 0"),
+    "camera height not a number": ({"camera_height_m": "nan"}, "camera_height_m", "finite"),
+    "unknown field": ({"headng_deg": "90"}, "headng_deg", "heading_deg"),
+    "empty plan id": ({"floorplan_id": ""}, "floorplan_id", "missing"),
+}
+
+
+@pytest.mark.parametrize(("fields", "name", "message"), BAD_FIELDS.values(), ids=BAD_FIELDS.keys())
+def test_a_bad_field_is_refused_by_name_value_and_limit(
+    client: httpx.Client, flat: str, panorama: bytes, fields: dict[str, str], name: str, message: str
+) -> None:
+    response = client.post(
+        "/localise", data={"floorplan_id": flat} | fields, files={"panorama": ("p.jpg", panorama, "image/jpeg")}
+    )
+    faults = {fault["field"]: fault["message"] for fault in assert_problem(response, 422, "invalid-request")["errors"]}
+    assert message in faults[name]
+
+
+def test_an_empty_optional_field_counts_as_left_out(client: httpx.Client, flat: str, panorama: bytes) -> None:
+    assert localise(client, flat, panorama, refine="none", heading_deg="", top_k="").status_code == 200
+
+
+def test_every_part_is_needed(client: httpx.Client, flat: str, panorama: bytes) -> None:
+    picture = {"panorama": ("p.jpg", panorama, "image/jpeg")}
+    no_plan = assert_problem(client.post("/localise", files=picture), 422, "invalid-request")
+    assert no_plan["errors"] == [{"field": "floorplan_id", "message": "is missing"}]
+    no_picture = client.post("/localise", files={"floorplan_id": (None, flat)})
+    assert assert_problem(no_picture, 422, "invalid-request")["errors"][0]["field"] == "panorama"
+    not_a_file = client.post("/localise", files={"floorplan_id": (None, flat), "panorama": (None, "x")})
+    assert "file" in assert_problem(not_a_file, 422, "invalid-request")["detail"]
+    assert_problem(client.post("/localise", json={"floorplan_id": flat}), 415, "unsupported-media")
+    assert_problem(client.post("/localise"), 415, "unsupported-media")
+
+
+def test_an_unknown_plan_is_named(client: httpx.Client, panorama: bytes) -> None:
+    assert "'nowhere'" in assert_problem(localise(client, "nowhere", panorama), 404, "unknown-floorplan")["detail"]
+
+
+def _png_header(width: int, height: int) -> bytes:
+    """A PNG of which nothing but the header is there: whoever decodes pixels finds none."""
+
+    def chunk(kind: bytes, content: bytes) -> bytes:
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(b"\0")) + chunk(b"IEND", b"")
+
+
+BAD_PICTURES = {
+    "empty": (b"", "empty"),
+    "no picture": (b"GIF89a but not really", "not a readable"),
+    "truncated": (encode_picture(512, 256, "JPEG")[:3000], "damaged"),
+    "bomb": (_png_header(20_000, 10_000), "pixels"),
+    "twelve thousand wide": (_png_header(16_000, 8_000), "16000 x 8000"),
+    "portrait": (encode_picture(256, 512, "JPEG"), "256 x 512"),
+    "square": (encode_picture(256, 256, "PNG"), "twice as wide"),
+    "tiny": (encode_picture(64, 32, "PNG"), "at least 64"),
+}
+
+
+@pytest.mark.parametrize(("picture", "message"), BAD_PICTURES.values(), ids=BAD_PICTURES.keys())
+def test_a_picture_that_is_no_panorama_is_refused_by_what_is_wrong(
+    client: httpx.Client, flat: str, picture: bytes, message: str
+) -> None:
+    begin = monotonic()
+    assert message in assert_problem(localise(client, flat, picture), 422, "invalid-panorama")["detail"]
+    assert monotonic() - begin < 2.0
+
+
+def test_a_picture_of_too_many_bytes_is_refused(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+    with start_app(tmp_path, max_panorama_bytes=len(panorama) - 1) as client:
+        plan_id = upload(client)
+        assert (
+            str(len(panorama) - 1)
+            in assert_problem(localise(client, plan_id, panorama), 413, "upload-too-large")["detail"]
+        )
+
+
+def test_another_camera_height_is_searched_at_that_height(client: httpx.Client, flat: str, panorama: bytes) -> None:
+    answer = localise(client, flat, panorama, refine="vdr", camera_height_m=1.713).json()
+    assert answer["camera_height_m"] == 1.72
+    own = localise(client, flat, panorama, refine="vdr", camera_height_m=1.505).json()
+    assert own["camera_height_m"] == 1.5
+    assert own["candidates"] != answer["candidates"]
+    highest = localise(client, flat, panorama, refine="none", camera_height_m=2.399)
+    assert highest.json()["camera_height_m"] == 2.38
+    above = assert_problem(localise(client, flat, panorama, camera_height_m=2.4), 422, "invalid-pose")
+    assert "2.4 m" in above["detail"]
+
+
+def test_confidence_is_that_of_the_best_two_however_many_are_asked_for(
+    start_app: StartApp, tiny_bundle: Path, tmp_path: Path, panorama: bytes
+) -> None:
+    copy = tmp_path / "bundle"
+    shutil.copytree(tiny_bundle, copy)
+    model = ConfidenceModel(bias=2.0, distance=-1.5, margin=3.0, no_rival_margin=1.0)
+    write_manifest(copy, dataclasses.replace(Bundle.open(copy).manifest, confidence=model))
+    with start_app(tmp_path / "data", bundle=copy) as client:
+        plan_id = upload(client)
+        answers = [localise(client, plan_id, panorama, refine="none", top_k=k).json() for k in (1, 2, 10)]
+    distances = [candidate["latent_distance"] for candidate in answers[-1]["candidates"]]
+    expected = model.probability(distances)
+    assert 0.0 < expected < 1.0
+    assert [answer["confidence"] for answer in answers] == pytest.approx([expected] * 3)
+
+
+def test_a_model_without_confidence_says_null(client: httpx.Client, flat: str, panorama: bytes) -> None:
+    assert localise(client, flat, panorama, refine="none").json()["confidence"] is None
+
+
+def test_a_plan_still_preparing_is_waited_for(client: httpx.Client, panorama: bytes) -> None:
+    plan_id = upload(client, HALL, wait=False)
+    assert client.get(f"/floorplans/{plan_id}").json()["status"] == "preparing"
+    assert localise(client, plan_id, panorama, refine="none").status_code == 200
+    client.delete(f"/floorplans/{plan_id}")
+
+
+def test_waiting_ends_at_the_deadline(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+    with start_app(tmp_path, request_deadline_s=0.15) as client:
+        plan_id = upload(client, HALL, wait=False)
+        response = localise(client, plan_id, panorama, refine="none")
+        assert "still preparing" in assert_problem(response, 503, "floorplan-not-ready")["detail"]
+        assert int(response.headers["retry-after"]) > 0
+        wait_for(lambda: client.get(f"/floorplans/{plan_id}").json()["status"] == "ready")
+    with start_app(tmp_path) as client:
+        assert localise(client, plan_id, panorama, refine="none").status_code == 200
+
+
+def test_a_query_that_cannot_be_computed_in_time_is_ended(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+    with start_app(tmp_path, request_deadline_s=1e-6) as client:
+        response = localise(client, upload(client), panorama)
+        assert_problem(response, 504, "deadline-exceeded")
+
+
+def test_queries_beyond_the_limit_are_refused_at_once(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+    with start_app(tmp_path, max_pending_requests=1) as client, ThreadPoolExecutor(1) as threads:
+        plan_id = upload(client, HALL, wait=False)
+        waiting = threads.submit(localise, client, plan_id, panorama, refine="none")
+        wait_for(lambda: "lalaloc_requests_in_flight 1.0" in client.get("/metrics").text)
+        refused = localise(client, plan_id, panorama, refine="none")
+        assert_problem(refused, 503, "overloaded")
+        assert refused.headers["retry-after"] == "1"
+        assert waiting.result().status_code == 200
+
+
+def test_deleting_a_plan_ends_the_queries_that_wait_for_it(client: httpx.Client, panorama: bytes) -> None:
+    plan_id = upload(client, HALL, wait=False)
+    responses: list[httpx.Response] = []
+    waiting = threading.Thread(target=lambda: responses.append(localise(client, plan_id, panorama, refine="none")))
+    waiting.start()
+    wait_for(lambda: "lalaloc_requests_in_flight 1.0" in client.get("/metrics").text)
+    assert client.delete(f"/floorplans/{plan_id}").status_code == 204
+    waiting.join()
+    assert_problem(responses[0], 404, "unknown-floorplan")
+
+
+def test_the_event_loop_stays_free_while_queries_compute(client: httpx.Client, flat: str) -> None:
+    picture = encode_picture(2048, 1024, "PNG")
+    with ThreadPoolExecutor(4) as threads:
+        queries = [threads.submit(localise, client, flat, picture, refine="vdr") for _ in range(8)]
+        slowest = 0.0
+        while not all(query.done() for query in queries):
+            begin = monotonic()
+            assert client.get("/healthz").status_code == 200
+            slowest = max(slowest, monotonic() - begin)
+        total_ms = max(query.result().json()["timings_ms"]["total"] for query in queries)
+    assert total_ms > 100.0, "the queries were too easy to tell"
+    assert slowest < 1.0

@@ -1,0 +1,88 @@
+"""Drawing and mesh show the plan at scale, whatever its rooms are called."""
+
+from __future__ import annotations
+
+import io
+import math
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan import FloorPlan
+from service.preview.mesh import plan_glb
+from service.preview.svg import Marker, plan_svg
+from tests.service.conftest import FLAT
+
+SVG = "{http://www.w3.org/2000/svg}"
+L_ROOM = {
+    "ceiling_height_m": 3.0,
+    "rooms": [{"name": "L", "polygon": [[0, 0], [4, 0], [4, 1], [1, 1], [1, 5], [0, 5]]}],
+}
+
+
+def test_the_drawing_has_every_room_at_its_place_with_y_pointing_up() -> None:
+    plan = FloorPlan.from_dict(FLAT)
+    root = ElementTree.fromstring(plan_svg(plan))
+    drawn = [
+        np.array([[float(value) for value in point.split(",")] for point in polygon.attrib["points"].split()])
+        for polygon in root.iter(f"{SVG}polygon")
+    ]
+    for room, points in zip(plan.rooms, drawn, strict=True):
+        np.testing.assert_allclose(points * [1, -1], room.polygon_m, atol=1e-3)
+    x, y, width, height = (float(value) for value in root.attrib["viewBox"].split())
+    x_min, y_min, x_max, y_max = plan.bounds_m
+    assert x < x_min < x_max < x + width
+    assert y < -y_max < -y_min < y + height
+
+
+@given(st.text(min_size=1, max_size=200))
+@example("<b>&\"'")
+@example("\ufffe \uffff")
+def test_a_name_that_is_accepted_makes_well_formed_svg(name: str) -> None:
+    document = {"name": name, "ceiling_height_m": 2.5, "rooms": [{"name": name, "polygon": [[0, 0], [3, 0], [0, 3]]}]}
+    try:
+        plan = FloorPlan.from_dict(document)
+    except InvalidFloorPlanError:
+        return
+    root = ElementTree.fromstring(plan_svg(plan))
+    drawn = next(root.iter(f"{SVG}text")).text
+    assert drawn == name.replace("\ufffe", "\ufffd").replace("\uffff", "\ufffd")
+
+
+def test_the_camera_is_drawn_at_its_position_and_turned_clockwise() -> None:
+    root = ElementTree.fromstring(plan_svg(FloorPlan.from_dict(FLAT), Marker(x_m=1.5, y_m=2.0, heading_deg=90.0)))
+    camera = next(group for group in root.iter(f"{SVG}g") if group.get("class") == "camera")
+    assert camera.attrib["transform"] == "translate(1.5000 -2.0000)"
+    wedge = camera.find(f"{SVG}path")
+    assert wedge is not None
+    assert wedge.attrib["transform"] == "rotate(90.000)"
+
+
+@pytest.mark.parametrize("document", [FLAT, L_ROOM], ids=["flat", "concave"])
+def test_the_mesh_encloses_the_plans_volume_seen_from_inside(document: dict) -> None:
+    plan = FloorPlan.from_dict(document)
+    scene = trimesh.load(io.BytesIO(plan_glb(plan)), file_type="glb")
+    assert isinstance(scene, trimesh.Scene)
+    merged = scene.to_mesh()
+    expected = sum(room.area_m2 * room.ceiling_height_m for room in plan.rooms)
+    # Faces look inwards, so the signed volume is negative.
+    assert math.isclose(-merged.volume, expected, rel_tol=1e-5)
+    x_min, y_min, x_max, y_max = plan.bounds_m
+    top = float(plan.ceiling_heights_m.max())
+    np.testing.assert_allclose(merged.bounds, [[x_min, 0.0, -y_max], [x_max, top, -y_min]], atol=1e-5)
+
+
+def test_floor_ceiling_and_walls_are_separate_and_named() -> None:
+    plan = FloorPlan.from_dict(FLAT)
+    scene = trimesh.load(io.BytesIO(plan_glb(plan)), file_type="glb")
+    assert isinstance(scene, trimesh.Scene)
+    areas = {name: mesh.area for name, mesh in scene.geometry.items()}
+    assert math.isclose(areas["1/kitchen/floor"], 12.0, rel_tol=1e-5)
+    assert math.isclose(areas["1/kitchen/ceiling"], 12.0, rel_tol=1e-5)
+    assert math.isclose(areas["1/kitchen/wall"], 14.0 * 2.4, rel_tol=1e-5)
+    assert len(areas) == 6

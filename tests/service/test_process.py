@@ -1,0 +1,186 @@
+"""The service as users run it: `uvicorn service.app:app` in a process of its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx
+import pytest
+
+from service.settings import PREFIX
+from tests.service.conftest import assert_problem, localise, upload, wait_for
+from tests.service.test_localise import HALL
+
+ROOT = Path(__file__).parents[2]
+
+
+def _environment(bundle: Path, data_dir: Path, **settings: str) -> dict[str, str]:
+    given = {"BUNDLE": str(bundle), "DATA_DIR": str(data_dir), "ONNX_THREADS": "1"} | settings
+    clean = {name: value for name, value in os.environ.items() if not name.upper().startswith(PREFIX)}
+    return clean | {PREFIX + name: value for name, value in given.items()} | {"PYTHONPATH": str(ROOT)}
+
+
+@contextmanager
+def _uvicorn(environment: dict[str, str], log: Path) -> Iterator[tuple[subprocess.Popen[bytes], httpx.Client]]:
+    """Run the service; whoever uses it ends it, and it is killed if they did not."""
+    port = _free_port()
+    command = [sys.executable, "-m", "uvicorn", "service.app:app", "--port", str(port)]
+    with log.open("ab") as output:
+        process = subprocess.Popen(command, env=environment, cwd=ROOT, stdout=output, stderr=output)
+    try:
+        with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30.0) as client:
+            wait_for(lambda: process.poll() is not None or _answers(client), 120.0)
+            assert process.poll() is None, log.read_text()
+            yield process, client
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.wait(10.0)
+
+
+def _free_port() -> int:
+    import socket
+
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def _answers(client: httpx.Client) -> bool:
+    try:
+        return client.get("/healthz").status_code == 200
+    except httpx.TransportError:
+        return False
+
+
+def _children(pid: int) -> list[int]:
+    """Worker processes of a service."""
+    listing = subprocess.run(["ps", "-eo", "pid=,ppid=,args="], capture_output=True, text=True, check=True).stdout
+    rows = [line.split(maxsplit=2) for line in listing.splitlines()]
+    return [int(row[0]) for row in rows if int(row[1]) == pid and "spawn_main" in row[2]]
+
+
+def _alive(pid: int) -> bool:
+    listing = subprocess.run(["ps", "-o", "stat=", "-p", str(pid)], capture_output=True, text=True, check=False).stdout
+    return bool(listing.strip()) and not listing.strip().startswith("Z")
+
+
+def _warm(client: httpx.Client) -> bool:
+    return client.get("/readyz").json()["lpo_pool"]["ready"] > 0
+
+
+def test_plans_and_grids_survive_a_restart_and_nothing_is_left_running(
+    tiny_bundle: Path, tmp_path: Path, panorama: bytes
+) -> None:
+    environment = _environment(tiny_bundle, tmp_path / "data", LPO_DEADLINE_S="9")
+    with _uvicorn(environment, tmp_path / "log") as (process, client):
+        early = client.get("/readyz")
+        assert early.status_code == (200 if early.json()["ready"] else 503)
+        wait_for(lambda: client.get("/readyz").status_code == 200, 120.0)
+        plan_id = upload(client)
+        before = localise(client, plan_id, panorama).json()
+        assert before["stage"] == "lpo"
+        assert before["timings_ms"]["lpo"] > 0.0
+        coarse = localise(client, plan_id, panorama, refine="none").json()
+        workers = _children(process.pid)
+        assert workers
+        process.send_signal(signal.SIGTERM)
+        # Some versions of uvicorn end by the signal itself, once they have shut down in order.
+        assert process.wait(20.0) in (0, -signal.SIGTERM)
+        assert "Application shutdown complete" in (tmp_path / "log").read_text()
+        assert not any(_alive(worker) for worker in workers)
+    with _uvicorn(environment | {"LALALOC_WORKERS": "0"}, tmp_path / "log") as (process, client):
+        # Ready at once: the grid was read, not computed.
+        assert client.get(f"/floorplans/{plan_id}").json()["status"] == "ready"
+        assert "lalaloc_grid_seconds_count 0.0" in client.get("/metrics").text
+        assert localise(client, plan_id, panorama, refine="none").json()["candidates"] == coarse["candidates"]
+
+
+def test_a_killed_worker_costs_no_query_its_answer(tiny_bundle: Path, tmp_path: Path, panorama: bytes) -> None:
+    with _uvicorn(_environment(tiny_bundle, tmp_path / "data"), tmp_path / "log") as (process, client):
+        wait_for(lambda: _warm(client), 120.0)
+        plan_id = upload(client)
+        with ThreadPoolExecutor(3) as threads:
+            queries = [threads.submit(localise, client, plan_id, panorama, refine="lpo") for _ in range(30)]
+            # Once while it works, and again whenever a new one appears, until all queries are answered.
+            wait_for(lambda: any(query.done() for query in queries))
+            while not all(query.done() for query in queries):
+                for worker in _children(process.pid):
+                    os.kill(worker, signal.SIGKILL)
+            answers = [query.result() for query in queries]
+        assert {answer.status_code for answer in answers} == {200}
+        stages = {answer.json()["stage"] for answer in answers}
+        assert stages <= {"lpo", "vdr"}
+        assert "vdr" in stages
+        wait_for(lambda: _warm(client), 120.0)
+        assert localise(client, plan_id, panorama).status_code == 200
+        assert "lalaloc_lpo_restarts_total 0.0" not in client.get("/metrics").text
+
+
+def test_a_killed_service_leaves_no_workers_and_takes_up_what_it_was_preparing(
+    tiny_bundle: Path, tmp_path: Path
+) -> None:
+    environment = _environment(tiny_bundle, tmp_path / "data")
+    with _uvicorn(environment, tmp_path / "log") as (process, client):
+        wait_for(lambda: _warm(client), 120.0)
+        workers = _children(process.pid)
+        plan_id = upload(client, HALL, wait=False)
+        assert client.get(f"/floorplans/{plan_id}").json()["status"] == "preparing"
+        process.kill()
+        process.wait(10.0)
+        wait_for(lambda: not any(_alive(worker) for worker in workers))
+    with _uvicorn(environment | {"LALALOC_WORKERS": "0"}, tmp_path / "log") as (process, client):
+        wait_for(lambda: client.get(f"/floorplans/{plan_id}").json()["status"] == "ready")
+        # A service that is preparing when it is told to stop does so without finishing first.
+        upload(client, HALL, wait=False)
+        process.send_signal(signal.SIGINT)
+        process.wait(10.0)
+    assert (tmp_path / "log").read_text().count("Application shutdown complete") == 1
+
+
+def test_the_service_process_never_loads_torch(tiny_bundle: Path, tmp_path: Path) -> None:
+    script = [sys.executable, "-m", "tests.service.torch_free", str(tiny_bundle), str(tmp_path)]
+    environment = {name: value for name, value in os.environ.items() if not name.upper().startswith(PREFIX)}
+    done = subprocess.run(script, env=environment, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    assert told["stage"] == "lpo"
+    assert "onnxruntime" in told["modules"]
+    assert not {"torch", "safetensors", "matplotlib", "onnx"} & set(told["modules"])
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "told"),
+    [("LALALOC_WORKER", "2", "unknown setting LALALOC_WORKER"), ("LALALOC_BUNDLE", "no/such", "no model bundle at")],
+)
+def test_a_wrong_setting_stops_the_start_and_is_named(
+    tiny_bundle: Path, tmp_path: Path, variable: str, value: str, told: str
+) -> None:
+    environment = _environment(tiny_bundle, tmp_path) | {variable: value}
+    command = [sys.executable, "-m", "service", "--port", "0"]
+    done = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode != 0
+    assert told in done.stderr
+
+
+def test_the_module_runs_on_a_free_port_and_says_where(tiny_bundle: Path, tmp_path: Path) -> None:
+    environment = _environment(tiny_bundle, tmp_path, WORKERS="0")
+    command = [sys.executable, "-m", "service", "--port", "0"]
+    process = subprocess.Popen(command, env=environment, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+    try:
+        assert process.stdout is not None
+        address = process.stdout.readline().decode().strip()
+        with httpx.Client(base_url=address, timeout=30.0) as client:
+            assert client.get("/healthz").status_code == 200
+            assert_problem(client.get("/floorplans/none"), 404, "unknown-floorplan")
+    finally:
+        process.terminate()
+        process.wait(10.0)

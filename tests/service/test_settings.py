@@ -1,0 +1,62 @@
+"""Settings come from the environment, typed, and nothing in it is overlooked."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from pydantic import ValidationError
+
+from lalaloc_core.errors import ConfigError
+from service.settings import PREFIX, Settings, settings_table
+
+
+def test_an_unknown_name_is_an_error_that_names_it_and_the_known_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LALALOC_DATADIR", "/tmp/x")
+    with pytest.raises(ConfigError, match="LALALOC_DATADIR") as raised:
+        Settings.load()
+    assert "LALALOC_DATA_DIR" in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("WORKERS", "-1"), ("WORKERS", "two"), ("REQUEST_DEADLINE_S", "nan"), ("GRID_STEP_M", "0"), ("LOG_LEVEL", "loud")],
+)
+def test_a_bad_value_is_an_error_that_names_variable_and_value(
+    monkeypatch: pytest.MonkeyPatch, name: str, value: str
+) -> None:
+    monkeypatch.setenv(PREFIX + name, value)
+    with pytest.raises(ConfigError, match=PREFIX + name) as raised:
+        Settings.load()
+    assert value in str(raised.value)
+
+
+def test_values_are_read_and_typed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LALALOC_DATA_DIR", "/srv/plans")
+    monkeypatch.setenv("LALALOC_WORKERS", "3")
+    monkeypatch.setenv("LALALOC_MAX_ROOMS", "7")
+    monkeypatch.setenv("LALALOC_DATABASE_URL", "")
+    settings = Settings.load()
+    assert settings.data_dir == Path("/srv/plans")
+    assert settings.workers == 3
+    assert settings.plan_limits.max_rooms == 7
+    assert settings.resolved_database_url == "sqlite:////srv/plans/lalaloc.sqlite3"
+
+
+def test_settings_cannot_change_once_read() -> None:
+    settings = Settings.load()
+    with pytest.raises(ValidationError):
+        settings.workers = 5  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_the_default_bundle_does_not_depend_on_the_working_directory(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert Settings.load().bundle == Path(__file__).parents[2] / "models" / "default"
+
+
+def test_the_table_of_settings_has_every_one_with_its_meaning() -> None:
+    rows = settings_table().splitlines()[2:]
+    assert len(rows) == len(Settings.model_fields)
+    assert all(len(row.split("|")[3].strip()) > 10 for row in rows)
