@@ -1,0 +1,42 @@
+# LaLaLoc: `make demo` shows it, `make serve` runs it, `make test` checks it.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo serve test lint openapi docs clean
+
+help: ## list the targets
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
+
+setup: $(STAMP) ## create .venv and install everything
+
+$(STAMP): pyproject.toml constraints.txt scripts/setup.sh scripts/install_torch.py
+	PYTHON="$(PYTHON)" VENV="$(VENV)" scripts/setup.sh
+	@touch $@
+
+demo: $(STAMP) ## localise the example panoramas over HTTP, write demo.png
+	$(BIN)/python -m examples.demo
+
+serve: $(STAMP) ## run the service at http://127.0.0.1:8000 with the example plan, data in ./data
+	$(BIN)/python -m examples.serve
+
+test: lint ## lint, then the tests
+	$(BIN)/python -m pytest
+
+lint: $(STAMP) ## ruff and pyright
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/pyright
+
+openapi: $(STAMP) ## write openapi.yaml from the application
+	$(BIN)/python -m service.openapi openapi.yaml
+
+docs: $(STAMP) ## write the generated parts of README.md and docs/architecture.md
+	$(BIN)/python -m scripts.write_docs
+
+clean: ## remove the environment and everything that was made; ./data and ./runs stay
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis demo.png
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,1 @@
+"""The demo: an example flat, photographs taken in it, and a client of the service."""

@@ -1,0 +1,82 @@
+"""Start the service as a process of its own, wait until it is ready, and stop it."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from examples.client import LocaliseClient
+
+ROOT = Path(__file__).resolve().parent.parent
+
+_POLL_S = 0.2
+_READY_TIMEOUT_S = 180.0
+_STOP_TIMEOUT_S = 20.0
+
+
+class ServiceFailedError(Exception):
+    """The service did not start; its own log says why."""
+
+
+@dataclass(frozen=True)
+class RunningService:
+    """A service that is ready, at `url`."""
+
+    url: str
+    process: subprocess.Popen[str]
+
+
+@contextmanager
+def running_service(port: int, environment: Mapping[str, str]) -> Iterator[RunningService]:
+    """The service at 127.0.0.1, ready; stopped when the block ends. It logs to this process' standard error.
+
+    Args:
+        port: where to listen, 0 for a free one.
+        environment: variables to set for the service, over those of this process.
+
+    Raises:
+        ServiceFailedError: it ended, or was not ready in time.
+    """
+    command = [sys.executable, "-m", "service", "--host", "127.0.0.1", "--port", str(port)]
+    process = subprocess.Popen(command, cwd=ROOT, env={**os.environ, **environment}, stdout=subprocess.PIPE, text=True)
+    try:
+        url = _announced_url(process)
+        _wait_until_ready(url, process)
+        yield RunningService(url, process)
+    finally:
+        _stop(process)
+
+
+def _announced_url(process: subprocess.Popen[str]) -> str:
+    """The address that the service prints as its first line, when it has bound its port."""
+    assert process.stdout is not None
+    line = process.stdout.readline().strip()
+    if not line:
+        raise ServiceFailedError(f"the service ended with status {process.wait()} before it listened")
+    return line
+
+
+def _wait_until_ready(url: str, process: subprocess.Popen[str]) -> None:
+    deadline = time.monotonic() + _READY_TIMEOUT_S
+    with LocaliseClient(url, timeout_s=5.0) as client:
+        while not client.is_ready():
+            if process.poll() is not None:
+                raise ServiceFailedError(f"the service ended with status {process.returncode} while starting")
+            if time.monotonic() > deadline:
+                raise ServiceFailedError(f"the service is not ready after {_READY_TIMEOUT_S:g} s")
+            time.sleep(_POLL_S)
+
+
+def _stop(process: subprocess.Popen[str]) -> None:
+    process.terminate()
+    try:
+        process.wait(_STOP_TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()

@@ -1,0 +1,167 @@
+"""Render the example panoramas and write down where they were taken.
+
+Run `python -m examples.make_examples` after a change of the flat, the shots or the renderer. The flat was drawn by
+hand: no home that any model was trained on has its plan, its furniture or its light.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from PIL import Image
+
+from examples.truth import FOLDER, PLAN_PATH, TruePose, write_poses
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.synth.materials import MaterialLibrary
+from lalaloc_core.synth.panorama import PanoramaRenderer, Shot
+from lalaloc_core.synth.plans import Home, Opening, OpeningKind
+
+HEIGHT, WIDTH = 512, 1024
+# Rays per pixel and axis, for smooth edges.
+_SUPERSAMPLE = 2
+_JPEG_QUALITY = 90
+_MATERIALS_SEED = 7
+# An opening is drawn on the middle of its wall; both rooms' sides of that wall are nearer than this.
+_WALL_REACH_M = 0.1
+
+
+@dataclass(frozen=True)
+class Hole:
+    """A door, wide opening or window on the drawing: from one point to another, along a wall's middle (metres)."""
+
+    kind: OpeningKind
+    start_m: tuple[float, float]
+    end_m: tuple[float, float]
+    sill_m: float = 0.0
+    head_m: float = 2.02
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """One photograph: its file, where the camera stood, and the seed of furniture, materials and light."""
+
+    file: str
+    position_m: tuple[float, float]
+    heading_deg: float
+    camera_height_m: float
+    seed: int
+
+
+HOLES = (
+    Hole("door_open", (3.66, 4.25), (3.66, 5.1)),
+    Hole("opening", (5.46, 0.9), (5.46, 2.1), head_m=2.2),
+    Hole("door_shut", (6.2, 3.96), (7.05, 3.96)),
+    Hole("door_shut", (3.76, 5.38), (4.54, 5.38)),
+    Hole("door_shut", (5.5, 5.38), (6.25, 5.38)),
+    Hole("door_open", (6.9, 5.38), (7.7, 5.38)),
+    Hole("door_shut", (4.66, 8.05), (4.66, 8.8)),
+    Hole("door_shut", (9.4, 5.4), (9.4, 6.35)),
+    Hole("window", (0.8, 0.0), (2.6, 0.0), sill_m=0.05, head_m=2.25),
+    Hole("window", (3.4, 0.0), (4.7, 0.0), sill_m=0.85, head_m=2.25),
+    Hole("window", (0.0, 3.3), (0.0, 4.6), sill_m=0.85, head_m=2.25),
+    Hole("window", (6.4, 0.0), (8.2, 0.0), sill_m=1.0, head_m=2.25),
+    Hole("window", (9.4, 1.2), (9.4, 2.2), sill_m=1.0, head_m=2.25),
+    Hole("window", (1.7, 9.0), (3.5, 9.0), sill_m=0.8, head_m=2.25),
+    Hole("window", (0.0, 6.1), (0.0, 7.3), sill_m=0.8, head_m=2.25),
+    Hole("window", (7.4, 9.0), (8.7, 9.0), sill_m=0.8, head_m=2.25),
+)
+
+VIEWS = (
+    View(file="living_room.jpg", position_m=(2.15, 2.3), heading_deg=30.0, camera_height_m=1.5, seed=15),
+    View(file="kitchen.jpg", position_m=(7.1, 2.2), heading_deg=250.0, camera_height_m=1.5, seed=25),
+    View(file="bedroom.jpg", position_m=(2.6, 6.75), heading_deg=120.0, camera_height_m=1.6, seed=37),
+    View(file="study.jpg", position_m=(7.7, 7.6), heading_deg=340.0, camera_height_m=1.4, seed=43),
+)
+
+
+def main() -> None:
+    """Render every view of the flat, and write its true pose beside it."""
+    home = example_home()
+    materials = MaterialLibrary.create(np.random.default_rng(_MATERIALS_SEED))
+    renderer = PanoramaRenderer(materials, height=HEIGHT, width=WIDTH, supersample=_SUPERSAMPLE)
+    for view in VIEWS:
+        (pixels,) = renderer.render([shot_of(home, view)]).numpy()
+        Image.fromarray(pixels).save(FOLDER / view.file, quality=_JPEG_QUALITY, optimize=True)
+        print(FOLDER / view.file)
+    write_poses([true_pose(home.plan, view) for view in VIEWS])
+
+
+def example_home() -> Home:
+    """The example flat with its doors and windows."""
+    plan = FloorPlan.from_json(PLAN_PATH.read_bytes())
+    return Home(plan, tuple(opening for hole in HOLES for opening in openings_of(plan, hole)))
+
+
+def openings_of(plan: FloorPlan, hole: Hole) -> list[Opening]:
+    """The hole as each of the rooms beside it sees it.
+
+    Raises:
+        ValueError: no wall of any room runs along the hole.
+    """
+    sides = list(_walls_beside(plan, hole))
+    if not sides:
+        raise ValueError(f"no wall along {hole}")
+    rooms = [room for room, _, _, _ in sides]
+    return [
+        Opening(
+            room=room,
+            wall=wall,
+            start_m=start_m,
+            end_m=end_m,
+            sill_m=hole.sill_m,
+            head_m=hole.head_m,
+            kind=hole.kind,
+            neighbour=next((other for other in rooms if other != room), -1),
+        )
+        for room, wall, start_m, end_m in sides
+    ]
+
+
+def _walls_beside(plan: FloorPlan, hole: Hole) -> Iterator[tuple[int, int, float, float]]:
+    """(room, wall, start, end along the wall) for every wall that contains the hole within `_WALL_REACH_M`."""
+    ends = np.array([hole.start_m, hole.end_m])
+    for room_index, room in enumerate(plan.rooms):
+        for wall_index, (x0, y0, x1, y1) in enumerate(room.walls_m):
+            length = math.hypot(x1 - x0, y1 - y0)
+            along = np.array([x1 - x0, y1 - y0]) / length
+            offset = ends - (x0, y0)
+            aside = np.abs(offset @ np.array([-along[1], along[0]]))
+            start, end = sorted(float(value) for value in offset @ along)
+            if aside.max() < _WALL_REACH_M and start >= 0.0 and end <= length:
+                yield room_index, wall_index, start, end
+
+
+def shot_of(home: Home, view: View) -> Shot:
+    """What the renderer needs to take the photograph."""
+    position = np.array(view.position_m)
+    return Shot(
+        home=home,
+        position_m=position,
+        room_index=int(home.plan.room_index_at(position[None])[0]),
+        heading=math.radians(view.heading_deg),
+        camera_height_m=view.camera_height_m,
+        furniture="full",
+        seed=view.seed,
+    )
+
+
+def true_pose(plan: FloorPlan, view: View) -> TruePose:
+    """The pose of a photograph as the file of true poses has it."""
+    x_m, y_m = view.position_m
+    room = plan.rooms[int(plan.room_index_at(np.array([view.position_m]))[0])]
+    return TruePose(
+        file=view.file,
+        plan=PLAN_PATH.name,
+        room=room.name,
+        x_m=x_m,
+        y_m=y_m,
+        heading_deg=view.heading_deg,
+        camera_height_m=view.camera_height_m,
+    )
+
+
+if __name__ == "__main__":
+    main()

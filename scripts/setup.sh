@@ -1,0 +1,37 @@
+#!/usr/bin/env bash
+# Creates the virtual environment and installs the project with everything that demo, service and tests need.
+# Settings: PYTHON (default python3), VENV (default .venv), TORCH_INDEX (see scripts/install_torch.py).
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/.."
+
+python="${PYTHON:-python3}"
+venv="${VENV:-.venv}"
+extras="train,service,ray,dev"
+is_recent='import sys; sys.exit(sys.version_info < (3, 11))'
+
+fail() {
+    printf 'setup: %s\n' "$*" >&2
+    exit 1
+}
+
+check_python() {
+    command -v "$python" >/dev/null || fail "no '$python' here; install Python 3.11 or later, or say: make PYTHON=..."
+    "$python" -c "$is_recent" ||
+        fail "'$python' is $("$python" --version 2>/dev/null || echo unusable); Python 3.11 or later is needed; say for instance: make PYTHON=python3.12"
+}
+
+# An environment that works is kept, so that a change of pyproject.toml does not download torch again.
+create_venv() {
+    if [ -x "$venv/bin/python" ] && "$venv/bin/python" -c "$is_recent" 2>/dev/null &&
+        "$venv/bin/python" -m pip --version >/dev/null 2>&1; then
+        return
+    fi
+    check_python
+    "$python" -m venv --clear "$venv" ||
+        fail "'$python' cannot create virtual environments; on Debian and Ubuntu the package is python3-venv"
+}
+
+create_venv
+"$venv/bin/python" scripts/install_torch.py
+"$venv/bin/python" -m pip install --disable-pip-version-check -c constraints.txt -e ".[$extras]"
+printf 'setup: done, the environment is in %s\n' "$venv"

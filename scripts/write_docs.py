@@ -1,0 +1,79 @@
+"""Write the generated parts of the documentation: `python -m scripts.write_docs`.
+
+They stand between `<!-- begin: NAME -->` and `<!-- end: NAME -->`; a stale one fails the tests.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+from service.settings import PREFIX, Settings
+
+ROOT = Path(__file__).resolve().parent.parent
+_PACKAGES = ("lalaloc_core", "service", "examples", "scripts")
+
+
+def main() -> None:
+    """Bring every document up to date."""
+    for path, text in documents().items():
+        path.write_text(text, encoding="utf-8")
+
+
+def documents() -> dict[Path, str]:
+    """Every document that has generated parts, as it should read."""
+    parts = {
+        ROOT / "README.md": {"settings": settings_table()},
+        ROOT / "docs" / "architecture.md": {f"files of {package}": file_map(package) for package in _PACKAGES},
+    }
+    return {path: _filled(path.read_text(encoding="utf-8"), contents) for path, contents in parts.items()}
+
+
+def settings_table() -> str:
+    """The service's settings as a Markdown table."""
+    rows = ["| variable | default | meaning |", "|---|---|---|"]
+    for name, field in Settings.model_fields.items():
+        default = field.default
+        if isinstance(default, Path) and default.is_absolute():
+            default = default.relative_to(ROOT)
+        shown = "" if default is None else f"`{default}`"
+        rows.append(f"| `{PREFIX}{name.upper()}` | {shown} | {field.description} |")
+    return "\n".join(rows)
+
+
+def file_map(package: str) -> str:
+    """Every module of a package, with the first paragraph of its docstring, as a Markdown table."""
+    rows = ["| file | what it is |", "|---|---|"]
+    for path in sorted((ROOT / package).rglob("*.py"), key=lambda path: (path.parent, path.name)):
+        docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
+        if docstring:
+            summary = " ".join(docstring.split("\n\n")[0].split()).replace("|", "\\|")
+            rows.append(f"| `{path.relative_to(ROOT)}` | {summary} |")
+    return "\n".join(rows)
+
+
+def _filled(text: str, contents: dict[str, str]) -> str:
+    """The text with each named part replaced.
+
+    Raises:
+        ValueError: a part has no place in the text, or a place no part.
+    """
+    places = list(_places(text))
+    if sorted(places) != sorted(contents):
+        raise ValueError(f"the document has places for {places}, the generated parts are {list(contents)}")
+    for name, content in contents.items():
+        begin, end = f"<!-- begin: {name} -->", f"<!-- end: {name} -->"
+        before, _, rest = text.partition(begin)
+        text = f"{before}{begin}\n{content}\n{end}{rest.partition(end)[2]}"
+    return text
+
+
+def _places(text: str) -> Iterator[str]:
+    for match in re.finditer(r"<!-- begin: (.+?) -->", text):
+        yield match[1]
+
+
+if __name__ == "__main__":
+    main()

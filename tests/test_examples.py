@@ -1,0 +1,94 @@
+"""The example flat, its panoramas and the demo belong together."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from examples.demo import StageMissingError, check_answer
+from examples.make_examples import HEIGHT, HOLES, VIEWS, WIDTH, example_home, openings_of, true_pose
+from examples.truth import FOLDER, PLAN_PATH, read_poses
+from lalaloc_core.floorplan import FloorPlan
+
+ROOT = Path(__file__).parents[1]
+PLAN = FloorPlan.from_json(PLAN_PATH.read_bytes())
+
+
+def test_the_flat_is_of_a_usual_size_and_has_no_warnings() -> None:
+    assert PLAN.warnings == ()
+    assert 60.0 < PLAN.area_m2 < 100.0
+
+
+def test_rooms_lie_one_wall_apart() -> None:
+    for index, room in enumerate(PLAN.rooms):
+        gaps = [room.shape.distance(other.shape) for other in PLAN.rooms if other is not room]
+        assert min(gaps) == pytest.approx(0.12), PLAN.rooms[index].name
+
+
+def test_true_poses_are_those_the_pictures_were_taken_from() -> None:
+    assert read_poses() == [true_pose(PLAN, view) for view in VIEWS]
+
+
+def test_every_picture_has_a_true_pose_in_its_room() -> None:
+    poses = read_poses()
+    assert sorted(pose.file for pose in poses) == sorted(path.name for path in FOLDER.glob("*.jpg"))
+    for pose in poses:
+        (room,) = PLAN.room_index_at(np.array([[pose.x_m, pose.y_m]]))
+        assert PLAN.rooms[room].name == pose.room
+        with Image.open(pose.picture) as picture:
+            assert picture.size == (WIDTH, HEIGHT)
+
+
+def test_doors_join_two_rooms_and_windows_look_outside() -> None:
+    for hole in HOLES:
+        openings = openings_of(PLAN, hole)
+        assert all(opening.end_m - opening.start_m > 0.5 for opening in openings)
+        if hole.kind == "window":
+            assert [opening.neighbour for opening in openings] == [-1]
+        elif len(openings) == 2:
+            first, second = openings
+            assert (first.neighbour, second.neighbour) == (second.room, first.room)
+
+
+def test_every_room_has_a_door() -> None:
+    with_door = {opening.room for opening in example_home().openings if opening.kind != "window"}
+    assert with_door == set(range(len(PLAN.rooms)))
+
+
+def _answer(**changes: Any) -> dict[str, Any]:
+    return {"stage": "lpo", "position": {"x_m": 1.0, "y_m": 2.0}, "candidates": [{}], "confidence": None, **changes}
+
+
+def test_a_full_answer_is_accepted() -> None:
+    check_answer(_answer())
+
+
+@pytest.mark.parametrize(
+    ("changes", "complaint"),
+    [
+        ({"stage": "vdr"}, "'vdr'"),
+        ({"candidates": []}, "no candidates"),
+        ({"position": {"x_m": float("nan"), "y_m": 0.0}}, r"answer\.position\.x_m"),
+    ],
+)
+def test_an_answer_that_is_not_full_is_refused(changes: dict[str, Any], complaint: str) -> None:
+    with pytest.raises(StageMissingError, match=complaint):
+        check_answer(_answer(**changes))
+
+
+def test_the_demo_runs_through_every_stage(tiny_bundle: Path, tmp_path: Path) -> None:
+    out = tmp_path / "demo.png"
+    environment = {**os.environ, "LALALOC_BUNDLE": str(tiny_bundle)}
+    command = [sys.executable, "-m", "examples.demo", "--out", str(out)]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count(".jpg") == 2 * len(VIEWS)
+    with Image.open(out) as picture:
+        assert picture.width > 1000

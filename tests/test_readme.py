@@ -1,0 +1,87 @@
+"""The documentation holds: its commands exist, its links resolve, its tables and examples are those of the code."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from lalaloc_core.cli import main as lalaloc
+from lalaloc_core.floorplan import FloorPlan
+from scripts.write_docs import documents
+from service.schemas import LocaliseAnswer
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")] + sorted(ROOT.glob("docs/*.md"))
+TARGETS = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+
+
+def _blocks(language: str) -> list[tuple[str, str]]:
+    """(page, content) of every fenced block of a language."""
+    pattern = re.compile(rf"```{language}\n(.*?)```", re.DOTALL)
+    return [(page.name, block) for page in PAGES for block in pattern.findall(page.read_text(encoding="utf-8"))]
+
+
+def _commands() -> Iterator[list[str]]:
+    """Every command of every shell block, and every command in running text, as words."""
+    for _, block in _blocks("sh"):
+        yield from (shlex.split(line, comments=True) for line in block.splitlines() if line.strip())
+    for page in PAGES:
+        inline = re.findall(r"`((?:make|lalaloc|\.venv/bin/\w+) [^`]+)`", page.read_text(encoding="utf-8"))
+        yield from (shlex.split(command) for command in inline)
+
+
+COMMANDS = list(_commands())
+
+
+def test_every_make_command_is_a_target() -> None:
+    used = {word for command in COMMANDS if command[0] == "make" for word in command[1:] if "=" not in word}
+    assert used >= {"demo", "serve", "test", "setup"}
+    assert used <= TARGETS
+
+
+def test_every_module_that_is_run_exists() -> None:
+    used = {command[command.index("-m") + 1] for command in COMMANDS if "python" in command[0] and "-m" in command}
+    assert [name for name in sorted(used) if importlib.util.find_spec(name) is None] == []
+
+
+@pytest.mark.parametrize(
+    "command", [command for command in COMMANDS if command[0].endswith("lalaloc")], ids=lambda words: " ".join(words)
+)
+def test_every_lalaloc_command_has_the_options_it_is_shown_with(
+    command: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        lalaloc([command[1], "--help"])
+    assert ended.value.code == 0
+    shown = capsys.readouterr().out
+    assert [word for word in command[2:] if word.startswith("--") and word not in shown] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_link_into_the_tree_resolves(page: Path) -> None:
+    targets = re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8"))
+    local = [target.partition("#")[0] for target in targets if "://" not in target]
+    assert [target for target in local if target and not (page.parent / target).exists()] == []
+
+
+def test_generated_parts_are_up_to_date() -> None:
+    stale = [path.name for path, text in documents().items() if path.read_text(encoding="utf-8") != text]
+    assert stale == [], "run `make docs`"
+
+
+def test_every_json_example_is_what_the_code_reads_or_writes() -> None:
+    kinds = set()
+    for page, block in _blocks("json"):
+        document = json.loads(block)
+        if "rooms" in document:
+            FloorPlan.from_dict(document)
+        else:
+            LocaliseAnswer.model_validate(document)
+        kinds.add(page)
+    assert "conventions.md" in kinds
