@@ -72,6 +72,7 @@ def _parser() -> argparse.ArgumentParser:
     bench.add_argument("--bundle", type=Path, default=Path("models/default"))
     bench.add_argument("--homes", type=int, default=125, help="test homes per accuracy figure, 4 queries each")
     bench.add_argument("--textures", type=Path, help="folder of material pictures for the test panoramas")
+    bench.add_argument("--out", type=Path, help="also write the JSON to this file")
     bench.add_argument("--only", choices=("rendering", "service", "accuracy"), help="one group of figures")
     bench.set_defaults(run=_bench)
 
@@ -168,7 +169,10 @@ def _bench(arguments: argparse.Namespace) -> None:
     from lalaloc_core.bench import run_bench
 
     groups = (arguments.only,) if arguments.only else ("rendering", "service", "accuracy")
-    _print_json(run_bench(arguments.bundle, groups, homes=arguments.homes, textures=arguments.textures))
+    report = run_bench(arguments.bundle, groups, homes=arguments.homes, textures=arguments.textures)
+    if arguments.out is not None:
+        arguments.out.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    _print_json(report)
 
 
 def _contact_sheet(arguments: argparse.Namespace) -> None:

@@ -7,6 +7,7 @@ then exported, then the exported files are compared with torch on random layouts
 from __future__ import annotations
 
 import dataclasses
+import logging
 import tempfile
 import warnings
 from pathlib import Path
@@ -106,6 +107,7 @@ def _export(path: Path, module: nn.Module, inputs: dict[str, Tensor], outputs: l
     with warnings.catch_warnings():
         # The exporter warns of its own internals, which no caller can act upon.
         warnings.simplefilter("ignore")
+        logging.getLogger("torch.onnx").setLevel(logging.ERROR)
         program = torch.onnx.export(
             module.eval(),
             tuple(inputs.values()),

@@ -46,7 +46,7 @@ def read_panorama(
                 # A JPEG can be decoded straight to a size near the wanted one.
                 image.draft("RGB", (2 * width, 2 * height))
                 upright = ImageOps.exif_transpose(image)
-                rgb = upright.convert("RGB").resize((width, height), Image.Resampling.BOX)
+                rgb = _to_rgb(upright).resize((width, height), Image.Resampling.BOX)
     except UnidentifiedImageError as error:
         raise InvalidPanoramaError(f"the panorama is not a readable {', '.join(FORMATS)} picture") from error
     except Image.DecompressionBombError as error:
@@ -71,6 +71,13 @@ def _upright_size(image: Image.Image) -> tuple[int, int]:
     width, height = image.size
     turned = image.getexif().get(ExifTags.Base.Orientation) in (5, 6, 7, 8)
     return (height, width) if turned else (width, height)
+
+
+def _to_rgb(image: Image.Image) -> Image.Image:
+    """8-bit RGB; Pillow's own conversion clips 16-bit grey at 255 instead of scaling it."""
+    if image.mode == "I" or image.mode.startswith("I;16"):
+        image = Image.fromarray((np.asarray(image).clip(0, 65535) // 256).astype(np.uint8))
+    return image.convert("RGB")
 
 
 def _check_aspect(width: int, height: int, limits: PanoramaLimits) -> None:

@@ -48,7 +48,7 @@ class LpoConfig:
     initial_damping: float = 1e-2
     max_step_m: float = 0.5
     max_turn: float = 0.2
-    prune_after: int = 5
+    prune_after: int = 4
     prune_ratio: float = 2.0
     adam_learning_rate: float = 0.01
     adam_steps: int = 150

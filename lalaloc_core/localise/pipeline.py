@@ -85,7 +85,8 @@ def localise(
     clock = StageClock()
     stage: Stage = "retrieval"
     with clock.stage("retrieve"):
-        wanted = max(top_k, config.lpo_candidates)
+        # Refined candidates may meet and become one; spare ones then take the free places.
+        wanted = max(top_k, config.lpo_candidates) + config.lpo_candidates
         candidates = retrieve(grid, query, top_k=wanted, separation_m=config.separation_m)
     if refine in ("vdr", "lpo"):
         with clock.stage("vdr"):

@@ -134,12 +134,13 @@ class PaperImageEncoder(nn.Module):
         self.config = config
         self.backbone = ResNet(config.image_depth)
         self.fc = nn.Linear(self.backbone.channels, config.latent_size)
-        self.register_buffer("mean", 255.0 * torch.tensor(IMAGE_MEAN)[None, :, None, None], persistent=False)
-        self.register_buffer("std", 255.0 * torch.tensor(IMAGE_STD)[None, :, None, None], persistent=False)
-        self.mean: Tensor
-        self.std: Tensor
+        # Not "mean": ONNX would take it for the output of the pooling.
+        self.register_buffer("pixel_mean", 255.0 * torch.tensor(IMAGE_MEAN)[None, :, None, None], persistent=False)
+        self.register_buffer("pixel_std", 255.0 * torch.tensor(IMAGE_STD)[None, :, None, None], persistent=False)
+        self.pixel_mean: Tensor
+        self.pixel_std: Tensor
 
     def forward(self, image: Tensor) -> Float[Tensor, "b d"]:
         """Encode `image`, (b, h, w, 3), values 0 to 255 of any type."""
-        pixels = (image.permute(0, 3, 1, 2).to(self.mean.dtype) - self.mean) / self.std
+        pixels = (image.permute(0, 3, 1, 2).to(self.pixel_mean.dtype) - self.pixel_mean) / self.pixel_std
         return functional.normalize(self.fc(self.backbone(pixels)), dim=1)

@@ -216,6 +216,7 @@ PRESETS: dict[str, TrainConfig] = {
             anchors_per_home=2,
             triplets=TripletSampling(positives=2, negatives=4),
             all_pairs=True,
+            decode_anchors_only=True,
             scale_weight=0.1,
         ),
         image=ImageStageConfig(steps=12, batch=8, ring_weight=1.0, profile_weight=0.5, ema_decay=0.9),

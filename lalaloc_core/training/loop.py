@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import csv
+import dataclasses
 import logging
 import math
 import time
@@ -16,7 +17,7 @@ from tqdm import tqdm
 
 from lalaloc_core.errors import CheckpointError
 from lalaloc_core.training.checkpoint import Checkpoint
-from lalaloc_core.training.config import OptimiserConfig
+from lalaloc_core.training.config import OptimiserConfig, TrainConfig
 from lalaloc_core.training.stages import Stage, build_optimiser
 from lalaloc_core.training.stream import Batch
 
@@ -151,8 +152,8 @@ class _Trainer:
         )
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint of the same configuration."""
-        if checkpoint.config != self.stage.config:
+        """Go on from a checkpoint of the same configuration; only the budget (steps, minutes) may change."""
+        if _without_budget(checkpoint.config) != _without_budget(self.stage.config):
             raise CheckpointError(f"the checkpoint of stage '{checkpoint.stage}' has another configuration")
         for name, module in self.stage.modules.items():
             module.load_state_dict(checkpoint.weights[name])
@@ -160,6 +161,14 @@ class _Trainer:
             module.load_state_dict(checkpoint.averaged[name])
         self.optimiser.load_state_dict(checkpoint.optimiser)
         self.step, self.seconds, self.metrics = checkpoint.step, checkpoint.seconds, checkpoint.metrics
+
+
+def _without_budget(config: TrainConfig) -> TrainConfig:
+    return dataclasses.replace(
+        config,
+        layout=dataclasses.replace(config.layout, steps=0, minutes=None),
+        image=dataclasses.replace(config.image, steps=0, minutes=None),
+    )
 
 
 def learning_rate(config: OptimiserConfig, progress: float) -> float:
