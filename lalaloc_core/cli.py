@@ -52,6 +52,7 @@ def _parser() -> argparse.ArgumentParser:
     export = commands.add_parser("export", help="export a trained run to a model bundle")
     export.add_argument("--run", type=Path, required=True, dest="folder")
     export.add_argument("--out", type=Path, required=True)
+    export.add_argument("--name", help="of the model; default: the name of the folder --out")
     export.add_argument("--version", required=True, dest="model_version")
     export.add_argument("--note", action="append", default=[], metavar="KEY=VALUE", help="recorded in the manifest")
     export.set_defaults(run=_export)
@@ -118,7 +119,8 @@ def _export(arguments: argparse.Namespace) -> None:
 
     pairs = [note.partition("=") for note in arguments.note]
     notes = {"hardware": platform.machine(), **{key: value for key, _, value in pairs}}
-    bundle = export_run(arguments.folder, arguments.out, version=arguments.model_version, notes=notes)
+    name = arguments.name or arguments.out.resolve().name
+    bundle = export_run(arguments.folder, arguments.out, name=name, version=arguments.model_version, notes=notes)
     _print_json({name: entry.bytes for name, entry in bundle.manifest.files.items()})
 
 
@@ -135,8 +137,17 @@ def _calibrate(arguments: argparse.Namespace) -> None:
         furniture=None,
         textures=arguments.textures,
     )
-    results = _answers(bundle, queries, kind="panorama", heading_known=True)
-    calibrate(bundle, results, f"{len(results)} panoramas of {queries.homes} validation homes, all furniture levels")
+    # One model serves both kinds of query, so it is fitted on both.
+    results = [
+        result
+        for heading_known in (True, False)
+        for result in _answers(bundle, queries, kind="panorama", heading_known=heading_known)
+    ]
+    description = (
+        f"{len(results)} panoramas of {queries.homes} validation homes, all furniture levels, "
+        "half with known and half with unknown heading"
+    )
+    calibrate(bundle, results, description)
     _print_json(summarise(results))
 
 
@@ -176,9 +187,11 @@ def _bench(arguments: argparse.Namespace) -> None:
 
 
 def _contact_sheet(arguments: argparse.Namespace) -> None:
+    import numpy as np
+
     from lalaloc_core.synth.gallery import contact_sheet
 
-    contact_sheet(arguments.out, seed=arguments.seed, textures=arguments.textures)
+    contact_sheet(arguments.out, np.random.default_rng(arguments.seed), arguments.textures)
 
 
 def _print_json(value: Any) -> None:

@@ -23,9 +23,8 @@ from torch import Tensor, nn
 from lalaloc_core.bundle import HEAD_ONNX, IMAGE_ONNX, IMAGE_WEIGHTS, LAYOUT_ONNX, LAYOUT_WEIGHTS, Bundle, Manifest
 from lalaloc_core.bundle import write_manifest as _write_manifest
 from lalaloc_core.errors import ExportError
-from lalaloc_core.nets import resnet, ring
+from lalaloc_core.nets import ImageEncoder, LayoutEncoder, resnet, ring
 from lalaloc_core.training.config import TrainConfig
-from lalaloc_core.training.stages import ImageEncoder, LayoutEncoder
 
 PARITY_TOLERANCE = 1e-4
 _PARITY_BATCH = 4
@@ -39,6 +38,7 @@ def export_bundle(
     layout_encoder: LayoutEncoder,
     image_encoder: ImageEncoder,
     *,
+    name: str,
     version: str,
     training: dict[str, Any] | None = None,
 ) -> Bundle:
@@ -57,7 +57,7 @@ def export_bundle(
         _save_weights(layout_encoder, work / LAYOUT_WEIGHTS)
         _save_weights(image_encoder, work / IMAGE_WEIGHTS)
         parity = _export_networks(work, config, layout_encoder, image_encoder)
-        manifest = _manifest(config, version, {**(training or {}), "parity_max_abs_difference": parity})
+        manifest = _manifest(config, name, version, {**(training or {}), "parity_max_abs_difference": parity})
         folder.mkdir(parents=True, exist_ok=True)
         for path in work.iterdir():
             (folder / path.name).write_bytes(path.read_bytes())
@@ -184,13 +184,13 @@ def _store_in_half(model: onnx.ModelProto) -> None:
     model.graph.node.extend(nodes)
 
 
-def _manifest(config: TrainConfig, version: str, training: dict[str, Any]) -> Manifest:
+def _manifest(config: TrainConfig, name: str, version: str, training: dict[str, Any]) -> Manifest:
     is_ring = config.architecture == "ring"
     sizes = config.ring if is_ring else config.paper
     statistics = ring if is_ring else resnet
     height, width = config.image_size
     return Manifest(
-        name=config.name,
+        name=name,
         version=version,
         architecture=config.architecture,
         layout_config=dataclasses.asdict(sizes),

@@ -47,6 +47,6 @@ class Accuracy:
             within_1m=float(np.mean(error < 1.0)),
         )
 
-    def to_dict(self) -> dict[str, float]:
+    def to_dict(self) -> dict[str, int | float]:
         """The figures by name."""
         return asdict(self)

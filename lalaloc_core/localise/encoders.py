@@ -52,7 +52,7 @@ class Encoders:
         parts = []
         for first in range(0, len(profile_m), _LAYOUT_BATCH):
             batch = {name: value[first : first + _LAYOUT_BATCH] for name, value in inputs.items()}
-            parts.append(self._layout.run(["latent"], batch)[0])
+            parts.append(_run(self._layout, "latent", batch))
         return np.concatenate(parts) if parts else np.empty((0, self.manifest.latent_size), np.float32)
 
     def poses(
@@ -114,11 +114,17 @@ class Encoders:
         inputs = {"image": np.ascontiguousarray(image[None])}
         if self._image_takes_height:
             inputs["camera_height_m"] = np.array([camera_height_m], dtype=np.float32)
-        return self._image.run([output], inputs)[0]
+        return _run(self._image, output, inputs)
 
     def _run_head(self, ring: Float[np.ndarray, "b c s"]) -> Float[np.ndarray, "b d"]:
         assert self._head is not None
-        return self._head.run(["latent"], {"ring": ring})[0]
+        return _run(self._head, "latent", {"ring": ring})
+
+
+def _run(session: onnxruntime.InferenceSession, output: str, inputs: dict[str, np.ndarray]) -> np.ndarray:
+    value = session.run([output], inputs)[0]
+    assert isinstance(value, np.ndarray)
+    return value
 
 
 def _session(model: bytes, threads: int) -> onnxruntime.InferenceSession:

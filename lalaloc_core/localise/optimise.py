@@ -18,12 +18,12 @@ from typing import Literal
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from lalaloc_core.bundle import LAYOUT_WEIGHTS, Bundle
 from lalaloc_core.errors import BundleError
 from lalaloc_core.localise.poses import RefinementJob, RefinementResult
-from lalaloc_core.nets import load_layout_encoder
+from lalaloc_core.nets import LayoutEncoder, load_layout_encoder
 from lalaloc_core.nets.ring import RingLayoutEncoder
 from lalaloc_core.render.profile import cast_rays, wall_profile
 
@@ -82,7 +82,7 @@ class _Evaluation:
 class LatentPoseOptimiser:
     """Refines poses with one layout encoder."""
 
-    def __init__(self, layout_encoder: nn.Module, config: LpoConfig | None = None) -> None:
+    def __init__(self, layout_encoder: LayoutEncoder, config: LpoConfig | None = None) -> None:
         layout_encoder = layout_encoder.eval().requires_grad_(False)
         self.encoder = layout_encoder.fused() if isinstance(layout_encoder, RingLayoutEncoder) else layout_encoder
         self.config = config or LpoConfig()
@@ -124,7 +124,7 @@ class _Problem:
     Positions are relative to each starting pose, so that single precision does not lose millimetres in large plans.
     """
 
-    def __init__(self, encoder: nn.Module, job: RefinementJob, device: torch.device) -> None:
+    def __init__(self, encoder: LayoutEncoder, job: RefinementJob, device: torch.device) -> None:
         def tensor(array: np.ndarray) -> Tensor:
             return torch.tensor(array, dtype=torch.float32, device=device)
 
@@ -135,7 +135,7 @@ class _Problem:
         self.camera_height_m = tensor(job.camera_height_m)
         self.ceiling_height_m = tensor(job.ceiling_height_m)
         self.targets = tensor(job.targets)
-        self.columns = int(encoder.config.profile_columns)
+        self.columns = encoder.config.profile_columns
         self.unknowns = 3 if job.optimise_heading else 2
         self.start = torch.zeros(len(job.targets), self.unknowns, device=device)
 
@@ -161,7 +161,7 @@ class _Problem:
 
         tangent = torch.eye(self.unknowns, device=pose.device).repeat(count, 1)
         repeated = pose.repeat_interleave(self.unknowns, dim=0)
-        value, derivative = torch.func.jvp(latents, (repeated,), (tangent,))
+        value, derivative = torch.func.jvp(latents, (repeated,), (tangent,))[:2]
         residual = value[:: self.unknowns] - self.targets[rows]
         return _Evaluation(residual, derivative.reshape(count, self.unknowns, -1).transpose(1, 2))
 

@@ -6,24 +6,25 @@ from typing import Any
 
 import safetensors.torch
 
-from lalaloc_core.nets.resnet import PaperConfig, PaperLayoutEncoder
-from lalaloc_core.nets.ring import RingConfig, RingLayoutEncoder
+from lalaloc_core.configuration import build_config
+from lalaloc_core.nets.resnet import PaperConfig, PaperImageEncoder, PaperLayoutEncoder
+from lalaloc_core.nets.ring import RingConfig, RingImageEncoder, RingLayoutEncoder
+
+LayoutEncoder = RingLayoutEncoder | PaperLayoutEncoder
+ImageEncoder = RingImageEncoder | PaperImageEncoder
 
 
-def load_layout_encoder(
-    architecture: str, config: dict[str, Any], weights: bytes
-) -> RingLayoutEncoder | PaperLayoutEncoder:
+def load_layout_encoder(architecture: str, config: dict[str, Any], weights: bytes) -> LayoutEncoder:
     """Rebuild a layout encoder from the configuration and the safetensors of a bundle.
 
     Raises:
-        ValueError: unknown architecture.
+        ValueError: unknown architecture, or a configuration that is not one (`ConfigError`).
         RuntimeError: the weights do not fit.
     """
-    sizes = {name: tuple(value) if isinstance(value, list) else value for name, value in config.items()}
     if architecture == "ring":
-        encoder: RingLayoutEncoder | PaperLayoutEncoder = RingLayoutEncoder(RingConfig(**sizes))
+        encoder: LayoutEncoder = RingLayoutEncoder(build_config(RingConfig, config))
     elif architecture == "paper":
-        encoder = PaperLayoutEncoder(PaperConfig(**sizes))
+        encoder = PaperLayoutEncoder(build_config(PaperConfig, config))
     else:
         raise ValueError(f"unknown architecture '{architecture}', known are 'ring' and 'paper'")
     state = safetensors.torch.load(weights)

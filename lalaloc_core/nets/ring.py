@@ -55,15 +55,16 @@ class RingConv1d(nn.Module):
         super().__init__()
         self.padding = (kernel - 1) // 2 * dilation
         self.conv = nn.Conv1d(inputs, outputs, kernel, stride=stride, dilation=dilation, bias=False)
-        self.norm: nn.Module = nn.BatchNorm1d(outputs)
+        self.norm: nn.BatchNorm1d | nn.Identity = nn.BatchNorm1d(outputs)
 
     def forward(self, x: Float[Tensor, "b i w"]) -> Float[Tensor, "b o v"]:
         return self.norm(self.conv(pad_around(x, self.padding)))
 
     def fuse(self) -> None:
         """Fold the normalisation into the convolution; for evaluation only."""
-        self.conv = fuse_conv_bn_eval(self.conv, self.norm)
-        self.norm = nn.Identity()
+        if isinstance(self.norm, nn.BatchNorm1d):
+            self.conv = fuse_conv_bn_eval(self.conv, self.norm)
+            self.norm = nn.Identity()
 
 
 class RingHead(nn.Module):

@@ -8,12 +8,13 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from lalaloc_core.nets import LayoutEncoder
 from lalaloc_core.nets.resnet import PaperImageEncoder
 from lalaloc_core.nets.ring import RingLayoutEncoder
 from lalaloc_core.training import losses
 from lalaloc_core.training.config import ImageStageConfig, TrainConfig
 from lalaloc_core.training.panoramas import PanoramaBatches
-from lalaloc_core.training.stages import LayoutEncoder, build_image_encoder
+from lalaloc_core.training.stages import build_image_encoder
 from lalaloc_core.training.stream import Batch, loader
 
 

@@ -9,12 +9,13 @@ import torch
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.export import export_bundle
+from lalaloc_core.nets import LayoutEncoder
 from lalaloc_core.training.checkpoint import Checkpoint
 from lalaloc_core.training.config import TrainConfig
 from lalaloc_core.training.image_stage import ImageStage
 from lalaloc_core.training.layout_stage import LayoutStage
 from lalaloc_core.training.loop import run_stage
-from lalaloc_core.training.stages import LayoutEncoder, build_image_encoder, build_layout_encoder
+from lalaloc_core.training.stages import build_image_encoder, build_layout_encoder
 from lalaloc_core.training.validate import ImageValidation, LayoutValidation
 
 
@@ -58,7 +59,7 @@ def load_layout_encoder_of(folder: Path) -> LayoutEncoder:
     return encoder
 
 
-def export_run(folder: Path, out: Path, *, version: str, notes: dict[str, Any] | None = None) -> Bundle:
+def export_run(folder: Path, out: Path, *, name: str, version: str, notes: dict[str, Any] | None = None) -> Bundle:
     """Export what both stages left in `folder` to a bundle at `out`.
 
     Raises:
@@ -80,5 +81,11 @@ def export_run(folder: Path, out: Path, *, version: str, notes: dict[str, Any] |
         **(notes or {}),
     }
     return export_bundle(
-        out, image.config, load_layout_encoder_of(folder), image_encoder, version=version, training=training
+        out,
+        image.config,
+        load_layout_encoder_of(folder),
+        image_encoder,
+        name=name,
+        version=version,
+        training=training,
     )

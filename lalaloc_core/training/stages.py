@@ -8,13 +8,11 @@ from typing import Protocol, runtime_checkable
 import torch
 from torch import Tensor, nn
 
+from lalaloc_core.nets import ImageEncoder, LayoutEncoder
 from lalaloc_core.nets.resnet import PaperImageEncoder, PaperLayoutEncoder
 from lalaloc_core.nets.ring import RingImageEncoder, RingLayoutEncoder
 from lalaloc_core.training.config import ImageStageConfig, LayoutStageConfig, OptimiserConfig, TrainConfig
 from lalaloc_core.training.stream import Batch
-
-LayoutEncoder = RingLayoutEncoder | PaperLayoutEncoder
-ImageEncoder = RingImageEncoder | PaperImageEncoder
 
 
 @runtime_checkable

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from lalaloc_core.metrics import Accuracy
+from lalaloc_core.nets import LayoutEncoder
 from lalaloc_core.nets.resnet import PaperImageEncoder
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.sampling import PoseSet, pose_grid, random_poses
@@ -20,7 +21,6 @@ from lalaloc_core.synth.materials import MaterialLibrary
 from lalaloc_core.synth.panorama import PanoramaRenderer, Shot, sample_shots
 from lalaloc_core.synth.plans import Home
 from lalaloc_core.training.config import TrainConfig
-from lalaloc_core.training.stages import LayoutEncoder
 from lalaloc_core.training.stream import VALIDATION, home_of
 
 _HOMES = 25
@@ -35,7 +35,10 @@ class LayoutValidation:
     def __init__(self, config: TrainConfig, device: torch.device) -> None:
         self.columns = config.profile_columns
         self.device = device
-        self.homes = [home_of(VALIDATION, config.seed, index) for index in range(_HOMES)]
+        self.queries: list[tuple[Home, PoseSet]] = []
+        for index in range(_HOMES):
+            home, rng = home_of(VALIDATION, config.seed, index)
+            self.queries.append((home, random_poses(home.plan, _SHOTS_PER_HOME, rng)))
 
     @torch.no_grad()
     def __call__(self, modules: dict[str, nn.Module]) -> dict[str, float]:
@@ -43,8 +46,7 @@ class LayoutValidation:
         training = encoder.training
         encoder.eval()
         errors, oracle, latents = [], [], []
-        for home, rng in self.homes:
-            queries = random_poses(home.plan, _SHOTS_PER_HOME, np.random.default_rng(rng.bit_generator.seed_seq))
+        for home, queries in self.queries:
             camera = float(home.plan.camera_height_m)
             grid = pose_grid(home.plan, _GRID_STEP_M)
             grid_latents = embed_poses(encoder, home, grid, camera, self.columns, self.device)

@@ -17,7 +17,7 @@ async function call(path, options) {
 async function listPlans(chosen) {
   const { floorplans } = await call("/floorplans?limit=500");
   element("plans").replaceChildren(...floorplans.map((plan) =>
-    new Option(`${plan.name} (${plan.rooms} rooms, ${plan.area_m2} m², ${plan.status})`, plan.id)));
+    new Option(`${plan.name} (${plan.rooms} rooms, ${plan.area_m2.toFixed(1)} m², ${plan.status})`, plan.id)));
   if (chosen) element("plans").value = chosen;
   showPreview();
 }
