@@ -6,11 +6,16 @@ Shares no formula with `render.profile` and `render.depth`. Needs the extra `ray
 from __future__ import annotations
 
 import numpy as np
+import trimesh
 from jaxtyping import Float
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from lalaloc_core.floorplan import Room
-from lalaloc_core.render.mesh import room_mesh
+
+
+def room_mesh(room: Room) -> trimesh.Trimesh:
+    """The closed surface of one room: its polygon extruded from the floor (z = 0) to its ceiling, metres."""
+    return trimesh.creation.extrude_polygon(room.shape, room.ceiling_height_m)
 
 
 def oracle_depth(

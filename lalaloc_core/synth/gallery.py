@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 import numpy as np
@@ -31,18 +30,3 @@ def contact_sheet(path: Path, rng: np.random.Generator, textures: Path | None = 
     pictures = renderer.render(shots).numpy()
     rows = pictures.reshape(_ROWS, _COLUMNS, height, 2 * height, 3).swapaxes(1, 2)
     Image.fromarray(rows.reshape(_ROWS * height, _COLUMNS * 2 * height, 3)).save(path, quality=85)
-
-
-def main(arguments: list[str] | None = None) -> None:
-    """`python -m lalaloc_core.synth.gallery SHEET [--seed N] [--textures FOLDER] [--height PIXELS]`."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("path", type=Path, help="where to write the sheet")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--textures", type=Path, help="folder of pictures: <category>/<material>/*.jpg")
-    parser.add_argument("--height", type=int, default=256, help="rows of one panorama")
-    options = parser.parse_args(arguments)
-    contact_sheet(options.path, np.random.default_rng(options.seed), options.textures, height=options.height)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,0 +1,57 @@
+"""Fixtures of the core's tests: networks small enough to run in milliseconds, and the tiny bundle, opened."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import HealthCheck, settings
+
+from lalaloc_core.bundle import Bundle
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.optimise import LatentPoseOptimiser
+from lalaloc_core.nets.ring import RingConfig, RingLayoutEncoder
+
+# Derandomised: the same commit always gives the same verdict.
+settings.register_profile(
+    "core",
+    deadline=None,
+    derandomize=True,
+    max_examples=50,
+    database=None,
+    suppress_health_check=[HealthCheck.too_slow, HealthCheck.function_scoped_fixture],
+)
+settings.load_profile("core")
+
+
+@pytest.fixture(autouse=True)
+def _same_weights_every_time() -> None:
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+
+
+@pytest.fixture(scope="session")
+def smooth_encoder() -> RingLayoutEncoder:
+    """An untrained layout encoder: a fixed smooth embedding of layouts, which is all that optimisation asks for."""
+    torch.manual_seed(0)
+    config = RingConfig(sectors=64, channels=8, layout_width=16, layout_dilations=(1,))
+    return RingLayoutEncoder(config).eval().requires_grad_(False)
+
+
+@pytest.fixture(scope="session")
+def opened_bundle(tiny_bundle: Path) -> Bundle:
+    """The tiny bundle, its manifest parsed."""
+    return Bundle.open(tiny_bundle)
+
+
+@pytest.fixture(scope="session")
+def encoders(opened_bundle: Bundle) -> Encoders:
+    """The tiny bundle on onnxruntime."""
+    return Encoders(opened_bundle, threads=1)
+
+
+@pytest.fixture(scope="session")
+def optimiser(opened_bundle: Bundle) -> LatentPoseOptimiser:
+    """Latent pose optimisation with the tiny bundle."""
+    return LatentPoseOptimiser.from_bundle(opened_bundle)

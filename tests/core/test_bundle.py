@@ -1,0 +1,225 @@
+"""Bundles: what is exported answers as torch does, and nothing altered or unknown is read."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+import torch
+
+from lalaloc_core import export
+from lalaloc_core.bundle import (
+    HEAD_ONNX,
+    IMAGE_ONNX,
+    IMAGE_WEIGHTS,
+    LAYOUT_ONNX,
+    LAYOUT_WEIGHTS,
+    MANIFEST_NAME,
+    Bundle,
+    ConfidenceModel,
+    Manifest,
+    write_manifest,
+)
+from lalaloc_core.errors import BundleError, ExportError
+from lalaloc_core.export import PARITY_TOLERANCE, export_bundle
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.optimise import LatentPoseOptimiser
+from lalaloc_core.training.config import PRESETS, TrainConfig
+from lalaloc_core.training.stages import build_image_encoder, build_layout_encoder
+from tests.core.test_training import small_paper
+from tests.strategies import crooked_flat, scene_of
+
+TINY = PRESETS["tiny"]
+
+
+def exported(folder: Path, config: TrainConfig) -> Bundle:
+    """A bundle of untrained networks."""
+    return export_bundle(
+        folder, config, build_layout_encoder(config), build_image_encoder(config), name="small", version="7"
+    )
+
+
+@pytest.fixture
+def copied(tiny_bundle: Path, tmp_path: Path) -> Path:
+    """A copy of the tiny bundle that a test may damage."""
+    return Path(shutil.copytree(tiny_bundle, tmp_path / "copy"))
+
+
+def edit_manifest(folder: Path, **changes: Any) -> None:
+    path = folder / MANIFEST_NAME
+    path.write_text(json.dumps({**json.loads(path.read_text(encoding="utf-8")), **changes}), encoding="utf-8")
+
+
+class TestExport:
+    def test_a_bundle_says_what_it_is_and_holds_what_it_says(self, opened_bundle: Bundle) -> None:
+        manifest = opened_bundle.manifest
+        assert (manifest.name, manifest.version, manifest.architecture) == ("tiny", "test", "ring")
+        assert (manifest.image_height, manifest.image_width, manifest.profile_columns) == (32, 64, 32)
+        assert (manifest.latent_size, manifest.ring_sectors) == (128, 16)
+        assert set(manifest.files) == {LAYOUT_ONNX, IMAGE_ONNX, HEAD_ONNX, LAYOUT_WEIGHTS, IMAGE_WEIGHTS}
+        for name, entry in manifest.files.items():
+            assert len(opened_bundle.read(name)) == entry.bytes
+        assert manifest.training["parity_max_abs_difference"] < PARITY_TOLERANCE == 1e-4
+        assert TrainConfig.from_dict(manifest.training["config"]) == TINY
+        assert manifest.training["layout"]["steps"] == TINY.layout.steps
+
+    def test_onnx_and_torch_agree_on_the_latents_of_layouts(
+        self, opened_bundle: Bundle, encoders: Encoders, optimiser: LatentPoseOptimiser
+    ) -> None:
+        # More than one batch of the session, so that no dimension is baked in.
+        scene = scene_of(crooked_flat(), 300, 0)
+        latents = encoders.poses(scene.plan, scene.poses, scene.heading, 1.5)
+        assert latents.shape == (300, opened_bundle.manifest.latent_size)
+        np.testing.assert_allclose(np.linalg.norm(latents, axis=1), 1.0, atol=1e-5)
+        profile = torch.empty(300, 32).uniform_(0.3, 8.0)
+        heights = (torch.full((300,), 1.4), torch.full((300,), 2.6))
+        expected = optimiser.encoder(profile, *heights).numpy()
+        actual = encoders.layouts(profile.numpy(), *(height.numpy() for height in heights))
+        np.testing.assert_allclose(actual, expected, atol=1e-4)
+
+    def test_no_layouts_give_no_latents(self, encoders: Encoders) -> None:
+        assert encoders.layouts(np.empty((0, 32)), np.empty(0), np.empty(0)).shape == (0, 128)
+
+    def test_the_exported_files_do_not_name_the_machine_they_were_made_on(self, tiny_bundle: Path) -> None:
+        for path in tiny_bundle.iterdir():
+            content = path.read_bytes()
+            assert b"site-packages" not in content, path.name
+            assert b"/lalaloc_core/" not in content, path.name
+
+    def test_large_weights_are_stored_in_half_precision(self, opened_bundle: Bundle) -> None:
+        model = onnx.load_from_string(opened_bundle.read(LAYOUT_ONNX))
+        large = [t for t in model.graph.initializer if np.prod(t.dims) >= 1024]
+        assert large
+        assert {t.data_type for t in large} == {onnx.TensorProto.FLOAT16}
+
+    def test_a_network_that_disagrees_is_not_exported(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(export, "PARITY_TOLERANCE", 0.0)
+        with pytest.raises(ExportError, match="differs from torch"):
+            exported(tmp_path / "bundle", TINY)
+        assert not (tmp_path / "bundle").exists()
+
+    def test_the_paper_s_architecture_exports_and_answers(self, tmp_path: Path) -> None:
+        config = small_paper()
+        bundle = exported(tmp_path, config)
+        assert (bundle.manifest.architecture, bundle.manifest.ring_sectors) == ("paper", 0)
+        assert HEAD_ONNX not in bundle.manifest.files
+        encoders, optimiser = Encoders(bundle, threads=1), LatentPoseOptimiser.from_bundle(bundle)
+        image = np.random.default_rng(0).integers(0, 256, (64, 128, 3), dtype=np.uint8)
+        known = encoders.query(image, 0.0, 1.5)
+        assert known.latents.shape == (1, 128)
+        # Turned by an eighth, the hypothesis of an eighth sees the picture it was.
+        unknown = encoders.query(np.roll(image, -16, axis=1), None, 1.5)
+        eighth = int(np.abs(unknown.roll - np.pi / 4).argmin())
+        np.testing.assert_allclose(unknown.latents[eighth], known.latents[0], atol=1e-5)
+        scene = scene_of(crooked_flat(), 2, 0)
+        profile = torch.empty(2, 64).uniform_(0.5, 5.0)
+        heights = (torch.full((2,), 1.5), torch.full((2,), 2.5))
+        np.testing.assert_allclose(
+            encoders.layouts(profile.numpy(), *(h.numpy() for h in heights)),
+            optimiser.encoder(profile, *heights).numpy(),
+            atol=1e-4,
+        )
+        assert encoders.poses(scene.plan, scene.poses, scene.heading, 1.5).shape == (2, 128)
+
+
+class TestReading:
+    @pytest.mark.parametrize("name", [LAYOUT_ONNX, IMAGE_ONNX, HEAD_ONNX])
+    def test_an_altered_network_is_not_loaded(self, copied: Path, name: str) -> None:
+        content = bytearray((copied / name).read_bytes())
+        content[len(content) // 2] ^= 1
+        (copied / name).write_bytes(content)
+        with pytest.raises(BundleError, match=f"{name}.*SHA-256"):
+            Encoders(Bundle.open(copied))
+
+    def test_altered_weights_are_not_loaded(self, copied: Path) -> None:
+        (copied / LAYOUT_WEIGHTS).write_bytes(b"")
+        with pytest.raises(BundleError, match="SHA-256"):
+            LatentPoseOptimiser.from_bundle(Bundle.open(copied))
+
+    def test_a_missing_file_is_named(self, copied: Path) -> None:
+        (copied / IMAGE_ONNX).unlink()
+        with pytest.raises(BundleError, match=IMAGE_ONNX):
+            Encoders(Bundle.open(copied))
+
+    @pytest.mark.parametrize("name", ["other.onnx", "../manifest.json", MANIFEST_NAME])
+    def test_only_listed_files_are_read(self, opened_bundle: Bundle, name: str) -> None:
+        with pytest.raises(BundleError, match="lists no file"):
+            opened_bundle.read(name)
+
+    def test_a_folder_without_a_bundle_is_named(self, tmp_path: Path) -> None:
+        with pytest.raises(BundleError, match="no model bundle at"):
+            Bundle.open(tmp_path / "nothing")
+
+    @pytest.mark.parametrize(
+        "changes",
+        [
+            {"colour": "blue"},
+            {"format_version": 2},
+            {"format_version": None},
+            {"files": []},
+            {"files": {"head.onnx": {"bytes": 1}}},
+            {"files": {"head.onnx": {"bytes": 1, "sha256": "", "md5": ""}}},
+            {"confidence": {"bias": 1.0}},
+            {"confidence": "high"},
+        ],
+    )
+    def test_a_manifest_with_anything_unknown_or_missing_is_refused(self, copied: Path, changes: dict) -> None:
+        edit_manifest(copied, **changes)
+        with pytest.raises(BundleError):
+            Bundle.open(copied)
+
+    @pytest.mark.parametrize("text", ["", "{", "[]", "null", "3"])
+    def test_a_manifest_that_is_no_object_is_refused(self, text: str) -> None:
+        with pytest.raises(BundleError):
+            Manifest.from_json(text)
+
+    def test_a_manifest_without_a_required_key_is_refused(self, opened_bundle: Bundle) -> None:
+        raw = json.loads(opened_bundle.manifest.to_json())
+        del raw["latent_size"]
+        with pytest.raises(BundleError, match="latent_size"):
+            Manifest.from_json(json.dumps(raw))
+
+    def test_a_manifest_survives_its_own_text(self, opened_bundle: Bundle) -> None:
+        confidence = ConfidenceModel(bias=1.0, distance=-2.0, margin=3.0, no_rival_margin=0.4)
+        manifest = dataclasses.replace(opened_bundle.manifest, confidence=confidence)
+        assert Manifest.from_json(manifest.to_json()) == manifest
+
+
+class TestIdentity:
+    def test_scores_and_names_do_not_change_the_identity_of_a_model(self, copied: Path) -> None:
+        before = Bundle.open(copied)
+        scored = dataclasses.replace(before.manifest, name="other", metrics={"within_1m": 0.5})
+        after = write_manifest(copied, scored)
+        assert after.sha256 == before.sha256 == Bundle.open(copied).sha256
+
+    def test_other_weights_are_another_model(self, copied: Path) -> None:
+        before = Bundle.open(copied)
+        (copied / HEAD_ONNX).write_bytes(b"other")
+        assert write_manifest(copied, before.manifest).sha256 != before.sha256
+
+    def test_exporting_over_a_bundle_replaces_it(self, copied: Path, opened_bundle: Bundle) -> None:
+        replaced = exported(copied, TINY)
+        assert replaced.sha256 != opened_bundle.sha256
+        assert Bundle.open(copied).sha256 == replaced.sha256
+        Encoders(replaced)
+
+
+class TestConfidence:
+    model = ConfidenceModel(bias=1.0, distance=-4.0, margin=2.0, no_rival_margin=0.5)
+
+    def test_it_is_the_documented_formula(self) -> None:
+        logit = 1.0 - 4.0 * 0.3 + 2.0 * 0.2
+        assert self.model.probability([0.3, 0.5, 0.6]) == pytest.approx(1.0 / (1.0 + np.exp(-logit)))
+
+    def test_no_rival_counts_as_a_distant_one(self) -> None:
+        assert self.model.probability([0.3]) == self.model.probability([0.3, 0.8]) == self.model.probability([0.3, 1.9])
+
+    @pytest.mark.parametrize("distance", [0.0, 1e9, -1e9])
+    def test_it_stays_a_probability(self, distance: float) -> None:
+        assert 0.0 <= self.model.probability([distance]) <= 1.0

@@ -1,0 +1,109 @@
+"""Training configuration: it survives plain data, and refuses what it does not know."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from typing import Any
+
+import pytest
+
+from lalaloc_core.errors import ConfigError
+from lalaloc_core.training.config import PRESETS, OptimiserConfig, TrainConfig
+from lalaloc_core.training.loop import learning_rate
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_configuration_survives_plain_data_and_json(name: str) -> None:
+    config = PRESETS[name]
+    assert TrainConfig.from_dict(config.to_dict()) == config
+    assert TrainConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
+    assert config.name == name
+
+
+def test_minutes_survive_as_number_and_as_none() -> None:
+    config = PRESETS["tiny"]
+    timed = dataclasses.replace(config, image=dataclasses.replace(config.image, minutes=2.5))
+    assert TrainConfig.from_dict(timed.to_dict()).image.minutes == 2.5
+    assert TrainConfig.from_dict(config.to_dict()).image.minutes is None
+
+
+def test_whole_numbers_are_fine_where_a_float_is_wanted() -> None:
+    raw = PRESETS["tiny"].to_dict()
+    raw["image"]["minutes"] = 3
+    raw["layout"]["optimiser"]["learning_rate"] = 1
+    config = TrainConfig.from_dict(raw)
+    assert isinstance(config.image.minutes, float)
+    assert isinstance(config.layout.optimiser.learning_rate, float)
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        (["lerning_rate"], 1.0, "config has no key 'lerning_rate'"),
+        (["layout", "optimiser", "lr"], 1.0, r"config\.layout\.optimiser has no key 'lr'"),
+        (["architecture"], "transformer", r"config\.architecture is 'transformer'"),
+        (["seed"], 1.5, r"config\.seed is 1\.5"),
+        (["seed"], True, r"config\.seed is True"),
+        (["seed"], None, r"config\.seed is None"),
+        (["layout", "all_pairs"], 1, r"config\.layout\.all_pairs is 1"),
+        (["layout", "decode_weight"], "0.3", r"config\.layout\.decode_weight is '0\.3'"),
+        (["layout", "decode_weight"], False, r"config\.layout\.decode_weight is False"),
+        (["layout", "minutes"], "long", r"config\.layout\.minutes is 'long'"),
+        (["layout"], [], r"config\.layout must be a mapping"),
+        (["ring", "image_widths"], 3, r"config\.ring\.image_widths is 3"),
+        (["ring", "image_widths"], [8, "x"], r"config\.ring\.image_widths is 'x'"),
+        (["layout", "triplets", "positives"], 1.5, r"config\.layout\.triplets\.positives"),
+    ],
+)
+def test_what_is_unknown_or_of_a_wrong_type_is_refused_by_its_path(path: list[str], value: Any, message: str) -> None:
+    raw = PRESETS["tiny"].to_dict()
+    inner = raw
+    for key in path[:-1]:
+        inner = inner[key]
+    inner[path[-1]] = value
+    with pytest.raises(ConfigError, match=message):
+        TrainConfig.from_dict(raw)
+
+
+def test_a_missing_key_without_default_is_refused() -> None:
+    with pytest.raises(ConfigError, match="name"):
+        TrainConfig.from_dict({"seed": 1})
+
+
+def test_a_configuration_cannot_be_changed() -> None:
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        PRESETS["tiny"].seed = 1  # type: ignore[misc]
+
+
+def test_the_paper_preset_says_what_the_paper_says() -> None:
+    config = PRESETS["paper"]
+    assert (config.paper.layout_depth, config.paper.image_depth, config.paper.latent_size) == (18, 50, 128)
+    assert (config.layout.triplets.positives, config.layout.triplets.negatives) == (1, 20)
+    assert (config.layout.triplets.positive_radius_m, config.layout.triplets.negative_radius_m) == (0.5, 2.0)
+    assert not config.layout.all_pairs
+    assert config.layout.optimiser.kind == config.image.optimiser.kind == "sgd"
+
+
+def test_sizes_follow_the_architecture() -> None:
+    config = PRESETS["tiny"]
+    paper = dataclasses.replace(config, architecture="paper")
+    assert (config.profile_columns, config.image_size) == (32, (32, 64))
+    assert (paper.profile_columns, paper.image_size) == (256, (256, 512))
+
+
+class TestLearningRate:
+    def test_cosine_warms_up_then_falls_to_a_hundredth(self) -> None:
+        config = OptimiserConfig(learning_rate=1.0, warmup=0.1)
+        rates = [learning_rate(config, step / 200) for step in range(201)]
+        assert rates[0] == pytest.approx(0.05)
+        assert rates[:20] == sorted(rates[:20])
+        assert rates[20:] == sorted(rates[20:], reverse=True)
+        assert max(rates) == pytest.approx(1.0, abs=0.03)
+        assert rates[100] == pytest.approx(0.505)
+        assert rates[-1] == pytest.approx(0.01)
+
+    def test_steps_fall_by_gamma_at_each_milestone(self) -> None:
+        config = OptimiserConfig(learning_rate=0.1, schedule="steps", warmup=0.0, milestones=(0.5, 0.75), gamma=0.1)
+        rates = [learning_rate(config, progress) for progress in (0.0, 0.49, 0.5, 0.74, 0.75, 1.0)]
+        assert rates == pytest.approx([0.1, 0.1, 0.01, 0.01, 0.001, 0.001])

@@ -1,0 +1,267 @@
+"""Floor plans: what is accepted, what is refused and how the refusal reads."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lalaloc_core.errors import InvalidFloorPlanError, InvalidInputError
+from lalaloc_core.floorplan import FloorPlan, PlanLimits, Room, pad_walls
+from tests.strategies import plan_document, plan_of, plans, rectangle, room_polygons
+
+EXAMPLE = {
+    "name": "Flat 3",
+    "ceiling_height_m": 2.5,
+    "camera_height_m": 1.5,
+    "rooms": [{"name": "kitchen", "polygon": [[0, 0], [4, 0], [4, 3], [0, 3]], "ceiling_height_m": 2.4}],
+}
+
+
+def refused(document: Any, limits: PlanLimits | None = None) -> InvalidFloorPlanError:
+    with pytest.raises(InvalidFloorPlanError) as caught:
+        FloorPlan.from_dict(document, limits or PlanLimits())
+    return caught.value
+
+
+def with_polygon(polygon: Any) -> dict[str, Any]:
+    return plan_document(rectangle(2.0, 2.0, at=(50.0, 0.0)), polygon)
+
+
+def test_the_native_format_is_read_as_documented() -> None:
+    plan = FloorPlan.from_json(json.dumps(EXAMPLE))
+    assert (plan.name, plan.camera_height_m, plan.warnings) == ("Flat 3", 1.5, ())
+    assert plan.rooms[0].name == "kitchen"
+    assert plan.rooms[0].ceiling_height_m == 2.4
+    assert plan.area_m2 == pytest.approx(12.0)
+    assert plan.bounds_m == (0.0, 0.0, 4.0, 3.0)
+
+
+@given(plans())
+def test_writing_a_plan_and_reading_it_again_changes_nothing(plan: FloorPlan) -> None:
+    again = FloorPlan.from_json(json.dumps(plan.to_dict()))
+    assert again.to_dict() == plan.to_dict()
+    assert again.warnings == plan.warnings
+    np.testing.assert_array_equal(again.walls_m, plan.walls_m)
+
+
+@given(room_polygons(), st.integers(0, 20), st.booleans())
+def test_any_vertex_order_is_the_same_room(polygon: list[list[float]], start: int, clockwise: bool) -> None:
+    start %= len(polygon)
+    turned = polygon[start:] + polygon[:start]
+    room = plan_of(turned[::-1] if clockwise else turned).rooms[0]
+    assert room.shape.exterior.is_ccw
+    assert room.shape.normalize().equals_exact(plan_of(polygon).rooms[0].shape.normalize(), 1e-12)
+
+
+def test_closing_and_repeated_vertices_are_dropped() -> None:
+    clean = rectangle(3.0, 2.0)
+    repeated = [clean[0], clean[0], clean[1], clean[2], clean[2], clean[2], clean[3], clean[0]]
+    assert plan_of(repeated).rooms[0].polygon_m.tolist() == plan_of(clean).rooms[0].polygon_m.tolist()
+
+
+def test_a_room_without_a_name_is_called_by_its_number() -> None:
+    document = plan_document(rectangle(2.0, 2.0))
+    del document["rooms"][0]["name"]
+    assert FloorPlan.from_dict(document).rooms[0].name == "room 1"
+
+
+@pytest.mark.parametrize(
+    ("polygon", "reason"),
+    [
+        ([[0, 0], [2, 2], [2, 0], [0, 2]], "crosses itself"),
+        ([[0, 0], [4, 0], [4, 4], [2, 4], [2, 0], [1, 0], [1, 4], [0, 4]], "crosses itself"),
+        (rectangle(0.4, 0.4), "0.2 m²"),
+        ([[0, 0], [1, 0], [2, 0]], "crosses itself"),
+        ([[0, 0], [0, 0], [1, 0], [0, 0]], "distinct"),
+        ([[0, 0], [1, 1]], "at least three"),
+        ([[0, 0], [3, 0], [3, math.nan]], "finite"),
+        ([[0, 0], [3, 0], [math.inf, 3]], "finite"),
+        ([[0, 0], [3, 0], [3, 10**400]], "finite"),
+        ([[0, 0], [3, 0], [3, 1e12]], "finite"),
+        ([[0, 0], [3, 0], [3, "3"]], "two numbers"),
+        ([[0, 0], [3, 0], [3, True]], "two numbers"),
+        ([[0, 0], [3, 0], [3, 3, 3]], "two numbers"),
+        ([[0, 0], [3, 0], None], "two numbers"),
+        ("polygon", "list"),
+        (None, "list"),
+        ({"x": 1}, "list"),
+    ],
+)
+def test_a_bad_polygon_is_refused_by_the_name_of_its_room(polygon: Any, reason: str) -> None:
+    error = refused(with_polygon(polygon))
+    assert error.room == "room 2"
+    assert reason in error.reason
+    assert "room 2" in str(error)
+    assert isinstance(error, InvalidInputError)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"rooms": []}, "at least one room"),
+        ({"rooms": "kitchen"}, "at least one room"),
+        ({"rooms": None}, "at least one room"),
+        ({"storeys": 2}, "unknown key 'storeys'"),
+        ({"name": ""}, "non-empty"),
+        ({"name": 3}, "non-empty"),
+        ({"name": "x" * 201}, "201 characters"),
+        ({"name": "flat\x00"}, "control"),
+        ({"name": "\ud800"}, "surrogate"),
+        ({"ceiling_height_m": "high"}, "number"),
+        ({"ceiling_height_m": 25.0}, "between 1 and 20"),
+        ({"camera_height_m": 0}, "above 0"),
+        ({"camera_height_m": -1.5}, "above 0"),
+        ({"camera_height_m": math.nan}, "finite"),
+        ({"camera_height_m": 10**400}, "finite"),
+        ({"camera_height_m": "1.5"}, "number"),
+        ({"camera_height_m": True}, "number"),
+        ({"camera_height_m": 2.5}, "below the lowest ceiling"),
+    ],
+)
+def test_a_bad_plan_is_refused_with_the_reason(change: dict[str, Any], reason: str) -> None:
+    document = plan_document(rectangle(3.0, 3.0))
+    document["rooms"][0]["ceiling_height_m"] = 2.5
+    error = refused({**document, **change})
+    assert error.room is None
+    assert reason in str(error)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"ceiling_height_m": 0.5}, "between 1 and 20"),
+        ({"ceiling_height_m": 2500}, "between 1 and 20"),
+        ({"ceiling_height_m": math.inf}, "finite"),
+        ({"ceiling_height_m": "high"}, "number"),
+        ({"floor": "parquet"}, "unknown key 'floor'"),
+    ],
+)
+def test_a_bad_room_is_refused_by_its_name(change: dict[str, Any], reason: str) -> None:
+    document = plan_document(rectangle(3.0, 3.0))
+    document["rooms"][0].update(change)
+    error = refused(document)
+    assert error.room == "room 1"
+    assert reason in error.reason
+
+
+@pytest.mark.parametrize("room", [None, 3, "kitchen", [[0, 0], [1, 0], [1, 1]]])
+def test_a_room_that_is_no_object_is_refused_by_its_number(room: Any) -> None:
+    document = plan_document(rectangle(3.0, 3.0))
+    document["rooms"].append(room)
+    assert refused(document).room == "room 2"
+
+
+def test_a_room_needs_a_ceiling_from_somewhere() -> None:
+    document = plan_document(rectangle(3.0, 3.0))
+    del document["ceiling_height_m"]
+    assert refused(document).room == "room 1"
+
+
+def test_the_camera_must_lie_below_the_lowest_ceiling_not_the_first() -> None:
+    document = plan_document(rectangle(3.0, 3.0), rectangle(3.0, 3.0, at=(4.0, 0.0)), camera_height_m=2.2)
+    FloorPlan.from_dict(document)
+    document["rooms"][1]["ceiling_height_m"] = 2.1
+    assert "2.1 m" in str(refused(document))
+
+
+def test_limits_hold_at_the_limit_and_not_beyond() -> None:
+    limits = PlanLimits(max_rooms=2, max_vertices_per_room=5)
+    square = rectangle(1.0, 1.0)
+    apart = [rectangle(1.0, 1.0, at=(2.0 * index, 0.0)) for index in range(3)]
+    assert len(FloorPlan.from_dict(plan_document(*apart[:2]), limits).rooms) == 2
+    assert "3 rooms, at most 2" in str(refused(plan_document(*apart), limits))
+    assert len(FloorPlan.from_dict(plan_document([*square, [-0.5, 0.5]]), limits).rooms) == 1
+    error = refused(plan_document([*square, [-0.5, 0.5], [-0.4, 0.2]]), limits)
+    assert (error.room, "6 vertices, at most 5" in error.reason) == ("room 1", True)
+
+
+def test_millimetres_given_as_metres_are_noticed() -> None:
+    assert "metres" in str(refused(plan_document(rectangle(4200.0, 3100.0))))
+
+
+def test_a_plan_far_from_the_origin_is_fine() -> None:
+    assert plan_of(rectangle(4.0, 3.0, at=(4.5e5, 5.4e6))).area_m2 == pytest.approx(12.0)
+
+
+def test_overlapping_rooms_are_a_warning_and_touching_ones_are_not() -> None:
+    touching = plan_of(rectangle(2.0, 2.0), rectangle(2.0, 2.0, at=(2.0, 0.0)))
+    overlapping = plan_of(rectangle(2.0, 2.0), rectangle(2.0, 2.0, at=(1.5, 0.0)))
+    assert touching.warnings == ()
+    assert overlapping.warnings == ("rooms 'room 1' and 'room 2' overlap by 1.00 m²",)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[1, 2", b"\xff\xfe\x00", "nothing", "[" * 100_000])
+def test_text_that_is_not_json_is_refused(text: str | bytes) -> None:
+    with pytest.raises(InvalidFloorPlanError, match="not valid JSON"):
+        FloorPlan.from_json(text)
+
+
+@pytest.mark.parametrize("text", ["3", "null", "[]", '"plan"'])
+def test_json_that_is_no_object_is_refused(text: str) -> None:
+    with pytest.raises(InvalidFloorPlanError, match="must be an object"):
+        FloorPlan.from_json(text)
+
+
+_json = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
+    lambda children: st.lists(children, max_size=4) | st.dictionaries(st.text(max_size=5), children, max_size=3),
+    max_leaves=8,
+)
+
+
+@given(st.sampled_from(["name", "rooms", "ceiling_height_m", "camera_height_m", "polygon", "vertex"]), _json)
+def test_whatever_stands_in_the_document_the_only_error_is_the_named_one(key: str, value: Any) -> None:
+    document = plan_document(rectangle(3.0, 3.0))
+    if key == "polygon":
+        document["rooms"][0]["polygon"] = value
+    elif key == "vertex":
+        document["rooms"][0]["polygon"][2] = value
+    else:
+        document[key] = value
+    with contextlib.suppress(InvalidFloorPlanError):
+        assert FloorPlan.from_dict(document).area_m2 > 0.0
+
+
+def test_a_plan_cannot_be_changed_after_it_was_validated() -> None:
+    plan = plan_of(rectangle(3.0, 2.0), [[4, 0], [6, 0], [5, 2]])
+    for array in (plan.rooms[0].polygon_m, plan.rooms[0].walls_m, plan.walls_m, plan.ceiling_heights_m):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 0.0
+    with pytest.raises(AttributeError):
+        plan.name = "other"  # type: ignore[misc]
+    with pytest.raises(AttributeError):
+        plan.rooms[0].name = "other"  # type: ignore[misc]
+
+
+@given(room_polygons())
+def test_walls_close_the_polygon(polygon: list[list[float]]) -> None:
+    room = plan_of(polygon).rooms[0]
+    np.testing.assert_array_equal(room.walls_m[:, :2], room.polygon_m)
+    np.testing.assert_array_equal(room.walls_m[:, 2:], np.roll(room.polygon_m, -1, axis=0))
+
+
+def test_padding_repeats_the_first_wall() -> None:
+    walls = plan_of(rectangle(3.0, 2.0)).rooms[0].walls_m
+    padded = pad_walls(walls, 6)
+    np.testing.assert_array_equal(padded[:4], walls)
+    np.testing.assert_array_equal(padded[4:], walls[[0, 0]])
+
+
+def test_positions_are_given_to_the_first_room_that_holds_them() -> None:
+    plan = plan_of(rectangle(2.0, 2.0), rectangle(2.0, 2.0, at=(1.0, 0.0)), rectangle(2.0, 2.0, at=(5.0, 0.0)))
+    positions = np.array([[0.5, 1.0], [1.5, 1.0], [2.5, 1.0], [4.0, 1.0], [6.0, 1.0], [np.nan, 0.0]])
+    assert plan.room_index_at(positions).tolist() == [0, 0, 1, -1, 2, -1]
+
+
+def test_rooms_compare_by_identity_because_arrays_do_not_compare() -> None:
+    first, second = (Room("a", np.zeros((3, 2)), 2.5) for _ in range(2))
+    assert first == first
+    assert first != second
+    assert len({first, second}) == 2

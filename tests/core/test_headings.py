@@ -1,0 +1,188 @@
+"""Signs, end to end: what "turned by a heading" means to the renderer, the encoders and the whole search.
+
+The encoder here is perfect: it reads the layout's wall profile from the pixels of a painted panorama. Whatever is
+then wrong in an answer is a wrong sign or an off-by-one between renderer, roll and search.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lalaloc_core.bundle import Bundle
+from lalaloc_core.conventions import TWO_PI, wrap_angle
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.optimise import LatentPoseOptimiser
+from lalaloc_core.localise.pipeline import localise, panorama_heading
+from lalaloc_core.localise.retrieval import build_grid
+from lalaloc_core.nets.ring import RingImageEncoder, RingLayoutEncoder
+from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.sampling import PoseSet
+from lalaloc_core.training.config import PRESETS
+from tests.strategies import Scene, crooked_flat, scenes
+
+RING = PRESETS["tiny"].ring
+COLUMNS, SECTORS = RING.profile_columns, RING.sectors
+SECTOR = TWO_PI / SECTORS
+CAMERA_M, CEILING_M = 1.5, 2.5
+_UNIT_M = 1e-4
+
+headings = st.floats(-math.pi, 2.0 * math.pi)
+
+
+def paint(profile_m: np.ndarray) -> np.ndarray:
+    """A panorama (4, columns, 3) whose pixels spell the wall profile, in tenths of a millimetre."""
+    value = np.round(profile_m / _UNIT_M).astype(np.int64)
+    return np.repeat(np.stack([value >> 16, value >> 8 & 255, value & 255], axis=-1)[None], 4, axis=0).astype(np.uint8)
+
+
+def photograph(plan: FloorPlan, pose: PoseSet, heading: float) -> np.ndarray:
+    """The painted panorama of a pose."""
+    walls = plan.walls_m[pose.room_index]
+    return paint(wall_profile(pose.position_m, np.array([heading]), walls, COLUMNS)[0])
+
+
+class PaintedSession:
+    """Stands in for the image encoder's session: the layout encoder's ring of the painted profile."""
+
+    def __init__(self, encoder: RingLayoutEncoder) -> None:
+        self.encoder = encoder
+
+    def run(self, outputs: list[str], inputs: dict[str, np.ndarray]) -> list[np.ndarray]:
+        assert outputs == ["ring"]
+        pixels = torch.from_numpy(inputs["image"].astype(np.float32))[:, 0]
+        profile = (pixels[..., 0] * 65536 + pixels[..., 1] * 256 + pixels[..., 2]) * _UNIT_M
+        camera = torch.from_numpy(inputs["camera_height_m"])
+        return [self.encoder.ring(profile, camera, torch.full_like(camera, CEILING_M)).numpy()]
+
+
+@pytest.fixture(scope="module")
+def perfect(opened_bundle: Bundle, optimiser: LatentPoseOptimiser) -> Encoders:
+    encoders = Encoders(opened_bundle, threads=1)
+    assert isinstance(optimiser.encoder, RingLayoutEncoder)
+    painted: Any = PaintedSession(optimiser.encoder)
+    encoders._image = painted
+    return encoders
+
+
+@pytest.fixture(scope="module")
+def flat() -> FloorPlan:
+    return crooked_flat()
+
+
+POSE = PoseSet(np.array([[1.37, 1.12]]), np.array([0]))
+
+
+class TestRolls:
+    @given(scenes(), st.integers(-COLUMNS, COLUMNS))
+    def test_rolling_a_profile_by_its_heading_gives_the_profile_at_heading_zero(self, scene: Scene, shift: int) -> None:
+        def at(heading: float) -> np.ndarray:
+            headings = np.full(len(scene.poses), heading)
+            return wall_profile(scene.poses.position_m, headings, scene.walls_m, COLUMNS)
+
+        rolled = np.roll(at(shift * TWO_PI / COLUMNS), shift, axis=1)
+        assert np.isclose(rolled, at(0.0), rtol=1e-6).mean() > 0.98
+
+    def test_the_layout_ring_rolls_with_the_profile(self, smooth_encoder: RingLayoutEncoder) -> None:
+        profile = torch.empty(3, 128).uniform_(0.5, 6.0, generator=torch.Generator().manual_seed(0))
+        heights = (torch.full((3,), 1.5), torch.full((3,), 2.5))
+        ring = smooth_encoder.ring(profile, *heights)
+        for sectors in (1, 5, 63):
+            rolled = smooth_encoder.ring(profile.roll(2 * sectors, dims=1), *heights)
+            torch.testing.assert_close(rolled, ring.roll(sectors, dims=2), atol=1e-5, rtol=1e-4)
+
+    def test_the_image_ring_and_profile_roll_with_the_panorama(self) -> None:
+        torch.manual_seed(0)
+        encoder = RingImageEncoder(RING).eval().requires_grad_(False)
+        image = torch.randint(0, 256, (2, RING.image_height, RING.image_width, 3))
+        height = torch.tensor([1.2, 1.7])
+        still = encoder(image, height)
+        pixels = RING.image_width // SECTORS
+        for sectors in (1, 7, SECTORS - 1):
+            turned = encoder(image.roll(pixels * sectors, dims=2), height)
+            torch.testing.assert_close(turned.ring, still.ring.roll(sectors, dims=2), atol=1e-4, rtol=1e-3)
+            for name in ("log_profile", "log_scale"):
+                expected = getattr(still, name).roll(COLUMNS // SECTORS * sectors, dims=1)
+                torch.testing.assert_close(getattr(turned, name), expected, atol=1e-4, rtol=1e-3)
+
+
+class TestRealEncoders:
+    """The exported networks themselves: relations that hold whatever the networks have learnt."""
+
+    @given(st.integers(0, SECTORS - 1))
+    @settings(max_examples=SECTORS)
+    def test_the_hypothesis_of_the_true_heading_has_the_latent_of_heading_zero(
+        self, encoders: Encoders, sector: int
+    ) -> None:
+        rng = np.random.default_rng(sector)
+        at_zero = rng.integers(0, 256, (RING.image_height, RING.image_width, 3), dtype=np.uint8)
+        # Looking along a heading h to the right brings what stood right of the centre into it: a roll to the left.
+        turned = np.roll(at_zero, -sector * RING.image_width // SECTORS, axis=1)
+        straight = encoders.query(at_zero, 0.0, CAMERA_M)
+        unknown = encoders.query(turned, None, CAMERA_M)
+        assert len(unknown.latents) == len(unknown.roll) == SECTORS
+        hypothesis = int(np.abs(wrap_angle(unknown.roll - sector * SECTOR)).argmin())
+        assert abs(wrap_angle(unknown.roll[hypothesis] - sector * SECTOR)) < 1e-9
+        np.testing.assert_allclose(unknown.latents[hypothesis], straight.latents[0], atol=1e-4)
+        known = encoders.query(turned, sector * SECTOR, CAMERA_M)
+        np.testing.assert_allclose(known.latents[0], straight.latents[0], atol=1e-4)
+        assert abs(known.frame_heading) < 1e-9
+
+    @given(headings)
+    def test_roll_and_frame_heading_of_a_known_heading_add_up_to_it(self, encoders: Encoders, heading: float) -> None:
+        image = np.zeros((RING.image_height, RING.image_width, 3), np.uint8)
+        query = encoders.query(image, heading, CAMERA_M)
+        assert query.heading_known
+        assert abs(wrap_angle(query.roll[0] + query.frame_heading - heading)) < 1e-9
+        assert abs(query.frame_heading) <= math.pi / RING.image_width + 1e-9
+
+
+class TestPerfectEncoder:
+    @given(headings)
+    @settings(max_examples=30)
+    def test_a_known_heading_gives_the_latent_of_the_layout_at_the_frame_heading(
+        self, perfect: Encoders, flat: FloorPlan, heading: float
+    ) -> None:
+        query = perfect.query(photograph(flat, POSE, heading), heading, CAMERA_M)
+        layout = perfect.poses(flat, POSE, np.array([query.frame_heading]), CAMERA_M)
+        np.testing.assert_allclose(query.latents, layout, atol=2e-3)
+
+    @given(headings)
+    @settings(max_examples=30)
+    def test_an_unknown_heading_has_a_hypothesis_with_the_latent_of_the_layout(
+        self, perfect: Encoders, flat: FloorPlan, heading: float
+    ) -> None:
+        query = perfect.query(photograph(flat, POSE, heading), None, CAMERA_M)
+        rest = wrap_angle(heading - query.roll)
+        nearest = int(np.abs(rest).argmin())
+        assert abs(rest[nearest]) <= SECTOR / 2 + 1e-9
+        layout = perfect.poses(flat, POSE, rest[nearest : nearest + 1], CAMERA_M)
+        np.testing.assert_allclose(query.latents[nearest], layout[0], atol=2e-3)
+
+    @given(heading=headings, known=st.booleans(), place=st.integers(0, 5))
+    @settings(max_examples=24)
+    def test_the_search_finds_the_pose_and_the_heading_it_was_photographed_with(
+        self,
+        perfect: Encoders,
+        optimiser: LatentPoseOptimiser,
+        flat: FloorPlan,
+        heading: float,
+        known: bool,
+        place: int,
+    ) -> None:
+        position = np.array([[1.37, 1.12], [3.21, 1.63], [0.81, 2.35], [5.12, 0.86], [4.23, 5.04], [1.66, 4.71]][place])
+        pose = PoseSet(position[None], flat.room_index_at(position[None]))
+        query = perfect.query(photograph(flat, pose, heading), heading if known else None, CAMERA_M)
+        grid = build_grid(flat, perfect, step_m=0.25, camera_height_m=CAMERA_M)
+        best = localise(flat, grid, perfect, query, refiner=optimiser.refine).candidates[0]
+        assert best.room_index == pose.room_index[0]
+        assert np.hypot(*(best.position_m - position)) < 0.02
+        assert abs(wrap_angle(panorama_heading(query, best) - heading)) < math.radians(1.0)
+        assert -math.pi <= panorama_heading(query, best) <= math.pi

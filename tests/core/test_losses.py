@@ -1,0 +1,159 @@
+"""Losses and distances in closed form, on tensors small enough to check by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lalaloc_core.metrics import Accuracy, chamfer_distance
+from lalaloc_core.training import losses
+from tests.strategies import seeds
+
+
+def distances(seed: int, anchors: int = 3, neighbours: int = 6) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(seed % 2**31)
+    return tuple(torch.empty(anchors, neighbours).uniform_(0.1, 2.0, generator=generator) for _ in range(2))  # type: ignore[return-value]
+
+
+class TestLogRatio:
+    @pytest.mark.parametrize("all_pairs", [True, False])
+    @given(seed=seeds(), scale=st.floats(0.05, 5.0))
+    def test_it_is_zero_where_latent_distance_is_proportional_to_structure(
+        self, all_pairs: bool, seed: int, scale: float
+    ) -> None:
+        chamfer, _ = distances(seed)
+        assert losses.log_ratio(scale * chamfer, chamfer, 2, all_pairs=all_pairs).item() < 1e-5
+
+    @pytest.mark.parametrize("all_pairs", [True, False])
+    @given(seed=seeds(), scale=st.floats(0.5, 5.0))
+    def test_it_does_not_depend_on_the_scale_of_either_distance(self, all_pairs: bool, seed: int, scale: float) -> None:
+        latent, chamfer = distances(seed)
+        expected = losses.log_ratio(latent, chamfer, 2, all_pairs=all_pairs)
+        torch.testing.assert_close(
+            losses.log_ratio(scale * latent, chamfer, 2, all_pairs=all_pairs), expected, rtol=1e-3, atol=1e-4
+        )
+        torch.testing.assert_close(
+            losses.log_ratio(latent, scale * chamfer, 2, all_pairs=all_pairs), expected, rtol=1e-3, atol=1e-4
+        )
+
+    def test_each_positive_is_compared_with_each_negative(self) -> None:
+        latent = torch.tensor([[0.5, 1.0, 2.0]])
+        chamfer = torch.tensor([[0.5, 2.0, 1.0]])
+        # Pairs (0, 1) and (0, 2): log(D0/Dj) - log(Ch0/Chj) = ±log 2.
+        expected = math.log(2.0) ** 2
+        assert losses.log_ratio(latent, chamfer, 1, all_pairs=False).item() == pytest.approx(expected, rel=1e-4)
+
+    def test_all_pairs_also_compares_negatives_with_one_another(self) -> None:
+        latent, chamfer = torch.tensor([[1.0, 1.0, 2.0]]), torch.tensor([[1.0, 1.0, 1.0]])
+        # Of the 9 ordered pairs, the 4 with the last neighbour differ by log 2.
+        expected = 4.0 / 9.0 * math.log(2.0) ** 2
+        assert losses.log_ratio(latent, chamfer, 2, all_pairs=True).item() == pytest.approx(expected, rel=1e-4)
+        order = torch.tensor([2, 0, 1])
+        shuffled = losses.log_ratio(latent[:, order], chamfer[:, order], 1, all_pairs=True)
+        assert shuffled.item() == pytest.approx(expected, rel=1e-4)
+
+    def test_coinciding_latents_give_finite_losses_and_gradients(self) -> None:
+        latent = torch.zeros(1, 3, requires_grad=True)
+        loss = losses.log_ratio(latent, torch.ones(1, 3), 1, all_pairs=True)
+        (loss + losses.log_ratio(latent, torch.tensor([[1.0, 0.0, 2.0]]), 1, all_pairs=False)).backward()
+        assert latent.grad is not None
+        assert bool(torch.isfinite(latent.grad).all())
+
+    def test_its_gradient_pushes_too_near_neighbours_away(self) -> None:
+        latent = torch.tensor([[1.0, 1.0]], requires_grad=True)
+        losses.log_ratio(latent, torch.tensor([[1.0, 3.0]]), 1, all_pairs=False).backward()
+        assert latent.grad is not None
+        assert latent.grad[0, 1] < 0.0 < latent.grad[0, 0]
+
+
+class TestOthers:
+    def test_the_scale_loss_fixes_latent_distance_per_metre(self) -> None:
+        _, chamfer = distances(0)
+        assert losses.distance_scale(0.5 * chamfer, chamfer, 0.5).item() < 1e-6
+        assert losses.distance_scale(chamfer, chamfer, 0.5).item() == pytest.approx(math.log(2.0) ** 2, rel=1e-3)
+        assert losses.distance_scale(0.25 * chamfer, chamfer, 0.5).item() == pytest.approx(math.log(2.0) ** 2, rel=1e-3)
+
+    def test_decode_is_the_mean_absolute_error_in_metres(self) -> None:
+        decoded = torch.tensor([[[1.0, 2.0], [3.0, 4.0]]])
+        assert losses.decode(decoded, decoded + torch.tensor([[[1.0, -1.0], [0.0, 2.0]]])).item() == 1.0
+
+    def test_l2_is_the_distance_not_its_square(self) -> None:
+        first = torch.tensor([[3.0, 0.0], [0.0, 0.0]])
+        second = torch.tensor([[0.0, 4.0], [0.0, 1.0]])
+        assert losses.l2(first, second).item() == 3.0
+
+    def test_ring_distillation_is_in_units_of_each_channel_s_spread(self) -> None:
+        teacher = torch.randn(8, 3, 16, generator=torch.Generator().manual_seed(0))
+        student = teacher + teacher.std(dim=(0, 2), keepdim=True) * torch.tensor([0.5, 1.0, 1.5])[None, :, None]
+        assert losses.ring_distillation(student, teacher).item() == pytest.approx(1.0, rel=1e-4)
+        stretch = torch.tensor([1.0, 10.0, 100.0])[None, :, None]
+        assert losses.ring_distillation(student * stretch, teacher * stretch).item() == pytest.approx(1.0, rel=1e-4)
+
+    @given(st.floats(-3.0, 1.0))
+    def test_the_laplace_likelihood_is_best_at_the_truth_with_the_true_scale(self, log_error: float) -> None:
+        profile = torch.full((1, 4), 3.0)
+        error = math.exp(log_error)
+        log_profile = torch.log(profile) + error
+
+        def loss(log_scale: float, shift: float = 0.0) -> float:
+            return losses.laplace(log_profile + shift, torch.full((1, 4), log_scale), profile).item()
+
+        # Of all scales that of the error itself; of all profiles the true one.
+        assert loss(log_error) < min(loss(log_error - 0.1), loss(log_error + 0.1))
+        assert loss(log_error) == pytest.approx(1.0 + log_error, abs=1e-4)
+        assert loss(log_error, shift=-error) == pytest.approx(log_error, abs=1e-4)
+
+
+class TestChamfer:
+    @given(seeds(), st.integers(1, 12), st.integers(1, 12))
+    def test_it_is_the_brute_force_sum_of_both_directions(self, seed: int, n: int, m: int) -> None:
+        rng = np.random.default_rng(seed)
+        first, second = rng.normal(size=(2, n, 3)), rng.normal(size=(2, m, 3))
+        for k in range(2):
+            pairs = np.array([[np.linalg.norm(a - b) for b in second[k]] for a in first[k]])
+            expected = pairs.min(axis=1).mean() + pairs.min(axis=0).mean()
+            assert chamfer_distance(first, second)[k] == pytest.approx(expected, abs=1e-6)
+
+    @given(seeds())
+    def test_it_is_symmetric_zero_on_itself_and_the_same_in_torch(self, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        first, second = rng.normal(size=(2, 10, 3)), rng.normal(size=(2, 7, 3))
+        distance = chamfer_distance(first, second)
+        np.testing.assert_allclose(chamfer_distance(second, first), distance)
+        np.testing.assert_allclose(chamfer_distance(first, first[:, ::-1].copy()), 0.0, atol=1e-6)
+        in_torch = chamfer_distance(torch.tensor(first), torch.tensor(second))
+        np.testing.assert_allclose(in_torch.numpy(), distance)
+
+
+class TestAccuracy:
+    def test_a_query_without_an_answer_is_a_miss_in_every_figure(self) -> None:
+        nan = float("nan")
+        accuracy = Accuracy.of(np.array([0.005, nan, 0.03, nan, 0.5]))
+        assert accuracy.n == 5
+        assert accuracy.within_1cm == pytest.approx(1 / 5)
+        assert accuracy.within_5cm == accuracy.within_10cm == pytest.approx(2 / 5)
+        assert accuracy.within_1m == pytest.approx(3 / 5)
+        assert accuracy.median_cm == pytest.approx(50.0)
+        assert Accuracy.of(np.array([0.1, nan, nan])).median_cm == math.inf
+
+    def test_shares_are_strictly_below_their_limits(self) -> None:
+        accuracy = Accuracy.of(np.array([0.01, 0.05, 0.10, 1.0]))
+        assert [accuracy.within_1cm, accuracy.within_5cm, accuracy.within_10cm, accuracy.within_1m] == [
+            0.0,
+            0.25,
+            0.5,
+            0.75,
+        ]
+
+    @given(st.lists(st.floats(0.0, 10.0) | st.just(float("nan")), min_size=1, max_size=30))
+    def test_wider_limits_hold_more(self, errors: list[float]) -> None:
+        figures = Accuracy.of(np.array(errors)).to_dict()
+        shares = [figures[f"within_{limit}"] for limit in ("1cm", "5cm", "10cm", "1m")]
+        assert shares == sorted(shares)
+        assert shares[0] >= 0.0
+        assert shares[-1] <= 1.0 - np.mean(np.isnan(errors))

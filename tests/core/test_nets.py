@@ -1,0 +1,167 @@
+"""Networks of both architectures: shapes, names, and what must hold of them before any training."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import safetensors.torch
+import torch
+
+from lalaloc_core.nets import load_layout_encoder
+from lalaloc_core.nets.decoder import LayoutDecoder
+from lalaloc_core.nets.resnet import PaperConfig, PaperImageEncoder, PaperLayoutEncoder, ResNet
+from lalaloc_core.nets.ring import RingConfig, RingImageEncoder, RingLayoutEncoder, pad_around
+from lalaloc_core.training.config import PRESETS
+
+TINY = PRESETS["tiny"].ring
+SMALL_PAPER = PaperConfig(layout_height=32, profile_columns=64, image_height=64, image_width=128)
+
+
+def layouts(count: int, columns: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    profile = torch.empty(count, columns).uniform_(0.5, 6.0, generator=torch.Generator().manual_seed(1))
+    return profile, torch.linspace(1.2, 1.7, count), torch.linspace(2.3, 3.0, count)
+
+
+class TestResNet:
+    @pytest.mark.parametrize(("depth", "parameters", "channels"), [(18, 11_176_512, 512), (50, 23_508_032, 2048)])
+    def test_the_backbones_are_torchvision_s_without_fc(self, depth: int, parameters: int, channels: int) -> None:
+        backbone = ResNet(depth)
+        assert sum(p.numel() for p in backbone.parameters()) == parameters
+        assert backbone.channels == channels
+
+    def test_parameters_have_torchvision_s_names_and_shapes(self) -> None:
+        state = {name: tuple(value.shape) for name, value in ResNet(18).state_dict().items()}
+        expected = {
+            "conv1.weight": (64, 3, 7, 7),
+            "bn1.running_mean": (64,),
+            "bn1.num_batches_tracked": (),
+            "layer1.0.conv1.weight": (64, 64, 3, 3),
+            "layer1.1.bn2.bias": (64,),
+            "layer2.0.downsample.0.weight": (128, 64, 1, 1),
+            "layer2.0.downsample.1.running_var": (128,),
+            "layer4.1.conv2.weight": (512, 512, 3, 3),
+        }
+        assert {name: state.get(name) for name in expected} == expected
+        assert not any(name.startswith("layer1.0.downsample") for name in state)
+        assert len(state) == 120
+        deep = {name: tuple(value.shape) for name, value in ResNet(50).state_dict().items()}
+        expected = {
+            "layer1.0.downsample.0.weight": (256, 64, 1, 1),
+            "layer1.0.conv3.weight": (256, 64, 1, 1),
+            "layer3.5.bn3.weight": (1024,),
+            # The stride is in the 3x3 convolution, as in torchvision.
+            "layer4.2.conv2.weight": (512, 512, 3, 3),
+        }
+        assert {name: deep.get(name) for name in expected} == expected
+        assert len(deep) == 318
+
+    def test_the_bottleneck_strides_in_its_middle_convolution(self) -> None:
+        block = ResNet(50).get_submodule("layer2.0")
+        strides = [block.get_submodule(name).stride for name in ("conv1", "conv2", "conv3")]
+        assert strides == [(1, 1), (2, 2), (1, 1)]
+
+
+class TestPaper:
+    def test_latents_are_unit_vectors_of_the_configured_size(self) -> None:
+        latent = PaperLayoutEncoder(SMALL_PAPER).eval()(*layouts(3, 64))
+        assert latent.shape == (3, 128)
+        torch.testing.assert_close(latent.norm(dim=1), torch.ones(3))
+        image = torch.randint(0, 256, (2, 64, 128, 3), dtype=torch.uint8)
+        latent = PaperImageEncoder(SMALL_PAPER).eval()(image)
+        assert latent.shape == (2, 128)
+        torch.testing.assert_close(latent.norm(dim=1), torch.ones(2))
+
+    def test_the_layout_encoder_sees_the_heights(self) -> None:
+        torch.manual_seed(0)
+        encoder = PaperLayoutEncoder(SMALL_PAPER).eval()
+        profile, camera, ceiling = layouts(2, 64)
+        assert not torch.allclose(encoder(profile, camera, ceiling), encoder(profile, camera, ceiling + 0.5), atol=1e-4)
+
+
+class TestRing:
+    def test_latents_are_unit_vectors_of_the_configured_size(self) -> None:
+        encoder = RingLayoutEncoder(TINY).eval()
+        latent = encoder(*layouts(5, TINY.profile_columns))
+        assert latent.shape == (5, TINY.latent_size)
+        torch.testing.assert_close(latent.norm(dim=1), torch.ones(5))
+        assert encoder.ring(*layouts(5, TINY.profile_columns)).shape == (5, TINY.channels, TINY.sectors)
+
+    @pytest.mark.parametrize("config", [TINY, RingConfig()], ids=["tiny", "default"])
+    def test_the_image_encoder_speaks_of_the_same_ring_and_profile(self, config: RingConfig) -> None:
+        encoder = RingImageEncoder(config).eval()
+        image = torch.randint(0, 256, (2, config.image_height, config.image_width, 3), dtype=torch.uint8)
+        with torch.no_grad():
+            features = encoder(image, torch.tensor([1.3, 1.6]))
+        assert features.ring.shape == (2, config.channels, config.sectors)
+        assert features.log_profile.shape == features.log_scale.shape == (2, config.profile_columns)
+
+    def test_fusing_the_normalisation_changes_nothing_but_speed(self) -> None:
+        torch.manual_seed(0)
+        encoder = RingLayoutEncoder(TINY).train()
+        for _ in range(3):
+            encoder(*layouts(8, TINY.profile_columns))
+        encoder.eval()
+        before = {name: value.clone() for name, value in encoder.state_dict().items()}
+        fused = encoder.fused()
+        inputs = layouts(5, TINY.profile_columns)
+        torch.testing.assert_close(fused(*inputs), encoder(*inputs), atol=1e-5, rtol=1e-4)
+        assert all(torch.equal(before[name], value) for name, value in encoder.state_dict().items())
+        assert not any(isinstance(module, torch.nn.BatchNorm1d) for module in fused.modules())
+
+    def test_distances_beyond_all_reason_do_not_become_nan(self) -> None:
+        encoder = RingLayoutEncoder(TINY).eval()
+        profile, camera, ceiling = layouts(2, TINY.profile_columns)
+        profile[0, 3], profile[1, 5] = float("inf"), 0.0
+        assert bool(torch.isfinite(encoder(profile, camera, ceiling)).all())
+
+    def test_the_predicted_profile_scales_with_the_camera_height(self) -> None:
+        # At initialisation the height enters the features too; with that input cut, only the units remain.
+        encoder = RingImageEncoder(TINY).eval()
+        with torch.no_grad():
+            encoder.squeeze.weight[:, -1] = 0.0
+            image = torch.randint(0, 256, (1, TINY.image_height, TINY.image_width, 3), dtype=torch.uint8)
+            low, high = (encoder(image, torch.tensor([height])).log_profile for height in (1.0, 2.0))
+        torch.testing.assert_close(high - low, torch.full_like(low, 0.6931472))
+
+    @pytest.mark.parametrize("padding", [0, 1, 3])
+    def test_the_horizon_has_no_border(self, padding: int) -> None:
+        padded = pad_around(torch.arange(6.0)[None, None], padding)[0, 0]
+        assert padded.tolist() == [float(i % 6) for i in range(-padding, 6 + padding)]
+
+    def test_sizes_that_do_not_meet_are_refused(self) -> None:
+        with pytest.raises(ValueError, match="33 columns"):
+            RingLayoutEncoder(dataclasses.replace(TINY, profile_columns=33))
+        with pytest.raises(ValueError, match="sectors"):
+            RingImageEncoder(dataclasses.replace(TINY, sectors=24, profile_columns=48))
+
+
+class TestDecoder:
+    @pytest.mark.parametrize("batch", [1, 3])
+    def test_a_latent_becomes_a_depth_image(self, batch: int) -> None:
+        decoded = LayoutDecoder(16).eval()(torch.randn(batch, 16))
+        assert decoded.shape == (batch, 32, 64)
+
+
+class TestLoading:
+    @pytest.mark.parametrize("half", [False, True])
+    def test_a_layout_encoder_comes_back_from_its_weights(self, half: bool) -> None:
+        torch.manual_seed(0)
+        encoder = RingLayoutEncoder(TINY).eval()
+        state = {k: v.half() if half and v.is_floating_point() else v for k, v in encoder.state_dict().items()}
+        # Through JSON, as in a manifest: tuples become lists.
+        sizes = {k: list(v) if isinstance(v, tuple) else v for k, v in dataclasses.asdict(TINY).items()}
+        loaded = load_layout_encoder("ring", sizes, safetensors.torch.save(state)).eval()
+        inputs = layouts(3, TINY.profile_columns)
+        torch.testing.assert_close(loaded(*inputs), encoder(*inputs), atol=5e-3 if half else 1e-6, rtol=0.0)
+        assert all(p.dtype == torch.float32 for p in loaded.parameters())
+
+    def test_missing_and_superfluous_weights_are_refused(self) -> None:
+        state = RingLayoutEncoder(TINY).state_dict()
+        for wrong in ({**state, "extra": torch.zeros(1)}, {k: v for k, v in state.items() if k != "head.fc.bias"}):
+            with pytest.raises(RuntimeError, match="state_dict"):
+                load_layout_encoder("ring", dataclasses.asdict(TINY), safetensors.torch.save(wrong))
+
+    def test_an_unknown_architecture_is_refused_by_name(self) -> None:
+        with pytest.raises(ValueError, match="'transformer'"):
+            load_layout_encoder("transformer", {}, b"")

@@ -1,0 +1,179 @@
+"""The numpy half of localisation: latent distances, non-maximum suppression and the Vogel disc."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.poses import Candidate, LatentGrid, Query
+from lalaloc_core.localise.retrieval import latent_distances, retrieve, suppress
+from lalaloc_core.localise.vogel import resample, vogel_disc
+from lalaloc_core.sampling import PoseSet
+from tests.strategies import plan_of, rectangle, seeds
+
+
+def unit(rng: np.random.Generator, *shape: int) -> np.ndarray:
+    vectors = rng.normal(size=shape)
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def random_grid(seed: int, poses: int = 60) -> LatentGrid:
+    rng = np.random.default_rng(seed)
+    return LatentGrid(PoseSet(rng.uniform(0, 6, (poses, 2)), np.zeros(poses, dtype=int)), unit(rng, poses, 8), 0.5, 1.5)
+
+
+def any_heading(latents: np.ndarray) -> Query:
+    return Query(latents, np.arange(len(latents)) * (2.0 * math.pi / len(latents)), 0.0, heading_known=False)
+
+
+def nearest_neighbour_distances(points: np.ndarray) -> np.ndarray:
+    distance = np.linalg.norm(points[:, None] - points[None], axis=-1)
+    np.fill_diagonal(distance, np.inf)
+    return distance.min(axis=1)
+
+
+class PlaceEncoders(Encoders):
+    """Stands in for the networks: a pose's latent is a direction that depends smoothly on where it is."""
+
+    def __init__(self) -> None:
+        pass
+
+    def poses(self, plan: FloorPlan, poses: PoseSet, heading: np.ndarray, camera_height_m: float) -> np.ndarray:
+        features = np.stack(
+            [poses.position_m[:, 0], poses.position_m[:, 1], 3.0 * np.sin(heading), np.full(len(poses), 5.0)], 1
+        )
+        return features / np.linalg.norm(features, axis=1, keepdims=True)
+
+
+PLACES = PlaceEncoders()
+
+
+class TestRetrieval:
+    @given(seeds())
+    def test_latent_distance_is_euclidean(self, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        latents, targets = unit(rng, 20, 16), unit(rng, 3, 16)
+        direct = np.linalg.norm(targets[:, None] - latents[None], axis=-1)
+        np.testing.assert_allclose(latent_distances(latents, targets), direct, atol=1e-7)
+
+    def test_the_distance_to_itself_is_zero_not_nan(self) -> None:
+        latents = unit(np.random.default_rng(0), 50, 128).astype(np.float32)
+        assert np.diag(latent_distances(latents, latents)).max() < 1e-3
+
+    @given(seeds(), st.integers(1, 12), st.floats(0.0, 3.0))
+    def test_kept_places_are_apart_best_first_and_nothing_better_is_left_out(
+        self, seed: int, limit: int, separation_m: float
+    ) -> None:
+        rng = np.random.default_rng(seed)
+        position, distance = rng.uniform(0, 5, (40, 2)), rng.uniform(0, 2, 40)
+        kept = suppress(position, distance, separation_m=separation_m, limit=limit)
+        assert 1 <= len(kept) <= limit
+        assert kept[0] == int(distance.argmin())
+        assert list(distance[kept]) == sorted(distance[kept])
+        gaps = np.linalg.norm(position[:, None] - position[kept][None], axis=-1)
+        assert all(gaps[a, k] >= separation_m for k in range(len(kept)) for a in kept[:k])
+        worst_kept = distance[kept[-1]]
+        for other in set(range(40)) - set(kept):
+            shadowed = any(gaps[other, k] < separation_m and distance[i] <= distance[other] for k, i in enumerate(kept))
+            assert shadowed or (len(kept) == limit and distance[other] >= worst_kept)
+
+    @given(seeds(), st.integers(1, 8))
+    def test_every_place_is_taken_at_its_best_hypothesis(self, seed: int, hypotheses: int) -> None:
+        grid = random_grid(seed)
+        query = any_heading(unit(np.random.default_rng(seed + 1), hypotheses, 8))
+        distances = latent_distances(grid.latents, query.latents)
+        found = retrieve(grid, query, top_k=5, separation_m=1.0)
+        assert found[0].latent_distance == distances.min()
+        for candidate in found:
+            place = int(np.linalg.norm(grid.poses.position_m - candidate.position_m, axis=1).argmin())
+            assert candidate.hypothesis == int(distances[:, place].argmin())
+            assert candidate.latent_distance == distances[:, place].min()
+            assert candidate.room_index == grid.poses.room_index[place]
+            assert candidate.frame_heading == query.frame_heading
+
+    def test_a_grid_pose_s_own_latent_retrieves_it(self) -> None:
+        grid = random_grid(0)
+        for index in (0, 17, 59):
+            query = any_heading(grid.latents[index : index + 1])
+            best = retrieve(grid, query, top_k=1, separation_m=1.0)[0]
+            np.testing.assert_array_equal(best.position_m, grid.poses.position_m[index])
+
+
+class TestVogelDisc:
+    @given(st.integers(1, 500))
+    def test_points_follow_the_formula_with_its_index(self, samples: int) -> None:
+        disc = vogel_disc(samples)
+        golden = (1.0 + math.sqrt(5.0)) / 2.0
+        for i in {0, 1, samples // 2, samples - 1} & set(range(samples)):
+            angle, radius = i * 2.0 * math.pi * (1.0 - 1.0 / golden), math.sqrt(i / samples)
+            np.testing.assert_allclose(disc[i], [radius * math.cos(angle), radius * math.sin(angle)], atol=1e-9)
+
+    @given(st.integers(1, 500))
+    def test_points_fill_the_unit_disc_from_its_centre(self, samples: int) -> None:
+        radius = np.linalg.norm(vogel_disc(samples), axis=1)
+        assert radius[0] == 0.0
+        assert radius.max() < 1.0
+        # Equal area: the share of points within r is r².
+        np.testing.assert_allclose(
+            np.mean(radius[:, None] < [0.25, 0.5, 0.75], axis=0), [0.0625, 0.25, 0.5625], atol=1 / samples
+        )
+
+    def test_points_are_even_where_random_ones_clump(self) -> None:
+        nearest = nearest_neighbour_distances(vogel_disc(200))
+        rng = np.random.default_rng(0)
+        angle, radius = rng.uniform(0, 2 * math.pi, 200), np.sqrt(rng.uniform(0, 1, 200))
+        scattered = nearest_neighbour_distances(np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1))
+        assert nearest.min() > 0.5 * nearest.max()
+        assert nearest.std() / nearest.mean() < 0.25 < scattered.std() / scattered.mean()
+
+
+class TestResampling:
+    plan = plan_of(rectangle(4.0, 4.0), rectangle(4.0, 4.0, at=(4.5, 0.0)))
+
+    def query(self, x: float, y: float, heading_known: bool = True, heading: float = 0.0) -> Query:
+        pose = PoseSet(np.array([[x, y]]), np.array([0]))
+        latent = PLACES.poses(self.plan, pose, np.array([heading]), 1.5)
+        return Query(latent, np.zeros(1), 0.0, heading_known) if heading_known else any_heading(latent.repeat(8, 0))
+
+    def candidate(self, query: Query, x: float, y: float) -> Candidate:
+        pose = PoseSet(np.array([[x, y]]), np.array([0]))
+        latent = PLACES.poses(self.plan, pose, np.zeros(1), 1.5)
+        return Candidate(x, y, 0, 0.0, 0, float(latent_distances(latent, query.latents[:1])[0, 0]))
+
+    def resample(self, query: Query, start: Candidate, radius_m: float) -> Candidate:
+        return resample(self.plan, PLACES, query, start, camera_height_m=1.5, samples=200, radius_m=radius_m)
+
+    def test_the_answer_moves_towards_the_truth_and_within_the_disc(self) -> None:
+        query = self.query(2.3, 2.6)
+        start = self.candidate(query, 2.0, 2.0)
+        found = self.resample(query, start, 1.0)
+        assert np.hypot(found.x_m - 2.3, found.y_m - 2.6) < 0.1
+        assert found.latent_distance < start.latent_distance
+        assert np.hypot(found.x_m - 2.0, found.y_m - 2.0) <= 1.0
+
+    def test_samples_outside_all_rooms_are_dropped_and_the_room_follows_the_pose(self) -> None:
+        # The truth lies in the wall between the rooms: whatever is answered is in a room, the one it names.
+        query = self.query(4.3, 2.0)
+        found = self.resample(query, self.candidate(query, 3.8, 2.0), 1.0)
+        assert self.plan.room_index_at(found.position_m[None])[0] == found.room_index
+        across = self.query(4.7, 2.0)
+        moved = self.resample(across, self.candidate(across, 3.8, 2.0), 1.2)
+        assert moved.room_index == 1
+        assert moved.x_m > 4.5
+
+    def test_a_candidate_at_the_optimum_is_kept(self) -> None:
+        query = self.query(2.0, 2.0)
+        start = self.candidate(query, 2.0, 2.0)
+        assert self.resample(query, start, 1.0) is start
+
+    def test_a_known_heading_is_never_touched_and_an_unknown_one_stays_in_its_sector(self) -> None:
+        known = self.query(2.3, 2.6)
+        assert self.resample(known, self.candidate(known, 2.0, 2.0), 1.0).frame_heading == 0.0
+        unknown = self.query(2.3, 2.6, heading_known=False, heading=0.3)
+        found = self.resample(unknown, self.candidate(unknown, 2.0, 2.0), 1.0)
+        assert 0.0 < found.frame_heading <= math.pi / 8

@@ -1,0 +1,151 @@
+"""Camera poses: the grid, random poses and training triplets."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.sampling import (
+    WALL_MARGIN_M,
+    PoseSet,
+    TripletSampling,
+    grid_size,
+    pose_grid,
+    random_poses,
+    sample_triplets,
+)
+from tests.strategies import crooked_flat, plan_of, plans, rectangle, room_polygons, seeds
+
+BIG = plan_of(rectangle(8.0, 6.0), rectangle(6.0, 6.0, at=(8.2, 0.0)))
+
+
+def wall_distance(plan: FloorPlan, poses: PoseSet) -> np.ndarray:
+    """Distance of each pose to the walls of its room, negative where it lies outside."""
+    rooms = np.array([room.shape for room in plan.rooms], dtype=object)[poses.room_index]
+    points = shapely.points(poses.position_m)
+    sign = np.where(shapely.contains(rooms, points), 1.0, -1.0)
+    return sign * shapely.distance(shapely.boundary(rooms), points)
+
+
+class TestGrid:
+    @given(plans(), st.floats(0.2, 1.5))
+    def test_every_pose_is_in_its_room_and_no_room_is_missing(self, plan: FloorPlan, step_m: float) -> None:
+        poses = pose_grid(plan, step_m)
+        assert (wall_distance(plan, poses) > 0.0).all()
+        assert set(poses.room_index) == set(range(len(plan.rooms)))
+
+    @given(room_polygons(offset_m=3.0), st.sampled_from([0.25, 0.5, 1.0]))
+    def test_the_grid_is_all_lattice_points_that_keep_the_margin(self, polygon: list, step_m: float) -> None:
+        plan = plan_of(polygon)
+        room = plan.rooms[0].shape
+        index = np.arange(-60, 61)
+        lattice = np.stack(np.meshgrid(index, index), axis=-1).reshape(-1, 2)
+        points = shapely.points(lattice * step_m)
+        clearance = np.where(shapely.contains(room, points), shapely.distance(room.exterior, points), 0.0)
+        poses = pose_grid(plan, step_m).position_m
+        found = {tuple(pair) for pair in np.round(poses / step_m).astype(int)}
+        # The eroded room has rounded corners of finitely many segments: points at the very margin go either way.
+        must = {tuple(pair) for pair in lattice[clearance > 1.02 * WALL_MARGIN_M]}
+        may = {tuple(pair) for pair in lattice[clearance >= 0.999 * WALL_MARGIN_M]}
+        if must:
+            assert must <= found <= may
+            np.testing.assert_allclose(poses / step_m, np.round(poses / step_m), atol=1e-9)
+        assert len(found) == len(poses)
+
+    @pytest.mark.parametrize("polygon", [rectangle(0.5, 0.5, at=(0.1, 0.1)), rectangle(0.25, 8.0, at=(0.1, 0.1))])
+    def test_a_room_without_lattice_points_gets_one_pose_well_inside(self, polygon: list) -> None:
+        plan = plan_of(rectangle(3.0, 3.0, at=(10.0, 0.0)), polygon)
+        poses = pose_grid(plan, 1.0)
+        assert (poses.room_index == 1).sum() == 1
+        assert wall_distance(plan, poses)[poses.room_index == 1] >= 0.1
+
+    def test_neighbouring_rooms_share_one_lattice(self) -> None:
+        together = pose_grid(plan_of(rectangle(3.0, 3.0), rectangle(3.0, 3.0, at=(3.1, 0.0))), 0.5).position_m
+        np.testing.assert_allclose(together / 0.5, np.round(together / 0.5))
+
+    @pytest.mark.parametrize("step_m", [0.0, -0.5, float("nan")])
+    def test_a_step_that_is_not_positive_is_refused(self, step_m: float) -> None:
+        with pytest.raises(InvalidInputError, match="positive"):
+            pose_grid(BIG, step_m)
+
+    @given(plans())
+    def test_the_size_estimate_is_of_the_right_order(self, plan: FloorPlan) -> None:
+        exact = len(pose_grid(plan, 0.5))
+        assert exact / 2 <= grid_size(plan, 0.5) <= 4 * exact + 20
+
+
+class TestRandomPoses:
+    @given(plans(), seeds(), st.integers(0, 40))
+    def test_poses_keep_the_margin_to_the_walls_of_their_room(self, plan: FloorPlan, seed: int, count: int) -> None:
+        poses = random_poses(plan, count, np.random.default_rng(seed), 0.15)
+        assert len(poses) == len(poses.room_index) == count
+        # shapely rounds the corners of the eroded room with segments.
+        assert (wall_distance(plan, poses) > 0.98 * 0.15).all()
+
+    @given(plans(), seeds())
+    def test_the_same_seed_gives_the_same_poses(self, plan: FloorPlan, seed: int) -> None:
+        first, second = (random_poses(plan, 20, np.random.default_rng(seed)) for _ in range(2))
+        np.testing.assert_array_equal(first.position_m, second.position_m)
+        np.testing.assert_array_equal(first.room_index, second.room_index)
+
+    def test_poses_are_uniform_over_the_floor(self) -> None:
+        margin = 0.1
+        plan = plan_of(rectangle(4.2, 2.2), rectangle(2.2, 2.2, at=(6.0, 0.0)))
+        count = 6000
+        poses = random_poses(plan, count, np.random.default_rng(0), margin)
+        # The first room splits into two squares of 2 m, the second is one: a third of the poses each.
+        cell = np.where(poses.room_index == 1, 2, (poses.position_m[:, 0] > 2.1).astype(int))
+        quarter = (poses.position_m[:, 1] > 1.1).astype(int)
+        counts = np.bincount(2 * cell + quarter, minlength=6)
+        # Six equal cells; 4.5 standard deviations.
+        np.testing.assert_allclose(counts, count / 6, atol=4.5 * np.sqrt(count / 6))
+        # In random order: a prefix is a sample of its own.
+        assert 0.2 < (poses.room_index[:300] == 1).mean() < 0.47
+
+    def test_a_room_too_narrow_for_the_margin_gets_no_poses(self) -> None:
+        plan = plan_of(rectangle(3.0, 3.0), rectangle(0.25, 3.0, at=(4.0, 0.0)))
+        assert set(random_poses(plan, 200, np.random.default_rng(0), 0.15).room_index) == {0}
+
+    def test_a_plan_too_narrow_for_the_margin_is_refused(self) -> None:
+        with pytest.raises(InvalidInputError, match=r"0\.15 m"):
+            random_poses(plan_of(rectangle(0.25, 3.0)), 5, np.random.default_rng(0), 0.15)
+
+
+class TestTriplets:
+    @given(seeds(), st.integers(1, 4), st.integers(1, 6), st.integers(1, 20))
+    def test_positives_are_near_and_negatives_far(
+        self, seed: int, anchors: int, positives: int, negatives: int
+    ) -> None:
+        sampling = TripletSampling(positives=positives, negatives=negatives)
+        drawn = sample_triplets(BIG, anchors, sampling, np.random.default_rng(seed))
+        assert drawn is not None
+        poses, rows = drawn
+        assert rows.shape == (anchors, 1 + positives + negatives)
+        distance = np.linalg.norm(poses.position_m[rows] - poses.position_m[rows[:, :1]], axis=-1)
+        assert (distance[:, 1 : 1 + positives] < sampling.positive_radius_m).all()
+        assert (distance[:, 1 + positives :] > sampling.negative_radius_m).all()
+        assert len(set(rows[:, 0])) == anchors
+        for row in rows:
+            assert len(set(row)) == len(row), "a neighbour was drawn twice"
+
+    @given(seeds())
+    def test_every_pose_lies_in_the_room_it_names(self, seed: int) -> None:
+        plan = crooked_flat()
+        drawn = sample_triplets(plan, 3, TripletSampling(positives=6, negatives=4), np.random.default_rng(seed))
+        assert drawn is not None
+        assert (wall_distance(plan, drawn[0]) > 0.0).all()
+
+    def test_the_same_seed_gives_the_same_triplets(self) -> None:
+        first, second = (sample_triplets(BIG, 4, TripletSampling(), np.random.default_rng(7)) for _ in range(2))
+        assert first is not None
+        assert second is not None
+        np.testing.assert_array_equal(first[0].position_m, second[0].position_m)
+        np.testing.assert_array_equal(first[1], second[1])
+
+    def test_a_plan_too_small_for_negatives_gives_none_rather_than_false_negatives(self) -> None:
+        assert sample_triplets(plan_of(rectangle(1.5, 1.2)), 1, TripletSampling(), np.random.default_rng(0)) is None

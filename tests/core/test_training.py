@@ -1,0 +1,373 @@
+"""Training: the loop resumes exactly, the streams never leak homes, and both stages learn."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import itertools
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor, nn
+
+from lalaloc_core.errors import CheckpointError
+from lalaloc_core.nets.ring import RingLayoutEncoder
+from lalaloc_core.training import stream
+from lalaloc_core.training.checkpoint import Checkpoint
+from lalaloc_core.training.config import PRESETS, ImageStageConfig, OptimiserConfig, TrainConfig
+from lalaloc_core.training.image_stage import ImageStage
+from lalaloc_core.training.layout_stage import LayoutStage
+from lalaloc_core.training.loop import run_stage
+from lalaloc_core.training.panoramas import PanoramaBatches, turn_and_mirror
+from lalaloc_core.training.run import export_run, train_image
+from lalaloc_core.training.stages import Stage, build_layout_encoder
+from lalaloc_core.training.stream import TEST, TRAIN, VALIDATION, Batch, LayoutBatches, home_of
+from tests.strategies import seeds
+
+CPU = torch.device("cpu")
+TINY = PRESETS["tiny"]
+
+
+class LineStage:
+    """The smallest stage there is: a line through points, its batches a function of the step."""
+
+    name = "line"
+
+    def __init__(self, steps: int = 12, **settings: Any) -> None:
+        torch.manual_seed(3)
+        self.config = dataclasses.replace(TINY, image=ImageStageConfig(steps=steps, **settings))
+        self.line = nn.Sequential(nn.Linear(2, 3), nn.BatchNorm1d(3), nn.Linear(3, 1))
+        self.modules: dict[str, nn.Module] = {"line": self.line}
+
+    @property
+    def settings(self) -> ImageStageConfig:
+        return self.config.image
+
+    def batches(self, first_step: int, workers: int) -> Iterator[Batch]:
+        for step in itertools.count(first_step):
+            generator = torch.Generator().manual_seed(step)
+            yield {"x": torch.randn(8, 2, generator=generator)}
+
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
+        x = batch["x"]
+        return {"fit": (self.line(x)[:, 0] - x.sum(dim=1)).square().mean()}
+
+
+class StopAt:
+    """Stands in for a crash while the checkpoint of the n-th call is being validated."""
+
+    def __init__(self, call: int) -> None:
+        self.left = call
+
+    def __call__(self, modules: dict[str, nn.Module]) -> dict[str, float]:
+        self.left -= 1
+        if self.left == 0:
+            raise KeyboardInterrupt
+        return {"val": 1.0}
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def same_weights(first: dict[str, dict[str, Tensor]], second: dict[str, dict[str, Tensor]]) -> bool:
+    return all(torch.equal(first[module][key], value) for module in second for key, value in second[module].items())
+
+
+class TestLoop:
+    @pytest.mark.parametrize("kind", ["adamw", "sgd"])
+    @pytest.mark.parametrize("ema_decay", [0.0, 0.9])
+    def test_an_interrupted_run_ends_where_an_uninterrupted_one_does(
+        self, tmp_path: Path, kind: Any, ema_decay: float
+    ) -> None:
+        settings = {"optimiser": OptimiserConfig(kind=kind, learning_rate=0.05), "ema_decay": ema_decay}
+        straight = run_stage(LineStage(**settings), tmp_path / "straight", device=CPU)
+        folder = tmp_path / "broken"
+        with pytest.raises(KeyboardInterrupt):
+            run_stage(LineStage(**settings), folder, device=CPU, checkpoint_minutes=0.0, validate=StopAt(6))
+        assert Checkpoint.load(folder / "line.pt").step == 5
+        resumed = run_stage(LineStage(**settings), folder, device=CPU, resume=True)
+        assert resumed.step == straight.step == 12
+        assert same_weights(resumed.weights, straight.weights)
+        assert same_weights(resumed.averaged, straight.averaged)
+        assert bool(straight.averaged) == (ema_decay > 0.0)
+
+    def test_the_log_has_one_row_per_step_and_value_and_goes_on_after_a_resume(self, tmp_path: Path) -> None:
+        first = LineStage(40)
+        with pytest.raises(KeyboardInterrupt):
+            run_stage(first, tmp_path, device=CPU, checkpoint_minutes=0.0, validate=StopAt(25))
+        run_stage(LineStage(40), tmp_path, device=CPU, resume=True, validate=StopAt(99))
+        rows = rows_of(tmp_path / "line.csv")
+        assert [row["step"] for row in rows if row["name"] == "fit"] == ["20", "40"]
+        assert [row["step"] for row in rows if row["name"] == "val"][-1] == "40"
+        assert all(float(row["seconds"]) >= 0.0 for row in rows)
+
+    def test_a_finished_run_resumes_to_itself(self, tmp_path: Path) -> None:
+        done = run_stage(LineStage(), tmp_path, device=CPU)
+        again = run_stage(LineStage(), tmp_path, device=CPU, resume=True)
+        assert again.step == done.step
+        assert same_weights(again.weights, done.weights)
+
+    def test_a_checkpoint_of_another_configuration_is_not_resumed(self, tmp_path: Path) -> None:
+        run_stage(LineStage(), tmp_path, device=CPU)
+        with pytest.raises(CheckpointError, match="another configuration"):
+            run_stage(LineStage(batch=64), tmp_path, device=CPU, resume=True)
+
+    def test_a_run_may_be_prolonged(self, tmp_path: Path) -> None:
+        run_stage(LineStage(), tmp_path, device=CPU)
+        assert run_stage(LineStage(15), tmp_path, device=CPU, resume=True).step == 15
+
+    def test_resuming_nothing_is_an_error(self, tmp_path: Path) -> None:
+        with pytest.raises(CheckpointError, match="no checkpoint"):
+            run_stage(LineStage(), tmp_path, device=CPU, resume=True)
+
+    def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_last_checkpoint(self, tmp_path: Path) -> None:
+        stage = LineStage()
+        healthy = stage.losses
+
+        def losses(batch: Batch) -> dict[str, Tensor]:
+            steps_done = Checkpoint.load(tmp_path / "line.pt").step if (tmp_path / "line.pt").exists() else 0
+            return {"fit": healthy(batch)["fit"] * (float("nan") if steps_done == 4 else 1.0)}
+
+        stage.losses = losses  # type: ignore[method-assign]
+        with pytest.raises(FloatingPointError, match="step 4"):
+            run_stage(stage, tmp_path, device=CPU, checkpoint_minutes=0.0)
+        saved = Checkpoint.load(tmp_path / "line.pt")
+        assert saved.step == 4
+        assert all(bool(torch.isfinite(value).all()) for value in saved.weights["line"].values())
+
+    def test_a_time_budget_ends_the_run_whatever_the_steps(self, tmp_path: Path) -> None:
+        done = run_stage(LineStage(10**9, minutes=0.2 / 60.0), tmp_path, device=CPU)
+        assert done.seconds >= 0.2
+        assert done.step < 10**6
+
+    def test_averaged_weights_are_what_is_shipped(self, tmp_path: Path) -> None:
+        plain = run_stage(LineStage(), tmp_path / "plain", device=CPU)
+        averaged = run_stage(LineStage(ema_decay=0.9), tmp_path / "averaged", device=CPU)
+        assert plain.best_weights is plain.weights
+        assert averaged.best_weights is averaged.averaged
+        assert not same_weights(averaged.averaged, averaged.weights)
+
+
+class TestCheckpoint:
+    def test_it_comes_back_as_it_was_saved(self, tmp_path: Path) -> None:
+        saved = run_stage(LineStage(ema_decay=0.9), tmp_path, device=CPU, validate=StopAt(99))
+        loaded = Checkpoint.load(tmp_path / "line.pt", stage="line")
+        assert (loaded.config, loaded.step, loaded.metrics) == (saved.config, 12, {"val": 1.0})
+        assert same_weights(loaded.weights, saved.weights)
+        assert same_weights(loaded.averaged, saved.averaged)
+        assert loaded.optimiser["state"].keys() == saved.optimiser["state"].keys()
+        assert not list(tmp_path.glob("*.part"))
+
+    def test_another_stage_s_checkpoint_is_refused(self, tmp_path: Path) -> None:
+        run_stage(LineStage(), tmp_path, device=CPU)
+        with pytest.raises(CheckpointError, match="'layout' is wanted"):
+            Checkpoint.load(tmp_path / "line.pt", stage="layout")
+
+    def test_damaged_files_are_refused(self, tmp_path: Path) -> None:
+        run_stage(LineStage(), tmp_path, device=CPU)
+        content = (tmp_path / "line.pt").read_bytes()
+        (tmp_path / "line.pt").write_bytes(content[: len(content) // 2])
+        with pytest.raises(CheckpointError, match="cannot read"):
+            Checkpoint.load(tmp_path / "line.pt")
+
+    def test_nothing_in_a_checkpoint_is_executed(self, tmp_path: Path) -> None:
+        path = tmp_path / "evil.pt"
+        torch.save({"stage": "layout", "config": TINY.to_dict(), "weights": {}, "metrics": _Evil()}, path)
+        with pytest.raises(CheckpointError):
+            Checkpoint.load(path)
+        assert not _Evil.executed
+
+    def test_unknown_contents_are_refused(self, tmp_path: Path) -> None:
+        torch.save({"stage": "layout", "config": {**TINY.to_dict(), "extra": 1}, "weights": {}}, tmp_path / "c.pt")
+        with pytest.raises(CheckpointError, match="no key 'extra'"):
+            Checkpoint.load(tmp_path / "c.pt")
+
+    def test_the_second_stage_and_the_export_say_what_is_missing(self, tmp_path: Path) -> None:
+        with pytest.raises(CheckpointError, match="no checkpoint"):
+            train_image(TINY, tmp_path, device=CPU)
+        with pytest.raises(CheckpointError, match="no checkpoint"):
+            export_run(tmp_path, tmp_path / "out", name="none", version="1")
+
+
+class _Evil:
+    """Runs code when it is unpickled."""
+
+    executed = False
+
+    def __reduce__(self) -> tuple[Callable[..., None], tuple[object, str, bool]]:
+        return setattr, (_Evil, "executed", True)
+
+
+class TestStreams:
+    def test_the_same_numbers_give_the_same_home(self) -> None:
+        first, second = (home_of(TRAIN, 5, 17) for _ in range(2))
+        assert first[0].plan.to_dict() == second[0].plan.to_dict()
+        assert first[1].integers(1 << 30) == second[1].integers(1 << 30)
+
+    def test_training_validation_and_test_never_share_a_home(self) -> None:
+        plans = [home_of(split, 0, index)[0].plan for split in (TRAIN, VALIDATION, TEST) for index in range(15)]
+        outlines = {np.concatenate([room.polygon_m for room in plan.rooms]).tobytes() for plan in plans}
+        assert len({TRAIN, VALIDATION, TEST}) == 3
+        assert len(outlines) == len(plans)
+
+    def test_a_layout_batch_is_anchors_with_their_neighbours(self) -> None:
+        batch = next(iter(LayoutBatches(TINY)))
+        stage = TINY.layout
+        anchors = stage.homes_per_step * stage.anchors_per_home
+        size = 1 + stage.triplets.positives + stage.triplets.negatives
+        assert {key: tuple(value.shape) for key, value in batch.items()} == {
+            "profile_m": (anchors, size, TINY.profile_columns),
+            "camera_height_m": (anchors, size),
+            "ceiling_height_m": (anchors, size),
+        }
+        assert all(value.dtype == torch.float32 for value in batch.values())
+        assert bool(torch.isfinite(batch["profile_m"]).all())
+        assert bool((batch["camera_height_m"] < batch["ceiling_height_m"]).all())
+        # An anchor and its neighbours are seen from one height.
+        assert bool((batch["camera_height_m"] == batch["camera_height_m"][:, :1]).all())
+
+    def test_turned_negatives_are_other_headings_of_the_anchor_s_surroundings(self) -> None:
+        layout = dataclasses.replace(TINY.layout, turned_share=0.5)
+        batch = next(iter(LayoutBatches(dataclasses.replace(TINY, layout=layout))))
+        profile = batch["profile_m"].sort(dim=2).values
+        # Turning changes the order of the columns, not the distances: so near a place looks alike when sorted.
+        change = (profile[:, 1:] - profile[:, :1]).abs().median(dim=2).values
+        negatives = layout.triplets.positives
+        far, turned = change[:, negatives : negatives + 2], change[:, negatives + 2 :]
+        assert turned.median() < 0.5 * far.median()
+
+    def test_workers_share_the_homes_without_overlap(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        drawn: dict[int, list[int]] = {0: [], 1: []}
+        for worker in (0, 1):
+
+            def recording(split: int, seed: int, index: int, worker: int = worker) -> Any:
+                assert split == TRAIN
+                drawn[worker].append(index)
+                return home_of(split, seed, index)
+
+            info = SimpleNamespace(id=worker, num_workers=2)
+            monkeypatch.setattr(stream, "get_worker_info", lambda info=info: info)
+            monkeypatch.setattr(stream, "home_of", recording)
+            list(itertools.islice(LayoutBatches(TINY, first=100), 2))
+        assert all(index >= 100 and index % 2 == worker for worker, indices in drawn.items() for index in indices)
+        assert not set(drawn[0]) & set(drawn[1])
+
+    def test_a_resumed_stage_goes_on_with_new_homes(self) -> None:
+        seen = list(itertools.islice(LayoutStage(TINY).batches(0, 0), 2))
+        resumed = next(LayoutStage(TINY).batches(2, 0))
+        assert not any(torch.equal(resumed["profile_m"], batch["profile_m"]) for batch in seen)
+
+    def test_a_panorama_batch_is_pictures_with_their_layouts(self) -> None:
+        batch = next(iter(PanoramaBatches(TINY)))
+        count, (height, width) = TINY.image.batch, TINY.image_size
+        assert batch["image"].shape == (count, height, width, 3)
+        assert batch["image"].dtype == torch.uint8
+        assert batch["profile_m"].shape == (count, TINY.profile_columns)
+        assert batch["camera_height_m"].shape == batch["ceiling_height_m"].shape == (count,)
+        assert bool(torch.isfinite(batch["profile_m"]).all())
+        assert bool((batch["camera_height_m"] < batch["ceiling_height_m"]).all())
+        again = next(iter(PanoramaBatches(TINY)))
+        assert all(torch.equal(batch[key], again[key]) for key in batch)
+
+    @given(seed=seeds(), pixels_per_column=st.sampled_from([1, 2, 4]))
+    def test_turning_and_mirroring_keep_picture_and_profile_together(self, seed: int, pixels_per_column: int) -> None:
+        profile = torch.arange(16.0) + 1.0
+        image = profile.repeat_interleave(pixels_per_column)[None, :, None].expand(2, -1, 3).clone()
+        turned_image, turned = turn_and_mirror(image, profile, np.random.default_rng(seed))
+        assert torch.equal(turned_image[0, :, 0], turned.repeat_interleave(pixels_per_column))
+        assert sorted(turned.tolist()) == profile.tolist()
+
+    def test_all_turns_and_both_hands_occur(self) -> None:
+        profile = torch.arange(8.0)
+        rng = np.random.default_rng(0)
+        seen = {tuple(turn_and_mirror(profile[None, :, None], profile, rng)[1].tolist()) for _ in range(300)}
+        assert len(seen) == 16
+
+
+class TestStages:
+    def repeated(self, stage: Stage, monkeypatch: pytest.MonkeyPatch) -> Batch:
+        """Let a stage see one batch over and over."""
+        batch = next(stage.batches(0, 0))
+        monkeypatch.setattr(stage, "batches", lambda first_step, workers: itertools.repeat(batch))
+        return batch
+
+    def total(self, stage: Stage, batch: Batch) -> float:
+        with torch.no_grad():
+            return float(sum(stage.losses(batch).values()))
+
+    def test_the_layout_loss_falls_on_layouts_not_seen(self, tmp_path: Path) -> None:
+        stage = LayoutStage(TINY)
+        unseen = next(stage.batches(1000, 0))
+        before = self.total(stage, unseen)
+        run_stage(stage, tmp_path, device=CPU, workers=0)
+        assert self.total(stage, unseen) < 0.8 * before
+
+    def test_a_layout_stage_has_the_losses_it_is_asked_for(self) -> None:
+        batch = next(iter(LayoutBatches(TINY)))
+
+        def terms(**changes: Any) -> dict[str, Tensor]:
+            config = dataclasses.replace(TINY, layout=dataclasses.replace(TINY.layout, **changes))
+            return LayoutStage(config).losses(batch)
+
+        assert set(terms()) == {"log_ratio", "scale", "decode"}
+        assert set(terms(scale_weight=0.0, decode_weight=0.0)) == {"log_ratio"}
+        assert set(terms(decode_anchors_only=False, all_pairs=False)) == {"log_ratio", "scale", "decode"}
+        assert all(term.ndim == 0 and bool(torch.isfinite(term)) for term in terms().values())
+
+    def test_the_image_encoder_learns_and_its_teacher_does_not(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        config = dataclasses.replace(
+            TINY, image=dataclasses.replace(TINY.image, steps=60, optimiser=OptimiserConfig(learning_rate=5e-3))
+        )
+        teacher = build_layout_encoder(config)
+        before = {key: value.clone() for key, value in teacher.state_dict().items()}
+        stage = ImageStage(config, teacher)
+        batch = self.repeated(stage, monkeypatch)
+        first = self.total(stage, batch)
+        run_stage(stage, tmp_path, device=CPU, workers=0)
+        assert self.total(stage, batch) < first - 0.5
+        assert all(torch.equal(before[key], value) for key, value in teacher.state_dict().items())
+        assert all(parameter.grad is None for parameter in teacher.parameters())
+        assert not teacher.training
+        saved = Checkpoint.load(tmp_path / "image.pt", stage="image")
+        assert set(saved.weights) == {"image_encoder"}
+
+    def test_a_perfect_image_encoder_has_no_latent_loss(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        teacher = build_layout_encoder(TINY)
+        assert isinstance(teacher, RingLayoutEncoder)
+        stage = ImageStage(TINY, teacher)
+        batch = next(stage.batches(0, 0))
+        profile, camera, ceiling = batch["profile_m"], batch["camera_height_m"], batch["ceiling_height_m"]
+        perfect = SimpleNamespace(
+            ring=teacher.ring(profile, camera, ceiling), log_profile=profile.log(), log_scale=torch.zeros_like(profile)
+        )
+        monkeypatch.setattr(stage, "encoder", lambda image, height: perfect)
+        assert all(abs(term.item()) < 1e-5 for term in stage.losses(batch).values())
+
+    def test_the_paper_s_image_loss_is_the_latent_distance_alone(self) -> None:
+        config = small_paper()
+        teacher = build_layout_encoder(config)
+        stage = ImageStage(config, teacher)
+        terms = stage.losses(next(stage.batches(0, 0)))
+        assert set(terms) == {"l2"}
+        assert 0.0 < terms["l2"].item() < 2.0
+        terms["l2"].backward()
+
+
+def small_paper() -> TrainConfig:
+    """The `paper` architecture at sizes a test can afford."""
+    paper = dataclasses.replace(
+        PRESETS["paper"].paper, image_depth=18, layout_height=32, profile_columns=64, image_height=64, image_width=128
+    )
+    image = dataclasses.replace(PRESETS["paper"].image, batch=2)
+    return dataclasses.replace(PRESETS["paper"], paper=paper, image=image)

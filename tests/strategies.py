@@ -1,0 +1,178 @@
+"""Random rooms, plans and poses for property tests, and the builders that tests of every layer share."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from hypothesis import strategies as st
+
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.sampling import PoseSet, random_poses
+
+Polygon = list[list[float]]
+
+# Rooms of the strategies are wider than this almost everywhere, so that a pose with the margin below always exists.
+POSE_MARGIN_M = 0.15
+
+
+def rectangle(width_m: float, depth_m: float, at: tuple[float, float] = (0.0, 0.0)) -> Polygon:
+    """A rectangle with its lower left corner at `at`."""
+    x, y = at
+    return [[x, y], [x + width_m, y], [x + width_m, y + depth_m], [x, y + depth_m]]
+
+
+def l_shape(width_m: float, depth_m: float, cut_width_m: float, cut_depth_m: float) -> Polygon:
+    """A rectangle at the origin whose upper right corner is cut out."""
+    x, y = width_m - cut_width_m, depth_m - cut_depth_m
+    return [[0.0, 0.0], [width_m, 0.0], [width_m, y], [x, y], [x, depth_m], [0.0, depth_m]]
+
+
+def plan_document(*polygons: Any, ceiling_m: float = 2.5, **extra: Any) -> dict[str, Any]:
+    """A plan in the native format with rooms "room 1", "room 2" and so on; `extra` replaces or adds keys."""
+    rooms = [{"name": f"room {index + 1}", "polygon": polygon} for index, polygon in enumerate(polygons)]
+    return {"name": "test plan", "ceiling_height_m": ceiling_m, "rooms": rooms, **extra}
+
+
+def plan_of(*polygons: Any, ceiling_m: float = 2.5, **extra: Any) -> FloorPlan:
+    """A validated plan of these polygons."""
+    return FloorPlan.from_dict(plan_document(*polygons, ceiling_m=ceiling_m, **extra))
+
+
+def crooked_flat() -> FloorPlan:
+    """Three rooms without any symmetry, so that every pose and heading looks different."""
+    return plan_of(
+        [[0.0, 0.0], [4.0, 0.0], [4.0, 2.2], [2.6, 2.2], [2.6, 3.4], [0.0, 3.0]],
+        [[4.2, 0.0], [6.3, 0.0], [6.0, 3.1], [4.2, 2.5]],
+        [[0.0, 3.6], [5.0, 3.6], [5.6, 4.4], [5.0, 6.0], [0.0, 6.0]],
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Poses in a plan with one heading each, ready for `wall_profile`."""
+
+    plan: FloorPlan
+    poses: PoseSet
+    heading: np.ndarray
+
+    @property
+    def walls_m(self) -> np.ndarray:
+        """Walls of each pose's room."""
+        return self.plan.walls_m[self.poses.room_index]
+
+    @property
+    def ceiling_height_m(self) -> np.ndarray:
+        """Ceiling of each pose's room."""
+        return self.plan.ceiling_heights_m[self.poses.room_index]
+
+
+def scene_of(plan: FloorPlan, count: int, seed: int, margin_m: float = POSE_MARGIN_M) -> Scene:
+    """`count` random poses of a plan with random headings."""
+    rng = np.random.default_rng(seed)
+    return Scene(plan, random_poses(plan, count, rng, margin_m), rng.uniform(-math.pi, math.pi, count))
+
+
+_lengths = st.floats(1.6, 8.0).map(lambda value: round(value, 2))
+_shares = st.floats(0.25, 0.7)
+_seeds = st.integers(0, 2**32 - 1)
+
+
+@st.composite
+def rectangles(draw: st.DrawFn) -> Polygon:
+    """Rectangular rooms at the origin."""
+    return rectangle(draw(_lengths), draw(_lengths))
+
+
+@st.composite
+def l_shapes(draw: st.DrawFn) -> Polygon:
+    """L-shaped rooms at the origin."""
+    width, depth = draw(_lengths), draw(_lengths)
+    return l_shape(width, depth, draw(_shares) * width, draw(_shares) * depth)
+
+
+@st.composite
+def notched(draw: st.DrawFn) -> Polygon:
+    """Rectangles with a pillar into the room, or a recess out of it, in the upper wall."""
+    width, depth = draw(_lengths), draw(_lengths)
+    start = draw(st.floats(0.1, 0.4)) * width
+    end = start + draw(st.floats(0.15, 0.4)) * width
+    tip = depth * (1.0 + draw(st.sampled_from([-1.0, 1.0])) * draw(st.floats(0.1, 0.5)))
+    return [
+        [0.0, 0.0],
+        [width, 0.0],
+        [width, depth],
+        [end, depth],
+        [end, tip],
+        [start, tip],
+        [start, depth],
+        [0, depth],
+    ]
+
+
+@st.composite
+def slanted(draw: st.DrawFn) -> Polygon:
+    """Rectangles with one corner cut off at an angle."""
+    width, depth = draw(_lengths), draw(_lengths)
+    return [
+        [0.0, 0.0],
+        [width, 0.0],
+        [width, depth * (1.0 - draw(_shares))],
+        [width * (1.0 - draw(_shares)), depth],
+        [0.0, depth],
+    ]
+
+
+@st.composite
+def star_shapes(draw: st.DrawFn) -> Polygon:
+    """Simple polygons with corners at rising angles around the origin and any distance: no right angles at all."""
+    count = draw(st.integers(4, 9))
+    radii = draw(st.lists(st.floats(1.2, 5.0), min_size=count, max_size=count))
+    jitter = draw(st.lists(st.floats(-0.3, 0.3), min_size=count, max_size=count))
+    angles = [2.0 * math.pi * (index + shift) / count for index, shift in enumerate(jitter)]
+    return [[r * math.cos(a), r * math.sin(a)] for r, a in zip(radii, angles, strict=True)]
+
+
+@st.composite
+def convex_polygons(draw: st.DrawFn) -> Polygon:
+    """Convex rooms: nothing hides anything, so the wall profile is continuous in the pose."""
+    return _moved(draw(st.one_of(rectangles(), slanted())), draw(st.floats(0.0, 2.0 * math.pi)), (0.0, 0.0))
+
+
+@st.composite
+def room_polygons(draw: st.DrawFn, offset_m: float = 20.0) -> Polygon:
+    """Simple polygons of every family, turned by any angle and moved by up to `offset_m`."""
+    polygon = draw(st.one_of(rectangles(), l_shapes(), notched(), slanted(), star_shapes()))
+    angle = draw(st.one_of(st.just(0.0), st.floats(0.0, 2.0 * math.pi)))
+    shift = (draw(st.floats(-offset_m, offset_m)), draw(st.floats(-offset_m, offset_m)))
+    return _moved(polygon, angle, shift)
+
+
+@st.composite
+def plans(draw: st.DrawFn, max_rooms: int = 3) -> FloorPlan:
+    """Plans of one to `max_rooms` rooms side by side, some with their own ceiling."""
+    polygons = draw(st.lists(room_polygons(offset_m=0.0), min_size=1, max_size=max_rooms))
+    placed = [_moved(polygon, 0.0, (30.0 * index, 0.0)) for index, polygon in enumerate(polygons)]
+    document = plan_document(*placed, ceiling_m=draw(st.floats(2.1, 4.0)))
+    for room in document["rooms"]:
+        if draw(st.booleans()):
+            room["ceiling_height_m"] = draw(st.floats(2.1, 4.0))
+    return FloorPlan.from_dict(document)
+
+
+@st.composite
+def scenes(draw: st.DrawFn, count: int = 3) -> Scene:
+    """Random poses with random headings in one random room far from the origin or near it."""
+    return scene_of(plan_of(draw(room_polygons()), ceiling_m=draw(st.floats(2.1, 4.0))), count, draw(_seeds))
+
+
+def seeds() -> st.SearchStrategy[int]:
+    """Seeds of numpy generators."""
+    return _seeds
+
+
+def _moved(polygon: Polygon, angle: float, shift_m: tuple[float, float]) -> Polygon:
+    cosine, sine = math.cos(angle), math.sin(angle)
+    return [[cosine * x - sine * y + shift_m[0], sine * x + cosine * y + shift_m[1]] for x, y in polygon]

@@ -1,0 +1,169 @@
+"""The architecture as a test: imports point down, and the numpy side never meets torch."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+# The one place where layers are written down. A module has the layer of its longest listed prefix, and may import
+# from lower layers and from its own layer in its own folder.
+LAYERS = {
+    "lalaloc_core.errors": 0,
+    "lalaloc_core.conventions": 0,
+    "lalaloc_core.configuration": 1,
+    "lalaloc_core.floorplan": 1,
+    "lalaloc_core.sampling": 1,
+    "lalaloc_core.metrics": 1,
+    "lalaloc_core.bundle": 1,
+    "lalaloc_core.render": 2,
+    "lalaloc_core.nets": 3,
+    "lalaloc_core.synth": 3,
+    "lalaloc_core.localise": 4,
+    "lalaloc_core.training": 5,
+    "lalaloc_core.evaluate": 6,
+    "lalaloc_core.calibrate": 6,
+    "lalaloc_core.export": 6,
+    # A run ends with its export, so this one file stands above it.
+    "lalaloc_core.training.run": 7,
+    "lalaloc_core.bench": 8,
+    "lalaloc_core.cli": 8,
+    "service.settings": 10,
+    "service.errors": 10,
+    "service.schemas": 10,
+    "service.telemetry": 10,
+    "service.uploads": 10,
+    "service.preview": 10,
+    "service.lpo_worker": 11,
+    "service.store": 11,
+    "service.grids": 11,
+    "service.refinement": 11,
+    "service.problems": 11,
+    "service.localiser": 12,
+    "service.runtime": 12,
+    "service.routes": 13,
+    "service.app": 14,
+    "service.openapi": 14,
+    "service.__main__": 14,
+}
+# Importing these loads torch; importing anything else must not.
+TORCH_ROOMS = (
+    "lalaloc_core.nets",
+    "lalaloc_core.synth",
+    "lalaloc_core.training",
+    "lalaloc_core.localise.optimise",
+    "lalaloc_core.evaluate",
+    "lalaloc_core.calibrate",
+    "lalaloc_core.export",
+    "lalaloc_core.bench",
+)
+
+
+def _modules() -> dict[str, Path]:
+    files = [path for package in ("lalaloc_core", "service") for path in sorted((ROOT / package).rglob("*.py"))]
+    return {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path for path in files}
+
+
+MODULES = _modules()
+PACKAGES = {name for name, path in MODULES.items() if path.name == "__init__.py"}
+
+
+@cache
+def _tree(module: str) -> ast.Module:
+    return ast.parse(MODULES[module].read_text(encoding="utf-8"))
+
+
+def _imported(module: str, nodes: Iterator[ast.AST]) -> set[str]:
+    """Names of the modules that import statements among `nodes` load."""
+    found = set()
+    for node in nodes:
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{module} uses a relative import"
+            for alias in node.names:
+                deeper = f"{node.module}.{alias.name}"
+                found.add(deeper if deeper in MODULES else str(node.module))
+    return found
+
+
+def _at_import_time(node: ast.AST) -> Iterator[ast.AST]:
+    """Nodes that run when the module is imported: not those in functions, nor those for the type checker only."""
+    for child in ast.iter_child_nodes(node):
+        lazy = isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+        typing_only = isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test)
+        if not lazy and not typing_only:
+            yield child
+            yield from _at_import_time(child)
+
+
+def _layer(module: str) -> int | None:
+    prefixes = [prefix for prefix in LAYERS if module == prefix or module.startswith(prefix + ".")]
+    return LAYERS[max(prefixes, key=len)] if prefixes else None
+
+
+def _folder(module: str) -> str:
+    return module if module in PACKAGES else module.rpartition(".")[0]
+
+
+def _in_torch_room(module: str) -> bool:
+    return any(module == room or module.startswith(room + ".") for room in TORCH_ROOMS)
+
+
+def _reaches_torch(module: str, seen: set[str]) -> bool:
+    seen.add(module)
+    loaded = _imported(module, _at_import_time(_tree(module)))
+    # Importing a module imports the packages around it.
+    loaded |= {name.rpartition(".")[0] for name in loaded | {module}}
+    if any(name == "torch" or name.startswith("torch.") for name in loaded):
+        return True
+    return any(_reaches_torch(name, seen) for name in sorted(loaded) if name in MODULES and name not in seen)
+
+
+@pytest.mark.parametrize("module", [name for name in MODULES if name not in {"lalaloc_core", "service"}])
+def test_every_module_imports_only_from_lower_layers_or_its_own_folder(module: str) -> None:
+    layer = _layer(module)
+    assert layer is not None, f"{module} has no layer yet, add it to LAYERS"
+    for target in sorted(_imported(module, ast.walk(_tree(module)))):
+        if target.split(".")[0] not in {"lalaloc_core", "service"} or target in {"lalaloc_core", "service"}:
+            continue
+        target_layer = _layer(target)
+        assert target_layer is not None, f"{module} imports {target}, which has no layer"
+        neighbour = target_layer == layer and _folder(target) == _folder(module)
+        assert target_layer < layer or neighbour, f"{module} (layer {layer}) imports {target} (layer {target_layer})"
+
+
+def test_the_layer_table_names_no_module_that_is_gone() -> None:
+    assert [name for name in LAYERS if name not in MODULES] == []
+
+
+@pytest.mark.parametrize("module", [name for name in MODULES if not _in_torch_room(name)])
+def test_no_module_outside_the_torch_rooms_imports_torch_when_it_is_imported(module: str) -> None:
+    assert not _reaches_torch(module, set())
+
+
+def test_every_torch_room_is_one() -> None:
+    lazy = [room for room in TORCH_ROOMS if not any(_reaches_torch(m, set()) for m in MODULES if m.startswith(room))]
+    assert lazy == [], "these could be opened to the numpy side"
+
+
+@pytest.mark.parametrize("package", ["lalaloc_core", "service"])
+def test_importing_the_numpy_side_leaves_torch_unloaded(package: str) -> None:
+    names = [
+        name
+        for name in MODULES
+        if name.split(".")[0] == package and not _in_torch_room(name) and not name.endswith("__main__")
+    ]
+    program = (
+        f"import importlib, sys\nfor name in {names!r}:\n    importlib.import_module(name)\n"
+        "sys.exit('torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr or "torch was imported"
