@@ -168,11 +168,10 @@ def _evaluate(arguments: argparse.Namespace) -> None:
 
 
 def _answers(bundle: Any, queries: Any, *, kind: Any, heading_known: bool) -> list[Any]:
-    from lalaloc_core.evaluate import evaluate
+    from lalaloc_core.evaluate import evaluate, local_refiner
     from lalaloc_core.localise.encoders import Encoders
-    from lalaloc_core.localise.optimise import LatentPoseOptimiser
 
-    refiner = LatentPoseOptimiser.from_bundle(bundle).refine
+    refiner = local_refiner(bundle)
     return evaluate(Encoders(bundle), queries, kind=kind, heading_known=heading_known, refiner=refiner)
 
 

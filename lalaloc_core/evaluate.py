@@ -8,10 +8,13 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import torch
 from tqdm import tqdm
 
+from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.optimise import LatentPoseOptimiser
 from lalaloc_core.localise.pipeline import LocaliseConfig, Refiner, localise, panorama_heading
 from lalaloc_core.localise.poses import Query
 from lalaloc_core.localise.retrieval import build_grid
@@ -92,6 +95,12 @@ def evaluate(
                 query = encoders.query(image, shot.heading if heading_known else None, shot.camera_height_m)
             results.append(_answer(encoders, shot, query, refiner, config))
     return results
+
+
+def local_refiner(bundle: Bundle) -> Refiner:
+    """LPO in this process. Sets torch to one thread: its tensors are too small to share, and waiting costs more."""
+    torch.set_num_threads(1)
+    return LatentPoseOptimiser.from_bundle(bundle).refine
 
 
 def _layout_query(encoders: Encoders, shot: Shot) -> Query:

@@ -52,7 +52,7 @@ class Encoders:
         parts = []
         for first in range(0, len(profile_m), _LAYOUT_BATCH):
             batch = {name: value[first : first + _LAYOUT_BATCH] for name, value in inputs.items()}
-            parts.append(_run(self._layout, "latent", batch))
+            parts.append(_array(self._layout.run(["latent"], batch)[0]))
         return np.concatenate(parts) if parts else np.empty((0, self.manifest.latent_size), np.float32)
 
     def poses(
@@ -114,15 +114,15 @@ class Encoders:
         inputs = {"image": np.ascontiguousarray(image[None])}
         if self._image_takes_height:
             inputs["camera_height_m"] = np.array([camera_height_m], dtype=np.float32)
-        return _run(self._image, output, inputs)
+        return _array(self._image.run([output], inputs)[0])
 
     def _run_head(self, ring: Float[np.ndarray, "b c s"]) -> Float[np.ndarray, "b d"]:
         assert self._head is not None
-        return _run(self._head, "latent", {"ring": ring})
+        return _array(self._head.run(["latent"], {"ring": ring})[0])
 
 
-def _run(session: onnxruntime.InferenceSession, output: str, inputs: dict[str, np.ndarray]) -> np.ndarray:
-    value = session.run([output], inputs)[0]
+def _array(value: object) -> np.ndarray:
+    """What a network returned; onnxruntime also knows outputs that are no arrays."""
     assert isinstance(value, np.ndarray)
     return value
 

@@ -35,6 +35,7 @@ class LpoConfig:
     Attributes:
         margin_m: poses keep this distance to walls, so that none ends on the other side of one.
         tolerance_m: a Levenberg-Marquardt step shorter than this ends the search.
+        tolerance_cost: and so does one that lowers the cost by less than this share, or would by the linear model.
         max_step_m, max_turn: longest step (m) and turn (radians) per iteration.
         prune_after, prune_ratio: after so many evaluations, starts farther than the best by this factor are left
             where they are: they will not become the answer.
@@ -44,12 +45,13 @@ class LpoConfig:
     method: Literal["levenberg-marquardt", "adam"] = "levenberg-marquardt"
     margin_m: float = 0.03
     max_iterations: int = 15
-    tolerance_m: float = 2e-4
+    tolerance_m: float = 1e-3
+    tolerance_cost: float = 1e-2
     initial_damping: float = 1e-2
     max_step_m: float = 0.5
     max_turn: float = 0.2
-    prune_after: int = 4
-    prune_ratio: float = 2.0
+    prune_after: int = 3
+    prune_ratio: float = 1.5
     adam_learning_rate: float = 0.01
     adam_steps: int = 150
     adam_plateau_threshold: float = 0.05
@@ -205,8 +207,12 @@ def _levenberg_marquardt(problem: _Problem, config: LpoConfig) -> _Outcome:
         there = problem.evaluate(pose[rows] + step, rows)
         evaluations += 1
         better = there.cost < here.cost[rows]
-        # A step that short cannot matter, whether it was good or not.
-        converged[rows] = torch.linalg.vector_norm(step, dim=1) < config.tolerance_m
+        # What the linear model promised: little promised is little to lose, whether the step was good or not.
+        promised = -torch.einsum("kp,kp->k", gradient, step) - 0.5 * torch.einsum("kp,kpq,kq->k", step, hessian, step)
+        least = config.tolerance_cost * here.cost[rows]
+        gained = here.cost[rows] - there.cost
+        short = torch.linalg.vector_norm(step, dim=1) < config.tolerance_m
+        converged[rows] = short | (promised < least) | (better & (gained < least))
         pose[rows[better]] += step[better]
         here.replace(rows, there, better)
         damping[rows] = (damping[rows] * torch.where(better, 0.2, 6.0)).clamp(1e-6, 1e8)

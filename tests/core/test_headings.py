@@ -10,6 +10,7 @@ import math
 from typing import Any
 
 import numpy as np
+import onnxruntime
 import pytest
 import torch
 from hypothesis import given, settings
@@ -49,17 +50,17 @@ def photograph(plan: FloorPlan, pose: PoseSet, heading: float) -> np.ndarray:
     return paint(wall_profile(pose.position_m, np.array([heading]), walls, COLUMNS)[0])
 
 
-class PaintedSession:
+class PaintedSession(onnxruntime.InferenceSession):
     """Stands in for the image encoder's session: the layout encoder's ring of the painted profile."""
 
     def __init__(self, encoder: RingLayoutEncoder) -> None:
         self.encoder = encoder
 
-    def run(self, outputs: list[str], inputs: dict[str, np.ndarray]) -> list[np.ndarray]:
-        assert outputs == ["ring"]
-        pixels = torch.from_numpy(inputs["image"].astype(np.float32))[:, 0]
+    def run(self, output_names: Any, input_feed: Any, run_options: Any = None) -> list[np.ndarray]:
+        assert output_names == ["ring"]
+        pixels = torch.from_numpy(input_feed["image"].astype(np.float32))[:, 0]
         profile = (pixels[..., 0] * 65536 + pixels[..., 1] * 256 + pixels[..., 2]) * _UNIT_M
-        camera = torch.from_numpy(inputs["camera_height_m"])
+        camera = torch.from_numpy(input_feed["camera_height_m"])
         return [self.encoder.ring(profile, camera, torch.full_like(camera, CEILING_M)).numpy()]
 
 
@@ -67,8 +68,7 @@ class PaintedSession:
 def perfect(opened_bundle: Bundle, optimiser: LatentPoseOptimiser) -> Encoders:
     encoders = Encoders(opened_bundle, threads=1)
     assert isinstance(optimiser.encoder, RingLayoutEncoder)
-    painted: Any = PaintedSession(optimiser.encoder)
-    encoders._image = painted
+    encoders._image = PaintedSession(optimiser.encoder)
     return encoders
 
 

@@ -221,6 +221,15 @@ class TestBatches:
         answer = pruned.position_m[int(pruned.latent_distance.argmin())]
         np.testing.assert_allclose(answer, full.position_m[best], atol=5e-3)
 
+    @given(seeds())
+    @settings(max_examples=10)
+    def test_the_best_start_is_never_pruned(self, smooth_encoder: RingLayoutEncoder, seed: int) -> None:
+        scene = scene_of(plan_of(l_shape(5.0, 4.0, 2.0, 2.5)), 1, seed)
+        job = job_near(smooth_encoder, scene, seed, heading_known=False)
+        strict = LpoConfig(prune_after=1, prune_ratio=1.0)
+        pruned, full = (LatentPoseOptimiser(smooth_encoder, config).refine(job) for config in (strict, LM))
+        np.testing.assert_allclose(pruned.position_m, full.position_m, atol=1e-6)
+
     def test_a_known_heading_comes_back_as_it_was(self, smooth_encoder: RingLayoutEncoder) -> None:
         scene = scene_of(plan_of(l_shape(5.0, 4.0, 2.0, 2.5)), 3, 1)
         job = job_near(smooth_encoder, scene, 0, heading_known=True)

@@ -160,7 +160,7 @@ class TestResampling:
         # The truth lies in the wall between the rooms: whatever is answered is in a room, the one it names.
         query = self.query(4.3, 2.0)
         found = self.resample(query, self.candidate(query, 3.8, 2.0), 1.0)
-        assert self.plan.room_index_at(found.position_m[None])[0] == found.room_index
+        assert self.plan.room_index_at(found.position_m[None])[0] == found.room_index >= 0
         across = self.query(4.7, 2.0)
         moved = self.resample(across, self.candidate(across, 3.8, 2.0), 1.2)
         assert moved.room_index == 1
