@@ -98,7 +98,8 @@ def _accuracy_rows(accuracy: dict[str, Any]) -> list[str]:
 
 
 def _accuracy(scores: dict[str, Any]) -> str:
+    median = "under 0.01" if scores["median_cm"] < 0.01 else f"{scores['median_cm']:.1f}"
     return (
         f"{scores['within_1m']:.1%} < 1 m, {scores['within_10cm']:.1%} < 10 cm, {scores['within_1cm']:.1%} < 1 cm, "
-        f"median {scores['median_cm']:.2g} cm (n = {scores['n']})"
+        f"median {median} cm (n = {scores['n']})"
     )
