@@ -110,14 +110,12 @@ def _grown(distance: Float[np.ndarray, "rows columns"]) -> Float[np.ndarray, "ro
 def _draw_photograph(axes: Axes, panel: Panel) -> None:
     with Image.open(panel.truth.picture) as picture:
         axes.imshow(np.asarray(picture.convert("RGB")))
-    axes.set_axis_off()
-    axes.set_anchor("NW")
+    axes.set(xticks=[], yticks=[], frame_on=False, anchor="NW")
     axes.set_title(panel.truth.file, loc="left", fontsize=12, fontweight="bold", color=_INK)
     sentences = [_sentence("heading given", panel.truth, panel.known)]
     sentences.append(_sentence("heading not given", panel.truth, panel.unknown))
-    axes.text(
-        0.0, -0.03, "\n".join(sentences), transform=axes.transAxes, va="top", fontsize=10, color=_INK, linespacing=1.5
-    )
+    # A label, not free text: the layout makes room for it.
+    axes.set_xlabel("\n".join(sentences), loc="left", fontsize=10, color=_INK, linespacing=1.5)
 
 
 def _sentence(label: str, truth: TruePose, answer: dict[str, Any]) -> str:

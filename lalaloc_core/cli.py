@@ -6,6 +6,7 @@ import argparse
 import dataclasses
 import json
 import logging
+import os
 import platform
 import shlex
 import sys
@@ -107,6 +108,9 @@ def _train(arguments: argparse.Namespace) -> None:
     if arguments.seed is not None:
         config = dataclasses.replace(config, seed=arguments.seed)
     device = torch.device(arguments.device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    if device.type == "cpu":
+        # The workers need cores of their own: threads that wait for each other on shared ones are slower than fewer.
+        torch.set_num_threads(max((os.cpu_count() or 1) - arguments.workers, 1))
     common = {"device": device, "workers": arguments.workers, "resume": arguments.resume}
     if arguments.stage == "layout":
         train_layout(config, arguments.out, **common)

@@ -20,7 +20,16 @@ import safetensors.torch
 import torch
 from torch import Tensor, nn
 
-from lalaloc_core.bundle import HEAD_ONNX, IMAGE_ONNX, IMAGE_WEIGHTS, LAYOUT_ONNX, LAYOUT_WEIGHTS, Bundle, Manifest
+from lalaloc_core.bundle import (
+    BUNDLE_FILES,
+    HEAD_ONNX,
+    IMAGE_ONNX,
+    IMAGE_WEIGHTS,
+    LAYOUT_ONNX,
+    LAYOUT_WEIGHTS,
+    Bundle,
+    Manifest,
+)
 from lalaloc_core.bundle import write_manifest as _write_manifest
 from lalaloc_core.errors import ExportError
 from lalaloc_core.nets import ImageEncoder, LayoutEncoder, resnet, ring
@@ -59,6 +68,9 @@ def export_bundle(
         parity = _export_networks(work, config, layout_encoder, image_encoder)
         manifest = _manifest(config, name, version, {**(training or {}), "parity_max_abs_difference": parity})
         folder.mkdir(parents=True, exist_ok=True)
+        for name in BUNDLE_FILES:
+            # A bundle of another architecture may have left files that this one does not have.
+            (folder / name).unlink(missing_ok=True)
         for path in work.iterdir():
             (folder / path.name).write_bytes(path.read_bytes())
     return _write_manifest(folder, manifest)

@@ -106,6 +106,8 @@ class TestExport:
 
     def test_the_paper_s_architecture_exports_and_answers(self, tmp_path: Path) -> None:
         config = small_paper()
+        # What a bundle of the other architecture left behind is not taken over.
+        (tmp_path / HEAD_ONNX).write_bytes(b"of another architecture")
         bundle = exported(tmp_path, config)
         assert (bundle.manifest.architecture, bundle.manifest.ring_sectors) == ("paper", 0)
         assert HEAD_ONNX not in bundle.manifest.files
