@@ -6,6 +6,7 @@ it when it dies or stalls. Nothing that happens to a worker reaches the caller e
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import multiprocessing
 import queue
@@ -139,11 +140,10 @@ class LpoPool:
         """A worker died over this job: let another one try, once, if there is one and time is left."""
         if not ticket.retried and not ticket.expired and self.state.ready > 0:
             ticket.retried = True
-            try:
+            # Without room for a second try, the caller gets what it gets without LPO.
+            with contextlib.suppress(queue.Full):
                 self._queue.put_nowait(ticket)
                 return
-            except queue.Full:
-                pass
         ticket.answer(None)
 
     def note_restart(self, index: int, reason: str) -> None:
