@@ -62,7 +62,7 @@ class GridAnswer(Answer):
     """The plan's latent grid."""
 
     step_m: float = Field(description="Distance of neighbouring poses.")
-    poses: int = Field(description="Number of poses; an upper estimate until the plan is ready.")
+    poses: int = Field(description="Number of poses; an estimate until the plan is ready.")
 
 
 class BoundsAnswer(Answer):
