@@ -32,7 +32,7 @@ from lalaloc_core.sampling import random_poses
 from lalaloc_core.synth.materials import MaterialLibrary
 from lalaloc_core.synth.panorama import PanoramaRenderer, sample_shots
 from lalaloc_core.synth.plans import Home
-from lalaloc_core.training.stream import TEST, home_of
+from lalaloc_core.synth.splits import TEST, home_of
 
 _REQUESTS = 40
 _STARTUP_SECONDS = 60.0

@@ -28,6 +28,8 @@ def build_config(kind: type[Any], raw: Any, *, path: str = "config") -> Any:
 
 
 def _convert(hint: Any, value: Any, path: str) -> Any:
+    if hint is Any:
+        return value
     if dataclasses.is_dataclass(hint):
         return build_config(hint, value, path=path)  # type: ignore[arg-type]
     origin = get_origin(hint)
@@ -39,6 +41,8 @@ def _convert(hint: Any, value: Any, path: str) -> Any:
         return None if value is None else _convert(next(a for a in get_args(hint) if a is not type(None)), value, path)
     if origin is tuple and isinstance(value, list | tuple):
         return tuple(_convert(get_args(hint)[0], item, path) for item in value)
+    if origin is dict and isinstance(value, dict):
+        return {key: _convert(get_args(hint)[1], item, f"{path}.{key}") for key, item in value.items()}
     if hint is float and isinstance(value, int) and not isinstance(value, bool):
         return float(value)
     if isinstance(hint, type) and isinstance(value, hint) and not (hint is int and isinstance(value, bool)):

@@ -4,14 +4,19 @@ LaLaLocError
 ├── InvalidInputError            the caller's data is wrong (a 4xx over HTTP, exit code 2 on the command line)
 │   ├── InvalidFloorPlanError    a plan cannot be what it says; names the room
 │   ├── InvalidPanoramaError     a picture that is not a usable 360° panorama
-│   └── InvalidPoseError         a position, heading or height outside its limits
+│   ├── InvalidPoseError         a position, heading or height outside its limits
+│   └── DatasetError             a data set's file is missing, damaged or impossible; names scene, room and path
 ├── ConfigError                  unknown key or value of a wrong type in a configuration
 ├── BundleError                  a model bundle is missing, incomplete or was altered
 ├── CheckpointError              a checkpoint is missing or belongs to another configuration
-└── ExportError                  an exported network disagrees with the one it was exported from
+├── ExportError                  an exported network disagrees with the one it was exported from
+└── RunError                     an evaluation run is missing, damaged, or was made with other settings
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
 
 
 class LaLaLocError(Exception):
@@ -44,6 +49,33 @@ class InvalidPoseError(InvalidInputError):
     """A position, heading or height lies outside its limits."""
 
 
+class DatasetError(InvalidInputError):
+    """A file of a data set is missing, damaged, or says what cannot be.
+
+    Attributes:
+        reason: what is wrong, with value and limit.
+        scene, room: where; None when the fault lies above them.
+        path: the file at fault, None when there is no single one.
+    """
+
+    def __init__(
+        self, reason: str, *, scene: str | None = None, room: str | None = None, path: Path | None = None
+    ) -> None:
+        self.reason, self.scene, self.room, self.path = reason, scene, room, path
+        where = [f"scene '{scene}'"] if scene is not None else []
+        where += [f"room '{room}'"] if room is not None else []
+        where += [f"'{path}'"] if path is not None else []
+        super().__init__(f"{', '.join(where)}: {reason}" if where else reason)
+
+    def __reduce__(self) -> tuple[Callable[..., DatasetError], tuple[object, ...]]:
+        """Errors of worker processes arrive whole."""
+        return _dataset_error, (self.reason, self.scene, self.room, self.path)
+
+
+def _dataset_error(reason: str, scene: str | None, room: str | None, path: Path | None) -> DatasetError:
+    return DatasetError(reason, scene=scene, room=room, path=path)
+
+
 class ConfigError(LaLaLocError, ValueError):
     """A configuration has an unknown key or a value of the wrong type."""
 
@@ -58,3 +90,7 @@ class CheckpointError(LaLaLocError):
 
 class ExportError(LaLaLocError):
     """An exported network disagrees with the one it was exported from."""
+
+
+class RunError(LaLaLocError):
+    """An evaluation run is missing, damaged, or was made with other settings."""

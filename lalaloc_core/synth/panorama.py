@@ -89,6 +89,12 @@ class PanoramaRenderer:
         batch = stack_scenes([build_scene(shot, self._materials) for shot in shots], self._device)
         return trace(batch, self._directions(batch), self._slope)
 
+    @torch.no_grad()
+    def depth_m(self, shots: Sequence[Shot]) -> Float[Tensor, "b h w"]:
+        """Range (m) along each pixel's ray to whatever it sees, furniture included; at least as large as a panorama."""
+        distance = self.hits(shots).distance_m.transpose(1, 2)
+        return distance * torch.sqrt(1.0 + self._slope.square())[None, :, None]
+
     def _directions(self, batch: SceneBatch) -> Float[Tensor, "b c 2"]:
         azimuth = batch.heading[:, None] + self._azimuth
         return torch.stack([azimuth.sin(), azimuth.cos()], dim=-1)

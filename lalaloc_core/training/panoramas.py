@@ -13,8 +13,9 @@ from torch.utils.data import IterableDataset
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.synth.materials import MaterialLibrary
 from lalaloc_core.synth.panorama import PanoramaRenderer, Shot, sample_shots
+from lalaloc_core.synth.splits import TRAIN, home_of
 from lalaloc_core.training.config import TrainConfig
-from lalaloc_core.training.stream import TRAIN, Batch, home_of, worker_share
+from lalaloc_core.training.stream import Batch, worker_share
 
 # Panoramas rendered together by a worker; more gains nothing on a CPU and costs memory.
 _RENDER_BATCH = 8

@@ -1,7 +1,4 @@
-"""Endless streams of training batches, made in worker processes while the network trains; here: layouts.
-
-Seeds: home number i of a split is `default_rng([split, seed, i])`; the splits below never share a home.
-"""
+"""Endless streams of training batches, made in worker processes while the network trains; here: layouts."""
 
 from __future__ import annotations
 
@@ -17,17 +14,10 @@ from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.sampling import sample_triplets
-from lalaloc_core.synth.plans import Home, generate_home
+from lalaloc_core.synth.splits import TRAIN, home_of
 from lalaloc_core.training.config import TrainConfig
 
-TRAIN, VALIDATION, TEST = 0, 1, 2
 Batch = dict[str, torch.Tensor]
-
-
-def home_of(split: int, seed: int, index: int) -> tuple[Home, np.random.Generator]:
-    """Home number `index` of a split, and the generator for whatever else is drawn for it."""
-    rng = np.random.default_rng([split, seed, index])
-    return generate_home(rng), rng
 
 
 @dataclass

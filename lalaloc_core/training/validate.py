@@ -20,8 +20,8 @@ from lalaloc_core.sampling import PoseSet, pose_grid, random_poses
 from lalaloc_core.synth.materials import MaterialLibrary
 from lalaloc_core.synth.panorama import PanoramaRenderer, Shot, sample_shots
 from lalaloc_core.synth.plans import Home
+from lalaloc_core.synth.splits import VALIDATION, home_of
 from lalaloc_core.training.config import TrainConfig
-from lalaloc_core.training.stream import VALIDATION, home_of
 
 _HOMES = 25
 _SHOTS_PER_HOME = 4

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from lalaloc_core.errors import CheckpointError
 from lalaloc_core.nets.ring import RingLayoutEncoder
+from lalaloc_core.synth.splits import TEST, TRAIN, VALIDATION, home_of
 from lalaloc_core.training import stream
 from lalaloc_core.training.checkpoint import Checkpoint
 from lalaloc_core.training.config import PRESETS, ImageStageConfig, OptimiserConfig, TrainConfig
@@ -28,7 +29,7 @@ from lalaloc_core.training.loop import run_stage
 from lalaloc_core.training.panoramas import PanoramaBatches, turn_and_mirror
 from lalaloc_core.training.run import export_run, train_image
 from lalaloc_core.training.stages import Stage, build_layout_encoder
-from lalaloc_core.training.stream import TEST, TRAIN, VALIDATION, Batch, LayoutBatches, home_of
+from lalaloc_core.training.stream import Batch, LayoutBatches
 from tests.strategies import seeds
 
 CPU = torch.device("cpu")

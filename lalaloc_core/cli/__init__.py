@@ -1,0 +1,36 @@
+"""The command line: `lalaloc COMMAND`; each module here adds the commands of one room of the project.
+
+Commands import what they run when they run it, so that `lalaloc --help` loads no network.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+
+from lalaloc_core.cli import evaluation, measuring, synthesis, training
+from lalaloc_core.errors import InvalidInputError, LaLaLocError
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run one command; 0 on success, 2 on the caller's mistake, 1 on any other error of this project."""
+    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
+    arguments = _parser().parse_args(argv)
+    try:
+        arguments.run(arguments)
+    except InvalidInputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    except LaLaLocError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="lalaloc", description="Localise panoramas in floor plans.")
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    for room in (synthesis, training, evaluation, measuring):
+        room.add_commands(commands)
+    return parser

@@ -1,0 +1,31 @@
+"""`lalaloc bench`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from lalaloc_core.cli.printing import print_json
+
+
+def add_commands(commands: Any) -> None:
+    """Add this room's commands to the parser."""
+    bench = commands.add_parser("bench", help="measure the figures of docs/results.md and print them as JSON")
+    bench.add_argument("--bundle", type=Path, default=Path("models/default"))
+    bench.add_argument("--homes", type=int, default=125, help="test homes per accuracy figure, 4 queries each")
+    bench.add_argument("--textures", type=Path, help="folder of material pictures for the test panoramas")
+    bench.add_argument("--out", type=Path, help="also write the JSON to this file")
+    bench.add_argument("--only", choices=("rendering", "service", "accuracy"), help="one group of figures")
+    bench.set_defaults(run=_bench)
+
+
+def _bench(arguments: argparse.Namespace) -> None:
+    from lalaloc_core.bench import run_bench
+
+    groups = (arguments.only,) if arguments.only else ("rendering", "service", "accuracy")
+    report = run_bench(arguments.bundle, groups, homes=arguments.homes, textures=arguments.textures)
+    if arguments.out is not None:
+        arguments.out.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    print_json(report)

@@ -1,0 +1,71 @@
+"""`lalaloc train` and `lalaloc export`."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import os
+import platform
+from pathlib import Path
+from typing import Any
+
+from lalaloc_core.cli.printing import print_json
+
+
+def add_commands(commands: Any) -> None:
+    """Add this room's commands to the parser."""
+    train = commands.add_parser("train", help="train a stage: the layout encoder, then the image encoder")
+    train.add_argument("stage", choices=("layout", "image"))
+    train.add_argument("--preset", default="ring", choices=("ring", "paper", "tiny"))
+    train.add_argument("--out", type=Path, required=True, help="folder of the run, shared by both stages")
+    train.add_argument("--minutes", type=float, help="wall-clock budget; sets the pace of the schedule")
+    train.add_argument("--steps", type=int, help="number of updates, instead of the preset's")
+    train.add_argument("--seed", type=int, help="instead of the preset's")
+    train.add_argument("--resume", action="store_true", help="go on from the checkpoint in --out")
+    train.add_argument("--device", help="cpu or cuda; default: cuda where there is one")
+    train.add_argument("--workers", type=int, default=1, help="processes that make training batches")
+    train.add_argument("--textures", type=Path, help="folder of material pictures; without it all are procedural")
+    train.set_defaults(run=_train)
+
+    export = commands.add_parser("export", help="export a trained run to a model bundle")
+    export.add_argument("--run", type=Path, required=True, dest="folder")
+    export.add_argument("--out", type=Path, required=True)
+    export.add_argument("--name", help="of the model; default: the name of the folder --out")
+    export.add_argument("--version", required=True, dest="model_version")
+    export.add_argument("--note", action="append", default=[], metavar="KEY=VALUE", help="recorded in the manifest")
+    export.set_defaults(run=_export)
+
+
+def _train(arguments: argparse.Namespace) -> None:
+    import torch
+
+    from lalaloc_core.training.config import PRESETS
+    from lalaloc_core.training.run import train_image, train_layout
+
+    config = PRESETS[arguments.preset]
+    changes: dict[str, Any] = {name: getattr(arguments, name) for name in ("minutes", "steps")}
+    stage = dataclasses.replace(
+        getattr(config, arguments.stage), **{name: value for name, value in changes.items() if value is not None}
+    )
+    config = dataclasses.replace(config, **{arguments.stage: stage})
+    if arguments.seed is not None:
+        config = dataclasses.replace(config, seed=arguments.seed)
+    device = torch.device(arguments.device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    if device.type == "cpu":
+        # The workers need cores of their own: threads that wait for each other on shared ones are slower than fewer.
+        torch.set_num_threads(max((os.cpu_count() or 1) - arguments.workers, 1))
+    common = {"device": device, "workers": arguments.workers, "resume": arguments.resume}
+    if arguments.stage == "layout":
+        train_layout(config, arguments.out, **common)
+    else:
+        train_image(config, arguments.out, textures=arguments.textures, **common)
+
+
+def _export(arguments: argparse.Namespace) -> None:
+    from lalaloc_core.training.run import export_run
+
+    pairs = [note.partition("=") for note in arguments.note]
+    notes = {"hardware": platform.machine(), **{key: value for key, _, value in pairs}}
+    name = arguments.name or arguments.out.resolve().name
+    bundle = export_run(arguments.folder, arguments.out, name=name, version=arguments.model_version, notes=notes)
+    print_json({name: entry.bytes for name, entry in bundle.manifest.files.items()})

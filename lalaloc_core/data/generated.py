@@ -1,0 +1,107 @@
+"""Synthetic scenes from the generator, without touching disk: homes by seed, rendered when they are looked at."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from lalaloc_core.data.dataset import Appearance, Camera, Scene, Split
+from lalaloc_core.errors import DatasetError
+from lalaloc_core.synth.furniture import FurnitureLevel
+from lalaloc_core.synth.materials import MaterialLibrary
+from lalaloc_core.synth.panorama import PanoramaRenderer
+from lalaloc_core.synth.shots import Shot, sample_shots
+from lalaloc_core.synth.splits import TEST, TRAIN, VALIDATION, home_of
+
+_DEPTH_HEIGHT = 256
+_SPLIT_NUMBERS: dict[Split, int] = {"train": TRAIN, "validation": VALIDATION, "test": TEST}
+
+
+@dataclass(frozen=True, kw_only=True)
+class GeneratedScenes:
+    """Homes of the generator with a few cameras each, at every heading and camera heights of 1.0 to 1.9 m.
+
+    Attributes:
+        homes: how many per split.
+        shots_per_home: cameras per home.
+        furniture: every camera's level, or None to draw it for each: then a camera's one photograph has no level.
+        textures: folder of material pictures; without it all are procedural.
+    """
+
+    homes: int
+    shots_per_home: int = 4
+    seed: int = 0
+    furniture: FurnitureLevel | None = "full"
+    textures: Path | None = None
+
+    @property
+    def description(self) -> str:
+        return f"generated homes (seed {self.seed})"
+
+    @property
+    def appearances(self) -> Sequence[Appearance]:
+        return (Appearance(self.furniture),)
+
+    def scenes(self, split: Split) -> Sequence[str]:
+        return [f"{split}-{index:05d}" for index in range(self.homes)]
+
+    def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
+        split, _, index = name.partition("-")
+        number = next((n for known, n in _SPLIT_NUMBERS.items() if known == split), None)
+        if number is None or not index.isdecimal():
+            raise DatasetError("no such generated scene; names are like 'test-00042'", scene=name)
+        home, rng = home_of(number, self.seed, int(index))
+        shots = sample_shots(home, self.shots_per_home, rng, self.furniture)
+        cameras = tuple(
+            Camera(
+                name=str(k),
+                position_m=shot.position_m,
+                room_index=shot.room_index,
+                heading=shot.heading,
+                camera_height_m=shot.camera_height_m,
+                photographs={self.appearances[0]: RenderedPhotograph(shot, self._studio(number))},
+            )
+            for k, shot in enumerate(shots)
+        )
+        return Scene(name=name, plan=home.plan, cameras=cameras)
+
+    def _studio(self, split: int) -> Studio:
+        return _studio(split, self.seed, self.textures)
+
+
+class Studio:
+    """The materials of a split, and its renderers by picture size: both take a second to build and are kept."""
+
+    def __init__(self, materials: MaterialLibrary) -> None:
+        self._materials = materials
+        self._renderers: dict[tuple[int, int], PanoramaRenderer] = {}
+
+    def renderer(self, height: int, width: int) -> PanoramaRenderer:
+        """The renderer of a picture size."""
+        if (height, width) not in self._renderers:
+            self._renderers[height, width] = PanoramaRenderer(self._materials, height=height, width=width)
+        return self._renderers[height, width]
+
+
+@lru_cache(maxsize=4)
+def _studio(split: int, seed: int, textures: Path | None) -> Studio:
+    return Studio(MaterialLibrary.create(np.random.default_rng([split, seed]), textures))
+
+
+@dataclass(frozen=True, eq=False)
+class RenderedPhotograph:
+    """A photograph that is rendered whenever it is asked for."""
+
+    shot: Shot
+    studio: Studio
+
+    def image(self, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
+        return self.studio.renderer(height, width).render([self.shot])[0].cpu().numpy()
+
+    def depth_m(self) -> Float[np.ndarray, "h w"]:
+        return self.studio.renderer(_DEPTH_HEIGHT, 2 * _DEPTH_HEIGHT).depth_m([self.shot])[0].cpu().numpy()

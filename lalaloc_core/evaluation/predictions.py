@@ -1,0 +1,185 @@
+"""What an evaluation leaves on disk: one folder per run, with what was asked and every answer.
+
+    RUN/run.json            what was asked: method, data, settings, model (`RunInfo`)
+    RUN/predictions.jsonl   one line per query, in order (`Prediction`)
+    RUN/scores.json         written by scoring; can be made again at any time, without model or data
+
+Files hold metres, degrees and milliseconds, as the names say.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from lalaloc_core.configuration import build_config
+from lalaloc_core.errors import ConfigError, RunError
+from lalaloc_core.methods.method import QueryKind
+
+RUN_FILE = "run.json"
+PREDICTIONS_FILE = "predictions.jsonl"
+SCORES_FILE = "scores.json"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pose:
+    """A pose in a plan; `distance` is how far the method's own measure says it is from the query (None: none)."""
+
+    x_m: float
+    y_m: float
+    room_index: int
+    heading_deg: float
+    distance: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Prediction:
+    """One query and its answer.
+
+    Attributes:
+        scene, camera: which query.
+        room: name of the true room.
+        truth: the true pose.
+        stages: the best pose after every stage ("retrieval", "vdr", "lpo", ...), in order; the last is the answer.
+            Empty where the method had none: a miss.
+        layout_hit: whether retrieval chose the grid pose whose layout is nearest the truth by Chamfer distance
+            (Layout R@1); None for methods that do not retrieve.
+        pose_hit: whether it chose the nearest grid pose (Pose R@1).
+        candidate_distances: of the distinct final candidates, best first.
+        confidence: probability, by the model, of being within 1 m.
+        timings_ms: per stage.
+        failure: why there is no answer.
+    """
+
+    scene: str
+    camera: str
+    room: str
+    camera_height_m: float
+    truth: Pose
+    stages: dict[str, Pose] = field(default_factory=dict)
+    layout_hit: bool | None = None
+    pose_hit: bool | None = None
+    candidate_distances: tuple[float, ...] = ()
+    confidence: float | None = None
+    timings_ms: dict[str, float] = field(default_factory=dict)
+    failure: str | None = None
+
+    @property
+    def answer(self) -> Pose | None:
+        """The pose after the last stage; None where there is no answer."""
+        return next(reversed(self.stages.values()), None)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunInfo:
+    """What was asked, enough to ask again.
+
+    Attributes:
+        label: what tables call the run.
+        method: "lalaloc", "oracle", "icp", "explicit" or "decode".
+        settings: the method's own settings, plain data.
+        dataset: what results are to be called, such as "Structured3D".
+        data: folder of the data set as it was given; None for generated homes.
+        generated: arguments of the generator where `data` is None.
+        furniture, lighting: the appearance of the photographs; None where the data set has none.
+        limit: at most so many queries; None for all.
+        bundle: folder of the model as it was given; None for methods without one.
+        model: name, version and SHA-256 of the bundle.
+        command: how to run it again.
+        skipped: scenes and cameras that could not be used, with reasons.
+    """
+
+    label: str
+    method: str
+    kind: QueryKind
+    dataset: str
+    split: str
+    settings: dict[str, Any] = field(default_factory=dict)
+    data: str | None = None
+    generated: dict[str, Any] | None = None
+    furniture: str | None = None
+    lighting: str | None = None
+    heading_known: bool = True
+    grid_step_m: float = 0.5
+    limit: int | None = None
+    bundle: str | None = None
+    model: dict[str, str] | None = None
+    command: str = ""
+    skipped: tuple[str, ...] = ()
+
+
+class RunFolder:
+    """Reads and writes the files of one run."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def read_info(self) -> RunInfo:
+        """What was asked.
+
+        Raises:
+            RunError: no run there, or not one this version reads.
+        """
+        path = self.path / RUN_FILE
+        try:
+            return build_config(RunInfo, json.loads(path.read_text(encoding="utf-8")), path=RUN_FILE)
+        except OSError as error:
+            raise RunError(f"no evaluation run at '{self.path}': {error.strerror} ({RUN_FILE})") from error
+        except (ValueError, ConfigError) as error:
+            raise RunError(f"'{path}' does not describe a run: {error}") from error
+
+    def write_info(self, info: RunInfo) -> None:
+        """Record what is asked."""
+        self.path.mkdir(parents=True, exist_ok=True)
+        write_atomically(self.path / RUN_FILE, json.dumps(dataclasses.asdict(info), indent=2) + "\n")
+
+    def read_predictions(self) -> list[Prediction]:
+        """Every complete answer; a last line that an interruption cut short is left out.
+
+        Raises:
+            RunError: a line that is not a prediction.
+        """
+        path = self.path / PREDICTIONS_FILE
+        if not path.exists():
+            return []
+        lines = path.read_text(encoding="utf-8").split("\n")
+        # What stands after the last line break was being written when the run was interrupted.
+        return [self._parse(line, number) for number, line in enumerate(lines[:-1], start=1)]
+
+    def append(self, predictions: Iterable[Prediction]) -> None:
+        """Add answers at the end of the file."""
+        text = "".join(json.dumps(dataclasses.asdict(one), allow_nan=False) + "\n" for one in predictions)
+        with (self.path / PREDICTIONS_FILE).open("a", encoding="utf-8") as file:
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+
+    def truncate(self, predictions: Iterable[Prediction]) -> None:
+        """Replace the file's content, atomically."""
+        text = "".join(json.dumps(dataclasses.asdict(one), allow_nan=False) + "\n" for one in predictions)
+        write_atomically(self.path / PREDICTIONS_FILE, text)
+
+    def _parse(self, line: str, number: int) -> Prediction:
+        try:
+            return build_config(Prediction, json.loads(line), path=f"line {number}")
+        except (ValueError, ConfigError) as error:
+            raise RunError(f"'{self.path / PREDICTIONS_FILE}' line {number} is no prediction: {error}") from error
+
+
+def read_runs(folders: Iterable[Path]) -> Iterator[tuple[RunInfo, list[Prediction]]]:
+    """What several runs asked and answered."""
+    for folder in folders:
+        run = RunFolder(folder)
+        yield run.read_info(), run.read_predictions()
+
+
+def write_atomically(path: Path, text: str) -> None:
+    """Write a text file so that a crash leaves the previous one."""
+    temporary = path.with_name(path.name + ".part")
+    temporary.write_text(text, encoding="utf-8")
+    temporary.replace(path)
