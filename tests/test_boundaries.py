@@ -31,6 +31,7 @@ LAYERS = {
     "lalaloc_core.training": 6,
     "lalaloc_core.methods": 6,
     "lalaloc_core.evaluation": 7,
+    "lalaloc_core.evaluation.report": 8,
     "lalaloc_core.calibrate": 8,
     "lalaloc_core.export": 8,
     # A run ends with its export, so this one file stands above it.
@@ -67,7 +68,6 @@ TORCH_ROOMS = (
     "lalaloc_core.methods",
     "lalaloc_core.evaluation",
     "lalaloc_core.reproduce",
-    "lalaloc_core.calibrate",
     "lalaloc_core.export",
     "lalaloc_core.bench",
 )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, Protocol, get_args
+from typing import Literal, Protocol, get_args, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -36,6 +36,7 @@ class Appearance:
         return "/".join(part for part in (self.furniture, self.lighting) if part is not None) or "as photographed"
 
 
+@runtime_checkable
 class Photograph(Protocol):
     """A panorama that can be read."""
 
@@ -93,6 +94,7 @@ class Scene:
         return found
 
 
+@runtime_checkable
 class Dataset(Protocol):
     """Scenes by split; small enough to be sent to worker processes.
 

@@ -1,0 +1,41 @@
+"""Opening a data set by its folder: which of the formats it holds shows in its files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lalaloc_core.data.dataset import Dataset
+from lalaloc_core.data.folder import PLAN_FILE, OwnData
+from lalaloc_core.data.structured3d import Structured3D
+from lalaloc_core.data.zind import DATA_FILE, PARTITION_FILE, Zind
+from lalaloc_core.errors import DatasetError
+
+_STRUCTURED3D_SCENES = "scene_" + 5 * "[0-9]"
+
+
+def open_dataset(root: Path) -> Dataset:
+    """The data set that a folder holds.
+
+    Raises:
+        DatasetError: there is no such folder, it holds none of the known formats, or more than one.
+    """
+    if not root.exists():
+        raise DatasetError("there is no such folder", path=root)
+    if not root.is_dir():
+        raise DatasetError("a data set is a folder, this is a file", path=root)
+    found: dict[str, Dataset] = {}
+    if any(path.is_dir() and not (path / PLAN_FILE).exists() for path in root.glob(_STRUCTURED3D_SCENES)):
+        found["Structured3D"] = Structured3D(root)
+    if (root / PARTITION_FILE).exists() or next(root.glob(f"*/{DATA_FILE}"), None) is not None:
+        found["ZInD"] = Zind(root)
+    if next(root.glob(f"*/{PLAN_FILE}"), None) is not None:
+        found["own data"] = OwnData(root)
+    if len(found) > 1:
+        raise DatasetError(f"the folder holds several data sets: {', '.join(found)}", path=root)
+    if not found:
+        raise DatasetError(
+            "no data set here; looked for folders 'scene_00000' (Structured3D), "
+            f"'{PARTITION_FILE}' or '*/{DATA_FILE}' (ZInD), and '*/{PLAN_FILE}' (own data)",
+            path=root,
+        )
+    return next(iter(found.values()))

@@ -1,0 +1,95 @@
+"""Photographs in files: nothing is opened before it is asked for."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image, UnidentifiedImageError
+
+from lalaloc_core.errors import DatasetError, InvalidPanoramaError
+from lalaloc_core.localise.images import PanoramaLimits, read_panorama
+
+_MM_PER_M = 1000.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class FilePhotograph:
+    """A panorama in a file.
+
+    Attributes:
+        path: the picture.
+        scene, room: where it was taken, for errors.
+        depth_path: 16-bit PNG with millimetres along each pixel's ray, 0 where there is no reading; None: no depth.
+        size: (height, width) that both must have; None: any that is a whole panorama.
+    """
+
+    path: Path
+    scene: str
+    room: str
+    depth_path: Path | None = None
+    size: tuple[int, int] | None = None
+
+    def image(self, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
+        """RGB pixels at the wanted size.
+
+        Raises:
+            DatasetError: missing, damaged, no panorama, or of another size than the data set's.
+        """
+        content = self._read(self.path)
+        limits = PanoramaLimits()
+        if self.size is not None:
+            self._check_size(self.path, content)
+            limits = PanoramaLimits(min_height=self.size[0])
+        try:
+            return read_panorama(content, height=height, width=width, limits=limits)
+        except InvalidPanoramaError as error:
+            raise self._error(str(error), self.path) from error
+
+    def depth_m(self) -> Float[np.ndarray, "h w"]:
+        """Distance (m) along each pixel's ray to what was seen; NaN where there is no reading.
+
+        Raises:
+            DatasetError: there is none, or it is missing or damaged.
+        """
+        if self.depth_path is None:
+            raise self._error("the data set has no depth", self.path)
+        content = self._read(self.depth_path)
+        if self.size is not None:
+            self._check_size(self.depth_path, content)
+        try:
+            with Image.open(io.BytesIO(content), formats=("PNG",)) as image:
+                if not image.mode.startswith("I"):
+                    raise self._error(f"depth has mode {image.mode}, a 16-bit grey PNG is needed", self.depth_path)
+                depth_mm = np.asarray(image)
+        except UnidentifiedImageError as error:
+            raise self._error("depth is not a PNG picture", self.depth_path) from error
+        except (OSError, SyntaxError, Image.DecompressionBombError) as error:
+            raise self._error(f"depth is damaged: {error}", self.depth_path) from error
+        return np.where(depth_mm == 0, np.nan, depth_mm / _MM_PER_M)
+
+    def _read(self, path: Path) -> bytes:
+        try:
+            return path.read_bytes()
+        except OSError as error:
+            raise self._error(f"cannot be read: {error.strerror}", path) from error
+
+    def _check_size(self, path: Path, content: bytes) -> None:
+        """Compare the size in the file's header, before any pixel is decoded."""
+        try:
+            with Image.open(io.BytesIO(content)) as image:
+                width, height = image.size
+        except UnidentifiedImageError as error:
+            raise self._error("not a readable picture", path) from error
+        except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+            raise self._error(f"damaged: {error}", path) from error
+        if (height, width) != self.size and self.size is not None:
+            raise self._error(
+                f"the picture is {width} x {height}, this data set's are {self.size[1]} x {self.size[0]}", path
+            )
+
+    def _error(self, reason: str, path: Path) -> DatasetError:
+        return DatasetError(reason, scene=self.scene, room=self.room, path=path)

@@ -1,0 +1,281 @@
+"""A user's own data, opening any data set, and the worked example."""
+
+from __future__ import annotations
+
+import json
+import math
+import pickle
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from examples.truth import FOLDER, PLAN_PATH, read_poses
+from lalaloc_core.data.dataset import Appearance, load_scenes
+from lalaloc_core.data.folder import OwnData
+from lalaloc_core.data.opening import open_dataset
+from lalaloc_core.data.structured3d import Structured3D
+from lalaloc_core.data.structured3d_splits import bad_scenes
+from lalaloc_core.data.zind import Zind
+from lalaloc_core.errors import DatasetError
+from tests.strategies import plan_document, rectangle
+
+ROOT = Path(__file__).parents[2]
+EXAMPLE = ROOT / "examples" / "own_data"
+HEADER = "panorama,x_m,y_m,heading_deg,camera_height_m"
+POSES = f"{HEADER}\nhall.png,1,2,90,1.4\nrooms/study.png,5.5,1,-45,\n"
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """One scene of two rooms and two panoramas."""
+    write_scene(tmp_path, "home")
+    return tmp_path
+
+
+def write_scene(root: Path, name: str, poses: str = POSES, **plan: Any) -> Path:
+    folder = root / name
+    (folder / "rooms").mkdir(parents=True)
+    document = plan_document(rectangle(3.0, 3.0), rectangle(3.0, 2.0, at=(4.0, 0.0)), camera_height_m=1.3, **plan)
+    document["rooms"][1]["ceiling_height_m"] = 2.1
+    (folder / "plan.json").write_text(json.dumps(document))
+    (folder / "poses.csv").write_text(poses)
+    for file in ("hall.png", "rooms/study.png"):
+        Image.fromarray(np.full((64, 128, 3), 200, np.uint8)).save(folder / file)
+    return folder
+
+
+class TestReading:
+    def test_scenes_are_read_as_documented(self, root: Path) -> None:
+        dataset = OwnData(root)
+        assert dataset.scenes("test") == ["home"]
+        assert dataset.scenes("train") == []
+        assert dataset.description == f"own data ({root.name})"
+        scene = dataset.load("home")
+        hall, study = scene.cameras
+        assert (hall.name, hall.position_m.tolist(), hall.room_index) == ("hall.png", [1.0, 2.0], 0)
+        assert (hall.heading, hall.camera_height_m) == (pytest.approx(math.pi / 2), 1.4)
+        assert (study.name, study.room_index) == ("rooms/study.png", 1)
+        assert (study.heading, study.camera_height_m) == (pytest.approx(1.75 * math.pi), 1.3)
+        assert scene.photograph(study, dataset.appearances[0]).image(64, 128).mean() == 200
+        assert pickle.loads(pickle.dumps(dataset)) == dataset
+
+    def test_the_column_of_heights_may_be_left_out(self, tmp_path: Path) -> None:
+        write_scene(tmp_path, "home", "panorama,x_m,y_m,heading_deg\nhall.png,1,2,0\n")
+        assert OwnData(tmp_path).load("home").cameras[0].camera_height_m == 1.3
+
+    def test_tables_of_spreadsheets_are_read(self, tmp_path: Path) -> None:
+        rows = '\ufeffheading_deg, y_m,x_m,panorama\r\n90,2,1,"hall.png"\r\n\r\n,,,\r\n'
+        write_scene(tmp_path, "home", rows)
+        (camera,) = OwnData(tmp_path).load("home").cameras
+        assert camera.position_m.tolist() == [1.0, 2.0]
+
+    def test_splits_are_those_of_the_table(self, root: Path) -> None:
+        write_scene(root, "barn")
+        write_scene(root, "cottage")
+        (root / "splits.csv").write_text("scene,split\nhome,train\ncottage,test\nbarn,test\n")
+        dataset = OwnData(root)
+        assert dataset.scenes("train") == ["home"]
+        assert dataset.scenes("validation") == []
+        assert dataset.scenes("test") == ["barn", "cottage"]
+
+    @pytest.mark.parametrize(
+        ("lines", "reason"),
+        [
+            ("home,dev", "line 2, column 'split' is 'dev': it must be one of train, validation, test"),
+            ("house,test", "line 2, column 'scene' is 'house': there is no plan.json in a folder of this name"),
+            ("home,test\nhome,train", "line 3, column 'scene' is 'home': it stands in an earlier line already"),
+            ("", "scene 'home'.*the scene has no line here"),
+            ("home", "line 2 has 1 cells, the header has 2"),
+        ],
+    )
+    def test_a_bad_table_of_splits_is_refused(self, root: Path, lines: str, reason: str) -> None:
+        (root / "splits.csv").write_text(f"scene,split\n{lines}\n")
+        with pytest.raises(DatasetError, match=reason) as caught:
+            OwnData(root).scenes("test")
+        assert caught.value.path == root / "splits.csv"
+
+
+class TestBadFiles:
+    @pytest.mark.parametrize(
+        ("line", "reasons"),
+        [
+            ("hall.png,one,2,0,1.4", ["column 'x_m' is 'one'", "must be a number"]),
+            ("hall.png,,2,0,1.4", ["column 'x_m' is ''", "must be a number"]),
+            ("hall.png,1,nan,0,1.4", ["column 'y_m' is 'nan'", "between -100000 and 100000"]),
+            ("hall.png,inf,2,0,1.4", ["column 'x_m' is 'inf'", "between"]),
+            ("hall.png,1e9,2,0,1.4", ["column 'x_m' is '1e9'", "between"]),
+            ("hall.png,1,2,400,1.4", ["column 'heading_deg' is '400'", "between -360 and 360"]),
+            ("hall.png,1,2,nan,1.4", ["column 'heading_deg' is 'nan'", "between"]),
+            ("hall.png,1,2,0,-1", ["column 'camera_height_m' is '-1'", "between 0 and 2.5"]),
+            ("hall.png,1,2,0,140", ["column 'camera_height_m' is '140'", "between 0 and 2.5"]),
+            ("hall.png,1,2,0,0", ["column 'camera_height_m' is '0'", "at least 0.1 m"]),
+            ("rooms/study.png,5,1,0,2.3", ["column 'camera_height_m' is '2.3'", "below the ceiling (2.1 m)"]),
+            ("hall.png,3.5,1.5,0,1.4", ["(3.5, 1.5) m lies in no room", "nearest is 'room 1', 0.5 m away"]),
+            ("attic.png,1,2,0,1.4", ["column 'panorama' is 'attic.png'", "no such file"]),
+            ("rooms,1,2,0,1.4", ["column 'panorama' is 'rooms'", "no such file"]),
+            (",1,2,0,1.4", ["column 'panorama' is ''", "below the scene's folder"]),
+            ("../home/hall.png,1,2,0,1.4", ["column 'panorama'", "below the scene's folder"]),
+            ("/etc/passwd,1,2,0,1.4", ["column 'panorama'", "below the scene's folder"]),
+        ],
+    )
+    def test_a_bad_cell_is_refused_by_name_or_left_out(self, tmp_path: Path, line: str, reasons: list[str]) -> None:
+        folder = write_scene(tmp_path, "home", f"{HEADER}\nhall.png,2,2,0,\n{line}\n")
+        panorama = line.split(",")[0]
+        with pytest.raises(DatasetError) as caught:
+            OwnData(tmp_path).load("home")
+        error = caught.value
+        assert (error.scene, error.room, error.path) == ("home", panorama or None, folder / "poses.csv")
+        for reason in ("line 3", *reasons):
+            assert reason in str(error)
+        problems: list[DatasetError] = []
+        assert len(OwnData(tmp_path).load("home", problems).cameras) == 1
+        assert [str(problem) for problem in problems] == [str(error)]
+
+    def test_a_panorama_stands_in_one_line(self, tmp_path: Path) -> None:
+        write_scene(tmp_path, "home", f"{HEADER}\nhall.png,1,2,0,\nhall.png,2,2,0,\n")
+        with pytest.raises(DatasetError, match=r"line 3, column 'panorama' is 'hall\.png': it stands in an"):
+            OwnData(tmp_path).load("home")
+
+    @pytest.mark.parametrize(
+        ("content", "reason"),
+        [
+            (None, "cannot be read: No such file"),
+            (b"", "line 1 is '', it must name the columns panorama,x_m"),
+            (b"panorama,x_m,y_m\n", "line 1 is 'panorama,x_m,y_m', it must name the columns"),
+            (b"panorama;x_m;y_m;heading_deg\n", "it must name the columns"),
+            (b"panorama,x_m,y_m,heading_deg,height\n", "it must name the columns"),
+            (b"panorama,x_m,x_m,y_m,heading_deg\n", "it must name the columns"),
+            (b"panorama,x_m,y_m,heading_deg\nhall.png,1,2\n", "line 2 has 3 cells, the header has 4"),
+            (b'panorama,x_m,y_m,heading_deg\n"hall.png,1,2,3\n', "line 2 is no CSV"),
+            (b"\xff\xfe\x00", "not UTF-8"),
+        ],
+    )
+    def test_a_bad_table_is_refused(self, root: Path, content: bytes | None, reason: str) -> None:
+        path = root / "home" / "poses.csv"
+        path.unlink()
+        if content is not None:
+            path.write_bytes(content)
+        problems: list[DatasetError] = []
+        with pytest.raises(DatasetError, match=reason) as caught:
+            OwnData(root).load("home", problems)
+        assert (caught.value.scene, caught.value.path) == ("home", path)
+
+    def test_a_bad_plan_is_refused_by_the_name_of_its_room(self, tmp_path: Path) -> None:
+        folder = write_scene(tmp_path, "home")
+        document = json.loads((folder / "plan.json").read_text())
+        document["rooms"][1]["polygon"] = [[0, 0], [2, 2], [2, 0], [0, 2]]
+        (folder / "plan.json").write_text(json.dumps(document))
+        with pytest.raises(DatasetError, match="crosses itself") as caught:
+            OwnData(tmp_path).load("home")
+        assert (caught.value.scene, caught.value.room, caught.value.path) == ("home", "room 2", folder / "plan.json")
+        assert caught.value.__cause__ is not None
+
+    def test_a_plan_in_millimetres_is_refused(self, tmp_path: Path) -> None:
+        folder = write_scene(tmp_path, "home")
+        document = plan_document(rectangle(4000.0, 3000.0))
+        (folder / "plan.json").write_text(json.dumps(document))
+        with pytest.raises(DatasetError, match="4000 m across, at most 1000 m is allowed; are the coordinates in met"):
+            OwnData(tmp_path).load("home")
+
+    @pytest.mark.parametrize("name", ["house", "../home", "", "/"])
+    def test_another_name_is_no_scene(self, root: Path, name: str) -> None:
+        with pytest.raises(DatasetError, match="no such scene"):
+            OwnData(root).load(name)
+
+    def test_a_picture_that_is_no_panorama_is_refused_when_read(self, root: Path) -> None:
+        path = root / "home" / "hall.png"
+        Image.fromarray(np.zeros((64, 64, 3), np.uint8)).save(path)
+        scene = OwnData(root).load("home")
+        with pytest.raises(DatasetError, match="64 x 64; a full 360° panorama is exactly twice as wide") as caught:
+            scene.photograph(scene.cameras[0], Appearance()).image(64, 128)
+        assert (caught.value.scene, caught.value.room, caught.value.path) == ("home", "hall.png", path)
+
+
+class TestOpening:
+    def test_each_format_is_recognised(self, tmp_path: Path, root: Path) -> None:
+        for folder in ("s3d/scene_00017", "zind/0000", "partition"):
+            (tmp_path / "sets" / folder).mkdir(parents=True)
+        (tmp_path / "sets" / "zind" / "0000" / "zind_data.json").write_text("{}")
+        (tmp_path / "sets" / "partition" / "zind_partition.json").write_text("{}")
+        assert open_dataset(tmp_path / "sets" / "s3d") == Structured3D(tmp_path / "sets" / "s3d")
+        assert open_dataset(tmp_path / "sets" / "zind") == Zind(tmp_path / "sets" / "zind")
+        assert isinstance(open_dataset(tmp_path / "sets" / "partition"), Zind)
+        assert isinstance(open_dataset(root), OwnData)
+
+    def test_own_scenes_may_have_any_name(self, tmp_path: Path) -> None:
+        write_scene(tmp_path, "scene_00000")
+        assert isinstance(open_dataset(tmp_path), OwnData)
+
+    @pytest.mark.parametrize(
+        ("make", "reason"),
+        [
+            (lambda path: None, "there is no such folder"),
+            (lambda path: path.write_text(""), "this is a file"),
+            (lambda path: path.mkdir(), "no data set here; looked for folders 'scene_00000'"),
+            (lambda path: (path / "photos").mkdir(parents=True), r"'\*/plan.json' \(own data\)"),
+        ],
+    )
+    def test_anything_else_is_refused(self, tmp_path: Path, make: Any, reason: str) -> None:
+        path = tmp_path / "data"
+        make(path)
+        with pytest.raises(DatasetError, match=reason) as caught:
+            open_dataset(path)
+        assert caught.value.path == path
+        assert str(path) in str(caught.value)
+
+    def test_two_data_sets_in_one_folder_are_refused(self, tmp_path: Path) -> None:
+        write_scene(tmp_path, "home")
+        (tmp_path / "scene_00000").mkdir()
+        with pytest.raises(DatasetError, match="several data sets: Structured3D, own data"):
+            open_dataset(tmp_path)
+
+
+class TestWorkedExample:
+    def test_is_a_data_set(self) -> None:
+        dataset = open_dataset(EXAMPLE)
+        (scene,) = load_scenes(dataset, dataset.scenes("test"))
+        assert len(scene.cameras) == 2
+        for camera in scene.cameras:
+            assert scene.photograph(camera, dataset.appearances[0]).image(128, 256).std() > 10.0
+
+    def test_is_a_part_of_the_example_flat(self) -> None:
+        truth = {pose.file: pose for pose in read_poses()}
+        (scene,) = load_scenes(OwnData(EXAMPLE), ["flat"])
+        assert (EXAMPLE / "flat" / "plan.json").read_bytes() == PLAN_PATH.read_bytes()
+        for camera in scene.cameras:
+            true = truth[camera.name]
+            assert (EXAMPLE / "flat" / camera.name).read_bytes() == (FOLDER / camera.name).read_bytes()
+            assert camera.position_m.tolist() == [true.x_m, true.y_m]
+            assert math.degrees(camera.heading) == pytest.approx(true.heading_deg)
+            assert camera.camera_height_m == true.camera_height_m
+            assert scene.plan.rooms[camera.room_index].name == true.room
+
+
+class TestDocumentation:
+    page = (ROOT / "docs" / "datasets.md").read_text(encoding="utf-8")
+
+    def test_lists_every_bad_scene_with_its_reasons(self) -> None:
+        expected = [
+            f"| {bad.number} | {bad.split} | {', '.join(bad.sources)} | {'left out' if bad.excluded else 'kept'} |"
+            for bad in bad_scenes()
+        ]
+        assert [line for line in self.page.splitlines() if re.match(r"\| \d", line)] == expected
+
+    def test_shows_an_error_as_it_is(self, tmp_path: Path) -> None:
+        shutil.copytree(EXAMPLE, tmp_path / "own_data")
+        path = tmp_path / "own_data" / "flat" / "poses.csv"
+        path.write_text(path.read_text().replace("7.1,2.2,250", "71,2.2,250"))
+        with pytest.raises(DatasetError) as caught:
+            open_dataset(tmp_path / "own_data").load("flat")
+        assert str(caught.value).replace(str(tmp_path), "examples") in self.page
+
+    def test_has_a_program_that_runs(self, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.chdir(ROOT)
+        (program,) = re.findall(r"```python\n(.*?)```", self.page, re.DOTALL)
+        exec(program, {})
+        assert capsys.readouterr().out == "flat 7 ['kitchen.jpg', 'bedroom.jpg']\n"

@@ -1,0 +1,297 @@
+"""ZInD: homes written with a known answer come back, and its azimuths are understood."""
+
+from __future__ import annotations
+
+import json
+import math
+import pickle
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+
+from lalaloc_core.conventions import column_azimuths, row_elevations, wrap_angle
+from lalaloc_core.data.dataset import Appearance, load_scenes
+from lalaloc_core.data.zind import Zind
+from lalaloc_core.errors import DatasetError
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.sampling import random_poses
+from tests.polygons import same_ring
+from tests.strategies import crooked_flat, plans, seeds
+from tests.zind_home import CEILING_GREY, FLOOR_GREY, HEIGHT, PANORAMAS, WIDTH, TruePanorama, wall_colour, write_home
+from tests.zind_home import write_homes as write_zind_homes
+
+NAME = "0002/floor_01"
+FIRST = "partial_room_01_pano_0"
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """Three homes, one for each split."""
+    write_zind_homes(tmp_path, np.random.default_rng(3), (32, 64))
+    return tmp_path
+
+
+def change_home(root: Path, change: Callable[[dict[str, Any]], None]) -> None:
+    path = root / "0002" / "zind_data.json"
+    document = json.loads(path.read_text())
+    change(document)
+    path.write_text(json.dumps(document))
+
+
+def panorama(document: dict[str, Any], room: int = 1, pano: int = 0) -> dict[str, Any]:
+    return document["merger"]["floor_01"][f"complete_room_{room:02d}"][f"partial_room_{room:02d}"][f"pano_{pano}"]
+
+
+def changed(room: int = 1, pano: int = 0, **changes: Any) -> Callable[[dict[str, Any]], None]:
+    return lambda document: panorama(document, room, pano).update(changes)
+
+
+def moved(**changes: Any) -> Callable[[dict[str, Any]], None]:
+    return lambda document: panorama(document)["floor_plan_transformation"].update(changes)
+
+
+class TestRoundTrip:
+    @settings(max_examples=25, deadline=None)
+    @given(plans(), seeds())
+    def test_any_plan_and_poses_come_back(
+        self, tmp_path_factory: pytest.TempPathFactory, plan: FloorPlan, seed: int
+    ) -> None:
+        rng = np.random.default_rng(seed)
+        poses = random_poses(plan, 4, rng)
+        taken = sorted(zip(poses.room_index.tolist(), poses.position_m.tolist(), strict=True))
+        panoramas = [
+            TruePanorama(
+                room_index=room,
+                x_m=x_m,
+                y_m=y_m,
+                heading=float(rng.uniform(0.0, 2.0 * math.pi)),
+                height_m=float(rng.uniform(1.0, 1.9)),
+            )
+            for room, (x_m, y_m) in taken
+        ]
+        root = tmp_path_factory.mktemp("zind")
+        write_home(root / "0002", plan, panoramas, rng, size=(4, 8))
+        scene = Zind(root).load(NAME)
+        rooms = sorted({room for room, _ in taken})
+        assert len(scene.plan.rooms) == len(rooms)
+        for found, room in zip(scene.plan.rooms, rooms, strict=True):
+            assert same_ring(found.polygon_m, plan.rooms[room].polygon_m, 1e-6)
+            assert found.ceiling_height_m == pytest.approx(plan.rooms[room].ceiling_height_m, abs=1e-9)
+        assert len(scene.cameras) == len(panoramas)
+        for number, (camera, true) in enumerate(zip(scene.cameras, panoramas, strict=True)):
+            assert camera.name == true.name(number)
+            assert camera.position_m.tolist() == pytest.approx([true.x_m, true.y_m], abs=1e-6)
+            assert wrap_angle(camera.heading - true.heading) == pytest.approx(0.0, abs=1e-9)
+            assert 0.0 <= camera.heading < 2.0 * math.pi
+            assert camera.camera_height_m == pytest.approx(true.height_m, abs=1e-9)
+            assert rooms[camera.room_index] == true.room_index
+
+    def test_every_pixel_shows_the_wall_that_the_pose_faces(self, tmp_path: Path) -> None:
+        """The picture is painted in ZInD's own frame; here the same rays are cast in the plan frame."""
+        plan = crooked_flat()
+        write_home(tmp_path / "0002", plan, PANORAMAS, np.random.default_rng(8))
+        scene = Zind(tmp_path).load(NAME)
+        for camera in scene.cameras:
+            pixels = scene.photograph(camera, Appearance()).image(HEIGHT, WIDTH).astype(int)
+            expected = expected_pixels(
+                plan, camera.room_index, camera.position_m, camera.heading, camera.camera_height_m
+            )
+            # Edges between walls, and what the JPEG smears around them.
+            differing = np.abs(pixels - expected).max(axis=2) > 60
+            assert differing.mean() < 0.05
+            mirrored = np.abs(pixels[:, ::-1] - expected).max(axis=2) > 60
+            assert mirrored.mean() > 0.15, "the picture would not tell a mirrored frame"
+
+    def test_the_module_writes_homes(self, tmp_path: Path) -> None:
+        subprocess.run([sys.executable, "-m", "tests.zind_home", str(tmp_path)], check=True, capture_output=True)
+        (name,) = Zind(tmp_path).scenes("test")
+        assert len(Zind(tmp_path).load(name).cameras) == len(PANORAMAS)
+
+
+def expected_pixels(
+    plan: FloorPlan, room_index: int, position_m: np.ndarray, heading: float, camera_height_m: float
+) -> np.ndarray:
+    """The panorama by this project's own conventions."""
+    room = plan.rooms[room_index]
+    pixels = np.zeros((HEIGHT, WIDTH, 3), dtype=int)
+    for column, azimuth in enumerate(heading + column_azimuths(WIDTH)):
+        end = position_m + 99.0 * np.array([math.sin(azimuth), math.cos(azimuth)])
+        ray = shapely.LineString([position_m, end])
+        hits = [shapely.LineString(wall.reshape(2, 2)).intersection(ray) for wall in room.walls_m]
+        reach = [math.inf if hit.is_empty else hit.distance(shapely.Point(position_m)) for hit in hits]
+        rises = min(reach) * np.tan(row_elevations(HEIGHT))
+        pixels[:, column] = wall_colour(int(np.argmin(reach)))
+        pixels[rises < -camera_height_m, column] = FLOOR_GREY
+        pixels[rises > room.ceiling_height_m - camera_height_m, column] = CEILING_GREY
+    return pixels
+
+
+class TestDataset:
+    def test_splits_are_those_of_the_partition(self, root: Path) -> None:
+        dataset = Zind(root)
+        assert [dataset.scenes(split) for split in ("train", "validation", "test")] == [
+            ["0000/floor_01"],
+            ["0001/floor_01"],
+            [NAME],
+        ]
+        assert dataset.description == "ZInD"
+        assert dataset.appearances == (Appearance(),)
+        assert pickle.loads(pickle.dumps(dataset)) == dataset
+
+    def test_homes_that_are_not_on_disk_are_passed_over(self, root: Path) -> None:
+        (root / "zind_partition.json").write_text('{"test": ["0001", "0099"]}')
+        assert Zind(root).scenes("test") == ["0001/floor_01"]
+        assert Zind(root).scenes("train") == []
+
+    @pytest.mark.parametrize(
+        ("content", "reason"),
+        [
+            (None, "cannot be read: No such file"),
+            ("[]", "must hold an object"),
+            ('{"test": "0002"}', "'test' must be a list"),
+            ('{"test": [2]}', "'test' must be a list"),
+            ('{"test": ["../0002"]}', "'test' must be a list"),
+            ('{"dev": []}', "no split is called 'dev'"),
+        ],
+    )
+    def test_a_bad_partition_is_refused(self, root: Path, content: str | None, reason: str) -> None:
+        path = root / "zind_partition.json"
+        path.unlink()
+        if content is not None:
+            path.write_text(content)
+        with pytest.raises(DatasetError, match=reason) as caught:
+            Zind(root).scenes("test")
+        assert caught.value.path == path
+
+    def test_a_damaged_home_is_listed_and_refused_when_loaded(self, root: Path) -> None:
+        (root / "0002" / "zind_data.json").write_text("{")
+        assert Zind(root).scenes("test") == ["0002"]
+        problems: list[DatasetError] = []
+        assert list(load_scenes(Zind(root), ["0002"], problems)) == []
+        assert "not valid JSON" in str(problems[0])
+
+    def test_a_floor_without_scale_is_a_problem(self, root: Path) -> None:
+        change_home(root, lambda document: document["scale_meters_per_coordinate"].update(floor_01=None))
+        assert Zind(root).scenes("test") == [NAME]
+        problems: list[DatasetError] = []
+        assert list(load_scenes(Zind(root), [NAME], problems)) == []
+        assert [problem.scene for problem in problems] == [NAME]
+        assert "no metric scale" in problems[0].reason
+
+    @pytest.mark.parametrize("name", ["../0002/floor_01", "/0002", "0002/floor_01/x", ""])
+    def test_another_name_is_no_scene(self, root: Path, name: str) -> None:
+        with pytest.raises(DatasetError, match="names are like '0000/floor_01'"):
+            Zind(root).load(name)
+
+    def test_an_unknown_floor_is_refused(self, root: Path) -> None:
+        with pytest.raises(DatasetError, match="no floor 'floor_07', there are: floor_01"):
+            Zind(root).load("0002/floor_07")
+
+    def test_pictures_need_not_be_there_until_they_are_read(self, root: Path) -> None:
+        path = root / "0002" / "panos" / f"floor_01_{FIRST}.jpg"
+        path.unlink()
+        scene = Zind(root).load(NAME)
+        photograph = scene.photograph(scene.cameras[0], Appearance())
+        with pytest.raises(DatasetError, match="cannot be read: No such file") as caught:
+            photograph.image(32, 64)
+        assert (caught.value.scene, caught.value.room, caught.value.path) == (NAME, FIRST, path)
+        with pytest.raises(DatasetError, match="no depth"):
+            photograph.depth_m()
+
+
+class TestRooms:
+    def test_the_outline_is_of_a_primary_panorama(self, root: Path) -> None:
+        """Of the room's secondary panorama, the layout is not looked at."""
+        change_home(root, lambda document: panorama(document, 1, 1).update(layout_complete={"vertices": "none"}))
+        assert len(Zind(root).load(NAME).plan.rooms) == 3
+
+    def test_the_first_primary_panorama_with_a_layout_counts(self, root: Path) -> None:
+        def change(document: dict[str, Any]) -> None:
+            del panorama(document, 1, 0)["layout_complete"]
+            panorama(document, 1, 1)["is_primary"] = True
+
+        change_home(root, change)
+        scene = Zind(root).load(NAME)
+        assert same_ring(scene.plan.rooms[0].polygon_m, crooked_flat().rooms[0].polygon_m, 1e-6)
+        assert len(scene.cameras) == len(PANORAMAS)
+
+    def test_a_room_without_layout_is_not_in_the_plan_and_its_panoramas_are_problems(self, root: Path) -> None:
+        change_home(root, lambda document: panorama(document, 2, 2).pop("layout_complete"))
+        problems: list[DatasetError] = []
+        scene = Zind(root).load(NAME, problems)
+        assert [room.name for room in scene.plan.rooms] == ["label 1 complete_room_01", "label 3 complete_room_03"]
+        assert [problem.room for problem in problems] == ["partial_room_02_pano_2"]
+        assert "'complete_room_02' has no usable layout_complete" in problems[0].reason
+        with pytest.raises(DatasetError, match="complete_room_02"):
+            Zind(root).load(NAME)
+
+    @pytest.mark.parametrize(
+        ("change", "reason"),
+        [
+            (changed(is_inside=False), "is_inside is false"),
+            (moved(translation=[99.0, 0.0]), "stands outside its room 'label 1 complete_room_01'"),
+            (moved(translation=[0.0]), r"translation is \[0.0\], two numbers"),
+            (moved(translation=None), "translation is None"),
+            (moved(rotation="north"), "rotation is 'north', a number is needed"),
+            (moved(rotation=float("nan")), "rotation is nan"),
+            (moved(scale=0), "scale is 0, a number above 0 is needed"),
+            (changed(floor_plan_transformation=None), "no object 'floor_plan_transformation'"),
+            (changed(camera_height=-1.0), "camera_height is -1.0"),
+            (changed(camera_height=9.0), "must be below the ceiling"),
+            (changed(image_path="../../secret.jpg"), "image_path is '../../secret.jpg'"),
+            (changed(image_path="/etc/passwd"), "image_path is '/etc/passwd'"),
+            (changed(image_path=7), "image_path is 7"),
+        ],
+    )
+    def test_a_bad_panorama_is_refused_by_name_or_left_out(
+        self, root: Path, change: Callable[[dict[str, Any]], None], reason: str
+    ) -> None:
+        # Another primary panorama draws the room, so that this one is a camera only.
+        def both(document: dict[str, Any]) -> None:
+            panorama(document, 1, 1)["is_primary"] = True
+            panorama(document, 1, 0)["is_primary"] = False
+            change(document)
+
+        change_home(root, both)
+        with pytest.raises(DatasetError, match=reason) as caught:
+            Zind(root).load(NAME)
+        assert (caught.value.scene, caught.value.room) == (NAME, FIRST)
+        assert caught.value.path == root / "0002" / "zind_data.json"
+        problems: list[DatasetError] = []
+        scene = Zind(root).load(NAME, problems)
+        assert [str(problem) for problem in problems] == [str(caught.value)]
+        assert len(scene.cameras) == len(PANORAMAS) - 1
+
+    @pytest.mark.parametrize(
+        ("change", "reason"),
+        [
+            (lambda document: document.pop("merger"), "'merger' and 'scale_meters_per_coordinate' must be objects"),
+            (lambda document: document.update(scale_meters_per_coordinate={"floor_01": "big"}), "is 'big'"),
+            (lambda document: document.update(scale_meters_per_coordinate={"floor_01": -1}), "is -1"),
+            (lambda document: document["merger"].update(floor_01=[]), "no floor 'floor_01'"),
+            (lambda document: document["merger"].update(floor_01={}), "there is no room"),
+            (lambda document: document["merger"]["floor_01"].update(complete_room_01=[]), "must be an object"),
+            (changed(layout_complete={"vertices": [[0, 0], [1, 1]]}), "at least three 'vertices'"),
+            (changed(layout_complete={"vertices": [[0, 0], [1, 1], [1, "x"]]}), "vertex 2 is .1, 'x'."),
+            (changed(layout_complete=[]), "at least three 'vertices'"),
+            (changed(layout_complete={"vertices": [[0, 0], [2, 2], [2, 0], [0, 2]]}), "crosses itself"),
+            (changed(ceiling_height="high"), "ceiling_height is 'high'"),
+            (changed(ceiling_height=90.0), "ceiling_height_m is 135"),
+            (lambda document: document.update(scale_meters_per_coordinate={"floor_01": 1e-6}), "ceiling|smaller than"),
+            (lambda document: document.update(scale_meters_per_coordinate={"floor_01": 1e6}), "ceiling_height_m is"),
+        ],
+    )
+    def test_a_bad_floor_is_refused(self, root: Path, change: Callable[[dict[str, Any]], None], reason: str) -> None:
+        change_home(root, change)
+        problems: list[DatasetError] = []
+        with pytest.raises(DatasetError, match=reason) as caught:
+            Zind(root).load(NAME, problems)
+        assert caught.value.scene == NAME
+        assert caught.value.path == root / "0002" / "zind_data.json"

@@ -1,0 +1,160 @@
+"""Small homes in ZInD's own structure with a known answer: `python -m tests.zind_home OUT`.
+
+A right-handed plan with true poses is mirrored into ZInD's frame, and every panorama gets a frame of its own with a
+random turn, scale and place. Its picture is painted from that frame alone, by ZInD's rule that a point (x, y) is seen
+at the image azimuth atan2(-x, y): each wall in a colour of its own, floor and ceiling in grey.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from PIL import Image
+
+from lalaloc_core.floorplan import FloorPlan
+from tests.strategies import crooked_flat
+
+FLOOR = "floor_01"
+HEIGHT, WIDTH = 128, 256
+PARTITION = {"train": ["0000"], "val": ["0001"], "test": ["0002"]}
+FLOOR_GREY, CEILING_GREY = 60, 200
+
+
+@dataclass(frozen=True, kw_only=True)
+class TruePanorama:
+    """A panorama as it truly was, in the plan frame: metres, radians clockwise from +y."""
+
+    room_index: int
+    x_m: float
+    y_m: float
+    heading: float
+    height_m: float = 1.5
+    primary: bool = True
+
+    def name(self, number: int) -> str:
+        """Name of its camera when it is panorama `number` of its floor."""
+        return f"partial_room_{self.room_index + 1:02d}_pano_{number}"
+
+
+PANORAMAS = (
+    TruePanorama(room_index=0, x_m=1.2, y_m=1.4, heading=0.7),
+    TruePanorama(room_index=0, x_m=3.1, y_m=1.0, heading=4.0, primary=False),
+    TruePanorama(room_index=1, x_m=5.2, y_m=1.2, heading=2.9),
+    TruePanorama(room_index=2, x_m=2.0, y_m=4.8, heading=5.9),
+    TruePanorama(room_index=2, x_m=4.4, y_m=5.0, heading=1.6, primary=False),
+)
+
+
+def wall_colour(wall: int) -> tuple[int, int, int]:
+    """Colour of a room's wall by its number."""
+    return 255 - 40 * (wall % 5), 30 + 45 * wall % 200, 20 + 90 * (wall % 3)
+
+
+def write_home(
+    folder: Path,
+    plan: FloorPlan,
+    panoramas: Sequence[TruePanorama],
+    rng: np.random.Generator,
+    size: tuple[int, int] = (HEIGHT, WIDTH),
+) -> None:
+    """Write a home of one floor."""
+    (folder / "panos").mkdir(parents=True)
+    scale_m = float(rng.uniform(0.5, 3.0))
+    floor: dict[str, Any] = {}
+    for number, panorama in enumerate(panoramas):
+        room = f"room_{panorama.room_index + 1:02d}"
+        image_path = f"panos/{FLOOR}_{panorama.name(number)}.jpg"
+        data, vertices = _panorama_data(plan, panorama, scale_m, rng)
+        data["image_path"] = image_path
+        floor.setdefault(f"complete_{room}", {}).setdefault(f"partial_{room}", {})[f"pano_{number}"] = data
+        Image.fromarray(_painted(vertices, data["ceiling_height"], size)).save(folder / image_path, quality=95)
+    document = {"scale_meters_per_coordinate": {FLOOR: scale_m}, "merger": {FLOOR: floor}, "redraw": {}}
+    (folder / "zind_data.json").write_text(json.dumps(document), encoding="utf-8")
+
+
+def write_homes(root: Path, rng: np.random.Generator, size: tuple[int, int] = (HEIGHT, WIDTH)) -> None:
+    """Write one home for each split, and the partition."""
+    root.mkdir(parents=True, exist_ok=True)
+    for homes in PARTITION.values():
+        for home in homes:
+            write_home(root / home, crooked_flat(), PANORAMAS, rng, size)
+    (root / "zind_partition.json").write_text(json.dumps(PARTITION), encoding="utf-8")
+
+
+def _panorama_data(
+    plan: FloorPlan, panorama: TruePanorama, scale_m: float, rng: np.random.Generator
+) -> tuple[dict[str, Any], np.ndarray]:
+    """What the file says of a panorama, and its room's vertices in its own frame."""
+    room = plan.rooms[panorama.room_index]
+    mirror = np.array([-1.0, 1.0])
+    # A panorama's own frame has the camera's height as its unit, and its image's centre column along +y.
+    scale = panorama.height_m / scale_m
+    translation = np.array([panorama.x_m, panorama.y_m]) * mirror / scale_m
+    turns = 360.0 * int(rng.integers(-1, 2))
+    # Seen from below, as in a mirror, clockwise is counter-clockwise.
+    angle = panorama.heading
+    cosine, sine = math.cos(angle), math.sin(angle)
+    offset = room.polygon_m * mirror / scale_m - translation
+    vertices = np.stack([cosine * offset[:, 0] + sine * offset[:, 1], -sine * offset[:, 0] + cosine * offset[:, 1]], 1)
+    vertices /= scale
+    layout = {"vertices": vertices.tolist(), "doors": [], "windows": [], "openings": [], "internal": []}
+    data = {
+        "label": f"label {panorama.room_index + 1}",
+        "is_primary": panorama.primary,
+        "is_inside": True,
+        "is_ceiling_flat": True,
+        "camera_height": 1.0,
+        "ceiling_height": room.ceiling_height_m / panorama.height_m,
+        "floor_number": 1,
+        "floor_plan_transformation": {
+            "translation": translation.tolist(),
+            "rotation": math.degrees(angle) + turns,
+            "scale": scale,
+        },
+        "layout_raw": layout,
+        "layout_complete": layout,
+    }
+    return data, vertices
+
+
+def _painted(vertices: np.ndarray, ceiling_height: float, size: tuple[int, int]) -> np.ndarray:
+    """The panorama of a room in the panorama's own frame, the camera at its origin, one unit over the floor."""
+    height, width = size
+    pixels = np.zeros((height, width, 3), dtype=np.uint8)
+    walls = [shapely.LineString([one, vertices[(k + 1) % len(vertices)]]) for k, one in enumerate(vertices)]
+    elevation = math.pi * (0.5 - (np.arange(height) + 0.5) / height)
+    for column in range(width):
+        image_azimuth = 2.0 * math.pi * ((column + 0.5) / width - 0.5)
+        # The direction whose atan2(-x, y) is this azimuth.
+        x, y = -math.sin(image_azimuth), math.cos(image_azimuth)
+        ray = shapely.LineString([(0.0, 0.0), (999.0 * x, 999.0 * y)])
+        crossings = [wall.intersection(ray) for wall in walls]
+        distances = [shapely.Point(0.0, 0.0).distance(c) if not c.is_empty else math.inf for c in crossings]
+        wall = int(np.argmin(distances))
+        rises = distances[wall] * np.tan(elevation)
+        pixels[:, column] = wall_colour(wall)
+        pixels[rises < -1.0, column] = FLOOR_GREY
+        pixels[rises > ceiling_height - 1.0, column] = CEILING_GREY
+    return pixels
+
+
+def main() -> None:
+    """Write the homes into a folder."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--seed", type=int, default=0)
+    arguments = parser.parse_args()
+    write_homes(arguments.out, np.random.default_rng(arguments.seed))
+    print(arguments.out)
+
+
+if __name__ == "__main__":
+    main()
