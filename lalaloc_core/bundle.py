@@ -24,7 +24,8 @@ IMAGE_ONNX = "image_encoder.onnx"
 HEAD_ONNX = "head.onnx"
 LAYOUT_WEIGHTS = "layout_encoder.safetensors"
 IMAGE_WEIGHTS = "image_encoder.safetensors"
-BUNDLE_FILES = (LAYOUT_ONNX, IMAGE_ONNX, HEAD_ONNX, LAYOUT_WEIGHTS, IMAGE_WEIGHTS)
+DECODER_WEIGHTS = "decoder.safetensors"
+BUNDLE_FILES = (LAYOUT_ONNX, IMAGE_ONNX, HEAD_ONNX, LAYOUT_WEIGHTS, IMAGE_WEIGHTS, DECODER_WEIGHTS)
 
 
 @dataclass(frozen=True, kw_only=True)

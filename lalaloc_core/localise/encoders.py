@@ -8,6 +8,7 @@ from jaxtyping import Float, UInt8
 
 from lalaloc_core.bundle import HEAD_ONNX, IMAGE_ONNX, LAYOUT_ONNX, Bundle
 from lalaloc_core.conventions import TWO_PI, wrap_angle
+from lalaloc_core.errors import BundleError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.poses import Query
 from lalaloc_core.render.profile import wall_profile
@@ -17,6 +18,7 @@ from lalaloc_core.sampling import PoseSet
 _LAYOUT_BATCH = 256
 # An architecture without a ring has to see the panorama turned, once per heading.
 _HEADINGS_WITHOUT_RING = 32
+_PROFILE_OUTPUT = "log_profile"
 
 
 class Encoders:
@@ -36,6 +38,8 @@ class Encoders:
         self._image = _session(bundle.read(IMAGE_ONNX), threads)
         self._image_takes_height = any(node.name == "camera_height_m" for node in self._image.get_inputs())
         self._head = _session(bundle.read(HEAD_ONNX), threads) if self.manifest.ring_sectors else None
+        # A ring (1, c, s) where the architecture has one, else the latent (1, d).
+        self._encoding = "ring" if self._head is not None else "latent"
 
     def layouts(
         self,
@@ -81,20 +85,36 @@ class Encoders:
             return self._query_any_heading(image, camera_height_m)
         return self._query_by_turning(image, camera_height_m)
 
+    def profile(
+        self, image: UInt8[np.ndarray, "h w 3"], heading: float, camera_height_m: float
+    ) -> tuple[Float[np.ndarray, "columns"], float]:
+        """The wall profile (m) that the image encoder predicts from a panorama of the bundle's input size.
+
+        Returns:
+            the profile with the heading undone by whole pixels, and what is left over: the heading (radians) at which
+            layouts are to be rendered to compare with it.
+
+        Raises:
+            BundleError: the bundle's image encoder predicts no wall profile.
+        """
+        if not any(node.name == _PROFILE_OUTPUT for node in self._image.get_outputs()):
+            raise BundleError(
+                f"model '{self.manifest.name}' (architecture '{self.manifest.architecture}') predicts no wall profile: "
+                f"{IMAGE_ONNX} has no output '{_PROFILE_OUTPUT}'"
+            )
+        turned, _, frame_heading = _undo_heading(image, heading)
+        return np.exp(self._run_image(turned, camera_height_m, _PROFILE_OUTPUT)[0]), frame_heading
+
     def _query_turned(self, image: UInt8[np.ndarray, "h w 3"], heading: float, camera_height_m: float) -> Query:
-        """Undo a known heading by rolling whole pixels; what is left over stays as the frame's heading."""
-        pixel = TWO_PI / image.shape[1]
-        shift = round(heading / pixel)
-        # Column j of the result is column j - shift of the input, which looks `shift` pixels more to the left.
-        turned = np.roll(image, shift, axis=1)
-        encoded = self._run_image(turned, camera_height_m)
+        """Undo a known heading; what whole pixels leave over stays as the frame's heading."""
+        turned, rolled, frame_heading = _undo_heading(image, heading)
+        encoded = self._run_image(turned, camera_height_m, self._encoding)
         latents = encoded if self._head is None else self._run_head(encoded)
-        frame_heading = float(wrap_angle(heading - shift * pixel))
-        return Query(latents, np.array([shift * pixel]), frame_heading, heading_known=True)
+        return Query(latents, np.array([rolled]), frame_heading, heading_known=True)
 
     def _query_any_heading(self, image: UInt8[np.ndarray, "h w 3"], camera_height_m: float) -> Query:
         """One forward of the image, then roll its ring: rolling a ring is turning the camera."""
-        ring = self._run_image(image, camera_height_m)
+        ring = self._run_image(image, camera_height_m, self._encoding)
         sectors = ring.shape[-1]
         shifts = np.arange(sectors)
         source = (np.arange(sectors)[None, :] - shifts[:, None]) % sectors
@@ -105,12 +125,11 @@ class Encoders:
         width = image.shape[1]
         shifts = np.arange(_HEADINGS_WITHOUT_RING) * width // _HEADINGS_WITHOUT_RING
         turned = (np.roll(image, int(shift), axis=1) for shift in shifts)
-        latents = np.concatenate([self._run_image(view, camera_height_m) for view in turned])
+        latents = np.concatenate([self._run_image(view, camera_height_m, self._encoding) for view in turned])
         return Query(latents, shifts * (TWO_PI / width), 0.0, heading_known=False)
 
-    def _run_image(self, image: UInt8[np.ndarray, "h w 3"], camera_height_m: float) -> np.ndarray:
-        """The ring (1, c, s) of an architecture that has them, else the latent (1, d)."""
-        output = "ring" if self._head is not None else "latent"
+    def _run_image(self, image: UInt8[np.ndarray, "h w 3"], camera_height_m: float, output: str) -> np.ndarray:
+        """One output of the image encoder, as a batch of one."""
         inputs = {"image": np.ascontiguousarray(image[None])}
         if self._image_takes_height:
             inputs["camera_height_m"] = np.array([camera_height_m], dtype=np.float32)
@@ -119,6 +138,15 @@ class Encoders:
     def _run_head(self, ring: Float[np.ndarray, "b c s"]) -> Float[np.ndarray, "b d"]:
         assert self._head is not None
         return _array(self._head.run(["latent"], {"ring": ring})[0])
+
+
+def _undo_heading(image: UInt8[np.ndarray, "h w 3"], heading: float) -> tuple[UInt8[np.ndarray, "h w 3"], float, float]:
+    """The panorama rolled so that its centre looks almost along azimuth 0, the angle rolled away, and what is left."""
+    pixel = TWO_PI / image.shape[1]
+    shift = round(heading / pixel)
+    # Column j of the result is column j - shift of the input, which looks `shift` pixels more to the left.
+    turned = np.roll(image, shift, axis=1)
+    return turned, shift * pixel, float(wrap_angle(heading - shift * pixel))
 
 
 def _array(value: object) -> np.ndarray:

@@ -6,12 +6,15 @@ evaluation (residuals and their derivatives by forward-mode differentiation, 2 o
 * Levenberg-Marquardt (default): under 15 evaluations, and more exact.
 * Adam with the paper's schedule (section A.3): the reference.
 
-Several starting poses are refined as one batch; every pose stays inside the room it started in.
+Several starting poses are refined as one batch; every pose stays inside the room it started in. The network may be any
+differentiable function of a layout (`PoseOptimiser`): comparing layouts themselves in place of their latents is a
+baseline of the paper's.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -21,11 +24,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lalaloc_core.bundle import LAYOUT_WEIGHTS, Bundle
-from lalaloc_core.errors import BundleError
+from lalaloc_core.errors import BundleError, ConfigError
 from lalaloc_core.localise.poses import RefinementJob, RefinementResult
 from lalaloc_core.nets import LayoutEncoder, load_layout_encoder
 from lalaloc_core.nets.ring import RingLayoutEncoder
 from lalaloc_core.render.profile import cast_rays, wall_profile
+
+# What is compared with the targets (k, d): a function of wall profiles (k, columns), camera and ceiling heights (k,).
+Embedding = Callable[[Tensor, Tensor, Tensor], Tensor]
+# The distance that is minimised: Euclidean, or the mean absolute difference.
+Norm = Literal["l2", "l1"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,10 +70,11 @@ class LpoConfig:
 
 @dataclass(frozen=True)
 class _Evaluation:
-    """Residuals at a pose and their derivatives by its unknowns; `cost` is half the squared latent distance."""
+    """Residuals at a pose and their derivatives by its unknowns; `cost` is half the sum of squares."""
 
     residual: Float[Tensor, "k d"]
     jacobian: Float[Tensor, "k d p"]
+    norm: Norm
 
     @property
     def cost(self) -> Float[Tensor, "k"]:
@@ -73,12 +82,65 @@ class _Evaluation:
 
     @property
     def distance(self) -> Float[Tensor, "k"]:
+        if self.norm == "l1":
+            return self.residual.abs().mean(dim=1)
         return torch.linalg.vector_norm(self.residual, dim=1)
+
+    @property
+    def gradient(self) -> Float[Tensor, "k p"]:
+        """Derivative of the distance by the unknowns."""
+        if self.norm == "l1":
+            return torch.einsum("kdp,kd->kp", self.jacobian, self.residual.sign()) / self.residual.shape[1]
+        return torch.einsum("kdp,kd->kp", self.jacobian, self.residual) / self.distance.clamp_min(1e-9)[:, None]
 
     def replace(self, rows: Tensor, other: _Evaluation, chosen: Tensor) -> None:
         """Take over those rows of `other`, which holds `rows` of this one, that are `chosen`."""
         self.residual[rows[chosen]] = other.residual[chosen]
         self.jacobian[rows[chosen]] = other.jacobian[chosen]
+
+
+class PoseOptimiser:
+    """Refines poses until what an embedding makes of their layouts is nearest to the targets."""
+
+    def __init__(
+        self,
+        embedding: Embedding,
+        columns: int,
+        *,
+        norm: Norm = "l2",
+        config: LpoConfig | None = None,
+        device: torch.device | None = None,
+    ) -> None:
+        """Choose what is compared, and how.
+
+        Args:
+            columns: azimuth columns of the wall profiles that the embedding takes.
+
+        Raises:
+            ConfigError: Levenberg-Marquardt is asked to minimise anything but squares.
+        """
+        self.config = config or LpoConfig()
+        if norm != "l2" and self.config.method != "adam":
+            raise ConfigError(f"optimiser '{self.config.method}' minimises squares; norm '{norm}' needs 'adam'")
+        self._embedding = embedding
+        self._columns = columns
+        self._norm: Norm = norm
+        self._device = device or torch.device("cpu")
+
+    def refine(self, job: RefinementJob) -> RefinementResult:
+        """Refine every starting pose of a job within its own room; `latent_distance` is by this optimiser's norm."""
+        problem = _Problem(self._embedding, self._columns, self._norm, job, self._device)
+        adam = self.config.method == "adam"
+        with torch.no_grad():
+            pose, distance, converged, evaluations = (_adam if adam else _levenberg_marquardt)(problem, self.config)
+        position, heading = problem.unpack(pose)
+        return RefinementResult(
+            position_m=position.cpu().numpy().astype(np.float64) + problem.origin,
+            heading=heading.cpu().numpy().astype(np.float64),
+            latent_distance=distance.cpu().numpy(),
+            converged=converged.cpu().numpy(),
+            evaluations=np.full(len(distance), evaluations),
+        )
 
 
 class LatentPoseOptimiser:
@@ -87,8 +149,8 @@ class LatentPoseOptimiser:
     def __init__(self, layout_encoder: LayoutEncoder, config: LpoConfig | None = None) -> None:
         layout_encoder = layout_encoder.eval().requires_grad_(False)
         self.encoder = layout_encoder.fused() if isinstance(layout_encoder, RingLayoutEncoder) else layout_encoder
-        self.config = config or LpoConfig()
-        self.device = next(layout_encoder.parameters()).device
+        device = next(layout_encoder.parameters()).device
+        self._optimiser = PoseOptimiser(self.encoder, self.encoder.config.profile_columns, config=config, device=device)
 
     @classmethod
     def from_bundle(cls, bundle: Bundle, config: LpoConfig | None = None) -> LatentPoseOptimiser:
@@ -106,18 +168,7 @@ class LatentPoseOptimiser:
 
     def refine(self, job: RefinementJob) -> RefinementResult:
         """Refine every starting pose of a job within its own room."""
-        problem = _Problem(self.encoder, job, self.device)
-        adam = self.config.method == "adam"
-        with torch.no_grad():
-            pose, distance, converged, evaluations = (_adam if adam else _levenberg_marquardt)(problem, self.config)
-        position, heading = problem.unpack(pose)
-        return RefinementResult(
-            position_m=position.cpu().numpy().astype(np.float64) + problem.origin,
-            heading=heading.cpu().numpy().astype(np.float64),
-            latent_distance=distance.cpu().numpy(),
-            converged=converged.cpu().numpy(),
-            evaluations=np.full(len(distance), evaluations),
-        )
+        return self._optimiser.refine(job)
 
 
 class _Problem:
@@ -126,18 +177,21 @@ class _Problem:
     Positions are relative to each starting pose, so that single precision does not lose millimetres in large plans.
     """
 
-    def __init__(self, encoder: LayoutEncoder, job: RefinementJob, device: torch.device) -> None:
+    def __init__(
+        self, embedding: Embedding, columns: int, norm: Norm, job: RefinementJob, device: torch.device
+    ) -> None:
         def tensor(array: np.ndarray) -> Tensor:
             return torch.tensor(array, dtype=torch.float32, device=device)
 
-        self.encoder = encoder
+        self.embedding = embedding
+        self.columns = columns
+        self.norm: Norm = norm
         self.origin = job.position_m
         self.walls_m = tensor(job.walls_m - np.tile(job.position_m, 2)[:, None, :])
         self.heading = tensor(job.heading)
         self.camera_height_m = tensor(job.camera_height_m)
         self.ceiling_height_m = tensor(job.ceiling_height_m)
         self.targets = tensor(job.targets)
-        self.columns = encoder.config.profile_columns
         self.unknowns = 3 if job.optimise_heading else 2
         self.start = torch.zeros(len(job.targets), self.unknowns, device=device)
 
@@ -156,16 +210,16 @@ class _Problem:
         walls, camera, ceiling = map(repeat, (self.walls_m, self.camera_height_m, self.ceiling_height_m))
         start_heading = repeat(self.heading)
 
-        def latents(unknowns: Tensor) -> Tensor:
+        def embedded(unknowns: Tensor) -> Tensor:
             heading = start_heading + unknowns[:, 2] if self.unknowns == 3 else start_heading
             profile = wall_profile(unknowns[:, :2], heading, walls, self.columns)
-            return self.encoder(profile, camera, ceiling)
+            return self.embedding(profile, camera, ceiling)
 
         tangent = torch.eye(self.unknowns, device=pose.device).repeat(count, 1)
         repeated = pose.repeat_interleave(self.unknowns, dim=0)
-        value, derivative = torch.func.jvp(latents, (repeated,), (tangent,))[:2]
+        value, derivative = torch.func.jvp(embedded, (repeated,), (tangent,))[:2]
         residual = value[:: self.unknowns] - self.targets[rows]
-        return _Evaluation(residual, derivative.reshape(count, self.unknowns, -1).transpose(1, 2))
+        return _Evaluation(residual, derivative.reshape(count, self.unknowns, -1).transpose(1, 2), self.norm)
 
     def stay_inside(
         self, pose: Float[Tensor, "m p"], step: Float[Tensor, "m p"], rows: Tensor, config: LpoConfig
@@ -247,7 +301,7 @@ def _adam(problem: _Problem, config: LpoConfig) -> _Outcome:
         stop_best = torch.where(fell, cost, stop_best)
         stop_age = torch.where(fell, torch.zeros_like(stop_age), stop_age + 1)
 
-        gradient = torch.einsum("kdp,kd->kp", here.jacobian, here.residual) / cost.clamp_min(1e-9)[:, None]
+        gradient = here.gradient
         first = 0.9 * first + 0.1 * gradient
         second = 0.999 * second + 0.001 * gradient.square()
         direction = first / (1.0 - 0.9**step_number) / ((second / (1.0 - 0.999**step_number)).sqrt() + 1e-8)

@@ -32,7 +32,7 @@ class LocaliseConfig:
 
     vdr_samples: int = 200
     vdr_radius_steps: float = 2.0
-    # How many of the candidates are re-sampled and optimised; the paper refines the first alone.
+    # How many of the candidates are re-sampled (0: no VDR) and optimised; the paper refines the first alone.
     vdr_candidates: int = 1
     lpo_candidates: int = 5
     separation_m: float = 1.0
@@ -40,10 +40,17 @@ class LocaliseConfig:
 
 @dataclass(frozen=True)
 class Localisation:
-    """Distinct candidates, best first, the stage that produced the best, and milliseconds per stage."""
+    """Distinct candidates, best first, and how they came about.
+
+    Attributes:
+        stage: the last stage that ran.
+        best: the best candidate after each stage that ran, in order.
+        timings_ms: milliseconds per stage.
+    """
 
     candidates: list[Candidate]
     stage: Stage
+    best: dict[Stage, Candidate] = field(default_factory=dict)
     timings_ms: dict[str, float] = field(default_factory=dict)
 
 
@@ -88,7 +95,8 @@ def localise(
         # Refined candidates may meet and become one; spare ones then take the free places.
         wanted = max(top_k, config.lpo_candidates) + config.lpo_candidates
         candidates = retrieve(grid, query, top_k=wanted, separation_m=config.separation_m)
-    if refine in ("vdr", "lpo"):
+    best: dict[Stage, Candidate] = {"retrieval": candidates[0]}
+    if refine in ("vdr", "lpo") and config.vdr_candidates:
         with clock.stage("vdr"):
             for index in range(min(config.vdr_candidates, len(candidates))):
                 candidates[index] = resample(
@@ -101,6 +109,7 @@ def localise(
                     radius_m=config.vdr_radius_steps * grid.step_m,
                 )
         stage = "vdr"
+        best[stage] = _nearest(candidates)
     if refine == "lpo" and refiner is not None:
         with clock.stage("lpo"):
             starts = candidates[: config.lpo_candidates]
@@ -108,7 +117,8 @@ def localise(
             if result is not None:
                 candidates = _merge(starts, result) + candidates[config.lpo_candidates :]
                 stage = "lpo"
-    return Localisation(_rank(candidates, config.separation_m, top_k), stage, clock.timings_ms)
+                best[stage] = _nearest(candidates)
+    return Localisation(_rank(candidates, config.separation_m, top_k), stage, best, clock.timings_ms)
 
 
 def panorama_heading(query: Query, candidate: Candidate) -> float:
@@ -147,6 +157,10 @@ def _merge(starts: list[Candidate], result: RefinementResult) -> list[Candidate]
             )
         )
     return moved
+
+
+def _nearest(candidates: list[Candidate]) -> Candidate:
+    return min(candidates, key=lambda candidate: candidate.latent_distance)
 
 
 def _rank(candidates: list[Candidate], separation_m: float, top_k: int) -> list[Candidate]:

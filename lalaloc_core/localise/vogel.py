@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.floorplan import FloorPlan
@@ -29,6 +29,16 @@ def vogel_disc(samples: int) -> Float[np.ndarray, "samples 2"]:
     return radius[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
+def disc_poses(
+    plan: FloorPlan, centre_m: Float[np.ndarray, "2"], *, samples: int, radius_m: float
+) -> tuple[PoseSet, Int[np.ndarray, "k"]]:
+    """The poses of a Vogel disc around a place that lie in some room, and their numbers on the disc."""
+    position = centre_m + radius_m * vogel_disc(samples)
+    room_index = plan.room_index_at(position)
+    kept = np.flatnonzero(room_index >= 0)
+    return PoseSet(position[kept], room_index[kept]), kept
+
+
 def resample(
     plan: FloorPlan,
     encoders: Encoders,
@@ -43,16 +53,13 @@ def resample(
 
     With an unknown heading the samples also cover the sector of headings that the hypothesis stands for.
     """
-    position = candidate.position_m + radius_m * vogel_disc(samples)
-    room_index = plan.room_index_at(position)
-    inside = room_index >= 0
-    poses = PoseSet(position[inside], room_index[inside])
+    poses, number = disc_poses(plan, candidate.position_m, samples=samples, radius_m=radius_m)
     if len(poses) == 0:
         return candidate
     heading = np.full(len(poses), candidate.frame_heading)
     if not query.heading_known:
         # A second low-discrepancy sequence, so that headings and positions are covered together.
-        sequence = (np.arange(samples)[inside] * (math.sqrt(2.0) - 1.0)) % 1.0
+        sequence = (number * (math.sqrt(2.0) - 1.0)) % 1.0
         heading += (sequence - 0.5) * (TWO_PI / len(query.roll))
     latents = encoders.poses(plan, poses, heading, camera_height_m)
     distance = latent_distances(latents, query.latents[candidate.hypothesis][None])[0]

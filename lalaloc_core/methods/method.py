@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal, Protocol
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -90,6 +90,7 @@ class Answer:
     timings_ms: dict[str, float] = field(default_factory=dict)
 
 
+@runtime_checkable
 class Method(Protocol):
     """A way to localise. Methods keep what belongs to a plan (grids, point clouds) from one question to the next."""
 

@@ -1,12 +1,18 @@
-"""The networks of both architectures, and loading a layout encoder from a bundle's weights."""
+"""The networks of both architectures, and loading a layout encoder or a decoder from a bundle's weights."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import safetensors.torch
+from torch import nn
+from torch import nn
 
+from lalaloc_core.bundle import DECODER_WEIGHTS, Bundle
 from lalaloc_core.configuration import build_config
+from lalaloc_core.errors import BundleError
+from lalaloc_core.nets.decoder import LayoutDecoder
+from lalaloc_core.nets.decoder import LayoutDecoder
 from lalaloc_core.nets.resnet import PaperConfig, PaperImageEncoder, PaperLayoutEncoder
 from lalaloc_core.nets.ring import RingConfig, RingImageEncoder, RingLayoutEncoder
 
@@ -27,7 +33,42 @@ def load_layout_encoder(architecture: str, config: dict[str, Any], weights: byte
         encoder = PaperLayoutEncoder(build_config(PaperConfig, config))
     else:
         raise ValueError(f"unknown architecture '{architecture}', known are 'ring' and 'paper'")
+    _load_weights(encoder, weights)
+    return encoder
+
+
+def load_decoder(bundle: Bundle) -> LayoutDecoder:
+    """The decoder that a bundle's layout encoder was trained with.
+
+    Raises:
+        BundleError: the bundle has none, or it was altered or does not fit.
+    """
+    decoder = LayoutDecoder(bundle.manifest.latent_size)
+    try:
+        _load_weights(decoder, bundle.read(DECODER_WEIGHTS))
+    except RuntimeError as error:
+        raise BundleError(f"bundle '{bundle.folder}': decoder does not load: {error}") from error
+    return decoder.eval()
+
+
+def _load_weights(module: nn.Module, weights: bytes) -> None:
+    """Half precision is a storage format here; arithmetic is single precision."""
+    _load(encoder, weights)
+    return encoder
+
+
+def load_decoder(latent_size: int, weights: bytes) -> LayoutDecoder:
+    """Rebuild the decoder of training from the safetensors of a bundle, `bundle.read(DECODER_WEIGHTS)`.
+
+    Raises:
+        RuntimeError: the weights do not fit.
+    """
+    decoder = LayoutDecoder(latent_size)
+    _load(decoder, weights)
+    return decoder
+
+
+def _load(module: nn.Module, weights: bytes) -> None:
     state = safetensors.torch.load(weights)
     # Half precision is a storage format here; arithmetic is single precision.
-    encoder.load_state_dict({k: v.float() if v.is_floating_point() else v for k, v in state.items()}, strict=True)
-    return encoder
+    module.load_state_dict({k: v.float() if v.is_floating_point() else v for k, v in state.items()}, strict=True)

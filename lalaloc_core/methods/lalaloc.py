@@ -1,0 +1,130 @@
+"""LaLaLoc itself as a method: retrieval, Vogel disc re-sampling, latent pose optimisation, as the service does it."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import UInt8
+
+from lalaloc_core.bundle import Bundle
+from lalaloc_core.conventions import TWO_PI
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.optimise import LatentPoseOptimiser, LpoConfig
+from lalaloc_core.localise.pipeline import (
+    LocaliseConfig,
+    Refine,
+    Refiner,
+    StageClock,
+    localise,
+    panorama_heading,
+)
+from lalaloc_core.localise.poses import Candidate, LatentGrid, Query
+from lalaloc_core.methods.kept import KeptPerPlan
+from lalaloc_core.methods.method import Answer, Found, Question
+from lalaloc_core.sampling import PoseSet
+
+# Hypotheses of a layout query with unknown heading, where no ring says how many there are.
+_HEADINGS = 64
+
+
+class LaLaLoc:
+    """Answers with one bundle.
+
+    As in the paper's table of times, neither embedding a plan's grid nor reading a photograph is counted.
+    """
+
+    def __init__(
+        self,
+        encoders: Encoders,
+        *,
+        refine: Refine = "lpo",
+        refiner: Refiner | None = None,
+        config: LocaliseConfig | None = None,
+    ) -> None:
+        self.encoders = encoders
+        self._refine: Refine = refine
+        self._refiner = refiner
+        self._config = config or LocaliseConfig()
+        self._grids: KeptPerPlan[LatentGrid] = KeptPerPlan()
+
+    def answer(self, question: Question) -> Answer:
+        """Encode the query and run the service's search."""
+        clock = StageClock()
+        image = read_image(self.encoders, question)
+        with clock.stage("encode"):
+            query = encode(self.encoders, question, image)
+        grid = self.grid(question)
+        found = localise(
+            question.plan,
+            grid,
+            self.encoders,
+            query,
+            refine=self._refine,
+            refiner=self._refiner,
+            config=self._config,
+        )
+        distances = tuple(candidate.latent_distance for candidate in found.candidates)
+        confidence = self.encoders.manifest.confidence
+        return Answer(
+            stages={stage: found_pose(query, candidate) for stage, candidate in found.best.items()},
+            retrieved=_grid_index(grid, found.best["retrieval"]),
+            candidate_distances=distances,
+            confidence=None if confidence is None else confidence.probability(list(distances)),
+            timings_ms={**clock.timings_ms, **found.timings_ms},
+        )
+
+    def grid(self, question: Question) -> LatentGrid:
+        """Latents of the question's grid at its camera height; the last few are kept."""
+        height, step_m, poses = question.camera.camera_height_m, question.grid_step_m, question.grid
+
+        def embed() -> LatentGrid:
+            latents = self.encoders.poses(question.plan, poses, np.zeros(len(poses)), height)
+            return LatentGrid(poses, latents, step_m, height)
+
+        return self._grids.get(question.plan, (height, step_m), embed)
+
+
+def local_refiner(bundle: Bundle, config: LpoConfig | None = None) -> Refiner:
+    """LPO in this process. Sets torch to one thread: its tensors are too small to share, and waiting costs more."""
+    torch.set_num_threads(1)
+    return LatentPoseOptimiser.from_bundle(bundle, config).refine
+
+
+def read_image(encoders: Encoders, question: Question) -> UInt8[np.ndarray, "h w 3"] | None:
+    """The photograph of a panorama query at the encoder's size; None for layout queries.
+
+    Raises:
+        DatasetError: it cannot be read.
+    """
+    if question.kind == "layout":
+        return None
+    return question.require_photograph().image(encoders.manifest.image_height, encoders.manifest.image_width)
+
+
+def encode(encoders: Encoders, question: Question, image: UInt8[np.ndarray, "h w 3"] | None) -> Query:
+    """The query of a question: a photograph's latents, or those of the true layout where there is none."""
+    camera = question.camera
+    if image is not None:
+        return encoders.query(image, camera.heading if question.heading_known else None, camera.camera_height_m)
+    rolls = np.array([camera.heading])
+    if not question.heading_known:
+        sectors = encoders.manifest.ring_sectors or _HEADINGS
+        rolls = np.arange(sectors) * (TWO_PI / sectors)
+    poses = PoseSet(np.repeat(camera.position_m[None], len(rolls), axis=0), np.full(len(rolls), camera.room_index))
+    latents = encoders.poses(question.plan, poses, camera.heading - rolls, camera.camera_height_m)
+    return Query(latents, rolls, 0.0, heading_known=question.heading_known)
+
+
+def found_pose(query: Query, candidate: Candidate) -> Found:
+    """A candidate as a pose of the panorama."""
+    return Found(
+        x_m=candidate.x_m,
+        y_m=candidate.y_m,
+        room_index=candidate.room_index,
+        heading=panorama_heading(query, candidate),
+        distance=candidate.latent_distance,
+    )
+
+
+def _grid_index(grid: LatentGrid, candidate: Candidate) -> int:
+    return int(np.linalg.norm(grid.poses.position_m - candidate.position_m, axis=1).argmin())
