@@ -19,7 +19,7 @@ from lalaloc_core.synth.shots import Shot, sample_shots
 from lalaloc_core.synth.splits import TEST, TRAIN, VALIDATION, home_of
 
 _DEPTH_HEIGHT = 256
-_SPLIT_NUMBERS: dict[Split, int] = {"train": TRAIN, "validation": VALIDATION, "test": TEST}
+SPLIT_NUMBERS: dict[Split, int] = {"train": TRAIN, "validation": VALIDATION, "test": TEST}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +52,7 @@ class GeneratedScenes:
 
     def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
         split, _, index = name.partition("-")
-        number = next((n for known, n in _SPLIT_NUMBERS.items() if known == split), None)
+        number = next((n for known, n in SPLIT_NUMBERS.items() if known == split), None)
         if number is None or not index.isdecimal():
             raise DatasetError("no such generated scene; names are like 'test-00042'", scene=name)
         home, rng = home_of(number, self.seed, int(index))
@@ -71,7 +71,7 @@ class GeneratedScenes:
         return Scene(name=name, plan=home.plan, cameras=cameras)
 
     def _studio(self, split: int) -> Studio:
-        return _studio(split, self.seed, self.textures)
+        return studio_of(split, self.seed, self.textures)
 
 
 class Studio:
@@ -89,7 +89,8 @@ class Studio:
 
 
 @lru_cache(maxsize=4)
-def _studio(split: int, seed: int, textures: Path | None) -> Studio:
+def studio_of(split: int, seed: int, textures: Path | None) -> Studio:
+    """The studio of a split: materials are drawn anew for each."""
     return Studio(MaterialLibrary.create(np.random.default_rng([split, seed]), textures))
 
 

@@ -9,7 +9,14 @@ import shapely
 
 from lalaloc_core.floorplan import Room
 from lalaloc_core.synth.furniture import CAMERA_CLEARANCE_M, FurnitureLevel, Prism, furnish, rectangle, wall_frame
-from lalaloc_core.synth.lighting import Lighting, draw_backdrop, draw_exposure, light_room
+from lalaloc_core.synth.lighting import (
+    Lighting,
+    draw_backdrop,
+    draw_exposure,
+    draw_staged_exposure,
+    light_room,
+    relit,
+)
 from lalaloc_core.synth.materials import MaterialLibrary
 from lalaloc_core.synth.openings import Opening
 from lalaloc_core.synth.scene import Scene
@@ -18,10 +25,14 @@ from lalaloc_core.synth.surfaces import SurfaceTable, bright, paint, vivid, wood
 
 _DEFAULT_WALL_DEPTH_M = 0.12
 
+# Parts of a staged scene that draw from streams of their own.
+_MOOD, _ROOM, _FLOOR, _ACCENT, _TRIM, _OPENING, _RADIATOR, _FURNITURE, _LAMPS, _CAMERA = range(10)
+
 
 def build_scene(shot: Shot, materials: MaterialLibrary) -> Scene:
     """The scene that a shot sees, everything that is random about it drawn from the shot's seed."""
-    return _Builder(shot, materials, np.random.default_rng(shot.seed)).build()
+    scene = _Builder(shot, materials, np.random.default_rng(shot.seed)).build()
+    return scene if shot.lighting is None else relit(scene, shot.lighting)
 
 
 class _Builder:
@@ -31,6 +42,7 @@ class _Builder:
         home, room_index = shot.home, shot.room_index
         self.shot, self.home, self.rng = shot, home, rng
         self.level: FurnitureLevel = shot.furniture
+        self.is_staged = shot.lighting is not None
         self.position = shot.position_m
         self.room = home.plan.rooms[room_index]
         self.openings = [opening for opening in home.openings if opening.room == room_index]
@@ -57,13 +69,16 @@ class _Builder:
         self.floor_surface = -1
 
     def build(self) -> Scene:
-        lighting = Lighting(self.rng)
+        self._begin(_MOOD)
+        lighting = Lighting(self.rng, neutral=self.is_staged)
         for slot, room_index in enumerate(self.slot_rooms):
             self._add_room(slot, room_index, lighting)
         self._add_jambs()
+        self._begin(_LAMPS, self.shot.room_index)
         lights, lamps, sun = light_room(self.room, self.openings, self.position, lighting, self.rng)
         for prism in lamps:
             self._add_prism(prism, opaque=False)
+        self._begin(_CAMERA, self.shot.room_index)
         return Scene(
             camera_height_m=self.shot.camera_height_m,
             heading=self.shot.heading,
@@ -77,8 +92,13 @@ class _Builder:
             lights=lights,
             sun=sun,
             backdrop=draw_backdrop(self.rng),
-            exposure=draw_exposure(self.rng),
+            exposure=draw_staged_exposure(self.rng) if self.is_staged else draw_exposure(self.rng),
         )
+
+    def _begin(self, part: int, *which: int) -> None:
+        """In a staged scene what a part draws must not depend on what was drawn before it: furniture, for one."""
+        if self.is_staged:
+            self.rng.bit_generator.state = np.random.default_rng([self.shot.seed, part, *which]).bit_generator.state
 
     def _door_colour(self) -> np.ndarray:
         kind = self.rng.random()
@@ -88,19 +108,22 @@ class _Builder:
 
     def _add_room(self, slot: int, room_index: int, lighting: Lighting) -> None:
         rng, room = self.rng, self.home.plan.rooms[room_index]
+        self._begin(_ROOM, room_index)
         colour = paint(rng)
         wall = self.table.add_wall(colour)
         accent = self.table.add_wall(paint(rng)) if rng.random() < 0.25 else wall
         ceiling_colour = colour * rng.uniform(0.85, 1.1) if rng.random() < 0.2 else bright(rng)
         ceiling = self.table.add_ceiling(np.clip(ceiling_colour, 0.01, 0.92))
-        _, along, _ = wall_frame(room, 0)
-        if self.floor_surface < 0 or rng.random() < 0.4:
+        if self._has_new_floor(room_index):
+            _, along, _ = wall_frame(room, 0)
             self.floor_surface = self.table.add_floor(colour, math.atan2(along[1], along[0]))
+        self._begin(_ACCENT, room_index)
         self.slots.append(
             [room.ceiling_height_m, self.floor_surface, ceiling, *lighting.of_room_beyond(room, self.position)]
         )
         accented = int(rng.integers(len(room.walls_m)))
         first = len(self.walls)
+        self._begin(_TRIM, room_index)
         for edge, ends in enumerate(room.walls_m):
             self.walls.append(ends)
             self.owner.append(slot)
@@ -108,11 +131,21 @@ class _Builder:
             self._add_wall_trim(first + edge, ends, room)
         openings = [opening for opening in self.home.openings if opening.room == room_index]
         for opening in openings:
+            self._begin(_OPENING, self.home.openings.index(opening))
             self._add_opening(first + opening.wall, room, opening, is_own=slot == 0)
         level: FurnitureLevel = self.level if slot == 0 or self.level == "empty" else "simple"
         camera = self.position if slot == 0 else None
+        self._begin(_FURNITURE, room_index)
         pieces = furnish(room, openings, level, rng, camera)
         self._add_pieces(pieces)
+
+    def _has_new_floor(self, room_index: int) -> bool:
+        """Whether a floor begins here; many homes have one floor throughout."""
+        if not self.is_staged:
+            return self.floor_surface < 0 or self.rng.random() < 0.4
+        # Every room draws its floor, those without one of their own all the same: so it looks alike from any room.
+        self._begin(_FLOOR, *([room_index] if self.rng.random() < 0.4 else []))
+        return True
 
     def _add_pieces(self, prisms: list[Prism]) -> None:
         known: dict[tuple[int, str], int] = {}
@@ -279,6 +312,7 @@ class _Builder:
             bottom = 0.03 if rng.random() < 0.7 else max(0.03, opening.sill_m - 0.1)
             for s in (opening.start_m, opening.end_m):
                 boxes.append((s, 0.5 * width, 0.05, 0.07, bottom, top, cloth))
+        self._begin(_RADIATOR, self.home.openings.index(opening))
         if opening.sill_m > 0.45 and rng.random() < 0.35:
             middle, half = 0.5 * (opening.start_m + opening.end_m), 0.4 * (opening.end_m - opening.start_m)
             boxes.append((middle, half, 0.05, 0.06, 0.1, min(0.7, opening.sill_m - 0.05), self.trim))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
+from typing import Literal, get_args
 
 import numpy as np
 import shapely
@@ -11,8 +13,24 @@ import shapely
 from lalaloc_core.floorplan import Room
 from lalaloc_core.synth.furniture import Prism, wall_frame
 from lalaloc_core.synth.openings import Opening
+from lalaloc_core.synth.scene import LIGHT_NORMAL, LIGHT_RGB, SLOT_AMBIENT, SLOT_LIGHT_RGB, Scene
+from lalaloc_core.synth.surfaces import BLUE, GLOW, OUTDOORS, RED
+
+Mood = Literal["cold", "raw", "warm"]
+MOODS: tuple[Mood, ...] = get_args(Mood)
 
 _MAX_WINDOWS = 2
+# What a mood multiplies the neutral light of lamps and of the sky with.
+_LAMP_TINTS: dict[Mood, tuple[float, float, float]] = {
+    "cold": (0.62, 0.85, 1.15),
+    "raw": (1.0, 1.0, 1.0),
+    "warm": (1.5, 0.96, 0.45),
+}
+_SKY_TINTS: dict[Mood, tuple[float, float, float]] = {
+    "cold": (1.0, 1.25, 1.6),
+    "raw": (1.0, 1.0, 1.0),
+    "warm": (0.7, 0.52, 0.36),
+}
 
 # Columns of an exposure row.
 TARGET, RED_GAIN, BLUE_GAIN, CONTRAST, SATURATION, NOISE, BLUR, NADIR, NADIR_TONE, NOISE_SEED, SHOULDER, TINT = range(
@@ -21,15 +39,23 @@ TARGET, RED_GAIN, BLUE_GAIN, CONTRAST, SATURATION, NOISE, BLUR, NADIR, NADIR_TON
 
 
 class Lighting:
-    """The mood shared by all lights of a scene: daylight or evening, warm or cold lamps."""
+    """The mood shared by all lights of a scene: daylight or evening, warm or cold lamps.
 
-    def __init__(self, rng: np.random.Generator) -> None:
+    Args:
+        rng: source of randomness.
+        neutral: lamps are on and hardly coloured, for a scene that is to be `relit`.
+    """
+
+    def __init__(self, rng: np.random.Generator, *, neutral: bool = False) -> None:
         self.rng = rng
         self.lamp_colour = np.array([1.0, rng.uniform(0.75, 1.0), rng.uniform(0.45, 1.0)])
         self.sky_colour = np.array([rng.uniform(0.85, 1.05), 1.0, rng.uniform(0.95, 1.2)])
         self.daylight = float(rng.uniform(0.4, 3.0) if rng.random() < 0.85 else 0.0)
         self.lamps_on = bool(rng.random() < 0.65 or self.daylight == 0.0)
         self.ambient = math.exp(rng.uniform(math.log(0.12), math.log(0.7)))
+        if neutral:
+            self.lamp_colour, self.sky_colour = self.lamp_colour**0.2, self.sky_colour**0.4
+            self.lamps_on = True
 
     def of_room_beyond(self, room: Room, origin_m: np.ndarray) -> list[float]:
         """Position and colour of the one lamp of a neighbouring room, and its ambient light."""
@@ -59,6 +85,23 @@ def light_room(
     if windows and lighting.daylight > 0.0 and rng.random() < 0.5:
         sun = _sun(room, windows[int(rng.integers(len(windows)))], origin_m, rng)
     return np.array(lights + rows).reshape(-1, 8), prisms, sun
+
+
+def relit(scene: Scene, mood: Mood) -> Scene:
+    """The same scene, shape and materials, in another light; `raw` is the neutral light that it was built with."""
+    lamp, sky = np.array(_LAMP_TINTS[mood]), np.array(_SKY_TINTS[mood])
+    lights, slots, surfaces = scene.lights.copy(), scene.slots.copy(), scene.surfaces.copy()
+    sun, backdrop = scene.sun.copy(), scene.backdrop.copy()
+    is_lamp = ~lights[:, LIGHT_NORMAL].any(axis=1, keepdims=True)
+    lights[:, LIGHT_RGB] *= np.where(is_lamp, lamp, sky)
+    slots[:, SLOT_LIGHT_RGB] *= lamp
+    # What light is left after many bounces comes from both.
+    slots[:, SLOT_AMBIENT] *= np.sqrt(lamp * sky)
+    glowing = (surfaces[:, GLOW] > 0.0) & (surfaces[:, OUTDOORS] == 0.0)
+    surfaces[glowing, RED : BLUE + 1] *= lamp
+    sun[11:14] *= sky
+    backdrop[:6] *= np.tile(sky, 2)
+    return dataclasses.replace(scene, lights=lights, slots=slots, surfaces=surfaces, sun=sun, backdrop=backdrop)
 
 
 def _window_light(room: Room, window: Opening, origin_m: np.ndarray, lighting: Lighting) -> list[float]:
@@ -134,4 +177,13 @@ def draw_exposure(rng: np.random.Generator) -> np.ndarray:
         row[NADIR_TONE] = 0.0 if rng.random() < 0.6 else rng.uniform(0.0, 0.9)
     row[NOISE_SEED] = rng.integers(1 << 20)
     row[SHOULDER] = rng.uniform(0.2, 1.0)
+    return row
+
+
+def draw_staged_exposure(rng: np.random.Generator) -> np.ndarray:
+    """As `draw_exposure`, for the pictures of one data set: they are more alike, and no tripod is in them."""
+    row = draw_exposure(rng)
+    row[TARGET] = math.sqrt(0.5 * row[TARGET])
+    row[SATURATION] = 0.5 + 0.5 * row[SATURATION]
+    row[NADIR] = 0.0
     return row

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -14,6 +15,7 @@ from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.synth.build import build_scene
 from lalaloc_core.synth.camera import develop
 from lalaloc_core.synth.cast import Hits, SceneBatch, trace
+from lalaloc_core.synth.lighting import Mood, relit
 from lalaloc_core.synth.materials import MaterialLibrary
 from lalaloc_core.synth.outdoors import Outdoors
 from lalaloc_core.synth.scene import DECAL_WALL, PRISM_A, PRISM_AX, PRISM_B, PRISM_X, Scene
@@ -77,11 +79,25 @@ class PanoramaRenderer:
         """Photograph scenes that were built elsewhere, such as in worker processes; all at once."""
         batch = stack_scenes(scenes, self._device)
         direction = self._directions(batch)
+        return self._photograph(batch, trace(batch, direction, self._slope), direction)
+
+    @torch.no_grad()
+    def render_moods(
+        self, shot: Shot, moods: Sequence[Mood]
+    ) -> tuple[UInt8[Tensor, "m h w 3"], Float[Tensor, "h2 w2"]]:
+        """Photograph one staged shot in several lights, casting its rays once.
+
+        Returns:
+            the pictures, and the ranges (m) of `depth_m`.
+        """
+        scene = build_scene(dataclasses.replace(shot, lighting="raw"), self._materials)
+        batch = stack_scenes([scene], self._device)
+        direction = self._directions(batch)
         hits = trace(batch, direction, self._slope)
-        radiance = shade(batch, hits, direction, self._slope, self._atlas, self._outdoors).transpose(1, 2)
-        if self._supersample > 1:
-            radiance = _shrink(radiance, self._supersample)
-        return develop(radiance, batch.exposure, self._noise)
+        pictures = [
+            self._photograph(stack_scenes([relit(scene, mood)], self._device), hits, direction) for mood in moods
+        ]
+        return torch.cat(pictures), self._range_m(hits)[0]
 
     @torch.no_grad()
     def hits(self, shots: Sequence[Shot]) -> Hits:
@@ -92,8 +108,16 @@ class PanoramaRenderer:
     @torch.no_grad()
     def depth_m(self, shots: Sequence[Shot]) -> Float[Tensor, "b h w"]:
         """Range (m) along each pixel's ray to whatever it sees, furniture included; at least as large as a panorama."""
-        distance = self.hits(shots).distance_m.transpose(1, 2)
-        return distance * torch.sqrt(1.0 + self._slope.square())[None, :, None]
+        return self._range_m(self.hits(shots))
+
+    def _photograph(self, batch: SceneBatch, hits: Hits, direction: Float[Tensor, "b c 2"]) -> UInt8[Tensor, "b h w 3"]:
+        radiance = shade(batch, hits, direction, self._slope, self._atlas, self._outdoors).transpose(1, 2)
+        if self._supersample > 1:
+            radiance = _shrink(radiance, self._supersample)
+        return develop(radiance, batch.exposure, self._noise)
+
+    def _range_m(self, hits: Hits) -> Float[Tensor, "b h w"]:
+        return hits.distance_m.transpose(1, 2) * torch.sqrt(1.0 + self._slope.square())[None, :, None]
 
     def _directions(self, batch: SceneBatch) -> Float[Tensor, "b c 2"]:
         azimuth = batch.heading[:, None] + self._azimuth

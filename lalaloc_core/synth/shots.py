@@ -12,11 +12,13 @@ from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.floorplan import Room
 from lalaloc_core.sampling import random_poses
 from lalaloc_core.synth.furniture import FURNITURE_LEVELS, FurnitureLevel
+from lalaloc_core.synth.lighting import Mood
 from lalaloc_core.synth.plans import Home
 
 POSE_MARGIN_M = 0.2
 _LEVEL_SHARES = (0.2, 0.25, 0.55)
 _CEILING_CLEARANCE_M = 0.3
+_STAGED_HEIGHTS_M = (1.2, 1.7)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -31,6 +33,8 @@ class Shot:
         camera_height_m: over the floor.
         furniture: how full the rooms are.
         seed: decides materials, furniture, light and camera settings.
+        lighting: the colour of all light; None draws one. With it the shot is *staged*: shots of one home that have
+            the same seed show the same materials, whatever their furniture and lighting, and there is no tripod.
     """
 
     home: Home
@@ -40,6 +44,7 @@ class Shot:
     camera_height_m: float
     furniture: FurnitureLevel
     seed: int
+    lighting: Mood | None = None
 
 
 def sample_shots(
@@ -82,6 +87,39 @@ def sample_shots(
             )
         )
     return shots
+
+
+def stage_rooms(home: Home, rng: np.random.Generator) -> list[Shot]:
+    """One staged shot of every room, all from the same height over the floor and looking along +y.
+
+    Cameras keep `POSE_MARGIN_M` from the walls; in a room too narrow for that they stand in its middle.
+    """
+    low, high = _STAGED_HEIGHTS_M
+    lowest_ceiling = min(room.ceiling_height_m for room in home.plan.rooms)
+    height = rng.uniform(low, min(high, lowest_ceiling - _CEILING_CLEARANCE_M))
+    seed = int(rng.integers(1 << 62))
+    return [
+        Shot(
+            home=home,
+            position_m=_position_in(room, rng) if _is_roomy(room) else _middle_of(room),
+            room_index=index,
+            heading=0.0,
+            camera_height_m=float(height),
+            furniture="full",
+            seed=seed,
+            lighting="raw",
+        )
+        for index, room in enumerate(home.plan.rooms)
+    ]
+
+
+def _is_roomy(room: Room) -> bool:
+    """Whether some place of the room keeps `POSE_MARGIN_M` from its walls, and not just a sliver."""
+    return room.shape.buffer(-POSE_MARGIN_M).area > 1e-2
+
+
+def _middle_of(room: Room) -> Float[np.ndarray, "2"]:
+    return np.array(shapely.maximum_inscribed_circle(room.shape, 0.01).coords[0])
 
 
 def _position_in(room: Room, rng: np.random.Generator) -> Float[np.ndarray, "2"]:

@@ -1,0 +1,574 @@
+"""Synthetic scenes on disk in Structured3D's layout: what is in the files, and how they come to be there."""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import itertools
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from lalaloc_core.cli import main
+from lalaloc_core.data import synthesise as module
+from lalaloc_core.data.dataset import Split
+from lalaloc_core.data.generated import studio_of
+from lalaloc_core.data.structured3d import FURNITURE, LIGHTING, Structured3D
+from lalaloc_core.data.structured3d_splits import EXCLUDED_BY_PAPER, OFFICIAL, scene_numbers
+from lalaloc_core.data.structured3d_writer import build_annotation, layout_pixels, room_type, write_depth
+from lalaloc_core.data.synthesise import Synthesis, share_out, synthesise
+from lalaloc_core.errors import DatasetError, InvalidInputError
+from lalaloc_core.render.depth import layout_depth
+from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.synth.build import build_scene
+from lalaloc_core.synth.furniture import FURNITURE_LEVELS
+from lalaloc_core.synth.lighting import MOODS
+from lalaloc_core.synth.materials import MaterialLibrary
+from lalaloc_core.synth.plans import Home, generate_home
+from lalaloc_core.synth.shots import POSE_MARGIN_M, stage_rooms
+from lalaloc_core.synth.splits import TEST, TRAIN, home_of
+
+# A seed whose first homes have four rooms each.
+HEIGHT, SEED = 32, 267
+NUMBERS: dict[Split, tuple[int, ...]] = {"test": (3250, 3251)}
+seeds = st.integers(0, 2**32 - 1)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two scenes of the test split."""
+    folder = tmp_path_factory.mktemp("synthetic") / "data"
+    synthesise(Synthesis(root=folder, seed=SEED, height=HEIGHT), NUMBERS)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def materials() -> MaterialLibrary:
+    return MaterialLibrary.create(np.random.default_rng(0))
+
+
+def content(root: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
+
+
+def homes_of(root: Path) -> Iterator[tuple[Path, Home, list]]:
+    """The scenes of a folder with the homes and shots that they must show."""
+    for number in NUMBERS["test"]:
+        home, rng = home_of(TEST, SEED, number)
+        yield root / f"scene_{number:05d}", home, stage_rooms(home, rng)
+
+
+# The annotation
+
+
+class Annotation:
+    """An independent look at an annotation, in matrices."""
+
+    def __init__(self, document: dict[str, Any]) -> None:
+        self.document = document
+        self.points = np.array([junction["coordinate"] for junction in document["junctions"]])
+        self.line_junctions = np.array(document["lineJunctionMatrix"])
+        self.plane_lines = np.array(document["planeLineMatrix"])
+        self.types = [plane["type"] for plane in document["planes"]]
+
+    def semantics(self, *kinds: str) -> list[dict[str, Any]]:
+        return [semantic for semantic in self.document["semantics"] if semantic["type"] in kinds]
+
+    @property
+    def rooms(self) -> list[dict[str, Any]]:
+        others = self.semantics("door", "window", "outwall")
+        return [semantic for semantic in self.document["semantics"] if semantic not in others]
+
+    def segments(self, plane: int) -> np.ndarray:
+        """(lines, 2, 3)."""
+        lines = np.flatnonzero(self.plane_lines[plane])
+        return np.stack([self.points[np.flatnonzero(self.line_junctions[line])] for line in lines])
+
+    def faces(self, plane: int) -> list[shapely.Polygon]:
+        """Closed rings of a horizontal plane, seen from above."""
+        return list(
+            shapely.get_parts(shapely.polygonize([shapely.LineString(ends) for ends in self.segments(plane)[..., :2]]))
+        )
+
+
+def annotation_of(seed: int) -> tuple[Home, Annotation]:
+    home = generate_home(np.random.default_rng(seed))
+    return home, Annotation(json.loads(json.dumps(build_annotation(home.plan, home.openings))))
+
+
+@given(seed=seeds)
+@settings(max_examples=15, deadline=None)
+def test_lines_have_two_ends_and_lie_in_their_planes(seed: int) -> None:
+    _, found = annotation_of(seed)
+    document = found.document
+    assert document["cuboids"] == document["manhattan"] == []
+    for key in ("junctions", "lines", "planes", "semantics"):
+        assert [entry["ID"] for entry in document[key]] == list(range(len(document[key])))
+    assert found.plane_lines.shape == (len(document["planes"]), len(document["lines"]))
+    assert found.line_junctions.shape == (len(document["lines"]), len(document["junctions"]))
+    assert (found.line_junctions.sum(axis=1) == 2).all()
+    assert (found.line_junctions.sum(axis=0) == 3).all(), "three lines meet at every corner of a prism"
+    for line, row in zip(document["lines"], found.line_junctions, strict=True):
+        ends = found.points[np.flatnonzero(row)]
+        direction = np.array(line["direction"])
+        assert abs(np.linalg.norm(direction) - 1.0) < 1e-9
+        assert np.linalg.norm(np.cross(ends - line["point"], direction), axis=1).max() < 1e-6
+    for number, plane in enumerate(document["planes"]):
+        normal = np.array(plane["normal"])
+        assert abs(np.linalg.norm(normal) - 1.0) < 1e-9
+        assert np.abs(found.segments(number) @ normal + plane["offset"]).max() < 1e-3
+        assert plane["type"] == {0: "wall", 1: "floor", -1: "ceiling"}[round(normal[2])]
+
+
+@given(seed=seeds)
+@settings(max_examples=15, deadline=None)
+def test_rooms_close_and_are_the_plans(seed: int) -> None:
+    home, found = annotation_of(seed)
+    assert len(found.rooms) == len(home.plan.rooms)
+    for semantic, room in zip(found.rooms, home.plan.rooms, strict=True):
+        planes = {kind: [p for p in semantic["planeID"] if found.types[p] == kind] for kind in ("floor", "ceiling")}
+        (floor,), (ceiling,) = planes["floor"], planes["ceiling"]
+        for plane, height_m in ((floor, 0.0), (ceiling, room.ceiling_height_m)):
+            (face,) = found.faces(plane)
+            expected = shapely.Polygon(1000.0 * room.polygon_m)
+            assert shapely.hausdorff_distance(face.exterior, expected.exterior) < 1e-3
+            assert np.abs(found.segments(plane)[..., 2] - 1000.0 * height_m).max() < 1e-3
+        assert len(semantic["planeID"]) == 2 + len(room.polygon_m)
+
+
+@given(seed=seeds)
+@settings(max_examples=15, deadline=None)
+def test_normals_point_into_the_empty_space(seed: int) -> None:
+    home, found = annotation_of(seed)
+    outline = shapely.union_all([room.shape for room in home.plan.rooms]).buffer(1e-9)
+    for semantic in found.document["semantics"]:
+        walls = [plane for plane in semantic["planeID"] if found.types[plane] == "wall"]
+        for plane in walls:
+            segments = found.segments(plane)
+            lowest = segments[segments[..., 2].max(axis=1) < segments[..., 2].min() + 1e-6]
+            longest = lowest[np.linalg.norm(lowest[:, 0] - lowest[:, 1], axis=1).argmax()]
+            normal = np.array(found.document["planes"][plane]["normal"])
+            beside = shapely.Point((longest.mean(axis=0) + normal)[:2] / 1000.0)
+            if semantic["type"] == "outwall":
+                assert outline.distance(beside) > 0.15
+            elif semantic["type"] not in ("door", "window"):
+                assert home.plan.rooms[semantic["ID"]].shape.contains(beside)
+
+
+@given(seed=seeds)
+@settings(max_examples=15, deadline=None)
+def test_doors_and_windows_are_boxes_that_make_holes_in_walls(seed: int) -> None:
+    home, found = annotation_of(seed)
+    doors = [opening for opening in home.openings if opening.kind != "window"]
+    between_rooms = sum(door.neighbour >= 0 for door in doors)
+    assert len(found.semantics("door")) == len(doors) - between_rooms // 2
+    assert len(found.semantics("window")) == len(home.openings) - len(doors)
+    walls_of_rooms = [plane for room in found.rooms for plane in room["planeID"] if found.types[plane] == "wall"]
+    holes: Counter[int] = Counter()
+    for box in found.semantics("door", "window"):
+        of_box = found.plane_lines[box["planeID"]]
+        assert (of_box.sum(axis=1) == 4).all()
+        assert set(of_box.sum(axis=0)) == {0, 2}, "the faces of a closed box share every edge"
+        faces = [row for row in of_box if ((found.plane_lines[walls_of_rooms] & row).sum(axis=1) == 4).any()]
+        holes[len(faces)] += 1
+    assert holes[2] == between_rooms // 2
+    assert holes[1] == len(home.openings) - between_rooms
+
+
+def test_the_outer_wall_is_around_the_home_as_the_data_sets_own_tools_look_for_it() -> None:
+    home, found = annotation_of(3)
+    (outwall,) = found.semantics("outwall")
+    on_floor = np.isclose(found.points[:, 2], 0.0)
+    pairs = [
+        np.flatnonzero(found.line_junctions[line])
+        for line in np.flatnonzero(found.plane_lines[outwall["planeID"]].any(axis=0))
+    ]
+    lines = [found.points[pair, :2] for pair in pairs if on_floor[pair].all()]
+    (outline,) = shapely.get_parts(shapely.polygonize([shapely.LineString(ends) for ends in lines]))
+    for room in home.plan.rooms:
+        assert outline.contains(shapely.Polygon(1000.0 * room.polygon_m))
+
+
+def test_outer_walls_have_no_edge_without_a_direction() -> None:
+    home, _ = home_of(TRAIN, 0, 59)
+    outside = shapely.union_all([room.shape.buffer(0.2, join_style="mitre") for room in home.plan.rooms])
+    steps = np.diff(shapely.get_coordinates(outside), axis=0)
+    assert np.linalg.norm(steps, axis=1).min() < 1e-9, "this home needs the care that is tested here"
+    found = Annotation(build_annotation(home.plan, home.openings))
+    ends = np.stack([found.points[np.flatnonzero(row)] for row in found.line_junctions])
+    assert np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).min() > 0.9
+    assert np.isfinite([line["direction"] for line in found.document["lines"]]).all()
+
+
+def test_rooms_have_the_data_sets_types() -> None:
+    names = ("bedroom 2", "living room", "closet 1", "storage", "dining room 12", "wine cellar")
+    assert [room_type(name) for name in names] == [
+        *("bedroom", "living room", "store room", "store room", "dining room", "undefined"),
+    ]
+
+
+def test_what_is_written_is_read_back(root: Path) -> None:
+    dataset = Structured3D(root)
+    assert dataset.panorama_size == (HEIGHT, 2 * HEIGHT)
+    assert dataset.scenes("test") == ["scene_03250", "scene_03251"]
+    assert dataset.scenes("train") == []
+    for folder, home, shots in homes_of(root):
+        scene = dataset.load(folder.name)
+        assert scene.plan.warnings == ()
+        assert len(scene.cameras) == len(shots) == len(home.plan.rooms)
+        for room, expected in zip(scene.plan.rooms, home.plan.rooms, strict=True):
+            assert shapely.hausdorff_distance(room.shape.exterior, expected.shape.exterior) < 1e-6
+            assert abs(room.ceiling_height_m - expected.ceiling_height_m) < 1e-6
+        for camera, shot in zip(scene.cameras, shots, strict=True):
+            assert camera.room_index == shot.room_index
+            assert camera.heading == shot.heading == 0.0
+            np.testing.assert_allclose(camera.position_m, shot.position_m, atol=1e-6)
+            assert abs(camera.camera_height_m - shot.camera_height_m) < 1e-6
+            assert set(camera.photographs) == set(dataset.appearances)
+
+
+# Cameras
+
+
+@given(seed=seeds)
+@settings(max_examples=25, deadline=None)
+def test_every_room_has_one_camera_and_a_home_one_camera_height(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    home = generate_home(rng)
+    shots = stage_rooms(home, rng)
+    assert [shot.room_index for shot in shots] == list(range(len(home.plan.rooms)))
+    assert len({shot.camera_height_m for shot in shots}) == len({shot.seed for shot in shots}) == 1
+    assert 1.2 <= shots[0].camera_height_m <= 1.7
+    for shot, room in zip(shots, home.plan.rooms, strict=True):
+        at = shapely.Point(shot.position_m)
+        margin_m = min(POSE_MARGIN_M - 1e-9, 0.9 * shapely.maximum_inscribed_circle(room.shape).length)
+        assert room.shape.contains(at)
+        assert room.shape.exterior.distance(at) >= margin_m
+        assert shot.camera_height_m <= room.ceiling_height_m - 0.3
+
+
+@given(seed=seeds)
+@settings(max_examples=25, deadline=None)
+def test_layout_pixels_lead_back_to_the_corners_that_the_camera_sees(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    home = generate_home(rng)
+    shot = stage_rooms(home, rng)[int(rng.integers(len(home.plan.rooms)))]
+    room = home.plan.rooms[shot.room_index]
+    pixels = layout_pixels(room, shot.position_m, shot.camera_height_m)
+    ceiling, floor = pixels[0::2], pixels[1::2]
+    np.testing.assert_array_equal(ceiling[:, 0], floor[:, 0])
+    assert (np.diff(floor[:, 0]) >= 0.0).all()
+    assert (ceiling[:, 1] < 255.5).all()
+    assert (floor[:, 1] > 255.5).all()
+    azimuth = ((floor[:, 0] + 0.5) / 1024 - 0.5) * 2.0 * math.pi
+    below = -(0.5 - (floor[:, 1] + 0.5) / 512) * math.pi
+    above = (0.5 - (ceiling[:, 1] + 0.5) / 512) * math.pi
+    distance_m = shot.camera_height_m / np.tan(below)
+    np.testing.assert_allclose(distance_m * np.tan(above), room.ceiling_height_m - shot.camera_height_m, atol=1e-9)
+    found = shot.position_m + distance_m[:, None] * np.stack([np.sin(azimuth), np.cos(azimuth)], axis=1)
+    inner = np.linspace(1e-3, 1.0 - 1e-3, 500)[:, None]
+    visible = []
+    for corner in room.polygon_m:
+        between = shot.position_m + inner * (corner - shot.position_m)
+        if shapely.contains_xy(room.shape.buffer(1e-6), between[:, 0], between[:, 1]).all():
+            visible.append(corner)
+    assert len(found) == len(visible)
+    assert np.linalg.norm(found[:, None] - np.array(visible)[None], axis=2).min(axis=0).max() < 1e-6
+
+
+# Pictures
+
+
+def test_every_room_has_nine_panoramas_and_three_depths(root: Path) -> None:
+    for folder, _, shots in homes_of(root):
+        for shot in shots:
+            panorama = folder / "2D_rendering" / str(shot.room_index) / "panorama"
+            assert {path.name for path in panorama.iterdir()} == {"camera_xyz.txt", "layout.txt", *FURNITURE}
+            np.testing.assert_allclose(
+                np.loadtxt(panorama / "layout.txt"),
+                layout_pixels(shot.home.plan.rooms[shot.room_index], shot.position_m, shot.camera_height_m),
+                atol=1e-3,
+            )
+            for furniture in FURNITURE:
+                files = {path.name: path for path in (panorama / furniture).iterdir()}
+                assert set(files) == {"depth.png", *(f"rgb_{light}light.png" for light in LIGHTING)}
+                for name, path in files.items():
+                    with Image.open(path) as image:
+                        assert image.size == (2 * HEIGHT, HEIGHT)
+                        assert image.mode == ("I;16" if name == "depth.png" else "RGB")
+
+
+def test_depth_of_an_empty_room_is_that_of_its_layout_but_for_doors_and_fittings(root: Path) -> None:
+    for folder, home, shots in homes_of(root):
+        for shot in shots:
+            panorama = folder / "2D_rendering" / str(shot.room_index) / "panorama"
+            depth_m = np.asarray(Image.open(panorama / "empty" / "depth.png")) / 1000.0
+            room = home.plan.rooms[shot.room_index]
+            profile = wall_profile(shot.position_m[None], np.zeros(1), room.walls_m[None], 2 * HEIGHT)
+            layout_m = layout_depth(
+                profile, np.array([shot.camera_height_m]), np.array([room.ceiling_height_m]), HEIGHT
+            )[0]
+            azimuth = ((np.arange(2 * HEIGHT) + 0.5) / (2 * HEIGHT) - 0.5) * 2.0 * math.pi
+            foot = shot.position_m + profile[0][:, None] * np.stack([np.sin(azimuth), np.cos(azimuth)], axis=1)
+            through = np.zeros(2 * HEIGHT, dtype=bool)
+            for opening in home.openings:
+                if opening.room == shot.room_index and opening.kind in ("door_open", "opening"):
+                    wall = room.walls_m[opening.wall]
+                    along = (wall[2:] - wall[:2]) / np.hypot(*(wall[2:] - wall[:2]))
+                    span = shapely.LineString([wall[:2] + along * opening.start_m, wall[:2] + along * opening.end_m])
+                    through |= shapely.distance(shapely.points(foot), span) < 0.02
+            assert (depth_m[:, ~through] <= layout_m[:, ~through] + 1.1e-3).all()
+            # Lamps, radiators and open doors' leaves stand in the way of the rest.
+            assert (np.abs(depth_m - layout_m)[:, ~through] < 1.1e-3).mean() > 0.75
+            assert depth_m.min() > 0.1
+
+
+def test_furniture_hides_the_layout_and_moves_nothing_else(root: Path) -> None:
+    hidden = []
+    for folder, _, shots in homes_of(root):
+        for shot in shots:
+            panorama = folder / "2D_rendering" / str(shot.room_index) / "panorama"
+            depth = {level: np.asarray(Image.open(panorama / level / "depth.png"), dtype=int) for level in FURNITURE}
+            for level in ("simple", "full"):
+                assert (depth[level] <= depth["empty"] + 1).all()
+            hidden.append([(depth[level] < depth["empty"] - 1).mean() for level in ("simple", "full")])
+    simple, full = np.mean(hidden, axis=0)
+    assert 0.02 < simple < full
+
+
+def test_light_changes_colours(root: Path) -> None:
+    for folder, _, shots in homes_of(root):
+        for shot, level in itertools.product(shots, FURNITURE):
+            panorama = folder / "2D_rendering" / str(shot.room_index) / "panorama"
+            blueness = []
+            for light in ("cold", "raw", "warm"):
+                pixels = np.asarray(Image.open(panorama / level / f"rgb_{light}light.png"), dtype=float)
+                blueness.append(math.log(pixels[..., 2].mean() / pixels[..., 0].mean()))
+                assert 40.0 < pixels.mean() < 220.0
+            assert blueness[0] - 0.05 > blueness[1] > blueness[2] + 0.05
+
+
+def test_pictures_in_several_lights_are_the_same_as_one_by_one() -> None:
+    home, rng = home_of(TEST, SEED, 3250)
+    shot = stage_rooms(home, rng)[0]
+    renderer = studio_of(TEST, SEED, None).renderer(HEIGHT, 2 * HEIGHT)
+    pictures, depth_m = renderer.render_moods(shot, MOODS)
+    for mood, picture in zip(MOODS, pictures, strict=True):
+        alone = dataclasses.replace(shot, lighting=mood)
+        assert (picture.int() - renderer.render([alone])[0].int()).abs().max() <= 1
+        np.testing.assert_array_equal(renderer.depth_m([alone])[0].numpy(), depth_m.numpy())
+
+
+def test_materials_are_the_same_however_a_room_is_furnished_and_lit(materials: MaterialLibrary) -> None:
+    home, rng = home_of(TEST, SEED, 3250)
+    for shot in stage_rooms(home, rng):
+        seen = []
+        for furniture, lighting in itertools.product(FURNITURE_LEVELS, MOODS):
+            scene = build_scene(dataclasses.replace(shot, furniture=furniture, lighting=lighting), materials)
+            flat = scene.slots[:, 1:3].astype(int)
+            seen.append((scene.walls_m, scene.surfaces[scene.wall_surface], scene.surfaces[flat], scene.lights[:, :3]))
+        for other in seen[1:]:
+            for first, second in zip(seen[0], other, strict=True):
+                np.testing.assert_array_equal(first, second)
+
+
+def test_a_room_has_the_same_materials_from_the_next_room(materials: MaterialLibrary) -> None:
+    home, rng = home_of(TEST, SEED, 3250)
+    shots = stage_rooms(home, rng)
+    scenes = [build_scene(shot, materials) for shot in shots]
+    pairs = 0
+    for shot, scene in zip(shots, scenes, strict=True):
+        behind = [
+            opening.neighbour
+            for opening in home.openings
+            if opening.room == shot.room_index and opening.kind in ("door_open", "opening") and opening.neighbour >= 0
+        ]
+        for slot, room in enumerate(dict.fromkeys(behind), start=1):
+            own = scenes[room].surfaces[scenes[room].slots[0, 1:3].astype(int)]
+            np.testing.assert_array_equal(scene.surfaces[scene.slots[slot, 1:3].astype(int)], own)
+            pairs += 1
+    assert pairs > 1
+
+
+def test_depth_out_of_range_is_no_reading(tmp_path: Path) -> None:
+    write_depth(tmp_path / "depth.png", np.array([[1.2345, 65.535, 65.536, np.inf, np.nan]]))
+    assert np.asarray(Image.open(tmp_path / "depth.png")).tolist() == [[1234, 65535, 0, 0, 0]]
+
+
+# Runs
+
+
+def test_an_interrupted_run_leaves_whole_scenes_and_goes_on(
+    root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rooms_of_first = len(home_of(TEST, SEED, 3250)[0].plan.rooms)
+    rooms = itertools.count()
+    write_room = module._write_room
+
+    def interrupted(*arguments: Any) -> None:
+        write_room(*arguments)
+        if next(rooms) == rooms_of_first + 1:
+            raise KeyboardInterrupt
+
+    out = tmp_path / "data"
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "_write_room", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            synthesise(Synthesis(root=out, seed=SEED, height=HEIGHT), NUMBERS)
+    assert {path.name for path in out.iterdir()} == {"synthetic.json", "scene_03250"}
+    # As a killed process would leave it.
+    (out / "scene_03251.part" / "2D_rendering").mkdir(parents=True)
+    before = (out / "scene_03250" / "annotation_3d.json").stat().st_mtime_ns
+    assert synthesise(Synthesis(root=out, seed=SEED, height=HEIGHT), NUMBERS) == 1
+    assert (out / "scene_03250" / "annotation_3d.json").stat().st_mtime_ns == before
+    assert content(out) == content(root)
+    assert synthesise(Synthesis(root=out, seed=SEED, height=HEIGHT), NUMBERS) == 0
+
+
+def test_any_number_of_workers_writes_the_same_files(root: Path, tmp_path: Path) -> None:
+    assert synthesise(Synthesis(root=tmp_path / "data", seed=SEED, height=HEIGHT), NUMBERS, workers=2) == 2
+    assert content(tmp_path / "data") == content(root)
+
+
+def test_a_full_disk_is_a_named_error_and_leaves_nothing_half_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path, *_: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
+
+    monkeypatch.setattr(module, "write_depth", full)
+    with pytest.raises(DatasetError, match="cannot be written: No space left") as caught:
+        synthesise(Synthesis(root=tmp_path, seed=SEED, height=HEIGHT), NUMBERS)
+    assert caught.value.path is not None
+    assert caught.value.path.name == "depth.png"
+    assert {path.name for path in tmp_path.iterdir()} == {"synthetic.json"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
+def test_an_ended_command_leaves_whole_scenes_and_no_process(tmp_path: Path, how: signal.Signals) -> None:
+    program = "import sys; from lalaloc_core.cli import main; sys.exit(main(sys.argv[1:]))"
+    arguments = ["synth", "--scenes", "40", "--split", "test", "--out", str(tmp_path), "--height", "64"]
+    process = subprocess.Popen(
+        [sys.executable, "-c", program, *arguments, "--workers", "2"], start_new_session=True, stderr=subprocess.PIPE
+    )
+    wait_until(lambda: bool(list(tmp_path.glob("scene_*[0-9]"))))
+    if how == signal.SIGINT:
+        # As a terminal does it.
+        os.killpg(process.pid, how)
+    else:
+        process.kill()
+    _, errors = process.communicate(timeout=60.0)
+    wait_until(lambda: not group_exists(process.pid))
+    if how == signal.SIGINT:
+        assert process.returncode == 130
+        assert b"goes on where it stopped" in errors
+        assert b"Traceback" not in errors
+        assert list(tmp_path.glob("*.part")) == []
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 120.0
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+
+
+def group_exists(group: int) -> bool:
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+# The command
+
+
+def test_scenes_are_shared_out_like_the_official_splits() -> None:
+    assert {split: len(found) for split, found in share_out(140, "all").items()} == {
+        "train": 120,
+        "validation": 10,
+        "test": 10,
+    }
+    assert share_out(3, "all") == {"train": (0,), "validation": (3000,), "test": (3250,)}
+    assert share_out(2, "test") == {"test": (3250, 3251)}
+    assert share_out(3474, "all") == {split: scene_numbers(split) for split in OFFICIAL}
+    for scenes in (1, 2, 4, 100, 1000, 3473):
+        shared = share_out(scenes, "all")
+        assert sum(len(found) for found in shared.values()) == scenes
+        for split, found in shared.items():
+            assert set(found) <= set(OFFICIAL[split]) - set(EXCLUDED_BY_PAPER[split])
+
+
+@pytest.mark.parametrize(("scenes", "split"), [(250, "test"), (3475, "all"), (0, "all"), (-1, "train")])
+def test_more_scenes_than_a_split_has_are_refused(scenes: int, split: Any) -> None:
+    with pytest.raises(InvalidInputError, match=rf"^{scenes} scenes asked for, from 1 to \d+ are possible"):
+        share_out(scenes, split)
+
+
+def test_the_command_writes_adds_and_says_so(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "data"
+    common = ["synth", "--out", str(out), "--height", str(HEIGHT), "--seed", str(SEED)]
+    assert main([*common, "--scenes", "1", "--split", "test"]) == 0
+    assert main([*common, "--scenes", "1", "--split", "validation"]) == 0
+    assert capsys.readouterr().out.splitlines()[-1] == f"{out}: 1 validation; 1 of them new"
+    assert Structured3D(out).scenes("validation") == ["scene_03000"]
+    assert content(out / "scene_03250") == content(root / "scene_03250")
+    assert json.loads((out / "synthetic.json").read_text()) == {
+        "format": 1,
+        "seed": SEED,
+        "height": HEIGHT,
+        "width": 2 * HEIGHT,
+        "textures": None,
+    }
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--scenes", "250", "--split", "test"], "250 scenes asked for, from 1 to 249"),
+        (["--scenes", "1", "--height", "33"], "panoramas of 33 rows, an even number"),
+        (["--scenes", "1", "--height", "8"], "panoramas of 8 rows"),
+        (["--scenes", "1", "--seed", "-1"], "the seed is -1"),
+        (["--scenes", "1", "--workers", "0"], "0 worker processes, at least 1"),
+        (["--scenes", "1", "--textures", "nowhere"], "no <category>/<material>/*.jpg below 'nowhere'"),
+    ],
+)
+def test_what_cannot_be_is_refused_before_anything_is_written(
+    arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["synth", "--out", str(tmp_path / "data"), *arguments]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "data").exists()
+
+
+def test_a_folder_of_other_scenes_is_left_alone(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = content(root)
+    assert main(["synth", "--scenes", "3", "--out", str(root), "--height", "64", "--seed", str(SEED)]) == 2
+    message = capsys.readouterr().err
+    assert f"its scenes were made with height {HEIGHT}, not 64; width {2 * HEIGHT}, not 128" in message
+    assert "seed" not in message
+    assert content(root) == before
+    (tmp_path / "scene_00000").mkdir()
+    assert main(["synth", "--scenes", "3", "--out", str(tmp_path)]) == 2
+    assert "holds 'scene_00000' but no synthetic.json" in capsys.readouterr().err
+    (tmp_path / "file").write_text("")
+    assert main(["synth", "--scenes", "3", "--out", str(tmp_path / "file")]) == 2
+    assert "cannot be written: File exists" in capsys.readouterr().err
+    assert {path.name for path in tmp_path.iterdir()} == {"scene_00000", "file"}
