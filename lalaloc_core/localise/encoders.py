@@ -35,8 +35,11 @@ class Encoders:
         """
         self.manifest = bundle.manifest
         self._layout = _session(bundle.read(LAYOUT_ONNX), threads)
-        self._image = _session(bundle.read(IMAGE_ONNX), threads)
-        self._image_takes_height = any(node.name == "camera_height_m" for node in self._image.get_inputs())
+        # A bundle of the layout branch alone answers layout queries only.
+        image = bundle.read(IMAGE_ONNX) if IMAGE_ONNX in self.manifest.files else None
+        self._image = None if image is None else _session(image, threads)
+        inputs = [] if self._image is None else self._image.get_inputs()
+        self._image_takes_height = any(node.name == "camera_height_m" for node in inputs)
         self._head = _session(bundle.read(HEAD_ONNX), threads) if self.manifest.ring_sectors else None
         # A ring (1, c, s) where the architecture has one, else the latent (1, d).
         self._encoding = "ring" if self._head is not None else "latent"
@@ -97,7 +100,7 @@ class Encoders:
         Raises:
             BundleError: the bundle's image encoder predicts no wall profile.
         """
-        if not any(node.name == _PROFILE_OUTPUT for node in self._image.get_outputs()):
+        if not any(node.name == _PROFILE_OUTPUT for node in self._require_image().get_outputs()):
             raise BundleError(
                 f"model '{self.manifest.name}' (architecture '{self.manifest.architecture}') predicts no wall profile: "
                 f"{IMAGE_ONNX} has no output '{_PROFILE_OUTPUT}'"
@@ -133,7 +136,12 @@ class Encoders:
         inputs = {"image": np.ascontiguousarray(image[None])}
         if self._image_takes_height:
             inputs["camera_height_m"] = np.array([camera_height_m], dtype=np.float32)
-        return _array(self._image.run([output], inputs)[0])
+        return _array(self._require_image().run([output], inputs)[0])
+
+    def _require_image(self) -> onnxruntime.InferenceSession:
+        if self._image is None:
+            raise BundleError(f"model '{self.manifest.name}' has no image encoder; it answers layout queries only")
+        return self._image
 
     def _run_head(self, ring: Float[np.ndarray, "b c s"]) -> Float[np.ndarray, "b d"]:
         assert self._head is not None

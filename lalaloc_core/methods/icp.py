@@ -1,10 +1,11 @@
 """2-D iterative closest point, the paper's baseline that measures (section A.3, "Iterative Closest Point Baseline").
 
 A scan, what a laser scanner at the camera would see of the horizon, is aligned with points along the walls of the plan,
-from every pose of the grid at once; the alignment with the lowest root mean square distance is the answer. Deviates
-from nothing the paper states; where it is silent:
+from every pose of the grid at once; the alignment with the lowest root mean square distance is the answer. The cloud of
+the plan is merged by finer cells than the paper's 5 cm (`IcpConfig.plan_cell_m`). Where the paper is silent:
 
-* the slice is the rows of the depth image nearest the horizon;
+* the slice is the rows of the depth image nearest the horizon, which sees over most furniture; projecting all that
+  stands between floor and ceiling would take furniture for walls;
 * the cloud of the plan has the walls of all rooms, so that what a scan sees through an open door finds its wall;
 * only a scan whose heading is known is aligned: the rotation of the alignment refines it.
 """

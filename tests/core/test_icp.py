@@ -136,6 +136,12 @@ class TestMethod:
         assert math.hypot(found.x_m - position[0], found.y_m - position[1]) < 0.02
         assert abs(wrap_angle(found.heading - heading)) < 0.01
 
+    def test_a_heading_that_is_a_little_off_is_put_right(self) -> None:
+        plan, position = crooked_flat(), (1.13, 1.02)
+        photograph = BareRoom(plan, position, 1.0, rows=128)
+        found = Icp().answer(question_at(plan, position, heading=1.03, photograph=photograph, step_m=0.7)).stages["icp"]
+        assert abs(wrap_angle(found.heading - 1.0)) < 0.005
+
     @pytest.mark.parametrize("rows", [32, 64])
     def test_the_scan_is_the_horizon_not_the_floor(self, rows: int) -> None:
         plan, position = plan_of(rectangle(9.0, 7.0)), (4.2, 3.1)
