@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from lalaloc_core.bundle import Bundle, ConfidenceModel, write_manifest
-from lalaloc_core.evaluate import QueryResult
+from lalaloc_core.evaluation.predictions import Prediction
+from lalaloc_core.evaluation.score import position_errors_m
 from lalaloc_core.metrics import Accuracy
 
 # A weak pull to zero keeps the fit finite when the queries are perfectly separable.
@@ -16,29 +17,25 @@ _RIDGE = 1e-2
 _ITERATIONS = 50
 
 
-def fit_confidence(results: list[QueryResult]) -> ConfidenceModel:
+def fit_confidence(predictions: list[Prediction]) -> ConfidenceModel:
     """Maximum-likelihood logistic model of the best latent distance and its margin over the second candidate."""
-    distance = np.array([result.candidate_distances[0] for result in results])
-    margins = [r.candidate_distances[1] - r.candidate_distances[0] for r in results if len(r.candidate_distances) > 1]
+    candidates = [prediction.candidate_distances for prediction in predictions]
+    distance = np.array([distances[0] for distances in candidates])
+    margins = [distances[1] - distances[0] for distances in candidates if len(distances) > 1]
     ceiling = float(np.quantile(margins, 0.95)) if margins else 0.0
     margin = np.array(
-        [
-            min(r.candidate_distances[1] - r.candidate_distances[0], ceiling)
-            if len(r.candidate_distances) > 1
-            else ceiling
-            for r in results
-        ]
+        [min(distances[1] - distances[0], ceiling) if len(distances) > 1 else ceiling for distances in candidates]
     )
-    correct = np.array([result.error_m < 1.0 for result in results])
+    correct = position_errors_m(predictions) < 1.0
     bias, by_distance, by_margin = _logistic(np.stack([np.ones_like(distance), distance, margin], axis=1), correct)
     return ConfidenceModel(bias=bias, distance=by_distance, margin=by_margin, no_rival_margin=ceiling)
 
 
-def calibrate(bundle: Bundle, results: list[QueryResult], description: str) -> Bundle:
+def calibrate(bundle: Bundle, predictions: list[Prediction], description: str) -> Bundle:
     """Store the fitted confidence and the validation figures in the bundle's manifest."""
-    errors = np.array([result.error_m for result in results])
+    errors = position_errors_m(predictions)
     metrics = {**bundle.manifest.metrics, "validation": {"queries": description, **Accuracy.of(errors).to_dict()}}
-    manifest = dataclasses.replace(bundle.manifest, confidence=fit_confidence(results), metrics=metrics)
+    manifest = dataclasses.replace(bundle.manifest, confidence=fit_confidence(predictions), metrics=metrics)
     return write_manifest(bundle.folder, manifest)
 
 

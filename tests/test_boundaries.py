@@ -34,8 +34,9 @@ LAYERS = {
     "lalaloc_core.evaluation.report": 8,
     "lalaloc_core.calibrate": 8,
     "lalaloc_core.export": 8,
-    # A run ends with its export, so this one file stands above it.
+    # A run ends with its export, so these two files stand above it.
     "lalaloc_core.training.run": 9,
+    "lalaloc_core.training.ablations": 9,
     "lalaloc_core.reproduce": 10,
     "lalaloc_core.bench": 10,
     "lalaloc_core.cli": 11,

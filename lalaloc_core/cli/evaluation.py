@@ -1,86 +1,175 @@
-"""`lalaloc evaluate` and `lalaloc calibrate`."""
+"""`lalaloc evaluate`, `score`, `report` and `calibrate`."""
 
 from __future__ import annotations
 
 import argparse
 import shlex
 import sys
+import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from lalaloc_core.cli.printing import print_json
+from lalaloc_core.data.dataset import SPLITS
+from lalaloc_core.errors import InvalidInputError
 
-_SPLITS = {"validation": 1, "test": 2}
+_BUNDLE = Path("models/default")
 
 
 def add_commands(commands: Any) -> None:
     """Add this room's commands to the parser."""
-    calibrate = commands.add_parser("calibrate", help="fit a bundle's confidence on validation homes")
-    _query_arguments(calibrate, homes=100)
-    calibrate.set_defaults(run=_calibrate)
-
-    evaluate = commands.add_parser("evaluate", help="localise synthetic queries with a bundle and score the answers")
-    _query_arguments(evaluate, homes=100)
-    evaluate.add_argument("--kind", choices=("layout", "panorama"), default="panorama")
-    evaluate.add_argument("--split", choices=tuple(_SPLITS), default="test")
-    evaluate.add_argument("--furniture", choices=("empty", "simple", "full"), default="full")
+    evaluate = commands.add_parser(
+        "evaluate", help="answer the queries of a data set, or of generated homes, and score the answers"
+    )
+    evaluate.add_argument("--bundle", type=Path, default=_BUNDLE, help="model (default: %(default)s)")
+    evaluate.add_argument(
+        "--method",
+        default="lalaloc",
+        choices=("lalaloc", "oracle", "icp", "explicit", "decode"),
+        help="who answers (default: %(default)s)",
+    )
+    evaluate.add_argument(
+        "--kind", choices=("layout", "panorama"), default="panorama", help="what is asked (default: %(default)s)"
+    )
+    _data_arguments(evaluate)
+    evaluate.add_argument("--split", choices=SPLITS, default="test")
+    evaluate.add_argument("--furniture", choices=("empty", "simple", "full"), help="default: the data set's usual")
+    evaluate.add_argument("--lighting", choices=("cold", "raw", "warm"), help="default: the data set's usual")
     evaluate.add_argument("--heading", choices=("known", "unknown"), default="known")
+    evaluate.add_argument("--grid-step", type=_positive, default=0.5, metavar="M", help="metres (default: %(default)s)")
+    evaluate.add_argument("--refine", choices=("none", "vdr", "lpo"), help="how far to go; default: lpo")
+    evaluate.add_argument("--limit", type=_count, metavar="N", help="at most N queries")
+    evaluate.add_argument("--skip-bad", action="store_true", help="leave out and list what cannot be used")
+    evaluate.add_argument("--workers", type=int, metavar="N", help="processes; default: one per core")
+    evaluate.add_argument("--out", type=Path, metavar="RUN", help="folder of the run; one that exists goes on")
     evaluate.set_defaults(run=_evaluate)
 
+    score = commands.add_parser("score", help="score the answers of runs again, without model or data")
+    score.add_argument("runs", type=Path, nargs="+", metavar="RUN")
+    score.set_defaults(run=_score)
 
-def _query_arguments(parser: argparse.ArgumentParser, homes: int) -> None:
-    parser.add_argument("--bundle", type=Path, default=Path("models/default"))
-    parser.add_argument("--homes", type=int, default=homes, help="number of synthetic homes, 4 queries each")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--textures", type=Path, help="folder of material pictures")
+    report = commands.add_parser("report", help="write one self-contained HTML page about runs")
+    report.add_argument("runs", type=Path, nargs="+", metavar="RUN")
+    report.add_argument("--out", type=Path, default=Path("report.html"))
+    report.add_argument("--pictures", type=Path, metavar="DIR", help="also write the page's pictures as files")
+    report.set_defaults(run=_report)
+
+    calibrate = commands.add_parser("calibrate", help="fit a bundle's confidence on generated validation homes")
+    calibrate.add_argument("--bundle", type=Path, default=_BUNDLE)
+    _generator_arguments(calibrate)
+    calibrate.set_defaults(run=_calibrate)
+
+
+def _data_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--data", type=Path, metavar="DIR", help="a data set; default: generated homes")
+    _generator_arguments(parser)
+
+
+def _generator_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--homes", type=_count, default=100, help="generated homes, 4 queries each")
+    parser.add_argument("--seed", type=int, default=0, help="of the generated homes")
+    parser.add_argument("--textures", type=Path, help="folder of material pictures for generated homes")
+
+
+def _count(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{value} must be at least 1")
+    return value
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not 0.0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} must be positive")
+    return value
+
+
+def _evaluate(arguments: argparse.Namespace) -> None:
+    from lalaloc_core.evaluation.building import build_dataset, choose_appearance, describe_model
+    from lalaloc_core.evaluation.predictions import RunFolder, RunInfo
+    from lalaloc_core.evaluation.run import run_evaluation
+    from lalaloc_core.evaluation.score import score_run
+
+    method, panorama = arguments.method, arguments.kind == "panorama"
+    bundle = None if method in ("oracle", "icp") else arguments.bundle
+    if arguments.refine is not None and method != "lalaloc":
+        raise InvalidInputError(f"--refine {arguments.refine} is for method 'lalaloc', not '{method}'")
+    info = RunInfo(
+        label=f"{method} {arguments.kind}",
+        method=method,
+        kind=arguments.kind,
+        dataset="",
+        split=arguments.split,
+        settings={} if arguments.refine is None else {"refine": arguments.refine},
+        data=None if arguments.data is None else str(arguments.data),
+        generated=_generated(arguments, arguments.furniture or "full") if arguments.data is None else None,
+        heading_known=arguments.heading == "known",
+        grid_step_m=arguments.grid_step,
+        limit=arguments.limit,
+        bundle=None if bundle is None else str(bundle),
+        model=None if bundle is None else describe_model(bundle),
+        skip_bad=arguments.skip_bad,
+        command=shlex.join(["lalaloc", *sys.argv[1:]]),
+    )
+    dataset = build_dataset(info)
+    appearance = choose_appearance(dataset, arguments.furniture, arguments.lighting)
+    shown = {"furniture": appearance.furniture, "lighting": appearance.lighting} if panorama else {}
+    info = replace(info, dataset=dataset.description, **shown)
+    with tempfile.TemporaryDirectory(prefix="lalaloc-run-") as temporary:
+        folder = RunFolder(arguments.out or Path(temporary))
+        run_evaluation(folder, info, workers=arguments.workers)
+        print_json(score_run(folder))
+
+
+def _score(arguments: argparse.Namespace) -> None:
+    from lalaloc_core.evaluation.predictions import RunFolder
+    from lalaloc_core.evaluation.score import score_run
+
+    print_json({str(path): score_run(RunFolder(path)) for path in arguments.runs})
+
+
+def _report(arguments: argparse.Namespace) -> None:
+    from lalaloc_core.evaluation.report import write_report
+
+    write_report(arguments.runs, arguments.out, pictures=arguments.pictures)
 
 
 def _calibrate(arguments: argparse.Namespace) -> None:
     from lalaloc_core.bundle import Bundle
     from lalaloc_core.calibrate import calibrate
-    from lalaloc_core.evaluate import QuerySet, summarise
+    from lalaloc_core.evaluation.predictions import RunFolder, RunInfo
+    from lalaloc_core.evaluation.run import run_evaluation
 
-    bundle = Bundle.open(arguments.bundle)
-    queries = QuerySet(
-        split=_SPLITS["validation"],
-        homes=arguments.homes,
-        seed=arguments.seed,
-        furniture=None,
-        textures=arguments.textures,
-    )
-    # One model serves both kinds of query, so it is fitted on both.
-    results = [
-        result
-        for heading_known in (True, False)
-        for result in _answers(bundle, queries, kind="panorama", heading_known=heading_known)
-    ]
+    # One model of confidence serves queries with known and with unknown heading, so it is fitted on both.
+    predictions = []
+    for known in (True, False):
+        info = RunInfo(
+            label=f"calibration, heading {'known' if known else 'unknown'}",
+            method="lalaloc",
+            kind="panorama",
+            dataset="generated homes",
+            split="validation",
+            generated=_generated(arguments, None),
+            heading_known=known,
+            bundle=str(arguments.bundle),
+        )
+        with tempfile.TemporaryDirectory(prefix="lalaloc-run-") as folder:
+            predictions += run_evaluation(RunFolder(Path(folder)), info)
     description = (
-        f"{len(results)} panoramas of {queries.homes} validation homes, all furniture levels, "
+        f"{len(predictions)} panoramas of {arguments.homes} validation homes, all furniture levels, "
         "half with known and half with unknown heading"
     )
-    calibrate(bundle, results, description)
-    print_json(summarise(results))
+    bundle = calibrate(Bundle.open(arguments.bundle), predictions, description)
+    print_json(bundle.manifest.metrics["validation"])
 
 
-def _evaluate(arguments: argparse.Namespace) -> None:
-    from lalaloc_core.bundle import Bundle
-    from lalaloc_core.evaluate import QuerySet, summarise
-
-    queries = QuerySet(
-        split=_SPLITS[arguments.split],
-        homes=arguments.homes,
-        seed=arguments.seed,
-        furniture=arguments.furniture,
-        textures=arguments.textures,
-    )
-    known = arguments.heading == "known"
-    results = _answers(Bundle.open(arguments.bundle), queries, kind=arguments.kind, heading_known=known)
-    print_json({"command": shlex.join(sys.argv), **summarise(results)})
-
-
-def _answers(bundle: Any, queries: Any, *, kind: Any, heading_known: bool) -> list[Any]:
-    from lalaloc_core.evaluate import evaluate, local_refiner
-    from lalaloc_core.localise.encoders import Encoders
-
-    refiner = local_refiner(bundle)
-    return evaluate(Encoders(bundle), queries, kind=kind, heading_known=heading_known, refiner=refiner)
+def _generated(arguments: argparse.Namespace, furniture: str | None) -> dict[str, Any]:
+    """Arguments of `GeneratedScenes`, as plain data."""
+    return {
+        "homes": arguments.homes,
+        "seed": arguments.seed,
+        "furniture": furniture,
+        "textures": None if arguments.textures is None else str(arguments.textures),
+    }

@@ -15,15 +15,18 @@ import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from lalaloc_core.configuration import build_config
+from lalaloc_core.data.dataset import Split
 from lalaloc_core.errors import ConfigError, RunError
 from lalaloc_core.methods.method import QueryKind
 
 RUN_FILE = "run.json"
 PREDICTIONS_FILE = "predictions.jsonl"
 SCORES_FILE = "scores.json"
+
+MethodName = Literal["lalaloc", "oracle", "pose-oracle", "similarity", "icp", "explicit", "decode"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,7 +56,6 @@ class Prediction:
         candidate_distances: of the distinct final candidates, best first.
         confidence: probability, by the model, of being within 1 m.
         timings_ms: per stage.
-        failure: why there is no answer.
     """
 
     scene: str
@@ -67,7 +69,6 @@ class Prediction:
     candidate_distances: tuple[float, ...] = ()
     confidence: float | None = None
     timings_ms: dict[str, float] = field(default_factory=dict)
-    failure: str | None = None
 
     @property
     def answer(self) -> Pose | None:
@@ -81,7 +82,6 @@ class RunInfo:
 
     Attributes:
         label: what tables call the run.
-        method: "lalaloc", "oracle", "icp", "explicit" or "decode".
         settings: the method's own settings, plain data.
         dataset: what results are to be called, such as "Structured3D".
         data: folder of the data set as it was given; None for generated homes.
@@ -90,15 +90,16 @@ class RunInfo:
         limit: at most so many queries; None for all.
         bundle: folder of the model as it was given; None for methods without one.
         model: name, version and SHA-256 of the bundle.
+        skip_bad: whether scenes and cameras that cannot be used are left out instead of ending the run.
         command: how to run it again.
         skipped: scenes and cameras that could not be used, with reasons.
     """
 
     label: str
-    method: str
+    method: MethodName
     kind: QueryKind
     dataset: str
-    split: str
+    split: Split
     settings: dict[str, Any] = field(default_factory=dict)
     data: str | None = None
     generated: dict[str, Any] | None = None
@@ -109,6 +110,7 @@ class RunInfo:
     limit: int | None = None
     bundle: str | None = None
     model: dict[str, str] | None = None
+    skip_bad: bool = False
     command: str = ""
     skipped: tuple[str, ...] = ()
 
@@ -133,6 +135,10 @@ class RunFolder:
         except (ValueError, ConfigError) as error:
             raise RunError(f"'{path}' does not describe a run: {error}") from error
 
+    def exists(self) -> bool:
+        """Whether a run was begun here."""
+        return (self.path / RUN_FILE).exists()
+
     def write_info(self, info: RunInfo) -> None:
         """Record what is asked."""
         self.path.mkdir(parents=True, exist_ok=True)
@@ -153,16 +159,15 @@ class RunFolder:
 
     def append(self, predictions: Iterable[Prediction]) -> None:
         """Add answers at the end of the file."""
-        text = "".join(json.dumps(dataclasses.asdict(one), allow_nan=False) + "\n" for one in predictions)
+        text = _lines(predictions)
         with (self.path / PREDICTIONS_FILE).open("a", encoding="utf-8") as file:
             file.write(text)
             file.flush()
             os.fsync(file.fileno())
 
-    def truncate(self, predictions: Iterable[Prediction]) -> None:
+    def replace(self, predictions: Iterable[Prediction]) -> None:
         """Replace the file's content, atomically."""
-        text = "".join(json.dumps(dataclasses.asdict(one), allow_nan=False) + "\n" for one in predictions)
-        write_atomically(self.path / PREDICTIONS_FILE, text)
+        write_atomically(self.path / PREDICTIONS_FILE, _lines(predictions))
 
     def _parse(self, line: str, number: int) -> Prediction:
         try:
@@ -176,6 +181,10 @@ def read_runs(folders: Iterable[Path]) -> Iterator[tuple[RunInfo, list[Predictio
     for folder in folders:
         run = RunFolder(folder)
         yield run.read_info(), run.read_predictions()
+
+
+def _lines(predictions: Iterable[Prediction]) -> str:
+    return "".join(json.dumps(dataclasses.asdict(one), allow_nan=False) + "\n" for one in predictions)
 
 
 def write_atomically(path: Path, text: str) -> None:

@@ -1,0 +1,140 @@
+"""From what a run asked (`RunInfo`) to the data set and the method that answer it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import torch
+
+from lalaloc_core.bundle import Bundle
+from lalaloc_core.configuration import build_config
+from lalaloc_core.data.dataset import Appearance, Dataset
+from lalaloc_core.data.generated import GeneratedScenes
+from lalaloc_core.data.opening import open_dataset
+from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.evaluation.predictions import RunInfo
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.optimise import LpoConfig
+from lalaloc_core.localise.pipeline import LocaliseConfig, Refine
+from lalaloc_core.methods.decode import VdrDecode
+from lalaloc_core.methods.explicit import ExplicitLayout
+from lalaloc_core.methods.icp import Icp
+from lalaloc_core.methods.lalaloc import LaLaLoc, local_refiner
+from lalaloc_core.methods.method import Method
+from lalaloc_core.methods.oracle import PoseOracle, SimilarityRetrieval
+from lalaloc_core.methods.similarity import LayoutMetric
+from lalaloc_core.nets import load_decoder
+
+
+@dataclass(frozen=True, kw_only=True)
+class LaLaLocSettings:
+    """Settings of method "lalaloc"; the defaults are the service's."""
+
+    refine: Refine = "lpo"
+    vdr_samples: int = 200
+    vdr_candidates: int = 1
+    lpo_candidates: int = 5
+    optimiser: Literal["levenberg-marquardt", "adam"] = "levenberg-marquardt"
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimilaritySettings:
+    """Settings of method "similarity": by which metric layouts are compared."""
+
+    metric: LayoutMetric = "chamfer"
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoSettings:
+    """Methods without settings."""
+
+
+_Settings = TypeVar("_Settings")
+
+
+def build_dataset(info: RunInfo) -> Dataset:
+    """The data set of a run.
+
+    Raises:
+        DatasetError: its folder is gone or holds no data set.
+    """
+    if info.data is not None:
+        return open_dataset(Path(info.data))
+    arguments: dict[str, Any] = dict(info.generated or {})
+    if arguments.get("textures") is not None:
+        arguments["textures"] = Path(arguments["textures"])
+    return GeneratedScenes(**arguments)
+
+
+def build_method(info: RunInfo) -> Method:
+    """The method of a run, ready to answer, on one thread.
+
+    Raises:
+        BundleError: the model is gone, was altered, or lacks what the method needs.
+        ConfigError: settings that the method does not have.
+        InvalidInputError: the method needs a bundle and none was named.
+    """
+    if info.method == "similarity":
+        return SimilarityRetrieval(_settings(SimilaritySettings, info).metric)
+    settings = _settings(LaLaLocSettings if info.method == "lalaloc" else NoSettings, info)
+    if info.method == "oracle":
+        return SimilarityRetrieval()
+    if info.method == "pose-oracle":
+        return PoseOracle()
+    if info.method == "icp":
+        return Icp()
+    bundle = require_bundle(info)
+    encoders = Encoders(bundle, threads=1)
+    # Tensors of a few poses are too small to share between threads.
+    torch.set_num_threads(1)
+    if info.method == "explicit":
+        return ExplicitLayout(encoders)
+    if info.method == "decode":
+        return VdrDecode(encoders, load_decoder(bundle))
+    assert isinstance(settings, LaLaLocSettings)
+    return _lalaloc(bundle, encoders, settings)
+
+
+def _lalaloc(bundle: Bundle, encoders: Encoders, settings: LaLaLocSettings) -> LaLaLoc:
+    refiner = None
+    if settings.refine == "lpo":
+        refiner = local_refiner(bundle, LpoConfig(method=settings.optimiser))
+    config = LocaliseConfig(
+        vdr_samples=settings.vdr_samples,
+        vdr_candidates=settings.vdr_candidates,
+        lpo_candidates=settings.lpo_candidates,
+    )
+    return LaLaLoc(encoders, refine=settings.refine, refiner=refiner, config=config)
+
+
+def _settings(kind: type[_Settings], info: RunInfo) -> _Settings:
+    return build_config(kind, info.settings, path=f"settings of method '{info.method}'")
+
+
+def require_bundle(info: RunInfo) -> Bundle:
+    """The bundle of a run."""
+    if info.bundle is None:
+        raise InvalidInputError(f"method '{info.method}' needs a model bundle")
+    return Bundle.open(Path(info.bundle))
+
+
+def describe_model(folder: Path) -> dict[str, str]:
+    """What a run records of its model."""
+    bundle = Bundle.open(folder)
+    return {"name": bundle.manifest.name, "version": bundle.manifest.version, "sha256": bundle.sha256}
+
+
+def choose_appearance(dataset: Dataset, furniture: str | None, lighting: str | None) -> Appearance:
+    """How the photographs of a run look: what was asked for, else what the data set is usually asked with.
+
+    Raises:
+        InvalidInputError: the data set has no such photographs.
+    """
+    usual = dataset.appearances[0]
+    wanted = Appearance(furniture or usual.furniture, lighting or usual.lighting)
+    if wanted not in dataset.appearances:
+        known = ", ".join(str(one) for one in dataset.appearances)
+        raise InvalidInputError(f"{dataset.description} has no photographs '{wanted}', there are: {known}")
+    return wanted

@@ -1,0 +1,187 @@
+"""Running an evaluation: every query is asked once, whatever interrupts it, and the command line says what it found."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lalaloc_core.cli import main
+from lalaloc_core.data.generated import GeneratedScenes
+from lalaloc_core.errors import InvalidInputError, RunError
+from lalaloc_core.evaluation.building import build_dataset, choose_appearance
+from lalaloc_core.evaluation.predictions import Prediction, RunFolder, RunInfo
+from lalaloc_core.evaluation.run import run_evaluation
+from lalaloc_core.evaluation.score import heading_errors_deg, position_errors_m, score
+
+
+@pytest.fixture
+def layout_run(tiny_bundle: Path) -> RunInfo:
+    """Layout queries of three generated homes, two each."""
+    return RunInfo(
+        label="test",
+        method="lalaloc",
+        kind="layout",
+        dataset="generated homes (seed 0)",
+        split="test",
+        generated={"homes": 3, "shots_per_home": 2},
+        bundle=str(tiny_bundle),
+    )
+
+
+def without_times(predictions: list[Prediction]) -> list[Prediction]:
+    return [dataclasses.replace(one, timings_ms={}) for one in predictions]
+
+
+class TestGeneratedScenes:
+    def test_the_same_scene_is_always_the_same_and_splits_differ(self) -> None:
+        scenes = GeneratedScenes(homes=3, shots_per_home=2)
+        assert list(scenes.scenes("test")) == ["test-00000", "test-00001", "test-00002"]
+        first, again = (scenes.load("test-00001") for _ in range(2))
+        other = scenes.load("validation-00001")
+        for a, b, c in zip(first.cameras, again.cameras, other.cameras, strict=True):
+            np.testing.assert_array_equal(a.position_m, b.position_m)
+            assert a.heading == b.heading != c.heading
+            assert first.plan.room_index_at(a.position_m[None])[0] == a.room_index
+
+    def test_a_photograph_and_its_depth_agree_about_the_room(self) -> None:
+        scene = GeneratedScenes(homes=1, furniture="empty").load("test-00000")
+        camera = scene.cameras[0]
+        (photograph,) = camera.photographs.values()
+        assert photograph.image(32, 64).shape == (32, 64, 3)
+        depth = photograph.depth_m()
+        # Right below the camera lies the floor, right above it the ceiling.
+        np.testing.assert_allclose(depth[-1], camera.camera_height_m, rtol=1e-3)
+        ceiling = scene.plan.ceiling_heights_m[camera.room_index]
+        assert np.median(depth[0]) <= ceiling - camera.camera_height_m + 1e-3
+
+    def test_an_unknown_scene_is_named(self) -> None:
+        with pytest.raises(InvalidInputError, match="scene 'roof-1'"):
+            GeneratedScenes(homes=1).load("roof-1")
+
+
+class TestRunning:
+    def test_layout_queries_are_found_again(self, layout_run: RunInfo, tmp_path: Path) -> None:
+        info = dataclasses.replace(layout_run, generated={"homes": 4, "shots_per_home": 3})
+        predictions = run_evaluation(RunFolder(tmp_path), info, workers=0)
+        assert len(predictions) == 12
+        errors = position_errors_m(predictions)
+        assert np.mean(errors < 0.05) > 0.6
+        assert np.median(errors) < np.median(position_errors_m(predictions, "retrieval"))
+        assert heading_errors_deg(predictions).max() < 1e-3
+        assert set(predictions[0].timings_ms) == {"encode", "retrieve", "vdr", "lpo"}
+        scores = score(predictions)
+        assert scores.layout_recall is not None
+        assert scores.layout_recall.value > 0.3
+        assert [one.scene for one in predictions[::3]] == list(build_dataset(info).scenes("test"))
+
+    @pytest.mark.parametrize("heading_known", [True, False])
+    def test_panoramas_are_answered_every_one(self, layout_run: RunInfo, tmp_path: Path, heading_known: bool) -> None:
+        info = dataclasses.replace(layout_run, kind="panorama", furniture="full", heading_known=heading_known)
+        predictions = run_evaluation(RunFolder(tmp_path), info, workers=0)
+        assert len(predictions) == 6
+        assert np.isfinite(position_errors_m(predictions)).all()
+        assert (heading_errors_deg(predictions).max() < 1e-3) == heading_known
+
+    def test_processes_answer_the_same_in_the_same_order(self, layout_run: RunInfo, tmp_path: Path) -> None:
+        here = run_evaluation(RunFolder(tmp_path / "here"), layout_run, workers=0)
+        there = run_evaluation(RunFolder(tmp_path / "there"), layout_run, workers=2)
+        assert without_times(here) == without_times(there)
+
+    def test_an_interrupted_run_ends_in_the_same_file(self, layout_run: RunInfo, tmp_path: Path) -> None:
+        whole = RunFolder(tmp_path / "whole")
+        expected = run_evaluation(whole, layout_run, workers=0)
+        broken = RunFolder(tmp_path / "broken")
+        broken.write_info(layout_run)
+        # Interrupted within the second scene.
+        broken.append(expected[:3])
+        done = run_evaluation(broken, dataclasses.replace(layout_run, command="again"), workers=0)
+        assert without_times(done) == without_times(expected)
+        assert without_times(broken.read_predictions()) == without_times(expected)
+        assert broken.read_info().command == "again"
+
+    def test_a_limit_ends_a_run_and_a_larger_one_goes_on(self, layout_run: RunInfo, tmp_path: Path) -> None:
+        folder = RunFolder(tmp_path)
+        first = run_evaluation(folder, dataclasses.replace(layout_run, limit=3), workers=0)
+        assert len(first) == len(folder.read_predictions()) == 3
+        more = run_evaluation(folder, dataclasses.replace(layout_run, limit=5), workers=0)
+        assert len(more) == len(folder.read_predictions()) == 5
+        assert without_times(more[:3]) == without_times(first)
+        assert len(run_evaluation(folder, dataclasses.replace(layout_run, limit=2), workers=0)) == 2
+
+    def test_another_question_in_the_same_folder_is_refused(self, layout_run: RunInfo, tmp_path: Path) -> None:
+        run_evaluation(RunFolder(tmp_path), dataclasses.replace(layout_run, limit=1), workers=0)
+        with pytest.raises(RunError, match=r"grid_step_m 0\.5, not 1\.0"):
+            run_evaluation(RunFolder(tmp_path), dataclasses.replace(layout_run, grid_step_m=1.0), workers=0)
+
+    def test_a_coarser_grid_finds_less_exactly(self, layout_run: RunInfo, tmp_path: Path) -> None:
+        medians = []
+        for step in (0.5, 2.0):
+            info = dataclasses.replace(layout_run, grid_step_m=step, settings={"refine": "none"})
+            predictions = run_evaluation(RunFolder(tmp_path / str(step)), info, workers=0)
+            assert list(predictions[0].stages) == ["retrieval"]
+            medians.append(np.median(position_errors_m(predictions)))
+        assert medians[0] < medians[1]
+
+    def test_photographs_that_a_data_set_lacks_are_refused(self) -> None:
+        scenes = GeneratedScenes(homes=1)
+        assert choose_appearance(scenes, None, None).furniture == "full"
+        with pytest.raises(InvalidInputError, match="no photographs 'full/warm', there are: full"):
+            choose_appearance(scenes, "full", "warm")
+
+
+class TestCommandLine:
+    def test_evaluate_prints_scores_and_score_needs_nothing_but_the_answers(
+        self, tiny_bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        asked = ["--bundle", str(tiny_bundle), "--homes", "1", "--kind", "layout", "--workers", "0"]
+        assert main(["evaluate", *asked, "--out", str(tmp_path / "run")]) == 0
+        printed = json.loads(capsys.readouterr().out)
+        assert printed["n"] == 4
+        assert 0.0 <= printed["final"]["within_1m"]["value"] <= 1.0
+        info = RunFolder(tmp_path / "run").read_info()
+        RunFolder(tmp_path / "run").write_info(dataclasses.replace(info, bundle="gone", data="gone"))
+        assert main(["score", str(tmp_path / "run")]) == 0
+        (again,) = json.loads(capsys.readouterr().out).values()
+        assert again == printed
+
+    def test_the_project_s_own_errors_are_a_message_and_an_exit_code(
+        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        assert main(["evaluate", "--bundle", str(tmp_path), "--homes", "1"]) == 1
+        assert main(["export", "--run", str(tmp_path), "--out", str(tmp_path / "o"), "--version", "1"]) == 1
+        assert main(["score", str(tmp_path)]) == 1
+        errors = capsys.readouterr().err
+        assert "error: no model bundle at" in errors
+        assert "error: no checkpoint at" in errors
+        assert "error: no evaluation run at" in errors
+
+    def test_the_caller_s_mistakes_are_exit_code_2(
+        self, tiny_bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        bundle = ["--bundle", str(tiny_bundle)]
+        assert main(["evaluate", *bundle, "--data", str(tmp_path / "nowhere")]) == 2
+        assert main(["evaluate", *bundle, "--lighting", "warm", "--out", str(tmp_path / "run")]) == 2
+        assert not (tmp_path / "run").exists()
+        errors = capsys.readouterr().err
+        assert "nowhere" in errors
+        assert "no photographs 'full/warm'" in errors
+
+    @pytest.mark.parametrize(
+        "arguments",
+        [
+            [],
+            ["fly"],
+            ["train", "roof"],
+            ["evaluate", "--kind", "song"],
+            ["evaluate", "--limit", "0"],
+            ["evaluate", "--grid-step", "-1"],
+        ],
+    )
+    def test_wrong_arguments_are_exit_code_2(self, arguments: list[str]) -> None:
+        with pytest.raises(SystemExit) as caught:
+            main(arguments)
+        assert caught.value.code == 2

@@ -1,0 +1,512 @@
+"""The evaluation report: what it says is what the scores are, and it needs nothing but itself."""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+import xml.etree.ElementTree as ElementTree
+from collections import Counter
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+
+from lalaloc_core.conventions import heading_to_degrees
+from lalaloc_core.data.generated import GeneratedScenes
+from lalaloc_core.errors import RunError
+from lalaloc_core.evaluation.failures import ALIGNMENT_LIMIT_M, Outcome, count_outcomes, outcomes
+from lalaloc_core.evaluation.predictions import Pose, Prediction, RunFolder, RunInfo
+from lalaloc_core.evaluation.report import write_report
+from lalaloc_core.evaluation.report.gallery import PER_GROUP, choose_queries
+from lalaloc_core.evaluation.report.pictures import DrawnMap, draw_map, draw_panorama, layout_lines
+from lalaloc_core.evaluation.report.plan import Cells
+from lalaloc_core.evaluation.report.tables import distance, number
+from lalaloc_core.evaluation.report.times import TOTAL, stage_times
+from lalaloc_core.evaluation.score import position_errors_m, score
+from lalaloc_core.render.depth import layout_depth
+from lalaloc_core.render.profile import wall_profile
+from tests.strategies import Scene, crooked_flat, plan_of, rectangle, scenes
+
+VOID = {"meta", "link", "img", "br", "hr", "path", "use", "circle", "rect"}
+NASTY = "<img src=x onerror=alert(1)> & \"'$x_{$"
+
+
+class Page(HTMLParser):
+    """A page taken apart, which fails where its tags do not balance."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(convert_charrefs=True)
+        self.open: list[str] = []
+        self.tags: list[tuple[str, dict[str, str]]] = []
+        self.words: list[str] = []
+        self.tables: dict[str, list[list[str]]] = {}
+        self._caption = ""
+        self.feed(text)
+        self.close()
+        assert self.open == []
+
+    @property
+    def text(self) -> str:
+        """What a reader sees, with single spaces."""
+        return " ".join(" ".join(self.words).split())
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, {name: value or "" for name, value in attrs}))
+        if tag not in VOID:
+            self.open.append(tag)
+        if tag == "tr":
+            self.tables[self._caption].append([])
+        if tag in ("td", "th"):
+            self.tables[self._caption][-1].append("")
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, {name: value or "" for name, value in attrs}))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if "style" in self.open:
+            return
+        data = data.replace("\N{NO-BREAK SPACE}", " ")
+        self.words.append(data)
+        if self.open and self.open[-1] == "caption":
+            self._caption = data
+            self.tables[data] = []
+        elif self.open and self.open[-1] in ("td", "th"):
+            self.tables[self._caption][-1][-1] += data.strip()
+
+    def table(self, caption: str) -> list[list[str]]:
+        """Cells of a table, without what stands in small below them."""
+        return next(rows for name, rows in self.tables.items() if name.startswith(caption))
+
+
+def prediction(index: int = 0, error_m: float | None = 0.02, **changes: Any) -> Prediction:
+    """An answer `error_m` to the right of the truth after a first stage twice as far off; None: no answer."""
+    truth = Pose(x_m=1.0, y_m=1.0, room_index=0, heading_deg=10.0)
+    found = {} if error_m is None else {"retrieval": 2.0 * error_m, "lpo": error_m}
+    values: dict[str, Any] = {
+        "scene": f"scene {index // 4}",
+        "camera": str(index),
+        "room": "kitchen",
+        "camera_height_m": 1.5,
+        "truth": truth,
+        "stages": {name: replace(truth, x_m=1.0 + off_m, heading_deg=12.0) for name, off_m in found.items()},
+        "timings_ms": {"retrieve": 1.0 + index, "lpo": 100.0 + 10.0 * index},
+    }
+    return Prediction(**(values | changes))
+
+
+def in_room(one: Prediction, room_index: int) -> Prediction:
+    """The same answer, put in another room."""
+    return replace(one, stages={name: replace(pose, room_index=room_index) for name, pose in one.stages.items()})
+
+
+def mixed() -> list[Prediction]:
+    """Twelve answers of every kind, with confidences and recalls."""
+    errors_m = [0.004, 0.02, 0.03, 0.06, 0.08, 0.3, 0.4, 0.7, 1.5, 3.0, 6.0, None]
+    some = [
+        prediction(k, error_m, layout_hit=k % 2 == 0, pose_hit=k % 3 == 0, confidence=0.95 - 0.07 * k)
+        for k, error_m in enumerate(errors_m)
+    ]
+    return [in_room(one, 1) if k in (9, 10) else one for k, one in enumerate(some)]
+
+
+def run_folder(path: Path, predictions: list[Prediction], **changes: Any) -> Path:
+    """A run on disk; its data set does not exist unless `changes` name one."""
+    values: dict[str, Any] = {
+        "label": "a run",
+        "method": "lalaloc",
+        "kind": "panorama",
+        "dataset": "Somewhere3D",
+        "split": "test",
+        "data": str(path / "gone"),
+        "command": "lalaloc evaluate --data gone",
+    }
+    folder = RunFolder(path)
+    folder.write_info(RunInfo(**(values | changes)))
+    folder.append(predictions)
+    return path
+
+
+def page_of(*runs: Path, out: Path) -> tuple[Page, str]:
+    """The report on some runs, parsed and as text."""
+    write_report(runs, out)
+    text = out.read_text(encoding="utf-8")
+    return Page(text), text
+
+
+def generated_run(path: Path, bundle: str | None, **changes: Any) -> Path:
+    """One answered query of a generated home, found 12 cm to the right and turned by 30°."""
+    data = GeneratedScenes(homes=1, shots_per_home=1)
+    scene = data.load(data.scenes("test")[0])
+    (camera,) = scene.cameras
+    truth = Pose(
+        x_m=float(camera.position_m[0]),
+        y_m=float(camera.position_m[1]),
+        room_index=camera.room_index,
+        heading_deg=heading_to_degrees(camera.heading),
+    )
+    found = replace(truth, x_m=truth.x_m + 0.12, heading_deg=(truth.heading_deg + 30.0) % 360.0)
+    one = prediction(
+        scene=scene.name,
+        camera=camera.name,
+        room=scene.plan.rooms[camera.room_index].name,
+        camera_height_m=camera.camera_height_m,
+        truth=truth,
+        stages={"lpo": found},
+    )
+    values = {"data": None, "generated": {"homes": 1, "shots_per_home": 1}, "furniture": "full", "bundle": bundle}
+    return run_folder(path, [one], **(values | changes))
+
+
+@pytest.fixture(scope="module")
+def text(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The report on `mixed`."""
+    folder = tmp_path_factory.mktemp("report")
+    return page_of(run_folder(folder / "run", mixed()), out=folder / "report.html")[1]
+
+
+@pytest.fixture(scope="module")
+def page(text: str) -> Page:
+    """The same, parsed."""
+    return Page(text)
+
+
+class TestFailures:
+    """Sorting answers by what went wrong."""
+
+    def test_every_kind_is_told_from_the_others(self) -> None:
+        kinds = {
+            Outcome.LOCATED: prediction(error_m=0.1),
+            Outcome.WRONG_ALIGNMENT: prediction(error_m=ALIGNMENT_LIMIT_M + 0.01),
+            Outcome.WRONG_ROOM: in_room(prediction(error_m=0.1), 1),
+            Outcome.NO_ANSWER: prediction(error_m=None),
+        }
+        assert outcomes(list(kinds.values())) == list(kinds)
+
+    def test_a_wrong_room_is_one_however_near(self) -> None:
+        assert outcomes([in_room(prediction(error_m=0.0), 1)]) == [Outcome.WRONG_ROOM]
+
+    def test_a_stage_is_judged_by_its_own_pose(self) -> None:
+        one = prediction(error_m=0.4 * ALIGNMENT_LIMIT_M + 0.1)
+        assert outcomes([one]) == [Outcome.LOCATED]
+        assert outcomes([one], "retrieval") == [Outcome.WRONG_ALIGNMENT]
+        assert outcomes([one], "vdr") == [Outcome.NO_ANSWER]
+
+    def test_counts_name_every_kind_and_sum_to_all_queries(self) -> None:
+        assert count_outcomes(mixed()) == dict(zip(Outcome, (7, 2, 2, 1), strict=True))
+        assert count_outcomes([]) == dict.fromkeys(Outcome, 0)
+
+
+class TestFigures:
+    """What the page says, against the scores."""
+
+    def test_the_table_has_the_scores(self, page: Page) -> None:
+        scores = score(mixed())
+        head, retrieval, lpo = page.table("Accuracy")
+        assert head[:4] == ["stage", "n", "Layout R@1", "Pose R@1"]
+        assert scores.layout_recall is not None
+        assert scores.pose_recall is not None
+        recalls = [f"{100 * one.value:.1f} %" for one in (scores.layout_recall, scores.pose_recall)]
+        for row, stage, chosen in ((retrieval, "retrieval", recalls), (lpo, "lpo", ["–", "–"])):
+            figures = scores.stages[stage]
+            shares = (figures.within_1cm, figures.within_5cm, figures.within_10cm, figures.within_1m)
+            assert row[:4] == [stage, "12", *chosen]
+            assert math.isclose(float(row[4].removesuffix(" cm")), figures.median_cm.value, rel_tol=0.01)
+            assert row[5:9] == [f"{100 * one.value:.1f} %" for one in shares]
+            assert row[9] == f"{100 * figures.correct_room.value:.1f} %"
+            assert row[10] == "2.00°"
+
+    def test_every_share_has_its_interval(self, page: Page) -> None:
+        interval = score(mixed()).final.within_1m
+        assert f"{100 * interval.low:.1f}–{100 * interval.high:.1f}" in page.text
+
+    def test_an_answer_that_is_not_the_last_stage_has_its_own_row(self, tmp_path: Path) -> None:
+        some = [prediction(0), prediction(1, stages={"retrieval": prediction(1).stages["retrieval"]})]
+        page, _ = page_of(run_folder(tmp_path / "run", some), out=tmp_path / "report.html")
+        assert [row[0] for row in page.table("Accuracy")] == ["stage", "retrieval", "lpo", "answer"]
+
+    def test_the_curves_are_also_a_table(self, page: Page) -> None:
+        head, retrieval, lpo = page.table("Queries within")
+        errors_m = position_errors_m(mixed(), "lpo")
+        assert lpo[0] == "lpo"
+        within_1m = 100 * np.mean(np.nan_to_num(errors_m, nan=np.inf) <= 1.0)
+        assert lpo[head.index("1 m")] == f"{within_1m:.1f} %"
+        assert retrieval[0] == "retrieval"
+
+    def test_failures_are_counted_and_the_limit_is_named(self, page: Page) -> None:
+        head, retrieval, answer = page.table("Queries by outcome")
+        assert head[1:] == [kind.value for kind in Outcome]
+        assert answer == ["answer", "7", "2", "2", "1"]
+        assert retrieval[1:] == [str(n) for n in count_outcomes(mixed(), "retrieval").values()]
+        assert f"more than {ALIGNMENT_LIMIT_M:g} m" in page.text
+
+    def test_times_and_calibration_stand_there(self, page: Page) -> None:
+        rows = {row[0]: row for row in page.table("Milliseconds")}
+        assert rows["retrieve"][1:] == ["12", "6.50", "11.4"]
+        assert rows[TOTAL][1] == "12"
+        error = score(mixed()).calibration_error
+        assert f"“within 1 m”: {error:.3f}" in page.text
+        assert len(page.table("Confidence and how often")) == 1 + len(score(mixed()).reliability)
+
+    def test_what_was_asked_stands_there(self, page: Page) -> None:
+        for words in (
+            "Somewhere3D, test split",
+            "12 panorama queries",
+            "1 without an answer",
+            "lalaloc evaluate --data",
+        ):
+            assert words in page.text
+
+    @pytest.mark.parametrize(
+        ("value", "text"),
+        [
+            (0.0, "0.00"),
+            (0.004, "< 0.01"),
+            (0.006, "0.01"),
+            (9.87, "9.87"),
+            (98.76, "98.8"),
+            (987.6, "988"),
+            (np.inf, "∞"),
+        ],
+    )
+    def test_figures_have_three_digits(self, value: float, text: str) -> None:
+        assert number(value) == text
+
+    def test_distances_are_in_metres_from_one_on(self) -> None:
+        assert (distance(0.0312), distance(1.0), distance(10.38)) == ("3.12 cm", "1.00 m", "10.4 m")
+
+    def test_times_are_of_the_queries_that_went_through_a_stage(self) -> None:
+        timings_ms: list[dict[str, float]] = [{"a": 1.0}, {"a": 3.0, "b": 5.0}, {}]
+        times = stage_times([prediction(k, timings_ms=one) for k, one in enumerate(timings_ms)])
+        assert (times["a"].count, times["a"].median_ms) == (2, 2.0)
+        assert (times["b"].count, times["b"].median_ms, times["b"].p95_ms) == (1, 5.0, 5.0)
+        assert times[TOTAL].median_ms == np.median([1.0, 8.0])
+
+
+class TestPage:
+    """The page as a document."""
+
+    def test_it_needs_nothing_but_itself(self, page: Page, text: str) -> None:
+        assert "script" not in {tag for tag, _ in page.tags}
+        for tag, attributes in page.tags:
+            for name in ("src", "href"):
+                assert attributes.get(name, "#").startswith(("#", "data:")), (tag, attributes)
+            assert not [name for name in attributes if name.startswith("on")]
+        assert set(re.findall(r"url\((.)", text)) <= {"#"}
+        assert "@import" not in text
+
+    def test_identifiers_are_unique_and_references_lead_somewhere(self, page: Page, text: str) -> None:
+        count = Counter(attributes["id"] for _, attributes in page.tags if "id" in attributes)
+        assert [name for name, times in count.items() if times > 1] == []
+        wanted = set(re.findall(r"url\(#([^)]+)\)", text)) | set(re.findall(r'href="#([^"]+)"', text))
+        for _, attributes in page.tags:
+            wanted |= set(attributes.get("aria-labelledby", "").split())
+        assert wanted
+        assert wanted <= set(count)
+
+    def test_every_colour_is_known_by_day_and_by_night(self, text: str) -> None:
+        day, night = re.findall(r":root \{(.*?)\}", text, re.DOTALL)
+        used = set(re.findall(r"var\((--[\w-]+)\)", text))
+        assert used
+        for colours in (day, night):
+            assert used <= set(re.findall(r"(--[\w-]+):", colours))
+
+    def test_charts_are_told_to_those_who_do_not_see_them(self, page: Page) -> None:
+        drawings = [attributes for tag, attributes in page.tags if tag == "svg"]
+        assert len(drawings) == 4
+        assert all(one["role"] == "img" and one["aria-labelledby"] for one in drawings)
+
+    def test_text_of_files_is_never_markup(self, tmp_path: Path) -> None:
+        one = prediction(scene=NASTY, room=NASTY, camera=NASTY, timings_ms={NASTY: 1.0})
+        one = replace(one, stages={NASTY: one.stages["lpo"], "lpo": one.stages["lpo"]}, confidence=0.5)
+        run = run_folder(
+            tmp_path / "run",
+            [one],
+            label=NASTY,
+            dataset=NASTY,
+            command=f"lalaloc {NASTY}",
+            skipped=(f"scene {NASTY}",),
+            furniture=NASTY,
+            model={"name": NASTY, "version": NASTY, "sha256": NASTY},
+            settings={NASTY: NASTY},
+            data=NASTY,
+        )
+        for runs in ([run], [run, run]):
+            page, _ = page_of(*runs, out=tmp_path / "report.html")
+            assert [attributes for tag, attributes in page.tags if tag == "img"] == []
+            for words in (f"lalaloc {NASTY}", f"scene {NASTY}", f"{NASTY}, test split"):
+                assert words in page.text
+
+    def test_the_same_runs_give_the_same_page(self, tmp_path: Path) -> None:
+        run = run_folder(tmp_path / "run", mixed())
+        assert page_of(run, out=tmp_path / "a.html")[1] == page_of(run, out=tmp_path / "b.html")[1]
+        assert list(tmp_path.glob("*.part")) == []
+
+    def test_what_is_no_run_is_refused_and_the_page_stays(self, tmp_path: Path) -> None:
+        (tmp_path / "report.html").write_text("before", encoding="utf-8")
+        with pytest.raises(RunError, match="no evaluation run at"):
+            write_report([tmp_path], tmp_path / "report.html")
+        with pytest.raises(RunError, match="at least one run"):
+            write_report([], tmp_path / "report.html")
+        assert (tmp_path / "report.html").read_text(encoding="utf-8") == "before"
+
+
+class TestRuns:
+    """Runs of every kind."""
+
+    def test_several_runs_stand_side_by_side(self, tmp_path: Path) -> None:
+        some = [run_folder(tmp_path / name, mixed()[: 4 * n], label=name) for n, name in ((3, "one"), (2, "two"))]
+        page, _ = page_of(*some, out=tmp_path / "report.html")
+        rows = page.table("Accuracy")[1:]
+        assert [row[0] for row in rows] == ["1. one", "lpo", "2. two", "lpo"]
+        assert [row[-10] for row in rows] == ["12", "12", "8", "8"]
+        assert [row[0] for row in page.table("Queries within")[1:]] == ["1. one", "2. two"]
+
+    def test_a_run_that_answered_nothing_is_all_misses(self, tmp_path: Path) -> None:
+        some = [prediction(k, None, timings_ms={}) for k in range(4)]
+        page, _ = page_of(run_folder(tmp_path / "run", some), out=tmp_path / "report.html")
+        (_, row) = page.table("Accuracy")
+        assert row[:2] == ["answer", "4"]
+        assert row[4:] == ["∞ cm", *["0.0 %"] * 5, "∞°"]
+        assert page.table("Queries by outcome")[1] == ["answer", "0", "0", "0", "4"]
+        assert "No times were recorded" in page.text
+
+    def test_a_run_without_predictions_has_nothing_to_score(self, tmp_path: Path) -> None:
+        empty = run_folder(tmp_path / "empty", [])
+        page, _ = page_of(empty, out=tmp_path / "report.html")
+        assert "holds no predictions yet" in page.text
+        assert page.tables == {}
+        page, _ = page_of(empty, run_folder(tmp_path / "run", mixed()), out=tmp_path / "report.html")
+        assert [row[0] for row in page.table("Accuracy")[1:]] == ["2. a run", "lpo"]
+
+    def test_without_confidences_there_is_no_calibration(self, tmp_path: Path) -> None:
+        some = [replace(one, confidence=None) for one in mixed()]
+        page, _ = page_of(run_folder(tmp_path / "run", some), out=tmp_path / "report.html")
+        assert "nothing to calibrate" in page.text
+        assert sum(tag == "svg" for tag, _ in page.tags) == 3
+
+
+class TestGallery:
+    """Choosing queries and drawing them."""
+
+    @given(st.lists(st.one_of(st.none(), st.floats(0.0, 20.0)), min_size=1, max_size=30))
+    def test_the_best_and_the_worst_are_chosen_and_none_twice(self, errors_m: list[float | None]) -> None:
+        chosen = choose_queries([prediction(k, error_m) for k, error_m in enumerate(errors_m)])
+        every = [index for indices in chosen.values() for index in indices]
+        assert len(set(every)) == len(every)
+        assert all(1 <= len(indices) <= PER_GROUP for indices in chosen.values())
+        ranked = sorted(math.inf if one is None else one for one in errors_m)
+        found = [errors_m[index] for index in chosen.get("best", [])]
+        assert found == [one for one in ranked[:PER_GROUP] if one < math.inf]
+        if len(errors_m) >= 2 * PER_GROUP:
+            worst = [math.inf if errors_m[index] is None else errors_m[index] for index in chosen["worst"]]
+            assert worst == ranked[::-1][:PER_GROUP]
+
+    def test_a_query_is_drawn_with_what_the_run_used(self, tmp_path: Path, tiny_bundle: Path) -> None:
+        run, pictures = generated_run(tmp_path / "run", str(tiny_bundle)), tmp_path / "pictures"
+        write_report([run], tmp_path / "report.html", pictures=pictures)
+        page = Page((tmp_path / "report.html").read_text(encoding="utf-8"))
+        drawn = [attributes for tag, attributes in page.tags if tag == "img"]
+        assert [one["src"].partition(";")[0] for one in drawn] == [
+            "data:image/jpeg",
+            "data:image/png",
+            "data:image/png",
+        ]
+        assert not [attributes for _, attributes in page.tags if attributes.get("class") == "warning"]
+        assert "Located: off by 12.0 cm and 30.0°." in page.text
+        drawings = ("panorama.jpg", "latent-distance.png", "true-layout-distance.png")
+        names = {path.name for path in pictures.iterdir()}
+        charts = {f"{name}{suffix}" for name in ("error-curves", "outcomes", "times") for suffix in (".svg", ".png")}
+        assert names == charts | {f"run-1-best-1-{name}" for name in drawings}
+        for path in pictures.iterdir():
+            if path.suffix == ".svg":
+                assert ElementTree.parse(path).getroot().tag == "{http://www.w3.org/2000/svg}svg"
+            else:
+                Image.open(path).verify()
+
+    def test_without_the_model_its_maps_are_missing_and_the_page_says_why(self, tmp_path: Path) -> None:
+        page, _ = page_of(generated_run(tmp_path / "run", "no-model"), out=tmp_path / "report.html")
+        assert "maps of latent distances are left out, because the model cannot be opened: no model bundle" in page.text
+        _, drawing = [attributes["alt"] for tag, attributes in page.tags if tag == "img"]
+        assert drawing == "Floor plan coloured by true layout distance"
+
+    def test_another_model_in_its_place_is_not_taken_for_it(self, tmp_path: Path, tiny_bundle: Path) -> None:
+        run = generated_run(tmp_path / "run", str(tiny_bundle), model={"sha256": "0" * 64})
+        page, _ = page_of(run, out=tmp_path / "report.html")
+        assert "holds another model now" in page.text
+
+    def test_a_method_without_latents_says_so(self, tmp_path: Path) -> None:
+        run = generated_run(tmp_path / "run", None, method="icp")
+        page, _ = page_of(run, out=tmp_path / "report.html")
+        assert "Method “icp” compares no latents" in page.text
+
+    def test_without_the_data_set_there_is_no_gallery_and_the_page_says_why(self, page: Page) -> None:
+        assert "The gallery is left out, because its data cannot be opened" in page.text
+        assert [tag for tag, _ in page.tags if tag == "img"] == []
+
+    def test_a_data_set_that_changed_is_not_drawn(self, tmp_path: Path) -> None:
+        run = generated_run(tmp_path / "run", "no-model")
+        (before,) = RunFolder(run).read_predictions()
+        RunFolder(run).replace([replace(before, truth=replace(before.truth, x_m=before.truth.x_m + 0.1))])
+        page, _ = page_of(run, out=tmp_path / "report.html")
+        assert "0.100 m from where the run saw it" in page.text
+        assert [tag for tag, _ in page.tags if tag == "img"] == []
+
+
+class TestDrawing:
+    """Pictures, against the renderer."""
+
+    @given(scenes(count=1))
+    def test_lines_run_where_the_layout_turns_from_wall_to_floor_and_ceiling(self, scene: Scene) -> None:
+        rows, columns, camera_height_m = 90, 40, 1.4
+        room = int(scene.poses.room_index[0])
+        pose = Pose(
+            x_m=float(scene.poses.position_m[0, 0]),
+            y_m=float(scene.poses.position_m[0, 1]),
+            room_index=room,
+            heading_deg=heading_to_degrees(float(scene.heading[0])),
+        )
+        floor, ceiling = layout_lines(scene.plan, pose, camera_height_m, rows, columns)
+        profile = wall_profile(scene.poses.position_m, scene.heading, scene.walls_m, columns)
+        depth = layout_depth(profile, np.array([camera_height_m]), scene.ceiling_height_m, rows)[0]
+        elevation = (0.5 - (np.arange(rows) + 0.5) / rows) * np.pi
+        is_wall = np.isclose(depth * np.cos(elevation)[:, None], profile, rtol=1e-6)
+        # Middles of the first and the last row that show wall, in every column, are at most a row inside the lines.
+        first, last = is_wall.argmax(axis=0) + 0.5, rows - is_wall[::-1].argmax(axis=0) - 0.5
+        assert np.all((first - ceiling[:, 1] > -1e-3) & (first - ceiling[:, 1] < 1.001))
+        assert np.all((floor[:, 1] - last > -1e-3) & (floor[:, 1] - last < 1.001))
+
+    def test_cells_keep_to_their_rooms(self) -> None:
+        plan = crooked_flat()
+        cells = Cells.of(plan, 0.25)
+        assert np.array_equal(plan.room_index_at(cells.poses.position_m), cells.poses.room_index)
+        x = cells.in_room(1, cells.poses.position_m[:, 0])
+        left, right, _, _ = cells.extent_m
+        middles = np.linspace(left, right, x.shape[1] + 1)[:-1] + 0.125
+        rows, columns = np.nonzero(cells.room == 1)
+        assert np.allclose(x[rows, columns], middles[columns])
+        # Grown by a cell, never further: everything else stays empty.
+        assert np.isnan(x[cells.room == 0]).mean() > 0.8
+
+    def test_names_with_dollar_signs_and_no_answer_can_be_drawn(self) -> None:
+        plan = plan_of(rectangle(3.0, 2.0))
+        plan = replace(plan, rooms=(replace(plan.rooms[0], name="$x_{$"),))
+        cells = Cells.of(plan, 0.2)
+        truth = Pose(x_m=1.0, y_m=1.0, room_index=0, heading_deg=0.0)
+        drawn = DrawnMap("distance", "metres", cells, np.linalg.norm(cells.poses.position_m - [1.0, 1.0], axis=1))
+        drawing = draw_map(plan, drawn, truth, None)
+        with Image.open(io.BytesIO(drawing.content)) as picture:
+            assert picture.size == (drawing.width, drawing.height)
+        black = np.zeros((64, 128, 3), dtype=np.uint8)
+        panorama = draw_panorama(black, plan, 1.5, truth, None)
+        with Image.open(io.BytesIO(panorama.content)) as picture:
+            assert np.asarray(picture).max() > 200

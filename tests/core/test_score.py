@@ -1,0 +1,200 @@
+"""Scores: what they count, what they hide (nothing), and how sure they are."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lalaloc_core.errors import InvalidInputError, RunError
+from lalaloc_core.evaluation.predictions import PREDICTIONS_FILE, SCORES_FILE, Pose, Prediction, RunFolder, RunInfo
+from lalaloc_core.evaluation.score import (
+    expected_calibration_error,
+    heading_errors_deg,
+    position_errors_m,
+    reliability_bins,
+    score,
+    score_run,
+)
+
+INFO = RunInfo(label="made up", method="lalaloc", kind="panorama", dataset="nowhere", split="test")
+
+
+def prediction(
+    *errors_m: float, scene: str = "a", confidence: float | None = None, turned_deg: float = 0.0, room: int = 0
+) -> Prediction:
+    """A query whose stages are that far off."""
+    stages = ("retrieval", "vdr", "lpo")
+    return Prediction(
+        scene=scene,
+        camera="0",
+        room="kitchen",
+        camera_height_m=1.5,
+        truth=Pose(x_m=1.0, y_m=2.0, room_index=0, heading_deg=350.0),
+        stages={
+            stage: Pose(x_m=1.0 + error, y_m=2.0, room_index=room, heading_deg=(350.0 + turned_deg) % 360.0)
+            for stage, error in zip(stages, errors_m, strict=False)
+        },
+        layout_hit=bool(errors_m) and errors_m[0] < 0.3,
+        pose_hit=bool(errors_m) and errors_m[0] < 0.2,
+        confidence=confidence,
+        timings_ms={"retrieve": 1.0, "lpo": 10.0} if errors_m else {},
+    )
+
+
+class TestScores:
+    def test_shares_and_medians_are_those_of_the_answer(self) -> None:
+        scores = score([prediction(0.25, 0.06, 0.005), prediction(0.1, 0.05, 0.04), prediction(3.0, 3.0, 3.0, room=1)])
+        assert (scores.n, scores.unanswered) == (3, 0)
+        final = scores.final
+        shares = (final.within_1cm, final.within_5cm, final.within_10cm, final.within_1m)
+        np.testing.assert_allclose([share.value for share in shares], [1 / 3, 2 / 3, 2 / 3, 2 / 3])
+        assert final.median_cm.value == pytest.approx(4.0)
+        assert final.correct_room.value == pytest.approx(2 / 3)
+        assert scores.stages["vdr"].median_cm.value == pytest.approx(6.0)
+        assert list(scores.stages) == ["retrieval", "vdr", "lpo"]
+        assert scores.layout_recall is not None
+        assert scores.pose_recall is not None
+        assert (scores.layout_recall.value, scores.pose_recall.value) == pytest.approx((2 / 3, 1 / 3))
+        assert scores.median_ms == {"retrieve": 1.0, "lpo": 10.0}
+
+    def test_a_query_without_an_answer_is_a_miss_everywhere(self) -> None:
+        scores = score([prediction(0.001), prediction(), prediction()])
+        assert scores.unanswered == 2
+        assert scores.final.within_1m.value == pytest.approx(1 / 3)
+        assert scores.final.correct_room.value == pytest.approx(1 / 3)
+        assert scores.final.median_cm.value == np.inf
+        assert scores.final.median_heading_error_deg.value == np.inf
+        assert scores.layout_recall is not None
+        assert scores.layout_recall.value == pytest.approx(1 / 3)
+
+    def test_a_stage_that_one_query_missed_counts_it_as_a_miss(self) -> None:
+        scores = score([prediction(0.1, 0.1, 0.1), prediction(0.1)])
+        assert scores.stages["lpo"].within_1m.value == 0.5
+
+    def test_headings_are_compared_around_the_circle(self) -> None:
+        assert heading_errors_deg([prediction(0.1, turned_deg=15.0)])[0] == pytest.approx(15.0)
+        assert heading_errors_deg([prediction(0.1, turned_deg=-200.0)])[0] == pytest.approx(160.0)
+        assert np.isnan(heading_errors_deg([prediction()])[0])
+
+    def test_methods_that_do_not_retrieve_have_no_recall(self) -> None:
+        plain = Prediction(scene="a", camera="0", room="r", camera_height_m=1.5, truth=prediction(0.1).truth)
+        assert score([plain]).layout_recall is None
+
+    def test_nothing_to_score_is_an_error(self) -> None:
+        with pytest.raises(InvalidInputError, match="no predictions"):
+            score([])
+
+    @given(st.lists(st.floats(0.0, 30.0), min_size=1, max_size=30), st.integers(0, 5))
+    def test_intervals_hold_the_figure_s_neighbourhood_and_repeat_by_seed(self, errors: list[float], seed: int) -> None:
+        predictions = [prediction(error, scene=str(k % 7)) for k, error in enumerate(errors)]
+        first, again = (score(predictions, seed) for _ in range(2))
+        assert first == again
+        for one in (first.final.within_1m, first.final.median_cm):
+            assert one.low <= one.high
+        assert 0.0 <= first.final.within_1m.low <= first.final.within_1m.value <= first.final.within_1m.high <= 1.0
+
+    def test_intervals_shrink_with_the_number_of_scenes_and_cover_the_truth(self) -> None:
+        rng = np.random.default_rng(0)
+        widths, covered = [], 0
+        for count in (20, 320):
+            hits = rng.random(count) < 0.7
+            found = score([prediction(0.1 if hit else 5.0, scene=str(k)) for k, hit in enumerate(hits)]).final.within_1m
+            widths.append(found.high - found.low)
+        assert widths[1] < 0.4 * widths[0]
+        for _ in range(40):
+            hits = rng.random(60) < 0.7
+            found = score([prediction(0.1 if hit else 5.0, scene=str(k)) for k, hit in enumerate(hits)]).final.within_1m
+            covered += found.low <= 0.7 <= found.high
+        assert covered >= 33
+
+    def test_queries_of_one_scene_do_not_count_as_independent(self) -> None:
+        hits = np.arange(80) % 4 > 0
+        apart = score([prediction(0.1 if hit else 5.0, scene=str(k)) for k, hit in enumerate(hits)])
+        rng = np.random.default_rng(1)
+        together = score(
+            [prediction(0.1 if hit else 5.0, scene=str(k // 20)) for k, hit in enumerate(np.sort(hits))],
+            seed=int(rng.integers(9)),
+        )
+        wide, narrow = together.final.within_1m, apart.final.within_1m
+        assert wide.value == narrow.value
+        assert wide.high - wide.low > 2.0 * (narrow.high - narrow.low)
+
+
+class TestCalibration:
+    def test_honest_confidence_has_no_error_and_boasting_all(self) -> None:
+        assert expected_calibration_error(np.array([0.0, 0.0, 1.0]), np.array([False, False, True])) == 0.0
+        assert expected_calibration_error(np.ones(4), np.zeros(4, dtype=bool)) == 1.0
+        assert expected_calibration_error(np.full(4, 0.75), np.array([True, True, True, False])) == 0.0
+
+    def test_bins_are_weighted_by_their_queries(self) -> None:
+        confidence = np.array([0.05, 0.95, 0.95, 0.95])
+        correct = np.array([True, True, True, True])
+        assert expected_calibration_error(confidence, correct) == pytest.approx(0.25 * 0.95 + 0.75 * 0.05)
+
+    @given(st.lists(st.tuples(st.floats(0.0, 1.0), st.booleans()), min_size=1, max_size=40))
+    def test_the_diagram_holds_every_query_once(self, queries: list[tuple[float, bool]]) -> None:
+        confidence, correct = (np.array(column) for column in zip(*queries, strict=True))
+        bins = reliability_bins(confidence, correct)
+        assert sum(one.count for one in bins) == len(queries)
+        for one in bins:
+            assert one.low <= one.confidence <= one.high
+            assert 0.0 <= one.frequency <= 1.0
+        assert 0.0 <= expected_calibration_error(confidence, correct) <= 1.0
+
+    def test_it_is_scored_where_there_is_confidence(self) -> None:
+        scores = score([prediction(0.2, confidence=1.0), prediction(3.0, confidence=1.0)])
+        assert scores.calibration_error == pytest.approx(0.5)
+        assert score([prediction(0.2)]).calibration_error is None
+
+
+class TestRunFolder:
+    def test_what_is_written_is_read_again(self, tmp_path: Path) -> None:
+        folder = RunFolder(tmp_path / "run")
+        assert not folder.exists()
+        folder.write_info(INFO)
+        predictions = [prediction(0.1, 0.05, scene="ä"), prediction(), prediction(0.3, confidence=0.25)]
+        folder.append(predictions[:2])
+        folder.append(predictions[2:])
+        assert folder.exists()
+        assert folder.read_info() == INFO
+        assert folder.read_predictions() == predictions
+
+    def test_a_line_that_was_being_written_is_left_out(self, tmp_path: Path) -> None:
+        folder = RunFolder(tmp_path)
+        folder.write_info(INFO)
+        folder.append([prediction(0.1), prediction(0.2)])
+        path = tmp_path / PREDICTIONS_FILE
+        path.write_text(path.read_text()[:-30])
+        assert folder.read_predictions() == [prediction(0.1)]
+
+    @pytest.mark.parametrize("text", ["not json\n", '{"scene": 3}\n', '{"scene": "a", "unknown": 1}\n', "[]\n"])
+    def test_a_line_that_is_no_prediction_is_named(self, tmp_path: Path, text: str) -> None:
+        folder = RunFolder(tmp_path)
+        folder.write_info(INFO)
+        folder.append([prediction(0.1)])
+        with (tmp_path / PREDICTIONS_FILE).open("a") as file:
+            file.write(text)
+        with pytest.raises(RunError, match="line 2 is no prediction"):
+            folder.read_predictions()
+
+    def test_a_folder_without_a_run_is_named(self, tmp_path: Path) -> None:
+        with pytest.raises(RunError, match="no evaluation run at"):
+            RunFolder(tmp_path / "nowhere").read_info()
+        (tmp_path / "run.json").write_text('{"label": 3}')
+        with pytest.raises(RunError, match="does not describe a run"):
+            RunFolder(tmp_path).read_info()
+
+    def test_scores_stand_beside_the_answers_and_infinity_is_null(self, tmp_path: Path) -> None:
+        folder = RunFolder(tmp_path)
+        folder.write_info(INFO)
+        folder.append([prediction(), prediction(), prediction(0.1)])
+        report = score_run(folder)
+        assert report == json.loads((tmp_path / SCORES_FILE).read_text())
+        assert report["final"]["median_cm"]["value"] is None
+        assert report["n"] == 3
+        assert position_errors_m(folder.read_predictions())[2] == pytest.approx(0.1)
