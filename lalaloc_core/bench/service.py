@@ -1,4 +1,4 @@
-"""`lalaloc bench`: measure the figures of docs/results.md. Each group prints what it measured, with its n."""
+"""What the running service takes: latency over real HTTP, and memory."""
 
 from __future__ import annotations
 
@@ -17,76 +17,17 @@ from typing import Any
 
 import httpx
 import numpy as np
-import torch
 from PIL import Image
 
+from lalaloc_core.bench.homes import home_of_area
 from lalaloc_core.bundle import Bundle
-from lalaloc_core.evaluate import GRID_STEP_M, QuerySet, evaluate, local_refiner, summarise
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.retrieval import build_grid
-from lalaloc_core.render.depth import layout_depth
-from lalaloc_core.render.oracle import oracle_depth
-from lalaloc_core.render.profile import wall_profile
-from lalaloc_core.sampling import random_poses
 from lalaloc_core.synth.materials import MaterialLibrary
 from lalaloc_core.synth.panorama import PanoramaRenderer, sample_shots
-from lalaloc_core.synth.plans import Home
-from lalaloc_core.synth.splits import TEST, home_of
 
 _REQUESTS = 40
 _STARTUP_SECONDS = 60.0
 _SMALL_PROCESS_MB = 50.0
-
-
-def run_bench(bundle_folder: Path, groups: tuple[str, ...], *, homes: int, textures: Path | None) -> dict[str, Any]:
-    """Measure the named groups of figures ("rendering", "service", "accuracy") with one bundle."""
-    bundle = Bundle.open(bundle_folder)
-    report: dict[str, Any] = {
-        "bundle": bundle.manifest.name,
-        "version": bundle.manifest.version,
-        "cores": os.cpu_count(),
-    }
-    if "rendering" in groups:
-        report["rendering"] = bench_rendering(bundle)
-    if "service" in groups:
-        report["service"] = bench_service(bundle, textures)
-    if "accuracy" in groups:
-        report["accuracy"] = bench_accuracy(bundle, homes, textures)
-    return report
-
-
-def bench_rendering(bundle: Bundle, poses: int = 200) -> dict[str, float]:
-    """Closed-form layout depth against the ray-casting oracle in the same run, and the grid of a 100 m² home."""
-    home = home_of_area(100.0)
-    plan = home.plan
-    drawn = random_poses(plan, poses, np.random.default_rng(0))
-    camera, ceiling = np.full(poses, 1.5), plan.ceiling_heights_m[drawn.room_index]
-    arrays = (drawn.position_m, np.zeros(poses), plan.walls_m[drawn.room_index], camera, ceiling)
-    position, heading, walls, cameras, ceilings = (torch.tensor(a, dtype=torch.float32) for a in arrays)
-
-    def closed_form() -> None:
-        layout_depth(wall_profile(position, heading, walls, 256), cameras, ceilings, 128)
-
-    sample = range(0, poses, poses // 10)
-
-    def oracle() -> None:
-        for index in sample:
-            room = plan.rooms[drawn.room_index[index]]
-            oracle_depth(room, drawn.position_m[index], 0.0, 1.5, 128, 256)
-
-    encoders = Encoders(bundle)
-    closed_form_ms = _median_ms(closed_form) / poses
-    oracle_ms = _median_ms(oracle, repeats=3) / len(sample)
-    grid = build_grid(plan, encoders, step_m=GRID_STEP_M, camera_height_m=1.5)
-    return {
-        "layout_depth_128x256_ms_per_pose": closed_form_ms,
-        "oracle_128x256_ms_per_pose": oracle_ms,
-        "oracle_to_closed_form_ratio": oracle_ms / closed_form_ms,
-        "grid_area_m2": plan.area_m2,
-        "grid_poses": len(grid.poses),
-        "grid_seconds": _median_ms(lambda: build_grid(plan, encoders, step_m=GRID_STEP_M, camera_height_m=1.5)) / 1e3,
-    }
 
 
 def bench_service(bundle: Bundle, textures: Path | None) -> dict[str, Any]:
@@ -125,30 +66,6 @@ def bench_service(bundle: Bundle, textures: Path | None) -> dict[str, Any]:
         # Besides the workers there is Python's own small resource tracker.
         report["workers_resident_mb"] = [size for size in sizes if size > _SMALL_PROCESS_MB]
     return report
-
-
-def bench_accuracy(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
-    """Accuracy on test homes: layout queries, then furnished, empty and unknown-heading panoramas."""
-    encoders = Encoders(bundle)
-    refiner = local_refiner(bundle)
-
-    def score(**changes: Any) -> dict[str, object]:
-        options = {"kind": "panorama", "heading_known": True, "furniture": "full"} | changes
-        queries = QuerySet(split=TEST, homes=homes, furniture=options.pop("furniture"), textures=textures)
-        return summarise(evaluate(encoders, queries, refiner=refiner, **options))
-
-    return {
-        "layout": score(kind="layout"),
-        "panorama_full": score(),
-        "panorama_empty": score(furniture="empty"),
-        "panorama_full_unknown_heading": score(heading_known=False),
-    }
-
-
-def home_of_area(area_m2: float) -> Home:
-    """The test home whose area comes nearest, among the first hundred."""
-    homes = (home_of(TEST, 0, index)[0] for index in range(100))
-    return min(homes, key=lambda home: abs(home.plan.area_m2 - area_m2))
 
 
 @contextmanager
@@ -212,13 +129,3 @@ def _jpeg(image: np.ndarray) -> bytes:
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, "JPEG", quality=90)
     return buffer.getvalue()
-
-
-def _median_ms(call: Callable[[], object], repeats: int = 9) -> float:
-    call()
-    times = []
-    for _ in range(repeats):
-        begin = time.perf_counter()
-        call()
-        times.append((time.perf_counter() - begin) * 1e3)
-    return statistics.median(times)

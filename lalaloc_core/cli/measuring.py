@@ -9,6 +9,8 @@ from typing import Any
 
 from lalaloc_core.cli.printing import print_json
 
+_GROUPS = ("rendering", "service", "accuracy", "methods", "datasets")
+
 
 def add_commands(commands: Any) -> None:
     """Add this room's commands to the parser."""
@@ -16,16 +18,17 @@ def add_commands(commands: Any) -> None:
     bench.add_argument("--bundle", type=Path, default=Path("models/default"))
     bench.add_argument("--homes", type=int, default=125, help="test homes per accuracy figure, 4 queries each")
     bench.add_argument("--textures", type=Path, help="folder of material pictures for the test panoramas")
-    bench.add_argument("--out", type=Path, help="also write the JSON to this file")
-    bench.add_argument("--only", choices=("rendering", "service", "accuracy"), help="one group of figures")
+    bench.add_argument("--out", type=Path, help="also write the JSON to this file; with --only, into it")
+    bench.add_argument("--only", choices=_GROUPS, action="append", help="a group of figures; again for more")
     bench.set_defaults(run=_bench)
 
 
 def _bench(arguments: argparse.Namespace) -> None:
-    from lalaloc_core.bench import run_bench
+    from lalaloc_core.bench.report import run_bench
 
-    groups = (arguments.only,) if arguments.only else ("rendering", "service", "accuracy")
+    groups = arguments.only or _GROUPS
     report = run_bench(arguments.bundle, groups, homes=arguments.homes, textures=arguments.textures)
     if arguments.out is not None:
-        arguments.out.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+        before = json.loads(arguments.out.read_text(encoding="utf-8")) if arguments.only else {}
+        arguments.out.write_text(json.dumps(before | report, indent=2) + "\n", encoding="utf-8")
     print_json(report)

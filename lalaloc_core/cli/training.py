@@ -10,14 +10,17 @@ from pathlib import Path
 from typing import Any
 
 from lalaloc_core.cli.printing import print_json
+from lalaloc_core.errors import InvalidInputError
 
 
 def add_commands(commands: Any) -> None:
     """Add this room's commands to the parser."""
     train = commands.add_parser("train", help="train a stage: the layout encoder, then the image encoder")
-    train.add_argument("stage", choices=("layout", "image"))
+    train.add_argument("stage", choices=("layout", "image", "end-to-end"), help="end-to-end is both stages at once")
     train.add_argument("--preset", default="ring", choices=("ring", "paper", "tiny"))
     train.add_argument("--out", type=Path, required=True, help="folder of the run, shared by both stages")
+    train.add_argument("--data", type=Path, metavar="DIR", help="a data set; default: homes drawn while training")
+    train.add_argument("--skip-bad", action="store_true", help="pass over files that cannot be used, naming each once")
     train.add_argument("--minutes", type=float, help="wall-clock budget; sets the pace of the schedule")
     train.add_argument("--steps", type=int, help="number of updates, instead of the preset's")
     train.add_argument("--seed", type=int, help="instead of the preset's")
@@ -39,26 +42,36 @@ def add_commands(commands: Any) -> None:
 def _train(arguments: argparse.Namespace) -> None:
     import torch
 
+    from lalaloc_core.data.opening import open_dataset
     from lalaloc_core.training.config import PRESETS
-    from lalaloc_core.training.run import train_image, train_layout
+    from lalaloc_core.training.data import TrainingData
+    from lalaloc_core.training.run import train_end_to_end, train_image, train_layout
 
+    if arguments.data is not None and arguments.textures is not None:
+        raise InvalidInputError("--textures is for generated homes, not for --data")
+    if arguments.data is None and arguments.skip_bad:
+        raise InvalidInputError("--skip-bad is for --data")
     config = PRESETS[arguments.preset]
+    # End-to-end training takes its schedule from the image stage.
+    part = "layout" if arguments.stage == "layout" else "image"
     changes: dict[str, Any] = {name: getattr(arguments, name) for name in ("minutes", "steps")}
     stage = dataclasses.replace(
-        getattr(config, arguments.stage), **{name: value for name, value in changes.items() if value is not None}
+        getattr(config, part), **{name: value for name, value in changes.items() if value is not None}
     )
-    config = dataclasses.replace(config, **{arguments.stage: stage})
+    config = dataclasses.replace(config, **{part: stage})
     if arguments.seed is not None:
         config = dataclasses.replace(config, seed=arguments.seed)
     device = torch.device(arguments.device or ("cuda" if torch.cuda.is_available() else "cpu"))
     if device.type == "cpu":
         # The workers need cores of their own: threads that wait for each other on shared ones are slower than fewer.
         torch.set_num_threads(max((os.cpu_count() or 1) - arguments.workers, 1))
-    common = {"device": device, "workers": arguments.workers, "resume": arguments.resume}
-    if arguments.stage == "layout":
-        train_layout(config, arguments.out, **common)
-    else:
-        train_image(config, arguments.out, textures=arguments.textures, **common)
+    data = TrainingData(
+        dataset=None if arguments.data is None else open_dataset(arguments.data),
+        skip_bad=arguments.skip_bad,
+        textures=arguments.textures,
+    )
+    train = {"layout": train_layout, "image": train_image, "end-to-end": train_end_to_end}[arguments.stage]
+    train(config, arguments.out, device=device, data=data, workers=arguments.workers, resume=arguments.resume)
 
 
 def _export(arguments: argparse.Namespace) -> None:

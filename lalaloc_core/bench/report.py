@@ -1,0 +1,29 @@
+"""All groups of figures in one report."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from lalaloc_core.bench.accuracy import bench_accuracy
+from lalaloc_core.bench.datasets import bench_datasets
+from lalaloc_core.bench.methods import bench_methods
+from lalaloc_core.bench.rendering import bench_rendering
+from lalaloc_core.bench.service import bench_service
+from lalaloc_core.bundle import Bundle
+
+
+def run_bench(bundle_folder: Path, groups: Sequence[str], *, homes: int, textures: Path | None) -> dict[str, Any]:
+    """Measure the named groups of figures with one bundle."""
+    bundle = Bundle.open(bundle_folder)
+    measure: Mapping[str, Callable[[], dict[str, Any]]] = {
+        "rendering": lambda: bench_rendering(bundle),
+        "service": lambda: bench_service(bundle, textures),
+        "accuracy": lambda: bench_accuracy(bundle, homes, textures),
+        "methods": lambda: bench_methods(bundle),
+        "datasets": lambda: bench_datasets(bundle, textures),
+    }
+    machine = {"bundle": bundle.manifest.name, "version": bundle.manifest.version, "cores": os.cpu_count()}
+    return machine | {group: measure[group]() for group in groups}

@@ -1,0 +1,66 @@
+"""Tables of results as Markdown and as a drawing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib.figure
+
+from lalaloc_core.reproduce.result import Figure, TableResult
+from lalaloc_core.reproduce.table import COLUMN_TITLES, SHARES
+
+_PAPER_DATA = "Structured3D"
+
+
+def markdown(table: TableResult) -> str:
+    """A table as Markdown: in each cell our figure, then in italics the paper's."""
+    same = table.dataset == _PAPER_DATA and table.budget == "full"
+    lines = [
+        f"**{table.title}** (`{table.source}`, `lalaloc reproduce --table {table.name}`). Upright: ours, on "
+        f"{table.dataset}, {table.split} split, budget {table.budget}, with 95 % intervals. Italic: the paper's, on "
+        f"{_PAPER_DATA}{'' if same else '; not the same experiment'}.",
+        "",
+        "| | " + " | ".join(COLUMN_TITLES[column] for column in table.columns) + " | n |",
+        "|---|" + "---|" * (len(table.columns) + 1),
+    ]
+    for row in table.rows:
+        name = f"{row.group}: {row.name}" if row.group else row.name
+        cells = [_cell(column, row.figures.get(column), row.paper.get(column)) for column in table.columns]
+        lines.append("| " + " | ".join([name, *cells, str(row.n)]) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _cell(column: str, ours: Figure | None, paper: float | None) -> str:
+    parts = []
+    if ours is not None:
+        interval = ""
+        if ours.low is not None or ours.high is not None:
+            interval = f" [{_number(column, ours.low)}, {_number(column, ours.high)}]"
+        parts.append(_number(column, ours.value) + interval)
+    if paper is not None:
+        parts.append(f"*{_number(column, paper)}*")
+    return " · ".join(parts) or "–"
+
+
+def _number(column: str, value: float | None) -> str:
+    if value is None:
+        return "∞"
+    if column in SHARES:
+        return f"{100.0 * value:.1f} %"
+    return f"{value:.3g}" if column.startswith("seconds") else f"{value:.1f}"
+
+
+def draw_vogel_samples(table: TableResult, path: Path) -> None:
+    """The paper's figure of Vogel disc samples: median error by number of samples, with and without LPO."""
+    figure = matplotlib.figure.Figure(figsize=(6.0, 3.6), layout="constrained")
+    axes = figure.add_subplot()
+    for name, style in (("VDR", "o-"), ("VDR + LPO", "s-")):
+        rows = [row for row in table.rows if row.name == name]
+        medians = [row.figures["median_cm"].value for row in rows]
+        axes.plot([int(row.group.split()[0]) for row in rows], medians, style, label=name)
+    for name, style in (("Retrieval", ":"), ("LPO", "--")):
+        (row,) = (row for row in table.rows if row.name == name and row.group == "without VDR")
+        axes.axhline(row.figures["median_cm"].value, linestyle=style, color="0.4", label=f"{name}, no VDR")
+    axes.set(xlabel="samples of the Vogel disc", ylabel="median error (cm)", ylim=(0.0, None))
+    axes.legend(frameon=False)
+    figure.savefig(path, dpi=120)

@@ -1,0 +1,168 @@
+"""The paper's tables: each is complete, says which figures are whose, and runs."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from lalaloc_core.cli import main
+from lalaloc_core.errors import RunError
+from lalaloc_core.evaluation.building import build_method
+from lalaloc_core.evaluation.predictions import RunInfo
+from lalaloc_core.evaluation.score import Scores, StageScores
+from lalaloc_core.reproduce.render import draw_vogel_samples, markdown
+from lalaloc_core.reproduce.result import Figure, RowResult, TableResult
+from lalaloc_core.reproduce.table import COLUMN_TITLES, SHIPPED
+from lalaloc_core.reproduce.tables import TABLES
+from lalaloc_core.training.ablations import ABLATIONS
+
+
+def result(dataset: str = "synthetic scenes (seed 0)", budget: str = "small") -> TableResult:
+    return TableResult(
+        name="localisation",
+        title="Localisation",
+        source="tab:localisation",
+        dataset=dataset,
+        split="test",
+        budget=budget,  # type: ignore[arg-type]
+        command="lalaloc reproduce",
+        columns=("pose_recall", "median_cm"),
+        rows=(
+            RowResult(
+                group="Layout",
+                name="LaLaLoc",
+                n=100,
+                figures={"pose_recall": Figure(value=0.5, low=0.4, high=0.6), "median_cm": Figure(value=None)},
+                paper={"pose_recall": 0.874},
+            ),
+        ),
+    )
+
+
+class TestTables:
+    def test_there_is_one_for_every_comparison_of_the_paper(self) -> None:
+        names = [table.name for table in TABLES]
+        assert len(set(names)) == len(names)
+        assert {table.source for table in TABLES} == {
+            "tab:localisation",
+            "tab:1m_refinement",
+            "tab:furniture",
+            "tab:refinement",
+            "fig:vdr_sample",
+            "tab:oracle",
+            "tab:1m_oracle",
+            "tab:e2e",
+            "tab:lalalearning",
+            "tab:layoutarch",
+            "tab:rgblearning",
+            "tab:time",
+        }
+
+    @pytest.mark.parametrize("table", TABLES, ids=lambda table: table.name)
+    def test_columns_are_scores_and_models_are_known(self, table) -> None:
+        fields = set(Scores.__dataclass_fields__) | set(StageScores.__dataclass_fields__)
+        for column in table.columns:
+            assert column in COLUMN_TITLES
+            assert column in fields or column.startswith("seconds")
+        for row in table.rows:
+            assert set(row.paper) <= set(table.columns), row.name
+        assert set(table.models) <= set(ABLATIONS)
+
+    @pytest.mark.parametrize("table", TABLES, ids=lambda table: table.name)
+    def test_every_row_is_a_method_that_can_be_built(self, table, tiny_bundle: Path) -> None:
+        for row in table.rows:
+            ask = row.ask
+            info = RunInfo(
+                label=row.name,
+                method=ask.method,
+                kind=ask.kind,
+                dataset="",
+                split=table.split,
+                settings=dict(ask.settings),
+                bundle=None if ask.model is None else str(tiny_bundle),
+            )
+            assert build_method(info) is not None
+
+    def test_both_architectures_are_in_the_main_table_for_both_kinds_of_query(self) -> None:
+        (table,) = (table for table in TABLES if table.name == "localisation")
+        asked = {(row.ask.method, row.ask.kind, row.ask.model) for row in table.rows}
+        for kind in ("layout", "panorama"):
+            assert {("lalaloc", kind, "paper"), ("lalaloc", kind, SHIPPED), ("icp", kind, None)} <= asked
+            assert {("explicit", kind, SHIPPED), ("decode", kind, SHIPPED)} <= asked
+        assert ("oracle", "layout", None) in asked
+
+
+class TestRendering:
+    def test_figures_say_whose_they_are(self) -> None:
+        text = markdown(result())
+        assert "| Layout: LaLaLoc | 50.0 % [40.0 %, 60.0 %] · *87.4 %* | ∞ | 100 |" in text
+        assert "synthetic scenes (seed 0)" in text
+        assert "not the same experiment" in text
+
+    @pytest.mark.parametrize(
+        ("dataset", "budget", "same"),
+        [("Structured3D", "full", True), ("Structured3D", "small", False), ("Structured4D", "full", False)],
+    )
+    def test_only_structured3d_at_full_budget_is_the_same_experiment(
+        self, dataset: str, budget: str, same: bool
+    ) -> None:
+        assert ("not the same experiment" not in markdown(result(dataset, budget))) == same
+
+    def test_a_table_is_written_and_read_again(self, tmp_path: Path) -> None:
+        path = tmp_path / "table.json"
+        path.write_text(result().to_json(), encoding="utf-8")
+        assert TableResult.read(path) == result()
+        path.write_text("{}", encoding="utf-8")
+        with pytest.raises(RunError, match="no table of results"):
+            TableResult.read(path)
+
+
+class TestCommand:
+    def test_list_names_every_table(self, capsys: pytest.CaptureFixture[str]) -> None:
+        assert main(["reproduce", "--list"]) == 0
+        printed = capsys.readouterr().out
+        assert all(f"{table.name} " in printed for table in TABLES)
+
+    @pytest.mark.parametrize(
+        ("arguments", "complaint"),
+        [
+            (["--table", "roof"], "no table 'roof', there are: localisation"),
+            ([], "name a table"),
+            (["--table", "similarity"], "--data is missing"),
+        ],
+    )
+    def test_what_is_asked_wrongly_is_exit_code_2(
+        self, arguments: list[str], complaint: str, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        assert main(["reproduce", *arguments]) == 2
+        assert complaint in capsys.readouterr().err
+
+    def test_tables_run_on_synthetic_scenes_and_share_their_runs(
+        self, tmp_path: Path, tiny_bundle: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        data, out = str(tmp_path / "scenes"), tmp_path / "out"
+        for split in ("validation", "test"):
+            assert main(["synth", "--scenes", "1", "--split", split, "--out", data, "--height", "64"]) == 0
+        tables = ["similarity", "vogel-samples"]
+        asked = [word for name in tables for word in ("--table", name)]
+        common = ["--data", data, "--out", str(out), "--bundle", str(tiny_bundle), "--limit", "3", "--workers", "0"]
+        assert main(["reproduce", *asked, *common]) == 0
+        printed = capsys.readouterr().out
+        assert "Layout-similarity metric" in printed
+        similarity = TableResult.read(out / "tables" / "similarity.json")
+        pose = similarity.rows[0].figures
+        assert pose["pose_recall"].value == 1.0
+        assert pose["correct_room"].value == 1.0
+        assert all(row.figures["median_cm"].value >= pose["median_cm"].value for row in similarity.rows)
+        assert (similarity.dataset, similarity.rows[0].n) == ("synthetic scenes (seed 0)", 3)
+        assert (out / "tables" / "vogel-samples.png").stat().st_size > 1000
+        assert json.loads((out / "tables" / "vogel-samples.json").read_text())["rows"]
+        # Four metrics and the nearest pose; six different numbers of samples.
+        assert len(list((out / "runs").iterdir())) == 11
+
+
+def test_the_figure_of_samples_needs_its_rows(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="not enough values"):
+        draw_vogel_samples(result(), tmp_path / "figure.png")
