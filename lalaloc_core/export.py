@@ -22,17 +22,20 @@ from torch import Tensor, nn
 
 from lalaloc_core.bundle import (
     BUNDLE_FILES,
+    DECODER_WEIGHTS,
     HEAD_ONNX,
     IMAGE_ONNX,
     IMAGE_WEIGHTS,
     LAYOUT_ONNX,
     LAYOUT_WEIGHTS,
+    MANIFEST_NAME,
     Bundle,
     Manifest,
 )
 from lalaloc_core.bundle import write_manifest as _write_manifest
 from lalaloc_core.errors import ExportError
 from lalaloc_core.nets import ImageEncoder, LayoutEncoder, resnet, ring
+from lalaloc_core.nets.decoder import LayoutDecoder
 from lalaloc_core.training.config import TrainConfig
 
 PARITY_TOLERANCE = 1e-4
@@ -45,7 +48,8 @@ def export_bundle(
     folder: Path,
     config: TrainConfig,
     layout_encoder: LayoutEncoder,
-    image_encoder: ImageEncoder,
+    image_encoder: ImageEncoder | None,
+    decoder: LayoutDecoder | None = None,
     *,
     name: str,
     version: str,
@@ -53,22 +57,27 @@ def export_bundle(
 ) -> Bundle:
     """Write a bundle into `folder`, which is created or whose files of the same names are replaced.
 
-    The encoders are put into evaluation mode and their weights rounded in place.
+    The networks are put into evaluation mode and their weights rounded in place. Without an image encoder the bundle
+    answers layout queries only.
 
     Raises:
         ExportError: an exported network differs from torch by more than `PARITY_TOLERANCE`; `folder` is untouched.
     """
-    for module in (layout_encoder, image_encoder):
+    for module in filter(None, (layout_encoder, image_encoder, decoder)):
         module.cpu().eval().requires_grad_(False)
         _round_to_half(module)
     with tempfile.TemporaryDirectory(prefix="lalaloc-export-") as scratch:
         work = Path(scratch)
         _save_weights(layout_encoder, work / LAYOUT_WEIGHTS)
-        _save_weights(image_encoder, work / IMAGE_WEIGHTS)
+        if image_encoder is not None:
+            _save_weights(image_encoder, work / IMAGE_WEIGHTS)
+        if decoder is not None:
+            _save_weights(decoder, work / DECODER_WEIGHTS)
         parity = _export_networks(work, config, layout_encoder, image_encoder)
         manifest = _manifest(config, name, version, {**(training or {}), "parity_max_abs_difference": parity})
         folder.mkdir(parents=True, exist_ok=True)
-        for name in BUNDLE_FILES:
+        # Without its manifest nothing is a bundle, until all files are written.
+        for name in (MANIFEST_NAME, *BUNDLE_FILES):
             # A bundle of another architecture may have left files that this one does not have.
             (folder / name).unlink(missing_ok=True)
         for path in work.iterdir():
@@ -77,7 +86,7 @@ def export_bundle(
 
 
 def _export_networks(
-    work: Path, config: TrainConfig, layout_encoder: LayoutEncoder, image_encoder: ImageEncoder
+    work: Path, config: TrainConfig, layout_encoder: LayoutEncoder, image_encoder: ImageEncoder | None
 ) -> float:
     """Export and compare every network; returns the largest difference found."""
     generator = torch.Generator().manual_seed(0)
@@ -90,14 +99,14 @@ def _export_networks(
     height, width = config.image_size
     image = torch.randint(0, 256, (_PARITY_BATCH, height, width, 3), dtype=torch.uint8, generator=generator)
     differences = [_export(work / LAYOUT_ONNX, layout_encoder, layout, ["latent"])]
+    if isinstance(layout_encoder, ring.RingLayoutEncoder):
+        features = layout_encoder.ring(*layout.values())
+        differences.append(_export(work / HEAD_ONNX, layout_encoder.head, {"ring": features}, ["latent"]))
     if isinstance(image_encoder, ring.RingImageEncoder):
-        assert isinstance(layout_encoder, ring.RingLayoutEncoder)
         inputs = {"image": image, "camera_height_m": heights(1.0, 1.9)}
         outputs = ["ring", "log_profile", "log_scale"]
         differences.append(_export(work / IMAGE_ONNX, _RingOutputs(image_encoder), inputs, outputs))
-        features = layout_encoder.ring(*layout.values())
-        differences.append(_export(work / HEAD_ONNX, layout_encoder.head, {"ring": features}, ["latent"]))
-    else:
+    elif image_encoder is not None:
         differences.append(_export(work / IMAGE_ONNX, image_encoder, {"image": image}, ["latent"]))
     return max(differences)
 

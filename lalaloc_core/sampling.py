@@ -6,13 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.floorplan import FloorPlan
 
 # Cameras do not stand in walls; grid poses keep this distance where the room allows it.
 WALL_MARGIN_M = 0.15
+_SMALLEST_RADIUS_M = 1e-3
+# Twice the negatives wanted are drawn at a time; where fewer than one in twelve is far enough, the plan is too small.
+_NEGATIVE_ROUNDS = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,13 +123,51 @@ def sample_triplets(
     return merged, np.stack(rows)
 
 
+def sample_neighbours(
+    plan: FloorPlan, anchor: PoseSet, sampling: TripletSampling, rng: np.random.Generator, lowest_ceiling_m: float = 0.0
+) -> PoseSet | None:
+    """Draw the positives, then the negatives, of one given pose.
+
+    Args:
+        plan: the plan.
+        anchor: one pose.
+        sampling: how many, and how near or far.
+        rng: source of randomness.
+        lowest_ceiling_m: rooms with a lower ceiling are left out; a camera cannot stand in them.
+
+    Returns:
+        `sampling.positives` + `sampling.negatives` poses; None where hardly any of the plan is far enough.
+    """
+    open_rooms = plan.ceiling_heights_m >= lowest_ceiling_m
+    far_position, far_room = [np.empty((0, 2))], [np.empty(0, dtype=int)]
+    for _ in range(_NEGATIVE_ROUNDS):
+        pool = random_poses(plan, 2 * sampling.negatives, rng)
+        distance = np.linalg.norm(pool.position_m - anchor.position_m[0], axis=1)
+        far = (distance > sampling.negative_radius_m) & open_rooms[pool.room_index]
+        far_position.append(pool.position_m[far])
+        far_room.append(pool.room_index[far])
+        if sum(map(len, far_room)) >= sampling.negatives:
+            near = _sample_near(plan, anchor, np.array([0]), sampling, rng, open_rooms)
+            return PoseSet(
+                np.concatenate([near.position_m, np.concatenate(far_position)[: sampling.negatives]]),
+                np.concatenate([near.room_index, np.concatenate(far_room)[: sampling.negatives]]),
+            )
+    return None
+
+
 def _sample_near(
-    plan: FloorPlan, pool: PoseSet, anchors: Int[np.ndarray, "k"], sampling: TripletSampling, rng: np.random.Generator
+    plan: FloorPlan,
+    pool: PoseSet,
+    anchors: Int[np.ndarray, "k"],
+    sampling: TripletSampling,
+    rng: np.random.Generator,
+    open_rooms: Bool[np.ndarray, "r"] | None = None,
 ) -> PoseSet:
     """Positions uniform on the disc around each anchor that lie in some room; anchors in tight corners shrink it."""
     count = len(anchors) * sampling.positives
     centre = np.repeat(pool.position_m[anchors], sampling.positives, axis=0)
-    result = PoseSet(np.empty((count, 2)), np.full(count, -1))
+    # Where rooms overlap, even the smallest disc may lie in another one: then the anchor is its own neighbour.
+    result = PoseSet(centre.copy(), np.repeat(pool.room_index[anchors], sampling.positives))
     radius = np.full(count, sampling.positive_radius_m)
     missing = np.arange(count)
     while len(missing):
@@ -134,9 +175,10 @@ def _sample_near(
         length = radius[missing] * np.sqrt(rng.uniform(0.0, 1.0, len(missing)))
         drawn = centre[missing] + length[:, None] * np.stack([np.sin(angle), np.cos(angle)], axis=-1)
         room = plan.room_index_at(drawn)
-        found = room >= 0
+        found = (room >= 0) & (True if open_rooms is None else open_rooms[room])
         result.position_m[missing[found]] = drawn[found]
         result.room_index[missing[found]] = room[found]
         missing = missing[~found]
         radius[missing] *= 0.7
+        missing = missing[radius[missing] > _SMALLEST_RADIUS_M]
     return result

@@ -6,12 +6,10 @@ from typing import Any
 
 import safetensors.torch
 from torch import nn
-from torch import nn
 
 from lalaloc_core.bundle import DECODER_WEIGHTS, Bundle
 from lalaloc_core.configuration import build_config
 from lalaloc_core.errors import BundleError
-from lalaloc_core.nets.decoder import LayoutDecoder
 from lalaloc_core.nets.decoder import LayoutDecoder
 from lalaloc_core.nets.resnet import PaperConfig, PaperImageEncoder, PaperLayoutEncoder
 from lalaloc_core.nets.ring import RingConfig, RingImageEncoder, RingLayoutEncoder
@@ -53,22 +51,5 @@ def load_decoder(bundle: Bundle) -> LayoutDecoder:
 
 def _load_weights(module: nn.Module, weights: bytes) -> None:
     """Half precision is a storage format here; arithmetic is single precision."""
-    _load(encoder, weights)
-    return encoder
-
-
-def load_decoder(latent_size: int, weights: bytes) -> LayoutDecoder:
-    """Rebuild the decoder of training from the safetensors of a bundle, `bundle.read(DECODER_WEIGHTS)`.
-
-    Raises:
-        RuntimeError: the weights do not fit.
-    """
-    decoder = LayoutDecoder(latent_size)
-    _load(decoder, weights)
-    return decoder
-
-
-def _load(module: nn.Module, weights: bytes) -> None:
     state = safetensors.torch.load(weights)
-    # Half precision is a storage format here; arithmetic is single precision.
     module.load_state_dict({k: v.float() if v.is_floating_point() else v for k, v in state.items()}, strict=True)

@@ -1,11 +1,13 @@
 """Architecture `paper`: ResNet-18 on layout depth, ResNet-50 on RGB, average pool, one FC to 128 (section A.1.1).
 
+The alternatives that the paper compares are options: ResNet-50 and a two-layer predictor on the layout's side.
 Parameter names are torchvision's, so that its ImageNet weights load into `backbone` as they are.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -21,10 +23,18 @@ IMAGE_STD = (0.229, 0.224, 0.225)
 
 @dataclass(frozen=True, kw_only=True)
 class PaperConfig:
-    """Sizes of the `paper` architecture; depths are (18 or 50)."""
+    """Sizes of the `paper` architecture.
 
-    layout_depth: int = 18
-    image_depth: int = 50
+    Attributes:
+        layout_depth, image_depth: layers of either ResNet.
+        layout_predictor: from pooled features to the latent: one fully connected layer, or two with a ReLU between.
+        width: channels of the first stage, which the later ones double; ResNets have 64.
+    """
+
+    layout_depth: Literal[18, 50] = 18
+    layout_predictor: Literal["fc", "mlp"] = "fc"
+    image_depth: Literal[18, 50] = 50
+    width: int = 64
     latent_size: int = 128
     layout_height: int = 128
     profile_columns: int = 256
@@ -82,17 +92,17 @@ def _shortcut(inputs: int, outputs: int, stride: int) -> nn.Sequential | None:
 class ResNet(nn.Module):
     """ResNet-18 or ResNet-50 up to and with its pooled features; `channels` of them."""
 
-    def __init__(self, depth: int, *, inputs: int = 3) -> None:
+    def __init__(self, depth: int, *, inputs: int = 3, width: int = 64) -> None:
         super().__init__()
         block, counts = {18: (BasicBlock, (2, 2, 2, 2)), 50: (Bottleneck, (3, 4, 6, 3))}[depth]
-        self.conv1 = nn.Conv2d(inputs, 64, 7, 2, 3, bias=False)
-        self.bn1 = nn.BatchNorm2d(64)
+        self.conv1 = nn.Conv2d(inputs, width, 7, 2, 3, bias=False)
+        self.bn1 = nn.BatchNorm2d(width)
         self.maxpool = nn.MaxPool2d(3, 2, 1)
-        self.channels = 64
-        self.layer1 = self._stage(block, 64, counts[0], 1)
-        self.layer2 = self._stage(block, 128, counts[1], 2)
-        self.layer3 = self._stage(block, 256, counts[2], 2)
-        self.layer4 = self._stage(block, 512, counts[3], 2)
+        self.channels = width
+        self.layer1 = self._stage(block, width, counts[0], 1)
+        self.layer2 = self._stage(block, 2 * width, counts[1], 2)
+        self.layer3 = self._stage(block, 4 * width, counts[2], 2)
+        self.layer4 = self._stage(block, 8 * width, counts[3], 2)
 
     def _stage(self, block: type[BasicBlock | Bottleneck], width: int, count: int, stride: int) -> nn.Sequential:
         layers = []
@@ -113,8 +123,11 @@ class PaperLayoutEncoder(nn.Module):
     def __init__(self, config: PaperConfig) -> None:
         super().__init__()
         self.config = config
-        self.backbone = ResNet(config.layout_depth, inputs=1)
-        self.fc = nn.Linear(self.backbone.channels, config.latent_size)
+        self.backbone = ResNet(config.layout_depth, inputs=1, width=config.width)
+        channels = self.backbone.channels
+        self.fc: nn.Module = nn.Linear(channels, config.latent_size)
+        if config.layout_predictor == "mlp":
+            self.fc = nn.Sequential(nn.Linear(channels, channels), nn.ReLU(), self.fc)
 
     def forward(
         self,
@@ -132,7 +145,7 @@ class PaperImageEncoder(nn.Module):
     def __init__(self, config: PaperConfig) -> None:
         super().__init__()
         self.config = config
-        self.backbone = ResNet(config.image_depth)
+        self.backbone = ResNet(config.image_depth, width=config.width)
         self.fc = nn.Linear(self.backbone.channels, config.latent_size)
         # Not "mean": ONNX would take it for the output of the pooling.
         self.register_buffer("pixel_mean", 255.0 * torch.tensor(IMAGE_MEAN)[None, :, None, None], persistent=False)

@@ -17,12 +17,13 @@ class Checkpoint:
     """State of a training stage.
 
     Attributes:
-        stage: "layout" or "image".
+        stage: "layout", "image" or "end-to-end".
         weights: state dict of the stage's modules by name.
         averaged: averaged weights (EMA) in the same form, empty when averaging is off.
         optimiser: state of the optimiser.
         step, seconds: progress so far.
         metrics: the last validation.
+        data: what the stage was trained on.
     """
 
     stage: str
@@ -33,6 +34,7 @@ class Checkpoint:
     step: int = 0
     seconds: float = 0.0
     metrics: dict[str, float] = field(default_factory=dict)
+    data: dict[str, Any] = field(default_factory=dict)
 
     @property
     def best_weights(self) -> dict[str, dict[str, torch.Tensor]]:

@@ -7,11 +7,14 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from lalaloc_core.configuration import build_config
+from lalaloc_core.errors import ConfigError
+from lalaloc_core.nets.decoder import DECODED_WIDTH
 from lalaloc_core.nets.resnet import PaperConfig
 from lalaloc_core.nets.ring import RingConfig
 from lalaloc_core.sampling import TripletSampling
 
 Architecture = Literal["ring", "paper"]
+Turns = Literal["any", "quarters", "none"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,6 +40,8 @@ class LayoutStageConfig:
         minutes: wall-clock budget; when given, it and not `steps` sets the pace of the schedule.
         all_pairs: compare every two neighbours of an anchor instead of positives with negatives only.
         turned_share: share of the negatives replaced by positives' places seen at another heading.
+        log_ratio_weight: weight of the log-ratio loss; 0 leaves it out.
+        decode_weight: weight of the decoding loss; 0 leaves it, and the decoder, out.
         decode_anchors_only: decode the anchors' latents alone; the decoder costs more than a small encoder.
         cloud_rows, cloud_columns: sub-sampling of the layouts whose Chamfer distances are taken.
         scale_weight: weight of the loss that fixes the global scale of latent distances, which the log-ratio
@@ -51,6 +56,7 @@ class LayoutStageConfig:
     triplets: TripletSampling = field(default_factory=TripletSampling)
     all_pairs: bool = False
     turned_share: float = 0.0
+    log_ratio_weight: float = 1.0
     decode_weight: float = 1.0
     decode_anchors_only: bool = False
     scale_weight: float = 0.0
@@ -62,13 +68,19 @@ class LayoutStageConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class ImageStageConfig:
-    """Stage 2: the image encoder against the frozen layout encoder (paper, section 3.2).
+    """Stage 2: the image encoder against the frozen layout encoder (paper, sections 3.2 and A.1.5).
+
+    End-to-end training, which is both stages at once, takes its schedule and the weight of its latent distance from
+    here as well, and everything else from `LayoutStageConfig`.
 
     Attributes:
         minutes: wall-clock budget; when given, it and not `steps` sets the pace of the schedule.
         by_room_share: share of the panoramas drawn evenly over rooms instead of over the floor, so that closets and
             corridors are seen often enough.
-        l2_weight: weight of the latent distance, the paper's only loss.
+        l2_weight: weight of the latent distance, the paper's choice; 0 leaves it out.
+        log_ratio_weight: weight of the log-ratio loss with the panorama as anchor and layouts as neighbours, drawn as
+            in stage 1.
+        kd_weight: weight of the same loss with the layout encoder's distances in place of the Chamfer distances.
         ring_weight: weight of distilling ring features (architecture `ring`).
         profile_weight: weight of the Laplace likelihood of the wall profile (architecture `ring`).
         ema_decay: decay per step of the averaged weights that are validated and shipped; 0 turns it off.
@@ -80,6 +92,8 @@ class ImageStageConfig:
     shots_per_home: int = 4
     by_room_share: float = 0.25
     l2_weight: float = 1.0
+    log_ratio_weight: float = 0.0
+    kd_weight: float = 0.0
     ring_weight: float = 0.0
     profile_weight: float = 0.0
     ema_decay: float = 0.0
@@ -88,15 +102,40 @@ class ImageStageConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
-    """Everything that decides what is trained."""
+    """Everything that decides what is trained, but the data.
+
+    Attributes:
+        turns: the headings that layouts and panoramas are turned to: any, and mirrored or not; a multiple of a quarter
+            turn, and mirrored or not; or none but heading 0, which is enough for queries whose heading is known.
+    """
 
     name: str
     architecture: Architecture = "ring"
     seed: int = 0
+    turns: Turns = "any"
     ring: RingConfig = field(default_factory=RingConfig)
     paper: PaperConfig = field(default_factory=PaperConfig)
     layout: LayoutStageConfig = field(default_factory=LayoutStageConfig)
     image: ImageStageConfig = field(default_factory=ImageStageConfig)
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be trained.
+
+        Raises:
+            ConfigError: names the key, its value and the limit.
+        """
+        for name, wanted in (("layout.cloud_columns", self.layout.cloud_columns), ("the decoder", DECODED_WIDTH)):
+            if self.profile_columns % min(wanted, self.profile_columns):
+                raise ConfigError(f"{self.profile_columns} profile columns cannot be thinned to {wanted} ({name})")
+        if not self.layout.log_ratio_weight and not self.layout.decode_weight:
+            raise ConfigError("config.layout: log_ratio_weight and decode_weight are both 0, nothing is learnt")
+        image = self.image
+        if not any((image.l2_weight, image.log_ratio_weight, image.kd_weight, image.ring_weight)):
+            raise ConfigError("config.image: the weights of all losses on the latent are 0, nothing is learnt")
+        if self.layout.turned_share and self.turns != "any":
+            raise ConfigError(
+                f"config.layout.turned_share is {self.layout.turned_share:g}, with turns other than 'any'"
+            )
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data, for checkpoints and manifests."""
@@ -112,6 +151,11 @@ class TrainConfig:
         return build_config(cls, raw, path="config")
 
     @property
+    def latent_size(self) -> int:
+        """Dimensions of the latent."""
+        return self.ring.latent_size if self.architecture == "ring" else self.paper.latent_size
+
+    @property
     def profile_columns(self) -> int:
         """Azimuth columns that the layout encoder expects."""
         return self.ring.profile_columns if self.architecture == "ring" else self.paper.profile_columns
@@ -123,19 +167,19 @@ class TrainConfig:
         return sizes.image_height, sizes.image_width
 
 
-_PAPER_SGD = OptimiserConfig(kind="sgd", learning_rate=0.01, schedule="steps", warmup=0.0, clip_norm=0.0)
+PAPER_SGD = OptimiserConfig(kind="sgd", learning_rate=0.01, schedule="steps", warmup=0.0, clip_norm=0.0)
 
 # The paper counts epochs over Structured3D; its 18,000 or so training panoramas give these numbers of steps.
 PRESETS: dict[str, TrainConfig] = {
     "paper": TrainConfig(
         name="paper",
         architecture="paper",
-        layout=LayoutStageConfig(steps=90_000, homes_per_step=4, anchors_per_home=1, optimiser=_PAPER_SGD),
+        layout=LayoutStageConfig(steps=90_000, homes_per_step=4, anchors_per_home=1, optimiser=PAPER_SGD),
         image=ImageStageConfig(
             steps=56_000,
             batch=64,
             shots_per_home=1,
-            optimiser=dataclasses.replace(_PAPER_SGD, learning_rate=0.1),
+            optimiser=dataclasses.replace(PAPER_SGD, learning_rate=0.1),
         ),
     ),
     "ring": TrainConfig(

@@ -1,21 +1,22 @@
-"""Stage 2: the image encoder against the frozen layout encoder (paper, section 3.2)."""
+"""Stage 2: the image encoder against the frozen layout encoder (paper, sections 3.2 and A.1.5)."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from lalaloc_core.nets import LayoutEncoder
-from lalaloc_core.nets.resnet import PaperImageEncoder
 from lalaloc_core.nets.ring import RingLayoutEncoder
 from lalaloc_core.training import losses
+from lalaloc_core.training.batches import Batch, receive
 from lalaloc_core.training.config import ImageStageConfig, TrainConfig
-from lalaloc_core.training.panoramas import PanoramaBatches
-from lalaloc_core.training.stages import build_image_encoder
-from lalaloc_core.training.stream import Batch, loader
+from lalaloc_core.training.objective import anchors_with_neighbours, chamfer_to_anchors, embed
+from lalaloc_core.training.sources import Source
+from lalaloc_core.training.stages import build_image_encoder, first_visit_of_panoramas
+from lalaloc_core.training.stream import PanoramaBatches
 
 
 class ImageStage:
@@ -23,9 +24,9 @@ class ImageStage:
 
     name = "image"
 
-    def __init__(self, config: TrainConfig, layout_encoder: LayoutEncoder, textures: Path | None = None) -> None:
+    def __init__(self, config: TrainConfig, source: Source, layout_encoder: LayoutEncoder) -> None:
         self.config = config
-        self.textures = textures
+        self.source = source
         self.teacher = layout_encoder.eval().requires_grad_(False)
         self.encoder = build_image_encoder(config)
         self.modules: dict[str, nn.Module] = {"image_encoder": self.encoder}
@@ -35,28 +36,55 @@ class ImageStage:
         """Settings of this stage."""
         return self.config.image
 
+    @property
+    def data(self) -> dict[str, Any]:
+        """What is trained on."""
+        return self.source.data
+
     def batches(self, first_step: int, workers: int) -> Iterator[Batch]:
-        """Panorama batches; a resumed run goes on with homes it has not seen."""
-        first = first_step * (self.settings.batch // self.settings.shots_per_home + 1)
-        return iter(loader(PanoramaBatches(self.config, self.textures, first), workers))
+        """Panorama batches; a resumed run goes on with homes, or parts of the epoch, that it has not seen."""
+        neighbours = bool(self.settings.log_ratio_weight or self.settings.kd_weight)
+        first = first_visit_of_panoramas(self.settings, first_step)
+        return receive(PanoramaBatches(self.config, self.source, neighbours, first), workers)
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Weighted losses of a batch by name; their sum is minimised."""
-        heights = (batch["camera_height_m"], batch["ceiling_height_m"])
-        stage = self.settings
-        if isinstance(self.encoder, PaperImageEncoder):
+        layout = (batch["profile_m"], batch["camera_height_m"], batch["ceiling_height_m"])
+        stage, terms = self.settings, {}
+        if isinstance(self.teacher, RingLayoutEncoder):
             with torch.no_grad():
-                target = self.teacher(batch["profile_m"], *heights)
-            return {"l2": stage.l2_weight * losses.l2(self.encoder(batch["image"]), target)}
-        assert isinstance(self.teacher, RingLayoutEncoder)
+                ring = self.teacher.ring(*layout)
+                target = self.teacher.head(ring)
+            seen = self.encoder(batch["image"], batch["camera_height_m"])
+            latent = self.teacher.head(seen.ring)
+            if stage.ring_weight:
+                terms["ring"] = stage.ring_weight * losses.ring_distillation(seen.ring, ring)
+            if stage.profile_weight:
+                likelihood = losses.laplace(seen.log_profile, seen.log_scale, batch["profile_m"])
+                terms["profile"] = stage.profile_weight * likelihood
+        else:
+            with torch.no_grad():
+                target = self.teacher(*layout)
+            latent = self.encoder(batch["image"])
+        if stage.l2_weight:
+            terms["l2"] = stage.l2_weight * losses.l2(latent, target)
+        if stage.log_ratio_weight or stage.kd_weight:
+            terms |= self._relational(latent.float(), target.float(), batch)
+        return terms
+
+    def _relational(self, latent: Tensor, target: Tensor, batch: Batch) -> dict[str, Tensor]:
+        """Losses on the distances of the neighbours' layouts to the panorama."""
+        stage, layout = self.settings, self.config.layout
+        groups = anchors_with_neighbours(batch)
         with torch.no_grad():
-            ring = self.teacher.ring(batch["profile_m"], *heights)
-            target = self.teacher.head(ring)
-        seen = self.encoder(batch["image"], batch["camera_height_m"])
-        terms = {"l2": stage.l2_weight * losses.l2(self.teacher.head(seen.ring), target)}
-        if stage.ring_weight:
-            terms["ring"] = stage.ring_weight * losses.ring_distillation(seen.ring, ring)
-        if stage.profile_weight:
-            likelihood = losses.laplace(seen.log_profile, seen.log_scale, batch["profile_m"])
-            terms["profile"] = stage.profile_weight * likelihood
+            neighbours = embed(self.teacher, {key: value[:, 1:] for key, value in groups.items()})
+            taught = torch.linalg.vector_norm(neighbours - target[:, None], dim=2)
+        distance = torch.linalg.vector_norm(neighbours - latent[:, None], dim=2)
+        positives, all_pairs, terms = layout.triplets.positives, layout.all_pairs, {}
+        if stage.log_ratio_weight:
+            chamfer = chamfer_to_anchors(groups, layout)
+            ratio = losses.log_ratio(distance, chamfer, positives, all_pairs=all_pairs)
+            terms["log_ratio"] = stage.log_ratio_weight * ratio
+        if stage.kd_weight:
+            terms["kd"] = stage.kd_weight * losses.log_ratio(distance, taught, positives, all_pairs=all_pairs)
         return terms

@@ -16,10 +16,10 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from lalaloc_core.errors import CheckpointError
+from lalaloc_core.training.batches import Batch
 from lalaloc_core.training.checkpoint import Checkpoint
 from lalaloc_core.training.config import OptimiserConfig, TrainConfig
 from lalaloc_core.training.stages import Stage, build_optimiser
-from lalaloc_core.training.stream import Batch
 
 _LOG = logging.getLogger(__name__)
 _LOG_EVERY = 20
@@ -46,7 +46,7 @@ def run_stage(
         validate: called with the modules (averaged where averaging is on) whenever a checkpoint is written.
 
     Raises:
-        CheckpointError: `resume` without a checkpoint, or of another configuration.
+        CheckpointError: `resume` without a checkpoint, or of another configuration or data.
     """
     path = folder / f"{stage.name}.pt"
     trainer = _Trainer(stage, device)
@@ -149,12 +149,15 @@ class _Trainer:
             step=self.step,
             seconds=self.seconds,
             metrics=self.metrics,
+            data=self.stage.data,
         )
 
     def restore(self, checkpoint: Checkpoint) -> None:
         """Go on from a checkpoint of the same configuration; only the budget (steps, minutes) may change."""
         if _without_budget(checkpoint.config) != _without_budget(self.stage.config):
             raise CheckpointError(f"the checkpoint of stage '{checkpoint.stage}' has another configuration")
+        if checkpoint.data and checkpoint.data != self.stage.data:
+            raise CheckpointError(f"the checkpoint was trained on {checkpoint.data}, not on {self.stage.data}")
         for name, module in self.stage.modules.items():
             module.load_state_dict(checkpoint.weights[name])
         for name, module in self.averaged.items():

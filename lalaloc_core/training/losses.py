@@ -1,4 +1,4 @@
-"""Training losses of both stages (paper, sections 3.1 and 3.2)."""
+"""Training losses of both stages (paper, sections 3.1, 3.2 and A.1.5)."""
 
 from __future__ import annotations
 
@@ -11,18 +11,20 @@ _SMALLEST_DISTANCE = 1e-4
 
 
 def log_ratio(
-    latent_distance: Float[Tensor, "a n"], chamfer: Float[Tensor, "a n"], positives: int, *, all_pairs: bool
+    latent_distance: Float[Tensor, "a n"], reference: Float[Tensor, "a n"], positives: int, *, all_pairs: bool
 ) -> Tensor:
     """Log-ratio loss (equation 1), averaged over anchors and pairs of neighbours.
 
-    `(log D_i / D_j - log Ch_i / Ch_j)²` for each anchor and pair (i, j) of its neighbours.
+    `(log D_i / D_j - log R_i / R_j)²` for each anchor and pair (i, j) of its neighbours. Between layouts, D is their
+    latents' distance and R their Chamfer distance. The panorama's variants (section A.1.5) measure D from the
+    panorama's latent; R stays (log-ratio') or is the distance of the teacher's latents (knowledge distillation).
 
     Args:
         latent_distance: D of each neighbour to its anchor; the first `positives` columns are the positives.
-        chamfer: Chamfer distance (m) of the same pairs.
+        reference: R of the same pairs, in any unit.
         all_pairs: use every pair of neighbours, else each positive with each negative, as in the paper.
     """
-    excess = _safe_log(latent_distance) - _safe_log(chamfer)
+    excess = _safe_log(latent_distance) - _safe_log(reference)
     if all_pairs:
         return (excess[:, :, None] - excess[:, None, :]).square().mean()
     return (excess[:, :positives, None] - excess[:, None, positives:]).square().mean()

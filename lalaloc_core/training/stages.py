@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
 
 from lalaloc_core.nets import ImageEncoder, LayoutEncoder
+from lalaloc_core.nets.decoder import LayoutDecoder
 from lalaloc_core.nets.resnet import PaperImageEncoder, PaperLayoutEncoder
 from lalaloc_core.nets.ring import RingImageEncoder, RingLayoutEncoder
+from lalaloc_core.training.batches import Batch
 from lalaloc_core.training.config import ImageStageConfig, LayoutStageConfig, OptimiserConfig, TrainConfig
-from lalaloc_core.training.stream import Batch
 
 
 @runtime_checkable
 class Stage(Protocol):
-    """What the training loop needs to know of a stage."""
+    """What the training loop needs to know of a stage; `data` says what it is trained on."""
 
     name: str
     config: TrainConfig
@@ -25,6 +26,9 @@ class Stage(Protocol):
 
     @property
     def settings(self) -> LayoutStageConfig | ImageStageConfig: ...
+
+    @property
+    def data(self) -> dict[str, Any]: ...
 
     def batches(self, first_step: int, workers: int) -> Iterator[Batch]: ...
 
@@ -39,6 +43,16 @@ def build_layout_encoder(config: TrainConfig) -> LayoutEncoder:
 def build_image_encoder(config: TrainConfig) -> ImageEncoder:
     """A fresh image encoder of the configured architecture."""
     return RingImageEncoder(config.ring) if config.architecture == "ring" else PaperImageEncoder(config.paper)
+
+
+def build_decoder(config: TrainConfig) -> LayoutDecoder | None:
+    """A fresh layout decoder, where one is trained."""
+    return LayoutDecoder(config.latent_size) if config.layout.decode_weight else None
+
+
+def first_visit_of_panoramas(settings: ImageStageConfig, first_step: int) -> int:
+    """The visit that a run goes on with at a step: not before those that earlier steps made."""
+    return first_step * (settings.batch // settings.shots_per_home + 1)
 
 
 def build_optimiser(modules: dict[str, nn.Module], config: OptimiserConfig) -> torch.optim.Optimizer:

@@ -1,27 +1,26 @@
-"""Endless streams of training batches, made in worker processes while the network trains; here: layouts."""
+"""Endless streams of training batches, made in worker processes while the network trains."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import torch
-from torch.utils.data import DataLoader, IterableDataset, get_worker_info
+from jaxtyping import Float, Int
 
-from lalaloc_core.conventions import TWO_PI
+from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.render.profile import wall_profile
-from lalaloc_core.sampling import sample_triplets
-from lalaloc_core.synth.splits import TRAIN, home_of
+from lalaloc_core.training.batches import Batch, Stream, Trouble, fruitful, stacked
 from lalaloc_core.training.config import TrainConfig
+from lalaloc_core.training.sources import Group, Source, View
+from lalaloc_core.training.turning import draw_heading, draw_turn
 
-Batch = dict[str, torch.Tensor]
+Row = dict[str, np.ndarray]
 
 
 @dataclass
-class LayoutBatches(IterableDataset[Batch]):
+class LayoutBatches(Stream):
     """Stage 1: triplets of layouts.
 
     Each batch holds `profile_m` (anchors, 1 + neighbours, columns) with the anchor first, `camera_height_m` and
@@ -29,66 +28,115 @@ class LayoutBatches(IterableDataset[Batch]):
     """
 
     config: TrainConfig
+    source: Source
     first: int = 0
 
-    def __iter__(self) -> Iterator[Batch]:
-        stage = self.config.layout
-        worker, workers = worker_share()
-        index = self.first + worker
-        while True:
-            groups: list[dict[str, np.ndarray]] = []
-            while len(groups) < stage.homes_per_step:
-                home, rng = home_of(TRAIN, self.config.seed, index)
-                index += workers
-                group = self._triplets(home.plan, rng)
-                if group is not None:
-                    groups.append(group)
-            yield {key: torch.from_numpy(np.concatenate([group[key] for group in groups])) for key in groups[0]}
+    def __iter__(self) -> Iterator[Batch | Trouble]:
+        size = self.config.layout.homes_per_step * self.config.layout.anchors_per_home
+        return _batches(self._visit, self.source, size, self.first)
 
-    def _triplets(self, plan: FloorPlan, rng: np.random.Generator) -> dict[str, np.ndarray] | None:
-        stage = self.config.layout
-        drawn = sample_triplets(plan, stage.anchors_per_home, stage.triplets, rng)
-        if drawn is None:
-            return None
-        poses, rows = drawn
-        anchors, size = rows.shape
-        # A random heading per anchor turns the whole plan; some negatives keep the place and change the heading.
-        heading = np.repeat(rng.uniform(0.0, TWO_PI, (anchors, 1)), size, axis=1)
+    def _visit(self, visit: int) -> list[Row] | None:
+        rng = self.source.rng(visit)
+        return [self._row(group, rng) for group in self.source.groups(visit)] or None
+
+    def _row(self, group: Group, rng: np.random.Generator) -> Row:
+        stage, turns = self.config.layout, self.config.turns
+        size = len(group.position_m)
+        # One heading for all turns the whole plan; some negatives stand where positives do and look elsewhere.
+        chosen, heading = np.arange(size), np.full(size, draw_heading(turns, rng))
         turned = int(stage.turned_share * stage.triplets.negatives)
         if turned:
-            last = size - turned
-            rows[:, last:] = rows[:, rng.integers(0, 1 + stage.triplets.positives, turned)]
-            heading[:, last:] = rng.uniform(0.0, TWO_PI, (anchors, turned))
-        chosen = rows.reshape(-1)
-        room = poses.room_index[chosen]
-        profile = wall_profile(
-            poses.position_m[chosen].astype(np.float32),
-            heading.reshape(-1).astype(np.float32),
-            plan.walls_m[room].astype(np.float32),
-            self.config.profile_columns,
-        )
-        ceiling = plan.ceiling_heights_m[room].reshape(anchors, size)
-        camera = rng.uniform(1.0, np.minimum(1.9, ceiling.min(axis=1, keepdims=True) - 0.3))
+            chosen[size - turned :] = rng.integers(0, 1 + stage.triplets.positives, turned)
+            heading[size - turned :] = [draw_heading(turns, rng) for _ in range(turned)]
+        room = group.room_index[chosen]
+        profile = layouts(group.plan, group.position_m[chosen], room, heading, self.config.profile_columns)
+        if turns != "none" and rng.random() < 0.5:
+            profile = profile[:, ::-1].copy()
         return {
-            "profile_m": profile.reshape(anchors, size, -1),
-            "camera_height_m": np.broadcast_to(camera, (anchors, size)).astype(np.float32),
-            "ceiling_height_m": ceiling.astype(np.float32),
+            "profile_m": profile,
+            "camera_height_m": np.full(size, group.camera_height_m, dtype=np.float32),
+            "ceiling_height_m": group.plan.ceiling_heights_m[room].astype(np.float32),
         }
 
 
-def loader(dataset: IterableDataset[Batch], workers: int) -> DataLoader[Batch]:
-    """Batches from `workers` processes with one thread each; 0 makes them in this process."""
-    options: dict[str, Any] = {}
-    if workers:
-        options = {"multiprocessing_context": "spawn", "worker_init_fn": _single_thread, "prefetch_factor": 6}
-    return DataLoader(dataset, batch_size=None, num_workers=workers, **options)
+@dataclass
+class PanoramaBatches(Stream):
+    """Stage 2: panoramas with their layouts, turned and mirrored together.
+
+    Each batch holds `image` (b, h, w, 3) uint8, `profile_m` (b, columns), `camera_height_m` and `ceiling_height_m`
+    (b), and where a loss compares with neighbours, `neighbour_profile_m` (b, n, columns) and
+    `neighbour_ceiling_height_m` (b, n), which are turned and mirrored as their panorama is.
+    """
+
+    config: TrainConfig
+    source: Source
+    neighbours: bool = False
+    first: int = 0
+
+    def __iter__(self) -> Iterator[Batch | Trouble]:
+        return _batches(self._visit, self.source, self.config.image.batch, self.first)
+
+    def _visit(self, visit: int) -> list[Row] | None:
+        rng = self.source.rng(visit)
+        drawn = [self._row(view, rng) for view in self.source.views(visit, *self.config.image_size)]
+        return [row for row in drawn if row is not None] or None
+
+    def _row(self, view: View, rng: np.random.Generator) -> Row | None:
+        turn = draw_turn(self.config.turns, view.heading, view.image.shape[1], rng)
+        position, room = view.position_m[None], np.array([view.room_index])
+        if self.neighbours:
+            group = view.group(self.config.layout.triplets, rng)
+            if group is None:
+                return None
+            position, room = group.position_m, group.room_index
+        heading = np.full(len(position), turn.heading)
+        profile = turn.profile(layouts(view.plan, position, room, heading, self.config.profile_columns))
+        ceiling = view.plan.ceiling_heights_m[room].astype(np.float32)
+        row = {
+            "image": turn.picture(view.image),
+            "profile_m": profile[0],
+            "camera_height_m": np.float32(view.camera_height_m),
+            "ceiling_height_m": ceiling[0],
+        }
+        if self.neighbours:
+            row |= {"neighbour_profile_m": profile[1:], "neighbour_ceiling_height_m": ceiling[1:]}
+        return row
 
 
-def _single_thread(_: int) -> None:
-    torch.set_num_threads(1)
+def layouts(
+    plan: FloorPlan,
+    position_m: Float[np.ndarray, "n 2"],
+    room_index: Int[np.ndarray, "n"],
+    heading: Float[np.ndarray, "n"],
+    columns: int,
+) -> Float[np.ndarray, "n {columns}"]:
+    """Wall profiles (m) of some poses of a plan, in single precision."""
+    return wall_profile(
+        position_m.astype(np.float32),
+        heading.astype(np.float32),
+        plan.walls_m[room_index].astype(np.float32),
+        columns,
+    )
 
 
-def worker_share() -> tuple[int, int]:
-    """(number, count) of the worker process this runs in."""
-    info = get_worker_info()
-    return (0, 1) if info is None else (info.id, info.num_workers)
+def _batches(
+    visit: Callable[[int], list[Row] | None], source: Source, size: int, first: int
+) -> Iterator[Batch | Trouble]:
+    """Rows of the visits from number `first` on, `size` to a batch, with what was passed over in between."""
+    rows: list[Row] = []
+    try:
+        for drawn in fruitful(visit, first, source.patience):
+            rows += drawn
+            if len(rows) >= size:
+                yield from _troubles(source)
+                yield stacked(rows[:size])
+                rows = rows[size:]
+    except DatasetError as error:
+        yield from _troubles(source)
+        yield Trouble(error, fatal=True)
+
+
+def _troubles(source: Source) -> Iterator[Trouble]:
+    """What was passed over since the last time."""
+    yield from [Trouble(error, fatal=False) for error in source.problems]
+    source.problems.clear()

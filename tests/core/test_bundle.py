@@ -11,10 +11,13 @@ from typing import Any
 import numpy as np
 import onnx
 import pytest
+import safetensors.torch
 import torch
 
 from lalaloc_core import export
 from lalaloc_core.bundle import (
+    BUNDLE_FILES,
+    DECODER_WEIGHTS,
     HEAD_ONNX,
     IMAGE_ONNX,
     IMAGE_WEIGHTS,
@@ -30,6 +33,9 @@ from lalaloc_core.errors import BundleError, ExportError
 from lalaloc_core.export import PARITY_TOLERANCE, export_bundle
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.optimise import LatentPoseOptimiser
+from lalaloc_core.nets import load_decoder
+from lalaloc_core.nets.decoder import LayoutDecoder
+from lalaloc_core.training.checkpoint import Checkpoint
 from lalaloc_core.training.config import PRESETS, TrainConfig
 from lalaloc_core.training.stages import build_image_encoder, build_layout_encoder
 from tests.core.test_training import small_paper
@@ -62,7 +68,7 @@ class TestExport:
         assert (manifest.name, manifest.version, manifest.architecture) == ("tiny", "test", "ring")
         assert (manifest.image_height, manifest.image_width, manifest.profile_columns) == (32, 64, 32)
         assert (manifest.latent_size, manifest.ring_sectors) == (128, 16)
-        assert set(manifest.files) == {LAYOUT_ONNX, IMAGE_ONNX, HEAD_ONNX, LAYOUT_WEIGHTS, IMAGE_WEIGHTS}
+        assert set(manifest.files) == set(BUNDLE_FILES)
         for name, entry in manifest.files.items():
             assert len(opened_bundle.read(name)) == entry.bytes
         assert manifest.training["parity_max_abs_difference"] < PARITY_TOLERANCE == 1e-4
@@ -97,6 +103,31 @@ class TestExport:
         large = [t for t in model.graph.initializer if np.prod(t.dims) >= 1024]
         assert large
         assert {t.data_type for t in large} == {onnx.TensorProto.FLOAT16}
+
+    def test_the_decoder_of_training_comes_back_from_the_bundle(self, tiny_bundle: Path, opened_bundle: Bundle) -> None:
+        weights = Checkpoint.load(tiny_bundle.parent / "layout.pt", stage="layout").best_weights["decoder"]
+        expected = LayoutDecoder(opened_bundle.manifest.latent_size).eval()
+        expected.load_state_dict(weights)
+        latent = torch.nn.functional.normalize(torch.randn(3, opened_bundle.manifest.latent_size), dim=1)
+        # Half precision is about three digits.
+        torch.testing.assert_close(load_decoder(opened_bundle)(latent), expected(latent), rtol=2e-2, atol=2e-2)
+        stored = safetensors.torch.load(opened_bundle.read(DECODER_WEIGHTS))
+        assert stored["expand.weight"].dtype == torch.float16
+
+    def test_a_bundle_without_a_decoder_is_valid_and_says_so(self, tmp_path: Path) -> None:
+        bundle = exported(tmp_path, TINY)
+        assert DECODER_WEIGHTS not in bundle.manifest.files
+        Encoders(bundle, threads=1)
+        with pytest.raises(BundleError, match=DECODER_WEIGHTS):
+            load_decoder(bundle)
+
+    def test_a_layout_encoder_alone_is_a_bundle_that_answers_layout_queries(self, tmp_path: Path) -> None:
+        bundle = export_bundle(tmp_path, TINY, build_layout_encoder(TINY), None, name="half", version="1")
+        assert not {IMAGE_ONNX, IMAGE_WEIGHTS} & set(bundle.manifest.files)
+        encoders = Encoders(bundle, threads=1)
+        assert encoders.layouts(np.full((1, 32), 2.0), np.array([1.5]), np.array([2.5])).shape == (1, 128)
+        with pytest.raises(BundleError, match="layout queries only"):
+            encoders.query(np.zeros((32, 64, 3), dtype=np.uint8), 0.0, 1.5)
 
     def test_a_network_that_disagrees_is_not_exported(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(export, "PARITY_TOLERANCE", 0.0)

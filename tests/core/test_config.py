@@ -92,6 +92,42 @@ def test_sizes_follow_the_architecture() -> None:
     assert (paper.profile_columns, paper.image_size) == (256, (256, 512))
 
 
+@pytest.mark.parametrize(
+    ("path", "value", "message"),
+    [
+        (["layout", "cloud_columns"], 24, r"32 profile columns cannot be thinned to 24 \(layout\.cloud_columns\)"),
+        (["ring", "profile_columns"], 80, r"80 profile columns cannot be thinned to \d+"),
+        (["layout"], {"log_ratio_weight": 0.0, "decode_weight": 0.0}, "nothing is learnt"),
+        (["image"], {"l2_weight": 0.0, "profile_weight": 1.0}, "nothing is learnt"),
+        (["turns"], "halves", r"config\.turns is 'halves'"),
+        (["paper", "layout_depth"], 34, r"config\.paper\.layout_depth is 34"),
+        (["paper", "layout_predictor"], "linear", r"config\.paper\.layout_predictor is 'linear'"),
+    ],
+)
+def test_what_cannot_be_trained_is_refused(path: list[str], value: Any, message: str) -> None:
+    raw = PRESETS["tiny"].to_dict()
+    inner = raw
+    for key in path[:-1]:
+        inner = inner[key]
+    inner[path[-1]] = value
+    with pytest.raises(ConfigError, match=message):
+        TrainConfig.from_dict(raw)
+
+
+def test_other_headings_are_no_negatives_where_nothing_is_turned() -> None:
+    config = PRESETS["ring"]
+    assert config.layout.turned_share > 0.0
+    with pytest.raises(ConfigError, match=r"turned_share is 0\.25"):
+        dataclasses.replace(config, turns="none")
+
+
+def test_configurations_from_before_the_comparisons_still_load() -> None:
+    raw = PRESETS["paper"].to_dict()
+    del raw["turns"], raw["layout"]["log_ratio_weight"], raw["image"]["log_ratio_weight"], raw["image"]["kd_weight"]
+    del raw["paper"]["layout_predictor"], raw["paper"]["width"]
+    assert TrainConfig.from_dict(raw) == PRESETS["paper"]
+
+
 class TestLearningRate:
     def test_cosine_warms_up_then_falls_to_a_hundredth(self) -> None:
         config = OptimiserConfig(learning_rate=1.0, warmup=0.1)

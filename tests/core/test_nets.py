@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import json
+from typing import Any
 
 import pytest
 import safetensors.torch
@@ -77,6 +79,35 @@ class TestPaper:
         encoder = PaperLayoutEncoder(SMALL_PAPER).eval()
         profile, camera, ceiling = layouts(2, 64)
         assert not torch.allclose(encoder(profile, camera, ceiling), encoder(profile, camera, ceiling + 0.5), atol=1e-4)
+
+    @pytest.mark.parametrize("depth", [18, 50])
+    @pytest.mark.parametrize("predictor", ["fc", "mlp"])
+    def test_every_architecture_of_the_comparison_comes_back_from_a_manifest(self, depth: Any, predictor: Any) -> None:
+        torch.manual_seed(0)
+        config = dataclasses.replace(SMALL_PAPER, layout_depth=depth, layout_predictor=predictor, width=8)
+        encoder = PaperLayoutEncoder(config).eval()
+        sizes = json.loads(json.dumps(dataclasses.asdict(config)))
+        loaded = load_layout_encoder("paper", sizes, safetensors.torch.save(encoder.state_dict())).eval()
+        inputs = layouts(3, 64)
+        torch.testing.assert_close(loaded(*inputs), encoder(*inputs))
+
+    def test_the_two_layer_predictor_has_one_hidden_layer_as_wide_as_the_features(self) -> None:
+        encoder = PaperLayoutEncoder(dataclasses.replace(SMALL_PAPER, layout_predictor="mlp"))
+        shapes = {name: tuple(p.shape) for name, p in encoder.fc.named_parameters() if p.ndim == 2}
+        assert list(shapes.values()) == [(512, 512), (128, 512)]
+
+    def test_manifests_from_before_the_options_still_load(self) -> None:
+        old = dataclasses.asdict(SMALL_PAPER)
+        del old["layout_predictor"], old["width"]
+        state = PaperLayoutEncoder(SMALL_PAPER).state_dict()
+        assert "fc.weight" in state
+        load_layout_encoder("paper", old, safetensors.torch.save(state))
+
+    @pytest.mark.parametrize("depth", [18, 50])
+    def test_a_narrow_backbone_has_the_same_layers(self, depth: int) -> None:
+        narrow, usual = ResNet(depth, width=16), ResNet(depth)
+        assert narrow.state_dict().keys() == usual.state_dict().keys()
+        assert 4 * narrow.channels == usual.channels
 
 
 class TestRing:

@@ -17,9 +17,10 @@ from lalaloc_core.sampling import (
     grid_size,
     pose_grid,
     random_poses,
+    sample_neighbours,
     sample_triplets,
 )
-from tests.strategies import crooked_flat, plan_of, plans, rectangle, room_polygons, seeds
+from tests.strategies import crooked_flat, plan_document, plan_of, plans, rectangle, room_polygons, seeds
 
 BIG = plan_of(rectangle(8.0, 6.0), rectangle(6.0, 6.0, at=(8.2, 0.0)))
 
@@ -149,3 +150,56 @@ class TestTriplets:
 
     def test_a_plan_too_small_for_negatives_gives_none_rather_than_false_negatives(self) -> None:
         assert sample_triplets(plan_of(rectangle(1.5, 1.2)), 1, TripletSampling(), np.random.default_rng(0)) is None
+
+
+class TestNeighbours:
+    @given(seeds(), st.integers(0, 6), st.integers(1, 20))
+    def test_positives_are_near_and_negatives_far_from_a_given_pose(
+        self, seed: int, positives: int, negatives: int
+    ) -> None:
+        rng = np.random.default_rng(seed)
+        sampling = TripletSampling(positives=positives, negatives=negatives)
+        anchor = random_poses(BIG, 1, rng)
+        poses = sample_neighbours(BIG, anchor, sampling, rng)
+        assert poses is not None
+        assert len(poses) == len(poses.room_index) == positives + negatives
+        distance = np.linalg.norm(poses.position_m - anchor.position_m, axis=1)
+        assert (distance[:positives] < sampling.positive_radius_m).all()
+        assert (distance[positives:] > sampling.negative_radius_m).all()
+        assert (wall_distance(BIG, poses) > 0.0).all()
+
+    def test_the_same_seed_gives_the_same_neighbours(self) -> None:
+        anchor = random_poses(BIG, 1, np.random.default_rng(0))
+        first, second = (sample_neighbours(BIG, anchor, TripletSampling(), np.random.default_rng(7)) for _ in range(2))
+        assert first is not None
+        assert second is not None
+        np.testing.assert_array_equal(first.position_m, second.position_m)
+
+    def test_a_plan_without_a_far_place_gives_none(self) -> None:
+        plan = plan_of(rectangle(1.5, 1.2))
+        anchor = random_poses(plan, 1, np.random.default_rng(0))
+        assert sample_neighbours(plan, anchor, TripletSampling(), np.random.default_rng(0)) is None
+
+    @given(seeds())
+    def test_rooms_too_low_for_the_camera_are_left_out(self, seed: int) -> None:
+        plan = plan_of(rectangle(3.0, 3.0), rectangle(6.0, 6.0, at=(3.1, 0.0)), rectangle(6.0, 6.0, at=(3.1, 6.1)))
+        document = plan.to_dict()
+        document["rooms"][1]["ceiling_height_m"] = 2.0
+        plan, rng = FloorPlan.from_dict(document), np.random.default_rng(seed)
+        # The anchor stands at the wall to the low room, so that positives are drawn there as well.
+        anchor = PoseSet(np.array([[2.9, 1.0]]), np.array([0]))
+        poses = sample_neighbours(plan, anchor, TripletSampling(positives=8, negatives=4), rng, lowest_ceiling_m=2.2)
+        assert poses is not None
+        assert set(poses.room_index[:8]) == {0}
+        assert set(poses.room_index[8:]) <= {0, 2}
+
+    def test_a_pose_that_a_low_room_covers_is_its_own_neighbour(self) -> None:
+        document = plan_document(rectangle(8.0, 8.0), rectangle(8.0, 8.0, at=(0.5, 0.0)))
+        document["rooms"][0]["ceiling_height_m"] = 2.0
+        plan = FloorPlan.from_dict(document)
+        anchor = PoseSet(np.array([[4.0, 4.0]]), np.array([1]))
+        poses = sample_neighbours(
+            plan, anchor, TripletSampling(positives=2, negatives=4), np.random.default_rng(0), lowest_ceiling_m=2.2
+        )
+        assert poses is not None
+        assert set(poses.room_index) == {1}

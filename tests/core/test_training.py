@@ -5,10 +5,11 @@ from __future__ import annotations
 import csv
 import dataclasses
 import itertools
+import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -17,23 +18,50 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from lalaloc_core.errors import CheckpointError
+from lalaloc_core.bundle import DECODER_WEIGHTS, IMAGE_ONNX
+from lalaloc_core.conventions import TWO_PI
+from lalaloc_core.errors import CheckpointError, ConfigError
+from lalaloc_core.metrics import chamfer_distance
+from lalaloc_core.nets import LayoutEncoder
 from lalaloc_core.nets.ring import RingLayoutEncoder
+from lalaloc_core.render.depth import back_project, layout_depth
+from lalaloc_core.sampling import TripletSampling, random_poses
 from lalaloc_core.synth.splits import TEST, TRAIN, VALIDATION, home_of
-from lalaloc_core.training import stream
+from lalaloc_core.training import batches, objective, sources
+from lalaloc_core.training.batches import Batch, receive
 from lalaloc_core.training.checkpoint import Checkpoint
-from lalaloc_core.training.config import PRESETS, ImageStageConfig, OptimiserConfig, TrainConfig
+from lalaloc_core.training.config import PRESETS, ImageStageConfig, OptimiserConfig, TrainConfig, Turns
+from lalaloc_core.training.end_to_end import EndToEndStage
 from lalaloc_core.training.image_stage import ImageStage
 from lalaloc_core.training.layout_stage import LayoutStage
 from lalaloc_core.training.loop import run_stage
-from lalaloc_core.training.panoramas import PanoramaBatches, turn_and_mirror
 from lalaloc_core.training.run import export_run, train_image
+from lalaloc_core.training.sources import GeneratedSource
 from lalaloc_core.training.stages import Stage, build_layout_encoder
-from lalaloc_core.training.stream import Batch, LayoutBatches
-from tests.strategies import seeds
+from lalaloc_core.training.stream import LayoutBatches, PanoramaBatches, layouts
+from lalaloc_core.training.turning import draw_turn
+from tests.strategies import crooked_flat, seeds
 
 CPU = torch.device("cpu")
 TINY = PRESETS["tiny"]
+
+
+def layout_batches(config: TrainConfig = TINY, first: int = 0) -> Iterator[Batch]:
+    """Stage 1's batches of generated homes, made in this process."""
+    return receive(LayoutBatches(config, GeneratedSource(config), first), 0)
+
+
+def panorama_batches(config: TrainConfig = TINY, *, neighbours: bool = False) -> Iterator[Batch]:
+    """Stage 2's batches of generated homes, made in this process."""
+    return receive(PanoramaBatches(config, GeneratedSource(config), neighbours), 0)
+
+
+def layout_stage(config: TrainConfig = TINY) -> LayoutStage:
+    return LayoutStage(config, GeneratedSource(config))
+
+
+def image_stage(config: TrainConfig, teacher: LayoutEncoder) -> ImageStage:
+    return ImageStage(config, GeneratedSource(config), teacher)
 
 
 class LineStage:
@@ -50,6 +78,10 @@ class LineStage:
     @property
     def settings(self) -> ImageStageConfig:
         return self.config.image
+
+    @property
+    def data(self) -> dict[str, Any]:
+        return {"description": "points"}
 
     def batches(self, first_step: int, workers: int) -> Iterator[Batch]:
         for step in itertools.count(first_step):
@@ -221,7 +253,7 @@ class TestStreams:
         assert len(outlines) == len(plans)
 
     def test_a_layout_batch_is_anchors_with_their_neighbours(self) -> None:
-        batch = next(iter(LayoutBatches(TINY)))
+        batch = next(layout_batches())
         stage = TINY.layout
         anchors = stage.homes_per_step * stage.anchors_per_home
         size = 1 + stage.triplets.positives + stage.triplets.negatives
@@ -238,7 +270,7 @@ class TestStreams:
 
     def test_turned_negatives_are_other_headings_of_the_anchor_s_surroundings(self) -> None:
         layout = dataclasses.replace(TINY.layout, turned_share=0.5)
-        batch = next(iter(LayoutBatches(dataclasses.replace(TINY, layout=layout))))
+        batch = next(layout_batches(dataclasses.replace(TINY, layout=layout)))
         profile = batch["profile_m"].sort(dim=2).values
         # Turning changes the order of the columns, not the distances: so near a place looks alike when sorted.
         change = (profile[:, 1:] - profile[:, :1]).abs().median(dim=2).values
@@ -256,19 +288,19 @@ class TestStreams:
                 return home_of(split, seed, index)
 
             info = SimpleNamespace(id=worker, num_workers=2)
-            monkeypatch.setattr(stream, "get_worker_info", lambda info=info: info)
-            monkeypatch.setattr(stream, "home_of", recording)
-            list(itertools.islice(LayoutBatches(TINY, first=100), 2))
+            monkeypatch.setattr(batches, "get_worker_info", lambda info=info: info)
+            monkeypatch.setattr(sources, "home_of", recording)
+            list(itertools.islice(LayoutBatches(TINY, GeneratedSource(TINY), first=100), 2))
         assert all(index >= 100 and index % 2 == worker for worker, indices in drawn.items() for index in indices)
         assert not set(drawn[0]) & set(drawn[1])
 
     def test_a_resumed_stage_goes_on_with_new_homes(self) -> None:
-        seen = list(itertools.islice(LayoutStage(TINY).batches(0, 0), 2))
-        resumed = next(LayoutStage(TINY).batches(2, 0))
+        seen = list(itertools.islice(layout_stage().batches(0, 0), 2))
+        resumed = next(layout_stage().batches(2, 0))
         assert not any(torch.equal(resumed["profile_m"], batch["profile_m"]) for batch in seen)
 
     def test_a_panorama_batch_is_pictures_with_their_layouts(self) -> None:
-        batch = next(iter(PanoramaBatches(TINY)))
+        batch = next(panorama_batches())
         count, (height, width) = TINY.image.batch, TINY.image_size
         assert batch["image"].shape == (count, height, width, 3)
         assert batch["image"].dtype == torch.uint8
@@ -276,22 +308,58 @@ class TestStreams:
         assert batch["camera_height_m"].shape == batch["ceiling_height_m"].shape == (count,)
         assert bool(torch.isfinite(batch["profile_m"]).all())
         assert bool((batch["camera_height_m"] < batch["ceiling_height_m"]).all())
-        again = next(iter(PanoramaBatches(TINY)))
+        again = next(panorama_batches())
         assert all(torch.equal(batch[key], again[key]) for key in batch)
 
-    @given(seed=seeds(), pixels_per_column=st.sampled_from([1, 2, 4]))
-    def test_turning_and_mirroring_keep_picture_and_profile_together(self, seed: int, pixels_per_column: int) -> None:
-        profile = torch.arange(16.0) + 1.0
-        image = profile.repeat_interleave(pixels_per_column)[None, :, None].expand(2, -1, 3).clone()
-        turned_image, turned = turn_and_mirror(image, profile, np.random.default_rng(seed))
-        assert torch.equal(turned_image[0, :, 0], turned.repeat_interleave(pixels_per_column))
-        assert sorted(turned.tolist()) == profile.tolist()
+    @pytest.mark.parametrize("turns", get_args(Turns))
+    @given(seed=seeds(), heading=st.floats(-7.0, 7.0), columns=st.sampled_from([16, 24, 48]))
+    def test_a_turned_panorama_and_its_layout_stay_together(
+        self, turns: Turns, seed: int, heading: float, columns: int
+    ) -> None:
+        rng = np.random.default_rng(seed)
+        plan, width = crooked_flat(), 48
+        poses = random_poses(plan, 1, rng)
 
-    def test_all_turns_and_both_hands_occur(self) -> None:
-        profile = torch.arange(8.0)
+        def seen(heading: float, columns: int) -> np.ndarray:
+            return layouts(plan, poses.position_m, poses.room_index, np.array([heading]), columns)[0]
+
+        # A picture that shows the distance to the wall, so that its layout can be read off it.
+        image = np.repeat(seen(heading, width)[None, :, None], 3, axis=2)
+        turn = draw_turn(turns, heading, width, rng)
+        shown = turn.picture(image)[0, :, 0]
+        np.testing.assert_allclose(shown, turn.profile(seen(turn.heading, width)), rtol=1e-4)
+        # Profiles need not have as many columns as the picture: mirroring keeps every resolution together.
+        coarse = turn.profile(seen(turn.heading, columns))
+        unturned = seen(turn.heading, columns)
+        np.testing.assert_array_equal(coarse[::-1] if turn.mirrored else coarse, unturned)
+        quarters = turn.heading / (math.pi / 2)
+        if turns != "any":
+            assert abs(quarters - round(quarters)) * (math.pi / 2) <= math.pi / width + 1e-9
+        if turns == "none":
+            assert abs(turn.heading) <= math.pi / width + 1e-9
+            assert not turn.mirrored
+
+    @pytest.mark.parametrize(("turns", "count"), [("any", 16), ("quarters", 8), ("none", 1)])
+    def test_all_turns_and_both_hands_occur(self, turns: Turns, count: int) -> None:
         rng = np.random.default_rng(0)
-        seen = {tuple(turn_and_mirror(profile[None, :, None], profile, rng)[1].tolist()) for _ in range(300)}
-        assert len(seen) == 16
+        drawn = [draw_turn(turns, 0.0, 8, rng) for _ in range(300)]
+        assert len({(round(turn.heading % TWO_PI, 6), turn.mirrored) for turn in drawn}) == count
+
+    def test_neighbours_are_turned_and_mirrored_as_their_panorama_is(self) -> None:
+        batch = next(panorama_batches(neighbours=True))
+        sampling = TINY.layout.triplets
+        count = sampling.positives + sampling.negatives
+        assert batch["neighbour_profile_m"].shape == (TINY.image.batch, count, TINY.profile_columns)
+        assert batch["neighbour_ceiling_height_m"].shape == (TINY.image.batch, count)
+        assert bool((batch["neighbour_ceiling_height_m"] > batch["camera_height_m"][:, None]).all())
+        # Layouts half a metre away look alike only when seen along the same heading and not in a mirror.
+        own = batch["profile_m"][:, None].log()
+        positives = batch["neighbour_profile_m"][:, : sampling.positives].log()
+        matched = (positives - own).abs().median(dim=2).values
+        turned = (positives.roll(TINY.profile_columns // 4, dims=2) - own).abs().median(dim=2).values
+        mirrored = (positives.flip(2) - own).abs().median(dim=2).values
+        assert matched.median() < 0.5 * turned.median()
+        assert matched.median() < 0.5 * mirrored.median()
 
 
 class TestStages:
@@ -306,18 +374,18 @@ class TestStages:
             return float(sum(stage.losses(batch).values()))
 
     def test_the_layout_loss_falls_on_layouts_not_seen(self, tmp_path: Path) -> None:
-        stage = LayoutStage(TINY)
+        stage = layout_stage()
         unseen = next(stage.batches(1000, 0))
         before = self.total(stage, unseen)
         run_stage(stage, tmp_path, device=CPU, workers=0)
         assert self.total(stage, unseen) < 0.8 * before
 
     def test_a_layout_stage_has_the_losses_it_is_asked_for(self) -> None:
-        batch = next(iter(LayoutBatches(TINY)))
+        batch = next(layout_batches())
 
         def terms(**changes: Any) -> dict[str, Tensor]:
             config = dataclasses.replace(TINY, layout=dataclasses.replace(TINY.layout, **changes))
-            return LayoutStage(config).losses(batch)
+            return layout_stage(config).losses(batch)
 
         assert set(terms()) == {"log_ratio", "scale", "decode"}
         assert set(terms(scale_weight=0.0, decode_weight=0.0)) == {"log_ratio"}
@@ -332,7 +400,7 @@ class TestStages:
         )
         teacher = build_layout_encoder(config)
         before = {key: value.clone() for key, value in teacher.state_dict().items()}
-        stage = ImageStage(config, teacher)
+        stage = image_stage(config, teacher)
         batch = self.repeated(stage, monkeypatch)
         first = self.total(stage, batch)
         run_stage(stage, tmp_path, device=CPU, workers=0)
@@ -346,7 +414,7 @@ class TestStages:
     def test_a_perfect_image_encoder_has_no_latent_loss(self, monkeypatch: pytest.MonkeyPatch) -> None:
         teacher = build_layout_encoder(TINY)
         assert isinstance(teacher, RingLayoutEncoder)
-        stage = ImageStage(TINY, teacher)
+        stage = image_stage(TINY, teacher)
         batch = next(stage.batches(0, 0))
         profile, camera, ceiling = batch["profile_m"], batch["camera_height_m"], batch["ceiling_height_m"]
         perfect = SimpleNamespace(
@@ -358,17 +426,118 @@ class TestStages:
     def test_the_paper_s_image_loss_is_the_latent_distance_alone(self) -> None:
         config = small_paper()
         teacher = build_layout_encoder(config)
-        stage = ImageStage(config, teacher)
+        stage = image_stage(config, teacher)
         terms = stage.losses(next(stage.batches(0, 0)))
         assert set(terms) == {"l2"}
         assert 0.0 < terms["l2"].item() < 2.0
         terms["l2"].backward()
 
+    @pytest.mark.parametrize("architecture", ["paper", "ring"])
+    @pytest.mark.parametrize(
+        ("weights", "names"),
+        [
+            ({"l2_weight": 0.0, "log_ratio_weight": 1.0}, {"log_ratio"}),
+            ({"log_ratio_weight": 2.0}, {"l2", "log_ratio"}),
+            ({"kd_weight": 1.0}, {"l2", "kd"}),
+        ],
+    )
+    def test_an_image_stage_has_the_losses_it_is_asked_for(
+        self, architecture: Any, weights: dict[str, float], names: set[str]
+    ) -> None:
+        config = dataclasses.replace(small_paper(), ring=TINY.ring, architecture=architecture)
+        config = dataclasses.replace(config, image=dataclasses.replace(config.image, **weights))
+        stage = image_stage(config, build_layout_encoder(config))
+        terms = stage.losses(next(stage.batches(0, 0)))
+        assert set(terms) == names
+        torch.stack(list(terms.values())).sum().backward()
+        assert all(p.grad is None for p in stage.teacher.parameters())
+        assert any(bool(p.grad.abs().sum() > 0) for p in stage.encoder.parameters() if p.grad is not None)
+
+    def test_the_image_losses_are_those_of_the_equations(self) -> None:
+        config = small_paper()
+        weights = {"l2_weight": 0.0, "log_ratio_weight": 0.5, "kd_weight": 0.25}
+        config = dataclasses.replace(config, image=dataclasses.replace(config.image, **weights))
+        stage = image_stage(config, build_layout_encoder(config))
+        batch = next(stage.batches(0, 0))
+        stage.encoder.eval()
+        with torch.no_grad():
+            terms = stage.losses(batch)
+            f = stage.encoder(batch["image"])
+        ratios, distilled = [], []
+        for p in range(len(f)):
+            profile = torch.cat([batch["profile_m"][p : p + 1], batch["neighbour_profile_m"][p]])
+            ceiling = torch.cat([batch["ceiling_height_m"][p : p + 1], batch["neighbour_ceiling_height_m"][p]])
+            camera = batch["camera_height_m"][p].expand(len(profile))
+            with torch.no_grad():
+                g = stage.teacher(profile, camera, ceiling)
+            thinned = profile[:, :: profile.shape[1] // config.layout.cloud_columns]
+            cloud = back_project(layout_depth(thinned, camera, ceiling, config.layout.cloud_rows))
+            for j in range(2, len(profile)):
+                latent = math.log((g[1] - f[p]).norm() / (g[j] - f[p]).norm())
+                structure = math.log(
+                    chamfer_distance(cloud[1:2], cloud[:1]).item()
+                    / chamfer_distance(cloud[j : j + 1], cloud[:1]).item()
+                )
+                ratios.append((latent - structure) ** 2)
+                distilled.append((latent - math.log((g[1] - g[0]).norm() / (g[j] - g[0]).norm())) ** 2)
+        assert terms["log_ratio"].item() == pytest.approx(0.5 * np.mean(ratios), rel=1e-3)
+        assert terms["kd"].item() == pytest.approx(0.25 * np.mean(distilled), rel=1e-3)
+
+    def test_losses_that_are_left_out_cost_nothing(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        def refused(*_: object) -> None:
+            raise AssertionError("the Chamfer distance was asked for")
+
+        monkeypatch.setattr(objective, "chamfer_to_anchors", refused)
+        layout = dataclasses.replace(TINY.layout, log_ratio_weight=0.0, scale_weight=0.0, decode_weight=1.0)
+        stage = layout_stage(dataclasses.replace(TINY, layout=layout))
+        assert set(stage.losses(next(layout_batches()))) == {"decode"}
+        assert "neighbour_profile_m" not in next(image_stage(TINY, build_layout_encoder(TINY)).batches(0, 0))
+        layout = dataclasses.replace(TINY.layout, decode_weight=0.0)
+        assert set(layout_stage(dataclasses.replace(TINY, layout=layout)).modules) == {"layout_encoder"}
+
+    def test_end_to_end_the_layout_branch_learns_as_if_alone(self) -> None:
+        config = small_paper()
+        stage = EndToEndStage(config, GeneratedSource(config))
+        batch = next(stage.batches(0, 0))
+        terms = stage.losses(batch)
+        assert set(terms) == {"log_ratio", "decode", "l2"}
+        terms["l2"].backward()
+        assert all(p.grad is None for p in stage.modules["layout_encoder"].parameters())
+        assert all(p.grad is not None for p in stage.modules["image_encoder"].parameters())
+        stage.encoder.zero_grad(set_to_none=True)
+        terms = stage.losses(batch)
+        (terms["log_ratio"] + terms["decode"]).backward()
+        assert all(p.grad is None for p in stage.modules["image_encoder"].parameters())
+        assert all(p.grad is not None for p in stage.modules["layout_encoder"].parameters())
+
+    def test_end_to_end_is_for_branches_without_a_shared_head(self) -> None:
+        with pytest.raises(ConfigError, match="'ring'"):
+            EndToEndStage(TINY, GeneratedSource(TINY))
+
+    def test_end_to_end_exports_as_two_stages_do(self, tmp_path: Path) -> None:
+        config = small_paper()
+        config = dataclasses.replace(config, image=dataclasses.replace(config.image, steps=1))
+        stage = EndToEndStage(config, GeneratedSource(config))
+        run_stage(stage, tmp_path, device=CPU, workers=0)
+        bundle = export_run(tmp_path, tmp_path / "bundle", name="both", version="1")
+        assert {IMAGE_ONNX, DECODER_WEIGHTS} <= set(bundle.manifest.files)
+        assert bundle.manifest.training["end-to-end"]["steps"] == 1
+        (tmp_path / "layout.pt").write_bytes(b"")
+        with pytest.raises(CheckpointError, match="both"):
+            export_run(tmp_path, tmp_path / "bundle", name="both", version="1")
+
 
 def small_paper() -> TrainConfig:
     """The `paper` architecture at sizes a test can afford."""
     paper = dataclasses.replace(
-        PRESETS["paper"].paper, image_depth=18, layout_height=32, profile_columns=64, image_height=64, image_width=128
+        PRESETS["paper"].paper,
+        image_depth=18,
+        width=8,
+        layout_height=32,
+        profile_columns=64,
+        image_height=64,
+        image_width=128,
     )
+    layout = dataclasses.replace(PRESETS["paper"].layout, triplets=TripletSampling(positives=1, negatives=4))
     image = dataclasses.replace(PRESETS["paper"].image, batch=2)
-    return dataclasses.replace(PRESETS["paper"], paper=paper, image=image)
+    return dataclasses.replace(PRESETS["paper"], paper=paper, layout=layout, image=image)

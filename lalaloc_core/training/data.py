@@ -1,0 +1,100 @@
+"""Where training and its validation get their scenes from: a data set, or the generator."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import nn
+
+from lalaloc_core.data.dataset import Appearance, Camera, Dataset, Scene, load_scenes
+from lalaloc_core.data.generated import GeneratedScenes, RenderedPhotograph
+from lalaloc_core.errors import DatasetError
+from lalaloc_core.training.config import TrainConfig
+from lalaloc_core.training.sources import GeneratedSource, SceneSource, Source
+from lalaloc_core.training.validate import ImageValidation
+
+_LOG = logging.getLogger(__name__)
+_SHOTS_PER_HOME = 4
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrainingData:
+    """What to train on.
+
+    Attributes:
+        dataset: None draws homes with the generator, without touching disk.
+        skip_bad: pass over files of the data set that cannot be used, naming each once.
+        textures: folder of material pictures for the generator; without it all are procedural.
+        validation_scenes: at most this many, spread evenly over the split.
+    """
+
+    dataset: Dataset | None = None
+    skip_bad: bool = False
+    textures: Path | None = None
+    validation_scenes: int = 25
+
+    def source(self, config: TrainConfig) -> Source:
+        """What training looks at."""
+        if self.dataset is None:
+            return GeneratedSource(config, self.textures)
+        return SceneSource(config, self.dataset, self.skip_bad)
+
+    def validation(self, config: TrainConfig) -> list[Scene]:
+        """Validation scenes, none where the data set has none.
+
+        Raises:
+            DatasetError: a scene cannot be used and `skip_bad` is off.
+        """
+        if self.dataset is None:
+            generated = GeneratedScenes(
+                homes=self.validation_scenes,
+                shots_per_home=_SHOTS_PER_HOME,
+                seed=config.seed,
+                furniture=None,
+                textures=self.textures,
+            )
+            return [_with_levels(scene) for scene in load_scenes(generated, generated.scenes("validation"))]
+        names = self.dataset.scenes("validation")
+        chosen = names[:: -(-len(names) // self.validation_scenes)] if names else []
+        problems: list[DatasetError] | None = [] if self.skip_bad else None
+        scenes = list(load_scenes(self.dataset, chosen, problems))
+        _log(problems)
+        return scenes
+
+    def image_validation(
+        self, config: TrainConfig, scenes: Sequence[Scene], layout_encoder: nn.Module | None, device: torch.device
+    ) -> ImageValidation:
+        """Panorama queries in those scenes, asked in the data set's usual look; see `ImageValidation`.
+
+        Raises:
+            DatasetError: a photograph cannot be read and `skip_bad` is off.
+        """
+        usual = None if self.dataset is None else self.dataset.appearances[0]
+        problems: list[DatasetError] | None = [] if self.skip_bad else None
+        validation = ImageValidation(config, scenes, layout_encoder, device, usual, problems)
+        _log(problems)
+        return validation
+
+
+def _log(problems: list[DatasetError] | None) -> None:
+    for number, problem in enumerate(problems or [], start=1):
+        _LOG.warning("left out of validation, number %d: %s", number, problem)
+
+
+def _with_levels(scene: Scene) -> Scene:
+    """A generated scene whose photographs say how full the rooms were drawn."""
+
+    def told(camera: Camera) -> Camera:
+        photographs = {
+            Appearance(photograph.shot.furniture): photograph
+            for photograph in camera.photographs.values()
+            if isinstance(photograph, RenderedPhotograph)
+        }
+        return dataclasses.replace(camera, photographs=photographs)
+
+    return dataclasses.replace(scene, cameras=tuple(told(camera) for camera in scene.cameras))

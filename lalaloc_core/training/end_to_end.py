@@ -1,0 +1,65 @@
+"""Both branches at once, which the paper compares with its two stages (section 6, "End-to-End Training")."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from torch import Tensor, nn
+
+from lalaloc_core.errors import ConfigError
+from lalaloc_core.training import losses
+from lalaloc_core.training.batches import Batch, receive
+from lalaloc_core.training.config import ImageStageConfig, TrainConfig
+from lalaloc_core.training.objective import LayoutObjective, anchors_with_neighbours
+from lalaloc_core.training.sources import Source
+from lalaloc_core.training.stages import (
+    build_decoder,
+    build_image_encoder,
+    build_layout_encoder,
+    first_visit_of_panoramas,
+)
+from lalaloc_core.training.stream import PanoramaBatches
+
+
+class EndToEndStage:
+    """The layout branch learns as in stage 1; the image branch follows its latents, which get no gradient from that.
+
+    Raises:
+        ConfigError: an architecture whose branches share their head cannot be trained like that.
+    """
+
+    name = "end-to-end"
+
+    def __init__(self, config: TrainConfig, source: Source) -> None:
+        if config.architecture != "paper":
+            raise ConfigError(f"config.architecture is '{config.architecture}', end-to-end training knows 'paper' only")
+        self.config = config
+        self.source = source
+        layout_encoder, decoder = build_layout_encoder(config), build_decoder(config)
+        self.objective = LayoutObjective(config.layout, layout_encoder, decoder)
+        self.encoder = build_image_encoder(config)
+        self.modules: dict[str, nn.Module] = {"layout_encoder": layout_encoder, "image_encoder": self.encoder}
+        if decoder is not None:
+            self.modules["decoder"] = decoder
+
+    @property
+    def settings(self) -> ImageStageConfig:
+        """Schedule, batch and the weight of the latent distance; the rest is in `config.layout`."""
+        return self.config.image
+
+    @property
+    def data(self) -> dict[str, Any]:
+        """What is trained on."""
+        return self.source.data
+
+    def batches(self, first_step: int, workers: int) -> Iterator[Batch]:
+        """Panorama batches with neighbours."""
+        first = first_visit_of_panoramas(self.settings, first_step)
+        return receive(PanoramaBatches(self.config, self.source, True, first), workers)
+
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
+        """Weighted losses of a batch by name; their sum is minimised."""
+        terms, latent = self.objective(anchors_with_neighbours(batch))
+        distance = losses.l2(self.encoder(batch["image"]).float(), latent[:, 0].detach())
+        return {**terms, "l2": self.settings.l2_weight * distance}

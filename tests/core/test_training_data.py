@@ -1,0 +1,280 @@
+"""Training from a data set on disk: what is drawn, in which order, and what happens to files that cannot be used."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import itertools
+import json
+import logging
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from lalaloc_core.cli import main
+from lalaloc_core.data.folder import OwnData
+from lalaloc_core.data.generated import GeneratedScenes
+from lalaloc_core.errors import CheckpointError, DatasetError
+from lalaloc_core.sampling import random_poses
+from lalaloc_core.training.batches import Batch, receive
+from lalaloc_core.training.checkpoint import Checkpoint
+from lalaloc_core.training.config import PRESETS, TrainConfig
+from lalaloc_core.training.data import TrainingData
+from lalaloc_core.training.recent import Recent
+from lalaloc_core.training.run import train_layout
+from lalaloc_core.training.sources import SceneSource
+from lalaloc_core.training.stream import LayoutBatches, PanoramaBatches, layouts
+from lalaloc_core.training.validate import ImageValidation, LayoutValidation
+from tests.strategies import crooked_flat
+
+CPU = torch.device("cpu")
+SCENES, CAMERAS, HEADING_DEG = 5, 3, 30.0
+# Small batches, and nothing turned, so that what is drawn can be told apart.
+CONFIG = dataclasses.replace(
+    PRESETS["tiny"],
+    turns="none",
+    layout=dataclasses.replace(PRESETS["tiny"].layout, homes_per_step=2, anchors_per_home=1, steps=2),
+    image=dataclasses.replace(PRESETS["tiny"].image, batch=4, shots_per_home=1, steps=2),
+)
+
+
+@pytest.fixture
+def data(tmp_path: Path) -> OwnData:
+    """Scenes 0 to 4 for training and one more for validation; panorama k of scene s is grey number 40 s + 10 k."""
+    root = tmp_path / "data"
+    plan = crooked_flat()
+    with_split = [(f"scene {number}", "train") for number in range(SCENES)] + [("scene v", "validation")]
+    for number, (name, _) in enumerate(with_split):
+        folder = root / name
+        folder.mkdir(parents=True)
+        (folder / "plan.json").write_text(json.dumps(plan.to_dict()), encoding="utf-8")
+        poses = random_poses(plan, CAMERAS, np.random.default_rng(number), 0.3)
+        with (folder / "poses.csv").open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(["panorama", "x_m", "y_m", "heading_deg", "camera_height_m"])
+            for k, (x, y) in enumerate(poses.position_m):
+                writer.writerow([f"{k}.png", x, y, HEADING_DEG, 1.2 + 0.1 * k])
+                Image.new("RGB", (128, 64), (40 * number + 10 * k,) * 3).save(folder / f"{k}.png")
+    (root / "splits.csv").write_text("\n".join(["scene,split", *map(",".join, with_split)]) + "\n", encoding="utf-8")
+    return OwnData(root)
+
+
+def panoramas(source: SceneSource, *, neighbours: bool = False) -> Iterator[Batch]:
+    return receive(PanoramaBatches(source.config, source, neighbours), 0)
+
+
+def greys(batches: Iterator[Batch], count: int) -> list[int]:
+    """The panoramas of the first batches, by their grey."""
+    return torch.cat([batch["image"][:, 0, 0, 0] for batch in itertools.islice(batches, count)]).tolist()
+
+
+class TestDrawing:
+    def test_a_panorama_comes_with_its_own_layout_at_its_heading(self, data: OwnData) -> None:
+        batch = next(panoramas(SceneSource(CONFIG, data)))
+        # "none" turns the pictures to heading 0, by whole pixels of 1/64 of a turn.
+        pixel = 2.0 * math.pi / CONFIG.image_size[1]
+        heading = math.radians(HEADING_DEG) % pixel
+        heading -= pixel * (heading > pixel / 2)
+        for grey, profile, height in zip(
+            batch["image"][:, 0, 0, 0].tolist(), batch["profile_m"].numpy(), batch["camera_height_m"], strict=True
+        ):
+            scene = data.load(f"scene {grey // 40}")
+            camera = scene.cameras[grey % 40 // 10]
+            expected = layouts(
+                scene.plan,
+                np.asarray(camera.position_m)[None],
+                np.array([camera.room_index]),
+                np.array([heading]),
+                CONFIG.profile_columns,
+            )[0]
+            np.testing.assert_allclose(profile, expected, rtol=1e-4)
+            assert height.item() == pytest.approx(camera.camera_height_m)
+
+    def test_every_epoch_visits_every_scene_once_in_an_order_of_its_own(self, data: OwnData) -> None:
+        config = dataclasses.replace(CONFIG, image=dataclasses.replace(CONFIG.image, batch=SCENES))
+        scenes = np.array(greys(panoramas(SceneSource(config, data)), 6)).reshape(6, SCENES) // 40
+        assert all(sorted(epoch) == list(range(SCENES)) for epoch in scenes.tolist())
+        assert len({tuple(epoch) for epoch in scenes.tolist()}) > 3
+
+    def test_every_camera_and_every_look_is_drawn_sooner_or_later(self, data: OwnData) -> None:
+        drawn = set(greys(panoramas(SceneSource(CONFIG, data)), 40))
+        assert drawn == {40 * scene + 10 * camera for scene in range(SCENES) for camera in range(CAMERAS)}
+
+    def test_the_same_seed_draws_the_same_and_another_one_does_not(self, data: OwnData) -> None:
+        first, again = (greys(panoramas(SceneSource(CONFIG, data)), 5) for _ in range(2))
+        other = greys(panoramas(SceneSource(dataclasses.replace(CONFIG, seed=1), data)), 5)
+        assert first == again != other
+
+    def test_workers_share_an_epoch_and_draw_what_one_process_draws(self, data: OwnData) -> None:
+        alone = SceneSource(CONFIG, data)
+        shared = [SceneSource(CONFIG, data) for _ in range(2)]
+        for visit in range(12):
+            mine, theirs = alone.views(visit, 32, 64), shared[visit % 2].views(visit, 32, 64)
+            assert [view.image.tobytes() for view in mine] == [view.image.tobytes() for view in theirs]
+
+    def test_layout_anchors_are_the_cameras_at_their_heights(self, data: OwnData) -> None:
+        source = SceneSource(CONFIG, data)
+        batch = next(receive(LayoutBatches(CONFIG, source), 0))
+        cameras = [camera for name in data.scenes("train") for camera in data.load(name).cameras]
+        plan = crooked_flat()
+        profiles = layouts(
+            plan,
+            np.stack([camera.position_m for camera in cameras]),
+            np.array([camera.room_index for camera in cameras]),
+            np.zeros(len(cameras)),
+            CONFIG.profile_columns,
+        )
+        for anchor, heights in zip(batch["profile_m"][:, 0].numpy(), batch["camera_height_m"], strict=True):
+            distance = np.abs(profiles - anchor).max(axis=1)
+            assert distance.min() < 1e-4
+            assert heights.tolist() == pytest.approx(
+                [cameras[int(distance.argmin())].camera_height_m] * len(heights), rel=1e-6
+            )
+
+    def test_looks_are_drawn_anew_for_each_visit(self) -> None:
+        # Generated scenes serve as a data set as well; here each camera has one look per furniture level.
+        levels = GeneratedScenes(homes=1, shots_per_home=1, furniture=None)
+        views = SceneSource(CONFIG, levels).views(0, 32, 64)
+        assert [view.image.shape for view in views] == [(32, 64, 3)]
+
+
+class TestBadFiles:
+    def damaged(self, data: OwnData) -> set[str]:
+        """Damage a picture and a plan; what the errors will name."""
+        (data.root / "scene 1" / "2.png").write_bytes(b"no picture")
+        (data.root / "scene 3" / "plan.json").write_text("{}", encoding="utf-8")
+        return {"2.png", "plan.json"}
+
+    def test_the_first_bad_file_ends_training_by_its_name(self, data: OwnData) -> None:
+        named = self.damaged(data)
+        with pytest.raises(DatasetError) as raised:
+            greys(panoramas(SceneSource(CONFIG, data)), 40)
+        assert raised.value.path is not None
+        assert raised.value.path.name in named
+
+    def test_skipped_files_are_named_once_and_counted(self, data: OwnData, caplog: pytest.LogCaptureFixture) -> None:
+        named = self.damaged(data)
+        with caplog.at_level(logging.WARNING):
+            drawn = set(greys(panoramas(SceneSource(CONFIG, data, skip_bad=True)), 60))
+        good = {40 * scene + 10 * camera for scene in range(SCENES) for camera in range(CAMERAS)}
+        assert drawn == good - {60} - {120, 130, 140}
+        messages = [record.getMessage() for record in caplog.records]
+        assert len(messages) == 2
+        assert all(sum(name in message for message in messages) == 1 for name in named)
+        assert ["number 1" in messages[0], "number 2" in messages[1]] == [True, True]
+
+    def test_nothing_usable_is_an_error_rather_than_an_endless_search(self, data: OwnData) -> None:
+        for number in range(SCENES):
+            (data.root / f"scene {number}" / "plan.json").write_text("{}", encoding="utf-8")
+        for stream in (LayoutBatches, PanoramaBatches):
+            with pytest.raises(DatasetError, match="in a row"):
+                next(receive(stream(CONFIG, SceneSource(CONFIG, data, skip_bad=True)), 0))
+
+    def test_a_data_set_without_training_scenes_is_refused(self, tmp_path: Path) -> None:
+        with pytest.raises(DatasetError, match="no training scenes"):
+            SceneSource(CONFIG, OwnData(tmp_path))
+
+    def test_errors_of_worker_processes_arrive_whole(self, data: OwnData) -> None:
+        (data.root / "scene 3" / "plan.json").write_text("{}", encoding="utf-8")
+        with pytest.raises(DatasetError) as raised:
+            for _ in itertools.islice(receive(LayoutBatches(CONFIG, SceneSource(CONFIG, data)), 1), 10):
+                pass
+        assert raised.value.path == data.root / "scene 3" / "plan.json"
+        assert raised.value.scene == "scene 3"
+
+
+class TestRuns:
+    def test_the_checkpoint_says_what_it_was_trained_on_and_resumes_on_nothing_else(self, data: OwnData) -> None:
+        folder = data.root.parent / "run"
+        trained = train_layout(CONFIG, folder, device=CPU, data=TrainingData(dataset=data), workers=0)
+        assert (
+            Checkpoint.load(folder / "layout.pt").data
+            == trained.data
+            == {
+                "description": data.description,
+                "scenes": SCENES,
+            }
+        )
+        assert {"val_within_1m", "val_median_cm"} <= set(trained.metrics)
+        with pytest.raises(CheckpointError, match="homes generated while training"):
+            train_layout(CONFIG, folder, device=CPU, workers=0, resume=True)
+
+    def test_the_command_trains_and_ends_with_2_at_a_bad_file(
+        self, data: OwnData, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        words = ["train", "layout", "--preset", "tiny", "--steps", "3", "--workers", "0", "--device", "cpu"]
+        words += ["--data", str(data.root), "--out", str(data.root.parent / "run")]
+        assert main(words) == 0
+        (data.root / "scene 3" / "plan.json").write_text("{}", encoding="utf-8")
+        assert main(words) == 2
+        assert "plan.json" in capsys.readouterr().err
+        assert main([*words, "--skip-bad"]) == 0
+
+    @pytest.mark.parametrize("words", [["--skip-bad"], ["--data", "x", "--textures", "y"]])
+    def test_options_that_do_not_go_together_are_refused(
+        self, words: list[str], capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        assert main(["train", "layout", "--out", "nowhere", *words]) == 2
+        assert words[0] in capsys.readouterr().err or "--textures" in words
+
+
+class TestValidation:
+    def test_generated_and_stored_scenes_validate_alike(self, data: OwnData) -> None:
+        for training in (TrainingData(validation_scenes=2), TrainingData(dataset=data)):
+            scenes = training.validation(CONFIG)
+            modules: dict[str, torch.nn.Module] = {"layout_encoder": PerfectLayouts()}
+            scores = LayoutValidation(CONFIG, scenes, CPU)(modules)
+            # An encoder that keeps the whole profile is beaten only by where the grid's poses happen to lie.
+            assert scores["val_within_1m"] >= 0.75
+            assert scores["val_median_cm"] >= scores["val_oracle_median_cm"]
+
+    def test_photographs_that_cannot_be_read_are_left_out_of_validation(self, data: OwnData) -> None:
+        (data.root / "scene v" / "1.png").write_bytes(b"no picture")
+        scenes = TrainingData(dataset=data).validation(CONFIG)
+        with pytest.raises(DatasetError, match=r"1\.png"):
+            ImageValidation(CONFIG, scenes, None, CPU)
+        problems: list[DatasetError] = []
+        validation = ImageValidation(CONFIG, scenes, None, CPU, problems=problems)
+        assert [problem.room for problem in problems] == ["1.png"]
+        assert len(validation.images) == len(validation.queries) == CAMERAS - 1
+
+    def test_generated_validation_tells_the_furniture_levels_apart(self) -> None:
+        validation = ImageValidation(CONFIG, TrainingData(validation_scenes=3).validation(CONFIG), None, CPU)
+        assert set(validation.levels) <= {"empty", "simple", "full"}
+        assert len(set(validation.levels)) > 1
+
+
+class PerfectLayouts(torch.nn.Module):
+    """Embeds a layout as itself."""
+
+    def forward(self, profile_m: torch.Tensor, camera_m: torch.Tensor, ceiling_m: torch.Tensor) -> torch.Tensor:
+        return torch.cat([profile_m, camera_m[:, None], ceiling_m[:, None]], dim=1)
+
+
+class TestRecent:
+    def test_it_keeps_what_was_used_last_up_to_its_limit(self) -> None:
+        made: list[str] = []
+        kept: Recent[str] = Recent(5, len)
+
+        def get(key: str) -> str:
+            return kept.get(key, lambda: made.append(key) or key)
+
+        for key in ("aa", "bb", "aa", "cc", "aa", "bb", "toolarge", "toolarge", "aa"):
+            assert get(key) == key
+        # "bb" left for "cc"; what is larger than the limit is kept alone.
+        assert made == ["aa", "bb", "cc", "bb", "toolarge", "aa"]
+
+    def test_what_cannot_be_made_is_not_kept(self) -> None:
+        kept: Recent[int] = Recent(2)
+        with pytest.raises(ZeroDivisionError):
+            kept.get("key", lambda: 1 // 0)
+        assert kept.get("key", lambda: 7) == 7
+
+
+def test_configurations_of_the_tests_are_valid() -> None:
+    assert TrainConfig.from_dict(CONFIG.to_dict()) == CONFIG
