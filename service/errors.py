@@ -25,12 +25,14 @@ from lalaloc_core.errors import (
     BundleError,
     CheckpointError,
     ConfigError,
+    DatasetError,
     ExportError,
     InvalidFloorPlanError,
     InvalidInputError,
     InvalidPanoramaError,
     InvalidPoseError,
     LaLaLocError,
+    RunError,
 )
 
 URN = "urn:lalaloc:problem:"
@@ -196,6 +198,8 @@ PROBLEMS: dict[type[Exception], ProblemKind] = {
     BundleError: INTERNAL,
     CheckpointError: INTERNAL,
     ExportError: INTERNAL,
+    DatasetError: INTERNAL,
+    RunError: INTERNAL,
 }
 
 # What the framework itself answers: no such route, method not allowed, and so on.
