@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -185,6 +186,15 @@ def read_runs(folders: Iterable[Path]) -> Iterator[tuple[RunInfo, list[Predictio
 
 def _lines(predictions: Iterable[Prediction]) -> str:
     return "".join(json.dumps(dataclasses.asdict(one), allow_nan=False) + "\n" for one in predictions)
+
+
+def without_infinity(value: Any) -> Any:
+    """Plain data as JSON can hold it: numbers that are not finite become None."""
+    if isinstance(value, dict):
+        return {key: without_infinity(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [without_infinity(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def write_atomically(path: Path, text: str) -> None:

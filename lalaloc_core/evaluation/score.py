@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -18,7 +17,13 @@ from jaxtyping import Bool, Float, Int
 
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.evaluation.predictions import SCORES_FILE, Prediction, RunFolder, write_atomically
+from lalaloc_core.evaluation.predictions import (
+    SCORES_FILE,
+    Prediction,
+    RunFolder,
+    without_infinity,
+    write_atomically,
+)
 
 _RESAMPLES = 1000
 _COVERAGE = 0.95
@@ -127,18 +132,10 @@ def score_run(folder: RunFolder) -> dict[str, Any]:
         InvalidInputError: it has no answers.
     """
     info = folder.read_info()
-    scores = _finite(dataclasses.asdict(score(folder.read_predictions())))
+    scores = without_infinity(dataclasses.asdict(score(folder.read_predictions())))
     report = {"label": info.label, "dataset": info.dataset, "skipped": len(info.skipped), **scores}
     write_atomically(folder.path / SCORES_FILE, json.dumps(report, indent=2, allow_nan=False) + "\n")
     return report
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def position_errors_m(predictions: Sequence[Prediction], stage: str | None = None) -> Float[np.ndarray, "n"]:

@@ -17,7 +17,7 @@ from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.optimise import LpoConfig
 from lalaloc_core.localise.pipeline import LocaliseConfig, StageClock, localise, refinement_job
 from lalaloc_core.methods.alignment import DepthAligner
-from lalaloc_core.methods.lalaloc import LaLaLoc, encode, found_pose, read_image
+from lalaloc_core.methods.lalaloc import LaLaLoc, encode, found_pose, grid_index, read_image
 from lalaloc_core.methods.method import Answer, Question
 from lalaloc_core.nets.decoder import DECODED_HEIGHT, DECODED_WIDTH, LayoutDecoder
 
@@ -65,7 +65,7 @@ class VdrDecode:
         best = {**found.best, "decode": aligned}
         return Answer(
             stages={stage: found_pose(query, candidate) for stage, candidate in best.items()},
-            retrieved=int(np.linalg.norm(grid.poses.position_m - best["retrieval"].position_m, axis=1).argmin()),
+            retrieved=grid_index(grid, best["retrieval"]),
             timings_ms=clock.timings_ms,
         )
 

@@ -67,7 +67,7 @@ class LaLaLoc:
         confidence = self.encoders.manifest.confidence
         return Answer(
             stages={stage: found_pose(query, candidate) for stage, candidate in found.best.items()},
-            retrieved=_grid_index(grid, found.best["retrieval"]),
+            retrieved=grid_index(grid, found.best["retrieval"]),
             candidate_distances=distances,
             confidence=None if confidence is None else confidence.probability(list(distances)),
             timings_ms={**clock.timings_ms, **found.timings_ms},
@@ -126,5 +126,6 @@ def found_pose(query: Query, candidate: Candidate) -> Found:
     )
 
 
-def _grid_index(grid: LatentGrid, candidate: Candidate) -> int:
+def grid_index(grid: LatentGrid, candidate: Candidate) -> int:
+    """Number of the grid pose that a candidate of retrieval is."""
     return int(np.linalg.norm(grid.poses.position_m - candidate.position_m, axis=1).argmin())

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from lalaloc_core.configuration import build_config
 from lalaloc_core.errors import ConfigError, RunError
+from lalaloc_core.evaluation.predictions import without_infinity
 
 Budget = Literal["small", "full"]
 
@@ -54,7 +53,7 @@ class TableResult:
 
     def to_json(self) -> str:
         """As indented JSON text."""
-        return json.dumps(_finite(dataclasses.asdict(self)), indent=1, allow_nan=False) + "\n"
+        return json.dumps(without_infinity(dataclasses.asdict(self)), indent=1, allow_nan=False) + "\n"
 
     @classmethod
     def read(cls, path: Path) -> TableResult:
@@ -67,11 +66,3 @@ class TableResult:
             return build_config(cls, json.loads(path.read_text(encoding="utf-8")), path=path.name)
         except (OSError, ValueError, ConfigError) as error:
             raise RunError(f"'{path}' is no table of results: {error}") from error
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -31,7 +31,7 @@ from lalaloc_core.reproduce.table import SHIPPED, Ask, Column, Row, Table
 from lalaloc_core.training.ablations import train_ablation
 
 # Queries per row: enough to tell methods apart at a small budget, and few enough that times are taken one at a time.
-_SMALL_LIMIT = 100
+_SMALL_LIMIT = 75
 _TIMED_LIMIT = 20
 
 
