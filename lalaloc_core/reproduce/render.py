@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import matplotlib.figure
 
-from lalaloc_core.reproduce.result import Figure, TableResult
+from lalaloc_core.reproduce.result import Figure, RowResult, TableResult
 from lalaloc_core.reproduce.table import COLUMN_TITLES, SHARES
 
 _PAPER_DATA = "Structured3D"
@@ -35,7 +36,7 @@ def _cell(column: str, ours: Figure | None, paper: float | None) -> str:
     if ours is not None:
         interval = ""
         if ours.low is not None or ours.high is not None:
-            interval = f" [{_number(column, ours.low)}, {_number(column, ours.high)}]"
+            interval = f" [{_bound(column, ours.low)}, {_bound(column, ours.high)}]"
         parts.append(_number(column, ours.value) + interval)
     if paper is not None:
         parts.append(f"*{_number(column, paper)}*")
@@ -47,7 +48,23 @@ def _number(column: str, value: float | None) -> str:
         return "∞"
     if column in SHARES:
         return f"{100.0 * value:.1f} %"
-    return f"{value:.3g}" if column.startswith("seconds") else f"{value:.1f}"
+    if column.startswith("seconds"):
+        return f"{value:.2g}"
+    # Layout queries end well below a millimetre.
+    return f"{value:.1f}" if value >= 1.0 else f"{value:.2f}" if value >= 0.01 else "< 0.01"
+
+
+def _bound(column: str, value: float | None) -> str:
+    """An end of an interval, as exact as it deserves."""
+    if value is not None and column in SHARES:
+        return f"{100.0 * value:.0f}"
+    return _number(column, value)
+
+
+def _median_cm(row: RowResult) -> float:
+    """Median error; infinite, and then not drawn, where half of the queries have no answer."""
+    value = row.figures["median_cm"].value
+    return math.inf if value is None else value
 
 
 def draw_vogel_samples(table: TableResult, path: Path) -> None:
@@ -56,11 +73,10 @@ def draw_vogel_samples(table: TableResult, path: Path) -> None:
     axes = figure.add_subplot()
     for name, style in (("VDR", "o-"), ("VDR + LPO", "s-")):
         rows = [row for row in table.rows if row.name == name]
-        medians = [row.figures["median_cm"].value for row in rows]
-        axes.plot([int(row.group.split()[0]) for row in rows], medians, style, label=name)
+        axes.plot([int(row.group.split()[0]) for row in rows], [_median_cm(row) for row in rows], style, label=name)
     for name, style in (("Retrieval", ":"), ("LPO", "--")):
         (row,) = (row for row in table.rows if row.name == name and row.group == "without VDR")
-        axes.axhline(row.figures["median_cm"].value, linestyle=style, color="0.4", label=f"{name}, no VDR")
+        axes.axhline(_median_cm(row), linestyle=style, color="0.4", label=f"{name}, no VDR")
     axes.set(xlabel="samples of the Vogel disc", ylabel="median error (cm)", ylim=(0.0, None))
     axes.legend(frameon=False)
     figure.savefig(path, dpi=120)

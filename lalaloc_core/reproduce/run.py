@@ -13,7 +13,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -117,11 +116,11 @@ class Workbench:
             skip_bad=self.skip_bad,
             command=self.command,
         )
-        folder = RunFolder(self.out / "runs" / _folder_name(info, timed))
+        folder = RunFolder(self.out / "runs" / _folder_name(ask, info, timed))
         return info, run_evaluation(folder, info, workers=0 if timed else self.workers)
 
 
-def _folder_name(info: RunInfo, timed: bool) -> str:
+def _folder_name(ask: Ask, info: RunInfo, timed: bool) -> str:
     """Readable, and different for everything that asks something else."""
     asked = {
         key: value
@@ -129,7 +128,7 @@ def _folder_name(info: RunInfo, timed: bool) -> str:
         if key not in ("label", "command", "limit", "skipped", "bundle", "data")
     }
     digest = hashlib.sha256(json.dumps([asked, timed], sort_keys=True).encode()).hexdigest()[:8]
-    return re.sub(r"[^a-z0-9-]+", "-", f"{info.label}-{info.split}".lower()) + f"-{digest}"
+    return "-".join(filter(None, (ask.method, ask.model, ask.kind, info.split, digest)))
 
 
 def _row_result(row: Row, table: Table, info: RunInfo, predictions: list[Prediction]) -> RowResult:

@@ -97,7 +97,7 @@ class TestTables:
 class TestRendering:
     def test_figures_say_whose_they_are(self) -> None:
         text = markdown(result())
-        assert "| Layout: LaLaLoc | 50.0 % [40.0 %, 60.0 %] · *87.4 %* | ∞ | 100 |" in text
+        assert "| Layout: LaLaLoc | 50.0 % [40, 60] · *87.4 %* | ∞ | 100 |" in text
         assert "synthetic scenes (seed 0)" in text
         assert "not the same experiment" in text
 
