@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from scripts.figures import figures_table, training_table
+from scripts.figures import figures_table, paper_tables, training_table
 from service.settings import PREFIX, Settings
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -27,7 +27,11 @@ def documents() -> dict[Path, str]:
     """Every document that has generated parts, as it should read."""
     parts = {
         ROOT / "README.md": {"settings": settings_table(), "figures": figures_table()},
-        ROOT / "docs" / "results.md": {"figures": figures_table(), "training": training_table()},
+        ROOT / "docs" / "results.md": {
+            "figures": figures_table(),
+            "paper": paper_tables(),
+            "training": training_table(),
+        },
         ROOT / "docs" / "architecture.md": {f"files of {package}": file_map(package) for package in _PACKAGES},
     }
     return {path: _filled(path.read_text(encoding="utf-8"), contents) for path, contents in parts.items()}

@@ -49,7 +49,7 @@ def _number(column: str, value: float | None) -> str:
     if column in SHARES:
         return f"{100.0 * value:.1f} %"
     if column.startswith("seconds"):
-        return f"{value:.2g}"
+        return f"{value:.2g}" if value < 10.0 else f"{value:.1f}"
     # Layout queries end well below a millimetre.
     return f"{value:.1f}" if value >= 1.0 else f"{value:.2f}" if value >= 0.01 else "< 0.01"
 
@@ -78,5 +78,5 @@ def draw_vogel_samples(table: TableResult, path: Path) -> None:
         (row,) = (row for row in table.rows if row.name == name and row.group == "without VDR")
         axes.axhline(_median_cm(row), linestyle=style, color="0.4", label=f"{name}, no VDR")
     axes.set(xlabel="samples of the Vogel disc", ylabel="median error (cm)", ylim=(0.0, None))
-    axes.legend(frameon=False)
+    axes.legend(frameon=False, loc="center right")
     figure.savefig(path, dpi=120)
