@@ -10,21 +10,26 @@ from lalaloc_core.bundle import Bundle
 from lalaloc_core.evaluation.predictions import Prediction, RunFolder, RunInfo
 from lalaloc_core.evaluation.run import run_evaluation
 from lalaloc_core.evaluation.score import StageScores, score
+from lalaloc_core.methods.method import QueryKind
 
 
 def bench_accuracy(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
     """Accuracy on generated test homes: layout queries, then furnished, empty and unknown-heading panoramas."""
 
-    def accuracy(label: str, *, furniture: str = "full", **asked: Any) -> dict[str, Any]:
+    def accuracy(
+        label: str, *, kind: QueryKind = "panorama", furniture: str = "full", heading_known: bool = True
+    ) -> dict[str, Any]:
         generated = {"homes": homes, "furniture": furniture, "textures": None if textures is None else str(textures)}
         info = RunInfo(
             label=label,
             method="lalaloc",
+            kind=kind,
             dataset="generated homes",
             split="test",
             generated=generated,
             bundle=str(bundle.folder),
-            **({"kind": "panorama", "furniture": furniture} | asked),
+            furniture=furniture if kind == "panorama" else None,
+            heading_known=heading_known,
         )
         with tempfile.TemporaryDirectory(prefix="lalaloc-bench-") as folder:
             return _summary(run_evaluation(RunFolder(Path(folder)), info))
