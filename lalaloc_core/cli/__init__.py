@@ -1,4 +1,4 @@
-"""The command line: `lalaloc COMMAND`; each module here adds the commands of one room of the project.
+"""The command line, `lalaloc`; each module here adds the commands of one room of the project.
 
 Commands import what they run when they run it, so that `lalaloc --help` loads no network.
 """
