@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from lalaloc_core.cli.arguments import count, positive, processes
 from lalaloc_core.cli.printing import print_json
 from lalaloc_core.data.dataset import SPLITS
 from lalaloc_core.errors import InvalidInputError
@@ -37,11 +38,11 @@ def add_commands(commands: Any) -> None:
     evaluate.add_argument("--furniture", choices=("empty", "simple", "full"), help="default: the data set's usual")
     evaluate.add_argument("--lighting", choices=("cold", "raw", "warm"), help="default: the data set's usual")
     evaluate.add_argument("--heading", choices=("known", "unknown"), default="known")
-    evaluate.add_argument("--grid-step", type=_positive, default=0.5, metavar="M", help="metres (default: %(default)s)")
+    evaluate.add_argument("--grid-step", type=positive, default=0.5, metavar="M", help="metres (default: %(default)s)")
     evaluate.add_argument("--refine", choices=("none", "vdr", "lpo"), help="how far to go; default: lpo")
-    evaluate.add_argument("--limit", type=_count, metavar="N", help="at most N queries")
+    evaluate.add_argument("--limit", type=count, metavar="N", help="at most N queries")
     evaluate.add_argument("--skip-bad", action="store_true", help="leave out and list what cannot be used")
-    evaluate.add_argument("--workers", type=int, metavar="N", help="processes; default: one per core")
+    evaluate.add_argument("--workers", type=processes, metavar="N", help="processes; default: one per core")
     evaluate.add_argument("--out", type=Path, metavar="RUN", help="folder of the run; one that exists goes on")
     evaluate.set_defaults(run=_evaluate)
 
@@ -67,23 +68,9 @@ def _data_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _generator_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--homes", type=_count, default=100, help="generated homes, 4 queries each")
+    parser.add_argument("--homes", type=count, default=100, help="generated homes, 4 queries each")
     parser.add_argument("--seed", type=int, default=0, help="of the generated homes")
     parser.add_argument("--textures", type=Path, help="folder of material pictures for generated homes")
-
-
-def _count(text: str) -> int:
-    value = int(text)
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{value} must be at least 1")
-    return value
-
-
-def _positive(text: str) -> float:
-    value = float(text)
-    if not 0.0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text} must be positive")
-    return value
 
 
 def _evaluate(arguments: argparse.Namespace) -> None:

@@ -27,7 +27,8 @@ def markdown(table: TableResult) -> str:
     for row in table.rows:
         name = f"{row.group}: {row.name}" if row.group else row.name
         cells = [_cell(column, row.figures.get(column), row.paper.get(column)) for column in table.columns]
-        lines.append("| " + " | ".join([name, *cells, str(row.n)]) + " |")
+        count = f"{row.n} ({row.skipped} skipped)" if row.skipped else str(row.n)
+        lines.append("| " + " | ".join([name, *cells, count]) + " |")
     return "\n".join(lines) + "\n"
 
 

@@ -117,7 +117,9 @@ class Workbench:
             command=self.command,
         )
         folder = RunFolder(self.out / "runs" / _folder_name(ask, info, timed))
-        return info, run_evaluation(folder, info, workers=0 if timed else self.workers)
+        predictions = run_evaluation(folder, info, workers=0 if timed else self.workers)
+        # As the run left it: with what it skipped.
+        return folder.read_info(), predictions
 
 
 def _folder_name(ask: Ask, info: RunInfo, timed: bool) -> str:

@@ -179,6 +179,8 @@ class TestCommandLine:
             ["evaluate", "--kind", "song"],
             ["evaluate", "--limit", "0"],
             ["evaluate", "--grid-step", "-1"],
+            ["evaluate", "--workers", "-1"],
+            ["reproduce", "--limit", "0"],
         ],
     )
     def test_wrong_arguments_are_exit_code_2(self, arguments: list[str]) -> None:
