@@ -1,0 +1,264 @@
+"""Out-of-family homes: sound plans, cameras in their rooms, photographs that show the truth, and apart from `synth`."""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+
+from lalaloc_core.cli.evaluation import add_commands
+from lalaloc_core.conventions import column_azimuths
+from lalaloc_core.data.dataset import Appearance, Dataset
+from lalaloc_core.data.unfamiliar import UnfamiliarPhotograph, UnfamiliarScenes
+from lalaloc_core.errors import DatasetError, InvalidInputError
+from lalaloc_core.evaluation.building import build_dataset
+from lalaloc_core.evaluation.predictions import RunInfo
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.render.depth import layout_depth
+from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.unfamiliar.furnish import LEVELS, Furnishing
+from lalaloc_core.unfamiliar.homes import WALL_MARGIN_M, HomeKey, UnfamiliarHome, home_of, stage_of
+from lalaloc_core.unfamiliar.openings import draw_openings
+from lalaloc_core.unfamiliar.outlines import AREAS_M2, draw_outline
+from lalaloc_core.unfamiliar.plans import MAX_AREA_M2, MAX_ROOMS, MIN_AREA_M2, MIN_ROOMS, draw_plan
+from lalaloc_core.unfamiliar.shell import shell_parts
+from lalaloc_core.unfamiliar.tracing import Tracer
+
+PACKAGE = Path(__file__).parents[2] / "lalaloc_core" / "unfamiliar"
+HOMES = 4
+
+
+def keys() -> list[HomeKey]:
+    return [HomeKey(1, 7, index) for index in range(HOMES)]
+
+
+def photograph(scenes: UnfamiliarScenes, name: str, camera: int) -> UnfamiliarPhotograph:
+    (one,) = scenes.load(name).cameras[camera].photographs.values()
+    assert isinstance(one, UnfamiliarPhotograph)
+    return one
+
+
+class TestApart:
+    @pytest.mark.parametrize("path", sorted(PACKAGE.glob("*.py")), ids=lambda path: path.stem)
+    def test_nothing_of_the_training_generator_is_used(self, path: Path) -> None:
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        imported = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+        ours = {name for name in imported if name is not None and name.startswith("lalaloc_core")}
+        plain = {"lalaloc_core.floorplan", "lalaloc_core.conventions"}
+        assert {name for name in ours if not name.startswith("lalaloc_core.unfamiliar")} <= plain
+
+
+class TestPlans:
+    def test_rooms_never_overlap_and_homes_keep_their_limits(self) -> None:
+        for key in keys():
+            plan = home_of(key).plan.plan
+            assert MIN_ROOMS <= len(plan.rooms) <= MAX_ROOMS
+            assert MIN_AREA_M2 <= plan.area_m2 <= MAX_AREA_M2
+            for first, second in itertools.combinations(plan.rooms, 2):
+                assert first.shape.distance(second.shape) >= home_of(key).plan.wall_m - 1e-5
+
+    @pytest.mark.parametrize("kind", AREAS_M2)
+    def test_outlines_are_simple_rings_of_the_wanted_size(self, kind: str) -> None:
+        rng = np.random.default_rng(0)
+        for _ in range(20):
+            shape = draw_outline(kind, rng)  # pyright: ignore[reportArgumentType]
+            assert shape.is_valid
+            assert shape.exterior.is_ccw
+            assert AREAS_M2[kind][0] - 1e-6 <= shape.area <= AREAS_M2[kind][1] + 1e-6  # pyright: ignore[reportArgumentType]
+
+    def test_many_walls_meet_at_other_than_right_angles(self) -> None:
+        oblique = []
+        for key in keys():
+            for room in home_of(key).plan.plan.rooms:
+                edges = room.walls_m[:, 2:] - room.walls_m[:, :2]
+                bearing = np.arctan2(edges[:, 1], edges[:, 0])
+                off = np.abs((np.diff(bearing, append=bearing[0]) + np.pi / 4) % (np.pi / 2) - np.pi / 4)
+                oblique.append(bool((off > np.radians(5)).any()))
+        assert np.mean(oblique) > 0.3
+
+    def test_every_room_can_be_reached_through_doors(self) -> None:
+        for key in keys():
+            home = home_of(key)
+            reached, before = {0}, 0
+            while len(reached) > before:
+                before = len(reached)
+                for opening in home.openings:
+                    if opening.behind is not None and {opening.wall.room, opening.behind.room} & reached:
+                        reached |= {opening.wall.room, opening.behind.room}
+            assert reached == set(range(len(home.plan.kinds)))
+
+    def test_openings_lie_within_their_walls_and_apart(self) -> None:
+        for key in keys():
+            by_wall: dict[tuple[int, int], list[tuple[float, float]]] = {}
+            for opening in home_of(key).openings:
+                assert 0.0 < opening.left_m < opening.right_m < opening.wall.length_m
+                assert opening.top_m < home_of(key).plan.plan.rooms[opening.wall.room].ceiling_height_m
+                by_wall.setdefault((opening.wall.room, opening.wall.edge), []).append((opening.left_m, opening.right_m))
+            for spans in by_wall.values():
+                for (_, end), (start, _) in itertools.pairwise(sorted(spans)):
+                    assert end < start
+
+
+class TestTruth:
+    @staticmethod
+    def closed(seed: int) -> tuple[FloorPlan, Tracer]:
+        """A home without any opening or furniture."""
+        rng = np.random.default_rng(seed)
+        plan = draw_plan(rng, "closed").plan
+        return plan, Tracer(shell_parts(plan, [], rng))
+
+    @pytest.mark.parametrize("seed", range(3))
+    def test_the_traced_horizon_of_a_closed_empty_room_is_its_wall_profile(self, seed: int) -> None:
+        plan, tracer = self.closed(seed)
+        columns = 512
+        for room in plan.rooms:
+            position = np.array(shapely.maximum_inscribed_circle(room.shape, 0.05).coords[0])
+            azimuth = 0.7 + column_azimuths(columns)
+            rays = np.stack([np.sin(azimuth), np.cos(azimuth), np.zeros(columns)], axis=1)
+            traced = tracer.first(np.broadcast_to([*position, 1.5], rays.shape), rays).distance_m
+            profile = wall_profile(position[None], np.array([0.7]), room.walls_m[None], columns)[0]
+            np.testing.assert_allclose(traced, profile, atol=0.01)
+
+    def test_an_empty_photograph_shows_the_layout_wherever_there_is_no_opening(self) -> None:
+        scenes = UnfamiliarScenes(homes=3, shots_per_home=2, furniture="empty")
+        for name in scenes.scenes("validation"):
+            scene = scenes.load(name)
+            for camera in scene.cameras:
+                room = scene.plan.rooms[camera.room_index]
+                (taken,) = camera.photographs.values()
+                seen = taken.depth_m()
+                profile = wall_profile(camera.position_m[None], np.array([camera.heading]), room.walls_m[None], 512)
+                height, ceiling = np.array([camera.camera_height_m]), np.array([room.ceiling_height_m])
+                truth = layout_depth(profile, height, ceiling, 256)[0]
+                # Leaves, frames and the lamp stand before walls, and openings let through.
+                assert np.mean(np.abs(seen - truth) < 0.02) > 0.7
+
+    def test_every_camera_stands_in_its_room_clear_of_walls_and_furniture(self) -> None:
+        scenes = UnfamiliarScenes(homes=3, shots_per_home=4)
+        for name in scenes.scenes("validation"):
+            scene = scenes.load(name)
+            for k, camera in enumerate(scene.cameras):
+                room, point = scene.plan.rooms[camera.room_index], shapely.Point(camera.position_m)
+                assert room.shape.contains(point)
+                assert room.shape.exterior.distance(point) >= WALL_MARGIN_M - 1e-9
+                assert 1.1 <= camera.camera_height_m <= 1.8
+                assert camera.camera_height_m < room.ceiling_height_m
+                assert np.nanmin(photograph(scenes, name, k).depth_m()) > 0.05
+
+
+class TestFurniture:
+    def test_simple_rooms_have_some_and_full_ones_more(self) -> None:
+        for key in keys():
+            home = home_of(key)
+            taken = {level: self.area(home, key, level) for level in LEVELS}
+            assert taken["empty"] == 0.0 < taken["simple"] < taken["full"]
+
+    @staticmethod
+    def area(home: UnfamiliarHome, key: HomeKey, level: str) -> float:
+        furnishing = Furnishing(home.plan, home.openings, level, key.rng(1))  # pyright: ignore[reportArgumentType]
+        return sum(float(shapely.area(shape)) for shape in furnishing.taken)
+
+    def test_what_a_simple_room_has_stands_in_the_full_one_too(self) -> None:
+        key = keys()[0]
+        home = home_of(key)
+        simple, full = (Furnishing(home.plan, home.openings, level, key.rng(1)) for level in ("simple", "full"))
+        for less, more in zip(simple.taken, full.taken, strict=True):
+            assert less.difference(more.buffer(1e-6)).area == pytest.approx(0.0, abs=1e-9)
+
+    def test_furniture_stays_in_its_room(self) -> None:
+        for key in keys():
+            home = home_of(key)
+            furnishing = Furnishing(home.plan, home.openings, "full", key.rng(1))
+            for room, taken in zip(home.plan.plan.rooms, furnishing.taken, strict=True):
+                assert taken.difference(room.shape).area == 0.0
+
+
+class TestScenes:
+    def test_the_same_scene_is_always_the_same_and_splits_differ(self) -> None:
+        scenes = UnfamiliarScenes(homes=2, shots_per_home=1)
+        assert isinstance(scenes, Dataset)
+        first = scenes.load("test-00001")
+        picture = photograph(scenes, "test-00001", 0).image(32, 64)
+        home_of.cache_clear()
+        stage_of.cache_clear()
+        again = scenes.load("test-00001")
+        np.testing.assert_array_equal(first.cameras[0].position_m, again.cameras[0].position_m)
+        np.testing.assert_array_equal(picture, photograph(scenes, "test-00001", 0).image(32, 64))
+        other = scenes.load("validation-00001")
+        assert other.plan.to_dict() != first.plan.to_dict()
+
+    def test_the_levels_are_asked_at_the_same_places(self) -> None:
+        places = [UnfamiliarScenes(homes=1, furniture=level).load("test-00000").cameras for level in LEVELS]
+        for cameras in zip(*places, strict=True):
+            assert len({tuple(camera.position_m) for camera in cameras}) == 1
+
+    def test_a_picture_has_the_wanted_size_and_contrast(self) -> None:
+        picture = photograph(UnfamiliarScenes(homes=1), "validation-00000", 0).image(64, 128)
+        assert picture.shape == (64, 128, 3)
+        assert picture.std() > 10
+
+    def test_without_a_level_each_camera_has_its_own(self) -> None:
+        scenes = UnfamiliarScenes(homes=2, shots_per_home=6, furniture=None)
+        assert scenes.appearances == (Appearance(None),)
+        levels = {photograph(scenes, name, k).shot.furniture for name in scenes.scenes("test") for k in range(6)}
+        assert len(levels) > 1
+
+    def test_there_is_nothing_to_train_on(self) -> None:
+        assert list(UnfamiliarScenes(homes=3).scenes("train")) == []
+        with pytest.raises(DatasetError, match="no such out-of-family scene"):
+            UnfamiliarScenes(homes=3).load("train-00000")
+
+    @pytest.mark.parametrize(
+        ("wrong", "message"),
+        [
+            ({"homes": -1}, "homes is -1, it must be at least 0"),
+            ({"homes": 1, "shots_per_home": 0}, "shots_per_home is 0, it must be at least 1"),
+            ({"homes": 1, "seed": -2}, "seed is -2, it must be at least 0"),
+        ],
+    )
+    def test_what_cannot_be_is_refused(self, wrong: dict, message: str) -> None:
+        with pytest.raises(InvalidInputError, match=message):
+            build_dataset(asked(wrong))
+
+
+def asked(generated: dict) -> RunInfo:
+    return RunInfo(
+        label="test",
+        method="oracle",
+        kind="layout",
+        dataset="",
+        split="test",
+        generated={"generator": "unfamiliar"} | generated,
+    )
+
+
+class TestAsking:
+    def test_a_run_can_ask_for_them(self) -> None:
+        dataset = build_dataset(asked({"homes": 2, "furniture": "empty"}))
+        assert dataset == UnfamiliarScenes(homes=2, furniture="empty")
+        assert dataset.description == "out-of-family homes (seed 0)"
+
+    @pytest.mark.parametrize(
+        ("options", "message"),
+        [
+            (["--split", "train"], "no split 'train'"),
+            (["--textures", "somewhere"], "--textures is for --generator synth"),
+            (["--data", "somewhere"], "not for --data"),
+        ],
+    )
+    def test_options_that_contradict_are_refused(self, options: list[str], message: str) -> None:
+        parser = argparse.ArgumentParser()
+        add_commands(parser.add_subparsers())
+        arguments = parser.parse_args(["evaluate", "--generator", "unfamiliar", "--method", "oracle", *options])
+        with pytest.raises(InvalidInputError, match=message):
+            arguments.run(arguments)
+
+
+def test_the_same_seed_draws_the_same_openings() -> None:
+    first, second = (draw_openings(draw_plan(rng, "x"), rng) for rng in (np.random.default_rng(3) for _ in range(2)))
+    assert [(o.kind, o.left_m, o.right_m) for o in first] == [(o.kind, o.left_m, o.right_m) for o in second]
