@@ -8,25 +8,27 @@ import numpy as np
 import shapely
 
 from lalaloc_core.floorplan import Room
+from lalaloc_core.synth.exposure import draw_exposure, draw_staged_exposure
 from lalaloc_core.synth.furniture import CAMERA_CLEARANCE_M, FurnitureLevel, Prism, furnish, rectangle, wall_frame
+from lalaloc_core.synth.leaves import boards, hang_leaves
 from lalaloc_core.synth.lighting import (
     Lighting,
     draw_backdrop,
-    draw_exposure,
-    draw_staged_exposure,
     light_room,
     relit,
 )
 from lalaloc_core.synth.materials import MaterialLibrary
+from lalaloc_core.synth.mirrors import Reflection, draw_mirror
 from lalaloc_core.synth.openings import Opening
-from lalaloc_core.synth.scene import Scene
+from lalaloc_core.synth.scene import LIGHT_RGB, LIGHT_XYZ, SLOT_AMBIENT, SLOT_LIGHT_RGB, SLOT_LIGHT_XYZ, Fact, Scene
 from lalaloc_core.synth.shots import Shot
-from lalaloc_core.synth.surfaces import SurfaceTable, bright, paint, vivid, wood_tone
+from lalaloc_core.synth.surfaces import SurfaceTable, bright, paint, pale, vivid, wood_tone
 
 _DEFAULT_WALL_DEPTH_M = 0.12
+_MIRROR_DEPTH_M = 0.004
 
 # Parts of a staged scene that draw from streams of their own.
-_MOOD, _ROOM, _FLOOR, _ACCENT, _TRIM, _OPENING, _RADIATOR, _FURNITURE, _LAMPS, _CAMERA = range(10)
+_MOOD, _ROOM, _FLOOR, _ACCENT, _TRIM, _OPENING, _RADIATOR, _FURNITURE, _LAMPS, _CAMERA, _MATERIALS = range(11)
 
 
 def build_scene(shot: Shot, materials: MaterialLibrary) -> Scene:
@@ -43,18 +45,23 @@ class _Builder:
         self.shot, self.home, self.rng = shot, home, rng
         self.level: FurnitureLevel = shot.furniture
         self.is_staged = shot.lighting is not None
+        # Homes for sale: bare, pale, in daylight.
+        self.is_bright = self.level == "empty" and not self.is_staged and rng.random() < 0.6
         self.position = shot.position_m
         self.room = home.plan.rooms[room_index]
         self.openings = [opening for opening in home.openings if opening.room == room_index]
         see_through = [o.neighbour for o in self.openings if o.kind in ("door_open", "opening") and o.neighbour >= 0]
         self.slot_rooms = [room_index, *dict.fromkeys(see_through)]
-        self.table = SurfaceTable(materials, materials.mean_colours, rng)
+        # Materials have a stream of their own: shapes must not depend on what pictures there are.
+        self.table_rng = np.random.default_rng([shot.seed, _MATERIALS])
+        self.table = SurfaceTable(materials, materials.mean_colours, self.table_rng)
         self.walls: list[np.ndarray] = []
         self.owner: list[int] = []
         self.wall_surface: list[int] = []
         self.decals: list[tuple[float, ...]] = []
         self.prisms: list[tuple[float, ...]] = []
         self.slots: list[list[float]] = []
+        self.facts: set[Fact] = set()
         # One house style: all doors and trims look alike.
         self.trim = self.table.add_plain(bright(rng) if rng.random() < 0.7 else wood_tone(rng))
         colour = self._door_colour()
@@ -63,21 +70,30 @@ class _Builder:
         self.door_panel = self.table.add_plain(np.clip(colour * rng.uniform(0.75, 1.15), 0.01, 0.92))
         self.handle = self.table.add_finish("metal")
         self.outdoors = self.table.add_outdoors(math.exp(rng.uniform(0.3, 2.3)))
-        self.gloom = self.table.add_plain(paint(rng) * 0.3)
+        # What lies behind the doors of rooms that are seen through doors, and behind panes.
+        self.gloom = self.table.add_plain(paint(rng) * math.exp(rng.uniform(math.log(0.08), 0.0)))
+        self.doors_are_glazed = rng.random() < 0.12
         self.baseboard_m = rng.uniform(0.04, 0.14) if rng.random() < 0.8 else 0.0
         self.crown_m = rng.uniform(0.03, 0.12) if rng.random() < 0.2 else 0.0
         self.floor_surface = -1
 
     def build(self) -> Scene:
         self._begin(_MOOD)
-        lighting = Lighting(self.rng, neutral=self.is_staged)
+        lighting = Lighting(self.rng, neutral=self.is_staged, bright=self.is_bright)
+        in_room: list[tuple[float, ...]] = []
         for slot, room_index in enumerate(self.slot_rooms):
             self._add_room(slot, room_index, lighting)
-        self._add_jambs()
+            if slot == 0:
+                in_room = list(self.prisms)
         self._begin(_LAMPS, self.shot.room_index)
         lights, lamps, sun = light_room(self.room, self.openings, self.position, lighting, self.rng)
         for prism in lamps:
             self._add_prism(prism, opaque=False)
+        if not self.is_staged:
+            self._add_mirror(in_room + self.prisms[len(self.prisms) - len(lamps) :], lights)
+        self._add_jambs()
+        if self.is_bright and any(opening.kind == "window" for opening in self.openings):
+            self.facts.add("bare_bright")
         self._begin(_CAMERA, self.shot.room_index)
         return Scene(
             camera_height_m=self.shot.camera_height_m,
@@ -92,13 +108,18 @@ class _Builder:
             lights=lights,
             sun=sun,
             backdrop=draw_backdrop(self.rng),
-            exposure=draw_staged_exposure(self.rng) if self.is_staged else draw_exposure(self.rng),
+            exposure=draw_staged_exposure(self.rng)
+            if self.is_staged
+            else draw_exposure(self.rng, bright=self.is_bright),
+            facts=frozenset(self.facts),
         )
 
     def _begin(self, part: int, *which: int) -> None:
         """In a staged scene what a part draws must not depend on what was drawn before it: furniture, for one."""
         if self.is_staged:
-            self.rng.bit_generator.state = np.random.default_rng([self.shot.seed, part, *which]).bit_generator.state
+            for stream, number in ((self.rng, ()), (self.table_rng, (_MATERIALS,))):
+                fresh = np.random.default_rng([self.shot.seed, part, *which, *number])
+                stream.bit_generator.state = fresh.bit_generator.state
 
     def _door_colour(self) -> np.ndarray:
         kind = self.rng.random()
@@ -109,14 +130,14 @@ class _Builder:
     def _add_room(self, slot: int, room_index: int, lighting: Lighting) -> None:
         rng, room = self.rng, self.home.plan.rooms[room_index]
         self._begin(_ROOM, room_index)
-        colour = paint(rng)
-        wall = self.table.add_wall(colour)
-        accent = self.table.add_wall(paint(rng)) if rng.random() < 0.25 else wall
+        colour = pale(rng) if self.is_bright else paint(rng)
+        wall = self.table.add_plain(colour) if self.is_bright else self.table.add_wall(colour)
+        accent = self.table.add_wall(paint(rng)) if rng.random() < (0.08 if self.is_bright else 0.25) else wall
         ceiling_colour = colour * rng.uniform(0.85, 1.1) if rng.random() < 0.2 else bright(rng)
         ceiling = self.table.add_ceiling(np.clip(ceiling_colour, 0.01, 0.92))
         if self._has_new_floor(room_index):
             _, along, _ = wall_frame(room, 0)
-            self.floor_surface = self.table.add_floor(colour, math.atan2(along[1], along[0]))
+            self.floor_surface = self.table.add_floor(colour, math.atan2(along[1], along[0]), plain=self.is_bright)
         self._begin(_ACCENT, room_index)
         self.slots.append(
             [room.ceiling_height_m, self.floor_surface, ceiling, *lighting.of_room_beyond(room, self.position)]
@@ -136,7 +157,11 @@ class _Builder:
         level: FurnitureLevel = self.level if slot == 0 or self.level == "empty" else "simple"
         camera = self.position if slot == 0 else None
         self._begin(_FURNITURE, room_index)
-        pieces = furnish(room, openings, level, rng, camera)
+        # The empty rooms of a staged home are bare; others keep what is built in.
+        fitted = not (self.is_staged and level == "empty")
+        pieces = furnish(room, openings, level, rng, camera, fitted=fitted)
+        if slot == 0:
+            self.facts |= {prism.label for prism in pieces if prism.label}
         self._add_pieces(pieces)
 
     def _has_new_floor(self, room_index: int) -> bool:
@@ -193,7 +218,9 @@ class _Builder:
             if 2 * half_width < length - 0.2:
                 s = rng.uniform(half_width + 0.1, length - half_width - 0.1)
                 z = rng.uniform(1.35, 1.7)
-                frame, picture = self.table.add_finish("dark"), self.table.add("furniture", vivid(rng), scale=0.7)
+                frame = self.table.add_finish("dark")
+                is_screen = rng.random() < 0.15
+                picture = frame if is_screen else self.table.add("furniture", vivid(rng), scale=0.7)
                 self._decal(wall, s - half_width, s + half_width, z - half_height, z + half_height, frame)
                 inset = rng.uniform(0.015, 0.05)
                 self._decal(
@@ -225,8 +252,9 @@ class _Builder:
             depth = self._hole_depth(opening)
             surface = self.trim if framed else self.wall_surface[wall]
             self._decal(wall, s0, s1, -1.0, z1, surface, slot, depth)
+            self._add_threshold(room, opening, depth)
             if opening.kind == "door_open":
-                self._add_door_leaf(room, opening, depth)
+                self._add_door_leaves(room, opening, depth)
         elif opening.kind == "door_shut" or (opening.kind == "door_open" and self.rng.random() < 0.5):
             self._add_shut_door(wall, s0, s1, z1)
         else:
@@ -244,7 +272,9 @@ class _Builder:
     def _add_window(self, wall: int, s0: float, s1: float, z0: float, z1: float) -> None:
         rng, border = self.rng, self.rng.uniform(0.04, 0.09)
         self._decal(wall, s0 - 0.03, s1 + 0.03, z0 - 0.03, z1 + 0.03, self.trim)
-        self._decal(wall, s0 + border, s1 - border, z0 + border, z1 - border, self.outdoors)
+        # The leaf of a French window has a broad rail at its foot.
+        rail = rng.uniform(0.1, 0.35) if z0 < 0.1 and rng.random() < 0.5 else border
+        self._decal(wall, s0 + border, s1 - border, z0 + rail, z1 - border, self.outdoors)
         sashes = max(1, round((s1 - s0) / rng.uniform(0.6, 1.4)))
         for k in range(1, sashes):
             s = s0 + (s1 - s0) * k / sashes
@@ -256,42 +286,44 @@ class _Builder:
             # A roller blind.
             blind = self.table.add("furniture", bright(rng), glow=rng.uniform(0.4, 1.2))
             self._decal(wall, s0, s1, z1 - rng.uniform(0.2, 0.9) * (z1 - z0), z1, blind)
+        elif rng.random() < 0.08:
+            # A sheer curtain before the whole window.
+            sheer = self.table.add("furniture", bright(rng), scale=rng.uniform(1.0, 3.0), glow=rng.uniform(0.3, 1.0))
+            self._decal(wall, s0 - 0.15, s1 + 0.15, 0.04 if rng.random() < 0.6 else z0 - 0.05, z1 + 0.1, sheer)
 
     def _add_shut_door(self, wall: int, s0: float, s1: float, z1: float) -> None:
         rng, double = self.rng, s1 - s0 > 1.15
         self._decal(wall, s0, s1, -1.0, z1, self.door)
         leaves = [(s0, 0.5 * (s0 + s1)), (0.5 * (s0 + s1), s1)] if double else [(s0, s1)]
         panels = int(rng.integers(0, 4))
+        panel = self.gloom if self.doors_are_glazed else self.door_panel
         for a, b in leaves:
             for k in range(panels):
                 low, high = 0.15 + k * (z1 - 0.25) / panels, 0.05 + (k + 1) * (z1 - 0.25) / panels
-                self._decal(wall, a + 0.12, b - 0.12, low, high, self.door_panel)
+                self._decal(wall, a + 0.12, b - 0.12, low, high, panel)
         s = 0.5 * (s0 + s1) - 0.08 if double else (s1 - 0.08 if rng.random() < 0.5 else s0 + 0.08)
         self._decal(wall, s - 0.05, s + 0.05, 1.0, 1.04, self.handle)
         if double:
             self._decal(wall, 0.5 * (s0 + s1) - 0.006, 0.5 * (s0 + s1) + 0.006, 0.0, z1, self.gloom)
 
-    def _add_door_leaf(self, room: Room, opening: Opening, depth: float) -> None:
-        """An open door's leaf, hinged at one end, standing in one of the two rooms; none if there is no space."""
-        rng = self.rng
+    def _add_door_leaves(self, room: Room, opening: Opening, depth: float) -> None:
+        neighbour = self.home.plan.rooms[opening.neighbour]
+        for leaf in hang_leaves(opening, room, neighbour, depth, self.position, self.rng):
+            for board in boards(leaf.half_width_m, opening.head_m, glazed=self.doors_are_glazed):
+                centre = leaf.centre_m + leaf.axis * board.along_m
+                self._add_box(centre, leaf.axis, board.half_a, board.half_b, board.z0, board.z1, self.door)
+            knob = leaf.centre_m + leaf.axis * 0.8 * leaf.half_width_m
+            self._add_box(knob, leaf.axis, 0.06, 0.06, 1.0, 1.03, self.handle)
+
+    def _add_threshold(self, room: Room, opening: Opening, depth: float) -> None:
+        """At times a strip in the doorway."""
+        if self.rng.random() > 0.2:
+            return
         start, along, inwards = wall_frame(room, opening.wall)
-        width = opening.end_m - opening.start_m
-        angle = math.radians(rng.uniform(55.0, 110.0))
-        for into_own in (True, False) if rng.random() < 0.5 else (False, True):
-            outward = inwards if into_own else -inwards
-            at_start = rng.random() < 0.5
-            hinge = start + along * (opening.start_m if at_start else opening.end_m)
-            hinge = hinge if into_own else hinge - inwards * depth
-            leaf = (along if at_start else -along) * math.cos(angle) + outward * math.sin(angle)
-            centre = hinge + leaf * 0.5 * width + outward * 0.03
-            footprint = rectangle(centre, leaf, 0.49 * width, 0.018)
-            target = room if into_own else self.home.plan.rooms[opening.neighbour]
-            clear = shapely.distance(footprint, shapely.Point(self.position)) > CAMERA_CLEARANCE_M
-            if clear and target.shape.contains(footprint):
-                self._add_box(centre, leaf, 0.49 * width, 0.018, 0.01, opening.head_m - 0.01, self.door)
-                knob = centre + leaf * 0.4 * width
-                self._add_box(knob, leaf, 0.06, 0.06, 1.0, 1.03, self.handle)
-                return
+        centre = start + along * 0.5 * (opening.start_m + opening.end_m) - inwards * 0.5 * depth
+        surface = self.trim if self.rng.random() < 0.5 else self.handle
+        half = 0.5 * (opening.end_m - opening.start_m)
+        self._add_box(centre, along, half, 0.5 * depth, 0.0, self.rng.uniform(0.006, 0.025), surface)
 
     def _add_box(
         self, centre: np.ndarray, axis: np.ndarray, a: float, b: float, z0: float, z1: float, surface: int
@@ -324,6 +356,40 @@ class _Builder:
                 continue
             if shapely.distance(footprint, shapely.Point(self.position)) > CAMERA_CLEARANCE_M:
                 self._add_box(centre, along, half, depth, z0, z1, surface)
+
+    def _add_mirror(self, prisms: list[tuple[float, ...]], lights: np.ndarray) -> None:
+        """A mirror on a wall of the own room, behind which the room is built once more, reflected."""
+        drawn = draw_mirror(self.room, self.openings, self.rng, is_bare=self.level == "empty")
+        if drawn is None:
+            return
+        wall, s0, s1, z0, z1 = drawn
+        self.facts.add("mirror")
+        reflection, count, slot = Reflection(self.walls[wall]), len(self.room.walls_m), len(self.slots)
+        relative = Reflection(self.walls[wall] - np.tile(self.position, 2))
+        own = np.array(self.slots[0], dtype=float)
+        if len(lights):
+            brightest = lights[lights[:, LIGHT_RGB].sum(axis=1).argmax()]
+            x, y, z = brightest[LIGHT_XYZ]
+            own[SLOT_LIGHT_XYZ] = [*relative.point(np.array([x, y])), z]
+            own[SLOT_LIGHT_RGB] = brightest[LIGHT_RGB]
+        own[SLOT_AMBIENT] = self.slots[0][SLOT_AMBIENT]
+        self.slots.append(list(own))
+        first = len(self.walls)
+        for edge in range(count):
+            self.walls.append(reflection.wall(self.walls[edge]))
+            self.owner.append(slot)
+            self.wall_surface.append(self.wall_surface[edge])
+        for on, a, b, low, high, surface, behind, _ in [decal for decal in self.decals if decal[0] < count]:
+            ends = self.walls[int(on)]
+            length = float(np.hypot(*(ends[2:] - ends[:2])))
+            seen = self.gloom if behind >= 0 else int(surface)
+            self._decal(first + int(on), length - b, length - a, low, high, seen)
+        self.prisms += [tuple(relative.prism(np.array(prism, dtype=float)).tolist()) for prism in prisms]
+        if self.rng.random() < 0.6:
+            border = self.rng.uniform(0.02, 0.08)
+            frame = self.table.add_finish("wood")
+            self._decal(wall, s0 - border, s1 + border, z0 - border, z1 + border, frame)
+        self._decal(wall, s0, s1, z0, z1, self.handle, slot, _MIRROR_DEPTH_M)
 
     def _add_jambs(self) -> None:
         """The cheeks of every hole: walls from one room to the next."""

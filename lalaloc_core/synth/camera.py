@@ -1,46 +1,73 @@
-"""From radiance to an 8-bit picture: exposure, white balance, tone curve, blur, noise and the tripod's patch."""
+"""From radiance to an 8-bit picture: exposure, white balance, lenses, tone curve, blur, noise, patches, compression."""
 
 from __future__ import annotations
 
-import math
+from collections.abc import Callable
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from lalaloc_core.synth import lighting as L
+from lalaloc_core.synth import exposure as E
+from lalaloc_core.synth.jpeg import compress
+from lalaloc_core.synth.lens import lens_gain, tilt
+from lalaloc_core.synth.patches import cover_poles
 
 _LUMA = (0.2126, 0.7152, 0.0722)
 _MIDDLE_GREY = 0.6
 
 
 def develop(
-    radiance: Float[Tensor, "b h w 3"], exposure: Float[Tensor, "b 12"], noise: Float[Tensor, "bh bw 3"]
+    radiance: Float[Tensor, "b h w 3"], exposure: Float[Tensor, "b 24"], noise: Float[Tensor, "bh bw 3"]
 ) -> UInt8[Tensor, "b h w 3"]:
     """Expose linear radiance and encode it as sRGB-like bytes.
 
     Args:
         radiance: linear light.
-        exposure: camera settings per picture, see `lighting.draw_exposure`.
+        exposure: camera settings per picture, see `exposure.draw_exposure`.
         noise: unit noise, at least as large as a picture; every picture takes its own rolled part of it.
     """
     luma = radiance @ radiance.new_tensor(_LUMA)
     # The mean of the logarithm weighs a dark room more than the bright window in it, as a light meter does.
-    level = luma.clamp_(1e-3, 20.0).log_().mean(dim=(1, 2)).exp()
-    gains = torch.stack([exposure[:, L.RED_GAIN], exposure[:, L.TINT], exposure[:, L.BLUE_GAIN]], dim=-1)
-    gains = gains * (_MIDDLE_GREY * exposure[:, L.TARGET] / level)[:, None]
-    picture = _blur(radiance * gains[:, None, None], exposure[:, L.BLUR])
+    luma = luma.clamp_(1e-3, 20.0).log_()
+    mean = luma.mean(dim=(1, 2))
+    level = mean.exp()
+    gains = torch.stack([exposure[:, E.RED_GAIN], exposure[:, E.TINT], exposure[:, E.BLUE_GAIN]], dim=-1)
+    gains = gains * (_MIDDLE_GREY * exposure[:, E.TARGET] / level)[:, None]
+    flatter = torch.exp(exposure[:, E.FLAT, None, None] * (mean[:, None, None] - luma))
+    _replace(
+        flatter,
+        exposure,
+        exposure[:, [E.VIGNETTE, E.SEAM_STEP]].any(dim=1),
+        lambda some, row: some * lens_gain(row, *some.shape[1:]),
+    )
+    picture = _blur(radiance * gains[:, None, None] * flatter[..., None], exposure[:, E.BLUR])
     column = exposure[:, None, None, None, :]
     # Highlights roll off instead of clipping hard; how softly differs between cameras.
-    shoulder = column[..., L.SHOULDER]
+    shoulder = column[..., E.SHOULDER]
     picture = (picture * (0.25 * shoulder)).add_(1.0).mul_(picture).div_((picture * shoulder).add_(1.0))
     picture = picture.clamp_(0.0, 1.0).pow_(1.0 / 2.2)
     grey = picture.mean(dim=-1, keepdim=True)
-    contrast, saturation = column[..., L.CONTRAST], column[..., L.SATURATION]
+    contrast, saturation = column[..., E.CONTRAST], column[..., E.SATURATION]
     # Saturation scales the distance to grey, contrast the distance to one half.
     picture = picture.mul_(contrast * saturation).add_(grey * (contrast * (1.0 - saturation)) + 0.5 * (1.0 - contrast))
-    picture.add_(_own_noise(noise, exposure, picture.shape[1], picture.shape[2]).mul_(column[..., L.NOISE]))
-    return _nadir(picture, exposure).clamp_(0.0, 1.0).mul_(255.0).round_().to(torch.uint8)
+    _replace(picture, exposure, exposure[:, [E.ROLL, E.PITCH, E.SEAM_SHIFT]].any(dim=1), tilt)
+    picture.add_(_own_noise(noise, exposure, picture.shape[1], picture.shape[2]).mul_(column[..., E.NOISE]))
+    picture = cover_poles(picture, exposure).clamp_(0.0, 1.0)
+    _replace(picture, exposure, exposure[:, E.JPEG] > 0.0, lambda some, row: compress(some, row[:, E.JPEG]))
+    return picture.mul_(255.0).round_().to(torch.uint8)
+
+
+def _replace(
+    picture: Float[Tensor, "b h w *c"],
+    exposure: Float[Tensor, "b 24"],
+    wanted: Bool[Tensor, "b"],
+    change: Callable[[Tensor, Tensor], Tensor],
+) -> None:
+    """Change some of the pictures in place."""
+    chosen = wanted.nonzero(as_tuple=True)[0]
+    if len(chosen):
+        picture[chosen] = change(picture[chosen], exposure[chosen])
 
 
 def _blur(picture: Float[Tensor, "b h w 3"], sigma: Float[Tensor, "b"]) -> Float[Tensor, "b h w 3"]:
@@ -55,14 +82,7 @@ def _blur(picture: Float[Tensor, "b h w 3"], sigma: Float[Tensor, "b"]) -> Float
 
 def _own_noise(noise: Tensor, exposure: Tensor, rows: int, columns: int) -> Float[Tensor, "b h w 3"]:
     parts = []
-    for seed in exposure[:, L.NOISE_SEED].long().tolist():
+    for seed in exposure[:, E.NOISE_SEED].long().tolist():
         top, left = seed % (noise.shape[0] - rows + 1), (seed // 7) % (noise.shape[1] - columns + 1)
         parts.append(noise[top : top + rows, left : left + columns])
     return torch.stack(parts)
-
-
-def _nadir(picture: Float[Tensor, "b h w 3"], exposure: Tensor) -> Float[Tensor, "b h w 3"]:
-    rows = picture.shape[1]
-    angle = (torch.arange(rows, device=picture.device) + 0.5) / rows * math.pi
-    patch = (math.pi - angle)[None] < exposure[:, L.NADIR, None]
-    return torch.where(patch[:, :, None, None], exposure[:, L.NADIR_TONE, None, None, None], picture)

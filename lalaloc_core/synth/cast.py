@@ -36,7 +36,7 @@ class SceneBatch:
     lights: Float[Tensor, "b l 8"]
     sun: Float[Tensor, "b 14"]
     backdrop: Float[Tensor, "b 10"]
-    exposure: Float[Tensor, "b 12"]
+    exposure: Float[Tensor, "b 24"]
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,8 +11,10 @@ from jaxtyping import Float
 
 from lalaloc_core.floorplan import Room
 from lalaloc_core.synth.catalogue import ROOM_PIECES
+from lalaloc_core.synth.fitted import Placed, Stretch, kitchen, sanitary, wardrobes
 from lalaloc_core.synth.openings import Opening
-from lalaloc_core.synth.pieces import Finish, Maker, Part, Piece
+from lalaloc_core.synth.pieces import Finish, Label, Maker, Part, Piece
+from lalaloc_core.synth.pieces_service import counter, island
 
 FurnitureLevel = Literal["empty", "simple", "full"]
 FURNITURE_LEVELS: tuple[FurnitureLevel, ...] = get_args(FurnitureLevel)
@@ -23,6 +25,9 @@ _TRIES = 20
 _ROOM_IS_FULL_AFTER = 5
 _WALL_GAP_M = 0.01
 _DOOR_CLEARANCE_M = 0.55
+_WORKTOP_M = 0.96
+_KITCHEN_CHANCE = {"kitchen": 0.85, "living": 0.3, "dining": 0.2}
+_WARDROBE_CHANCE = {"bedroom": 0.4, "corridor": 0.2, "closet": 0.3, "storage": 0.3, "study": 0.2}
 
 
 # Centres and unit axes, of one piece or of several tries.
@@ -40,6 +45,7 @@ class Prism(NamedTuple):
         finish: what it is made of.
         piece: number of the piece of furniture that it is part of.
         round: whether it is a cylinder.
+        label: of the piece, see `pieces`.
     """
 
     x: float
@@ -53,6 +59,7 @@ class Prism(NamedTuple):
     finish: Finish
     piece: int
     round: bool
+    label: Label = ""
 
 
 class _Floor:
@@ -64,6 +71,7 @@ class _Floor:
         shapely.prepare(self._shape)
         self._taken = list(keep_clear)
         self._windows = [opening for opening in openings if opening.kind == "window"]
+        self._openings = openings
         self._start = room.walls_m[:, :2]
         along = room.walls_m[:, 2:] - self._start
         self._length = np.hypot(along[:, 0], along[:, 1])
@@ -72,9 +80,33 @@ class _Floor:
     def find(self, piece: Piece, rng: np.random.Generator) -> Pose | None:
         """A free place for a piece, which is then taken; None if several tries found none."""
         pose = self._along_walls(piece, rng) if piece.against_wall else self._anywhere(rng)
-        if pose is None:
-            return None
-        centre, axis = pose
+        return None if pose is None else self._take(piece, *pose)
+
+    def fit(self, placed: Placed) -> Pose | None:
+        """The pose of a piece whose place is given, which is then taken; None if it is not free."""
+        axis, wall = self._along[placed.wall], placed.wall
+        inwards = np.array([-axis[1], axis[0]])
+        from_wall = placed.from_wall_m + 0.5 * placed.piece.depth_m + _WALL_GAP_M
+        centre = self._start[wall] + axis * placed.middle_m + inwards * from_wall
+        return self._take(placed.piece, centre[None], axis[None])
+
+    def stretches(self) -> tuple[list[Stretch], Float[np.ndarray, "n"]]:
+        """The stretches of wall without doors and low windows, and the length of every wall."""
+        found = []
+        for wall, length in enumerate(self._length):
+            holes = [opening for opening in self._openings if opening.wall == wall]
+            high = [hole for hole in holes if hole.kind == "window" and hole.sill_m > _WORKTOP_M]
+            ends = sorted((hole.start_m - 0.1, hole.end_m + 0.1) for hole in holes if hole not in high)
+            start = 0.0
+            for begin, end in [*ends, (float(length), 0.0)]:
+                if begin - start > 0.3:
+                    has_window = any(hole.start_m < begin and hole.end_m > start for hole in high)
+                    found.append(Stretch(wall, start, begin, has_window))
+                start = end
+        return found, self._length
+
+    def _take(self, piece: Piece, centre: Float[np.ndarray, "n 2"], axis: Float[np.ndarray, "n 2"]) -> Pose | None:
+        """The first of several poses that is free, if any."""
         footprints = _rectangles(centre, axis, 0.5 * piece.width_m - 1e-3, 0.5 * piece.depth_m - 1e-3)
         free = shapely.contains_properly(self._shape, footprints)
         if self._taken:
@@ -125,6 +157,8 @@ def furnish(
     level: FurnitureLevel,
     rng: np.random.Generator,
     camera_m: Float[np.ndarray, "2"] | None = None,
+    *,
+    fitted: bool = False,
 ) -> list[Prism]:
     """Furnish one room.
 
@@ -134,20 +168,23 @@ def furnish(
         level: how much.
         rng: source of randomness.
         camera_m: nothing comes closer to this position than `CAMERA_CLEARANCE_M`.
+        fitted: whether kitchens, bathrooms and wardrobes are built in where they belong, in empty rooms too.
     """
     most = _MAX_PIECES[level]
-    if most == 0:
+    if most == 0 and not fitted:
         return []
     keep_clear = [_door_zone(room, opening) for opening in openings if opening.kind != "window"]
     if camera_m is not None:
         keep_clear.append(shapely.Point(camera_m).buffer(CAMERA_CLEARANCE_M + 0.01))
     floor = _Floor(room, openings, keep_clear)
-    prisms: list[Prism] = []
+    prisms = _build_in(floor, room, rng) if fitted else []
+    first = 1 + max((prism.piece for prism in prisms), default=-1)
+    has_kitchen = any(prism.label == "counter" for prism in prisms)
     placed = refused = 0
     for maker, chance in _wanted(room, level, rng):
         if placed >= most or refused >= _ROOM_IS_FULL_AFTER:
             break
-        if rng.random() > chance:
+        if rng.random() > chance or (has_kitchen and maker in (counter, island)):
             continue
         piece = maker(rng)
         if piece.height_m > room.ceiling_height_m - 0.02:
@@ -156,9 +193,31 @@ def furnish(
         if pose is None:
             refused += 1
             continue
-        prisms += place(piece, *pose, placed)
+        prisms += place(piece, *pose, first + placed)
         placed += 1
-    return prisms + _rugs(floor, rng, first_number=placed)
+    return prisms + (_rugs(floor, rng, first_number=first + placed) if most else [])
+
+
+def _build_in(floor: _Floor, room: Room, rng: np.random.Generator) -> list[Prism]:
+    """What is built into a room by its kind; the pieces of one kitchen share a number, and so their looks."""
+    kind = room.name.split()[0]
+    stretches, lengths = floor.stretches()
+    groups: list[list[Placed]] = []
+    if rng.random() < _KITCHEN_CHANCE.get(kind, 0.0):
+        groups.append(kitchen(stretches, lengths, room.ceiling_height_m, rng))
+    if rng.random() < _WARDROBE_CHANCE.get(kind, 0.1):
+        groups.append(wardrobes(stretches, room.ceiling_height_m, rng))
+    prisms: list[Prism] = []
+    for number, group in enumerate(groups):
+        for one in group:
+            pose = floor.fit(one)
+            if pose is not None:
+                prisms += place(one.piece, *pose, number)
+    if kind == "bathroom" and rng.random() < 0.7:
+        for number, piece in enumerate(sanitary(rng), start=len(groups)):
+            pose = floor.find(piece, rng)
+            prisms += place(piece, *pose, number) if pose is not None else []
+    return prisms
 
 
 def place(piece: Piece, centre_m: Float[np.ndarray, "2"], axis: Float[np.ndarray, "2"], number: int) -> list[Prism]:
@@ -178,6 +237,7 @@ def place(piece: Piece, centre_m: Float[np.ndarray, "2"], axis: Float[np.ndarray
             part.finish,
             number,
             part.round,
+            piece.label,
         )
         for part in piece.parts
     ]

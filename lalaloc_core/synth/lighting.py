@@ -1,4 +1,4 @@
-"""Drawing the light of a scene and the settings of the camera."""
+"""Drawing the light of a scene."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import shapely
 from lalaloc_core.floorplan import Room
 from lalaloc_core.synth.furniture import Prism, wall_frame
 from lalaloc_core.synth.openings import Opening
+from lalaloc_core.synth.pieces import Finish
 from lalaloc_core.synth.scene import LIGHT_NORMAL, LIGHT_RGB, SLOT_AMBIENT, SLOT_LIGHT_RGB, Scene
 from lalaloc_core.synth.surfaces import BLUE, GLOW, OUTDOORS, RED
 
@@ -20,6 +21,7 @@ Mood = Literal["cold", "raw", "warm"]
 MOODS: tuple[Mood, ...] = get_args(Mood)
 
 _MAX_WINDOWS = 2
+_DOWNLIGHTS, _MAX_DOWNLIGHTS = 4, 10
 # What a mood multiplies the neutral light of lamps and of the sky with.
 _LAMP_TINTS: dict[Mood, tuple[float, float, float]] = {
     "cold": (0.62, 0.85, 1.15),
@@ -32,11 +34,6 @@ _SKY_TINTS: dict[Mood, tuple[float, float, float]] = {
     "warm": (0.7, 0.52, 0.36),
 }
 
-# Columns of an exposure row.
-TARGET, RED_GAIN, BLUE_GAIN, CONTRAST, SATURATION, NOISE, BLUR, NADIR, NADIR_TONE, NOISE_SEED, SHOULDER, TINT = range(
-    12
-)
-
 
 class Lighting:
     """The mood shared by all lights of a scene: daylight or evening, warm or cold lamps.
@@ -44,10 +41,11 @@ class Lighting:
     Args:
         rng: source of randomness.
         neutral: lamps are on and hardly coloured, for a scene that is to be `relit`.
+        bright: strong daylight that pale walls throw everywhere.
     """
 
-    def __init__(self, rng: np.random.Generator, *, neutral: bool = False) -> None:
-        self.rng = rng
+    def __init__(self, rng: np.random.Generator, *, neutral: bool = False, bright: bool = False) -> None:
+        self.rng, self._bright = rng, bright
         self.lamp_colour = np.array([1.0, rng.uniform(0.75, 1.0), rng.uniform(0.45, 1.0)])
         self.sky_colour = np.array([rng.uniform(0.85, 1.05), 1.0, rng.uniform(0.95, 1.2)])
         self.daylight = float(rng.uniform(0.4, 3.0) if rng.random() < 0.85 else 0.0)
@@ -56,6 +54,9 @@ class Lighting:
         if neutral:
             self.lamp_colour, self.sky_colour = self.lamp_colour**0.2, self.sky_colour**0.4
             self.lamps_on = True
+        if bright:
+            self.daylight, self.lamps_on = float(rng.uniform(1.2, 4.0)), bool(rng.random() < 0.4)
+            self.ambient = math.exp(rng.uniform(math.log(0.4), math.log(1.1)))
 
     def of_room_beyond(self, room: Room, origin_m: np.ndarray) -> list[float]:
         """Position and colour of the one lamp of a neighbouring room, and its ambient light."""
@@ -63,7 +64,9 @@ class Lighting:
         centre = np.array(room.shape.representative_point().coords[0]) - origin_m
         strength = math.exp(rng.uniform(math.log(0.1), math.log(3.5)))
         tint = self.lamp_colour if rng.random() < 0.5 else self.sky_colour
-        ambient = self.ambient * math.exp(rng.uniform(-1.8, 0.6)) * (0.5 + 0.5 * tint)
+        # Seen from a room, the next one may lie in the dark or be flooded with light.
+        low, high = (-0.7, 0.6) if self._bright else (-2.4, 1.1)
+        ambient = self.ambient * math.exp(rng.uniform(low, high)) * (0.5 + 0.5 * tint)
         return [*centre, room.ceiling_height_m - 0.3, *(strength * tint), *ambient]
 
 
@@ -82,7 +85,7 @@ def light_room(
     lights = [_window_light(room, window, origin_m, lighting) for window in windows if lighting.daylight > 0.0]
     rows, prisms = _lamps(room, origin_m, lighting, lit=lighting.lamps_on or not lights, rng=rng)
     sun = np.zeros(14)
-    if windows and lighting.daylight > 0.0 and rng.random() < 0.5:
+    if windows and lighting.daylight > 0.0 and rng.random() < 0.4:
         sun = _sun(room, windows[int(rng.integers(len(windows)))], origin_m, rng)
     return np.array(lights + rows).reshape(-1, 8), prisms, sun
 
@@ -115,7 +118,7 @@ def _window_light(room: Room, window: Opening, origin_m: np.ndarray, lighting: L
 def _lamps(
     room: Room, origin_m: np.ndarray, lighting: Lighting, lit: bool, rng: np.random.Generator
 ) -> tuple[list[list[float]], list[Prism]]:
-    """One lamp in the middle of the room, a second one in a large room."""
+    """One lamp in the middle of the room, a second one in a large room or on a wall; or a ceiling of downlights."""
     spots = [np.array(room.shape.representative_point().coords[0])]
     if room.area_m2 > 18.0:
         x_min, y_min, x_max, y_max = room.shape.bounds
@@ -123,25 +126,61 @@ def _lamps(
         if shapely.contains_xy(room.shape.buffer(-0.5), *other):
             spots.append(other)
     rows, prisms = [], []
+    finish: Finish = "glow" if lit else "white"
     power = math.exp(rng.uniform(math.log(0.8), math.log(4.0))) * (0.5 + room.area_m2 / 15.0) / len(spots)
     ceiling = room.ceiling_height_m
-    style = int(rng.integers(4))
+    style = int(rng.integers(5))
+    if style == _DOWNLIGHTS:
+        prisms += _downlights(room, finish, rng)
     for spot in spots:
         drop = rng.uniform(0.3, 0.9) if style == 0 and np.hypot(*(spot - origin_m)) > 0.6 else 0.0
         radius = rng.uniform(0.1, 0.3)
-        finish = "glow" if lit else "white"
         thickness = rng.uniform(0.02, 0.12) if style != 3 else 0.01
         at = (float(spot[0]), float(spot[1]), 1.0, 0.0)
         clear = shapely.contains_xy(room.shape.buffer(-radius - 0.02), *spot)
-        if clear:
+        if clear and style != _DOWNLIGHTS:
             if drop:
                 prisms.append(Prism(*at, 0.008, 0.008, ceiling - drop, ceiling - 1e-3, "dark", -2, True))
             z1 = ceiling - drop - 1e-3
             z0 = z1 - (rng.uniform(0.12, 0.3) if drop else thickness)
             prisms.append(Prism(*at, radius, radius, z0, z1, finish, -2, style != 2))
         if lit:
-            rows.append([*(spot - origin_m), ceiling - drop - 0.2, *(power * lighting.lamp_colour), 0.0, 0.0])
+            # Lamps of one room need not have one colour.
+            colour = lighting.lamp_colour * np.exp(rng.normal(0.0, 0.08, 3))
+            rows.append([*(spot - origin_m), ceiling - drop - 0.2, *(power * colour), 0.0, 0.0])
+    if lit and len(rows) == 1 and rng.random() < 0.15:
+        row, lamp = _wall_lamp(room, origin_m, lighting, rng)
+        rows.append(row)
+        prisms.append(lamp)
     return rows, prisms
+
+
+def _downlights(room: Room, finish: Finish, rng: np.random.Generator) -> list[Prism]:
+    """Small round lamps in a grid, flush with the ceiling."""
+    x_min, y_min, x_max, y_max = room.shape.bounds
+    step, radius = rng.uniform(0.9, 2.0), rng.uniform(0.035, 0.08)
+    xs, ys = np.arange(x_min + 0.4, x_max, step), np.arange(y_min + 0.4, y_max, step)
+    spots = np.stack(np.meshgrid(xs, ys), axis=-1).reshape(-1, 2)
+    spots = spots[shapely.contains_xy(room.shape.buffer(-0.15), spots[:, 0], spots[:, 1])][:_MAX_DOWNLIGHTS]
+    z1 = room.ceiling_height_m - 1e-3
+    return [Prism(float(x), float(y), 1.0, 0.0, radius, radius, z1 - 0.008, z1, finish, -2, True) for x, y in spots]
+
+
+def _wall_lamp(
+    room: Room, origin_m: np.ndarray, lighting: Lighting, rng: np.random.Generator
+) -> tuple[list[float], Prism]:
+    """A lamp on the longest wall, which it washes with light."""
+    lengths = np.hypot(*(room.walls_m[:, 2:] - room.walls_m[:, :2]).T)
+    wall = int(lengths.argmax())
+    start, along, inwards = wall_frame(room, wall)
+    foot = start + along * lengths[wall] * rng.uniform(0.15, 0.85)
+    at, z = foot + inwards * 0.06, rng.uniform(1.6, 1.95)
+    power = math.exp(rng.uniform(math.log(0.15), math.log(0.8)))
+    light = [*(foot + inwards * 0.2 - origin_m), z, *(power * lighting.lamp_colour), 0.0, 0.0]
+    lamp = Prism(
+        float(at[0]), float(at[1]), float(along[0]), float(along[1]), 0.06, 0.04, z - 0.1, z + 0.1, "glow", -2, False
+    )
+    return light, lamp
 
 
 def _sun(room: Room, window: Opening, origin_m: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -150,7 +189,7 @@ def _sun(room: Room, window: Opening, origin_m: np.ndarray, rng: np.random.Gener
     side, elevation = rng.uniform(-1.0, 1.0), math.radians(rng.uniform(15.0, 55.0))
     toward = math.cos(side) * -inwards + math.sin(side) * along
     direction = [*(toward * math.cos(elevation)), math.sin(elevation)]
-    colour = math.exp(rng.uniform(math.log(1.0), math.log(10.0))) * np.array([1.0, 0.93, 0.8])
+    colour = math.exp(rng.uniform(math.log(1.5), math.log(14.0))) * np.array([1.0, 0.93, 0.8])
     rectangle = [window.start_m + 0.06, window.end_m - 0.06, window.sill_m + 0.06, window.head_m - 0.06]
     return np.array([*direction, *(start - origin_m), *along, *rectangle, *colour])
 
@@ -160,30 +199,3 @@ def draw_backdrop(rng: np.random.Generator) -> np.ndarray:
     sky = rng.uniform(0.7, 1.0) * np.array([rng.uniform(0.7, 1.0), rng.uniform(0.85, 1.0), 1.0])
     ground = rng.uniform(0.05, 0.5) * np.array([rng.uniform(0.6, 1.1), 1.0, rng.uniform(0.4, 1.0)])
     return np.array([*sky, *ground, rng.uniform(-0.15, 0.6), rng.uniform(0.02, 0.25), *rng.uniform(0.0, 1.0, 2)])
-
-
-def draw_exposure(rng: np.random.Generator) -> np.ndarray:
-    """How the camera turns light into a picture; see the column names above."""
-    row = np.zeros(12)
-    row[TARGET] = math.exp(rng.normal(math.log(0.42), 0.38))
-    row[RED_GAIN], row[BLUE_GAIN] = np.exp(rng.normal(0.0, 0.09, 2))
-    row[TINT] = math.exp(rng.normal(0.0, 0.02))
-    row[CONTRAST] = rng.uniform(0.85, 1.25)
-    row[SATURATION] = rng.uniform(0.5, 1.25)
-    row[NOISE] = 0.03 * rng.random() ** 3
-    row[BLUR] = rng.uniform(0.0, 0.9)
-    if rng.random() < 0.25:
-        row[NADIR] = math.radians(rng.uniform(6.0, 24.0))
-        row[NADIR_TONE] = 0.0 if rng.random() < 0.6 else rng.uniform(0.0, 0.9)
-    row[NOISE_SEED] = rng.integers(1 << 20)
-    row[SHOULDER] = rng.uniform(0.2, 1.0)
-    return row
-
-
-def draw_staged_exposure(rng: np.random.Generator) -> np.ndarray:
-    """As `draw_exposure`, for the pictures of one data set: they are more alike, and no tripod is in them."""
-    row = draw_exposure(rng)
-    row[TARGET] = math.sqrt(0.5 * row[TARGET])
-    row[SATURATION] = 0.5 + 0.5 * row[SATURATION]
-    row[NADIR] = 0.0
-    return row

@@ -14,6 +14,10 @@ OpeningKind = Literal["door_shut", "door_open", "opening", "window"]
 
 _CORNER_CLEARANCE_M = 0.06
 _MIN_DOOR_M = 0.65
+_MAX_OPENING_M = 5.0
+_WIDE_M = 1.2
+# Share of open doors, by home, and how often a home has it: shut, as usual, all open.
+_OPEN_SHARES, _OPEN_SHARE_SHARES = (0.3, 0.65, 0.95), (0.2, 0.4, 0.4)
 _PUBLIC = ("living", "kitchen", "corridor", "dining", "hall")
 _WINDOWLESS = ("corridor", "closet", "storage")
 
@@ -125,6 +129,7 @@ def _connect_rooms(
     openings: list[Opening] = []
     facings = walls.facing(max_gap_m)
     public = [name.startswith(_PUBLIC) for name in names]
+    open_share = float(rng.choice(_OPEN_SHARES, p=_OPEN_SHARE_SHARES))
     rank = [rng.random() + public[f.first[0]] + public[f.second[0]] for f in facings]
     for index in np.argsort(rank)[::-1]:
         facing = facings[index]
@@ -132,7 +137,9 @@ def _connect_rooms(
         joins = group[i] != group[j]
         if not joins and rng.random() > 0.25:
             continue
-        pair = _door_or_opening(walls, facing, public[i] and public[j], min(ceilings_m[i], ceilings_m[j]), rng)
+        pair = _door_or_opening(
+            walls, facing, public[i] and public[j], min(ceilings_m[i], ceilings_m[j]), open_share, rng
+        )
         openings += pair
         if joins and pair:
             group = [group[i] if g == group[j] else g for g in group]
@@ -140,20 +147,25 @@ def _connect_rooms(
 
 
 def _door_or_opening(
-    walls: _Walls, facing: _Facing, is_public: bool, ceiling_m: float, rng: np.random.Generator
+    walls: _Walls, facing: _Facing, is_public: bool, ceiling_m: float, open_share: float, rng: np.random.Generator
 ) -> list[Opening]:
-    kind: OpeningKind = "door_open" if rng.random() < 0.6 else "door_shut"
+    kind: OpeningKind = "door_open" if rng.random() < open_share else "door_shut"
     width, head = rng.uniform(_MIN_DOOR_M, 1.0), rng.uniform(1.95, min(2.15, ceiling_m - 0.1))
     if rng.random() < 0.1:
         width = rng.uniform(1.2, 1.7)
-    if is_public and rng.random() < 0.6:
-        kind = "opening"
-        width = rng.uniform(0.8, max(0.9, facing.length_m)) if rng.random() < 0.7 else facing.length_m
-        head = ceiling_m if rng.random() < 0.4 else rng.uniform(2.0, ceiling_m)
-    width = min(width, facing.length_m, 4.5)
-    slack = facing.length_m - width
     # Doors stand near a corner more often than in the middle of a wall.
-    shift = slack * float(np.clip(rng.choice([0.0, 1.0, rng.random()]) + rng.normal(0.0, 0.05), 0.0, 1.0))
+    side = float(np.clip(rng.choice([0.0, 1.0, rng.random()]) + rng.normal(0.0, 0.05), 0.0, 1.0))
+    if rng.random() < (0.7 if is_public else 0.06):
+        kind = "opening"
+        head = ceiling_m if rng.random() < 0.45 else rng.uniform(2.0, ceiling_m)
+        stubs = np.where(rng.random(2) < 0.3, 0.0, rng.uniform(0.05, 0.6, 2))
+        if is_public and rng.random() < 0.6 and facing.length_m - stubs.sum() > _WIDE_M:
+            # Open plan: nothing of the wall is left but stubs at its ends, if that.
+            width, side = facing.length_m - stubs.sum(), stubs[0] / max(stubs.sum(), 1e-6)
+        elif is_public:
+            width = rng.uniform(0.8, max(0.9, facing.length_m))
+    width = min(width, facing.length_m, _MAX_OPENING_M)
+    shift = (facing.length_m - width) * float(side)
     first = (facing.first_interval[0] + shift, facing.first_interval[0] + shift + width)
     second = (facing.second_interval[1] - shift - width, facing.second_interval[1] - shift)
     if not (walls.is_free(facing.first, *first) and walls.is_free(facing.second, *second)):
@@ -197,7 +209,8 @@ def _windows(
         if length < 0.9 or indoors[index].any() or names[room].startswith(_WINDOWLESS) or rng.random() < 0.25:
             continue
         for _ in range(1 + int(length > 3.0 and rng.random() < 0.5)):
-            width = rng.uniform(0.5, min(2.8, length - 0.3))
+            widest = 5.0 if rng.random() < 0.2 else 2.8
+            width = rng.uniform(0.5, min(widest, length - 0.3))
             start = rng.uniform(0.12, length - width - 0.12)
             if not walls.is_free((room, edge), start, start + width):
                 continue

@@ -37,7 +37,11 @@ class PanoramaRenderer:
         height: rows of a panorama, even.
         width: columns.
         device: where to render.
-        supersample: rays per pixel along either axis; 2 smooths edges at four times the cost.
+        supersample: rays per pixel along a column and along a row, or one number for both. Photographs average over
+            their pixels; (2, 1) smooths the edges of floor and ceiling, 2 those of doors too.
+
+    Raises:
+        InvalidInputError: `height` is odd, or a count of rays is less than one.
     """
 
     def __init__(
@@ -47,7 +51,7 @@ class PanoramaRenderer:
         height: int = 128,
         width: int = 256,
         device: str | torch.device = "cpu",
-        supersample: int = 1,
+        supersample: int | tuple[int, int] = 1,
     ) -> None:
         if height % 2:
             raise InvalidInputError(f"a panorama of {height} rows has a row on the horizon; the height must be even")
@@ -55,8 +59,11 @@ class PanoramaRenderer:
         self._device = torch.device(device)
         self._atlas = Atlas(materials, self._device)
         self._outdoors = Outdoors(self._device)
-        self._supersample = supersample
-        rows, columns = height * supersample, width * supersample
+        rays = (supersample, supersample) if isinstance(supersample, int) else supersample
+        if min(rays) < 1:
+            raise InvalidInputError(f"{rays} rays per pixel along its two axes, at least 1 is needed along each")
+        self._rays_per_pixel = rays
+        rows, columns = height * rays[0], width * rays[1]
         at_once = _PIXELS_AT_ONCE.get(self._device.type, _PIXELS_AT_ONCE_ELSEWHERE)
         self._scenes_at_once = max(1, at_once // (rows * columns))
         self._slope = self._tensor(np.tan(row_elevations(rows)))
@@ -112,8 +119,8 @@ class PanoramaRenderer:
 
     def _photograph(self, batch: SceneBatch, hits: Hits, direction: Float[Tensor, "b c 2"]) -> UInt8[Tensor, "b h w 3"]:
         radiance = shade(batch, hits, direction, self._slope, self._atlas, self._outdoors).transpose(1, 2)
-        if self._supersample > 1:
-            radiance = _shrink(radiance, self._supersample)
+        if self._rays_per_pixel != (1, 1):
+            radiance = _shrink(radiance, self._rays_per_pixel)
         return develop(radiance, batch.exposure, self._noise)
 
     def _range_m(self, hits: Hits) -> Float[Tensor, "b h w"]:
@@ -127,7 +134,7 @@ class PanoramaRenderer:
         return torch.from_numpy(np.asarray(array, dtype=np.float32)).to(self._device)
 
 
-def _shrink(radiance: Float[Tensor, "b h w 3"], factor: int) -> Float[Tensor, "b h2 w2 3"]:
+def _shrink(radiance: Float[Tensor, "b h w 3"], factor: tuple[int, int]) -> Float[Tensor, "b h2 w2 3"]:
     """Average blocks of rays; what is much brighter than the rest is clipped first, as on a sensor."""
     planes = radiance.clamp(max=8.0).permute(0, 3, 1, 2)
     return torch.nn.functional.avg_pool2d(planes, factor).permute(0, 2, 3, 1)

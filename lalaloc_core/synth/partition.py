@@ -33,11 +33,13 @@ def partition(rng: np.random.Generator, rooms: int, area_m2: float, corridor_wid
     aspect = rng.uniform(0.5, 1.0)
     width, height = np.sqrt(area_m2 / aspect), np.sqrt(area_m2 * aspect)
     footprint = (0.0, 0.0, float(width), float(height))
-    if rooms >= 4 and rng.random() < 0.7 and height > 5.0:
-        cells = _along_corridor(footprint, rooms, rng, rng.uniform(*corridor_width_m))
+    if rooms >= 4 and rng.random() < 0.85 and height > 5.0:
+        low, high = corridor_width_m
+        # Narrow corridors are the usual ones.
+        cells = _along_corridor(footprint, rooms, rng, low + (high - low) * rng.random() ** 1.7)
     else:
         cells = [Cell(_rectangle(rect)) for rect in _split(footprint, rooms, rng)]
-    cells = _carve_corners(cells, max(rooms - len(cells), 0) + int(rng.integers(0, 3)), rng)
+    cells = _carve_corners(cells, max(rooms - len(cells), 0) + int(rng.integers(0, 4)), rng)
     if len(cells) > 4 and rng.random() < 0.25:
         # A patio or a terrace: the footprint is then no rectangle.
         candidates = [index for index, cell in enumerate(cells) if not cell.corridor and len(cell.outline_m) == 4]

@@ -14,6 +14,8 @@ import numpy as np
 
 Finish = Literal["wood", "fabric", "paint", "white", "metal", "dark", "leaf", "accent", "ceramic", "stone", "glow"]
 
+Label = Literal["", "counter"]
+
 
 class Part(NamedTuple):
     """A vertical box, or an elliptic cylinder when `round`; metres."""
@@ -30,12 +32,13 @@ class Part(NamedTuple):
 
 @dataclass(frozen=True)
 class Piece:
-    """A piece of furniture with its footprint (width, depth) in metres."""
+    """A piece of furniture with its footprint (width, depth) in metres; `label` names what is reported of a shot."""
 
     width_m: float
     depth_m: float
     parts: tuple[Part, ...]
     against_wall: bool = True
+    label: Label = ""
 
     @property
     def height_m(self) -> float:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 
 from lalaloc_core.synth.pieces import Finish, Part, Piece, square_legs
@@ -107,18 +109,23 @@ def desk(rng: np.random.Generator) -> Piece:
 
 def wardrobe(rng: np.random.Generator) -> Piece:
     """A tall box with doors and handles, as high as the ceiling at times."""
-    doors = int(rng.integers(1, 6))
-    width, depth = doors * rng.uniform(0.45, 0.62), rng.uniform(0.35, 0.65)
-    height = rng.uniform(1.7, 2.6)
-    body: Finish = "white" if rng.random() < 0.45 else "wood"
-    front = 0.5 * depth
+    width = int(rng.integers(1, 6)) * rng.uniform(0.45, 0.62)
+    return wardrobe_run(rng, width, rng.uniform(1.7, 2.6))
+
+
+def wardrobe_run(rng: np.random.Generator, width: float, height: float) -> Piece:
+    """A wardrobe as wide and high (m) as asked for; its doors have handles unless they are sliding ones."""
+    doors = max(1, round(width / rng.uniform(0.45, 0.62)))
+    depth, body = rng.uniform(0.35, 0.65), cast(Finish, "white" if rng.random() < 0.5 else "wood")
+    has_handles, front = rng.random() < 0.75, 0.5 * depth
     parts = [Part(0, -0.01, 0.5 * width, front - 0.01, 0.0, height, body)]
     pitch = width / doors
     for k in range(doors):
         x = -0.5 * width + (k + 0.5) * pitch
         parts.append(Part(x, front - 0.01, 0.5 * pitch - 0.008, 0.01, 0.06, height - 0.03, body))
         side = 1 if k % 2 == 0 else -1
-        parts.append(Part(x + side * (0.5 * pitch - 0.06), front + 0.015, 0.01, 0.012, 0.95, 1.15, "metal"))
+        if has_handles:
+            parts.append(Part(x + side * (0.5 * pitch - 0.06), front + 0.015, 0.01, 0.012, 0.95, 1.15, "metal"))
     return Piece(width, depth, tuple(parts))
 
 

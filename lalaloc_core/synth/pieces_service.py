@@ -6,33 +6,43 @@ import numpy as np
 
 from lalaloc_core.synth.pieces import Finish, Part, Piece
 
+COUNTER_DEPTH_M = 0.62
+_UNIT_M = 0.6
+
 
 def counter(rng: np.random.Generator) -> Piece:
     """A run of kitchen units: base units, worktop, backsplash, hob, sink and wall units."""
-    units = int(rng.integers(2, 7))
-    width, depth, height = 0.6 * units, 0.62, rng.uniform(0.85, 0.95)
-    hx, hy = 0.5 * width, 0.5 * depth
     body: Finish = ("white", "wood", "paint")[int(rng.integers(3))]
+    width = _UNIT_M * int(rng.integers(2, 7))
+    return counter_run(rng, width, rng.uniform(0.85, 0.95), body, wall_units=bool(rng.random() < 0.75))
+
+
+def counter_run(rng: np.random.Generator, width: float, height: float, body: Finish, *, wall_units: bool) -> Piece:
+    """A run of kitchen units, as wide and high (m) as asked for."""
+    units = max(1, round(width / _UNIT_M))
+    unit, depth = width / units, COUNTER_DEPTH_M
+    hx, hy = 0.5 * width, 0.5 * depth
     parts = [
         Part(0, -0.03, hx, hy - 0.06, 0.0, 0.1, "dark"),
         Part(0, -0.01, hx, hy - 0.03, 0.1, height - 0.04, body),
         Part(0, 0, hx, hy, height - 0.04, height, "stone"),
-        Part(0, -hy + 0.01, hx, 0.01, height, height + rng.uniform(0.1, 0.55), "ceramic"),
-        Part(rng.uniform(-0.3, 0.0) * width, 0, 0.25, 0.22, height, height + 0.01, "dark"),
-        Part(rng.uniform(0.1, 0.3) * width, -0.1, 0.02, 0.02, height, height + 0.3, "metal", True),
+        Part(0, -hy + 0.01, hx, 0.01, height, height + rng.uniform(0.1, 0.35), "ceramic"),
     ]
+    if width > 3 * _UNIT_M:
+        parts.append(Part(rng.uniform(-0.3, 0.0) * width, 0, 0.25, 0.22, height, height + 0.01, "dark"))
+        parts.append(Part(rng.uniform(0.1, 0.3) * width, -0.1, 0.02, 0.02, height, height + 0.3, "metal", True))
     for k in range(units):
-        x = -hx + 0.6 * (k + 0.5)
+        x = -hx + unit * (k + 0.5)
         oven = rng.random() < 0.15
-        parts.append(Part(x, hy - 0.03, 0.294, 0.01, 0.11, height - 0.06, "dark" if oven else body))
-        parts.append(Part(x, hy - 0.01, 0.15, 0.01, height - 0.14, height - 0.12, "metal"))
-    if rng.random() < 0.75:
-        bottom, top = rng.uniform(1.35, 1.5), rng.uniform(1.95, 2.35)
+        parts.append(Part(x, hy - 0.03, 0.49 * unit, 0.01, 0.11, height - 0.06, "dark" if oven else body))
+        parts.append(Part(x, hy - 0.01, 0.25 * unit, 0.01, height - 0.14, height - 0.12, "metal"))
+    if wall_units:
+        bottom, top = rng.uniform(1.35, 1.5), rng.uniform(1.95, 2.15)
         for k in range(units):
             if rng.random() < 0.85:
-                x = -hx + 0.6 * (k + 0.5)
-                parts.append(Part(x, -hy + 0.17, 0.297, 0.17, bottom, top, body))
-    return Piece(width, depth, tuple(parts))
+                x = -hx + unit * (k + 0.5)
+                parts.append(Part(x, -hy + 0.17, 0.495 * unit, 0.17, bottom, top, body))
+    return Piece(width, depth, tuple(parts), label="counter")
 
 
 def island(rng: np.random.Generator) -> Piece:
@@ -48,7 +58,7 @@ def island(rng: np.random.Generator) -> Piece:
         if rng.random() < 0.5:
             parts.append(Part(float(x), hy + 0.25, 0.17, 0.17, 0.62, 0.67, "wood", True))
             parts.append(Part(float(x), hy + 0.25, 0.03, 0.03, 0.0, 0.62, "metal", True))
-    return Piece(width, depth + 0.9, tuple(parts), against_wall=False)
+    return Piece(width, depth + 0.9, tuple(parts), against_wall=False, label="counter")
 
 
 def fridge(rng: np.random.Generator) -> Piece:

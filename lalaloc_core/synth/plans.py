@@ -24,8 +24,12 @@ class HomeConfig:
     area_m2: tuple[float, float] = (30.0, 180.0)
     area_per_room_m2: tuple[float, float] = (8.0, 28.0)
     wall_thickness_m: tuple[float, float] = (0.08, 0.25)
-    corridor_width_m: tuple[float, float] = (1.05, 1.9)
+    corridor_width_m: tuple[float, float] = (1.0, 1.9)
     ceiling_height_m: tuple[float, float] = (2.2, 3.5)
+    # Open-plan homes: few rooms, large ones.
+    open_plan_share: float = 0.15
+    open_plan_rooms: tuple[int, int] = (3, 5)
+    open_plan_area_per_room_m2: tuple[float, float] = (25.0, 42.0)
     # Share of homes that are turned in the plan frame, that have no right angles, whose ceilings differ.
     rotated_share: float = 0.3
     sheared_share: float = 0.1
@@ -46,8 +50,10 @@ def generate_home(rng: np.random.Generator, config: HomeConfig = HomeConfig()) -
 
     Rooms never overlap and lie one wall thickness apart. Openings are consistent between the two rooms they join.
     """
-    rooms = int(rng.integers(config.rooms[0], config.rooms[1] + 1))
-    per_room = config.area_per_room_m2
+    is_open_plan = rng.random() < config.open_plan_share
+    between = config.open_plan_rooms if is_open_plan else config.rooms
+    rooms = int(rng.integers(between[0], between[1] + 1))
+    per_room = config.open_plan_area_per_room_m2 if is_open_plan else config.area_per_room_m2
     area = float(np.clip(rooms * rng.uniform(*per_room), *config.area_m2))
     cells = partition(rng, rooms, area, config.corridor_width_m)[: config.rooms[1]]
     if rng.random() < config.sheared_share:

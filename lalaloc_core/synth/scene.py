@@ -7,9 +7,26 @@ relative to the floor. The camera's own room has slot 0; rooms seen through its 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
+
+Fact = Literal[
+    "open_door",
+    "wide_opening",
+    "wall_stub",
+    "corridor",
+    "closet",
+    "near_wall",
+    "threshold",
+    "counter",
+    "sun_patch",
+    "nadir_patch",
+    "mirror",
+    "bare_bright",
+    "large_room",
+]
 
 # Columns of the tables below.
 DECAL_WALL, DECAL_S0, DECAL_S1, DECAL_Z0, DECAL_Z1, DECAL_SURFACE, DECAL_SLOT, DECAL_DEPTH = range(8)
@@ -42,7 +59,8 @@ class Scene:
         sun: sunlight through one window: direction to the sun (3), window's wall (4: point, unit vector along),
             window rectangle (s0, s1, z0, z1), colour (3).
         backdrop: the outdoors: sky (3), ground (3), horizon slope, ruggedness, two phases.
-        exposure: see `camera`.
+        exposure: see `exposure`.
+        facts: what was drawn of what is worth knowing about a picture; `facts` knows more.
     """
 
     camera_height_m: float
@@ -57,4 +75,5 @@ class Scene:
     lights: Float[np.ndarray, "l 8"]
     sun: Float[np.ndarray, "14"]
     backdrop: Float[np.ndarray, "10"]
-    exposure: Float[np.ndarray, "12"]
+    exposure: Float[np.ndarray, "24"]
+    facts: frozenset[Fact] = frozenset()

@@ -100,7 +100,9 @@ def _albedo(
     distance = hits.distance_m * torch.sqrt(1.0 + slope**2)
     # How much of the surface a pixel covers grows with distance and where it is seen at a grazing angle.
     grazing = torch.where(flat, (slope.abs() / torch.sqrt(1.0 + slope**2)), 1.0).clamp(min=0.1)
-    footprint = distance * scale * (PICTURE_SIZE * math.pi / slope.shape[0]) / torch.sqrt(grazing)
+    # Rays may be denser along one axis than along the other: their mean density counts.
+    pitch = math.pi * math.sqrt(2.0 / (slope.shape[0] * hits.distance_m.shape[1]))
+    footprint = distance * scale * (PICTURE_SIZE * pitch) / torch.sqrt(grazing)
     colour = atlas.sample(rows[..., F.PICTURE].int(), u, v, footprint)
     return (colour * rows[..., F.RED : F.BLUE + 1]).clamp(max=0.95)
 

@@ -11,14 +11,16 @@ from jaxtyping import Float
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.floorplan import Room
 from lalaloc_core.sampling import random_poses
-from lalaloc_core.synth.furniture import FURNITURE_LEVELS, FurnitureLevel
+from lalaloc_core.synth.furniture import FURNITURE_LEVELS, FurnitureLevel, wall_frame
 from lalaloc_core.synth.lighting import Mood
 from lalaloc_core.synth.plans import Home
 
 POSE_MARGIN_M = 0.2
-_LEVEL_SHARES = (0.2, 0.25, 0.55)
+_LEVEL_SHARES = (0.3, 0.2, 0.5)
 _CEILING_CLEARANCE_M = 0.3
 _STAGED_HEIGHTS_M = (1.2, 1.7)
+_THRESHOLD_M = 0.55
+_TRIES = 8
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -54,6 +56,7 @@ def sample_shots(
     level: FurnitureLevel | None = None,
     *,
     by_room_share: float = 0.0,
+    hard_share: float = 0.0,
 ) -> list[Shot]:
     """Draw shots uniform over a home's floor.
 
@@ -63,6 +66,8 @@ def sample_shots(
         rng: source of randomness.
         level: how full the rooms are; None draws it for every shot.
         by_room_share: share of shots whose room is drawn first, all rooms alike: more of closets and corridors.
+        hard_share: share of shots from places that are rare on the floor and hard to localise: close to a wall, on
+            the threshold of an open door, in the narrowest rooms.
     """
     poses = random_poses(home.plan, count, rng, POSE_MARGIN_M)
     by_room = np.flatnonzero(rng.random(count) < by_room_share)
@@ -70,6 +75,8 @@ def sample_shots(
         room = int(rng.integers(len(home.plan.rooms)))
         poses.position_m[index] = _position_in(home.plan.rooms[room], rng)
         poses.room_index[index] = room
+    for index in np.flatnonzero(rng.random(count) < hard_share):
+        poses.position_m[index], poses.room_index[index] = _hard_place(home, rng)
     shots = []
     for position, room in zip(poses.position_m, poses.room_index, strict=True):
         usual = rng.random() < 0.75
@@ -120,6 +127,35 @@ def _is_roomy(room: Room) -> bool:
 
 def _middle_of(room: Room) -> Float[np.ndarray, "2"]:
     return np.array(shapely.maximum_inscribed_circle(room.shape, 0.01).coords[0])
+
+
+def _hard_place(home: Home, rng: np.random.Generator) -> tuple[Float[np.ndarray, "2"], int]:
+    """A position and its room: on a threshold, beside a wall, in a corridor or another narrow room."""
+    rooms = home.plan.rooms
+    kind = rng.random()
+    passages = [opening for opening in home.openings if opening.kind in ("door_open", "opening")]
+    if kind < 0.3 and passages:
+        opening = passages[int(rng.integers(len(passages)))]
+        room = rooms[opening.room]
+        start, along, inwards = wall_frame(room, opening.wall)
+        inner = room.shape.buffer(-POSE_MARGIN_M)
+        for _ in range(_TRIES):
+            at = start + along * rng.uniform(opening.start_m, opening.end_m)
+            at = at + inwards * rng.uniform(POSE_MARGIN_M, _THRESHOLD_M)
+            if shapely.contains_xy(inner, *at):
+                return at, opening.room
+    if kind < 0.5:
+        index = int(rng.integers(len(rooms)))
+        places = np.stack([_position_in(rooms[index], rng) for _ in range(_TRIES)])
+        walls = shapely.distance(rooms[index].shape.exterior, shapely.points(places))
+        return places[int(walls.argmin())], index
+    corridors = [number for number, room in enumerate(rooms) if room.name.startswith("corridor")]
+    if kind < 0.75 and corridors:
+        index = int(rng.choice(corridors))
+        return _position_in(rooms[index], rng), index
+    narrowness = np.array([room.shape.length / room.area_m2 for room in rooms]) ** 2
+    index = int(rng.choice(len(rooms), p=narrowness / narrowness.sum()))
+    return _position_in(rooms[index], rng), index
 
 
 def _position_in(room: Room, rng: np.random.Generator) -> Float[np.ndarray, "2"]:

@@ -71,9 +71,15 @@ class SurfaceTable:
         self.rows.append([0.0, 1.0, 1.0, 0.0, 1.0, 1.0, 1.0, 0.0, glow, 1.0, 0.0, 0.0])
         return len(self.rows) - 1
 
-    def add_floor(self, walls: Colour, direction: float) -> int:
-        """A floor: mostly with a picture's own colours, sometimes as the walls; laid along `direction` (radians)."""
+    def add_floor(self, walls: Colour, direction: float, *, plain: bool = False) -> int:
+        """A floor: mostly with a picture's own colours, sometimes as the walls; laid along `direction` (radians).
+
+        A `plain` one is wooden, beige or grey.
+        """
         colour = walls * self._rng.uniform(0.8, 1.1) if self._rng.random() < 0.08 else None
+        if plain and self._rng.random() < 0.7:
+            neutral = pale(self._rng) * self._rng.uniform(0.4, 0.9)
+            colour = neutral if self._rng.random() < 0.5 else 1.5 * wood_tone(self._rng)
         gloss = self._rng.uniform(0.05, 0.35) if self._rng.random() < 0.5 else 0.0
         angle = -direction + 0.5 * math.pi * int(self._rng.integers(2))
         if self._rng.random() < 0.1:
@@ -115,6 +121,12 @@ def paint(rng: np.random.Generator) -> Colour:
         level, strength = rng.uniform(0.03, 0.3), 0.45
     warm, green = rng.normal(0.25, 0.7) * strength, rng.normal(0.0, 0.5) * strength
     return np.clip(level * np.array([1.0 + warm, 1.0 + green, 1.0 - warm]), 0.01, 0.92)
+
+
+def pale(rng: np.random.Generator) -> Colour:
+    """White, beige, light grey: the walls of a home for sale."""
+    warm = rng.uniform(-0.01, 0.09)
+    return rng.uniform(0.5, 0.88) * np.array([1.0 + 0.5 * warm, 1.0, 1.0 - warm])
 
 
 def bright(rng: np.random.Generator) -> Colour:

@@ -20,6 +20,7 @@ from lalaloc_core.render.depth import layout_depth
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.synth.build import build_scene
 from lalaloc_core.synth.catalogue import ROOM_PIECES
+from lalaloc_core.synth.facts import facts_of
 from lalaloc_core.synth.furniture import CAMERA_CLEARANCE_M, FURNITURE_LEVELS, furnish, rectangle
 from lalaloc_core.synth.gallery import contact_sheet
 from lalaloc_core.synth.materials import MaterialLibrary
@@ -140,7 +141,8 @@ def test_an_empty_shut_room_shows_exactly_its_layout(renderer: PanoramaRenderer,
         room = home.plan.rooms[shot.room_index]
         profile = wall_profile(shot.position_m[None], np.array([shot.heading]), room.walls_m[None], COLUMNS)
         expected = layout_depth(profile, np.array([shot.camera_height_m]), np.array([room.ceiling_height_m]), ROWS)[0]
-        bare = ~hits.furniture[index].numpy().T
+        # Mirrors show more than the layout.
+        bare = (~hits.furniture[index] & (hits.slot[index] == 0)).numpy().T
         assert bare.mean() > 0.5
         np.testing.assert_allclose(depth[index][bare], expected[bare], atol=1e-3)
 
@@ -156,7 +158,7 @@ def test_one_sees_no_further_than_the_walls_unless_through_an_opening(renderer: 
     profile = wall_profile(shot.position_m[None], np.array([shot.heading]), walls[None], COLUMNS)[0]
     through = hits.distance_m[0].numpy().max(axis=1) > profile + 1e-3
     kinds = {opening.kind for opening in home.openings if opening.room == shot.room_index}
-    assert not through.any() or kinds & {"door_open", "opening"}
+    assert not through.any() or kinds & {"door_open", "opening"} or "mirror" in facts_of(shot)
     assert hits.distance_m.isfinite().all()
 
 

@@ -1,0 +1,78 @@
+"""Mirrors on walls: holes through which one sees a reflected copy of the room, with all that stands in it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from lalaloc_core.floorplan import Room
+from lalaloc_core.synth.openings import Opening
+from lalaloc_core.synth.scene import PRISM_AX, PRISM_AY, PRISM_OPAQUE, PRISM_X, PRISM_Y
+
+# How likely a room of a kind has a large mirror.
+_CHANCE = {"bathroom": 0.4, "corridor": 0.22, "bedroom": 0.25, "living": 0.15, "dining": 0.12, "closet": 0.12}
+_OTHERS = 0.05
+_BARE_SHARE = 0.4
+_CLEARANCE_M = 0.15
+_NARROWEST_M = 0.35
+
+Rectangle = tuple[int, float, float, float, float]
+
+
+def draw_mirror(
+    room: Room, openings: Sequence[Opening], rng: np.random.Generator, *, is_bare: bool
+) -> Rectangle | None:
+    """Wall, start and end along it, lower and upper edge (m) of a mirror between the openings; None for no mirror."""
+    chance = _CHANCE.get(room.name.split()[0], _OTHERS) * (_BARE_SHARE if is_bare else 1.0)
+    if rng.random() > chance:
+        return None
+    lengths = np.hypot(*(room.walls_m[:, 2:] - room.walls_m[:, :2]).T)
+    for wall in rng.permutation(len(lengths))[:4]:
+        length = float(lengths[wall])
+        widest = min(3.0, length - 2.0 * _CLEARANCE_M)
+        if widest < _NARROWEST_M:
+            continue
+        width = rng.uniform(_NARROWEST_M, widest)
+        start = rng.uniform(_CLEARANCE_M, length - _CLEARANCE_M - width)
+        free = all(
+            hole.wall != wall or start > hole.end_m + _CLEARANCE_M or start + width < hole.start_m - _CLEARANCE_M
+            for hole in openings
+        )
+        if free:
+            stands = rng.random() < 0.4
+            low = rng.uniform(0.03, 0.3) if stands else rng.uniform(0.8, 1.15)
+            high = min(rng.uniform(1.6, 2.3), room.ceiling_height_m - 0.1)
+            return int(wall), float(start), float(start + width), float(low), float(high)
+    return None
+
+
+class Reflection:
+    """Reflection in the vertical plane through a wall.
+
+    Args:
+        wall_m: the wall's ends (x0, y0, x1, y1).
+    """
+
+    def __init__(self, wall_m: Float[np.ndarray, "4"]) -> None:
+        along = wall_m[2:] - wall_m[:2]
+        along = along / np.hypot(*along)
+        self._matrix = 2.0 * np.outer(along, along) - np.eye(2)
+        self._offset = wall_m[:2] - self._matrix @ wall_m[:2]
+
+    def point(self, point_m: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
+        """Where a point is seen."""
+        return self._matrix @ point_m + self._offset
+
+    def wall(self, ends_m: Float[np.ndarray, "4"]) -> Float[np.ndarray, "4"]:
+        """Where a wall is seen; its ends change places, so that the room stays on its left."""
+        return np.concatenate([self.point(ends_m[2:]), self.point(ends_m[:2])])
+
+    def prism(self, row: Float[np.ndarray, "11"]) -> Float[np.ndarray, "11"]:
+        """Where a prism is seen; it casts no shadow."""
+        seen = row.copy()
+        seen[[PRISM_X, PRISM_Y]] = self.point(seen[[PRISM_X, PRISM_Y]])
+        seen[[PRISM_AX, PRISM_AY]] = self._matrix @ seen[[PRISM_AX, PRISM_AY]]
+        seen[PRISM_OPAQUE] = 0.0
+        return seen
