@@ -26,12 +26,16 @@ LAYERS = {
     "lalaloc_core.render": 2,
     "lalaloc_core.nets": 3,
     "lalaloc_core.synth": 3,
+    # Beside synth and apart from it: neither may import the other.
+    "lalaloc_core.unfamiliar": 3,
     "lalaloc_core.localise": 4,
     "lalaloc_core.data": 5,
     "lalaloc_core.training": 6,
     "lalaloc_core.methods": 6,
     "lalaloc_core.evaluation": 7,
     "lalaloc_core.evaluation.report": 8,
+    # Draws with the report's tools.
+    "lalaloc_core.evaluation.worst": 9,
     "lalaloc_core.calibrate": 8,
     "lalaloc_core.export": 8,
     # A run ends with its export, so these two files stand above it.

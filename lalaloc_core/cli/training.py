@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import json
 import os
 import platform
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from lalaloc_core.cli.printing import print_json
 from lalaloc_core.errors import InvalidInputError
+
+# Four panoramas each; drawing one takes a third of a second, and validation shows all of them every few minutes.
+_UNFAMILIAR_HOMES = 15
 
 
 def add_commands(commands: Any) -> None:
@@ -24,9 +29,24 @@ def add_commands(commands: Any) -> None:
     train.add_argument("--minutes", type=float, help="wall-clock budget; sets the pace of the schedule")
     train.add_argument("--steps", type=int, help="number of updates, instead of the preset's")
     train.add_argument("--seed", type=int, help="instead of the preset's")
+    train.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        dest="settings",
+        help="replace one setting of the preset, such as image.uses_per_panorama=4 or image.supersample=[2,1]",
+    )
+    train.add_argument(
+        "--from",
+        type=Path,
+        metavar="DIR",
+        dest="begin",
+        help="begin with the weights of a bundle or of another run, instead of fresh ones",
+    )
     train.add_argument("--resume", action="store_true", help="go on from the checkpoint in --out")
     train.add_argument("--device", help="cpu or cuda; default: cuda where there is one")
-    train.add_argument("--workers", type=int, default=1, help="processes that make training batches")
+    train.add_argument("--workers", type=int, default=1, help="processes that make batches; 0: none")
     train.add_argument("--textures", type=Path, help="folder of material pictures; without it all are procedural")
     train.set_defaults(run=_train)
 
@@ -36,6 +56,7 @@ def add_commands(commands: Any) -> None:
     export.add_argument("--name", help="of the model; default: the name of the folder --out")
     export.add_argument("--version", required=True, dest="model_version")
     export.add_argument("--note", action="append", default=[], metavar="KEY=VALUE", help="recorded in the manifest")
+    export.add_argument("--last", action="store_true", help="the last weights, instead of the best by validation")
     export.set_defaults(run=_export)
 
 
@@ -43,6 +64,7 @@ def _train(arguments: argparse.Namespace) -> None:
     import torch
 
     from lalaloc_core.data.opening import open_dataset
+    from lalaloc_core.data.unfamiliar import UnfamiliarScenes
     from lalaloc_core.training.config import PRESETS
     from lalaloc_core.training.data import TrainingData
     from lalaloc_core.training.run import train_end_to_end, train_image, train_layout
@@ -51,7 +73,9 @@ def _train(arguments: argparse.Namespace) -> None:
         raise InvalidInputError("--textures is for generated homes, not for --data")
     if arguments.data is None and arguments.skip_bad:
         raise InvalidInputError("--skip-bad is for --data")
-    config = PRESETS[arguments.preset]
+    if arguments.begin is not None and (arguments.resume or arguments.stage == "end-to-end"):
+        raise InvalidInputError("--from is for a run of one stage that begins, neither for --resume nor for end-to-end")
+    config = PRESETS[arguments.preset].with_settings(_settings(arguments.settings))
     # End-to-end training takes its schedule from the image stage.
     part = "layout" if arguments.stage == "layout" else "image"
     changes: dict[str, Any] = {name: getattr(arguments, name) for name in ("minutes", "steps")}
@@ -69,9 +93,27 @@ def _train(arguments: argparse.Namespace) -> None:
         dataset=None if arguments.data is None else open_dataset(arguments.data),
         skip_bad=arguments.skip_bad,
         textures=arguments.textures,
+        unfamiliar=UnfamiliarScenes(homes=_UNFAMILIAR_HOMES) if arguments.data is None else None,
     )
-    train = {"layout": train_layout, "image": train_image, "end-to-end": train_end_to_end}[arguments.stage]
-    train(config, arguments.out, device=device, data=data, workers=arguments.workers, resume=arguments.resume)
+    train: Callable[..., Any] = {"layout": train_layout, "image": train_image, "end-to-end": train_end_to_end}[
+        arguments.stage
+    ]
+    begin = {} if arguments.begin is None else {"begin": arguments.begin}
+    train(config, arguments.out, device=device, data=data, workers=arguments.workers, resume=arguments.resume, **begin)
+
+
+def _settings(pairs: list[str]) -> dict[str, Any]:
+    """Settings by path; values are JSON, and plain words are text."""
+    settings = {}
+    for pair in pairs:
+        path, equals, value = pair.partition("=")
+        if not equals:
+            raise InvalidInputError(f"--set {pair}: KEY=VALUE is wanted")
+        try:
+            settings[path] = json.loads(value)
+        except ValueError:
+            settings[path] = value
+    return settings
 
 
 def _export(arguments: argparse.Namespace) -> None:
@@ -80,5 +122,7 @@ def _export(arguments: argparse.Namespace) -> None:
     pairs = [note.partition("=") for note in arguments.note]
     notes = {"hardware": platform.machine(), **{key: value for key, _, value in pairs}}
     name = arguments.name or arguments.out.resolve().name
-    bundle = export_run(arguments.folder, arguments.out, name=name, version=arguments.model_version, notes=notes)
+    bundle = export_run(
+        arguments.folder, arguments.out, name=name, version=arguments.model_version, notes=notes, last=arguments.last
+    )
     print_json({name: entry.bytes for name, entry in bundle.manifest.files.items()})

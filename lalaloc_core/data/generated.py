@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +12,7 @@ from jaxtyping import Float, UInt8
 
 from lalaloc_core.data.dataset import Appearance, Camera, Scene, Split
 from lalaloc_core.errors import DatasetError
+from lalaloc_core.synth.facts import facts_of
 from lalaloc_core.synth.furniture import FurnitureLevel
 from lalaloc_core.synth.materials import MaterialLibrary
 from lalaloc_core.synth.panorama import PanoramaRenderer
@@ -19,6 +20,7 @@ from lalaloc_core.synth.shots import Shot, sample_shots
 from lalaloc_core.synth.splits import TEST, TRAIN, VALIDATION, home_of
 
 _DEPTH_HEIGHT = 256
+_PHOTOGRAPH_RAYS = (2, 2)
 SPLIT_NUMBERS: dict[Split, int] = {"train": TRAIN, "validation": VALIDATION, "test": TEST}
 
 
@@ -75,17 +77,20 @@ class GeneratedScenes:
 
 
 class Studio:
-    """The materials of a split, and its renderers by picture size: both take a second to build and are kept."""
+    """The materials of a split, and its renderers by picture: both take a second to build and are kept."""
 
     def __init__(self, materials: MaterialLibrary) -> None:
         self._materials = materials
-        self._renderers: dict[tuple[int, int], PanoramaRenderer] = {}
+        self._renderers: dict[tuple[int, int, tuple[int, int]], PanoramaRenderer] = {}
 
-    def renderer(self, height: int, width: int) -> PanoramaRenderer:
-        """The renderer of a picture size."""
-        if (height, width) not in self._renderers:
-            self._renderers[height, width] = PanoramaRenderer(self._materials, height=height, width=width)
-        return self._renderers[height, width]
+    def renderer(self, height: int, width: int, supersample: tuple[int, int] = (1, 1)) -> PanoramaRenderer:
+        """The renderer of a picture size with `supersample` rays per pixel along (rows, columns)."""
+        key = height, width, supersample
+        if key not in self._renderers:
+            self._renderers[key] = PanoramaRenderer(
+                self._materials, height=height, width=width, supersample=supersample
+            )
+        return self._renderers[key]
 
 
 @lru_cache(maxsize=4)
@@ -96,13 +101,18 @@ def studio_of(split: int, seed: int, textures: Path | None) -> Studio:
 
 @dataclass(frozen=True, eq=False)
 class RenderedPhotograph:
-    """A photograph that is rendered whenever it is asked for."""
+    """A photograph that is rendered whenever it is asked for; like a real one it averages over each pixel's area."""
 
     shot: Shot
     studio: Studio
 
+    @cached_property
+    def facts(self) -> frozenset[str]:
+        """What makes the shot hard, see `synth.facts`."""
+        return frozenset(facts_of(self.shot))
+
     def image(self, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
-        return self.studio.renderer(height, width).render([self.shot])[0].cpu().numpy()
+        return self.studio.renderer(height, width, _PHOTOGRAPH_RAYS).render([self.shot])[0].cpu().numpy()
 
     def depth_m(self) -> Float[np.ndarray, "h w"]:
         return self.studio.renderer(_DEPTH_HEIGHT, 2 * _DEPTH_HEIGHT).depth_m([self.shot])[0].cpu().numpy()

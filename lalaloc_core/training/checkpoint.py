@@ -24,6 +24,7 @@ class Checkpoint:
         step, seconds: progress so far.
         metrics: the last validation.
         data: what the stage was trained on.
+        begun_from: the model whose weights it began with, and how long that had been trained; empty for none.
     """
 
     stage: str
@@ -35,6 +36,7 @@ class Checkpoint:
     seconds: float = 0.0
     metrics: dict[str, float] = field(default_factory=dict)
     data: dict[str, Any] = field(default_factory=dict)
+    begun_from: dict[str, Any] = field(default_factory=dict)
 
     @property
     def best_weights(self) -> dict[str, dict[str, torch.Tensor]]:

@@ -15,18 +15,29 @@ from lalaloc_core.sampling import TripletSampling
 
 Architecture = Literal["ring", "paper"]
 Turns = Literal["any", "quarters", "none"]
+_MOST_RAYS = 8
+# Of the spread; errors are cut off at three times that, and no camera stands lower than a metre or so.
+_LARGEST_HEIGHT_ERROR_M = 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
 class OptimiserConfig:
-    """Optimiser and learning-rate schedule; fractions are of the whole stage."""
+    """Optimiser and learning-rate schedule; fractions are of the whole stage.
+
+    Attributes:
+        schedule: "cosine" falls to 1 % all the way; "steps" multiplies by `gamma` at each milestone; "trapezoid" stays
+            at the full rate and falls to 1 % at the end, as 1 - √, so that a run may be prolonged before it falls.
+        warmup: share in which the rate rises, from 5 %.
+        decay: share in which a trapezoid falls.
+    """
 
     kind: Literal["adamw", "sgd"] = "adamw"
     learning_rate: float = 1e-3
     weight_decay: float = 1e-4
     momentum: float = 0.9
-    schedule: Literal["cosine", "steps"] = "cosine"
+    schedule: Literal["cosine", "steps", "trapezoid"] = "cosine"
     warmup: float = 0.02
+    decay: float = 0.2
     milestones: tuple[float, ...] = (0.5, 0.75)
     gamma: float = 0.1
     clip_norm: float = 1.0
@@ -77,6 +88,14 @@ class ImageStageConfig:
         minutes: wall-clock budget; when given, it and not `steps` sets the pace of the schedule.
         by_room_share: share of the panoramas drawn evenly over rooms instead of over the floor, so that closets and
             corridors are seen often enough.
+        supersample: rays per pixel along (rows, columns) of generated panoramas; may be changed when a run resumes.
+        uses_per_panorama: how often a panorama is learnt from, each time turned and mirrored anew; 1 never repeats.
+        replay_panoramas: how many wait for their next use, over all worker processes; the more, the farther apart
+            are the uses of one.
+        photometric: strength, 0 to 1, of random changes of exposure, contrast and colours.
+        camera_height_error_m: spread (normal) of the error of the camera heights that the networks are told. Targets
+            are the true walls at the told height, because that is what a query is compared with: the grid is embedded
+            at the told height as well.
         l2_weight: weight of the latent distance, the paper's choice; 0 leaves it out.
         log_ratio_weight: weight of the log-ratio loss with the panorama as anchor and layouts as neighbours, drawn as
             in stage 1.
@@ -91,6 +110,11 @@ class ImageStageConfig:
     batch: int = 32
     shots_per_home: int = 4
     by_room_share: float = 0.25
+    supersample: tuple[int, int] = (1, 1)
+    uses_per_panorama: int = 1
+    replay_panoramas: int = 4096
+    photometric: float = 0.0
+    camera_height_error_m: float = 0.0
     l2_weight: float = 1.0
     log_ratio_weight: float = 0.0
     kd_weight: float = 0.0
@@ -132,6 +156,25 @@ class TrainConfig:
         image = self.image
         if not any((image.l2_weight, image.log_ratio_weight, image.kd_weight, image.ring_weight)):
             raise ConfigError("config.image: the weights of all losses on the latent are 0, nothing is learnt")
+        if len(image.supersample) != 2 or not all(1 <= rays <= _MOST_RAYS for rays in image.supersample):
+            raise ConfigError(f"config.image.supersample is {image.supersample}, it must be two of 1 to {_MOST_RAYS}")
+        for name in ("uses_per_panorama", "replay_panoramas"):
+            if getattr(image, name) < 1:
+                raise ConfigError(f"config.image.{name} is {getattr(image, name)}, it must be at least 1")
+        if not 0.0 <= image.photometric <= 1.0:
+            raise ConfigError(f"config.image.photometric is {image.photometric:g}, it must lie within 0 and 1")
+        if not 0.0 <= image.camera_height_error_m <= _LARGEST_HEIGHT_ERROR_M:
+            raise ConfigError(
+                f"config.image.camera_height_error_m is {image.camera_height_error_m:g}, "
+                f"it must lie within 0 and {_LARGEST_HEIGHT_ERROR_M:g} m"
+            )
+        for part in ("layout", "image"):
+            optimiser = getattr(self, part).optimiser
+            if not 0.0 < optimiser.decay <= 1.0 - optimiser.warmup:
+                raise ConfigError(
+                    f"config.{part}.optimiser.decay is {optimiser.decay:g}, it must lie within 0 "
+                    f"and what the warm-up leaves, {1.0 - optimiser.warmup:g}"
+                )
         if self.layout.turned_share and self.turns != "any":
             raise ConfigError(
                 f"config.layout.turned_share is {self.layout.turned_share:g}, with turns other than 'any'"
@@ -149,6 +192,26 @@ class TrainConfig:
             ConfigError: an unknown key or a value of the wrong type, named with its path.
         """
         return build_config(cls, raw, path="config")
+
+    def with_settings(self, settings: dict[str, Any]) -> TrainConfig:
+        """Replace single settings, each by its path such as "image.optimiser.learning_rate".
+
+        Raises:
+            ConfigError: no such setting, or a value of the wrong type.
+        """
+        raw = self.to_dict()
+        for path, value in settings.items():
+            part, keys = raw, path.split(".")
+            for key in keys[:-1]:
+                part = part.get(key)
+                if not isinstance(part, dict):
+                    raise ConfigError(f"config has no part '{path.rpartition('.')[0]}'")
+            part[keys[-1]] = value
+        return self.from_dict(raw)
+
+    def with_networks(self, sizes: RingConfig | PaperConfig) -> TrainConfig:
+        """The same with other sizes of the architecture that they are sizes of."""
+        return dataclasses.replace(self, **{"ring" if isinstance(sizes, RingConfig) else "paper": sizes})
 
     @property
     def latent_size(self) -> int:
@@ -196,7 +259,12 @@ PRESETS: dict[str, TrainConfig] = {
             optimiser=OptimiserConfig(learning_rate=2e-3),
         ),
         image=ImageStageConfig(
-            ring_weight=1.0, profile_weight=0.5, ema_decay=0.999, optimiser=OptimiserConfig(learning_rate=1.5e-3)
+            photometric=1.0,
+            camera_height_error_m=0.02,
+            ring_weight=1.0,
+            profile_weight=0.5,
+            ema_decay=0.999,
+            optimiser=OptimiserConfig(learning_rate=1.5e-3),
         ),
     ),
     "tiny": TrainConfig(

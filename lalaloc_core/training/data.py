@@ -14,6 +14,7 @@ from torch import nn
 from lalaloc_core.data.dataset import Appearance, Camera, Dataset, Scene, load_scenes
 from lalaloc_core.data.generated import GeneratedScenes, RenderedPhotograph
 from lalaloc_core.errors import DatasetError
+from lalaloc_core.training.best import Validate
 from lalaloc_core.training.config import TrainConfig
 from lalaloc_core.training.sources import GeneratedSource, SceneSource, Source
 from lalaloc_core.training.validate import ImageValidation
@@ -31,12 +32,15 @@ class TrainingData:
         skip_bad: pass over files of the data set that cannot be used, naming each once.
         textures: folder of material pictures for the generator; without it all are procedural.
         validation_scenes: at most this many, spread evenly over the split.
+        unfamiliar: scenes that are nothing like those trained on; image validation reports those of their validation
+            split as well, and nothing is chosen by them.
     """
 
     dataset: Dataset | None = None
     skip_bad: bool = False
     textures: Path | None = None
-    validation_scenes: int = 25
+    validation_scenes: int = 50
+    unfamiliar: Dataset | None = None
 
     def source(self, config: TrainConfig) -> Source:
         """What training looks at."""
@@ -67,18 +71,38 @@ class TrainingData:
         return scenes
 
     def image_validation(
-        self, config: TrainConfig, scenes: Sequence[Scene], layout_encoder: nn.Module | None, device: torch.device
-    ) -> ImageValidation:
+        self,
+        config: TrainConfig,
+        scenes: Sequence[Scene],
+        layout_encoder: nn.Module | None,
+        device: torch.device,
+        folder: Path | None = None,
+    ) -> Validate:
         """Panorama queries in those scenes, asked in the data set's usual look; see `ImageValidation`.
+
+        Args:
+            folder: where to keep pictures that were rendered.
 
         Raises:
             DatasetError: a photograph cannot be read and `skip_bad` is off.
         """
         usual = None if self.dataset is None else self.dataset.appearances[0]
         problems: list[DatasetError] | None = [] if self.skip_bad else None
-        validation = ImageValidation(config, scenes, layout_encoder, device, usual, problems)
+        kept = folder / "validation.npz" if folder is not None and self.dataset is None else None
+        familiar = ImageValidation(config, scenes, layout_encoder, device, usual, problems, kept=kept)
         _log(problems)
-        return validation
+        if self.unfamiliar is None:
+            return familiar
+        others = ImageValidation(
+            config,
+            list(load_scenes(self.unfamiliar, self.unfamiliar.scenes("validation"))),
+            layout_encoder,
+            device,
+            self.unfamiliar.appearances[0],
+            prefix="unfamiliar",
+            kept=None if folder is None else folder / "unfamiliar.npz",
+        )
+        return lambda modules: familiar(modules) | others(modules)
 
 
 def _log(problems: list[DatasetError] | None) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -14,6 +15,7 @@ from lalaloc_core.training import losses
 from lalaloc_core.training.batches import Batch, receive
 from lalaloc_core.training.config import ImageStageConfig, TrainConfig
 from lalaloc_core.training.objective import anchors_with_neighbours, chamfer_to_anchors, embed
+from lalaloc_core.training.photometric import changed
 from lalaloc_core.training.sources import Source
 from lalaloc_core.training.stages import build_image_encoder, first_visit_of_panoramas
 from lalaloc_core.training.stream import PanoramaBatches
@@ -30,6 +32,8 @@ class ImageStage:
         self.teacher = layout_encoder.eval().requires_grad_(False)
         self.encoder = build_image_encoder(config)
         self.modules: dict[str, nn.Module] = {"image_encoder": self.encoder}
+        self._generator: torch.Generator | None = None
+        self._first_step = 0
 
     @property
     def settings(self) -> ImageStageConfig:
@@ -45,17 +49,19 @@ class ImageStage:
         """Panorama batches; a resumed run goes on with homes, or parts of the epoch, that it has not seen."""
         neighbours = bool(self.settings.log_ratio_weight or self.settings.kd_weight)
         first = first_visit_of_panoramas(self.settings, first_step)
+        self._first_step, self._generator = first_step, None
         return receive(PanoramaBatches(self.config, self.source, neighbours, first), workers)
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Weighted losses of a batch by name; their sum is minimised."""
         layout = (batch["profile_m"], batch["camera_height_m"], batch["ceiling_height_m"])
         stage, terms = self.settings, {}
+        image = self._seen(batch["image"])
         if isinstance(self.teacher, RingLayoutEncoder):
             with torch.no_grad():
                 ring = self.teacher.ring(*layout)
                 target = self.teacher.head(ring)
-            seen = self.encoder(batch["image"], batch["camera_height_m"])
+            seen = self.encoder(image, batch["camera_height_m"])
             latent = self.teacher.head(seen.ring)
             if stage.ring_weight:
                 terms["ring"] = stage.ring_weight * losses.ring_distillation(seen.ring, ring)
@@ -65,12 +71,21 @@ class ImageStage:
         else:
             with torch.no_grad():
                 target = self.teacher(*layout)
-            latent = self.encoder(batch["image"])
+            latent = self.encoder(image)
         if stage.l2_weight:
             terms["l2"] = stage.l2_weight * losses.l2(latent, target)
         if stage.log_ratio_weight or stage.kd_weight:
             terms |= self._relational(latent.float(), target.float(), batch)
         return terms
+
+    def _seen(self, image: Tensor) -> Tensor:
+        """Pictures with the photometric changes that are asked for; what is drawn depends on seed and first step."""
+        if not self.settings.photometric:
+            return image
+        if self._generator is None:
+            seed = int(np.random.default_rng([9, self.config.seed, self._first_step]).integers(1 << 62))
+            self._generator = torch.Generator(image.device).manual_seed(seed)
+        return changed(image, self.settings.photometric, self._generator)
 
     def _relational(self, latent: Tensor, target: Tensor, batch: Batch) -> dict[str, Tensor]:
         """Losses on the distances of the neighbours' layouts to the panorama."""

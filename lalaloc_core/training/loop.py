@@ -8,8 +8,8 @@ import dataclasses
 import logging
 import math
 import time
-from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -17,14 +17,13 @@ from tqdm import tqdm
 
 from lalaloc_core.errors import CheckpointError
 from lalaloc_core.training.batches import Batch
+from lalaloc_core.training.best import BestCheckpoint, Validate, best_path
 from lalaloc_core.training.checkpoint import Checkpoint
 from lalaloc_core.training.config import OptimiserConfig, TrainConfig
 from lalaloc_core.training.stages import Stage, build_optimiser
 
 _LOG = logging.getLogger(__name__)
 _LOG_EVERY = 20
-
-Validate = Callable[[dict[str, nn.Module]], dict[str, float]]
 
 
 def run_stage(
@@ -36,13 +35,17 @@ def run_stage(
     resume: bool = False,
     checkpoint_minutes: float = 5.0,
     validate: Validate | None = None,
+    begun_from: dict[str, Any] | None = None,
 ) -> Checkpoint:
     """Train a stage to the end of its schedule, or resume one that was interrupted.
 
-    Writes `<stage>.pt` (checkpoint) and `<stage>.csv` (losses and validation by step) into `folder`.
+    Writes `<stage>.pt` (the last checkpoint), `<stage>.best.pt` (the best by validation, where that tells accuracies)
+    and `<stage>.csv` (losses and validation by step) into `folder`.
 
     Args:
         workers: processes that make batches.
+        begun_from: what checkpoints say of the origin of the weights that the stage's modules have now; a resumed run
+            keeps what its checkpoint says.
         validate: called with the modules (averaged where averaging is on) whenever a checkpoint is written.
 
     Raises:
@@ -50,8 +53,10 @@ def run_stage(
     """
     path = folder / f"{stage.name}.pt"
     trainer = _Trainer(stage, device)
+    trainer.begun_from = begun_from or {}
     if resume:
         trainer.restore(Checkpoint.load(path, stage=stage.name))
+    best = BestCheckpoint(best_path(path), stage, validate, resume=resume)
     batches = stage.batches(trainer.step, workers)
     last_saved = time.monotonic()
     with (
@@ -72,7 +77,9 @@ def run_stage(
                     trainer.metrics = validate(trainer.averaged or stage.modules)
                     log.write(trainer.step, trainer.seconds, trainer.metrics)
                     _LOG.info("step %d: %s", trainer.step, trainer.metrics)
-                trainer.checkpoint().save(path)
+                checkpoint = trainer.checkpoint()
+                checkpoint.save(path)
+                best.consider(checkpoint)
                 last_saved = time.monotonic()
     return trainer.checkpoint()
 
@@ -94,6 +101,7 @@ class _Trainer:
         self.step = 0
         self.seconds = 0.0
         self.metrics: dict[str, float] = {}
+        self.begun_from: dict[str, Any] = {}
 
     @property
     def progress(self) -> float:
@@ -150,11 +158,12 @@ class _Trainer:
             seconds=self.seconds,
             metrics=self.metrics,
             data=self.stage.data,
+            begun_from=self.begun_from,
         )
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint of the same configuration; only the budget (steps, minutes) may change."""
-        if _without_budget(checkpoint.config) != _without_budget(self.stage.config):
+        """Go on from a checkpoint of the same configuration; only budgets and the rays per pixel may change."""
+        if _lasting(checkpoint.config) != _lasting(self.stage.config):
             raise CheckpointError(f"the checkpoint of stage '{checkpoint.stage}' has another configuration")
         if checkpoint.data and checkpoint.data != self.stage.data:
             raise CheckpointError(f"the checkpoint was trained on {checkpoint.data}, not on {self.stage.data}")
@@ -164,13 +173,15 @@ class _Trainer:
             module.load_state_dict(checkpoint.averaged[name])
         self.optimiser.load_state_dict(checkpoint.optimiser)
         self.step, self.seconds, self.metrics = checkpoint.step, checkpoint.seconds, checkpoint.metrics
+        self.begun_from = checkpoint.begun_from
 
 
-def _without_budget(config: TrainConfig) -> TrainConfig:
+def _lasting(config: TrainConfig) -> TrainConfig:
+    """A configuration without what may change when a run resumes."""
     return dataclasses.replace(
         config,
         layout=dataclasses.replace(config.layout, steps=0, minutes=None),
-        image=dataclasses.replace(config.image, steps=0, minutes=None),
+        image=dataclasses.replace(config.image, steps=0, minutes=None, supersample=(1, 1)),
     )
 
 
@@ -180,6 +191,9 @@ def learning_rate(config: OptimiserConfig, progress: float) -> float:
         return config.learning_rate * (0.05 + 0.95 * progress / config.warmup)
     if config.schedule == "steps":
         return config.learning_rate * config.gamma ** sum(progress >= milestone for milestone in config.milestones)
+    if config.schedule == "trapezoid":
+        fallen = max(0.0, progress - (1.0 - config.decay)) / config.decay
+        return config.learning_rate * (0.01 + 0.99 * (1.0 - math.sqrt(fallen)))
     return config.learning_rate * (0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * progress)))
 
 

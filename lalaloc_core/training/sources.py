@@ -28,6 +28,8 @@ from lalaloc_core.training.recent import Recent
 _HEADROOM_M = 0.1
 _LOWEST_CAMERA_M, _HIGHEST_CAMERA_M = 1.0, 1.9
 _CEILING_CLEARANCE_M = 0.3
+# Share of generated panoramas from thresholds, beside walls, in corridors and closets.
+_HARD_SHARE = 0.25
 _SCENES_KEPT = 256
 _PICTURE_BYTES_KEPT = 1 << 28
 # Visits in a row without any use after which there is something wrong with the generator.
@@ -151,10 +153,10 @@ class GeneratedSource:
     def views(self, visit: int, height: int, width: int) -> list[View]:
         stage = self.config.image
         home, rng = home_of(TRAIN, self.config.seed, visit)
-        shots = sample_shots(home, stage.shots_per_home, rng, by_room_share=stage.by_room_share)
+        shots = sample_shots(home, stage.shots_per_home, rng, by_room_share=stage.by_room_share, hard_share=_HARD_SHARE)
         if self._studio is None:
             self._studio = Studio(MaterialLibrary.create(np.random.default_rng(self.config.seed), self.textures))
-        images = self._studio.renderer(height, width).render(shots).cpu().numpy()
+        images = self._studio.renderer(height, width, stage.supersample).render(shots).cpu().numpy()
         return [
             View(
                 plan=home.plan,

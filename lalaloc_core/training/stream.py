@@ -11,8 +11,9 @@ from jaxtyping import Float, Int
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.render.profile import wall_profile
-from lalaloc_core.training.batches import Batch, Stream, Trouble, fruitful, stacked
+from lalaloc_core.training.batches import Batch, Stream, Trouble, fruitful, stacked, worker_share
 from lalaloc_core.training.config import TrainConfig
+from lalaloc_core.training.replay import Replay
 from lalaloc_core.training.sources import Group, Source, View
 from lalaloc_core.training.turning import draw_heading, draw_turn
 
@@ -63,8 +64,8 @@ class LayoutBatches(Stream):
 class PanoramaBatches(Stream):
     """Stage 2: panoramas with their layouts, turned and mirrored together.
 
-    Each batch holds `image` (b, h, w, 3) uint8, `profile_m` (b, columns), `camera_height_m` and `ceiling_height_m`
-    (b), and where a loss compares with neighbours, `neighbour_profile_m` (b, n, columns) and
+    Each batch holds `image` (b, h, w, 3) uint8, `profile_m` (b, columns), `camera_height_m` (b) as it is told,
+    `ceiling_height_m` (b), and where a loss compares with neighbours, `neighbour_profile_m` (b, n, columns) and
     `neighbour_ceiling_height_m` (b, n), which are turned and mirrored as their panorama is.
     """
 
@@ -74,11 +75,14 @@ class PanoramaBatches(Stream):
     first: int = 0
 
     def __iter__(self) -> Iterator[Batch | Trouble]:
-        return _batches(self._visit, self.source, self.config.image.batch, self.first)
+        stage, (_, workers) = self.config.image, worker_share()
+        replay: Replay[View] = Replay(stage.uses_per_panorama, stage.replay_panoramas // workers)
+        return _batches(lambda visit: self._visit(visit, replay), self.source, stage.batch, self.first)
 
-    def _visit(self, visit: int) -> list[Row] | None:
+    def _visit(self, visit: int, replay: Replay[View]) -> list[Row] | None:
         rng = self.source.rng(visit)
-        drawn = [self._row(view, rng) for view in self.source.views(visit, *self.config.image_size)]
+        new = self.source.views(visit, *self.config.image_size)
+        drawn = [self._row(used, rng) for view in new for used in replay.after(view, rng)]
         return [row for row in drawn if row is not None] or None
 
     def _row(self, view: View, rng: np.random.Generator) -> Row | None:
@@ -95,12 +99,16 @@ class PanoramaBatches(Stream):
         row = {
             "image": turn.picture(view.image),
             "profile_m": profile[0],
-            "camera_height_m": np.float32(view.camera_height_m),
+            "camera_height_m": np.float32(view.camera_height_m + self._height_error_m(rng)),
             "ceiling_height_m": ceiling[0],
         }
         if self.neighbours:
             row |= {"neighbour_profile_m": profile[1:], "neighbour_ceiling_height_m": ceiling[1:]}
         return row
+
+    def _height_error_m(self, rng: np.random.Generator) -> float:
+        spread = self.config.image.camera_height_error_m
+        return float(np.clip(rng.normal(0.0, spread), -3.0 * spread, 3.0 * spread)) if spread else 0.0
 
 
 def layouts(

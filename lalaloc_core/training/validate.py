@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -18,12 +19,15 @@ from lalaloc_core.errors import DatasetError
 from lalaloc_core.metrics import Accuracy
 from lalaloc_core.nets.resnet import PaperImageEncoder
 from lalaloc_core.sampling import PoseSet, pose_grid
+from lalaloc_core.training import losses
 from lalaloc_core.training.config import TrainConfig
+from lalaloc_core.training.kept_pictures import kept_pictures
 from lalaloc_core.training.recent import Recent
 from lalaloc_core.training.stream import layouts
 from lalaloc_core.training.turning import Turn, draw_turn
 
 _GRID_STEP_M = 0.5
+_FARTHEST = 0.7
 _BATCH = 16
 _LAYOUT_BATCH = 256
 
@@ -40,6 +44,13 @@ class _Query:
     @property
     def pose(self) -> PoseSet:
         return PoseSet(np.asarray(self.camera.position_m)[None], np.array([self.camera.room_index]))
+
+    @property
+    def told(self) -> bytes:
+        """Tells this query from others of its kind."""
+        camera, plan = self.camera, self.scene.plan
+        numbers = [*camera.position_m, camera.heading, camera.camera_height_m, self.turn.shift]
+        return np.array(numbers).tobytes() + plan.walls_m.tobytes() + plan.ceiling_heights_m.tobytes()
 
     def distance_m(self) -> np.ndarray:
         """From every grid pose to the camera."""
@@ -78,7 +89,10 @@ class LayoutValidation:
 
 
 class ImageValidation:
-    """Panorama queries, each camera in its usual look, read once: accuracy of the nearest grid latent.
+    """Panorama queries, each camera in its usual look, read once: accuracy of the nearest grid pose.
+
+    Nearest by latent, and with architecture `ring` also by the predicted wall profile: the mean |Δ log distance|, each
+    at most `_FARTHEST`, against the layouts of the grid. Reported over all queries and by furniture level.
 
     Args:
         config: sizes.
@@ -87,6 +101,8 @@ class ImageValidation:
         device: where to run.
         usual: the look to ask with, where a camera was photographed so; else its first.
         problems: photographs that cannot be read are left out and their errors appended here.
+        prefix: what the names of all figures begin with.
+        kept: file to keep the pictures in, for photographs that take long to make.
 
     Raises:
         DatasetError: the first of them where `problems` is None; or none can be read.
@@ -100,28 +116,41 @@ class ImageValidation:
         device: torch.device,
         usual: Appearance | None = None,
         problems: list[DatasetError] | None = None,
+        *,
+        prefix: str = "val",
+        kept: Path | None = None,
     ) -> None:
         self.columns = config.profile_columns
         self.device = device
         self.layout_encoder = layout_encoder
-        self.queries: list[_Query] = []
-        levels, pictures = [], []
-        for query in _queries(config, scenes):
-            look = _look(query.camera, usual)
-            try:
-                image = query.scene.photograph(query.camera, look).image(*config.image_size)
-            except DatasetError as error:
-                if problems is None:
-                    raise
-                problems.append(error)
-                continue
-            self.queries.append(query)
-            levels.append(str(look.furniture))
-            pictures.append(query.turn.picture(image))
-        if not pictures:
-            raise DatasetError("no validation scene has a photograph that can be read")
-        self.levels = np.array(levels)
-        self.images = torch.from_numpy(np.stack(pictures))
+        self.prefix = prefix
+        self.queries = _queries(config, scenes)
+        looks = [_look(query.camera, usual) for query in self.queries]
+        read: list[bool] = [True] * len(looks)
+
+        def pictures() -> np.ndarray:
+            found = []
+            for k, (query, look) in enumerate(zip(self.queries, looks, strict=True)):
+                try:
+                    image = query.scene.photograph(query.camera, look).image(*config.image_size)
+                except DatasetError as error:
+                    if problems is None:
+                        raise
+                    problems.append(error)
+                    read[k] = False
+                    continue
+                found.append(query.turn.picture(image))
+            if not found:
+                raise DatasetError("no validation scene has a photograph that can be read")
+            return np.stack(found)
+
+        about = [str(config.image_size).encode()]
+        about += [query.told + str(look).encode() for query, look in zip(self.queries, looks, strict=True)]
+        self.images = torch.from_numpy(kept_pictures(kept, about, pictures))
+        self.queries = [query for query, good in zip(self.queries, read, strict=True) if good]
+        self.levels = np.array([str(look.furniture) for look, good in zip(looks, read, strict=True) if good])
+        self._grid_latents: list[Tensor] | None = None
+        self._layouts: list[_Layouts] = []
 
     @torch.no_grad()
     def __call__(self, modules: dict[str, nn.Module]) -> dict[str, float]:
@@ -130,29 +159,88 @@ class ImageValidation:
         training = [(module, module.training) for module in (encoder, layout_encoder)]
         encoder.eval()
         layout_encoder.to(self.device).eval()
+        if not self._layouts:
+            self._layouts = [_Layouts.of(query, query.grid, self.columns, self.device) for query in self.queries]
+        if self._grid_latents is None or self.layout_encoder is None:
+            self._grid_latents = [layouts.embedded(layout_encoder) for layouts in self._layouts]
         parts = range(0, len(self.queries), _BATCH)
-        latents = torch.cat([self._embed(encoder, layout_encoder, slice(k, k + _BATCH)) for k in parts])
-        grids = _Grids(layout_encoder, self.columns, self.device)
-        errors = np.array(
-            [
-                query.distance_m()[grids.nearest(query, latent[None])]
-                for query, latent in zip(self.queries, latents, strict=True)
-            ]
-        )
+        seen = [self._see(encoder, layout_encoder, slice(k, k + _BATCH)) for k in parts]
+        latents = torch.cat([answer.latent for answer in seen])
+        nearest = [
+            int(torch.cdist(latent[None], grid).argmin())
+            for latent, grid in zip(latents, self._grid_latents, strict=True)
+        ]
+        scores = self._scores("", nearest)
+        profiles = [answer.log_profile for answer in seen if answer.log_profile is not None]
+        if profiles:
+            scores |= self._scores(
+                "profile_",
+                [
+                    int((profile - layouts.profile_m.log()).abs().clamp_max(_FARTHEST).mean(dim=1).argmin())
+                    for profile, layouts in zip(torch.cat(profiles), self._layouts, strict=True)
+                ],
+            )
+            scores[f"{self.prefix}_nll"] = sum(answer.nll for answer in seen) / len(self.queries)
         for module, was_training in training:
             module.train(was_training)
-        scores = {"val_within_1m": Accuracy.of(errors).within_1m, "val_median_cm": Accuracy.of(errors).median_cm}
-        levels = sorted(set(self.levels))
-        if len(levels) > 1:
-            scores |= {f"val_within_1m_{k}": Accuracy.of(errors[self.levels == k]).within_1m for k in levels}
         return scores
 
-    def _embed(self, encoder: nn.Module, layout_encoder: nn.Module, part: slice) -> Tensor:
+    def _scores(self, by: str, nearest: list[int]) -> dict[str, float]:
+        errors = np.array([query.distance_m()[k] for query, k in zip(self.queries, nearest, strict=True)])
+        levels = sorted(set(self.levels))
+        slices = {"": np.full(len(errors), True)}
+        slices |= {f"_{level}": self.levels == level for level in levels} if len(levels) > 1 else {}
+        scores = {}
+        for name, chosen in slices.items():
+            accuracy = Accuracy.of(errors[chosen])
+            scores[f"{self.prefix}_{by}within_1m{name}"] = accuracy.within_1m
+            scores[f"{self.prefix}_{by}median_cm{name}"] = accuracy.median_cm
+        return scores
+
+    def _see(self, encoder: nn.Module, layout_encoder: nn.Module, part: slice) -> _Answer:
         images = self.images[part].to(self.device)
         if isinstance(encoder, PaperImageEncoder):
-            return encoder(images)
-        heights = torch.tensor([query.camera.camera_height_m for query in self.queries[part]], dtype=torch.float32)
-        return layout_encoder.get_submodule("head")(encoder(images, heights.to(self.device)).ring)
+            return _Answer(encoder(images))
+        queries = self.queries[part]
+        heights = torch.tensor([query.camera.camera_height_m for query in queries], dtype=torch.float32)
+        features = encoder(images, heights.to(self.device))
+        true = torch.cat([_Layouts.of(query, query.pose, self.columns, self.device).profile_m for query in queries])
+        nll = float(losses.laplace(features.log_profile, features.log_scale, true))
+        latent = layout_encoder.get_submodule("head")(features.ring)
+        return _Answer(latent, features.log_profile, nll * len(queries))
+
+
+@dataclass(frozen=True, eq=False)
+class _Answer:
+    """What an image encoder says of some queries; `nll` is the sum of their profiles' negative log likelihoods."""
+
+    latent: Tensor
+    log_profile: Tensor | None = None
+    nll: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class _Layouts:
+    """Layouts at some poses of a query's plan, seen as its camera is turned."""
+
+    profile_m: Tensor
+    camera_height_m: Tensor
+    ceiling_height_m: Tensor
+
+    @classmethod
+    def of(cls, query: _Query, poses: PoseSet, columns: int, device: torch.device) -> _Layouts:
+        plan = query.scene.plan
+        heading = np.full(len(poses), query.turn.heading)
+        profile = torch.from_numpy(layouts(plan, poses.position_m, poses.room_index, heading, columns))
+        ceiling = torch.tensor(plan.ceiling_heights_m[poses.room_index], dtype=torch.float32)
+        camera = torch.full((len(poses),), query.camera.camera_height_m)
+        return cls(profile.to(device), camera.to(device), ceiling.to(device))
+
+    def embedded(self, encoder: nn.Module) -> Tensor:
+        """Latents (n, d)."""
+        inputs = (self.profile_m, self.camera_height_m, self.ceiling_height_m)
+        parts = zip(*(tensor.split(_LAYOUT_BATCH) for tensor in inputs), strict=True)
+        return torch.cat([encoder(*part) for part in parts])
 
 
 class _Grids:
@@ -169,16 +257,7 @@ class _Grids:
 
     def embed(self, query: _Query, poses: PoseSet) -> Tensor:
         """Latents (n, d) of the layouts at some poses, seen as the query's camera is turned."""
-        plan = query.scene.plan
-        heading = np.full(len(poses), query.turn.heading)
-        profile = torch.from_numpy(layouts(plan, poses.position_m, poses.room_index, heading, self.columns))
-        ceiling = torch.tensor(plan.ceiling_heights_m[poses.room_index], dtype=torch.float32)
-        camera = torch.full((len(poses),), query.camera.camera_height_m)
-        parts = [
-            self.encoder(*(part.to(self.device) for part in inputs))
-            for inputs in zip(*(tensor.split(_LAYOUT_BATCH) for tensor in (profile, camera, ceiling)), strict=True)
-        ]
-        return torch.cat(parts)
+        return _Layouts.of(query, poses, self.columns, self.device).embedded(self.encoder)
 
 
 def _queries(config: TrainConfig, scenes: Sequence[Scene]) -> list[_Query]:

@@ -139,6 +139,11 @@ class TestLearningRate:
         assert rates[100] == pytest.approx(0.505)
         assert rates[-1] == pytest.approx(0.01)
 
+    def test_a_trapezoid_stays_up_and_falls_at_the_end(self) -> None:
+        config = OptimiserConfig(learning_rate=2.0, schedule="trapezoid", warmup=0.1, decay=0.2)
+        rates = [learning_rate(config, progress) for progress in (0.0, 0.05, 0.1, 0.5, 0.8, 0.85, 1.0)]
+        assert rates == pytest.approx([0.1, 1.05, 2.0, 2.0, 2.0, 2.0 * (0.01 + 0.99 * 0.5), 0.02])
+
     def test_steps_fall_by_gamma_at_each_milestone(self) -> None:
         config = OptimiserConfig(learning_rate=0.1, schedule="steps", warmup=0.0, milestones=(0.5, 0.75), gamma=0.1)
         rates = [learning_rate(config, progress) for progress in (0.0, 0.49, 0.5, 0.74, 0.75, 1.0)]

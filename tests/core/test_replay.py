@@ -1,0 +1,166 @@
+"""Panoramas are used again: how often, how far apart, and how they are changed."""
+
+from __future__ import annotations
+
+import itertools
+from collections import Counter, defaultdict
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lalaloc_core.errors import ConfigError
+from lalaloc_core.training.batches import Batch, receive
+from lalaloc_core.training.config import PRESETS, TrainConfig
+from lalaloc_core.training.image_stage import ImageStage
+from lalaloc_core.training.photometric import changed
+from lalaloc_core.training.replay import Replay
+from lalaloc_core.training.sources import GeneratedSource
+from lalaloc_core.training.stages import build_layout_encoder
+from lalaloc_core.training.stream import PanoramaBatches
+from tests.strategies import seeds
+
+TINY = PRESETS["tiny"]
+
+
+def used(uses: int, limit: int, count: int) -> list[int]:
+    replay: Replay[int] = Replay(uses, limit)
+    rng = np.random.default_rng(0)
+    drawn: list[int] = []
+    for new in range(count):
+        drawn += replay.after(new, rng)
+        assert len(replay) <= limit
+    return drawn
+
+
+class TestReplay:
+    @given(uses=st.integers(1, 6), limit=st.integers(1, 40))
+    def test_nothing_is_used_more_often_than_asked_and_all_that_left_exactly_so(self, uses: int, limit: int) -> None:
+        counts = Counter(used(uses, limit, 300))
+        assert max(counts.values()) <= uses
+        assert set(counts) == set(range(300))
+        unfinished = sum(count < uses for count in counts.values())
+        assert unfinished <= (limit if uses > 1 else 0)
+
+    def test_once_begun_there_are_as_many_repeats_as_asked_for_every_new_thing(self) -> None:
+        replay: Replay[int] = Replay(4, 300)
+        rng = np.random.default_rng(0)
+        together = [len(replay.after(new, rng)) for new in range(3000)]
+        assert together[0] == 1
+        assert np.mean(together[1000:]) == pytest.approx(4.0, rel=0.02)
+        assert 250 < len(replay) <= 300
+
+    def test_uses_of_one_thing_are_far_apart(self) -> None:
+        last: dict[int, int] = {}
+        gaps: dict[int, list[int]] = defaultdict(list)
+        for place, thing in enumerate(used(4, 400, 4000)):
+            if thing in last:
+                gaps[thing].append(place - last[thing])
+            last[thing] = place
+        assert np.median([gap for found in gaps.values() for gap in found]) > 200
+
+
+def batches(**image: Any) -> list[Batch]:
+    config = TINY.with_settings({f"image.{name}": value for name, value in image.items()})
+    return list(itertools.islice(receive(PanoramaBatches(config, GeneratedSource(config)), 0), 6))
+
+
+def colours(found: list[Batch]) -> Counter[tuple[int, ...]]:
+    """Panoramas by the sorted values of a row's pixels, which no turn and no mirror changes."""
+    rows = torch.cat([batch["image"] for batch in found])[:, 16, :, 0]
+    return Counter(tuple(row.tolist()) for row in rows.sort(dim=1).values)
+
+
+class TestStream:
+    def test_panoramas_come_again_turned_anew_with_the_layout_that_belongs_to_the_turn(self) -> None:
+        found = batches(uses_per_panorama=3, replay_panoramas=6)
+        counts = colours(found)
+        assert 2 <= max(counts.values()) <= 3
+        most = max(counts, key=lambda key: counts[key])
+        images, profiles = (torch.cat([batch[key] for batch in found]) for key in ("image", "profile_m"))
+        same = [k for k, row in enumerate(images[:, 16, :, 0]) if tuple(row.sort().values.tolist()) == most]
+        shown, other = images[same[0]], images[same[1]]
+        fitting = [
+            (shift, flip)
+            for shift in range(shown.shape[1])
+            for flip in (False, True)
+            if torch.equal((shown.flip(1) if flip else shown).roll(shift, dims=1), other)
+        ]
+        assert len(fitting) == 1
+        shift, flip = fitting[0]
+        profile = profiles[same[0]].flip(0) if flip else profiles[same[0]]
+        # Profiles of `tiny` have half as many columns as pictures: half a column is all that may be left.
+        rolled = [profile.roll(k) for k in (shift // 2, -(-shift // 2))]
+        assert (sum(rolled) / 2 - profiles[same[1]]).abs().median() < 0.05
+
+    def test_the_same_seed_repeats_the_same(self) -> None:
+        first, again = (batches(uses_per_panorama=3, replay_panoramas=6) for _ in range(2))
+        assert all(torch.equal(a[key], b[key]) for a, b in zip(first, again, strict=True) for key in a)
+
+    def test_a_resumed_stage_goes_on_with_new_homes(self) -> None:
+        config = TINY.with_settings({"image.uses_per_panorama": 3, "image.replay_panoramas": 6})
+        stage = ImageStage(config, GeneratedSource(config), build_layout_encoder(config))
+        seen = colours(list(itertools.islice(stage.batches(0, 0), 6)))
+        resumed = colours(list(itertools.islice(stage.batches(6, 0), 6)))
+        assert not set(seen) & set(resumed)
+
+    def test_told_heights_are_off_by_as_much_as_asked_and_nothing_else_is(self) -> None:
+        exact, off = batches(), batches(camera_height_error_m=0.05)
+        # The error is drawn after the turn of each picture, so that only the first of a home is the same.
+        assert torch.equal(exact[0]["image"][0], off[0]["image"][0])
+        assert torch.equal(exact[0]["profile_m"][0], off[0]["profile_m"][0])
+        assert exact[0]["camera_height_m"][0] != off[0]["camera_height_m"][0]
+        true, told = (torch.cat([batch["camera_height_m"] for batch in found]) for found in (exact, off))
+        error = told - true
+        assert 0.025 < error.std() < 0.1
+        assert error.abs().max() <= 0.15 + 1e-6
+
+
+class TestPhotometric:
+    @given(seed=seeds())
+    def test_pictures_keep_their_range_and_their_content(self, seed: int) -> None:
+        image = torch.randint(0, 256, (4, 8, 16, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(seed))
+        shown = changed(image, 1.0, torch.Generator().manual_seed(seed))
+        again = changed(image, 1.0, torch.Generator().manual_seed(seed))
+        assert torch.equal(shown, again)
+        assert shown.min() >= 0.0
+        assert shown.max() <= 255.0
+        for before, after in zip(image.float(), shown, strict=True):
+            assert torch.corrcoef(torch.stack([before.flatten(), after.flatten()]))[0, 1] > 0.9
+
+    def test_without_strength_nothing_changes_and_every_picture_changes_its_own_way(self) -> None:
+        image = torch.full((3, 4, 8, 3), 100, dtype=torch.uint8)
+        generator = torch.Generator().manual_seed(0)
+        torch.testing.assert_close(changed(image, 0.0, generator), image.float())
+        brightness = changed(image, 1.0, generator).mean(dim=(1, 2, 3))
+        assert len({round(float(value), 1) for value in brightness}) == 3
+
+
+@pytest.mark.parametrize(
+    ("setting", "value", "message"),
+    [
+        ("image.uses_per_panorama", 0, "uses_per_panorama is 0"),
+        ("image.replay_panoramas", 0, "replay_panoramas is 0"),
+        ("image.photometric", 1.5, "photometric is 1.5"),
+        ("image.camera_height_error_m", -0.1, "camera_height_error_m is -0.1"),
+        ("image.supersample", [2], "supersample"),
+        ("image.supersample", [0, 2], "supersample"),
+        ("image.optimiser.decay", 1.0, "decay is 1"),
+        ("image.uses", 2, "no key 'uses'"),
+        ("pictures.uses", 2, "no part 'pictures'"),
+        ("image.batch", "many", "batch is 'many'"),
+    ],
+)
+def test_settings_that_cannot_be_are_refused_by_name(setting: str, value: Any, message: str) -> None:
+    with pytest.raises(ConfigError, match=message.replace(".", r"\.")):
+        TINY.with_settings({setting: value})
+
+
+def test_single_settings_are_replaced() -> None:
+    changed_config = TINY.with_settings({"image.supersample": [2, 1], "image.optimiser.learning_rate": 1})
+    assert changed_config.image.supersample == (2, 1)
+    assert changed_config.image.optimiser.learning_rate == 1.0
+    assert TrainConfig.from_dict(changed_config.to_dict()) == changed_config
