@@ -12,7 +12,7 @@ from lalaloc_core.training.checkpoint import Checkpoint
 from lalaloc_core.training.stages import Stage
 
 Validate = Callable[[dict[str, nn.Module]], dict[str, float]]
-_ACCURACY, _TIE_BREAKER = "val_within_1m", "val_median_cm"
+_LIKELIHOOD, _ACCURACY, _TIE_BREAKER = "val_nll", "val_within_1m", "val_median_cm"
 
 
 def best_path(path: Path) -> Path:
@@ -21,9 +21,10 @@ def best_path(path: Path) -> Path:
 
 
 class BestCheckpoint:
-    """Keeps the checkpoint with the most validation queries within 1 m; of several, that with the smallest median.
+    """Keeps the best checkpoint: with the most likely wall profiles, because poses are compared by that likelihood.
 
-    Without `val_within_1m` among the metrics nothing is kept.
+    Of networks that predict none it is the one with the most validation queries within 1 m, of several such that with
+    the smallest median. Without either among the metrics nothing is kept.
 
     Args:
         path: where it is kept; what an earlier run left there is deleted unless this one resumes it.
@@ -33,7 +34,7 @@ class BestCheckpoint:
 
     def __init__(self, path: Path, stage: Stage, validate: Validate | None, *, resume: bool) -> None:
         self._path = path
-        self._score: tuple[float, float] | None = None
+        self._score: tuple[float, ...] | None = None
         if not resume:
             path.unlink(missing_ok=True)
         elif validate is not None and path.exists():
@@ -51,6 +52,8 @@ class BestCheckpoint:
             self._score = score
 
 
-def _score(metrics: dict[str, float]) -> tuple[float, float] | None:
+def _score(metrics: dict[str, float]) -> tuple[float, ...] | None:
     """Orders validations; None for one that tells no accuracy."""
+    if _LIKELIHOOD in metrics:
+        return (-metrics[_LIKELIHOOD],)
     return (metrics[_ACCURACY], -metrics[_TIE_BREAKER]) if _ACCURACY in metrics else None

@@ -143,6 +143,18 @@ class TestBest:
         assert self.best_of(tmp_path / "b", 0.5, 0.7, 0.7).step == 3
         assert not list(tmp_path.rglob("*.part"))
 
+    def test_likelihood_decides_where_there_is_one(self, tmp_path: Path) -> None:
+        scores = Scores(0.5, 0.7, 0.6)
+        likelihoods = iter((-1.0, -1.1, -1.2))
+        run_stage(
+            LineStage(3),
+            tmp_path,
+            device=CPU,
+            checkpoint_minutes=0.0,
+            validate=lambda modules: scores(modules) | {"val_nll": next(likelihoods)},
+        )
+        assert Checkpoint.load(tmp_path / "line.best.pt").step == 3
+
     def test_a_resumed_run_scores_the_kept_one_anew(self, tmp_path: Path) -> None:
         first = self.best_of(tmp_path, 0.5, 0.7, 0.6)
         # On the scenes of today the kept weights have 0.3.
