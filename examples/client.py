@@ -63,19 +63,23 @@ class LocaliseClient:
         panorama: Path,
         *,
         heading_deg: float | None = None,
+        heading_tolerance_deg: float | None = None,
         camera_height_m: float | None = None,
     ) -> dict[str, Any]:
         """Where in the plan the panorama was taken.
 
         Args:
             heading_deg: azimuth of the picture's centre column; None when unknown, then it is found as well.
+            heading_tolerance_deg: how far off that may be, up to 45; None when it is exact.
             camera_height_m: None stands for the plan's own.
         """
         fields: dict[str, Any] = {"floorplan_id": floorplan_id}
-        if heading_deg is not None:
-            fields["heading_deg"] = heading_deg
-        if camera_height_m is not None:
-            fields["camera_height_m"] = camera_height_m
+        optional = {
+            "heading_deg": heading_deg,
+            "heading_tolerance_deg": heading_tolerance_deg,
+            "camera_height_m": camera_height_m,
+        }
+        fields |= {name: value for name, value in optional.items() if value is not None}
         picture = {"panorama": (panorama.name, panorama.read_bytes())}
         return _content(self._http.post("/localise", data=fields, files=picture))
 

@@ -24,8 +24,8 @@ from lalaloc_core.conventions import heading_from_degrees
 from lalaloc_core.evaluation.report.plan import INK, Cells, draw_camera, draw_distances, draw_plan, halo
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.evidence import latent_distances
 from lalaloc_core.localise.images import read_panorama
-from lalaloc_core.localise.retrieval import latent_distances
 from service.settings import Settings
 
 _CELL_M = 0.1
@@ -62,7 +62,7 @@ def latent_map(cells: Cells, plan: FloorPlan, encoders: Encoders, truth: TruePos
     panorama = read_panorama(truth.picture.read_bytes(), height=manifest.image_height, width=manifest.image_width)
     query = encoders.query(panorama, heading_from_degrees(truth.heading_deg), truth.camera_height_m)
     heading = np.full(len(cells.poses), query.frame_heading)
-    latents = encoders.poses(plan, cells.poses, heading, truth.camera_height_m)
+    latents, _ = encoders.poses(plan, cells.poses, heading, truth.camera_height_m)
     return latent_distances(latents, query.latents)[0]
 
 

@@ -10,6 +10,7 @@ import dataclasses
 import hashlib
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from typing import Any
 from lalaloc_core.errors import BundleError
 
 MANIFEST_NAME = "manifest.json"
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 
 LAYOUT_ONNX = "layout_encoder.onnx"
 IMAGE_ONNX = "image_encoder.onnx"
@@ -29,23 +30,52 @@ BUNDLE_FILES = (LAYOUT_ONNX, IMAGE_ONNX, HEAD_ONNX, LAYOUT_WEIGHTS, IMAGE_WEIGHT
 
 
 @dataclass(frozen=True, kw_only=True)
-class ConfidenceModel:
-    """Logistic model of "the answer is within 1 m", fitted on validation queries.
-
-    The probability is `sigmoid(bias + distance * d + margin * m)` with d the latent distance of the best candidate
-    and m by how much the second, distinct candidate is farther (`no_rival_margin` when there is none).
-    """
+class LogisticModel:
+    """Probability of "the answer is within 1 m" by the signals of `localise.confidence`."""
 
     bias: float
-    distance: float
-    margin: float
-    no_rival_margin: float
+    log_odds: float
+    cost: float
+    uncertainty: float
+    latent_distance: float
 
-    def probability(self, distances: list[float]) -> float:
-        """Confidence of an answer whose distinct candidates have these latent distances, best first."""
-        margin = distances[1] - distances[0] if len(distances) > 1 else self.no_rival_margin
-        logit = self.bias + self.distance * distances[0] + self.margin * min(margin, self.no_rival_margin)
+    def probability(self, *, log_odds: float, cost: float, uncertainty: float, latent_distance: float) -> float:
+        """Confidence of an answer with these signals."""
+        logit = self.bias + self.log_odds * log_odds + self.cost * cost
+        logit += self.uncertainty * uncertainty + self.latent_distance * latent_distance
         return 1.0 / (1.0 + math.exp(-max(-30.0, min(30.0, logit))))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConfidenceModel:
+    """How sure answers are, fitted on validation queries.
+
+    Attributes:
+        known_heading, searched_heading: by the stage that the answer came from ("retrieval", "vdr", "lpo").
+        position_factor: covariance (m²) of the position, where the heading is known, in units of the inverse of the
+            cost's curvature.
+        position_factor_searched, heading_factor: of the position (m²) and the heading (radians²) where it is searched.
+    """
+
+    known_heading: dict[str, LogisticModel]
+    searched_heading: dict[str, LogisticModel]
+    position_factor: float | None = None
+    position_factor_searched: float | None = None
+    heading_factor: float | None = None
+
+    def probability(self, stage: str, signals: Mapping[str, float], *, heading_known: bool) -> float | None:
+        """Confidence of an answer; None for a stage that no validation query was answered by."""
+        model = (self.known_heading if heading_known else self.searched_heading).get(stage)
+        return None if model is None else model.probability(**signals)
+
+    @classmethod
+    def from_dict(cls, raw: dict[str, Any]) -> ConfidenceModel:
+        """Rebuild from plain data; unknown keys are a `TypeError`."""
+        stages = {
+            name: {stage: LogisticModel(**model) for stage, model in raw[name].items()}
+            for name in ("known_heading", "searched_heading")
+        }
+        return cls(**{**raw, **stages})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -106,7 +136,7 @@ class Manifest:
                 raise BundleError(f"manifest format {raw.get('format_version')!r}, this code reads {FORMAT_VERSION}")
             raw["files"] = {name: FileEntry(**entry) for name, entry in raw["files"].items()}
             if raw["confidence"] is not None:
-                raw["confidence"] = ConfidenceModel(**raw["confidence"])
+                raw["confidence"] = ConfidenceModel.from_dict(raw["confidence"])
             return cls(**raw)
         except (ValueError, TypeError, KeyError, AttributeError) as error:
             raise BundleError(f"not a valid {MANIFEST_NAME}: {error}") from error

@@ -1,42 +1,83 @@
-"""Fit the confidence of answers: a logistic model of "within 1 m" on validation queries."""
+"""Fit what answers say of themselves on validation queries: the probability of "within 1 m", and the covariance."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from lalaloc_core.bundle import Bundle, ConfidenceModel, write_manifest
+from lalaloc_core.bundle import Bundle, ConfidenceModel, LogisticModel, write_manifest
+from lalaloc_core.conventions import heading_from_degrees, wrap_angle
 from lalaloc_core.evaluation.predictions import Prediction
 from lalaloc_core.evaluation.score import position_errors_m
+from lalaloc_core.localise.confidence import RIGHT_WITHIN_M
+from lalaloc_core.localise.covariance import marginal_information
 from lalaloc_core.metrics import Accuracy
 
 # A weak pull to zero keeps the fit finite when the queries are perfectly separable.
 _RIDGE = 1e-2
 _ITERATIONS = 50
+# Medians of the chi-squared distribution with one and with two degrees of freedom.
+_MEDIAN_CHI2 = {1: 0.4549, 2: 1.3863}
+_SIGNALS = ("log_odds", "cost", "uncertainty", "latent_distance")
 
 
-def fit_confidence(predictions: list[Prediction]) -> ConfidenceModel:
-    """Maximum-likelihood logistic model of the best latent distance and its margin over the second candidate."""
-    candidates = [prediction.candidate_distances for prediction in predictions]
-    distance = np.array([distances[0] for distances in candidates])
-    margins = [distances[1] - distances[0] for distances in candidates if len(distances) > 1]
-    ceiling = float(np.quantile(margins, 0.95)) if margins else 0.0
-    margin = np.array(
-        [min(distances[1] - distances[0], ceiling) if len(distances) > 1 else ceiling for distances in candidates]
+def fit_confidence(known: Sequence[Prediction], searched: Sequence[Prediction]) -> ConfidenceModel:
+    """Fit on answers to queries with known heading, and to queries whose heading was searched."""
+    position, _ = _covariance_factors(known)
+    position_searched, heading = _covariance_factors(searched)
+    return ConfidenceModel(
+        known_heading=_by_stage(known),
+        searched_heading=_by_stage(searched),
+        position_factor=position,
+        position_factor_searched=position_searched,
+        heading_factor=heading,
     )
-    correct = position_errors_m(predictions) < 1.0
-    bias, by_distance, by_margin = _logistic(np.stack([np.ones_like(distance), distance, margin], axis=1), correct)
-    return ConfidenceModel(bias=bias, distance=by_distance, margin=by_margin, no_rival_margin=ceiling)
 
 
-def calibrate(bundle: Bundle, predictions: list[Prediction], description: str) -> Bundle:
+def calibrate(bundle: Bundle, known: list[Prediction], searched: list[Prediction], description: str) -> Bundle:
     """Store the fitted confidence and the validation figures in the bundle's manifest."""
-    errors = position_errors_m(predictions)
-    metrics = {**bundle.manifest.metrics, "validation": {"queries": description, **Accuracy.of(errors).to_dict()}}
-    manifest = dataclasses.replace(bundle.manifest, confidence=fit_confidence(predictions), metrics=metrics)
+    metrics = {**bundle.manifest.metrics, "validation_queries": description}
+    for name, predictions in (("validation", known), ("validation_heading_searched", searched)):
+        metrics[name] = Accuracy.of(position_errors_m(predictions)).to_dict()
+    manifest = dataclasses.replace(bundle.manifest, confidence=fit_confidence(known, searched), metrics=metrics)
     return write_manifest(bundle.folder, manifest)
+
+
+def _by_stage(predictions: Sequence[Prediction]) -> dict[str, LogisticModel]:
+    stages = dict.fromkeys(stage for prediction in predictions for stage in prediction.signals)
+    return {stage: _fit_stage(stage, predictions) for stage in stages}
+
+
+def _fit_stage(stage: str, predictions: Sequence[Prediction]) -> LogisticModel:
+    """Maximum-likelihood logistic model of a stage's pose being within 1 m of the truth."""
+    told = [prediction for prediction in predictions if stage in prediction.signals]
+    features = np.array([[1.0, *(one.signals[stage][name] for name in _SIGNALS)] for one in told])
+    distance = [np.hypot(one.stages[stage].x_m - one.truth.x_m, one.stages[stage].y_m - one.truth.y_m) for one in told]
+    bias, *weights = _logistic(features, np.array(distance) < RIGHT_WITHIN_M)
+    return LogisticModel(bias=bias, **dict(zip(_SIGNALS, weights, strict=True)))
+
+
+def _covariance_factors(predictions: Sequence[Prediction]) -> tuple[float | None, float | None]:
+    """Factors that make half of the right answers' errors fall into the ellipse (interval) that should hold half."""
+    position, heading = [], []
+    for one in predictions:
+        answer = one.answer
+        if answer is None or one.information is None:
+            continue
+        offset = np.array([answer.x_m - one.truth.x_m, answer.y_m - one.truth.y_m])
+        by_position, by_heading = marginal_information(np.array(one.information))
+        if np.hypot(*offset) < RIGHT_WITHIN_M:
+            position.append(offset @ by_position @ offset)
+            if by_heading is not None:
+                turn = wrap_angle(heading_from_degrees(answer.heading_deg - one.truth.heading_deg))
+                heading.append(turn**2 * by_heading)
+    return (
+        float(np.median(position)) / _MEDIAN_CHI2[2] if position else None,
+        float(np.median(heading)) / _MEDIAN_CHI2[1] if heading else None,
+    )
 
 
 def _logistic(features: Float[np.ndarray, "n f"], correct: Bool[np.ndarray, "n"]) -> list[float]:

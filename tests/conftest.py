@@ -12,11 +12,14 @@ import torch
 def tiny_bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A real bundle: both stages of the `tiny` preset, trained for seconds and exported."""
     from lalaloc_core.training.config import PRESETS
+    from lalaloc_core.training.data import TrainingData
     from lalaloc_core.training.run import export_run, train_image, train_layout
 
     torch.set_num_threads(1)
     folder = tmp_path_factory.mktemp("tiny")
     device = torch.device("cpu")
-    train_layout(PRESETS["tiny"], folder, device=device, workers=0)
-    train_image(PRESETS["tiny"], folder, device=device, workers=0)
+    # Rendering the usual number of validation panoramas would take longer than the training.
+    data = TrainingData(validation_scenes=2)
+    train_layout(PRESETS["tiny"], folder, device=device, data=data, workers=0)
+    train_image(PRESETS["tiny"], folder, device=device, data=data, workers=0)
     return export_run(folder, folder / "bundle", name="tiny", version="test").folder

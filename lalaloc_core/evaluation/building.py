@@ -16,6 +16,7 @@ from lalaloc_core.data.opening import open_dataset
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.evaluation.predictions import RunInfo
 from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.evidence import EvidenceConfig
 from lalaloc_core.localise.optimise import LpoConfig
 from lalaloc_core.localise.pipeline import LocaliseConfig, Refine
 from lalaloc_core.methods.decode import VdrDecode
@@ -30,12 +31,18 @@ from lalaloc_core.nets import load_decoder
 
 @dataclass(frozen=True, kw_only=True)
 class LaLaLocSettings:
-    """Settings of method "lalaloc"; the defaults are the service's."""
+    """Settings of method "lalaloc"; the defaults are the service's.
+
+    Attributes:
+        evidence: what poses are compared by: the predicted wall profile, where the model predicts one; the latent; or
+            the sum of both.
+    """
 
     refine: Refine = "lpo"
     vdr_samples: int = 200
     vdr_candidates: int = 1
     lpo_candidates: int = 5
+    evidence: Literal["profile", "latent", "both"] = "profile"
     optimiser: Literal["levenberg-marquardt", "adam"] = "levenberg-marquardt"
 
 
@@ -51,6 +58,11 @@ class NoSettings:
     """Methods without settings."""
 
 
+_EVIDENCE = {
+    "profile": EvidenceConfig(),
+    "latent": EvidenceConfig(use_profile=False),
+    "both": EvidenceConfig(latent_weight=1.0),
+}
 _Settings = TypeVar("_Settings")
 
 
@@ -63,6 +75,11 @@ def build_dataset(info: RunInfo) -> Dataset:
     if info.data is not None:
         return open_dataset(Path(info.data))
     arguments: dict[str, Any] = dict(info.generated or {})
+    if arguments.pop("generator", "synth") == "unfamiliar":
+        # Traced by embree, which only the extra `ray` brings.
+        from lalaloc_core.data.unfamiliar import UnfamiliarScenes
+
+        return UnfamiliarScenes(**arguments)
     if arguments.get("textures") is not None:
         arguments["textures"] = Path(arguments["textures"])
     return GeneratedScenes(**arguments)
@@ -105,6 +122,7 @@ def _lalaloc(bundle: Bundle, encoders: Encoders, settings: LaLaLocSettings) -> L
         vdr_samples=settings.vdr_samples,
         vdr_candidates=settings.vdr_candidates,
         lpo_candidates=settings.lpo_candidates,
+        evidence=_EVIDENCE[settings.evidence],
     )
     return LaLaLoc(encoders, refine=settings.refine, refiner=refiner, config=config)
 

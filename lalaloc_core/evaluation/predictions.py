@@ -54,9 +54,11 @@ class Prediction:
         layout_hit: whether retrieval chose the grid pose whose layout is nearest the truth by Chamfer distance
             (Layout R@1); None for methods that do not retrieve.
         pose_hit: whether it chose the nearest grid pose (Pose R@1).
-        candidate_distances: of the distinct final candidates, best first.
+        signals: by stage, what speaks for its pose and against it; see `localise.confidence`.
+        information: curvature of the cost at the answer, by x and y (m) and, where it was searched, heading (radians).
         confidence: probability, by the model, of being within 1 m.
         timings_ms: per stage.
+        facts: what is known to make the photograph hard, in alphabetical order; see `data.dataset.Described`.
     """
 
     scene: str
@@ -67,9 +69,11 @@ class Prediction:
     stages: dict[str, Pose] = field(default_factory=dict)
     layout_hit: bool | None = None
     pose_hit: bool | None = None
-    candidate_distances: tuple[float, ...] = ()
+    signals: dict[str, dict[str, float]] = field(default_factory=dict)
+    information: tuple[tuple[float, ...], ...] | None = None
     confidence: float | None = None
     timings_ms: dict[str, float] = field(default_factory=dict)
+    facts: tuple[str, ...] = ()
 
     @property
     def answer(self) -> Pose | None:

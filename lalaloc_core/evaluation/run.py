@@ -23,7 +23,7 @@ from tqdm import tqdm
 
 from lalaloc_core.configuration import build_config
 from lalaloc_core.conventions import heading_to_degrees
-from lalaloc_core.data.dataset import Appearance, Camera, Dataset, Scene, load_scenes
+from lalaloc_core.data.dataset import Appearance, Camera, Dataset, Scene, facts_of_photograph, load_scenes
 from lalaloc_core.errors import DatasetError, RunError
 from lalaloc_core.evaluation.building import build_dataset, build_method
 from lalaloc_core.evaluation.predictions import Pose, Prediction, RunFolder, RunInfo
@@ -196,9 +196,11 @@ class _Examiner:
             stages={stage: _pose(found) for stage, found in answer.stages.items()},
             layout_hit=self._layout_hit(question, answer),
             pose_hit=self._pose_hit(camera, answer),
-            candidate_distances=answer.candidate_distances,
+            signals=answer.signals,
+            information=None if answer.information is None else tuple(map(tuple, answer.information.tolist())),
             confidence=answer.confidence,
             timings_ms=answer.timings_ms,
+            facts=tuple(sorted(facts_of_photograph(photograph))),
         )
 
     def _layout_hit(self, question: Question, answer: Answer) -> bool | None:

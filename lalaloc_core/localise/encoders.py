@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import onnxruntime
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 
 from lalaloc_core.bundle import HEAD_ONNX, IMAGE_ONNX, LAYOUT_ONNX, Bundle
 from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.errors import BundleError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.poses import Query
+from lalaloc_core.localise.poses import PredictedProfile, Query
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.sampling import PoseSet
 
@@ -18,7 +20,7 @@ from lalaloc_core.sampling import PoseSet
 _LAYOUT_BATCH = 256
 # An architecture without a ring has to see the panorama turned, once per heading.
 _HEADINGS_WITHOUT_RING = 32
-_PROFILE_OUTPUT = "log_profile"
+_PROFILE_OUTPUTS = ["log_profile", "log_scale"]
 
 
 class Encoders:
@@ -40,9 +42,9 @@ class Encoders:
         self._image = None if image is None else _session(image, threads)
         inputs = [] if self._image is None else self._image.get_inputs()
         self._image_takes_height = any(node.name == "camera_height_m" for node in inputs)
+        outputs = [] if self._image is None else self._image.get_outputs()
+        self.predicts_profile = {node.name for node in outputs}.issuperset(_PROFILE_OUTPUTS)
         self._head = _session(bundle.read(HEAD_ONNX), threads) if self.manifest.ring_sectors else None
-        # A ring (1, c, s) where the architecture has one, else the latent (1, d).
-        self._encoding = "ring" if self._head is not None else "latent"
 
     def layouts(
         self,
@@ -64,29 +66,48 @@ class Encoders:
 
     def poses(
         self, plan: FloorPlan, poses: PoseSet, heading: Float[np.ndarray, "b"], camera_height_m: float
-    ) -> Float[np.ndarray, "b d"]:
-        """Render the layout of every pose of a plan and embed it."""
-        profile = wall_profile(
+    ) -> tuple[Float[np.ndarray, "b d"], Float[np.ndarray, "b c"]]:
+        """Render the layout of every pose of a plan; latents and wall profiles (m)."""
+        profile_m = self.profiles(plan, poses, heading)
+        heights = np.full(len(poses), camera_height_m)
+        return self.layouts(profile_m, heights, plan.ceiling_heights_m[poses.room_index]), profile_m
+
+    def profiles(self, plan: FloorPlan, poses: PoseSet, heading: Float[np.ndarray, "b"]) -> Float[np.ndarray, "b c"]:
+        """Wall profiles (m) of poses of a plan, as wide as the layout encoder takes them."""
+        return wall_profile(
             poses.position_m.astype(np.float32),
             heading.astype(np.float32),
             plan.walls_m[poses.room_index].astype(np.float32),
             self.manifest.profile_columns,
         )
-        return self.layouts(profile, np.full(len(poses), camera_height_m), plan.ceiling_heights_m[poses.room_index])
 
-    def query(self, image: UInt8[np.ndarray, "h w 3"], heading: float | None, camera_height_m: float) -> Query:
+    def query(
+        self,
+        image: UInt8[np.ndarray, "h w 3"],
+        heading: float | None,
+        camera_height_m: float,
+        *,
+        heading_tolerance: float = 0.0,
+    ) -> Query:
         """Encode a panorama of the bundle's input size.
 
         Args:
             camera_height_m: gives the picture its metric scale.
             heading: azimuth of the centre column (radians); None when unknown, then there is one hypothesis per
                 sector of the ring.
+            heading_tolerance: how far (radians) the true heading may be from `heading`; with it there are hypotheses
+                for the sectors within that, and the heading is refined.
         """
-        if heading is not None:
-            return self._query_turned(image, heading, camera_height_m)
-        if self._head is not None:
-            return self._query_any_heading(image, camera_height_m)
-        return self._query_by_turning(image, camera_height_m)
+        turned, rolled, frame_heading = (image, 0.0, 0.0) if heading is None else _undo_heading(image, heading)
+        steps = self.manifest.ring_sectors or _HEADINGS_WITHOUT_RING
+        if heading is None:
+            shifts = np.arange(steps)
+        else:
+            most = min(math.ceil(heading_tolerance / TWO_PI * steps), (steps - 1) // 2)
+            shifts = np.arange(-most, most + 1)
+        exact = heading is not None and heading_tolerance == 0.0
+        latents, profile = self._hypotheses(turned, camera_height_m, shifts, steps)
+        return Query(latents, rolled + shifts * (TWO_PI / steps), frame_heading, heading_known=exact, profile=profile)
 
     def profile(
         self, image: UInt8[np.ndarray, "h w 3"], heading: float, camera_height_m: float
@@ -100,52 +121,55 @@ class Encoders:
         Raises:
             BundleError: the bundle's image encoder predicts no wall profile.
         """
-        if not any(node.name == _PROFILE_OUTPUT for node in self._require_image().get_outputs()):
+        query = self.query(image, heading, camera_height_m)
+        if query.profile is None:
             raise BundleError(
                 f"model '{self.manifest.name}' (architecture '{self.manifest.architecture}') predicts no wall profile: "
-                f"{IMAGE_ONNX} has no output '{_PROFILE_OUTPUT}'"
+                f"{IMAGE_ONNX} has no output '{_PROFILE_OUTPUTS[0]}'"
             )
-        turned, _, frame_heading = _undo_heading(image, heading)
-        return np.exp(self._run_image(turned, camera_height_m, _PROFILE_OUTPUT)[0]), frame_heading
+        return np.exp(query.profile.log_m[0]), query.frame_heading
 
-    def _query_turned(self, image: UInt8[np.ndarray, "h w 3"], heading: float, camera_height_m: float) -> Query:
-        """Undo a known heading; what whole pixels leave over stays as the frame's heading."""
-        turned, rolled, frame_heading = _undo_heading(image, heading)
-        encoded = self._run_image(turned, camera_height_m, self._encoding)
-        latents = encoded if self._head is None else self._run_head(encoded)
-        return Query(latents, np.array([rolled]), frame_heading, heading_known=True)
+    def _hypotheses(
+        self, image: UInt8[np.ndarray, "h w 3"], camera_height_m: float, shifts: Int[np.ndarray, "k"], steps: int
+    ) -> tuple[Float[np.ndarray, "k d"], PredictedProfile | None]:
+        """Latents and wall profiles of a panorama turned to the right by each of some numbers of `steps`."""
+        if self._head is None:
+            width = image.shape[1]
+            turned = (np.roll(image, int(shift) * width // steps, axis=1) for shift in shifts)
+            latents = [self._run_image(view[None], camera_height_m, ["latent"])[0] for view in turned]
+            return np.concatenate(latents), None
+        # One forward of the image, then roll its ring: rolling a ring is turning the camera.
+        ring, profile = self._ring(image, camera_height_m)
+        source = (np.arange(steps)[None, :] - shifts[:, None]) % steps
+        rolled = np.ascontiguousarray(np.moveaxis(ring[:, source], 0, 1))
+        if profile is not None:
+            log_m, log_scale = profile
+            profile = PredictedProfile.rolled(log_m, log_scale, shifts * (len(log_m) // steps))
+        return _array(self._head.run(["latent"], {"ring": rolled})[0]), profile
 
-    def _query_any_heading(self, image: UInt8[np.ndarray, "h w 3"], camera_height_m: float) -> Query:
-        """One forward of the image, then roll its ring: rolling a ring is turning the camera."""
-        ring = self._run_image(image, camera_height_m, self._encoding)
-        sectors = ring.shape[-1]
-        shifts = np.arange(sectors)
-        source = (np.arange(sectors)[None, :] - shifts[:, None]) % sectors
-        rolled = np.ascontiguousarray(np.moveaxis(ring[0][:, source], 0, 1))
-        return Query(self._run_head(rolled), shifts * (TWO_PI / sectors), 0.0, heading_known=False)
+    def _ring(
+        self, image: UInt8[np.ndarray, "h w 3"], camera_height_m: float
+    ) -> tuple[Float[np.ndarray, "c s"], tuple[Float[np.ndarray, "w"], Float[np.ndarray, "w"]] | None]:
+        """The ring of a panorama, and the log wall profile and log scale where the network predicts them.
 
-    def _query_by_turning(self, image: UInt8[np.ndarray, "h w 3"], camera_height_m: float) -> Query:
-        width = image.shape[1]
-        shifts = np.arange(_HEADINGS_WITHOUT_RING) * width // _HEADINGS_WITHOUT_RING
-        turned = (np.roll(image, int(shift), axis=1) for shift in shifts)
-        latents = np.concatenate([self._run_image(view, camera_height_m, self._encoding) for view in turned])
-        return Query(latents, shifts * (TWO_PI / width), 0.0, heading_known=False)
+        They are averaged with what it predicts of the mirrored panorama: two views of one room err less than one.
+        """
+        if not self.predicts_profile:
+            return self._run_image(image[None], camera_height_m, ["ring"])[0][0], None
+        views = np.stack([image, image[:, ::-1]])
+        ring, log_m, log_scale = self._run_image(views, camera_height_m, ["ring", *_PROFILE_OUTPUTS])
+        return ring[0], (0.5 * (log_m[0] + log_m[1, ::-1]), 0.5 * (log_scale[0] + log_scale[1, ::-1]))
 
-    def _run_image(self, image: UInt8[np.ndarray, "h w 3"], camera_height_m: float, output: str) -> np.ndarray:
-        """One output of the image encoder, as a batch of one."""
-        inputs = {"image": np.ascontiguousarray(image[None])}
-        if self._image_takes_height:
-            inputs["camera_height_m"] = np.array([camera_height_m], dtype=np.float32)
-        return _array(self._require_image().run([output], inputs)[0])
-
-    def _require_image(self) -> onnxruntime.InferenceSession:
+    def _run_image(
+        self, images: UInt8[np.ndarray, "b h w 3"], camera_height_m: float, outputs: list[str]
+    ) -> list[np.ndarray]:
+        """Some outputs of the image encoder for a batch."""
         if self._image is None:
             raise BundleError(f"model '{self.manifest.name}' has no image encoder; it answers layout queries only")
-        return self._image
-
-    def _run_head(self, ring: Float[np.ndarray, "b c s"]) -> Float[np.ndarray, "b d"]:
-        assert self._head is not None
-        return _array(self._head.run(["latent"], {"ring": ring})[0])
+        inputs = {"image": np.ascontiguousarray(images)}
+        if self._image_takes_height:
+            inputs["camera_height_m"] = np.full(len(images), camera_height_m, dtype=np.float32)
+        return [_array(value) for value in self._image.run(outputs, inputs)]
 
 
 def _undo_heading(image: UInt8[np.ndarray, "h w 3"], heading: float) -> tuple[UInt8[np.ndarray, "h w 3"], float, float]:

@@ -1,7 +1,9 @@
 """Latent pose optimisation (LPO): move a pose until the latent of its layout meets the query's (paper, section 4.2.1).
 
-`min over pose of | Φ_layout(Ω(pose, plan)) - f |₂`, with the closed-form renderer Ω. Two optimisers share one
-evaluation (residuals and their derivatives by forward-mode differentiation, 2 or 3 unknowns against 128 residuals):
+`min over pose of | Φ_layout(Ω(pose, plan)) - f |₂`, with the closed-form renderer Ω. Where the model predicts a wall
+profile with its uncertainty, the layout's profile is compared with that, by the cost of `localise.evidence`. Two
+optimisers share one evaluation (residuals and their derivatives by forward-mode differentiation, 2 or 3 unknowns
+against 128 residuals):
 
 * Levenberg-Marquardt (default): under 15 evaluations, and more exact.
 * Adam with the paper's schedule (section A.3): the reference.
@@ -15,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -32,8 +34,8 @@ from lalaloc_core.render.profile import cast_rays, wall_profile
 
 # What is compared with the targets (k, d): a function of wall profiles (k, columns), camera and ceiling heights (k,).
 Embedding = Callable[[Tensor, Tensor, Tensor], Tensor]
-# The distance that is minimised: Euclidean, or the mean absolute difference.
-Norm = Literal["l2", "l1"]
+# The distance that is minimised: Euclidean, the mean absolute difference, or the mean of log(1 + r²).
+Norm = Literal["l2", "l1", "cauchy"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,6 +49,7 @@ class LpoConfig:
         max_step_m, max_turn: longest step (m) and turn (radians) per iteration.
         prune_after, prune_ratio: after so many evaluations, starts farther than the best by this factor are left
             where they are: they will not become the answer.
+        prune_margin: the same of wall profiles, by how much their cost exceeds the best; it is a log likelihood.
         adam_*: the paper's schedule.
     """
 
@@ -60,6 +63,7 @@ class LpoConfig:
     max_turn: float = 0.2
     prune_after: int = 3
     prune_ratio: float = 1.5
+    prune_margin: float = 0.6
     adam_learning_rate: float = 0.01
     adam_steps: int = 150
     adam_plateau_threshold: float = 0.05
@@ -70,7 +74,7 @@ class LpoConfig:
 
 @dataclass(frozen=True)
 class _Evaluation:
-    """Residuals at a pose and their derivatives by its unknowns; `cost` is half the sum of squares."""
+    """Residuals at a pose and their derivatives by its unknowns; `cost` is what Levenberg-Marquardt lowers."""
 
     residual: Float[Tensor, "k d"]
     jacobian: Float[Tensor, "k d p"]
@@ -78,12 +82,28 @@ class _Evaluation:
 
     @property
     def cost(self) -> Float[Tensor, "k"]:
+        if self.norm == "cauchy":
+            return 0.5 * self.residual.square().log1p().sum(dim=1)
         return 0.5 * self.residual.square().sum(dim=1)
+
+    @property
+    def weighted(self) -> Float[Tensor, "k d p"]:
+        """The Jacobian, its rows weighted so that squares have the slope of `cost` (iteratively re-weighted)."""
+        if self.norm == "cauchy":
+            return self.jacobian / (1.0 + self.residual.square())[:, :, None]
+        return self.jacobian
+
+    @property
+    def information(self) -> Float[Tensor, "k p p"]:
+        """Curvature of `cost` by the unknowns, after Gauss and Newton."""
+        return torch.einsum("kdp,kdq->kpq", self.weighted, self.jacobian)
 
     @property
     def distance(self) -> Float[Tensor, "k"]:
         if self.norm == "l1":
             return self.residual.abs().mean(dim=1)
+        if self.norm == "cauchy":
+            return self.residual.square().log1p().mean(dim=1)
         return torch.linalg.vector_norm(self.residual, dim=1)
 
     @property
@@ -91,10 +111,12 @@ class _Evaluation:
         """Derivative of the distance by the unknowns."""
         if self.norm == "l1":
             return torch.einsum("kdp,kd->kp", self.jacobian, self.residual.sign()) / self.residual.shape[1]
+        if self.norm == "cauchy":
+            return 2.0 * torch.einsum("kdp,kd->kp", self.weighted, self.residual) / self.residual.shape[1]
         return torch.einsum("kdp,kd->kp", self.jacobian, self.residual) / self.distance.clamp_min(1e-9)[:, None]
 
-    def replace(self, rows: Tensor, other: _Evaluation, chosen: Tensor) -> None:
-        """Take over those rows of `other`, which holds `rows` of this one, that are `chosen`."""
+    def take_over(self, rows: Tensor, other: _Evaluation, chosen: Tensor) -> None:
+        """Replace by those rows of `other`, which holds `rows` of this one, that are `chosen`."""
         self.residual[rows[chosen]] = other.residual[chosen]
         self.jacobian[rows[chosen]] = other.jacobian[chosen]
 
@@ -117,40 +139,47 @@ class PoseOptimiser:
             columns: azimuth columns of the wall profiles that the embedding takes.
 
         Raises:
-            ConfigError: Levenberg-Marquardt is asked to minimise anything but squares.
+            ConfigError: Levenberg-Marquardt is asked to minimise absolute differences.
         """
         self.config = config or LpoConfig()
-        if norm != "l2" and self.config.method != "adam":
-            raise ConfigError(f"optimiser '{self.config.method}' minimises squares; norm '{norm}' needs 'adam'")
+        if norm == "l1" and self.config.method != "adam":
+            raise ConfigError(f"optimiser '{self.config.method}' needs a smooth cost; norm '{norm}' needs 'adam'")
         self._embedding = embedding
         self._columns = columns
         self._norm: Norm = norm
         self._device = device or torch.device("cpu")
 
     def refine(self, job: RefinementJob) -> RefinementResult:
-        """Refine every starting pose of a job within its own room; `latent_distance` is by this optimiser's norm."""
+        """Refine every starting pose of a job within its own room by its `targets`, and `precision` where it has some.
+
+        Both distances of the result are by this optimiser's norm.
+        """
         problem = _Problem(self._embedding, self._columns, self._norm, job, self._device)
         adam = self.config.method == "adam"
         with torch.no_grad():
-            pose, distance, converged, evaluations = (_adam if adam else _levenberg_marquardt)(problem, self.config)
+            pose, here, converged, evaluations = (_adam if adam else _levenberg_marquardt)(problem, self.config)
         position, heading = problem.unpack(pose)
+        distance = here.distance.cpu().numpy()
         return RefinementResult(
             position_m=position.cpu().numpy().astype(np.float64) + problem.origin,
             heading=heading.cpu().numpy().astype(np.float64),
-            latent_distance=distance.cpu().numpy(),
+            cost=distance,
+            latent_distance=distance,
+            information=here.information.cpu().numpy(),
             converged=converged.cpu().numpy(),
             evaluations=np.full(len(distance), evaluations),
         )
 
 
 class LatentPoseOptimiser:
-    """Refines poses with one layout encoder."""
+    """Refines poses with one layout encoder, by predicted wall profiles where a job has them."""
 
     def __init__(self, layout_encoder: LayoutEncoder, config: LpoConfig | None = None) -> None:
         layout_encoder = layout_encoder.eval().requires_grad_(False)
         self.encoder = layout_encoder.fused() if isinstance(layout_encoder, RingLayoutEncoder) else layout_encoder
-        device = next(layout_encoder.parameters()).device
-        self._optimiser = PoseOptimiser(self.encoder, self.encoder.config.profile_columns, config=config, device=device)
+        self._device = next(layout_encoder.parameters()).device
+        self._config = config or LpoConfig()
+        self._columns = self.encoder.config.profile_columns
 
     @classmethod
     def from_bundle(cls, bundle: Bundle, config: LpoConfig | None = None) -> LatentPoseOptimiser:
@@ -168,7 +197,31 @@ class LatentPoseOptimiser:
 
     def refine(self, job: RefinementJob) -> RefinementResult:
         """Refine every starting pose of a job within its own room."""
-        return self._optimiser.refine(job)
+        if job.log_profile is None or job.precision is None:
+            return self._optimiser(self.encoder, "l2").refine(replace(job, precision=None))
+        by_profile = replace(job, targets=job.log_profile)
+        result = self._optimiser(_log_profile, "cauchy").refine(by_profile)
+        distance = self._latent_distance(job, result)
+        return replace(result, cost=result.cost + job.latent_weight * distance, latent_distance=distance)
+
+    def _optimiser(self, embedding: Embedding, norm: Norm) -> PoseOptimiser:
+        return PoseOptimiser(embedding, self._columns, norm=norm, config=self._config, device=self._device)
+
+    @torch.no_grad()
+    def _latent_distance(self, job: RefinementJob, result: RefinementResult) -> Float[np.ndarray, "k"]:
+        """How far the latents of the refined poses are from the query's."""
+
+        def tensor(array: np.ndarray) -> Tensor:
+            return torch.tensor(array, dtype=torch.float32, device=self._device)
+
+        relative = tensor(job.walls_m - np.tile(result.position_m, 2)[:, None, :])
+        profile = wall_profile(torch.zeros_like(relative[:, 0, :2]), tensor(result.heading), relative, self._columns)
+        latent = self.encoder(profile, tensor(job.camera_height_m), tensor(job.ceiling_height_m))
+        return torch.linalg.vector_norm(latent - tensor(job.targets), dim=1).cpu().numpy()
+
+
+def _log_profile(profile_m: Tensor, _camera_height_m: Tensor, _ceiling_height_m: Tensor) -> Tensor:
+    return torch.log(profile_m)
 
 
 class _Problem:
@@ -192,6 +245,7 @@ class _Problem:
         self.camera_height_m = tensor(job.camera_height_m)
         self.ceiling_height_m = tensor(job.ceiling_height_m)
         self.targets = tensor(job.targets)
+        self.precision = None if job.precision is None else tensor(job.precision)
         self.unknowns = 3 if job.optimise_heading else 2
         self.start = torch.zeros(len(job.targets), self.unknowns, device=device)
 
@@ -219,7 +273,10 @@ class _Problem:
         repeated = pose.repeat_interleave(self.unknowns, dim=0)
         value, derivative = torch.func.jvp(embedded, (repeated,), (tangent,))[:2]
         residual = value[:: self.unknowns] - self.targets[rows]
-        return _Evaluation(residual, derivative.reshape(count, self.unknowns, -1).transpose(1, 2), self.norm)
+        jacobian = derivative.reshape(count, self.unknowns, -1).transpose(1, 2)
+        if self.precision is not None:
+            residual, jacobian = residual * self.precision[rows], jacobian * self.precision[rows][:, :, None]
+        return _Evaluation(residual, jacobian, self.norm)
 
     def stay_inside(
         self, pose: Float[Tensor, "m p"], step: Float[Tensor, "m p"], rows: Tensor, config: LpoConfig
@@ -234,7 +291,8 @@ class _Problem:
         return torch.cat([step[:, :2] * scale[:, None], turn], dim=1)
 
 
-_Outcome = tuple[Tensor, Tensor, Tensor, int]
+# Poses, the evaluation there, whether each converged, and the number of evaluations.
+_Outcome = tuple[Tensor, _Evaluation, Tensor, int]
 
 
 def _levenberg_marquardt(problem: _Problem, config: LpoConfig) -> _Outcome:
@@ -248,13 +306,12 @@ def _levenberg_marquardt(problem: _Problem, config: LpoConfig) -> _Outcome:
     while evaluations < config.max_iterations:
         active = ~converged
         if evaluations >= config.prune_after:
-            active &= here.distance <= config.prune_ratio * here.distance.min()
+            active &= here.distance <= _worth_going_on(here, config)
         rows = active.nonzero()[:, 0]
         if len(rows) == 0:
             break
-        jacobian, residual = here.jacobian[rows], here.residual[rows]
-        gradient = torch.einsum("kdp,kd->kp", jacobian, residual)
-        hessian = torch.einsum("kdp,kdq->kpq", jacobian, jacobian)
+        gradient = torch.einsum("kdp,kd->kp", here.weighted[rows], here.residual[rows])
+        hessian = here.information[rows]
         scaling = torch.diagonal(hessian, dim1=1, dim2=2) * damping[rows, None] + 1e-8
         step = -torch.linalg.solve(hessian + torch.diag_embed(scaling), gradient)
         step = problem.stay_inside(pose[rows], step, rows, config)
@@ -268,9 +325,15 @@ def _levenberg_marquardt(problem: _Problem, config: LpoConfig) -> _Outcome:
         short = torch.linalg.vector_norm(step, dim=1) < config.tolerance_m
         converged[rows] = short | (promised < least) | (better & (gained < least))
         pose[rows[better]] += step[better]
-        here.replace(rows, there, better)
+        here.take_over(rows, there, better)
         damping[rows] = (damping[rows] * torch.where(better, 0.2, 6.0)).clamp(1e-6, 1e8)
-    return pose, here.distance, converged, evaluations
+    return pose, here, converged, evaluations
+
+
+def _worth_going_on(here: _Evaluation, config: LpoConfig) -> Tensor:
+    """The distance up to which poses may still become the best."""
+    nearest = here.distance.min()
+    return nearest + config.prune_margin if here.norm == "cauchy" else config.prune_ratio * nearest
 
 
 def _adam(problem: _Problem, config: LpoConfig) -> _Outcome:
@@ -306,4 +369,4 @@ def _adam(problem: _Problem, config: LpoConfig) -> _Outcome:
         second = 0.999 * second + 0.001 * gradient.square()
         direction = first / (1.0 - 0.9**step_number) / ((second / (1.0 - 0.999**step_number)).sqrt() + 1e-8)
         pose = pose + problem.stay_inside(pose, -rate[:, None] * direction, rows, config)
-    return best_pose, best, stop_age >= config.adam_stop_patience, step_number
+    return best_pose, problem.evaluate(best_pose, rows), stop_age >= config.adam_stop_patience, step_number

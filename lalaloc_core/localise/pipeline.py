@@ -1,4 +1,4 @@
-"""The path of a query: retrieve, re-sample on the Vogel disc, optimise in the latent space, rank.
+"""The path of a query: retrieve, re-sample on the Vogel disc, optimise the pose, rank.
 
 The same code answers over HTTP and in evaluation; only `refine`, who runs the optimiser, differs.
 """
@@ -15,27 +15,46 @@ import numpy as np
 
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.confidence import Signals, signals_of
 from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.evidence import EvidenceConfig, targets
 from lalaloc_core.localise.poses import Candidate, LatentGrid, Query, RefinementJob, RefinementResult
 from lalaloc_core.localise.retrieval import retrieve, suppress
 from lalaloc_core.localise.vogel import resample
 
 Stage = Literal["retrieval", "vdr", "lpo"]
 Refine = Literal["none", "vdr", "lpo"]
-# Runs latent pose optimisation; None when it could not answer (in time).
+# Runs pose optimisation; None when it could not answer (in time).
 Refiner = Callable[[RefinementJob], RefinementResult | None]
 
 
 @dataclass(frozen=True, kw_only=True)
 class LocaliseConfig:
-    """Settings of the search; the defaults are the paper's where it names them (section 5)."""
+    """Settings of the search; the defaults are the paper's where it names them (section 5).
+
+    Attributes:
+        vdr_candidates: how many of the candidates are re-sampled; 0: no VDR.
+        lpo_candidates: how many are optimised in the latent space; the paper refines the first alone.
+        profile_candidates: how many are optimised by their wall profiles, which is cheaper.
+        profile_candidates_turned: the same where the heading is searched: rooms look alike from several sides.
+        separation_m: candidates nearer than this to a better one, and turned alike, are dropped.
+        evidence: what poses are compared by.
+    """
 
     vdr_samples: int = 200
     vdr_radius_steps: float = 2.0
-    # How many of the candidates are re-sampled (0: no VDR) and optimised; the paper refines the first alone.
     vdr_candidates: int = 1
     lpo_candidates: int = 5
+    profile_candidates: int = 10
+    profile_candidates_turned: int = 20
     separation_m: float = 1.0
+    evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
+
+    def starts(self, query: Query) -> int:
+        """How many candidates of a query are optimised."""
+        if not self.evidence.compares_profiles(query):
+            return self.lpo_candidates
+        return self.profile_candidates if query.heading_known else self.profile_candidates_turned
 
 
 @dataclass(frozen=True)
@@ -45,11 +64,13 @@ class Localisation:
     Attributes:
         stage: the last stage that ran.
         best: the best candidate after each stage that ran, in order.
+        signals: what the confidence of the best candidate after each stage is judged by.
         timings_ms: milliseconds per stage.
     """
 
     candidates: list[Candidate]
     stage: Stage
+    signals: dict[Stage, Signals]
     best: dict[Stage, Candidate] = field(default_factory=dict)
     timings_ms: dict[str, float] = field(default_factory=dict)
 
@@ -91,11 +112,16 @@ def localise(
     config = config or LocaliseConfig()
     clock = StageClock()
     stage: Stage = "retrieval"
+    starts = config.starts(query)
     with clock.stage("retrieve"):
         # Refined candidates may meet and become one; spare ones then take the free places.
-        wanted = max(top_k, config.lpo_candidates) + config.lpo_candidates
-        candidates = retrieve(grid, query, top_k=wanted, separation_m=config.separation_m)
+        wanted = max(top_k, starts) + starts
+        candidates = retrieve(grid, query, top_k=wanted, separation_m=config.separation_m, evidence=config.evidence)
     best: dict[Stage, Candidate] = {"retrieval": candidates[0]}
+    # Of a number of candidates that does not depend on how many are asked for.
+    signals: dict[Stage, Signals] = {
+        "retrieval": signals_of(query, candidates[: 2 * starts], complete=len(candidates) < 2 * starts)
+    }
     if refine in ("vdr", "lpo") and config.vdr_candidates:
         with clock.stage("vdr"):
             for index in range(min(config.vdr_candidates, len(candidates))):
@@ -107,18 +133,25 @@ def localise(
                     camera_height_m=grid.camera_height_m,
                     samples=config.vdr_samples,
                     radius_m=config.vdr_radius_steps * grid.step_m,
+                    evidence=config.evidence,
                 )
+            candidates[: config.vdr_candidates] = sorted(candidates[: config.vdr_candidates], key=lambda c: c.cost)
         stage = "vdr"
-        best[stage] = _nearest(candidates)
+        best[stage] = candidates[0]
+        # Costs of re-sampled poses do not compare with those of the grid's.
+        signals[stage] = signals["retrieval"]
     if refine == "lpo" and refiner is not None:
         with clock.stage("lpo"):
-            starts = candidates[: config.lpo_candidates]
-            result = refiner(refinement_job(plan, query, starts, grid.camera_height_m))
+            job = refinement_job(plan, query, candidates[:starts], grid.camera_height_m, config.evidence)
+            result = refiner(job)
             if result is not None:
-                candidates = _merge(starts, result) + candidates[config.lpo_candidates :]
+                moved = [_moved(start, result, index) for index, start in enumerate(candidates[:starts])]
+                moved.sort(key=lambda candidate: candidate.cost)
+                candidates = moved + candidates[starts:]
                 stage = "lpo"
-                best[stage] = _nearest(candidates)
-    return Localisation(_rank(candidates, config.separation_m, top_k), stage, best, clock.timings_ms)
+                best[stage] = candidates[0]
+                signals[stage] = signals_of(query, moved, complete=len(candidates) == len(moved))
+    return Localisation(_distinct(candidates, config.separation_m, top_k), stage, signals, best, clock.timings_ms)
 
 
 def panorama_heading(query: Query, candidate: Candidate) -> float:
@@ -126,45 +159,44 @@ def panorama_heading(query: Query, candidate: Candidate) -> float:
     return float(wrap_angle(query.roll[candidate.hypothesis] + candidate.frame_heading))
 
 
-def refinement_job(plan: FloorPlan, query: Query, candidates: list[Candidate], camera_height_m: float) -> RefinementJob:
+def refinement_job(
+    plan: FloorPlan, query: Query, candidates: list[Candidate], camera_height_m: float, evidence: EvidenceConfig
+) -> RefinementJob:
     """What the optimiser needs to refine these candidates, each within its own room."""
     rooms = np.array([candidate.room_index for candidate in candidates])
+    hypotheses = np.array([candidate.hypothesis for candidate in candidates])
+    centre = precision = None
+    if evidence.compares_profiles(query):
+        centre, precision = targets(query, hypotheses, evidence.fine_reach_m, evidence)
     return RefinementJob(
-        targets=query.latents[[candidate.hypothesis for candidate in candidates]],
+        targets=query.latents[hypotheses],
         position_m=np.stack([candidate.position_m for candidate in candidates]),
         heading=np.array([candidate.frame_heading for candidate in candidates]),
         walls_m=plan.walls_m[rooms],
         camera_height_m=np.full(len(rooms), camera_height_m),
         ceiling_height_m=plan.ceiling_heights_m[rooms],
         optimise_heading=not query.heading_known,
+        log_profile=centre,
+        precision=precision,
+        latent_weight=evidence.latent_weight,
     )
 
 
-def _merge(starts: list[Candidate], result: RefinementResult) -> list[Candidate]:
-    """Candidates moved to where the optimiser took them, unless that made them worse."""
-    moved = []
-    for index, start in enumerate(starts):
-        if not result.latent_distance[index] < start.latent_distance:
-            moved.append(start)
-            continue
-        moved.append(
-            replace(
-                start,
-                x_m=float(result.position_m[index, 0]),
-                y_m=float(result.position_m[index, 1]),
-                frame_heading=float(result.heading[index]),
-                latent_distance=float(result.latent_distance[index]),
-            )
-        )
-    return moved
+def _moved(start: Candidate, result: RefinementResult, index: int) -> Candidate:
+    """A candidate where the optimiser took it; no optimiser ends where the fit is worse than at its start."""
+    return replace(
+        start,
+        x_m=float(result.position_m[index, 0]),
+        y_m=float(result.position_m[index, 1]),
+        frame_heading=float(result.heading[index]),
+        cost=float(result.cost[index]),
+        latent_distance=float(result.latent_distance[index]),
+        information=result.information[index],
+    )
 
 
-def _nearest(candidates: list[Candidate]) -> Candidate:
-    return min(candidates, key=lambda candidate: candidate.latent_distance)
-
-
-def _rank(candidates: list[Candidate], separation_m: float, top_k: int) -> list[Candidate]:
+def _distinct(candidates: list[Candidate], separation_m: float, top_k: int) -> list[Candidate]:
+    """The first candidates of which no two are at one place."""
     positions = np.stack([candidate.position_m for candidate in candidates])
-    distances = np.array([candidate.latent_distance for candidate in candidates])
-    kept = suppress(positions, distances, separation_m=separation_m, limit=top_k)
+    kept = suppress(positions, np.arange(len(candidates), dtype=float), separation_m=separation_m, limit=top_k)
     return [candidates[index] for index in kept]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -12,12 +12,35 @@ from lalaloc_core.sampling import PoseSet
 
 @dataclass(frozen=True, eq=False)
 class LatentGrid:
-    """Poses and latents of one plan for one model, one camera height and one grid step; heading 0."""
+    """Poses, latents and wall profiles of one plan for one model, one camera height and one grid step; heading 0."""
 
     poses: PoseSet
     latents: Float[np.ndarray, "n d"]
+    profile_m: Float[np.ndarray, "n w"]
     step_m: float
     camera_height_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class PredictedProfile:
+    """Laplace distributions of the log wall profile (m), for every hypothesis of how the panorama is turned.
+
+    Attributes:
+        log_m: (k, w) their centres.
+        log_scale: (k, w) logs of their scales.
+    """
+
+    log_m: Float[np.ndarray, "k w"]
+    log_scale: Float[np.ndarray, "k w"]
+
+    @classmethod
+    def rolled(
+        cls, log_m: Float[np.ndarray, "w"], log_scale: Float[np.ndarray, "w"], shifts: Int[np.ndarray, "k"]
+    ) -> PredictedProfile:
+        """One prediction, moved to the right by so many columns for each hypothesis."""
+        columns = len(log_m)
+        source = (np.arange(columns)[None, :] - shifts[:, None]) % columns
+        return cls(log_m[source], log_scale[source])
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,22 +55,29 @@ class Query:
         latents: (k, d), L2-normalised.
         roll: (k,) radians, what was rolled away.
         frame_heading: radians; what whole-pixel rolling could not remove, 0 when the heading is unknown.
-        heading_known: whether the heading was given; if not, it is searched over and refined.
+        heading_known: whether the heading was given exactly; if not, it is searched over and refined.
+        profile: what the image encoder says of the walls; None where it predicts no wall profile.
     """
 
     latents: Float[np.ndarray, "k d"]
     roll: Float[np.ndarray, "k"]
     frame_heading: float
     heading_known: bool
+    profile: PredictedProfile | None = None
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """One answer: a pose and how far the latent of its layout lies from the query's.
+    """One answer: a pose and how badly its layout fits the query.
 
     Attributes:
         frame_heading: heading (radians) of the layout in the frame of `Query` hypothesis number `hypothesis`;
             the panorama's heading is `query.roll[hypothesis] + frame_heading`.
+        cost: what candidates are ranked by, see `localise.evidence`; the latent distance where the model predicts no
+            wall profile.
+        latent_distance: from the latent of its layout to the query's.
+        information: (p, p) curvature of the cost by x, y (m) and, where it was searched, the heading (radians); set by
+            the optimiser. Its inverse is the covariance but for a factor.
     """
 
     x_m: float
@@ -55,7 +85,9 @@ class Candidate:
     room_index: int
     frame_heading: float
     hypothesis: int
+    cost: float
     latent_distance: float
+    information: Float[np.ndarray, "p p"] | None = field(default=None, compare=False)
 
     @property
     def position_m(self) -> Float[np.ndarray, "2"]:
@@ -65,7 +97,14 @@ class Candidate:
 
 @dataclass(frozen=True, eq=False)
 class RefinementJob:
-    """Starting poses for latent pose optimisation, each with its own target latent and room."""
+    """Starting poses for pose optimisation, each with its own targets and room.
+
+    Attributes:
+        targets: (k, d) what the layouts' embeddings, or latents, are compared with.
+        log_profile: (k, w) centres of the predicted log wall profiles (m); None compares latents alone.
+        precision: (k, w) factors that turn differences of log distance into residuals.
+        latent_weight: weight of the latent distance in the cost of what was optimised by its profile.
+    """
 
     targets: Float[np.ndarray, "k d"]
     position_m: Float[np.ndarray, "k 2"]
@@ -74,14 +113,25 @@ class RefinementJob:
     camera_height_m: Float[np.ndarray, "k"]
     ceiling_height_m: Float[np.ndarray, "k"]
     optimise_heading: bool
+    log_profile: Float[np.ndarray, "k w"] | None = None
+    precision: Float[np.ndarray, "k w"] | None = None
+    latent_weight: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class RefinementResult:
-    """Where the optimisation ended: poses inside the same rooms, their latent distances, and what it took."""
+    """Where the optimisation ended: poses inside the same rooms, how well they fit, and what it took.
+
+    Attributes:
+        cost: (k,) what was minimised: of profiles as in `localise.evidence`, else the distance of the embeddings.
+        latent_distance: (k,) distance of the embeddings.
+        information: (k, p, p) curvature of the cost by the unknowns.
+    """
 
     position_m: Float[np.ndarray, "k 2"]
     heading: Float[np.ndarray, "k"]
+    cost: Float[np.ndarray, "k"]
     latent_distance: Float[np.ndarray, "k"]
+    information: Float[np.ndarray, "k p p"]
     converged: Bool[np.ndarray, "k"]
     evaluations: Int[np.ndarray, "k"]

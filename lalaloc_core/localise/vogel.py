@@ -11,8 +11,8 @@ from jaxtyping import Float, Int
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.evidence import EvidenceConfig, latent_distances, profile_costs, targets
 from lalaloc_core.localise.poses import Candidate, Query
-from lalaloc_core.localise.retrieval import latent_distances
 from lalaloc_core.sampling import PoseSet
 
 _GOLDEN_RATIO = (1.0 + math.sqrt(5.0)) / 2.0
@@ -48,29 +48,62 @@ def resample(
     camera_height_m: float,
     samples: int,
     radius_m: float,
+    evidence: EvidenceConfig | None = None,
 ) -> Candidate:
     """The best pose of a Vogel disc around `candidate`, clipped to the rooms; the candidate itself if none is better.
 
     With an unknown heading the samples also cover the sector of headings that the hypothesis stands for.
     """
-    poses, number = disc_poses(plan, candidate.position_m, samples=samples, radius_m=radius_m)
-    if len(poses) == 0:
-        return candidate
+    evidence = evidence or EvidenceConfig()
+    disc, number = disc_poses(plan, candidate.position_m, samples=samples, radius_m=radius_m)
+    # The candidate first, so that of equals it is kept.
+    poses = PoseSet(
+        np.concatenate([candidate.position_m[None], disc.position_m]),
+        np.concatenate([[candidate.room_index], disc.room_index]),
+    )
     heading = np.full(len(poses), candidate.frame_heading)
     if not query.heading_known:
         # A second low-discrepancy sequence, so that headings and positions are covered together.
         sequence = (number * (math.sqrt(2.0) - 1.0)) % 1.0
-        heading += (sequence - 0.5) * (TWO_PI / len(query.roll))
-    latents = encoders.poses(plan, poses, heading, camera_height_m)
-    distance = latent_distances(latents, query.latents[candidate.hypothesis][None])[0]
-    best = int(distance.argmin())
-    if distance[best] >= candidate.latent_distance:
-        return candidate
+        heading[1:] += (sequence - 0.5) * _sector(query)
+    cost = _costs(plan, encoders, query, candidate.hypothesis, poses, heading, camera_height_m, evidence)
+    best = slice(index := int(cost.argmin()), index + 1)
+    chosen = PoseSet(poses.position_m[best], poses.room_index[best])
+    latent, _ = encoders.poses(plan, chosen, heading[best], camera_height_m)
     return replace(
         candidate,
-        x_m=float(poses.position_m[best, 0]),
-        y_m=float(poses.position_m[best, 1]),
-        room_index=int(poses.room_index[best]),
-        frame_heading=float(heading[best]),
-        latent_distance=float(distance[best]),
+        x_m=float(chosen.position_m[0, 0]),
+        y_m=float(chosen.position_m[0, 1]),
+        room_index=int(chosen.room_index[0]),
+        frame_heading=float(heading[index]),
+        cost=float(cost[index]),
+        latent_distance=float(latent_distances(latent, query.latents[candidate.hypothesis][None])[0, 0]),
     )
+
+
+def _costs(
+    plan: FloorPlan,
+    encoders: Encoders,
+    query: Query,
+    hypothesis: int,
+    poses: PoseSet,
+    heading: Float[np.ndarray, "n"],
+    camera_height_m: float,
+    evidence: EvidenceConfig,
+) -> Float[np.ndarray, "n"]:
+    """Costs of poses under one hypothesis; latents, which are dear, only where they count."""
+
+    def distances() -> Float[np.ndarray, "n"]:
+        latents, _ = encoders.poses(plan, poses, heading, camera_height_m)
+        return latent_distances(latents, query.latents[hypothesis][None])[0]
+
+    if not evidence.compares_profiles(query):
+        return distances()
+    centre, precision = targets(query, np.array(hypothesis), evidence.fine_reach_m, evidence)
+    cost = profile_costs(np.log(encoders.profiles(plan, poses, heading)), centre, precision)
+    return cost + evidence.latent_weight * distances() if evidence.latent_weight else cost
+
+
+def _sector(query: Query) -> float:
+    """Angle (radians) between neighbouring hypotheses."""
+    return float(query.roll[1] - query.roll[0]) if len(query.roll) > 1 else 0.0

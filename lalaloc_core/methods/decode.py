@@ -14,6 +14,7 @@ from jaxtyping import Float
 from torch.nn import functional
 
 from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.evidence import EvidenceConfig
 from lalaloc_core.localise.optimise import LpoConfig
 from lalaloc_core.localise.pipeline import LocaliseConfig, StageClock, localise, refinement_job
 from lalaloc_core.methods.alignment import DepthAligner
@@ -33,8 +34,9 @@ class VdrDecode:
         config: LocaliseConfig | None = None,
         schedule: LpoConfig | None = None,
     ) -> None:
-        self._lalaloc = LaLaLoc(encoders, refine="vdr", config=config)
-        self._config = config or LocaliseConfig()
+        self._lalaloc = LaLaLoc(encoders, refine="vdr")
+        # What the paper compares with is the latent alone.
+        self._config = replace(config or LocaliseConfig(), evidence=EvidenceConfig(use_profile=False))
         self._decoder = decoder.eval().requires_grad_(False)
         # Training shows the decoder every so manieth column of the encoder's wall profile.
         columns = encoders.manifest.profile_columns
@@ -53,14 +55,14 @@ class VdrDecode:
         clock.timings_ms.update(found.timings_ms)
         with clock.stage("decode"):
             start = found.candidates[0]
-            job = refinement_job(plan, query, [start], grid.camera_height_m)
+            job = refinement_job(plan, query, [start], grid.camera_height_m, self._config.evidence)
             result = self._aligner.refine(replace(job, targets=self.decode(job.targets)))
         aligned = replace(
             start,
             x_m=float(result.position_m[0, 0]),
             y_m=float(result.position_m[0, 1]),
             frame_heading=float(result.heading[0]),
-            latent_distance=float(result.latent_distance[0]),
+            cost=float(result.cost[0]),
         )
         best = {**found.best, "decode": aligned}
         return Answer(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import torch
 from jaxtyping import UInt8
@@ -18,13 +20,15 @@ from lalaloc_core.localise.pipeline import (
     localise,
     panorama_heading,
 )
-from lalaloc_core.localise.poses import Candidate, LatentGrid, Query
+from lalaloc_core.localise.poses import Candidate, LatentGrid, PredictedProfile, Query
 from lalaloc_core.methods.kept import KeptPerPlan
 from lalaloc_core.methods.method import Answer, Found, Question
 from lalaloc_core.sampling import PoseSet
 
 # Hypotheses of a layout query with unknown heading, where no ring says how many there are.
 _HEADINGS = 64
+# How sure a layout query is of its wall profile: it is the truth, to single precision.
+_TRUE_LAYOUT_LOG_SCALE = -7.0
 
 
 class LaLaLoc:
@@ -63,13 +67,16 @@ class LaLaLoc:
             refiner=self._refiner,
             config=self._config,
         )
-        distances = tuple(candidate.latent_distance for candidate in found.candidates)
-        confidence = self.encoders.manifest.confidence
+        signals: dict[str, dict[str, float]] = {stage: dataclasses.asdict(one) for stage, one in found.signals.items()}
+        model = self.encoders.manifest.confidence
         return Answer(
             stages={stage: found_pose(query, candidate) for stage, candidate in found.best.items()},
             retrieved=grid_index(grid, found.best["retrieval"]),
-            candidate_distances=distances,
-            confidence=None if confidence is None else confidence.probability(list(distances)),
+            signals=signals,
+            information=found.best[found.stage].information,
+            confidence=None
+            if model is None
+            else model.probability(found.stage, signals[found.stage], heading_known=query.heading_known),
             timings_ms={**clock.timings_ms, **found.timings_ms},
         )
 
@@ -78,8 +85,8 @@ class LaLaLoc:
         height, step_m, poses = question.camera.camera_height_m, question.grid_step_m, question.grid
 
         def embed() -> LatentGrid:
-            latents = self.encoders.poses(question.plan, poses, np.zeros(len(poses)), height)
-            return LatentGrid(poses, latents, step_m, height)
+            latents, profile_m = self.encoders.poses(question.plan, poses, np.zeros(len(poses)), height)
+            return LatentGrid(poses, latents, profile_m, step_m, height)
 
         return self._grids.get(question.plan, (height, step_m), embed)
 
@@ -102,7 +109,7 @@ def read_image(encoders: Encoders, question: Question) -> UInt8[np.ndarray, "h w
 
 
 def encode(encoders: Encoders, question: Question, image: UInt8[np.ndarray, "h w 3"] | None) -> Query:
-    """The query of a question: a photograph's latents, or those of the true layout where there is none."""
+    """The query of a question: what the encoder says of a photograph, or the true layout where there is none."""
     camera = question.camera
     if image is not None:
         return encoders.query(image, camera.heading if question.heading_known else None, camera.camera_height_m)
@@ -111,8 +118,11 @@ def encode(encoders: Encoders, question: Question, image: UInt8[np.ndarray, "h w
         sectors = encoders.manifest.ring_sectors or _HEADINGS
         rolls = np.arange(sectors) * (TWO_PI / sectors)
     poses = PoseSet(np.repeat(camera.position_m[None], len(rolls), axis=0), np.full(len(rolls), camera.room_index))
-    latents = encoders.poses(question.plan, poses, camera.heading - rolls, camera.camera_height_m)
-    return Query(latents, rolls, 0.0, heading_known=question.heading_known)
+    latents, profile_m = encoders.poses(question.plan, poses, camera.heading - rolls, camera.camera_height_m)
+    profile = None
+    if encoders.predicts_profile:
+        profile = PredictedProfile(np.log(profile_m), np.full_like(profile_m, _TRUE_LAYOUT_LOG_SCALE))
+    return Query(latents, rolls, 0.0, heading_known=question.heading_known, profile=profile)
 
 
 def found_pose(query: Query, candidate: Candidate) -> Found:
@@ -122,7 +132,7 @@ def found_pose(query: Query, candidate: Candidate) -> Found:
         y_m=candidate.y_m,
         room_index=candidate.room_index,
         heading=panorama_heading(query, candidate),
-        distance=candidate.latent_distance,
+        distance=candidate.cost,
     )
 
 

@@ -78,14 +78,16 @@ class Answer:
     Attributes:
         stages: the best pose after each stage, in order; the last is the answer. Empty: no answer.
         retrieved: number of the grid pose that retrieval chose; None for methods that do not retrieve.
-        candidate_distances: of the distinct final candidates, best first.
+        signals: by stage, what speaks for its pose and against it; see `localise.confidence`.
+        information: curvature of the cost at the answer, see `localise.poses.Candidate`.
         confidence: probability of being within 1 m, where the method has a model of it.
         timings_ms: wall-clock per stage.
     """
 
     stages: dict[str, Found] = field(default_factory=dict)
     retrieved: int | None = None
-    candidate_distances: tuple[float, ...] = ()
+    signals: dict[str, dict[str, float]] = field(default_factory=dict)
+    information: Float[np.ndarray, "p p"] | None = None
     confidence: float | None = None
     timings_ms: dict[str, float] = field(default_factory=dict)
 

@@ -6,7 +6,7 @@ import dataclasses
 import json
 import shutil
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import onnx
@@ -26,6 +26,7 @@ from lalaloc_core.bundle import (
     MANIFEST_NAME,
     Bundle,
     ConfidenceModel,
+    LogisticModel,
     Manifest,
     write_manifest,
 )
@@ -40,6 +41,8 @@ from lalaloc_core.training.config import PRESETS, TrainConfig
 from lalaloc_core.training.stages import build_image_encoder, build_layout_encoder
 from tests.core.test_training import small_paper
 from tests.strategies import crooked_flat, scene_of
+
+LOGISTIC = LogisticModel(bias=1.0, log_odds=2.0, cost=-4.0, uncertainty=-0.5, latent_distance=-6.0)
 
 TINY = PRESETS["tiny"]
 
@@ -80,7 +83,8 @@ class TestExport:
     ) -> None:
         # More than one batch of the session, so that no dimension is baked in.
         scene = scene_of(crooked_flat(), 300, 0)
-        latents = encoders.poses(scene.plan, scene.poses, scene.heading, 1.5)
+        latents, profile_m = encoders.poses(scene.plan, scene.poses, scene.heading, 1.5)
+        assert profile_m.shape == (300, opened_bundle.manifest.profile_columns)
         assert latents.shape == (300, opened_bundle.manifest.latent_size)
         np.testing.assert_allclose(np.linalg.norm(latents, axis=1), 1.0, atol=1e-5)
         profile = torch.empty(300, 32).uniform_(0.3, 8.0)
@@ -158,7 +162,7 @@ class TestExport:
             optimiser.encoder(profile, *heights).numpy(),
             atol=1e-4,
         )
-        assert encoders.poses(scene.plan, scene.poses, scene.heading, 1.5).shape == (2, 128)
+        assert encoders.poses(scene.plan, scene.poses, scene.heading, 1.5)[0].shape == (2, 128)
 
 
 class TestReading:
@@ -193,12 +197,14 @@ class TestReading:
         "changes",
         [
             {"colour": "blue"},
-            {"format_version": 2},
+            {"format_version": 1},
             {"format_version": None},
             {"files": []},
             {"files": {"head.onnx": {"bytes": 1}}},
             {"files": {"head.onnx": {"bytes": 1, "sha256": "", "md5": ""}}},
             {"confidence": {"bias": 1.0}},
+            {"confidence": {"known_heading": {}, "searched_heading": {"lpo": {"bias": 1.0}}}},
+            {"confidence": {"known_heading": {}, "searched_heading": {}, "margin": 1.0}},
             {"confidence": "high"},
         ],
     )
@@ -219,7 +225,8 @@ class TestReading:
             Manifest.from_json(json.dumps(raw))
 
     def test_a_manifest_survives_its_own_text(self, opened_bundle: Bundle) -> None:
-        confidence = ConfidenceModel(bias=1.0, distance=-2.0, margin=3.0, no_rival_margin=0.4)
+        stages = {"retrieval": LOGISTIC, "lpo": dataclasses.replace(LOGISTIC, bias=2.0)}
+        confidence = ConfidenceModel(known_heading=stages, searched_heading={"lpo": LOGISTIC}, heading_factor=0.4)
         manifest = dataclasses.replace(opened_bundle.manifest, confidence=confidence)
         assert Manifest.from_json(manifest.to_json()) == manifest
 
@@ -244,15 +251,23 @@ class TestIdentity:
 
 
 class TestConfidence:
-    model = ConfidenceModel(bias=1.0, distance=-4.0, margin=2.0, no_rival_margin=0.5)
+    model = ConfidenceModel(
+        known_heading={"vdr": dataclasses.replace(LOGISTIC, bias=0.0), "lpo": LOGISTIC},
+        searched_heading={"lpo": dataclasses.replace(LOGISTIC, bias=-1.0)},
+    )
+    signals: ClassVar = {"log_odds": 1.5, "cost": 0.2, "uncertainty": -3.0, "latent_distance": 0.1}
 
-    def test_it_is_the_documented_formula(self) -> None:
-        logit = 1.0 - 4.0 * 0.3 + 2.0 * 0.2
-        assert self.model.probability([0.3, 0.5, 0.6]) == pytest.approx(1.0 / (1.0 + np.exp(-logit)))
+    @pytest.mark.parametrize(("stage", "known", "bias"), [("lpo", True, 1.0), ("vdr", True, 0.0), ("lpo", False, -1.0)])
+    def test_it_is_the_documented_formula_of_the_stage(self, stage: str, known: bool, bias: float) -> None:
+        logit = bias + 2.0 * 1.5 - 4.0 * 0.2 - 0.5 * -3.0 - 6.0 * 0.1
+        found = self.model.probability(stage, self.signals, heading_known=known)
+        assert found == pytest.approx(1.0 / (1.0 + np.exp(-logit)))
 
-    def test_no_rival_counts_as_a_distant_one(self) -> None:
-        assert self.model.probability([0.3]) == self.model.probability([0.3, 0.8]) == self.model.probability([0.3, 1.9])
+    def test_a_stage_that_was_never_seen_has_none(self) -> None:
+        assert self.model.probability("vdr", self.signals, heading_known=False) is None
 
-    @pytest.mark.parametrize("distance", [0.0, 1e9, -1e9])
-    def test_it_stays_a_probability(self, distance: float) -> None:
-        assert 0.0 <= self.model.probability([distance]) <= 1.0
+    @pytest.mark.parametrize("cost", [0.0, 1e9, -1e9])
+    def test_it_stays_a_probability(self, cost: float) -> None:
+        found = self.model.probability("lpo", {**self.signals, "cost": cost}, heading_known=True)
+        assert found is not None
+        assert 0.0 <= found <= 1.0

@@ -1,99 +1,164 @@
-"""Confidence: fitted on answers, honest on fresh ones."""
+"""Confidence and covariance: fitted on answers, honest on fresh ones."""
 
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lalaloc_core.bundle import Bundle, write_manifest
+from lalaloc_core.bundle import Bundle, LogisticModel, write_manifest
 from lalaloc_core.calibrate import calibrate, fit_confidence
 from lalaloc_core.evaluation.predictions import Pose, Prediction
 from lalaloc_core.evaluation.score import expected_calibration_error, position_errors_m
 from tests.strategies import seeds
 
+TRUTH = Pose(x_m=0.0, y_m=0.0, room_index=0, heading_deg=0.0)
+# What made the answers of `believable`.
+MAKER = LogisticModel(bias=1.0, log_odds=0.8, cost=-6.0, uncertainty=-0.7, latent_distance=-3.0)
 
-def result(error_m: float, distances: tuple[float, ...]) -> Prediction:
+
+def result(error_m: float, log_odds: float = 0.0, cost: float = 0.1, uncertainty: float = -3.0) -> Prediction:
     """A query that was answered that far off; NaN stands for no answer."""
-    truth = Pose(x_m=0.0, y_m=0.0, room_index=0, heading_deg=0.0)
+    answered = not math.isnan(error_m)
+    signals = {"log_odds": log_odds, "cost": cost, "uncertainty": uncertainty, "latent_distance": 0.5 * cost}
     return Prediction(
         scene="a",
         camera="0",
         room="kitchen",
         camera_height_m=1.5,
-        truth=truth,
-        stages={} if np.isnan(error_m) else {"lpo": dataclasses.replace(truth, x_m=error_m)},
-        candidate_distances=distances,
+        truth=TRUTH,
+        stages={"lpo": dataclasses.replace(TRUTH, x_m=error_m)} if answered else {},
+        signals={"lpo": signals} if answered else {},
     )
 
 
+def confidence(model: LogisticModel, prediction: Prediction) -> float:
+    return model.probability(**prediction.signals["lpo"])
+
+
 def believable(count: int, seed: int) -> list[Prediction]:
-    """Queries whose chance of being right falls with the latent distance and rises with the margin."""
+    """Queries that are right as often as `MAKER` says of their signals."""
     rng = np.random.default_rng(seed)
     results = []
-    for distance, margin in rng.uniform(0.0, 1.0, (count, 2)):
-        right = rng.random() < 1.0 / (1.0 + np.exp(-(1.0 - 6.0 * distance + 4.0 * margin)))
-        results.append(result(0.2 if right else 3.0, (distance, distance + margin)))
+    for log_odds, cost, uncertainty in rng.uniform([-3.0, 0.0, -4.0], [4.0, 1.0, -2.0], (count, 3)):
+        one = result(0.2, log_odds, cost, uncertainty)
+        results.append(one if rng.random() < confidence(MAKER, one) else result(3.0, log_odds, cost, uncertainty))
     return results
+
+
+def fitted(predictions: list[Prediction]) -> LogisticModel:
+    return fit_confidence(predictions, []).known_heading["lpo"]
+
+
+def bent(offset: np.ndarray, information: np.ndarray, turn_deg: float = 0.0) -> Prediction:
+    """A query answered off by `offset` (m) and `turn_deg`, whose cost had this curvature."""
+    pose = dataclasses.replace(TRUTH, x_m=float(offset[0]), y_m=float(offset[1]), heading_deg=turn_deg)
+    return dataclasses.replace(result(0.0), stages={"lpo": pose}, information=tuple(map(tuple, information.tolist())))
 
 
 class TestConfidence:
     def test_a_fit_finds_the_model_that_made_the_data(self) -> None:
-        model = fit_confidence(believable(8000, 0))
-        assert model.bias == pytest.approx(1.0, abs=0.3)
-        assert model.distance == pytest.approx(-6.0, abs=0.6)
-        assert model.margin == pytest.approx(4.0, abs=0.6)
+        model = fitted(believable(8000, 0))
+        assert model.log_odds == pytest.approx(MAKER.log_odds, abs=0.15)
+        assert model.uncertainty == pytest.approx(MAKER.uncertainty, abs=0.2)
+        # Latent distances of these queries are half their costs: only the sum can be told.
+        assert model.cost + 0.5 * model.latent_distance == pytest.approx(-7.5, abs=1.0)
 
-    @given(seeds(), st.floats(0.0, 0.8), st.floats(0.0, 0.8), st.floats(0.01, 0.2))
-    def test_confidence_falls_with_distance_and_rises_with_the_margin(
-        self, seed: int, distance: float, margin: float, more: float
-    ) -> None:
-        model = fit_confidence(believable(800, seed))
-        here = model.probability([distance, distance + margin])
-        assert model.probability([distance + more, distance + more + margin]) < here
-        assert model.probability([distance, distance + margin + more]) >= here
+    @given(seeds())
+    @settings(max_examples=10)
+    def test_it_rises_with_the_odds_and_falls_with_cost_and_uncertainty(self, seed: int) -> None:
+        model = fitted(believable(800, seed))
+        here = confidence(model, result(0.0, 0.0, 0.2, -3.0))
+        assert confidence(model, result(0.0, 1.0, 0.2, -3.0)) > here
+        assert confidence(model, result(0.0, 0.0, 0.4, -3.0)) < here
+        assert confidence(model, result(0.0, 0.0, 0.2, -2.0)) < here
 
     def test_its_probabilities_are_frequencies(self) -> None:
-        model = fit_confidence(believable(4000, 1))
+        model = fitted(believable(4000, 1))
         fresh = believable(4000, 2)
-        confidence = np.array([model.probability(list(r.candidate_distances)) for r in fresh])
-        assert expected_calibration_error(confidence, position_errors_m(fresh) < 1.0) < 0.04
+        told = np.array([confidence(model, one) for one in fresh])
+        assert expected_calibration_error(told, position_errors_m(fresh) < 1.0) < 0.04
 
     @pytest.mark.parametrize("right", [True, False])
     def test_queries_that_all_went_the_same_way_give_a_finite_model(self, right: bool) -> None:
-        model = fit_confidence([result(0.1 if right else 5.0, (0.1 * k, 0.1 * k + 0.3)) for k in range(10)])
+        model = fitted([result(0.1 if right else 5.0, 0.1 * k, 0.1 * k) for k in range(10)])
         assert all(np.isfinite(value) for value in dataclasses.asdict(model).values())
-        assert (model.probability([0.3, 0.6]) > 0.5) == right
+        assert (confidence(model, result(0.0, 0.3, 0.3)) > 0.5) == right
 
     def test_separable_queries_give_a_finite_model(self) -> None:
-        results = [result(0.1, (0.1, 0.5)), result(5.0, (0.9, 0.95))] * 20
-        model = fit_confidence(results)
-        assert model.probability([0.1, 0.5]) > 0.9 > 0.1 > model.probability([0.9, 0.95])
+        good, bad = result(0.1, 4.0, 0.01), result(5.0, -2.0, 0.9)
+        model = fitted([good, bad] * 20)
+        assert confidence(model, good) > 0.9 > 0.1 > confidence(model, bad)
 
-    def test_single_candidates_count_as_clear_ones(self) -> None:
-        lonely = [result(0.1, (0.2,)) for _ in range(5)] + [result(5.0, (0.8,)) for _ in range(5)]
-        model = fit_confidence(lonely)
-        assert model.no_rival_margin == 0.0
-        assert model.probability([0.2]) > 0.5 > model.probability([0.8])
+    def test_known_and_searched_headings_and_stages_have_models_of_their_own(self) -> None:
+        early = [
+            dataclasses.replace(
+                one,
+                stages={"retrieval": dataclasses.replace(TRUTH, x_m=5.0), **one.stages},
+                signals={"retrieval": one.signals["lpo"], **one.signals},
+            )
+            for one in (result(0.1) for _ in range(20))
+        ]
+        model = fit_confidence(early, [result(5.0) for _ in range(20)])
+        signals = result(0.0).signals["lpo"]
+        told = {
+            (stage, known): model.probability(stage, signals, heading_known=known)
+            for stage, known in (("lpo", True), ("retrieval", True), ("lpo", False), ("retrieval", False))
+        }
+        assert told["lpo", True] is not None
+        assert told["retrieval", True] is not None
+        assert told["lpo", False] is not None
+        assert told["lpo", True] > 0.5 > max(told["retrieval", True], told["lpo", False])
+        assert told["retrieval", False] is None
 
-    def test_a_query_without_an_answer_counts_as_wrong(self) -> None:
-        nan = float("nan")
-        model = fit_confidence([result(nan, (0.5, 0.6)) for _ in range(20)])
-        assert model.probability([0.5, 0.6]) < 0.5
+    def test_queries_without_an_answer_have_no_say(self) -> None:
+        some = believable(100, 0)
+        assert fitted(some + [result(math.nan)] * 50) == fitted(some)
 
     def test_calibration_is_stored_without_changing_the_model_s_identity(
         self, tiny_bundle: Path, opened_bundle: Bundle
     ) -> None:
         try:
-            calibrated = calibrate(opened_bundle, believable(200, 0), "200 made-up queries")
+            calibrated = calibrate(opened_bundle, believable(200, 0), believable(50, 1), "made-up queries")
             again = Bundle.open(tiny_bundle)
             assert again.sha256 == calibrated.sha256 == opened_bundle.sha256
             assert again.manifest.confidence == calibrated.manifest.confidence is not None
             assert again.manifest.metrics["validation"]["n"] == 200
-            assert again.manifest.metrics["validation"]["queries"] == "200 made-up queries"
+            assert again.manifest.metrics["validation_heading_searched"]["n"] == 50
+            assert again.manifest.metrics["validation_queries"] == "made-up queries"
         finally:
             write_manifest(tiny_bundle, opened_bundle.manifest)
+
+
+class TestCovariance:
+    @given(seed=seeds(), factor=st.floats(1e-3, 1e3))
+    @settings(max_examples=10)
+    def test_a_fit_finds_the_factors_that_made_the_errors(self, seed: int, factor: float) -> None:
+        rng = np.random.default_rng(seed)
+        known, searched = [], []
+        for _ in range(600):
+            rows = rng.normal(size=(5, 3))
+            information = 1e4 * factor * (rows.T @ rows + np.eye(3))
+            error = rng.multivariate_normal(np.zeros(3), factor * np.linalg.inv(information))
+            searched.append(bent(error[:2], information, math.degrees(error[2])))
+            error = rng.multivariate_normal(np.zeros(2), 2.0 * factor * np.linalg.inv(information[:2, :2]))
+            known.append(bent(error, information[:2, :2]))
+        model = fit_confidence(known, searched)
+        assert model.position_factor == pytest.approx(2.0 * factor, rel=0.25)
+        assert model.position_factor_searched == pytest.approx(factor, rel=0.25)
+        assert model.heading_factor == pytest.approx(factor, rel=0.35)
+
+    def test_wrong_answers_and_those_without_curvature_have_no_say(self) -> None:
+        right = [bent(np.array([0.01 * k, 0.0]), 100.0 * np.eye(2)) for k in range(1, 6)]
+        wrong = [bent(np.array([2.0, 0.0]), 100.0 * np.eye(2))] * 20
+        plain = [result(0.1)] * 20
+        expected = fit_confidence(right, []).position_factor
+        assert expected is not None
+        assert fit_confidence(right + wrong + plain, []).position_factor == expected
+        assert fit_confidence(plain, []).position_factor is None
+        assert fit_confidence(right, []).heading_factor is None

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 
 from lalaloc_core.cli import main
-from lalaloc_core.data.generated import GeneratedScenes
+from lalaloc_core.data.generated import GeneratedScenes, RenderedPhotograph
 from lalaloc_core.errors import InvalidInputError, RunError
 from lalaloc_core.evaluation.building import build_dataset, choose_appearance
-from lalaloc_core.evaluation.predictions import Prediction, RunFolder, RunInfo
+from lalaloc_core.evaluation.predictions import PREDICTIONS_FILE, Prediction, RunFolder, RunInfo
 from lalaloc_core.evaluation.run import run_evaluation
 from lalaloc_core.evaluation.score import heading_errors_deg, position_errors_m, score
+from lalaloc_core.synth.facts import facts_of
 
 
 @pytest.fixture
@@ -85,6 +86,15 @@ class TestRunning:
         assert len(predictions) == 6
         assert np.isfinite(position_errors_m(predictions)).all()
         assert (heading_errors_deg(predictions).max() < 1e-3) == heading_known
+        assert RunFolder(tmp_path).read_predictions() == predictions
+        # What is known of the photographs is what the generator says of its shots.
+        scenes = build_dataset(info)
+        for one in predictions:
+            camera = next(c for c in scenes.load(one.scene).cameras if c.name == one.camera)
+            (photograph,) = camera.photographs.values()
+            assert isinstance(photograph, RenderedPhotograph)
+            assert one.facts == tuple(sorted(facts_of(photograph.shot)))
+        assert any(one.facts for one in predictions)
 
     def test_processes_answer_the_same_in_the_same_order(self, layout_run: RunInfo, tmp_path: Path) -> None:
         here = run_evaluation(RunFolder(tmp_path / "here"), layout_run, workers=0)
@@ -111,6 +121,15 @@ class TestRunning:
         assert len(more) == len(folder.read_predictions()) == 5
         assert without_times(more[:3]) == without_times(first)
         assert len(run_evaluation(folder, dataclasses.replace(layout_run, limit=2), workers=0)) == 2
+
+    def test_answers_without_facts_are_still_read(self, layout_run: RunInfo, tmp_path: Path) -> None:
+        (asked,) = run_evaluation(RunFolder(tmp_path), dataclasses.replace(layout_run, limit=1), workers=0)
+        assert asked.facts == ()
+        path = tmp_path / PREDICTIONS_FILE
+        line = json.loads(path.read_text(encoding="utf-8"))
+        del line["facts"]
+        path.write_text(json.dumps(line) + "\n", encoding="utf-8")
+        assert RunFolder(tmp_path).read_predictions() == [asked]
 
     def test_another_question_in_the_same_folder_is_refused(self, layout_run: RunInfo, tmp_path: Path) -> None:
         run_evaluation(RunFolder(tmp_path), dataclasses.replace(layout_run, limit=1), workers=0)

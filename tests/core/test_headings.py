@@ -51,17 +51,18 @@ def photograph(plan: FloorPlan, pose: PoseSet, heading: float) -> np.ndarray:
 
 
 class PaintedSession(onnxruntime.InferenceSession):
-    """Stands in for the image encoder's session: the layout encoder's ring of the painted profile."""
+    """Stands in for the image encoder's session: the painted profile, and the layout encoder's ring of it."""
 
     def __init__(self, encoder: RingLayoutEncoder) -> None:
         self.encoder = encoder
 
     def run(self, output_names: Any, input_feed: Any, run_options: Any = None) -> list[np.ndarray]:
-        assert output_names == ["ring"]
+        assert output_names == ["ring", "log_profile", "log_scale"]
         pixels = torch.from_numpy(input_feed["image"].astype(np.float32))[:, 0]
         profile = (pixels[..., 0] * 65536 + pixels[..., 1] * 256 + pixels[..., 2]) * _UNIT_M
         camera = torch.from_numpy(input_feed["camera_height_m"])
-        return [self.encoder.ring(profile, camera, torch.full_like(camera, CEILING_M)).numpy()]
+        ring = self.encoder.ring(profile, camera, torch.full_like(camera, CEILING_M)).numpy()
+        return [ring, np.log(profile.numpy()), np.full_like(profile.numpy(), -5.0)]
 
 
 @pytest.fixture(scope="module")
@@ -151,8 +152,10 @@ class TestPerfectEncoder:
         self, perfect: Encoders, flat: FloorPlan, heading: float
     ) -> None:
         query = perfect.query(photograph(flat, POSE, heading), heading, CAMERA_M)
-        layout = perfect.poses(flat, POSE, np.array([query.frame_heading]), CAMERA_M)
+        layout, profile_m = perfect.poses(flat, POSE, np.array([query.frame_heading]), CAMERA_M)
         np.testing.assert_allclose(query.latents, layout, atol=2e-3)
+        assert query.profile is not None
+        np.testing.assert_allclose(np.exp(query.profile.log_m), profile_m, atol=2e-4)
 
     @given(headings)
     @settings(max_examples=30)
@@ -163,8 +166,32 @@ class TestPerfectEncoder:
         rest = wrap_angle(heading - query.roll)
         nearest = int(np.abs(rest).argmin())
         assert abs(rest[nearest]) <= SECTOR / 2 + 1e-9
-        layout = perfect.poses(flat, POSE, rest[nearest : nearest + 1], CAMERA_M)
+        layout, profile_m = perfect.poses(flat, POSE, rest[nearest : nearest + 1], CAMERA_M)
         np.testing.assert_allclose(query.latents[nearest], layout[0], atol=2e-3)
+        assert query.profile is not None
+        np.testing.assert_allclose(np.exp(query.profile.log_m[nearest]), profile_m[0], atol=2e-4)
+
+    @given(heading=headings, off=st.floats(-1.0, 1.0), tolerance=st.floats(0.01, math.pi / 4.0))
+    @settings(max_examples=30)
+    def test_an_inexact_heading_is_searched_within_its_tolerance_and_refined(
+        self,
+        perfect: Encoders,
+        optimiser: LatentPoseOptimiser,
+        flat: FloorPlan,
+        heading: float,
+        off: float,
+        tolerance: float,
+    ) -> None:
+        image = photograph(flat, POSE, heading)
+        query = perfect.query(image, heading + off * tolerance, CAMERA_M, heading_tolerance=tolerance)
+        assert not query.heading_known
+        turned = wrap_angle(query.roll + query.frame_heading - (heading + off * tolerance))
+        assert tolerance <= np.abs(turned).max() < tolerance + SECTOR
+        np.testing.assert_allclose(np.diff(np.sort(turned)), SECTOR, atol=1e-9)
+        grid = build_grid(flat, perfect, step_m=0.25, camera_height_m=CAMERA_M)
+        best = localise(flat, grid, perfect, query, refiner=optimiser.refine).candidates[0]
+        assert np.hypot(*(best.position_m - POSE.position_m[0])) < 0.02
+        assert abs(wrap_angle(panorama_heading(query, best) - heading)) < math.radians(1.0)
 
     @given(heading=headings, known=st.booleans(), place=st.integers(0, 5))
     @settings(max_examples=24)

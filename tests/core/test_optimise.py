@@ -53,18 +53,29 @@ def job_near(encoder: RingLayoutEncoder, scene: Scene, seed: int, *, heading_kno
     )
 
 
+def by_profile(job: RefinementJob, scene: Scene, columns: int, *, offset: float = 0.0) -> RefinementJob:
+    """The same job, compared by the wall profiles of the scene's own poses; `offset` is added to the log profile."""
+    profile = wall_profile(scene.poses.position_m, np.zeros(len(scene.poses)), scene.walls_m, columns)
+    log_profile = (np.log(profile) + offset).astype(np.float32)
+    return dataclasses.replace(job, log_profile=log_profile, precision=np.full_like(log_profile, 5.0))
+
+
+def profile_cost(job: RefinementJob, position_m: np.ndarray, heading: np.ndarray) -> np.ndarray:
+    """What a job by profiles minimises, with numpy, at one pose per start."""
+    assert job.log_profile is not None
+    assert job.precision is not None
+    log_profile = np.log(wall_profile(position_m, heading, job.walls_m, job.log_profile.shape[1]))
+    return np.log1p(np.square((log_profile - job.log_profile) * job.precision)).mean(axis=1)
+
+
 def errors_m(result: RefinementResult, scene: Scene) -> np.ndarray:
     return np.linalg.norm(result.position_m - scene.poses.position_m, axis=1)
 
 
 def one_pose(job: RefinementJob, index: int) -> RefinementJob:
     """The job of a single one of its poses."""
-    arrays = {
-        field.name: getattr(job, field.name)[index : index + 1]
-        for field in dataclasses.fields(job)
-        if field.name != "optimise_heading"
-    }
-    return RefinementJob(**arrays, optimise_heading=job.optimise_heading)
+    arrays = {name: value[index : index + 1] for name, value in vars(job).items() if isinstance(value, np.ndarray)}
+    return dataclasses.replace(job, **arrays)
 
 
 class TestConvergence:
@@ -134,6 +145,55 @@ class TestConvergence:
         )
         here, there = (LatentPoseOptimiser(smooth_encoder, LM).refine(each) for each in (near, job))
         np.testing.assert_allclose(there.position_m - [500.0, -500.0], here.position_m, atol=1e-4)
+
+
+class TestProfiles:
+    @pytest.mark.parametrize("heading_known", [True, False])
+    @given(polygon=convex_polygons(), seed=seeds())
+    @settings(max_examples=10)
+    def test_the_truth_is_found_by_its_wall_profile(
+        self, smooth_encoder: RingLayoutEncoder, heading_known: bool, polygon: list, seed: int
+    ) -> None:
+        scene = scene_of(plan_of(polygon), 4, seed)
+        job = job_near(smooth_encoder, scene, seed, heading_known=heading_known)
+        job = by_profile(job, scene, smooth_encoder.config.profile_columns)
+        result = LatentPoseOptimiser(smooth_encoder, LM).refine(job)
+        assert errors_m(result, scene).max() < 5e-3
+        assert np.abs(result.heading).max() < 5e-3
+
+    @pytest.mark.parametrize("latent_weight", [0.0, 0.5])
+    def test_cost_and_latent_distance_are_those_of_the_pose_it_ends_at(
+        self, smooth_encoder: RingLayoutEncoder, latent_weight: float
+    ) -> None:
+        scene = scene_of(plan_of(l_shape(5.0, 4.0, 2.0, 2.5)), 5, 2)
+        job = job_near(smooth_encoder, scene, 2, heading_known=False)
+        job = by_profile(job, scene, smooth_encoder.config.profile_columns, offset=0.05)
+        job = dataclasses.replace(job, latent_weight=latent_weight)
+        result = LatentPoseOptimiser(smooth_encoder, LpoConfig()).refine(job)
+        fit = profile_cost(job, result.position_m, result.heading)
+        np.testing.assert_allclose(result.cost, fit + latent_weight * result.latent_distance, rtol=1e-3, atol=1e-4)
+        assert (fit <= profile_cost(job, job.position_m, job.heading) + 1e-5).all()
+        profile = wall_profile(result.position_m, result.heading, scene.walls_m, smooth_encoder.config.profile_columns)
+        arrays = (profile, np.full(5, CAMERA_M), scene.ceiling_height_m)
+        latents = smooth_encoder(*(torch.tensor(array, dtype=torch.float32) for array in arrays)).numpy()
+        np.testing.assert_allclose(result.latent_distance, np.linalg.norm(latents - job.targets, axis=1), atol=1e-4)
+
+    @given(seeds())
+    @settings(max_examples=10)
+    def test_information_is_the_curvature_of_the_cost_where_the_fit_is_exact(
+        self, smooth_encoder: RingLayoutEncoder, seed: int
+    ) -> None:
+        scene = scene_of(plan_of([[0.0, 0.0], [5.0, 0.3], [4.4, 3.8], [0.4, 3.2]]), 1, seed)
+        columns = smooth_encoder.config.profile_columns
+        job = job_near(smooth_encoder, scene, seed, heading_known=False)
+        job = by_profile(job, scene, columns)
+        job = dataclasses.replace(job, position_m=scene.poses.position_m, heading=np.zeros(1))
+        (information,) = LatentPoseOptimiser(smooth_encoder, LM).refine(job).information
+        np.testing.assert_allclose(information, information.T, rtol=1e-5)
+        for step in 1e-3 * np.eye(3):
+            costs = [profile_cost(job, job.position_m + sign * step[:2], sign * step[2:]) for sign in (1.0, -1.0)]
+            # The optimiser's cost is half the sum over the columns, and the two sides cancel what is not curvature.
+            assert 0.5 * columns * np.mean(costs) == pytest.approx(0.5 * step @ information @ step, rel=0.05)
 
 
 class TestStayingInside:

@@ -249,6 +249,18 @@ class TestFigures:
         assert retrieval[1:] == [str(n) for n in count_outcomes(mixed(), "retrieval").values()]
         assert f"more than {ALIGNMENT_LIMIT_M:g} m" in page.text
 
+    def test_hard_cases_have_a_table_worst_first_where_facts_are_known(self, tmp_path: Path, page: Page) -> None:
+        known = [
+            prediction(k, error_m, facts=facts)
+            for k, (error_m, facts) in enumerate([(0.02, ("near_wall",)), (3.0, ("corridor",)), (0.05, ("near_wall",))])
+        ]
+        rows = page_of(run_folder(tmp_path / "run", known), out=tmp_path / "r.html")[0].table(
+            "Accuracy by what is in the picture"
+        )
+        assert [row[0] for row in rows] == ["fact", "corridor", "near wall", "all queries"]
+        assert [row[1].split()[0] for row in rows[1:]] == ["1", "2", "3"]
+        assert not any(caption.startswith("Accuracy by what is in the picture") for caption in page.tables)
+
     def test_times_and_calibration_stand_there(self, page: Page) -> None:
         rows = {row[0]: row for row in page.table("Milliseconds")}
         assert rows["retrieve"][1:] == ["12", "6.50", "11.4"]

@@ -1,17 +1,22 @@
-"""The numpy half of localisation: latent distances, non-maximum suppression and the Vogel disc."""
+"""The numpy half of localisation: retrieval, non-maximum suppression and the Vogel disc."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from jaxtyping import Float
 
+from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.poses import Candidate, LatentGrid, Query
-from lalaloc_core.localise.retrieval import latent_distances, retrieve, suppress
+from lalaloc_core.localise.evidence import EvidenceConfig, latent_distances, profile_costs, targets
+from lalaloc_core.localise.poses import Candidate, LatentGrid, PredictedProfile, Query
+from lalaloc_core.localise.retrieval import retrieve, suppress
 from lalaloc_core.localise.vogel import resample, vogel_disc
 from lalaloc_core.sampling import PoseSet
 from tests.strategies import plan_of, rectangle, seeds
@@ -24,7 +29,8 @@ def unit(rng: np.random.Generator, *shape: int) -> np.ndarray:
 
 def random_grid(seed: int, poses: int = 60) -> LatentGrid:
     rng = np.random.default_rng(seed)
-    return LatentGrid(PoseSet(rng.uniform(0, 6, (poses, 2)), np.zeros(poses, dtype=int)), unit(rng, poses, 8), 0.5, 1.5)
+    places = PoseSet(rng.uniform(0, 6, (poses, 2)), np.zeros(poses, dtype=int))
+    return LatentGrid(places, unit(rng, poses, 8), rng.uniform(0.5, 5.0, (poses, 16)), 0.5, 1.5)
 
 
 def any_heading(latents: np.ndarray) -> Query:
@@ -43,11 +49,13 @@ class PlaceEncoders(Encoders):
     def __init__(self) -> None:
         pass
 
-    def poses(self, plan: FloorPlan, poses: PoseSet, heading: np.ndarray, camera_height_m: float) -> np.ndarray:
+    def poses(
+        self, plan: FloorPlan, poses: PoseSet, heading: Float[np.ndarray, "b"], camera_height_m: float
+    ) -> tuple[np.ndarray, np.ndarray]:
         features = np.stack(
             [poses.position_m[:, 0], poses.position_m[:, 1], 3.0 * np.sin(heading), np.full(len(poses), 5.0)], 1
         )
-        return features / np.linalg.norm(features, axis=1, keepdims=True)
+        return features / np.linalg.norm(features, axis=1, keepdims=True), np.ones((len(poses), 1))
 
 
 PLACES = PlaceEncoders()
@@ -82,8 +90,17 @@ class TestRetrieval:
             shadowed = any(gaps[other, k] < separation_m and distance[i] <= distance[other] for k, i in enumerate(kept))
             assert shadowed or (len(kept) == limit and distance[other] >= worst_kept)
 
+    @given(seeds())
+    def test_one_place_is_kept_once_for_every_way_to_be_turned(self, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        position, heading = np.zeros((60, 2)), rng.uniform(-math.pi, math.pi, 60)
+        kept = suppress(position, rng.uniform(0, 2, 60), separation_m=1.0, limit=60, heading=heading)
+        gaps = np.abs(wrap_angle(heading[kept][:, None] - heading[kept][None])) + 9.0 * np.eye(len(kept))
+        assert gaps.min() > math.radians(25.0)
+        assert np.abs(wrap_angle(heading[:, None] - heading[kept][None])).min(axis=1).max() <= math.radians(25.0)
+
     @given(seeds(), st.integers(1, 8))
-    def test_every_place_is_taken_at_its_best_hypothesis(self, seed: int, hypotheses: int) -> None:
+    def test_the_first_is_the_best_of_all_places_and_hypotheses(self, seed: int, hypotheses: int) -> None:
         grid = random_grid(seed)
         query = any_heading(unit(np.random.default_rng(seed + 1), hypotheses, 8))
         distances = latent_distances(grid.latents, query.latents)
@@ -91,8 +108,7 @@ class TestRetrieval:
         assert found[0].latent_distance == distances.min()
         for candidate in found:
             place = int(np.linalg.norm(grid.poses.position_m - candidate.position_m, axis=1).argmin())
-            assert candidate.hypothesis == int(distances[:, place].argmin())
-            assert candidate.latent_distance == distances[:, place].min()
+            assert candidate.cost == candidate.latent_distance == distances[candidate.hypothesis, place]
             assert candidate.room_index == grid.poses.room_index[place]
             assert candidate.frame_heading == query.frame_heading
 
@@ -102,6 +118,34 @@ class TestRetrieval:
             query = any_heading(grid.latents[index : index + 1])
             best = retrieve(grid, query, top_k=1, separation_m=1.0)[0]
             np.testing.assert_array_equal(best.position_m, grid.poses.position_m[index])
+
+    def test_a_grid_pose_s_own_profile_retrieves_it_turned_as_it_was(self) -> None:
+        grid = random_grid(0)
+        for index in (0, 17, 59):
+            # Hypothesis k undoes a turn by k of 8 sectors, two columns each; the truth is hypothesis 3.
+            seen = np.roll(np.log(grid.profile_m[index]), -6)
+            profile = PredictedProfile.rolled(seen, np.full(16, -3.0), 2 * np.arange(8))
+            query = dataclasses.replace(any_heading(unit(np.random.default_rng(1), 8, 8)), profile=profile)
+            best = retrieve(grid, query, top_k=1, separation_m=1.0)[0]
+            np.testing.assert_array_equal(best.position_m, grid.poses.position_m[index])
+            assert best.hypothesis == 3
+            assert best.cost < 1e-9
+
+    @given(seeds())
+    def test_a_profile_is_ranked_by_its_cost_and_the_latent_by_its_weight(self, seed: int) -> None:
+        grid, rng = random_grid(seed), np.random.default_rng(seed)
+        query = dataclasses.replace(
+            any_heading(unit(rng, 3, 8)), profile=PredictedProfile(rng.normal(size=(3, 16)), rng.normal(size=(3, 16)))
+        )
+        evidence = EvidenceConfig(latent_weight=0.7)
+        centre, precision = targets(query, np.arange(3), 0.3, evidence)
+        costs = np.stack([profile_costs(np.log(grid.profile_m), *one) for one in zip(centre, precision, strict=True)])
+        costs += 0.7 * latent_distances(grid.latents, query.latents)
+        best = retrieve(grid, query, top_k=1, separation_m=1.0, evidence=evidence)[0]
+        assert best.cost == pytest.approx(costs.min())
+        assert retrieve(grid, query, top_k=1, separation_m=1.0, evidence=EvidenceConfig(use_profile=False))[
+            0
+        ].cost == pytest.approx(latent_distances(grid.latents, query.latents).min())
 
 
 class TestVogelDisc:
@@ -137,13 +181,14 @@ class TestResampling:
 
     def query(self, x: float, y: float, heading_known: bool = True, heading: float = 0.0) -> Query:
         pose = PoseSet(np.array([[x, y]]), np.array([0]))
-        latent = PLACES.poses(self.plan, pose, np.array([heading]), 1.5)
+        latent, _ = PLACES.poses(self.plan, pose, np.array([heading]), 1.5)
         return Query(latent, np.zeros(1), 0.0, heading_known) if heading_known else any_heading(latent.repeat(8, 0))
 
     def candidate(self, query: Query, x: float, y: float) -> Candidate:
         pose = PoseSet(np.array([[x, y]]), np.array([0]))
-        latent = PLACES.poses(self.plan, pose, np.zeros(1), 1.5)
-        return Candidate(x, y, 0, 0.0, 0, float(latent_distances(latent, query.latents[:1])[0, 0]))
+        latent, _ = PLACES.poses(self.plan, pose, np.zeros(1), 1.5)
+        distance = float(latent_distances(latent, query.latents[:1])[0, 0])
+        return Candidate(x, y, 0, 0.0, 0, distance, distance)
 
     def resample(self, query: Query, start: Candidate, radius_m: float) -> Candidate:
         return resample(self.plan, PLACES, query, start, camera_height_m=1.5, samples=200, radius_m=radius_m)
@@ -153,7 +198,8 @@ class TestResampling:
         start = self.candidate(query, 2.0, 2.0)
         found = self.resample(query, start, 1.0)
         assert np.hypot(found.x_m - 2.3, found.y_m - 2.6) < 0.1
-        assert found.latent_distance < start.latent_distance
+        assert found.cost < start.cost
+        assert found.latent_distance == pytest.approx(found.cost, abs=1e-6)
         assert np.hypot(found.x_m - 2.0, found.y_m - 2.0) <= 1.0
 
     def test_samples_outside_all_rooms_are_dropped_and_the_room_follows_the_pose(self) -> None:
@@ -169,7 +215,8 @@ class TestResampling:
     def test_a_candidate_at_the_optimum_is_kept(self) -> None:
         query = self.query(2.0, 2.0)
         start = self.candidate(query, 2.0, 2.0)
-        assert self.resample(query, start, 1.0) is start
+        found = self.resample(query, start, 1.0)
+        assert (found.x_m, found.y_m, found.room_index, found.frame_heading) == (2.0, 2.0, 0, 0.0)
 
     def test_a_known_heading_is_never_touched_and_an_unknown_one_stays_in_its_sector(self) -> None:
         known = self.query(2.3, 2.6)

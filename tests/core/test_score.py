@@ -25,7 +25,12 @@ INFO = RunInfo(label="made up", method="lalaloc", kind="panorama", dataset="nowh
 
 
 def prediction(
-    *errors_m: float, scene: str = "a", confidence: float | None = None, turned_deg: float = 0.0, room: int = 0
+    *errors_m: float,
+    scene: str = "a",
+    confidence: float | None = None,
+    turned_deg: float = 0.0,
+    room: int = 0,
+    facts: tuple[str, ...] = (),
 ) -> Prediction:
     """A query whose stages are that far off."""
     stages = ("retrieval", "vdr", "lpo")
@@ -43,6 +48,7 @@ def prediction(
         pose_hit=bool(errors_m) and errors_m[0] < 0.2,
         confidence=confidence,
         timings_ms={"retrieve": 1.0, "lpo": 10.0} if errors_m else {},
+        facts=facts,
     )
 
 
@@ -84,6 +90,36 @@ class TestScores:
     def test_methods_that_do_not_retrieve_have_no_recall(self) -> None:
         plain = Prediction(scene="a", camera="0", room="r", camera_height_m=1.5, truth=prediction(0.1).truth)
         assert score([plain]).layout_recall is None
+
+    def test_slices_count_the_queries_of_each_fact_worst_first(self) -> None:
+        both, one = ("corridor", "mirror"), ("corridor",)
+        scores = score(
+            [prediction(0.04, facts=both), prediction(facts=both), prediction(0.3, facts=one), prediction(0.02)]
+        )
+        assert list(scores.slices) == ["mirror", "corridor"]
+        mirror, corridor = scores.slices.values()
+        assert (mirror.n, corridor.n) == (2, 3)
+        assert (mirror.within_1m.value, mirror.median_cm.value) == (0.5, np.inf)
+        assert corridor.within_1m.value == pytest.approx(2 / 3)
+        assert corridor.within_10cm.value == pytest.approx(1 / 3)
+        assert corridor.median_cm.value == pytest.approx(30.0)
+        assert score([prediction(0.1)]).slices == {}
+
+    def test_a_fact_of_every_query_has_the_figures_of_all(self) -> None:
+        scores = score([prediction(0.05 * k, scene=str(k % 5), facts=("closet",)) for k in range(30)])
+        closet, final = scores.slices["closet"], scores.final
+        assert closet.n == scores.n
+        assert (closet.within_1m, closet.within_10cm, closet.median_cm) == (
+            final.within_1m,
+            final.within_10cm,
+            final.median_cm,
+        )
+
+    def test_a_slice_of_one_scene_has_its_own_figures_as_interval(self) -> None:
+        rare = prediction(2.0, scene="b", facts=("closet",))
+        found = score([rare, *(prediction(0.1, scene=str(k)) for k in range(9))]).slices["closet"]
+        assert (found.median_cm.low, found.median_cm.high) == pytest.approx((200.0, 200.0))
+        assert (found.within_1m.low, found.within_1m.high) == (0.0, 0.0)
 
     def test_nothing_to_score_is_an_error(self) -> None:
         with pytest.raises(InvalidInputError, match="no predictions"):
