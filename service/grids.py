@@ -210,14 +210,16 @@ class Grids:
         poses = pose_grid(plan, key.step_m)
         rays = self._encoders.manifest.profile_columns * plan.walls_m.shape[1]
         chunk = min(max(_CAST_AT_ONCE // rays, _MIN_CHUNK), _MAX_CHUNK)
-        parts = []
+        latents, profiles_m = [], []
         for first in range(0, len(poses), chunk):
             if task.cancelled.is_set():
                 raise StoppingError() if self._closing else UnknownFloorPlanError(key.plan_id)
             part = PoseSet(poses.position_m[first : first + chunk], poses.room_index[first : first + chunk])
-            parts.append(self._encoders.poses(plan, part, np.zeros(len(part)), key.camera_height_m))
+            latent, profile_m = self._encoders.poses(plan, part, np.zeros(len(part)), key.camera_height_m)
+            latents.append(latent)
+            profiles_m.append(profile_m)
             task.progress = min(first + chunk, len(poses)) / len(poses)
-        return LatentGrid(poses, np.concatenate(parts), key.step_m, key.camera_height_m)
+        return LatentGrid(poses, np.concatenate(latents), np.concatenate(profiles_m), key.step_m, key.camera_height_m)
 
     def _note_failure(self, key: GridKey, task: _Task, error: Exception) -> None:
         logger = logging.getLogger(LOGGER_NAME)
@@ -287,4 +289,5 @@ class _Cache:
 
 
 def _size(grid: LatentGrid) -> int:
-    return grid.latents.nbytes + grid.poses.position_m.nbytes + grid.poses.room_index.nbytes
+    arrays = (grid.latents, grid.profile_m, grid.poses.position_m, grid.poses.room_index)
+    return sum(array.nbytes for array in arrays)

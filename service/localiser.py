@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
 from time import monotonic
 from typing import TypeVar
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import heading_from_degrees, heading_to_degrees
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.covariance import spread_of
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.images import read_panorama
 from lalaloc_core.localise.pipeline import Localisation, StageClock, localise, panorama_heading
@@ -25,8 +28,6 @@ from service.telemetry import Telemetry
 
 # Kept free of LPO before the request's deadline, to rank and send the answer.
 _ANSWER_S = 0.25
-# Confidence compares the best candidate with its rival, also when only the best is asked for.
-_LEAST_CANDIDATES = 2
 
 T = TypeVar("T")
 
@@ -120,7 +121,8 @@ class Localiser:
             )
         with clock.stage("encode"):
             heading = None if form.heading_deg is None else heading_from_degrees(form.heading_deg)
-            return self._encoders.query(image, heading, height_m)
+            tolerance = math.radians(form.heading_tolerance_deg)
+            return self._encoders.query(image, heading, height_m, heading_tolerance=tolerance)
 
     def _search(
         self, plan: FloorPlan, grid: LatentGrid, query: Query, form: LocaliseForm, deadline: float
@@ -131,7 +133,7 @@ class Localiser:
             self._encoders,
             query,
             refine=form.refine,
-            top_k=max(form.top_k, _LEAST_CANDIDATES),
+            top_k=form.top_k,
             refiner=lambda job: self._pool.refine(
                 job, min(self._settings.lpo_deadline_s, deadline - monotonic() - _ANSWER_S)
             ),
@@ -152,16 +154,25 @@ class Localiser:
         timings_ms: dict[str, float],
     ) -> LocaliseAnswer:
         model = self._bundle.manifest.confidence
-        distances = [candidate.latent_distance for candidate in found.candidates[:_LEAST_CANDIDATES]]
-        candidates = [_candidate(record.plan, query, candidate) for candidate in found.candidates[: form.top_k]]
+        signals = asdict(found.signals[found.stage])
+        answer = found.best[found.stage]
+        spread = None
+        if model is not None and answer.information is not None:
+            spread = spread_of(answer.information, record.plan.rooms[answer.room_index], model)
+        candidates = [_candidate(record.plan, query, candidate) for candidate in found.candidates]
         best = candidates[0]
         return LocaliseAnswer(
             floorplan_id=record.id,
             position=best.position,
             heading_deg=best.heading_deg,
             room=best.room,
-            confidence=None if model is None else model.probability(distances),
+            confidence=model and model.probability(found.stage, signals, heading_known=query.heading_known),
+            covariance_m2=None if spread is None else spread.position_m2.tolist(),
+            heading_std_deg=None
+            if spread is None or spread.heading_std is None
+            else round(math.degrees(spread.heading_std), 3),
             stage=found.stage,
+            cost=best.cost,
             latent_distance=best.latent_distance,
             camera_height_m=round(height_m, 3),
             candidates=candidates,
@@ -183,5 +194,6 @@ def _candidate(plan: FloorPlan, query: Query, candidate: Candidate) -> Candidate
         position=Position(x_m=round(candidate.x_m, 4), y_m=round(candidate.y_m, 4)),
         heading_deg=round(heading_to_degrees(panorama_heading(query, candidate)), 3) % 360.0,
         room=plan.rooms[candidate.room_index].name,
+        cost=candidate.cost,
         latent_distance=min(max(candidate.latent_distance, 0.0), 2.0),
     )

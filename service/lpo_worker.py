@@ -9,13 +9,14 @@ from __future__ import annotations
 import os
 import signal
 from dataclasses import dataclass
+from itertools import product
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from lalaloc_core.bundle import Bundle
+from lalaloc_core.bundle import Bundle, Manifest
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.poses import RefinementJob
 
@@ -71,17 +72,18 @@ def _load(bundle_folder: Path, model_sha256: str, threads: int) -> LatentPoseOpt
     if bundle.sha256 != model_sha256:
         raise RuntimeError("the bundle on disk is no longer the one the service runs")
     optimiser = LatentPoseOptimiser.from_bundle(bundle)
-    for optimise_heading in (False, True):
-        optimiser.refine(warm_up_job(bundle.manifest.latent_size, optimise_heading=optimise_heading))
+    for optimise_heading, by_profile in product((False, True), repeat=2):
+        optimiser.refine(warm_up_job(bundle.manifest, optimise_heading=optimise_heading, by_profile=by_profile))
     return optimiser
 
 
-def warm_up_job(latent_size: int, *, optimise_heading: bool) -> RefinementJob:
+def warm_up_job(manifest: Manifest, *, optimise_heading: bool, by_profile: bool) -> RefinementJob:
     """A small job, so that the first real one does not pay for what is built on first use."""
     plan = FloorPlan.from_dict(
         {"ceiling_height_m": 2.5, "rooms": [{"polygon": [[0.0, 0.0], [4.0, 0.0], [4.0, 3.0], [0.0, 3.0]]}]}
     )
-    target = np.ones((2, latent_size), np.float32) / np.sqrt(np.float32(latent_size))
+    target = np.ones((2, manifest.latent_size), np.float32) / np.sqrt(np.float32(manifest.latent_size))
+    profile = np.zeros((2, manifest.profile_columns), np.float32)
     return RefinementJob(
         targets=target,
         position_m=np.array([[1.0, 1.0], [2.5, 2.0]]),
@@ -90,6 +92,8 @@ def warm_up_job(latent_size: int, *, optimise_heading: bool) -> RefinementJob:
         camera_height_m=np.full(2, plan.camera_height_m),
         ceiling_height_m=plan.ceiling_heights_m[[0, 0]],
         optimise_heading=optimise_heading,
+        log_profile=profile if by_profile else None,
+        precision=np.ones_like(profile) if by_profile else None,
     )
 
 

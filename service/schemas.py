@@ -5,12 +5,19 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
 PlanStatus = Literal["preparing", "ready", "failed"]
 Finite = Field(allow_inf_nan=False)
 
 HEADING_MEANING = "azimuth of the panorama's centre column, clockwise from the plan's +y seen from above"
+_LATENT_DISTANCE = Field(ge=0, le=2, description="Distance of the pose's layout to the panorama's latent.")
+_COST = Field(
+    ge=0,
+    description="What candidates are ranked by: how badly the walls around the pose fit the panorama, without unit, "
+    "lower is better. Candidates that were not refined as far as the first come after those that were, and their "
+    "costs, which allow for the distance of neighbouring poses, do not compare.",
+)
 
 
 class Answer(BaseModel):
@@ -119,6 +126,13 @@ class LocaliseForm(BaseModel):
     heading_deg: Annotated[float, Finite] | None = Field(
         None, ge=-360, le=360, description=f"The {HEADING_MEANING}; left out: unknown, searched over."
     )
+    heading_tolerance_deg: Annotated[float, Finite] = Field(
+        0,
+        ge=0,
+        le=45,
+        description="How far off `heading_deg` may be: it is then searched for within that, to the next sector of the "
+        "model's ring, and refined. 0: it is exact. Needs `heading_deg`.",
+    )
     camera_height_m: Annotated[float, Finite] | None = Field(
         None, gt=0, description="Height of the camera over the floor; left out: the plan's. Rounded to 2 cm."
     )
@@ -127,12 +141,23 @@ class LocaliseForm(BaseModel):
     )
     top_k: int = Field(5, ge=1, le=10, description="How many distinct candidates to return.")
 
-    @field_validator("heading_deg", "camera_height_m", "top_k", mode="before")
+    @field_validator("heading_deg", "heading_tolerance_deg", "camera_height_m", "top_k", mode="before")
     @classmethod
     def _plain_number(cls, value: object) -> object:
         if isinstance(value, str) and "_" in value:
             raise ValueError("not a number")
         return value
+
+    @field_validator("heading_tolerance_deg")
+    @classmethod
+    def _of_a_heading(cls, value: float, given: ValidationInfo) -> float:
+        if given.data.get("heading_deg", 0.0) is None:
+            raise ValueError("heading_deg, whose tolerance this is, is missing")
+        return value
+
+
+Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
+Covariance = Annotated[list[Pair], Field(min_length=2, max_length=2)]
 
 
 class Position(Answer):
@@ -148,7 +173,8 @@ class CandidateAnswer(Answer):
     position: Position
     heading_deg: float = Field(ge=0, lt=360, description=f"The {HEADING_MEANING}.")
     room: str = Field(description="Name of the room the position lies in.")
-    latent_distance: float = Field(ge=0, le=2, description="Distance of the pose's layout to the panorama's latent.")
+    cost: float = _COST
+    latent_distance: float = _LATENT_DISTANCE
 
 
 class TimingsAnswer(Answer):
@@ -178,10 +204,22 @@ class LocaliseAnswer(Answer):
     heading_deg: float = Field(ge=0, lt=360, description=f"The {HEADING_MEANING}.")
     room: str
     confidence: float | None = Field(
-        ge=0, le=1, description="Probability that the position is right within 1 m; null for a model without it."
+        ge=0,
+        le=1,
+        description="Probability that the position is right within 1 m, as fitted for this `stage`, and for a heading "
+        "given exactly or searched; null for a model without it.",
     )
     stage: Literal["retrieval", "vdr", "lpo"] = Field(description="The last stage that produced the position.")
-    latent_distance: float = Field(ge=0, le=2)
+    covariance_m2: Covariance | None = Field(
+        description="Covariance [[xx, xy], [xy, yy]] of the position in m², given that it is right within 1 m; along "
+        "what the panorama does not tell, as in a corridor, that of a place anywhere in the room. Null unless `stage` "
+        "is `lpo`, and for a model without it."
+    )
+    heading_std_deg: float | None = Field(
+        ge=0, description="Standard deviation of the heading where it was searched; null where `covariance_m2` is."
+    )
+    cost: float = _COST
+    latent_distance: float = _LATENT_DISTANCE
     camera_height_m: float = Field(description="Camera height the panorama was compared at.")
     candidates: list[CandidateAnswer] = Field(description="Best first; the first one is the answer.")
     timings_ms: TimingsAnswer

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from sqlalchemy import (
+    DDL,
     DateTime,
     Engine,
     Float,
@@ -47,6 +48,8 @@ from service.errors import TooManyFloorPlansError
 # A stored plan was valid under the limits of its day; tighter limits must not make it unreadable.
 _STORED_LIMITS = PlanLimits(max_rooms=10**9, max_vertices_per_room=10**9, max_extent_m=math.inf)
 _PARSED_PLANS = 64
+# Tables of grids in older formats: they are dropped, and their grids computed again.
+_OLDER_GRIDS = ("latent_grids",)
 
 
 class _Base(DeclarativeBase):
@@ -76,7 +79,8 @@ class _OriginalRow(_Base):
 
 
 class _GridRow(_Base):
-    __tablename__ = "latent_grids"
+    # What a grid holds has changed once; see `_OLDER_GRIDS`.
+    __tablename__ = "latent_grids_2"
 
     id: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=True)
     plan_id: Mapped[str] = mapped_column(ForeignKey("floorplans.id", ondelete="CASCADE"))
@@ -144,7 +148,7 @@ class Store:
     """The database; safe to share between threads and between processes."""
 
     def __init__(self, url: str) -> None:
-        """Connect and create missing tables.
+        """Connect, create missing tables, and drop those of older formats that hold nothing but what can be computed.
 
         Raises:
             ConfigError: not a usable database URL, or the database cannot be opened.
@@ -152,6 +156,9 @@ class Store:
         try:
             self._engine = _engine(url)
             _Base.metadata.create_all(self._engine)
+            with self._engine.begin() as connection:
+                for name in _OLDER_GRIDS:
+                    connection.execute(DDL(f"DROP TABLE IF EXISTS {name}"))
         except (ArgumentError, ImportError, OSError, SQLAlchemyError) as error:
             raise ConfigError(f"cannot open the database: {error}") from error
         # A plan never changes once stored, so its text stands for it.
@@ -335,6 +342,7 @@ def _pack(grid: LatentGrid) -> bytes:
         position_m=grid.poses.position_m,
         room_index=grid.poses.room_index.astype(np.int32),
         latents=grid.latents.astype(np.float32),
+        profile_m=grid.profile_m.astype(np.float32),
     )
     return buffer.getvalue()
 
@@ -343,9 +351,9 @@ def _unpack(content: bytes, key: GridKey) -> LatentGrid | None:
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
             poses = PoseSet(arrays["position_m"], arrays["room_index"].astype(np.int64))
-            latents = arrays["latents"]
+            latents, profile_m = arrays["latents"], arrays["profile_m"]
     except (ValueError, KeyError, OSError, EOFError):
         return None
-    if not (len(poses.position_m) == len(poses.room_index) == len(latents)):
+    if not (len(poses.position_m) == len(poses.room_index) == len(latents) == len(profile_m)):
         return None
-    return LatentGrid(poses, latents, key.step_m, key.camera_height_m)
+    return LatentGrid(poses, latents, profile_m, key.step_m, key.camera_height_m)

@@ -6,6 +6,7 @@ import math
 from dataclasses import dataclass
 from html import escape
 
+import numpy as np
 import shapely
 
 from lalaloc_core.floorplan import FloorPlan, Room
@@ -14,15 +15,18 @@ _MARGIN_M = 0.5
 _FILLS = ("#eef4fb", "#f7f1e6", "#eef7ee", "#f8eef4", "#f2f0fa", "#f4f6ea")
 # A scale bar of a round length, about this share of the drawing's width.
 _BAR_SHARE = 0.2
+# 95 % of a normal distribution in the plane lie within so many standard deviations: the root of -2 log 0.05.
+_ELLIPSE_STDS = 2.4477
 
 
 @dataclass(frozen=True, kw_only=True)
 class Marker:
-    """A camera to draw: position (m) and, when known, heading (degrees)."""
+    """A camera to draw: position (m) and, when known, heading (degrees) and covariance (xx, xy, yy; m²)."""
 
     x_m: float
     y_m: float
     heading_deg: float | None = None
+    covariance_m2: tuple[float, float, float] | None = None
 
 
 def plan_svg(plan: FloorPlan, marker: Marker | None = None) -> str:
@@ -87,7 +91,7 @@ def _text(name: str) -> str:
 
 
 def _camera(marker: Marker, extent_m: float) -> str:
-    """A dot, and a wedge that opens towards the heading."""
+    """A dot, a wedge that opens towards the heading, and the ellipse that holds 95 % of its covariance."""
     radius = extent_m / 80.0
     wedge = ""
     if marker.heading_deg is not None:
@@ -97,6 +101,20 @@ def _camera(marker: Marker, extent_m: float) -> str:
             f'transform="rotate({marker.heading_deg:.3f})" fill-opacity="0.35"/>'
         )
     return (
-        f'<g class="camera" transform="translate({marker.x_m:.4f} {-marker.y_m:.4f})" fill="#c0392b">{wedge}'
-        f'<circle r="{radius:.4f}"/></g>'
+        f'<g class="camera" transform="translate({marker.x_m:.4f} {-marker.y_m:.4f})" fill="#c0392b">'
+        f'{_ellipse(marker.covariance_m2, extent_m)}{wedge}<circle r="{radius:.4f}"/></g>'
+    )
+
+
+def _ellipse(covariance_m2: tuple[float, float, float] | None, extent_m: float) -> str:
+    if covariance_m2 is None:
+        return ""
+    xx, xy, yy = covariance_m2
+    variance, axes = np.linalg.eigh([[xx, xy], [xy, yy]])
+    minor_m, major_m = _ELLIPSE_STDS * np.sqrt(np.maximum(variance, 0.0))
+    # The y axis of the drawing points down, so angles from +x turn the other way.
+    angle_deg = -math.degrees(math.atan2(axes[1, 1], axes[0, 1]))
+    return (
+        f'<ellipse rx="{major_m:.4f}" ry="{minor_m:.4f}" transform="rotate({angle_deg:.3f})" fill-opacity="0.2" '
+        f'stroke="#c0392b" stroke-width="{extent_m / 500:.4f}"/>'
     )

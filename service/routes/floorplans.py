@@ -9,6 +9,7 @@ from contextlib import suppress
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Query, Request, Response, status
+from pydantic import Field
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
@@ -45,6 +46,8 @@ from service.uploads import JSON, MULTIPART, UploadLimits, media_type, read_body
 router = APIRouter(prefix="/floorplans", tags=["floor plans"])
 Running = Annotated[Runtime, Depends(runtime_of)]
 
+# Three rounded numbers may be a covariance by so much less.
+_ROUNDED = 1e-3
 _ID = re.compile(r"[0-9a-f]{32}")
 _DOCUMENT: dict[str, Any] = {"$ref": "#/components/schemas/FloorPlanDocument"}
 _UPLOAD = {
@@ -176,6 +179,15 @@ def get_preview(
     heading_deg: Annotated[
         float | None, Query(ge=-360, le=360, allow_inf_nan=False, description="Heading of the marked camera.")
     ] = None,
+    covariance_m2: Annotated[
+        list[Annotated[float, Field(allow_inf_nan=False)]] | None,
+        Query(
+            min_length=3,
+            max_length=3,
+            description="Covariance of the marked position in m², given three times as xx, xy and yy: the ellipse that "
+            "holds 95 % is drawn.",
+        ),
+    ] = None,
 ) -> Response:
     """The plan with the names of its rooms, optionally with a camera drawn in; one SVG unit is one metre."""
     if (x_m is None) != (y_m is None):
@@ -183,7 +195,7 @@ def get_preview(
     record = stored_plan(floorplan_id, runtime)
     marker = None
     if x_m is not None and y_m is not None:
-        marker = Marker(x_m=x_m, y_m=y_m, heading_deg=heading_deg)
+        marker = Marker(x_m=x_m, y_m=y_m, heading_deg=heading_deg, covariance_m2=_covariance(covariance_m2))
     return Response(
         plan_svg(record.plan, marker),
         media_type="image/svg+xml",
@@ -204,6 +216,22 @@ def get_preview(
 def get_mesh(floorplan_id: str, runtime: Running) -> Response:
     """Floor, walls and ceiling of every room as binary glTF, in metres and y-up."""
     return Response(plan_glb(stored_plan(floorplan_id, runtime).plan), media_type="model/gltf-binary")
+
+
+def _covariance(given: list[float] | None) -> tuple[float, float, float] | None:
+    """Three numbers as (xx, xy, yy).
+
+    Raises:
+        InvalidRequestError: no covariance has these.
+    """
+    if given is None:
+        return None
+    xx, xy, yy = given
+    if xx < 0.0 or yy < 0.0 or xy**2 > xx * yy * (1.0 + _ROUNDED):
+        raise InvalidRequestError(
+            [("covariance_m2", f"is {xx:g}, {xy:g}, {yy:g}: xx and yy must not be negative, nor xy² above xx·yy")]
+        )
+    return xx, xy, yy
 
 
 def stored_plan(floorplan_id: str, runtime: Runtime) -> PlanRecord:

@@ -27,8 +27,10 @@ function showPreview(answer) {
   element("preview").hidden = !id;
   element("answer").hidden = !answer;
   if (!id) return;
-  const marker = answer ? new URLSearchParams({
-    x_m: answer.position.x_m, y_m: answer.position.y_m, heading_deg: answer.heading_deg }) : "";
+  const marker = new URLSearchParams(answer ? {
+    x_m: answer.position.x_m, y_m: answer.position.y_m, heading_deg: answer.heading_deg } : {});
+  const [[xx, xy], [, yy]] = answer?.covariance_m2 ?? [[], []];
+  if (xx !== undefined) [xx, xy, yy].forEach((value) => marker.append("covariance_m2", value));
   element("preview").src = `/floorplans/${encodeURIComponent(id)}/preview.svg?${marker}`;
   if (answer) element("answer").textContent = JSON.stringify(answer, null, 2);
 }
@@ -60,7 +62,8 @@ element("query").addEventListener("submit", (event) => {
     showPreview(answer);
     const { x_m, y_m } = answer.position;
     const sure = answer.confidence === null ? "" : `, confidence ${Math.round(100 * answer.confidence)} %`;
-    say(`${answer.room}: x ${x_m.toFixed(2)} m, y ${y_m.toFixed(2)} m, heading ${answer.heading_deg.toFixed(1)}°${sure}`);
+    const turn = answer.heading_std_deg === null ? "" : ` ± ${answer.heading_std_deg.toFixed(1)}`;
+    say(`${answer.room}: x ${x_m.toFixed(2)} m, y ${y_m.toFixed(2)} m, heading ${answer.heading_deg.toFixed(1)}${turn}°${sure}`);
   });
 });
 

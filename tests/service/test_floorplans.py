@@ -150,6 +150,11 @@ def test_preview_and_mesh_are_served_as_what_they_are(client: httpx.Client) -> N
     mesh = client.get(f"/floorplans/{plan_id}/mesh.glb")
     assert mesh.headers["content-type"] == "model/gltf-binary"
     assert trimesh.load(io.BytesIO(mesh.content), file_type="glb")
+    sure = {"x_m": 1, "y_m": 2, "covariance_m2": [0.04, 0.01, 0.09]}
+    assert "<ellipse" in client.get(f"/floorplans/{plan_id}/preview.svg", params=sure).text
+    for numbers in ([0.04, 0.01], [-0.04, 0.0, 0.09], [0.04, 0.1, 0.09]):
+        wrong = client.get(f"/floorplans/{plan_id}/preview.svg", params=sure | {"covariance_m2": numbers})
+        assert assert_problem(wrong, 422, "invalid-request")["errors"][0]["field"].startswith("covariance_m2")
     half = client.get(f"/floorplans/{plan_id}/preview.svg", params={"x_m": 1})
     assert_problem(half, 422, "invalid-request")
 

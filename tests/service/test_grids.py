@@ -50,6 +50,8 @@ def test_chunks_make_the_same_grid_as_the_core_does_at_once(store: Store, encode
     expected = build_grid(FloorPlan.from_dict(FLAT), encoders, step_m=0.5, camera_height_m=1.5)
     np.testing.assert_array_equal(computed.poses.position_m, expected.poses.position_m)
     np.testing.assert_allclose(computed.latents, expected.latents, atol=1e-5)
+    np.testing.assert_array_equal(computed.profile_m, expected.profile_m)
+    assert computed.profile_m.dtype == np.float32
 
 
 def test_asking_twice_computes_once(store: Store, encoders: Encoders) -> None:
@@ -68,6 +70,9 @@ def test_the_cache_never_holds_more_than_its_limit(store: Store, encoders: Encod
     for height_m in (1.5, 1.6, 1.7):
         grids.compute(grids.key("p", height_m)).result(30.0)
         assert grids._cache.bytes <= cache_bytes
+        kept = grids._cache._grids.values()
+        arrays = [a for g in kept for a in (g.latents, g.profile_m, g.poses.position_m, g.poses.room_index)]
+        assert grids._cache.bytes == sum(array.nbytes for array in arrays)
     # What fell out of memory is still in the store.
     assert all(grids.find(grids.key("p", height_m)) is not None for height_m in (1.5, 1.6, 1.7))
     grids.close()

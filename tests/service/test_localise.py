@@ -17,9 +17,15 @@ import numpy as np
 import pytest
 from shapely import Point
 
-from lalaloc_core.bundle import Bundle, ConfidenceModel, write_manifest
+from lalaloc_core.bundle import Bundle, ConfidenceModel, LogisticModel, write_manifest
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise import pipeline
+from lalaloc_core.localise.confidence import Signals
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.images import read_panorama
+from lalaloc_core.localise.retrieval import build_grid
 from service.schemas import TimingsAnswer
+from service.settings import Settings
 from tests.service.conftest import FLAT, StartApp, assert_problem, encode_picture, localise, upload, wait_for
 
 # Large enough that its grid takes a while, small enough for the default limits.
@@ -61,11 +67,12 @@ def test_an_answer_is_a_place_in_the_plan_by_the_stage_asked_for(
 def test_candidates_are_distinct_best_first_and_the_first_is_the_answer(
     client: httpx.Client, flat: str, panorama: bytes
 ) -> None:
-    answer = localise(client, flat, panorama, refine="vdr", top_k=10).json()
+    answer = localise(client, flat, panorama, refine="none", top_k=10).json()
     candidates = answer["candidates"]
     assert 2 <= len(candidates) <= 10
-    distances = [candidate["latent_distance"] for candidate in candidates]
-    assert distances == sorted(distances)
+    costs = [candidate["cost"] for candidate in candidates]
+    assert costs == sorted(costs)
+    assert costs[0] < costs[-1]
     positions = np.array([[c["position"]["x_m"], c["position"]["y_m"]] for c in candidates])
     gaps = np.linalg.norm(positions[:, None] - positions[None], axis=-1) + 10.0 * np.eye(len(positions))
     assert gaps.min() >= 1.0 - 1e-3
@@ -111,6 +118,10 @@ BAD_FIELDS = {
     "too many candidates": ({"top_k": "11"}, "top_k", "10"),
     "half a candidate": ({"top_k": "2.5"}, "top_k", "2.5"),
     "unknown stage": ({"refine": "magic"}, "refine", "'lpo'"),
+    "tolerance without heading": ({"heading_tolerance_deg": "5"}, "heading_tolerance_deg", "heading_deg"),
+    "tolerance negative": ({"heading_deg": "1", "heading_tolerance_deg": "-1"}, "heading_tolerance_deg", "0"),
+    "tolerance too large": ({"heading_deg": "1", "heading_tolerance_deg": "46"}, "heading_tolerance_deg", "45"),
+    "tolerance not a number": ({"heading_deg": "1", "heading_tolerance_deg": "nan"}, "heading_tolerance_deg", "finite"),
     "camera in the floor": ({"camera_height_m": "0"}, "camera_height_m", "greater than 0"),
     "camera height not a number": ({"camera_height_m": "nan"}, "camera_height_m", "finite"),
     "unknown field": ({"headng_deg": "90"}, "headng_deg", "heading_deg"),
@@ -130,7 +141,21 @@ def test_a_bad_field_is_refused_by_name_value_and_limit(
 
 
 def test_an_empty_optional_field_counts_as_left_out(client: httpx.Client, flat: str, panorama: bytes) -> None:
-    assert localise(client, flat, panorama, refine="none", heading_deg="", top_k="").status_code == 200
+    empty = localise(client, flat, panorama, refine="none", heading_deg="", heading_tolerance_deg="", top_k="")
+    assert empty.status_code == 200
+
+
+def test_a_heading_is_searched_for_within_its_tolerance(client: httpx.Client, flat: str, panorama: bytes) -> None:
+    def headings(**fields: Any) -> np.ndarray:
+        candidates = localise(client, flat, panorama, refine="none", top_k=10, heading_deg=30, **fields)
+        found = np.array([candidate["heading_deg"] for candidate in candidates.json()["candidates"]])
+        return np.abs((found - 30.0 + 180.0) % 360.0 - 180.0)
+
+    assert headings().max() < 1e-2
+    assert headings(heading_tolerance_deg=0).max() < 1e-2
+    # The tiny model's ring has sectors of 22.5°.
+    searched = headings(heading_tolerance_deg=25)
+    assert 1.0 < searched.max() <= 45.01
 
 
 def test_every_part_is_needed(client: httpx.Client, flat: str, panorama: bytes) -> None:
@@ -201,24 +226,46 @@ def test_another_camera_height_is_searched_at_that_height(client: httpx.Client, 
     assert "2.4 m" in above["detail"]
 
 
-def test_confidence_is_that_of_the_best_two_however_many_are_asked_for(
-    start_app: StartApp, tiny_bundle: Path, tmp_path: Path, panorama: bytes
+@pytest.mark.parametrize("heading", [None, 30.0])
+def test_confidence_is_that_of_the_stage_s_signals_however_many_are_asked_for(
+    start_app: StartApp, tiny_bundle: Path, tmp_path: Path, panorama: bytes, heading: float | None
 ) -> None:
     copy = tmp_path / "bundle"
     shutil.copytree(tiny_bundle, copy)
-    model = ConfidenceModel(bias=2.0, distance=-1.5, margin=3.0, no_rival_margin=1.0)
+    known = LogisticModel(bias=0.4, log_odds=0.3, cost=-1.5, uncertainty=-0.2, latent_distance=-0.5)
+    model = ConfidenceModel(
+        known_heading={"retrieval": known}, searched_heading={"retrieval": dataclasses.replace(known, bias=0.9)}
+    )
     write_manifest(copy, dataclasses.replace(Bundle.open(copy).manifest, confidence=model))
+    fields = {} if heading is None else {"heading_deg": heading}
     with start_app(tmp_path / "data", bundle=copy) as client:
         plan_id = upload(client)
-        answers = [localise(client, plan_id, panorama, refine="none", top_k=k).json() for k in (1, 2, 10)]
-    distances = [candidate["latent_distance"] for candidate in answers[-1]["candidates"]]
-    expected = model.probability(distances)
+        answers = [localise(client, plan_id, panorama, refine="none", top_k=k, **fields).json() for k in (1, 2, 10)]
+        unfitted = localise(client, plan_id, panorama, refine="vdr", **fields).json()
+    signals = _retrieval_signals(tiny_bundle, panorama, heading)
+    expected = model.probability("retrieval", dataclasses.asdict(signals), heading_known=heading is not None)
+    assert expected is not None
     assert 0.0 < expected < 1.0
-    assert [answer["confidence"] for answer in answers] == pytest.approx([expected] * 3)
+    assert [answer["confidence"] for answer in answers] == pytest.approx([expected] * 3, abs=1e-4)
+    assert unfitted["confidence"] is None
+
+
+def _retrieval_signals(bundle: Path, content: bytes, heading_deg: float | None) -> Signals:
+    """What the core says of a query of the flat, as far as the first stage."""
+    encoders = Encoders(Bundle.open(bundle), threads=1)
+    manifest, limits = encoders.manifest, Settings().panorama_limits
+    image = read_panorama(content, height=manifest.image_height, width=manifest.image_width, limits=limits)
+    query = encoders.query(image, None if heading_deg is None else np.radians(heading_deg), 1.5)
+    plan = FloorPlan.from_dict(FLAT)
+    grid = build_grid(plan, encoders, step_m=Settings().grid_step_m, camera_height_m=1.5)
+    return pipeline.localise(plan, grid, encoders, query, refine="none").signals["retrieval"]
 
 
 def test_a_model_without_confidence_says_null(client: httpx.Client, flat: str, panorama: bytes) -> None:
-    assert localise(client, flat, panorama, refine="none").json()["confidence"] is None
+    answer = localise(client, flat, panorama, refine="none").json()
+    assert answer["confidence"] is None
+    assert answer["covariance_m2"] is None
+    assert answer["heading_std_deg"] is None
 
 
 def test_a_plan_still_preparing_is_waited_for(client: httpx.Client, panorama: bytes) -> None:

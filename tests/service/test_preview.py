@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import example, given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from lalaloc_core.errors import InvalidFloorPlanError
@@ -43,6 +43,7 @@ def test_the_drawing_has_every_room_at_its_place_with_y_pointing_up() -> None:
 @given(st.text(min_size=1, max_size=200))
 @example("<b>&\"'")
 @example("\ufffe \uffff")
+@settings(deadline=None)
 def test_a_name_that_is_accepted_makes_well_formed_svg(name: str) -> None:
     document = {"name": name, "ceiling_height_m": 2.5, "rooms": [{"name": name, "polygon": [[0, 0], [3, 0], [0, 3]]}]}
     try:
@@ -86,3 +87,17 @@ def test_floor_ceiling_and_walls_are_separate_and_named() -> None:
     assert math.isclose(areas["1/kitchen/ceiling"], 12.0, rel_tol=1e-5)
     assert math.isclose(areas["1/kitchen/wall"], 14.0 * 2.4, rel_tol=1e-5)
     assert len(areas) == 6
+
+
+def test_the_ellipse_of_a_covariance_is_drawn_along_its_axes_with_y_pointing_up() -> None:
+    # Long by 0.4 m (one standard deviation) along 30° from +x towards +y, and 0.1 m across.
+    along = np.array([math.cos(math.radians(30.0)), math.sin(math.radians(30.0))])
+    covariance = 0.01 * np.eye(2) + (0.16 - 0.01) * np.outer(along, along)
+    marker = Marker(x_m=1.5, y_m=2.0, covariance_m2=(covariance[0, 0], covariance[0, 1], covariance[1, 1]))
+    root = ElementTree.fromstring(plan_svg(FloorPlan.from_dict(FLAT), marker))
+    ellipse = next(root.iter(f"{SVG}ellipse"))
+    # 95 % of a normal distribution in the plane lie within √5.991 standard deviations.
+    assert float(ellipse.attrib["rx"]) == pytest.approx(math.sqrt(5.991) * 0.4, abs=1e-3)
+    assert float(ellipse.attrib["ry"]) == pytest.approx(math.sqrt(5.991) * 0.1, abs=1e-3)
+    turn = float(ellipse.attrib["transform"].removeprefix("rotate(").removesuffix(")"))
+    assert turn % 180.0 == pytest.approx(-30.0 % 180.0, abs=1e-2)

@@ -56,22 +56,26 @@ def _all_warm(request: pytest.FixtureRequest) -> None:
 
 
 @pytest.fixture
-def job() -> RefinementJob:
-    return warm_up_job(128, optimise_heading=True)
+def job(bundle: Bundle) -> RefinementJob:
+    return warm_up_job(bundle.manifest, optimise_heading=True, by_profile=False)
 
 
 def _workers() -> list[int]:
     return [child.pid for child in multiprocessing.active_children() if child.pid and "lpo" in child.name]
 
 
-def test_a_worker_gives_what_the_optimiser_gives(pool: LpoPool, bundle: Bundle, job: RefinementJob) -> None:
+@pytest.mark.parametrize("by_profile", [False, True])
+def test_a_worker_gives_what_the_optimiser_gives(pool: LpoPool, bundle: Bundle, by_profile: bool) -> None:
     from lalaloc_core.localise.optimise import LatentPoseOptimiser
 
+    job = warm_up_job(bundle.manifest, optimise_heading=True, by_profile=by_profile)
     expected = LatentPoseOptimiser.from_bundle(bundle).refine(job)
     result = pool.refine(job, 20.0)
     assert result is not None
     np.testing.assert_allclose(result.position_m, expected.position_m, atol=1e-4)
     np.testing.assert_allclose(result.latent_distance, expected.latent_distance, atol=1e-4)
+    np.testing.assert_allclose(result.cost, expected.cost, atol=1e-4)
+    np.testing.assert_allclose(result.information, expected.information, rtol=1e-2, atol=1e-2)
 
 
 def test_many_callers_each_get_their_own_answer(pool: LpoPool, job: RefinementJob) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import sqlite3
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -41,7 +43,8 @@ def _key(plan_id: str, **changes: object) -> GridKey:
 def _grid(seed: int = 0, count: int = 7) -> LatentGrid:
     rng = np.random.default_rng(seed)
     poses = PoseSet(rng.normal(size=(count, 2)), rng.integers(0, 2, count))
-    return LatentGrid(poses, rng.normal(size=(count, 128)).astype(np.float32), 0.5, 1.5)
+    latents, profile_m = rng.normal(size=(count, 128)), rng.uniform(0.3, 6.0, (count, 32))
+    return LatentGrid(poses, latents.astype(np.float32), profile_m.astype(np.float32), 0.5, 1.5)
 
 
 def _put(store: Store, key: GridKey, grid: LatentGrid, keep: int = 8) -> bool:
@@ -67,6 +70,8 @@ def test_a_grid_comes_back_exactly(store: Store) -> None:
     found = store.grid(key)
     assert found is not None
     np.testing.assert_array_equal(found.latents, grid.latents)
+    np.testing.assert_array_equal(found.profile_m, grid.profile_m)
+    assert found.profile_m.dtype == np.float32
     np.testing.assert_array_equal(found.poses.position_m, grid.poses.position_m)
     np.testing.assert_array_equal(found.poses.room_index, grid.poses.room_index)
     assert (found.step_m, found.camera_height_m) == (0.5, 1.5)
@@ -127,14 +132,48 @@ def test_the_number_of_plans_is_limited(store: Store) -> None:
     assert store.plan_count() == 1
 
 
-def test_damaged_arrays_count_as_not_stored(store: Store, tmp_path: Path) -> None:
-    import sqlite3
+def _archive(**arrays: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    np.savez(buffer, **arrays)  # pyright: ignore[reportArgumentType]
+    return buffer.getvalue()
 
+
+@pytest.mark.parametrize(
+    "arrays",
+    [
+        b"not an archive",
+        _archive(position_m=np.zeros((3, 2)), room_index=np.zeros(3), latents=np.zeros((3, 128))),
+        _archive(
+            position_m=np.zeros((3, 2)), room_index=np.zeros(3), latents=np.zeros((3, 128)), profile_m=np.ones((2, 32))
+        ),
+    ],
+    ids=["not an archive", "no profiles", "too few profiles"],
+)
+def test_damaged_or_incomplete_arrays_count_as_not_stored(store: Store, tmp_path: Path, arrays: bytes) -> None:
     key = _key(_add(store))
     _put(store, key, _grid())
     with sqlite3.connect(tmp_path / "test.sqlite3") as raw:
-        raw.execute("UPDATE latent_grids SET arrays = ?", (b"not an archive",))
+        raw.execute("UPDATE latent_grids_2 SET arrays = ?", (arrays,))
     assert store.grid(key) is None
+
+
+def test_grids_of_an_older_format_are_dropped_and_plans_are_kept(tmp_path: Path) -> None:
+    older = Store(_url(tmp_path))
+    plan_id = _add(older)
+    _put(older, _key(plan_id), _grid())
+    older.close()
+    with sqlite3.connect(tmp_path / "test.sqlite3") as raw:
+        raw.execute("ALTER TABLE latent_grids_2 RENAME TO latent_grids")
+    store = Store(_url(tmp_path))
+    assert store.plan(plan_id) is not None
+    # Not counted among the stored ones either, so that the service computes it again when it starts.
+    assert store.grid_poses("m1", 0.5) == {}
+    assert store.grid(_key(plan_id)) is None
+    assert _put(store, _key(plan_id), _grid())
+    assert store.grid(_key(plan_id)) is not None
+    store.close()
+    with sqlite3.connect(tmp_path / "test.sqlite3") as raw:
+        assert raw.execute("SELECT name FROM sqlite_master WHERE name = 'latent_grids'").fetchall() == []
 
 
 def test_sqlite_runs_with_foreign_keys_and_a_write_ahead_log(store: Store) -> None:

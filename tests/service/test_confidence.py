@@ -1,0 +1,174 @@
+"""What the shipped model says of how sure it is: of photographs of the plan's home, and of what is none.
+
+Rendered homes of the validation split, beyond those that confidence is fitted on.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+from PIL import Image
+
+from lalaloc_core.bundle import Bundle
+from lalaloc_core.data.generated import GeneratedScenes
+from tests.service.conftest import StartApp, localise, upload, wait_for
+
+BUNDLE = Path(__file__).parents[2] / "models" / "default"
+HOMES = 12
+FIRST_HOME = 1000
+HEIGHT, WIDTH = 128, 256
+# A few degrees: what a compass is off by.
+TOLERANCE_DEG = 5.0
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A rendered photograph of a home."""
+
+    plan: dict[str, Any]
+    picture: bytes
+    position_m: np.ndarray
+    heading_deg: float
+    camera_height_m: float
+
+
+@pytest.fixture(scope="module")
+def shots() -> list[Shot]:
+    """One photograph of each of some homes."""
+    source = GeneratedScenes(homes=FIRST_HOME + HOMES, shots_per_home=1)
+    found = []
+    for number in range(FIRST_HOME, FIRST_HOME + HOMES):
+        scene = source.load(f"validation-{number:05d}")
+        camera = scene.cameras[0]
+        picture = png(camera.photographs[source.appearances[0]].image(HEIGHT, WIDTH))
+        # With the camera's height as the plan's own, one grid per home is enough.
+        plan = {**scene.plan.to_dict(), "camera_height_m": round(camera.camera_height_m, 2)}
+        height_m = plan["camera_height_m"]
+        found.append(Shot(plan, picture, camera.position_m, np.degrees(camera.heading) % 360.0, height_m))
+    return found
+
+
+@pytest.fixture(scope="module")
+def shipped(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+    """The production app with the bundle that ships, and a worker that is warm."""
+    assert Bundle.open(BUNDLE).manifest.confidence is not None, "calibrate the bundle before it ships"
+    deadlines = {"lpo_deadline_s": 60.0, "request_deadline_s": 90.0}
+    with start_app(tmp_path_factory.mktemp("data"), bundle=BUNDLE, workers=1, **deadlines) as client:
+        client.timeout = 100.0
+        wait_for(lambda: client.get("/readyz").status_code == 200, 120.0)
+        yield client
+
+
+@pytest.fixture(scope="module")
+def homes(shipped: httpx.Client, shots: list[Shot]) -> list[str]:
+    """The homes' plans, ready, in the order of their photographs."""
+    return [upload(shipped, shot.plan) for shot in shots]
+
+
+@pytest.fixture(scope="module", params=["heading given", "heading searched"])
+def given(request: pytest.FixtureRequest) -> bool:
+    return request.param == "heading given"
+
+
+@pytest.fixture(scope="module")
+def right(shipped: httpx.Client, shots: list[Shot], homes: list[str], given: bool) -> list[dict[str, Any]]:
+    """Answers to every photograph in its own home."""
+    pairs = zip(shots, homes, strict=True)
+    return [ask(shipped, home, shot.picture, shot.heading_deg if given else None) for shot, home in pairs]
+
+
+def png(image: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+def blank(value: int) -> bytes:
+    """A wall right before the camera."""
+    return png(np.full((HEIGHT, WIDTH, 3), value, np.uint8))
+
+
+def outdoors(sky: tuple[int, int, int], ground: tuple[int, int, int]) -> bytes:
+    """A plain under the sky, paler towards the horizon, with grain."""
+    up = np.linspace(1.0, -1.0, HEIGHT)[:, None, None]
+    colours = np.where(up > 0.0, np.array(sky) + 60.0 * (1.0 - up), np.array(ground) * (0.7 - 0.3 * up))
+    grain = np.random.default_rng(0).normal(0.0, 6.0, (HEIGHT, WIDTH, 3))
+    return png(np.clip(colours + grain, 0.0, 255.0).astype(np.uint8))
+
+
+PICTURES_OF_NO_ROOM = {
+    "grey": blank(128),
+    "white": blank(245),
+    "meadow": outdoors((80, 130, 190), (90, 120, 60)),
+    "beach": outdoors((120, 150, 180), (190, 170, 120)),
+}
+
+
+def ask(client: httpx.Client, plan_id: str, picture: bytes, heading_deg: float | None, **fields: Any) -> dict[str, Any]:
+    """An answer of the last stage."""
+    if heading_deg is not None:
+        fields["heading_deg"] = heading_deg
+    response = localise(client, plan_id, picture, **fields)
+    assert response.status_code == 200, response.text
+    answer = response.json()
+    assert answer["stage"] == "lpo"
+    return answer
+
+
+def confidences(answers: list[dict[str, Any]]) -> np.ndarray:
+    return np.array([answer["confidence"] for answer in answers])
+
+
+def test_a_photograph_of_the_home_is_trusted(right: list[dict[str, Any]]) -> None:
+    assert np.median(confidences(right)) > 0.7
+
+
+@pytest.mark.parametrize("picture", PICTURES_OF_NO_ROOM.values(), ids=PICTURES_OF_NO_ROOM.keys())
+def test_a_picture_of_no_room_is_not(shipped: httpx.Client, homes: list[str], given: bool, picture: bytes) -> None:
+    answers = [ask(shipped, home, picture, 0.0 if given else None) for home in homes[:4]]
+    assert confidences(answers).max() < 0.3
+
+
+def test_a_photograph_of_another_home_is_trusted_less_than_half_as_much(
+    shipped: httpx.Client, shots: list[Shot], homes: list[str], given: bool, right: list[dict[str, Any]]
+) -> None:
+    pairs = zip(shots, homes[1:] + homes[:1], strict=True)
+    foreign = [ask(shipped, home, shot.picture, shot.heading_deg if given else None) for shot, home in pairs]
+    assert confidences(foreign).mean() < 0.5 * confidences(right).mean()
+
+
+def test_an_answer_tells_its_spread(right: list[dict[str, Any]], given: bool) -> None:
+    for answer in right:
+        covariance = np.array(answer["covariance_m2"])
+        np.testing.assert_array_equal(covariance, covariance.T)
+        assert np.linalg.eigvalsh(covariance).min() >= 0.0
+        assert (answer["heading_std_deg"] is None) == given
+    assert np.median([np.sqrt(np.trace(answer["covariance_m2"])) for answer in right]) < 0.5
+
+
+def test_right_answers_lie_within_their_spread(shots: list[Shot], right: list[dict[str, Any]]) -> None:
+    distances = []
+    for shot, answer in zip(shots, right, strict=True):
+        offset = np.array([answer["position"]["x_m"], answer["position"]["y_m"]]) - shot.position_m
+        if np.hypot(*offset) < 1.0:
+            distances.append(offset @ np.linalg.solve(np.array(answer["covariance_m2"]), offset))
+    assert len(distances) >= HOMES // 2
+    # Half of them should be below 1.4, nineteen in twenty below 6; a handful of answers tells no more than the order.
+    assert 0.15 < np.median(distances) < 10.0
+
+
+def test_a_heading_of_a_compass_is_corrected(shipped: httpx.Client, shots: list[Shot], homes: list[str]) -> None:
+    off = []
+    for shot, home in list(zip(shots, homes, strict=True))[:6]:
+        wrong_deg = shot.heading_deg + 0.8 * TOLERANCE_DEG
+        answer = ask(shipped, home, shot.picture, wrong_deg % 360.0, heading_tolerance_deg=TOLERANCE_DEG)
+        assert answer["heading_std_deg"] > 0.0
+        off.append(abs((answer["heading_deg"] - shot.heading_deg + 180.0) % 360.0 - 180.0))
+    assert np.median(off) < 0.4 * TOLERANCE_DEG
