@@ -1,4 +1,4 @@
-"""`lalaloc evaluate`, `score`, `report` and `calibrate`."""
+"""`lalaloc evaluate`, `score`, `report`, `worst` and `calibrate`."""
 
 from __future__ import annotations
 
@@ -56,6 +56,12 @@ def add_commands(commands: Any) -> None:
     report.add_argument("--pictures", type=Path, metavar="DIR", help="also write the page's pictures as files")
     report.set_defaults(run=_report)
 
+    worst = commands.add_parser("worst", help="draw the worst queries of a run and count what they have in common")
+    worst.add_argument("folder", type=Path, metavar="RUN")
+    worst.add_argument("--count", type=count, default=100, metavar="N", help="how many (default: %(default)s)")
+    worst.add_argument("--out", type=Path, default=Path("worst"), metavar="FOLDER", help="default: %(default)s")
+    worst.set_defaults(run=_worst)
+
     calibrate = commands.add_parser("calibrate", help="fit a bundle's confidence on generated validation homes")
     calibrate.add_argument("--bundle", type=Path, default=_BUNDLE)
     _generator_arguments(calibrate)
@@ -64,6 +70,12 @@ def add_commands(commands: Any) -> None:
 
 def _data_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--data", type=Path, metavar="DIR", help="a data set; default: generated homes")
+    parser.add_argument(
+        "--generator",
+        choices=("synth", "unfamiliar"),
+        default="synth",
+        help="who draws generated homes: training's generator, or one written apart from it (default: %(default)s)",
+    )
     _generator_arguments(parser)
 
 
@@ -81,6 +93,8 @@ def _evaluate(arguments: argparse.Namespace) -> None:
 
     method, panorama = arguments.method, arguments.kind == "panorama"
     bundle = None if method in ("oracle", "icp") else arguments.bundle
+    if arguments.data is not None and arguments.generator != "synth":
+        raise InvalidInputError(f"--generator {arguments.generator} is for generated homes, not for --data")
     if arguments.refine is not None and method != "lalaloc":
         raise InvalidInputError(f"--refine {arguments.refine} is for method 'lalaloc', not '{method}'")
     info = RunInfo(
@@ -91,7 +105,7 @@ def _evaluate(arguments: argparse.Namespace) -> None:
         split=arguments.split,
         settings={} if arguments.refine is None else {"refine": arguments.refine},
         data=None if arguments.data is None else str(arguments.data),
-        generated=_generated(arguments, arguments.furniture or "full") if arguments.data is None else None,
+        generated=_asked_homes(arguments) if arguments.data is None else None,
         heading_known=arguments.heading == "known",
         grid_step_m=arguments.grid_step,
         limit=arguments.limit,
@@ -123,17 +137,21 @@ def _report(arguments: argparse.Namespace) -> None:
     write_report(arguments.runs, arguments.out, pictures=arguments.pictures)
 
 
+def _worst(arguments: argparse.Namespace) -> None:
+    from lalaloc_core.evaluation.worst import write_worst
+
+    print_json(write_worst(arguments.folder, arguments.out, arguments.count))
+
+
 def _calibrate(arguments: argparse.Namespace) -> None:
     from lalaloc_core.bundle import Bundle
     from lalaloc_core.calibrate import calibrate
-    from lalaloc_core.evaluation.predictions import RunFolder, RunInfo
+    from lalaloc_core.evaluation.predictions import Prediction, RunFolder, RunInfo
     from lalaloc_core.evaluation.run import run_evaluation
 
-    # One model of confidence serves queries with known and with unknown heading, so it is fitted on both.
-    predictions = []
-    for known in (True, False):
+    def answers(known: bool) -> list[Prediction]:
         info = RunInfo(
-            label=f"calibration, heading {'known' if known else 'unknown'}",
+            label=f"calibration, heading {'known' if known else 'searched'}",
             method="lalaloc",
             kind="panorama",
             dataset="generated homes",
@@ -143,13 +161,24 @@ def _calibrate(arguments: argparse.Namespace) -> None:
             bundle=str(arguments.bundle),
         )
         with tempfile.TemporaryDirectory(prefix="lalaloc-run-") as folder:
-            predictions += run_evaluation(RunFolder(Path(folder)), info)
-    description = (
-        f"{len(predictions)} panoramas of {arguments.homes} validation homes, all furniture levels, "
-        "half with known and half with unknown heading"
-    )
-    bundle = calibrate(Bundle.open(arguments.bundle), predictions, description)
-    print_json(bundle.manifest.metrics["validation"])
+            return run_evaluation(RunFolder(Path(folder)), info)
+
+    known, searched = answers(True), answers(False)
+    description = f"{len(known)} panoramas of {arguments.homes} generated validation homes, all furniture levels"
+    bundle = calibrate(Bundle.open(arguments.bundle), known, searched, description)
+    print_json(bundle.manifest.metrics)
+
+
+def _asked_homes(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Arguments of the generator that was asked for, as plain data."""
+    generated = _generated(arguments, arguments.furniture or "full")
+    if arguments.generator == "synth":
+        return generated
+    if arguments.textures is not None:
+        raise InvalidInputError("--textures is for --generator synth; the other paints its own materials")
+    if arguments.split == "train":
+        raise InvalidInputError("--generator unfamiliar has no split 'train', it is for reporting only")
+    return {"generator": arguments.generator} | {name: generated[name] for name in ("homes", "seed", "furniture")}
 
 
 def _generated(arguments: argparse.Namespace, furniture: str | None) -> dict[str, Any]:

@@ -9,14 +9,14 @@ from typing import Any
 
 from lalaloc_core.cli.printing import print_json
 
-_GROUPS = ("rendering", "service", "accuracy", "methods", "datasets")
+_GROUPS = ("rendering", "service", "accuracy", "evidence", "methods", "datasets")
 
 
 def add_commands(commands: Any) -> None:
     """Add this room's commands to the parser."""
     bench = commands.add_parser("bench", help="measure the figures of docs/results.md and print them as JSON")
     bench.add_argument("--bundle", type=Path, default=Path("models/default"))
-    bench.add_argument("--homes", type=int, default=125, help="test homes per accuracy figure, 4 queries each")
+    bench.add_argument("--homes", type=int, default=250, help="test homes per accuracy figure, 4 queries each")
     bench.add_argument("--textures", type=Path, help="folder of material pictures for the test panoramas")
     bench.add_argument("--out", type=Path, help="also write the JSON to this file; with --only, into it")
     bench.add_argument("--only", choices=_GROUPS, action="append", help="a group of figures; again for more")

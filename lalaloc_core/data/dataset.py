@@ -53,6 +53,23 @@ class Photograph(Protocol):
         ...
 
 
+@runtime_checkable
+class Described(Protocol):
+    """A photograph of which it is known what makes it hard, beyond what its appearance tells.
+
+    Attributes:
+        facts: names of what holds for it, such as "open_door" or "near_wall"; worked out when asked for.
+    """
+
+    @property
+    def facts(self) -> frozenset[str]: ...
+
+
+def facts_of_photograph(photograph: Photograph | None) -> frozenset[str]:
+    """What holds for a photograph; nothing where its data set does not tell, or where there is none."""
+    return photograph.facts if isinstance(photograph, Described) else frozenset()
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Camera:
     """A place where photographs were taken.

@@ -6,6 +6,7 @@ queries, because the queries of one scene succeed and fail together.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import json
 from collections.abc import Callable, Sequence
@@ -65,6 +66,16 @@ class ReliabilityBin:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SliceScores:
+    """The answers to those `n` queries for which one fact holds; a query counts in the slice of each of its facts."""
+
+    n: int
+    within_1m: Estimate
+    within_10cm: Estimate
+    median_cm: Estimate
+
+
+@dataclass(frozen=True, kw_only=True)
 class Scores:
     """Figures of one run.
 
@@ -73,6 +84,8 @@ class Scores:
         stages: by stage in order; `final` is the answer, whichever stage gave it.
         calibration_error: expected calibration error of "within 1 m"; None without confidences.
         median_ms: per stage, of the queries that went through it.
+        slices: by fact (`Prediction.facts`), the one with the smallest share within 1 m first; empty where no facts
+            are known.
     """
 
     n: int
@@ -85,6 +98,7 @@ class Scores:
     reliability: tuple[ReliabilityBin, ...] = ()
     median_ms: dict[str, float] = field(default_factory=dict)
     mean_ms: dict[str, float] = field(default_factory=dict)
+    slices: dict[str, SliceScores] = field(default_factory=dict)
 
 
 def score(predictions: Sequence[Prediction], seed: int = 0) -> Scores:
@@ -119,6 +133,7 @@ def score(predictions: Sequence[Prediction], seed: int = 0) -> Scores:
         reliability=reliability,
         median_ms=_timings(predictions, np.median),
         mean_ms=_timings(predictions, np.mean),
+        slices=_slices(bootstrap, predictions),
     )
 
 
@@ -195,6 +210,13 @@ class _Bootstrap:
             float
         )
 
+    def among(self, chosen: Bool[np.ndarray, "n"]) -> _Bootstrap:
+        """The same resamples of some of the queries, without those resamples that hold none of them."""
+        part = copy.copy(self)
+        weights = self._weights[:, chosen]
+        part._weights = weights[weights.any(axis=1)]
+        return part
+
     def mean(self, values: Float[np.ndarray, "n"] | Bool[np.ndarray, "n"]) -> Estimate:
         """Mean, such as a share."""
         total = self._weights.sum(axis=1)
@@ -224,9 +246,8 @@ def _stage_scores(bootstrap: _Bootstrap, predictions: Sequence[Prediction], stag
     heading = _infinite(heading_errors_deg(predictions, stage))
     found = [p.answer if stage is None else p.stages.get(stage) for p in predictions]
     rooms = [f is not None and f.room_index == p.truth.room_index for f, p in zip(found, predictions, strict=True)]
-    median = bootstrap.median(error)
     return StageScores(
-        median_cm=Estimate(value=100.0 * median.value, low=100.0 * median.low, high=100.0 * median.high),
+        median_cm=_centimetres(bootstrap.median(error)),
         within_1cm=bootstrap.mean(error < 0.01),
         within_5cm=bootstrap.mean(error < 0.05),
         within_10cm=bootstrap.mean(error < 0.10),
@@ -235,6 +256,25 @@ def _stage_scores(bootstrap: _Bootstrap, predictions: Sequence[Prediction], stag
         median_heading_error_deg=bootstrap.median(heading),
         heading_within_2deg=bootstrap.mean(heading < 2.0),
     )
+
+
+def _slices(bootstrap: _Bootstrap, predictions: Sequence[Prediction]) -> dict[str, SliceScores]:
+    error = _infinite(position_errors_m(predictions))
+    slices = {}
+    for fact in sorted({fact for prediction in predictions for fact in prediction.facts}):
+        holds = np.array([fact in prediction.facts for prediction in predictions])
+        part, error_m = bootstrap.among(holds), error[holds]
+        slices[fact] = SliceScores(
+            n=len(error_m),
+            within_1m=part.mean(error_m < 1.0),
+            within_10cm=part.mean(error_m < 0.10),
+            median_cm=_centimetres(part.median(error_m)),
+        )
+    return dict(sorted(slices.items(), key=lambda item: item[1].within_1m.value))
+
+
+def _centimetres(metres: Estimate) -> Estimate:
+    return Estimate(value=100.0 * metres.value, low=100.0 * metres.low, high=100.0 * metres.high)
 
 
 def _infinite(errors: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:

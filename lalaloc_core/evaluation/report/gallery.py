@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lalaloc_core.data.dataset import Appearance, Camera, Dataset, Scene
-from lalaloc_core.errors import BundleError, DatasetError, LaLaLocError
-from lalaloc_core.evaluation.building import build_dataset, choose_appearance, require_bundle
+from lalaloc_core.data.dataset import Camera, Scene
+from lalaloc_core.errors import LaLaLocError
+from lalaloc_core.evaluation.building import build_dataset, choose_appearance
 from lalaloc_core.evaluation.failures import Outcome, outcomes
 from lalaloc_core.evaluation.predictions import Prediction, RunInfo
 from lalaloc_core.evaluation.report.pictures import (
@@ -22,13 +22,13 @@ from lalaloc_core.evaluation.report.pictures import (
 )
 from lalaloc_core.evaluation.report.plan import Cells
 from lalaloc_core.evaluation.report.reading import Run
+from lalaloc_core.evaluation.report.reopening import ask_again, find_camera, open_model
 from lalaloc_core.evaluation.score import heading_errors_deg, position_errors_m
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.retrieval import latent_distances
+from lalaloc_core.localise.evidence import latent_distances
 from lalaloc_core.methods.lalaloc import encode, read_image
 from lalaloc_core.methods.method import Question
 from lalaloc_core.methods.similarity import ChamferGrid, true_layout
-from lalaloc_core.sampling import pose_grid
 
 PER_GROUP = 3
 BEST, MEDIAN, WORST, MISALIGNED = "best", "median", "worst", "wrong alignment"
@@ -36,7 +36,6 @@ BEST, MEDIAN, WORST, MISALIGNED = "best", "median", "worst", "wrong alignment"
 _LATENT_METHODS = ("lalaloc", "decode")
 # Cells of the maps; larger in plans that would have more of them than this.
 _CELL_M, _MAX_CELLS = 0.2, 5000
-_SAME_PLACE_M = 1e-3
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -143,8 +142,8 @@ class _Atelier:
             DatasetError: its scene is gone or has changed.
         """
         prediction = self._run.predictions[index]
-        scene, camera = _find(self._dataset, prediction)
-        question = _question(self._run.info, scene, camera, self._appearance)
+        scene, camera = find_camera(self._dataset, prediction)
+        question = ask_again(self._run.info, scene, camera, self._appearance)
         found = prediction.answer
         return Card(
             scene=prediction.scene,
@@ -179,49 +178,10 @@ def _open_encoders(info: RunInfo, left_out: list[str]) -> Encoders | None:
         left_out.append(f"Method “{info.method}” compares no latents, so there is no map of latent distances.")
         return None
     try:
-        bundle = require_bundle(info)
-        if info.model is not None and info.model.get("sha256") not in (None, bundle.sha256):
-            raise BundleError(f"'{info.bundle}' holds another model now, with SHA-256 {bundle.sha256}")
-        return Encoders(bundle)
+        return open_model(info)
     except (LaLaLocError, OSError) as error:
         left_out.append(f"The maps of latent distances are left out, because the model cannot be opened: {error}.")
         return None
-
-
-def _find(dataset: Dataset, prediction: Prediction) -> tuple[Scene, Camera]:
-    """The scene and the camera of a query.
-
-    Raises:
-        DatasetError: they are gone, or the camera stands elsewhere now.
-    """
-    scene = dataset.load(prediction.scene, [])
-    camera = next((one for one in scene.cameras if one.name == prediction.camera), None)
-    if camera is None:
-        raise DatasetError(f"no camera '{prediction.camera}' any more", scene=scene.name)
-    moved_m = float(np.hypot(*(camera.position_m - [prediction.truth.x_m, prediction.truth.y_m])))
-    if moved_m > _SAME_PLACE_M or camera.room_index != prediction.truth.room_index:
-        raise DatasetError(
-            f"camera '{camera.name}' stands {moved_m:.3f} m from where the run saw it: the data set has changed",
-            scene=scene.name,
-        )
-    return scene, camera
-
-
-def _question(info: RunInfo, scene: Scene, camera: Camera, appearance: Appearance) -> Question:
-    """The query as the run asked it.
-
-    Raises:
-        DatasetError: there is no such photograph.
-    """
-    return Question(
-        plan=scene.plan,
-        grid=pose_grid(scene.plan, info.grid_step_m),
-        grid_step_m=info.grid_step_m,
-        camera=camera,
-        kind=info.kind,
-        photograph=scene.photograph(camera, appearance) if info.kind == "panorama" else None,
-        heading_known=info.heading_known,
-    )
 
 
 def _maps(question: Question, encoders: Encoders | None, left_out: list[str]) -> list[DrawnMap]:
@@ -236,7 +196,7 @@ def _maps(question: Question, encoders: Encoders | None, left_out: list[str]) ->
             left_out.append(f"A map of latent distances is left out: {error}.")
         else:
             heading = np.full(len(cells.poses), query.frame_heading)
-            latents = encoders.poses(plan, cells.poses, heading, camera.camera_height_m)
+            latents, _ = encoders.poses(plan, cells.poses, heading, camera.camera_height_m)
             # At the best hypothesis of how the camera was turned.
             distances = latent_distances(latents, query.latents).min(axis=0)
             maps.append(DrawnMap("latent distance", "latent distance (log scale)", cells, distances))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,6 +51,16 @@ class Picture:
 
 
 @dataclass(frozen=True, eq=False)
+class Stroke:
+    """Lines of pixels (x, y) in one colour, `width` pixels broad, on a dark edge of `edge_width`."""
+
+    lines: Sequence[Float[np.ndarray, "n 2"]]
+    colour: str
+    width: float
+    edge_width: float
+
+
+@dataclass(frozen=True, eq=False)
 class DrawnMap:
     """Distances of `cells.poses`, with the words that go with them."""
 
@@ -64,24 +75,30 @@ def draw_panorama(
 ) -> Picture:
     """A panorama with the wall-floor and wall-ceiling lines of the true pose's layout, and of the found one's."""
     height, width, _ = image.shape
-    large = Image.fromarray(image).resize((width * _OVERSAMPLING, height * _OVERSAMPLING), Image.Resampling.BICUBIC)
-    draw = ImageDraw.Draw(large)
     # The truth is broader and lies below, so that both show where they agree.
-    for pose, colour, stroke, edge in ((truth, TRUE_COLOUR, 5, 7), (found, FOUND_COLOUR, 2, 3)):
-        if pose is None:
-            continue
-        lines = [
-            [tuple(point) for point in line * _OVERSAMPLING]
-            for line in layout_lines(plan, pose, camera_height_m, height, width)
-        ]
-        for line_colour, line_width in ((_EDGE, edge), (colour, stroke)):
-            for line in lines:
-                draw.line(line, fill=line_colour, width=line_width * _OVERSAMPLING, joint="curve")
+    strokes = [
+        Stroke(layout_lines(plan, pose, camera_height_m, height, width), colour, line_width, edge_width)
+        for pose, colour, line_width, edge_width in ((truth, TRUE_COLOUR, 5.0, 7.0), (found, FOUND_COLOUR, 2.0, 3.0))
+        if pose is not None
+    ]
     buffer = io.BytesIO()
-    large.resize((width, height), Image.Resampling.LANCZOS).save(buffer, "JPEG", quality=_JPEG_QUALITY, optimize=True)
+    draw_strokes(image, strokes).save(buffer, "JPEG", quality=_JPEG_QUALITY, optimize=True)
     what = "the true layout" if found is None else "the true and the found layout"
     alt = f"Panorama with the outlines of {what} drawn over it"
     return Picture(name="panorama", content=buffer.getvalue(), kind="jpeg", width=width, height=height, alt=alt)
+
+
+def draw_strokes(image: UInt8[np.ndarray, "h w 3"], strokes: Sequence[Stroke]) -> Image.Image:
+    """A picture with lines over it, the last ones on top."""
+    height, width, _ = image.shape
+    large = Image.fromarray(image).resize((width * _OVERSAMPLING, height * _OVERSAMPLING), Image.Resampling.BICUBIC)
+    draw = ImageDraw.Draw(large)
+    for stroke in strokes:
+        lines = [[tuple(point) for point in line * _OVERSAMPLING] for line in stroke.lines]
+        for line_colour, line_width in ((_EDGE, stroke.edge_width), (stroke.colour, stroke.width)):
+            for line in lines:
+                draw.line(line, fill=line_colour, width=round(line_width * _OVERSAMPLING), joint="curve")
+    return large.resize((width, height), Image.Resampling.LANCZOS)
 
 
 def layout_lines(
@@ -90,12 +107,14 @@ def layout_lines(
     """Where the floor and the ceiling of a pose's room meet its walls, as pixels (x, y) of its panorama."""
     position_m, heading = np.array([[pose.x_m, pose.y_m]]), np.array([heading_from_degrees(pose.heading_deg)])
     profile = wall_profile(position_m, heading, plan.walls_m[[pose.room_index]], width)[0]
-    x = np.arange(width) + 0.5
     over_floor, under_ceiling = camera_height_m, float(plan.ceiling_heights_m[pose.room_index]) - camera_height_m
-    return [
-        np.stack([x, (0.5 - np.arctan2(rise, profile) / np.pi) * height], axis=1)
-        for rise in (-over_floor, under_ceiling)
-    ]
+    return [wall_line(profile, rise_m, height) for rise_m in (-over_floor, under_ceiling)]
+
+
+def wall_line(profile_m: Float[np.ndarray, "w"], rise_m: float, height: int) -> Float[np.ndarray, "w 2"]:
+    """Where the walls of a profile pass a level `rise_m` above the camera, as pixels (x, y) of a panorama."""
+    x = np.arange(len(profile_m)) + 0.5
+    return np.stack([x, (0.5 - np.arctan2(rise_m, profile_m) / np.pi) * height], axis=1)
 
 
 def draw_map(plan: FloorPlan, drawn: DrawnMap, truth: Pose, found: Pose | None) -> Picture:

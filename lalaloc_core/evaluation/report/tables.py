@@ -12,7 +12,7 @@ from lalaloc_core.evaluation.failures import Outcome, count_outcomes
 from lalaloc_core.evaluation.report.charts import curves
 from lalaloc_core.evaluation.report.reading import Run
 from lalaloc_core.evaluation.report.times import stage_times
-from lalaloc_core.evaluation.score import Estimate, StageScores
+from lalaloc_core.evaluation.score import Estimate, SliceScores, StageScores
 
 CURVE_POINTS_M = (0.01, 0.05, 0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 20.0)
 METRICS = ("median", "< 1 cm", "< 5 cm", "< 10 cm", "< 1 m", "right room", "heading")
@@ -74,6 +74,26 @@ def outcome_rows(runs: Sequence[Run]) -> list[Row]:
             counts = count_outcomes(run.predictions, stage)
             cells = tuple(Cell(str(counts[kind]), percent(counts[kind] / len(run.predictions))) for kind in Outcome)
             rows.append(Row(run=run.name, part=part, cells=cells, strong=stage is None))
+    return rows
+
+
+def slice_rows(runs: Sequence[Run]) -> list[Row]:
+    """Per run with known facts one row per fact, the worst first, and all queries beside them."""
+    rows = []
+    for run in runs:
+        if run.scores is None or not run.scores.slices:
+            continue
+        parts: dict[str, SliceScores | StageScores] = {**run.scores.slices, "all queries": run.scores.final}
+        for name, figures in parts.items():
+            count = figures.n if isinstance(figures, SliceScores) else run.scores.n
+            cells = (
+                Cell(str(count), percent(count / run.scores.n)),
+                _share(figures.within_1m),
+                _share(figures.within_10cm),
+                _median(figures.median_cm, " cm"),
+            )
+            strong = isinstance(figures, StageScores)
+            rows.append(Row(run=run.name, part=name.replace("_", " "), cells=cells, strong=strong))
     return rows
 
 

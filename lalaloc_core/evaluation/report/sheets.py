@@ -1,0 +1,57 @@
+"""Contact sheets: many small pictures on one page, each with a few words below it."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from matplotlib.font_manager import findfont
+from PIL import Image, ImageDraw, ImageFont
+
+COLUMNS, ROWS = 4, 5
+PER_SHEET = COLUMNS * ROWS
+# A panorama this large shows a door, and four side by side still fit on a screen.
+PICTURE_HEIGHT, PICTURE_WIDTH = 192, 384
+_TEXT_LINES, _LINE = 4, 15
+_FONT_SIZE, _CHARACTERS = 12, 58
+_GAP, _HEADER = 8, 26
+_PAPER, _INK = "white", "#20242c"
+
+
+@dataclass(frozen=True, eq=False)
+class Thumbnail:
+    """A picture of `PICTURE_HEIGHT` x `PICTURE_WIDTH` and the lines below it; what does not fit is cut."""
+
+    picture: Image.Image
+    caption: Sequence[str]
+
+
+def draw_sheet(title: str, key: Mapping[str, str], thumbnails: Sequence[Thumbnail]) -> Image.Image:
+    """One page.
+
+    Args:
+        key: what each colour of the pictures' lines means, by colour.
+        thumbnails: at most `PER_SHEET`, row by row.
+    """
+    assert len(thumbnails) <= PER_SHEET, f"{len(thumbnails)} pictures do not fit on a sheet of {PER_SHEET}"
+    cell_width, cell_height = PICTURE_WIDTH + _GAP, PICTURE_HEIGHT + _TEXT_LINES * _LINE + _GAP
+    rows = -(-len(thumbnails) // COLUMNS)
+    sheet = Image.new("RGB", (COLUMNS * cell_width + _GAP, _HEADER + rows * cell_height + _GAP), _PAPER)
+    draw = ImageDraw.Draw(sheet)
+    font = ImageFont.truetype(findfont("DejaVu Sans"), _FONT_SIZE)
+    x = float(_GAP)
+    for text, colour in ((title, None), *((meaning, colour) for colour, meaning in key.items())):
+        if colour is not None:
+            draw.rectangle((x, 8, x + 18, 18), fill=colour, outline=_INK)
+            x += 24
+        draw.text((x, 6), text, font=font, fill=_INK)
+        x += draw.textlength(text, font=font) + 24
+    for index, thumbnail in enumerate(thumbnails):
+        row, column = divmod(index, COLUMNS)
+        left, top = _GAP + column * cell_width, _HEADER + row * cell_height
+        sheet.paste(thumbnail.picture, (left, top))
+        lines = [part for line in thumbnail.caption for part in textwrap.wrap(line, _CHARACTERS)]
+        for place, line in enumerate(lines[:_TEXT_LINES]):
+            draw.text((left, top + PICTURE_HEIGHT + place * _LINE + 1), line, font=font, fill=_INK)
+    return sheet
