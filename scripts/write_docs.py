@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from scripts.figures import figures_table, paper_tables, training_table
+from scripts.figures import evidence_table, figures_table, paper_tables, training_table
 from service.settings import PREFIX, Settings
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -29,6 +29,7 @@ def documents() -> dict[Path, str]:
         ROOT / "README.md": {"settings": settings_table(), "figures": figures_table()},
         ROOT / "docs" / "results.md": {
             "figures": figures_table(),
+            "evidence": evidence_table(),
             "paper": paper_tables(),
             "training": training_table(),
         },

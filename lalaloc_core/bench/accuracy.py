@@ -1,8 +1,9 @@
-"""How well the shipped model does on generated test homes."""
+"""How well the shipped model does on homes that training never draws."""
 
 from __future__ import annotations
 
 import tempfile
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,47 +13,85 @@ from lalaloc_core.evaluation.run import run_evaluation
 from lalaloc_core.evaluation.score import StageScores, score
 from lalaloc_core.methods.method import QueryKind
 
+# Homes that the comparison of evidence is made on: it asks the same six times.
+_MOST_HOMES_PER_EVIDENCE = 100
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Exam:
+    """What is asked of the model; `unfamiliar`: in homes that another generator than training's drew."""
+
+    kind: QueryKind = "panorama"
+    furniture: str = "full"
+    heading_known: bool = True
+    unfamiliar: bool = False
+    evidence: str = "profile"
+
+
+_EXAMS = {
+    "layout": _Exam(kind="layout"),
+    "panorama_full": _Exam(),
+    "panorama_empty": _Exam(furniture="empty"),
+    "panorama_full_unknown_heading": _Exam(heading_known=False),
+    "out_of_family_full": _Exam(unfamiliar=True),
+    "out_of_family_empty": _Exam(unfamiliar=True, furniture="empty"),
+}
+
 
 def bench_accuracy(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
-    """Accuracy on generated test homes: layout queries, then furnished, empty and unknown-heading panoramas."""
+    """Accuracy on generated test homes, and on out-of-family ones, 4 queries each."""
+    return {name: _summary(_answers(bundle, exam, homes, textures)) for name, exam in _EXAMS.items()}
 
-    def accuracy(
-        label: str, *, kind: QueryKind = "panorama", furniture: str = "full", heading_known: bool = True
-    ) -> dict[str, Any]:
-        generated = {"homes": homes, "furniture": furniture, "textures": None if textures is None else str(textures)}
-        info = RunInfo(
-            label=label,
-            method="lalaloc",
-            kind=kind,
-            dataset="generated homes",
-            split="test",
-            generated=generated,
-            bundle=str(bundle.folder),
-            furniture=furniture if kind == "panorama" else None,
-            heading_known=heading_known,
-        )
-        with tempfile.TemporaryDirectory(prefix="lalaloc-bench-") as folder:
-            return _summary(run_evaluation(RunFolder(Path(folder)), info))
 
+def bench_evidence(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
+    """What poses are compared by: the latent, the predicted wall profile, or both; heading known and unknown."""
+    homes = min(homes, _MOST_HOMES_PER_EVIDENCE)
     return {
-        "layout": accuracy("layout queries", kind="layout"),
-        "panorama_full": accuracy("furnished"),
-        "panorama_empty": accuracy("empty", furniture="empty"),
-        "panorama_full_unknown_heading": accuracy("heading unknown", heading_known=False),
+        heading: {
+            evidence: _summary(
+                _answers(bundle, _Exam(evidence=evidence, heading_known=heading == "known_heading"), homes, textures)
+            )
+            for evidence in ("latent", "profile", "both")
+        }
+        for heading in ("known_heading", "unknown_heading")
     }
 
 
+def _answers(bundle: Bundle, exam: _Exam, homes: int, textures: Path | None) -> list[Prediction]:
+    generated: dict[str, Any] = {"homes": homes, "furniture": exam.furniture}
+    if exam.unfamiliar:
+        generated["generator"] = "unfamiliar"
+    else:
+        generated["textures"] = None if textures is None else str(textures)
+    info = RunInfo(
+        label=f"{exam.kind}, {exam.furniture}",
+        method="lalaloc",
+        kind=exam.kind,
+        dataset="out-of-family homes" if exam.unfamiliar else "generated homes",
+        split="test",
+        settings={"evidence": exam.evidence},
+        generated=generated,
+        bundle=str(bundle.folder),
+        furniture=exam.furniture if exam.kind == "panorama" else None,
+        heading_known=exam.heading_known,
+    )
+    with tempfile.TemporaryDirectory(prefix="lalaloc-bench-") as folder:
+        return run_evaluation(RunFolder(Path(folder)), info)
+
+
 def _summary(predictions: list[Prediction]) -> dict[str, Any]:
-    """The figures that tables show, without their intervals."""
+    """The figures that tables show."""
     scores = score(predictions)
     shares = ("within_1cm", "within_5cm", "within_10cm", "within_1m")
 
     def figures(stage: StageScores) -> dict[str, float]:
         return {name: getattr(stage, name).value for name in ("median_cm", *shares)}
 
+    interval = scores.final.within_1m
     return {
         "n": scores.n,
         **figures(scores.final),
+        "within_1m_interval": [interval.low, interval.high],
         "retrieval": figures(scores.stages["retrieval"]),
         "correct_room": scores.final.correct_room.value,
         "heading_within_2deg": scores.final.heading_within_2deg.value,

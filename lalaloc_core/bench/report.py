@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lalaloc_core.bench.accuracy import bench_accuracy
+from lalaloc_core.bench.accuracy import bench_accuracy, bench_evidence
 from lalaloc_core.bench.datasets import bench_datasets
 from lalaloc_core.bench.methods import bench_methods
 from lalaloc_core.bench.rendering import bench_rendering
@@ -22,6 +22,7 @@ def run_bench(bundle_folder: Path, groups: Sequence[str], *, homes: int, texture
         "rendering": lambda: bench_rendering(bundle),
         "service": lambda: bench_service(bundle, textures),
         "accuracy": lambda: bench_accuracy(bundle, homes, textures),
+        "evidence": lambda: bench_evidence(bundle, homes, textures),
         "methods": lambda: bench_methods(bundle),
         "datasets": lambda: bench_datasets(bundle, textures),
     }
