@@ -14,6 +14,7 @@ from lalaloc_core.reproduce.tables import TABLES
 
 ROOT = Path(__file__).resolve().parent.parent
 BENCH = ROOT / "docs" / "bench.json"
+SIZES = ROOT / "docs" / "encoder_sizes.json"
 PAPER_TABLES = ROOT / "docs" / "tables"
 MANIFEST = ROOT / "models" / "default" / "manifest.json"
 
@@ -69,6 +70,19 @@ def evidence_table() -> str:
     return "\n".join(rows)
 
 
+def sizes_table() -> str:
+    """Sizes of the image encoder that were compared, as a Markdown table."""
+    rows = [
+        "| input | channels | parameters | multiply-adds | CPU minutes | panoramas seen | latent | profile | likelihood |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for one in json.loads(SIZES.read_text(encoding="utf-8")).values():
+        cells = [one["input"], ", ".join(map(str, one["widths"])), f"{one['parameters'] / 1e6:.1f} M"]
+        cells += [f"{one['forward_mega_multiply_adds']} M", f"{one['cpu_minutes']:g}", f"{one['panoramas']:,}"]
+        rows.append(_row(*cells, *(f"{one[by]['within_100']:.1%}" for by in ("latent", "profile", "likelihood"))))
+    return "\n".join(rows)
+
+
 def paper_tables() -> str:
     """Every table of the paper with our figures beside the paper's, as Markdown."""
     return "\n".join(markdown(TableResult.read(PAPER_TABLES / f"{table.name}.json")) for table in TABLES).rstrip()
@@ -78,18 +92,23 @@ def training_table() -> str:
     """How the shipped model came to be, from its manifest."""
     manifest = json.loads(MANIFEST.read_text(encoding="utf-8"))
     training = manifest["training"]
+    layout, image = training["layout"], training["image"]
+    begun = image["begun_from"]
     rows = [
         "| | |",
         "|---|---|",
         _row("model", f"`{manifest['name']}` {manifest['version']}, architecture `{manifest['architecture']}`"),
-        _row("bundle", f"{_bundle_mb():.1f} MB"),
         _row("hardware", training["hardware"]),
-        _row("stage 1", f"{training['layout']['minutes']} minutes, {training['layout']['steps']} steps"),
+        _row("command", f"`{training['command']}`"),
+        _row("stage 1", f"that of version {begun['version']}: {layout['minutes_in_all']:g} minutes"),
         _row(
             "stage 2",
-            f"{training['image']['minutes']} minutes, {training['image']['steps']} steps, "
-            f"{training['image']['panoramas']:,} panoramas, each seen once",
+            f"begun with version {begun['version']} ({begun['panoramas_in_all']:,} panoramas, "
+            f"{begun['minutes_in_all']:g} minutes), then {image['steps']:,} steps in {image['minutes']:g} minutes on "
+            f"{image['panoramas']:,} new panoramas",
         ),
+        _row("in all", f"{image['panoramas_in_all']:,} panoramas, {image['minutes_in_all']:g} minutes"),
+        _row("weights", image["checkpoint"]),
         _row("export", f"largest difference from torch {training['parity_max_abs_difference']:.1e}"),
     ]
     return "\n".join(rows)

@@ -10,7 +10,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from scripts.figures import evidence_table, figures_table, paper_tables, training_table
+from scripts.figures import evidence_table, figures_table, paper_tables, sizes_table, training_table
 from service.settings import PREFIX, Settings
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -32,6 +32,7 @@ def documents() -> dict[Path, str]:
             "evidence": evidence_table(),
             "paper": paper_tables(),
             "training": training_table(),
+            "sizes": sizes_table(),
         },
         ROOT / "docs" / "architecture.md": {f"files of {package}": file_map(package) for package in _PACKAGES},
     }

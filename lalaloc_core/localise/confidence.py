@@ -19,7 +19,7 @@ _INDEPENDENT = 16.0
 # An answer is right within this distance.
 RIGHT_WITHIN_M = 1.0
 # No posterior over a handful of candidates is surer than this, either way.
-_MOST_LOG_ODDS = 12.0
+_MOST_LOG_ODDS = 6.0
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -149,7 +149,7 @@ class Encoders:
 
     def _ring(
         self, image: UInt8[np.ndarray, "h w 3"], camera_height_m: float
-    ) -> tuple[Float[np.ndarray, "c s"], tuple[Float[np.ndarray, "w"], Float[np.ndarray, "w"]] | None]:
+    ) -> tuple[Float[np.ndarray, "c s"], tuple[Float[np.ndarray, "p"], Float[np.ndarray, "p"]] | None]:
         """The ring of a panorama, and the log wall profile and log scale where the network predicts them.
 
         They are averaged with what it predicts of the mirrored panorama: two views of one room err less than one.

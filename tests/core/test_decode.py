@@ -9,6 +9,8 @@ import pytest
 import torch
 
 from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.evidence import EvidenceConfig
+from lalaloc_core.localise.pipeline import LocaliseConfig
 from lalaloc_core.methods.decode import VdrDecode
 from lalaloc_core.methods.lalaloc import LaLaLoc
 from lalaloc_core.methods.method import Question
@@ -47,7 +49,8 @@ def test_retrieval_and_re_sampling_are_lalaloc_s(encoders: Encoders, heading_kno
     torch.manual_seed(0)
     question = question_at(crooked_flat(), (1.2, 1.1), heading=0.7, heading_known=heading_known)
     answer = VdrDecode(encoders, LayoutDecoder()).answer(question)
-    expected = LaLaLoc(encoders, refine="vdr").answer(question)
+    by_latent = LocaliseConfig(evidence=EvidenceConfig(use_profile=False))
+    expected = LaLaLoc(encoders, refine="vdr", config=by_latent).answer(question)
     assert list(answer.stages) == ["retrieval", "vdr", "decode"]
     assert {stage: answer.stages[stage] for stage in expected.stages} == expected.stages
     assert answer.retrieved == expected.retrieved

@@ -158,14 +158,17 @@ class TestPredictedProfile:
         expected = wall_profile(np.array([position]), np.array([left_over]), plan.walls_m[[0]], COLUMNS)[0]
         np.testing.assert_allclose(profile, expected, atol=_ROUNDED)
 
-    def test_it_is_what_the_image_encoder_says(self, encoders: Encoders) -> None:
+    def test_it_is_what_the_image_encoder_says_of_the_panorama_and_its_mirror_image(self, encoders: Encoders) -> None:
         image = np.random.default_rng(0).integers(0, 256, (RING.image_height, RING.image_width, 3), dtype=np.uint8)
         profile, left_over = encoders.profile(image, 0.0, CAMERA_M)
-        inputs = {"image": image[None], "camera_height_m": np.array([CAMERA_M], dtype=np.float32)}
-        assert encoders._image is not None
-        (expected,) = encoders._image.run(["log_profile"], inputs)
+        said = []
+        for view in (image, image[:, ::-1]):
+            inputs = {"image": np.ascontiguousarray(view[None]), "camera_height_m": np.float32([CAMERA_M])}
+            assert encoders._image is not None
+            (predicted,) = encoders._image.run(["log_profile"], inputs)
+            said.append(np.asarray(predicted)[0])
         assert left_over == 0.0
-        np.testing.assert_allclose(np.log(profile), np.asarray(expected)[0], atol=1e-5)
+        np.testing.assert_allclose(np.log(profile), 0.5 * (said[0] + said[1][::-1]), atol=1e-5)
         assert profile.shape == (COLUMNS,)
 
     def test_a_network_that_predicts_none_is_a_bundle_error(self, opened_bundle: Bundle) -> None:
