@@ -73,7 +73,7 @@ def evidence_table() -> str:
 def sizes_table() -> str:
     """Sizes of the image encoder that were compared, as a Markdown table."""
     rows = [
-        "| input | channels | parameters | multiply-adds | CPU minutes | panoramas seen | latent | profile | likelihood |",
+        "| input | channels | parameters | multiply-adds | CPU minutes | panoramas | latent | profile | likelihood |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for one in json.loads(SIZES.read_text(encoding="utf-8")).values():

@@ -1,4 +1,4 @@
-"""Draw the learning curve of docs/results.md from a run's log: `python -m scripts.learning_curve LOG.csv PICTURE.png`."""
+"""Draw the learning curve of docs/results.md: `python -m scripts.learning_curve LOG.csv PICTURE.png`."""
 
 from __future__ import annotations
 

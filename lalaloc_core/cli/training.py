@@ -15,7 +15,9 @@ from lalaloc_core.cli.printing import print_json
 from lalaloc_core.errors import InvalidInputError
 
 # Four panoramas each; drawing one takes a third of a second, and validation shows all of them every few minutes.
-_UNFAMILIAR_HOMES = 15
+_VALIDATION_HOMES = 50
+# So many validation homes for one that is out of the family, which takes longer to draw.
+_PER_UNFAMILIAR_HOME = 3
 
 
 def add_commands(commands: Any) -> None:
@@ -47,6 +49,13 @@ def add_commands(commands: Any) -> None:
     train.add_argument("--resume", action="store_true", help="go on from the checkpoint in --out")
     train.add_argument("--device", help="cpu or cuda; default: cuda where there is one")
     train.add_argument("--workers", type=int, default=1, help="processes that make batches; 0: none")
+    train.add_argument(
+        "--validation-homes",
+        type=int,
+        default=_VALIDATION_HOMES,
+        metavar="N",
+        help="validate on at most so many homes or scenes (default: %(default)s)",
+    )
     train.add_argument("--textures", type=Path, help="folder of material pictures; without it all are procedural")
     train.set_defaults(run=_train)
 
@@ -89,11 +98,15 @@ def _train(arguments: argparse.Namespace) -> None:
     if device.type == "cpu":
         # The workers need cores of their own: threads that wait for each other on shared ones are slower than fewer.
         torch.set_num_threads(max((os.cpu_count() or 1) - arguments.workers, 1))
+    if arguments.validation_homes < 1:
+        raise InvalidInputError(f"--validation-homes {arguments.validation_homes}: at least 1 is needed")
+    unfamiliar_homes = max(arguments.validation_homes // _PER_UNFAMILIAR_HOME, 1)
     data = TrainingData(
         dataset=None if arguments.data is None else open_dataset(arguments.data),
         skip_bad=arguments.skip_bad,
         textures=arguments.textures,
-        unfamiliar=UnfamiliarScenes(homes=_UNFAMILIAR_HOMES) if arguments.data is None else None,
+        validation_scenes=arguments.validation_homes,
+        unfamiliar=None if arguments.data is not None else UnfamiliarScenes(homes=unfamiliar_homes),
     )
     train: Callable[..., Any] = {"layout": train_layout, "image": train_image, "end-to-end": train_end_to_end}[
         arguments.stage

@@ -185,6 +185,8 @@ def train_ablation(
         notes={"budget": budget},
         layout_from=teacher,
         layout_only=ablation.stages == ("layout",),
+        # Variants are compared after the same training, not each at its best.
+        last=True,
     )
 
 

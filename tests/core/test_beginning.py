@@ -109,6 +109,7 @@ class TestBeginning:
     def test_the_command_begins_and_says_what_does_not_go_together(self, tiny_bundle: Path, tmp_path: Path) -> None:
         words = ["train", "image", "--preset", "tiny", "--workers", "0", "--device", "cpu", "--out", str(tmp_path)]
         words += ["--from", str(tiny_bundle), "--set", "image.uses_per_panorama=2", "--set", "image.batch=4"]
+        words += ["--validation-homes", "1"]
         assert main([*words, "--steps", "1"]) == 0
         config = Checkpoint.load(tmp_path / "image.pt").config
         assert (config.image.uses_per_panorama, config.image.batch) == (2, 4)
