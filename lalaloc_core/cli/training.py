@@ -98,6 +98,8 @@ def _train(arguments: argparse.Namespace) -> None:
     if device.type == "cpu":
         # The workers need cores of their own: threads that wait for each other on shared ones are slower than fewer.
         torch.set_num_threads(max((os.cpu_count() or 1) - arguments.workers, 1))
+    if arguments.workers < 0:
+        raise InvalidInputError(f"--workers {arguments.workers}: at least 0 is needed")
     if arguments.validation_homes < 1:
         raise InvalidInputError(f"--validation-homes {arguments.validation_homes}: at least 1 is needed")
     unfamiliar_homes = max(arguments.validation_homes // _PER_UNFAMILIAR_HOME, 1)

@@ -37,7 +37,7 @@ class LocaliseConfig:
         lpo_candidates: how many are optimised in the latent space; the paper refines the first alone.
         profile_candidates: how many are optimised by their wall profiles, which is cheaper.
         profile_candidates_turned: the same where the heading is searched: rooms look alike from several sides.
-        separation_m: candidates nearer than this to a better one, and turned alike, are dropped.
+        separation_m: candidates nearer than this to a better one are dropped; retrieval keeps those turned otherwise.
         evidence: what poses are compared by.
     """
 
@@ -183,7 +183,7 @@ def refinement_job(
 
 
 def _moved(start: Candidate, result: RefinementResult, index: int) -> Candidate:
-    """A candidate where the optimiser took it; no optimiser ends where the fit is worse than at its start."""
+    """A candidate where the optimiser took it."""
     return replace(
         start,
         x_m=float(result.position_m[index, 0]),

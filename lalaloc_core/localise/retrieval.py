@@ -14,8 +14,8 @@ from lalaloc_core.sampling import pose_grid
 
 # Poses times hypotheses whose profiles are compared; of larger grids, the poses with the nearest latents.
 _MOST_PAIRS = 200_000
-# Pairs that are looked at for distinct candidates.
-_MOST_RANKED = 4096
+# The best pairs, which are looked at for distinct candidates; more if they hold too few.
+_FIRST_RANKED = 4096
 # Two candidates at one place are distinct if they are turned against each other by this much (radians).
 _SEPARATION = np.radians(25.0)
 
@@ -44,16 +44,21 @@ def retrieve(
         centre, precision = targets(query, np.arange(hypotheses), evidence.grid_reach * grid.step_m, evidence)
         cost = np.stack([profile_costs(log_profile, *one) for one in zip(centre, precision, strict=True)])
         cost += evidence.latent_weight * distance[:, poses]
-    best = np.argsort(cost, axis=None)[: max(_MOST_RANKED, top_k)]
-    hypothesis, column = np.unravel_index(best, cost.shape)
-    pose = poses[column]
-    kept = suppress(
-        grid.poses.position_m[pose],
-        cost[hypothesis, column],
-        separation_m=separation_m,
-        limit=top_k,
-        heading=query.roll[hypothesis],
-    )
+    ranked, ranks = np.argsort(cost, axis=None), max(_FIRST_RANKED, top_k)
+    while True:
+        hypothesis, column = np.unravel_index(ranked[:ranks], cost.shape)
+        pose = poses[column]
+        kept = suppress(
+            grid.poses.position_m[pose],
+            cost[hypothesis, column],
+            separation_m=separation_m,
+            limit=top_k,
+            heading=query.roll[hypothesis],
+        )
+        if len(kept) == top_k or ranks >= len(ranked):
+            break
+        # On a fine grid the best pairs may all be of a few places.
+        ranks *= 4
     return [
         Candidate(
             x_m=float(grid.poses.position_m[pose[index], 0]),

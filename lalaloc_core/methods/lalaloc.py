@@ -11,6 +11,7 @@ from jaxtyping import UInt8
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.evidence import EvidenceConfig
 from lalaloc_core.localise.optimise import LatentPoseOptimiser, LpoConfig
 from lalaloc_core.localise.pipeline import (
     LocaliseConfig,
@@ -68,7 +69,9 @@ class LaLaLoc:
             config=self._config,
         )
         signals: dict[str, dict[str, float]] = {stage: dataclasses.asdict(one) for stage, one in found.signals.items()}
-        model = self.encoders.manifest.confidence
+        # Confidence is fitted on photographs that are compared as the service does.
+        calibrated = question.kind == "panorama" and self._config.evidence == EvidenceConfig()
+        model = self.encoders.manifest.confidence if calibrated else None
         return Answer(
             stages={stage: found_pose(query, candidate) for stage, candidate in found.best.items()},
             retrieved=grid_index(grid, found.best["retrieval"]),

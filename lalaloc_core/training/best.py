@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -53,7 +54,9 @@ class BestCheckpoint:
 
 
 def _score(metrics: dict[str, float]) -> tuple[float, ...] | None:
-    """Orders validations; None for one that tells no accuracy."""
+    """Orders validations; None for one that tells no accuracy, or no number."""
+    if not all(math.isfinite(value) for value in metrics.values()):
+        return None
     if _LIKELIHOOD in metrics:
         return (-metrics[_LIKELIHOOD],)
     return (metrics[_ACCURACY], -metrics[_TIE_BREAKER]) if _ACCURACY in metrics else None

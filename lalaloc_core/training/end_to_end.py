@@ -26,7 +26,7 @@ class EndToEndStage:
     """The layout branch learns as in stage 1; the image branch follows its latents, which get no gradient from that.
 
     Raises:
-        ConfigError: an architecture whose branches share their head cannot be trained like that.
+        ConfigError: an architecture whose branches share their head, or changed exposures, cannot be trained like that.
     """
 
     name = "end-to-end"
@@ -34,6 +34,8 @@ class EndToEndStage:
     def __init__(self, config: TrainConfig, source: Source) -> None:
         if config.architecture != "paper":
             raise ConfigError(f"config.architecture is '{config.architecture}', end-to-end training knows 'paper' only")
+        if config.image.photometric:
+            raise ConfigError(f"config.image.photometric is {config.image.photometric:g}, end-to-end training has none")
         self.config = config
         self.source = source
         layout_encoder, decoder = build_layout_encoder(config), build_decoder(config)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -93,7 +94,8 @@ def train_image(
     """
     torch.manual_seed(config.seed + 1)
     if begin is not None and teacher is None and not (folder / "layout.pt").exists():
-        begin_from(begin, "layout", config).checkpoint.save(folder / "layout.pt")
+        found = begin_from(begin, "layout", config).checkpoint
+        dataclasses.replace(found, stage="layout").save(folder / "layout.pt")
     teacher = teacher or folder
     check_same_networks(config, checkpoint_with("layout", teacher).config, str(teacher))
     layout_encoder = load_layout_encoder_of(teacher)

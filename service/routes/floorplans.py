@@ -180,7 +180,7 @@ def get_preview(
         float | None, Query(ge=-360, le=360, allow_inf_nan=False, description="Heading of the marked camera.")
     ] = None,
     covariance_m2: Annotated[
-        list[Annotated[float, Field(allow_inf_nan=False)]] | None,
+        list[Annotated[float, Field(allow_inf_nan=False, ge=-1e6, le=1e6)]] | None,
         Query(
             min_length=3,
             max_length=3,
@@ -227,7 +227,7 @@ def _covariance(given: list[float] | None) -> tuple[float, float, float] | None:
     if given is None:
         return None
     xx, xy, yy = given
-    if xx < 0.0 or yy < 0.0 or xy**2 > xx * yy * (1.0 + _ROUNDED):
+    if xx < 0.0 or yy < 0.0 or xy * xy > xx * yy * (1.0 + _ROUNDED):
         raise InvalidRequestError(
             [("covariance_m2", f"is {xx:g}, {xy:g}, {yy:g}: xx and yy must not be negative, nor xy² above xx·yy")]
         )

@@ -163,7 +163,7 @@ class TestPredictedProfile:
         profile, left_over = encoders.profile(image, 0.0, CAMERA_M)
         said = []
         for view in (image, image[:, ::-1]):
-            inputs = {"image": np.ascontiguousarray(view[None]), "camera_height_m": np.float32([CAMERA_M])}
+            inputs = {"image": np.ascontiguousarray(view[None]), "camera_height_m": np.array([CAMERA_M], np.float32)}
             assert encoders._image is not None
             (predicted,) = encoders._image.run(["log_profile"], inputs)
             said.append(np.asarray(predicted)[0])

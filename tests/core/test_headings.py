@@ -187,7 +187,7 @@ class TestPerfectEncoder:
         assert not query.heading_known
         turned = wrap_angle(query.roll + query.frame_heading - (heading + off * tolerance))
         assert tolerance <= np.abs(turned).max() < tolerance + SECTOR
-        np.testing.assert_allclose(np.diff(np.sort(turned)), SECTOR, atol=1e-9)
+        assert np.abs(np.diff(np.sort(np.asarray(turned, dtype=float))) - SECTOR).max(initial=0.0) < 1e-9
         grid = build_grid(flat, perfect, step_m=0.25, camera_height_m=CAMERA_M)
         best = localise(flat, grid, perfect, query, refiner=optimiser.refine).candidates[0]
         assert np.hypot(*(best.position_m - POSE.position_m[0])) < 0.02

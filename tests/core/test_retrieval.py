@@ -112,6 +112,17 @@ class TestRetrieval:
             assert candidate.room_index == grid.poses.room_index[place]
             assert candidate.frame_heading == query.frame_heading
 
+    def test_a_fine_grid_with_many_headings_gives_as_many_candidates_as_are_asked_for(self) -> None:
+        rng = np.random.default_rng(0)
+        position = np.stack(np.meshgrid(np.arange(0, 6, 0.1), np.arange(0, 4, 0.1)), axis=-1).reshape(-1, 2)
+        poses = PoseSet(position, np.zeros(len(position), dtype=int))
+        latents = unit(rng, len(position), 8)
+        # One place fits far better than all others, whatever the heading.
+        latents[np.linalg.norm(position - 2.0, axis=1) < 1.0] = np.eye(8)[0]
+        grid = LatentGrid(poses, latents, np.ones((len(position), 4)), 0.1, 1.5)
+        query = any_heading(np.repeat(np.eye(8)[:1], 64, axis=0))
+        assert len(retrieve(grid, query, top_k=40, separation_m=1.0)) == 40
+
     def test_a_grid_pose_s_own_latent_retrieves_it(self) -> None:
         grid = random_grid(0)
         for index in (0, 17, 59):
