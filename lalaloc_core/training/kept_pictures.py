@@ -30,6 +30,7 @@ def kept_pictures(
             if str(kept["digest"]) == digest:
                 return kept["pictures"]
     except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile):
+        # A file that is missing or damaged is as good as none: its pictures are made again.
         pass
     pictures = make()
     path.parent.mkdir(parents=True, exist_ok=True)
