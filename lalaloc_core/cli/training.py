@@ -50,6 +50,12 @@ def add_commands(commands: Any) -> None:
     train.add_argument("--device", help="cpu or cuda; default: cuda where there is one")
     train.add_argument("--workers", type=int, default=1, help="processes that make batches; 0: none")
     train.add_argument(
+        "--render",
+        choices=("workers", "device"),
+        help="where generated homes are photographed: by the processes that make batches, or on --device, which they "
+        "then send scenes instead of pixels; default: on the device if it is a GPU",
+    )
+    train.add_argument(
         "--validation-homes",
         type=int,
         default=_VALIDATION_HOMES,
@@ -82,6 +88,8 @@ def _train(arguments: argparse.Namespace) -> None:
         raise InvalidInputError("--textures is for generated homes, not for --data")
     if arguments.data is None and arguments.skip_bad:
         raise InvalidInputError("--skip-bad is for --data")
+    if arguments.data is not None and arguments.render is not None:
+        raise InvalidInputError("--render is for generated homes, not for --data")
     if arguments.begin is not None and (arguments.resume or arguments.stage == "end-to-end"):
         raise InvalidInputError("--from is for a run of one stage that begins, neither for --resume nor for end-to-end")
     config = PRESETS[arguments.preset].with_settings(_settings(arguments.settings))
@@ -102,11 +110,13 @@ def _train(arguments: argparse.Namespace) -> None:
         raise InvalidInputError(f"--workers {arguments.workers}: at least 0 is needed")
     if arguments.validation_homes < 1:
         raise InvalidInputError(f"--validation-homes {arguments.validation_homes}: at least 1 is needed")
+    render = arguments.render or ("workers" if device.type == "cpu" else "device")
     unfamiliar_homes = max(arguments.validation_homes // _PER_UNFAMILIAR_HOME, 1)
     data = TrainingData(
         dataset=None if arguments.data is None else open_dataset(arguments.data),
         skip_bad=arguments.skip_bad,
         textures=arguments.textures,
+        staged=arguments.data is None and render == "device",
         validation_scenes=arguments.validation_homes,
         unfamiliar=None if arguments.data is not None else UnfamiliarScenes(homes=unfamiliar_homes),
     )

@@ -73,17 +73,15 @@ class PanoramaRenderer:
 
     def render(self, shots: Sequence[Shot]) -> UInt8[Tensor, "b h w 3"]:
         """Photograph `shots`; each picture depends on its shot and the materials only."""
-        step = self._scenes_at_once
-        return torch.cat(
-            [
-                self.render_scenes([build_scene(shot, self._materials) for shot in shots[k : k + step]])
-                for k in range(0, len(shots), step)
-            ]
-        )
+        return self.render_scenes([build_scene(shot, self._materials) for shot in shots])
 
     @torch.no_grad()
     def render_scenes(self, scenes: Sequence[Scene]) -> UInt8[Tensor, "b h w 3"]:
-        """Photograph scenes that were built elsewhere, such as in worker processes; all at once."""
+        """Photograph scenes that were built elsewhere, such as in worker processes, with the same materials."""
+        step = self._scenes_at_once
+        return torch.cat([self._render_at_once(scenes[k : k + step]) for k in range(0, len(scenes), step)])
+
+    def _render_at_once(self, scenes: Sequence[Scene]) -> UInt8[Tensor, "b h w 3"]:
         batch = stack_scenes(scenes, self._device)
         direction = self._directions(batch)
         return self._photograph(batch, trace(batch, direction, self._slope), direction)

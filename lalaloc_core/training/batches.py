@@ -28,7 +28,8 @@ class Trouble:
     fatal: bool
 
 
-Stream = IterableDataset[Batch | Trouble]
+# Of batches, with pixels or without, and of trouble.
+Stream = IterableDataset[Any]
 
 
 def worker_share() -> tuple[int, int]:
@@ -61,7 +62,7 @@ def stacked(rows: list[dict[str, np.ndarray]]) -> Batch:
     return {key: torch.from_numpy(np.stack([row[key] for row in rows])) for key in rows[0]}
 
 
-def receive(stream: Stream, workers: int) -> Iterator[Batch]:
+def receive(stream: Stream, workers: int) -> Iterator[Any]:
     """Batches from `workers` processes with one thread each; 0 makes them in this process.
 
     What could not be used is logged with its number, once.
@@ -75,7 +76,7 @@ def receive(stream: Stream, workers: int) -> Iterator[Batch]:
     yield from _received(DataLoader(stream, batch_size=None, num_workers=workers, **options))
 
 
-def _received(items: Iterable[Batch | Trouble]) -> Iterator[Batch]:
+def _received(items: Iterable[Any]) -> Iterator[Any]:
     left_out: set[str] = set()
     for item in items:
         if not isinstance(item, Trouble):

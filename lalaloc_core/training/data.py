@@ -32,6 +32,7 @@ class TrainingData:
         skip_bad: pass over files of the data set that cannot be used, naming each once.
         textures: folder of material pictures for the generator; without it all are procedural.
         validation_scenes: at most this many, spread evenly over the split.
+        staged: the generator's panoramas are photographed on the device that trains, not where homes are made.
         unfamiliar: scenes that are nothing like those trained on; image validation reports those of their validation
             split as well, and nothing is chosen by them.
     """
@@ -39,13 +40,14 @@ class TrainingData:
     dataset: Dataset | None = None
     skip_bad: bool = False
     textures: Path | None = None
+    staged: bool = False
     validation_scenes: int = 50
     unfamiliar: Dataset | None = None
 
     def source(self, config: TrainConfig) -> Source:
         """What training looks at."""
         if self.dataset is None:
-            return GeneratedSource(config, self.textures)
+            return GeneratedSource(config, self.textures, self.staged)
         return SceneSource(config, self.dataset, self.skip_bad)
 
     def validation(self, config: TrainConfig) -> list[Scene]:

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.training import losses
-from lalaloc_core.training.batches import Batch, receive
+from lalaloc_core.training.batches import Batch
 from lalaloc_core.training.config import ImageStageConfig, TrainConfig
 from lalaloc_core.training.objective import LayoutObjective, anchors_with_neighbours
 from lalaloc_core.training.sources import Source
@@ -17,9 +17,8 @@ from lalaloc_core.training.stages import (
     build_decoder,
     build_image_encoder,
     build_layout_encoder,
-    first_visit_of_panoramas,
+    panorama_batches,
 )
-from lalaloc_core.training.stream import PanoramaBatches
 
 
 class EndToEndStage:
@@ -57,8 +56,14 @@ class EndToEndStage:
 
     def batches(self, first_step: int, workers: int) -> Iterator[Batch]:
         """Panorama batches with neighbours."""
-        first = first_visit_of_panoramas(self.settings, first_step)
-        return receive(PanoramaBatches(self.config, self.source, True, first), workers)
+        return panorama_batches(
+            self.config,
+            self.source,
+            neighbours=True,
+            first_step=first_step,
+            workers=workers,
+            device=next(self.encoder.parameters()).device,
+        )
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Weighted losses of a batch by name; their sum is minimised."""

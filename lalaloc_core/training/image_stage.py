@@ -12,13 +12,12 @@ from torch import Tensor, nn
 from lalaloc_core.nets import LayoutEncoder
 from lalaloc_core.nets.ring import RingLayoutEncoder
 from lalaloc_core.training import losses
-from lalaloc_core.training.batches import Batch, receive
+from lalaloc_core.training.batches import Batch
 from lalaloc_core.training.config import ImageStageConfig, TrainConfig
 from lalaloc_core.training.objective import anchors_with_neighbours, chamfer_to_anchors, embed
 from lalaloc_core.training.photometric import changed
 from lalaloc_core.training.sources import Source
-from lalaloc_core.training.stages import build_image_encoder, first_visit_of_panoramas
-from lalaloc_core.training.stream import PanoramaBatches
+from lalaloc_core.training.stages import build_image_encoder, panorama_batches
 
 
 class ImageStage:
@@ -46,11 +45,16 @@ class ImageStage:
         return self.source.data
 
     def batches(self, first_step: int, workers: int) -> Iterator[Batch]:
-        """Panorama batches; a resumed run goes on with homes, or parts of the epoch, that it has not seen."""
-        neighbours = bool(self.settings.log_ratio_weight or self.settings.kd_weight)
-        first = first_visit_of_panoramas(self.settings, first_step)
+        """Panorama batches, see `panorama_batches`."""
         self._first_step, self._generator = first_step, None
-        return receive(PanoramaBatches(self.config, self.source, neighbours, first), workers)
+        return panorama_batches(
+            self.config,
+            self.source,
+            neighbours=bool(self.settings.log_ratio_weight or self.settings.kd_weight),
+            first_step=first_step,
+            workers=workers,
+            device=next(self.encoder.parameters()).device,
+        )
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Weighted losses of a batch by name; their sum is minimised."""

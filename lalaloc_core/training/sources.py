@@ -6,22 +6,26 @@ epochs. Both are small and travel to worker processes.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+import torch
 from jaxtyping import Float, Int
 
 from lalaloc_core.data.dataset import Camera, Dataset, Scene
-from lalaloc_core.data.generated import Studio
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.sampling import PoseSet, TripletSampling, sample_neighbours, sample_triplets
+from lalaloc_core.synth.build import build_scene
 from lalaloc_core.synth.materials import MaterialLibrary
+from lalaloc_core.synth.panorama import PanoramaRenderer
 from lalaloc_core.synth.shots import sample_shots
 from lalaloc_core.synth.splits import TRAIN, home_of
 from lalaloc_core.training.config import TrainConfig
+from lalaloc_core.training.darkroom import Staged
 from lalaloc_core.training.recent import Recent
 
 # Cameras stand at least this far below the ceiling of a neighbour's room.
@@ -48,14 +52,14 @@ class Group:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class View:
-    """A panorama and the pose it was taken from; `image` is (h, w, 3) RGB bytes."""
+    """A panorama and the pose it was taken from; `image` is (h, w, 3) RGB bytes, or what is yet to be photographed."""
 
     plan: FloorPlan
     position_m: Float[np.ndarray, "2"]
     room_index: int
     heading: float
     camera_height_m: float
-    image: np.ndarray
+    image: np.ndarray | Staged
 
     def group(self, sampling: TripletSampling, rng: np.random.Generator) -> Group | None:
         """Its pose with neighbours; None where the plan is too small for them."""
@@ -71,7 +75,11 @@ class Source(Protocol):
         patience: visits in a row that may give nothing.
         skip_bad: whether files that cannot be used are passed over.
         problems: errors of what was passed over since this list was last emptied.
+        staged: whether its panoramas are scenes that are yet to be photographed.
     """
+
+    @property
+    def staged(self) -> bool: ...
 
     @property
     def data(self) -> dict[str, Any]: ...
@@ -108,11 +116,18 @@ class Source(Protocol):
 
 @dataclass(eq=False)
 class GeneratedSource:
-    """A new home of the generator for every visit, its anchors and cameras anywhere on the floor."""
+    """A new home of the generator for every visit, its anchors and cameras anywhere on the floor.
+
+    Attributes:
+        textures: folder of material pictures; without it all are procedural.
+        staged: panoramas are scenes, to be photographed by `renderer` elsewhere.
+    """
 
     config: TrainConfig
     textures: Path | None = None
-    _studio: Studio | None = field(default=None, init=False)
+    staged: bool = False
+    _materials: MaterialLibrary | None = field(default=None, init=False)
+    _renderer: PanoramaRenderer | None = field(default=None, init=False)
     patience = _GENERATOR_PATIENCE
     skip_bad = False
 
@@ -154,9 +169,16 @@ class GeneratedSource:
         stage = self.config.image
         home, rng = home_of(TRAIN, self.config.seed, visit)
         shots = sample_shots(home, stage.shots_per_home, rng, by_room_share=stage.by_room_share, hard_share=_HARD_SHARE)
-        if self._studio is None:
-            self._studio = Studio(MaterialLibrary.create(np.random.default_rng(self.config.seed), self.textures))
-        images = self._studio.renderer(height, width, stage.supersample).render(shots).cpu().numpy()
+        # Both take a second to make and much memory: only the process that needs them has them.
+        self._materials = self._materials or self._drawn_materials()
+        scenes = [build_scene(shot, self._materials) for shot in shots]
+        images: Sequence[np.ndarray | Staged]
+        if self.staged:
+            first = visit * stage.shots_per_home
+            images = [Staged(number=first + k, scene=scene) for k, scene in enumerate(scenes)]
+        else:
+            self._renderer = self._renderer or self._renderer_of(self._materials, "cpu", height, width)
+            images = list(self._renderer.render_scenes(scenes).numpy())
         return [
             View(
                 plan=home.plan,
@@ -168,6 +190,19 @@ class GeneratedSource:
             )
             for shot, image in zip(shots, images, strict=True)
         ]
+
+    def renderer(self, device: torch.device) -> PanoramaRenderer:
+        """Photographs staged panoramas as `views` would have."""
+        return self._renderer_of(self._drawn_materials(), device, *self.config.image_size)
+
+    def _drawn_materials(self) -> MaterialLibrary:
+        return MaterialLibrary.create(np.random.default_rng(self.config.seed), self.textures)
+
+    def _renderer_of(
+        self, materials: MaterialLibrary, device: torch.device | str, height: int, width: int
+    ) -> PanoramaRenderer:
+        rays = self.config.image.supersample
+        return PanoramaRenderer(materials, height=height, width=width, device=device, supersample=rays)
 
 
 @dataclass(eq=False)
@@ -181,6 +216,7 @@ class SceneSource:
     dataset: Dataset
     skip_bad: bool = False
     problems: list[DatasetError] = field(default_factory=list, init=False)
+    staged = False
 
     def __post_init__(self) -> None:
         self._names = tuple(self.dataset.scenes("train"))

@@ -12,8 +12,11 @@ from lalaloc_core.nets import ImageEncoder, LayoutEncoder
 from lalaloc_core.nets.decoder import LayoutDecoder
 from lalaloc_core.nets.resnet import PaperImageEncoder, PaperLayoutEncoder
 from lalaloc_core.nets.ring import RingImageEncoder, RingLayoutEncoder
-from lalaloc_core.training.batches import Batch
+from lalaloc_core.training.batches import Batch, receive
 from lalaloc_core.training.config import ImageStageConfig, LayoutStageConfig, OptimiserConfig, TrainConfig
+from lalaloc_core.training.darkroom import Darkroom
+from lalaloc_core.training.sources import GeneratedSource, Source
+from lalaloc_core.training.stream import PanoramaBatches
 
 
 @runtime_checkable
@@ -50,9 +53,20 @@ def build_decoder(config: TrainConfig) -> LayoutDecoder | None:
     return LayoutDecoder(config.latent_size) if config.layout.decode_weight else None
 
 
-def first_visit_of_panoramas(settings: ImageStageConfig, first_step: int) -> int:
-    """The visit that a run goes on with at a step: not before those that earlier steps made."""
-    return first_step * (settings.batch // settings.shots_per_home + 1)
+def panorama_batches(
+    config: TrainConfig, source: Source, *, neighbours: bool, first_step: int, workers: int, device: torch.device
+) -> Iterator[Batch]:
+    """Panorama batches from a step on: with homes, or parts of the epoch, that earlier steps have not seen.
+
+    Args:
+        neighbours: whether rows have the layouts of neighbours.
+        device: where staged panoramas are photographed.
+    """
+    first = first_step * (config.image.batch // config.image.shots_per_home + 1)
+    batches = receive(PanoramaBatches(config, source, neighbours, first), workers)
+    if isinstance(source, GeneratedSource) and source.staged:
+        return Darkroom(source.renderer(device)).developed(batches)
+    return batches
 
 
 def build_optimiser(modules: dict[str, nn.Module], config: OptimiserConfig) -> torch.optim.Optimizer:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -13,11 +14,13 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.training.batches import Batch, Stream, Trouble, fruitful, stacked, worker_share
 from lalaloc_core.training.config import TrainConfig
+from lalaloc_core.training.darkroom import Negative, Negatives, Row, Staged, StagedRow
 from lalaloc_core.training.replay import Replay
 from lalaloc_core.training.sources import Group, Source, View
-from lalaloc_core.training.turning import draw_heading, draw_turn
+from lalaloc_core.training.turning import Turn, draw_heading, draw_turn
 
-Row = dict[str, np.ndarray]
+_Drawn = TypeVar("_Drawn")
+_Packed = TypeVar("_Packed")
 
 
 @dataclass
@@ -34,7 +37,7 @@ class LayoutBatches(Stream):
 
     def __iter__(self) -> Iterator[Batch | Trouble]:
         size = self.config.layout.homes_per_step * self.config.layout.anchors_per_home
-        return _batches(self._visit, self.source, size, self.first)
+        return _batches(self._visit, stacked, self.source, size, self.first)
 
     def _visit(self, visit: int) -> list[Row] | None:
         rng = self.source.rng(visit)
@@ -66,7 +69,8 @@ class PanoramaBatches(Stream):
 
     Each batch holds `image` (b, h, w, 3) uint8, `profile_m` (b, columns), `camera_height_m` (b) as it is told,
     `ceiling_height_m` (b), and where a loss compares with neighbours, `neighbour_profile_m` (b, n, columns) and
-    `neighbour_ceiling_height_m` (b, n), which are turned and mirrored as their panorama is.
+    `neighbour_ceiling_height_m` (b, n), which are turned and mirrored as their panorama is. From a source of staged
+    panoramas come `Negative`s of such batches.
     """
 
     config: TrainConfig
@@ -74,19 +78,44 @@ class PanoramaBatches(Stream):
     neighbours: bool = False
     first: int = 0
 
-    def __iter__(self) -> Iterator[Batch | Trouble]:
+    def __iter__(self) -> Iterator[Batch | Negative | Trouble]:
         stage, (_, workers) = self.config.image, worker_share()
         replay: Replay[View] = Replay(stage.uses_per_panorama, stage.replay_panoramas // workers)
-        return _batches(lambda visit: self._visit(visit, replay), self.source, stage.batch, self.first)
+        negatives = Negatives(stage.uses_per_panorama)
 
-    def _visit(self, visit: int, replay: Replay[View]) -> list[Row] | None:
+        def pictured(visit: int) -> list[Row] | None:
+            drawn = self._drawn(visit, replay)
+            return [
+                row | {"image": turn.picture(view.image)}
+                for view, turn, row in drawn
+                if row is not None and isinstance(view.image, np.ndarray)
+            ] or None
+
+        def staged(visit: int) -> list[StagedRow] | None:
+            rows = []
+            for view, turn, row in self._drawn(visit, replay):
+                assert isinstance(view.image, Staged)
+                if row is None:
+                    negatives.lose(view.image)
+                else:
+                    rows.append(StagedRow(view.image, turn, row))
+            return rows or None
+
+        if self.source.staged:
+            return _batches(staged, negatives.pack, self.source, stage.batch, self.first)
+        return _batches(pictured, stacked, self.source, stage.batch, self.first)
+
+    def _drawn(self, visit: int, replay: Replay[View]) -> list[tuple[View, Turn, Row | None]]:
+        """What a visit shows, how it is turned, and the rest of its rows: None where neighbours are wanted in vain."""
         rng = self.source.rng(visit)
-        new = self.source.views(visit, *self.config.image_size)
-        drawn = [self._row(used, rng) for view in new for used in replay.after(view, rng)]
-        return [row for row in drawn if row is not None] or None
+        drawn = []
+        for new in self.source.views(visit, *self.config.image_size):
+            for view in replay.after(new, rng):
+                turn = draw_turn(self.config.turns, view.heading, self.config.image_size[1], rng)
+                drawn.append((view, turn, self._row(view, turn, rng)))
+        return drawn
 
-    def _row(self, view: View, rng: np.random.Generator) -> Row | None:
-        turn = draw_turn(self.config.turns, view.heading, view.image.shape[1], rng)
+    def _row(self, view: View, turn: Turn, rng: np.random.Generator) -> Row | None:
         position, room = view.position_m[None], np.array([view.room_index])
         if self.neighbours:
             group = view.group(self.config.layout.triplets, rng)
@@ -97,7 +126,6 @@ class PanoramaBatches(Stream):
         profile = turn.profile(layouts(view.plan, position, room, heading, self.config.profile_columns))
         ceiling = view.plan.ceiling_heights_m[room].astype(np.float32)
         row = {
-            "image": turn.picture(view.image),
             "profile_m": profile[0],
             "camera_height_m": np.float32(view.camera_height_m + self._height_error_m(rng)),
             "ceiling_height_m": ceiling[0],
@@ -128,16 +156,20 @@ def layouts(
 
 
 def _batches(
-    visit: Callable[[int], list[Row] | None], source: Source, size: int, first: int
-) -> Iterator[Batch | Trouble]:
-    """Rows of the visits from number `first` on, `size` to a batch, with what was passed over in between."""
-    rows: list[Row] = []
+    visit: Callable[[int], list[_Drawn] | None],
+    pack: Callable[[list[_Drawn]], _Packed],
+    source: Source,
+    size: int,
+    first: int,
+) -> Iterator[_Packed | Trouble]:
+    """What the visits from number `first` on draw, `size` to a batch, with what was passed over in between."""
+    rows: list[_Drawn] = []
     try:
         for drawn in fruitful(visit, first, source.patience):
             rows += drawn
             if len(rows) >= size:
                 yield from _troubles(source)
-                yield stacked(rows[:size])
+                yield pack(rows[:size])
                 rows = rows[size:]
     except DatasetError as error:
         yield from _troubles(source)

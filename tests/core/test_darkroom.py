@@ -1,0 +1,98 @@
+"""Staged panoramas: what the training device photographs is what the workers would have, none is kept too long."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lalaloc_core.cli import main
+from lalaloc_core.training.batches import Batch, receive
+from lalaloc_core.training.checkpoint import Checkpoint
+from lalaloc_core.training.config import PRESETS, TrainConfig
+from lalaloc_core.training.darkroom import Darkroom, turned
+from lalaloc_core.training.sources import GeneratedSource
+from lalaloc_core.training.stages import panorama_batches
+from lalaloc_core.training.stream import PanoramaBatches
+from lalaloc_core.training.turning import Turn
+
+CPU = torch.device("cpu")
+
+
+def config(uses: int) -> TrainConfig:
+    return PRESETS["tiny"].with_settings(
+        {
+            "image.batch": 6,
+            "image.shots_per_home": 2,
+            "image.uses_per_panorama": uses,
+            "image.replay_panoramas": 6,
+        }
+    )
+
+
+def batches(
+    uses: int, *, staged: bool, neighbours: bool = False, workers: int = 0, textures: Path | None = None
+) -> list[Batch]:
+    source = GeneratedSource(config(uses), textures, staged)
+    found = panorama_batches(source.config, source, neighbours=neighbours, first_step=1, workers=workers, device=CPU)
+    return list(itertools.islice(found, 6))
+
+
+@pytest.mark.parametrize(("uses", "neighbours", "workers"), [(1, False, 0), (3, False, 1), (3, True, 0)])
+def test_staged_batches_are_the_same_as_pictured_ones(uses: int, neighbours: bool, workers: int) -> None:
+    pictured = batches(uses, staged=False, neighbours=neighbours, workers=workers)
+    staged = batches(uses, staged=True, neighbours=neighbours, workers=workers)
+    for a, b in zip(pictured, staged, strict=True):
+        assert a.keys() == b.keys()
+        for key in a.keys() - {"image"}:
+            assert torch.equal(a[key], b[key])
+        # The same rays in batches of other sizes may round differently.
+        assert (a["image"].int() - b["image"].int()).abs().max() <= 1
+
+
+def test_pictures_are_developed_once_and_forgotten_after_their_last_use() -> None:
+    source = GeneratedSource(config(3), staged=True)
+    darkroom, shown, seen = Darkroom(source.renderer(CPU)), set(), 0
+    negatives = list(itertools.islice(receive(PanoramaBatches(source.config, source), 0), 40))
+    for negative, _ in zip(negatives, darkroom.developed(negatives), strict=True):
+        assert not shown & negative.scenes.keys()
+        shown |= negative.scenes.keys()
+        seen += len(negative.number)
+        # Those that wait for their next use, and those that the next batch has begun with.
+        assert len(darkroom) <= source.config.image.replay_panoramas + source.config.image.batch
+    assert len(shown) < seen / 2
+
+
+@given(shift=st.integers(-40, 40), mirrored=st.booleans())
+def test_whole_batches_turn_as_single_pictures_do(shift: int, mirrored: bool) -> None:
+    images = np.random.default_rng(0).integers(0, 256, (2, 3, 16, 3), dtype=np.uint8)
+    found = turned(torch.from_numpy(images), torch.tensor([shift, 1]), torch.tensor([mirrored, True]))
+    expected = [
+        Turn(shift=shift, heading=0.0, mirrored=mirrored).picture(images[0]),
+        Turn(shift=1, heading=0.0, mirrored=True).picture(images[1]),
+    ]
+    assert np.array_equal(found.numpy(), np.stack(expected))
+
+
+def test_training_learns_the_same_wherever_panoramas_are_rendered(tmp_path: Path) -> None:
+    common = ["--preset", "tiny", "--workers", "0", "--steps", "3", "--validation-homes", "1"]
+    weights = []
+    for place in ("workers", "device"):
+        out = tmp_path / place
+        assert main(["train", "layout", "--out", str(out), *common]) == 0
+        assert main(["train", "image", "--out", str(out), *common, "--render", place, "--device", "cpu"]) == 0
+        weights.append(Checkpoint.load(out / "image.pt").best_weights["image_encoder"])
+    for name, value in weights[0].items():
+        assert torch.allclose(value.float(), weights[1][name].float(), atol=1e-3), name
+
+
+def test_where_to_render_is_a_question_of_generated_homes_only(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["train", "image", "--out", str(tmp_path), "--data", "somewhere", "--render", "device"]) != 0
+    assert "--render is for generated homes" in capsys.readouterr().err
