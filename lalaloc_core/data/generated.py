@@ -8,6 +8,7 @@ from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Float, UInt8
 
 from lalaloc_core.data.dataset import Appearance, Camera, Scene, Split
@@ -79,8 +80,9 @@ class GeneratedScenes:
 class Studio:
     """The materials of a split, and its renderers by picture: both take a second to build and are kept."""
 
-    def __init__(self, materials: MaterialLibrary) -> None:
-        self._materials = materials
+    def __init__(self, materials: MaterialLibrary, device: torch.device | str = "cpu") -> None:
+        self.materials = materials
+        self._device = device
         self._renderers: dict[tuple[int, int, tuple[int, int]], PanoramaRenderer] = {}
 
     def renderer(self, height: int, width: int, supersample: tuple[int, int] = (1, 1)) -> PanoramaRenderer:
@@ -88,7 +90,7 @@ class Studio:
         key = height, width, supersample
         if key not in self._renderers:
             self._renderers[key] = PanoramaRenderer(
-                self._materials, height=height, width=width, supersample=supersample
+                self.materials, height=height, width=width, device=self._device, supersample=supersample
             )
         return self._renderers[key]
 

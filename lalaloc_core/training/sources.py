@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float, Int
 
 from lalaloc_core.data.dataset import Camera, Dataset, Scene
+from lalaloc_core.data.generated import Studio
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.sampling import PoseSet, TripletSampling, sample_neighbours, sample_triplets
@@ -126,8 +127,7 @@ class GeneratedSource:
     config: TrainConfig
     textures: Path | None = None
     staged: bool = False
-    _materials: MaterialLibrary | None = field(default=None, init=False)
-    _renderer: PanoramaRenderer | None = field(default=None, init=False)
+    _studio: Studio | None = field(default=None, init=False)
     patience = _GENERATOR_PATIENCE
     skip_bad = False
 
@@ -169,16 +169,15 @@ class GeneratedSource:
         stage = self.config.image
         home, rng = home_of(TRAIN, self.config.seed, visit)
         shots = sample_shots(home, stage.shots_per_home, rng, by_room_share=stage.by_room_share, hard_share=_HARD_SHARE)
-        # Both take a second to make and much memory: only the process that needs them has them.
-        self._materials = self._materials or self._drawn_materials()
-        scenes = [build_scene(shot, self._materials) for shot in shots]
+        # Made where it is needed: it does not travel to worker processes.
+        self._studio = self._studio or self._studio_on("cpu")
+        scenes = [build_scene(shot, self._studio.materials) for shot in shots]
         images: Sequence[np.ndarray | Staged]
         if self.staged:
             first = visit * stage.shots_per_home
             images = [Staged(number=first + k, scene=scene) for k, scene in enumerate(scenes)]
         else:
-            self._renderer = self._renderer or self._renderer_of(self._materials, "cpu", height, width)
-            images = list(self._renderer.render_scenes(scenes).numpy())
+            images = list(self._studio.renderer(height, width, stage.supersample).render_scenes(scenes).numpy())
         return [
             View(
                 plan=home.plan,
@@ -193,16 +192,10 @@ class GeneratedSource:
 
     def renderer(self, device: torch.device) -> PanoramaRenderer:
         """Photographs staged panoramas as `views` would have."""
-        return self._renderer_of(self._drawn_materials(), device, *self.config.image_size)
+        return self._studio_on(device).renderer(*self.config.image_size, self.config.image.supersample)
 
-    def _drawn_materials(self) -> MaterialLibrary:
-        return MaterialLibrary.create(np.random.default_rng(self.config.seed), self.textures)
-
-    def _renderer_of(
-        self, materials: MaterialLibrary, device: torch.device | str, height: int, width: int
-    ) -> PanoramaRenderer:
-        rays = self.config.image.supersample
-        return PanoramaRenderer(materials, height=height, width=width, device=device, supersample=rays)
+    def _studio_on(self, device: torch.device | str) -> Studio:
+        return Studio(MaterialLibrary.create(np.random.default_rng(self.config.seed), self.textures), device)
 
 
 @dataclass(eq=False)
