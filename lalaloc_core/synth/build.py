@@ -182,21 +182,12 @@ class _Builder:
 
     def _add_prism(self, prism: Prism, *, opaque: bool = True, surface: int | None = None) -> None:
         row = self.table.add_finish(prism.finish) if surface is None else surface
-        self.prisms.append(
-            (
-                prism.x - self.position[0],
-                prism.y - self.position[1],
-                prism.axis_x,
-                prism.axis_y,
-                prism.half_a,
-                prism.half_b,
-                prism.z0,
-                prism.z1,
-                float(prism.round),
-                float(row),
-                float(opaque),
-            )
+        x, y = self.position
+        values = (
+            *(prism.x - x, prism.y - y, prism.axis_x, prism.axis_y, prism.half_a, prism.half_b, prism.z0, prism.z1),
+            *(prism.round, row, opaque),
         )
+        self.prisms.append(tuple(float(value) for value in values))
 
     def _decal(
         self, wall: int, s0: float, s1: float, z0: float, z1: float, surface: int, slot: int = -1, depth: float = 0.0
