@@ -43,11 +43,7 @@ def facts_of(shot: Shot) -> frozenset[Fact]:
 
 def _facts_of_place(shot: Shot) -> set[Fact]:
     room, here = shot.home.plan.rooms[shot.room_index], shapely.Point(shot.position_m)
-    passages = [
-        opening
-        for opening in shot.home.openings
-        if opening.room == shot.room_index and opening.neighbour >= 0 and opening.kind in ("door_open", "opening")
-    ]
+    passages = [opening for opening in shot.home.openings if opening.room == shot.room_index and opening.is_passage]
     wide = [opening for opening in passages if opening.kind == "opening" and opening.end_m - opening.start_m >= _WIDE_M]
     inscribed_m = 2.0 * shapely.maximum_inscribed_circle(room.shape, 0.02).length
     holds: dict[Fact, bool] = {

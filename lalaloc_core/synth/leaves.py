@@ -13,9 +13,10 @@ from lalaloc_core.floorplan import Room
 from lalaloc_core.synth.furniture import CAMERA_CLEARANCE_M, rectangle, wall_frame
 from lalaloc_core.synth.openings import Opening
 
+# Wider doors have two leaves.
+DOUBLE_FROM_M = 1.15
 _HALF_THICKNESS_M = 0.018
 _HINGE_GAP_M = 0.03
-_DOUBLE_FROM_M = 1.15
 _STILE_M = 0.055
 
 # What share of leaves stands ajar, at about a right angle, and flat against the wall, and at which angles (degrees).
@@ -71,7 +72,7 @@ def hang_leaves(
         return []
     start, along, inwards = wall_frame(room, opening.wall)
     width = opening.end_m - opening.start_m
-    is_double = width > _DOUBLE_FROM_M
+    is_double = width > DOUBLE_FROM_M
     if is_double:
         width *= 0.5
     sides = (True, False) if rng.random() < 0.6 else (False, True)

@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from jaxtyping import Float
 
 from lalaloc_core.floorplan import Room
 from lalaloc_core.synth.openings import Opening
-from lalaloc_core.synth.scene import PRISM_AX, PRISM_AY, PRISM_OPAQUE, PRISM_X, PRISM_Y
+from lalaloc_core.synth.scene import (
+    LIGHT_RGB,
+    LIGHT_XYZ,
+    PRISM_AX,
+    PRISM_AY,
+    PRISM_OPAQUE,
+    PRISM_X,
+    PRISM_Y,
+    SLOT_LIGHT_RGB,
+    SLOT_LIGHT_XYZ,
+)
+from lalaloc_core.synth.style import HouseStyle
+from lalaloc_core.synth.tables import SceneTables
 
 # How likely a room of a kind has a large mirror.
 _CHANCE = {"bathroom": 0.4, "corridor": 0.22, "bedroom": 0.25, "living": 0.15, "dining": 0.12, "closet": 0.12}
@@ -17,6 +29,7 @@ _OTHERS = 0.05
 _BARE_SHARE = 0.4
 _CLEARANCE_M = 0.15
 _NARROWEST_M = 0.35
+_DEPTH_M = 0.004
 
 Rectangle = tuple[int, float, float, float, float]
 
@@ -46,6 +59,55 @@ def draw_mirror(
             high = min(rng.uniform(1.6, 2.3), room.ceiling_height_m - 0.1)
             return int(wall), float(start), float(start + width), float(low), float(high)
     return None
+
+
+def add_mirror(
+    tables: SceneTables,
+    style: HouseStyle,
+    mirror: Rectangle,
+    room: Room,
+    prisms: Iterable[tuple[float, ...]],
+    lights: Float[np.ndarray, "l 8"],
+    rng: np.random.Generator,
+) -> None:
+    """Hang a mirror, behind which the room is built once more, reflected; its doors are dark.
+
+    Args:
+        tables: of the scene, whose first walls are those of the room.
+        style: the house's.
+        mirror: where it hangs, see `draw_mirror`.
+        room: the own room.
+        prisms: what stands and hangs in it, rows of `tables.prisms`.
+        lights: its lamps and windows, of which the brightest shines in the reflected room.
+        rng: source of randomness.
+    """
+    wall, s0, s1, z0, z1 = mirror
+    ends, count, first, slot = tables.walls_m[wall], len(room.walls_m), len(tables.walls_m), len(tables.slots)
+    reflection, relative = Reflection(ends), Reflection(ends - np.tile(tables.camera_m, 2))
+    tables.slots.append(_reflected_slot(tables.slots[0], lights, relative))
+    for edge in range(count):
+        tables.add_wall(reflection.wall(tables.walls_m[edge]), slot, tables.wall_surfaces[edge])
+    for decal in [decal for decal in tables.decals if decal.wall < count]:
+        length = tables.wall_length_m(decal.wall)
+        seen = style.gloom if decal.slot >= 0 else decal.surface
+        tables.add_decal(first + decal.wall, length - decal.s1, length - decal.s0, decal.z0, decal.z1, seen)
+    tables.prisms += [tuple(relative.prism(np.array(prism)).tolist()) for prism in prisms]
+    if rng.random() < 0.6:
+        border = rng.uniform(0.02, 0.08)
+        frame = tables.surfaces.add_finish("wood")
+        tables.add_decal(wall, s0 - border, s1 + border, z0 - border, z1 + border, frame)
+    tables.add_decal(wall, s0, s1, z0, z1, style.handle, slot=slot, depth_m=_DEPTH_M)
+
+
+def _reflected_slot(own: list[float], lights: Float[np.ndarray, "l 8"], relative: Reflection) -> list[float]:
+    """The room's slot with its brightest light where the mirror shows it."""
+    slot = np.array(own, dtype=float)
+    if len(lights):
+        brightest = lights[lights[:, LIGHT_RGB].sum(axis=1).argmax()]
+        x, y, z = brightest[LIGHT_XYZ]
+        slot[SLOT_LIGHT_XYZ] = [*relative.point(np.array([x, y])), z]
+        slot[SLOT_LIGHT_RGB] = brightest[LIGHT_RGB]
+    return slot.tolist()
 
 
 class Reflection:

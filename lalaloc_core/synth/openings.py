@@ -46,6 +46,11 @@ class Opening:
     kind: OpeningKind
     neighbour: int
 
+    @property
+    def is_passage(self) -> bool:
+        """Whether one looks through it into another room of the plan."""
+        return self.kind in ("door_open", "opening") and self.neighbour >= 0
+
 
 class _Facing(NamedTuple):
     """Two walls that face each other across one wall thickness; both intervals are metres along their walls."""

@@ -1,0 +1,156 @@
+"""The tables of a scene while it is being built."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from lalaloc_core.synth.furniture import Prism
+from lalaloc_core.synth.scene import Fact, Scene
+from lalaloc_core.synth.shots import Shot
+from lalaloc_core.synth.surfaces import SurfaceTable
+
+# How far a jamb reaches beyond both ends of its hole.
+_JAMB_OVERLAP_M = 1e-4
+
+
+class Decal(NamedTuple):
+    """A rectangle on a wall: the columns of `Scene.decals`."""
+
+    wall: int
+    s0: float
+    s1: float
+    z0: float
+    z1: float
+    surface: int
+    slot: int = -1
+    depth_m: float = 0.0
+
+
+class SceneTables:
+    """Collects the tables of one scene; see `Scene` for their rows.
+
+    Args:
+        camera_m: camera position (2,) in the plan frame.
+        surfaces: the table of surfaces, which decals, prisms and walls refer to.
+
+    Attributes:
+        walls_m: ends of the walls in the plan frame; those of the own room come first.
+        wall_surfaces: their surfaces.
+        decals: later ones cover earlier ones.
+        prisms: rows of `Scene.prisms`, relative to the camera.
+        slots: rows of `Scene.slots`.
+    """
+
+    def __init__(self, camera_m: Float[np.ndarray, "2"], surfaces: SurfaceTable) -> None:
+        self.camera_m = camera_m
+        self.surfaces = surfaces
+        self.walls_m: list[Float[np.ndarray, "4"]] = []
+        self.wall_surfaces: list[int] = []
+        self._wall_owners: list[int] = []
+        self.decals: list[Decal] = []
+        self.prisms: list[tuple[float, ...]] = []
+        self.slots: list[list[float]] = []
+
+    def add_wall(self, ends_m: Float[np.ndarray, "4"], owner: int, surface: int) -> int:
+        """A wall, with its row of `Scene.wall_owner`; returns its index."""
+        self.walls_m.append(ends_m)
+        self._wall_owners.append(owner)
+        self.wall_surfaces.append(surface)
+        return len(self.walls_m) - 1
+
+    def wall_length_m(self, wall: int) -> float:
+        """Length of a wall."""
+        ends = self.walls_m[wall]
+        return float(np.hypot(*(ends[2:] - ends[:2])))
+
+    def add_decal(
+        self,
+        wall: int,
+        s0: float,
+        s1: float,
+        z0: float,
+        z1: float,
+        surface: int,
+        *,
+        slot: int = -1,
+        depth_m: float = 0.0,
+    ) -> None:
+        """A rectangle on a wall, with a `slot` a hole of some depth through which one sees that room."""
+        self.decals.append(Decal(wall, s0, s1, z0, z1, surface, slot, depth_m))
+
+    def add_prism(self, prism: Prism, surface: int, *, opaque: bool = True) -> None:
+        """A box or cylinder with a surface of its finish; an `opaque` one casts shadows."""
+        x, y = self.camera_m
+        values = (prism.x - x, prism.y - y, prism.axis_x, prism.axis_y, prism.half_a, prism.half_b, prism.z0, prism.z1)
+        self._append_prism((*values, prism.round, surface, opaque))
+
+    def add_box(
+        self,
+        centre_m: Float[np.ndarray, "2"],
+        axis: Float[np.ndarray, "2"],
+        half_a: float,
+        half_b: float,
+        z0: float,
+        z1: float,
+        surface: int,
+    ) -> None:
+        """A box that casts shadows; centre in the plan frame, the first half extent along `axis`."""
+        self._append_prism((*(centre_m - self.camera_m), *axis, half_a, half_b, z0, z1, False, surface, True))
+
+    def add_pieces(self, prisms: Iterable[Prism]) -> None:
+        """Furniture; the parts of a piece that have one finish share a surface."""
+        known: dict[tuple[int, str], int] = {}
+        for prism in prisms:
+            key = (prism.piece, prism.finish)
+            if key not in known:
+                known[key] = self.surfaces.add_finish(prism.finish)
+            self.add_prism(prism, known[key], opaque=prism.finish != "glow")
+
+    def add_jambs(self) -> None:
+        """The cheeks of every hole: walls from one room to the next."""
+        for index, hole in enumerate(self.decals):
+            if hole.slot < 0:
+                continue
+            ends = self.walls_m[hole.wall]
+            along = (ends[2:] - ends[:2]) / np.hypot(*(ends[2:] - ends[:2]))
+            outward = np.array([along[1], -along[0]])
+            for s in (hole.s0, hole.s1):
+                near = ends[:2] + along * s
+                # Reaching back into the room a little closes the gap that rounding may leave.
+                back, front = near - outward * _JAMB_OVERLAP_M, near + outward * (hole.depth_m + _JAMB_OVERLAP_M)
+                self.add_wall(np.concatenate([back, front]), -1 - index, hole.surface)
+
+    def to_scene(
+        self,
+        shot: Shot,
+        *,
+        lights: Float[np.ndarray, "l 8"],
+        sun: Float[np.ndarray, "14"],
+        backdrop: Float[np.ndarray, "10"],
+        exposure: Float[np.ndarray, "24"],
+        facts: Iterable[Fact],
+    ) -> Scene:
+        """The finished scene; see `Scene` for what it has besides the tables."""
+        return Scene(
+            camera_height_m=shot.camera_height_m,
+            heading=shot.heading,
+            walls_m=np.array(self.walls_m) - np.tile(self.camera_m, 2),
+            wall_owner=np.array(self._wall_owners),
+            wall_surface=np.array(self.wall_surfaces),
+            decals=np.array(self.decals, dtype=float).reshape(-1, len(Decal._fields)),
+            prisms=np.array(self.prisms, dtype=float).reshape(-1, 11),
+            surfaces=np.array(self.surfaces.rows),
+            slots=np.array(self.slots),
+            lights=lights,
+            sun=sun,
+            backdrop=backdrop,
+            exposure=exposure,
+            facts=frozenset(facts),
+        )
+
+    def _append_prism(self, values: Iterable[float | int]) -> None:
+        self.prisms.append(tuple(float(value) for value in values))
