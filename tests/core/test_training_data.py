@@ -115,7 +115,9 @@ class TestDrawing:
         shared = [SceneSource(CONFIG, data) for _ in range(2)]
         for visit in range(12):
             mine, theirs = alone.views(visit, 32, 64), shared[visit % 2].views(visit, 32, 64)
-            assert [view.image.tobytes() for view in mine] == [view.image.tobytes() for view in theirs]
+            assert [np.asarray(view.image).tobytes() for view in mine] == [
+                np.asarray(view.image).tobytes() for view in theirs
+            ]
 
     def test_layout_anchors_are_the_cameras_at_their_heights(self, data: OwnData) -> None:
         source = SceneSource(CONFIG, data)
@@ -140,7 +142,7 @@ class TestDrawing:
         # Generated scenes serve as a data set as well; here each camera has one look per furniture level.
         levels = GeneratedScenes(homes=1, shots_per_home=1, furniture=None)
         views = SceneSource(CONFIG, levels).views(0, 32, 64)
-        assert [view.image.shape for view in views] == [(32, 64, 3)]
+        assert [np.shape(np.asarray(view.image)) for view in views] == [(32, 64, 3)]
 
 
 class TestBadFiles:
