@@ -1,9 +1,13 @@
-"""Fit what answers say of themselves on validation queries: the probability of "within 1 m", and the covariance."""
+"""Fit what answers say of themselves on validation queries: the probability of "within 1 m", and the covariance.
+
+Queries are photographs of the plan's home, and some of other homes and of none: what fits nothing must not be trusted.
+"""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -16,6 +20,9 @@ from lalaloc_core.localise.confidence import RIGHT_WITHIN_M
 from lalaloc_core.localise.covariance import marginal_information
 from lalaloc_core.metrics import Accuracy
 
+# Of all that is fitted on, photographs of something else than the plan's home weigh so much: enough to tell them, too
+# little to make answers about the home itself look less sure than they are.
+_STRANGE_SHARE = 0.1
 # A weak pull to zero keeps the fit finite when the queries are perfectly separable.
 _RIDGE = 1e-2
 _ITERATIONS = 50
@@ -24,10 +31,23 @@ _MEDIAN_CHI2 = {1: 0.4549, 2: 1.3863}
 _SIGNALS = ("log_odds", "cost", "uncertainty", "latent_distance")
 
 
-def fit_confidence(known: Sequence[Prediction], searched: Sequence[Prediction]) -> ConfidenceModel:
+@dataclass(frozen=True, kw_only=True)
+class Answers:
+    """Answers to fit on.
+
+    Attributes:
+        own: to photographs of the plan's home.
+        strange: to photographs of anything else, which no answer is right about.
+    """
+
+    own: Sequence[Prediction]
+    strange: Sequence[Prediction] = ()
+
+
+def fit_confidence(known: Answers, searched: Answers) -> ConfidenceModel:
     """Fit on answers to queries with known heading, and to queries whose heading was searched."""
-    position, _ = _covariance_factors(known)
-    position_searched, heading = _covariance_factors(searched)
+    position, _ = _covariance_factors(known.own)
+    position_searched, heading = _covariance_factors(searched.own)
     return ConfidenceModel(
         known_heading=_by_stage(known),
         searched_heading=_by_stage(searched),
@@ -37,26 +57,31 @@ def fit_confidence(known: Sequence[Prediction], searched: Sequence[Prediction]) 
     )
 
 
-def calibrate(bundle: Bundle, known: list[Prediction], searched: list[Prediction], description: str) -> Bundle:
+def calibrate(bundle: Bundle, known: Answers, searched: Answers, description: str) -> Bundle:
     """Store the fitted confidence and the validation figures in the bundle's manifest."""
     metrics = {**bundle.manifest.metrics, "validation_queries": description}
-    for name, predictions in (("validation", known), ("validation_heading_searched", searched)):
-        metrics[name] = Accuracy.of(position_errors_m(predictions)).to_dict()
+    for name, answers in (("validation", known), ("validation_heading_searched", searched)):
+        metrics[name] = Accuracy.of(position_errors_m(answers.own)).to_dict()
     manifest = dataclasses.replace(bundle.manifest, confidence=fit_confidence(known, searched), metrics=metrics)
     return write_manifest(bundle.folder, manifest)
 
 
-def _by_stage(predictions: Sequence[Prediction]) -> dict[str, LogisticModel]:
-    stages = dict.fromkeys(stage for prediction in predictions for stage in prediction.signals)
-    return {stage: _fit_stage(stage, predictions) for stage in stages}
+def _by_stage(answers: Answers) -> dict[str, LogisticModel]:
+    stages = dict.fromkeys(stage for prediction in answers.own for stage in prediction.signals)
+    return {stage: _fit_stage(stage, answers) for stage in stages}
 
 
-def _fit_stage(stage: str, predictions: Sequence[Prediction]) -> LogisticModel:
+def _fit_stage(stage: str, answers: Answers) -> LogisticModel:
     """Maximum-likelihood logistic model of a stage's pose being within 1 m of the truth."""
-    told = [prediction for prediction in predictions if stage in prediction.signals]
-    features = np.array([[1.0, *(one.signals[stage][name] for name in _SIGNALS)] for one in told])
-    distance = [np.hypot(one.stages[stage].x_m - one.truth.x_m, one.stages[stage].y_m - one.truth.y_m) for one in told]
-    bias, *weights = _logistic(features, np.array(distance) < RIGHT_WITHIN_M)
+    own = [one for one in answers.own if stage in one.signals]
+    strange = [one for one in answers.strange if stage in one.signals]
+    features = np.array([[1.0, *(one.signals[stage][name] for name in _SIGNALS)] for one in own + strange])
+    distance = [np.hypot(one.stages[stage].x_m - one.truth.x_m, one.stages[stage].y_m - one.truth.y_m) for one in own]
+    right = np.append(np.array(distance) < RIGHT_WITHIN_M, np.zeros(len(strange), bool))
+    weight = np.ones(len(features))
+    if strange:
+        weight[len(own) :] = _STRANGE_SHARE / (1.0 - _STRANGE_SHARE) * len(own) / len(strange)
+    bias, *weights = _logistic(features, right, weight)
     return LogisticModel(bias=bias, **dict(zip(_SIGNALS, weights, strict=True)))
 
 
@@ -80,15 +105,19 @@ def _covariance_factors(predictions: Sequence[Prediction]) -> tuple[float | None
     )
 
 
-def _logistic(features: Float[np.ndarray, "n f"], correct: Bool[np.ndarray, "n"]) -> list[float]:
+def _logistic(
+    features: Float[np.ndarray, "n f"], correct: Bool[np.ndarray, "n"], weight: Float[np.ndarray, "n"]
+) -> list[float]:
     """Newton's method on the ridge-regularised log likelihood; features are scaled so that one ridge fits all."""
     scale = np.maximum(np.abs(features).max(axis=0), 1e-9)
     scaled = features / scale
     weights = np.zeros(features.shape[1])
     for _ in range(_ITERATIONS):
         probability = 1.0 / (1.0 + np.exp(-np.clip(scaled @ weights, -30.0, 30.0)))
-        gradient = scaled.T @ (probability - correct) + _RIDGE * weights
-        hessian = (scaled * (probability * (1.0 - probability))[:, None]).T @ scaled + _RIDGE * np.eye(len(weights))
+        gradient = scaled.T @ (weight * (probability - correct)) + _RIDGE * weights
+        hessian = (scaled * (weight * probability * (1.0 - probability))[:, None]).T @ scaled + _RIDGE * np.eye(
+            len(weights)
+        )
         step = np.linalg.solve(hessian, gradient)
         weights -= step
         if np.abs(step).max() < 1e-9:

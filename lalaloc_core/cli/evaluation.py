@@ -15,6 +15,8 @@ from lalaloc_core.cli.printing import print_json
 from lalaloc_core.data.dataset import SPLITS
 from lalaloc_core.errors import InvalidInputError
 
+# So many homes that calibration asks with their own photographs for one that it asks with those of others.
+_PER_STRANGE_HOME = 3
 _BUNDLE = Path("models/default")
 
 
@@ -145,26 +147,33 @@ def _worst(arguments: argparse.Namespace) -> None:
 
 def _calibrate(arguments: argparse.Namespace) -> None:
     from lalaloc_core.bundle import Bundle
-    from lalaloc_core.calibrate import calibrate
+    from lalaloc_core.calibrate import Answers, calibrate
     from lalaloc_core.evaluation.predictions import Prediction, RunFolder, RunInfo
     from lalaloc_core.evaluation.run import run_evaluation
 
-    def answers(known: bool) -> list[Prediction]:
+    def asked(generated: dict[str, Any], known: bool, whose: str) -> list[Prediction]:
         info = RunInfo(
-            label=f"calibration, heading {'known' if known else 'searched'}",
+            label=f"calibration, {whose} homes, heading {'known' if known else 'searched'}",
             method="lalaloc",
             kind="panorama",
             dataset="generated homes",
             split="validation",
-            generated=_generated(arguments, None),
+            generated=generated,
             heading_known=known,
             bundle=str(arguments.bundle),
         )
         with tempfile.TemporaryDirectory(prefix="lalaloc-run-") as folder:
             return run_evaluation(RunFolder(Path(folder)), info)
 
-    known, searched = answers(True), answers(False)
-    description = f"{len(known)} panoramas of {arguments.homes} generated validation homes, all furniture levels"
+    own = _generated(arguments, None)
+    strange = own | {"generator": "strangers", "homes": max(arguments.homes // _PER_STRANGE_HOME, 1)}
+    known, searched = (
+        Answers(own=asked(own, heading, "own"), strange=asked(strange, heading, "strange")) for heading in (True, False)
+    )
+    description = (
+        f"{len(known.own)} panoramas of {arguments.homes} generated validation homes, all furniture levels; confidence "
+        f"besides on {len(known.strange)} photographs of others or of no room"
+    )
     bundle = calibrate(Bundle.open(arguments.bundle), known, searched, description)
     print_json(bundle.manifest.metrics)
 

@@ -13,6 +13,7 @@ from lalaloc_core.configuration import build_config
 from lalaloc_core.data.dataset import Appearance, Dataset
 from lalaloc_core.data.generated import GeneratedScenes
 from lalaloc_core.data.opening import open_dataset
+from lalaloc_core.data.strangers import StrangeScenes
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.evaluation.predictions import RunInfo
 from lalaloc_core.localise.encoders import Encoders
@@ -75,14 +76,16 @@ def build_dataset(info: RunInfo) -> Dataset:
     if info.data is not None:
         return open_dataset(Path(info.data))
     arguments: dict[str, Any] = dict(info.generated or {})
-    if arguments.pop("generator", "synth") == "unfamiliar":
+    generator = arguments.pop("generator", "synth")
+    if generator == "unfamiliar":
         # Traced by embree, which only the extra `ray` brings.
         from lalaloc_core.data.unfamiliar import UnfamiliarScenes
 
         return UnfamiliarScenes(**arguments)
     if arguments.get("textures") is not None:
         arguments["textures"] = Path(arguments["textures"])
-    return GeneratedScenes(**arguments)
+    homes = GeneratedScenes(**arguments)
+    return StrangeScenes(homes) if generator == "strangers" else homes
 
 
 def build_method(info: RunInfo) -> Method:

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lalaloc_core.bundle import Bundle, LogisticModel, write_manifest
-from lalaloc_core.calibrate import calibrate, fit_confidence
+from lalaloc_core.bundle import Bundle, ConfidenceModel, LogisticModel, write_manifest
+from lalaloc_core.calibrate import Answers, calibrate, fit_confidence
 from lalaloc_core.evaluation.predictions import Pose, Prediction
 from lalaloc_core.evaluation.score import expected_calibration_error, position_errors_m
 from tests.strategies import seeds
@@ -51,8 +51,12 @@ def believable(count: int, seed: int) -> list[Prediction]:
     return results
 
 
+def both(known: list[Prediction], searched: list[Prediction]) -> ConfidenceModel:
+    return fit_confidence(Answers(own=known), Answers(own=searched))
+
+
 def fitted(predictions: list[Prediction]) -> LogisticModel:
-    return fit_confidence(predictions, []).known_heading["lpo"]
+    return both(predictions, []).known_heading["lpo"]
 
 
 def bent(offset: np.ndarray, information: np.ndarray, turn_deg: float = 0.0) -> Prediction:
@@ -68,6 +72,20 @@ class TestConfidence:
         assert model.uncertainty == pytest.approx(MAKER.uncertainty, abs=0.2)
         # Latent distances of these queries are half their costs: only the sum can be told.
         assert model.cost + 0.5 * model.latent_distance == pytest.approx(-7.5, abs=1.0)
+
+    def test_what_fits_like_photographs_of_other_homes_is_not_trusted(self) -> None:
+        # Of the home's own photographs none tells that a poor fit is bad: all have the same cost.
+        rng = np.random.default_rng(0)
+        own = [result(0.2 if rng.random() < 0.9 else 3.0, rng.uniform(-3.0, 4.0)) for _ in range(400)]
+        strange = [result(0.2, rng.uniform(-3.0, 4.0), cost=0.6) for _ in range(100)]
+        plain, taught = (
+            fit_confidence(Answers(own=own, strange=others), Answers(own=own)).known_heading["lpo"]
+            for others in ([], strange)
+        )
+        assert np.mean([confidence(plain, one) for one in strange]) > 0.5
+        assert np.mean([confidence(taught, one) for one in strange]) < 0.1
+        # Answers about the home itself are told as right as they are.
+        assert np.mean([confidence(taught, one) for one in own]) == pytest.approx(0.9, abs=0.02)
 
     @given(seeds())
     @settings(max_examples=10)
@@ -104,7 +122,7 @@ class TestConfidence:
             )
             for one in (result(0.1) for _ in range(20))
         ]
-        model = fit_confidence(early, [result(5.0) for _ in range(20)])
+        model = both(early, [result(5.0) for _ in range(20)])
         signals = result(0.0).signals["lpo"]
         told = {
             (stage, known): model.probability(stage, signals, heading_known=known)
@@ -123,7 +141,9 @@ class TestConfidence:
         self, tiny_bundle: Path, opened_bundle: Bundle
     ) -> None:
         try:
-            calibrated = calibrate(opened_bundle, believable(200, 0), believable(50, 1), "made-up queries")
+            calibrated = calibrate(
+                opened_bundle, Answers(own=believable(200, 0)), Answers(own=believable(50, 1)), "made-up queries"
+            )
             again = Bundle.open(tiny_bundle)
             assert again.sha256 == calibrated.sha256 == opened_bundle.sha256
             assert again.manifest.confidence == calibrated.manifest.confidence is not None
@@ -147,7 +167,7 @@ class TestCovariance:
             searched.append(bent(error[:2], information, math.degrees(error[2])))
             error = rng.multivariate_normal(np.zeros(2), 2.0 * factor * np.linalg.inv(information[:2, :2]))
             known.append(bent(error, information[:2, :2]))
-        model = fit_confidence(known, searched)
+        model = both(known, searched)
         assert model.position_factor == pytest.approx(2.0 * factor, rel=0.25)
         assert model.position_factor_searched == pytest.approx(factor, rel=0.25)
         assert model.heading_factor == pytest.approx(factor, rel=0.35)
@@ -156,8 +176,8 @@ class TestCovariance:
         right = [bent(np.array([0.01 * k, 0.0]), 100.0 * np.eye(2)) for k in range(1, 6)]
         wrong = [bent(np.array([2.0, 0.0]), 100.0 * np.eye(2))] * 20
         plain = [result(0.1)] * 20
-        expected = fit_confidence(right, []).position_factor
+        expected = both(right, []).position_factor
         assert expected is not None
-        assert fit_confidence(right + wrong + plain, []).position_factor == expected
-        assert fit_confidence(plain, []).position_factor is None
-        assert fit_confidence(right, []).heading_factor is None
+        assert both(right + wrong + plain, []).position_factor == expected
+        assert both(plain, []).position_factor is None
+        assert both(right, []).heading_factor is None

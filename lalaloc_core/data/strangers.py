@@ -1,0 +1,78 @@
+"""Questions without an answer: homes that are asked with photographs of other homes, and of no room at all.
+
+Confidence learns from them what it looks like when nothing fits (`lalaloc_core.calibrate`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from lalaloc_core.data.dataset import Appearance, Camera, Photograph, Scene, Split
+from lalaloc_core.data.generated import GeneratedScenes
+from lalaloc_core.errors import DatasetError
+
+# One of so many photographs shows no room.
+_ROOMLESS = 4
+
+
+@dataclass(frozen=True)
+class StrangeScenes:
+    """Generated homes whose cameras show what the cameras of the next home see, and one in four the open air.
+
+    Poses and heights are those of the home's own cameras: where a camera stands has nothing to do with what it shows.
+    """
+
+    homes: GeneratedScenes
+
+    @property
+    def description(self) -> str:
+        return f"{self.homes.description}, asked with photographs of others"
+
+    @property
+    def appearances(self) -> Sequence[Appearance]:
+        return self.homes.appearances
+
+    def scenes(self, split: Split) -> Sequence[str]:
+        return self.homes.scenes(split)
+
+    def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
+        own = self.homes.load(name, problems)
+        prefix, _, number = name.rpartition("-")
+        other = self.homes.load(f"{prefix}-{int(number) + 1:0{len(number)}d}", problems)
+        cameras = [
+            dataclasses.replace(camera, photographs=self._shown(camera, other.cameras[k % len(other.cameras)], k))
+            for k, camera in enumerate(own.cameras)
+        ]
+        return dataclasses.replace(own, cameras=tuple(cameras))
+
+    def _shown(self, camera: Camera, other: Camera, k: int) -> dict[Appearance, Photograph]:
+        if k % _ROOMLESS == _ROOMLESS - 1:
+            seed = int(1e3 * abs(camera.position_m).sum())
+            return dict.fromkeys(camera.photographs, OpenAir(seed))
+        return dict(zip(camera.photographs, other.photographs.values(), strict=True))
+
+
+@dataclass(frozen=True)
+class OpenAir:
+    """Ground under a sky, both of any colour, at times the same one, as of a lens against a wall."""
+
+    seed: int
+
+    def image(self, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
+        rng = np.random.default_rng(self.seed)
+        sky, ground = rng.uniform(20.0, 250.0, (2, 3))
+        if rng.random() < 0.4:
+            ground = sky
+        up = np.linspace(1.0, -1.0, height)[:, None, None]
+        haze = rng.uniform(0.0, 0.5)
+        colour = np.where(up > 0.0, sky, ground) * (1.0 - haze * np.abs(up))
+        grain = rng.normal(0.0, rng.uniform(0.0, 10.0), (height, width, 3))
+        return np.clip(colour + grain, 0.0, 255.0).astype(np.uint8)
+
+    def depth_m(self) -> Float[np.ndarray, "h w"]:
+        raise DatasetError("a photograph of no room has no depth")

@@ -1,0 +1,36 @@
+"""Homes asked with photographs of others: everything of the question is the home's own but what is seen."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lalaloc_core.data.generated import GeneratedScenes
+from lalaloc_core.data.strangers import OpenAir, StrangeScenes
+
+HOMES = GeneratedScenes(homes=2, shots_per_home=4, furniture=None)
+LOOK = HOMES.appearances[0]
+
+
+def test_cameras_are_the_homes_own_and_see_the_next_home() -> None:
+    strange, own = StrangeScenes(HOMES).load("validation-00001"), HOMES.load("validation-00001")
+    # The next one is there beyond the last that is asked about, too.
+    other = HOMES.load("validation-00002")
+    assert strange.plan.to_dict() == own.plan.to_dict()
+    for k, (camera, mine, theirs) in enumerate(zip(strange.cameras, own.cameras, other.cameras, strict=True)):
+        assert np.array_equal(camera.position_m, mine.position_m)
+        assert (camera.room_index, camera.heading) == (mine.room_index, mine.heading)
+        if k == 3:
+            assert isinstance(camera.photographs[LOOK], OpenAir)
+        else:
+            pictures = [one.photographs[LOOK].image(16, 32) for one in (camera, mine, theirs)]
+            assert np.array_equal(pictures[0], pictures[2])
+            assert not np.array_equal(pictures[0], pictures[1])
+
+
+def test_the_open_air_has_no_walls() -> None:
+    for seed in range(20):
+        picture = OpenAir(seed).image(64, 128).astype(float)
+        # Nothing but grain tells one azimuth from another.
+        columns = picture.mean(axis=0)
+        assert np.ptp(columns, axis=0).max() < 12.0
+        assert np.array_equal(picture, OpenAir(seed).image(64, 128))
