@@ -7,6 +7,7 @@ extruded from the floor to its own ceiling; doors count as wall.
 from __future__ import annotations
 
 import json
+import re
 import sys
 import unicodedata
 from collections.abc import Mapping
@@ -18,16 +19,23 @@ import numpy as np
 import shapely
 from jaxtyping import Float, Int
 
+from lalaloc_core.conventions import heading_from_degrees, heading_to_degrees
 from lalaloc_core.errors import InvalidFloorPlanError
 
 
 @dataclass(frozen=True, kw_only=True)
 class PlanLimits:
-    """What a floor plan may be; anything outside is refused with the value and the limit."""
+    """What a floor plan may be; anything outside is refused with the value, the limit and the limit's name.
+
+    `max_plan_vertices` are those of all rooms; `max_depth` is of objects and lists within each other.
+    """
 
     max_rooms: int = 500
     max_vertices_per_room: int = 500
+    max_plan_vertices: int = 100_000
     max_extent_m: float = 1000.0
+    max_area_m2: float = 200_000.0
+    max_depth: int = 8
     max_name_length: int = 200
     min_room_area_m2: float = 0.2
     min_ceiling_height_m: float = 1.0
@@ -40,6 +48,10 @@ DEFAULT_LIMITS = PlanLimits()
 DEFAULT_CAMERA_HEIGHT_M = 1.5
 # Unicode categories that neither files nor drawings can hold: control characters and lone surrogates.
 _NOT_TEXT = {"Cc", "Cs"}
+_OPENING, _CLOSING = np.frombuffer(b"[{", np.uint8), np.frombuffer(b"]}", np.uint8)
+_JSON_STRING = re.compile(r'"(?:[^"\\]|\\.)*"', re.DOTALL)
+# Looking for overlaps ends after so many found, or so many pairs looked at: their number grows with the square.
+_MOST_OVERLAPS, _MOST_PAIRS = 20, 5000
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,6 +86,7 @@ class FloorPlan:
         name: what the user calls it.
         rooms: at least one.
         camera_height_m: height of the camera assumed for panoramas of this plan.
+        north: azimuth of true north (radians), None when it is not known.
         warnings: what is odd but usable, such as overlapping rooms.
     """
 
@@ -81,6 +94,7 @@ class FloorPlan:
     rooms: tuple[Room, ...]
     camera_height_m: float = DEFAULT_CAMERA_HEIGHT_M
     warnings: tuple[str, ...] = field(default=())
+    north: float | None = None
 
     @classmethod
     def from_json(cls, text: str | bytes, limits: PlanLimits = DEFAULT_LIMITS) -> FloorPlan:
@@ -90,7 +104,12 @@ class FloorPlan:
             InvalidFloorPlanError: not JSON, or not a valid plan.
         """
         try:
+            if isinstance(text, bytes):
+                text = text.decode(json.detect_encoding(text), "surrogatepass")
+            _check_depth(text, limits)
             document = json.loads(text)
+        except InvalidFloorPlanError:
+            raise
         except (ValueError, RecursionError) as error:
             raise InvalidFloorPlanError(f"not valid JSON: {error}") from error
         return cls.from_dict(document, limits)
@@ -100,14 +119,14 @@ class FloorPlan:
         """Validate a plan in the native format.
 
         Keys: `name`, `rooms` (each `name`, `polygon`, optional `ceiling_height_m`), `ceiling_height_m` (default
-        for rooms without their own), optional `camera_height_m`. Unknown keys are refused.
+        for rooms without their own), optional `camera_height_m` and `north_deg`. Unknown keys are refused.
 
         Raises:
             InvalidFloorPlanError: names the room and what is wrong.
         """
         if not isinstance(document, Mapping):
             raise InvalidFloorPlanError(f"a plan must be an object, not {type(document).__name__}")
-        _known_keys(document, {"name", "rooms", "ceiling_height_m", "camera_height_m"}, room=None)
+        _known_keys(document, {"name", "rooms", "ceiling_height_m", "camera_height_m", "north_deg"}, room=None)
         name = _name(document.get("name", "floor plan"), limits, what="the plan's name")
         default_ceiling = document.get("ceiling_height_m")
         if default_ceiling is not None:
@@ -116,11 +135,12 @@ class FloorPlan:
         if not isinstance(raw_rooms, list) or not raw_rooms:
             raise InvalidFloorPlanError("'rooms' must be a list of at least one room")
         if len(raw_rooms) > limits.max_rooms:
-            raise InvalidFloorPlanError(f"{len(raw_rooms)} rooms, at most {limits.max_rooms} are allowed")
+            raise InvalidFloorPlanError(f"{len(raw_rooms)} rooms, at most {limits.max_rooms} are allowed (max_rooms)")
+        _check_vertices(raw_rooms, limits)
         rooms = tuple(
             _parse_room(raw, f"room {index + 1}", default_ceiling, limits) for index, raw in enumerate(raw_rooms)
         )
-        _check_extent(rooms, limits)
+        _check_size(rooms, limits)
         lowest_ceiling = min(room.ceiling_height_m for room in rooms)
         camera_height = _number(
             document.get("camera_height_m", DEFAULT_CAMERA_HEIGHT_M), "camera_height_m", None, above=0.0
@@ -129,13 +149,17 @@ class FloorPlan:
             raise InvalidFloorPlanError(
                 f"camera_height_m is {camera_height:g}, it must lie below the lowest ceiling ({lowest_ceiling:g} m)"
             )
-        return cls(name, rooms, camera_height, _overlap_warnings(rooms, limits))
+        north = _north(document.get("north_deg"))
+        return cls(name, rooms, camera_height, _overlap_warnings(rooms, limits), north)
 
     def to_dict(self) -> dict[str, Any]:
         """The plan in the native format; `from_dict` of it gives an equal plan."""
+        # Rounded, so that degrees which went through radians are the same again.
+        north = {} if self.north is None else {"north_deg": round(heading_to_degrees(self.north), 9) % 360.0}
         return {
             "name": self.name,
             "camera_height_m": self.camera_height_m,
+            **north,
             "rooms": [
                 {"name": room.name, "polygon": room.polygon_m.tolist(), "ceiling_height_m": room.ceiling_height_m}
                 for room in self.rooms
@@ -197,7 +221,9 @@ def _name(value: Any, limits: PlanLimits, what: str) -> str:
     if not isinstance(value, str) or not value.strip():
         raise InvalidFloorPlanError(f"{what} must be a non-empty string")
     if len(value) > limits.max_name_length:
-        raise InvalidFloorPlanError(f"{what} has {len(value)} characters, at most {limits.max_name_length} are allowed")
+        raise InvalidFloorPlanError(
+            f"{what} has {len(value)} characters, at most {limits.max_name_length} are allowed (max_name_length)"
+        )
     if any(unicodedata.category(character) in _NOT_TEXT for character in value):
         raise InvalidFloorPlanError(f"{what} has control characters or lone surrogates")
     return value
@@ -244,7 +270,7 @@ def _parse_polygon(raw: Any, room: str, limits: PlanLimits) -> Float[np.ndarray,
         raise InvalidFloorPlanError("'polygon' must be a list of at least three [x, y] vertices", room=room)
     if len(raw) > limits.max_vertices_per_room:
         raise InvalidFloorPlanError(
-            f"{len(raw)} vertices, at most {limits.max_vertices_per_room} are allowed", room=room
+            f"{len(raw)} vertices, at most {limits.max_vertices_per_room} are allowed (max_vertices)", room=room
         )
     for index, vertex in enumerate(raw):
         if not (
@@ -271,21 +297,62 @@ def _parse_polygon(raw: Any, room: str, limits: PlanLimits) -> Float[np.ndarray,
     return _frozen(polygon if shape.exterior.is_ccw else polygon[::-1].copy())
 
 
-def _check_extent(rooms: tuple[Room, ...], limits: PlanLimits) -> None:
+def _north(degrees: Any) -> float | None:
+    if degrees is None:
+        return None
+    value = _number(degrees, "north_deg", None, above=-sys.float_info.max)
+    if not -360.0 <= value <= 360.0:
+        raise InvalidFloorPlanError(f"north_deg is {value:g}, it must lie between -360 and 360")
+    return heading_from_degrees(value)
+
+
+def _check_depth(text: str, limits: PlanLimits) -> None:
+    """Refuse deep nesting before it is parsed."""
+    characters = np.frombuffer(_JSON_STRING.sub("", text).encode("utf-8", "surrogatepass"), np.uint8)
+    steps = np.isin(characters, _OPENING).astype(np.int64) - np.isin(characters, _CLOSING)
+    depth = int(np.cumsum(steps).max(initial=0))
+    if depth > limits.max_depth:
+        raise InvalidFloorPlanError(
+            f"the JSON is nested {depth} deep, at most {limits.max_depth} is allowed (max_depth)"
+        )
+
+
+def _check_vertices(raw_rooms: list[Any], limits: PlanLimits) -> None:
+    """Refuse too many vertices before any is looked at."""
+    polygons = [raw.get("polygon") for raw in raw_rooms if isinstance(raw, Mapping)]
+    vertices = sum(len(polygon) for polygon in polygons if isinstance(polygon, list | tuple))
+    if vertices > limits.max_plan_vertices:
+        raise InvalidFloorPlanError(
+            f"{vertices} vertices, at most {limits.max_plan_vertices} are allowed (max_plan_vertices)"
+        )
+
+
+def _check_size(rooms: tuple[Room, ...], limits: PlanLimits) -> None:
     corners = np.concatenate([room.polygon_m for room in rooms])
     extent = float(np.ptp(corners, axis=0).max())
     if extent > limits.max_extent_m:
         raise InvalidFloorPlanError(
-            f"the plan is {extent:.6g} m across, at most {limits.max_extent_m:g} m is allowed; "
+            f"the plan is {extent:.6g} m across, at most {limits.max_extent_m:g} m is allowed (max_extent_m); "
+            "are the coordinates in metres?"
+        )
+    area_m2 = sum(room.area_m2 for room in rooms)
+    if area_m2 > limits.max_area_m2:
+        raise InvalidFloorPlanError(
+            f"the floor area is {area_m2:.6g} m², at most {limits.max_area_m2:g} m² is allowed (max_area_m2); "
             "are the coordinates in metres?"
         )
 
 
 def _overlap_warnings(rooms: tuple[Room, ...], limits: PlanLimits) -> tuple[str, ...]:
     shapes = [room.shape for room in rooms]
-    first, second = shapely.STRtree(shapes).query(shapes, predicate="intersects")
-    warnings = []
-    for i, j in sorted((int(i), int(j)) for i, j in zip(first, second, strict=True) if i < j):
+    # Whose boxes meet; whether the rooms themselves do is asked of each pair, and of not too many.
+    first, second = shapely.STRtree(shapes).query(shapes)
+    pairs = sorted((int(i), int(j)) for i, j in zip(first, second, strict=True) if i < j)
+    warnings: list[str] = []
+    for looked_at, (i, j) in enumerate(pairs):
+        if len(warnings) == _MOST_OVERLAPS or looked_at == _MOST_PAIRS:
+            warnings.append("more rooms may overlap, the rest was not looked at")
+            break
         shared = float(shapely.intersection(shapes[i], shapes[j]).area)
         if shared > limits.overlap_tolerance_m2:
             warnings.append(f"rooms '{rooms[i].name}' and '{rooms[j].name}' overlap by {shared:.2f} m²")

@@ -1,18 +1,46 @@
-"""Reading panoramas: from encoded bytes to the pixels that the image encoder expects."""
+"""Reading panoramas: from encoded bytes to the pixels that the image encoder expects.
+
+The header is checked before any pixel is allocated, and a large picture is scaled down band by band, so that next to it
+only little memory is needed. What the picture says of itself is followed: its EXIF orientation, the part of the sphere
+it shows, and how the camera was held (`photo_sphere`). Nothing else of its metadata is looked at.
+"""
 
 from __future__ import annotations
 
 import io
+import math
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import UInt8
-from PIL import ExifTags, Image, ImageOps, UnidentifiedImageError
+from PIL import ExifTags, Image, ImageChops, UnidentifiedImageError
 
 from lalaloc_core.errors import InvalidPanoramaError
+from lalaloc_core.localise.levelling import level
+from lalaloc_core.localise.photo_sphere import PhotoSphere, SpherePart, read_photo_sphere
 
 FORMATS = ("JPEG", "PNG", "WEBP")
+# What stands where a picture shows nothing: the mean that encoders subtract.
+NEUTRAL = (128, 128, 128)
+# Pictures with more pixels are scaled down in bands of about so many.
+_BAND_PIXELS = 2**22
+# How much finer than the encoder's input a picture is kept until it is in place.
+_FINER = 2
+_UPRIGHT = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+# Shares of a pixel that are rounding.
+_EDGE = 1e-6
+_SIDEWAYS = {5, 6, 7, 8}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,65 +53,196 @@ class PanoramaLimits:
     aspect_tolerance: float = 0.01
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Panorama:
+    """A panorama as the image encoder expects it: the full sphere, level.
+
+    Attributes:
+        pixels: RGB.
+        compass_heading: where the centre column looks, clockwise from true north (radians), if the picture says so.
+    """
+
+    pixels: UInt8[np.ndarray, "h w 3"]
+    compass_heading: float | None = None
+
+
 def read_panorama(
     content: bytes, *, height: int, width: int, limits: PanoramaLimits | None = None
 ) -> UInt8[np.ndarray, "{height} {width} 3"]:
-    """Decode a full equirectangular JPEG, PNG or WebP and scale it to `height` x `width` RGB.
+    """The pixels of `open_panorama`, which says what is raised."""
+    return open_panorama(content, height=height, width=width, limits=limits).pixels
+
+
+def open_panorama(content: bytes, *, height: int, width: int, limits: PanoramaLimits | None = None) -> Panorama:
+    """Decode an equirectangular JPEG, PNG or WebP and scale it to `height` x `width` RGB; the first one of several.
 
     Raises:
-        InvalidPanoramaError: empty, not one of the formats, damaged, too large, or not twice as wide as high.
+        InvalidPanoramaError: empty, not one of the formats, damaged, too large, or neither the full sphere nor a part
+            of it that its metadata tell.
     """
     limits = limits or PanoramaLimits()
     if not content:
         raise InvalidPanoramaError("the panorama is empty")
+    _check_webp_size(content, limits)
+    with _named_errors(limits), Image.open(io.BytesIO(content), formats=FORMATS) as image:
+        _check_pixels(*image.size, limits)
+        orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
+        upright = _turned(image.size, orientation)
+        sphere = read_photo_sphere(image.info.get("xmp"), width=upright[0], height=upright[1])
+        _check_shape(*upright, sphere, limits)
+        finer = 1 if sphere.part is None and sphere.level else _FINER
+        canvas_size = (width * finer, height * finer)
+        picture = _scaled(image, orientation, _shown_size(sphere.part, canvas_size))
+        canvas = picture if sphere.part is None else _placed(picture, sphere.part, canvas_size)
+        if not sphere.level:
+            canvas = Image.fromarray(level(np.asarray(canvas), pitch=sphere.pitch, roll=sphere.roll))
+        pixels = np.asarray(canvas if finer == 1 else canvas.resize((width, height), Image.Resampling.BOX))
+    return Panorama(pixels=pixels, compass_heading=sphere.compass_heading)
+
+
+def warm_up(*, height: int, width: int) -> None:
+    """Read a small picture of every format, so that the first real one does not pay for what is loaded on first use."""
+    picture = Image.new("RGB", (256, 128), NEUTRAL)
+    for picture_format in FORMATS:
+        buffer = io.BytesIO()
+        picture.save(buffer, picture_format)
+        open_panorama(buffer.getvalue(), height=height, width=width)
+
+
+@contextmanager
+def _named_errors(limits: PanoramaLimits) -> Iterator[None]:
     try:
         with warnings.catch_warnings():
-            # Our own pixel limit, checked right below on the header, replaces Pillow's warning.
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            with Image.open(io.BytesIO(content), formats=FORMATS) as image:
-                _check_header(image, limits)
-                _check_aspect(*_upright_size(image), limits)
-                # A JPEG can be decoded straight to a size near the wanted one.
-                image.draft("RGB", (2 * width, 2 * height))
-                upright = ImageOps.exif_transpose(image)
-                rgb = _to_rgb(upright).resize((width, height), Image.Resampling.BOX)
+            # Our own pixel limit, checked on the header, replaces Pillow's warning; damaged metadata do not matter.
+            warnings.simplefilter("ignore")
+            yield
+    except InvalidPanoramaError:
+        raise
     except UnidentifiedImageError as error:
         raise InvalidPanoramaError(f"the panorama is not a readable {', '.join(FORMATS)} picture") from error
     except Image.DecompressionBombError as error:
-        raise InvalidPanoramaError(f"the panorama has more than {limits.max_pixels} pixels") from error
+        raise InvalidPanoramaError(f"the panorama has more than {limits.max_pixels} pixels (max_pixels)") from error
+    except MemoryError as error:
+        raise InvalidPanoramaError("the panorama needs more memory than there is to decode it") from error
     except (OSError, SyntaxError, ValueError, EOFError) as error:
-        if isinstance(error, InvalidPanoramaError):
-            raise
         raise InvalidPanoramaError(f"the panorama is damaged: {error}") from error
-    return np.asarray(rgb)
 
 
-def _check_header(image: Image.Image, limits: PanoramaLimits) -> None:
-    width, height = image.size
+def _check_webp_size(content: bytes, limits: PanoramaLimits) -> None:
+    """WebP's decoder allocates its canvas when it is opened, so the header is looked at before."""
+    if content[:4] != b"RIFF" or content[8:12] != b"WEBP" or len(content) < 30:
+        return
+    kind, head = content[12:16], content[20:30]
+    if kind == b"VP8X":
+        size = int.from_bytes(head[4:7], "little") + 1, int.from_bytes(head[7:10], "little") + 1
+    elif kind == b"VP8L":
+        bits = int.from_bytes(head[1:5], "little")
+        size = (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    else:
+        size = int.from_bytes(head[6:8], "little") & 0x3FFF, int.from_bytes(head[8:10], "little") & 0x3FFF
+    _check_pixels(*size, limits)
+
+
+def _check_pixels(width: int, height: int, limits: PanoramaLimits) -> None:
     if width * height > limits.max_pixels:
         raise InvalidPanoramaError(
-            f"the panorama has {width} x {height} = {width * height} pixels, at most {limits.max_pixels} are allowed"
+            f"the panorama has {width} x {height} = {width * height} pixels, at most {limits.max_pixels} are allowed "
+            "(max_pixels)"
         )
 
 
-def _upright_size(image: Image.Image) -> tuple[int, int]:
-    """(width, height) once turned as its EXIF orientation says; must be asked before `draft` scales the picture."""
+def _check_shape(width: int, height: int, sphere: PhotoSphere, limits: PanoramaLimits) -> None:
+    if sphere.refusal is not None:
+        raise InvalidPanoramaError(f"the panorama cannot be used by its photo sphere metadata: {sphere.refusal}")
+    full_height = height if sphere.part is None else round(height / sphere.part.height)
+    if full_height < limits.min_height:
+        raise InvalidPanoramaError(
+            f"the panorama is {full_height} pixels high, at least {limits.min_height} are needed"
+        )
+    if sphere.part is None and abs(width / height - 2.0) > 2.0 * limits.aspect_tolerance:
+        fault = "" if sphere.fault is None else f"; its photo sphere metadata do not help: {sphere.fault}"
+        raise InvalidPanoramaError(
+            f"the panorama is {width} x {height}; a full 360° panorama is exactly twice as wide as high{fault}"
+        )
+
+
+def _turned(size: tuple[int, int], orientation: int) -> tuple[int, int]:
+    """(width, height) turned as an EXIF orientation says; the same either way."""
+    return (size[1], size[0]) if orientation in _SIDEWAYS else size
+
+
+def _shown_size(part: SpherePart | None, canvas_size: tuple[int, int]) -> tuple[int, int]:
+    """Size that a picture of a part is scaled to, at least as fine as the canvas."""
+    width, height = canvas_size
+    return (width, height) if part is None else (math.ceil(width * part.width), math.ceil(height * part.height))
+
+
+def _scaled(image: Image.Image, orientation: int, size: tuple[int, int]) -> Image.Image:
+    """The whole picture as RGB of a size, turned upright."""
+    stored_size = _turned(size, orientation)
+    # A JPEG can be decoded straight to a size near the wanted one.
+    image.draft("RGB", (2 * stored_size[0], 2 * stored_size[1]))
     width, height = image.size
-    turned = image.getexif().get(ExifTags.Base.Orientation) in (5, 6, 7, 8)
-    return (height, width) if turned else (width, height)
+    factor = max(1, min(width // (2 * stored_size[0]), height // (2 * stored_size[1])))
+    if width * height <= _BAND_PIXELS or factor == 1:
+        scaled = _to_rgb(image).resize(stored_size, Image.Resampling.BOX)
+    else:
+        # The last block of a row or column may be cut off, hence the box.
+        box = (0.0, 0.0, width / factor, height / factor)
+        scaled = _reduced(image, factor).resize(stored_size, Image.Resampling.BOX, box=box)
+    turn = _UPRIGHT.get(orientation)
+    return scaled if turn is None else scaled.transpose(turn)
+
+
+def _reduced(image: Image.Image, factor: int) -> Image.Image:
+    """The picture as RGB, `factor` times smaller; converted in bands, a copy of the whole would double its memory."""
+    width, height = image.size
+    rows = factor * max(1, _BAND_PIXELS // width // factor)
+    reduced = Image.new("RGB", (-(-width // factor), -(-height // factor)))
+    for top in range(0, height, rows):
+        band = _to_rgb(image.crop((0, top, width, min(top + rows, height))))
+        reduced.paste(band.reduce(factor), (0, top // factor))
+    return reduced
 
 
 def _to_rgb(image: Image.Image) -> Image.Image:
-    """8-bit RGB; Pillow's own conversion clips 16-bit grey at 255 instead of scaling it."""
+    """8-bit RGB: 16-bit grey scaled, which Pillow would clip; what is transparent becomes neutral."""
     if image.mode == "I" or image.mode.startswith("I;16"):
-        image = Image.fromarray((np.asarray(image).clip(0, 65535) // 256).astype(np.uint8))
+        image = _eight_bit(image)
+    if image.mode == "CMYK" and "adobe" not in image.info:
+        # Pillow takes every CMYK picture to be stored inverted, as Adobe's are.
+        image = ImageChops.invert(image)
+    if image.has_transparency_data:
+        opaque = Image.new("RGBA", image.size, (*NEUTRAL, 255))
+        image = Image.alpha_composite(opaque, image.convert("RGBA"))
     return image.convert("RGB")
 
 
-def _check_aspect(width: int, height: int, limits: PanoramaLimits) -> None:
-    if height < limits.min_height:
-        raise InvalidPanoramaError(f"the panorama is {height} pixels high, at least {limits.min_height} are needed")
-    if abs(width / height - 2.0) > 2.0 * limits.aspect_tolerance:
-        raise InvalidPanoramaError(
-            f"the panorama is {width} x {height}; a full 360° panorama is exactly twice as wide as high"
-        )
+def _eight_bit(image: Image.Image) -> Image.Image:
+    values = np.asarray(image)
+    grey = Image.fromarray((values.clip(0, 65535) // 256).astype(np.uint8))
+    transparent = image.info.get("transparency")
+    if not isinstance(transparent, int):
+        return grey
+    opacity = np.where(values == transparent, 0, 255).astype(np.uint8)
+    return Image.merge("LA", (grey, Image.fromarray(opacity)))
+
+
+def _placed(picture: Image.Image, part: SpherePart, size: tuple[int, int]) -> Image.Image:
+    """The full sphere, neutral but for the part that a picture shows; pixels it covers in part stay neutral."""
+    width, height = size
+    edges_x = (part.left * width, (part.left + part.width) * width)
+    edges_y = (part.top * height, (part.top + part.height) * height)
+    left, right = math.ceil(edges_x[0] - _EDGE), math.floor(edges_x[1] + _EDGE)
+    top, bottom = math.ceil(edges_y[0] - _EDGE), math.floor(edges_y[1] + _EDGE)
+    scale_x = picture.width / (edges_x[1] - edges_x[0])
+    scale_y = picture.height / (edges_y[1] - edges_y[0])
+    box = (
+        max(0.0, (left - edges_x[0]) * scale_x),
+        max(0.0, (top - edges_y[0]) * scale_y),
+        min(float(picture.width), (right - edges_x[0]) * scale_x),
+        min(float(picture.height), (bottom - edges_y[0]) * scale_y),
+    )
+    canvas = Image.new("RGB", size, NEUTRAL)
+    canvas.paste(picture.resize((right - left, bottom - top), Image.Resampling.BILINEAR, box=box), (left, top))
+    return canvas

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import time
 from typing import Any
 
 import numpy as np
@@ -197,7 +198,7 @@ def test_overlapping_rooms_are_a_warning_and_touching_ones_are_not() -> None:
     assert overlapping.warnings == ("rooms 'room 1' and 'room 2' overlap by 1.00 m²",)
 
 
-@pytest.mark.parametrize("text", ["", "{", "[1, 2", b"\xff\xfe\x00", "nothing", "[" * 100_000])
+@pytest.mark.parametrize("text", ["", "{", "[1, 2", b"\xff\xfe\x00", "nothing"])
 def test_text_that_is_not_json_is_refused(text: str | bytes) -> None:
     with pytest.raises(InvalidFloorPlanError, match="not valid JSON"):
         FloorPlan.from_json(text)
@@ -265,3 +266,70 @@ def test_rooms_compare_by_identity_because_arrays_do_not_compare() -> None:
     assert first == first
     assert first != second
     assert len({first, second}) == 2
+
+
+@pytest.mark.parametrize(("degrees", "azimuth"), [(0, 0.0), (90, math.pi / 2), (-90, 1.5 * math.pi), (360, 0.0)])
+def test_north_is_an_azimuth_of_the_plan(degrees: float, azimuth: float) -> None:
+    plan = FloorPlan.from_dict(EXAMPLE | {"north_deg": degrees})
+    assert plan.north == pytest.approx(azimuth)
+    assert FloorPlan.from_dict(EXAMPLE).north is None
+    assert "north_deg" not in FloorPlan.from_dict(EXAMPLE).to_dict()
+
+
+@given(degrees=st.floats(-360, 360))
+def test_north_survives_being_written_and_read(degrees: float) -> None:
+    once = FloorPlan.from_dict(EXAMPLE | {"north_deg": degrees}).to_dict()
+    assert math.cos(math.radians(once["north_deg"] - degrees)) == pytest.approx(1.0, abs=1e-12)
+    assert FloorPlan.from_dict(once).to_dict() == once
+
+
+@pytest.mark.parametrize("degrees", [361, -360.5, math.nan, math.inf, "north", True, [0]])
+def test_a_north_that_is_no_direction_is_refused(degrees: Any) -> None:
+    assert "north_deg" in str(refused(EXAMPLE | {"north_deg": degrees}))
+
+
+@pytest.mark.parametrize(
+    "text", ["[" * 100_000, '{"rooms":' * 1000, '{"name": "\\"[[[[[[", "rooms": [[[[[[[[[0]]]]]]]]]}']
+)
+def test_deep_nesting_is_refused_before_it_is_parsed(text: str) -> None:
+    for form in (text, text.encode("utf-8"), text.encode("utf-16")):
+        with pytest.raises(InvalidFloorPlanError, match=r"nested \d+ deep, at most 8 is allowed \(max_depth\)"):
+            FloorPlan.from_json(form)
+
+
+def test_brackets_in_names_are_no_nesting() -> None:
+    name = '[[[[[[[[[[ {{{{{{{{{{ \\" \\\\'
+    plan = FloorPlan.from_json(json.dumps(EXAMPLE | {"name": name}))
+    assert plan.name == name
+
+
+def test_a_million_vertices_are_refused_without_looking_at_them() -> None:
+    one_room = '{"ceiling_height_m": 2.5, "rooms": [{"polygon": [' + ",".join(["[0,0]"] * 10**6) + "]}]}"
+    begin = time.perf_counter()
+    with pytest.raises(InvalidFloorPlanError, match=r"1000000 vertices, at most 100000 .*\(max_plan_vertices\)"):
+        FloorPlan.from_json(one_room)
+    assert time.perf_counter() - begin < 10.0
+
+
+def test_vertices_are_counted_over_all_rooms() -> None:
+    document = plan_document(*[rectangle(2.0, 2.0, at=(3.0 * i, 0.0)) for i in range(3)])
+    assert "12 vertices, at most 11" in str(refused(document, PlanLimits(max_plan_vertices=11)))
+    FloorPlan.from_dict(document, PlanLimits(max_plan_vertices=12))
+
+
+def test_too_large_a_floor_is_refused() -> None:
+    document = plan_document(rectangle(10.0, 10.0), rectangle(10.0, 10.0, at=(20.0, 0.0)))
+    assert "200 m², at most 199 m² is allowed (max_area_m2)" in str(refused(document, PlanLimits(max_area_m2=199.0)))
+    FloorPlan.from_dict(document, PlanLimits(max_area_m2=200.0))
+
+
+def test_looking_for_overlaps_ends_early() -> None:
+    """250 times the same jagged room: all pairs would take minutes."""
+    angles = 2.0 * math.pi * np.arange(200) / 200.0
+    radii = 2.0 + np.arange(200) % 2
+    star = np.round(np.stack([radii * np.cos(angles), radii * np.sin(angles)], axis=-1), 3).tolist()
+    begin = time.perf_counter()
+    plan = plan_of(*[star] * 250)
+    assert time.perf_counter() - begin < 10.0
+    assert len(plan.warnings) == 21
+    assert plan.warnings[-1] == "more rooms may overlap, the rest was not looked at"

@@ -5,16 +5,17 @@ from __future__ import annotations
 import io
 import struct
 import time
+import zipfile
 import zlib
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from PIL import Image
+from PIL import Image, ImageChops
 
 from lalaloc_core.errors import InvalidPanoramaError
-from lalaloc_core.localise.images import PanoramaLimits, read_panorama
+from lalaloc_core.localise.images import NEUTRAL, PanoramaLimits, open_panorama, read_panorama
 
 HEIGHT, WIDTH = 32, 64
 LOSSLESS = {"PNG": {}, "WEBP": {"lossless": True}}
@@ -41,12 +42,17 @@ def read(content: bytes, limits: PanoramaLimits | None = None) -> np.ndarray:
 
 def png_header(width: int, height: int) -> bytes:
     """A PNG that claims a size and has next to no pixels."""
+    return png(width, height, b"\0" * 100)
+
+
+def png(width: int, height: int, rows: bytes, *, depth: int = 8, colour_type: int = 2) -> bytes:
+    """A PNG of rows that begin with their filter's number."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
         return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
 
-    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
-    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", zlib.compress(b"\0" * 100)) + chunk(b"IEND", b"")
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, colour_type, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
 
 
 def grey_16_bit(values: np.ndarray) -> bytes:
@@ -71,6 +77,64 @@ class TestAccepted:
             read(content)[24, [8, 24, 40, 56]].astype(int), np.array(picture())[96, 32::64], atol=8
         )
 
+    def test_cmyk_is_right_whether_or_not_adobe_s_marker_says_that_it_is_inverted(self) -> None:
+        inks = picture("CMYK")
+        with_marker = encoded(inks, "JPEG", quality=98)
+        np.testing.assert_allclose(read(with_marker).astype(int), read(encoded(inks.convert("RGB"))), atol=8)
+        # Without it nothing is inverted; Pillow writes inverted inks, so a file of the others is the same picture.
+        start = with_marker.index(b"\xff\xee")
+        length = 2 + int.from_bytes(with_marker[start + 2 : start + 4], "big")
+        assert with_marker[start + 4 : start + 9] == b"Adobe"
+        plain = encoded(ImageChops.invert(inks), "JPEG", quality=98)
+        plain = plain[:start] + plain[start + length :]
+        np.testing.assert_allclose(read(plain).astype(int), read(with_marker), atol=8)
+
+    @pytest.mark.parametrize("kind", LOSSLESS)
+    @pytest.mark.parametrize("opacity", [0, 64, 128, 255])
+    def test_what_is_transparent_becomes_neutral(self, kind: str, opacity: int) -> None:
+        see_through = picture("RGBA")
+        see_through.putalpha(opacity)
+        options = LOSSLESS[kind] | ({"exact": True} if kind == "WEBP" else {})
+        share = opacity / 255.0
+        expected = share * np.asarray(read(encoded(picture()))) + (1.0 - share) * np.array(NEUTRAL)
+        np.testing.assert_allclose(read(encoded(see_through, kind, **options)), expected, atol=1.5)
+
+    def test_transparent_colours_of_other_modes_become_neutral(self) -> None:
+        palette = picture().quantize(8)
+        red = palette.getpixel((10, 100))
+        pixels = read(encoded(palette, transparency=red))
+        assert pixels[24, 8].tolist() == list(NEUTRAL)
+        np.testing.assert_allclose(pixels[24, 24], (0, 255, 0), atol=3)
+        grey = picture("L")
+        pixels = read(encoded(grey, transparency=255))
+        assert pixels[24, 56].tolist() == list(NEUTRAL)
+        assert pixels[24, 8].tolist() == [76, 76, 76]
+        pixels = read(encoded(picture(), transparency=(0, 255, 0)))
+        assert pixels[24, 24].tolist() == list(NEUTRAL)
+        assert pixels[24, 8].tolist() == [255, 0, 0]
+
+    def test_a_transparent_grey_of_sixteen_bits_becomes_neutral(self) -> None:
+        values = np.full((128, 256), 51_400, np.uint16)
+        values[:, :128] = 1000
+        content = encoded(Image.fromarray(values))
+        # Pillow does not write tRNS for 16 bits; the chunk stands right after IHDR's 33 bytes.
+        chunk = b"tRNS" + struct.pack(">H", 1000)
+        content = content[:33] + struct.pack(">I", 2) + chunk + struct.pack(">I", zlib.crc32(chunk)) + content[33:]
+        pixels = read(content)
+        assert pixels[10, 10].tolist() == list(NEUTRAL)
+        assert pixels[10, 50].tolist() == [200, 200, 200]
+
+    @pytest.mark.parametrize(("colour_type", "channels"), [(2, 3), (4, 2), (6, 4)])
+    def test_sixteen_bits_of_colour_keep_their_tones(self, colour_type: int, channels: int) -> None:
+        values = np.linspace(0, 65535, 128 * 256 * channels).reshape(128, 256, channels).astype(">u2")
+        if channels in (2, 4):
+            values[..., -1] = 65535
+        rows = b"".join(b"\0" + row.tobytes() for row in values)
+        pixels = read(png(256, 128, rows, depth=16, colour_type=colour_type)).astype(float)
+        colours = values[..., :3] if channels > 2 else values[..., :1].repeat(3, -1)
+        expected = colours.astype(float).reshape(HEIGHT, 4, WIDTH, 4, 3).mean(axis=(1, 3)) / 257.0
+        np.testing.assert_allclose(pixels, expected, atol=1.5)
+
     @pytest.mark.parametrize("mode", ["L", "LA", "1"])
     def test_grey_pictures_are_grey_in_all_channels(self, mode: str) -> None:
         pixels = read(encoded(picture(mode)))
@@ -89,6 +153,56 @@ class TestAccepted:
         turned = picture(height=256).transpose(Image.Transpose.ROTATE_90)
         content = encoded(turned, "JPEG", exif=exif.tobytes(), quality=95)
         np.testing.assert_allclose(read(content).astype(int), read(encoded(picture(height=256))), atol=12)
+
+    @pytest.mark.parametrize("orientation", range(1, 9))
+    def test_every_exif_orientation_is_undone(self, orientation: int) -> None:
+        turned = [
+            Image.Transpose.FLIP_LEFT_RIGHT,
+            Image.Transpose.ROTATE_180,
+            Image.Transpose.FLIP_TOP_BOTTOM,
+            Image.Transpose.TRANSPOSE,
+            Image.Transpose.ROTATE_90,
+            Image.Transpose.TRANSVERSE,
+            Image.Transpose.ROTATE_270,
+        ]
+        stored = picture() if orientation == 1 else picture().transpose(turned[orientation - 2])
+        exif = Image.Exif()
+        exif[0x0112] = orientation
+        np.testing.assert_array_equal(read(encoded(stored, exif=exif.tobytes())), read(encoded(picture())))
+
+    @pytest.mark.parametrize(("kind", "mode"), [("PNG", "RGB"), ("PNG", "P"), ("PNG", "RGBA"), ("WEBP", "RGB")])
+    def test_a_large_picture_that_is_scaled_in_bands_is_the_same_picture(self, kind: str, mode: str) -> None:
+        height = 1999
+        pixels = read(encoded(picture(mode, height=height).resize((2 * height + 1, height)), kind, **LOSSLESS[kind]))
+        small = read(encoded(picture(mode)))
+        inner = np.ones(WIDTH, bool)
+        inner[::16] = inner[15::16] = False
+        for half in (slice(0, 15), slice(17, 32)):
+            np.testing.assert_allclose(pixels[half, inner].astype(int), small[half, inner], atol=6)
+
+    def test_of_several_pictures_the_first_one_is_read(self) -> None:
+        first, second = picture(), Image.new("RGB", (256, 128), (255, 255, 0))
+        for kind, options in {"WEBP": {"lossless": True}, "PNG": {}, "MPO": {"quality": 95}}.items():
+            content = encoded(first, kind, save_all=True, append_images=[second] * 3, **options)
+            np.testing.assert_allclose(read(content).astype(int), read(encoded(first)), atol=8)
+
+    def test_what_follows_a_picture_is_not_looked_at(self) -> None:
+        archive = io.BytesIO()
+        with zipfile.ZipFile(archive, "w") as file:
+            file.writestr("index.html", "<script>alert(1)</script>")
+        np.testing.assert_array_equal(
+            read(encoded(picture(), "JPEG", quality=95) + archive.getvalue()),
+            read(encoded(picture(), "JPEG", quality=95)),
+        )
+
+    def test_nothing_of_the_place_is_in_the_answer(self) -> None:
+        exif = Image.Exif()
+        exif.get_ifd(0x8825).update({1: "N", 2: (48.0, 8.0, 1.0), 3: "E", 4: (11.0, 34.0, 2.0)})
+        found = open_panorama(encoded(picture(), "JPEG", exif=exif), height=HEIGHT, width=WIDTH)
+        assert {name: type(value) for name, value in vars(found).items()} == {
+            "pixels": np.ndarray,
+            "compass_heading": type(None),
+        }
 
     def test_scaling_averages_instead_of_picking(self) -> None:
         stripes = np.zeros((128, 256, 3), np.uint8)
@@ -140,6 +254,18 @@ class TestRefused:
         with pytest.raises(InvalidPanoramaError, match=r"pixels|damaged"):
             read(png_header(width, height))
         assert time.perf_counter() - begin < 1.0
+
+    @pytest.mark.parametrize("kind", [b"VP8X", b"VP8L", b"VP8 "])
+    def test_a_webp_bomb_is_refused_before_its_canvas_is_allocated(self, kind: bytes) -> None:
+        side = 16_383
+        heads = {
+            b"VP8X": bytes(4) + (side - 1).to_bytes(3, "little") * 2,
+            b"VP8L": b"\x2f" + ((side - 1) | (side - 1) << 14).to_bytes(4, "little") + bytes(5),
+            b"VP8 ": bytes(3) + b"\x9d\x01\x2a" + side.to_bytes(2, "little") * 2,
+        }
+        content = b"RIFF" + struct.pack("<I", 100) + b"WEBP" + kind + struct.pack("<I", 88) + heads[kind] + bytes(78)
+        with pytest.raises(InvalidPanoramaError, match=r"16383 x 16383 = \d+ pixels, at most 1000 .*\(max_pixels\)"):
+            read(content, PanoramaLimits(max_pixels=1000))
 
     def test_the_limit_on_pixels_is_configurable(self) -> None:
         with pytest.raises(InvalidPanoramaError, match="at most 1000"):

@@ -1,0 +1,295 @@
+"""Photo spheres: parts put in place, tilted cameras levelled, and metadata that is never trusted."""
+
+from __future__ import annotations
+
+import io
+import math
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
+
+from lalaloc_core.conventions import column_azimuths, row_elevations
+from lalaloc_core.errors import InvalidPanoramaError
+from lalaloc_core.localise.images import NEUTRAL, Panorama, open_panorama
+from lalaloc_core.localise.levelling import level
+from lalaloc_core.localise.photo_sphere import PhotoSphere, read_photo_sphere
+
+HEIGHT, WIDTH = 64, 128
+FULL_HEIGHT, FULL_WIDTH = 512, 1024
+NAMESPACE = "http://ns.google.com/photos/1.0/panorama/"
+
+
+def xmp(**properties: object) -> bytes:
+    """A packet with GPano properties as attributes."""
+    return packet_of(" " + " ".join(f'GPano:{name}="{value}"' for name, value in properties.items()) + ">")
+
+
+def xmp_of_elements(**properties: object) -> bytes:
+    """A packet with GPano properties as elements."""
+    return packet_of(">" + "".join(f"<GPano:{name}>{value}</GPano:{name}>" for name, value in properties.items()))
+
+
+def packet_of(description: str) -> bytes:
+    return (
+        '<?xpacket begin="\ufeff" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta xmlns:x="adobe:ns:meta/">'
+        '<rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+        f'<rdf:Description rdf:about="" xmlns:GPano="{NAMESPACE}"{description}</rdf:Description>'
+        '</rdf:RDF></x:xmpmeta><?xpacket end="w"?>'
+    ).encode()
+
+
+def crop(left: int, top: int, width: int, height: int, **others: object) -> dict[str, object]:
+    return {
+        "FullPanoWidthPixels": FULL_WIDTH,
+        "FullPanoHeightPixels": FULL_HEIGHT,
+        "CroppedAreaImageWidthPixels": width,
+        "CroppedAreaImageHeightPixels": height,
+        "CroppedAreaLeftPixels": left,
+        "CroppedAreaTopPixels": top,
+    } | others
+
+
+def directions(height: int, width: int) -> np.ndarray:
+    """(h, w, 3): right, forward and up of a level camera that each pixel looks along."""
+    azimuth, elevation = np.meshgrid(column_azimuths(width), row_elevations(height))
+    return np.stack(
+        [np.cos(elevation) * np.sin(azimuth), np.cos(elevation) * np.cos(azimuth), np.sin(elevation)], axis=-1
+    )
+
+
+def world(rays: np.ndarray) -> np.ndarray:
+    """Smooth colours all over the sphere, different in every direction."""
+    x, y, z = np.moveaxis(rays, -1, 0)
+    channels = [x + 0.4 * y * z, y - 0.4 * x * z, z + 0.3 * np.sin(3.0 * x)]
+    return np.round(127.5 + 85.0 * np.stack(channels, axis=-1)).astype(np.uint8)
+
+
+def turn(axis: int, angle: float) -> np.ndarray:
+    """Rotation about right (0), forward (1) or up (2), right-handed."""
+    first, second = [i for i in range(3) if i != axis]
+    sign = -1.0 if axis == 1 else 1.0
+    matrix = np.eye(3)
+    matrix[first, first] = matrix[second, second] = math.cos(angle)
+    matrix[first, second], matrix[second, first] = -sign * math.sin(angle), sign * math.sin(angle)
+    return matrix
+
+
+def tilted(height: int, width: int, pitch_deg: float, roll_deg: float) -> np.ndarray:
+    """The world as a camera sees it that was pitched up, then rolled clockwise about its viewing direction.
+
+    Independent of the code under test: the camera is turned by rotation matrices. Right-handed about `right` lifts the
+    viewing direction; right-handed about `forward`, which points away from the photographer, is clockwise to them.
+    """
+    pose = turn(0, math.radians(pitch_deg)) @ turn(1, math.radians(roll_deg))
+    return world(directions(height, width) @ pose.T)
+
+
+def encoded(pixels: np.ndarray, kind: str = "PNG", packet: bytes | None = None) -> bytes:
+    """A picture of a kind with an XMP packet in it."""
+    buffer = io.BytesIO()
+    options: dict[str, object] = {"quality": 98, "subsampling": 0} if kind == "JPEG" else {}
+    options |= {"lossless": True} if kind == "WEBP" else {}
+    if packet is not None and kind == "PNG":
+        info = PngInfo()
+        info.add_itxt("XML:com.adobe.xmp", packet.decode())
+        options["pnginfo"] = info
+    elif packet is not None:
+        options["xmp"] = packet
+    Image.fromarray(pixels).save(buffer, kind, **options)
+    return buffer.getvalue()
+
+
+def opened(content: bytes) -> Panorama:
+    return open_panorama(content, height=HEIGHT, width=WIDTH)
+
+
+FULL = world(directions(FULL_HEIGHT, FULL_WIDTH))
+LEVEL = world(directions(HEIGHT, WIDTH)).astype(int)
+
+
+class TestParts:
+    @pytest.mark.parametrize("kind", ["JPEG", "PNG", "WEBP"])
+    @pytest.mark.parametrize("write", [xmp, xmp_of_elements])
+    @pytest.mark.parametrize(
+        ("left", "top", "width", "height"),
+        [(0, 128, 1024, 256), (256, 0, 512, 512), (128, 64, 640, 320), (131, 67, 637, 315)],
+    )
+    def test_a_part_is_put_in_its_place_and_the_rest_is_neutral(
+        self, kind: str, write: Callable[..., bytes], left: int, top: int, width: int, height: int
+    ) -> None:
+        packet = write(**crop(left, top, width, height))
+        pixels = opened(encoded(FULL[top : top + height, left : left + width], kind, packet)).pixels.astype(int)
+        scale = FULL_WIDTH // WIDTH
+        inner = (
+            slice(-(-top // scale) + 1, (top + height) // scale - 1),
+            slice(-(-left // scale) + 1, (left + width) // scale - 1),
+        )
+        np.testing.assert_allclose(pixels[inner], LEVEL[inner], atol=5)
+        outside = np.ones((HEIGHT, WIDTH), bool)
+        outside[top // scale : -(-(top + height) // scale), left // scale : -(-(left + width) // scale)] = False
+        assert (pixels[outside] == NEUTRAL).all()
+        assert outside.any()
+
+    def test_a_part_that_was_scaled_afterwards_keeps_its_place(self) -> None:
+        packet = xmp(**crop(128, 64, 640, 320))
+        small = np.asarray(Image.fromarray(FULL[64:384, 128:768]).resize((320, 160), Image.Resampling.BOX))
+        pixels = opened(encoded(small, "PNG", packet)).pixels.astype(int)
+        np.testing.assert_allclose(pixels[10:46, 18:94], LEVEL[10:46, 18:94], atol=5)
+
+    def test_a_full_sphere_that_says_so_is_read_like_one_that_does_not(self) -> None:
+        said = opened(encoded(FULL, "PNG", xmp(**crop(0, 0, 1024, 512)))).pixels
+        np.testing.assert_array_equal(said, opened(encoded(FULL)).pixels)
+
+    @pytest.mark.parametrize(
+        ("changes", "reason"),
+        [
+            ({"CroppedAreaLeftPixels": 500}, "does not lie within the full sphere of 1024 x 512"),
+            ({"CroppedAreaTopPixels": -1}, "CroppedAreaTopPixels is '-1', it must lie between 0 and"),
+            ({"CroppedAreaImageHeightPixels": 400}, "the part is 640 x 400, the picture 640 x 256"),
+            ({"FullPanoHeightPixels": 400}, "not twice as wide as high"),
+            ({"FullPanoWidthPixels": "1e300"}, "FullPanoWidthPixels is '1e300'"),
+            ({"FullPanoWidthPixels": "nan"}, "FullPanoWidthPixels is 'nan'"),
+            ({"FullPanoWidthPixels": ""}, "FullPanoWidthPixels is ''"),
+            ({"CroppedAreaImageWidthPixels": 0}, "width or height of 0"),
+        ],
+    )
+    def test_numbers_that_contradict_are_refused_but_for_a_picture_that_is_full_anyway(
+        self, changes: dict[str, object], reason: str
+    ) -> None:
+        packet = xmp(**(crop(128, 64, 640, 320) | changes))
+        np.testing.assert_array_equal(
+            opened(encoded(FULL[:320, :640], "PNG", packet)).pixels, opened(encoded(FULL[:320, :640])).pixels
+        )
+        flat = encoded(FULL[:256, :640], "PNG", xmp(**(crop(128, 64, 640, 256) | changes)))
+        with pytest.raises(InvalidPanoramaError, match=f"640 x 256; .* twice as wide as high; .*: .*{reason}"):
+            opened(flat)
+
+    @pytest.mark.parametrize(
+        ("changes", "reason"),
+        [
+            (
+                {"FullPanoWidthPixels": 10240, "FullPanoHeightPixels": 5120},
+                "0.4% of the sphere, at least 10% is needed",
+            ),
+            ({"ProjectionType": "cylindrical"}, "'cylindrical', only 'equirectangular'"),
+        ],
+    )
+    def test_what_is_no_use_by_its_own_account_is_refused(self, changes: dict[str, object], reason: str) -> None:
+        packet = xmp(**(crop(128, 64, 640, 320) | changes))
+        with pytest.raises(InvalidPanoramaError, match=reason):
+            opened(encoded(FULL[:320, :640], "PNG", packet))
+
+
+class TestLevelling:
+    @pytest.mark.parametrize(
+        ("pitch_deg", "roll_deg"),
+        [(0, 10), (0, -10), (15, 0), (-15, 0), (20, 30), (-40, 115), (0, 180), (90, 0), (-90, 45), (0.5, -0.5)],
+    )
+    def test_a_tilted_camera_gives_the_picture_of_a_level_one(self, pitch_deg: float, roll_deg: float) -> None:
+        packet = xmp(PosePitchDegrees=pitch_deg, PoseRollDegrees=roll_deg)
+        content = encoded(tilted(FULL_HEIGHT, FULL_WIDTH, pitch_deg, roll_deg), "PNG", packet)
+        np.testing.assert_allclose(opened(content).pixels.astype(int), LEVEL, atol=5)
+
+    @pytest.mark.parametrize(("pitch_deg", "roll_deg"), [(30, 0), (0, 20)])
+    def test_the_signs_are_those_of_the_specification(self, pitch_deg: float, roll_deg: float) -> None:
+        """White sky, black ground; that the pictures are turned as the specification says is looked up in them."""
+        pose = turn(0, math.radians(pitch_deg)) @ turn(1, math.radians(roll_deg))
+        rays = directions(FULL_HEIGHT, FULL_WIDTH) @ pose.T
+        seen = np.where(rays[..., 2:] < 0.0, 0, 255).astype(np.uint8).repeat(3, -1)
+        row, column = FULL_HEIGHT // 2, FULL_WIDTH // 2
+        if pitch_deg > 0.0:
+            below = row + round(pitch_deg / 180.0 * FULL_HEIGHT)
+            assert seen[below - 3, column, 0] == 255, "pitch is degrees above the horizon for the centre"
+            assert seen[below + 3, column, 0] == 0
+        else:
+            assert seen[row - 20, column + FULL_WIDTH // 8, 0] == 0, "as roll grows, the horizon turns counterclockwise"
+            assert seen[row - 20, column - FULL_WIDTH // 8, 0] == 255
+        levelled = level(seen, pitch=math.radians(pitch_deg), roll=math.radians(roll_deg))
+        assert (levelled[: row - 4] == 255).all()
+        assert (levelled[row + 4 :] == 0).all()
+
+    @given(
+        pitch=st.floats(-math.pi / 2, math.pi / 2),
+        roll=st.floats(-math.pi, math.pi),
+    )
+    @settings(max_examples=25)
+    def test_every_pose_is_undone_also_at_seam_and_poles(self, pitch: float, roll: float) -> None:
+        picture = tilted(256, 512, math.degrees(pitch), math.degrees(roll))
+        expected = world(directions(256, 512)).astype(int)
+        np.testing.assert_allclose(level(picture, pitch=pitch, roll=roll).astype(int), expected, atol=4)
+
+    def test_a_level_pose_changes_nothing(self) -> None:
+        np.testing.assert_array_equal(level(FULL, pitch=0.0, roll=0.0), FULL)
+
+    def test_a_tilted_part_is_put_in_place_first(self) -> None:
+        whole = tilted(FULL_HEIGHT, FULL_WIDTH, 10, 5)
+        packet = xmp(**crop(0, 64, 1024, 384, PosePitchDegrees=10, PoseRollDegrees=5))
+        pixels = opened(encoded(whole[64:448], "PNG", packet)).pixels.astype(int)
+        np.testing.assert_allclose(pixels[20:44], LEVEL[20:44], atol=5)
+
+
+class TestMetadata:
+    def test_the_compass_heading_is_told(self) -> None:
+        heading = opened(encoded(FULL, "JPEG", xmp(PoseHeadingDegrees=123.5))).compass_heading
+        assert heading == pytest.approx(math.radians(123.5))
+        assert opened(encoded(FULL)).compass_heading is None
+
+    def test_where_a_viewer_begins_is_ignored(self) -> None:
+        packet = xmp(InitialViewHeadingDegrees=90, InitialViewPitchDegrees=20, InitialViewRollDegrees=20)
+        assert read_photo_sphere(packet, width=1024, height=512) == PhotoSphere()
+
+    @pytest.mark.parametrize(
+        "properties",
+        [
+            {"PosePitchDegrees": 91, "PoseRollDegrees": 181, "PoseHeadingDegrees": 361},
+            {"PosePitchDegrees": "inf", "PoseRollDegrees": "-nan", "PoseHeadingDegrees": -1},
+            {"PosePitchDegrees": "up", "PoseRollDegrees": "", "PoseHeadingDegrees": "north"},
+        ],
+    )
+    def test_angles_out_of_range_are_ignored(self, properties: dict[str, object]) -> None:
+        assert read_photo_sphere(xmp(**properties), width=1024, height=512) == PhotoSphere()
+
+    @pytest.mark.parametrize(
+        "packet",
+        [
+            b"",
+            b"<x",
+            b"\0\0\0",
+            b"\xff\xfe<",
+            b'<?xml version="1.0" encoding="nonsense"?><x/>',
+            xmp(PosePitchDegrees=45).replace(b"</rdf:Description>", b""),
+            b"<!-- " + b"x" * 300_000 + b" -->" + xmp(PosePitchDegrees=45),
+        ],
+    )
+    def test_a_packet_that_cannot_be_read_says_nothing(self, packet: bytes) -> None:
+        assert read_photo_sphere(packet, width=1024, height=512) == PhotoSphere()
+        np.testing.assert_array_equal(opened(encoded(FULL, "WEBP", packet)).pixels, opened(encoded(FULL)).pixels)
+
+    def test_an_entity_bomb_does_not_go_off(self) -> None:
+        levels = "".join(f'<!ENTITY e{i} "{f"&e{i - 1};" * 10}">' for i in range(1, 10))
+        bomb = f'<!DOCTYPE x [<!ENTITY e0 "{"x" * 100}">{levels}]>'.encode() + xmp(PosePitchDegrees="&e9;")
+        begin = time.perf_counter()
+        assert read_photo_sphere(bomb, width=1024, height=512) == PhotoSphere()
+        assert time.perf_counter() - begin < 1.0
+
+    def test_no_file_is_read_for_a_packet(self, tmp_path: Path) -> None:
+        (tmp_path / "pitch").write_text("45", encoding="ascii")
+        packet = f'<!DOCTYPE x [<!ENTITY e SYSTEM "{(tmp_path / "pitch").as_uri()}">]>'.encode()
+        assert read_photo_sphere(packet + xmp(PosePitchDegrees="&e;"), width=1024, height=512) == PhotoSphere()
+
+    def test_deep_elements_are_no_trouble(self) -> None:
+        deep = b"<a>" * 30_000 + b"</a>" * 30_000
+        assert read_photo_sphere(deep, width=1024, height=512) == PhotoSphere()
+
+    @given(packet=st.binary(max_size=200), cut=st.integers(0, 600))
+    @settings(max_examples=100)
+    def test_no_packet_raises(self, packet: bytes, cut: int) -> None:
+        whole = xmp(**crop(128, 64, 640, 320, PosePitchDegrees=3))
+        read_photo_sphere(whole[:cut] + packet + whole[cut:], width=640, height=320)
