@@ -6,7 +6,7 @@ The same code answers over HTTP and in evaluation; only `refine`, who runs the o
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Literal
@@ -75,11 +75,15 @@ class Localisation:
     timings_ms: dict[str, float] = field(default_factory=dict)
 
 
+Steps = Generator[RefinementJob, RefinementResult | None, Localisation]
+
+
 class StageClock:
     """Wall-clock milliseconds per named stage."""
 
     def __init__(self) -> None:
         self.timings_ms: dict[str, float] = {}
+        self._begun_s: dict[str, float] = {}
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
@@ -88,7 +92,12 @@ class StageClock:
         try:
             yield
         finally:
+            self._begun_s[name] = begin
             self.timings_ms[name] = (time.perf_counter() - begin) * 1e3
+
+    def spans(self) -> dict[str, tuple[float, float]]:
+        """When each finished stage began, on the clock of `time.perf_counter`, and how long it took; both seconds."""
+        return {name: (self._begun_s[name], spent_ms / 1e3) for name, spent_ms in dict(self.timings_ms).items()}
 
 
 def localise(
@@ -101,6 +110,7 @@ def localise(
     top_k: int = 5,
     refiner: Refiner | None = None,
     config: LocaliseConfig | None = None,
+    clock: StageClock | None = None,
 ) -> Localisation:
     """Find an encoded panorama in a plan.
 
@@ -108,9 +118,46 @@ def localise(
         grid: the plan's latent grid; its camera height is the query's.
         refine: how far to go; "lpo" without a `refiner`, or with one that returns None, ends at "vdr".
         top_k: how many distinct candidates to return.
+        clock: times the stages; by default one of their own.
     """
+    if refiner is None and refine == "lpo":
+        refine = "vdr"
+    steps = localise_steps(plan, grid, encoders, query, refine=refine, top_k=top_k, config=config, clock=clock)
+    result: RefinementResult | None = None
+    while True:
+        step = next_step(steps, result)
+        if isinstance(step, Localisation):
+            return step
+        assert refiner is not None
+        result = refiner(step)
+
+
+def next_step(steps: Steps, result: RefinementResult | None) -> RefinementJob | Localisation:
+    """Go on with a search: what is to be refined next, or what was found.
+
+    Args:
+        result: of the job that the last step gave; None at first, and where nobody could refine it (in time).
+    """
+    try:
+        return steps.send(result)
+    except StopIteration as done:
+        return done.value
+
+
+def localise_steps(
+    plan: FloorPlan,
+    grid: LatentGrid,
+    encoders: Encoders,
+    query: Query,
+    *,
+    refine: Refine = "lpo",
+    top_k: int = 5,
+    config: LocaliseConfig | None = None,
+    clock: StageClock | None = None,
+) -> Steps:
+    """`localise` for who waits for the optimiser elsewhere: stops where poses are to be optimised; see `next_step`."""
     config = config or LocaliseConfig()
-    clock = StageClock()
+    clock = clock or StageClock()
     stage: Stage = "retrieval"
     starts = config.starts(query)
     with clock.stage("retrieve"):
@@ -140,10 +187,10 @@ def localise(
         best[stage] = candidates[0]
         # Costs of re-sampled poses do not compare with those of the grid's.
         signals[stage] = signals["retrieval"]
-    if refine == "lpo" and refiner is not None:
+    if refine == "lpo":
         with clock.stage("lpo"):
             job = refinement_job(plan, query, candidates[:starts], grid.camera_height_m, config.evidence)
-            result = refiner(job)
+            result = yield job
             if result is not None:
                 moved = [_moved(start, result, index) for index, start in enumerate(candidates[:starts])]
                 moved.sort(key=lambda candidate: candidate.cost)
