@@ -1,11 +1,14 @@
-"""Latent grids: the same as the core's, computed once, kept within bounds, replaced with the model."""
+"""Latent grids: the same as the core's, computed once by whichever replica, bounded, replaced with the model."""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+import threading
+import time
+from collections.abc import Callable, Iterator
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import httpx
 import numpy as np
@@ -18,79 +21,460 @@ from lalaloc_core.errors import InvalidPoseError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.retrieval import build_grid
-from service.errors import UnknownFloorPlanError
-from service.grids import Grids, query_height_m
+from service.errors import (
+    OverloadedError,
+    PlanNotReadyError,
+    StoppingError,
+    StoreUnavailableError,
+    UnknownFloorPlanError,
+)
+from service.grids.caretaker import Caretaker
+from service.grids.courtesy import QueriesInWork
+from service.grids.embedding import grid_bytes
+from service.grids.grids import Grids
+from service.grids.heights import query_height_m
+from service.grids.jobs import MOST_ON_DEMAND
+from service.grids.known_plans import KnownPlans
+from service.lru import BoundedCache
 from service.settings import Settings
-from service.store import PlanRecord, Store
+from service.storage.records import PlanRecord
+from service.storage.store import Store
 from service.telemetry import Telemetry
-from tests.service.conftest import FLAT, StartApp, localise, upload, wait_for
+from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, localise, upload, wait_for
+from tests.service.postgres import PostgresServer
+
+PLAN = FloorPlan.from_dict(FLAT)
+# About 1700 poses in seven chunks.
+HALL = FloorPlan.from_dict(
+    {"ceiling_height_m": 3.0, "rooms": [{"name": "hall", "polygon": [[0, 0], [20, 0], [20, 20], [0, 20]]}]}
+)
+
+
+class CountingEncoders(Encoders):
+    """The real encoders; count the poses that they embed, and wait between chunks if told to."""
+
+    def __init__(self, bundle: Bundle) -> None:
+        super().__init__(bundle, threads=1)
+        self.embedded = 0
+        self.go_on = threading.Event()
+        self.go_on.set()
+
+    def poses(self, *arguments: Any, **named: Any) -> Any:
+        """As the encoders do."""
+        result = super().poses(*arguments, **named)
+        self.embedded += len(result[0])
+        assert self.go_on.wait(30.0)
+        return result
 
 
 @pytest.fixture(scope="module")
-def encoders(tiny_bundle: Path) -> Encoders:
-    return Encoders(Bundle.open(tiny_bundle), threads=1)
+def bundle(tiny_bundle: Path) -> Bundle:
+    return Bundle.open(tiny_bundle)
+
+
+@pytest.fixture
+def encoders(bundle: Bundle) -> CountingEncoders:
+    return CountingEncoders(bundle)
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def open_store(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Callable[[], Store]]:
+    """Opens one database, of either kind, as often as there are replicas."""
+    url = f"sqlite:///{tmp_path / 'test.sqlite3'}"
+    if request.param == "postgresql":
+        url = request.getfixturevalue("postgres").new_database()
+    opened: list[Store] = []
+
+    def one_more() -> Store:
+        opened.append(Store(url))
+        return opened[-1]
+
+    yield one_more
+    for store in opened:
+        store.close()
 
 
 @pytest.fixture
 def store(tmp_path: Path) -> Iterator[Store]:
     opened = Store(f"sqlite:///{tmp_path / 'test.sqlite3'}")
-    opened.add_plan("p", FloorPlan.from_dict(FLAT), original=b"{}", limit=10)
     yield opened
     opened.close()
 
 
-def _grids(store: Store, encoders: Encoders, cache_bytes: int = 2**20) -> Grids:
-    return Grids(store, encoders, "m1", Settings(grid_cache_bytes=cache_bytes), Telemetry())
+def _add(store: Store, plan: FloorPlan = PLAN, plan_id: str = "p") -> PlanRecord:
+    return store.plans.add("default", plan_id, plan, original=b"{}", limit=10)
 
 
-def test_chunks_make_the_same_grid_as_the_core_does_at_once(store: Store, encoders: Encoders) -> None:
-    grids = _grids(store, encoders)
-    computed = grids.compute(grids.key("p", 1.5)).result(30.0)
-    grids.close()
-    expected = build_grid(FloorPlan.from_dict(FLAT), encoders, step_m=0.5, camera_height_m=1.5)
+@pytest.fixture
+def make_grids(encoders: CountingEncoders) -> Iterator[Callable[..., Grids]]:
+    made: list[Grids] = []
+
+    def make(store: Store, own_encoders: Encoders | None = None, **settings: Any) -> Grids:
+        made.append(Grids(store, own_encoders or encoders, "m1", Settings(**settings), Telemetry()))
+        return made[-1]
+
+    yield make
+    for grids in made:
+        grids.close()
+
+
+MakeGrids = Callable[..., Grids]
+OpenStore = Callable[[], Store]
+
+
+def test_chunks_make_the_same_grid_as_the_core_does_at_once(
+    store: Store, make_grids: MakeGrids, encoders: Encoders
+) -> None:
+    computed = make_grids(store).compute(_add(store, HALL), 1.5).result(30.0)
+    expected = build_grid(HALL, encoders, step_m=0.5, camera_height_m=1.5)
     np.testing.assert_array_equal(computed.poses.position_m, expected.poses.position_m)
     np.testing.assert_allclose(computed.latents, expected.latents, atol=1e-5)
     np.testing.assert_array_equal(computed.profile_m, expected.profile_m)
     assert computed.profile_m.dtype == np.float32
 
 
-def test_asking_twice_computes_once(store: Store, encoders: Encoders) -> None:
-    grids = _grids(store, encoders)
-    key = grids.key("p", 1.5)
-    futures = [grids.compute(key) for _ in range(5)]
+def test_asking_twice_computes_once(store: Store, make_grids: MakeGrids, encoders: CountingEncoders) -> None:
+    grids, record = make_grids(store), _add(store)
+    futures = [grids.compute(record, 1.5) for _ in range(5)]
     results = [future.result(30.0) for future in futures]
     assert all(result is results[0] for result in results)
-    assert grids.find(key) is results[0]
-    grids.close()
+    assert grids.find(grids.key(record.revision_id, 1.5)) is results[0]
+    assert encoders.embedded == len(results[0].poses)
 
 
-@pytest.mark.parametrize("cache_bytes", [0, 100_000])
-def test_the_cache_never_holds_more_than_its_limit(store: Store, encoders: Encoders, cache_bytes: int) -> None:
-    grids = _grids(store, encoders, cache_bytes)
-    for height_m in (1.5, 1.6, 1.7):
-        grids.compute(grids.key("p", height_m)).result(30.0)
-        assert grids._cache.bytes <= cache_bytes
-        kept = grids._cache._grids.values()
-        arrays = [a for g in kept for a in (g.latents, g.profile_m, g.poses.position_m, g.poses.room_index)]
-        assert grids._cache.bytes == sum(array.nbytes for array in arrays)
-    # What fell out of memory is still in the store.
-    assert all(grids.find(grids.key("p", height_m)) is not None for height_m in (1.5, 1.6, 1.7))
-    grids.close()
-
-
-def test_the_grid_of_an_unknown_plan_is_an_error(store: Store, encoders: Encoders) -> None:
-    grids = _grids(store, encoders)
+def test_the_grid_of_an_unknown_plan_is_an_error(store: Store, make_grids: MakeGrids) -> None:
+    grids, record = make_grids(store), _add(store)
+    store.plans.delete("default", "p")
     with pytest.raises(UnknownFloorPlanError):
-        grids.compute(grids.key("q", 1.5)).result(30.0)
+        grids.compute(record, 1.5).result(30.0)
     assert grids.pending == 0
+
+
+# In memory
+
+
+@pytest.mark.parametrize("cache_bytes", [0, 200_000])
+def test_the_cache_never_holds_more_than_its_limit(store: Store, make_grids: MakeGrids, cache_bytes: int) -> None:
+    grids, record = make_grids(store, grid_cache_bytes=cache_bytes), _add(store)
+    for height_m in (1.5, 1.6, 1.7):
+        grids.compute(record, height_m).result(30.0)
+        assert grids._cache.bytes <= cache_bytes
+        assert grids._cache.bytes == sum(grid_bytes(grid) for _, grid in grids._cache.items())
+    assert (len(grids._cache.items()) > 0) == (cache_bytes > 0)
+    # What fell out of memory is still in the store.
+    assert all(grids.find(grids.key(record.revision_id, height_m)) is not None for height_m in (1.5, 1.6, 1.7))
+
+
+@given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 60)), max_size=30), st.integers(0, 100))
+def test_a_bounded_cache_counts_right_and_drops_the_least_recently_used(
+    puts: list[tuple[int, int]], limit_bytes: int
+) -> None:
+    cache: BoundedCache[int, int] = BoundedCache(limit_bytes, lambda size: size)
+    expected: list[tuple[int, int]] = []
+    for key, size in puts:
+        cache.put(key, size)
+        expected = [entry for entry in expected if entry[0] != key]
+        if size <= limit_bytes:
+            expected.append((key, size))
+        while sum(size for _, size in expected) > limit_bytes:
+            expected.pop(0)
+        assert cache.items() == expected
+        assert cache.bytes == sum(size for _, size in expected)
+        # Looking at one makes it the most recently used.
+        if expected:
+            assert cache.get(expected[0][0]) == expected[0][1]
+            expected.append(expected.pop(0))
+
+
+def test_what_the_cache_did_is_in_the_metrics(store: Store, encoders: Encoders) -> None:
+    telemetry = Telemetry()
+    grids = Grids(store, encoders, "m1", Settings(), telemetry)
+    record = _add(store)
+    key = grids.key(record.revision_id, 1.5)
+    assert grids.find(key) is None
+    grids.compute(record, 1.5).result(30.0)
+    assert grids.find(key) is not None
     grids.close()
+    text = telemetry.render().decode()
+    assert "lalaloc_grid_cache_hits_total 1.0" in text
+    assert "lalaloc_grid_cache_misses_total 1.0" in text
+    assert "lalaloc_grid_cache_evictions_total 0.0" in text
+
+
+# Several replicas
+
+
+def test_replicas_compute_a_grid_once_and_see_how_far_it_is(
+    open_store: OpenStore, make_grids: MakeGrids, bundle: Bundle
+) -> None:
+    first_store, second_store = open_store(), open_store()
+    first_encoders, second_encoders = CountingEncoders(bundle), CountingEncoders(bundle)
+    first = make_grids(first_store, first_encoders, grid_lease_s=10.0)
+    second = make_grids(second_store, second_encoders, grid_lease_s=10.0)
+    record = _add(first_store, HALL)
+    first_encoders.go_on.clear()
+    first_future = first.compute(record, 1.5)
+    wait_for(lambda: first_encoders.embedded > 0)
+    second_future = second.compute(record, 1.5)
+    wait_for(lambda: len(second._jobs.elsewhere()) == 1)
+    first_encoders.go_on.set()
+    wait_for(lambda: first.progress(first.key(record.revision_id, 1.5)) > 0.0 or first_future.done())
+    summary = second_store.plans.list("default", limit=1)[0]
+    assert second.states([summary])[0].status in ("preparing", "ready")
+    grid = first_future.result(30.0)
+    wait_for(lambda: _looked(second) or second_future.done())
+    np.testing.assert_array_equal(second_future.result(30.0).latents, grid.latents)
+    assert (first_encoders.embedded, second_encoders.embedded) == (len(grid.poses), 0)
+    assert second.states([summary])[0].poses == len(grid.poses)
+
+
+def _looked(grids: Grids) -> bool:
+    grids.look_elsewhere()
+    return False
+
+
+def test_progress_elsewhere_is_told(open_store: OpenStore, make_grids: MakeGrids) -> None:
+    store = open_store()
+    grids, record = make_grids(open_store()), _add(store, HALL)
+    key = grids.key(record.revision_id, 1.5)
+    store.leases.claim(key, "another replica", 60.0)
+    store.leases.renew(key, "another replica", 60.0, 0.25)
+    state = grids.states(store.plans.list("default", limit=1))[0]
+    assert (state.status, state.progress) == ("preparing", 0.25)
+    grids.compute(record, 1.5)
+    wait_for(lambda: _looked(grids) or grids.progress(key) == 0.25)
+
+
+def test_the_lease_of_a_dead_replica_is_taken_over(
+    open_store: OpenStore, make_grids: MakeGrids, encoders: CountingEncoders
+) -> None:
+    store = open_store()
+    grids, record = make_grids(store), _add(store)
+    store.leases.claim(grids.key(record.revision_id, 1.5), "dead", 1.0)
+    future = grids.compute(record, 1.5)
+    wait_for(lambda: len(grids._jobs.elsewhere()) == 1)
+    grids.look_elsewhere()
+    assert encoders.embedded == 0
+    wait_for(lambda: _looked(grids) or future.done())
+    assert len(future.result(30.0).poses) == encoders.embedded
+
+
+def test_a_replica_that_was_thought_dead_gives_way(
+    open_store: OpenStore, make_grids: MakeGrids, encoders: CountingEncoders
+) -> None:
+    store = open_store()
+    grids, record = make_grids(store, grid_lease_s=0.2), _add(store, HALL)
+    key = grids.key(record.revision_id, 1.5)
+    encoders.go_on.clear()
+    future = grids.compute(record, 1.5)
+    wait_for(lambda: encoders.embedded > 0)
+    time.sleep(0.3)
+    assert store.leases.claim(key, "another replica", 60.0)
+    encoders.go_on.set()
+    wait_for(lambda: len(grids._jobs.elsewhere()) == 1)
+    assert encoders.embedded < 1521
+    grid = build_grid(HALL, encoders, step_m=0.5, camera_height_m=1.5)
+    assert store.grids.put(key, grid, keep=8, always_keep_mm=1500)
+    wait_for(lambda: _looked(grids) or future.done())
+    np.testing.assert_array_equal(future.result().latents, grid.latents)
+
+
+def test_deleting_a_plan_on_another_replica_ends_the_work_on_its_grid(
+    open_store: OpenStore, make_grids: MakeGrids, encoders: CountingEncoders
+) -> None:
+    store = open_store()
+    grids, record = make_grids(store, grid_lease_s=0.1), _add(store, HALL)
+    encoders.go_on.clear()
+    future = grids.compute(record, 1.5)
+    wait_for(lambda: encoders.embedded > 0)
+    assert open_store().plans.delete("default", "p")
+    encoders.go_on.set()
+    wait_for(lambda: _looked(grids) or future.done())
+    assert isinstance(future.exception(), UnknownFloorPlanError)
+    assert encoders.embedded < 1521
+    assert grids.pending == 0
+
+
+def test_what_a_stopped_replica_left_is_taken_up_by_another(
+    open_store: OpenStore, make_grids: MakeGrids, encoders: CountingEncoders, bundle: Bundle
+) -> None:
+    first, second = open_store(), open_store()
+    stopping, record = make_grids(first), _add(first, HALL)
+    encoders.go_on.clear()
+    future = stopping.compute(record, 1.5)
+    wait_for(lambda: encoders.embedded > 0)
+    closing = threading.Thread(target=stopping.close)
+    closing.start()
+    wait_for(stopping._jobs.closing.is_set)
+    encoders.go_on.set()
+    closing.join(30.0)
+    assert isinstance(future.exception(), StoppingError)
+    grids = make_grids(second, CountingEncoders(bundle))
+    assert not grids.take_up()
+    assert grids.pending == 1
+    wait_for(lambda: grids.pending == 0)
+    assert grids.find(grids.key(record.revision_id, 1.5)) is not None
+
+
+def test_gone_plans_and_old_revisions_are_dropped_from_memory_on_every_replica(
+    open_store: OpenStore, make_grids: MakeGrids
+) -> None:
+    store, elsewhere = open_store(), open_store()
+    grids, known = make_grids(store), KnownPlans(store, limit_bytes=2**20, max_age_s=600.0)
+    records = {name: _add(store, plan_id=name) for name in ("deleted", "changed", "kept")}
+    for name, record in records.items():
+        grids.compute(record, 1.5).result(30.0)
+        assert known.get("default", name) == record
+    elsewhere.plans.delete("default", "deleted")
+    elsewhere.plans.add_revision("default", "changed", PLAN, original=b"", keep=5)
+    Caretaker(store, grids, known, sweep_s=5.0).sweep()
+    assert grids.revisions() == known.revisions() == {records["kept"].revision_id}
+
+
+# A large grid in the background
+
+
+def test_small_grids_overtake_a_large_one(store: Store, make_grids: MakeGrids, encoders: CountingEncoders) -> None:
+    grids = make_grids(store, grid_step_m=0.4)
+    large, small = _add(store, HALL, "large"), _add(store, PLAN, "small")
+    encoders.go_on.clear()
+    slow = grids.compute(large, 1.5)
+    wait_for(lambda: encoders.embedded > 0)
+    quick = grids.compute(small, 1.5)
+    encoders.go_on.set()
+    quick.result(30.0)
+    assert not slow.done()
+    assert slow.result(60.0) is not None
+
+
+def test_what_waits_is_bounded_and_a_plans_own_grid_has_a_place_of_its_own(
+    store: Store, make_grids: MakeGrids, encoders: CountingEncoders
+) -> None:
+    grids, record = make_grids(store), _add(store)
+    encoders.go_on.clear()
+    asked = [grids.compute(record, 1.0 + 0.02 * number) for number in range(MOST_ON_DEMAND)]
+    with pytest.raises(OverloadedError, match=str(MOST_ON_DEMAND)):
+        grids.compute(record, 2.2)
+    own = grids.compute(record, 1.5)
+    encoders.go_on.set()
+    assert all(future.result(60.0) is not None for future in (*asked, own))
+
+
+def test_work_on_a_revision_that_was_replaced_ends(
+    store: Store, make_grids: MakeGrids, encoders: CountingEncoders
+) -> None:
+    grids, record = make_grids(store), _add(store, HALL)
+    encoders.go_on.clear()
+    future = grids.compute(record, 1.5)
+    wait_for(lambda: encoders.embedded > 0)
+    new = store.plans.add_revision("default", "p", PLAN, original=b"", keep=5)
+    grids.forget({record.revision_id})
+    encoders.go_on.set()
+    assert isinstance(future.exception(30.0), PlanNotReadyError)
+    assert len(grids.compute(new, 1.5).result(30.0).poses) == 110
+
+
+def test_the_background_pauses_for_queries_but_not_for_good() -> None:
+    queries = QueriesInWork()
+    with queries.one(), queries.one():
+        begin = time.monotonic()
+        queries.make_way(0.05)
+        assert 0.19 < time.monotonic() - begin < 5.0
+        waiting = threading.Thread(target=queries.make_way, args=(60.0,))
+        begin = time.monotonic()
+        waiting.start()
+    waiting.join(10.0)
+    assert time.monotonic() - begin < 0.9
+    begin = time.monotonic()
+    queries.make_way(60.0)
+    assert time.monotonic() - begin < 0.5
+
+
+# The database away
+
+
+def test_plans_that_were_read_lately_are_known_while_the_database_is_away(
+    postgres: PostgresServer, make_grids: MakeGrids
+) -> None:
+    store = Store(postgres.new_database())
+    grids, record = make_grids(store), _add(store)
+    known = KnownPlans(store, limit_bytes=2**20, max_age_s=600.0)
+    forgetful = KnownPlans(store, limit_bytes=2**20, max_age_s=0.0)
+    assert known.get("default", "p") == forgetful.get("default", "p") == record
+    grids.compute(record, 1.5).result(30.0)
+    _add(store, plan_id="q")
+    postgres.stop()
+    try:
+        assert known.get("default", "p") == record
+        assert grids.find(grids.key(record.revision_id, 1.5)) is not None
+        for plans, tenant, plan_id in ((known, "default", "q"), (known, "other", "p"), (forgetful, "default", "p")):
+            with pytest.raises(StoreUnavailableError):
+                plans.get(tenant, plan_id)
+        with pytest.raises(StoreUnavailableError):
+            grids.compute(record, 1.6).result(30.0)
+    finally:
+        postgres.start()
+    wait_for(lambda: known.get("default", "q") is not None)
+    # It was no failure of the plan.
+    assert grids.compute(record, 1.6).result(30.0) is not None
+    store.plans.delete("default", "p")
+    time.sleep(1.1)
+    assert known.get("default", "p") is None
+    store.close()
+
+
+@pytest.fixture(scope="module")
+def postgres_app(start_app: StartApp, postgres: PostgresServer, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    url = postgres.new_database()
+    return lambda: start_app(tmp_path_factory.mktemp("data"), database_url=url, sweep_s=0.2)
+
+
+def test_two_replicas_serve_the_same_plans(postgres_app: Any, panorama: bytes) -> None:
+    with postgres_app() as one, postgres_app() as other:
+        plan_id = upload(one, wait=False)
+        assert localise(other, plan_id, panorama, refine="none").status_code == 200
+        assert other.delete(f"/floorplans/{plan_id}").status_code == 204
+        assert_problem(localise(one, plan_id, panorama, refine="none"), 404, "unknown-floorplan")
+        wait_for(lambda: "lalaloc_grid_cache_bytes 0.0" in one.get("/metrics").text)
+
+
+def test_localise_goes_on_while_the_database_is_away(
+    postgres_app: Any, postgres: PostgresServer, panorama: bytes
+) -> None:
+    with postgres_app() as client:
+        plan_id = upload(client)
+        assert localise(client, plan_id, panorama, refine="none").status_code == 200
+        postgres.stop()
+        try:
+            assert localise(client, plan_id, panorama, refine="none").status_code == 200
+            refused = client.get(f"/floorplans/{plan_id}")
+            assert_problem(refused, 503, "store-unavailable")
+            assert int(refused.headers["retry-after"]) > 0
+        finally:
+            postgres.start()
+        wait_for(lambda: client.get(f"/floorplans/{plan_id}").status_code == 200)
+
+
+# The whole service
+
+
+def test_a_small_plan_is_ready_when_its_upload_is_answered(start_app: StartApp, tmp_path: Path) -> None:
+    with start_app(tmp_path) as client:
+        answer = client.post("/floorplans", json=FLAT).json()
+        assert (answer["status"], answer["grid"]["poses"]) == ("ready", 110)
+    with start_app(tmp_path, inline_grid_poses=0) as client:
+        plan_id = client.post("/floorplans", json=FLAT).json()["id"]
+        wait_for(lambda: client.get(f"/floorplans/{plan_id}").json()["status"] == "ready")
 
 
 @given(st.floats(0.001, 3.0))
 @example(2.399)
 @example(0.001)
 def test_a_rounded_height_is_near_and_always_below_the_ceiling(asked_m: float) -> None:
-    record = PlanRecord(id="p", created_at=datetime.now(UTC), plan=FloorPlan.from_dict(FLAT), failure=None)
+    now = datetime.now(UTC)
+    record = PlanRecord(
+        id="p", tenant="t", revision_id="r", revision=1, created_at=now, updated_at=now, plan=PLAN, failure=None
+    )
     if asked_m >= 2.4:
         with pytest.raises(InvalidPoseError, match=r"2\.4"):
             query_height_m(record, asked_m)
@@ -118,15 +502,17 @@ def test_a_new_model_recomputes_the_grids(
         assert localise(client, plan_id, panorama, refine="none").json()["model"]["sha256"] == bundle.sha256
 
 
-def test_grids_of_other_camera_heights_are_bounded(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+def test_grids_of_other_camera_heights_are_bounded(
+    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, panorama: bytes
+) -> None:
     with start_app(tmp_path, max_grids_per_plan=3) as client:
         plan_id = upload(client)
         for height_m in (1.6, 1.7, 1.8, 1.9):
             _localise_at(client, plan_id, panorama, height_m)
-    store = Store(f"sqlite:///{tmp_path / 'lalaloc.sqlite3'}")
+    store = Store(database_of(tmp_path))
     with start_app(tmp_path) as client:
         sha256 = client.get("/readyz").json()["model"]["sha256"]
-    assert {height for _, height in store.grid_poses(sha256, 0.5)} == {1500, 1800, 1900}
+    assert {height for _, height in store.grids.poses(sha256, 0.5)} == {1500, 1800, 1900}
     store.close()
 
 

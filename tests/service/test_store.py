@@ -1,42 +1,78 @@
-"""What is stored comes back the same, in one piece or not at all."""
+"""What is stored comes back the same, in one piece or not at all; on SQLite and on PostgreSQL."""
 
 from __future__ import annotations
 
-import io
+import json
 import sqlite3
-from collections.abc import Iterator
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
 import pytest
+from alembic.autogenerate import compare_metadata
+from alembic.migration import MigrationContext
+from sqlalchemy import event, func, select, update
 
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.poses import LatentGrid
 from lalaloc_core.sampling import PoseSet
-from service.errors import TooManyFloorPlansError
-from service.store import GridKey, Store
+from service.errors import RevisionMismatchError, StoreUnavailableError, TooManyFloorPlansError, UnknownFloorPlanError
+from service.storage.chunks import CHUNK_BYTES
+from service.storage.idempotency import KEPT_FOR
+from service.storage.records import ComputedGrid, Conflict, Cursor, Fresh, GridKey, InProgress, StoredAnswer
+from service.storage.store import Store
+from service.storage.tables import GRID_CHUNKS, GRID_LEASES, IDEMPOTENCY, LATENT_GRIDS, METADATA, ORIGINAL_CHUNKS
 from tests.service.conftest import FLAT
+from tests.service.postgres import PostgresServer
+
+OpenStore = Callable[[], Store]
+PLAN = FloorPlan.from_dict(FLAT)
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """An empty database of either kind."""
+    if request.param == "sqlite":
+        return _url(tmp_path)
+    return request.getfixturevalue("postgres").new_database()
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Iterator[Store]:
-    opened = Store(_url(tmp_path))
-    yield opened
-    opened.close()
+def open_store(url: str) -> Iterator[OpenStore]:
+    """Opens the database once more, as another process would."""
+    opened: list[Store] = []
+
+    def one_more() -> Store:
+        opened.append(Store(url, wait_s=5.0))
+        return opened[-1]
+
+    yield one_more
+    for store in opened:
+        store.close()
+
+
+@pytest.fixture
+def store(open_store: OpenStore) -> Store:
+    return open_store()
 
 
 def _url(folder: Path) -> str:
     return f"sqlite:///{folder / 'test.sqlite3'}"
 
 
-def _add(store: Store, plan_id: str = "a" * 32) -> str:
-    store.add_plan(plan_id, FloorPlan.from_dict(FLAT), original=b"{}", limit=100)
-    return plan_id
+def _add(store: Store, plan_id: str = "a" * 32, *, tenant: str = "default", name: str = "Flat 3") -> str:
+    """Add a plan, return the id of its revision."""
+    plan = FloorPlan.from_dict({**FLAT, "name": name})
+    return store.plans.add(tenant, plan_id, plan, original=b"{}", limit=100).revision_id
 
 
-def _key(plan_id: str, **changes: object) -> GridKey:
-    values = {"plan_id": plan_id, "model_sha256": "m1", "step_m": 0.5, "camera_height_mm": 1500} | changes
+def _key(revision_id: str, **changes: object) -> GridKey:
+    values = {"revision_id": revision_id, "model_sha256": "m1", "step_m": 0.5, "camera_height_mm": 1500} | changes
     return GridKey(**values)  # pyright: ignore[reportArgumentType]
 
 
@@ -47,148 +83,547 @@ def _grid(seed: int = 0, count: int = 7) -> LatentGrid:
     return LatentGrid(poses, latents.astype(np.float32), profile_m.astype(np.float32), 0.5, 1.5)
 
 
-def _put(store: Store, key: GridKey, grid: LatentGrid, keep: int = 8) -> bool:
-    return store.put_grid(key, grid, keep=keep, always_keep_mm=1500)
+def _put(store: Store, key: GridKey, grid: LatentGrid | None = None, keep: int = 8) -> bool:
+    return store.grids.put(key, grid or _grid(), keep=keep, always_keep_mm=1500)
 
 
-def test_a_plan_and_its_original_survive_reopening(tmp_path: Path) -> None:
-    first = Store(_url(tmp_path))
-    first.add_plan("p1", FloorPlan.from_dict(FLAT), original=b"\x00 as sent \xff", limit=10)
-    first.close()
-    second = Store(_url(tmp_path))
-    record = second.plan("p1")
-    assert record is not None
-    assert record.plan.to_dict() == FloorPlan.from_dict(FLAT).to_dict()
-    assert record.created_at.tzinfo is not None
-    assert second.original("p1") == b"\x00 as sent \xff"
-    second.close()
-
-
-def test_a_grid_comes_back_exactly(store: Store) -> None:
-    key, grid = _key(_add(store)), _grid()
-    assert _put(store, key, grid)
-    found = store.grid(key)
+def _assert_same(found: LatentGrid | None, grid: LatentGrid) -> None:
     assert found is not None
     np.testing.assert_array_equal(found.latents, grid.latents)
     np.testing.assert_array_equal(found.profile_m, grid.profile_m)
-    assert found.profile_m.dtype == np.float32
     np.testing.assert_array_equal(found.poses.position_m, grid.poses.position_m)
     np.testing.assert_array_equal(found.poses.room_index, grid.poses.room_index)
-    assert (found.step_m, found.camera_height_m) == (0.5, 1.5)
+    assert (found.latents.dtype, found.profile_m.dtype) == (np.float32, np.float32)
+    assert (found.step_m, found.camera_height_m) == (grid.step_m, grid.camera_height_m)
+
+
+def _rows(store: Store, table: object) -> int:
+    with store._database.reading() as connection:
+        return connection.scalar(select(func.count()).select_from(table)) or 0  # pyright: ignore[reportArgumentType]
+
+
+# Plans and originals
+
+
+@pytest.mark.parametrize("size", [0, 1, CHUNK_BYTES, 2 * CHUNK_BYTES + 3])
+def test_a_plan_and_its_original_are_seen_by_another_process_at_once(open_store: OpenStore, size: int) -> None:
+    first, second = open_store(), open_store()
+    original = np.random.default_rng(1).bytes(size)
+    added = first.plans.add("default", "p1", PLAN, original=original, limit=10)
+    record = second.plans.get("default", "p1")
+    assert record is not None
+    assert record.plan.to_dict() == PLAN.to_dict()
+    assert (record.revision_id, record.revision) == (added.revision_id, 1)
+    assert record.created_at == added.created_at
+    assert record.created_at.utcoffset() == timedelta(0)
+    assert second.plans.original("default", "p1") == original
+    assert first.plans.delete("default", "p1")
+    assert second.plans.get("default", "p1") is None
+
+
+def test_a_plan_may_be_stored_along_with_its_grid(store: Store) -> None:
+    computed = ComputedGrid(model_sha256="m1", grid=_grid())
+    record = store.plans.add("default", "p1", PLAN, original=b"{}", limit=10, grid=computed)
+    _assert_same(store.grids.get(computed.key(record.revision_id)), computed.grid)
+
+
+@pytest.mark.parametrize("broken", ["original", "grid"])
+def test_a_plan_that_cannot_be_stored_whole_is_not_stored_at_all(store: Store, broken: str) -> None:
+    grid = ComputedGrid(model_sha256=None if broken == "grid" else "m1", grid=_grid())  # pyright: ignore[reportArgumentType]
+    original = None if broken == "original" else b"{}"
+    with pytest.raises(Exception, match=r"(?i)not.null|buffer"):
+        store.plans.add("default", "p", PLAN, original=original, limit=10, grid=grid)  # pyright: ignore[reportArgumentType]
+    assert store.plans.get("default", "p") is None
+    assert [_rows(store, table) for table in METADATA.sorted_tables] == [0] * len(METADATA.sorted_tables)
+
+
+def test_the_number_of_plans_is_limited_for_all_tenants_together(store: Store) -> None:
+    _add(store, tenant="one")
+    with pytest.raises(TooManyFloorPlansError, match="1 floor plans"):
+        store.plans.add("two", "b", PLAN, original=b"{}", limit=1)
+    assert store.plans.list("two", limit=10) == []
+
+
+def test_the_limit_holds_when_many_upload_at_once(open_store: OpenStore) -> None:
+    stores = [open_store(), open_store()]
+
+    def add(number: int) -> bool:
+        try:
+            stores[number % 2].plans.add("default", f"p{number}", PLAN, original=b"{}", limit=5)
+        except TooManyFloorPlansError:
+            return False
+        return True
+
+    with ThreadPoolExecutor(8) as threads:
+        assert sum(threads.map(add, range(20))) == 5
+    assert len(stores[0].plans.list("default", limit=10)) == 5
+
+
+def test_a_tenants_plan_does_not_exist_for_others(store: Store) -> None:
+    revision_id = _add(store, "p", tenant="one")
+    assert store.plans.get("two", "p") is None
+    assert store.plans.get_revision("two", "p", revision_id) is None
+    assert store.plans.original("two", "p") is None
+    assert store.plans.list("two", limit=10) == []
+    assert not store.plans.delete("two", "p")
+    with pytest.raises(UnknownFloorPlanError):
+        store.plans.add_revision("two", "p", PLAN, original=b"", keep=5)
+    assert store.plans.get("one", "p") is not None
+
+
+def test_deleting_a_plan_leaves_nothing_of_it(store: Store) -> None:
+    revision_id = _add(store, "p")
+    store.plans.add_revision("default", "p", PLAN, original=b"second", keep=5)
+    _put(store, _key(revision_id))
+    store.leases.claim(_key(revision_id, camera_height_mm=1600), "me", 60.0)
+    assert store.plans.delete("default", "p")
+    assert not store.plans.delete("default", "p")
+    assert store.plans.get_revision("default", "p", revision_id) is None
+    assert store.grids.get(_key(revision_id)) is None
+    assert [_rows(store, table) for table in METADATA.sorted_tables] == [0] * len(METADATA.sorted_tables)
+
+
+def test_listing_is_newest_first_and_paged_by_cursor(store: Store) -> None:
+    ids = [f"{index:032d}" for index in range(5)]
+    for plan_id in ids:
+        _add(store, plan_id)
+    _add(store, "z" * 32, tenant="other")
+    found, after = [], None
+    while page := store.plans.list("default", limit=2, after=after):
+        found += [summary.id for summary in page]
+        after = Cursor(page[-1].created_at, page[-1].id)
+    assert found == ids[::-1]
+
+
+@pytest.mark.parametrize(
+    ("asked", "found"),
+    [("FLAT", {"a", "b"}), ("straße", {"c"}), ("STRASSE", {"c"}), ("äpfel", {"d"}), ("%", {"b"}), ("_", set())],
+)
+def test_names_are_found_by_any_part_in_any_case(store: Store, asked: str, found: set[str]) -> None:
+    for plan_id, name in {"a": "Flat 3", "b": "flat 100%", "c": "Lange Straße 5", "d": "ÄPFEL"}.items():
+        _add(store, plan_id, name=name)
+    assert {summary.id for summary in store.plans.list("default", limit=10, name=asked)} == found
+
+
+def test_summaries_are_those_of_the_plans_that_there_are(store: Store) -> None:
+    _add(store, "a", name="one")
+    _add(store, "b", name="two")
+    assert {summary.id: summary.name for summary in store.plans.summaries({"b", "gone"})} == {"b": "two"}
+    assert store.plans.summaries(set()) == []
+
+
+def test_an_upload_that_is_repeated_under_its_id_is_stored_once(store: Store) -> None:
+    first = store.plans.add("default", "p", PLAN, original=b"{}", limit=1)
+    again = store.plans.add("default", "p", PLAN, original=b"{}", limit=1)
+    assert (again.revision_id, again.revision) == (first.revision_id, 1)
+    assert len(store.plans.list("default", limit=10)) == 1
+
+
+# Revisions
+
+
+def test_a_new_revision_replaces_the_plan_and_the_old_one_stays_readable(store: Store) -> None:
+    old = _add(store, "p")
+    smaller = FloorPlan.from_dict({**FLAT, "name": "smaller", "rooms": FLAT["rooms"][:1]})
+    new = store.plans.add_revision("default", "p", smaller, original=b"new", keep=5, expected=old)
+    current = store.plans.get("default", "p")
+    assert current is not None
+    assert (current.revision, current.revision_id) == (2, new.revision_id) != (1, old)
+    assert (current.plan.name, len(current.plan.rooms)) == ("smaller", 1)
+    assert current.updated_at > current.created_at
+    assert store.plans.original("default", "p") == b"new"
+    assert store.plans.list("default", limit=5)[0].name == "smaller"
+    before = store.plans.get_revision("default", "p", old)
+    assert before is not None
+    assert (before.revision, before.plan.name) == (1, "Flat 3")
+    assert store.plans.current([old, new.revision_id, "nonsense"]) == {new.revision_id}
+
+
+def test_a_revision_that_follows_another_one_than_expected_is_refused(store: Store) -> None:
+    old = _add(store, "p")
+    new = store.plans.add_revision("default", "p", PLAN, original=b"2", keep=5, expected=old)
+    with pytest.raises(RevisionMismatchError, match=new.revision_id):
+        store.plans.add_revision("default", "p", PLAN, original=b"3", keep=5, expected=old)
+    assert store.plans.original("default", "p") == b"2"
+
+
+def test_of_two_revisions_at_the_same_time_that_expect_the_same_one_is_refused(open_store: OpenStore) -> None:
+    stores = [open_store(), open_store()]
+    old = _add(stores[0], "p")
+
+    def add(store: Store) -> bool:
+        try:
+            store.plans.add_revision("default", "p", PLAN, original=b"x", keep=5, expected=old)
+        except RevisionMismatchError:
+            return False
+        return True
+
+    with ThreadPoolExecutor(2) as threads:
+        assert sorted(threads.map(add, stores)) == [False, True]
+
+
+def test_revisions_and_their_grids_are_bounded(store: Store) -> None:
+    ids = [_add(store, "p")]
+    for number in range(4):
+        _put(store, _key(ids[-1]))
+        ids.append(store.plans.add_revision("default", "p", PLAN, original=b"%d" % number, keep=3).revision_id)
+    kept = [store.plans.get_revision("default", "p", revision_id) is not None for revision_id in ids]
+    assert kept == [False, False, True, True, True]
+    # A query in work may still want the grid of the revision before.
+    assert {revision_id for revision_id, _ in store.grids.poses("m1", 0.5)} == {ids[3]}
+    assert _rows(store, ORIGINAL_CHUNKS) == 3
+
+
+# Grids
+
+
+def test_a_grid_comes_back_exactly_without_being_copied(store: Store) -> None:
+    grid = _grid(count=5000)
+    key = _key(_add(store))
+    assert _put(store, key, grid)
+    assert _rows(store, GRID_CHUNKS) > 1
+    found = store.grids.get(key)
+    _assert_same(found, grid)
+    assert found is not None
+    assert not found.latents.flags.owndata
+    assert not found.latents.flags.writeable
 
 
 @pytest.mark.parametrize("changed", [{"model_sha256": "m2"}, {"step_m": 0.25}, {"camera_height_mm": 1520}])
 def test_a_grid_is_found_for_its_own_key_only(store: Store, changed: dict[str, object]) -> None:
-    plan_id = _add(store)
-    _put(store, _key(plan_id), _grid())
-    assert store.grid(_key(plan_id, **changed)) is None
+    revision_id = _add(store)
+    _put(store, _key(revision_id))
+    assert store.grids.get(_key(revision_id, **changed)) is None
 
 
-def test_a_new_model_replaces_the_grids_of_the_old_one(store: Store) -> None:
-    plan_id = _add(store)
-    _put(store, _key(plan_id), _grid())
-    _put(store, _key(plan_id, model_sha256="m2"), _grid(1))
-    assert store.grid(_key(plan_id)) is None
-    assert store.grid(_key(plan_id, model_sha256="m2")) is not None
+def test_grids_of_a_model_and_of_the_one_before_are_kept(store: Store) -> None:
+    revision_id = _add(store)
+    for model in ("m1", "m2", "m3"):
+        _put(store, _key(revision_id, model_sha256=model))
+    kept = [store.grids.get(_key(revision_id, model_sha256=model)) is not None for model in ("m1", "m2", "m3")]
+    assert kept == [False, True, True]
 
 
 def test_grids_of_other_heights_are_bounded_and_the_plans_own_is_never_dropped(store: Store) -> None:
-    plan_id = _add(store)
-    _put(store, _key(plan_id), _grid())
+    revision_id = _add(store)
+    _put(store, _key(revision_id))
     for height_mm in (1600, 1620, 1640, 1660):
-        _put(store, _key(plan_id, camera_height_mm=height_mm), _grid(), keep=3)
-    assert set(store.grid_poses("m1", 0.5)) == {(plan_id, 1500), (plan_id, 1640), (plan_id, 1660)}
-
-
-def test_deleting_a_plan_takes_original_and_grids_along(store: Store) -> None:
-    plan_id = _add(store)
-    _put(store, _key(plan_id), _grid())
-    assert store.delete_plan(plan_id)
-    assert not store.delete_plan(plan_id)
-    assert store.plan(plan_id) is None
-    assert store.original(plan_id) is None
-    assert store.grid(_key(plan_id)) is None
-    assert store.grid_poses("m1", 0.5) == {}
+        _put(store, _key(revision_id, camera_height_mm=height_mm), keep=3)
+    heights = {height_mm for _, height_mm in store.grids.poses("m1", 0.5)}
+    assert heights == {1500, 1640, 1660}
 
 
 def test_a_grid_of_a_deleted_plan_is_not_stored(store: Store) -> None:
-    plan_id = _add(store)
-    store.delete_plan(plan_id)
-    assert not _put(store, _key(plan_id), _grid())
-    assert store.grid_poses("m1", 0.5) == {}
-
-
-def test_a_plan_that_cannot_be_stored_whole_is_not_stored_at_all(store: Store) -> None:
-    with pytest.raises(Exception, match=r"(?i)not null|interface|bind|type"):
-        store.add_plan("p", FloorPlan.from_dict(FLAT), original=None, limit=10)  # pyright: ignore[reportArgumentType]
-    assert store.plan("p") is None
-    assert store.plan_count() == 0
-
-
-def test_the_number_of_plans_is_limited(store: Store) -> None:
-    _add(store)
-    with pytest.raises(TooManyFloorPlansError, match="1 floor plans"):
-        store.add_plan("b", FloorPlan.from_dict(FLAT), original=b"{}", limit=1)
-    assert store.plan_count() == 1
-
-
-def _archive(**arrays: np.ndarray) -> bytes:
-    buffer = io.BytesIO()
-    np.savez(buffer, **arrays)  # pyright: ignore[reportArgumentType]
-    return buffer.getvalue()
+    revision_id = _add(store, "p")
+    store.plans.delete("default", "p")
+    assert not _put(store, _key(revision_id))
+    assert _rows(store, LATENT_GRIDS) == 0
 
 
 @pytest.mark.parametrize(
-    "arrays",
+    "damage",
     [
-        b"not an archive",
-        _archive(position_m=np.zeros((3, 2)), room_index=np.zeros(3), latents=np.zeros((3, 128))),
-        _archive(
-            position_m=np.zeros((3, 2)), room_index=np.zeros(3), latents=np.zeros((3, 128)), profile_m=np.ones((2, 32))
-        ),
+        lambda content: content[:-1],
+        lambda content: content + b"x",
+        lambda content: b"NOPE" + content[4:],
+        lambda content: content[:4] + b"\x08" + content[5:],
+        lambda content: b"",
     ],
-    ids=["not an archive", "no profiles", "too few profiles"],
+    ids=["cut off", "too long", "another format", "more poses", "empty"],
 )
-def test_damaged_or_incomplete_arrays_count_as_not_stored(store: Store, tmp_path: Path, arrays: bytes) -> None:
+def test_a_damaged_grid_counts_as_not_stored_and_may_be_stored_again(
+    store: Store, damage: Callable[[bytes], bytes]
+) -> None:
     key = _key(_add(store))
-    _put(store, key, _grid())
-    with sqlite3.connect(tmp_path / "test.sqlite3") as raw:
-        raw.execute("UPDATE latent_grids_2 SET arrays = ?", (arrays,))
-    assert store.grid(key) is None
+    _put(store, key)
+    with store._database.writing() as connection:
+        content = connection.scalar(select(GRID_CHUNKS.c.content))
+        assert content is not None
+        damaged = damage(bytes(content))
+        connection.execute(update(GRID_CHUNKS).values(content=damaged))
+        # What it says of its size agrees, so that the content itself is looked at.
+        connection.execute(update(LATENT_GRIDS).values(size_bytes=len(damaged)))
+    assert store.grids.get(key) is None
+    assert _put(store, key)
+    assert store.grids.get(key) is not None
 
 
-def test_grids_of_an_older_format_are_dropped_and_plans_are_kept(tmp_path: Path) -> None:
-    older = Store(_url(tmp_path))
-    plan_id = _add(older)
-    _put(older, _key(plan_id), _grid())
-    older.close()
+# Leases
+
+
+def test_a_lease_is_one_owners_until_it_runs_out(open_store: OpenStore) -> None:
+    first, second = open_store(), open_store()
+    key = _key(_add(first))
+    assert first.leases.claim(key, "one", 0.5)
+    assert not second.leases.claim(key, "two", 0.5)
+    assert first.leases.renew(key, "one", 0.5, 0.25)
+    assert second.leases.progress("m1", 0.5, [key.revision_id]) == {(key.revision_id, 1500): 0.25}
+    time.sleep(0.6)
+    assert second.leases.progress("m1", 0.5, [key.revision_id]) == {}
+    assert second.leases.claim(key, "two", 60.0)
+    assert not first.leases.renew(key, "one", 0.5, 0.5)
+    first.leases.release(key, "one")
+    assert not first.leases.claim(key, "one", 60.0)
+
+
+def test_of_many_who_claim_at_once_one_gets_the_lease(open_store: OpenStore) -> None:
+    stores = [open_store(), open_store()]
+    key = _key(_add(stores[0]))
+    start = threading.Barrier(8)
+
+    def claim(number: int) -> bool:
+        start.wait(10.0)
+        return stores[number % 2].leases.claim(key, f"owner {number}", 60.0)
+
+    with ThreadPoolExecutor(8) as threads:
+        assert sum(threads.map(claim, range(8))) == 1
+
+
+def test_the_lease_of_a_deleted_plan_is_gone_and_cannot_be_had(store: Store) -> None:
+    key = _key(_add(store, "p"))
+    assert store.leases.claim(key, "me", 60.0)
+    store.plans.delete("default", "p")
+    assert not store.leases.renew(key, "me", 60.0, 0.5)
+    assert not store.leases.claim(key, "me", 60.0)
+
+
+def test_storing_a_grid_ends_the_lease_on_it(store: Store) -> None:
+    key = _key(_add(store))
+    store.leases.claim(key, "me", 60.0)
+    _put(store, key)
+    assert _rows(store, GRID_LEASES) == 0
+
+
+def test_missing_grids_are_those_that_nobody_has_computes_or_failed_at(store: Store) -> None:
+    revisions = {name: _add(store, name) for name in ("stored", "leased", "failed", "other height", "missing")}
+    _put(store, _key(revisions["stored"]))
+    store.leases.claim(_key(revisions["leased"]), "someone", 1.0)
+    store.plans.set_failure(revisions["failed"], "too large")
+    _put(store, _key(revisions["other height"], camera_height_mm=1600))
+
+    def missing() -> list[str]:
+        return [summary.id for summary in store.grids.missing("m1", 0.5, 10)]
+
+    assert missing() == ["other height", "missing"]
+    time.sleep(1.1)
+    assert missing() == ["leased", "other height", "missing"]
+    store.plans.clear_failures()
+    assert [summary.id for summary in store.grids.missing("m1", 0.5, 2)] == ["leased", "failed"]
+    assert len(store.grids.missing("m2", 0.5, 10)) == 5
+
+
+# Idempotency and keys
+
+ANSWER = StoredAnswer(201, {"location": "/floorplans/x"}, b'{"id": "x"}')
+
+
+def test_a_request_is_carried_out_once_and_its_answer_kept(open_store: OpenStore) -> None:
+    first, second = open_store(), open_store()
+    claim = first.idempotency.begin("t", "POST /floorplans", "k", "body")
+    assert isinstance(claim, Fresh)
+    assert not claim.resumed
+    assert second.idempotency.begin("t", "POST /floorplans", "k", "body") == InProgress()
+    assert second.idempotency.begin("t", "POST /floorplans", "k", "another") == Conflict()
+    first.idempotency.finish("t", "POST /floorplans", "k", claim.token, ANSWER)
+    assert second.idempotency.begin("t", "POST /floorplans", "k", "body") == ANSWER
+    assert second.idempotency.begin("t", "POST /floorplans", "k", "another") == Conflict()
+    for other in (("u", "POST /floorplans", "k"), ("t", "POST /localise", "k"), ("t", "POST /floorplans", "l")):
+        assert isinstance(second.idempotency.begin(*other, "body"), Fresh)
+
+
+def test_an_abandoned_request_may_be_sent_again_an_answered_one_not(store: Store) -> None:
+    claim = store.idempotency.begin("t", "r", "k", "body")
+    assert isinstance(claim, Fresh)
+    store.idempotency.abandon("t", "r", "k", "not the token")
+    assert store.idempotency.begin("t", "r", "k", "body") == InProgress()
+    store.idempotency.abandon("t", "r", "k", claim.token)
+    again = store.idempotency.begin("t", "r", "k", "another")
+    assert isinstance(again, Fresh)
+    store.idempotency.finish("t", "r", "k", again.token, ANSWER)
+    store.idempotency.abandon("t", "r", "k", again.token)
+    assert store.idempotency.begin("t", "r", "k", "another") == ANSWER
+
+
+def test_the_request_of_a_dead_owner_is_taken_over_once_under_the_same_token(open_store: OpenStore) -> None:
+    stores = [open_store(), open_store()]
+    dead = stores[0].idempotency.begin("t", "r", "k", "body", lease_s=0.2)
+    assert isinstance(dead, Fresh)
+    time.sleep(0.3)
+    with ThreadPoolExecutor(4) as threads:
+        claims = list(threads.map(lambda n: stores[n % 2].idempotency.begin("t", "r", "k", "body"), range(4)))
+    assert [claim for claim in claims if claim != InProgress()] == [Fresh(dead.token, resumed=True)]
+
+
+def test_answers_are_kept_for_a_day(store: Store) -> None:
+    for key in ("old", "new"):
+        claim = store.idempotency.begin("t", "r", key, "body")
+        assert isinstance(claim, Fresh)
+        store.idempotency.finish("t", "r", key, claim.token, ANSWER)
+    with store._database.writing() as connection:
+        yesterday = datetime.now(UTC) - KEPT_FOR - timedelta(minutes=1)
+        connection.execute(update(IDEMPOTENCY).where(IDEMPOTENCY.c.key == "old").values(created_at=yesterday))
+    # Not given out any more, also before it is swept away.
+    assert isinstance(store.idempotency.begin("t", "r", "old", "another"), Fresh)
+    with store._database.writing() as connection:
+        connection.execute(update(IDEMPOTENCY).where(IDEMPOTENCY.c.key == "old").values(created_at=yesterday))
+    assert store.idempotency.purge() == 1
+    assert store.idempotency.begin("t", "r", "new", "body") == ANSWER
+
+
+def test_keys_are_found_by_hash_until_revoked(store: Store) -> None:
+    made = store.keys.create("t", "robot", "h1", {"read", "localise"})
+    store.keys.create("u", "other", "h2", {"read"})
+    assert store.keys.find("h1") == made
+    assert made.scopes == {"read", "localise"}
+    assert store.keys.find("h3") is None
+    assert [key.name for key in store.keys.list("t")] == ["robot"]
+    store.keys.touch(made.id)
+    touched = store.keys.find("h1")
+    assert touched is not None
+    assert touched.last_used_at is not None
+    assert store.keys.revoke(made.id)
+    assert not store.keys.revoke(made.id)
+    assert store.keys.find("h1") is None
+    assert [key.revoked_at is None for key in store.keys.list()] == [False, True]
+
+
+# The database itself
+
+
+def test_the_migrations_make_the_tables_that_the_code_uses(store: Store) -> None:
+    with store._database.reading() as connection:
+        context = MigrationContext.configure(connection, opts={"compare_type": True})
+        assert compare_metadata(context, METADATA) == []
+
+
+def test_processes_that_start_together_make_the_tables_once(url: str) -> None:
+    with ThreadPoolExecutor(4) as threads:
+        stores = list(threads.map(lambda _: Store(url), range(4)))
+    _add(stores[0])
+    assert all(len(store.plans.list("default", limit=10)) == 1 for store in stores)
+    for store in stores:
+        store.close()
+
+
+def test_a_database_of_a_newer_version_is_left_alone(store: Store, url: str) -> None:
+    with store._database.writing() as connection:
+        connection.exec_driver_sql("UPDATE alembic_version SET version_num = '9999'")
+    with pytest.raises(ConfigError, match="9999"):
+        Store(url)
+
+
+_FIRST_SCHEMA = """
+CREATE TABLE floorplans (
+    id VARCHAR(32) NOT NULL, created_at DATETIME NOT NULL, name TEXT NOT NULL, document TEXT NOT NULL,
+    room_count INTEGER NOT NULL, area_m2 FLOAT NOT NULL, camera_height_m FLOAT NOT NULL, failure TEXT, PRIMARY KEY (id)
+);
+CREATE INDEX floorplans_by_age ON floorplans (created_at, id);
+CREATE TABLE originals (
+    plan_id VARCHAR(32) NOT NULL, content BLOB NOT NULL, PRIMARY KEY (plan_id),
+    FOREIGN KEY(plan_id) REFERENCES floorplans (id) ON DELETE CASCADE
+);
+CREATE TABLE {grids} (
+    id INTEGER NOT NULL, plan_id VARCHAR(32) NOT NULL, model_sha256 VARCHAR(64) NOT NULL, step_m FLOAT NOT NULL,
+    camera_height_mm INTEGER NOT NULL, poses INTEGER NOT NULL, arrays BLOB NOT NULL, PRIMARY KEY (id),
+    UNIQUE (plan_id, model_sha256, step_m, camera_height_mm),
+    FOREIGN KEY(plan_id) REFERENCES floorplans (id) ON DELETE CASCADE
+);
+"""
+
+
+@pytest.mark.parametrize("grids", ["latent_grids", "latent_grids_2"])
+def test_a_database_of_the_first_version_is_taken_over(tmp_path: Path, grids: str) -> None:
+    original = b"\x00 as sent \xff" * 200_000
     with sqlite3.connect(tmp_path / "test.sqlite3") as raw:
-        raw.execute("ALTER TABLE latent_grids_2 RENAME TO latent_grids")
+        raw.executescript(_FIRST_SCHEMA.format(grids=grids))
+        for number in (1, 2):
+            plan_id, created_at = f"{number}" * 32, f"2026-01-0{number} 10:00:00.123456"
+            document = FloorPlan.from_dict({**FLAT, "name": f"Flat {number}"}).to_dict()
+            values = (plan_id, created_at, f"Flat {number}", json.dumps(document), 2, 36.0, 1.5, None)
+            raw.execute("INSERT INTO floorplans VALUES (?, ?, ?, ?, ?, ?, ?, ?)", values)
+            raw.execute("INSERT INTO originals VALUES (?, ?)", (plan_id, original))
+            raw.execute(f"INSERT INTO {grids} VALUES (?, ?, 'm1', 0.5, 1500, 7, x'00')", (number, plan_id))
+    raw.close()
     store = Store(_url(tmp_path))
-    assert store.plan(plan_id) is not None
-    # Not counted among the stored ones either, so that the service computes it again when it starts.
-    assert store.grid_poses("m1", 0.5) == {}
-    assert store.grid(_key(plan_id)) is None
-    assert _put(store, _key(plan_id), _grid())
-    assert store.grid(_key(plan_id)) is not None
+    assert [summary.name for summary in store.plans.list("default", limit=10)] == ["Flat 2", "Flat 1"]
+    record = store.plans.get("default", "1" * 32)
+    assert record is not None
+    assert record.created_at == datetime(2026, 1, 1, 10, 0, 0, 123456, tzinfo=UTC)
+    assert record.plan.to_dict() == FloorPlan.from_dict({**FLAT, "name": "Flat 1"}).to_dict()
+    assert store.plans.original("default", "1" * 32) == original
+    # Grids are computed again.
+    assert [summary.name for summary in store.grids.missing("m1", 0.5, 10)] == ["Flat 1", "Flat 2"]
+    with store._database.reading() as connection:
+        context = MigrationContext.configure(connection, opts={"compare_type": True})
+        assert compare_metadata(context, METADATA) == []
     store.close()
-    with sqlite3.connect(tmp_path / "test.sqlite3") as raw:
-        assert raw.execute("SELECT name FROM sqlite_master WHERE name = 'latent_grids'").fetchall() == []
+    again = Store(_url(tmp_path))
+    assert len(again.plans.list("default", limit=10)) == 2
+    again.close()
 
 
-def test_sqlite_runs_with_foreign_keys_and_a_write_ahead_log(store: Store) -> None:
-    with store._engine.connect() as connection:
+def test_sqlite_runs_with_foreign_keys_and_a_write_ahead_log(tmp_path: Path) -> None:
+    store = Store(_url(tmp_path))
+    with store._database.reading() as connection:
         assert connection.exec_driver_sql("PRAGMA journal_mode").scalar() == "wal"
         assert connection.exec_driver_sql("PRAGMA foreign_keys").scalar() == 1
+        assert connection.exec_driver_sql("PRAGMA synchronous").scalar() == 1
+    store.close()
 
 
-@pytest.mark.parametrize("url", ["nonsense", "sqlite:////no/such/folder/x.sqlite3", "nosuchdialect://x"])
-def test_a_database_that_cannot_be_opened_is_a_configuration_error(url: str) -> None:
+@pytest.mark.parametrize(
+    "url",
+    [
+        "nonsense",
+        "sqlite:////no/such/folder/x.sqlite3",
+        "nosuchdialect://x",
+        "sqlite://",
+        "mysql://x/y",
+        "postgresql://127.0.0.1:9/x",
+    ],
+)
+def test_a_database_that_cannot_be_used_is_a_configuration_error(url: str) -> None:
     with pytest.raises(ConfigError, match="database"):
         Store(url)
 
 
-def test_listing_is_newest_first_and_paged(store: Store) -> None:
-    ids = [_add(store, f"{index:032d}") for index in range(5)]
-    assert [summary.id for summary in store.plans()] == ids[::-1]
-    assert [summary.id for summary in store.plans(offset=1, limit=2)] == [ids[3], ids[2]]
+def test_what_is_open_is_bounded_and_waiting_for_it_as_well(url: str) -> None:
+    store = Store(url, connections=2, wait_s=0.2)
+    with store._database.reading(), store._database.reading():
+        begin = time.monotonic()
+        with pytest.raises(StoreUnavailableError):
+            store.plans.list("default", limit=1)
+        assert time.monotonic() - begin < 2.0
+    assert store.plans.list("default", limit=1) == []
+    store.close()
+
+
+def test_an_address_may_say_postgresql_or_name_the_driver(postgres: PostgresServer) -> None:
+    plain = postgres.new_database()
+    for url in (plain, plain.replace("postgresql:", "postgresql+psycopg:"), plain.replace("postgresql:", "postgres:")):
+        store = Store(url)
+        assert store.plans.list("default", limit=1) == []
+        store.close()
+
+
+def test_a_server_that_was_away_is_used_again_when_it_is_back(postgres: PostgresServer) -> None:
+    store = Store(postgres.new_database())
+    _add(store, "p")
+    postgres.stop()
+    try:
+        for _ in range(3):
+            with pytest.raises(StoreUnavailableError):
+                store.plans.get("default", "p")
+    finally:
+        postgres.start()
+    assert store.plans.get("default", "p") is not None
+    store.close()
+
+
+def test_a_read_of_a_plan_in_memory_is_one_query(store: Store) -> None:
+    _add(store, "p")
+    statements: list[str] = []
+    event.listen(store._database._engine, "before_cursor_execute", lambda *arguments: statements.append(arguments[2]))
+    assert store.plans.get("default", "p") is not None
+    assert len([statement for statement in statements if statement.startswith("SELECT floorplans")]) == 1
+    assert not any("document" in statement for statement in statements)

@@ -1,0 +1,73 @@
+"""Looks after what other replicas do: plans that are gone, grids that they compute, and grids that nobody does."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from time import monotonic
+
+from service.errors import StoreUnavailableError
+from service.grids.grids import Grids
+from service.grids.known_plans import KnownPlans
+from service.storage.store import Store
+from service.telemetry import LOGGER_NAME
+
+# Revisions that one query asks about.
+_AT_ONCE = 500
+_POLL_S = 0.5
+_PURGE_EVERY_S = 3600.0
+
+
+class Caretaker:
+    """A thread with a few cheap queries every now and then; a database that is away is tried again."""
+
+    def __init__(self, store: Store, grids: Grids, known: KnownPlans, *, sweep_s: float) -> None:
+        self._store = store
+        self._grids = grids
+        self._known = known
+        self._sweep_s = sweep_s
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="caretaker", daemon=True)
+
+    def start(self) -> None:
+        """Try once more what failed under an earlier start, then look after things until `close`."""
+        self._store.plans.clear_failures()
+        self._grids.take_up()
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop."""
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join()
+
+    def sweep(self) -> None:
+        """Forget plans and grids in memory whose revisions are gone, on whichever replica they were deleted."""
+        in_memory = sorted(self._grids.revisions() | self._known.revisions())
+        for first in range(0, len(in_memory), _AT_ONCE):
+            asked = in_memory[first : first + _AT_ONCE]
+            gone = set(asked) - self._store.plans.current(asked)
+            if gone:
+                self._grids.forget(gone)
+                self._known.drop(gone)
+
+    def _run(self) -> None:
+        sweep_at = purge_at = monotonic()
+        more = True
+        while not self._stop.wait(min(_POLL_S, self._sweep_s)):
+            try:
+                self._grids.look_elsewhere()
+                due = monotonic() >= sweep_at
+                if due:
+                    sweep_at = monotonic() + self._sweep_s
+                    self.sweep()
+                # A backlog, as after a new model, goes on as soon as what was taken up is done.
+                if due or (more and self._grids.pending == 0):
+                    more = self._grids.take_up()
+                if monotonic() >= purge_at:
+                    purge_at = monotonic() + _PURGE_EVERY_S
+                    self._store.idempotency.purge()
+            except StoreUnavailableError:
+                continue
+            except Exception:
+                logging.getLogger(LOGGER_NAME).exception("looking after grids failed")

@@ -1,0 +1,158 @@
+"""Grids that are to be computed: by one thread here, or by another replica, whichever took the lease.
+
+A job waits in the queue, is computed here under a lease, or is *elsewhere*: another replica has the lease, and the
+store is asked now and then how far it is. A lease that ran out puts the job back into the queue. Small grids go first,
+also before the rest of a large one that has begun.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+
+from lalaloc_core.localise.poses import LatentGrid
+from service.errors import OverloadedError, StoppingError
+from service.storage.records import GridKey
+
+# More are not queued: whoever asks is told, and what has no grid is found again by `Grids.take_up`.
+MOST_JOBS = 256
+MOST_ON_DEMAND = 16
+# A grid of so many poses takes a moment, and does not wait behind larger ones.
+_SMALL_POSES = 2000
+
+
+@dataclass(eq=False)
+class Job:
+    """One grid that is to be computed.
+
+    Attributes:
+        poses: about how many it has.
+        on_demand: whether a query asked for it, for a camera height that is not the plan's own.
+        cancelled: set to end the work.
+        progress: share that is done, 0 to 1, here or elsewhere.
+        elsewhere: whether another replica computes it.
+    """
+
+    key: GridKey
+    plan_id: str
+    poses: int
+    on_demand: bool
+    future: Future[LatentGrid] = field(default_factory=Future)
+    cancelled: threading.Event = field(default_factory=threading.Event)
+    progress: float = 0.0
+    elsewhere: bool = False
+
+
+class Jobs:
+    """The jobs of this replica and the thread that works on them."""
+
+    def __init__(self, work: Callable[[Job], None]) -> None:
+        """Start the thread.
+
+        Args:
+            work: computes a job and ends it with `end`, or leaves it `elsewhere`; must not raise.
+        """
+        self._work = work
+        self._changed = threading.Condition()
+        self._jobs: dict[GridKey, Job] = {}
+        self._queued: list[Job] = []
+        self.closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="grids", daemon=True)
+        self._thread.start()
+
+    def __len__(self) -> int:
+        return len(self._jobs)
+
+    def get(self, key: GridKey) -> Job | None:
+        """The job for a grid."""
+        return self._jobs.get(key)
+
+    def add(self, key: GridKey, *, plan_id: str, poses: int, on_demand: bool) -> Job:
+        """The job for a grid, a new one if there is none.
+
+        Raises:
+            OverloadedError: too many jobs are waiting already.
+            StoppingError: the service stops.
+        """
+        with self._changed:
+            job = self._jobs.get(key)
+            if job is not None:
+                return job
+            if self.closing.is_set():
+                raise StoppingError()
+            if on_demand and sum(other.on_demand for other in self._jobs.values()) >= MOST_ON_DEMAND:
+                raise OverloadedError(MOST_ON_DEMAND)
+            if len(self._jobs) >= MOST_JOBS:
+                raise OverloadedError(MOST_JOBS)
+            job = Job(key, plan_id, poses, on_demand)
+            # Others may wait for the same future: nobody can cancel it for them.
+            job.future.set_running_or_notify_cancel()
+            self._jobs[key] = job
+            self._queued.append(job)
+            self._changed.notify()
+            return job
+
+    def end(self, job: Job, outcome: LatentGrid | Exception) -> None:
+        """Forget a job, then give its outcome to those who wait, so that they find the plan in its final state."""
+        with self._changed:
+            self._jobs.pop(job.key, None)
+        if isinstance(outcome, Exception):
+            job.future.set_exception(outcome)
+        else:
+            job.future.set_result(outcome)
+
+    def elsewhere(self) -> list[Job]:
+        """The jobs that other replicas have the lease of."""
+        with self._changed:
+            return [job for job in self._jobs.values() if job.elsewhere]
+
+    def requeue(self, job: Job) -> None:
+        """Look after a job that was elsewhere."""
+        with self._changed:
+            job.elsewhere = False
+            self._queued.append(job)
+            self._changed.notify()
+
+    def cancel(self, revision_id: str) -> None:
+        """End the jobs for a revision that is gone."""
+        with self._changed:
+            for job in self._jobs.values():
+                if job.key.revision_id == revision_id:
+                    job.cancelled.set()
+
+    def let_pass(self, large: Job) -> None:
+        """Compute one of the small grids that wait, between two chunks of a large one."""
+        if large.poses > _SMALL_POSES and (job := self._next(_SMALL_POSES)) is not None:
+            self._work(job)
+
+    def close(self) -> None:
+        """End the work; all who still wait get StoppingError."""
+        with self._changed:
+            self.closing.set()
+            self._queued.clear()
+            for job in self._jobs.values():
+                job.cancelled.set()
+            self._changed.notify()
+        self._thread.join()
+        for job in list(self._jobs.values()):
+            self.end(job, StoppingError())
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._queued or self.closing.is_set())
+            if self.closing.is_set():
+                return
+            if (job := self._next()) is not None:
+                self._work(job)
+
+    def _next(self, most_poses: int | None = None) -> Job | None:
+        """Take the smallest job from the queue."""
+        with self._changed:
+            job = min(self._queued, key=lambda job: job.poses, default=None)
+            if job is None or (most_poses is not None and job.poses > most_poses):
+                return None
+            self._queued.remove(job)
+            return job

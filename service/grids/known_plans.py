@@ -1,0 +1,68 @@
+"""Plans as queries need them: read anew for each one, and from memory while the database is away."""
+
+from __future__ import annotations
+
+from time import monotonic
+
+from service.errors import StoreUnavailableError
+from service.lru import BoundedCache
+from service.storage.plans import plan_bytes
+from service.storage.records import PlanRecord
+from service.storage.store import Store
+
+# After a failure the database is left alone for so long by queries that can be answered without it.
+_LEFT_ALONE_S = 1.0
+
+
+class KnownPlans:
+    """Finds plans for queries; safe to share between threads."""
+
+    def __init__(self, store: Store, *, limit_bytes: int, max_age_s: float) -> None:
+        """Nothing is known at first.
+
+        Args:
+            max_age_s: how long after it was last read a plan counts as known.
+        """
+        self._store = store
+        self._max_age_s = max_age_s
+        self._known: BoundedCache[tuple[str, str], tuple[PlanRecord, float]] = BoundedCache(
+            limit_bytes, lambda entry: plan_bytes(entry[0].plan)
+        )
+        self._away_until = 0.0
+
+    def get(self, tenant: str, plan_id: str) -> PlanRecord | None:
+        """A plan at its current revision; while the database is away, at the one that it last had.
+
+        Raises:
+            StoreUnavailableError: the database is away, and the plan was not read lately.
+        """
+        key = (tenant, plan_id)
+        if monotonic() < self._away_until and (known := self._lately(key)) is not None:
+            return known
+        try:
+            record = self._store.plans.get(tenant, plan_id)
+        except StoreUnavailableError:
+            self._away_until = monotonic() + _LEFT_ALONE_S
+            known = self._lately(key)
+            if known is None:
+                raise
+            return known
+        if record is None:
+            self._known.drop(lambda other, _: other == key)
+        else:
+            self._known.put(key, (record, monotonic()))
+        return record
+
+    def revisions(self) -> set[str]:
+        """The revisions in memory."""
+        return {record.revision_id for _, (record, _) in self._known.items()}
+
+    def drop(self, revision_ids: set[str]) -> None:
+        """Forget plans at revisions that are gone."""
+        self._known.drop(lambda _, entry: entry[0].revision_id in revision_ids)
+
+    def _lately(self, key: tuple[str, str]) -> PlanRecord | None:
+        entry = self._known.get(key)
+        if entry is None or monotonic() - entry[1] > self._max_age_s:
+            return None
+        return entry[0]

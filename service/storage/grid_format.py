@@ -1,0 +1,51 @@
+"""A latent grid as one blob: a header, then its arrays as they lie in memory, so that reading copies nothing.
+
+4 bytes "LLG1", then the numbers of poses, latent values and profile columns as little-endian uint32;
+positions (float64, n·2), latents (float32, n·d), profiles (float32, n·w), room indices (int32, n).
+"""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+
+from lalaloc_core.localise.poses import LatentGrid
+from lalaloc_core.sampling import PoseSet
+
+_HEADER = struct.Struct("<4s3I")
+_MAGIC = b"LLG1"
+_POSE_BYTES, _VALUE_BYTES, _ROOM_BYTES = 16, 4, 4
+
+
+def pack(grid: LatentGrid) -> bytes:
+    """The blob of a grid."""
+    count, latent_size = grid.latents.shape
+    header = _HEADER.pack(_MAGIC, count, latent_size, grid.profile_m.shape[1])
+    arrays = (
+        grid.poses.position_m.astype("<f8", copy=False),
+        grid.latents.astype("<f4", copy=False),
+        grid.profile_m.astype("<f4", copy=False),
+        grid.poses.room_index.astype("<i4", copy=False),
+    )
+    return b"".join((header, *(np.ascontiguousarray(array).data.cast("B") for array in arrays)))
+
+
+def unpack(content: bytes | bytearray, *, step_m: float, camera_height_m: float) -> LatentGrid | None:
+    """The grid in a blob, as read-only views of it; None when the blob is not one."""
+    if len(content) < _HEADER.size:
+        return None
+    magic, count, latent_size, columns = _HEADER.unpack_from(content)
+    pose_bytes = _POSE_BYTES + _VALUE_BYTES * (latent_size + columns) + _ROOM_BYTES
+    if magic != _MAGIC or count == 0 or len(content) != _HEADER.size + count * pose_bytes:
+        return None
+    view, offset = memoryview(content).toreadonly(), _HEADER.size
+
+    def take(dtype: str, width: int) -> np.ndarray:
+        nonlocal offset
+        array = np.frombuffer(view, dtype, count * width, offset)
+        offset += array.nbytes
+        return array.reshape(count, width)
+
+    position_m, latents, profile_m = take("<f8", 2), take("<f4", latent_size), take("<f4", columns)
+    return LatentGrid(PoseSet(position_m, take("<i4", 1)[:, 0]), latents, profile_m, step_m, camera_height_m)

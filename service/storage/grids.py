@@ -1,0 +1,222 @@
+"""Latent grids and the leases of those that compute them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from sqlalchemy import ColumnElement, Connection, Table, and_, delete, exists, select, update
+from sqlalchemy.exc import IntegrityError
+
+from lalaloc_core.localise.poses import LatentGrid
+from service.storage.chunks import read_exactly, write_chunks
+from service.storage.database import Database
+from service.storage.grid_format import pack, unpack
+from service.storage.records import GridKey, PlanSummary
+from service.storage.tables import FLOORPLANS, GRID_CHUNKS, GRID_LEASES, LATENT_GRIDS, REVISIONS
+
+
+class StoredGrids:
+    """Grids, whole or not at all."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def get(self, key: GridKey) -> LatentGrid | None:
+        """A grid, None when it is not stored (or not readable, then it has to be computed again)."""
+        with self._database.reading() as connection:
+            query = select(LATENT_GRIDS.c.id, LATENT_GRIDS.c.size_bytes).where(*_where(LATENT_GRIDS, key))
+            row = connection.execute(query).one_or_none()
+            if row is None:
+                return None
+            content = read_exactly(connection, GRID_CHUNKS, {"grid_id": row.id}, row.size_bytes)
+        if content is None:
+            return None
+        return unpack(content, step_m=key.step_m, camera_height_m=key.camera_height_m)
+
+    def poses(
+        self, model_sha256: str, step_m: float, revision_ids: Sequence[str] | None = None
+    ) -> dict[tuple[str, int], int]:
+        """Poses of the stored grids of a model, by revision and camera height (mm); of all revisions, or some."""
+        columns = LATENT_GRIDS.c
+        query = select(columns.revision_id, columns.camera_height_mm, columns.poses).where(
+            columns.model_sha256 == model_sha256, columns.step_m == step_m
+        )
+        if revision_ids is not None:
+            query = query.where(columns.revision_id.in_(revision_ids))
+        with self._database.reading() as connection:
+            return {(row.revision_id, row.camera_height_mm): row.poses for row in connection.execute(query)}
+
+    def put(self, key: GridKey, grid: LatentGrid, *, keep: int, always_keep_mm: int) -> bool:
+        """Store a grid, drop the oldest of its revision beyond `keep`, and end the lease on it.
+
+        Grids for one other model or grid step stay, the latest: while a model is replaced, replicas with the old one
+        and with the new one serve the same plans, and must not take each other's grids away.
+
+        Args:
+            always_keep_mm: the camera height (mm) that is never dropped to make room.
+
+        Returns:
+            False when the revision is gone, then nothing is stored.
+        """
+        content = memoryview(pack(grid))
+        with self._database.writing() as connection:
+            # Whoever stores grids of one revision takes turns.
+            lock = select(REVISIONS.c.id).where(REVISIONS.c.id == key.revision_id).with_for_update(key_share=True)
+            if connection.scalar(lock) is None:
+                return False
+            connection.execute(delete(GRID_LEASES).where(*_where(GRID_LEASES, key)))
+            connection.execute(delete(LATENT_GRIDS).where(*_where(LATENT_GRIDS, key)))
+            _drop_older_models(connection, key)
+            _make_room(connection, key, keep=keep, always_keep_mm=always_keep_mm)
+            insert_grid(connection, key, len(grid.poses), content)
+        return True
+
+    def missing(self, model_sha256: str, step_m: float, limit: int) -> list[PlanSummary]:
+        """Plans, oldest first, whose own grid is neither stored, nor computed by anyone, nor failed before."""
+        with self._database.reading() as connection:
+            of_model = (
+                LATENT_GRIDS.c.revision_id == REVISIONS.c.id,
+                LATENT_GRIDS.c.model_sha256 == model_sha256,
+                LATENT_GRIDS.c.step_m == step_m,
+                _is_own_height(LATENT_GRIDS),
+            )
+            leased = (
+                GRID_LEASES.c.revision_id == REVISIONS.c.id,
+                GRID_LEASES.c.model_sha256 == model_sha256,
+                GRID_LEASES.c.step_m == step_m,
+                _is_own_height(GRID_LEASES),
+                GRID_LEASES.c.lease_until_s > self._database.now_s(),
+            )
+            query = (
+                select_summaries()
+                .where(REVISIONS.c.failure.is_(None))
+                .where(~exists().where(*of_model), ~exists().where(*leased))
+                .order_by(FLOORPLANS.c.created_at, FLOORPLANS.c.id)
+                .limit(limit)
+            )
+            return [PlanSummary(**row._mapping) for row in connection.execute(query)]
+
+
+class GridLeases:
+    """Who computes which grid. A lease that is not renewed runs out; one of a revision that is gone is gone as well."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def claim(self, key: GridKey, owner: str, lease_s: float) -> bool:
+        """Take the lease on a grid, if nobody has it or it has run out.
+
+        Returns:
+            False when another owner has it, or the revision is gone.
+        """
+        until_s = self._database.now_s() + lease_s
+        values = {"owner": owner, "lease_until_s": until_s, "progress": 0.0}
+        statement = self._database.insert(GRID_LEASES).values(**_columns(key), **values)
+        statement = statement.on_conflict_do_update(
+            index_elements=list(GRID_LEASES.primary_key),
+            set_=values,
+            where=(GRID_LEASES.c.lease_until_s < self._database.now_s()) | (GRID_LEASES.c.owner == owner),
+        )
+        try:
+            with self._database.writing() as connection:
+                return connection.scalar(statement.returning(GRID_LEASES.c.owner)) == owner
+        except IntegrityError:
+            return False
+
+    def renew(self, key: GridKey, owner: str, lease_s: float, progress: float) -> bool:
+        """Keep a lease and say how far the grid is; False when it is no longer the owner's, or the revision is gone."""
+        statement = (
+            update(GRID_LEASES)
+            .where(*_where(GRID_LEASES, key), GRID_LEASES.c.owner == owner)
+            .values(lease_until_s=self._database.now_s() + lease_s, progress=progress)
+        )
+        with self._database.writing() as connection:
+            return connection.execute(statement).rowcount == 1
+
+    def release(self, key: GridKey, owner: str) -> None:
+        """Give a lease back without having finished."""
+        with self._database.writing() as connection:
+            connection.execute(delete(GRID_LEASES).where(*_where(GRID_LEASES, key), GRID_LEASES.c.owner == owner))
+
+    def progress(self, model_sha256: str, step_m: float, revision_ids: Sequence[str]) -> dict[tuple[str, int], float]:
+        """Share computed of the grids under live leases, by revision and camera height (mm)."""
+        columns = GRID_LEASES.c
+        query = select(columns.revision_id, columns.camera_height_mm, columns.progress).where(
+            columns.model_sha256 == model_sha256,
+            columns.step_m == step_m,
+            columns.revision_id.in_(revision_ids),
+            columns.lease_until_s > self._database.now_s(),
+        )
+        with self._database.reading() as connection:
+            return {(row.revision_id, row.camera_height_mm): row.progress for row in connection.execute(query)}
+
+
+def insert_grid(connection: Connection, key: GridKey, poses: int, content: memoryview) -> None:
+    """Write a packed grid within a transaction."""
+    values = {**_columns(key), "poses": poses, "size_bytes": len(content)}
+    grid_id = connection.scalar(LATENT_GRIDS.insert().values(values).returning(LATENT_GRIDS.c.id))
+    write_chunks(connection, GRID_CHUNKS, {"grid_id": grid_id}, content)
+
+
+def select_summaries() -> Any:
+    """A query for the columns of `PlanSummary`, of all plans at their current revision."""
+    return select(
+        FLOORPLANS.c.id,
+        FLOORPLANS.c.revision_id,
+        REVISIONS.c.number.label("revision"),
+        FLOORPLANS.c.created_at,
+        FLOORPLANS.c.updated_at,
+        FLOORPLANS.c.name,
+        REVISIONS.c.room_count,
+        REVISIONS.c.area_m2,
+        REVISIONS.c.camera_height_m,
+        REVISIONS.c.failure,
+    ).join_from(FLOORPLANS, REVISIONS, FLOORPLANS.c.revision_id == REVISIONS.c.id)
+
+
+def _columns(key: GridKey) -> dict[str, Any]:
+    return {
+        "revision_id": key.revision_id,
+        "model_sha256": key.model_sha256,
+        "step_m": key.step_m,
+        "camera_height_mm": key.camera_height_mm,
+    }
+
+
+def _where(table: Table, key: GridKey) -> list[ColumnElement[bool]]:
+    return [table.c[name] == value for name, value in _columns(key).items()]
+
+
+def _is_own_height(table: Table) -> ColumnElement[bool]:
+    """Whether a row is for the plan's own camera height; half a millimetre more or less is the same one."""
+    return and_(
+        table.c.camera_height_mm >= REVISIONS.c.camera_height_m * 1000.0 - 0.501,
+        table.c.camera_height_mm <= REVISIONS.c.camera_height_m * 1000.0 + 0.501,
+    )
+
+
+def _drop_older_models(connection: Connection, key: GridKey) -> None:
+    columns = LATENT_GRIDS.c
+    own = columns.revision_id == key.revision_id
+    of_key = and_(columns.model_sha256 == key.model_sha256, columns.step_m == key.step_m)
+    query = select(columns.model_sha256, columns.step_m).where(own, ~of_key).order_by(columns.id.desc()).limit(1)
+    latest = connection.execute(query).one_or_none()
+    if latest is not None:
+        of_latest = and_(columns.model_sha256 == latest.model_sha256, columns.step_m == latest.step_m)
+        connection.execute(delete(LATENT_GRIDS).where(own, ~of_key, ~of_latest))
+
+
+def _make_room(connection: Connection, key: GridKey, *, keep: int, always_keep_mm: int) -> None:
+    if key.camera_height_mm == always_keep_mm:
+        return
+    columns = LATENT_GRIDS.c
+    on_demand = select(columns.id).where(
+        columns.revision_id == key.revision_id,
+        columns.model_sha256 == key.model_sha256,
+        columns.step_m == key.step_m,
+        columns.camera_height_mm != always_keep_mm,
+    )
+    # Two are not among them: the plan's own, and the one that is about to be stored.
+    surplus = connection.scalars(on_demand.order_by(columns.id.desc()).offset(max(keep - 2, 0))).all()
+    connection.execute(delete(LATENT_GRIDS).where(columns.id.in_(surplus)))

@@ -1,0 +1,291 @@
+"""Floor plans with their revisions and originals; every call says whose plans it is about."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import uuid
+from collections.abc import Collection
+from datetime import UTC, datetime
+from typing import Any
+
+from sqlalchemy import Connection, Row, and_, delete, func, or_, select, text, update
+
+from lalaloc_core.floorplan import FloorPlan, PlanLimits
+from service.errors import RevisionMismatchError, TooManyFloorPlansError, UnknownFloorPlanError
+from service.lru import BoundedCache
+from service.storage.chunks import read_chunks, write_chunks
+from service.storage.database import Database
+from service.storage.grid_format import pack
+from service.storage.grids import insert_grid, select_summaries
+from service.storage.records import ComputedGrid, Cursor, PlanRecord, PlanSummary
+from service.storage.tables import FLOORPLANS, LATENT_GRIDS, ORIGINAL_CHUNKS, REVISIONS
+
+# A stored plan was valid under the limits of its day; tighter limits must not make it unreadable.
+_STORED_LIMITS = PlanLimits(
+    max_rooms=10**9,
+    max_vertices_per_room=10**9,
+    max_plan_vertices=10**9,
+    max_extent_m=math.inf,
+    max_area_m2=math.inf,
+)
+_PARSED_BYTES = 64 * 2**20
+# Uploads take turns on PostgreSQL, so that the number of plans is exact; differs from the lock of `migration`.
+_COUNT_LOCK = 5_210_002
+
+
+class Plans:
+    """Plans of all tenants; another tenant's plan is one that does not exist."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+        # A revision never changes, so its id stands for it.
+        self._parsed: BoundedCache[str, FloorPlan] = BoundedCache(_PARSED_BYTES, plan_bytes)
+
+    def add(
+        self,
+        tenant: str,
+        plan_id: str,
+        plan: FloorPlan,
+        *,
+        original: bytes,
+        limit: int,
+        grid: ComputedGrid | None = None,
+    ) -> PlanRecord:
+        """Store a plan, the bytes it was uploaded as, and its grid if that is there already.
+
+        A plan that has the id already is the one: an upload that was stored, and whose answer got lost.
+
+        Args:
+            plan_id: a new one, or that of an upload that is repeated; never a caller's choice.
+            limit: most plans that are stored, of all tenants together.
+
+        Raises:
+            TooManyFloorPlansError: there are `limit` already.
+        """
+        now = datetime.now(UTC)
+        record = _record(plan, plan_id=plan_id, tenant=tenant, number=1, created_at=now, updated_at=now)
+        with self._database.writing() as connection:
+            if self._database.is_postgresql:
+                connection.execute(text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": _COUNT_LOCK})
+            if (stored := self._record(connection, _current_head(tenant, plan_id))) is not None:
+                return stored
+            if (connection.scalar(select(func.count()).select_from(FLOORPLANS)) or 0) >= limit:
+                raise TooManyFloorPlansError(limit)
+            values = {"id": plan_id, "tenant": tenant, "created_at": now, **_head(record)}
+            connection.execute(FLOORPLANS.insert(), values)
+            _insert_revision(connection, record, original, grid)
+        self._parsed.put(record.revision_id, plan)
+        return record
+
+    def add_revision(
+        self,
+        tenant: str,
+        plan_id: str,
+        plan: FloorPlan,
+        *,
+        original: bytes,
+        keep: int,
+        expected: str | None = None,
+        grid: ComputedGrid | None = None,
+    ) -> PlanRecord:
+        """Store a plan anew under its id; the revisions before it stay readable, up to `keep` in all.
+
+        Grids stay of the new revision and the one before it, which queries in work may still need.
+
+        Args:
+            expected: id of the revision that this one is to follow; None for any.
+
+        Raises:
+            UnknownFloorPlanError: the tenant has no such plan.
+            RevisionMismatchError: it has another revision than the one expected.
+        """
+        now = datetime.now(UTC)
+        with self._database.writing() as connection:
+            query = select(FLOORPLANS).where(FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
+            row = connection.execute(query.with_for_update()).one_or_none()
+            if row is None:
+                raise UnknownFloorPlanError(plan_id)
+            if expected is not None and row.revision_id != expected:
+                raise RevisionMismatchError(plan_id, expected, row.revision_id)
+            own = REVISIONS.c.plan_id == plan_id
+            number = (connection.scalar(select(func.max(REVISIONS.c.number)).where(own)) or 0) + 1
+            record = _record(
+                plan, plan_id=plan_id, tenant=tenant, number=number, created_at=row.created_at, updated_at=now
+            )
+            _insert_revision(connection, record, original, grid)
+            connection.execute(update(FLOORPLANS).where(FLOORPLANS.c.id == plan_id).values(**_head(record)))
+            connection.execute(delete(REVISIONS).where(own, REVISIONS.c.number <= number - keep))
+            old = select(REVISIONS.c.id).where(own, REVISIONS.c.number < number - 1)
+            connection.execute(delete(LATENT_GRIDS).where(LATENT_GRIDS.c.revision_id.in_(old)))
+        self._parsed.put(record.revision_id, plan)
+        return record
+
+    def get(self, tenant: str, plan_id: str) -> PlanRecord | None:
+        """A plan at its current revision."""
+        return self._one(_current_head(tenant, plan_id))
+
+    def get_revision(self, tenant: str, plan_id: str, revision_id: str) -> PlanRecord | None:
+        """A plan at any revision that is kept."""
+        query = _select_heads(current=False).where(FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
+        return self._one(query.where(REVISIONS.c.id == revision_id))
+
+    def by_revision(self, revision_id: str) -> PlanRecord | None:
+        """A plan at some revision, whoever's it is: for work on grids, which knows no tenants."""
+        return self._one(_select_heads(current=False).where(REVISIONS.c.id == revision_id))
+
+    def original(self, tenant: str, plan_id: str) -> bytes | None:
+        """The bytes that the current revision of a plan was uploaded as."""
+        query = select(FLOORPLANS.c.revision_id).where(FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
+        with self._database.reading() as connection:
+            revision_id = connection.scalar(query)
+            if revision_id is None:
+                return None
+            return b"".join(read_chunks(connection, ORIGINAL_CHUNKS, {"revision_id": revision_id}))
+
+    def list(
+        self, tenant: str, *, limit: int, after: Cursor | None = None, name: str | None = None
+    ) -> list[PlanSummary]:
+        """Plans, newest first.
+
+        Args:
+            after: the last plan of the page before.
+            name: only plans with this in their name, whatever the case of letters.
+        """
+        age, plan_id = FLOORPLANS.c.created_at, FLOORPLANS.c.id
+        query = select_summaries().where(FLOORPLANS.c.tenant == tenant)
+        if name:
+            query = query.where(FLOORPLANS.c.folded_name.contains(name.casefold(), autoescape=True))
+        if after is not None:
+            query = query.where(or_(age < after.created_at, and_(age == after.created_at, plan_id < after.id)))
+        return self._summaries(query.order_by(age.desc(), plan_id.desc()).limit(limit))
+
+    def summaries(self, plan_ids: Collection[str]) -> list[PlanSummary]:
+        """Those of some plans that there are, whoever's they are: for callers that were let at them before."""
+        return self._summaries(select_summaries().where(FLOORPLANS.c.id.in_(plan_ids)))
+
+    def delete(self, tenant: str, plan_id: str, *, expected: str | None = None) -> bool:
+        """Delete a plan with all its revisions, originals and grids; False when there was none.
+
+        Args:
+            expected: id of the revision that it must have; None for any.
+
+        Raises:
+            RevisionMismatchError: it has another one.
+        """
+        own = (FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
+        with self._database.writing() as connection:
+            query = select(FLOORPLANS.c.revision_id).where(*own).with_for_update()
+            revision_id = connection.scalar(query)
+            if revision_id is not None and expected not in (None, revision_id):
+                raise RevisionMismatchError(plan_id, expected, revision_id)
+            return connection.execute(delete(FLOORPLANS).where(*own)).rowcount == 1
+
+    def set_failure(self, revision_id: str, reason: str) -> None:
+        """Record why a revision's latent grid could not be computed."""
+        with self._database.writing() as connection:
+            connection.execute(update(REVISIONS).where(REVISIONS.c.id == revision_id).values(failure=reason))
+
+    def clear_failures(self) -> None:
+        """Forget all of them, so that those grids are tried again."""
+        with self._database.writing() as connection:
+            connection.execute(update(REVISIONS).where(REVISIONS.c.failure.is_not(None)).values(failure=None))
+
+    def current(self, revision_ids: Collection[str]) -> set[str]:
+        """Those among some revisions that are the current ones of their plans."""
+        query = select(FLOORPLANS.c.revision_id).where(FLOORPLANS.c.revision_id.in_(revision_ids))
+        with self._database.reading() as connection:
+            return set(connection.scalars(query))
+
+    def _summaries(self, query: Any) -> list[PlanSummary]:
+        with self._database.reading() as connection:
+            return [PlanSummary(**row._mapping) for row in connection.execute(query)]
+
+    def _one(self, query: Any) -> PlanRecord | None:
+        with self._database.reading() as connection:
+            return self._record(connection, query)
+
+    def _record(self, connection: Connection, query: Any) -> PlanRecord | None:
+        row = connection.execute(query).one_or_none()
+        if row is None:
+            return None
+        plan = self._parsed.get(row.revision_id) or self._parse(connection, row)
+        return PlanRecord(**row._mapping, plan=plan)
+
+    def _parse(self, connection: Connection, row: Row[Any]) -> FloorPlan:
+        """The plan of a revision that is not in memory; documents are long, so they are fetched for this alone."""
+        document = connection.scalar(select(REVISIONS.c.document).where(REVISIONS.c.id == row.revision_id))
+        assert document is not None
+        plan = FloorPlan.from_json(document, _STORED_LIMITS)
+        self._parsed.put(row.revision_id, plan)
+        return plan
+
+
+def plan_bytes(plan: FloorPlan) -> int:
+    """About how much memory a plan takes: its walls as the renderer wants them, and its corners three times over."""
+    return plan.walls_m.nbytes + 3 * sum(room.polygon_m.nbytes for room in plan.rooms) + 2000 * len(plan.rooms)
+
+
+def _record(
+    plan: FloorPlan, *, plan_id: str, tenant: str, number: int, created_at: datetime, updated_at: datetime
+) -> PlanRecord:
+    return PlanRecord(
+        id=plan_id,
+        tenant=tenant,
+        revision_id=uuid.uuid4().hex,
+        revision=number,
+        created_at=created_at,
+        updated_at=updated_at,
+        plan=plan,
+        failure=None,
+    )
+
+
+def _head(record: PlanRecord) -> dict[str, Any]:
+    """What changes in the table of plans with a revision."""
+    name = record.plan.name
+    return {
+        "name": name,
+        "folded_name": name.casefold(),
+        "revision_id": record.revision_id,
+        "updated_at": record.updated_at,
+    }
+
+
+def _insert_revision(connection: Connection, record: PlanRecord, original: bytes, grid: ComputedGrid | None) -> None:
+    plan = record.plan
+    values = {
+        "id": record.revision_id,
+        "plan_id": record.id,
+        "number": record.revision,
+        "created_at": record.updated_at,
+        "document": json.dumps(plan.to_dict()),
+        "original_sha256": hashlib.sha256(original).hexdigest(),
+        "room_count": len(plan.rooms),
+        "area_m2": plan.area_m2,
+        "camera_height_m": plan.camera_height_m,
+    }
+    connection.execute(REVISIONS.insert(), values)
+    write_chunks(connection, ORIGINAL_CHUNKS, {"revision_id": record.revision_id}, memoryview(original))
+    if grid is not None:
+        key = grid.key(record.revision_id)
+        insert_grid(connection, key, len(grid.grid.poses), memoryview(pack(grid.grid)))
+
+
+def _current_head(tenant: str, plan_id: str) -> Any:
+    return _select_heads(current=True).where(FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
+
+
+def _select_heads(*, current: bool) -> Any:
+    """A query for the columns of `PlanRecord` but for the plan itself."""
+    link = FLOORPLANS.c.revision_id == REVISIONS.c.id if current else FLOORPLANS.c.id == REVISIONS.c.plan_id
+    return select(
+        FLOORPLANS.c.id,
+        FLOORPLANS.c.tenant,
+        REVISIONS.c.id.label("revision_id"),
+        REVISIONS.c.number.label("revision"),
+        FLOORPLANS.c.created_at,
+        REVISIONS.c.created_at.label("updated_at"),
+        REVISIONS.c.failure,
+    ).join_from(FLOORPLANS, REVISIONS, link)

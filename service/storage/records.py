@@ -1,0 +1,150 @@
+"""What the store takes and answers: plain values, no rows and no connections."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime
+
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.poses import LatentGrid
+
+# Whose plans are whose without API keys.
+DEFAULT_TENANT = "default"
+
+
+@dataclass(frozen=True, kw_only=True)
+class GridKey:
+    """Which latent grid: of one revision of a plan, for one model, grid step and camera height."""
+
+    revision_id: str
+    model_sha256: str
+    step_m: float
+    camera_height_mm: int
+
+    @property
+    def camera_height_m(self) -> float:
+        """The camera height in metres."""
+        return self.camera_height_mm / 1000.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComputedGrid:
+    """A grid that is stored along with its plan; the revision it belongs to is only made then."""
+
+    model_sha256: str
+    grid: LatentGrid
+
+    def key(self, revision_id: str) -> GridKey:
+        """Its key, once the revision is known."""
+        return GridKey(
+            revision_id=revision_id,
+            model_sha256=self.model_sha256,
+            step_m=self.grid.step_m,
+            camera_height_mm=millimetres(self.grid.camera_height_m),
+        )
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanRecord:
+    """A stored floor plan at one of its revisions.
+
+    Attributes:
+        revision_id: names plan and revision; it never stands for anything else.
+        revision: number of the revision, from 1.
+        created_at: when the plan was first stored.
+        updated_at: when the revision was.
+        failure: why its latent grid could not be computed last time, None when that did not happen.
+    """
+
+    id: str
+    tenant: str
+    revision_id: str
+    revision: int
+    created_at: datetime
+    updated_at: datetime
+    plan: FloorPlan
+    failure: str | None
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanSummary:
+    """A stored floor plan without its rooms; what `PlanRecord` says, and what listings need."""
+
+    id: str
+    revision_id: str
+    revision: int
+    created_at: datetime
+    updated_at: datetime
+    name: str
+    room_count: int
+    area_m2: float
+    camera_height_m: float
+    failure: str | None
+
+
+@dataclass(frozen=True)
+class Cursor:
+    """A place in a listing: after this plan."""
+
+    created_at: datetime
+    id: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class ApiKey:
+    """An API key; what the caller presents is not stored, only its hash.
+
+    Attributes:
+        scopes: what it is good for.
+        rate_per_minute: requests that it may send; 0 for any number, None for as many as the settings say.
+    """
+
+    id: str
+    tenant: str
+    name: str
+    scopes: frozenset[str]
+    rate_per_minute: int | None
+    created_at: datetime
+    revoked_at: datetime | None
+    last_used_at: datetime | None
+
+
+@dataclass(frozen=True)
+class StoredAnswer:
+    """What a request with an idempotency key was answered with."""
+
+    status: int
+    headers: dict[str, str]
+    body: bytes
+
+
+@dataclass(frozen=True)
+class Fresh:
+    """The request is to be carried out.
+
+    Attributes:
+        token: 32 hexadecimal digits that stay the same when another process takes over from one that died half-way:
+            what is made under this id is made once.
+        resumed: whether that is so, and something may have been made already.
+    """
+
+    token: str
+    resumed: bool
+
+
+@dataclass(frozen=True)
+class Conflict:
+    """The key was used with another body."""
+
+
+@dataclass(frozen=True)
+class InProgress:
+    """The same request is being carried out at this moment."""
+
+
+Claim = StoredAnswer | Fresh | Conflict | InProgress
+
+
+def millimetres(height_m: float) -> int:
+    """A height (m) in whole millimetres, as keys have it."""
+    return round(height_m * 1000.0)

@@ -1,0 +1,72 @@
+"""The store: one object per group of tables, over one database."""
+
+from __future__ import annotations
+
+from alembic.script.revision import RevisionError
+from alembic.util import CommandError
+from sqlalchemy.exc import ArgumentError, SQLAlchemyError
+
+from lalaloc_core.errors import ConfigError
+from service.settings import Settings
+from service.storage.api_keys import ApiKeys
+from service.storage.database import Database
+from service.storage.grids import GridLeases, StoredGrids
+from service.storage.idempotency import Idempotency
+from service.storage.migration import migrate
+from service.storage.plans import Plans
+
+
+class Store:
+    """Everything that persists; safe to share between threads and between processes.
+
+    Every call of its parts may raise StoreUnavailableError; the next one connects again by itself.
+
+    Attributes:
+        plans: floor plans with revisions and originals.
+        grids: their latent grids.
+        leases: who computes which grid.
+        idempotency: answers to requests that may be sent twice.
+        keys: API keys.
+    """
+
+    def __init__(self, url: str, *, connections: int = 8, wait_s: float = 2.0) -> None:
+        """Connect, and bring the schema up to date.
+
+        Args:
+            connections: most connections that are open at a time.
+            wait_s: longest wait for one of them.
+
+        Raises:
+            ConfigError: not a usable database URL, or the database cannot be opened.
+        """
+        try:
+            database = Database(url, connections=connections, wait_s=wait_s)
+            migrate(database)
+        except (ArgumentError, CommandError, RevisionError, ImportError, OSError, SQLAlchemyError) as error:
+            raise ConfigError(f"cannot open the database: {error}") from error
+        self._database = database
+        self.plans = Plans(database)
+        self.grids = StoredGrids(database)
+        self.leases = GridLeases(database)
+        self.idempotency = Idempotency(database)
+        self.keys = ApiKeys(database)
+
+    def close(self) -> None:
+        """Give all connections back."""
+        self._database.close()
+
+
+def open_store(settings: Settings) -> Store:
+    """Open the database that the settings name; the data folder of SQLite is made when it is missing.
+
+    Raises:
+        ConfigError: the data folder or the database cannot be used.
+    """
+    if settings.database_url is None:
+        try:
+            settings.data_dir.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigError(f"cannot create the data folder '{settings.data_dir}': {error.strerror}") from error
+    return Store(
+        settings.resolved_database_url, connections=settings.database_connections, wait_s=settings.database_wait_s
+    )

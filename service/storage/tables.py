@@ -1,0 +1,151 @@
+"""The tables as they are now; `migrations` says how they came to be, and a test compares the two."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+
+from sqlalchemy import (
+    Column,
+    DateTime,
+    Dialect,
+    Double,
+    ForeignKey,
+    Index,
+    Integer,
+    LargeBinary,
+    MetaData,
+    String,
+    Table,
+    Text,
+    UniqueConstraint,
+)
+from sqlalchemy.types import TypeDecorator
+
+METADATA = MetaData()
+
+
+class Moment(TypeDecorator[datetime]):
+    """A moment in UTC. SQLite forgets the time zone, PostgreSQL may answer in another one."""
+
+    impl = DateTime(timezone=True)
+    cache_ok = True
+
+    def process_bind_param(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+        """To the database."""
+        return None if value is None else value.astimezone(UTC)
+
+    def process_result_value(self, value: datetime | None, dialect: Dialect) -> datetime | None:
+        """From the database."""
+        if value is None:
+            return None
+        return value.astimezone(UTC) if value.tzinfo else value.replace(tzinfo=UTC)
+
+
+def _of_revision(*, primary_key: bool = False) -> Column[str]:
+    owner = ForeignKey("revisions.id", ondelete="CASCADE")
+    return Column("revision_id", String(32), owner, primary_key=primary_key, nullable=False)
+
+
+FLOORPLANS = Table(
+    "floorplans",
+    METADATA,
+    Column("id", String(32), primary_key=True),
+    Column("tenant", String(64), nullable=False),
+    Column("name", Text, nullable=False),
+    # The name as it is searched: without the case of its letters, which databases fold in different ways.
+    Column("folded_name", Text, nullable=False),
+    # The current revision; no foreign key, as revisions already refer to their plan.
+    Column("revision_id", String(32), nullable=False),
+    Column("created_at", Moment, nullable=False),
+    Column("updated_at", Moment, nullable=False),
+    Index("floorplans_by_tenant_and_age", "tenant", "created_at", "id"),
+    Index("floorplans_by_revision", "revision_id"),
+)
+
+REVISIONS = Table(
+    "revisions",
+    METADATA,
+    Column("id", String(32), primary_key=True),
+    Column("plan_id", String(32), ForeignKey("floorplans.id", ondelete="CASCADE"), nullable=False),
+    Column("number", Integer, nullable=False),
+    Column("created_at", Moment, nullable=False),
+    Column("document", Text, nullable=False),
+    Column("original_sha256", String(64), nullable=False),
+    Column("room_count", Integer, nullable=False),
+    Column("area_m2", Double, nullable=False),
+    Column("camera_height_m", Double, nullable=False),
+    Column("failure", Text),
+    UniqueConstraint("plan_id", "number", name="revisions_of_plan"),
+)
+
+ORIGINAL_CHUNKS = Table(
+    "original_chunks",
+    METADATA,
+    _of_revision(primary_key=True),
+    Column("number", Integer, primary_key=True, autoincrement=False),
+    Column("content", LargeBinary, nullable=False),
+)
+
+LATENT_GRIDS = Table(
+    "latent_grids",
+    METADATA,
+    Column("id", Integer, primary_key=True, autoincrement=True),
+    _of_revision(),
+    Column("model_sha256", String(64), nullable=False),
+    Column("step_m", Double, nullable=False),
+    Column("camera_height_mm", Integer, nullable=False),
+    Column("poses", Integer, nullable=False),
+    Column("size_bytes", Integer, nullable=False),
+    UniqueConstraint("revision_id", "model_sha256", "step_m", "camera_height_mm", name="latent_grid_key"),
+)
+
+GRID_CHUNKS = Table(
+    "grid_chunks",
+    METADATA,
+    Column("grid_id", Integer, ForeignKey("latent_grids.id", ondelete="CASCADE"), primary_key=True),
+    Column("number", Integer, primary_key=True, autoincrement=False),
+    Column("content", LargeBinary, nullable=False),
+)
+
+GRID_LEASES = Table(
+    "grid_leases",
+    METADATA,
+    _of_revision(primary_key=True),
+    Column("model_sha256", String(64), primary_key=True),
+    Column("step_m", Double, primary_key=True),
+    Column("camera_height_mm", Integer, primary_key=True, autoincrement=False),
+    Column("owner", String(32), nullable=False),
+    # Seconds since 1970 by the clock that all owners share, see `Database.now_s`.
+    Column("lease_until_s", Double, nullable=False),
+    Column("progress", Double, nullable=False),
+)
+
+API_KEYS = Table(
+    "api_keys",
+    METADATA,
+    Column("id", String(32), primary_key=True),
+    Column("tenant", String(64), nullable=False),
+    Column("name", Text, nullable=False),
+    Column("hash", String(64), nullable=False, unique=True),
+    Column("scopes", Text, nullable=False),
+    Column("rate_per_minute", Integer),
+    Column("created_at", Moment, nullable=False),
+    Column("revoked_at", Moment),
+    Column("last_used_at", Moment),
+)
+
+IDEMPOTENCY = Table(
+    "idempotency",
+    METADATA,
+    Column("tenant", String(64), primary_key=True),
+    Column("route", String(64), primary_key=True),
+    Column("key", String(255), primary_key=True),
+    Column("body_sha256", String(64), nullable=False),
+    Column("token", String(32), nullable=False),
+    Column("lease_until_s", Double, nullable=False),
+    Column("created_at", Moment, nullable=False),
+    Column("status", Integer),
+    Column("headers", Text),
+    Column("body", LargeBinary),
+    Index("idempotency_by_age", "created_at"),
+)
