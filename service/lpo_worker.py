@@ -1,14 +1,11 @@
 """The body of an LPO worker process: the only place of the service that imports torch.
 
-The parent sends `RefinementJob`s through the pipe and gets, for each, a `RefinementResult` or the text of what went
-wrong. The worker ends when the parent closes the pipe or dies.
+From `RefinementJob` to `RefinementResult`; `service.worker_process` has the rest.
 """
 
 from __future__ import annotations
 
 import os
-import signal
-from dataclasses import dataclass
 from itertools import product
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -19,47 +16,17 @@ import numpy as np
 from lalaloc_core.bundle import Bundle, Manifest
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.poses import RefinementJob
+from service.worker_process import serve_jobs
 
 if TYPE_CHECKING:
     from lalaloc_core.localise.optimise import LatentPoseOptimiser
 
 
-@dataclass(frozen=True)
-class WorkerFault:
-    """What a worker says instead of a result."""
-
-    reason: str
-
-
-@dataclass(frozen=True)
-class WorkerReady:
-    """What a worker says once it is warm."""
-
-
 def run_worker(connection: Connection, bundle_folder: str, model_sha256: str, threads: int) -> None:
     """Load the optimiser, warm it up, then answer jobs until the pipe closes."""
-    # Ctrl-C reaches the whole process group; the parent decides when its workers end.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
     for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ[variable] = str(threads)
-    try:
-        optimiser = _load(Path(bundle_folder), model_sha256, threads)
-    except Exception as error:
-        _send(connection, WorkerFault(f"{type(error).__name__}: {error}"))
-        return
-    if not _send(connection, WorkerReady()):
-        return
-    while True:
-        try:
-            job = connection.recv()
-        except (EOFError, OSError):
-            return
-        try:
-            answer = optimiser.refine(job)
-        except Exception as error:
-            answer = WorkerFault(f"{type(error).__name__}: {error}")
-        if not _send(connection, answer):
-            return
+    serve_jobs(connection, lambda: _load(Path(bundle_folder), model_sha256, threads).refine)
 
 
 def _load(bundle_folder: Path, model_sha256: str, threads: int) -> LatentPoseOptimiser:
@@ -95,12 +62,3 @@ def warm_up_job(manifest: Manifest, *, optimise_heading: bool, by_profile: bool)
         log_profile=profile if by_profile else None,
         precision=np.ones_like(profile) if by_profile else None,
     )
-
-
-def _send(connection: Connection, message: object) -> bool:
-    """False when the parent is gone."""
-    try:
-        connection.send(message)
-    except (BrokenPipeError, OSError):
-        return False
-    return True

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator, Iterator, Mapping
-from contextlib import asynccontextmanager, contextmanager
+from collections.abc import AsyncGenerator, Mapping
+from contextlib import asynccontextmanager
 from dataclasses import dataclass
-from typing import TypeVar
+from time import monotonic
+from typing import Literal, Self, TypeVar
 
 from fastapi import Request
 from pydantic import BaseModel, ValidationError
@@ -18,11 +19,11 @@ from starlette.requests import ClientDisconnect
 from service.errors import (
     InvalidRequestError,
     MalformedRequestError,
-    OverloadedError,
     UnsupportedMediaError,
     UploadTimeoutError,
     UploadTooLargeError,
 )
+from service.settings import Settings
 
 JSON = "application/json"
 MULTIPART = "multipart/form-data"
@@ -34,35 +35,34 @@ _MAX_FIELD_BYTES = 4096
 Model = TypeVar("Model", bound=BaseModel)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class UploadLimits:
-    """Bytes that the uploaded file may have, and seconds that the whole upload may take."""
+    """What an upload may be.
+
+    Attributes:
+        max_bytes: of the uploaded file.
+        name: of the setting that `max_bytes` comes from, for the error.
+        deadline_s: for the whole upload.
+        idle_s: the longest wait for the next bytes; also how far the upload may be behind `bytes_per_s`.
+        bytes_per_s: how fast it must come at least.
+    """
 
     max_bytes: int
+    name: str
     deadline_s: float
+    idle_s: float
+    bytes_per_s: float
 
-
-class Slots:
-    """How many uploads, and the work that follows them, may go on at the same time; for one event loop."""
-
-    def __init__(self, limit: int) -> None:
-        self._limit = limit
-        self.taken = 0
-
-    @contextmanager
-    def one(self) -> Iterator[None]:
-        """Hold a slot.
-
-        Raises:
-            OverloadedError: all are taken.
-        """
-        if self.taken >= self._limit:
-            raise OverloadedError(self._limit)
-        self.taken += 1
-        try:
-            yield
-        finally:
-            self.taken -= 1
+    @classmethod
+    def of(cls, settings: Settings, name: Literal["max_plan_bytes", "max_panorama_bytes"]) -> Self:
+        """As set for one kind of upload."""
+        return cls(
+            max_bytes=getattr(settings, name),
+            name=name,
+            deadline_s=settings.upload_deadline_s,
+            idle_s=settings.upload_idle_s,
+            bytes_per_s=settings.upload_bytes_per_s,
+        )
 
 
 @dataclass(frozen=True)
@@ -92,9 +92,8 @@ async def read_body(request: Request, limits: UploadLimits) -> bytes:
     Raises:
         UploadTooLargeError, UploadTimeoutError: see the limits.
     """
-    _check_stated_size(request, limits.max_bytes)
     async with _in_time(limits):
-        return b"".join([chunk async for chunk in _counted(request, limits.max_bytes)])
+        return b"".join([chunk async for chunk in _counted(request, limits)])
 
 
 async def read_parts(request: Request, limits: UploadLimits, *, files: set[str], fields: set[str]) -> Parts:
@@ -105,11 +104,9 @@ async def read_parts(request: Request, limits: UploadLimits, *, files: set[str],
         MalformedRequestError: not valid multipart.
         InvalidRequestError: a part is missing, unknown, given twice, or a field where a file belongs.
     """
-    limit = limits.max_bytes + _ENVELOPE_BYTES
-    _check_stated_size(request, limit)
     parser = MultiPartParser(
         request.headers,
-        _counted(request, limit),
+        _counted(request, limits, envelope_bytes=_ENVELOPE_BYTES),
         max_files=_MAX_PARTS,
         max_fields=_MAX_PARTS,
         max_part_size=_MAX_FIELD_BYTES,
@@ -122,7 +119,7 @@ async def read_parts(request: Request, limits: UploadLimits, *, files: set[str],
     except FormParserError as error:
         raise MalformedRequestError(f"not valid {MULTIPART}: {error}") from error
     try:
-        return await _sort(form.multi_items(), limits.max_bytes, files, fields)
+        return await _sort(form.multi_items(), limits, files, fields)
     finally:
         await form.close()
 
@@ -154,7 +151,9 @@ def describe_fault(fault: Mapping[str, object]) -> tuple[str, str]:
     return ".".join(parts) or "body", message
 
 
-async def _sort(items: list[tuple[str, UploadFile | str]], max_bytes: int, files: set[str], fields: set[str]) -> Parts:
+async def _sort(
+    items: list[tuple[str, UploadFile | str]], limits: UploadLimits, files: set[str], fields: set[str]
+) -> Parts:
     faults: list[tuple[str, str]] = []
     found = Parts({}, {})
     for name, value in items:
@@ -171,8 +170,8 @@ async def _sort(items: list[tuple[str, UploadFile | str]], max_bytes: int, files
                 found.fields[name] = value
         elif isinstance(value, UploadFile):
             content = await value.read()
-            if len(content) > max_bytes:
-                raise UploadTooLargeError(max_bytes, len(content))
+            if len(content) > limits.max_bytes:
+                raise UploadTooLargeError(limits.name, limits.max_bytes, len(content))
             found.files[name] = content
         else:
             faults.append((shown, "must be a file (a part with a file name)"))
@@ -183,20 +182,36 @@ async def _sort(items: list[tuple[str, UploadFile | str]], max_bytes: int, files
     return found
 
 
-def _check_stated_size(request: Request, limit: int) -> None:
+async def _counted(request: Request, limits: UploadLimits, *, envelope_bytes: int = 0) -> AsyncGenerator[bytes, None]:
+    """The body as it arrives, as long as it is neither too large nor too slow."""
+    most = limits.max_bytes + envelope_bytes
     stated = request.headers.get("content-length", "")
-    if stated.isdecimal() and int(stated) > limit:
-        raise UploadTooLargeError(limit, int(stated))
+    # What is too large by its own account is not even begun.
+    if stated.isdecimal() and int(stated) > most:
+        raise UploadTooLargeError(limits.name, limits.max_bytes, int(stated))
+    received, begin = 0, monotonic()
+    chunks = request.stream()
+    while True:
+        ahead_s = received / limits.bytes_per_s - (monotonic() - begin)
+        chunk = await _next_chunk(chunks, min(limits.idle_s, limits.idle_s + ahead_s), limits)
+        if chunk is None:
+            return
+        received += len(chunk)
+        if received > most:
+            raise UploadTooLargeError(limits.name, limits.max_bytes)
+        yield chunk
 
 
-async def _counted(request: Request, limit: int) -> AsyncGenerator[bytes, None]:
-    received = 0
+async def _next_chunk(chunks: AsyncGenerator[bytes, None], patience_s: float, limits: UploadLimits) -> bytes | None:
+    """The next bytes of a body, None at its end."""
     try:
-        async for chunk in request.stream():
-            received += len(chunk)
-            if received > limit:
-                raise UploadTooLargeError(limit)
-            yield chunk
+        async with asyncio.timeout(max(patience_s, 0.0)):
+            return await anext(chunks, None)
+    except TimeoutError as error:
+        raise UploadTimeoutError(
+            f"the upload stopped for {limits.idle_s:g} s (upload_idle_s), or was so far behind {limits.bytes_per_s:g} "
+            "bytes/s (upload_bytes_per_s)"
+        ) from error
     except ClientDisconnect as error:
         raise MalformedRequestError("the connection was closed before the whole body arrived") from error
 
@@ -207,4 +222,4 @@ async def _in_time(limits: UploadLimits) -> AsyncGenerator[None, None]:
         async with asyncio.timeout(limits.deadline_s):
             yield
     except TimeoutError as error:
-        raise UploadTimeoutError(limits.deadline_s) from error
+        raise UploadTimeoutError(f"the upload took longer than {limits.deadline_s:g} s (upload_deadline_s)") from error

@@ -1,7 +1,8 @@
-"""The LPO pool: right answers, and None, soon, whatever happens to its workers."""
+"""The LPO pool: right answers, and None, soon, whatever happens to its workers; `test_workers` has the rest."""
 
 from __future__ import annotations
 
+import asyncio
 import multiprocessing
 import os
 import shutil
@@ -18,7 +19,7 @@ import numpy as np
 import pytest
 
 from lalaloc_core.bundle import LAYOUT_WEIGHTS, Bundle
-from lalaloc_core.localise.poses import RefinementJob
+from lalaloc_core.localise.poses import RefinementJob, RefinementResult
 from service.lpo_worker import warm_up_job
 from service.refinement import LpoPool
 from service.settings import Settings
@@ -60,6 +61,11 @@ def job(bundle: Bundle) -> RefinementJob:
     return warm_up_job(bundle.manifest, optimise_heading=True, by_profile=False)
 
 
+def _refine(pool: LpoPool, job: RefinementJob, timeout_s: float) -> RefinementResult | None:
+    """As the service does, but on an event loop of its own."""
+    return asyncio.run(pool.refine(job, timeout_s))
+
+
 def _workers() -> list[int]:
     return [child.pid for child in multiprocessing.active_children() if child.pid and "lpo" in child.name]
 
@@ -70,7 +76,7 @@ def test_a_worker_gives_what_the_optimiser_gives(pool: LpoPool, bundle: Bundle, 
 
     job = warm_up_job(bundle.manifest, optimise_heading=True, by_profile=by_profile)
     expected = LatentPoseOptimiser.from_bundle(bundle).refine(job)
-    result = pool.refine(job, 20.0)
+    result = _refine(pool, job, 20.0)
     assert result is not None
     np.testing.assert_allclose(result.position_m, expected.position_m, atol=1e-4)
     np.testing.assert_allclose(result.latent_distance, expected.latent_distance, atol=1e-4)
@@ -80,9 +86,9 @@ def test_a_worker_gives_what_the_optimiser_gives(pool: LpoPool, bundle: Bundle, 
 
 def test_many_callers_each_get_their_own_answer(pool: LpoPool, job: RefinementJob) -> None:
     jobs = [replace(job, position_m=job.position_m + 0.05 * index) for index in range(4)]
-    alone = [pool.refine(one, 20.0) for one in jobs]
+    alone = [_refine(pool, one, 20.0) for one in jobs]
     with ThreadPoolExecutor(4) as threads:
-        together = list(threads.map(lambda one: pool.refine(one, 20.0), jobs))
+        together = list(threads.map(lambda one: _refine(pool, one, 20.0), jobs))
     for first, second in zip(alone, together, strict=True):
         assert first is not None
         assert second is not None
@@ -93,21 +99,21 @@ def test_a_job_that_breaks_the_optimiser_has_no_answer_and_leaves_the_worker_ali
     pool: LpoPool, job: RefinementJob
 ) -> None:
     workers = set(_workers())
-    assert pool.refine(replace(job, targets=np.ones((2, 3), np.float32)), 20.0) is None
-    assert pool.refine(job, 20.0) is not None
+    assert _refine(pool, replace(job, targets=np.ones((2, 3), np.float32)), 20.0) is None
+    assert _refine(pool, job, 20.0) is not None
     assert set(_workers()) == workers
 
 
 def test_no_time_means_no_answer_at_once(pool: LpoPool, job: RefinementJob) -> None:
-    assert pool.refine(job, 0.0) is None
-    assert pool.refine(job, -1.0) is None
+    assert _refine(pool, job, 0.0) is None
+    assert _refine(pool, job, -1.0) is None
 
 
 def test_a_worker_killed_while_idle_is_replaced(pool: LpoPool, job: RefinementJob) -> None:
     killed, other = _workers()
     os.kill(killed, signal.SIGKILL)
     # Right after the kill nobody knows yet: the other worker answers all the same.
-    assert pool.refine(job, 20.0) is not None
+    assert _refine(pool, job, 20.0) is not None
     wait_for(lambda: killed not in _workers() and pool.state.ready == len(_workers()) == 2, 120.0)
     assert other in _workers()
 
@@ -118,8 +124,8 @@ def test_while_another_worker_lives_a_killed_one_costs_no_answer(pool: LpoPool, 
         os.kill(pid, signal.SIGSTOP)
     with ThreadPoolExecutor(1) as threads:
         # One of the two, who knows which, holds the job when the first dies.
-        waiting = threads.submit(pool.refine, job, 20.0)
-        wait_for(lambda: pool._queue.empty() and waiting.running())
+        waiting = threads.submit(_refine, pool, job, 20.0)
+        wait_for(lambda: pool._workers.waiting == 0 and waiting.running())
         sleep(0.3)
         os.kill(first, signal.SIGKILL)
         os.kill(second, signal.SIGCONT)
@@ -131,13 +137,13 @@ def test_a_worker_that_stalls_costs_its_deadline_and_is_replaced(pool: LpoPool, 
     for pid in stopped:
         os.kill(pid, signal.SIGSTOP)
     begin = monotonic()
-    assert pool.refine(job, 0.5) is None
+    assert _refine(pool, job, 0.5) is None
     assert monotonic() - begin < 3.0
     # The one that holds the job is given up; the other one is only idle.
     wait_for(lambda: len(stopped & set(_workers())) == 1)
     for pid in stopped & set(_workers()):
         os.kill(pid, signal.SIGCONT)
-    assert pool.refine(job, 20.0) is not None
+    assert _refine(pool, job, 20.0) is not None
 
 
 def test_a_full_queue_means_no_answer_at_once(pool: LpoPool, job: RefinementJob) -> None:
@@ -145,27 +151,33 @@ def test_a_full_queue_means_no_answer_at_once(pool: LpoPool, job: RefinementJob)
         os.kill(pid, signal.SIGSTOP)
     with ThreadPoolExecutor(6) as threads:
         # Two jobs are at the workers, four fill the queue.
-        waiting = [threads.submit(pool.refine, job, 1.5) for _ in range(6)]
-        wait_for(lambda: pool._queue.full(), 1.0)
+        waiting = [threads.submit(_refine, pool, job, 1.5) for _ in range(6)]
+        wait_for(lambda: pool._workers.waiting == 4, 1.0)
         begin = monotonic()
-        assert pool.refine(job, 20.0) is None
+        assert _refine(pool, job, 20.0) is None
         assert monotonic() - begin < 0.5
         for pid in _workers():
             os.kill(pid, signal.SIGCONT)
         assert len([future.result() for future in waiting]) == 6
 
 
-def test_a_pool_that_is_not_warm_yet_answers_none_at_once_and_closes_cleanly(
+def test_a_pool_that_will_not_be_warm_in_time_answers_none_at_once_and_closes_cleanly(
     bundle: Bundle, job: RefinementJob
 ) -> None:
     others = set(_workers())
     with _pool(bundle, workers=1) as cold:
         wait_for(lambda: bool(set(_workers()) - others))
         begin = monotonic()
-        assert cold.refine(job, 20.0) is None
+        assert _refine(cold, job, 2.0) is None
         assert monotonic() - begin < 0.5
         assert not cold.state.warmed_up
     assert not set(_workers()) - others
+
+
+def test_a_pool_without_workers_answers_none(bundle: Bundle, job: RefinementJob) -> None:
+    with _pool(bundle, workers=0) as none:
+        assert _refine(none, job, 20.0) is None
+        assert none.state.warmed_up
 
 
 def test_a_bundle_changed_on_disk_is_not_used(tiny_bundle: Path, tmp_path: Path, job: RefinementJob) -> None:
@@ -177,4 +189,4 @@ def test_a_bundle_changed_on_disk_is_not_used(tiny_bundle: Path, tmp_path: Path,
         wait_for(lambda: broken.state.fault is not None, 120.0)
         assert "SHA-256" in str(broken.state.fault)
         assert not broken.state.warmed_up
-        assert broken.refine(job, 5.0) is None
+        assert _refine(broken, job, 5.0) is None

@@ -1,0 +1,58 @@
+"""The body of a decoding worker process: the only place of the service that opens pictures it was sent.
+
+From the bytes of an upload to a `Panorama`, or to the `Refusal` of what is none; `service.worker_process` has the rest.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+
+from lalaloc_core.errors import InvalidPanoramaError
+from lalaloc_core.localise.images import Panorama, PanoramaLimits, open_panorama, warm_up
+from service.worker_process import serve_jobs
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """Why a picture is no usable panorama."""
+
+    reason: str
+
+
+def run_decoder(connection: Connection, height: int, width: int, limits: PanoramaLimits, memory_bytes: int) -> None:
+    """Answer uploads with panoramas of `height` x `width`.
+
+    Args:
+        memory_bytes: what decoding may need, besides what the process has before its first picture.
+    """
+    serve_jobs(connection, lambda: _load(height, width, limits, memory_bytes))
+
+
+def _load(height: int, width: int, limits: PanoramaLimits, memory_bytes: int) -> Callable[[bytes], Panorama | Refusal]:
+    warm_up(height=height, width=width)
+    _limit_memory(memory_bytes)
+
+    def decode(content: bytes) -> Panorama | Refusal:
+        try:
+            return open_panorama(content, height=height, width=width, limits=limits)
+        except InvalidPanoramaError as error:
+            return Refusal(str(error))
+
+    return decode
+
+
+def _limit_memory(memory_bytes: int) -> None:
+    """Let allocations fail, where the system can, beyond what is in use now and `memory_bytes`."""
+    if sys.platform != "linux":
+        return
+    import resource
+
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+    limit = pages * os.sysconf("SC_PAGE_SIZE") + memory_bytes
+    _, most = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (limit if most == resource.RLIM_INFINITY else min(limit, most), most))

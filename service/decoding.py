@@ -1,0 +1,97 @@
+"""Decoding panoramas in worker processes, bounded in memory and time.
+
+A picture that kills such a process gets a second try, and kills nothing else.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from time import monotonic
+
+from lalaloc_core.bundle import Manifest
+from lalaloc_core.errors import InvalidPanoramaError
+from lalaloc_core.localise.images import Panorama
+from service.decode_worker import Refusal, run_decoder
+from service.errors import DeadlineExceededError, DecoderNotReadyError, OverloadedError, StoppingError
+from service.settings import Settings
+from service.telemetry import Telemetry
+from service.workers import JobLostError, PoolState, WorkerPool, WorkerSpec
+
+
+class Decoder:
+    """Bounded pool of decoding workers."""
+
+    def __init__(self, manifest: Manifest, settings: Settings, telemetry: Telemetry) -> None:
+        self._settings = settings
+        self._pool: WorkerPool[bytes, Panorama | Refusal] = WorkerPool(
+            WorkerSpec(
+                "decode",
+                run_decoder,
+                (manifest.image_height, manifest.image_width, settings.panorama_limits, settings.decode_memory_bytes),
+                stall_s=settings.decode_stall_s,
+            ),
+            workers=settings.decode_workers,
+            queue_limit=settings.decode_queue,
+            on_restart=lambda _reason: telemetry.note_restart("decode"),
+        )
+        telemetry.gauge(
+            "lalaloc_decode_queue_depth", "Panoramas waiting for a decoding worker.", lambda: self._pool.waiting
+        )
+        telemetry.gauge(
+            "lalaloc_decode_workers_ready", "Decoding workers that are warm.", lambda: self._pool.state.ready
+        )
+
+    def start(self) -> None:
+        """Start all workers; returns at once."""
+        self._pool.start()
+
+    @property
+    def state(self) -> PoolState:
+        """How many workers are wanted and warm."""
+        return self._pool.state
+
+    async def decode(self, content: bytes, deadline: float) -> Panorama:
+        """The panorama in an uploaded file, by a deadline (`monotonic`).
+
+        Raises:
+            InvalidPanoramaError: see `open_panorama`; or two workers died or stalled over it.
+            OverloadedError: too many panoramas wait already.
+            DeadlineExceededError: it was not decoded in time.
+            DecoderNotReadyError: no worker is running, nor will be in time.
+            StoppingError: the service is shutting down.
+        """
+        timeout_s = max(deadline - monotonic(), 0.0)
+        try:
+            async with asyncio.timeout(timeout_s):
+                # On a thread: copying and hashing a large upload would hold up everybody else.
+                future = await asyncio.to_thread(self._pool.submit, content, timeout_s)
+                answer = await asyncio.wrap_future(future)
+        except TimeoutError as error:
+            raise DeadlineExceededError(self._settings.request_deadline_s) from error
+        except JobLostError as error:
+            raise self._explained(error) from error
+        if isinstance(answer, Refusal):
+            raise InvalidPanoramaError(answer.reason)
+        return answer
+
+    def close(self) -> None:
+        """End all workers and wait for them."""
+        self._pool.close()
+
+    def _explained(self, error: JobLostError) -> Exception:
+        match error.reason:
+            case "poisoned":
+                return InvalidPanoramaError(
+                    "the panorama could not be decoded: twice that took longer than "
+                    f"{self._settings.decode_stall_s:g} s (decode_stall_s), or ended the process that tried"
+                )
+            case "fault":
+                return InvalidPanoramaError("the panorama is damaged")
+            case "queue-full":
+                return OverloadedError(self._settings.decode_queue)
+            case "not-ready":
+                return DecoderNotReadyError()
+            case "closing":
+                return StoppingError()
+            case "deadline" | "died":
+                return DeadlineExceededError(self._settings.request_deadline_s)

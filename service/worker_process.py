@@ -1,0 +1,78 @@
+"""The inside of a worker process: announce itself, then answer one job at a time until the parent is gone.
+
+`service.workers` starts such processes and watches over them. Imports little, because every worker imports it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import signal
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from typing import Any
+
+_PR_SET_PDEATHSIG = 1
+
+
+@dataclass(frozen=True)
+class Ready:
+    """What a worker says once it is warm."""
+
+
+@dataclass(frozen=True)
+class Answered:
+    """A job's answer."""
+
+    value: Any
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What a worker says instead of an answer, or instead of being ready."""
+
+    reason: str
+
+
+def serve_jobs(connection: Connection, load: Callable[[], Callable[[Any], Any]]) -> None:
+    """Load what does the work, then answer jobs until the pipe closes.
+
+    Args:
+        load: takes its time and returns the function from job to answer. What either raises is told to the parent; a
+            worker whose function raised goes on with the next job.
+    """
+    # Ctrl-C and a service manager's signal reach the whole process group; the parent decides when its workers end.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    _die_with_parent()
+    try:
+        work = load()
+    except Exception as error:
+        _send(connection, Fault(f"{type(error).__name__}: {error}"))
+        return
+    message: Ready | Answered | Fault = Ready()
+    while _send(connection, message):
+        try:
+            job = connection.recv()
+        except (EOFError, OSError):
+            return
+        try:
+            message = Answered(work(job))
+        except Exception as error:
+            message = Fault(f"{type(error).__name__}: {error}")
+
+
+def _die_with_parent() -> None:
+    """Also in the middle of a job; an idle worker would notice that the pipe closed."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+
+
+def _send(connection: Connection, message: Ready | Answered | Fault) -> bool:
+    """False when the parent is gone."""
+    try:
+        connection.send(message)
+    except OSError:
+        return False
+    return True

@@ -1,0 +1,53 @@
+"""Cores are shared out, and no more threads compute than there are cores."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from service.cores import CoreShares, _quota_cores, share_cores, usable_cores
+
+
+@pytest.mark.parametrize("cores", range(2, 130))
+def test_left_open_all_cores_are_used_and_none_twice(cores: int) -> None:
+    shares = share_cores(cores, workers=None, worker_threads=0, compute_threads=0, onnx_threads=0)
+    assert shares.total == cores
+    assert min(shares.workers, shares.compute_threads) >= 1
+
+
+def test_one_core_still_gets_one_thread_of_each_kind() -> None:
+    assert share_cores(1, workers=None, worker_threads=0, compute_threads=0, onnx_threads=0) == CoreShares(1, 1, 1, 1)
+
+
+def test_what_is_given_is_kept_and_the_rest_shared_out() -> None:
+    assert share_cores(8, workers=0, worker_threads=0, compute_threads=0, onnx_threads=2) == CoreShares(0, 1, 4, 2)
+    assert share_cores(8, workers=None, worker_threads=2, compute_threads=0, onnx_threads=0) == CoreShares(2, 2, 4, 1)
+    assert share_cores(2, workers=3, worker_threads=1, compute_threads=5, onnx_threads=1) == CoreShares(3, 1, 5, 1)
+
+
+def test_cores_are_those_that_the_scheduler_gives() -> None:
+    assert 1 <= usable_cores() <= len(os.sched_getaffinity(0))
+
+
+@pytest.mark.parametrize(
+    ("files", "expected"),
+    [
+        ({}, float("inf")),
+        ({"cpu.max": "max 100000"}, float("inf")),
+        ({"cpu.max": "150000 100000"}, 1.5),
+        ({"a/b/cpu.max": "400000 100000", "a/cpu.max": "300000 100000"}, 3.0),
+        ({"a/b/cpu.max": "nonsense"}, float("inf")),
+        ({"cpu/cpu.cfs_quota_us": "-1", "cpu/cpu.cfs_period_us": "100000"}, float("inf")),
+        ({"cpu/cpu.cfs_quota_us": "250000", "cpu/cpu.cfs_period_us": "100000"}, 2.5),
+    ],
+)
+def test_the_least_quota_of_the_control_groups_counts(tmp_path: Path, files: dict[str, str], expected: float) -> None:
+    own = tmp_path / "cgroup"
+    own.write_text("0::/a/b\n")
+    for name, content in files.items():
+        path = tmp_path / "fs" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(content + "\n")
+    assert _quota_cores(tmp_path / "fs", own) == expected

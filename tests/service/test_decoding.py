@@ -1,0 +1,184 @@
+"""Panoramas are decoded in processes that may die: whatever a picture does to them, the service goes on."""
+
+from __future__ import annotations
+
+import io
+import logging
+import multiprocessing
+import os
+import signal
+import struct
+import time
+import zlib
+from concurrent.futures import ThreadPoolExecutor
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+
+import httpx
+import pytest
+from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
+
+from service.telemetry import LOGGER_NAME
+from tests.service.conftest import StartApp, assert_problem, localise, upload, wait_for
+
+MIB = 2**20
+QUICK = {"refine": "none", "top_k": 1}
+
+
+def decoders() -> list[BaseProcess]:
+    return [child for child in multiprocessing.active_children() if child.name.startswith("lalaloc-decode")]
+
+
+def decoder() -> int:
+    """Process id of the only decoding worker."""
+    wait_for(lambda: len(decoders()) == 1 and decoders()[0].pid is not None)
+    pid = decoders()[0].pid
+    assert pid is not None
+    return pid
+
+
+def most_memory(pid: int) -> int:
+    """The most bytes that a process ever had resident."""
+    status = Path(f"/proc/{pid}/status").read_text(encoding="ascii")
+    line = next(line for line in status.splitlines() if line.startswith("VmHWM"))
+    return 1024 * int(line.split()[1])
+
+
+def ready(client: httpx.Client) -> None:
+    wait_for(lambda: client.get("/readyz").json()["decode_pool"]["ready"] == 1)
+
+
+def restarts(client: httpx.Client) -> float:
+    name = 'lalaloc_pool_restarts_total{pool="decode"}'
+    return float(next(line for line in client.get("/metrics").text.splitlines() if line.startswith(name)).split()[-1])
+
+
+def black_png(width: int, height: int) -> bytes:
+    """A PNG of nothing but zeros, a thousandth of its pixels' size."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+    packer = zlib.compressobj(9)
+    rows = bytes(1 + 3 * width)
+    data = b"".join([packer.compress(rows) for _ in range(height)]) + packer.flush()
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", data) + chunk(b"IEND", b"")
+
+
+def black(width: int, height: int, kind: str, **options: object) -> bytes:
+    buffer = io.BytesIO()
+    Image.new("RGB", (width, height)).save(buffer, kind, **options)
+    return buffer.getvalue()
+
+
+def test_a_killed_decoder_costs_no_query_its_answer(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+    with start_app(tmp_path) as client:
+        plan_id = upload(client)
+        for _ in range(3):
+            ready(client)
+            os.kill(decoder(), signal.SIGKILL)
+            assert localise(client, plan_id, panorama, **QUICK).status_code == 200
+        assert restarts(client) == 3.0
+    assert decoders() == [], "the pool left a process behind"
+
+
+def test_a_picture_over_which_decoders_stall_is_refused_and_the_next_one_is_answered(
+    start_app: StartApp, tmp_path: Path, panorama: bytes
+) -> None:
+    slow = black_png(10_000, 5_000)
+    with start_app(tmp_path, decode_stall_s=0.2) as client:
+        plan_id = upload(client)
+        ready(client)
+        problem = assert_problem(localise(client, plan_id, slow, **QUICK), 422, "invalid-panorama")
+        assert "longer than 0.2 s (decode_stall_s)" in problem["detail"]
+        assert restarts(client) == 2.0
+        begin = time.monotonic()
+        assert_problem(localise(client, plan_id, slow, **QUICK), 422, "invalid-panorama")
+        assert time.monotonic() - begin < 2.0, "what killed two decoders is not tried again"
+        assert restarts(client) == 2.0
+        assert localise(client, plan_id, panorama, **QUICK).status_code == 200
+
+
+def test_more_panoramas_than_may_wait_are_refused_at_once(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+    with start_app(tmp_path, decode_queue=1, decode_stall_s=2.0) as client, ThreadPoolExecutor(4) as threads:
+        plan_id = upload(client)
+        ready(client)
+        os.kill(decoder(), signal.SIGSTOP)
+        # Different bytes: the same picture would count as the one that made the decoder stall.
+        pictures = [panorama + bytes([i]) for i in range(4)]
+        answers = [threads.submit(localise, client, plan_id, picture, **QUICK) for picture in pictures]
+        codes = sorted(answer.result().status_code for answer in answers)
+        assert codes == [200, 200, 503, 503]
+        refused = next(answer.result() for answer in answers if answer.result().status_code == 503)
+        assert_problem(refused, 503, "overloaded")
+        assert "retry-after" in refused.headers
+
+
+class TestBombs:
+    """Small files that claim many pixels; the decoder's memory is looked up in its process."""
+
+    CAP = 96 * MIB
+
+    @pytest.mark.parametrize(
+        ("kind", "options"),
+        [("PNG", {}), ("WEBP", {"lossless": True, "method": 0}), ("JPEG", {"progressive": True, "subsampling": 0})],
+    )
+    def test_one_that_needs_too_much_memory_is_refused_and_the_next_is_answered(
+        self, start_app: StartApp, tmp_path: Path, panorama: bytes, kind: str, options: dict[str, object]
+    ) -> None:
+        bomb = black_png(7_000, 3_500) if kind == "PNG" else black(7_000, 3_500, kind, **options)
+        assert len(bomb) < MIB
+        with start_app(tmp_path, decode_memory_bytes=self.CAP) as client:
+            plan_id = upload(client)
+            ready(client)
+            pid, before = decoder(), most_memory(decoder())
+            assert_problem(localise(client, plan_id, bomb, **QUICK), 422, "invalid-panorama")
+            assert localise(client, plan_id, panorama, **QUICK).status_code == 200
+            assert decoder() == pid, "it did not have to die for that"
+            assert most_memory(pid) < before + self.CAP
+
+    def test_one_that_claims_too_many_pixels_is_refused_on_its_header(
+        self, start_app: StartApp, tmp_path: Path, panorama: bytes
+    ) -> None:
+        bombs = {kind: black(4_000, 2_000, kind) for kind in ("PNG", "WEBP", "JPEG")}
+        with start_app(tmp_path, max_pixels=1_000_000) as client:
+            plan_id = upload(client)
+            assert localise(client, plan_id, panorama, **QUICK).status_code == 200
+            before = most_memory(decoder())
+            for kind, bomb in bombs.items():
+                problem = assert_problem(localise(client, plan_id, bomb, **QUICK), 422, "invalid-panorama")
+                assert "4000 x 2000 = 8000000 pixels, at most 1000000 are allowed (max_pixels)" in problem["detail"], (
+                    kind
+                )
+            assert most_memory(decoder()) < before + 4 * MIB
+
+    def test_a_large_panorama_is_read_in_little_memory(self, start_app: StartApp, tmp_path: Path) -> None:
+        with start_app(tmp_path, decode_memory_bytes=64 * MIB) as client:
+            plan_id = upload(client)
+            assert localise(client, plan_id, black(10_000, 5_000, "JPEG"), **QUICK).status_code == 200
+
+
+def test_the_place_where_a_panorama_was_taken_is_neither_stored_nor_logged(
+    start_app: StartApp, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    exif = Image.Exif()
+    exif.get_ifd(0x8825).update({1: "N", 2: tuple(IFDRational(n, 9973) for n in (479_111, 81_003, 7_177))})
+    exif[0x010E] = "at home, Ringelnatterweg 7"
+    picture, portrait = io.BytesIO(), io.BytesIO()
+    Image.new("RGB", (512, 256)).save(picture, "JPEG", exif=exif)
+    Image.new("RGB", (256, 512)).save(portrait, "JPEG", exif=exif)
+    with start_app(tmp_path, log_level="debug") as client:
+        # Only now: starting the app sets its log up.
+        monkeypatch.setattr(logging.getLogger(LOGGER_NAME), "propagate", True)
+        plan_id = upload(client)
+        assert localise(client, plan_id, picture.getvalue(), **QUICK).status_code == 200
+        assert localise(client, plan_id, portrait.getvalue(), **QUICK).status_code == 422
+    assert any("localise" in str(vars(record)) for record in caplog.records)
+    assert b"Ringelnatterweg" in picture.getvalue()
+    logged = "".join(str(vars(record)) for record in caplog.records).encode()
+    stored = b"".join(file.read_bytes() for file in tmp_path.rglob("*") if file.is_file())
+    assert b"kitchen" in stored
+    for trace in (b"Ringelnatterweg", b"479111", struct.pack(">II", 479_111, 9973)):
+        assert trace not in stored + logged

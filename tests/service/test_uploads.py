@@ -1,0 +1,96 @@
+"""Bodies that come too slowly, or never end."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx
+import pytest
+
+from tests.service.conftest import StartApp, assert_problem
+
+HEAD = (
+    "POST /floorplans HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
+    "Content-Length: 100000\r\nConnection: close\r\n\r\n"
+)
+
+
+@contextmanager
+def open_body(client: httpx.Client) -> Iterator[socket.socket]:
+    """A connection on which a body has been announced."""
+    port = client.base_url.port
+    assert port is not None
+    with socket.create_connection(("127.0.0.1", port), timeout=20.0) as connection:
+        connection.sendall(HEAD.encode("ascii"))
+        yield connection
+
+
+def answer_to(connection: socket.socket, send: Callable[[socket.socket], None]) -> str:
+    """What comes back while something is being sent."""
+    connection.setblocking(False)
+    received, begin = b"", time.monotonic()
+    while b"}" not in received:
+        assert time.monotonic() - begin < 15.0, "no answer"
+        try:
+            send(connection)
+            received += connection.recv(65536)
+        except BlockingIOError:
+            time.sleep(0.05)
+    return received.decode("utf-8")
+
+
+def test_a_body_that_stops_is_given_up_long_before_the_deadline(start_app: StartApp, tmp_path: Path) -> None:
+    with start_app(tmp_path, upload_idle_s=0.5, upload_deadline_s=60.0) as client, open_body(client) as connection:
+        begin = time.monotonic()
+        answer = answer_to(connection, lambda _connection: None)
+        assert time.monotonic() - begin < 5.0
+    assert "408" in answer.splitlines()[0]
+    assert "stopped for 0.5 s (upload_idle_s)" in answer
+
+
+def test_a_body_that_trickles_is_given_up_as_well(start_app: StartApp, tmp_path: Path) -> None:
+    limits = {"upload_idle_s": 0.5, "upload_bytes_per_s": 1000.0, "upload_deadline_s": 60.0}
+    with start_app(tmp_path, **limits) as client, open_body(client) as connection:
+        begin = time.monotonic()
+        answer = answer_to(connection, lambda connection: connection.sendall(b"["))
+        assert time.monotonic() - begin < 5.0
+    assert "408" in answer.splitlines()[0]
+    assert "behind 1000 bytes/s (upload_bytes_per_s)" in answer
+
+
+def test_a_slow_body_that_is_fast_enough_arrives(start_app: StartApp, tmp_path: Path) -> None:
+    def trickle() -> Iterator[bytes]:
+        for _ in range(10):
+            time.sleep(0.1)
+            yield b" " * 500
+
+    with start_app(tmp_path, upload_idle_s=0.5, upload_bytes_per_s=1000.0) as client:
+        response = client.post("/floorplans", content=trickle(), headers={"content-type": "application/json"})
+        assert_problem(response, 422, "invalid-floorplan")
+
+
+@pytest.mark.parametrize(
+    ("path", "media", "name"),
+    [
+        ("/floorplans", "application/json", "max_plan_bytes"),
+        ("/floorplans", "multipart/form-data; boundary=x", "max_plan_bytes"),
+        ("/localise", "multipart/form-data; boundary=x", "max_panorama_bytes"),
+    ],
+)
+def test_a_body_without_a_stated_size_is_cut_off_at_the_limit(
+    start_app: StartApp, tmp_path: Path, path: str, media: str, name: str
+) -> None:
+    def endless() -> Iterator[bytes]:
+        begin = b'--x\r\nContent-Disposition: form-data; name="panorama"; filename="p"\r\n\r\n'
+        yield begin if "multipart" in media else b"["
+        for _ in range(100):
+            yield b" " * 50_000
+
+    with start_app(tmp_path, **{name: 100_000}) as client:
+        response = client.post(path, content=endless(), headers={"content-type": media})
+        problem = assert_problem(response, 413, "upload-too-large")
+        assert f"at most 100000 bytes are allowed ({name})" in problem["detail"]

@@ -1,0 +1,267 @@
+"""Pools of worker processes: what happens to a worker costs its callers at most a `JobLostError`, and that soon."""
+
+from __future__ import annotations
+
+import asyncio
+import multiprocessing
+import os
+import random
+import signal
+import threading
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from time import monotonic, sleep
+from typing import Any
+
+import pytest
+
+from service.workers import JobLostError, WorkerPool, WorkerSpec
+from tests.service import worker_jobs
+from tests.service.conftest import wait_for
+
+Pool = WorkerPool[tuple[str, Any], Any]
+
+
+@contextmanager
+def _pool(log: Path, *, workers: int = 1, queue_limit: int = 4, target: Any = None, **spec: Any) -> Iterator[Pool]:
+    log.touch()
+    arguments = spec.pop("arguments", (str(log),))
+    pool: Pool = WorkerPool(
+        WorkerSpec("test", target or worker_jobs.run, arguments, **{"stall_s": 5.0, "start_s": 1.0} | spec),
+        workers=workers,
+        queue_limit=queue_limit,
+    )
+    pool.start()
+    try:
+        yield pool
+    finally:
+        pool.close()
+    assert _pids() == []
+
+
+@contextmanager
+def _warm_pool(log: Path, *, workers: int = 1, **options: Any) -> Iterator[Pool]:
+    with _pool(log, workers=workers, **options) as pool:
+        wait_for(lambda: pool.state.ready == workers)
+        yield pool
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    return tmp_path / "log"
+
+
+def _pids() -> list[int]:
+    return [child.pid for child in multiprocessing.active_children() if child.pid and "-test-" in child.name]
+
+
+def _count(log: Path, line: str) -> int:
+    return log.read_text(encoding="utf-8").split().count(line)
+
+
+def _kill(pids: list[int]) -> None:
+    for pid in pids:
+        # It may just have been replaced.
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+
+
+def _reason(future: Future[Any]) -> str:
+    with pytest.raises(JobLostError) as lost:
+        future.result(20.0)
+    return lost.value.reason
+
+
+def test_every_caller_gets_its_own_answer_and_errors_cost_no_worker(log: Path) -> None:
+    with _warm_pool(log, workers=2, queue_limit=100) as pool, ThreadPoolExecutor(8) as threads:
+        answers = [threads.submit(pool.run, ("echo", index), 20.0) for index in range(50)]
+        broken = [threads.submit(pool.run, ("raise", "on purpose"), 20.0) for _ in range(5)]
+        assert [answer.result() for answer in answers] == list(range(50))
+        assert {_reason(future) for future in broken} == {"fault"}
+        assert _count(log, "start") == 2
+
+
+def test_a_job_whose_worker_is_killed_is_done_by_the_next_one(log: Path) -> None:
+    with _warm_pool(log) as pool:
+        answer = pool.submit(("sleep", 0.5), 20.0)
+        wait_for(lambda: _count(log, "sleep") == 1)
+        killed = _pids()
+        _kill(killed)
+        assert answer.result(20.0) not in killed
+        assert _count(log, "sleep") == 2
+
+
+def test_a_job_has_no_answer_when_there_is_no_time_for_another_try(log: Path) -> None:
+    with _warm_pool(log) as pool:
+        pool._supervisors[0]._start_s = 60.0
+        begin = monotonic()
+        answer = pool.submit(("sleep", 30.0), 10.0)
+        wait_for(lambda: _count(log, "sleep") == 1)
+        _kill(_pids())
+        assert _reason(answer) == "died"
+        with pytest.raises(JobLostError, match="not-ready"):
+            pool.submit(("echo", 1), 10.0)
+        assert monotonic() - begin < 5.0
+
+
+def test_a_job_that_kills_two_workers_is_never_tried_again(log: Path) -> None:
+    with _warm_pool(log, workers=2) as pool:
+        assert _reason(pool.submit(("die", 1), 30.0)) == "poisoned"
+        with pytest.raises(JobLostError, match="poisoned"):
+            pool.submit(("die", 1), 30.0)
+        assert _count(log, "die") == 2
+        # Others go on as before.
+        assert pool.run(("echo", 2), 30.0) == 2
+
+
+def test_killing_at_any_moment_loses_no_answer_and_mixes_up_none(log: Path) -> None:
+    """Also in the middle of a message: answers are larger than what a pipe holds."""
+    rng = random.Random(5)
+    stop = threading.Event()
+
+    def kill_now_and_then(pool: Pool) -> None:
+        while not stop.wait(rng.uniform(0.0, 0.8)):
+            # Now and then all at once; those that start up are killed as well.
+            _kill(rng.sample(pids, rng.randint(1, len(pids))) if (pids := _pids()) else [])
+
+    def ask(pool: Pool, size: int) -> str:
+        try:
+            return "right" if len(pool.run(("bytes", size), 5.0)) == size else "wrong"
+        except JobLostError as lost:
+            return lost.reason
+
+    with _warm_pool(log, workers=2, queue_limit=16) as pool:
+        killer = threading.Thread(target=kill_now_and_then, args=(pool,))
+        killer.start()
+        end, told = monotonic() + 4.0, set[str]()
+        with ThreadPoolExecutor(4) as threads:
+            while monotonic() < end:
+                sizes = [rng.randint(1, 20_000_000) for _ in range(4)]
+                told |= set(threads.map(lambda size: ask(pool, size), sizes))
+        stop.set()
+        killer.join()
+        # On a busy machine no worker may live long enough to be right.
+        assert told <= {"right", "poisoned", "died", "deadline", "not-ready"}
+        assert _count(log, "start") > 4
+        wait_for(lambda: pool.state.ready == 2)
+        assert ask(pool, 20_000_000) == "right"
+
+
+def test_a_worker_that_stalls_is_replaced_even_in_the_middle_of_a_message(log: Path) -> None:
+    with _warm_pool(log, stall_s=1.0) as pool:
+        (stalled,) = _pids()
+        os.kill(stalled, signal.SIGSTOP)
+        # Larger than what the pipe holds: the supervisor cannot even send it.
+        begin = monotonic()
+        assert pool.run(("echo", b"x" * 10_000_000), 20.0) == b"x" * 10_000_000
+        assert monotonic() - begin > 1.0
+        assert stalled not in _pids()
+
+
+def test_jobs_that_nobody_waits_for_are_not_started(log: Path) -> None:
+    with _warm_pool(log) as pool:
+        busy = pool.submit(("sleep", 1.0), 20.0)
+        wait_for(lambda: _count(log, "sleep") == 1)
+        cancelled, late = pool.submit(("echo", 1), 20.0), pool.submit(("raise", 1), 0.2)
+        assert cancelled.cancel()
+        busy.result(20.0)
+        assert _reason(late) == "deadline"
+        assert pool.run(("bytes", 1), 20.0) == b"\0"
+        assert _count(log, "echo") == _count(log, "raise") == 0
+
+
+def test_a_wait_that_is_cancelled_on_the_event_loop_cancels_the_job(log: Path) -> None:
+    async def give_up(pool: Pool) -> None:
+        waiting = asyncio.create_task(pool.answer(("echo", 1), 20.0))
+        await asyncio.sleep(0.1)
+        waiting.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await waiting
+
+    with _warm_pool(log) as pool:
+        busy = pool.submit(("sleep", 1.0), 20.0)
+        wait_for(lambda: _count(log, "sleep") == 1)
+        asyncio.run(give_up(pool))
+        busy.result(20.0)
+        assert asyncio.run(pool.answer(("bytes", 1), 20.0)) == b"\0"
+        assert _count(log, "echo") == 0
+
+
+def test_a_deadline_is_kept_and_the_worker_goes_on(log: Path) -> None:
+    with _warm_pool(log) as pool:
+        begin = monotonic()
+        with pytest.raises(JobLostError, match="deadline"):
+            pool.run(("sleep", 1.0), 0.2)
+        assert monotonic() - begin < 0.7
+        assert pool.run(("echo", 1), 20.0) == 1
+        assert _count(log, "start") == 1
+
+
+def test_a_full_queue_refuses_at_once_and_places_given_up_are_free_again(log: Path) -> None:
+    with _warm_pool(log, queue_limit=2) as pool:
+        pool.submit(("sleep", 1.5), 20.0)
+        wait_for(lambda: _count(log, "sleep") == 1)
+        first, second = pool.submit(("echo", 1), 20.0), pool.submit(("echo", 2), 20.0)
+        begin = monotonic()
+        with pytest.raises(JobLostError, match="queue-full"):
+            pool.submit(("echo", 3), 20.0)
+        assert monotonic() - begin < 0.5
+        first.cancel()
+        assert pool.submit(("echo", 4), 20.0).result(20.0) == 4
+        assert second.result(20.0) == 2
+
+
+def test_closing_finishes_what_is_at_work_and_loses_what_waits(log: Path) -> None:
+    with _warm_pool(log) as pool:
+        at_work = pool.submit(("sleep", 0.5), 20.0)
+        wait_for(lambda: _count(log, "sleep") == 1)
+        waiting = pool.submit(("echo", 1), 20.0)
+        pool.close(drain_s=10.0)
+        assert isinstance(at_work.result(0.0), int)
+        assert _reason(waiting) == "closing"
+        with pytest.raises(JobLostError, match="closing"):
+            pool.submit(("echo", 1), 20.0)
+
+
+def test_closing_does_not_wait_longer_than_it_is_told(log: Path) -> None:
+    with _warm_pool(log) as pool:
+        at_work = pool.submit(("sleep", 30.0), 60.0)
+        wait_for(lambda: _count(log, "sleep") == 1)
+        begin = monotonic()
+        pool.close(drain_s=0.2)
+        assert monotonic() - begin < 2.0
+        assert _reason(at_work) == "closing"
+
+
+def test_workers_that_cannot_start_are_tried_less_and_less_often(log: Path) -> None:
+    with _pool(log, target=worker_jobs.run_broken) as pool:
+        wait_for(lambda: _count(log, "start") == 3)
+        begin = monotonic()
+        wait_for(lambda: _count(log, "start") == 5)
+        # Pauses of 0.5 and 1 s.
+        assert monotonic() - begin > 1.4
+        assert pool.state.fault == "the worker died starting"
+        assert not pool.state.warmed_up
+
+
+def test_a_worker_that_never_gets_ready_is_given_up(log: Path) -> None:
+    slow = {"target": worker_jobs.run_slow_start, "arguments": (str(log), 60.0)}
+    with _pool(log, longest_start_s=1.0, **slow) as pool:
+        wait_for(lambda: pool.state.fault is not None)
+        assert pool.state.fault == "the worker did not start within 1 s"
+
+
+def test_a_worker_killed_while_it_starts_costs_a_waiting_job_only_time(log: Path) -> None:
+    with _pool(log, start_s=2.0) as pool:
+        answer = pool.submit(("echo", 1), 30.0)
+        wait_for(lambda: pool.state.warmed_up)
+        assert answer.result(30.0) == 1
+        _kill(_pids())
+        answer = pool.submit(("echo", 2), 30.0)
+        for _ in range(2):
+            wait_for(lambda: len(_pids()) == 1 and not pool.state.ready)
+            sleep(0.05)
+            _kill(_pids())
+        assert answer.result(30.0) == 2
