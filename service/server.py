@@ -1,0 +1,128 @@
+"""The HTTP server around the app: bounded connections, and a stop that finishes what is in work.
+
+Running the app under another ASGI server works as well; what stands here is then that server's to do.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import os
+import threading
+from time import monotonic
+from types import FrameType
+from typing import Any
+
+import uvicorn
+from fastapi import FastAPI
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from service.admission import Admission, AdmissionLimits
+from service.settings import Settings
+
+# Heads of requests; larger ones get a 400.
+_MAX_HEAD_BYTES = 16 * 1024
+# Shares of the time for stopping: for requests in work, and then for connections to close. The rest is for workers,
+# background threads and the store.
+_FOR_REQUESTS, _FOR_CONNECTIONS = 0.6, 0.1
+
+
+def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
+    """How the app is served."""
+    limits = AdmissionLimits.of(settings)
+    # The server's own refusal is plain text; ours comes first.
+    least = limits.requests + limits.reads + limits.streams + 1
+    return uvicorn.Config(
+        app,
+        http=bounded_protocol(settings.head_deadline_s),
+        ws="none",
+        log_level="warning",
+        limit_concurrency=max(settings.max_connections, least),
+        timeout_keep_alive=math.ceil(settings.keep_alive_s),
+        timeout_graceful_shutdown=math.ceil(_FOR_CONNECTIONS * settings.stop_deadline_s),
+        h11_max_incomplete_event_size=_MAX_HEAD_BYTES,
+    )
+
+
+class Server(uvicorn.Server):
+    """Stops in two steps: requests are refused while those in work are finished, then the listener is closed."""
+
+    def __init__(self, config: uvicorn.Config, app: FastAPI, settings: Settings) -> None:
+        super().__init__(config)
+        self._app = app
+        self._settings = settings
+        self._stopping_since: float | None = None
+
+    def handle_exit(self, sig: int, frame: FrameType | None) -> None:
+        """The first signal begins to stop, the second ends the process; workers notice and follow."""
+        if self._stopping_since is not None:
+            os._exit(1)
+        self._stopping_since = monotonic()
+        # Whatever hangs, a thread or a disk, ends then.
+        last_resort = threading.Timer(self._settings.stop_deadline_s, os._exit, [1])
+        last_resort.daemon = True
+        last_resort.start()
+        admission = self._admission
+        if admission is not None:
+            admission.stop()
+        else:
+            self.should_exit = True
+
+    async def on_tick(self, counter: int) -> bool:
+        """Called ten times a second; true when it is time to close the listener."""
+        ended = await super().on_tick(counter)
+        if ended or self._stopping_since is None:
+            return ended
+        waited_s = monotonic() - self._stopping_since
+        told = waited_s >= min(self._settings.stop_notice_s, _FOR_REQUESTS * self._settings.stop_deadline_s)
+        admission = self._admission
+        done = admission is None or admission.idle or waited_s >= _FOR_REQUESTS * self._settings.stop_deadline_s
+        return told and done
+
+    @property
+    def _admission(self) -> Admission | None:
+        """None before the app has started."""
+        return getattr(self._app.state, "admission", None)
+
+
+def bounded_protocol(head_deadline_s: float) -> type[asyncio.Protocol]:
+    """HTTP/1.1 with a limit on what the server alone sees: heads of requests, and bodies of refused ones."""
+
+    class BoundedProtocol(H11Protocol):
+        """Ends a connection that is longer without a request in work than being idle and sending a head may take.
+
+        Idle connections end earlier, by the server's own clock; but that stops with the first byte that comes.
+        """
+
+        _limit: asyncio.TimerHandle | None = None
+
+        def connection_made(self, transport: asyncio.Transport) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+            super().connection_made(transport)
+            self._watch()
+
+        def data_received(self, data: bytes) -> None:
+            super().data_received(data)
+            self._watch()
+
+        def on_response_complete(self) -> None:
+            super().on_response_complete()
+            self._watch()
+
+        def connection_lost(self, exc: Exception | None) -> None:
+            super().connection_lost(exc)
+            self._unwatch()
+
+        def _watch(self) -> None:
+            cycle: Any = self.cycle
+            if cycle is not None and not cycle.response_complete:
+                self._unwatch()
+            elif self._limit is None:
+                delay_s = self.timeout_keep_alive + head_deadline_s
+                self._limit = self.loop.call_later(delay_s, self.transport.abort)
+
+        def _unwatch(self) -> None:
+            if self._limit is not None:
+                self._limit.cancel()
+                self._limit = None
+
+    return BoundedProtocol

@@ -1,0 +1,116 @@
+"""Admission: a place or a refusal at once, places that come free again, and nobody working for a client that left."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
+from time import monotonic
+
+import httpx
+import pytest
+
+from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upload, wait_for
+from tests.service.test_localise import HALL
+
+PLACES = 3
+
+
+@pytest.fixture(scope="module")
+def small(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+    """An app with few places, one thread that computes, and large grids that take their time."""
+    limits = {"max_pending_requests": PLACES, "max_queries": 1, "max_reads": 2, "compute_threads": 1}
+    with start_app(tmp_path_factory.mktemp("data"), upload_deadline_s=30.0, **limits) as client:
+        yield client
+
+
+@contextmanager
+def _open_upload(client: httpx.Client, path: str = "/floorplans") -> Iterator[socket.socket]:
+    """An upload whose body does not come."""
+    with socket.create_connection((client.base_url.host, client.base_url.port or 80), timeout=10.0) as connection:
+        head = f"POST {path} HTTP/1.1\r\nHost: test\r\nContent-Type: application/json\r\nContent-Length: 100000\r\n\r\n"
+        connection.sendall(head.encode() + b"{")
+        yield connection
+
+
+def _metric(client: httpx.Client, name: str) -> float:
+    lines = [line for line in client.get("/metrics").text.splitlines() if line.startswith(f"{name} ")]
+    return float(lines[0].split()[1])
+
+
+def _in_flight(client: httpx.Client) -> float:
+    return _metric(client, "lalaloc_requests_in_flight")
+
+
+def test_past_the_limit_requests_are_refused_at_once_and_places_come_free_again(small: httpx.Client) -> None:
+    with ExitStack() as uploads:
+        for _ in range(PLACES):
+            uploads.enter_context(_open_upload(small))
+        wait_for(lambda: _in_flight(small) == PLACES)
+        begin = monotonic()
+        response = small.post("/floorplans", json=FLAT)
+        assert monotonic() - begin < 0.5
+        assert f"{PLACES} others" in assert_problem(response, 503, "overloaded")["detail"]
+        assert 1 <= int(response.headers["retry-after"]) <= 30
+        # What changes nothing has places of its own, health and metrics need none.
+        assert small.get("/floorplans").status_code == 200
+        assert small.get("/healthz").status_code == 200
+    wait_for(lambda: _in_flight(small) == 0)
+    upload(small)
+
+
+def test_a_refusal_does_not_wait_for_the_body(small: httpx.Client) -> None:
+    with ExitStack() as uploads:
+        for _ in range(PLACES):
+            uploads.enter_context(_open_upload(small))
+        wait_for(lambda: _in_flight(small) == PLACES)
+        refused = uploads.enter_context(_open_upload(small))
+        assert refused.recv(4096).startswith(b"HTTP/1.1 503 ")
+    wait_for(lambda: _in_flight(small) == 0)
+
+
+def test_a_query_past_the_limit_is_refused_before_it_is_uploaded(small: httpx.Client, panorama: bytes) -> None:
+    plan_id = upload(small)
+    with ThreadPoolExecutor(8) as threads:
+        answers = list(threads.map(lambda _: localise(small, plan_id, panorama), range(24)))
+    refused = [answer for answer in answers if answer.status_code != 200]
+    assert refused
+    assert len(refused) < len(answers)
+    for answer in refused:
+        assert_problem(answer, 503, "overloaded")
+    assert localise(small, plan_id, panorama).status_code == 200
+    assert 'lalaloc_rejections_total{reason="overloaded"}' in small.get("/metrics").text
+
+
+def test_a_query_that_waits_for_its_grid_holds_up_no_other(small: httpx.Client, panorama: bytes) -> None:
+    ready, preparing = upload(small), upload(small, HALL, wait=False)
+    with ThreadPoolExecutor(1) as threads:
+        waiting = threads.submit(localise, small, preparing, panorama)
+        wait_for(lambda: _in_flight(small) == 1 and _metric(small, "lalaloc_queries_in_work") == 0)
+        assert localise(small, ready, panorama).status_code == 200
+        assert small.delete(f"/floorplans/{preparing}").status_code == 204
+        assert waiting.result().status_code in (200, 404, 503)
+
+
+def test_a_client_that_hangs_up_frees_its_place(small: httpx.Client, panorama: bytes) -> None:
+    preparing = upload(small, HALL, wait=False)
+    body, content_type = _multipart(preparing, panorama)
+    with socket.create_connection((small.base_url.host, small.base_url.port or 80), timeout=10.0) as connection:
+        lines = ["POST /localise HTTP/1.1", "Host: test", f"Content-Type: {content_type}"]
+        head = "\r\n".join([*lines, f"Content-Length: {len(body)}", "", ""])
+        connection.sendall(head.encode() + body)
+        wait_for(lambda: _in_flight(small) == 1)
+    begin = monotonic()
+    wait_for(lambda: _in_flight(small) == 0)
+    assert monotonic() - begin < 2.0
+    assert 'lalaloc_disconnects_total{route="/localise"} 1.0' in small.get("/metrics").text
+    assert small.delete(f"/floorplans/{preparing}").status_code == 204
+    assert _metric(small, "lalaloc_queries_in_work") == 0
+
+
+def _multipart(plan_id: str, panorama: bytes) -> tuple[bytes, str]:
+    request = httpx.Request(
+        "POST", "http://test", data={"floorplan_id": plan_id}, files={"panorama": ("p.jpg", panorama, "image/jpeg")}
+    )
+    return request.read(), request.headers["content-type"]

@@ -1,0 +1,159 @@
+"""`python -m service` told to stop, and clients that take their time: real processes, real signals, raw sockets."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from time import monotonic, sleep
+
+import httpx
+
+from tests.service.conftest import FLAT, assert_problem, upload, wait_for
+from tests.service.test_process import ROOT, alive, children, environment_of
+
+
+@dataclass(frozen=True)
+class _Service:
+    process: subprocess.Popen[bytes]
+    client: httpx.Client
+    port: int
+
+    def connect(self, sent: bytes) -> socket.socket:
+        """A connection on which something was sent already."""
+        connection = socket.create_connection(("127.0.0.1", self.port), timeout=20.0)
+        connection.sendall(sent)
+        return connection
+
+
+@contextmanager
+def _service(bundle: Path, data_dir: Path, **settings: str) -> Iterator[_Service]:
+    environment = environment_of(bundle, data_dir, **{"WORKERS": "0"} | settings)
+    command = [sys.executable, "-m", "service", "--port", "0"]
+    with (data_dir.parent / "log").open("ab") as log:
+        process = subprocess.Popen(command, env=environment, cwd=ROOT, stdout=subprocess.PIPE, stderr=log)
+    try:
+        assert process.stdout is not None
+        address = process.stdout.readline().decode().strip()
+        with httpx.Client(base_url=address, timeout=60.0) as client:
+            wait_for(lambda: client.get("/readyz").status_code == 200)
+            yield _Service(process, client, int(address.rpartition(":")[2]))
+    finally:
+        process.kill()
+        process.wait(10.0)
+
+
+def _upload_head(body: bytes, path: str = "/floorplans") -> bytes:
+    lines = [f"POST {path} HTTP/1.1", "Host: test", "Content-Type: application/json", f"Content-Length: {len(body)}"]
+    return "\r\n".join([*lines, "", ""]).encode()
+
+
+def _in_flight(client: httpx.Client) -> bool:
+    return "lalaloc_requests_in_flight 1.0" in client.get("/metrics").text
+
+
+def test_told_to_stop_it_finishes_what_is_in_work_and_refuses_the_rest(tiny_bundle: Path, tmp_path: Path) -> None:
+    body = json.dumps(FLAT).encode()
+    with _service(tiny_bundle, tmp_path / "data") as service:
+        workers = children(service.process.pid)
+        assert workers
+        with service.connect(_upload_head(body) + body[:10]) as upload:
+            wait_for(lambda: _in_flight(service.client))
+            service.process.send_signal(signal.SIGTERM)
+            wait_for(lambda: service.client.get("/readyz").status_code == 503, 2.0)
+            refused = service.client.post("/floorplans", json=FLAT)
+            assert_problem(refused, 503, "stopping")
+            assert int(refused.headers["retry-after"]) >= 1
+            assert_problem(service.client.get("/floorplans"), 503, "stopping")
+            assert service.client.get("/healthz").status_code == 200
+            upload.sendall(body[10:])
+            assert upload.recv(4096).startswith(b"HTTP/1.1 201 ")
+        assert service.process.wait(10.0) == 0
+        assert not any(alive(worker) for worker in workers)
+
+
+def test_a_load_balancer_is_told_before_the_service_stops(tiny_bundle: Path, tmp_path: Path) -> None:
+    with _service(tiny_bundle, tmp_path / "data", STOP_NOTICE_S="1") as service:
+        begin = monotonic()
+        service.process.send_signal(signal.SIGTERM)
+        wait_for(lambda: service.client.get("/readyz").status_code == 503, 0.9)
+        assert service.process.wait(10.0) == 0
+        assert monotonic() - begin > 1.0
+
+
+def test_stopping_takes_no_longer_than_it_may(tiny_bundle: Path, tmp_path: Path) -> None:
+    with _service(tiny_bundle, tmp_path / "data", STOP_DEADLINE_S="3") as service:
+        workers = children(service.process.pid)
+        with service.connect(_upload_head(b"x" * 100)) as upload:
+            wait_for(lambda: _in_flight(service.client))
+            begin = monotonic()
+            service.process.send_signal(signal.SIGTERM)
+            upload.settimeout(20.0)
+            assert upload.recv(4096).startswith(b"HTTP/1.1 503 ")
+            service.process.wait(20.0)
+            # An upload may take a minute.
+            assert monotonic() - begin < 10.0
+        wait_for(lambda: not any(alive(worker) for worker in workers), 5.0)
+
+
+def test_clients_that_follow_events_do_not_hold_it_up(tiny_bundle: Path, tmp_path: Path) -> None:
+    hall = {"ceiling_height_m": 3.0, "rooms": [{"polygon": [[0, 0], [40, 0], [40, 40], [0, 40]]}]}
+    settings = {"GRID_STEP_M": "0.1", "MAX_GRID_POSES": "1000000"}
+    with _service(tiny_bundle, tmp_path / "data", **settings) as service:
+        plan_id = upload(service.client, hall, wait=False)
+        with service.client.stream("GET", f"/floorplans/{plan_id}/events") as response:
+            lines = response.iter_lines()
+            assert "event: progress" in lines
+            service.process.send_signal(signal.SIGTERM)
+            # It ends as a whole answer does, and not with the connection.
+            assert "event: ready" not in lines
+        assert service.process.wait(10.0) == 0
+
+
+def test_a_second_signal_ends_it_at_once(tiny_bundle: Path, tmp_path: Path) -> None:
+    with _service(tiny_bundle, tmp_path / "data") as service:
+        workers = children(service.process.pid)
+        with service.connect(_upload_head(b"x" * 100)):
+            wait_for(lambda: _in_flight(service.client))
+            service.process.send_signal(signal.SIGTERM)
+            wait_for(lambda: service.client.get("/readyz").status_code == 503, 2.0)
+            begin = monotonic()
+            service.process.send_signal(signal.SIGTERM)
+            assert service.process.wait(10.0) == 1
+            assert monotonic() - begin < 2.0
+        wait_for(lambda: not any(alive(worker) for worker in workers), 5.0)
+
+
+def test_clients_that_dribble_are_cut_off(tiny_bundle: Path, tmp_path: Path) -> None:
+    limits = {"KEEP_ALIVE_S": "1", "HEAD_DEADLINE_S": "1", "MAX_PENDING_REQUESTS": "1"}
+    with _service(tiny_bundle, tmp_path / "data", **limits) as service:
+        with service.connect(b"GET /healthz HTTP/1.1\r\nX-Slow: ") as slow_head:
+            assert _dribble_until_closed(slow_head) < 6.0
+        with service.connect(b"") as silent:
+            assert silent.recv(1) == b""
+        with service.connect(_upload_head(b"x" * 100)), service.connect(_upload_head(b"x" * 10_000)) as refused:
+            assert refused.recv(4096).startswith(b"HTTP/1.1 503 ")
+            assert _dribble_until_closed(refused) < 6.0
+        assert service.client.get("/healthz").status_code == 200
+
+
+def _dribble_until_closed(connection: socket.socket) -> float:
+    """Send a byte now and then; returns after how many seconds the other side had enough."""
+    begin = monotonic()
+    connection.settimeout(0.2)
+    while monotonic() - begin < 20.0:
+        try:
+            connection.sendall(b"x")
+            if connection.recv(4096) == b"":
+                break
+        except TimeoutError:
+            sleep(0.1)
+        except ConnectionError:
+            break
+    return monotonic() - begin
