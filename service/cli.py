@@ -1,0 +1,204 @@
+"""The command line of the service: `lalaloc-service serve`, and `lalaloc-service keys create|list|revoke`.
+
+Keys are kept in the database that the settings name, so these commands work while the service runs as well.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import socket
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict
+from datetime import datetime
+
+from lalaloc_core.errors import ConfigError, LaLaLocError
+from service.security.access import Permission
+from service.security.exposure import check_address
+from service.security.keys import hash_of, key_text, new_secret
+from service.settings import Settings
+from service.storage.records import ApiKey
+from service.storage.store import Store, open_store
+
+# Connections that the kernel accepts while the service is busy; it answers all of them, if only with a 503.
+_BACKLOG = 1024
+_TENANT = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+_MAX_NAME = 200
+_MAX_RATE = 10**6
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command.
+
+    Returns:
+        the exit status: 0, or 1 when it could not be done; one that cannot be understood ends the process with 2.
+    """
+    parsed = _parser().parse_args(arguments)
+    try:
+        return parsed.run(parsed)
+    except LaLaLocError as error:
+        print(f"lalaloc-service: {error}", file=sys.stderr)
+        return 1
+
+
+def add_serve_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `serve`."""
+    parser.add_argument("--host", default="127.0.0.1", help="address to listen on (default: %(default)s)")
+    parser.add_argument("--port", type=int, default=8000, help="port to listen on, 0 for a free one (default: 8000)")
+
+
+def serve(arguments: argparse.Namespace) -> int:
+    """Bind, say where, serve until told to stop.
+
+    Raises:
+        ConfigError: a setting is wrong, or the address would let others in without keys.
+    """
+    settings = Settings.load()
+    with _listener(arguments.host, arguments.port) as listener:
+        host, port = listener.getsockname()[:2]
+        check_address(host, settings)
+        # Bound already: whoever reads this line can connect, and is answered once the service has started.
+        print(f"http://{f'[{host}]' if ':' in host else host}:{port}", flush=True)
+        # Takes a second or two, which those who only ask for help or keys need not wait.
+        from service.app import create_app
+        from service.server import Server, server_config
+
+        app = create_app(settings)
+        Server(server_config(app, settings), app, settings).run(sockets=[listener])
+    return 0
+
+
+def _listener(host: str, port: int) -> socket.socket:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        return socket.create_server((host, port), family=family, backlog=_BACKLOG)
+    except (OSError, OverflowError) as error:
+        raise ConfigError(f"cannot listen on {host} port {port}: {error}") from error
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="lalaloc-service", description=__doc__)
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    serving = commands.add_parser("serve", help="run the service")
+    add_serve_arguments(serving)
+    serving.set_defaults(run=serve)
+    keys = commands.add_parser("keys", help="make, list and revoke API keys").add_subparsers(required=True)
+
+    create = keys.add_parser("create", help="make a key and print it: once, it cannot be read back")
+    create.add_argument("--tenant", required=True, type=_tenant, help="whose floor plans it gives access to")
+    create.add_argument("--name", required=True, type=_name, help="what it is for, to tell it from others")
+    create.add_argument(
+        "--scope",
+        dest="scopes",
+        action="append",
+        required=True,
+        choices=[str(permission) for permission in Permission],
+        help="what it may do; give it again for more",
+    )
+    create.add_argument(
+        "--rate-per-minute", type=_rate, help="requests per minute, 0 for any number; by default as the settings say"
+    )
+    create.set_defaults(run=_create)
+
+    listing = keys.add_parser("list", help="show the keys there are, revoked ones as well, without their secrets")
+    listing.add_argument("--tenant", type=_tenant, help="only this tenant's")
+    listing.add_argument("--json", action="store_true", help="as JSON instead of a table")
+    listing.set_defaults(run=_list)
+
+    revoke = keys.add_parser("revoke", help="end a key; it is refused within a few seconds (LALALOC_KEY_CACHE_S)")
+    revoke.add_argument("id", help="the key's id, the part of it between the underscores")
+    revoke.set_defaults(run=_revoke)
+    return parser
+
+
+def _create(arguments: argparse.Namespace) -> int:
+    secret = new_secret()
+    with _store() as store:
+        key = store.keys.create(
+            arguments.tenant,
+            arguments.name,
+            hash_of(secret),
+            arguments.scopes,
+            rate_per_minute=arguments.rate_per_minute,
+        )
+    # The key alone goes to standard output, so that it can be piped to where it is kept.
+    print(f"key {key.id} of tenant '{key.tenant}', shown this once:", file=sys.stderr)
+    print(key_text(key.id, secret))
+    return 0
+
+
+def _list(arguments: argparse.Namespace) -> int:
+    with _store() as store:
+        keys = store.keys.list(arguments.tenant)
+    if arguments.json:
+        print(json.dumps([asdict(key) | {"scopes": sorted(key.scopes)} for key in keys], default=str, indent=2))
+    else:
+        print(_table(keys))
+    return 0
+
+
+def _revoke(arguments: argparse.Namespace) -> int:
+    with _store() as store:
+        if not store.keys.revoke(arguments.id):
+            print(f"lalaloc-service: no key '{arguments.id[:64]}' is in use", file=sys.stderr)
+            return 1
+    print(f"revoked {arguments.id}")
+    return 0
+
+
+@contextmanager
+def _store() -> Iterator[Store]:
+    store = open_store(Settings.load())
+    try:
+        yield store
+    finally:
+        store.close()
+
+
+def _table(keys: Sequence[ApiKey]) -> str:
+    head = ("ID", "TENANT", "NAME", "SCOPES", "RATE", "CREATED", "LAST USED", "REVOKED")
+    rows = [
+        (
+            key.id,
+            key.tenant,
+            key.name,
+            ",".join(sorted(key.scopes)),
+            "-" if key.rate_per_minute is None else str(key.rate_per_minute),
+            _moment(key.created_at),
+            _moment(key.last_used_at),
+            _moment(key.revoked_at),
+        )
+        for key in keys
+    ]
+    widths = [max(len(row[column]) for row in (head, *rows)) for column in range(len(head))]
+    lines = ("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in (head, *rows))
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def _moment(moment: datetime | None) -> str:
+    return "-" if moment is None else moment.isoformat(timespec="seconds")
+
+
+def _tenant(given: str) -> str:
+    if not _TENANT.fullmatch(given):
+        raise argparse.ArgumentTypeError("1 to 64 letters, digits, '.', '_' and '-', beginning with a letter or digit")
+    return given
+
+
+def _name(given: str) -> str:
+    if not 0 < len(given) <= _MAX_NAME or not given.isprintable():
+        raise argparse.ArgumentTypeError(f"1 to {_MAX_NAME} printable characters")
+    return given
+
+
+def _rate(given: str) -> int:
+    if not given.isascii() or not given.isdigit() or int(given) > _MAX_RATE:
+        raise argparse.ArgumentTypeError(f"a whole number from 0 to {_MAX_RATE}")
+    return int(given)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,87 @@
+"""Scopes, the one table that says which route needs which, and on whose behalf a request comes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+
+from fastapi import Request
+from starlette.routing import compile_path
+from starlette.types import Scope
+
+from service.storage.records import DEFAULT_TENANT
+
+_SCOPE_KEY = "lalaloc.caller"
+
+
+class Permission(StrEnum):
+    """What a key is good for; none includes another."""
+
+    READ = "read"
+    LOCALISE = "localise"
+    WRITE = "write"
+
+
+# Answered to everybody: whoever watches the process need not have a key.
+OPEN_PATHS = frozenset({"/healthz", "/readyz"})
+
+# Every other route. With keys, what does not stand here is not there: a new route is closed until it has a row.
+NEEDED: Mapping[tuple[str, str], Permission] = {
+    ("GET", "/"): Permission.READ,
+    ("GET", "/docs"): Permission.READ,
+    ("GET", "/openapi.json"): Permission.READ,
+    ("GET", "/web/try.js"): Permission.READ,
+    ("GET", "/web/docs.js"): Permission.READ,
+    ("GET", "/web/style.css"): Permission.READ,
+    ("GET", "/metrics"): Permission.READ,
+    ("GET", "/limits"): Permission.READ,
+    ("GET", "/floorplans"): Permission.READ,
+    ("POST", "/floorplans"): Permission.WRITE,
+    ("GET", "/floorplans/{floorplan_id}"): Permission.READ,
+    ("PUT", "/floorplans/{floorplan_id}"): Permission.WRITE,
+    ("DELETE", "/floorplans/{floorplan_id}"): Permission.WRITE,
+    ("GET", "/floorplans/{floorplan_id}/events"): Permission.READ,
+    ("GET", "/floorplans/{floorplan_id}/original"): Permission.READ,
+    ("GET", "/floorplans/{floorplan_id}/preview.svg"): Permission.READ,
+    ("GET", "/floorplans/{floorplan_id}/mesh.glb"): Permission.READ,
+    ("POST", "/localise"): Permission.LOCALISE,
+}
+_PATTERNS = {path: compile_path(path)[0] for _, path in NEEDED}
+
+
+@dataclass(frozen=True)
+class Caller:
+    """On whose behalf a request comes.
+
+    Attributes:
+        tenant: whose plans it may see.
+        key_id: id of its API key, None where there are no keys.
+        permissions: what it may do.
+    """
+
+    tenant: str
+    key_id: str | None
+    permissions: frozenset[Permission]
+
+
+# Whoever asks while keys are off.
+ANYONE = Caller(DEFAULT_TENANT, None, frozenset(Permission))
+
+
+def permissions_needed(path: str) -> dict[str, Permission]:
+    """Which methods a path has and what each needs; empty for a path that is none of a route."""
+    # The framework redirects from a path with a slash at its end.
+    plain = path.rstrip("/") or "/"
+    template = next((template for template, pattern in _PATTERNS.items() if pattern.match(plain)), None)
+    return {method: needed for (method, row), needed in NEEDED.items() if row == template}
+
+
+def put_caller(scope: Scope, caller: Caller) -> None:
+    """Attach the caller to a request."""
+    scope[_SCOPE_KEY] = caller
+
+
+def caller_of(request: Request) -> Caller:
+    """The caller of a request that was let in."""
+    return request.scope[_SCOPE_KEY]

@@ -1,0 +1,84 @@
+"""How often: requests per key, and refused keys per client address. Counted in memory, each replica for itself."""
+
+from __future__ import annotations
+
+import ipaddress
+import math
+import time
+
+from limits import RateLimitItem, RateLimitItemPerMinute, RateLimitItemPerSecond
+from limits.aio.storage import MemoryStorage
+from limits.aio.strategies import SlidingWindowCounterRateLimiter
+
+from service.errors import RateLimitedError, TooManyRefusedKeysError
+from service.settings import Settings
+from service.storage.records import ApiKey
+
+# Client addresses share this many counters, so that their number does not matter. Only an address with refused keys
+# of its own notices that another one fell on the same counter.
+_ADDRESS_COUNTERS = 1024
+# Who has one IPv6 address commonly has all that begin like it.
+_IPV6_NETWORK_BITS = 64
+
+
+class Rates:
+    """Counts over a sliding window; for one event loop."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._limiter = SlidingWindowCounterRateLimiter(MemoryStorage())
+        self._per_minute = settings.rate_per_minute
+        self._burst = settings.rate_burst
+        self._refused = RateLimitItemPerMinute(settings.refused_keys_per_minute, namespace="refused")
+
+    async def count(self, key: ApiKey) -> None:
+        """Count a request of a key.
+
+        Raises:
+            RateLimitedError: it has sent too many.
+        """
+        per_minute = self._per_minute if key.rate_per_minute is None else key.rate_per_minute
+        if self._burst:
+            await self._count(RateLimitItemPerSecond(self._burst, namespace="burst"), key.id, "second")
+        if per_minute:
+            await self._count(RateLimitItemPerMinute(per_minute, namespace="rate"), key.id, "minute")
+
+    async def count_refused(self, client: str) -> None:
+        """Count a refused key of a client address.
+
+        Raises:
+            TooManyRefusedKeysError: it has sent too many.
+        """
+        if not await self._limiter.hit(self._refused, _counter_of(client)):
+            raise await self._too_many_refused(client)
+
+    async def check_refused(self, client: str) -> None:
+        """Raises:
+        TooManyRefusedKeysError: the client address has sent so many refused keys that its next is not looked at.
+        """
+        if not await self._limiter.test(self._refused, _counter_of(client)):
+            raise await self._too_many_refused(client)
+
+    async def _count(self, limit: RateLimitItem, key_id: str, period: str) -> None:
+        if not await self._limiter.hit(limit, key_id):
+            raise RateLimitedError(limit.amount, period, await self._retry_after_s(limit, key_id))
+
+    async def _too_many_refused(self, client: str) -> TooManyRefusedKeysError:
+        retry_after_s = await self._retry_after_s(self._refused, _counter_of(client))
+        return TooManyRefusedKeysError(self._refused.amount, retry_after_s)
+
+    async def _retry_after_s(self, limit: RateLimitItem, identifier: str) -> int:
+        """Whole seconds until the count is lower than now."""
+        freed_at_s, _ = await self._limiter.get_window_stats(limit, identifier)
+        return max(math.ceil(freed_at_s - time.time()), 1)
+
+
+def _counter_of(client: str) -> str:
+    """The counter of a client address. Which others share it differs from process to process, and cannot be told."""
+    try:
+        address = ipaddress.ip_address(client)
+        if address.version == 6:
+            client = str(ipaddress.ip_network((int(address), _IPV6_NETWORK_BITS), strict=False))
+    except ValueError:
+        # A Unix socket has none, and proxies may state anything.
+        pass
+    return str(hash(client) % _ADDRESS_COUNTERS)

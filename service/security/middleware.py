@@ -1,0 +1,142 @@
+"""Decides about every request before its body is read: where it came in, whose key it has, how often, and for what."""
+
+from __future__ import annotations
+
+from starlette.datastructures import Headers
+from starlette.exceptions import HTTPException
+from starlette.requests import Request
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from service.errors import (
+    ExposedWithoutKeysError,
+    InsufficientScopeError,
+    RateLimitedError,
+    StoreUnavailableError,
+    TooManyRefusedKeysError,
+    UnauthenticatedError,
+)
+from service.problems import http_problem_answer, problem_answer
+from service.security.access import ANYONE, OPEN_PATHS, Caller, Permission, permissions_needed, put_caller
+from service.security.exposure import is_local
+from service.security.key_ring import KeyRing
+from service.security.keys import parse_authorization
+from service.security.limits import Rates
+from service.settings import Settings
+from service.storage.api_keys import ApiKeys
+from service.storage.records import ApiKey
+from service.telemetry import note
+
+# What `GateMiddleware` refuses with, besides 404 and 405.
+REFUSALS = (
+    UnauthenticatedError,
+    InsufficientScopeError,
+    ExposedWithoutKeysError,
+    RateLimitedError,
+    TooManyRefusedKeysError,
+    StoreUnavailableError,
+)
+_NO_KEY = "an API key is needed: send `Authorization: Bearer lalaloc_...`"
+_MALFORMED = "the Authorization header does not hold one API key; it reads `Bearer lalaloc_...`"
+_REFUSED = "the API key is not known here, or was revoked"
+
+
+class Gate:
+    """Lets the requests of one running app in, or refuses them."""
+
+    def __init__(self, keys: ApiKeys, settings: Settings) -> None:
+        self._needs_keys = settings.api_keys
+        self._allow_anonymous = settings.allow_anonymous
+        self._ring = KeyRing(keys, fresh_s=settings.key_cache_s)
+        self._rates = Rates(settings)
+
+    def close(self) -> None:
+        """Stop looking up keys."""
+        self._ring.close()
+
+    async def let_in(self, request: Request) -> Caller:
+        """Who sent a request to anything but health.
+
+        Raises:
+            ExposedWithoutKeysError: it came from elsewhere, and there are no keys.
+            UnauthenticatedError: it has no valid key.
+            TooManyRefusedKeysError: its client sent too many keys that are not valid.
+            RateLimitedError: its key sent too many requests.
+            StoreUnavailableError: the database is away, and its key is not known from the last minutes.
+            InsufficientScopeError: its key is not good for this.
+            HTTPException: there is no such route, or it has no such method.
+        """
+        if not self._needs_keys:
+            if not self._allow_anonymous and not is_local(request.scope.get("server")):
+                raise ExposedWithoutKeysError()
+            return ANYONE
+        key = await self._key_of(request)
+        note(request, key=key.id, tenant=key.tenant)
+        await self._rates.count(key)
+        caller = Caller(key.tenant, key.id, frozenset(scope for scope in Permission if scope in key.scopes))
+        needed = _needed(request)
+        if needed not in caller.permissions:
+            raise InsufficientScopeError(needed, caller.permissions)
+        return caller
+
+    async def _key_of(self, request: Request) -> ApiKey:
+        values = Headers(scope=request.scope).getlist("authorization")
+        if not values:
+            raise UnauthenticatedError(_NO_KEY)
+        client = request.client.host if request.client is not None else ""
+        presented = parse_authorization(values)
+        if presented is None:
+            await self._rates.count_refused(client)
+            raise UnauthenticatedError(_MALFORMED)
+        # Many clients may share an address, so keys that work are not held up by those that do not.
+        if not self._ring.remembers(presented):
+            await self._rates.check_refused(client)
+        key = await self._ring.find(presented)
+        if key is None:
+            await self._rates.count_refused(client)
+            raise UnauthenticatedError(_REFUSED)
+        return key
+
+
+class GateMiddleware:
+    """Asks the running app's gate about every request, and tells the routes who called."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle one request."""
+        # An app that has not been started, or is used without its lifespan, has nothing to guard.
+        gate: Gate | None = getattr(scope["app"].state, "gate", None)
+        if scope["type"] == "http" and gate is not None and _path(scope) not in OPEN_PATHS:
+            request = Request(scope)
+            try:
+                put_caller(scope, await gate.let_in(request))
+            except REFUSALS as error:
+                await problem_answer(request, error)(scope, receive, send)
+                return
+            except HTTPException as error:
+                await http_problem_answer(request, error)(scope, receive, send)
+                return
+        await self._app(scope, receive, send)
+
+
+def _needed(request: Request) -> Permission:
+    """What a request's route needs.
+
+    Raises:
+        HTTPException: there is no such route, or it has no such method.
+    """
+    methods = permissions_needed(_path(request.scope))
+    if not methods:
+        raise HTTPException(404)
+    # Where there is HEAD, it is GET without its body.
+    method = "GET" if request.method == "HEAD" else request.method
+    if method not in methods:
+        raise HTTPException(405, headers={"Allow": ", ".join(methods)})
+    return methods[method]
+
+
+def _path(scope: Scope) -> str:
+    """The path as routes know it: without the prefix that a proxy put before it."""
+    path, prefix = scope["path"], scope.get("root_path", "")
+    return path[len(prefix) :] if prefix and path.startswith(f"{prefix}/") else path

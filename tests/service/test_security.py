@@ -1,0 +1,584 @@
+"""Who gets in: with keys every route is closed but to the right one, without keys only this machine is answered."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import logging
+import re
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from time import monotonic, sleep
+from typing import Any
+
+import httpx
+import pytest
+import sqlalchemy
+from fastapi.routing import iter_route_contexts
+from starlette.types import Receive, Scope, Send
+
+from lalaloc_core.errors import ConfigError
+from service.app import create_app
+from service.errors import StoreUnavailableError, TooManyRefusedKeysError
+from service.security.access import NEEDED, OPEN_PATHS, Permission
+from service.security.exposure import check_address, is_local
+from service.security.key_ring import KeyRing
+from service.security.keys import PresentedKey, hash_of, key_text, new_secret, parse_authorization
+from service.security.limits import Rates
+from service.settings import Settings
+from service.storage.store import Store
+from service.telemetry import LOGGER_NAME
+from service.telemetry.logs import JsonFormatter
+from tests.service.conftest import (
+    FLAT,
+    DatabaseOf,
+    StartApp,
+    assert_problem,
+    encode_picture,
+    localise,
+    serve,
+    upload,
+    wait_for,
+)
+from tests.service.postgres import PostgresServer
+
+ROOT = Path(__file__).parents[2]
+EVERYTHING = tuple(Permission)
+PLAN = "floorplan_id"
+_HTTP_METHODS = {"get", "put", "post", "delete", "patch", "options", "head", "trace"}
+
+
+def _documented() -> list[tuple[str, str]]:
+    """Method and path of every operation in the API description but those about health."""
+    paths = create_app().openapi()["paths"]
+    return [
+        (method.upper(), path)
+        for path, operations in paths.items()
+        for method in operations
+        if method in _HTTP_METHODS and path not in OPEN_PATHS
+    ]
+
+
+def _served() -> set[tuple[str, str]]:
+    """Method and path of everything that the app answers, documented or not."""
+    routes = [context for context in iter_route_contexts(create_app().routes) if context.path not in OPEN_PATHS]
+    assert all(route.methods for route in routes), "websockets and mounted apps have no scopes"
+    return {(method, str(route.path)) for route in routes for method in route.methods or ()}
+
+
+OPERATIONS = _documented()
+ABOUT_A_PLAN = [operation for operation in OPERATIONS if PLAN in operation[1] or operation[1] == "/localise"]
+
+
+def make_key(
+    store: Store, *, tenant: str = "ours", scopes: tuple[str, ...] = EVERYTHING, rate_per_minute: int | None = None
+) -> str:
+    """Store a key, as the command line does; gives its text."""
+    secret = new_secret()
+    return key_text(
+        store.keys.create(tenant, "test", hash_of(secret), scopes, rate_per_minute=rate_per_minute).id, secret
+    )
+
+
+def bearer(key: str) -> dict[str, str]:
+    """The header that a key is sent in."""
+    return {"Authorization": f"Bearer {key}"}
+
+
+def id_of(key: str) -> str:
+    """The id in a key's text."""
+    return key.split("_")[1]
+
+
+@dataclass(frozen=True)
+class Guarded:
+    """A running app with keys on, with a plan of the tenant "ours" in it."""
+
+    client: httpx.Client
+    store: Store
+    plan_id: str
+    key: str
+
+    def send(self, method: str, path: str, key: str | None, plan_id: str | None = None) -> httpx.Response:
+        """Send a request that is right but for its key."""
+        plan_id = plan_id or self.plan_id
+        body: dict[str, Any] = {}
+        if path == "/localise":
+            picture = encode_picture(512, 256, "JPEG")
+            body = {"data": {PLAN: plan_id, "refine": "none"}, "files": {"panorama": ("p.jpg", picture, "image/jpeg")}}
+        elif method in ("POST", "PUT"):
+            body = {"json": FLAT}
+        path = path.replace(f"{{{PLAN}}}", plan_id)
+        return self.client.request(method, path, headers=bearer(key) if key is not None else {}, **body)
+
+
+@pytest.fixture(scope="module")
+def guarded(
+    start_app: StartApp, database_of: DatabaseOf, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Guarded]:
+    data_dir = tmp_path_factory.mktemp("data")
+    rates = {"rate_per_minute": 0, "rate_burst": 0, "refused_keys_per_minute": 10**6}
+    with start_app(data_dir, api_keys=True, key_cache_s=0.1, **rates) as client:
+        store = Store(database_of(data_dir))
+        key = make_key(store)
+        client.headers.update(bearer(key))
+        plan_id = upload(client)
+        del client.headers["Authorization"]
+        yield Guarded(client, store, plan_id, key)
+        store.close()
+
+
+def test_every_route_says_which_scope_it_needs() -> None:
+    served = {operation for operation in _served() if operation[0] != "HEAD"}
+    assert served - set(NEEDED) == set(), "these routes are closed to everybody: give them a row in NEEDED"
+    assert set(NEEDED) - served == set(), "these routes are gone"
+    assert set(OPERATIONS) <= served
+    # Paths are compared without the slash that the framework would redirect from.
+    assert all(path == "/" or not path.endswith("/") for _, path in NEEDED)
+
+
+@pytest.mark.parametrize("scheme", [None, "malformed", "unknown", "revoked"])
+@pytest.mark.parametrize(("method", "path"), sorted(_served() | set(OPERATIONS)))
+def test_nothing_but_health_is_answered_without_a_valid_key(
+    guarded: Guarded, method: str, path: str, scheme: str | None
+) -> None:
+    key = {None: None, "malformed": "lalaloc_x", "unknown": key_text("0" * 32, new_secret())}.get(scheme)
+    if scheme == "revoked":
+        key = make_key(guarded.store)
+        assert guarded.store.keys.revoke(id_of(key))
+    response = guarded.send(method, path, key)
+    assert response.status_code == 401
+    assert response.headers["www-authenticate"] == "Bearer"
+    if method != "HEAD":
+        assert_problem(response, 401, "unauthenticated")
+
+
+@pytest.mark.parametrize(("method", "path"), OPERATIONS)
+def test_a_key_without_the_scope_is_refused_and_told_which_it_needs(guarded: Guarded, method: str, path: str) -> None:
+    needed = NEEDED[method, path]
+    others = tuple(permission for permission in EVERYTHING if permission != needed)
+    problem = assert_problem(
+        guarded.send(method, path, make_key(guarded.store, scopes=others)), 403, "insufficient-scope"
+    )
+    assert f"'{needed}'" in problem["detail"]
+
+
+@pytest.mark.parametrize(("method", "path"), OPERATIONS)
+def test_a_key_with_the_scope_alone_is_let_in(guarded: Guarded, method: str, path: str) -> None:
+    plan_id = guarded.send("POST", "/floorplans", guarded.key).json()["id"]
+    key = make_key(guarded.store, scopes=(NEEDED[method, path],))
+    if path.endswith("/events"):
+        with guarded.client.stream(method, path.replace(f"{{{PLAN}}}", plan_id), headers=bearer(key)) as response:
+            assert response.status_code == 200
+    else:
+        assert guarded.send(method, path, key, plan_id).is_success
+
+
+@pytest.mark.parametrize(("method", "path"), ABOUT_A_PLAN)
+def test_the_plan_of_another_tenant_does_not_exist(guarded: Guarded, method: str, path: str) -> None:
+    theirs = make_key(guarded.store, tenant="theirs")
+    never = "0123456789abcdef" * 2
+    mine, unknown = guarded.send(method, path, theirs), guarded.send(method, path, theirs, never)
+    problem = assert_problem(mine, 404, "unknown-floorplan")
+    told = assert_problem(unknown, 404, "unknown-floorplan")
+    assert problem["detail"].replace(guarded.plan_id, never) == told["detail"]
+    # It is still there for those whose it is.
+    assert guarded.send("GET", f"/floorplans/{{{PLAN}}}", guarded.key).json()["name"] == FLAT["name"]
+
+
+def test_listings_have_the_plans_of_the_tenant_only(guarded: Guarded) -> None:
+    theirs = make_key(guarded.store, tenant="others")
+    assert guarded.send("GET", "/floorplans", theirs).json()["floorplans"] == []
+    own = guarded.send("POST", "/floorplans", theirs).json()["id"]
+    assert [plan["id"] for plan in guarded.send("GET", "/floorplans", theirs).json()["floorplans"]] == [own]
+    listed = guarded.send("GET", "/floorplans", guarded.key).json()["floorplans"]
+    assert guarded.plan_id in [plan["id"] for plan in listed]
+    assert own not in [plan["id"] for plan in listed]
+
+
+@pytest.mark.parametrize("path", sorted(OPEN_PATHS))
+@pytest.mark.parametrize("key", [None, "nonsense"])
+def test_health_is_told_to_everybody(guarded: Guarded, path: str, key: str | None) -> None:
+    wait_for(lambda: guarded.send("GET", path, key).status_code == 200)
+
+
+def test_an_unknown_path_and_method_are_told_to_those_with_a_key_only(guarded: Guarded) -> None:
+    assert_problem(guarded.send("GET", "/no/such/route", guarded.key), 404, "not-found")
+    refused = guarded.send("PATCH", "/localise", guarded.key)
+    assert_problem(refused, 405, "method-not-allowed")
+    assert refused.headers["allow"] == "POST"
+    for method, path in (("GET", "/no/such/route"), ("PATCH", "/localise"), ("GET", "/healthz/"), ("GET", "//healthz")):
+        assert guarded.send(method, path, None).status_code == 401
+
+
+def test_a_path_with_a_slash_at_its_end_needs_what_it_leads_to(guarded: Guarded) -> None:
+    writer = make_key(guarded.store, scopes=("write",))
+    assert guarded.send("GET", "/floorplans/", writer).status_code == 403
+    assert guarded.send("GET", "/floorplans/", guarded.key).headers["location"].endswith("/floorplans")
+
+
+def test_a_route_that_nobody_gave_a_scope_is_not_there(
+    tiny_bundle: Path, database_of: DatabaseOf, tmp_path: Path
+) -> None:
+    settings = Settings(
+        data_dir=tmp_path,
+        database_url=database_of(tmp_path),
+        bundle=tiny_bundle,
+        workers=0,
+        log_level="error",
+        api_keys=True,
+    )
+    app = create_app(settings)
+    app.get("/later")(lambda: "forgotten")
+    with serve(app) as base_url:
+        store = Store(database_of(tmp_path))
+        assert_problem(httpx.get(f"{base_url}/later", headers=bearer(make_key(store))), 404, "not-found")
+        store.close()
+
+
+def test_unknown_revoked_and_mistaken_keys_are_refused_in_the_same_words(guarded: Guarded) -> None:
+    revoked = make_key(guarded.store)
+    guarded.store.keys.revoke(id_of(revoked))
+    keys = {
+        "revoked": revoked,
+        "unknown id": key_text("f" * 32, new_secret()),
+        "wrong secret": key_text(id_of(guarded.key), new_secret()),
+        "the secret of another": key_text("f" * 32, guarded.key.split("_", 2)[2]),
+    }
+    told = {guarded.send("GET", "/limits", key).json()["detail"] for key in keys.values()}
+    assert len(told) == 1
+
+
+@pytest.mark.parametrize(
+    ("values", "accepted"),
+    [
+        (["Bearer {key}"], True),
+        (["bearer  {key}"], True),
+        (["{key}"], False),
+        (["Basic {key}"], False),
+        (["Bearer {key}x"], False),
+        (["Bearer {key} {key}"], False),
+        (["Bearer"], False),
+        ([""], False),
+        ([], False),
+        (["Bearer {key}", "Bearer {key}"], False),
+    ],
+)
+def test_one_authorization_header_with_one_whole_key_counts(values: list[str], accepted: bool) -> None:
+    key_id, secret = "0123456789abcdef" * 2, new_secret()
+    parsed = parse_authorization([value.format(key=key_text(key_id, secret)) for value in values])
+    assert parsed == (PresentedKey(key_id, hash_of(secret)) if accepted else None)
+
+
+def test_secrets_have_256_bits_and_are_never_the_same() -> None:
+    secrets = {new_secret() for _ in range(1000)}
+    assert len(secrets) == 1000
+    assert {len(secret) for secret in secrets} == {43}
+    assert 43 * 6 >= 256
+
+
+def test_a_key_that_is_revoked_in_use_is_refused_soon(guarded: Guarded) -> None:
+    key = make_key(guarded.store)
+    assert guarded.send("GET", "/limits", key).status_code == 200
+    guarded.store.keys.revoke(id_of(key))
+    sleep(0.2)
+    assert_problem(guarded.send("GET", "/limits", key), 401, "unauthenticated")
+
+
+def test_when_a_key_was_used_is_written_once_a_minute(guarded: Guarded) -> None:
+    key = make_key(guarded.store)
+
+    def last_used() -> object:
+        return next(row.last_used_at for row in guarded.store.keys.list() if row.id == id_of(key))
+
+    assert last_used() is None
+    assert guarded.send("GET", "/limits", key).status_code == 200
+    wait_for(lambda: last_used() is not None)
+    first = last_used()
+    for _ in range(3):
+        sleep(0.15)
+        guarded.send("GET", "/limits", key)
+    assert last_used() == first
+
+
+def test_a_body_is_not_waited_for_when_its_request_is_refused(guarded: Guarded) -> None:
+    head = "POST /floorplans HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: 1000000\r\n\r\n"
+    with socket.create_connection((guarded.client.base_url.host, guarded.client.base_url.port or 0), 5.0) as raw:
+        begin = monotonic()
+        raw.sendall(head.encode())
+        assert raw.recv(4096).startswith(b"HTTP/1.1 401 ")
+        assert monotonic() - begin < 2.0
+
+
+def test_the_log_names_key_and_tenant_and_never_the_secret(start_app: StartApp, tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path / 'own.sqlite3'}"
+    stream = io.StringIO()
+    handler = logging.StreamHandler(stream)
+    handler.setFormatter(JsonFormatter())
+    with start_app(tmp_path, api_keys=True, database_url=url, log_level="debug") as client:
+        store = Store(url)
+        key = make_key(store, tenant="acme", scopes=("read",))
+        logging.getLogger(LOGGER_NAME).addHandler(handler)
+        try:
+            for method, path in (("GET", "/limits"), ("POST", "/floorplans"), ("GET", "/no/such/route")):
+                client.request(method, path, headers=bearer(key))
+            client.get("/limits", headers={"Authorization": key})
+            wait_for(lambda: stream.getvalue().count('"message": "request"') == 4, 10.0)
+        finally:
+            logging.getLogger(LOGGER_NAME).removeHandler(handler)
+            store.close()
+    lines = stream.getvalue()
+    assert lines.count(f'"key": "{id_of(key)}", "tenant": "acme"') == 3
+    assert key.split("_", 2)[2] not in lines
+
+
+def test_no_stack_trace_leaves_when_the_store_is_broken(start_app: StartApp, tmp_path: Path) -> None:
+    database = tmp_path / "own.sqlite3"
+    with start_app(tmp_path, database_url=f"sqlite:///{database}", log_level="error") as client:
+        plan_id = upload(client)
+        engine = sqlalchemy.create_engine(f"sqlite:///{database}")
+        with engine.begin() as connection:
+            connection.exec_driver_sql("UPDATE floorplans SET created_at = 'very-secret-detail'")
+        engine.dispose()
+        for path in ("/floorplans", f"/floorplans/{plan_id}", f"/floorplans/{plan_id}/mesh.glb"):
+            response = client.get(path)
+            problem = assert_problem(response, 500, "internal")
+            assert problem.keys() == {"type", "title", "status", "detail", "request_id"}
+            assert not re.search(r"secret|sqlalchemy|\.py|line \d", response.text)
+
+
+def test_the_api_description_says_what_each_operation_needs_and_how_it_refuses() -> None:
+    document = create_app().openapi()
+    (scheme,) = document["components"]["securitySchemes"]
+    assert document["components"]["securitySchemes"][scheme]["scheme"] == "bearer"
+    for method, path in OPERATIONS:
+        operation = document["paths"][path][method.lower()]
+        assert operation["security"] == [{scheme: [NEEDED[method, path]]}]
+        assert {"401", "403", "429", "503"} <= operation["responses"].keys()
+    for path in OPEN_PATHS:
+        assert "security" not in document["paths"][path]["get"]
+
+
+# --- rates ------------------------------------------------------------------------------------------------------------
+
+
+def test_a_key_may_send_so_many_requests_a_minute_and_is_told_when_to_go_on(
+    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path
+) -> None:
+    with start_app(tmp_path, api_keys=True, rate_per_minute=5, rate_burst=0) as client:
+        store = Store(database_of(tmp_path))
+        usual, unlimited = make_key(store), make_key(store, rate_per_minute=0)
+        more = make_key(store, rate_per_minute=9)
+
+        def accepted(key: str) -> int:
+            answers = [client.get("/limits", headers=bearer(key)) for _ in range(20)]
+            for refused in (answer for answer in answers if answer.status_code != 200):
+                assert_problem(refused, 429, "rate-limited")
+                assert 1 <= int(refused.headers["retry-after"]) <= 60
+            return sum(answer.status_code == 200 for answer in answers)
+
+        # One more where the clock's minute ends meanwhile.
+        assert 5 <= accepted(usual) <= 6
+        assert 9 <= accepted(more) <= 10
+        assert accepted(unlimited) == 20
+        metrics = client.get("/metrics", headers=bearer(unlimited)).text
+        assert re.search(r'lalaloc_rejections_total\{reason="rate-limited"\} (2[4-6])\.0', metrics)
+        store.close()
+
+
+def test_a_burst_is_cut_short(start_app: StartApp, database_of: DatabaseOf, tmp_path: Path) -> None:
+    with start_app(tmp_path, api_keys=True, rate_per_minute=0, rate_burst=2) as client:
+        store = Store(database_of(tmp_path))
+        key = make_key(store)
+        answers = [client.get("/limits", headers=bearer(key)) for _ in range(15)]
+        refused = [answer for answer in answers if answer.status_code == 429]
+        assert refused
+        assert {answer.headers["retry-after"] for answer in refused} == {"1"}
+        wait_for(lambda: client.get("/limits", headers=bearer(key)).status_code == 200, 5.0)
+        store.close()
+
+
+@pytest.mark.parametrize("kind", ["unknown", "malformed"])
+def test_a_client_with_many_invalid_keys_is_not_listened_to_but_keys_that_work_are(
+    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, kind: str
+) -> None:
+    with start_app(tmp_path, api_keys=True, key_cache_s=0.0, refused_keys_per_minute=5) as client:
+        store = Store(database_of(tmp_path))
+        key = make_key(store)
+        assert client.get("/limits", headers=bearer(key)).status_code == 200
+        statuses = []
+        for _ in range(12):
+            invalid = key_text("a" * 32, new_secret()) if kind == "unknown" else "nonsense"
+            response = client.get("/limits", headers=bearer(invalid))
+            statuses.append(response.status_code)
+        assert statuses == sorted(statuses)
+        assert 5 <= statuses.count(401) <= 6
+        assert_problem(response, 429, "too-many-refused-keys")
+        assert 1 <= int(response.headers["retry-after"]) <= 60
+        assert client.get("/limits", headers=bearer(key)).status_code == 200
+        store.close()
+
+
+def test_counters_of_client_addresses_are_bounded_and_a_network_counts_as_one() -> None:
+    async def count() -> int:
+        rates = Rates(Settings(refused_keys_per_minute=1))
+        await rates.count_refused("2001:db8:1:2::1")
+        with pytest.raises(TooManyRefusedKeysError):
+            await rates.check_refused("2001:db8:1:2:ffff::2")
+        for number in range(5000):
+            try:
+                await rates.count_refused(f"10.0.{number // 256}.{number % 256}")
+            except TooManyRefusedKeysError:
+                continue
+        return len(rates._limiter.storage.storage)  # pyright: ignore[reportAttributeAccessIssue]
+
+    # Of each counter the minute that is, and the one before it.
+    assert asyncio.run(count()) <= 2 * 1024
+
+
+# --- the database away ------------------------------------------------------------------------------------------------
+
+
+def test_known_keys_go_on_working_while_the_database_is_away(
+    start_app: StartApp, postgres: PostgresServer, tmp_path: Path, panorama: bytes
+) -> None:
+    url = postgres.new_database()
+    with start_app(tmp_path, api_keys=True, database_url=url, key_cache_s=0.1) as client:
+        store = Store(url)
+        key, other = make_key(store), make_key(store)
+        client.headers.update(bearer(key))
+        plan_id = upload(client)
+        assert localise(client, plan_id, panorama, refine="none").status_code == 200
+        store.close()
+        postgres.stop()
+        try:
+            sleep(0.2)
+            assert localise(client, plan_id, panorama, refine="none").status_code == 200
+            assert client.get("/limits").status_code == 200
+            unknown = client.get("/limits", headers=bearer(other))
+            assert_problem(unknown, 503, "store-unavailable")
+            assert "retry-after" in unknown.headers
+        finally:
+            postgres.start()
+        wait_for(lambda: client.get("/limits", headers=bearer(other)).status_code == 200, 10.0)
+
+
+def test_a_key_is_trusted_for_ten_minutes_without_the_database_and_not_longer(tmp_path: Path) -> None:
+    store = Store(f"sqlite:///{tmp_path / 'keys.sqlite3'}", connections=1, wait_s=0.05)
+    clock_s = [1000.0]
+    ring = KeyRing(store.keys, fresh_s=5.0, clock=lambda: clock_s[0])
+    presented = parse_authorization([f"Bearer {make_key(store)}"])
+    assert presented is not None
+    try:
+        key = asyncio.run(ring.find(presented))
+        assert key is not None
+        wait_for(lambda: store.keys.list()[0].last_used_at is not None)
+        # The only connection is taken, so nobody else has one.
+        with store._database.reading():
+            for clock_s[0] in (1004.0, 1006.0, 1300.0, 1600.0):
+                assert asyncio.run(ring.find(presented)) == key
+            clock_s[0] = 1606.0
+            with pytest.raises(StoreUnavailableError):
+                asyncio.run(ring.find(presented))
+        clock_s[0] = 1608.0
+        store.keys.revoke(key.id)
+        assert asyncio.run(ring.find(presented)) is None
+        assert not ring.remembers(presented)
+    finally:
+        ring.close()
+        store.close()
+
+
+# --- without keys -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("server", "local"),
+    [
+        (("127.0.0.1", 8000), True),
+        (("127.8.9.10", 8000), True),
+        (("::1", 8000), True),
+        (("::ffff:127.0.0.1", 8000), True),
+        (("/run/lalaloc.sock", None), True),
+        (None, True),
+        (("0.0.0.0", 8000), False),
+        (("::", 8000), False),
+        (("192.168.1.7", 8000), False),
+        (("fe80::1%eth0", 8000), False),
+        (("::ffff:10.0.0.1", 8000), False),
+        (("", 8000), False),
+        (("example.org", 8000), False),
+    ],
+)
+def test_loopback_and_unix_sockets_are_local(server: tuple[str, int | None] | None, local: bool) -> None:
+    assert is_local(server) == local
+
+
+@pytest.mark.parametrize(("allowed", "status"), [(False, 403), (True, 200)])
+def test_without_keys_others_than_this_machine_are_refused_unless_told_otherwise(
+    tiny_bundle: Path, database_of: DatabaseOf, tmp_path: Path, allowed: bool, status: int
+) -> None:
+    settings = Settings(
+        data_dir=tmp_path,
+        database_url=database_of(tmp_path),
+        bundle=tiny_bundle,
+        workers=0,
+        log_level="error",
+        allow_anonymous=allowed,
+    )
+    app = create_app(settings)
+
+    async def from_elsewhere(scope: Scope, receive: Receive, send: Send) -> None:
+        # As if the connection had come in over the network.
+        await app({**scope, "server": ("192.0.2.1", 8000)} if scope["type"] == "http" else scope, receive, send)
+
+    with serve(from_elsewhere) as base_url, httpx.Client(base_url=base_url) as client:  # pyright: ignore[reportArgumentType]
+        assert client.get("/healthz").status_code == 200
+        wait_for(lambda: client.get("/readyz").status_code == 200)
+        for path in ("/", "/docs", "/openapi.json", "/metrics", "/limits", "/floorplans"):
+            response = client.get(path)
+            assert response.status_code == status
+            if not allowed:
+                assert_problem(response, 403, "exposed-without-keys")
+        assert client.post("/floorplans", json=FLAT).status_code == (201 if allowed else 403)
+
+
+@pytest.mark.parametrize(
+    ("host", "settings", "refused"),
+    [
+        ("127.0.0.1", {}, False),
+        ("::1", {}, False),
+        ("0.0.0.0", {}, True),
+        ("::", {}, True),
+        ("10.1.2.3", {}, True),
+        ("0.0.0.0", {"api_keys": True}, False),
+        ("0.0.0.0", {"allow_anonymous": True}, False),
+    ],
+)
+def test_an_address_for_others_is_refused_without_keys(host: str, settings: dict[str, Any], refused: bool) -> None:
+    if not refused:
+        check_address(host, Settings(**settings))
+        return
+    with pytest.raises(ConfigError, match=r"without API keys.*LALALOC_API_KEYS.*LALALOC_ALLOW_ANONYMOUS"):
+        check_address(host, Settings(**settings))
+
+
+@pytest.mark.parametrize("command", [["service"], ["service.cli", "serve"]], ids=" ".join)
+def test_the_service_does_not_start_on_a_public_address_without_keys(command: list[str], tmp_path: Path) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", *command, "--host", "0.0.0.0", "--port", "0"],
+        env={"LALALOC_DATA_DIR": str(tmp_path), "PYTHONPATH": str(ROOT)},
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode != 0
+    assert done.stdout == ""
+    assert "refusing to listen on 0.0.0.0 without API keys" in done.stderr
+    assert "Traceback" not in done.stderr
