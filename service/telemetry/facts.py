@@ -1,0 +1,96 @@
+"""What a request turned out to be about, noted by whoever learns it and told in its one log line."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, MutableMapping
+from contextvars import ContextVar
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from starlette.requests import HTTPConnection
+
+from service.telemetry.trace_context import TraceContext
+
+if TYPE_CHECKING:
+    from lalaloc_core.localise.pipeline import StageClock
+
+_SCOPE_KEY = "lalaloc.facts"
+
+
+@dataclass
+class RequestFacts:
+    """Facts of one request; what was not learnt is None.
+
+    Attributes:
+        request_id: names the request in answers and log lines.
+        trace: this service's span of the caller's trace.
+        plan: id of the floor plan.
+        revision: id of the plan's revision.
+        stage: the last stage that produced the position.
+        clock: times of the request's stages, also of those that ran before it failed.
+        rejection: the kind of problem (its slug) that it was refused with.
+        key: id of the API key, never the key itself.
+        tenant: whose key it is.
+        bytes_in: bytes of the body that arrived.
+        gave_up: the client hung up before it had its whole answer.
+    """
+
+    request_id: str
+    trace: TraceContext
+    plan: str | None = None
+    revision: str | None = None
+    stage: str | None = None
+    clock: StageClock | None = None
+    rejection: str | None = None
+    key: str | None = None
+    tenant: str | None = None
+    bytes_in: int = 0
+    gave_up: bool = False
+
+
+# Of the request that the running code works for; log lines tell its ids.
+current_facts: ContextVar[RequestFacts | None] = ContextVar("lalaloc_request", default=None)
+
+
+def put_facts(scope: MutableMapping[str, Any], facts: RequestFacts) -> None:
+    """Attach the facts to a request."""
+    scope[_SCOPE_KEY] = facts
+
+
+def note(
+    request: HTTPConnection,
+    *,
+    plan: str | None = None,
+    revision: str | None = None,
+    stage: str | None = None,
+    clock: StageClock | None = None,
+    rejection: str | None = None,
+    key: str | None = None,
+    tenant: str | None = None,
+) -> None:
+    """Put facts on a request; what is left out stays as it was. They must never be secrets."""
+    facts = _facts_of(request.scope)
+    if facts is None:
+        return
+    given = {
+        "plan": plan,
+        "revision": revision,
+        "stage": stage,
+        "clock": clock,
+        "rejection": rejection,
+        "key": key,
+        "tenant": tenant,
+    }
+    for name, value in given.items():
+        if value is not None:
+            setattr(facts, name, value)
+
+
+def request_id_of(scope: Mapping[str, Any]) -> str | None:
+    """The id of the request with this scope."""
+    facts = _facts_of(scope)
+    return None if facts is None else facts.request_id
+
+
+def _facts_of(scope: Mapping[str, Any]) -> RequestFacts | None:
+    return scope.get(_SCOPE_KEY)

@@ -1,0 +1,51 @@
+"""Log lines as JSON on standard error, each with the ids of the request that it belongs to."""
+
+from __future__ import annotations
+
+import json
+import logging
+from datetime import UTC, datetime
+
+from service.telemetry.facts import current_facts
+
+LOGGER_NAME = "lalaloc"
+# The HTTP server's own: its log of accesses holds query strings, and says nothing that ours does not.
+_SERVER, _SERVER_ACCESS = "uvicorn", "uvicorn.access"
+
+
+class JsonFormatter(logging.Formatter):
+    """One JSON object per line: time (UTC), level, message, ids, and the fields given as `extra={"fields": ...}`.
+
+    `request_id` and `trace_id` are null on lines that belong to no request.
+    """
+
+    def format(self, record: logging.LogRecord) -> str:
+        """The line, plain ASCII."""
+        facts = current_facts.get()
+        line: dict[str, object] = {
+            "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
+            "level": record.levelname.lower(),
+            "message": record.getMessage(),
+            "request_id": facts and facts.request_id,
+            "trace_id": facts and facts.trace.trace_id,
+        }
+        line.update(getattr(record, "fields", {}))
+        if record.exc_info:
+            line["exception"] = self.formatException(record.exc_info)
+        return json.dumps(line, default=str)
+
+
+def configure_logging(level: str) -> logging.Logger:
+    """Send the service's log, and the HTTP server's, to standard error; calling it again only changes the level."""
+    logger = logging.getLogger(LOGGER_NAME)
+    logger.setLevel(level.upper())
+    if not any(isinstance(handler.formatter, JsonFormatter) for handler in logger.handlers):
+        handler = logging.StreamHandler()
+        handler.setFormatter(JsonFormatter())
+        logger.addHandler(handler)
+        logger.propagate = False
+        server = logging.getLogger(_SERVER)
+        server.handlers, server.propagate = [handler], False
+    access = logging.getLogger(_SERVER_ACCESS)
+    access.handlers, access.propagate = [], False
+    return logger

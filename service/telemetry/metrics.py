@@ -1,0 +1,105 @@
+"""Metrics for Prometheus, in a registry of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from time import perf_counter
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, ProcessCollector, generate_latest
+
+from service.telemetry.tracing import Tracing
+
+_SECONDS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0)
+_GRID_SECONDS = (0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0, 30.0, 60.0, 300.0, 1800.0)
+
+
+class Telemetry:
+    """The service's Prometheus metrics; one instance, hence one registry, per app.
+
+    Labels come from small sets: route templates, stages, kinds of problems; never from what callers send.
+
+    Attributes:
+        tracing: where spans go, None when none are exported.
+    """
+
+    def __init__(self) -> None:
+        self.registry = CollectorRegistry()
+        self.tracing: Tracing | None = None
+        self._gauges: dict[str, Gauge] = {}
+        self._counters: dict[str, Counter] = {}
+        ProcessCollector(registry=self.registry)
+        self.requests = self.counter("lalaloc_http_requests", "Requests answered.", ["method", "route", "status"])
+        self.request_seconds = Histogram(
+            "lalaloc_http_request_seconds",
+            "Time to answer, upload included.",
+            ["route"],
+            buckets=_SECONDS,
+            registry=self.registry,
+        )
+        self.rejections = self.counter("lalaloc_rejections", "Requests refused, by the kind of problem.", ["reason"])
+        self.disconnects = self.counter(
+            "lalaloc_disconnects", "Requests whose client hung up before the answer was complete.", ["route"]
+        )
+        self.stage_seconds = Histogram(
+            "lalaloc_stage_seconds", "Time per stage of a query.", ["stage"], buckets=_SECONDS, registry=self.registry
+        )
+        self.answers = self.counter(
+            "lalaloc_localise_answers", "Queries answered, by the stage that answered.", ["stage"]
+        )
+        self.lpo_restarts = self.counter("lalaloc_lpo_restarts", "LPO workers that had to be replaced.")
+        self.lpo_missed = self.counter(
+            "lalaloc_lpo_missed", "LPO jobs without an answer in time, by reason.", ["reason"]
+        )
+        self.pool_restarts = self.counter(
+            "lalaloc_pool_restarts", "Worker processes that had to be replaced, by pool.", ["pool"]
+        )
+        # Shown as 0 from the start, so that the first restart is a rise.
+        for pool in ("lpo", "decode"):
+            self.pool_restarts.labels(pool)
+        self.grid_cache_hits = self.counter("lalaloc_grid_cache_hits", "Latent grids found in memory.")
+        self.grid_cache_misses = self.counter("lalaloc_grid_cache_misses", "Latent grids not found in memory.")
+        self.grid_cache_evictions = self.counter("lalaloc_grid_cache_evictions", "Latent grids that made room.")
+        self.grid_seconds = Histogram(
+            "lalaloc_grid_seconds", "Time to compute a latent grid.", buckets=_GRID_SECONDS, registry=self.registry
+        )
+
+    def counter(self, name: str, meaning: str, labels: Sequence[str] = ()) -> Counter:
+        """Add a counter; an app that is started again goes on with the one of this name."""
+        if name not in self._counters:
+            self._counters[name] = Counter(name, meaning, labels, registry=self.registry)
+        return self._counters[name]
+
+    def gauge(self, name: str, meaning: str, read: Callable[[], float]) -> None:
+        """Add a gauge that is read when metrics are asked for; an app that is started again replaces its gauges."""
+        self._gauge(name, meaning).set_function(read)
+
+    def describe_build(self, version: str, model: str, model_sha256: str) -> None:
+        """Say which software answers with which model: a gauge that is 1, for joining with others."""
+        gauge = self._gauge("lalaloc_build_info", "Version and model that answer.", ("version", "model", "sha256"))
+        gauge.clear()
+        gauge.labels(version, model, model_sha256).set(1.0)
+
+    def note_restart(self, pool: str) -> None:
+        """Count that a worker process of a pool has to be replaced."""
+        self.pool_restarts.labels(pool).inc()
+        if pool == "lpo":
+            self.lpo_restarts.inc()
+
+    @contextmanager
+    def timed(self, histogram: Histogram) -> Iterator[None]:
+        """Observe the duration of the block."""
+        begin = perf_counter()
+        try:
+            yield
+        finally:
+            histogram.observe(perf_counter() - begin)
+
+    def render(self) -> bytes:
+        """All metrics in Prometheus' text format."""
+        return generate_latest(self.registry)
+
+    def _gauge(self, name: str, meaning: str, labels: Sequence[str] = ()) -> Gauge:
+        if name not in self._gauges:
+            self._gauges[name] = Gauge(name, meaning, labels, registry=self.registry)
+        return self._gauges[name]

@@ -1,0 +1,158 @@
+"""Gives every request its ids, and when it is over counts, times and logs it: one line for each."""
+
+from __future__ import annotations
+
+import logging
+import re
+import uuid
+from collections.abc import Sequence
+from time import perf_counter
+from typing import Any
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.routing import Route
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from service.telemetry.facts import RequestFacts, current_facts, put_facts
+from service.telemetry.logs import LOGGER_NAME
+from service.telemetry.metrics import Telemetry
+from service.telemetry.trace_context import child_of, parse_traceparent
+from service.telemetry.tracing import OpenSpan
+
+_METHODS = {"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"}
+_REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
+_PLAN_ID = re.compile(r"[0-9a-f]{32}")
+# What nginx logs for a client that closed the connection before there was any answer.
+_CLIENT_CLOSED = 499
+
+
+class TelemetryMiddleware:
+    """The outermost layer of the app: even the answers to unexpected errors pass through here.
+
+    A caller's `X-Request-ID` is kept if it is a sane one, and its `traceparent` if it is valid; both are answered.
+    """
+
+    def __init__(self, app: ASGIApp, telemetry: Telemetry, routes: Sequence[Route]) -> None:
+        """
+        Args:
+            routes: name requests that are refused before it is looked at where they lead.
+        """
+        self._app = app
+        self._telemetry = telemetry
+        self._routes = tuple(routes)
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle one request."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        facts, opened = self._begin(Headers(scope=scope))
+        put_facts(scope, facts)
+        token = current_facts.set(facts)
+        exchange = _Exchange(facts, receive, send)
+        begin = perf_counter()
+        try:
+            await self._app(scope, exchange.receive, exchange.send)
+        except Exception:
+            logging.getLogger(LOGGER_NAME).exception("unexpected error")
+            # The answer says what there is to say, and the server's log would have the same trace without any ids.
+            if not exchange.complete:
+                raise
+        finally:
+            self._end(scope, facts, opened, exchange.status, perf_counter() - begin)
+            current_facts.reset(token)
+
+    def _begin(self, headers: Headers) -> tuple[RequestFacts, OpenSpan | None]:
+        given = headers.get("x-request-id", "")
+        request_id = given if _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex
+        parent = parse_traceparent(headers.getlist("traceparent"))
+        tracing, opened = self._telemetry.tracing, None
+        if tracing is None:
+            trace = child_of(parent)
+        else:
+            trace, opened = tracing.begin(parent)
+        return RequestFacts(request_id, trace), opened
+
+    def _end(self, scope: Scope, facts: RequestFacts, opened: OpenSpan | None, status: int, duration_s: float) -> None:
+        route = self._template(scope)
+        method = scope["method"] if scope["method"] in _METHODS else "OTHER"
+        if facts.plan is None:
+            facts.plan = _plan_in_path(scope)
+        telemetry = self._telemetry
+        telemetry.requests.labels(method, route, str(status)).inc()
+        telemetry.request_seconds.labels(route).observe(duration_s)
+        if facts.rejection is not None:
+            telemetry.rejections.labels(facts.rejection).inc()
+        if facts.gave_up:
+            telemetry.disconnects.labels(route).inc()
+        if opened is not None and telemetry.tracing is not None:
+            telemetry.tracing.end(opened, facts, method=method, route=route, status=status)
+        spans = facts.clock.spans() if facts.clock is not None else {}
+        fields: dict[str, Any] = {
+            "method": method,
+            "route": route,
+            "status": status,
+            "ms": round(duration_s * 1e3, 1),
+            "bytes_in": facts.bytes_in,
+            "plan": facts.plan,
+            "revision": facts.revision,
+            "stage": facts.stage,
+            "stages_ms": {name: round(spent_s * 1e3, 1) for name, (_, spent_s) in spans.items()},
+            "gave_up": facts.gave_up,
+            "rejection": facts.rejection,
+            "key": facts.key,
+            "tenant": facts.tenant,
+            "span_id": facts.trace.span_id,
+        }
+        logging.getLogger(LOGGER_NAME).info("request", extra={"fields": fields})
+
+    def _template(self, scope: Scope) -> str:
+        """The route's template: real paths would make a new time series per floor plan."""
+        if "route" in scope:
+            return getattr(scope["route"], "path", "unmatched")
+        found = (route.path for route in self._routes if route.path_regex.match(scope["path"]))
+        return next(found, "unmatched")
+
+
+class _Exchange:
+    """Watches what goes in and out of one request."""
+
+    def __init__(self, facts: RequestFacts, receive: Receive, send: Send) -> None:
+        self._facts = facts
+        self._receive = receive
+        self._send = send
+        self._status: int | None = None
+        self.complete = False
+
+    @property
+    def status(self) -> int:
+        """The status that was answered, or stands for why there was no answer."""
+        if self._status is not None:
+            return self._status
+        return _CLIENT_CLOSED if self._facts.gave_up else 500
+
+    async def receive(self) -> Message:
+        """The next part of the body, counted."""
+        message = await self._receive()
+        if message["type"] == "http.request":
+            self._facts.bytes_in += len(message.get("body", b""))
+        elif message["type"] == "http.disconnect" and not self.complete:
+            self._facts.gave_up = True
+        return message
+
+    async def send(self, message: Message) -> None:
+        """Pass a part of the answer on, the first with the request's ids."""
+        if message["type"] == "http.response.start":
+            self._status = message["status"]
+            headers = MutableHeaders(scope=message)
+            headers["X-Request-ID"] = self._facts.request_id
+            headers["traceparent"] = self._facts.trace.header
+        elif message["type"] == "http.response.body" and not message.get("more_body", False):
+            self.complete = True
+        await self._send(message)
+
+
+def _plan_in_path(scope: Scope) -> str | None:
+    """The id of the floor plan that the path names, if it looks like one."""
+    given = scope.get("path_params", {}).get("floorplan_id", "")
+    return given if _PLAN_ID.fullmatch(given) else None

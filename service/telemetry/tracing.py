@@ -1,0 +1,109 @@
+"""Spans of requests and their stages for OpenTelemetry: needs the extra `otel`, which is imported only when used."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from time import perf_counter, time_ns
+from typing import TYPE_CHECKING
+
+from lalaloc_core.errors import ConfigError
+from service.telemetry.facts import RequestFacts
+from service.telemetry.trace_context import TraceContext
+
+if TYPE_CHECKING:
+    from opentelemetry.sdk.trace.export import SpanExporter
+    from opentelemetry.trace import Span
+
+_EXPORT_TIMEOUT_S = 5.0
+
+
+def otlp_exporter(endpoint: str) -> SpanExporter:
+    """Sends spans over OTLP/HTTP to the full address of a collector, such as `http://collector:4318/v1/traces`.
+
+    Raises:
+        ConfigError: the extra is not installed.
+    """
+    try:
+        from opentelemetry.exporter.otlp.proto.http.trace_exporter import OTLPSpanExporter
+    except ImportError as error:
+        raise ConfigError(
+            f"LALALOC_OTLP_ENDPOINT is '{endpoint}', but '{error.name}' is missing: install the extra 'otel'"
+        ) from error
+    return OTLPSpanExporter(endpoint=endpoint, timeout=_EXPORT_TIMEOUT_S)
+
+
+@dataclass(frozen=True)
+class OpenSpan:
+    """A span that goes on, and when it began on the clock that stages are timed by (`perf_counter`, seconds)."""
+
+    span: Span
+    began_ns: int
+    began_s: float
+
+    def at_ns(self, moment_s: float) -> int:
+        """A moment of that clock as nanoseconds of Unix time."""
+        return self.began_ns + round((moment_s - self.began_s) * 1e9)
+
+
+class Tracing:
+    """Makes spans and hands them to an exporter from a thread of its own, dropping what it cannot send in time."""
+
+    def __init__(self, exporter: SpanExporter, version: str) -> None:
+        from opentelemetry.sdk.resources import Resource
+        from opentelemetry.sdk.trace import TracerProvider
+        from opentelemetry.sdk.trace.export import BatchSpanProcessor
+
+        resource = Resource.create({"service.name": "lalaloc", "service.version": version})
+        # By default whoever began the trace decides whether it is recorded; those that begin here are.
+        self._provider = TracerProvider(resource=resource, shutdown_on_exit=False)
+        self._provider.add_span_processor(BatchSpanProcessor(exporter))
+        self._tracer = self._provider.get_tracer("lalaloc", version)
+
+    def begin(self, parent: TraceContext | None) -> tuple[TraceContext, OpenSpan]:
+        """Open a request's span, in the caller's trace when there is one."""
+        from opentelemetry import trace
+
+        context = trace.set_span_in_context(trace.INVALID_SPAN)
+        if parent is not None:
+            caller = trace.SpanContext(
+                trace_id=int(parent.trace_id, 16),
+                span_id=int(parent.span_id, 16),
+                is_remote=True,
+                trace_flags=trace.TraceFlags(trace.TraceFlags.SAMPLED if parent.sampled else 0),
+            )
+            context = trace.set_span_in_context(trace.NonRecordingSpan(caller))
+        began_ns, began_s = time_ns(), perf_counter()
+        span = self._tracer.start_span("request", context, kind=trace.SpanKind.SERVER, start_time=began_ns)
+        own = span.get_span_context()
+        ids = TraceContext(f"{own.trace_id:032x}", f"{own.span_id:016x}", own.trace_flags.sampled)
+        return ids, OpenSpan(span, began_ns, began_s)
+
+    def end(self, opened: OpenSpan, facts: RequestFacts, *, method: str, route: str, status: int) -> None:
+        """Close a request's span, with one below it for every stage that was timed."""
+        from opentelemetry import trace
+
+        span = opened.span
+        span.update_name(f"{method} {route}")
+        attributes = {
+            "http.request.method": method,
+            "http.route": route,
+            "http.response.status_code": status,
+            "lalaloc.request_id": facts.request_id,
+            "lalaloc.plan": facts.plan,
+            "lalaloc.revision": facts.revision,
+            "lalaloc.stage": facts.stage,
+            "lalaloc.rejection": facts.rejection,
+            "lalaloc.tenant": facts.tenant,
+        }
+        span.set_attributes({name: value for name, value in attributes.items() if value is not None})
+        if status >= 500:
+            span.set_status(trace.StatusCode.ERROR)
+        inside = trace.set_span_in_context(span)
+        for name, (begun_s, duration_s) in (facts.clock.spans() if facts.clock else {}).items():
+            stage = self._tracer.start_span(name, inside, start_time=opened.at_ns(begun_s))
+            stage.end(opened.at_ns(begun_s + duration_s))
+        span.end()
+
+    def close(self) -> None:
+        """Send what is left, for a bounded time, and end."""
+        self._provider.shutdown()

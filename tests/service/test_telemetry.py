@@ -1,0 +1,345 @@
+"""What the service tells of itself: one log line per request, trace context, metrics, spans, the dashboard."""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+import re
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import ExportTraceServiceRequest
+from opentelemetry.sdk.trace.export.in_memory_span_exporter import InMemorySpanExporter
+from opentelemetry.trace import SpanContext
+
+from lalaloc_core.errors import ConfigError
+from lalaloc_core.localise.pipeline import StageClock
+from service.telemetry import LOGGER_NAME, RequestFacts
+from service.telemetry.logs import JsonFormatter
+from service.telemetry.trace_context import TraceContext, child_of, parse_traceparent
+from service.telemetry.tracing import Tracing, otlp_exporter
+from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upload, wait_for
+
+ROOT = Path(__file__).parents[2]
+TRACE, SPAN = "4bf92f3577b34da6a3ce929d0e0e4736", "00f067aa0ba902b7"
+_HEX_16 = st.text("0123456789abcdef", min_size=16, max_size=16)
+
+
+class Log:
+    """The lines that the service wrote since it was attached."""
+
+    def __init__(self) -> None:
+        self._stream = io.StringIO()
+        self.handler = logging.StreamHandler(self._stream)
+        self.handler.setFormatter(JsonFormatter())
+
+    @property
+    def text(self) -> str:
+        return self._stream.getvalue()
+
+    def of_request(self, request_id: str) -> list[dict[str, Any]]:
+        """The lines "request" of one request, once there is one: it is written after the answer."""
+        wait_for(lambda: any(line["message"] == "request" for line in self._of(request_id)), 10.0)
+        return [line for line in self._of(request_id) if line["message"] == "request"]
+
+    def all_of(self, request_id: str) -> list[dict[str, Any]]:
+        """All lines of one request, once it is over."""
+        self.of_request(request_id)
+        return self._of(request_id)
+
+    def _of(self, request_id: str) -> list[dict[str, Any]]:
+        lines = [json.loads(line) for line in self.text.splitlines() if line.endswith("}")]
+        return [line for line in lines if line["request_id"] == request_id]
+
+
+@pytest.fixture(scope="module")
+def client(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+    """The app with its lines about requests."""
+    with start_app(tmp_path_factory.mktemp("data"), log_level="debug") as started:
+        yield started
+
+
+@pytest.fixture
+def log() -> Iterator[Log]:
+    """What is logged from here on."""
+    attached = Log()
+    logger = logging.getLogger(LOGGER_NAME)
+    logger.addHandler(attached.handler)
+    yield attached
+    logger.removeHandler(attached.handler)
+
+
+def _metric(client: httpx.Client, sample: str) -> float:
+    """The value of one sample, 0 where there is none yet."""
+    match = re.search(rf"^{re.escape(sample)} (\S+)$", client.get("/metrics").text, re.MULTILINE)
+    return float(match[1]) if match else 0.0
+
+
+def test_a_query_has_one_line_with_plan_stage_and_times(client: httpx.Client, log: Log, panorama: bytes) -> None:
+    plan_id = upload(client)
+    response = localise(client, plan_id, panorama, refine="vdr")
+    (line,) = log.of_request(response.headers["x-request-id"])
+    assert line.keys() >= {"time", "level", "request_id", "trace_id", "span_id", "revision"}
+    assert line["level"] == "info"
+    assert (line["method"], line["route"], line["status"]) == ("POST", "/localise", 200)
+    assert (line["plan"], line["stage"], line["gave_up"], line["rejection"]) == (plan_id, "vdr", False, None)
+    assert line["bytes_in"] > len(panorama)
+    assert set(line["stages_ms"]) == {"upload", "decode", "encode", "grid", "retrieve", "vdr"}
+    assert 0.0 < sum(line["stages_ms"].values()) <= line["ms"] + 1.0
+    assert line["stages_ms"]["encode"] == pytest.approx(response.json()["timings_ms"]["encode"], abs=0.1)
+
+
+def test_the_path_of_a_plan_is_its_route_and_its_id_a_field(client: httpx.Client, log: Log) -> None:
+    plan_id = upload(client)
+    found = client.get(f"/floorplans/{plan_id}")
+    (line,) = log.of_request(found.headers["x-request-id"])
+    assert (line["route"], line["plan"]) == ("/floorplans/{floorplan_id}", plan_id)
+    other = client.get("/floorplans/not-an-id")
+    (line,) = log.of_request(other.headers["x-request-id"])
+    assert (line["route"], line["plan"]) == ("/floorplans/{floorplan_id}", None)
+
+
+def test_what_was_refused_tells_why_and_how_far_it_came(client: httpx.Client, log: Log) -> None:
+    plan_id = upload(client)
+    refusals = 'lalaloc_rejections_total{reason="invalid-panorama"}'
+    before = _metric(client, refusals)
+    response = localise(client, plan_id, b"no picture")
+    assert_problem(response, 422, "invalid-panorama")
+    (line,) = log.of_request(response.headers["x-request-id"])
+    assert (line["status"], line["rejection"], line["plan"]) == (422, "invalid-panorama", plan_id)
+    assert set(line["stages_ms"]) == {"upload", "decode"}
+    assert _metric(client, refusals) == before + 1.0
+
+
+def test_what_is_refused_before_it_is_routed_has_its_route_all_the_same(
+    start_app: StartApp, tmp_path: Path, log: Log
+) -> None:
+    with start_app(tmp_path, api_keys=True, log_level="info") as client:
+        response = client.get(f"/floorplans/{'0' * 32}", headers={"authorization": "Bearer very-secret"})
+        (line,) = log.of_request(response.headers["x-request-id"])
+    assert (response.status_code, line["route"]) == (401, "/floorplans/{floorplan_id}")
+    assert line["rejection"]
+    assert "very-secret" not in log.text
+
+
+def test_a_client_that_hangs_up_is_counted_and_told(client: httpx.Client, log: Log) -> None:
+    gone = 'lalaloc_disconnects_total{route="/floorplans"}'
+    before = _metric(client, gone)
+    with socket.create_connection((client.base_url.host, client.base_url.port or 80)) as connection:
+        head = (
+            "POST /floorplans HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
+            "Content-Length: 1000\r\nX-Request-ID: gone-1\r\n\r\n"
+        )
+        connection.sendall(head.encode() + b"{" * 10)
+        wait_for(lambda: _metric(client, "lalaloc_requests_in_flight") == 1.0)
+    (line,) = log.of_request("gone-1")
+    assert line["gave_up"] is True
+    assert line["bytes_in"] == 10
+    assert _metric(client, gone) == before + 1.0
+
+
+def test_no_line_tells_a_key_or_a_query(client: httpx.Client, log: Log, panorama: bytes) -> None:
+    plan_id = upload(client)
+    headers = {"Authorization": "Bearer very-secret", "Cookie": "very-secret"}
+    for method, path in [
+        ("GET", "/floorplans?limit=3&name=very-secret"),
+        ("GET", f"/floorplans/{plan_id}/preview.svg?x_m=very-secret"),
+        ("GET", "/no/such/very-secret?very-secret"),
+        ("GET", "/floorplans/very-secret"),
+        ("PUT", "/localise?very-secret"),
+        ("POST", "/floorplans?very-secret"),
+    ]:
+        response = client.request(method, path, headers=headers, content=b'{"very-secret": 1}')
+        assert len(log.of_request(response.headers["x-request-id"])) == 1
+    assert "very-secret" not in log.text
+
+
+def test_a_valid_trace_goes_on_in_the_answer_and_the_log(client: httpx.Client, log: Log) -> None:
+    response = client.get("/healthz", headers={"traceparent": f"00-{TRACE}-{SPAN}-01"})
+    version, trace_id, span_id, flags = response.headers["traceparent"].split("-")
+    assert (version, trace_id, flags) == ("00", TRACE, "01")
+    assert span_id != SPAN
+    (line,) = log.of_request(response.headers["x-request-id"])
+    assert (line["trace_id"], line["span_id"]) == (TRACE, span_id)
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "",
+        "no trace",
+        f"ff-{TRACE}-{SPAN}-01",
+        f"00-{'0' * 32}-{SPAN}-01",
+        f"00-{TRACE}-{'0' * 16}-01",
+        f"00-{TRACE.upper()}-{SPAN}-01",
+        f"00-{TRACE}-{SPAN}-01-more",
+        f"00-{TRACE}-{SPAN}-1",
+        f"01-{TRACE}-{SPAN}-01.more",
+        f"00-{TRACE[1:]}-{SPAN}-01",
+    ],
+)
+def test_an_invalid_trace_is_replaced(client: httpx.Client, header: str) -> None:
+    answered = client.get("/healthz", headers={"traceparent": header}).headers["traceparent"]
+    fresh = parse_traceparent([answered])
+    assert fresh is not None
+    assert fresh.trace_id != TRACE
+    assert fresh.sampled is False
+
+
+def test_two_traces_are_none_and_later_versions_are_read_as_far_as_known() -> None:
+    header = f"00-{TRACE}-{SPAN}-01"
+    assert parse_traceparent([header, header]) is None
+    assert parse_traceparent([f"cc-{TRACE}-{SPAN}-ff-what-comes"]) == TraceContext(TRACE, SPAN, sampled=True)
+    assert parse_traceparent([f"cc-{TRACE}-{SPAN}-fe"]) == TraceContext(TRACE, SPAN, sampled=False)
+
+
+@given(_HEX_16, _HEX_16, _HEX_16, st.booleans())
+def test_a_header_reads_as_the_span_that_wrote_it(high: str, low: str, span: str, sampled: bool) -> None:
+    written = TraceContext(high + low, span, sampled)
+    zero = not int(high + low, 16) or not int(span, 16)
+    assert parse_traceparent([written.header]) == (None if zero else written)
+    child = child_of(written)
+    assert (child.trace_id, child.sampled) == (written.trace_id, sampled)
+
+
+@given(st.text(max_size=80))
+def test_no_header_is_too_odd_to_be_refused(header: str) -> None:
+    found = parse_traceparent([header])
+    assert found is None or found.trace_id in header
+
+
+def test_the_build_is_told_and_metrics_of_rooms_are_made_once(client: httpx.Client) -> None:
+    model = client.get("/readyz").json()["model"]
+    labels = f'model="{model["name"]}",sha256="{model["sha256"]}",version='
+    text = client.get("/metrics").text
+    assert re.search(rf"^lalaloc_build_info{{{labels}\"[^\"]+\"}} 1\.0$", text, re.MULTILINE)
+    assert re.search(r"^process_resident_memory_bytes \d", text, re.MULTILINE)
+
+
+def test_labels_stay_bounded_whatever_is_asked_for(client: httpx.Client) -> None:
+    for attempt in range(5):
+        client.get(f"/odd/{attempt}")
+        client.request(f"ODD{attempt}", "/healthz")
+        client.get(f"/floorplans/{attempt:032x}")
+    text = client.get("/metrics").text
+    assert 'method="OTHER"' in text
+    assert not re.search(r"odd/|ODD\d|0{31}", text)
+
+
+def test_the_dashboard_asks_only_for_metrics_that_are_there(client: httpx.Client) -> None:
+    dashboard = json.loads((ROOT / "docker" / "grafana" / "lalaloc.json").read_text(encoding="utf-8"))
+    expressions = [target["expr"] for panel in dashboard["panels"] for target in panel.get("targets", [])]
+    asked = {name for text in expressions for name in re.findall(r"\b(?:lalaloc|process)_\w+", text)}
+    kinds = dict(re.findall(r"^# TYPE (\S+) (\S+)$", client.get("/metrics").text, re.MULTILINE))
+    buckets = {f"{name}_bucket" for name, kind in kinds.items() if kind == "histogram"}
+    assert {"lalaloc_stage_seconds_bucket", "lalaloc_grid_cache_bytes", "lalaloc_rejections_total"} <= asked
+    assert sorted(asked - kinds.keys() - buckets) == []
+    assert all(expression.count("{") == expression.count("}") for expression in expressions)
+
+
+def test_spans_of_stages_lie_inside_that_of_the_request() -> None:
+    exporter = InMemorySpanExporter()
+    tracing = Tracing(exporter, "0")
+    parent = TraceContext(TRACE, SPAN, sampled=True)
+    ids, opened = tracing.begin(parent)
+    assert (ids.trace_id, ids.sampled) == (TRACE, True)
+    clock = StageClock()
+    with clock.stage("decode"):
+        pass
+    with pytest.raises(RuntimeError), clock.stage("encode"):
+        raise RuntimeError("fails, and is timed all the same")
+    facts = RequestFacts("r-1", ids, plan="p", rejection="overloaded", clock=clock)
+    tracing.end(opened, facts, method="POST", route="/localise", status=503)
+    tracing.close()
+    spans = {span.name: span for span in exporter.get_finished_spans()}
+    assert set(spans) == {"POST /localise", "decode", "encode"}
+    request = spans["POST /localise"]
+    # What is handed to an exporter is complete; types that allow None stand for spans that go on.
+    attributes: Any = request.attributes
+    assert attributes["lalaloc.rejection"] == "overloaded"
+    assert (_id_of(request.context), _id_of(request.parent)) == (ids.span_id, SPAN)
+    for name in ("decode", "encode"):
+        assert _id_of(spans[name].parent) == ids.span_id
+        times: Any = [request.start_time, spans[name].start_time, spans[name].end_time, request.end_time]
+        # Of two clocks, which may differ by a little.
+        assert all(later - earlier >= -1_000_000 for earlier, later in pairwise(times))
+
+
+def _id_of(context: SpanContext | None) -> str | None:
+    return None if context is None else f"{context.span_id:016x}"
+
+
+def test_a_trace_that_its_caller_does_not_record_is_not_exported() -> None:
+    exporter = InMemorySpanExporter()
+    tracing = Tracing(exporter, "0")
+    ids, opened = tracing.begin(TraceContext(TRACE, SPAN, sampled=False))
+    tracing.end(opened, RequestFacts("r-1", ids), method="GET", route="/healthz", status=200)
+    tracing.close()
+    assert (ids.trace_id, ids.sampled) == (TRACE, False)
+    assert exporter.get_finished_spans() == ()
+
+
+def test_a_collector_gets_the_spans_of_a_query(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+    with (
+        _collector() as (endpoint, received),
+        start_app(tmp_path, otlp_endpoint=endpoint) as client,
+    ):
+        plan_id = upload(client, FLAT)
+        answered = localise(client, plan_id, panorama, refine="vdr").headers["traceparent"].split("-")
+        # Sent in batches, the last when the service stops; this one need not wait for it.
+        wait_for(lambda: any(span.name == "POST /localise" for span in received), 20.0)
+    (request,) = [span for span in received if span.name == "POST /localise"]
+    assert (request.trace_id.hex(), request.span_id.hex()) == (answered[1], answered[2])
+    assert answered[3] == "01"
+    children = {span.name for span in received if span.parent_span_id == request.span_id}
+    assert children == {"upload", "decode", "encode", "grid", "retrieve", "vdr"}
+
+
+@contextmanager
+def _collector() -> Iterator[tuple[str, list[Any]]]:
+    """A collector that keeps the spans it is sent."""
+    received: list[Any] = []
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_POST(self) -> None:
+            body = self.rfile.read(int(self.headers["content-length"]))
+            message = ExportTraceServiceRequest.FromString(body)
+            received.extend(span for one in message.resource_spans for scope in one.scope_spans for span in scope.spans)
+            self.send_response(200)
+            self.send_header("content-length", "0")
+            self.end_headers()
+
+        def log_message(self, format: str, *args: object) -> None: ...
+
+    with HTTPServer(("127.0.0.1", 0), Handler) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield f"http://127.0.0.1:{server.server_address[1]}/v1/traces", received
+        finally:
+            server.shutdown()
+            thread.join(10.0)
+
+
+def test_without_the_extra_an_endpoint_is_a_clear_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "opentelemetry.exporter.otlp.proto.http.trace_exporter", None)
+    with pytest.raises(ConfigError, match=r"LALALOC_OTLP_ENDPOINT is 'http://c/v1/traces'.*extra 'otel'"):
+        otlp_exporter("http://c/v1/traces")
+
+
+def test_without_an_endpoint_the_sdk_is_not_loaded() -> None:
+    program = "import sys, service.app; sys.exit(any(n.startswith('opentelemetry.sdk') for n in sys.modules))"
+    assert subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=False).returncode == 0
