@@ -13,12 +13,18 @@ from typing import Any
 
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
+from starlette.routing import BaseRoute, Route
+from starlette.types import ASGIApp
 
 from lalaloc_core import __version__
-from service.problems import install_problem_handlers
-from service.routes import floorplans, health, localise, pages
+from service.admission import EXEMPT, REFUSALS, AdmissionMiddleware
+from service.headers import SecurityHeadersMiddleware
+from service.problems import add_problems, install_problem_handlers
+from service.routes import floorplans, health, limits, localise, pages, plan_events, plan_files
 from service.runtime import start_runtime
-from service.schemas import FloorPlanDocument, Problem
+from service.schemas import FloorPlanDocument, PlanEvent, Problem
+from service.security.description import describe_security
+from service.security.middleware import GateMiddleware
 from service.settings import Settings
 from service.telemetry import Telemetry, TelemetryMiddleware, configure_logging
 
@@ -44,12 +50,25 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         docs_url=None,
         redoc_url=None,
     )
-    app.add_middleware(TelemetryMiddleware, telemetry=telemetry)
     install_problem_handlers(app)
-    for router in (floorplans.router, localise.router, health.router, pages.router):
+    rooms = (floorplans, plan_files, plan_events, localise, health, limits, pages)
+    routers = [room.router for room in rooms]
+    for router in routers:
         app.include_router(router)
     app.openapi = partial(_openapi, app)
+    routes = [route for router in routers for route in router.routes]
+    app.build_middleware_stack = partial(_layers, app, telemetry, routes)
     return app
+
+
+def _layers(app: FastAPI, telemetry: Telemetry, routes: list[BaseRoute]) -> ASGIApp:
+    """The app's layers, outermost first: ids and log, security headers, admission, keys, then the framework's.
+
+    Middleware that is added to an app lies inside the layer that answers unexpected errors, and never sees those.
+    """
+    admitted = AdmissionMiddleware(GateMiddleware(FastAPI.build_middleware_stack(app)))
+    named = [route for route in routes if isinstance(route, Route)]
+    return TelemetryMiddleware(SecurityHeadersMiddleware(admitted), telemetry, named)
 
 
 @asynccontextmanager
@@ -57,7 +76,9 @@ async def _lifespan(settings: Settings | None, telemetry: Telemetry, app: FastAP
     settings = settings or Settings.load()
     configure_logging(settings.log_level)
     with ExitStack() as cleanup:
-        app.state.runtime = await asyncio.to_thread(start_runtime, settings, telemetry, cleanup)
+        runtime = app.state.runtime = await asyncio.to_thread(start_runtime, settings, telemetry, cleanup)
+        app.state.admission = runtime.admission
+        app.state.gate = runtime.gate
         yield
 
 
@@ -66,11 +87,16 @@ def _openapi(app: FastAPI) -> dict[str, Any]:
     if app.openapi_schema is None:
         document = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
         schemas = document["components"]["schemas"]
-        for model in (FloorPlanDocument, Problem):
+        for model in (FloorPlanDocument, PlanEvent, Problem):
             schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
             schemas |= schema.pop("$defs", {})
             schemas[model.__name__] = schema
         document["components"]["schemas"] = dict(sorted(schemas.items()))
+        for path, operations in document["paths"].items():
+            if path not in EXEMPT:
+                for operation in operations.values():
+                    add_problems(operation, *REFUSALS)
+        describe_security(document)
         app.openapi_schema = document
     return app.openapi_schema
 

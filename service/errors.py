@@ -5,6 +5,7 @@ LaLaLocError
     ├── MalformedRequestError       a body that does not follow its media type
     ├── InvalidRequestError         a field that is missing, unknown or outside its limits
     ├── UnknownFloorPlanError       no floor plan with this id
+    ├── UnknownRevisionError        no such revision of the floor plan
     ├── UploadTooLargeError         more bytes than allowed
     ├── UploadTimeoutError          the upload took too long
     ├── UnsupportedMediaError       a body of a type that is not read here
@@ -12,13 +13,24 @@ LaLaLocError
     ├── PlanFailedError             the plan's latent grid could not be computed
     ├── PlanNotReadyError           still preparing at the request's deadline
     ├── TooManyFloorPlansError      the store is full
+    ├── RevisionMismatchError       the plan has another revision than the one expected
+    ├── IdempotencyKeyReusedError   the key was sent with another body before
+    ├── IdempotencyInProgressError  the same request is being carried out
+    ├── StoreUnavailableError       the database cannot be reached
+    ├── UnauthenticatedError        no valid API key
+    ├── InsufficientScopeError      the API key is not good for this
+    ├── ExposedWithoutKeysError     asked from elsewhere while there are no API keys
+    ├── RateLimitedError            more requests of an API key than allowed
+    ├── TooManyRefusedKeysError     more invalid API keys from one client than allowed
     ├── OverloadedError             more requests in flight than allowed
+    ├── DecoderNotReadyError        panoramas cannot be decoded at the moment
     ├── DeadlineExceededError       the query could not be computed in time
     └── StoppingError               the service is shutting down
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from lalaloc_core.errors import (
@@ -71,19 +83,23 @@ class UnknownFloorPlanError(ServiceError):
         super().__init__(f"there is no floor plan '{plan_id[:64]}'")
 
 
+class UnknownRevisionError(ServiceError):
+    """The floor plan has no such revision, or it is no longer kept."""
+
+    def __init__(self, plan_id: str, revision_id: str) -> None:
+        super().__init__(f"floor plan '{plan_id}' has no revision '{revision_id[:64]}', or has it no more")
+
+
 class UploadTooLargeError(ServiceError):
     """The body has more bytes than allowed."""
 
-    def __init__(self, limit: int, stated: int | None = None) -> None:
+    def __init__(self, name: str, limit: int, stated: int | None = None) -> None:
         size = f"{stated} bytes" if stated is not None else "too large"
-        super().__init__(f"the body is {size}, at most {limit} bytes are allowed")
+        super().__init__(f"the body is {size}, at most {limit} bytes are allowed ({name})")
 
 
 class UploadTimeoutError(ServiceError):
-    """The upload did not finish in time."""
-
-    def __init__(self, limit_s: float) -> None:
-        super().__init__(f"the upload took longer than {limit_s:g} s")
+    """The upload did not finish in time, or came too slowly."""
 
 
 class UnsupportedMediaError(ServiceError):
@@ -100,8 +116,8 @@ class PlanTooLargeError(ServiceError):
 
     def __init__(self, estimate: int, limit: int, step_m: float) -> None:
         super().__init__(
-            f"the plan needs about {estimate} grid poses at a step of {step_m:g} m, at most {limit} are allowed; "
-            "are the coordinates in metres?"
+            f"the plan needs about {estimate} grid poses at a step of {step_m:g} m, at most {limit} are allowed "
+            "(max_grid_poses); are the coordinates in metres?"
         )
 
 
@@ -127,16 +143,102 @@ class TooManyFloorPlansError(ServiceError):
     """The store holds as many plans as allowed."""
 
     def __init__(self, limit: int) -> None:
-        super().__init__(f"{limit} floor plans are stored, no more are allowed; delete some")
+        super().__init__(f"{limit} floor plans are stored, no more are allowed (max_floorplans); delete some")
+
+
+class RevisionMismatchError(ServiceError):
+    """The plan has another revision than the one that the caller expects.
+
+    Attributes:
+        current: id of the revision that it has.
+    """
+
+    def __init__(self, plan_id: str, expected: str, current: str) -> None:
+        self.current = current
+        super().__init__(f"floor plan '{plan_id}' has revision '{current}', not '{expected[:64]}'")
+
+
+class IdempotencyKeyReusedError(ServiceError):
+    """The idempotency key was sent with another body before."""
+
+    def __init__(self, key: str) -> None:
+        super().__init__(f"Idempotency-Key '{key[:64]}' was sent with another body before; take a new one")
+
+
+class IdempotencyInProgressError(ServiceError):
+    """The same request, under the same idempotency key, is being carried out."""
+
+    retry_after_s = 1
+
+    def __init__(self, key: str) -> None:
+        super().__init__(f"the request with Idempotency-Key '{key[:64]}' is being carried out; ask again later")
+
+
+class StoreUnavailableError(ServiceError):
+    """The database cannot be reached, or did not answer in time."""
+
+    retry_after_s = 2
+
+    def __init__(self) -> None:
+        super().__init__("the database cannot be reached at the moment")
+
+
+class UnauthenticatedError(ServiceError):
+    """The request has no valid API key. An unknown key and a revoked one are told in the same words."""
+
+
+class InsufficientScopeError(ServiceError):
+    """The API key is not good for this."""
+
+    def __init__(self, needed: str, given: Iterable[str]) -> None:
+        scopes = ", ".join(sorted(given))
+        super().__init__(f"this needs an API key with the scope '{needed}', the one given has: {scopes}")
+
+
+class ExposedWithoutKeysError(ServiceError):
+    """The request came from elsewhere than this machine, while API keys are off."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            "API keys are off, so only requests over a loopback address are answered; see LALALOC_API_KEYS and "
+            "LALALOC_ALLOW_ANONYMOUS"
+        )
+
+
+class RateLimitedError(ServiceError):
+    """The API key sent more requests than allowed."""
+
+    def __init__(self, limit: int, period: str, retry_after_s: int) -> None:
+        self.retry_after_s = retry_after_s
+        super().__init__(f"this API key may send {limit} requests per {period}, and has")
+
+
+class TooManyRefusedKeysError(ServiceError):
+    """The client sent more invalid API keys than allowed."""
+
+    def __init__(self, limit: int, retry_after_s: int) -> None:
+        self.retry_after_s = retry_after_s
+        super().__init__(
+            f"{limit} invalid API keys came from this address within a minute (refused_keys_per_minute), no more are "
+            "looked at for now"
+        )
 
 
 class OverloadedError(ServiceError):
     """More requests are in flight, or more grids asked for, than allowed."""
 
-    retry_after_s = 1
-
-    def __init__(self, limit: int) -> None:
+    def __init__(self, limit: int, retry_after_s: int = 1) -> None:
+        self.retry_after_s = retry_after_s
         super().__init__(f"{limit} others are waiting to be answered, no more are taken")
+
+
+class DecoderNotReadyError(ServiceError):
+    """No process that decodes panoramas is running, nor will be before the request's deadline."""
+
+    retry_after_s = 2
+
+    def __init__(self) -> None:
+        super().__init__("panoramas cannot be decoded at the moment")
 
 
 class DeadlineExceededError(ServiceError):
@@ -182,6 +284,7 @@ PROBLEMS: dict[type[Exception], ProblemKind] = {
     MalformedRequestError: ProblemKind(400, "malformed-request", "Malformed request"),
     InvalidRequestError: ProblemKind(422, "invalid-request", "Invalid request"),
     UnknownFloorPlanError: ProblemKind(404, "unknown-floorplan", "Unknown floor plan"),
+    UnknownRevisionError: ProblemKind(404, "unknown-revision", "Unknown revision"),
     UploadTooLargeError: ProblemKind(413, "upload-too-large", "Upload too large"),
     UploadTimeoutError: ProblemKind(408, "upload-timeout", "Upload took too long"),
     UnsupportedMediaError: ProblemKind(415, "unsupported-media", "Unsupported media type"),
@@ -189,7 +292,17 @@ PROBLEMS: dict[type[Exception], ProblemKind] = {
     PlanFailedError: ProblemKind(409, "floorplan-failed", "Floor plan could not be prepared"),
     PlanNotReadyError: ProblemKind(503, "floorplan-not-ready", "Floor plan still preparing"),
     TooManyFloorPlansError: ProblemKind(507, "too-many-floorplans", "Too many floor plans"),
+    RevisionMismatchError: ProblemKind(412, "revision-mismatch", "Another revision than expected"),
+    IdempotencyKeyReusedError: ProblemKind(422, "idempotency-key-reused", "Idempotency key used for something else"),
+    IdempotencyInProgressError: ProblemKind(409, "idempotency-in-progress", "Request already in work"),
+    StoreUnavailableError: ProblemKind(503, "store-unavailable", "Storage unavailable"),
+    UnauthenticatedError: ProblemKind(401, "unauthenticated", "API key needed"),
+    InsufficientScopeError: ProblemKind(403, "insufficient-scope", "API key not good for this"),
+    ExposedWithoutKeysError: ProblemKind(403, "exposed-without-keys", "Only answered on its own machine"),
+    RateLimitedError: ProblemKind(429, "rate-limited", "Too many requests"),
+    TooManyRefusedKeysError: ProblemKind(429, "too-many-refused-keys", "Too many invalid API keys"),
     OverloadedError: ProblemKind(503, "overloaded", "Overloaded"),
+    DecoderNotReadyError: ProblemKind(503, "decoder-not-ready", "Decoder not ready"),
     DeadlineExceededError: ProblemKind(504, "deadline-exceeded", "Deadline exceeded"),
     StoppingError: ProblemKind(503, "stopping", "Shutting down"),
     ServiceError: INTERNAL,

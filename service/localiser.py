@@ -6,24 +6,30 @@ import asyncio
 import math
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextvars import copy_context
 from dataclasses import asdict
+from functools import partial
 from time import monotonic
 from typing import TypeVar
 
 from lalaloc_core.bundle import Bundle
-from lalaloc_core.conventions import heading_from_degrees, heading_to_degrees
+from lalaloc_core.conventions import heading_to_degrees
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.covariance import spread_of
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.images import read_panorama
-from lalaloc_core.localise.pipeline import Localisation, StageClock, localise, panorama_heading
+from lalaloc_core.localise.images import Panorama
+from lalaloc_core.localise.pipeline import Localisation, StageClock, localise_steps, next_step, panorama_heading
 from lalaloc_core.localise.poses import Candidate, LatentGrid, Query
+from service.admission import Places
+from service.decoding import Decoder
 from service.errors import DeadlineExceededError, PlanFailedError, PlanNotReadyError
-from service.grids import Grids, query_height_m
+from service.grids.grids import Grids
+from service.grids.heights import query_height_m
+from service.heading import HeadingSource, KnownHeading, known_heading
 from service.refinement import LpoPool
 from service.schemas import CandidateAnswer, LocaliseAnswer, LocaliseForm, ModelAnswer, Position, TimingsAnswer
 from service.settings import Settings
-from service.store import PlanRecord
+from service.storage.records import PlanRecord
 from service.telemetry import Telemetry
 
 # Kept free of LPO before the request's deadline, to rank and send the answer.
@@ -43,6 +49,8 @@ class Localiser:
         encoders: Encoders,
         grids: Grids,
         pool: LpoPool,
+        decoder: Decoder,
+        queries: Places,
         telemetry: Telemetry,
     ) -> None:
         self._settings = settings
@@ -50,36 +58,50 @@ class Localiser:
         self._encoders = encoders
         self._grids = grids
         self._pool = pool
+        self._decoder = decoder
+        self._queries = queries
         self._telemetry = telemetry
-        self._executor = ThreadPoolExecutor(settings.compute_threads, thread_name_prefix="localise")
+        self._executor = ThreadPoolExecutor(settings.cores.compute_threads, thread_name_prefix="localise")
 
     @property
     def model(self) -> ModelAnswer:
         """The model that answers."""
         return model_answer(self._bundle)
 
-    async def answer(self, record: PlanRecord, form: LocaliseForm, content: bytes) -> LocaliseAnswer:
+    async def answer(self, record: PlanRecord, form: LocaliseForm, content: bytes, clock: StageClock) -> LocaliseAnswer:
         """Localise an encoded panorama in a stored plan.
 
+        Args:
+            clock: times the stages, the wait for the plan's grid included, also when they fail.
+
         Raises:
-            InvalidPanoramaError: see `read_panorama`.
+            InvalidPanoramaError, DecoderNotReadyError, StoppingError: see `Decoder.decode`.
             InvalidPoseError: a camera height above the ceiling.
             PlanFailedError: the plan's grid could not be computed.
             PlanNotReadyError: the grid was not finished by the deadline.
             DeadlineExceededError: the rest was not.
-            OverloadedError: too many grids are waiting to be computed on demand.
+            OverloadedError: too many queries are computed or wait for it, or grids to be computed on demand.
         """
+        with self._queries.one():
+            return await self._answer(record, form, content, clock)
+
+    async def _answer(
+        self, record: PlanRecord, form: LocaliseForm, content: bytes, clock: StageClock
+    ) -> LocaliseAnswer:
         begin = monotonic()
         deadline = begin + self._settings.request_deadline_s
         height_m = query_height_m(record, form.camera_height_m)
-        clock = StageClock()
         # The picture first: a bad one is refused without waiting for the plan.
-        query = await self._compute(lambda: self._encode(content, form, height_m, clock), deadline)
-        grid = await self._grid(record, height_m, deadline)
-        found = await self._compute(lambda: self._search(record.plan, grid, query, form, deadline), deadline)
-        timings_ms = clock.timings_ms | found.timings_ms | {"total": (monotonic() - begin) * 1e3}
+        with clock.stage("decode"):
+            panorama = await self._decoder.decode(content, deadline)
+        known = known_heading(form, record.plan, panorama, self._settings.compass_tolerance_deg)
+        query = await self._compute(lambda: self._encode(panorama, known, height_m, clock), deadline)
+        with clock.stage("grid"):
+            grid = await self._grid(record, height_m, deadline)
+        found = await self._search(record.plan, grid, query, form, deadline, clock)
+        timings_ms = clock.timings_ms | {"total": (monotonic() - begin) * 1e3}
         self._observe(timings_ms, found.stage)
-        return self._compose(record, form, height_m, query, found, timings_ms)
+        return self._compose(record, known.source, height_m, query, found, timings_ms)
 
     def close(self) -> None:
         """Finish what is being computed."""
@@ -87,57 +109,50 @@ class Localiser:
 
     async def _compute(self, work: Callable[[], T], deadline: float) -> T:
         """Run CPU work on a thread; past the deadline it is not started, or its outcome dropped."""
+
+        def run() -> T:
+            with self._grids.queries.one():
+                return work()
+
         try:
             async with asyncio.timeout(max(deadline - monotonic(), 0.0)):
-                return await asyncio.get_running_loop().run_in_executor(self._executor, work)
+                return await asyncio.get_running_loop().run_in_executor(self._executor, copy_context().run, run)
         except TimeoutError as error:
             raise DeadlineExceededError(self._settings.request_deadline_s) from error
 
     async def _grid(self, record: PlanRecord, height_m: float, deadline: float) -> LatentGrid:
         """The plan's grid for a camera height, computed on demand, waited for until the deadline."""
-        key = self._grids.key(record.id, height_m)
+        key = self._grids.key(record.revision_id, height_m)
         grid = await self._compute(lambda: self._grids.find(key), deadline)
         if grid is not None:
             return grid
         own_height = height_m == record.plan.camera_height_m
         if own_height and record.failure is not None:
             raise PlanFailedError(record.id, record.failure)
-        future = self._grids.compute(key, on_demand=not own_height)
+        future = self._grids.compute(record, height_m)
         begin = monotonic()
         try:
             async with asyncio.timeout(max(deadline - begin, 0.0)):
-                return await asyncio.wrap_future(future)
+                with self._queries.lent():
+                    return await asyncio.wrap_future(future)
         except TimeoutError as error:
             raise PlanNotReadyError(record.id, monotonic() - begin, self._grids.progress(key)) from error
 
-    def _encode(self, content: bytes, form: LocaliseForm, height_m: float, clock: StageClock) -> Query:
-        manifest = self._encoders.manifest
-        with clock.stage("decode"):
-            image = read_panorama(
-                content,
-                height=manifest.image_height,
-                width=manifest.image_width,
-                limits=self._settings.panorama_limits,
-            )
+    def _encode(self, panorama: Panorama, known: KnownHeading, height_m: float, clock: StageClock) -> Query:
         with clock.stage("encode"):
-            heading = None if form.heading_deg is None else heading_from_degrees(form.heading_deg)
-            tolerance = math.radians(form.heading_tolerance_deg)
-            return self._encoders.query(image, heading, height_m, heading_tolerance=tolerance)
+            return self._encoders.query(panorama.pixels, known.heading, height_m, heading_tolerance=known.tolerance)
 
-    def _search(
-        self, plan: FloorPlan, grid: LatentGrid, query: Query, form: LocaliseForm, deadline: float
+    async def _search(
+        self, plan: FloorPlan, grid: LatentGrid, query: Query, form: LocaliseForm, deadline: float, clock: StageClock
     ) -> Localisation:
-        return localise(
-            plan,
-            grid,
-            self._encoders,
-            query,
-            refine=form.refine,
-            top_k=form.top_k,
-            refiner=lambda job: self._pool.refine(
-                job, min(self._settings.lpo_deadline_s, deadline - monotonic() - _ANSWER_S)
-            ),
-        )
+        """Search on the threads of the localiser, which do something else while LPO is waited for."""
+        steps = localise_steps(plan, grid, self._encoders, query, refine=form.refine, top_k=form.top_k, clock=clock)
+        step = await self._compute(partial(next_step, steps, None), deadline)
+        while not isinstance(step, Localisation):
+            timeout_s = min(self._settings.lpo_deadline_s, deadline - monotonic() - _ANSWER_S)
+            result = await self._pool.refine(step, timeout_s)
+            step = await self._compute(partial(next_step, steps, result), deadline)
+        return step
 
     def _observe(self, timings_ms: dict[str, float], stage: str) -> None:
         for name, duration_ms in timings_ms.items():
@@ -147,7 +162,7 @@ class Localiser:
     def _compose(
         self,
         record: PlanRecord,
-        form: LocaliseForm,
+        source: HeadingSource,
         height_m: float,
         query: Query,
         found: Localisation,
@@ -163,8 +178,10 @@ class Localiser:
         best = candidates[0]
         return LocaliseAnswer(
             floorplan_id=record.id,
+            floorplan_revision=record.revision_id,
             position=best.position,
             heading_deg=best.heading_deg,
+            heading_source=source,
             room=best.room,
             confidence=model and model.probability(found.stage, signals, heading_known=query.heading_known),
             covariance_m2=None if spread is None else spread.position_m2.tolist(),

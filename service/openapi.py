@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from pathlib import Path
 
@@ -14,7 +15,9 @@ from service.app import create_app
 def openapi_text() -> str:
     """The API description as YAML; the same for the same code."""
     header = "# Written by `python -m service.openapi openapi.yaml`; do not edit.\n"
-    return header + yaml.safe_dump(create_app().openapi(), sort_keys=False, allow_unicode=True, width=120)
+    # Through JSON, so that parts which the description shares are written out each time.
+    document = json.loads(json.dumps(create_app().openapi()))
+    return header + yaml.safe_dump(document, sort_keys=False, allow_unicode=True, width=120)
 
 
 def main() -> None:

@@ -18,11 +18,12 @@ from service.errors import (
     InvalidRequestError,
     ProblemKind,
     ServiceError,
+    UnauthenticatedError,
     UnsupportedMediaError,
     problem_kind,
 )
 from service.schemas import Fault, Problem
-from service.telemetry import request_id_of
+from service.telemetry import note, request_id_of
 from service.uploads import describe_fault
 
 PROBLEM_JSON = "application/problem+json"
@@ -31,9 +32,9 @@ _HIDDEN = "something went wrong in the service; its log has the details under th
 
 def install_problem_handlers(app: FastAPI) -> None:
     """Answer every error, expected or not, with a problem document."""
-    app.add_exception_handler(LaLaLocError, _on_known_error)
+    app.add_exception_handler(LaLaLocError, problem_answer)
     app.add_exception_handler(RequestValidationError, _on_invalid_request)
-    app.add_exception_handler(HTTPException, _on_http_error)
+    app.add_exception_handler(HTTPException, http_problem_answer)
     app.add_exception_handler(Exception, _on_unexpected_error)
 
 
@@ -51,11 +52,25 @@ def problem_responses(*errors: type[Exception]) -> dict[int | str, dict[str, Any
     }
 
 
-def _on_known_error(request: Request, error: Exception) -> JSONResponse:
+def add_problems(operation: dict[str, Any], *errors: type[Exception]) -> None:
+    """Add problems to those that an operation of an OpenAPI document answers with already."""
+    responses = operation["responses"]
+    for status, added in problem_responses(*errors).items():
+        response = responses.setdefault(str(status), added)
+        lines = response["description"].split("; ")
+        lines += [line for line in added["description"].split("; ") if line not in lines]
+        response["description"] = "; ".join(lines)
+    operation["responses"] = dict(sorted(responses.items()))
+
+
+def problem_answer(request: Request, error: Exception) -> JSONResponse:
+    """What is answered to an error that has a row in the table."""
     kind = problem_kind(error)
     headers = {}
     if isinstance(error, ServiceError) and error.retry_after_s is not None:
         headers["Retry-After"] = str(error.retry_after_s)
+    if isinstance(error, UnauthenticatedError):
+        headers["WWW-Authenticate"] = "Bearer"
     if isinstance(error, UnsupportedMediaError):
         headers["Accept-Post"] = ", ".join(error.accepted)
     return _answer(
@@ -68,16 +83,17 @@ def _on_known_error(request: Request, error: Exception) -> JSONResponse:
     )
 
 
-def _on_invalid_request(request: Request, error: Exception) -> JSONResponse:
-    assert isinstance(error, RequestValidationError)
-    return _on_known_error(request, InvalidRequestError([describe_fault(fault) for fault in error.errors()]))
-
-
-def _on_http_error(request: Request, error: Exception) -> JSONResponse:
+def http_problem_answer(request: Request, error: Exception) -> JSONResponse:
+    """What is answered to an error of the framework, such as a route that there is not."""
     assert isinstance(error, HTTPException)
     kind = HTTP_PROBLEMS.get(error.status_code, ProblemKind(error.status_code, "http-error", "HTTP error"))
     detail = f"{request.method} {request.url.path[:200]}: {error.detail}"
     return _answer(request, kind, detail, headers=dict(error.headers or {}))
+
+
+def _on_invalid_request(request: Request, error: Exception) -> JSONResponse:
+    assert isinstance(error, RequestValidationError)
+    return problem_answer(request, InvalidRequestError([describe_fault(fault) for fault in error.errors()]))
 
 
 def _on_unexpected_error(request: Request, _error: Exception) -> JSONResponse:
@@ -93,6 +109,8 @@ def _answer(
     room: str | None = None,
     faults: list[tuple[str, str]] | None = None,
 ) -> JSONResponse:
+    if kind is not INTERNAL:
+        note(request, rejection=kind.slug)
     problem = Problem(
         type=kind.type,
         title=kind.title,

@@ -9,16 +9,22 @@ from dataclasses import dataclass
 import numpy as np
 from fastapi import Request
 
+from lalaloc_core import __version__
 from lalaloc_core.bundle import Bundle
-from lalaloc_core.errors import ConfigError
 from lalaloc_core.localise.encoders import Encoders
-from service.grids import Grids
+from service.admission import Admission, AdmissionLimits
+from service.decoding import Decoder
+from service.events import PlanEvents
+from service.grids.caretaker import Caretaker
+from service.grids.grids import Grids
+from service.grids.known_plans import KnownPlans
 from service.localiser import Localiser
 from service.refinement import LpoPool
+from service.security.middleware import Gate
 from service.settings import Settings
-from service.store import Store
+from service.storage.store import Store, open_store
 from service.telemetry import LOGGER_NAME, Telemetry
-from service.uploads import Slots
+from service.telemetry.tracing import Tracing, otlp_exporter
 
 
 @dataclass(frozen=True)
@@ -29,14 +35,18 @@ class Runtime:
     telemetry: Telemetry
     store: Store
     grids: Grids
+    known_plans: KnownPlans
     pool: LpoPool
+    decoder: Decoder
     localiser: Localiser
-    slots: Slots
+    admission: Admission
+    gate: Gate
+    events: PlanEvents
 
     @property
     def ready(self) -> bool:
-        """Whether model and LPO pool are warm; the model is before the first request is taken."""
-        return self.pool.state.warmed_up
+        """Whether workers are warm, as the model is before the first request is taken, and the service goes on."""
+        return not self.admission.stopping and self.pool.state.warmed_up and self.decoder.state.warmed_up
 
 
 def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack) -> Runtime:
@@ -52,32 +62,46 @@ def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack) 
         BundleError: there is no usable model.
     """
     logger = logging.getLogger(LOGGER_NAME)
+    if settings.otlp_endpoint is not None:
+        telemetry.tracing = Tracing(otlp_exporter(settings.otlp_endpoint), __version__)
+        cleanup.callback(telemetry.tracing.close)
     bundle = Bundle.open(settings.bundle)
-    if settings.database_url is None:
-        try:
-            settings.data_dir.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise ConfigError(f"cannot create the data folder '{settings.data_dir}': {error.strerror}") from error
-    store = Store(settings.resolved_database_url)
+    telemetry.describe_build(__version__, bundle.manifest.name, bundle.sha256)
+    store = open_store(settings)
     cleanup.callback(store.close)
+    gate = Gate(store.keys, settings)
+    cleanup.callback(gate.close)
     # The pool first: loading torch in the workers overlaps with loading the model here.
     pool = LpoPool(bundle, settings, telemetry)
     cleanup.callback(pool.close)
     pool.start()
-    encoders = Encoders(bundle, threads=settings.onnx_threads)
+    decoder = Decoder(bundle.manifest, settings, telemetry)
+    cleanup.callback(decoder.close)
+    decoder.start()
+    encoders = Encoders(bundle, threads=settings.cores.onnx_threads)
     _warm_up(encoders)
     grids = Grids(store, encoders, bundle.sha256, settings, telemetry)
     cleanup.callback(grids.close)
+    admission = Admission(AdmissionLimits.of(settings), telemetry)
     localiser = Localiser(
-        settings=settings, bundle=bundle, encoders=encoders, grids=grids, pool=pool, telemetry=telemetry
+        settings=settings,
+        bundle=bundle,
+        encoders=encoders,
+        grids=grids,
+        pool=pool,
+        decoder=decoder,
+        queries=admission.queries,
+        telemetry=telemetry,
     )
     cleanup.callback(localiser.close)
-    resumed = grids.resume()
-    fields = {"model": bundle.manifest.name, "sha256": bundle.sha256, "grids_to_compute": resumed}
+    known_plans = KnownPlans(store, limit_bytes=settings.plan_cache_bytes, max_age_s=settings.plan_cache_age_s)
+    caretaker = Caretaker(store, grids, known_plans, sweep_s=settings.sweep_s)
+    cleanup.callback(caretaker.close)
+    caretaker.start()
+    events = PlanEvents(store, grids, admission, longest_s=settings.stream_deadline_s)
+    fields = {"model": bundle.manifest.name, "sha256": bundle.sha256, "grids_to_compute": grids.pending}
     logger.info("service started", extra={"fields": fields})
-    slots = Slots(settings.max_pending_requests)
-    telemetry.gauge("lalaloc_requests_in_flight", "Uploads and queries not yet answered.", lambda: slots.taken)
-    return Runtime(settings, telemetry, store, grids, pool, localiser, slots)
+    return Runtime(settings, telemetry, store, grids, known_plans, pool, decoder, localiser, admission, gate, events)
 
 
 def runtime_of(request: Request) -> Runtime:

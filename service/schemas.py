@@ -53,6 +53,9 @@ class FloorPlanDocument(BaseModel):
     name: str = Field("floor plan", description="What to call the plan.")
     ceiling_height_m: float | None = Field(None, gt=0, description="Ceiling of rooms without their own.")
     camera_height_m: float = Field(1.5, gt=0, description="Height of the camera assumed for panoramas of this plan.")
+    north_deg: float | None = Field(
+        None, ge=-360, le=360, description="Azimuth of true north: degrees clockwise from the plan's +y."
+    )
     rooms: list[RoomDocument] = Field(min_length=1, description="Closed rooms; doors count as wall.")
 
 
@@ -85,8 +88,13 @@ class FloorPlanAnswer(Answer):
     """A stored floor plan."""
 
     id: str = Field(description="Identifier for later requests.")
+    revision: str = Field(description="Identifier of what was uploaded; a replaced plan has another one.")
+    revision_number: int = Field(ge=1, description="How often the plan was uploaded up to this revision.")
     name: str
-    status: PlanStatus = Field(description="`preparing` while the latent grid is computed, then `ready` or `failed`.")
+    status: PlanStatus | Literal["superseded"] = Field(
+        description="`preparing` while the latent grid is computed, then `ready` or `failed`; `superseded` for a "
+        "revision that is not the current one."
+    )
     progress: float = Field(ge=0, le=1, description="Share of the latent grid that is computed.")
     reason: str | None = Field(description="Why the plan failed, null unless it did.")
     rooms: list[RoomAnswer]
@@ -95,26 +103,40 @@ class FloorPlanAnswer(Answer):
     camera_height_m: float = Field(description="Camera height assumed for panoramas of this plan.")
     grid: GridAnswer
     warnings: list[str] = Field(description="What is odd about the plan but usable, such as overlapping rooms.")
-    created_at: datetime = Field(description="When the plan was uploaded, UTC.")
+    created_at: datetime = Field(description="When the plan was first uploaded, UTC.")
+    updated_at: datetime = Field(description="When this revision was uploaded, UTC.")
 
 
 class FloorPlanSummary(Answer):
     """A stored floor plan in a listing."""
 
     id: str
+    revision: str
     name: str
     status: PlanStatus
     progress: float = Field(ge=0, le=1)
     rooms: int = Field(description="Number of rooms.")
     area_m2: float
     created_at: datetime
+    updated_at: datetime
 
 
 class FloorPlanList(Answer):
-    """Stored floor plans, newest first."""
+    """A page of stored floor plans, newest first."""
 
     floorplans: list[FloorPlanSummary]
-    total: int = Field(description="Number of stored plans, those on other pages included.")
+    next_cursor: str | None = Field(description="The `cursor` of the next page, null on the last one.")
+
+
+class PlanEvent(Answer):
+    """How far a floor plan is; one event of a stream."""
+
+    status: PlanStatus | Literal["deleted"]
+    progress: float | None = Field(
+        default=None, ge=0, le=1, description="Share of the latent grid that is computed; not of a deleted plan."
+    )
+    revision: str | None = Field(default=None, description="The current revision; a plan may get another meanwhile.")
+    reason: str | None = Field(default=None, description="Why the plan failed.")
 
 
 class LocaliseForm(BaseModel):
@@ -124,7 +146,11 @@ class LocaliseForm(BaseModel):
 
     floorplan_id: str = Field(min_length=1, description="Id of the floor plan the panorama was taken in.")
     heading_deg: Annotated[float, Finite] | None = Field(
-        None, ge=-360, le=360, description=f"The {HEADING_MEANING}; left out: unknown, searched over."
+        None,
+        ge=-360,
+        le=360,
+        description=f"The {HEADING_MEANING}; left out: what the panorama's metadata say (`GPano:PoseHeadingDegrees`), "
+        "where the plan has `north_deg`, else unknown and searched over.",
     )
     heading_tolerance_deg: Annotated[float, Finite] = Field(
         0,
@@ -139,7 +165,7 @@ class LocaliseForm(BaseModel):
     refine: Literal["none", "vdr", "lpo"] = Field(
         "lpo", description="How far to refine: nearest grid pose, denser poses around it, or optimised pose."
     )
-    top_k: int = Field(5, ge=1, le=10, description="How many distinct candidates to return.")
+    top_k: int = Field(5, ge=1, le=100, description="How many distinct candidates to return, up to `max_top_k`.")
 
     @field_validator("heading_deg", "heading_tolerance_deg", "camera_height_m", "top_k", mode="before")
     @classmethod
@@ -200,6 +226,7 @@ class LocaliseAnswer(Answer):
     """Where the panorama was taken."""
 
     floorplan_id: str
+    floorplan_revision: str = Field(description="The plan's revision that was searched.")
     position: Position
     heading_deg: float = Field(ge=0, lt=360, description=f"The {HEADING_MEANING}.")
     room: str
@@ -208,6 +235,9 @@ class LocaliseAnswer(Answer):
         le=1,
         description="Probability that the position is right within 1 m, as fitted for this `stage`, and for a heading "
         "given exactly or searched; null for a model without it.",
+    )
+    heading_source: Literal["given", "panorama", "searched"] = Field(
+        description="Where the heading came from: the request, the panorama's metadata, or the search."
     )
     stage: Literal["retrieval", "vdr", "lpo"] = Field(description="The last stage that produced the position.")
     covariance_m2: Covariance | None = Field(
@@ -226,6 +256,31 @@ class LocaliseAnswer(Answer):
     model: ModelAnswer
 
 
+class LimitsAnswer(Answer):
+    """What requests may be; each is the setting of the same name, and named by the error about it."""
+
+    max_plan_bytes: int = Field(description="Upload of a floor plan.")
+    max_floorplans: int = Field(description="Stored floor plans.")
+    max_rooms: int = Field(description="Rooms per floor plan.")
+    max_vertices: int = Field(description="Vertices per room.")
+    max_plan_vertices: int = Field(description="Vertices of all rooms of a floor plan.")
+    max_extent_m: float = Field(description="Width or height of a floor plan.")
+    max_area_m2: float = Field(description="Floor area of all rooms of a floor plan.")
+    max_grid_poses: int = Field(description="Poses that a plan's latent grid may have.")
+    max_panorama_bytes: int = Field(description="Upload of a panorama.")
+    max_pixels: int = Field(description="Pixels of a panorama.")
+    max_top_k: int = Field(description="Candidates of an answer.")
+    max_pending_requests: int = Field(description="Uploads and queries in flight.")
+    max_queries: int = Field(description="Queries in work; more get a 503 at once.")
+    max_reads: int = Field(description="Requests in work that change nothing; more get a 503 at once.")
+    max_streams: int = Field(description="Clients that follow events; more get a 503 at once.")
+    max_revisions: int = Field(description="Kept revisions of a floor plan.")
+    upload_deadline_s: float = Field(description="Longest an upload may take.")
+    upload_idle_s: float = Field(description="Longest wait for the next bytes of an upload.")
+    upload_bytes_per_s: float = Field(description="Slowest an upload may be, once it is `upload_idle_s` behind.")
+    request_deadline_s: float = Field(description="Longest a query may take once it is uploaded.")
+
+
 class HealthAnswer(Answer):
     """The process is alive."""
 
@@ -233,7 +288,7 @@ class HealthAnswer(Answer):
 
 
 class PoolAnswer(Answer):
-    """State of the LPO worker pool."""
+    """State of a pool of worker processes."""
 
     workers: int = Field(description="Worker processes wanted.")
     ready: int = Field(description="Worker processes that are warm now.")
@@ -247,6 +302,7 @@ class ReadyAnswer(Answer):
     ready: bool
     model: ModelAnswer
     lpo_pool: PoolAnswer
+    decode_pool: PoolAnswer
     plans_preparing: int = Field(description="Latent grids being computed or waiting for it.")
 
 

@@ -13,6 +13,7 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.floorplan import PlanLimits
 from lalaloc_core.localise.images import PanoramaLimits
+from service.cores import CoreShares, share_cores, usable_cores
 
 PREFIX = "LALALOC_"
 _DEFAULT_BUNDLE = Path(__file__).resolve().parent.parent / "models" / "default"
@@ -31,40 +32,166 @@ class Settings(BaseSettings):
     model_config = SettingsConfigDict(env_prefix=PREFIX, env_ignore_empty=True, frozen=True, extra="forbid")
 
     data_dir: Path = Field(default=Path("data"), description="Folder of the database; created when missing.")
-    database_url: str | None = Field(default=None, description="SQLAlchemy URL; by default SQLite in the data folder.")
+    database_url: str | None = Field(
+        default=None,
+        description="`postgresql://user:password@host/name` or `sqlite:///file`; by default SQLite in the data folder.",
+    )
+    database_connections: Annotated[int, Field(ge=1, le=1000)] = Field(
+        default=8, description="Connections to the database that are open at a time."
+    )
+    database_wait_s: Seconds = Field(
+        default=2.0, description="Longest wait for a connection to the database; then the answer is a 503."
+    )
     bundle: Path = Field(default=_DEFAULT_BUNDLE, description="Folder of the model bundle.")
     log_level: str = Field(
         default="info", pattern="^(debug|info|warning|error)$", description="Least level that is logged."
     )
-
-    workers: int = Field(
-        default=1, ge=0, le=64, description="LPO worker processes; 0 turns LPO off, answers end at VDR."
+    otlp_endpoint: str | None = Field(
+        default=None,
+        pattern="^https?://[^/]+",
+        description="Full address of an OpenTelemetry collector, `http://collector:4318/v1/traces`; spans of requests "
+        "and their stages go there. Needs the extra `otel`.",
     )
-    worker_threads: Count = Field(default=1, description="Torch threads of each LPO worker.")
-    onnx_threads: int = Field(default=0, ge=0, description="onnxruntime threads per network, 0 for one per core.")
-    compute_threads: Count = Field(default=2, description="Queries that are computed at the same time.")
+
+    workers: int | None = Field(
+        default=None,
+        ge=0,
+        le=64,
+        description="LPO worker processes; by default six of ten cores that the process may use (affinity and control "
+        "group's quota), at least one. 0 turns LPO off, answers end at VDR.",
+    )
+    worker_threads: int = Field(default=0, ge=0, le=256, description="Torch threads of each LPO worker; 0: one.")
+    onnx_threads: int = Field(default=0, ge=0, le=256, description="onnxruntime threads per network; 0: one.")
+    compute_threads: int = Field(
+        default=0,
+        ge=0,
+        le=256,
+        description="Queries that the service's own process computes at the same time, besides those in LPO; 0: as "
+        "many as the LPO workers leave cores for, at least one.",
+    )
     lpo_queue: Count = Field(default=16, description="LPO jobs that may wait for a worker; more are answered by VDR.")
     lpo_deadline_s: Seconds = Field(default=2.0, description="Longest wait for LPO before the VDR pose is the answer.")
     lpo_stall_s: Seconds = Field(default=10.0, description="An LPO worker busy with one job for longer is restarted.")
 
+    decode_workers: Annotated[int, Field(ge=1, le=64)] = Field(
+        default=1, description="Processes that decode panoramas, one picture at a time each."
+    )
+    decode_queue: Count = Field(default=32, description="Panoramas that may wait to be decoded; more get a 503.")
+    decode_stall_s: Seconds = Field(
+        default=4.0, description="A process busy with one panorama for longer is replaced; after two the query fails."
+    )
+    decode_memory_bytes: Annotated[int, Field(ge=64 * 2**20)] = Field(
+        default=2**30, description="Memory that decoding one panorama may need; enforced on Linux."
+    )
+    compass_tolerance_deg: float = Field(
+        default=20.0,
+        ge=0.0,
+        le=45.0,
+        description="How far off the compass heading in a panorama's metadata may be: it is searched for within that.",
+    )
+
+    api_keys: bool = Field(
+        default=False,
+        description="Every route but health needs an API key; make them with `lalaloc-service keys create`.",
+    )
+    allow_anonymous: bool = Field(
+        default=False,
+        description="Without API keys, answer others than this machine as well: where something else decides who gets "
+        "here.",
+    )
+    key_cache_s: Annotated[float, Field(ge=0.0, le=60.0)] = Field(
+        default=5.0, description="How long an API key is remembered: a revoked one is refused at most that much later."
+    )
+    rate_per_minute: Annotated[int, Field(ge=0, le=10**6)] = Field(
+        default=600,
+        description="Requests per minute of an API key that has no rate of its own, counted by each replica; 0: any "
+        "number.",
+    )
+    rate_burst: Annotated[int, Field(ge=0, le=10**6)] = Field(
+        default=60, description="Of these, most within one second; 0: any number."
+    )
+    refused_keys_per_minute: Annotated[int, Field(ge=1, le=10**6)] = Field(
+        default=60,
+        description="Invalid API keys per minute of a client address, counted by each replica; further ones are not "
+        "looked at, those that work go on working.",
+    )
+
     request_deadline_s: Seconds = Field(default=10.0, description="Longest a query may take once it is uploaded.")
     upload_deadline_s: Seconds = Field(default=60.0, description="Longest an upload may take.")
-    max_pending_requests: Count = Field(default=32, description="Uploads and queries in flight; more get a 503.")
+    upload_idle_s: Seconds = Field(default=10.0, description="Longest wait for the next bytes of an upload.")
+    upload_bytes_per_s: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] = Field(
+        default=8192.0, description="Slowest an upload may be, once it is `upload_idle_s` behind."
+    )
+    max_pending_requests: Count = Field(
+        default=32, description="Uploads and queries in work, from the first byte on; more get a 503 at once."
+    )
+    max_queries: int = Field(
+        default=0,
+        ge=0,
+        description="Queries, of these, that are computed or wait for it; more get a 503 before they are uploaded. "
+        "0: twice as many as LPO workers and compute threads.",
+    )
+    max_reads: Count = Field(default=64, description="Requests in work that change nothing; more get a 503 at once.")
+    max_streams: Count = Field(default=64, description="Clients that follow events; more get a 503 at once.")
+    stream_deadline_s: Seconds = Field(
+        default=900.0, description="Longest that a client follows events before it has to ask anew."
+    )
+    max_connections: Count = Field(default=1024, description="Open connections, idle ones included; more get a 503.")
+    keep_alive_s: Seconds = Field(default=15.0, description="How long a connection may be idle between requests.")
+    head_deadline_s: Seconds = Field(
+        default=10.0, description="Longest that the head of a request, or the rest of a refused body, may take."
+    )
+    stop_deadline_s: Annotated[float, Field(ge=1.0, le=3600.0)] = Field(
+        default=20.0, description="Longest that stopping may take: what is in work is finished, the rest refused."
+    )
+    stop_notice_s: Annotated[float, Field(ge=0.0, le=3600.0)] = Field(
+        default=0.0, description="How long `/readyz` tells a load balancer that the service stops before it does."
+    )
 
     grid_step_m: float = Field(default=0.5, ge=0.1, le=5.0, description="Distance of the poses of a latent grid.")
     max_grid_poses: Count = Field(default=40_000, description="Poses that a plan's latent grid may have.")
+    inline_grid_poses: int = Field(
+        default=1000,
+        ge=0,
+        description="A plan that needs no more grid poses than this is ready when its upload is answered; larger ones "
+        "are prepared in the background.",
+    )
+    grid_lease_s: Annotated[float, Field(ge=0.1, le=3600.0, allow_inf_nan=False)] = Field(
+        default=15.0,
+        description="A replica that is silent for longer loses the latent grid that it computes to another.",
+    )
+    sweep_s: Annotated[float, Field(ge=0.1, le=3600.0, allow_inf_nan=False)] = Field(
+        default=5.0,
+        description="How often plans that are gone are dropped from memory, and grids that nobody computes taken up.",
+    )
+    plan_cache_bytes: int = Field(
+        default=64 * 2**20, ge=0, description="Floor plans kept in memory, to localise while the database is away."
+    )
+    plan_cache_age_s: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] = Field(
+        default=600.0, description="How long a plan in memory is trusted while the database is away."
+    )
     grid_cache_bytes: int = Field(default=256 * 2**20, ge=0, description="Latent grids kept in memory.")
     max_grids_per_plan: Annotated[int, Field(ge=2)] = Field(
         default=8, description="Stored latent grids (camera heights) per plan; the oldest on-demand one makes room."
     )
 
+    max_revisions: Annotated[int, Field(ge=2)] = Field(
+        default=10, description="Revisions kept per floor plan; the oldest makes room."
+    )
     max_floorplans: Count = Field(default=10_000, description="Stored floor plans.")
     max_plan_bytes: Count = Field(default=2 * 2**20, description="Upload of a floor plan.")
     max_rooms: Count = Field(default=500, description="Rooms per floor plan.")
     max_vertices: Annotated[int, Field(ge=3)] = Field(default=200, description="Vertices per room.")
+    max_plan_vertices: Annotated[int, Field(ge=3)] = Field(
+        default=10_000, description="Vertices of all rooms of a floor plan."
+    )
     max_extent_m: Metres = Field(default=500.0, description="Width or height of a floor plan.")
+    max_area_m2: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] = Field(
+        default=20_000.0, description="Floor area of all rooms of a floor plan."
+    )
     max_panorama_bytes: Count = Field(default=40 * 2**20, description="Upload of a panorama.")
     max_pixels: Count = Field(default=100_000_000, description="Pixels of a panorama.")
+    max_top_k: Annotated[int, Field(ge=1, le=100)] = Field(default=10, description="Candidates of an answer.")
 
     @classmethod
     def load(cls) -> Self:
@@ -83,6 +210,22 @@ class Settings(BaseSettings):
             raise ConfigError("; ".join(_describe(fault) for fault in error.errors())) from error
 
     @property
+    def cores(self) -> CoreShares:
+        """How the cores are shared out, with what is left open filled in."""
+        return share_cores(
+            usable_cores(),
+            workers=self.workers,
+            worker_threads=self.worker_threads,
+            compute_threads=self.compute_threads,
+            onnx_threads=self.onnx_threads,
+        )
+
+    @property
+    def query_limit(self) -> int:
+        """Queries that may be computed or wait for it."""
+        return self.max_queries or 2 * (self.cores.workers + self.cores.compute_threads)
+
+    @property
     def resolved_database_url(self) -> str:
         """The SQLAlchemy URL in use."""
         return self.database_url or f"sqlite:///{(self.data_dir / 'lalaloc.sqlite3').resolve()}"
@@ -91,7 +234,11 @@ class Settings(BaseSettings):
     def plan_limits(self) -> PlanLimits:
         """Limits of floor plans in the terms of the core."""
         return PlanLimits(
-            max_rooms=self.max_rooms, max_vertices_per_room=self.max_vertices, max_extent_m=self.max_extent_m
+            max_rooms=self.max_rooms,
+            max_vertices_per_room=self.max_vertices,
+            max_plan_vertices=self.max_plan_vertices,
+            max_extent_m=self.max_extent_m,
+            max_area_m2=self.max_area_m2,
         )
 
     @property

@@ -44,23 +44,42 @@ LAYERS = {
     "lalaloc_core.reproduce": 10,
     "lalaloc_core.bench": 10,
     "lalaloc_core.cli": 11,
+    "service.cores": 20,
+    # Below everything: it may import nothing of the rest.
+    "lalaloc_client": 0,
     "service.settings": 20,
     "service.errors": 20,
     "service.schemas": 20,
     "service.telemetry": 20,
+    "service.headers": 20,
     "service.uploads": 20,
     "service.preview": 20,
+    "service.worker_process": 20,
+    "service.workers": 21,
+    "service.admission": 21,
     "service.lpo_worker": 21,
-    "service.store": 21,
-    "service.grids": 21,
+    "service.decode_worker": 21,
+    "service.decoding": 22,
+    "service.heading": 21,
+    "service.lru": 20,
+    "service.storage": 21,
+    "service.grids": 22,
     "service.refinement": 21,
     "service.problems": 21,
-    "service.localiser": 22,
-    "service.runtime": 22,
-    "service.routes": 23,
-    "service.app": 24,
-    "service.openapi": 24,
-    "service.__main__": 24,
+    "service.security": 22,
+    "service.conditional": 21,
+    "service.cursors": 22,
+    "service.idempotency": 22,
+    "service.plan_answers": 23,
+    "service.events": 23,
+    "service.localiser": 23,
+    "service.runtime": 23,
+    "service.routes": 24,
+    "service.app": 25,
+    "service.server": 25,
+    "service.openapi": 25,
+    "service.cli": 25,
+    "service.__main__": 25,
 }
 # Importing these loads torch; importing anything else must not.
 TORCH_ROOMS = (
@@ -78,8 +97,11 @@ TORCH_ROOMS = (
 )
 
 
+OURS = ("lalaloc_core", "service", "lalaloc_client")
+
+
 def _modules() -> dict[str, Path]:
-    files = [path for package in ("lalaloc_core", "service") for path in sorted((ROOT / package).rglob("*.py"))]
+    files = [path for package in OURS for path in sorted((ROOT / package).rglob("*.py"))]
     return {".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path for path in files}
 
 
@@ -144,7 +166,7 @@ def test_every_module_imports_only_from_lower_layers_or_its_own_folder(module: s
     layer = _layer(module)
     assert layer is not None, f"{module} has no layer yet, add it to LAYERS"
     for target in sorted(_imported(module, ast.walk(_tree(module)))):
-        if target.split(".")[0] not in {"lalaloc_core", "service"} or target in {"lalaloc_core", "service"}:
+        if target.split(".")[0] not in OURS or target in {"lalaloc_core", "service"}:
             continue
         target_layer = _layer(target)
         assert target_layer is not None, f"{module} imports {target}, which has no layer"
@@ -164,6 +186,13 @@ def test_no_module_outside_the_torch_rooms_imports_torch_when_it_is_imported(mod
 def test_every_torch_room_is_one() -> None:
     lazy = [room for room in TORCH_ROOMS if not any(_reaches_torch(m, set()) for m in MODULES if m.startswith(room))]
     assert lazy == [], "these could be opened to the numpy side"
+
+
+def test_the_client_needs_nothing_but_httpx() -> None:
+    modules = [name for name in MODULES if name.split(".")[0] == "lalaloc_client"]
+    loaded = {name for module in modules for name in _imported(module, _at_import_time(_tree(module)))}
+    tops = {name.split(".")[0] for name in loaded} - sys.stdlib_module_names
+    assert tops == {"httpx", "lalaloc_client"}
 
 
 @pytest.mark.parametrize("package", ["lalaloc_core", "service"])

@@ -1,309 +1,261 @@
-"""Floor plans: upload, list, look at, delete."""
+"""Floor plans: upload, list, look at, replace, delete."""
 
 from __future__ import annotations
 
 import asyncio
-import re
-import uuid
-from contextlib import suppress
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Depends, Query, Request, Response, status
-from pydantic import Field
+from fastapi import APIRouter, Query, Request, Response, status
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.sampling import grid_size
+from service.conditional import conditional_answer, expected_revision
+from service.cursors import cursor_text, parse_cursor
 from service.errors import (
+    IdempotencyInProgressError,
+    IdempotencyKeyReusedError,
     InvalidRequestError,
     MalformedRequestError,
-    OverloadedError,
     PlanTooLargeError,
-    StoppingError,
+    RevisionMismatchError,
+    StoreUnavailableError,
     TooManyFloorPlansError,
     UnknownFloorPlanError,
+    UnknownRevisionError,
     UnsupportedMediaError,
     UploadTimeoutError,
     UploadTooLargeError,
 )
-from service.grids import GridState
-from service.preview.mesh import plan_glb
-from service.preview.svg import Marker, plan_svg
+from service.idempotency import Once
+from service.plan_answers import list_entries, plan_representation
 from service.problems import problem_responses
-from service.runtime import Runtime, runtime_of
-from service.schemas import (
-    BoundsAnswer,
-    FloorPlanAnswer,
-    FloorPlanDocument,
-    FloorPlanList,
-    FloorPlanSummary,
-    GridAnswer,
-    RoomAnswer,
+from service.routes.requested import (
+    IDEMPOTENCY_KEY,
+    IF_NONE_MATCH,
+    NOT_MODIFIED,
+    Running,
+    Tenant,
+    header,
+    is_id,
+    stored_plan,
 )
-from service.store import PlanRecord, PlanSummary
-from service.uploads import JSON, MULTIPART, UploadLimits, media_type, read_body, read_parts
+from service.runtime import Runtime
+from service.schemas import FloorPlanAnswer, FloorPlanDocument, FloorPlanList
+from service.storage.records import ComputedGrid, Cursor, PlanRecord
+from service.telemetry import note
+from service.uploads import JSON, MULTIPART, Parts, UploadLimits, media_type, read_body, read_parts
 
 router = APIRouter(prefix="/floorplans", tags=["floor plans"])
-Running = Annotated[Runtime, Depends(runtime_of)]
 
-# Three rounded numbers may be a covariance by so much less.
-_ROUNDED = 1e-3
-_ID = re.compile(r"[0-9a-f]{32}")
+_FILE = "file"
+_MOST_LISTED = 500
+_NO_CONTROLS = r"^[^\x00-\x1f\x7f]*$"
 _DOCUMENT: dict[str, Any] = {"$ref": "#/components/schemas/FloorPlanDocument"}
-_UPLOAD = {
-    "requestBody": {
-        "required": True,
-        "content": {
-            JSON: {"schema": _DOCUMENT},
-            MULTIPART: {
-                "schema": {
-                    "type": "object",
-                    "required": ["file"],
-                    "properties": {
-                        "file": {
-                            "type": "string",
-                            "format": "binary",
-                            "description": f"The same JSON ({FloorPlanDocument.__name__}) as a file.",
-                        }
-                    },
+_BODY = {
+    "required": True,
+    "content": {
+        JSON: {"schema": _DOCUMENT},
+        MULTIPART: {
+            "schema": {
+                "type": "object",
+                "required": [_FILE],
+                "properties": {
+                    _FILE: {
+                        "type": "string",
+                        "format": "binary",
+                        "description": f"The same JSON ({FloorPlanDocument.__name__}) as a file.",
+                    }
                 },
             },
         },
-    }
+    },
 }
+_UNLESS_CHANGED = [
+    header("If-Match", "Entity tags of the revision that the plan must still have, or `*`; 412 when it has another."),
+    header("If-None-Match", "Entity tags of revisions that the plan must not have; 412 when it has one of them."),
+]
+_REFUSED_UPLOADS = (
+    InvalidFloorPlanError,
+    InvalidRequestError,
+    PlanTooLargeError,
+    MalformedRequestError,
+    UnsupportedMediaError,
+    UploadTooLargeError,
+    UploadTimeoutError,
+    StoreUnavailableError,
+)
 
 
 @router.post(
     "",
     status_code=status.HTTP_201_CREATED,
     summary="Upload a floor plan",
-    openapi_extra=_UPLOAD,
+    response_model=FloorPlanAnswer,
+    openapi_extra={"requestBody": _BODY, "parameters": [IDEMPOTENCY_KEY]},
     responses=problem_responses(
-        InvalidFloorPlanError,
-        InvalidRequestError,
-        PlanTooLargeError,
-        MalformedRequestError,
-        UnsupportedMediaError,
-        UploadTooLargeError,
-        UploadTimeoutError,
-        TooManyFloorPlansError,
-        OverloadedError,
+        *_REFUSED_UPLOADS, TooManyFloorPlansError, IdempotencyKeyReusedError, IdempotencyInProgressError
     ),
 )
-async def create_floorplan(request: Request, response: Response, runtime: Running) -> FloorPlanAnswer:
-    """Store a floor plan; its latent grid is computed in the background (see `status` and `progress`)."""
-    with runtime.slots.one():
-        content = await _uploaded_plan(request, runtime)
-        record = await asyncio.to_thread(_store, content, runtime)
-    response.headers["Location"] = str(request.app.url_path_for("get_floorplan", floorplan_id=record.id))
-    return await asyncio.to_thread(_answer, record, runtime)
+async def create_floorplan(request: Request, runtime: Running, tenant: Tenant) -> Response:
+    """Store a floor plan.
+
+    A small one is `ready` with the answer; the latent grid of a larger one is computed in the background (see `status`
+    and `progress`, and `/events`).
+    """
+    once = Once(runtime.store.idempotency, request, tenant, "POST /floorplans")
+    content = await _uploaded_plan(request, runtime)
+
+    def store(token: str) -> Response:
+        plan, grid = _prepared(content, runtime)
+        limit = runtime.settings.max_floorplans
+        record = runtime.store.plans.add(tenant, token, plan, original=content, limit=limit, grid=grid)
+        # A plan that was stored before may have been replaced since, and then has another grid.
+        runtime.grids.follow_up(record, grid if record.plan is plan else None)
+        return _written(request, record, runtime, status.HTTP_201_CREATED)
+
+    # One call from the claim to the answer: a client that hangs up meanwhile does not leave it half-way.
+    return await asyncio.to_thread(once.run, Parts({}, {_FILE: content}), store)
 
 
-@router.get("", summary="List floor plans", responses=problem_responses(InvalidRequestError))
+@router.get("", summary="List floor plans", responses=problem_responses(InvalidRequestError, StoreUnavailableError))
 def list_floorplans(
     runtime: Running,
-    offset: Annotated[int, Query(ge=0, le=10**9, description="How many of the newest to skip.")] = 0,
-    limit: Annotated[int, Query(ge=1, le=500, description="How many to return.")] = 100,
+    tenant: Tenant,
+    name: Annotated[
+        str | None,
+        Query(max_length=200, pattern=_NO_CONTROLS, description="Only plans with this in their name, in any case."),
+    ] = None,
+    limit: Annotated[int, Query(ge=1, le=_MOST_LISTED, description="How many to return.")] = 100,
+    cursor: Annotated[str | None, Query(description="The `next_cursor` of the page before.")] = None,
 ) -> FloorPlanList:
-    """Stored floor plans, newest first."""
-    summaries = runtime.store.plans(offset=offset, limit=limit)
-    states = runtime.grids.states(summaries)
-    return FloorPlanList(
-        floorplans=[
-            FloorPlanSummary(
-                id=summary.id,
-                name=summary.name,
-                status=state.status,
-                progress=state.progress,
-                rooms=summary.room_count,
-                area_m2=round(summary.area_m2, 3),
-                created_at=summary.created_at,
-            )
-            for summary, state in zip(summaries, states, strict=True)
-        ],
-        total=runtime.store.plan_count(),
-    )
+    """Stored floor plans, newest first.
+
+    Going from page to page gives every plan once that is there all the while, whatever is uploaded or deleted.
+    """
+    after = None if cursor is None else parse_cursor(cursor)
+    # One more than asked for tells whether there is another page.
+    found = runtime.store.plans.list(tenant, limit=limit + 1, after=after, name=name)
+    page = found[:limit]
+    more = cursor_text(Cursor(page[-1].created_at, page[-1].id)) if len(found) > limit else None
+    return FloorPlanList(floorplans=list_entries(page, runtime.grids), next_cursor=more)
 
 
-@router.get("/{floorplan_id}", summary="A floor plan", responses=problem_responses(UnknownFloorPlanError))
-def get_floorplan(floorplan_id: str, runtime: Running) -> FloorPlanAnswer:
+@router.get(
+    "/{floorplan_id}",
+    summary="A floor plan",
+    response_model=FloorPlanAnswer,
+    openapi_extra={"parameters": [IF_NONE_MATCH]},
+    responses=NOT_MODIFIED
+    | problem_responses(UnknownFloorPlanError, UnknownRevisionError, InvalidRequestError, StoreUnavailableError),
+)
+def get_floorplan(
+    floorplan_id: str,
+    request: Request,
+    runtime: Running,
+    tenant: Tenant,
+    revision: Annotated[str | None, Query(description="An older revision, while it is kept.")] = None,
+) -> Response:
     """A stored floor plan with the status and progress of its latent grid."""
-    return _answer(stored_plan(floorplan_id, runtime), runtime)
+    record = stored_plan(tenant, floorplan_id, runtime.store.plans)
+    superseded = revision is not None and revision != record.revision_id
+    if revision is not None and superseded:
+        record = _at_revision(record, revision, runtime)
+    note(request, plan=record.id, revision=record.revision_id)
+    step_m = runtime.settings.grid_step_m
+    content, etag = plan_representation(record, runtime.grids, step_m, superseded=superseded)
+    return conditional_answer(request, content, JSON, etag)
+
+
+@router.put(
+    "/{floorplan_id}",
+    summary="Replace a floor plan",
+    response_model=FloorPlanAnswer,
+    openapi_extra={"requestBody": _BODY, "parameters": _UNLESS_CHANGED},
+    responses=problem_responses(*_REFUSED_UPLOADS, UnknownFloorPlanError, RevisionMismatchError),
+)
+async def replace_floorplan(floorplan_id: str, request: Request, runtime: Running, tenant: Tenant) -> Response:
+    """Store a new revision of a plan that there is.
+
+    Queries in work are answered by the revision that they began with, and say which (`floorplan_revision`).
+    """
+    current = await asyncio.to_thread(stored_plan, tenant, floorplan_id, runtime.store.plans)
+    expected = expected_revision(request, current.id, current.revision_id)
+    content = await _uploaded_plan(request, runtime)
+
+    def store() -> Response:
+        plan, grid = _prepared(content, runtime)
+        keep = runtime.settings.max_revisions
+        record = runtime.store.plans.add_revision(
+            tenant, current.id, plan, original=content, keep=keep, expected=expected, grid=grid
+        )
+        runtime.grids.follow_up(record, grid)
+        runtime.known_plans.drop({current.revision_id})
+        return _written(request, record, runtime, status.HTTP_200_OK)
+
+    return await asyncio.to_thread(store)
 
 
 @router.delete(
     "/{floorplan_id}",
     status_code=status.HTTP_204_NO_CONTENT,
     summary="Delete a floor plan",
-    responses=problem_responses(UnknownFloorPlanError),
+    openapi_extra={"parameters": _UNLESS_CHANGED},
+    responses=problem_responses(
+        UnknownFloorPlanError, RevisionMismatchError, InvalidRequestError, StoreUnavailableError
+    ),
 )
-def delete_floorplan(floorplan_id: str, runtime: Running) -> None:
-    """Delete a floor plan, the file it was uploaded as, and its latent grids."""
-    record = stored_plan(floorplan_id, runtime)
-    if not runtime.store.delete_plan(record.id):
+def delete_floorplan(floorplan_id: str, request: Request, runtime: Running, tenant: Tenant) -> None:
+    """Delete a floor plan with all its revisions, the files they were uploaded as, and their latent grids, for good.
+
+    A latent grid that is being computed is not any more.
+    """
+    record = stored_plan(tenant, floorplan_id, runtime.store.plans)
+    note(request, plan=record.id, revision=record.revision_id)
+    expected = expected_revision(request, record.id, record.revision_id)
+    if not runtime.store.plans.delete(tenant, record.id, expected=expected):
         raise UnknownFloorPlanError(floorplan_id)
-    runtime.grids.forget(record.id)
+    runtime.grids.forget({record.revision_id})
+    runtime.known_plans.drop({record.revision_id})
 
 
-@router.get(
-    "/{floorplan_id}/original",
-    summary="The file as it was uploaded",
-    response_class=Response,
-    responses={
-        200: {"content": {JSON: {"schema": _DOCUMENT}}},
-        **problem_responses(UnknownFloorPlanError),
-    },
-)
-def get_original(floorplan_id: str, runtime: Running) -> Response:
-    """The bytes that were uploaded, unchanged."""
-    content = runtime.store.original(stored_plan(floorplan_id, runtime).id)
-    if content is None:
-        raise UnknownFloorPlanError(floorplan_id)
-    return Response(content, media_type=JSON, headers={"X-Content-Type-Options": "nosniff"})
-
-
-@router.get(
-    "/{floorplan_id}/preview.svg",
-    summary="A drawing",
-    response_class=Response,
-    responses={
-        200: {"content": {"image/svg+xml": {"schema": {"type": "string"}}}},
-        **problem_responses(UnknownFloorPlanError, InvalidRequestError),
-    },
-)
-def get_preview(
-    floorplan_id: str,
-    runtime: Running,
-    x_m: Annotated[float | None, Query(allow_inf_nan=False, description="Mark a camera at this x.")] = None,
-    y_m: Annotated[float | None, Query(allow_inf_nan=False, description="Mark a camera at this y.")] = None,
-    heading_deg: Annotated[
-        float | None, Query(ge=-360, le=360, allow_inf_nan=False, description="Heading of the marked camera.")
-    ] = None,
-    covariance_m2: Annotated[
-        list[Annotated[float, Field(allow_inf_nan=False, ge=-1e6, le=1e6)]] | None,
-        Query(
-            min_length=3,
-            max_length=3,
-            description="Covariance of the marked position in m², given three times as xx, xy and yy: the ellipse that "
-            "holds 95 % is drawn.",
-        ),
-    ] = None,
-) -> Response:
-    """The plan with the names of its rooms, optionally with a camera drawn in; one SVG unit is one metre."""
-    if (x_m is None) != (y_m is None):
-        raise InvalidRequestError([("y_m" if y_m is None else "x_m", "is missing; x_m and y_m belong together")])
-    record = stored_plan(floorplan_id, runtime)
-    marker = None
-    if x_m is not None and y_m is not None:
-        marker = Marker(x_m=x_m, y_m=y_m, heading_deg=heading_deg, covariance_m2=_covariance(covariance_m2))
-    return Response(
-        plan_svg(record.plan, marker),
-        media_type="image/svg+xml",
-        # An SVG can carry scripts; ours never does, and must not be talked into it.
-        headers={"Content-Security-Policy": "default-src 'none'", "X-Content-Type-Options": "nosniff"},
-    )
-
-
-@router.get(
-    "/{floorplan_id}/mesh.glb",
-    summary="A mesh",
-    response_class=Response,
-    responses={
-        200: {"content": {"model/gltf-binary": {"schema": {"type": "string", "format": "binary"}}}},
-        **problem_responses(UnknownFloorPlanError),
-    },
-)
-def get_mesh(floorplan_id: str, runtime: Running) -> Response:
-    """Floor, walls and ceiling of every room as binary glTF, in metres and y-up."""
-    return Response(plan_glb(stored_plan(floorplan_id, runtime).plan), media_type="model/gltf-binary")
-
-
-def _covariance(given: list[float] | None) -> tuple[float, float, float] | None:
-    """Three numbers as (xx, xy, yy).
+def _at_revision(current: PlanRecord, revision_id: str, runtime: Runtime) -> PlanRecord:
+    """Another revision of a plan.
 
     Raises:
-        InvalidRequestError: no covariance has these.
+        UnknownRevisionError: it is not kept, or never was.
     """
-    if given is None:
-        return None
-    xx, xy, yy = given
-    if xx < 0.0 or yy < 0.0 or xy * xy > xx * yy * (1.0 + _ROUNDED):
-        raise InvalidRequestError(
-            [("covariance_m2", f"is {xx:g}, {xy:g}, {yy:g}: xx and yy must not be negative, nor xy² above xx·yy")]
-        )
-    return xx, xy, yy
-
-
-def stored_plan(floorplan_id: str, runtime: Runtime) -> PlanRecord:
-    """A stored plan.
-
-    Raises:
-        UnknownFloorPlanError: there is none.
-    """
-    # Ids are made here; whatever looks different need not reach the database.
-    record = runtime.store.plan(floorplan_id) if _ID.fullmatch(floorplan_id) else None
-    if record is None:
-        raise UnknownFloorPlanError(floorplan_id)
-    return record
+    found = None
+    if is_id(revision_id):
+        found = runtime.store.plans.get_revision(current.tenant, current.id, revision_id)
+    if found is None:
+        raise UnknownRevisionError(current.id, revision_id)
+    return found
 
 
 async def _uploaded_plan(request: Request, runtime: Runtime) -> bytes:
-    limits = UploadLimits(runtime.settings.max_plan_bytes, runtime.settings.upload_deadline_s)
+    limits = UploadLimits.of(runtime.settings, "max_plan_bytes")
     if media_type(request, (JSON, MULTIPART)) == JSON:
         content = await read_body(request, limits)
     else:
-        content = (await read_parts(request, limits, files={"file"}, fields=set())).files["file"]
+        content = (await read_parts(request, limits, files={_FILE}, fields=set())).files[_FILE]
     if not content.strip():
         raise InvalidFloorPlanError("the body is empty, a floor plan in JSON is needed")
     return content
 
 
-def _store(content: bytes, runtime: Runtime) -> PlanRecord:
+def _prepared(content: bytes, runtime: Runtime) -> tuple[FloorPlan, ComputedGrid | None]:
+    """An uploaded plan, and its grid if that is computed at once."""
     plan = FloorPlan.from_json(content, runtime.settings.plan_limits)
     runtime.grids.check_size(plan)
-    record = runtime.store.add_plan(uuid.uuid4().hex, plan, original=content, limit=runtime.settings.max_floorplans)
-    # A service that is stopping has the plan stored all the same, and takes its grid up at the next start.
-    with suppress(StoppingError):
-        runtime.grids.compute(runtime.grids.key(record.id, plan.camera_height_m))
-    return record
+    return plan, runtime.grids.prepare(plan)
 
 
-def _answer(record: PlanRecord, runtime: Runtime) -> FloorPlanAnswer:
-    plan = record.plan
-    state: GridState = runtime.grids.states([_summary(record)])[0]
-    x_min, y_min, x_max, y_max = plan.bounds_m
-    step_m = runtime.settings.grid_step_m
-    return FloorPlanAnswer(
-        id=record.id,
-        name=plan.name,
-        status=state.status,
-        progress=state.progress,
-        reason=state.reason,
-        rooms=[
-            RoomAnswer(
-                name=room.name,
-                area_m2=round(room.area_m2, 3),
-                ceiling_height_m=room.ceiling_height_m,
-                vertices=len(room.polygon_m),
-            )
-            for room in plan.rooms
-        ],
-        area_m2=round(plan.area_m2, 3),
-        bounds=BoundsAnswer(x_min_m=x_min, y_min_m=y_min, x_max_m=x_max, y_max_m=y_max),
-        camera_height_m=plan.camera_height_m,
-        grid=GridAnswer(step_m=step_m, poses=grid_size(plan, step_m) if state.poses is None else state.poses),
-        warnings=list(plan.warnings),
-        created_at=record.created_at,
-    )
-
-
-def _summary(record: PlanRecord) -> PlanSummary:
-    return PlanSummary(
-        id=record.id,
-        created_at=record.created_at,
-        name=record.plan.name,
-        room_count=len(record.plan.rooms),
-        area_m2=record.plan.area_m2,
-        camera_height_m=record.plan.camera_height_m,
-        failure=record.failure,
-    )
+def _written(request: Request, record: PlanRecord, runtime: Runtime, code: int) -> Response:
+    note(request, plan=record.id, revision=record.revision_id)
+    content, etag = plan_representation(record, runtime.grids, runtime.settings.grid_step_m)
+    path = str(request.app.url_path_for("get_floorplan", floorplan_id=record.id))
+    # The tag is that of this answer, which is what a GET from there gives, and not of what was uploaded.
+    headers = {"Content-Location": path, "ETag": etag}
+    if code == status.HTTP_201_CREATED:
+        headers["Location"] = path
+    return Response(content, code, headers, JSON)

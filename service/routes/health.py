@@ -9,6 +9,7 @@ from prometheus_client import CONTENT_TYPE_LATEST
 
 from service.runtime import Runtime, runtime_of
 from service.schemas import HealthAnswer, PoolAnswer, ReadyAnswer
+from service.workers import PoolState
 
 router = APIRouter(tags=["operations"])
 
@@ -22,21 +23,26 @@ async def healthz() -> HealthAnswer:
 @router.get(
     "/readyz",
     summary="Can it answer at full quality?",
-    responses={503: {"model": ReadyAnswer, "description": "Not yet: the LPO pool is still warming up."}},
+    responses={
+        503: {
+            "model": ReadyAnswer,
+            "description": "Not yet: LPO or decoding processes are still warming up. Or no longer: the service stops.",
+        }
+    },
 )
 async def readyz(runtime: Annotated[Runtime, Depends(runtime_of)], response: Response) -> ReadyAnswer:
-    """200 once the model and every LPO worker have been warm, 503 before.
+    """200 once the model and every worker have been warm, 503 before, and from when the service is told to stop.
 
-    A worker that is replaced later does not make the service unready: its queries are answered by VDR.
+    A worker that is replaced later does not make the service unready: queries are answered by VDR, or wait.
     """
-    state = runtime.pool.state
     if not runtime.ready:
         response.status_code = status.HTTP_503_SERVICE_UNAVAILABLE
         response.headers["Retry-After"] = "1"
     return ReadyAnswer(
         ready=runtime.ready,
         model=runtime.localiser.model,
-        lpo_pool=PoolAnswer(workers=state.workers, ready=state.ready, warmed_up=state.warmed_up, fault=state.fault),
+        lpo_pool=_pool(runtime.pool.state),
+        decode_pool=_pool(runtime.decoder.state),
         plans_preparing=runtime.grids.pending,
     )
 
@@ -50,3 +56,7 @@ async def readyz(runtime: Annotated[Runtime, Depends(runtime_of)], response: Res
 def metrics(runtime: Annotated[Runtime, Depends(runtime_of)]) -> Response:
     """All metrics in Prometheus' text format."""
     return Response(runtime.telemetry.render(), media_type=CONTENT_TYPE_LATEST)
+
+
+def _pool(state: PoolState) -> PoolAnswer:
+    return PoolAnswer(workers=state.workers, ready=state.ready, warmed_up=state.warmed_up, fault=state.fault)

@@ -3,29 +3,35 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Annotated, Any
+from typing import Any
 
-from fastapi import APIRouter, Depends, Request
+from fastapi import APIRouter, Request, Response
 
 from lalaloc_core.errors import InvalidPanoramaError, InvalidPoseError
+from lalaloc_core.localise.pipeline import StageClock
 from service.errors import (
     DeadlineExceededError,
+    DecoderNotReadyError,
+    IdempotencyInProgressError,
+    IdempotencyKeyReusedError,
     InvalidRequestError,
     MalformedRequestError,
     OverloadedError,
     PlanFailedError,
     PlanNotReadyError,
     StoppingError,
+    StoreUnavailableError,
     UnknownFloorPlanError,
     UnsupportedMediaError,
     UploadTimeoutError,
     UploadTooLargeError,
 )
+from service.idempotency import Once
 from service.problems import problem_responses
-from service.routes.floorplans import stored_plan
-from service.runtime import Runtime, runtime_of
+from service.routes.requested import IDEMPOTENCY_KEY, Running, Tenant, stored_plan
 from service.schemas import LocaliseAnswer, LocaliseForm
-from service.uploads import MULTIPART, UploadLimits, media_type, read_parts, validate_fields
+from service.telemetry import note
+from service.uploads import JSON, MULTIPART, UploadLimits, media_type, read_parts, validate_fields
 
 router = APIRouter(tags=["localisation"])
 
@@ -35,15 +41,18 @@ def _body_schema() -> dict[str, Any]:
     schema["properties"]["panorama"] = {
         "type": "string",
         "format": "binary",
-        "description": "Full 360° equirectangular panorama, twice as wide as high: JPEG, PNG or WebP.",
+        "description": "Equirectangular panorama as JPEG, PNG or WebP: the full 360°, twice as wide as high, or the "
+        "part of it that its photo sphere metadata (GPano in XMP) tell.",
     }
     schema["required"] = [*schema["required"], "panorama"]
-    return {"requestBody": {"required": True, "content": {MULTIPART: {"schema": schema}}}}
+    body = {"required": True, "content": {MULTIPART: {"schema": schema}}}
+    return {"requestBody": body, "parameters": [IDEMPOTENCY_KEY]}
 
 
 @router.post(
     "/localise",
     summary="Localise a panorama",
+    response_model=LocaliseAnswer,
     openapi_extra=_body_schema(),
     responses=problem_responses(
         InvalidPanoramaError,
@@ -57,21 +66,38 @@ def _body_schema() -> dict[str, Any]:
         UploadTooLargeError,
         UploadTimeoutError,
         OverloadedError,
+        StoreUnavailableError,
         StoppingError,
+        DecoderNotReadyError,
         DeadlineExceededError,
+        IdempotencyKeyReusedError,
+        IdempotencyInProgressError,
     ),
 )
-async def localise(request: Request, runtime: Annotated[Runtime, Depends(runtime_of)]) -> LocaliseAnswer:
+async def localise(request: Request, runtime: Running, tenant: Tenant) -> Response:
     """Find where in a stored floor plan a panorama was taken.
 
     A plan that is still preparing is waited for. When optimisation (`lpo`) cannot answer in time, the answer is
     the one before it, with `"stage": "vdr"`.
     """
     settings = runtime.settings
+    once = Once(runtime.store.idempotency, request, tenant, "POST /localise")
     media_type(request, (MULTIPART,))
-    limits = UploadLimits(settings.max_panorama_bytes, settings.upload_deadline_s)
-    with runtime.slots.one():
+    limits = UploadLimits.of(settings, "max_panorama_bytes")
+    clock = StageClock()
+    note(request, clock=clock)
+    with clock.stage("upload"):
         parts = await read_parts(request, limits, files={"panorama"}, fields=set(LocaliseForm.model_fields))
-        form = validate_fields(LocaliseForm, parts.fields)
-        record = await asyncio.to_thread(stored_plan, form.floorplan_id, runtime)
-        return await runtime.localiser.answer(record, form, parts.files["panorama"])
+    form = validate_fields(LocaliseForm, parts.fields)
+    if form.top_k > settings.max_top_k:
+        fault = f"is {form.top_k}, at most {settings.max_top_k} are allowed (max_top_k)"
+        raise InvalidRequestError([("top_k", fault)])
+
+    async def answer() -> Response:
+        record = await asyncio.to_thread(stored_plan, tenant, form.floorplan_id, runtime.known_plans)
+        note(request, plan=record.id, revision=record.revision_id)
+        found = await runtime.localiser.answer(record, form, parts.files["panorama"], clock)
+        note(request, stage=found.stage)
+        return Response(found.model_dump_json(), media_type=JSON)
+
+    return await once.run_async(parts, answer)

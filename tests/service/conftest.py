@@ -8,6 +8,7 @@ import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from functools import cache
 from pathlib import Path
 from time import monotonic, sleep
 from typing import Any
@@ -21,6 +22,7 @@ from PIL import Image
 
 from service.app import create_app
 from service.settings import Settings
+from tests.service.postgres import PostgresServer, postgres_programs, postgres_server
 
 FLAT: dict[str, Any] = {
     "name": "Flat 3",
@@ -32,6 +34,8 @@ FLAT: dict[str, Any] = {
     ],
 }
 
+# From an app's data folder to the address of its database.
+DatabaseOf = Callable[[Path], str]
 StartApp = Callable[..., AbstractContextManager[httpx.Client]]
 
 
@@ -49,11 +53,32 @@ def panorama() -> bytes:
 
 
 @pytest.fixture(scope="session")
-def start_app(tiny_bundle: Path) -> StartApp:
+def postgres() -> Iterator[PostgresServer]:
+    """A PostgreSQL server for the tests."""
+    programs = postgres_programs()
+    if programs is None:
+        pytest.skip("PostgreSQL is not installed; on Debian and Ubuntu the package is postgresql")
+    with postgres_server(programs) as server:
+        yield server
+
+
+@pytest.fixture(scope="session")
+def database_of(request: pytest.FixtureRequest) -> DatabaseOf:
+    """The database that an app started on a data folder uses: SQLite, or PostgreSQL with TEST_DATABASE=postgresql."""
+    if os.environ.get("TEST_DATABASE", "sqlite") == "sqlite":
+        return lambda data_dir: f"sqlite:///{data_dir / 'lalaloc.sqlite3'}"
+    server = request.getfixturevalue("postgres")
+    return cache(lambda _data_dir: server.new_database())
+
+
+@pytest.fixture(scope="session")
+def start_app(tiny_bundle: Path, database_of: DatabaseOf) -> StartApp:
     """Starts the production app in this process; without LPO workers unless asked for."""
 
     @contextmanager
     def start(data_dir: Path, **overrides: Any) -> Iterator[httpx.Client]:
+        if not (url := database_of(data_dir)).startswith("sqlite"):
+            overrides = {"database_url": url} | overrides
         values = {"data_dir": data_dir, "bundle": tiny_bundle, "workers": 0, "onnx_threads": 1, "log_level": "error"}
         app = create_app(Settings(**(values | overrides)))
         with serve(app) as base_url, httpx.Client(base_url=base_url, timeout=30.0) as client:

@@ -44,10 +44,10 @@ BAD_PLANS = {
 def test_a_bad_plan_is_refused_by_what_is_wrong_and_nothing_is_stored(
     client: httpx.Client, plan: Any, message: str
 ) -> None:
-    before = client.get("/floorplans").json()["total"]
+    before = client.get("/floorplans").json()
     response = client.post("/floorplans", content=json.dumps(plan), headers={"content-type": "application/json"})
     assert message in assert_problem(response, 422, "invalid-floorplan")["detail"]
-    assert client.get("/floorplans").json()["total"] == before
+    assert client.get("/floorplans").json() == before
 
 
 @pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity", "1e999"])
@@ -130,17 +130,6 @@ def test_a_deleted_plan_is_gone(client: httpx.Client) -> None:
         assert_problem(client.get(f"/floorplans/{plan_id}{path}"), 404, "unknown-floorplan")
 
 
-def test_the_list_is_newest_first_and_paged(start_app: StartApp, tmp_path: Path) -> None:
-    with start_app(tmp_path) as client:
-        ids = [upload(client, {**FLAT, "name": f"flat {index}"}, wait=False) for index in range(3)]
-        everything = client.get("/floorplans").json()
-        assert [plan["id"] for plan in everything["floorplans"]] == ids[::-1]
-        page = client.get("/floorplans", params={"offset": 1, "limit": 1}).json()
-        assert [plan["id"] for plan in page["floorplans"]] == [ids[1]]
-        assert page["total"] == 3
-        assert_problem(client.get("/floorplans", params={"limit": 0}), 422, "invalid-request")
-
-
 def test_preview_and_mesh_are_served_as_what_they_are(client: httpx.Client) -> None:
     plan_id = upload(client, wait=False)
     drawing = client.get(f"/floorplans/{plan_id}/preview.svg", params={"x_m": 1, "y_m": 2, "heading_deg": 30})
@@ -166,7 +155,7 @@ def test_a_plan_whose_grid_would_be_too_large_is_refused_by_estimate_and_limit(
         detail = assert_problem(client.post("/floorplans", json=FLAT), 422, "floorplan-too-large")["detail"]
         assert "146" in detail
         assert "100" in detail
-        assert client.get("/floorplans").json()["total"] == 0
+        assert client.get("/floorplans").json()["floorplans"] == []
 
 
 def test_an_upload_is_cut_off_at_its_limit_stated_or_streamed(start_app: StartApp, tmp_path: Path) -> None:
@@ -178,7 +167,7 @@ def test_an_upload_is_cut_off_at_its_limit_stated_or_streamed(start_app: StartAp
         assert_problem(streamed, 413, "upload-too-large")
         as_file = client.post("/floorplans", files={"file": ("plan.json", b" " * 2001)})
         assert_problem(as_file, 413, "upload-too-large")
-        assert client.get("/floorplans").json()["total"] == 0
+        assert client.get("/floorplans").json()["floorplans"] == []
 
 
 def test_limits_come_from_the_settings(start_app: StartApp, tmp_path: Path) -> None:

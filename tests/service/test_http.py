@@ -9,10 +9,11 @@ import httpx
 import pytest
 import yaml
 
+from service.admission import EXEMPT
 from service.app import create_app
 from service.openapi import openapi_text
 from service.runtime import Runtime, runtime_of
-from tests.service.conftest import assert_problem, localise, serve, upload
+from tests.service.conftest import assert_problem, localise, serve, upload, wait_for
 
 ROOT = Path(__file__).parents[2]
 
@@ -37,7 +38,8 @@ def test_an_unexpected_error_tells_nothing_but_the_request_id() -> None:
         response = httpx.get(f"{base_url}/floorplans", headers={"x-request-id": "r-1"})
     assert response.status_code == 500
     assert response.headers["content-type"] == "application/problem+json"
-    assert response.json()["request_id"] == "r-1"
+    assert response.json()["request_id"] == response.headers["x-request-id"] == "r-1"
+    assert response.headers["x-content-type-options"] == "nosniff"
     assert "secret" not in response.text
     assert "Traceback" not in response.text
 
@@ -59,10 +61,11 @@ def test_a_sane_request_id_is_kept(client: httpx.Client, given: str, kept: bool)
 
 def test_without_workers_the_service_is_ready_when_it_is_up(client: httpx.Client) -> None:
     assert client.get("/healthz").json() == {"status": "ok"}
+    wait_for(lambda: client.get("/readyz").status_code == 200)
     response = client.get("/readyz")
-    assert response.status_code == 200
     assert response.json()["ready"] is True
     assert response.json()["lpo_pool"]["workers"] == 0
+    assert response.json()["decode_pool"]["workers"] == 1
 
 
 def test_metrics_count_requests_by_route_and_queries_by_stage(client: httpx.Client, panorama: bytes) -> None:
@@ -92,9 +95,75 @@ def test_the_api_description_refers_to_nothing_that_is_missing(client: httpx.Cli
     assert references <= set(client.get("/openapi.json").json()["components"]["schemas"])
 
 
+def test_every_operation_but_health_says_that_it_may_be_refused_for_now(client: httpx.Client) -> None:
+    document = client.get("/openapi.json").json()
+    for path, operations in document["paths"].items():
+        for operation in operations.values():
+            told = {status: response["description"] for status, response in operation["responses"].items()}
+            assert all(f"problem:{slug}" in told.get("503", "") for slug in ("overloaded", "stopping")) == (
+                path not in EXEMPT
+            )
+            assert ("504" in told) == (path not in EXEMPT)
+    assert "HTTPValidationError" not in document["components"]["schemas"]
+
+
 @pytest.mark.parametrize("path", ["/", "/docs", "/web/try.js", "/web/docs.js", "/web/style.css"])
 def test_pages_load_nothing_from_elsewhere(client: httpx.Client, path: str) -> None:
     response = client.get(path)
     assert response.status_code == 200
     assert "default-src 'none'" in response.headers["content-security-policy"]
     assert not re.search(r"https?://|//cdn", response.text)
+
+
+_EVERYWHERE = {
+    "x-content-type-options": "nosniff",
+    "x-frame-options": "DENY",
+    "referrer-policy": "no-referrer",
+    "cross-origin-resource-policy": "same-origin",
+}
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "status"),
+    [
+        ("GET", "/healthz", 200),
+        ("GET", "/metrics", 200),
+        ("GET", "/openapi.json", 200),
+        ("GET", "/floorplans", 200),
+        ("POST", "/floorplans", 415),
+        ("GET", "/floorplans/none", 404),
+        ("GET", "/no/such/route", 404),
+        ("PUT", "/localise", 405),
+    ],
+)
+def test_every_answer_has_security_headers_and_is_not_kept(
+    client: httpx.Client, method: str, path: str, status: int
+) -> None:
+    response = client.request(method, path)
+    assert response.status_code == status
+    assert response.headers.items() >= _EVERYWHERE.items()
+    assert response.headers["content-security-policy"] == "default-src 'none'; frame-ancestors 'none'"
+    assert response.headers["cache-control"] == "no-store"
+    assert "strict-transport-security" not in response.headers
+
+
+@pytest.mark.parametrize("path", ["/", "/docs"])
+def test_pages_may_load_what_they_link_to_and_no_one_may_frame_them(client: httpx.Client, path: str) -> None:
+    response = client.get(path)
+    assert response.headers.items() >= _EVERYWHERE.items()
+    policy = dict(part.strip().split(" ", 1) for part in response.headers["content-security-policy"].split(";"))
+    assert policy["frame-ancestors"] == policy["default-src"] == "'none'"
+    assert policy["connect-src"] == policy["script-src"] == policy["style-src"] == "'self'"
+    # Nothing is inline, so nothing inline has to be allowed.
+    assert not re.search(r"<style|<script>|<script (?!src)|\son\w+=|style=", response.text)
+    for link in re.findall(r'(?:src|href)="(/[^"]*)"', response.text):
+        assert client.get(link).status_code == 200
+    assert response.headers["cache-control"] == "no-cache"
+
+
+@pytest.mark.parametrize(("scheme", "told"), [("https", "max-age=31536000"), ("http", None)])
+def test_browsers_are_told_to_stay_with_https_when_they_came_by_it(
+    client: httpx.Client, scheme: str, told: str | None
+) -> None:
+    response = client.get("/healthz", headers={"x-forwarded-proto": scheme})
+    assert response.headers.get("strict-transport-security") == told

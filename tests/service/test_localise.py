@@ -277,6 +277,8 @@ def test_a_plan_still_preparing_is_waited_for(client: httpx.Client, panorama: by
 
 def test_waiting_ends_at_the_deadline(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
     with start_app(tmp_path, request_deadline_s=0.15) as client:
+        # Else it may be the decoder that is waited for.
+        wait_for(lambda: client.get("/readyz").status_code == 200)
         plan_id = upload(client, HALL, wait=False)
         response = localise(client, plan_id, panorama, refine="none")
         assert "still preparing" in assert_problem(response, 503, "floorplan-not-ready")["detail"]

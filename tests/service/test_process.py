@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import os
+import random
 import signal
 import subprocess
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from time import monotonic, sleep
 
 import httpx
 import pytest
@@ -22,7 +24,8 @@ from tests.service.test_localise import HALL
 ROOT = Path(__file__).parents[2]
 
 
-def _environment(bundle: Path, data_dir: Path, **settings: str) -> dict[str, str]:
+def environment_of(bundle: Path, data_dir: Path, **settings: str) -> dict[str, str]:
+    """Of a service with these settings, and none that happen to be set here."""
     given = {"BUNDLE": str(bundle), "DATA_DIR": str(data_dir), "ONNX_THREADS": "1"} | settings
     clean = {name: value for name, value in os.environ.items() if not name.upper().startswith(PREFIX)}
     return clean | {PREFIX + name: value for name, value in given.items()} | {"PYTHONPATH": str(ROOT)}
@@ -61,7 +64,7 @@ def _answers(client: httpx.Client) -> bool:
         return False
 
 
-def _children(pid: int) -> list[int]:
+def children(pid: int) -> list[int]:
     """Worker processes of a service."""
     listing = subprocess.run(
         ["ps", "-ww", "-eo", "pid=,ppid=,args="], capture_output=True, text=True, check=True
@@ -70,7 +73,8 @@ def _children(pid: int) -> list[int]:
     return [int(row[0]) for row in rows if int(row[1]) == pid and "spawn_main" in row[2]]
 
 
-def _alive(pid: int) -> bool:
+def alive(pid: int) -> bool:
+    """Whether a process runs; one that only waits to be buried does not."""
     listing = subprocess.run(["ps", "-o", "stat=", "-p", str(pid)], capture_output=True, text=True, check=False).stdout
     return bool(listing.strip()) and not listing.strip().startswith("Z")
 
@@ -82,7 +86,7 @@ def _warm(client: httpx.Client) -> bool:
 def test_plans_and_grids_survive_a_restart_and_nothing_is_left_running(
     tiny_bundle: Path, tmp_path: Path, panorama: bytes
 ) -> None:
-    environment = _environment(tiny_bundle, tmp_path / "data", LPO_DEADLINE_S="9")
+    environment = environment_of(tiny_bundle, tmp_path / "data", LPO_DEADLINE_S="9")
     with _uvicorn(environment, tmp_path / "log") as (process, client):
         early = client.get("/readyz")
         assert early.status_code == (200 if early.json()["ready"] else 503)
@@ -92,13 +96,13 @@ def test_plans_and_grids_survive_a_restart_and_nothing_is_left_running(
         assert before["stage"] == "lpo"
         assert before["timings_ms"]["lpo"] > 0.0
         coarse = localise(client, plan_id, panorama, refine="none").json()
-        workers = _children(process.pid)
+        workers = children(process.pid)
         assert workers
         process.send_signal(signal.SIGTERM)
         # Some versions of uvicorn end by the signal itself, once they have shut down in order.
         assert process.wait(20.0) in (0, -signal.SIGTERM)
         assert "Application shutdown complete" in (tmp_path / "log").read_text()
-        assert not any(_alive(worker) for worker in workers)
+        assert not any(alive(worker) for worker in workers)
     with _uvicorn(environment | {"LALALOC_WORKERS": "0"}, tmp_path / "log") as (process, client):
         # Ready at once: the grid was read, not computed.
         assert client.get(f"/floorplans/{plan_id}").json()["status"] == "ready"
@@ -106,39 +110,51 @@ def test_plans_and_grids_survive_a_restart_and_nothing_is_left_running(
         assert localise(client, plan_id, panorama, refine="none").json()["candidates"] == coarse["candidates"]
 
 
-def test_a_killed_worker_costs_no_query_its_answer(tiny_bundle: Path, tmp_path: Path, panorama: bytes) -> None:
-    with _uvicorn(_environment(tiny_bundle, tmp_path / "data"), tmp_path / "log") as (process, client):
-        wait_for(lambda: _warm(client), 120.0)
+def test_workers_killed_at_random_cost_no_query_its_answer(tiny_bundle: Path, tmp_path: Path, panorama: bytes) -> None:
+    rng = random.Random(3)
+    environment = environment_of(tiny_bundle, tmp_path / "data", WORKERS="2", MAX_QUERIES="8")
+    with _uvicorn(environment, tmp_path / "log") as (process, client):
+        wait_for(lambda: client.get("/readyz").status_code == 200, 120.0)
         plan_id = upload(client)
-        with ThreadPoolExecutor(3) as threads:
-            queries = [threads.submit(localise, client, plan_id, panorama, refine="lpo") for _ in range(30)]
-            # Once while it works, and again whenever a new one appears, until all queries are answered.
-            wait_for(lambda: any(query.done() for query in queries))
-            while not all(query.done() for query in queries):
-                for worker in _children(process.pid):
-                    os.kill(worker, signal.SIGKILL)
-            answers = [query.result() for query in queries]
+        end = monotonic() + 10.0
+
+        def ask_until_the_end() -> list[httpx.Response]:
+            answers = []
+            while monotonic() < end:
+                answers.append(localise(client, plan_id, panorama, refine="lpo"))
+            return answers
+
+        with ThreadPoolExecutor(4) as threads:
+            clients = [threads.submit(ask_until_the_end) for _ in range(4)]
+            while monotonic() < end:
+                # Mostly one, now and then all, and at any stage of their lives.
+                workers = children(process.pid)
+                for worker in rng.sample(workers, len(workers) if rng.random() < 0.2 else 1) if workers else []:
+                    with suppress(ProcessLookupError):
+                        os.kill(worker, signal.SIGKILL)
+                sleep(rng.uniform(0.2, 1.5))
+            answers = [answer for asking in clients for answer in asking.result()]
         assert {answer.status_code for answer in answers} == {200}
-        stages = {answer.json()["stage"] for answer in answers}
-        assert stages <= {"lpo", "vdr"}
-        assert "vdr" in stages
+        assert {answer.json()["stage"] for answer in answers} == {"lpo", "vdr"}
         wait_for(lambda: _warm(client), 120.0)
-        assert localise(client, plan_id, panorama).status_code == 200
+        assert localise(client, plan_id, panorama).json()["stage"] == "lpo"
         assert "lalaloc_lpo_restarts_total 0.0" not in client.get("/metrics").text
 
 
 def test_a_killed_service_leaves_no_workers_and_takes_up_what_it_was_preparing(
     tiny_bundle: Path, tmp_path: Path
 ) -> None:
-    environment = _environment(tiny_bundle, tmp_path / "data")
+    environment = environment_of(tiny_bundle, tmp_path / "data")
     with _uvicorn(environment, tmp_path / "log") as (process, client):
         wait_for(lambda: _warm(client), 120.0)
-        workers = _children(process.pid)
+        workers = children(process.pid)
         plan_id = upload(client, HALL, wait=False)
         assert client.get(f"/floorplans/{plan_id}").json()["status"] == "preparing"
+        # Not even one that cannot notice anything by itself outlives the service.
+        os.kill(workers[0], signal.SIGSTOP)
         process.kill()
         process.wait(10.0)
-        wait_for(lambda: not any(_alive(worker) for worker in workers))
+        wait_for(lambda: not any(alive(worker) for worker in workers))
     with _uvicorn(environment | {"LALALOC_WORKERS": "0"}, tmp_path / "log") as (process, client):
         wait_for(lambda: client.get(f"/floorplans/{plan_id}").json()["status"] == "ready")
         # A service that is preparing when it is told to stop does so without finishing first.
@@ -166,7 +182,7 @@ def test_the_service_process_never_loads_torch(tiny_bundle: Path, tmp_path: Path
 def test_a_wrong_setting_stops_the_start_and_is_named(
     tiny_bundle: Path, tmp_path: Path, variable: str, value: str, told: str
 ) -> None:
-    environment = _environment(tiny_bundle, tmp_path) | {variable: value}
+    environment = environment_of(tiny_bundle, tmp_path) | {variable: value}
     command = [sys.executable, "-m", "service", "--port", "0"]
     done = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode != 0
@@ -174,7 +190,7 @@ def test_a_wrong_setting_stops_the_start_and_is_named(
 
 
 def test_the_module_runs_on_a_free_port_and_says_where(tiny_bundle: Path, tmp_path: Path) -> None:
-    environment = _environment(tiny_bundle, tmp_path, WORKERS="0")
+    environment = environment_of(tiny_bundle, tmp_path, WORKERS="0")
     command = [sys.executable, "-m", "service", "--port", "0"]
     process = subprocess.Popen(command, env=environment, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
     try:
@@ -186,3 +202,18 @@ def test_the_module_runs_on_a_free_port_and_says_where(tiny_bundle: Path, tmp_pa
     finally:
         process.terminate()
         process.wait(10.0)
+
+
+def test_every_log_line_from_the_start_on_is_json_and_holds_no_query(tiny_bundle: Path, tmp_path: Path) -> None:
+    environment = environment_of(tiny_bundle, tmp_path / "data", WORKERS="0")
+    with _uvicorn(environment, tmp_path / "log") as (process, client):
+        client.get("/floorplans", params={"name": "very-secret"}, headers={"authorization": "Bearer very-secret"})
+        process.send_signal(signal.SIGINT)
+        process.wait(20.0)
+    text = (tmp_path / "log").read_text()
+    assert "very-secret" not in text
+    # The server says two lines of its own before it starts the application.
+    lines = [json.loads(line) for line in text.splitlines() if "INFO: " not in line]
+    assert all(line.keys() >= {"time", "level", "message", "request_id", "trace_id"} for line in lines)
+    assert [line["route"] for line in lines if line["message"] == "request"][-1] == "/floorplans"
+    assert len(text.splitlines()) - len(lines) <= 2

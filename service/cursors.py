@@ -1,0 +1,37 @@
+"""Places in a listing as callers get them: opaque text, and exactly one for each place."""
+
+from __future__ import annotations
+
+import base64
+import re
+import struct
+from datetime import UTC, datetime, timedelta
+
+from service.errors import InvalidRequestError
+from service.storage.records import Cursor
+
+# Microseconds since 1970 and the 16 bytes of an id: 24 bytes are 32 characters without padding.
+_LAYOUT = struct.Struct(">Q16s")
+_TEXT = re.compile(r"[A-Za-z0-9_-]{32}")
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_MICROSECOND = timedelta(microseconds=1)
+_LAST = (datetime.max.replace(tzinfo=UTC) - _EPOCH) // _MICROSECOND
+
+
+def cursor_text(cursor: Cursor) -> str:
+    """A place as text."""
+    moment = (cursor.created_at - _EPOCH) // _MICROSECOND
+    return base64.urlsafe_b64encode(_LAYOUT.pack(moment, bytes.fromhex(cursor.id))).decode("ascii")
+
+
+def parse_cursor(text: str) -> Cursor:
+    """The place that a text stands for.
+
+    Raises:
+        InvalidRequestError: it is not one that `cursor_text` makes.
+    """
+    if _TEXT.fullmatch(text):
+        moment, plan_id = _LAYOUT.unpack(base64.urlsafe_b64decode(text))
+        if moment <= _LAST:
+            return Cursor(_EPOCH + moment * _MICROSECOND, plan_id.hex())
+    raise InvalidRequestError([("cursor", f"is '{text[:100]}', not the next_cursor of a listing")])

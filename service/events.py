@@ -1,0 +1,157 @@
+"""Server-sent events about plans that are being prepared, also by another replica.
+
+All streams together cost a few queries per look, however many they are, and no thread of their own.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import AsyncGenerator
+from contextlib import suppress
+from contextvars import Context
+from time import monotonic
+
+from starlette.responses import StreamingResponse
+from starlette.types import Receive, Scope, Send
+
+from service.admission import Admission
+from service.errors import StoreUnavailableError
+from service.grids.grids import Grids
+from service.schemas import PlanEvent
+from service.storage.store import Store
+from service.telemetry import LOGGER_NAME
+
+_LOOK_EVERY_S = 0.25
+HEARTBEAT_S = 15.0
+# How long a browser waits before it asks again after a stream has ended.
+_ASK_AGAIN_MS = 3000
+# A reader so slow that even the end of its stream does not get through is left after this.
+_LAST_BYTES_S = 5.0
+_FINAL = frozenset({"ready", "failed", "deleted"})
+
+
+class EventStream(StreamingResponse):
+    """A stream that ends in bounded time, whether or not its client reads."""
+
+    media_type = "text/event-stream"
+
+    def __init__(self, events: AsyncGenerator[bytes], longest_s: float) -> None:
+        # Proxies must pass each event on as it comes.
+        super().__init__(events, headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"})
+        self._events = events
+        self._longest_s = longest_s
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Send it."""
+        try:
+            with suppress(TimeoutError):
+                async with asyncio.timeout(self._longest_s + _LAST_BYTES_S):
+                    await super().__call__(scope, receive, send)
+        finally:
+            await self._events.aclose()
+
+
+class PlanEvents:
+    """Tells followers how far plans are; for one event loop."""
+
+    def __init__(
+        self, store: Store, grids: Grids, admission: Admission, *, longest_s: float, heartbeat_s: float = HEARTBEAT_S
+    ) -> None:
+        """
+        Args:
+            longest_s: how long a stream lasts at most.
+            heartbeat_s: how often something is sent when there is nothing to tell, so that nobody takes it for dead.
+        """
+        self._store = store
+        self._grids = grids
+        self._admission = admission
+        self._longest_s = longest_s
+        self._heartbeat_s = heartbeat_s
+        self._followers: set[_Follower] = set()
+        self._watch: asyncio.Task[None] | None = None
+
+    def answer(self, plan_id: str) -> EventStream:
+        """The stream of a plan that there is."""
+        return EventStream(self.stream(plan_id), self._longest_s)
+
+    async def stream(self, plan_id: str) -> AsyncGenerator[bytes]:
+        """Events as they go over the wire, until the plan is in a final state, time is up, or the service stops."""
+        follower = _Follower(plan_id)
+        self._followers.add(follower)
+        if self._watch is None or self._watch.done():
+            # It outlives the request that it begins with, and must not log as that.
+            self._watch = asyncio.create_task(self._look_after_all(), context=Context())
+        try:
+            yield f"retry: {_ASK_AGAIN_MS}\n\n".encode()
+            until = monotonic() + self._longest_s
+            while (left_s := until - monotonic()) > 0.0 and not self._admission.stopping:
+                try:
+                    async with asyncio.timeout(min(left_s, self._heartbeat_s)):
+                        event = await follower.next()
+                except TimeoutError:
+                    yield b": heartbeat\n\n"
+                    continue
+                if event is None:
+                    return
+                yield _encoded(event)
+                if event.status in _FINAL:
+                    return
+        finally:
+            self._followers.discard(follower)
+
+    async def _look_after_all(self) -> None:
+        while self._followers:
+            asked = list(self._followers)
+            try:
+                found = await asyncio.to_thread(self._look, {follower.plan_id for follower in asked})
+                for follower in asked:
+                    follower.tell(found.get(follower.plan_id, PlanEvent(status="deleted")))
+            except StoreUnavailableError:
+                # Followers go on waiting.
+                pass
+            except Exception:
+                logging.getLogger(LOGGER_NAME).exception("looking after followed plans failed")
+            if self._admission.stopping:
+                for follower in list(self._followers):
+                    follower.tell(None)
+            await asyncio.sleep(_LOOK_EVERY_S)
+
+    def _look(self, plan_ids: set[str]) -> dict[str, PlanEvent]:
+        summaries = self._store.plans.summaries(plan_ids)
+        states = self._grids.states(summaries)
+        return {
+            summary.id: PlanEvent(
+                status=state.status,
+                progress=round(state.progress, 4),
+                revision=summary.revision_id,
+                reason=state.reason,
+            )
+            for summary, state in zip(summaries, states, strict=True)
+        }
+
+
+class _Follower:
+    """One stream; what it was not told yet is overtaken by what comes after."""
+
+    def __init__(self, plan_id: str) -> None:
+        self.plan_id = plan_id
+        self._event: PlanEvent | None = None
+        self._changed = asyncio.Event()
+
+    def tell(self, event: PlanEvent | None) -> None:
+        """Pass on what changed; None ends the stream."""
+        if event is None or event != self._event:
+            self._event = event
+            self._changed.set()
+
+    async def next(self) -> PlanEvent | None:
+        """Wait for the next change."""
+        await self._changed.wait()
+        self._changed.clear()
+        return self._event
+
+
+def _encoded(event: PlanEvent) -> bytes:
+    name = event.status if event.status in _FINAL else "progress"
+    return f"event: {name}\ndata: {event.model_dump_json(exclude_none=True)}\n\n".encode()

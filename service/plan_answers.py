@@ -1,0 +1,86 @@
+"""Stored plans in the words of the API."""
+
+from __future__ import annotations
+
+from lalaloc_core.sampling import grid_size
+from service.conditional import plan_etag
+from service.grids.grids import Grids, GridState
+from service.schemas import BoundsAnswer, FloorPlanAnswer, FloorPlanSummary, GridAnswer, RoomAnswer
+from service.storage.records import PlanRecord, PlanSummary
+
+
+def plan_representation(
+    record: PlanRecord, grids: Grids, step_m: float, *, superseded: bool = False
+) -> tuple[bytes, str]:
+    """A plan as JSON, and the entity tag of that.
+
+    Args:
+        step_m: grid step of the service.
+        superseded: whether the plan has another revision by now.
+    """
+    state = grids.states([_summary(record)])[0]
+    content = _answer(record, state, step_m, superseded=superseded).model_dump_json().encode()
+    return content, plan_etag(record.revision_id, content)
+
+
+def list_entries(summaries: list[PlanSummary], grids: Grids) -> list[FloorPlanSummary]:
+    """Plans as a listing has them."""
+    return [
+        FloorPlanSummary(
+            id=summary.id,
+            revision=summary.revision_id,
+            name=summary.name,
+            status=state.status,
+            progress=state.progress,
+            rooms=summary.room_count,
+            area_m2=round(summary.area_m2, 3),
+            created_at=summary.created_at,
+            updated_at=summary.updated_at,
+        )
+        for summary, state in zip(summaries, grids.states(summaries), strict=True)
+    ]
+
+
+def _answer(record: PlanRecord, state: GridState, step_m: float, *, superseded: bool) -> FloorPlanAnswer:
+    plan = record.plan
+    x_min, y_min, x_max, y_max = plan.bounds_m
+    return FloorPlanAnswer(
+        id=record.id,
+        revision=record.revision_id,
+        revision_number=record.revision,
+        name=plan.name,
+        status="superseded" if superseded else state.status,
+        progress=state.progress,
+        reason=state.reason,
+        rooms=[
+            RoomAnswer(
+                name=room.name,
+                area_m2=round(room.area_m2, 3),
+                ceiling_height_m=room.ceiling_height_m,
+                vertices=len(room.polygon_m),
+            )
+            for room in plan.rooms
+        ],
+        area_m2=round(plan.area_m2, 3),
+        bounds=BoundsAnswer(x_min_m=x_min, y_min_m=y_min, x_max_m=x_max, y_max_m=y_max),
+        camera_height_m=plan.camera_height_m,
+        grid=GridAnswer(step_m=step_m, poses=grid_size(plan, step_m) if state.poses is None else state.poses),
+        warnings=list(plan.warnings),
+        created_at=record.created_at,
+        updated_at=record.updated_at,
+    )
+
+
+def _summary(record: PlanRecord) -> PlanSummary:
+    return PlanSummary(
+        id=record.id,
+        revision_id=record.revision_id,
+        revision=record.revision,
+        created_at=record.created_at,
+        updated_at=record.updated_at,
+        name=record.plan.name,
+        room_count=len(record.plan.rooms),
+        area_m2=record.plan.area_m2,
+        camera_height_m=record.plan.camera_height_m,
+        failure=record.failure,
+    )

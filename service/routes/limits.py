@@ -1,0 +1,21 @@
+"""What requests may be."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Depends
+
+from service.runtime import Runtime, runtime_of
+from service.schemas import LimitsAnswer
+
+router = APIRouter(tags=["operations"])
+
+
+@router.get("/limits", summary="What may requests be?")
+async def limits(runtime: Annotated[Runtime, Depends(runtime_of)]) -> LimitsAnswer:
+    """The limits this service was started with; the error about one names it."""
+    settings = runtime.settings
+    told = {name: getattr(settings, name) for name in LimitsAnswer.model_fields}
+    # As it is in effect: the setting may leave the number to the service.
+    return LimitsAnswer(**told | {"max_queries": settings.query_limit})

@@ -1,0 +1,40 @@
+"""How far a plan is, told as it happens."""
+
+from __future__ import annotations
+
+import asyncio
+
+from fastapi import APIRouter, Request, Response
+from fastapi.responses import StreamingResponse
+
+from service.errors import InvalidRequestError, StoreUnavailableError, UnknownFloorPlanError
+from service.events import EventStream
+from service.problems import problem_responses
+from service.routes.requested import Running, Tenant, stored_plan
+from service.telemetry import note
+
+router = APIRouter(prefix="/floorplans", tags=["floor plans"])
+
+
+@router.get(
+    "/{floorplan_id}/events",
+    summary="Follow a floor plan",
+    response_class=StreamingResponse,
+    responses={
+        200: {
+            "description": "Server-sent events; their data is a PlanEvent.",
+            "content": {EventStream.media_type: {"schema": {"type": "string"}}},
+        },
+        **problem_responses(UnknownFloorPlanError, InvalidRequestError, StoreUnavailableError),
+    },
+)
+async def follow_floorplan(floorplan_id: str, request: Request, runtime: Running, tenant: Tenant) -> Response:
+    """Server-sent events about the plan's latent grid, whichever replica computes it.
+
+    `progress` comes at once and whenever something changed, at most four times a second; `ready`, `failed` or
+    `deleted` is the last one. A comment comes every 15 s when there is nothing to tell. The stream also ends after
+    `stream_deadline_s`, and when the service stops: ask anew.
+    """
+    record = await asyncio.to_thread(stored_plan, tenant, floorplan_id, runtime.store.plans)
+    note(request, plan=record.id, revision=record.revision_id)
+    return runtime.events.answer(record.id)

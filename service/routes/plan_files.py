@@ -1,0 +1,124 @@
+"""What there is of a stored plan to download: the original, a drawing, a mesh."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Request, Response
+from pydantic import Field
+
+from service.conditional import conditional_answer, content_etag
+from service.errors import InvalidRequestError, StoreUnavailableError, UnknownFloorPlanError
+from service.preview.mesh import plan_glb
+from service.preview.svg import Marker, plan_svg
+from service.problems import problem_responses
+from service.routes.requested import IF_NONE_MATCH, NOT_MODIFIED, Running, Tenant, stored_plan
+from service.storage.records import PlanRecord
+from service.telemetry import note
+from service.uploads import JSON
+
+router = APIRouter(prefix="/floorplans", tags=["floor plans"])
+
+_SVG, _GLB = "image/svg+xml", "model/gltf-binary"
+# Three rounded numbers may be a covariance by so much less.
+_ROUNDED = 1e-3
+_PROBLEMS = problem_responses(UnknownFloorPlanError, InvalidRequestError, StoreUnavailableError)
+_CONDITIONAL = {"parameters": [IF_NONE_MATCH]}
+
+
+@router.get(
+    "/{floorplan_id}/original",
+    summary="The file as it was uploaded",
+    response_class=Response,
+    openapi_extra=_CONDITIONAL,
+    responses={
+        200: {"content": {JSON: {"schema": {"$ref": "#/components/schemas/FloorPlanDocument"}}}},
+        **NOT_MODIFIED,
+        **_PROBLEMS,
+    },
+)
+def get_original(floorplan_id: str, request: Request, runtime: Running, tenant: Tenant) -> Response:
+    """The bytes that were uploaded, unchanged; of the current revision."""
+    record = _noted(request, stored_plan(tenant, floorplan_id, runtime.store.plans))
+    content = runtime.store.plans.original(tenant, record.id)
+    if content is None:
+        raise UnknownFloorPlanError(floorplan_id)
+    return conditional_answer(request, content, JSON, content_etag(content))
+
+
+@router.get(
+    "/{floorplan_id}/preview.svg",
+    summary="A drawing",
+    response_class=Response,
+    openapi_extra=_CONDITIONAL,
+    responses={200: {"content": {_SVG: {"schema": {"type": "string"}}}}, **NOT_MODIFIED, **_PROBLEMS},
+)
+def get_preview(
+    floorplan_id: str,
+    request: Request,
+    runtime: Running,
+    tenant: Tenant,
+    x_m: Annotated[float | None, Query(allow_inf_nan=False, description="Mark a camera at this x.")] = None,
+    y_m: Annotated[float | None, Query(allow_inf_nan=False, description="Mark a camera at this y.")] = None,
+    heading_deg: Annotated[
+        float | None, Query(ge=-360, le=360, allow_inf_nan=False, description="Heading of the marked camera.")
+    ] = None,
+    covariance_m2: Annotated[
+        list[Annotated[float, Field(allow_inf_nan=False, ge=-1e6, le=1e6)]] | None,
+        Query(
+            min_length=3,
+            max_length=3,
+            description="Covariance of the marked position in m², given three times as xx, xy and yy: the ellipse that "
+            "holds 95 % is drawn.",
+        ),
+    ] = None,
+) -> Response:
+    """The plan with the names of its rooms, optionally with a camera drawn in; one SVG unit is one metre."""
+    if (x_m is None) != (y_m is None):
+        raise InvalidRequestError([("y_m" if y_m is None else "x_m", "is missing; x_m and y_m belong together")])
+    record = _noted(request, stored_plan(tenant, floorplan_id, runtime.store.plans))
+    marker = None
+    if x_m is not None and y_m is not None:
+        marker = Marker(x_m=x_m, y_m=y_m, heading_deg=heading_deg, covariance_m2=_covariance(covariance_m2))
+    content = plan_svg(record.plan, marker).encode()
+    # An SVG can carry scripts; ours never does, and must not be talked into it.
+    policy = {"Content-Security-Policy": "default-src 'none'"}
+    return conditional_answer(request, content, _SVG, content_etag(content), policy)
+
+
+@router.get(
+    "/{floorplan_id}/mesh.glb",
+    summary="A mesh",
+    response_class=Response,
+    openapi_extra=_CONDITIONAL,
+    responses={
+        200: {"content": {_GLB: {"schema": {"type": "string", "format": "binary"}}}},
+        **NOT_MODIFIED,
+        **_PROBLEMS,
+    },
+)
+def get_mesh(floorplan_id: str, request: Request, runtime: Running, tenant: Tenant) -> Response:
+    """Floor, walls and ceiling of every room as binary glTF, in metres and y-up."""
+    content = plan_glb(_noted(request, stored_plan(tenant, floorplan_id, runtime.store.plans)).plan)
+    return conditional_answer(request, content, _GLB, content_etag(content))
+
+
+def _noted(request: Request, record: PlanRecord) -> PlanRecord:
+    note(request, plan=record.id, revision=record.revision_id)
+    return record
+
+
+def _covariance(given: list[float] | None) -> tuple[float, float, float] | None:
+    """Three numbers as (xx, xy, yy).
+
+    Raises:
+        InvalidRequestError: no covariance has these.
+    """
+    if given is None:
+        return None
+    xx, xy, yy = given
+    if xx < 0.0 or yy < 0.0 or xy * xy > xx * yy * (1.0 + _ROUNDED):
+        raise InvalidRequestError(
+            [("covariance_m2", f"is {xx:g}, {xy:g}, {yy:g}: xx and yy must not be negative, nor xy² above xx·yy")]
+        )
+    return xx, xy, yy

@@ -1,0 +1,58 @@
+"""What routes about plans have in common: the running service, whose plans it is about, and the one in the path."""
+
+from __future__ import annotations
+
+import re
+from typing import Annotated, Any
+
+from fastapi import Depends, Request
+
+from service.errors import UnknownFloorPlanError
+from service.grids.known_plans import KnownPlans
+from service.idempotency import HEADER, MOST_CHARACTERS
+from service.runtime import Runtime, runtime_of
+from service.security.access import caller_of
+from service.storage.plans import Plans
+from service.storage.records import PlanRecord
+
+_ID = re.compile(r"[0-9a-f]{32}")
+
+
+async def _tenant_of(request: Request) -> str:
+    return caller_of(request).tenant
+
+
+Running = Annotated[Runtime, Depends(runtime_of)]
+Tenant = Annotated[str, Depends(_tenant_of)]
+
+
+def stored_plan(tenant: str, floorplan_id: str, plans: Plans | KnownPlans) -> PlanRecord:
+    """A stored plan of a tenant.
+
+    Raises:
+        UnknownFloorPlanError: there is none.
+        StoreUnavailableError: the database is away.
+    """
+    record = plans.get(tenant, floorplan_id) if is_id(floorplan_id) else None
+    if record is None:
+        raise UnknownFloorPlanError(floorplan_id)
+    return record
+
+
+def is_id(text: str) -> bool:
+    """Whether a text looks like an id; they are made here, and whatever looks different need not reach the database."""
+    return _ID.fullmatch(text) is not None
+
+
+def header(name: str, description: str) -> dict[str, Any]:
+    """An optional header of a request in the API description."""
+    return {"name": name, "in": "header", "required": False, "description": description, "schema": {"type": "string"}}
+
+
+IDEMPOTENCY_KEY = header(
+    HEADER,
+    f"1 to {MOST_CHARACTERS} visible ASCII characters. The same key with the same content within 24 hours is the same "
+    "request, and answered alike, with `Idempotency-Replayed: true`.",
+)
+IF_NONE_MATCH = header("If-None-Match", "Entity tags that the caller has, or `*`; with one of them the answer is 304.")
+NOT_MODIFIED: dict[int | str, dict[str, Any]] = {304: {"description": "The caller has this representation."}}

@@ -1,0 +1,184 @@
+"""Server-sent events about plans: progress from whichever replica, one end, bounded in number and time."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from time import monotonic, sleep
+from typing import Any
+
+import httpx
+
+from service.app import create_app
+from service.events import PlanEvents
+from service.settings import Settings
+from tests.service.conftest import FLAT, StartApp, assert_problem, serve, upload, wait_for
+from tests.service.postgres import PostgresServer
+
+HALL = {"ceiling_height_m": 3.0, "rooms": [{"name": "hall", "polygon": [[0, 0], [40, 0], [40, 40], [0, 40]]}]}
+SLOW: dict[str, Any] = {"grid_step_m": 0.1, "max_grid_poses": 10**6}
+Event = tuple[str, dict[str, Any]]
+
+
+def _events(response: httpx.Response) -> Iterator[Event]:
+    """The events of a stream as they come; comments are left out."""
+    name, data = "message", ""
+    for line in response.iter_lines():
+        field, _, value = line.partition(": ")
+        if field == "event":
+            name = value
+        elif field == "data":
+            data = value
+        elif not line and data:
+            yield name, json.loads(data)
+            name, data = "message", ""
+
+
+def _follow(client: httpx.Client, plan_id: str) -> list[Event]:
+    with client.stream("GET", f"/floorplans/{plan_id}/events") as response:
+        assert response.status_code == 200
+        return list(_events(response))
+
+
+def _streams(client: httpx.Client) -> float:
+    lines = client.get("/metrics").text.splitlines()
+    return float(next(line for line in lines if line.startswith("lalaloc_streams ")).split()[1])
+
+
+def test_a_plan_that_is_ready_has_one_event(client: httpx.Client) -> None:
+    plan_id = upload(client)
+    with client.stream("GET", f"/floorplans/{plan_id}/events", headers={"Last-Event-ID": "7"}) as response:
+        assert response.headers["content-type"] == "text/event-stream; charset=utf-8"
+        assert response.headers["cache-control"] == "no-store"
+        assert response.headers["x-accel-buffering"] == "no"
+        events = list(_events(response))
+    revision = client.get(f"/floorplans/{plan_id}").json()["revision"]
+    assert events == [("ready", {"status": "ready", "progress": 1.0, "revision": revision})]
+
+
+def test_progress_is_told_until_the_plan_is_ready(start_app: StartApp, tmp_path: Path) -> None:
+    with start_app(tmp_path, grid_step_m=0.2, max_grid_poses=10**5) as client:
+        plan_id = upload(client, HALL, wait=False)
+        begin = monotonic()
+        events = _follow(client, plan_id)
+        took_s = monotonic() - begin
+        assert [name for name, _ in events] == ["progress"] * (len(events) - 1) + ["ready"]
+        assert len(events) >= 2
+        assert len(events) <= 5.0 * took_s + 2
+        progress = [event["progress"] for _, event in events]
+        assert progress == sorted(progress)
+        assert progress[-1] == 1.0
+        assert all(one != other for one, other in itertools.pairwise(events))
+        assert client.get(f"/floorplans/{plan_id}").json()["status"] == "ready"
+
+
+def test_a_plan_that_fails_says_why(start_app: StartApp, tmp_path: Path) -> None:
+    with start_app(tmp_path) as client:
+        plan_id = upload(client)
+    with start_app(tmp_path, grid_step_m=0.25, max_grid_poses=146) as client:
+        name, event = _follow(client, plan_id)[-1]
+        assert name == event["status"] == "failed"
+        assert "at most 146" in event["reason"]
+
+
+def test_a_plan_that_is_deleted_ends_its_streams(start_app: StartApp, tmp_path: Path) -> None:
+    with start_app(tmp_path, **SLOW) as client:
+        plan_id = upload(client, HALL, wait=False)
+        with client.stream("GET", f"/floorplans/{plan_id}/events") as response:
+            events = _events(response)
+            assert next(events)[0] == "progress"
+            assert client.delete(f"/floorplans/{plan_id}").status_code == 204
+            assert list(events)[-1] == ("deleted", {"status": "deleted"})
+        wait_for(lambda: _streams(client) == 0, 5.0)
+
+
+def test_a_replaced_plan_tells_its_new_revision(start_app: StartApp, tmp_path: Path) -> None:
+    with start_app(tmp_path, **SLOW) as client:
+        plan_id = upload(client, HALL, wait=False)
+        with client.stream("GET", f"/floorplans/{plan_id}/events") as response:
+            events = _events(response)
+            before = next(events)[1]["revision"]
+            after = client.put(f"/floorplans/{plan_id}", json=FLAT | {"name": "small"}).json()["revision"]
+            name, last = list(events)[-1]
+            assert (name, last["revision"]) == ("ready", after)
+            assert before != after
+
+
+def test_there_is_no_stream_about_nothing(client: httpx.Client) -> None:
+    for plan_id in ("0" * 32, "x"):
+        assert_problem(client.get(f"/floorplans/{plan_id}/events"), 404, "unknown-floorplan")
+
+
+def test_streams_are_bounded_in_number_and_a_client_that_goes_frees_its_place(
+    start_app: StartApp, tmp_path: Path
+) -> None:
+    with start_app(tmp_path, max_streams=2, **SLOW) as client:
+        plan_id = upload(client, HALL, wait=False)
+        url = f"/floorplans/{plan_id}/events"
+        with client.stream("GET", url) as first, client.stream("GET", url) as second:
+            # An iterator that is dropped closes its stream.
+            both = [_events(first), _events(second)]
+            assert [next(events)[0] for events in both] == ["progress"] * 2
+            refused = client.get(url)
+            assert_problem(refused, 503, "overloaded")
+            assert int(refused.headers["retry-after"]) >= 1
+            assert client.get(f"/floorplans/{plan_id}").status_code == 200
+        wait_for(lambda: _streams(client) == 0, 5.0)
+        with client.stream("GET", url) as again:
+            assert next(_events(again))[0] == "progress"
+
+
+def test_a_stream_lasts_no_longer_than_it_may(start_app: StartApp, tmp_path: Path) -> None:
+    with start_app(tmp_path, stream_deadline_s=1.0, **SLOW) as client:
+        plan_id = upload(client, HALL, wait=False)
+        begin = monotonic()
+        assert {name for name, _ in _follow(client, plan_id)} == {"progress"}
+        assert 0.9 < monotonic() - begin < 5.0
+
+
+def test_streams_end_when_the_service_stops(tiny_bundle: Path, tmp_path: Path) -> None:
+    settings = Settings(data_dir=tmp_path, bundle=tiny_bundle, workers=0, log_level="error", **SLOW)
+    app = create_app(settings)
+    with serve(app) as base_url, httpx.Client(base_url=base_url, timeout=30.0) as client:
+        plan_id = upload(client, HALL, wait=False)
+        with client.stream("GET", f"/floorplans/{plan_id}/events") as response:
+            events = _events(response)
+            assert next(events)[0] == "progress"
+            begin = monotonic()
+            app.state.admission.stop()
+            assert {name for name, _ in events} <= {"progress"}
+            assert monotonic() - begin < 3.0
+
+
+def test_silence_is_broken_by_comments(tiny_bundle: Path, tmp_path: Path) -> None:
+    settings = Settings(data_dir=tmp_path, bundle=tiny_bundle, workers=0, log_level="error", **SLOW)
+    app = create_app(settings)
+    with serve(app) as base_url, httpx.Client(base_url=base_url, timeout=30.0) as client:
+        plan_id = upload(client, HALL, wait=False)
+        runtime = app.state.runtime
+
+        async def read() -> list[bytes]:
+            events = PlanEvents(runtime.store, runtime.grids, runtime.admission, longest_s=0.5, heartbeat_s=0.05)
+            return [chunk async for chunk in events.stream(plan_id)]
+
+        chunks = asyncio.run(read())
+        assert chunks.count(b": heartbeat\n\n") >= 3
+
+
+def test_what_another_replica_computes_is_followed_here(
+    postgres: PostgresServer, start_app: StartApp, tmp_path: Path
+) -> None:
+    shared = {"database_url": postgres.new_database(), "sweep_s": 0.2, "grid_lease_s": 0.8, **SLOW}
+    with start_app(tmp_path / "a", **shared) as first, start_app(tmp_path / "b", **shared) as second:
+        plan_id = upload(first, HALL, wait=False)
+        wait_for(lambda: first.get(f"/floorplans/{plan_id}").json()["progress"] > 0.0)
+        with second.stream("GET", f"/floorplans/{plan_id}/events") as response:
+            events = _events(response)
+            seen = {next(events)[1]["progress"] for _ in range(3)}
+            assert max(seen) > 0.0
+            sleep(0.1)
+            assert first.delete(f"/floorplans/{plan_id}").status_code == 204
+            assert list(events)[-1][0] == "deleted"

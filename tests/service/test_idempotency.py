@@ -1,0 +1,235 @@
+"""Requests with an `Idempotency-Key`: carried out once, answered alike, whatever is lost on the way."""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lalaloc_core.floorplan import FloorPlan
+from service.idempotency import parts_sha256
+from service.storage.records import Fresh
+from service.storage.store import Store
+from service.uploads import Parts
+from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, upload, wait_for
+
+CONTENT = json.dumps(FLAT).encode()
+
+
+def _keyed(key: str) -> dict[str, str]:
+    return {"Idempotency-Key": key}
+
+
+def _post(client: httpx.Client, key: str, plan: Any = None) -> httpx.Response:
+    return client.post("/floorplans", json=plan or FLAT, headers=_keyed(key))
+
+
+def _query(client: httpx.Client, key: str, plan_id: str, picture: bytes, **fields: str) -> httpx.Response:
+    data = {"floorplan_id": plan_id, "refine": "none"} | fields
+    return client.post("/localise", data=data, files={"panorama": ("p.jpg", picture)}, headers=_keyed(key))
+
+
+def _count(client: httpx.Client) -> int:
+    return len(client.get("/floorplans", params={"limit": 500}).json()["floorplans"])
+
+
+def _same(first: httpx.Response, again: httpx.Response) -> bool:
+    assert "idempotency-replayed" not in first.headers
+    assert again.headers["idempotency-replayed"] == "true"
+    told = ("content-type", "location", "etag")
+    return (first.status_code, first.content, [first.headers.get(name) for name in told]) == (
+        again.status_code,
+        again.content,
+        [again.headers.get(name) for name in told],
+    )
+
+
+@pytest.fixture
+def own(start_app: StartApp, tmp_path: Path) -> Iterator[httpx.Client]:
+    with start_app(tmp_path) as started:
+        yield started
+
+
+def test_the_same_upload_again_is_the_same_plan(own: httpx.Client) -> None:
+    first = _post(own, "a")
+    assert first.status_code == 201
+    assert _same(first, _post(own, "a"))
+    assert _count(own) == 1
+    assert own.get(first.headers["location"]).status_code == 200
+    # Another key, or none, is another upload.
+    assert len({_post(own, "b").json()["id"], upload(own), upload(own)}) == 3
+    assert _count(own) == 4
+
+
+def test_the_answer_is_kept_over_a_restart(start_app: StartApp, tmp_path: Path) -> None:
+    with start_app(tmp_path) as client:
+        first = _post(client, "a")
+    with start_app(tmp_path) as client:
+        assert _same(first, _post(client, "a"))
+
+
+def test_the_same_file_in_another_envelope_is_the_same_upload(own: httpx.Client) -> None:
+    first = own.post("/floorplans", content=CONTENT, headers=_keyed("a") | {"Content-Type": "application/json"})
+    for name in ("flat.json", "again.json"):
+        # Every form has a boundary of its own.
+        assert _same(first, own.post("/floorplans", files={"file": (name, CONTENT)}, headers=_keyed("a")))
+
+
+def test_another_body_under_the_same_key_is_refused(own: httpx.Client) -> None:
+    _post(own, "a")
+    problem = assert_problem(_post(own, "a", {**FLAT, "name": "other"}), 422, "idempotency-key-reused")
+    assert "'a'" in problem["detail"]
+    assert _count(own) == 1
+
+
+@pytest.mark.parametrize("key", ["x" * 255, "!~", '"quoted"'])
+def test_a_key_is_visible_ascii(client: httpx.Client, key: str) -> None:
+    assert _same(_post(client, key), _post(client, key))
+
+
+@pytest.mark.parametrize("key", ["", "x" * 256, "a b", "a\tb", "é"])
+def test_another_key_is_refused_by_its_name(client: httpx.Client, panorama: bytes, key: str) -> None:
+    headers = [(b"Idempotency-Key", key.encode("latin-1"))]
+    form = {"data": {"floorplan_id": "x"}, "files": {"panorama": ("p.jpg", panorama)}}
+    for response in (
+        client.post("/floorplans", json=FLAT, headers=headers),
+        client.post("/localise", headers=headers, **form),
+    ):
+        problem = assert_problem(response, 422, "invalid-request")
+        assert [fault["field"] for fault in problem["errors"]] == ["Idempotency-Key"]
+        assert "1 to 255" in problem["detail"]
+
+
+def test_two_keys_are_none(client: httpx.Client) -> None:
+    headers = [("Idempotency-Key", "a"), ("Idempotency-Key", "b")]
+    assert_problem(client.post("/floorplans", json=FLAT, headers=headers), 422, "invalid-request")
+
+
+def test_the_same_query_again_has_the_same_answer(own: httpx.Client, panorama: bytes) -> None:
+    plan_id = upload(own)
+    first = _query(own, "a", plan_id, panorama)
+    assert first.status_code == 200
+    # Times and all.
+    assert _same(first, _query(own, "a", plan_id, panorama))
+    assert_problem(_query(own, "a", plan_id, panorama, top_k="1"), 422, "idempotency-key-reused")
+    assert_problem(_query(own, "a", plan_id, panorama + b"\0"), 422, "idempotency-key-reused")
+    # The key of a query is none of an upload.
+    assert _post(own, "a").status_code == 201
+
+
+def test_a_refusal_for_good_is_kept_and_one_for_now_is_not(
+    start_app: StartApp, tmp_path: Path, panorama: bytes
+) -> None:
+    with start_app(tmp_path, max_floorplans=1) as client:
+        bad = {"rooms": []}
+        assert _same(_post(client, "bad", bad), _post(client, "bad", bad))
+        # The request id in it is that of the request that was carried out.
+        assert _post(client, "bad", bad).json()["type"] == "urn:lalaloc:problem:invalid-floorplan"
+        never = "0" * 32
+        assert _same(_query(client, "q", never, panorama), _query(client, "q", never, panorama))
+        plan_id = upload(client)
+        assert_problem(_post(client, "full"), 507, "too-many-floorplans")
+        client.delete(f"/floorplans/{plan_id}")
+        assert _post(client, "full").status_code == 201
+
+
+def test_of_many_at_once_one_is_carried_out(own: httpx.Client) -> None:
+    with ThreadPoolExecutor(8) as threads:
+        answers = list(threads.map(lambda _: _post(own, "a"), range(8)))
+    done = [answer for answer in answers if answer.status_code == 201]
+    for refused in answers:
+        if refused not in done:
+            assert_problem(refused, 409, "idempotency-in-progress")
+            assert int(refused.headers["retry-after"]) >= 1
+    assert len({answer.json()["id"] for answer in done}) == 1
+    assert sum("idempotency-replayed" not in answer.headers for answer in done) == 1
+    assert _count(own) == 1
+
+
+def test_what_a_process_that_died_had_stored_is_found_by_the_next(
+    start_app: StartApp, tmp_path: Path, database_of: DatabaseOf
+) -> None:
+    with start_app(tmp_path) as client:
+        store = Store(database_of(tmp_path))
+        # As the one that died left it: the plan is stored, the answer is not.
+        digest = parts_sha256(Parts({}, {"file": CONTENT}))
+        claim = store.idempotency.begin("default", "POST /floorplans", "a", digest, lease_s=1.0)
+        assert isinstance(claim, Fresh)
+        plan_id = claim.token
+        headers = _keyed("a") | {"Content-Type": "application/json"}
+
+        def send() -> httpx.Response:
+            return client.post("/floorplans", content=CONTENT, headers=headers)
+
+        assert_problem(send(), 409, "idempotency-in-progress")
+        store.plans.add("default", plan_id, FloorPlan.from_json(CONTENT), original=CONTENT, limit=10)
+        wait_for(lambda: send().status_code == 201, 10.0)
+        again = send()
+        assert again.json()["id"] == plan_id
+        assert again.headers["idempotency-replayed"] == "true"
+        assert _count(client) == 1
+        store.close()
+
+
+def test_an_upload_whose_client_hangs_up_is_carried_out_once(own: httpx.Client) -> None:
+    head = (
+        "POST /floorplans HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nIdempotency-Key: a\r\n"
+        f"Content-Length: {len(CONTENT)}\r\n\r\n"
+    )
+    address = (own.base_url.host, own.base_url.port or 0)
+    with socket.create_connection(address) as connection:
+        connection.sendall(head.encode() + CONTENT)
+
+    def send() -> httpx.Response:
+        return own.post("/floorplans", content=CONTENT, headers=_keyed("a") | {"Content-Type": "application/json"})
+
+    wait_for(lambda: send().status_code == 201, 10.0)
+    assert send().headers["idempotency-replayed"] == "true"
+    assert _count(own) == 1
+
+
+def test_a_query_whose_client_hangs_up_may_be_sent_again_at_once(
+    start_app: StartApp, tmp_path: Path, panorama: bytes
+) -> None:
+    hall = {"ceiling_height_m": 3.0, "rooms": [{"polygon": [[0, 0], [40, 0], [40, 40], [0, 40]]}]}
+    with start_app(tmp_path, grid_step_m=0.1, max_grid_poses=10**6) as client:
+        plan_id = upload(client, hall, wait=False)
+        # It waits for the plan's grid.
+        query = client.build_request(
+            "POST",
+            "/localise",
+            data={"floorplan_id": plan_id, "refine": "none"},
+            files={"panorama": ("p.jpg", panorama)},
+            headers=_keyed("a"),
+        )
+        body = query.read()
+        head = b"".join(name + b": " + value + b"\r\n" for name, value in query.headers.raw)
+        with socket.create_connection((client.base_url.host, client.base_url.port or 0)) as connection:
+            connection.sendall(b"POST /localise HTTP/1.1\r\n" + head + b"\r\n" + body)
+            wait_for(lambda: "lalaloc_requests_in_flight 1.0" in client.get("/metrics").text)
+        wait_for(lambda: "lalaloc_requests_in_flight 0.0" in client.get("/metrics").text)
+        client.delete(f"/floorplans/{plan_id}")
+        assert_problem(_query(client, "a", plan_id, panorama), 404, "unknown-floorplan")
+
+
+PARTS = st.dictionaries(st.text(max_size=3), st.text(max_size=3), max_size=3)
+FILES = st.dictionaries(st.text(max_size=3), st.binary(max_size=3), max_size=3)
+
+
+@given(PARTS, FILES, PARTS, FILES)
+def test_digests_are_equal_for_equal_parts_only(
+    fields: dict[str, str], files: dict[str, bytes], other_fields: dict[str, str], other_files: dict[str, bytes]
+) -> None:
+    turned = Parts(dict(reversed(fields.items())), dict(reversed(files.items())))
+    digest = parts_sha256(Parts(fields, files))
+    assert parts_sha256(turned) == digest
+    same = (fields, files) == (other_fields, other_files)
+    assert (parts_sha256(Parts(other_fields, other_files)) == digest) == same

@@ -1,0 +1,100 @@
+"""What requests may be is told, set, and named in the refusal."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from service.schemas import LimitsAnswer
+from service.settings import Settings
+from tests.service.conftest import FLAT, StartApp, assert_problem, encode_picture, localise, upload
+
+
+def room(x: float, width: float = 3.0) -> dict[str, Any]:
+    return {"polygon": [[x, 0], [x + width, 0], [x + width, 3], [x, 3]], "ceiling_height_m": 2.5}
+
+
+TWO_ROOMS = {"rooms": [room(0.0), room(4.0)]}
+
+
+def test_every_limit_is_a_setting_and_is_told(client: httpx.Client) -> None:
+    told = client.get("/limits").json()
+    settings = Settings()
+    # Left to the number of cores; this app has no LPO workers.
+    assert told.pop("max_queries") == Settings(workers=0, onnx_threads=1).query_limit > 0
+    assert told == {name: getattr(settings, name) for name in LimitsAnswer.model_fields if name != "max_queries"}
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "plan"),
+    [
+        ("max_rooms", 1, TWO_ROOMS),
+        ("max_vertices", 3, TWO_ROOMS),
+        ("max_plan_vertices", 7, TWO_ROOMS),
+        ("max_extent_m", 6.5, TWO_ROOMS),
+        ("max_area_m2", 17.5, TWO_ROOMS),
+        ("max_grid_poses", 3, TWO_ROOMS),
+        ("max_plan_bytes", 100, TWO_ROOMS),
+    ],
+)
+def test_a_plan_over_a_limit_is_refused_by_its_name(
+    start_app: StartApp, tmp_path: Path, name: str, value: float, plan: dict[str, Any]
+) -> None:
+    with start_app(tmp_path, **{name: value}) as client:
+        assert client.get("/limits").json()[name] == value
+        response = client.post("/floorplans", json=plan)
+        assert 400 <= response.status_code < 500
+        assert f"({name})" in response.json()["detail"]
+        assert f"at most {value:g}" in response.json()["detail"]
+
+
+def test_more_plans_than_allowed_are_refused_by_the_limit_s_name(start_app: StartApp, tmp_path: Path) -> None:
+    with start_app(tmp_path, max_floorplans=1) as client:
+        upload(client)
+        problem = assert_problem(client.post("/floorplans", json=FLAT), 507, "too-many-floorplans")
+        assert "(max_floorplans)" in problem["detail"]
+
+
+def test_a_query_over_a_limit_is_refused_by_its_name(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+    with start_app(tmp_path, max_pixels=100_000, max_top_k=3, max_panorama_bytes=100_000) as client:
+        plan_id = upload(client)
+        assert localise(client, plan_id, encode_picture(256, 128, "JPEG"), top_k=3).status_code == 200
+        refusals = {
+            "max_pixels": localise(client, plan_id, panorama, top_k=3),
+            "max_top_k": localise(client, plan_id, panorama, top_k=4),
+            "max_panorama_bytes": localise(client, plan_id, bytes(100_001), top_k=3),
+        }
+        for name, response in refusals.items():
+            assert 400 <= response.status_code < 500
+            assert f"({name})" in response.json()["detail"], name
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        "[" * 1_000_000,
+        '{"rooms":' * 200_000,
+        '{"ceiling_height_m": 2.5, "rooms": [{"polygon": [' + ",".join(["[0,0]"] * 300_000) + "]}]}",
+        json.dumps({"ceiling_height_m": 2.5, "rooms": [{"polygon": [[0, 0]] * 199}] * 490}),
+    ],
+    ids=["deep lists", "deep objects", "one room of many vertices", "many rooms of many vertices"],
+)
+def test_plans_made_to_keep_the_service_busy_are_refused_quickly(client: httpx.Client, body: str) -> None:
+    response = client.post("/floorplans", content=body, headers={"content-type": "application/json"})
+    assert_problem(response, 422, "invalid-floorplan")
+    assert response.elapsed.total_seconds() < 5.0
+
+
+def test_a_plan_of_a_million_vertices_is_refused_also_where_it_may_be_that_large(
+    start_app: StartApp, tmp_path: Path
+) -> None:
+    body = '{"ceiling_height_m": 2.5, "rooms": [{"polygon": [' + ",".join(["[0,0]"] * 10**6) + "]}]}"
+    with start_app(tmp_path, max_plan_bytes=10**7) as client:
+        response = client.post("/floorplans", content=body, headers={"content-type": "application/json"})
+        problem = assert_problem(response, 422, "invalid-floorplan")
+        assert "1000000 vertices" in problem["detail"]
+        assert response.elapsed.total_seconds() < 10.0

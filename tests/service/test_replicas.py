@@ -1,0 +1,93 @@
+"""Two replicas on one PostgreSQL behind the nginx that docker/ configures: one service to whoever uses it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import socket
+import subprocess
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import httpx
+import pytest
+
+from tests.service.conftest import StartApp, localise, upload, wait_for
+from tests.service.postgres import PostgresServer
+
+CONFIGURATION = Path(__file__).parents[2] / "docker" / "nginx.conf"
+
+
+@contextmanager
+def nginx(folder: Path, replicas: list[httpx.Client]) -> Iterator[httpx.Client]:
+    """Run nginx as configured, but for names and ports."""
+    program = shutil.which("nginx") or shutil.which("nginx", path="/usr/sbin")
+    if program is None:
+        pytest.skip("nginx is not installed; on Debian and Ubuntu the package is nginx-light")
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    text = CONFIGURATION.read_text(encoding="utf-8")
+    for number, replica in enumerate(replicas, start=1):
+        assert text.count(f"replica-{number}:8000") == 1
+        text = text.replace(f"replica-{number}:8000", urlsplit(str(replica.base_url)).netloc)
+    text = text.replace("listen 8080;", f"listen 127.0.0.1:{port};").replace("/tmp/", f"{folder}/")
+    path = folder / "nginx.conf"
+    path.write_text(text, encoding="utf-8")
+    # Started by root it would go on as another user, who may not write here.
+    options = "daemon off; user root;" if os.geteuid() == 0 else "daemon off;"
+    process = subprocess.Popen([program, "-c", str(path), "-g", options])
+    try:
+        with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30.0) as client:
+            wait_for(lambda: _listens(client))
+            yield client
+    finally:
+        process.send_signal(signal.SIGTERM)
+        process.wait(10.0)
+
+
+def _listens(client: httpx.Client) -> bool:
+    try:
+        return client.get("/healthz").status_code == 200
+    except httpx.TransportError:
+        return False
+
+
+def test_two_replicas_behind_the_proxy_are_one_service(
+    start_app: StartApp, postgres: PostgresServer, panorama: bytes, tmp_path: Path
+) -> None:
+    url = postgres.new_database()
+    with ExitStack() as second, start_app(tmp_path / "a", database_url=url) as a:
+        b = second.enter_context(start_app(tmp_path / "b", database_url=url))
+        with nginx(tmp_path, [a, b]) as proxy:
+            plan_id = upload(proxy)
+            # Either replica alone knows what came through the proxy.
+            for replica in (a, b):
+                assert replica.get(f"/floorplans/{plan_id}").json()["status"] == "ready"
+                assert localise(replica, plan_id, panorama, heading_deg=0).status_code == 200
+            answers = [localise(proxy, plan_id, panorama, heading_deg=0) for _ in range(4)]
+            assert {answer.status_code for answer in answers} == {200}
+            assert len({answer.json()["position"]["x_m"] for answer in answers}) == 1
+            named = proxy.get(f"/floorplans/{plan_id}", headers={"X-Request-ID": "mine-1"})
+            assert named.headers["x-request-id"] == "mine-1"
+            assert proxy.get("/metrics").status_code == 404
+            # One replica goes: what it would have answered, the other one does.
+            second.close()
+            answers = [localise(proxy, plan_id, panorama, heading_deg=0) for _ in range(4)]
+            assert {answer.status_code for answer in answers} == {200}
+            assert proxy.delete(f"/floorplans/{plan_id}").status_code == 204
+            assert localise(a, plan_id, panorama, heading_deg=0).status_code == 404
+
+
+def test_the_proxy_lets_through_what_the_service_takes(
+    start_app: StartApp, postgres: PostgresServer, tmp_path: Path
+) -> None:
+    url = postgres.new_database()
+    with start_app(tmp_path / "a", database_url=url) as a, nginx(tmp_path, [a, a]) as proxy:
+        limit = a.get("/limits").json()["max_panorama_bytes"]
+        # The service's own refusal, a problem document, and not the proxy's page.
+        answer = proxy.post("/localise", files={"panorama": ("p.jpg", bytes(limit - 1))})
+        assert answer.status_code == 422, answer.text
+        assert answer.headers["content-type"] == "application/problem+json"

@@ -1,0 +1,372 @@
+"""Plans as resources: pages and names, entity tags and what depends on them, revisions, deletion for good."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from service.cursors import cursor_text, parse_cursor
+from service.errors import InvalidRequestError
+from service.storage.records import Cursor
+from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upload, wait_for
+from tests.service.postgres import PostgresServer
+
+NEVER = "0123456789abcdef" * 2
+# Large enough for its grid to take a while, and not all of a test.
+HALL = {"ceiling_height_m": 3.0, "rooms": [{"name": "hall", "polygon": [[0, 0], [40, 0], [40, 40], [0, 40]]}]}
+
+
+def _hall(step_m: float = 0.25) -> dict[str, Any]:
+    """Settings under which the hall takes a while, and its grid is left to the background."""
+    return {"grid_step_m": step_m, "inline_grid_poses": 100}
+
+
+def _named(name: str) -> dict[str, Any]:
+    return {**FLAT, "name": name}
+
+
+@pytest.fixture(scope="module")
+def listed(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[httpx.Client, list[str]]]:
+    """An app with seven plans, and their ids from old to new."""
+    names = ["Flat 1", "flat 2", "House", "FLAT_3", "100% flat", "Ärger", "house 2"]
+    with start_app(tmp_path_factory.mktemp("data")) as client:
+        yield client, [upload(client, _named(name), wait=False) for name in names]
+
+
+def _pages(client: httpx.Client, **params: Any) -> list[list[str]]:
+    pages, cursor = [], None
+    while True:
+        answer = client.get("/floorplans", params=params | ({} if cursor is None else {"cursor": cursor})).json()
+        pages.append([plan["id"] for plan in answer["floorplans"]])
+        cursor = answer["next_cursor"]
+        if cursor is None:
+            return pages
+
+
+@pytest.mark.parametrize(("limit", "sizes"), [(1, [1] * 7), (3, [3, 3, 1]), (7, [7]), (500, [7])])
+def test_pages_have_every_plan_once_newest_first(
+    listed: tuple[httpx.Client, list[str]], limit: int, sizes: list[int]
+) -> None:
+    client, ids = listed
+    pages = _pages(client, limit=limit)
+    assert [len(page) for page in pages] == sizes
+    assert [plan_id for page in pages for plan_id in page] == ids[::-1]
+
+
+def test_what_comes_and_goes_meanwhile_moves_no_other_plan(start_app: StartApp, tmp_path: Path) -> None:
+    with start_app(tmp_path) as client:
+        ids = [upload(client, wait=False) for _ in range(4)]
+        first = client.get("/floorplans", params={"limit": 2}).json()
+        upload(client, wait=False)
+        # The place is found also when the plan that it stands at is gone.
+        client.delete(f"/floorplans/{ids[2]}")
+        second = client.get("/floorplans", params={"limit": 5, "cursor": first["next_cursor"]}).json()
+        assert [plan["id"] for plan in first["floorplans"]] == [ids[3], ids[2]]
+        assert [plan["id"] for plan in second["floorplans"]] == [ids[1], ids[0]]
+        assert second["next_cursor"] is None
+
+
+@pytest.mark.parametrize(
+    ("name", "found"), [("flat", [4, 3, 1, 0]), ("HOUSE", [6, 2]), ("ärg", [5]), ("%", [4]), ("_", [3]), ("none", [])]
+)
+def test_plans_are_found_by_a_part_of_their_name(
+    listed: tuple[httpx.Client, list[str]], name: str, found: list[int]
+) -> None:
+    client, ids = listed
+    pages = _pages(client, name=name, limit=2)
+    assert [plan_id for page in pages for plan_id in page] == [ids[index] for index in found]
+
+
+@pytest.mark.parametrize(
+    ("params", "field"),
+    [
+        ({"cursor": ""}, "cursor"),
+        ({"cursor": "x"}, "cursor"),
+        ({"cursor": "A" * 33}, "cursor"),
+        ({"cursor": "é" * 32}, "cursor"),
+        # A moment after the last one that there is.
+        ({"cursor": "_" * 32}, "cursor"),
+        ({"limit": 0}, "limit"),
+        ({"limit": 501}, "limit"),
+        ({"name": "a\0b"}, "name"),
+        ({"name": "x" * 201}, "name"),
+    ],
+)
+def test_a_listing_that_makes_no_sense_is_refused_by_the_field(
+    listed: tuple[httpx.Client, list[str]], params: dict[str, Any], field: str
+) -> None:
+    problem = assert_problem(listed[0].get("/floorplans", params=params), 422, "invalid-request")
+    assert [fault["field"] for fault in problem["errors"]] == [field]
+
+
+@given(
+    st.datetimes(datetime(1970, 1, 1), datetime(9999, 12, 31), timezones=st.just(UTC)),
+    st.binary(min_size=16, max_size=16),
+)
+def test_a_cursor_stands_for_one_place(moment: datetime, plan_id: bytes) -> None:
+    place = Cursor(moment, plan_id.hex())
+    assert parse_cursor(cursor_text(place)) == place
+
+
+@given(st.text(alphabet="Aa9_-+/=", min_size=31, max_size=33))
+def test_no_two_texts_are_the_same_cursor(text: str) -> None:
+    with contextlib.suppress(InvalidRequestError):
+        assert cursor_text(parse_cursor(text)) == text
+
+
+# Entity tags
+
+
+REPRESENTATIONS = ["", "/original", "/preview.svg", "/mesh.glb"]
+
+
+@pytest.mark.parametrize("path", REPRESENTATIONS)
+def test_who_has_a_representation_gets_304(client: httpx.Client, path: str) -> None:
+    url = f"/floorplans/{upload(client)}{path}"
+    first = client.get(url)
+    etag = first.headers["etag"]
+    assert etag.startswith('"')
+    assert first.headers["cache-control"] == "private, no-cache"
+    for known in (etag, f'"other", {etag}', f"W/{etag}", "*", f',{etag} ,"x,y"'):
+        again = client.get(url, headers={"If-None-Match": known})
+        assert again.status_code == 304, known
+        assert again.content == b""
+        assert again.headers["etag"] == etag
+        assert again.headers["cache-control"] == "private, no-cache"
+    lines = client.get(url, headers=[("If-None-Match", '"other"'), ("If-None-Match", etag)])
+    assert lines.status_code == 304
+    for other in ('"other"', 'W/"other"', etag.upper().replace("F", "0")[:-1] + '0"'):
+        changed = client.get(url, headers={"If-None-Match": other})
+        assert (changed.status_code, changed.content) == (200, first.content)
+    assert "etag" not in client.get("/floorplans").headers
+
+
+@pytest.mark.parametrize("value", ["", "x", '"', '"a" "b"', "*, *", '"a", b', "W/", 'w/"a"'])
+def test_a_header_that_is_no_list_of_tags_is_refused(client: httpx.Client, value: str) -> None:
+    url = f"/floorplans/{upload(client)}"
+    looked_at = client.get(url, headers={"If-None-Match": value})
+    assert assert_problem(looked_at, 422, "invalid-request")["errors"][0]["field"] == "If-None-Match"
+    deleted = client.delete(url, headers={"If-Match": value})
+    assert assert_problem(deleted, 422, "invalid-request")["errors"][0]["field"] == "If-Match"
+
+
+def test_drawings_of_other_poses_have_other_tags(client: httpx.Client) -> None:
+    url = f"/floorplans/{upload(client)}/preview.svg"
+    tags = {client.get(url, params={"x_m": x, "y_m": 1}).headers["etag"] for x in (1, 2)} | {
+        client.get(url).headers["etag"]
+    }
+    assert len(tags) == 3
+
+
+def test_a_tag_stands_for_the_very_bytes_while_a_plan_is_prepared(start_app: StartApp, tmp_path: Path) -> None:
+    with start_app(tmp_path, **_hall()) as client:
+        created = client.post("/floorplans", json=HALL)
+        url = created.headers["location"]
+        bodies: dict[str, set[bytes]] = {created.headers["etag"]: {created.content}}
+        while (answer := client.get(url)).json()["status"] == "preparing":
+            bodies.setdefault(answer.headers["etag"], set()).add(answer.content)
+        bodies.setdefault(answer.headers["etag"], set()).add(answer.content)
+        assert len(bodies) > 2
+        assert all(len(same) == 1 for same in bodies.values())
+        # Progress is no other revision: any of them may be named by who replaces the plan.
+        replaced = client.put(url, json=HALL, headers={"If-Match": created.headers["etag"]})
+        assert replaced.status_code == 200
+
+
+# Revisions
+
+
+def test_a_replaced_plan_has_another_revision(client: httpx.Client) -> None:
+    created = client.post("/floorplans", json=FLAT)
+    before, url = created.json(), created.headers["location"]
+    response = client.put(url, json=_named("Flat 3, rebuilt"))
+    assert response.status_code == 200
+    after = response.json()
+    assert (before["revision_number"], after["revision_number"]) == (1, 2)
+    assert (after["id"], after["name"], after["created_at"]) == (before["id"], "Flat 3, rebuilt", before["created_at"])
+    assert after["updated_at"] > before["updated_at"]
+    assert after["revision"] != before["revision"]
+    assert response.headers["etag"] != created.headers["etag"]
+    assert response.headers["content-location"] == created.headers["content-location"] == url
+    now = client.get(url)
+    assert (now.json(), now.headers["etag"]) == (after, response.headers["etag"])
+    listed = client.get("/floorplans").json()["floorplans"]
+    assert [plan["revision"] for plan in listed if plan["id"] == before["id"]] == [after["revision"]]
+
+
+def test_an_older_revision_is_told_while_it_is_kept(start_app: StartApp, tmp_path: Path) -> None:
+    with start_app(tmp_path, max_revisions=2) as client:
+        created = client.post("/floorplans", json=FLAT)
+        url, revisions = created.headers["location"], [created.json()["revision"]]
+        revisions += [client.put(url, json=_named(f"Flat {n}")).json()["revision"] for n in (4, 5)]
+        for revision, name, status in ((revisions[1], "Flat 4", "superseded"), (revisions[2], "Flat 5", "ready")):
+            told = client.get(url, params={"revision": revision}).json()
+            assert (told["revision"], told["name"], told["status"]) == (revision, name, status)
+        other = client.post("/floorplans", json=FLAT).json()["revision"]
+        for unknown in (revisions[0], other, NEVER, "x", ""):
+            assert_problem(client.get(url, params={"revision": unknown}), 404, "unknown-revision")
+
+
+def test_answers_name_the_revision_that_was_searched(client: httpx.Client, panorama: bytes) -> None:
+    created = client.post("/floorplans", json=FLAT).json()
+    answers = [localise(client, created["id"], panorama, refine="none").json()]
+    replaced = client.put(f"/floorplans/{created['id']}", json=_named("other")).json()
+    answers.append(localise(client, created["id"], panorama, refine="none").json())
+    assert [answer["floorplan_revision"] for answer in answers] == [created["revision"], replaced["revision"]]
+
+
+def test_queries_in_work_finish_while_their_plan_is_replaced(client: httpx.Client, panorama: bytes) -> None:
+    plan_id = upload(client)
+    url = f"/floorplans/{plan_id}"
+    known, stop = {client.get(url).json()["revision"]}, threading.Event()
+
+    def replace() -> None:
+        while not stop.is_set():
+            known.add(client.put(url, json=FLAT).json()["revision"])
+
+    with ThreadPoolExecutor(4) as threads:
+        replacing = threads.submit(replace)
+        queries = [threads.submit(localise, client, plan_id, panorama, refine="none") for _ in range(12)]
+        answers = [query.result() for query in queries]
+        stop.set()
+        replacing.result()
+    assert [answer.status_code for answer in answers] == [200] * 12
+    assert {answer.json()["floorplan_revision"] for answer in answers} <= known
+    assert len(known) > 2
+
+
+def test_a_plan_that_is_not_there_is_not_made_by_replacing_it(client: httpx.Client) -> None:
+    for plan_id in (NEVER, "x"):
+        assert_problem(client.put(f"/floorplans/{plan_id}", json=FLAT), 404, "unknown-floorplan")
+    plan_id = upload(client)
+    assert client.delete(f"/floorplans/{plan_id}").status_code == 204
+    assert_problem(client.put(f"/floorplans/{plan_id}", json=FLAT), 404, "unknown-floorplan")
+
+
+def test_a_bad_plan_replaces_nothing(client: httpx.Client) -> None:
+    url = f"/floorplans/{upload(client)}"
+    before = client.get(url).json()
+    assert_problem(client.put(url, json={"rooms": []}), 422, "invalid-floorplan")
+    assert_problem(client.put(url, content=b"x", headers={"content-type": "text/plain"}), 415, "unsupported-media")
+    assert client.get(url).json() == before
+
+
+@pytest.mark.parametrize("method", ["PUT", "DELETE"])
+def test_who_expects_another_revision_is_refused(client: httpx.Client, method: str) -> None:
+    body: dict[str, Any] = {"json": FLAT} if method == "PUT" else {}
+    created = client.post("/floorplans", json=FLAT)
+    url, old = created.headers["location"], created.headers["etag"]
+    replaced = client.put(url, json=FLAT, headers={"If-Match": old})
+    new = replaced.headers["etag"]
+    conditions = [
+        {"If-Match": old},
+        {"If-Match": f"W/{new}"},
+        {"If-Match": f'"{NEVER}"'},
+        {"If-None-Match": "*"},
+        {"If-None-Match": new},
+    ]
+    for condition in conditions:
+        problem = assert_problem(client.request(method, url, headers=condition, **body), 412, "revision-mismatch")
+        assert replaced.json()["revision"] in problem["detail"], condition
+    assert client.get(url).headers["etag"] == new
+    met = client.request(method, url, headers={"If-Match": f"{old}, {new}", "If-None-Match": old}, **body)
+    assert met.is_success
+
+
+@pytest.mark.parametrize("condition", ["*", "revision"])
+def test_any_revision_and_the_plain_id_of_the_revision_are_conditions_as_well(
+    client: httpx.Client, condition: str
+) -> None:
+    created = client.post("/floorplans", json=FLAT)
+    value = "*" if condition == "*" else f'"{created.json()["revision"]}"'
+    url, headers = created.headers["location"], {"If-Match": value}
+    assert client.put(url, json=FLAT, headers=headers).status_code == 200
+    assert client.delete(url, headers=headers).status_code == (204 if condition == "*" else 412)
+
+
+def test_of_many_who_replace_the_same_revision_one_does(client: httpx.Client) -> None:
+    created = client.post("/floorplans", json=FLAT)
+    url, headers = created.headers["location"], {"If-Match": created.headers["etag"]}
+    with ThreadPoolExecutor(6) as threads:
+        answers = list(threads.map(lambda n: client.put(url, json=_named(f"{n}"), headers=headers), range(6)))
+    assert sorted(answer.status_code for answer in answers) == [200] + [412] * 5
+    winner = next(answer.json() for answer in answers if answer.status_code == 200)
+    assert client.get(url).json()["name"] == winner["name"]
+    assert client.get(url).json()["revision_number"] == 2
+
+
+# Deletion and jobs
+
+
+def test_a_plan_that_is_deleted_while_it_is_prepared_is_not_any_longer(
+    start_app: StartApp, tmp_path: Path, panorama: bytes
+) -> None:
+    with start_app(tmp_path, **_hall(0.1), max_grid_poses=10**6) as client:
+        plan_id = upload(client, HALL, wait=False)
+        wait_for(lambda: client.get(f"/floorplans/{plan_id}").json()["progress"] > 0.0)
+        with ThreadPoolExecutor(1) as threads:
+            waiting = threads.submit(localise, client, plan_id, panorama)
+            wait_for(lambda: "lalaloc_requests_in_flight 1.0" in client.get("/metrics").text)
+            assert client.delete(f"/floorplans/{plan_id}").status_code == 204
+            assert_problem(waiting.result(), 404, "unknown-floorplan")
+        wait_for(lambda: client.get("/readyz").json()["plans_preparing"] == 0, 10.0)
+        assert_problem(client.get(f"/floorplans/{plan_id}"), 404, "unknown-floorplan")
+
+
+def test_a_plan_that_was_being_prepared_is_taken_up_after_a_restart(start_app: StartApp, tmp_path: Path) -> None:
+    with start_app(tmp_path, **_hall(), grid_lease_s=0.5) as client:
+        plan_id = upload(client, HALL, wait=False)
+        assert client.get(f"/floorplans/{plan_id}").json()["status"] == "preparing"
+    with start_app(tmp_path, **_hall(), sweep_s=0.2) as client:
+        assert client.get(f"/floorplans/{plan_id}").json()["status"] in ("preparing", "ready")
+        wait_for(lambda: client.get(f"/floorplans/{plan_id}").json()["status"] == "ready")
+
+
+def test_queries_are_answered_while_a_large_plan_is_prepared(
+    start_app: StartApp, tmp_path: Path, panorama: bytes
+) -> None:
+    with start_app(tmp_path, **_hall(0.1), max_grid_poses=10**6) as client:
+        small = upload(client)
+        large = upload(client, HALL, wait=False)
+        wait_for(lambda: client.get(f"/floorplans/{large}").json()["progress"] > 0.0)
+        assert localise(client, small, panorama, refine="vdr").status_code == 200
+        assert client.get(f"/floorplans/{large}").json()["status"] == "preparing"
+
+
+@pytest.fixture
+def replicas(postgres: PostgresServer, start_app: StartApp, tmp_path: Path) -> Iterator[list[httpx.Client]]:
+    """Two apps on one PostgreSQL."""
+    shared = {"database_url": postgres.new_database(), "sweep_s": 0.2}
+    with start_app(tmp_path / "a", **shared) as first, start_app(tmp_path / "b", **shared) as second:
+        yield [first, second]
+
+
+def _cached_bytes(client: httpx.Client) -> float:
+    lines = client.get("/metrics").text.splitlines()
+    return float(next(line for line in lines if line.startswith("lalaloc_grid_cache_bytes ")).split()[1])
+
+
+def test_what_one_replica_does_the_other_knows_at_once(replicas: list[httpx.Client], panorama: bytes) -> None:
+    first, second = replicas
+    created = first.post("/floorplans", json=FLAT).json()
+    url = f"/floorplans/{created['id']}"
+    assert localise(second, created["id"], panorama, refine="none").json()["floorplan_revision"] == created["revision"]
+    replaced = second.put(url, json=_named("new")).json()
+    assert first.get(url).json()["name"] == "new"
+    assert localise(first, created["id"], panorama, refine="none").json()["floorplan_revision"] == replaced["revision"]
+    wait_for(lambda: _cached_bytes(first) > 0 and _cached_bytes(second) > 0)
+    assert first.delete(url).status_code == 204
+    assert_problem(second.get(url), 404, "unknown-floorplan")
+    assert_problem(localise(second, created["id"], panorama), 404, "unknown-floorplan")
+    # Neither keeps anything of it in memory.
+    wait_for(lambda: _cached_bytes(first) == _cached_bytes(second) == 0, 10.0)
