@@ -1,1 +1,1 @@
-"""The demo: an example flat, photographs taken in it, and a client of the service."""
+"""The demo: an example flat and photographs taken in it, localised over HTTP."""

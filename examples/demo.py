@@ -8,6 +8,7 @@ exit status is 0 only when every stage ran.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import math
 import os
 import sys
@@ -16,12 +17,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import httpx
-
-from examples.client import LocaliseClient, ServiceRefusedError
 from examples.launch import ROOT, ServiceFailedError, running_service
 from examples.picture import Panel, draw_demo
 from examples.truth import PLAN_PATH, TruePose, read_poses
+from lalaloc_client import Client, ClientError, Localisation
 
 _PLAN_TIMEOUT_S = 120.0
 # A busy machine shall be slow here, not fall back to a coarser stage; and only warnings shall break the table.
@@ -45,7 +44,7 @@ def main() -> int:
     try:
         panels = localise_examples()
         draw_demo(panels, out)
-    except (StageMissingError, ServiceFailedError, ServiceRefusedError, TimeoutError, httpx.HTTPError) as error:
+    except (StageMissingError, ServiceFailedError, ClientError) as error:
         print(f"demo: {error}", file=sys.stderr)
         return 1
     print(f"\nthe picture is {out}: true and found position, other candidates, and the distance of every place")
@@ -56,31 +55,30 @@ def localise_examples() -> list[Panel]:
     """Ask a fresh service for every example panorama; prints a line per answer.
 
     Raises:
-        StageMissingError: the plan did not get ready, or an answer is not a full one.
+        ClientError: the plan did not get ready, or a query was refused.
+        StageMissingError: an answer is not a full one.
     """
     with tempfile.TemporaryDirectory(prefix="lalaloc-demo-") as data:
         given = {name: os.environ[name] for name in _DEFAULTS if name in os.environ}
         environment = _DEFAULTS | given | {"LALALOC_DATA_DIR": data}
         print("starting the service ...", flush=True)
-        with running_service(0, environment) as service, LocaliseClient(service.url) as client:
+        with running_service(0, environment) as service, Client(service.url) as client:
             plan_id = prepare_plan(client)
             print(_HEADER, flush=True)
             return [_localise_one(client, plan_id, truth) for truth in read_poses()]
 
 
-def prepare_plan(client: LocaliseClient) -> str:
+def prepare_plan(client: Client) -> str:
     """Upload the example flat and wait for its latent grid; the plan's id."""
-    plan = client.wait_for_plan(client.upload_plan(PLAN_PATH)["id"], timeout_s=_PLAN_TIMEOUT_S)
-    if plan["status"] != "ready":
-        raise StageMissingError(f"the plan is {plan['status']}: {plan['reason']}")
+    plan = client.wait_until_ready(client.upload_floorplan(PLAN_PATH).id, timeout_s=_PLAN_TIMEOUT_S)
     print(
-        f"plan '{plan['name']}' is ready: {len(plan['rooms'])} rooms, {plan['area_m2']:.1f} m², "
-        f"{plan['grid']['poses']} poses every {plan['grid']['step_m']:g} m\n"
+        f"plan '{plan.name}' is ready: {len(plan.rooms)} rooms, {plan.area_m2:.1f} m², "
+        f"{plan.grid.poses} poses every {plan.grid.step_m:g} m\n"
     )
-    return plan["id"]
+    return plan.id
 
 
-def _localise_one(client: LocaliseClient, plan_id: str, truth: TruePose) -> Panel:
+def _localise_one(client: Client, plan_id: str, truth: TruePose) -> Panel:
     known = client.localise(
         plan_id, truth.picture, heading_deg=truth.heading_deg, camera_height_m=truth.camera_height_m
     )
@@ -91,27 +89,27 @@ def _localise_one(client: LocaliseClient, plan_id: str, truth: TruePose) -> Pane
     return Panel(truth, known, unknown)
 
 
-def check_answer(answer: dict[str, Any]) -> None:
+def check_answer(answer: Localisation) -> None:
     """Make sure that an answer went through every stage and is made of numbers.
 
     Raises:
         StageMissingError: it is not.
     """
-    if answer["stage"] != "lpo":
-        raise StageMissingError(f"the answer ends at stage '{answer['stage']}', not at 'lpo'")
-    if not answer["candidates"]:
+    if answer.stage != "lpo":
+        raise StageMissingError(f"the answer ends at stage '{answer.stage}', not at 'lpo'")
+    if not answer.candidates:
         raise StageMissingError("the answer has no candidates")
-    broken = [path for path, value in _numbers(answer) if not math.isfinite(value)]
+    broken = [path for path, value in _numbers(dataclasses.asdict(answer)) if not math.isfinite(value)]
     if broken:
         raise StageMissingError(f"the answer has numbers that are not finite: {', '.join(broken)}")
 
 
 def _numbers(value: Any, path: str = "answer") -> Iterator[tuple[str, float]]:
-    """Every number in a JSON value with the path to it."""
+    """Every number in nested values with the path to it."""
     if isinstance(value, dict):
         for key, inner in value.items():
             yield from _numbers(inner, f"{path}.{key}")
-    elif isinstance(value, list):
+    elif isinstance(value, list | tuple):
         for index, inner in enumerate(value):
             yield from _numbers(inner, f"{path}[{index}]")
     elif isinstance(value, int | float):
@@ -124,14 +122,14 @@ _HEADER = (
 )
 
 
-def _line(truth: TruePose, label: str, answer: dict[str, Any]) -> str:
-    x_m, y_m = answer["position"]["x_m"], answer["position"]["y_m"]
+def _line(truth: TruePose, label: str, answer: Localisation) -> str:
+    x_m, y_m = answer.position.x_m, answer.position.y_m
     error_m = math.hypot(x_m - truth.x_m, y_m - truth.y_m)
-    confidence = "-" if answer["confidence"] is None else f"{answer['confidence']:.2f}"
+    confidence = "-" if answer.confidence is None else f"{answer.confidence:.2f}"
     return (
         f"{truth.file:<16} {label:<8} {f'{truth.x_m:.2f}, {truth.y_m:.2f}':>12} {f'{x_m:.2f}, {y_m:.2f}':>12} "
-        f"{error_m:>8.3f} {answer['heading_deg']:>12.1f} {confidence:>10} {answer['room']:<12} "
-        f"{answer['timings_ms']['total']:>6.0f}"
+        f"{error_m:>8.3f} {answer.heading_deg:>12.1f} {confidence:>10} {answer.room:<12} "
+        f"{answer.timings_ms['total']:>6.0f}"
     )
 
 

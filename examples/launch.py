@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from examples.client import LocaliseClient
+from lalaloc_client import Client, ConnectionFailedError, RetryPolicy
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -64,13 +64,21 @@ def _announced_url(process: subprocess.Popen[str]) -> str:
 
 def _wait_until_ready(url: str, process: subprocess.Popen[str]) -> None:
     deadline = time.monotonic() + _READY_TIMEOUT_S
-    with LocaliseClient(url, timeout_s=5.0) as client:
-        while not client.is_ready():
+    # Asked again below, where the process is looked at as well.
+    with Client(url, timeout_s=5.0, retry=RetryPolicy(attempts=1)) as client:
+        while not _is_ready(client):
             if process.poll() is not None:
                 raise ServiceFailedError(f"the service ended with status {process.returncode} while starting")
             if time.monotonic() > deadline:
                 raise ServiceFailedError(f"the service is not ready after {_READY_TIMEOUT_S:g} s")
             time.sleep(_POLL_S)
+
+
+def _is_ready(client: Client) -> bool:
+    try:
+        return client.ready().ready
+    except ConnectionFailedError:
+        return False
 
 
 def _stop(process: subprocess.Popen[str]) -> None:

@@ -10,7 +10,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -19,6 +18,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from examples.truth import FOLDER, TruePose
+from lalaloc_client import Candidate, Localisation
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import heading_from_degrees
 from lalaloc_core.evaluation.report.plan import INK, Cells, draw_camera, draw_distances, draw_plan, halo
@@ -39,8 +39,8 @@ class Panel:
     """One panorama: the truth, and the service's answers with and without its heading."""
 
     truth: TruePose
-    known: dict[str, Any]
-    unknown: dict[str, Any]
+    known: Localisation
+    unknown: Localisation
 
 
 def draw_demo(panels: Sequence[Panel], path: Path) -> None:
@@ -77,12 +77,12 @@ def _draw_photograph(axes: Axes, panel: Panel) -> None:
     axes.set_xlabel("\n".join(sentences), loc="left", fontsize=10, color=INK, linespacing=1.5)
 
 
-def _sentence(label: str, truth: TruePose, answer: dict[str, Any]) -> str:
-    x_m, y_m = answer["position"]["x_m"], answer["position"]["y_m"]
+def _sentence(label: str, truth: TruePose, answer: Localisation) -> str:
+    x_m, y_m = answer.position.x_m, answer.position.y_m
     error_m = math.hypot(x_m - truth.x_m, y_m - truth.y_m)
-    turned = (answer["heading_deg"] - truth.heading_deg + 180.0) % 360.0 - 180.0
-    confidence = "" if answer["confidence"] is None else f", confidence {answer['confidence']:.2f}"
-    return f"{label}: {answer['room']} ({x_m:.2f}, {y_m:.2f}) m, off by {error_m:.2f} m and {turned:+.1f}°{confidence}"
+    turned = (answer.heading_deg - truth.heading_deg + 180.0) % 360.0 - 180.0
+    confidence = "" if answer.confidence is None else f", confidence {answer.confidence:.2f}"
+    return f"{label}: {answer.room} ({x_m:.2f}, {y_m:.2f}) m, off by {error_m:.2f} m and {turned:+.1f}°{confidence}"
 
 
 def _draw_plan(figure: Figure, axes: Axes, plan: FloorPlan, encoders: Encoders, panel: Panel) -> None:
@@ -90,17 +90,17 @@ def _draw_plan(figure: Figure, axes: Axes, plan: FloorPlan, encoders: Encoders, 
     distance = latent_map(cells, plan, encoders, panel.truth)
     draw_distances(figure, axes, plan, cells, distance, "latent distance (log scale)")
     draw_plan(axes, plan)
-    for rank, candidate in enumerate(panel.known["candidates"][1:], start=2):
+    for rank, candidate in enumerate(panel.known.candidates[1:], start=2):
         _draw_candidate(axes, candidate, rank)
     truth, found = panel.truth, panel.known
     draw_camera(axes, (truth.x_m, truth.y_m), heading_from_degrees(truth.heading_deg), _TRUE, "true", 9.0)
-    position = (found["position"]["x_m"], found["position"]["y_m"])
-    draw_camera(axes, position, heading_from_degrees(found["heading_deg"]), _FOUND, "found", 4.5)
+    position = (found.position.x_m, found.position.y_m)
+    draw_camera(axes, position, heading_from_degrees(found.heading_deg), _FOUND, "found", 4.5)
     axes.legend(loc="upper left", bbox_to_anchor=(0.0, 0.01), ncols=3, frameon=False, fontsize=9, handletextpad=0.3)
 
 
-def _draw_candidate(axes: Axes, candidate: dict[str, Any], rank: int) -> None:
-    x, y = candidate["position"]["x_m"], candidate["position"]["y_m"]
+def _draw_candidate(axes: Axes, candidate: Candidate, rank: int) -> None:
+    x, y = candidate.position.x_m, candidate.position.y_m
     label = "other candidates" if rank == 2 else None
     ring = {"mfc": "none", "mec": "white", "markersize": 11, "mew": 1.0}
     axes.plot(x, y, "o", ls="", path_effects=halo(2.5), zorder=3, label=label, **ring)

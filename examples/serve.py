@@ -6,9 +6,9 @@ import json
 import signal
 import sys
 
-from examples.client import LocaliseClient
 from examples.launch import ServiceFailedError, running_service
 from examples.truth import PLAN_PATH
+from lalaloc_client import Client, ClientError, FloorPlan
 
 _PORT = 8000
 _PLAN_TIMEOUT_S = 120.0
@@ -19,23 +19,22 @@ def main() -> int:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         with running_service(_PORT, {}) as service:
-            with LocaliseClient(service.url) as client:
+            with Client(service.url) as client:
                 plan = load_example_plan(client)
-            print(f"ready: {service.url} (plan '{plan['name']}': {plan['id']}); stop with Ctrl-C", flush=True)
+            print(f"ready: {service.url} (plan '{plan.name}': {plan.id}); stop with Ctrl-C", flush=True)
             return service.process.wait()
     except KeyboardInterrupt:
         return 0
-    except (ServiceFailedError, TimeoutError) as error:
+    except (ServiceFailedError, ClientError) as error:
         print(f"serve: {error}", file=sys.stderr)
         return 1
 
 
-def load_example_plan(client: LocaliseClient) -> dict[str, object]:
+def load_example_plan(client: Client) -> FloorPlan:
     """The example plan as the service stores it; uploaded unless one of its name is there."""
     name = json.loads(PLAN_PATH.read_bytes())["name"]
-    stored = [plan["id"] for plan in client.floorplans() if plan["name"] == name]
-    plan_id = stored[0] if stored else client.upload_plan(PLAN_PATH)["id"]
-    return client.wait_for_plan(plan_id, timeout_s=_PLAN_TIMEOUT_S)
+    stored = next((plan.id for plan in client.floorplans(name) if plan.name == name), None)
+    return client.wait_until_ready(stored or client.upload_floorplan(PLAN_PATH).id, timeout_s=_PLAN_TIMEOUT_S)
 
 
 if __name__ == "__main__":

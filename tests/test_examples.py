@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import subprocess
 import sys
@@ -15,6 +16,7 @@ from PIL import Image
 from examples.demo import StageMissingError, check_answer
 from examples.make_examples import HEIGHT, HOLES, VIEWS, WIDTH, example_home, openings_of, true_pose
 from examples.truth import FOLDER, PLAN_PATH, read_poses
+from lalaloc_client import Candidate, Localisation, Model, Position
 from lalaloc_core.floorplan import FloorPlan
 
 ROOT = Path(__file__).parents[1]
@@ -62,8 +64,25 @@ def test_every_room_has_a_door() -> None:
     assert with_door == set(range(len(PLAN.rooms)))
 
 
-def _answer(**changes: Any) -> dict[str, Any]:
-    return {"stage": "lpo", "position": {"x_m": 1.0, "y_m": 2.0}, "candidates": [{}], "confidence": None, **changes}
+def _answer(**changes: Any) -> Localisation:
+    position = Position(1.0, 2.0)
+    answer = Localisation(
+        floorplan_id="p",
+        position=position,
+        heading_deg=0.0,
+        room="hall",
+        confidence=None,
+        stage="lpo",
+        covariance_m2=None,
+        heading_std_deg=None,
+        cost=0.1,
+        latent_distance=0.1,
+        camera_height_m=1.5,
+        candidates=(Candidate(position, 0.0, "hall", 0.1, 0.1),),
+        timings_ms={"total": 1.0},
+        model=Model("m", "1", "0"),
+    )
+    return dataclasses.replace(answer, **changes)
 
 
 def test_a_full_answer_is_accepted() -> None:
@@ -74,8 +93,8 @@ def test_a_full_answer_is_accepted() -> None:
     ("changes", "complaint"),
     [
         ({"stage": "vdr"}, "'vdr'"),
-        ({"candidates": []}, "no candidates"),
-        ({"position": {"x_m": float("nan"), "y_m": 0.0}}, r"answer\.position\.x_m"),
+        ({"candidates": ()}, "no candidates"),
+        ({"position": Position(float("nan"), 0.0)}, r"answer\.position\.x_m"),
     ],
 )
 def test_an_answer_that_is_not_full_is_refused(changes: dict[str, Any], complaint: str) -> None:

@@ -1,0 +1,66 @@
+"""Client of the LaLaLoc service: `Client` blocks, `AsyncClient` is for asyncio; both do the same.
+
+from lalaloc_client import Client
+
+with Client("http://127.0.0.1:8000") as service:
+    plan = service.wait_until_ready(service.upload_floorplan("flat.json").id)
+    answer = service.localise(plan.id, "kitchen.jpg", heading_deg=250)
+"""
+
+from lalaloc_client.aio import AsyncClient
+from lalaloc_client.client import Client
+from lalaloc_client.errors import (
+    ClientError,
+    ConflictError,
+    ConnectionFailedError,
+    FloorPlanFailedError,
+    InvalidError,
+    MalformedAnswerError,
+    NotFoundError,
+    NotReadyError,
+    OverloadedError,
+    ProblemError,
+    UnauthorisedError,
+)
+from lalaloc_client.model import (
+    Bounds,
+    Candidate,
+    FloorPlan,
+    FloorPlanSummary,
+    Grid,
+    Localisation,
+    Model,
+    Pool,
+    Position,
+    Readiness,
+    Room,
+)
+from lalaloc_client.retry import RetryPolicy
+
+__all__ = [
+    "AsyncClient",
+    "Bounds",
+    "Candidate",
+    "Client",
+    "ClientError",
+    "ConflictError",
+    "ConnectionFailedError",
+    "FloorPlan",
+    "FloorPlanFailedError",
+    "FloorPlanSummary",
+    "Grid",
+    "InvalidError",
+    "Localisation",
+    "MalformedAnswerError",
+    "Model",
+    "NotFoundError",
+    "NotReadyError",
+    "OverloadedError",
+    "Pool",
+    "Position",
+    "ProblemError",
+    "Readiness",
+    "RetryPolicy",
+    "Room",
+    "UnauthorisedError",
+]

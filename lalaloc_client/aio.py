@@ -1,0 +1,133 @@
+"""The client for asyncio: the methods of `Client`, which has their documentation, with `await`."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+from collections.abc import AsyncIterator, Mapping
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import httpx
+
+from lalaloc_client import operations, requests
+from lalaloc_client.connection import http_options
+from lalaloc_client.model import FloorPlan, FloorPlanSummary, Localisation, Readiness
+from lalaloc_client.operations import Patience, Reply, Steps, Wait
+from lalaloc_client.requests import Document, Refine, Request
+from lalaloc_client.retry import RetryPolicy
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+T = TypeVar("T")
+
+
+class AsyncClient:
+    """Asks a LaLaLoc service; close it, or use it in an `async with` block. For one event loop."""
+
+    def __init__(
+        self, base_url: str, *, api_key: str | None = None, timeout_s: float = 60.0, retry: RetryPolicy | None = None
+    ) -> None:
+        """See `Client`."""
+        self._http = httpx.AsyncClient(**http_options(base_url, api_key, timeout_s))
+        self._patience = Patience(retry or RetryPolicy())
+
+    async def __aenter__(self) -> AsyncClient:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
+
+    async def close(self) -> None:
+        """Close the connections."""
+        await self._http.aclose()
+
+    async def upload_floorplan(self, document: Document, *, idempotency_key: str | None = None) -> FloorPlan:
+        """See `Client.upload_floorplan`."""
+        request = await asyncio.to_thread(requests.upload_request, document, idempotency_key)
+        return await self._run(operations.plan(request, self._patience))
+
+    async def replace_floorplan(
+        self, floorplan_id: str, document: Document, *, if_match: str | None = None
+    ) -> FloorPlan:
+        """See `Client.replace_floorplan`."""
+        request = await asyncio.to_thread(requests.replace_request, floorplan_id, document, if_match)
+        return await self._run(operations.plan(request, self._patience))
+
+    async def floorplan(self, floorplan_id: str) -> FloorPlan:
+        """See `Client.floorplan`."""
+        return await self._run(operations.plan(requests.plan_request(floorplan_id), self._patience))
+
+    async def floorplans(self, name: str | None = None, *, page_size: int = 100) -> AsyncIterator[FloorPlanSummary]:
+        """See `Client.floorplans`."""
+        cursor = None
+        while True:
+            page = await self._run(operations.page(requests.page_request(name, page_size, cursor), self._patience))
+            for summary in page.floorplans:
+                yield summary
+            cursor = page.next_cursor
+            if cursor is None:
+                return
+
+    async def delete_floorplan(self, floorplan_id: str) -> None:
+        """See `Client.delete_floorplan`."""
+        await self._run(operations.delete(floorplan_id, self._patience))
+
+    async def wait_until_ready(self, floorplan_id: str, *, timeout_s: float = 300.0) -> FloorPlan:
+        """See `Client.wait_until_ready`."""
+        return await self._run(operations.ready_plan(floorplan_id, timeout_s, self._patience))
+
+    async def localise(
+        self,
+        floorplan_id: str,
+        panorama: bytes | str | os.PathLike[str] | Image,
+        *,
+        heading_deg: float | None = None,
+        heading_tolerance_deg: float | None = None,
+        camera_height_m: float | None = None,
+        refine: Refine | None = None,
+        top_k: int | None = None,
+    ) -> Localisation:
+        """See `Client.localise`."""
+        # On a thread: reading and encoding a picture takes a while.
+        request = await asyncio.to_thread(
+            requests.localise_request,
+            floorplan_id,
+            panorama,
+            heading_deg=heading_deg,
+            heading_tolerance_deg=heading_tolerance_deg,
+            camera_height_m=camera_height_m,
+            refine=refine,
+            top_k=top_k,
+        )
+        return await self._run(operations.localisation(request, self._patience))
+
+    async def limits(self) -> Mapping[str, Any]:
+        """See `Client.limits`."""
+        return await self._run(operations.limits(self._patience))
+
+    async def ready(self) -> Readiness:
+        """See `Client.ready`."""
+        return await self._run(operations.readiness(self._patience))
+
+    async def _run(self, steps: Steps[T]) -> T:
+        try:
+            step = next(steps)
+            while True:
+                reply = await self._do(step)
+                step = steps.send(reply)
+        except StopIteration as done:
+            return done.value
+
+    async def _do(self, step: Request | Wait) -> Reply:
+        if isinstance(step, Wait):
+            await asyncio.sleep(step.duration_s)
+            return Reply()
+        try:
+            return Reply(
+                await self._http.request(
+                    step.method, step.path, params=step.params, headers=step.headers, content=step.content
+                )
+            )
+        except httpx.TransportError as error:
+            return Reply(failure=error)

@@ -1,0 +1,161 @@
+"""The client that blocks."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import httpx
+
+from lalaloc_client import operations, requests
+from lalaloc_client.connection import http_options
+from lalaloc_client.model import FloorPlan, FloorPlanSummary, Localisation, Readiness
+from lalaloc_client.operations import Patience, Reply, Steps, Wait
+from lalaloc_client.requests import Document, Refine, Request
+from lalaloc_client.retry import RetryPolicy
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+T = TypeVar("T")
+
+
+class Client:
+    """Asks a LaLaLoc service; close it, or use it in a `with` block. May be shared between threads.
+
+    Every method raises ProblemError when the service answers with a problem, ConnectionFailedError when it does not
+    answer, and MalformedAnswerError when it answers something else; see `lalaloc_client.errors`.
+    """
+
+    def __init__(
+        self, base_url: str, *, api_key: str | None = None, timeout_s: float = 60.0, retry: RetryPolicy | None = None
+    ) -> None:
+        """
+        Args:
+            base_url: address of the service, with `http://` or `https://`.
+            api_key: sent as `Authorization: Bearer`.
+            timeout_s: longest that connecting, sending or waiting for a part of an answer may take.
+            retry: how often requests are sent again when the service is overloaded or does not answer.
+        """
+        self._http = httpx.Client(**http_options(base_url, api_key, timeout_s))
+        self._patience = Patience(retry or RetryPolicy())
+
+    def __enter__(self) -> Client:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connections."""
+        self._http.close()
+
+    def upload_floorplan(self, document: Document, *, idempotency_key: str | None = None) -> FloorPlan:
+        """Store a plan; its latent grid may still be computed afterwards, see `wait_until_ready`.
+
+        Args:
+            document: the plan in the native format: a mapping, the bytes of the JSON, or the path of a file.
+            idempotency_key: the same key with the same plan is the same upload, whoever sends it again; by default a
+                new one, which the retries of this call share.
+        """
+        return self._run(operations.plan(requests.upload_request(document, idempotency_key), self._patience))
+
+    def replace_floorplan(self, floorplan_id: str, document: Document, *, if_match: str | None = None) -> FloorPlan:
+        """Store a new revision of a plan.
+
+        Args:
+            if_match: the `etag` of the plan that it replaces; when that is no longer the newest one, ConflictError.
+        """
+        request = requests.replace_request(floorplan_id, document, if_match)
+        return self._run(operations.plan(request, self._patience))
+
+    def floorplan(self, floorplan_id: str) -> FloorPlan:
+        """A stored plan."""
+        return self._run(operations.plan(requests.plan_request(floorplan_id), self._patience))
+
+    def floorplans(self, name: str | None = None, *, page_size: int = 100) -> Iterator[FloorPlanSummary]:
+        """All stored plans, newest first, or those that the service finds by a name; asks page by page."""
+        cursor = None
+        while True:
+            page = self._run(operations.page(requests.page_request(name, page_size, cursor), self._patience))
+            yield from page.floorplans
+            cursor = page.next_cursor
+            if cursor is None:
+                return
+
+    def delete_floorplan(self, floorplan_id: str) -> None:
+        """Delete a plan with everything that was made of it."""
+        self._run(operations.delete(floorplan_id, self._patience))
+
+    def wait_until_ready(self, floorplan_id: str, *, timeout_s: float = 300.0) -> FloorPlan:
+        """The plan, once its latent grid is computed.
+
+        Raises:
+            FloorPlanFailedError: it cannot be.
+            NotReadyError: it was not within `timeout_s`.
+        """
+        return self._run(operations.ready_plan(floorplan_id, timeout_s, self._patience))
+
+    def localise(
+        self,
+        floorplan_id: str,
+        panorama: bytes | str | os.PathLike[str] | Image,
+        *,
+        heading_deg: float | None = None,
+        heading_tolerance_deg: float | None = None,
+        camera_height_m: float | None = None,
+        refine: Refine | None = None,
+        top_k: int | None = None,
+    ) -> Localisation:
+        """Where in a plan a panorama was taken.
+
+        Args:
+            panorama: full sphere, twice as wide as high: the bytes or the path of a JPEG, PNG or WebP file, or a
+                picture of PIL, which is sent as JPEG.
+            heading_deg: azimuth of the picture's centre column, clockwise from the plan's +y; None: unknown, found.
+            heading_tolerance_deg: how far off that may be, up to 45; None: not at all.
+            camera_height_m: over the floor; None: the plan's.
+            refine: `none`, `vdr` or `lpo`, how far to go; None: as far as possible.
+            top_k: how many candidates; None: as many as the service likes.
+        """
+        request = requests.localise_request(
+            floorplan_id,
+            panorama,
+            heading_deg=heading_deg,
+            heading_tolerance_deg=heading_tolerance_deg,
+            camera_height_m=camera_height_m,
+            refine=refine,
+            top_k=top_k,
+        )
+        return self._run(operations.localisation(request, self._patience))
+
+    def limits(self) -> Mapping[str, Any]:
+        """What the service allows, by name."""
+        return self._run(operations.limits(self._patience))
+
+    def ready(self) -> Readiness:
+        """Whether the service can answer at full quality."""
+        return self._run(operations.readiness(self._patience))
+
+    def _run(self, steps: Steps[T]) -> T:
+        try:
+            step = next(steps)
+            while True:
+                step = steps.send(self._do(step))
+        except StopIteration as done:
+            return done.value
+
+    def _do(self, step: Request | Wait) -> Reply:
+        if isinstance(step, Wait):
+            time.sleep(step.duration_s)
+            return Reply()
+        try:
+            return Reply(
+                self._http.request(
+                    step.method, step.path, params=step.params, headers=step.headers, content=step.content
+                )
+            )
+        except httpx.TransportError as error:
+            return Reply(failure=error)

@@ -1,0 +1,27 @@
+"""How both clients connect."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import httpx
+
+
+def http_options(base_url: str, api_key: str | None, timeout_s: float) -> dict[str, Any]:
+    """Options of httpx's clients.
+
+    Raises:
+        ValueError: not an address of HTTP, or not what a key or a timeout can be.
+    """
+    address = httpx.URL(base_url)
+    if address.scheme not in ("http", "https") or not address.host:
+        raise ValueError(f"base_url is '{base_url}', it must begin with http:// or https:// and name a host")
+    if not timeout_s > 0.0:
+        raise ValueError(f"timeout_s is {timeout_s}, it must be above 0")
+    headers = {"Accept": "application/json", "User-Agent": "lalaloc-client"}
+    if api_key is not None:
+        if not (api_key.isascii() and api_key.isprintable()) or not api_key or " " in api_key:
+            # Not quoted: it may be most of a good one.
+            raise ValueError("api_key must be printable ASCII without spaces, and not empty")
+        headers["Authorization"] = f"Bearer {api_key}"
+    return {"base_url": address, "headers": headers, "timeout": timeout_s}

@@ -1,0 +1,257 @@
+"""What the service answers, as frozen dataclasses. Units stand in the names: `_m`, `_m2`, `_deg`, `_ms`.
+
+Fields that this client does not know are left out, so that a newer service can be asked; those that it knows must be
+there and of the right type.
+"""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from datetime import datetime
+from functools import cache
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from lalaloc_client.errors import MalformedAnswerError
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Position:
+    """A point of the plan frame: x to the right, y up on the drawing."""
+
+    x_m: float
+    y_m: float
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Smallest axis-parallel box around a plan."""
+
+    x_min_m: float
+    y_min_m: float
+    x_max_m: float
+    y_max_m: float
+
+
+@dataclass(frozen=True)
+class Room:
+    """One room of a stored plan."""
+
+    name: str
+    area_m2: float
+    ceiling_height_m: float
+    vertices: int
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A plan's latent grid; the number of poses is an estimate until the plan is ready."""
+
+    step_m: float
+    poses: int
+
+
+@dataclass(frozen=True)
+class FloorPlan:
+    """A stored floor plan.
+
+    Attributes:
+        status: `preparing`, then `ready` or `failed`.
+        progress: share of its latent grid that is computed, 0 to 1.
+        reason: why it failed, None unless it did.
+        warnings: what is odd about it but usable.
+        revision: names what was uploaded, as `Localisation.floorplan_revision` does.
+        revision_number: how often the plan was uploaded up to this revision.
+        created_at: when it was first uploaded; `updated_at`: when this revision was.
+        etag: names this revision, for `replace_floorplan(..., if_match=...)`.
+    """
+
+    id: str
+    name: str
+    status: str
+    progress: float
+    rooms: tuple[Room, ...]
+    area_m2: float
+    bounds: Bounds
+    camera_height_m: float
+    grid: Grid
+    created_at: datetime
+    warnings: tuple[str, ...] = ()
+    reason: str | None = None
+    revision: str | None = None
+    revision_number: int | None = None
+    updated_at: datetime | None = None
+    etag: str | None = None
+
+
+@dataclass(frozen=True)
+class FloorPlanSummary:
+    """A stored floor plan in a listing; `rooms` is their number."""
+
+    id: str
+    name: str
+    status: str
+    progress: float
+    rooms: int
+    area_m2: float
+    created_at: datetime
+    revision: str | None = None
+    updated_at: datetime | None = None
+
+
+@dataclass(frozen=True)
+class FloorPlanPage:
+    """One page of a listing; `next_cursor` asks for the one after it, None ends the listing."""
+
+    floorplans: tuple[FloorPlanSummary, ...]
+    next_cursor: str | None = None
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One possible pose; candidates are ranked by `cost`, lower is better."""
+
+    position: Position
+    heading_deg: float
+    room: str
+    cost: float
+    latent_distance: float
+
+
+@dataclass(frozen=True)
+class Model:
+    """The model that answered."""
+
+    name: str
+    version: str
+    sha256: str
+
+
+@dataclass(frozen=True)
+class Localisation:
+    """Where a panorama was taken.
+
+    Attributes:
+        heading_deg: azimuth of the panorama's centre column, clockwise from the plan's +y.
+        heading_source: `given`, `panorama` (its metadata) or `searched`; None for a service that does not tell.
+        confidence: probability that the position is right within 1 m, None for a model that does not tell.
+        stage: the last stage that produced the position: `retrieval`, `vdr` or `lpo`.
+        covariance_m2: of the position, given that it is right within 1 m; None unless `stage` is `lpo`.
+        heading_std_deg: standard deviation of the heading where it was searched.
+        candidates: best first; the first one is the answer.
+        timings_ms: per stage of the service.
+        floorplan_revision: the revision of the plan that was compared with.
+    """
+
+    floorplan_id: str
+    position: Position
+    heading_deg: float
+    room: str
+    confidence: float | None
+    stage: str
+    covariance_m2: tuple[tuple[float, float], tuple[float, float]] | None
+    heading_std_deg: float | None
+    cost: float
+    latent_distance: float
+    camera_height_m: float
+    candidates: tuple[Candidate, ...]
+    timings_ms: Mapping[str, float]
+    model: Model
+    floorplan_revision: str | None = None
+    heading_source: str | None = None
+
+
+@dataclass(frozen=True)
+class Pool:
+    """The service's LPO workers: wanted, warm now, and whether each has been warm once."""
+
+    workers: int
+    ready: int
+    warmed_up: bool
+    fault: str | None = None
+
+
+@dataclass(frozen=True)
+class Readiness:
+    """Whether the service can answer at full quality."""
+
+    ready: bool
+    model: Model
+    lpo_pool: Pool
+    plans_preparing: int = field(default=0)
+
+
+def parse(wanted: type[T], data: object, where: str = "answer") -> T:
+    """JSON values as a dataclass of this module.
+
+    Raises:
+        MalformedAnswerError: names the field that is missing or of another type.
+    """
+    return _value(wanted, data, where)
+
+
+@cache
+def _types_of(cls: type) -> dict[str, Any]:
+    return get_type_hints(cls)
+
+
+def _value(wanted: Any, data: object, where: str) -> Any:
+    origin, arguments = get_origin(wanted), get_args(wanted)
+    if origin in (Union, types.UnionType):
+        if data is None:
+            return None
+        return _value(next(one for one in arguments if one is not type(None)), data, where)
+    if is_dataclass(wanted):
+        return _record(wanted, data, where)
+    if origin is tuple:
+        return _sequence(arguments, data, where)
+    if wanted is datetime:
+        return _moment(data, where)
+    if origin is not None:
+        # Mappings are the only other kind of container here.
+        return {str(key): _value(arguments[1], one, f"{where}.{key}") for key, one in _object(data, where).items()}
+    if wanted is float and type(data) is int:
+        return float(data)
+    # By type and not isinstance: true is no number.
+    if type(data) is not wanted:
+        raise MalformedAnswerError(f"{where} is {data!r:.100}, not of type {wanted.__name__}")
+    return data
+
+
+def _record(cls: Any, data: object, where: str) -> Any:
+    given, hints = _object(data, where), _types_of(cls)
+    values = {}
+    for one in fields(cls):
+        if one.name in given:
+            values[one.name] = _value(hints[one.name], given[one.name], f"{where}.{one.name}")
+        elif one.default is MISSING:
+            raise MalformedAnswerError(f"{where}.{one.name} is missing")
+    return cls(**values)
+
+
+def _sequence(arguments: tuple[Any, ...], data: object, where: str) -> tuple[Any, ...]:
+    if not isinstance(data, list):
+        raise MalformedAnswerError(f"{where} is {data!r:.100}, not a list")
+    if arguments[-1] is Ellipsis:
+        arguments = (arguments[0],) * len(data)
+    if len(arguments) != len(data):
+        raise MalformedAnswerError(f"{where} has {len(data)} items, not {len(arguments)}")
+    return tuple(
+        _value(one, item, f"{where}[{index}]") for index, (one, item) in enumerate(zip(arguments, data, strict=True))
+    )
+
+
+def _moment(data: object, where: str) -> datetime:
+    try:
+        return datetime.fromisoformat(str(data))
+    except ValueError as error:
+        raise MalformedAnswerError(f"{where} is {data!r:.100}, not a time") from error
+
+
+def _object(data: object, where: str) -> dict[str, Any]:
+    if not isinstance(data, dict):
+        raise MalformedAnswerError(f"{where} is {data!r:.100}, not an object")
+    return data

@@ -1,0 +1,150 @@
+"""What is sent: requests as plain data, the same bytes every time they are sent."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import math
+import os
+import re
+import uuid
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import httpx
+
+from lalaloc_client.retry import Safety
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+Document = Mapping[str, Any] | bytes | str | os.PathLike[str]
+Refine = Literal["none", "vdr", "lpo"]
+
+_JSON = "application/json"
+_JPEG_QUALITY = 95
+_ID = re.compile(r"[A-Za-z0-9_-]{1,128}")
+
+
+@dataclass(frozen=True)
+class Request:
+    """One request to the service.
+
+    Attributes:
+        safety: what sending it twice may do.
+        answers: statuses that are an answer, and not a failure.
+    """
+
+    method: str
+    path: str
+    params: Mapping[str, str] = field(default_factory=dict)
+    headers: Mapping[str, str] = field(default_factory=dict)
+    content: bytes = b""
+    safety: Safety = Safety.ANY
+    answers: frozenset[int] = frozenset({200, 201, 204})
+
+
+def upload_request(document: Document, idempotency_key: str | None) -> Request:
+    """Store a plan; the key lets the service see that a second one is the same request."""
+    headers = {"Content-Type": _JSON, "Idempotency-Key": idempotency_key or uuid.uuid4().hex}
+    return Request("POST", "/floorplans", headers=headers, content=_document(document))
+
+
+def replace_request(floorplan_id: str, document: Document, if_match: str | None) -> Request:
+    """Store a new revision of a plan; with `if_match` a second one would be refused, though the first was done."""
+    headers = {"Content-Type": _JSON}
+    if if_match is not None:
+        headers["If-Match"] = if_match
+    safety = Safety.ANY if if_match is None else Safety.UNSENT
+    return Request("PUT", _plan_path(floorplan_id), headers=headers, content=_document(document), safety=safety)
+
+
+def plan_request(floorplan_id: str) -> Request:
+    """Look at a plan."""
+    return Request("GET", _plan_path(floorplan_id))
+
+
+def delete_request(floorplan_id: str) -> Request:
+    """Delete a plan."""
+    return Request("DELETE", _plan_path(floorplan_id))
+
+
+def page_request(name: str | None, limit: int, cursor: str | None) -> Request:
+    """One page of the stored plans."""
+    given = {"name": name, "limit": str(limit), "cursor": cursor}
+    return Request("GET", "/floorplans", {key: value for key, value in given.items() if value is not None})
+
+
+def localise_request(
+    floorplan_id: str,
+    panorama: bytes | str | os.PathLike[str] | Image,
+    *,
+    heading_deg: float | None,
+    heading_tolerance_deg: float | None,
+    camera_height_m: float | None,
+    refine: Refine | None,
+    top_k: int | None,
+) -> Request:
+    """A query; it stores nothing, so asking twice is as good as once."""
+    given = {
+        "floorplan_id": floorplan_id,
+        "heading_deg": heading_deg,
+        "heading_tolerance_deg": heading_tolerance_deg,
+        "camera_height_m": camera_height_m,
+        "refine": refine,
+        "top_k": top_k,
+    }
+    for name, value in given.items():
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ValueError(f"{name} is {value}, it must be a finite number")
+    fields = {name: str(value) for name, value in given.items() if value is not None}
+    picture = _picture(panorama)
+    # Made of the content, so that the same query is the same bytes.
+    boundary = hashlib.sha256(picture).hexdigest()
+    encoded = httpx.Request(
+        "POST",
+        "http://service/localise",
+        headers={"Content-Type": f"multipart/form-data; boundary={boundary}"},
+        data=fields,
+        files={"panorama": ("panorama", picture, "application/octet-stream")},
+    )
+    headers = {"Content-Type": encoded.headers["content-type"]}
+    return Request("POST", "/localise", headers=headers, content=encoded.read())
+
+
+def limits_request() -> Request:
+    """What the service allows."""
+    return Request("GET", "/limits")
+
+
+def ready_request() -> Request:
+    """Whether the service can answer; 503 says that it cannot yet."""
+    return Request("GET", "/readyz", answers=frozenset({200, 503}))
+
+
+def _plan_path(floorplan_id: str) -> str:
+    # Anything else could name another route, however it is quoted: servers undo that before they look.
+    if not _ID.fullmatch(floorplan_id):
+        raise ValueError(f"floorplan_id is {floorplan_id!r:.100}, it must be 1 to 128 letters, digits, _ or -")
+    return f"/floorplans/{floorplan_id}"
+
+
+def _document(document: Document) -> bytes:
+    if isinstance(document, bytes):
+        return document
+    if isinstance(document, Mapping):
+        return json.dumps(dict(document), allow_nan=False).encode()
+    return Path(document).read_bytes()
+
+
+def _picture(panorama: bytes | str | os.PathLike[str] | Image) -> bytes:
+    if isinstance(panorama, bytes):
+        return panorama
+    if isinstance(panorama, str | os.PathLike):
+        return Path(panorama).read_bytes()
+    buffer = io.BytesIO()
+    panorama.convert("RGB").save(buffer, "JPEG", quality=_JPEG_QUALITY)
+    return buffer.getvalue()
