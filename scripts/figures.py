@@ -73,12 +73,12 @@ def evidence_table() -> str:
 def sizes_table() -> str:
     """Sizes of the image encoder that were compared, as a Markdown table."""
     rows = [
-        "| input | channels | parameters | CPU minutes | panoramas | latent | profile | likelihood |",
-        "|---|---|---|---|---|---|---|---|",
+        "| variant | input | channels | parameters | panoramas | ms | latent | profile | likelihood |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
-    for one in json.loads(SIZES.read_text(encoding="utf-8")).values():
-        cells = [one["input"], ", ".join(map(str, one["widths"])), f"{one['parameters'] / 1e6:.1f} M"]
-        cells += [f"{one['cpu_minutes']:g}", f"{one['panoramas']:,}"]
+    for name, one in json.loads(SIZES.read_text(encoding="utf-8")).items():
+        cells = [name, one["input"], ", ".join(map(str, one["widths"])), f"{one['parameters'] / 1e6:.1f} M"]
+        cells += [f"{one['panoramas']:,}", f"{one['latency_ms']:.0f}"]
         rows.append(_row(*cells, *(f"{one[by]['within_100']:.1%}" for by in ("latent", "profile", "likelihood"))))
     return "\n".join(rows)
 

@@ -14,7 +14,7 @@ from scripts.figures import evidence_table, figures_table, paper_tables, sizes_t
 from service.settings import PREFIX, Settings
 
 ROOT = Path(__file__).resolve().parent.parent
-_PACKAGES = ("lalaloc_core", "service", "examples", "scripts")
+_PACKAGES = ("lalaloc_core", "service", "lalaloc_client", "examples", "scripts", "benchmarks")
 
 
 def main() -> None:
@@ -26,7 +26,8 @@ def main() -> None:
 def documents() -> dict[Path, str]:
     """Every document that has generated parts, as it should read."""
     parts = {
-        ROOT / "README.md": {"settings": settings_table(), "figures": figures_table()},
+        ROOT / "README.md": {"figures": figures_table()},
+        ROOT / "docs" / "operations.md": {"settings": settings_table()},
         ROOT / "docs" / "results.md": {
             "figures": figures_table(),
             "evidence": evidence_table(),

@@ -17,6 +17,7 @@ from service.settings import PREFIX, Settings
 
 ROOT = Path(__file__).parents[1]
 DOCKERFILE = (ROOT / "docker" / "Dockerfile").read_text(encoding="utf-8")
+REPLICAS = yaml.safe_load((ROOT / "docker" / "compose.replicas.yaml").read_text(encoding="utf-8"))["services"]
 COMPOSE = yaml.safe_load((ROOT / "docker" / "compose.yaml").read_text(encoding="utf-8"))["services"]["service"]
 PYPROJECT = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
 SETTINGS = {PREFIX + name.upper() for name in Settings.model_fields}
@@ -110,6 +111,24 @@ def test_image_and_compose_name_known_settings_and_one_port() -> None:
     assert f'"--port", "{port}"' in DOCKERFILE
     assert f"http://127.0.0.1:{port}/readyz" in DOCKERFILE
     assert [published.split(":")[-1] for published in COMPOSE["ports"]] == [port]
+
+
+def test_the_proxy_and_the_replicas_find_each_other() -> None:
+    replicas = {name: service for name, service in REPLICAS.items() if name.startswith("replica-")}
+    proxy = (ROOT / "docker" / "nginx.conf").read_text(encoding="utf-8")
+    (port,) = re.findall(r"^EXPOSE (\d+)$", DOCKERFILE, re.MULTILINE)
+    assert set(re.findall(r"^ *server (\S+):(\d+)", proxy, re.MULTILINE)) == {(name, port) for name in replicas}
+    (listens,) = re.findall(r"listen (\d+);", proxy)
+    assert [published.split(":")[-1] for published in REPLICAS["proxy"]["ports"]] == [listens]
+    for service in replicas.values():
+        assert {name for name in service["environment"] if name.startswith("LALALOC_")} <= SETTINGS
+        assert service["build"] == COMPOSE["build"]
+        assert service["environment"]["LALALOC_API_KEYS"] == "on"
+
+
+def test_containers_are_given_the_time_that_stopping_takes() -> None:
+    for service in (COMPOSE, REPLICAS["replica-1"]):
+        assert float(service["stop_grace_period"].rstrip("s")) > Settings.model_fields["stop_deadline_s"].default
 
 
 def test_the_image_does_not_run_as_root_and_compose_builds_it() -> None:

@@ -1,0 +1,212 @@
+"""Thousands of requests that are wrong in some way: no error of the service's own, no hang, no worker lost.
+
+    python -m benchmarks.fuzz --requests 10000
+
+Half are made by schemathesis from the API's description, a quarter are panoramas and a quarter floor plans that were
+valid before bytes or values were changed. The seed is fixed; what is found can be found again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import random
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Any
+
+import httpx
+import hypothesis
+import numpy as np
+import schemathesis
+from PIL import Image
+
+from benchmarks.load import queries, upload_example_plan
+from benchmarks.processes import workers
+from examples.launch import running_service
+from examples.truth import PLAN_PATH
+
+_HANG_S = 5.0
+_CLIENTS = 4
+# Events are an endless answer to a right request.
+_LEFT_OUT = r"/events$"
+
+
+@dataclass
+class Outcome:
+    """What came back, by kind of request and status, and what must not have."""
+
+    statuses: dict[str, Counter[str]] = field(default_factory=dict)
+    bad: list[str] = field(default_factory=list)
+    slowest_s: float = 0.0
+
+    def note(self, kind: str, send: Callable[[], httpx.Response]) -> None:
+        """Send a request and look at the answer."""
+        begin = time.perf_counter()
+        try:
+            answer = send()
+        except httpx.HTTPError as error:
+            self.statuses.setdefault(kind, Counter())[type(error).__name__] += 1
+            self.bad.append(f"{kind}: {type(error).__name__} {error}")
+            return
+        seconds = time.perf_counter() - begin
+        self.slowest_s = max(self.slowest_s, seconds)
+        self.statuses.setdefault(kind, Counter())[str(answer.status_code)] += 1
+        deliberate = answer.status_code == httpx.codes.SERVICE_UNAVAILABLE and "retry-after" in answer.headers
+        if (answer.status_code >= 500 and not deliberate) or "Traceback" in answer.text:
+            self.bad.append(f"{kind}: {answer.status_code} {answer.text[:300]}")
+        if seconds > _HANG_S:
+            self.bad.append(f"{kind}: took {seconds:.1f} s")
+
+
+def main() -> int:
+    """Run; 1 when the service failed, hung or lost a worker."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--requests", type=int, default=10_000)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    outcome = Outcome()
+    with tempfile.TemporaryDirectory() as data:
+        settings = {"LALALOC_DATA_DIR": data, "LALALOC_LOG_LEVEL": "critical"}
+        with running_service(0, settings) as service, httpx.Client(base_url=service.url, timeout=30.0) as client:
+            plan_id, before = upload_example_plan(service.url), len(workers(service.process.pid))
+            quarter = options.requests // 4
+            with ThreadPoolExecutor(_CLIENTS) as pool:
+                sends = [*_panoramas(client, plan_id, quarter, options.seed), *_plans(client, quarter, options.seed)]
+                list(pool.map(lambda one: outcome.note(*one), sends))
+            _described(service.url, options.requests - 2 * quarter, options.seed, outcome)
+            # A worker that was replaced takes seconds to come back.
+            deadline = time.monotonic() + 60.0
+            while client.get("/readyz").status_code != httpx.codes.OK and time.monotonic() < deadline:
+                time.sleep(0.2)
+            after = len(workers(service.process.pid))
+            well = client.get("/healthz").status_code == httpx.codes.OK and service.process.poll() is None
+    report = {
+        "requests": sum(sum(found.values()) for found in outcome.statuses.values()),
+        "statuses": {kind: dict(sorted(found.items())) for kind, found in sorted(outcome.statuses.items())},
+        "slowest_s": round(outcome.slowest_s, 2),
+        "workers": {"before": before, "after": after},
+        "bad": dict(Counter(outcome.bad).most_common(20)),
+    }
+    print(json.dumps(report, indent=2))
+    return int(bool(outcome.bad) or after != before or not well)
+
+
+def _described(url: str, requests: int, seed: int, outcome: Outcome) -> None:
+    """Requests that follow the API's description, and others that just do not."""
+    schema = schemathesis.openapi.from_url(f"{url}/openapi.json").exclude(path_regex=_LEFT_OUT)
+    operations = [found.ok() for found in schema.get_all_operations()]  # pyright: ignore[reportAttributeAccessIssue]
+    each = -(-requests // (2 * len(operations)))
+    for operation in operations:
+        for mode in schemathesis.GenerationMode:
+
+            @hypothesis.seed(seed)
+            @hypothesis.settings(
+                max_examples=each,
+                database=None,
+                deadline=None,
+                phases=[hypothesis.Phase.generate],
+                suppress_health_check=[*hypothesis.HealthCheck],  # pyright: ignore[reportArgumentType]
+            )
+            @hypothesis.given(case=operation.as_strategy(generation_mode=mode))
+            def send(case: Any) -> None:
+                outcome.note("described", lambda: _sent(case, url))
+
+            send()
+
+
+def _sent(case: Any, url: str) -> httpx.Response:
+    answer = case.call(base_url=url, timeout=30.0)
+    return httpx.Response(answer.status_code, headers=dict(answer.headers), content=answer.content or b"")
+
+
+def _panoramas(
+    client: httpx.Client, plan_id: str, count: int, seed: int
+) -> Iterator[tuple[str, Callable[[], httpx.Response]]]:
+    rng = random.Random(seed)
+    with Image.open(io.BytesIO(queries()[0].picture)) as opened:
+        picture = opened.convert("RGB").resize((256, 128))
+    valid = {name: _encoded(picture, name) for name in ("JPEG", "PNG", "WEBP")}
+    for _ in range(count):
+        name = rng.choice(list(valid))
+        content = mutated(valid[name], rng)
+
+        def send(content: bytes = content) -> httpx.Response:
+            return client.post("/localise", data={"floorplan_id": plan_id}, files={"panorama": ("p", content)})
+
+        yield f"mutated {name}", send
+
+
+def _encoded(picture: Image.Image, name: str) -> bytes:
+    buffer = io.BytesIO()
+    picture.save(buffer, name)
+    return buffer.getvalue()
+
+
+def mutated(content: bytes, rng: random.Random) -> bytes:
+    """Bytes with some changed, cut out, doubled or cut off."""
+    found = bytearray(content)
+    for _ in range(rng.choice((1, 1, 2, 4, 16))):
+        place = rng.randrange(len(found)) if len(found) > 1 else 0
+        # Headers decide more than pixels do.
+        place = place if rng.random() < 0.5 else min(place, rng.randrange(1, 200))
+        kind = rng.randrange(5)
+        if kind == 0:
+            found[place : place + 1] = bytes([rng.randrange(256)])
+        elif kind == 1:
+            found[place : place + 4] = rng.choice((b"\xff\xff\xff\xff", b"\0\0\0\0", b"\x7f\xff\xff\xff"))
+        elif kind == 2:
+            del found[place : place + rng.randrange(1, 64)]
+        elif kind == 3:
+            found[place:place] = found[place : place + rng.randrange(1, 64)]
+        else:
+            del found[max(place, 1) :]
+    return bytes(found)
+
+
+def _plans(client: httpx.Client, count: int, seed: int) -> Iterator[tuple[str, Callable[[], httpx.Response]]]:
+    rng = random.Random(seed + 1)
+    text = PLAN_PATH.read_bytes()
+    for number in range(count):
+        if number % 2:
+            kind, content = "mutated bytes of a plan", mutated(text, rng)
+        else:
+            kind, content = "mutated values of a plan", json.dumps(_bent(json.loads(text), rng)).encode()
+
+        def send(content: bytes = content) -> httpx.Response:
+            return client.post("/floorplans", content=content, headers={"Content-Type": "application/json"})
+
+        yield kind, send
+
+
+_ODD: tuple[Any, ...] = (
+    *(None, True, "", "x" * 10_000, [], {}, [[[[]]]], 0, -1, 1e308, -1e308, 1e-308, 2**63, float("nan"), float("inf")),
+    *("\0", "\ud800", "<script>", {"a": {"b": []}}, list(range(1000)), np.pi),
+)
+
+
+def _bent(value: Any, rng: random.Random) -> Any:
+    """A JSON value with one of its parts replaced, removed or doubled."""
+    if isinstance(value, dict | list) and value and rng.random() < 0.85:
+        keys = list(value) if isinstance(value, dict) else list(range(len(value)))
+        key, kind = rng.choice(keys), rng.random()
+        if kind < 0.1:
+            del value[key]
+        elif kind < 0.2 and isinstance(value, list):
+            value.insert(key, value[key])
+        else:
+            value[key] = _bent(value[key], rng)
+        return value
+    if isinstance(value, int | float) and rng.random() < 0.5:
+        return value * rng.choice((-1, 0, 1e-6, 1e6, 1 + 1e-9)) + rng.choice((0, 0, 1e-9, 0.1))
+    return rng.choice(_ODD)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
