@@ -46,7 +46,7 @@ def main() -> int:
     """Run; 1 when something was taken, or memory rose too far."""
     failed = False
     with tempfile.TemporaryDirectory() as data:
-        settings = {"LALALOC_DATA_DIR": data, "LALALOC_LOG_LEVEL": "critical"}
+        settings = {"LALALOC_DATA_DIR": data, "LALALOC_LOG_LEVEL": "error"}
         with running_service(0, settings) as service:
             plan_id = upload_example_plan(service.url)
             print("| upload | bytes sent | answer | seconds | memory |\n|---|---|---|---|---|", flush=True)

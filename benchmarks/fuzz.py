@@ -73,7 +73,7 @@ def main() -> int:
     options = parser.parse_args()
     outcome = Outcome()
     with tempfile.TemporaryDirectory() as data:
-        settings = {"LALALOC_DATA_DIR": data, "LALALOC_LOG_LEVEL": "critical"}
+        settings = {"LALALOC_DATA_DIR": data, "LALALOC_LOG_LEVEL": "error"}
         with running_service(0, settings) as service, httpx.Client(base_url=service.url, timeout=30.0) as client:
             plan_id, before = upload_example_plan(service.url), len(workers(service.process.pid))
             quarter = options.requests // 4

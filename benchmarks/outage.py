@@ -38,7 +38,7 @@ def main() -> int:
         parser.error("PostgreSQL is not installed")
     with postgres_server(programs) as server, tempfile.TemporaryDirectory() as data:
         settings = {"LALALOC_DATA_DIR": data, "LALALOC_DATABASE_URL": server.new_database()}
-        with running_service(0, settings | {"LALALOC_LOG_LEVEL": "critical"}) as service:
+        with running_service(0, settings | {"LALALOC_LOG_LEVEL": "error"}) as service:
             known = upload_example_plan(service.url)
             report = asyncio.run(_through_an_outage(service.url, known, server, options.seconds))
     print(json.dumps(report, indent=2))
