@@ -115,6 +115,7 @@ class Admission:
         self.queries = Places(limits.queries)
         self.reads = Places(limits.reads)
         self.streams = Places(limits.streams)
+        self.draining = False
         self.stopping = False
         telemetry.gauge(
             "lalaloc_requests_in_flight", "Uploads and queries not yet answered.", lambda: self.requests.taken
@@ -127,9 +128,13 @@ class Admission:
         telemetry.gauge("lalaloc_reads_in_flight", "Requests that change nothing.", lambda: self.reads.taken)
         telemetry.gauge("lalaloc_streams", "Clients that follow events.", lambda: self.streams.taken)
 
+    def drain(self) -> None:
+        """Say that the service is about to stop, and go on for now. May be called by a signal handler."""
+        self.draining = True
+
     def stop(self) -> None:
         """Refuse every request from now on; those in work go on. May be called by a signal handler."""
-        self.stopping = True
+        self.draining = self.stopping = True
 
     @property
     def idle(self) -> bool:

@@ -5,7 +5,6 @@ A picture that kills such a process gets a second try, and kills nothing else.
 
 from __future__ import annotations
 
-import asyncio
 from time import monotonic
 
 from lalaloc_core.bundle import Manifest
@@ -62,12 +61,7 @@ class Decoder:
         """
         timeout_s = max(deadline - monotonic(), 0.0)
         try:
-            async with asyncio.timeout(timeout_s):
-                # On a thread: copying and hashing a large upload would hold up everybody else.
-                future = await asyncio.to_thread(self._pool.submit, content, timeout_s)
-                answer = await asyncio.wrap_future(future)
-        except TimeoutError as error:
-            raise DeadlineExceededError(self._settings.request_deadline_s) from error
+            answer = await self._pool.answer(content, timeout_s)
         except JobLostError as error:
             raise self._explained(error) from error
         if isinstance(answer, Refusal):

@@ -12,11 +12,12 @@ LaLaLocError
     ├── PlanTooLargeError           the latent grid would have more poses than allowed
     ├── PlanFailedError             the plan's latent grid could not be computed
     ├── PlanNotReadyError           still preparing at the request's deadline
-    ├── TooManyFloorPlansError      the store is full
+    ├── TooManyFloorPlansError      the tenant has as many as allowed
     ├── RevisionMismatchError       the plan has another revision than the one expected
     ├── IdempotencyKeyReusedError   the key was sent with another body before
     ├── IdempotencyInProgressError  the same request is being carried out
     ├── StoreUnavailableError       the database cannot be reached
+    │   └── StoreBusyError          it answers, but all connections to it are in use
     ├── UnauthenticatedError        no valid API key
     ├── InsufficientScopeError      the API key is not good for this
     ├── ExposedWithoutKeysError     asked from elsewhere while there are no API keys
@@ -140,7 +141,7 @@ class PlanNotReadyError(ServiceError):
 
 
 class TooManyFloorPlansError(ServiceError):
-    """The store holds as many plans as allowed."""
+    """The tenant has as many plans as allowed."""
 
     def __init__(self, limit: int) -> None:
         super().__init__(f"{limit} floor plans are stored, no more are allowed (max_floorplans); delete some")
@@ -179,8 +180,18 @@ class StoreUnavailableError(ServiceError):
 
     retry_after_s = 2
 
+    def __init__(self, reason: str = "the database cannot be reached at the moment") -> None:
+        super().__init__(reason)
+
+
+class StoreBusyError(StoreUnavailableError):
+    """The database answers others, but no connection to it became free in time.
+
+    No reason to go by what was read earlier, as while it is away: what it says may be another thing by now.
+    """
+
     def __init__(self) -> None:
-        super().__init__("the database cannot be reached at the moment")
+        super().__init__("too many requests use the database at the moment")
 
 
 class UnauthenticatedError(ServiceError):
@@ -196,11 +207,11 @@ class InsufficientScopeError(ServiceError):
 
 
 class ExposedWithoutKeysError(ServiceError):
-    """The request came from elsewhere than this machine, while API keys are off."""
+    """The request came from elsewhere than this machine, or a page from elsewhere made it, while keys are off."""
 
-    def __init__(self) -> None:
+    def __init__(self, wanted: str) -> None:
         super().__init__(
-            "API keys are off, so only requests over a loopback address are answered; see LALALOC_API_KEYS and "
+            f"API keys are off, so only requests {wanted} are answered; see LALALOC_API_KEYS and "
             "LALALOC_ALLOW_ANONYMOUS"
         )
 
@@ -296,6 +307,7 @@ PROBLEMS: dict[type[Exception], ProblemKind] = {
     IdempotencyKeyReusedError: ProblemKind(422, "idempotency-key-reused", "Idempotency key used for something else"),
     IdempotencyInProgressError: ProblemKind(409, "idempotency-in-progress", "Request already in work"),
     StoreUnavailableError: ProblemKind(503, "store-unavailable", "Storage unavailable"),
+    StoreBusyError: ProblemKind(503, "store-unavailable", "Storage unavailable"),
     UnauthenticatedError: ProblemKind(401, "unauthenticated", "API key needed"),
     InsufficientScopeError: ProblemKind(403, "insufficient-scope", "API key not good for this"),
     ExposedWithoutKeysError: ProblemKind(403, "exposed-without-keys", "Only answered on its own machine"),

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import AsyncGenerator
+from collections.abc import AsyncGenerator, Awaitable, Callable
 from contextlib import suppress
 from contextvars import Context
 from time import monotonic
@@ -29,6 +29,13 @@ _ASK_AGAIN_MS = 3000
 # A reader so slow that even the end of its stream does not get through is left after this.
 _LAST_BYTES_S = 5.0
 _FINAL = frozenset({"ready", "failed", "deleted"})
+
+
+Welcome = Callable[[], Awaitable[bool]]
+
+
+async def _everybody() -> bool:
+    return True
 
 
 class EventStream(StreamingResponse):
@@ -56,12 +63,13 @@ class PlanEvents:
     """Tells followers how far plans are; for one event loop."""
 
     def __init__(
-        self, store: Store, grids: Grids, admission: Admission, *, longest_s: float, heartbeat_s: float = HEARTBEAT_S
+        self, store: Store, grids: Grids, admission: Admission, *, longest_s: float, heartbeat_s: float
     ) -> None:
         """
         Args:
             longest_s: how long a stream lasts at most.
-            heartbeat_s: how often something is sent when there is nothing to tell, so that nobody takes it for dead.
+            heartbeat_s: how often something is sent when there is nothing to tell, so that nobody takes it for dead,
+                and how often it is asked whether a caller is still welcome.
         """
         self._store = store
         self._grids = grids
@@ -71,11 +79,15 @@ class PlanEvents:
         self._followers: set[_Follower] = set()
         self._watch: asyncio.Task[None] | None = None
 
-    def answer(self, plan_id: str) -> EventStream:
-        """The stream of a plan that there is."""
-        return EventStream(self.stream(plan_id), self._longest_s)
+    def answer(self, plan_id: str, welcome: Welcome = _everybody) -> EventStream:
+        """The stream of a plan that there is.
 
-    async def stream(self, plan_id: str) -> AsyncGenerator[bytes]:
+        Args:
+            welcome: asked after every heartbeat's time whether the caller, let in once, still would be.
+        """
+        return EventStream(self.stream(plan_id, welcome), self._longest_s)
+
+    async def stream(self, plan_id: str, welcome: Welcome = _everybody) -> AsyncGenerator[bytes]:
         """Events as they go over the wire, until the plan is in a final state, time is up, or the service stops."""
         follower = _Follower(plan_id)
         self._followers.add(follower)
@@ -85,7 +97,12 @@ class PlanEvents:
         try:
             yield f"retry: {_ASK_AGAIN_MS}\n\n".encode()
             until = monotonic() + self._longest_s
+            ask_at = monotonic() + self._heartbeat_s
             while (left_s := until - monotonic()) > 0.0 and not self._admission.stopping:
+                if monotonic() >= ask_at:
+                    if not await welcome():
+                        return
+                    ask_at = monotonic() + self._heartbeat_s
                 try:
                     async with asyncio.timeout(min(left_s, self._heartbeat_s)):
                         event = await follower.next()

@@ -1,41 +1,53 @@
 """`Idempotency-Key`: a request that is sent twice is carried out once, and answered alike both times.
 
-What is kept for a day is the answer, be it a refusal for good; what may end otherwise next time (408, 429 and 5xx) is
-not. While the first one is in work, the second is refused; if the process that works on it dies, the next one takes
-over under the same token once its lease has run out.
+What is kept for a day is the answer, be it a refusal for good; what may end otherwise next time is not, and then the
+next one is carried out under the same token. While the first one is in work, the second is refused; if the process that
+works on it dies, the next one takes over, under the same token, once its lease has run out.
 """
 
 from __future__ import annotations
 
-import asyncio
 import hashlib
 import json
 import logging
 import re
+import threading
 import uuid
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 
 from starlette.requests import Request
 from starlette.responses import Response
 
-from lalaloc_core.errors import LaLaLocError
+from lalaloc_core.errors import InvalidFloorPlanError, InvalidPanoramaError, InvalidPoseError
 from service.errors import (
     IdempotencyInProgressError,
     IdempotencyKeyReusedError,
     InvalidRequestError,
+    PlanTooLargeError,
     StoreUnavailableError,
-    problem_kind,
+    UnknownFloorPlanError,
 )
 from service.problems import problem_answer
 from service.storage.idempotency import Idempotency
 from service.storage.records import Conflict, Fresh, InProgress, StoredAnswer
 from service.telemetry import LOGGER_NAME
+from service.threads import BoundedReads
 from service.uploads import Parts
+from service.workers import JobLostError
 
 HEADER, REPLAYED = "Idempotency-Key", "Idempotency-Replayed"
 MOST_CHARACTERS = 255
 _KEY = re.compile(rf"[\x21-\x7e]{{1,{MOST_CHARACTERS}}}")
-_NOT_FOR_GOOD = frozenset({408, 429})
+# What the request itself is to blame for, and will be tomorrow. Others are not kept, whatever their status.
+_FOR_GOOD = (
+    InvalidFloorPlanError,
+    InvalidPanoramaError,
+    InvalidPoseError,
+    InvalidRequestError,
+    PlanTooLargeError,
+    UnknownFloorPlanError,
+)
 
 
 class Once:
@@ -77,18 +89,37 @@ class Once:
                 raise
             return refusal
 
-    async def run_async(self, parts: Parts, work: Callable[[], Awaitable[Response]]) -> Response:
-        """As `run`, for work that is dropped when its caller goes, and leaves nothing behind."""
-        token = await asyncio.to_thread(self._begin, parts)
+    async def run_async(self, parts: Parts, work: Callable[[], Awaitable[Response]], reads: BoundedReads) -> Response:
+        """As `run`, for work that is dropped when its caller goes, and leaves nothing behind.
+
+        Args:
+            reads: where the database is asked, and not waited for when it is silent.
+        """
+        if self._key is None:
+            # Without a key there is nothing to ask the database.
+            return await work()
+        waiting = _Waiting()
+        try:
+            token = await reads.run(self._begin_for, waiting, parts)
+        except BaseException:
+            if (left := waiting.leave()) is not None:
+                with suppress(StoreUnavailableError):
+                    await reads.run(self._abandon, left)
+            raise
         if isinstance(token, Response):
             return token
         try:
             answer = await work()
         except BaseException as error:
-            if (refusal := await asyncio.to_thread(self._fail, token, error)) is None:
+            refusal = None
+            with suppress(StoreUnavailableError):
+                refusal = await reads.run(self._fail, token, error)
+            if refusal is None:
                 raise
             return refusal
-        return await asyncio.to_thread(self._keep, token, answer)
+        with suppress(StoreUnavailableError):
+            await reads.run(self._keep, token, answer)
+        return answer
 
     def _begin(self, parts: Parts) -> Response | str:
         if self._key is None:
@@ -103,6 +134,12 @@ class Once:
                 raise IdempotencyKeyReusedError(self._key)
             case InProgress():
                 raise IdempotencyInProgressError(self._key)
+
+    def _begin_for(self, waiting: _Waiting, parts: Parts) -> Response | str:
+        begun = self._begin(parts)
+        if isinstance(begun, str) and not waiting.give(begun):
+            self._abandon(begun)
+        return begun
 
     def _keep(self, token: str, answer: Response) -> Response:
         if self._key is None:
@@ -120,15 +157,40 @@ class Once:
         """The refusal, if it is one for good and kept; None when the error is to go its way."""
         if self._key is None:
             return None
-        if isinstance(error, LaLaLocError):
-            status = problem_kind(error).status
-            if status < 500 and status not in _NOT_FOR_GOOD:
-                return self._keep(token, problem_answer(self._request, error))
+        # A picture that decoders were lost over may have had bad luck.
+        if isinstance(error, _FOR_GOOD) and not isinstance(error.__cause__, JobLostError):
+            return self._keep(token, problem_answer(self._request, error))
+        self._abandon(token)
+        return None
+
+    def _abandon(self, token: str) -> None:
+        if self._key is None:
+            return
         try:
             self._claims.abandon(*self._place, self._key, token)
         except StoreUnavailableError:
             logging.getLogger(LOGGER_NAME).warning("an idempotent request that failed stays in work for its lease")
-        return None
+
+
+class _Waiting:
+    """Who waits for a claim; when they leave before they have it, it must not stay for its lease."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._left = False
+        self._token: str | None = None
+
+    def give(self, token: str) -> bool:
+        """Hand the claim over; False when nobody waits any more."""
+        with self._lock:
+            self._token = token
+            return not self._left
+
+    def leave(self) -> str | None:
+        """Wait no longer; the claim if it has been handed over already."""
+        with self._lock:
+            self._left = True
+            return self._token
 
 
 def parts_sha256(parts: Parts) -> str:

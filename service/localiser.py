@@ -31,6 +31,7 @@ from service.schemas import CandidateAnswer, LocaliseAnswer, LocaliseForm, Model
 from service.settings import Settings
 from service.storage.records import PlanRecord
 from service.telemetry import Telemetry
+from service.threads import BoundedReads
 
 # Kept free of LPO before the request's deadline, to rank and send the answer.
 _ANSWER_S = 0.25
@@ -51,6 +52,7 @@ class Localiser:
         pool: LpoPool,
         decoder: Decoder,
         queries: Places,
+        reads: BoundedReads,
         telemetry: Telemetry,
     ) -> None:
         self._settings = settings
@@ -60,6 +62,7 @@ class Localiser:
         self._pool = pool
         self._decoder = decoder
         self._queries = queries
+        self._reads = reads
         self._telemetry = telemetry
         self._executor = ThreadPoolExecutor(settings.cores.compute_threads, thread_name_prefix="localise")
 
@@ -68,10 +71,13 @@ class Localiser:
         """The model that answers."""
         return model_answer(self._bundle)
 
-    async def answer(self, record: PlanRecord, form: LocaliseForm, content: bytes, clock: StageClock) -> LocaliseAnswer:
+    async def answer(
+        self, record: PlanRecord, form: LocaliseForm, content: bytes, begin: float, clock: StageClock
+    ) -> LocaliseAnswer:
         """Localise an encoded panorama in a stored plan.
 
         Args:
+            begin: when (`monotonic`) the query was there as a whole; its deadline counts from then.
             clock: times the stages, the wait for the plan's grid included, also when they fail.
 
         Raises:
@@ -80,15 +86,15 @@ class Localiser:
             PlanFailedError: the plan's grid could not be computed.
             PlanNotReadyError: the grid was not finished by the deadline.
             DeadlineExceededError: the rest was not.
+            StoreUnavailableError: the grid is not in memory, and the database is away or silent.
             OverloadedError: too many queries are computed or wait for it, or grids to be computed on demand.
         """
         with self._queries.one():
-            return await self._answer(record, form, content, clock)
+            return await self._answer(record, form, content, begin, clock)
 
     async def _answer(
-        self, record: PlanRecord, form: LocaliseForm, content: bytes, clock: StageClock
+        self, record: PlanRecord, form: LocaliseForm, content: bytes, begin: float, clock: StageClock
     ) -> LocaliseAnswer:
-        begin = monotonic()
         deadline = begin + self._settings.request_deadline_s
         height_m = query_height_m(record, form.camera_height_m)
         # The picture first: a bad one is refused without waiting for the plan.
@@ -123,7 +129,10 @@ class Localiser:
     async def _grid(self, record: PlanRecord, height_m: float, deadline: float) -> LatentGrid:
         """The plan's grid for a camera height, computed on demand, waited for until the deadline."""
         key = self._grids.key(record.revision_id, height_m)
-        grid = await self._compute(lambda: self._grids.find(key), deadline)
+        grid = self._grids.at_hand(key)
+        if grid is None:
+            # Not on the threads that compute: a database that hangs would hold them up.
+            grid = await self._reads.run(self._grids.find, key)
         if grid is not None:
             return grid
         own_height = height_m == record.plan.camera_height_m

@@ -9,8 +9,13 @@ from service.schemas import BoundsAnswer, FloorPlanAnswer, FloorPlanSummary, Gri
 from service.storage.records import PlanRecord, PlanSummary
 
 
+def plan_state(record: PlanRecord, grids: Grids) -> GridState:
+    """How far a plan's own grid is at this moment."""
+    return grids.states([_summary(record)])[0]
+
+
 def plan_representation(
-    record: PlanRecord, grids: Grids, step_m: float, *, superseded: bool = False
+    record: PlanRecord, state: GridState, step_m: float, *, superseded: bool = False
 ) -> tuple[bytes, str]:
     """A plan as JSON, and the entity tag of that.
 
@@ -18,7 +23,6 @@ def plan_representation(
         step_m: grid step of the service.
         superseded: whether the plan has another revision by now.
     """
-    state = grids.states([_summary(record)])[0]
     content = _answer(record, state, step_m, superseded=superseded).model_dump_json().encode()
     return content, plan_etag(record.revision_id, content)
 

@@ -14,7 +14,7 @@ from lalaloc_core.bundle import Bundle
 from lalaloc_core.localise.encoders import Encoders
 from service.admission import Admission, AdmissionLimits
 from service.decoding import Decoder
-from service.events import PlanEvents
+from service.events import HEARTBEAT_S, PlanEvents
 from service.grids.caretaker import Caretaker
 from service.grids.grids import Grids
 from service.grids.known_plans import KnownPlans
@@ -25,11 +25,26 @@ from service.settings import Settings
 from service.storage.store import Store, open_store
 from service.telemetry import LOGGER_NAME, Telemetry
 from service.telemetry.tracing import Tracing, otlp_exporter
+from service.threads import BoundedReads, Threads
+
+# Queries read little: their plan, and a grid that is not in memory.
+_READ_THREADS = 4
+# Small grids are computed on them: more would take the cores from queries.
+_UPLOAD_THREADS = 2
+# With keys that are not remembered, streams still look no more often.
+_SOONEST_S = 1.0
+# Share of the time for stopping that LPO jobs may go on in.
+_LPO_DRAIN = 0.1
 
 
 @dataclass(frozen=True)
 class Runtime:
-    """Everything that the routes need."""
+    """Everything that the routes need.
+
+    Attributes:
+        uploads: threads that check, prepare and store plans.
+        reads: what queries read of the store.
+    """
 
     settings: Settings
     telemetry: Telemetry
@@ -42,11 +57,13 @@ class Runtime:
     admission: Admission
     gate: Gate
     events: PlanEvents
+    uploads: Threads
+    reads: BoundedReads
 
     @property
     def ready(self) -> bool:
         """Whether workers are warm, as the model is before the first request is taken, and the service goes on."""
-        return not self.admission.stopping and self.pool.state.warmed_up and self.decoder.state.warmed_up
+        return not self.admission.draining and self.pool.state.warmed_up and self.decoder.state.warmed_up
 
 
 def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack) -> Runtime:
@@ -73,7 +90,7 @@ def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack) 
     cleanup.callback(gate.close)
     # The pool first: loading torch in the workers overlaps with loading the model here.
     pool = LpoPool(bundle, settings, telemetry)
-    cleanup.callback(pool.close)
+    cleanup.callback(pool.close, _LPO_DRAIN * settings.stop_deadline_s)
     pool.start()
     decoder = Decoder(bundle.manifest, settings, telemetry)
     cleanup.callback(decoder.close)
@@ -83,6 +100,10 @@ def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack) 
     grids = Grids(store, encoders, bundle.sha256, settings, telemetry)
     cleanup.callback(grids.close)
     admission = Admission(AdmissionLimits.of(settings), telemetry)
+    reads = BoundedReads(threads=_READ_THREADS, most=settings.max_pending_requests, wait_s=settings.database_wait_s)
+    cleanup.callback(reads.close)
+    uploads = Threads("lalaloc-uploads", _UPLOAD_THREADS)
+    cleanup.callback(uploads.close)
     localiser = Localiser(
         settings=settings,
         bundle=bundle,
@@ -91,6 +112,7 @@ def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack) 
         pool=pool,
         decoder=decoder,
         queries=admission.queries,
+        reads=reads,
         telemetry=telemetry,
     )
     cleanup.callback(localiser.close)
@@ -98,14 +120,33 @@ def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack) 
     caretaker = Caretaker(store, grids, known_plans, sweep_s=settings.sweep_s)
     cleanup.callback(caretaker.close)
     caretaker.start()
-    events = PlanEvents(store, grids, admission, longest_s=settings.stream_deadline_s)
+    # Their callers' keys are looked at again as often.
+    heartbeat_s = max(min(settings.key_cache_s, HEARTBEAT_S), _SOONEST_S) if settings.api_keys else HEARTBEAT_S
+    events = PlanEvents(store, grids, admission, longest_s=settings.stream_deadline_s, heartbeat_s=heartbeat_s)
     fields = {"model": bundle.manifest.name, "sha256": bundle.sha256, "grids_to_compute": grids.pending}
     logger.info("service started", extra={"fields": fields})
-    return Runtime(settings, telemetry, store, grids, known_plans, pool, decoder, localiser, admission, gate, events)
+    return Runtime(
+        settings,
+        telemetry,
+        store,
+        grids,
+        known_plans,
+        pool,
+        decoder,
+        localiser,
+        admission,
+        gate,
+        events,
+        uploads,
+        reads,
+    )
 
 
-def runtime_of(request: Request) -> Runtime:
-    """The running service that a request came to."""
+async def runtime_of(request: Request) -> Runtime:
+    """The running service that a request came to.
+
+    A coroutine only so that the framework does not call it on one of its threads, which slow reads may fill.
+    """
     return request.app.state.runtime
 
 

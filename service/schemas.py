@@ -260,7 +260,7 @@ class LimitsAnswer(Answer):
     """What requests may be; each is the setting of the same name, and named by the error about it."""
 
     max_plan_bytes: int = Field(description="Upload of a floor plan.")
-    max_floorplans: int = Field(description="Stored floor plans.")
+    max_floorplans: int = Field(description="Stored floor plans per tenant.")
     max_rooms: int = Field(description="Rooms per floor plan.")
     max_vertices: int = Field(description="Vertices per room.")
     max_plan_vertices: int = Field(description="Vertices of all rooms of a floor plan.")

@@ -45,7 +45,7 @@ def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
 
 
 class Server(uvicorn.Server):
-    """Stops in two steps: requests are refused while those in work are finished, then the listener is closed."""
+    """Stops in steps: it says so, then refuses requests while those in work are finished, then closes the listener."""
 
     def __init__(self, config: uvicorn.Config, app: FastAPI, settings: Settings) -> None:
         super().__init__(config)
@@ -63,10 +63,13 @@ class Server(uvicorn.Server):
         last_resort.daemon = True
         last_resort.start()
         admission = self._admission
-        if admission is not None:
-            admission.stop()
-        else:
+        if admission is None:
             self.should_exit = True
+        elif self._settings.stop_notice_s > 0.0:
+            # Load balancers go on sending until they have noticed.
+            admission.drain()
+        else:
+            admission.stop()
 
     async def on_tick(self, counter: int) -> bool:
         """Called ten times a second; true when it is time to close the listener."""
@@ -74,10 +77,14 @@ class Server(uvicorn.Server):
         if ended or self._stopping_since is None:
             return ended
         waited_s = monotonic() - self._stopping_since
-        told = waited_s >= min(self._settings.stop_notice_s, _FOR_REQUESTS * self._settings.stop_deadline_s)
+        longest_s = _FOR_REQUESTS * self._settings.stop_deadline_s
+        if waited_s < min(self._settings.stop_notice_s, longest_s):
+            return False
         admission = self._admission
-        done = admission is None or admission.idle or waited_s >= _FOR_REQUESTS * self._settings.stop_deadline_s
-        return told and done
+        if admission is None:
+            return True
+        admission.stop()
+        return admission.idle or waited_s >= longest_s
 
     @property
     def _admission(self) -> Admission | None:

@@ -178,7 +178,7 @@ class Settings(BaseSettings):
     max_revisions: Annotated[int, Field(ge=2)] = Field(
         default=10, description="Revisions kept per floor plan; the oldest makes room."
     )
-    max_floorplans: Count = Field(default=10_000, description="Stored floor plans.")
+    max_floorplans: Count = Field(default=10_000, description="Stored floor plans per tenant.")
     max_plan_bytes: Count = Field(default=2 * 2**20, description="Upload of a floor plan.")
     max_rooms: Count = Field(default=500, description="Rooms per floor plan.")
     max_vertices: Annotated[int, Field(ge=3)] = Field(default=200, description="Vertices per room.")

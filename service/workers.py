@@ -5,8 +5,7 @@ when it stalls, and replaces it when it dies. What happens to a worker reaches c
 
     pool = WorkerPool(WorkerSpec("decode", run_decoder, (limits,), stall_s=10.0), workers=2, queue_limit=16)
     pool.start()
-    answer = pool.run(job, timeout_s=5.0)               # from a thread
-    answer = await pool.answer(job, timeout_s=5.0)      # from the event loop; cancelling it cancels the job
+    answer = await pool.answer(job, timeout_s=5.0)      # cancelling it cancels the job
 
 with `run_decoder(connection, limits)` a function of a module that calls `worker_process.serve_jobs`.
 """
@@ -22,8 +21,7 @@ import pickle
 import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable
-from concurrent.futures import CancelledError, Future
-from concurrent.futures import TimeoutError as FutureTimeoutError
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
@@ -46,8 +44,8 @@ _FIRST_BACKOFF_S = 0.25
 _LONGEST_BACKOFF_S, _LONGEST_WARM_BACKOFF_S = 30.0, 1.0
 # After so many failed starts in a row, or none that succeeded, nobody waits for the next one.
 _HOPELESS_STARTS = 3
-# So many workers may die over one job.
-_DEATHS_PER_JOB = 2
+# So many workers may die or stall over one job.
+_TRIES_PER_JOB = 2
 _POISON_MEMORY_S, _POISON_MEMORY = 600.0, 256
 _KILL_S = 5.0
 
@@ -57,9 +55,9 @@ class JobLostError(Exception):
 
     Attributes:
         reason: `not-ready`: no worker is warm, nor will be in time. `queue-full`: too many jobs wait already.
-            `deadline`: no answer in time. `poisoned`: workers died over this job. `fault`: the work raised an error,
-            which the log has. `died`: the worker died, and there is no time for another try. `closing`: the pool
-            shuts down.
+            `deadline`: no answer in time. `poisoned`: workers died or stalled over this job. `fault`: the work raised
+            an error, which the log has. `died`: the worker died, and there is no time for another try. `closing`: the
+            pool shuts down.
     """
 
     def __init__(self, reason: LostReason) -> None:
@@ -105,7 +103,7 @@ class _Ticket:
         self.content = content
         self.digest = digest
         self.deadline = deadline
-        self.deaths = 0
+        self.deaths = self.stalls = 0
         self.future: Future[Any] = Future()
 
     @property
@@ -143,6 +141,7 @@ class WorkerPool(Generic[Job, Answer]):
         self._poisoned: OrderedDict[bytes, float] = OrderedDict()
         self._changed = threading.Condition()
         self._closing = False
+        self._submitting = ThreadPoolExecutor(1, thread_name_prefix=f"{spec.name}-submit")
         self._supervisors = [_Supervisor(self, index) for index in range(workers)]
 
     def start(self) -> None:
@@ -190,31 +189,25 @@ class WorkerPool(Generic[Job, Answer]):
             self._changed.notify()
         return ticket.future
 
-    def run(self, job: Job, timeout_s: float) -> Answer:
-        """The answer to a job, waited for on this thread.
-
-        Raises:
-            JobLostError: there is none within `timeout_s`.
-        """
-        future = self.submit(job, timeout_s)
-        try:
-            return future.result(timeout_s)
-        except (FutureTimeoutError, CancelledError):
-            future.cancel()
-            raise JobLostError("deadline") from None
-
     async def answer(self, job: Job, timeout_s: float) -> Answer:
         """The answer to a job, awaited; a job that is no longer awaited is not started.
 
         Raises:
             JobLostError: there is none within `timeout_s`.
         """
-        future = asyncio.wrap_future(self.submit(job, timeout_s))
+        if self._closing:
+            raise JobLostError("closing")
+        # On a thread: copying and hashing a large job would hold up everybody else.
+        submitted = self._submitting.submit(self.submit, job, timeout_s)
         try:
             async with asyncio.timeout(timeout_s):
-                return await future
+                return await asyncio.wrap_future(await asyncio.wrap_future(submitted))
         except TimeoutError:
+            submitted.add_done_callback(_take_back)
             raise JobLostError("deadline") from None
+        except asyncio.CancelledError:
+            submitted.add_done_callback(_take_back)
+            raise
 
     def close(self, drain_s: float = 0.0) -> None:
         """End all workers and wait for them: jobs at work have `drain_s` to finish, those that wait are lost."""
@@ -228,6 +221,7 @@ class WorkerPool(Generic[Job, Answer]):
         deadline = monotonic() + drain_s
         for supervisor in self._supervisors:
             supervisor.stop(deadline)
+        self._submitting.shutdown()
 
     def _refusal(self, ticket: _Ticket) -> LostReason | None:
         if self._closing:
@@ -267,11 +261,11 @@ class WorkerPool(Generic[Job, Answer]):
         """For supervisors: the worker with this job died; let another one try, if the job may and has the time."""
         reason: LostReason | None = None
         with self._changed:
-            if ticket.deaths >= _DEATHS_PER_JOB:
+            if ticket.deaths + ticket.stalls >= _TRIES_PER_JOB:
                 reason = "poisoned"
-                self._poisoned[ticket.digest] = monotonic() + _POISON_MEMORY_S
-                while len(self._poisoned) > _POISON_MEMORY:
-                    self._poisoned.popitem(last=False)
+                # A worker may stall because the machine is busy; that says nothing about the next time.
+                if ticket.stalls == 0:
+                    self._ban(ticket.digest)
             elif self._closing:
                 reason = "closing"
             elif not ticket.wanted or not self._served_by(ticket.deadline):
@@ -283,6 +277,11 @@ class WorkerPool(Generic[Job, Answer]):
         if reason is not None:
             ticket.lose(reason)
 
+    def _ban(self, digest: bytes) -> None:
+        self._poisoned[digest] = monotonic() + _POISON_MEMORY_S
+        while len(self._poisoned) > _POISON_MEMORY:
+            self._poisoned.popitem(last=False)
+
     def pause(self, duration_s: float) -> None:
         """For supervisors: wait, but not longer than until the pool shuts down."""
         with self._changed:
@@ -293,6 +292,12 @@ class WorkerPool(Generic[Job, Answer]):
         self._on_restart(reason)
         fields = {"pool": self.spec.name, "worker": index, "reason": reason}
         logging.getLogger(LOGGER_NAME).warning("worker is replaced", extra={"fields": fields})
+
+
+def _take_back(submitted: Future[Future[Any]]) -> None:
+    """Give up a job whose caller left while it was being submitted, or after."""
+    if not submitted.cancelled() and submitted.exception() is None:
+        submitted.result().cancel()
 
 
 class _Supervisor:
@@ -418,7 +423,8 @@ class _Supervisor:
             if answer is None:
                 self.ready = False
                 self._starts_at = monotonic()
-                ticket.deaths += sent
+                ticket.stalls += watchdog.barked
+                ticket.deaths += sent and not watchdog.barked
                 self._pool.give_back(ticket)
                 return "stalled" if watchdog.barked else "died at work" if sent else "died idle"
             self._settle(ticket, answer)

@@ -42,7 +42,10 @@ class Caretaker:
             self._thread.join()
 
     def sweep(self) -> None:
-        """Forget plans and grids in memory whose revisions are gone, on whichever replica they were deleted."""
+        """Forget plans and grids in memory whose revisions are gone, on whichever replica they were deleted.
+
+        Grids of theirs that are being computed, or wait for it, are not any more.
+        """
         in_memory = sorted(self._grids.revisions() | self._known.revisions())
         for first in range(0, len(in_memory), _AT_ONCE):
             asked = in_memory[first : first + _AT_ONCE]

@@ -5,10 +5,12 @@ from __future__ import annotations
 import logging
 import threading
 import uuid
+from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass
 from time import monotonic
+from typing import Self
 
 from lalaloc_core.errors import LaLaLocError
 from lalaloc_core.floorplan import FloorPlan
@@ -54,9 +56,34 @@ class GridState:
     poses: int | None
     reason: str | None = None
 
+    @classmethod
+    def after_upload(cls, prepared: ComputedGrid | None) -> Self:
+        """That of a plan that was stored just now, with its grid or without."""
+        return cls("preparing", 0.0, None) if prepared is None else cls("ready", 1.0, len(prepared.grid.poses))
+
 
 class _LeaseLostError(Exception):
     """Another replica took the work over, or the plan is gone."""
+
+
+class _Heart:
+    """Renews the lease of a job now and then.
+
+    Attributes:
+        stopped: whether the lease is another's.
+    """
+
+    def __init__(self, renew: Callable[[], bool], every_s: float) -> None:
+        self._renew = renew
+        self._every_s = every_s
+        self._beat_at = monotonic()
+        self.stopped = False
+
+    def beat(self) -> None:
+        """Renew the lease if it is time."""
+        if not self.stopped and monotonic() >= self._beat_at:
+            self.stopped = not self._renew()
+            self._beat_at = monotonic() + self._every_s
 
 
 class Grids:
@@ -84,6 +111,8 @@ class Grids:
         self._cache: BoundedCache[GridKey, LatentGrid] = BoundedCache(settings.grid_cache_bytes, grid_bytes)
         self._loading = threading.Lock()
         self._inline = threading.Lock()
+        # Of the jobs that are being computed, all by the one thread of `Jobs`.
+        self._hearts: list[_Heart] = []
         self._jobs = Jobs(self._work)
         telemetry.gauge("lalaloc_grids_pending", "Latent grids computed or waiting for it.", lambda: self.pending)
         telemetry.gauge("lalaloc_grid_cache_bytes", "Latent grids in memory.", lambda: self._cache.bytes)
@@ -140,7 +169,7 @@ class Grids:
                     self._encoders,
                     step_m=self._settings.grid_step_m,
                     camera_height_m=millimetres(plan.camera_height_m) / 1000.0,
-                    after_chunk=lambda _progress, _worked_s: None,
+                    after_chunk=lambda _progress, worked_s: self.queries.make_way(worked_s),
                 )
             return ComputedGrid(model_sha256=self._model_sha256, grid=grid)
         except Exception:
@@ -165,12 +194,18 @@ class Grids:
         Raises:
             StoreUnavailableError: it is not in memory, and the database is away.
         """
-        grid = self._cache.get(key)
+        grid = self.at_hand(key)
         if grid is not None:
-            self._telemetry.grid_cache_hits.inc()
             return grid
         self._telemetry.grid_cache_misses.inc()
         return self._load(key)
+
+    def at_hand(self, key: GridKey) -> LatentGrid | None:
+        """A grid that is in memory."""
+        grid = self._cache.get(key)
+        if grid is not None:
+            self._telemetry.grid_cache_hits.inc()
+        return grid
 
     def compute(self, record: PlanRecord, camera_height_m: float) -> Future[LatentGrid]:
         """Compute a grid in the background; asking again while that runs gives the same future.
@@ -198,9 +233,13 @@ class Grids:
         for revision_id in revision_ids:
             self._jobs.cancel(revision_id)
 
+    def cancel(self, revision_id: str) -> None:
+        """Stop computing the grids of a revision that is gone, or no longer its plan's."""
+        self._jobs.cancel(revision_id)
+
     def revisions(self) -> set[str]:
-        """The revisions with grids in memory."""
-        return {key.revision_id for key, _ in self._cache.items()}
+        """The revisions with grids in memory, or with grids that are to be computed."""
+        return {key.revision_id for key, _ in self._cache.items()} | self._jobs.revisions()
 
     def take_up(self) -> bool:
         """Queue the oldest grids that nobody computes, unless there is enough to do; tells whether there are more."""
@@ -223,7 +262,7 @@ class Grids:
         leased = self._store.leases.progress(self._model_sha256, self._settings.grid_step_m, revision_ids)
         for job in jobs:
             progress = leased.get((job.key.revision_id, job.key.camera_height_mm))
-            if progress is None:
+            if progress is None or job.cancelled.is_set():
                 self._jobs.requeue(job)
             else:
                 job.progress = progress
@@ -261,6 +300,8 @@ class Grids:
         self._jobs.end(job, outcome)
 
     def _compute(self, job: Job) -> LatentGrid:
+        if job.cancelled.is_set():
+            raise self._why_cancelled(job)
         record = self._store.plans.by_revision(job.key.revision_id)
         if record is None:
             raise UnknownFloorPlanError(job.plan_id)
@@ -280,14 +321,16 @@ class Grids:
         return grid
 
     def _embed(self, job: Job, plan: FloorPlan) -> LatentGrid:
-        beat_at = monotonic()
+        heart = _Heart(lambda: self._renew(job), self._settings.grid_lease_s / _HEARTBEATS)
 
         def after_chunk(progress: float, worked_s: float) -> None:
-            nonlocal beat_at
             job.progress = progress
-            if monotonic() >= beat_at:
-                self._beat(job)
-                beat_at = monotonic() + self._settings.grid_lease_s / _HEARTBEATS
+            # A small grid may be computed between two chunks of a large one, whose lease must last meanwhile.
+            for beating in self._hearts:
+                beating.beat()
+            if heart.stopped:
+                # Leases go with their plans; if this one has, the job fails when it is looked at again.
+                raise _LeaseLostError
             if progress < 1.0:
                 self._jobs.let_pass(job)
                 self.queries.make_way(worked_s)
@@ -295,7 +338,11 @@ class Grids:
                 raise self._why_cancelled(job)
 
         height_m = job.key.camera_height_m
-        return embed(plan, self._encoders, step_m=job.key.step_m, camera_height_m=height_m, after_chunk=after_chunk)
+        self._hearts.append(heart)
+        try:
+            return embed(plan, self._encoders, step_m=job.key.step_m, camera_height_m=height_m, after_chunk=after_chunk)
+        finally:
+            self._hearts.pop()
 
     def _why_cancelled(self, job: Job) -> Exception:
         if self._jobs.closing.is_set():
@@ -305,15 +352,12 @@ class Grids:
         # The plan has another revision by now, which the next query finds.
         return PlanNotReadyError(job.plan_id, 0.0, 0.0)
 
-    def _beat(self, job: Job) -> None:
+    def _renew(self, job: Job) -> bool:
         try:
-            kept = self._store.leases.renew(job.key, self._owner, self._settings.grid_lease_s, job.progress)
+            return self._store.leases.renew(job.key, self._owner, self._settings.grid_lease_s, job.progress)
         except StoreUnavailableError:
             # Nobody else can take the lease meanwhile either.
-            return
-        if not kept:
-            # Leases go with their plans; if this one has, the job fails when it is looked at again.
-            raise _LeaseLostError
+            return True
 
     def _put(self, job: Job, grid: LatentGrid, *, always_keep_mm: int) -> bool:
         """Store a grid; it may have taken minutes, so a database that is away for a moment is waited for."""

@@ -115,6 +115,11 @@ class Jobs:
             self._queued.append(job)
             self._changed.notify()
 
+    def revisions(self) -> set[str]:
+        """The revisions that there are jobs for."""
+        with self._changed:
+            return {key.revision_id for key in self._jobs}
+
     def cancel(self, revision_id: str) -> None:
         """End the jobs for a revision that is gone."""
         with self._changed:

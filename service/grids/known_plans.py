@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from time import monotonic
 
-from service.errors import StoreUnavailableError
+from service.errors import StoreBusyError, StoreUnavailableError
 from service.lru import BoundedCache
 from service.storage.plans import plan_bytes
 from service.storage.records import PlanRecord
@@ -35,14 +35,18 @@ class KnownPlans:
 
         Raises:
             StoreUnavailableError: the database is away, and the plan was not read lately.
+            StoreBusyError: too many use it.
         """
-        key = (tenant, plan_id)
-        if monotonic() < self._away_until and (known := self._lately(key)) is not None:
+        if (known := self.while_away(tenant, plan_id)) is not None:
             return known
+        key = (tenant, plan_id)
         try:
             record = self._store.plans.get(tenant, plan_id)
+        except StoreBusyError:
+            # It is there, and the plan may be gone.
+            raise
         except StoreUnavailableError:
-            self._away_until = monotonic() + _LEFT_ALONE_S
+            self.note_silence()
             known = self._lately(key)
             if known is None:
                 raise
@@ -52,6 +56,14 @@ class KnownPlans:
         else:
             self._known.put(key, (record, monotonic()))
         return record
+
+    def while_away(self, tenant: str, plan_id: str) -> PlanRecord | None:
+        """A plan that was read lately, if the database was away a moment ago; from memory, at once."""
+        return self._lately((tenant, plan_id)) if monotonic() < self._away_until else None
+
+    def note_silence(self) -> None:
+        """The database does not answer: leave it alone for a moment."""
+        self._away_until = monotonic() + _LEFT_ALONE_S
 
     def revisions(self) -> set[str]:
         """The revisions in memory."""

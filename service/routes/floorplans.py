@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response, status
@@ -26,8 +25,9 @@ from service.errors import (
     UploadTimeoutError,
     UploadTooLargeError,
 )
+from service.grids.grids import GridState
 from service.idempotency import Once
-from service.plan_answers import list_entries, plan_representation
+from service.plan_answers import list_entries, plan_representation, plan_state
 from service.problems import problem_responses
 from service.routes.requested import (
     IDEMPOTENCY_KEY,
@@ -109,12 +109,18 @@ async def create_floorplan(request: Request, runtime: Running, tenant: Tenant) -
         plan, grid = _prepared(content, runtime)
         limit = runtime.settings.max_floorplans
         record = runtime.store.plans.add(tenant, token, plan, original=content, limit=limit, grid=grid)
-        # A plan that was stored before may have been replaced since, and then has another grid.
-        runtime.grids.follow_up(record, grid if record.plan is plan else None)
-        return _written(request, record, runtime, status.HTTP_201_CREATED)
+        if record.plan is plan:
+            runtime.grids.follow_up(record, grid)
+            # Not asked for: what is stored is answered for, whatever becomes of the database.
+            state = GridState.after_upload(grid)
+        else:
+            # It was stored before, and may have been replaced since, and then has another grid.
+            runtime.grids.follow_up(record, None)
+            state = plan_state(record, runtime.grids)
+        return _written(request, record, state, runtime, status.HTTP_201_CREATED)
 
     # One call from the claim to the answer: a client that hangs up meanwhile does not leave it half-way.
-    return await asyncio.to_thread(once.run, Parts({}, {_FILE: content}), store)
+    return await runtime.uploads.run(once.run, Parts({}, {_FILE: content}), store)
 
 
 @router.get("", summary="List floor plans", responses=problem_responses(InvalidRequestError, StoreUnavailableError))
@@ -162,7 +168,7 @@ def get_floorplan(
         record = _at_revision(record, revision, runtime)
     note(request, plan=record.id, revision=record.revision_id)
     step_m = runtime.settings.grid_step_m
-    content, etag = plan_representation(record, runtime.grids, step_m, superseded=superseded)
+    content, etag = plan_representation(record, plan_state(record, runtime.grids), step_m, superseded=superseded)
     return conditional_answer(request, content, JSON, etag)
 
 
@@ -178,7 +184,7 @@ async def replace_floorplan(floorplan_id: str, request: Request, runtime: Runnin
 
     Queries in work are answered by the revision that they began with, and say which (`floorplan_revision`).
     """
-    current = await asyncio.to_thread(stored_plan, tenant, floorplan_id, runtime.store.plans)
+    current = await runtime.uploads.run(stored_plan, tenant, floorplan_id, runtime.store.plans)
     expected = expected_revision(request, current.id, current.revision_id)
     content = await _uploaded_plan(request, runtime)
 
@@ -188,11 +194,13 @@ async def replace_floorplan(floorplan_id: str, request: Request, runtime: Runnin
         record = runtime.store.plans.add_revision(
             tenant, current.id, plan, original=content, keep=keep, expected=expected, grid=grid
         )
+        # First, so that it is not in the way of the new grid; queries in work may still need the one in memory.
+        runtime.grids.cancel(current.revision_id)
         runtime.grids.follow_up(record, grid)
         runtime.known_plans.drop({current.revision_id})
-        return _written(request, record, runtime, status.HTTP_200_OK)
+        return _written(request, record, GridState.after_upload(grid), runtime, status.HTTP_200_OK)
 
-    return await asyncio.to_thread(store)
+    return await runtime.uploads.run(store)
 
 
 @router.delete(
@@ -250,9 +258,9 @@ def _prepared(content: bytes, runtime: Runtime) -> tuple[FloorPlan, ComputedGrid
     return plan, runtime.grids.prepare(plan)
 
 
-def _written(request: Request, record: PlanRecord, runtime: Runtime, code: int) -> Response:
+def _written(request: Request, record: PlanRecord, state: GridState, runtime: Runtime, code: int) -> Response:
     note(request, plan=record.id, revision=record.revision_id)
-    content, etag = plan_representation(record, runtime.grids, runtime.settings.grid_step_m)
+    content, etag = plan_representation(record, state, runtime.settings.grid_step_m)
     path = str(request.app.url_path_for("get_floorplan", floorplan_id=record.id))
     # The tag is that of this answer, which is what a GET from there gives, and not of what was uploaded.
     headers = {"Content-Location": path, "ETag": etag}

@@ -53,8 +53,9 @@ async def readyz(runtime: Annotated[Runtime, Depends(runtime_of)], response: Res
     response_class=Response,
     responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}},
 )
-def metrics(runtime: Annotated[Runtime, Depends(runtime_of)]) -> Response:
+async def metrics(runtime: Annotated[Runtime, Depends(runtime_of)]) -> Response:
     """All metrics in Prometheus' text format."""
+    # From memory in milliseconds, and told also when every thread is busy.
     return Response(runtime.telemetry.render(), media_type=CONTENT_TYPE_LATEST)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
+from time import monotonic
 from typing import Any
 
 from fastapi import APIRouter, Request, Response
@@ -28,7 +28,7 @@ from service.errors import (
 )
 from service.idempotency import Once
 from service.problems import problem_responses
-from service.routes.requested import IDEMPOTENCY_KEY, Running, Tenant, stored_plan
+from service.routes.requested import IDEMPOTENCY_KEY, Running, Tenant, known_plan
 from service.schemas import LocaliseAnswer, LocaliseForm
 from service.telemetry import note
 from service.uploads import JSON, MULTIPART, UploadLimits, media_type, read_parts, validate_fields
@@ -88,16 +88,17 @@ async def localise(request: Request, runtime: Running, tenant: Tenant) -> Respon
     note(request, clock=clock)
     with clock.stage("upload"):
         parts = await read_parts(request, limits, files={"panorama"}, fields=set(LocaliseForm.model_fields))
+    begin = monotonic()
     form = validate_fields(LocaliseForm, parts.fields)
     if form.top_k > settings.max_top_k:
         fault = f"is {form.top_k}, at most {settings.max_top_k} are allowed (max_top_k)"
         raise InvalidRequestError([("top_k", fault)])
 
     async def answer() -> Response:
-        record = await asyncio.to_thread(stored_plan, tenant, form.floorplan_id, runtime.known_plans)
+        record = await known_plan(tenant, form.floorplan_id, runtime)
         note(request, plan=record.id, revision=record.revision_id)
-        found = await runtime.localiser.answer(record, form, parts.files["panorama"], clock)
+        found = await runtime.localiser.answer(record, form, parts.files["panorama"], begin, clock)
         note(request, stage=found.stage)
         return Response(found.model_dump_json(), media_type=JSON)
 
-    return await once.run_async(parts, answer)
+    return await once.run_async(parts, answer, runtime.reads)

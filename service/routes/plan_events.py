@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from functools import partial
 
 from fastapi import APIRouter, Request, Response
 from fastapi.responses import StreamingResponse
@@ -32,9 +33,9 @@ async def follow_floorplan(floorplan_id: str, request: Request, runtime: Running
     """Server-sent events about the plan's latent grid, whichever replica computes it.
 
     `progress` comes at once and whenever something changed, at most four times a second; `ready`, `failed` or
-    `deleted` is the last one. A comment comes every 15 s when there is nothing to tell. The stream also ends after
-    `stream_deadline_s`, and when the service stops: ask anew.
+    `deleted` is the last one. A comment comes at least every 15 s when there is nothing to tell. The stream also ends
+    after `stream_deadline_s`, soon after the caller's API key was revoked, and when the service stops: ask anew.
     """
     record = await asyncio.to_thread(stored_plan, tenant, floorplan_id, runtime.store.plans)
     note(request, plan=record.id, revision=record.revision_id)
-    return runtime.events.answer(record.id)
+    return runtime.events.answer(record.id, partial(runtime.gate.knows, request))

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
+from time import monotonic
 from typing import Annotated, Any
 
 from fastapi import Depends, Request
 
-from service.errors import UnknownFloorPlanError
+from service.errors import StoreUnavailableError, UnknownFloorPlanError
 from service.grids.known_plans import KnownPlans
 from service.idempotency import HEADER, MOST_CHARACTERS
 from service.runtime import Runtime, runtime_of
@@ -37,6 +38,30 @@ def stored_plan(tenant: str, floorplan_id: str, plans: Plans | KnownPlans) -> Pl
     if record is None:
         raise UnknownFloorPlanError(floorplan_id)
     return record
+
+
+async def known_plan(tenant: str, floorplan_id: str, runtime: Runtime) -> PlanRecord:
+    """A plan for a query: as the database has it, or as it was read lately when the database is away or silent.
+
+    Raises:
+        UnknownFloorPlanError: there is none.
+        StoreUnavailableError: the database is away, and the plan was not read lately; or too many use it.
+    """
+    begin_s = monotonic()
+    known = runtime.known_plans.while_away(tenant, floorplan_id)
+    if known is not None:
+        return known
+    try:
+        return await runtime.reads.run(stored_plan, tenant, floorplan_id, runtime.known_plans)
+    except StoreUnavailableError:
+        if runtime.store.answered_since(begin_s):
+            # It is there, and the plan may be gone.
+            raise
+        runtime.known_plans.note_silence()
+        known = runtime.known_plans.while_away(tenant, floorplan_id)
+        if known is None:
+            raise
+        return known
 
 
 def is_id(text: str) -> bool:

@@ -1,11 +1,20 @@
-"""Without API keys the service answers its own machine only, unless it is told otherwise."""
+"""Without API keys the service answers its own machine only, unless it is told otherwise.
+
+A browser on this machine counts as it only under a loopback name, and for changes only with a page from here: names
+of other sites may be made to resolve to 127.0.0.1, and their forms may be sent anywhere.
+"""
 
 from __future__ import annotations
 
 import ipaddress
+from collections.abc import Sequence
+from urllib.parse import urlsplit
 
 from lalaloc_core.errors import ConfigError
+from service.errors import ExposedWithoutKeysError
 from service.settings import Settings
+
+_CHANGING = frozenset({"POST", "PUT", "PATCH", "DELETE"})
 
 
 def is_local(server: tuple[str, int | None] | None) -> bool:
@@ -23,6 +32,35 @@ def is_local(server: tuple[str, int | None] | None) -> bool:
     # 127.0.0.1 as a socket for both kinds of addresses names it.
     mapped = getattr(address, "ipv4_mapped", None)
     return (mapped or address).is_loopback
+
+
+def names_this_machine(authority: str) -> bool:
+    """Whether a host with or without a port is a loopback address, or `localhost`.
+
+    A browser that was sent here by the page of another site, under a name that the site controls, says that name.
+    """
+    try:
+        host = urlsplit(f"//{authority}").hostname or ""
+    except ValueError:
+        return False
+    return host == "localhost" or is_local((host, 0))
+
+
+def check_origin(method: str, hosts: Sequence[str], origins: Sequence[str]) -> None:
+    """Refuse what a browser was made to send by a page from elsewhere.
+
+    Args:
+        hosts: values of `Host`; programs may leave it out, browsers do not.
+        origins: values of `Origin`, which browsers send with whatever changes something.
+
+    Raises:
+        ExposedWithoutKeysError: another name than this machine's, or a change that a page from elsewhere asked for.
+    """
+    if not all(names_this_machine(host) for host in hosts):
+        raise ExposedWithoutKeysError("to localhost or a loopback address (Host)")
+    pages = [origin.partition("://")[2] for origin in origins]
+    if method in _CHANGING and not all(names_this_machine(page) for page in pages):
+        raise ExposedWithoutKeysError("from pages of this machine (Origin)")
 
 
 def check_address(host: str, settings: Settings) -> None:

@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 
-from service.errors import StoreUnavailableError
+from service.errors import StoreBusyError, StoreUnavailableError
 from service.lru import BoundedCache
 from service.security.keys import PresentedKey
 from service.storage.api_keys import ApiKeys
@@ -66,6 +66,7 @@ class KeyRing:
 
         Raises:
             StoreUnavailableError: the database is away, and the key is not known from the last minutes.
+            StoreBusyError: too many use it.
         """
         known = self._known.get(presented.hash)
         if known is not None and self._clock() < known.ask_again_s:
@@ -87,6 +88,9 @@ class KeyRing:
             return known.key
         try:
             key = self._find(key_hash)
+        except StoreBusyError:
+            # It is there, and the key may be revoked.
+            raise
         except StoreUnavailableError:
             now_s = self._clock()
             if known is None or now_s - known.verified_s > _TRUSTED_S:
@@ -108,6 +112,8 @@ class KeyRing:
             raise StoreUnavailableError()
         try:
             return self._keys.find(key_hash)
+        except StoreBusyError:
+            raise
         except StoreUnavailableError:
             self._away_until_s = self._clock() + _AWAY_S
             raise

@@ -17,7 +17,7 @@ from service.errors import (
 )
 from service.problems import http_problem_answer, problem_answer
 from service.security.access import ANYONE, OPEN_PATHS, Caller, Permission, permissions_needed, put_caller
-from service.security.exposure import is_local
+from service.security.exposure import check_origin, is_local
 from service.security.key_ring import KeyRing
 from service.security.keys import parse_authorization
 from service.security.limits import Rates
@@ -66,8 +66,8 @@ class Gate:
             HTTPException: there is no such route, or it has no such method.
         """
         if not self._needs_keys:
-            if not self._allow_anonymous and not is_local(request.scope.get("server")):
-                raise ExposedWithoutKeysError()
+            if not self._allow_anonymous:
+                _check_local(request)
             return ANYONE
         key = await self._key_of(request)
         note(request, key=key.id, tenant=key.tenant)
@@ -77,6 +77,16 @@ class Gate:
         if needed not in caller.permissions:
             raise InsufficientScopeError(needed, caller.permissions)
         return caller
+
+    async def knows(self, request: Request) -> bool:
+        """Whether the key of a request that was let in is still valid; true where there are no keys."""
+        presented = parse_authorization(Headers(scope=request.scope).getlist("authorization"))
+        if not self._needs_keys or presented is None:
+            return not self._needs_keys
+        try:
+            return await self._ring.find(presented) is not None
+        except StoreUnavailableError:
+            return False
 
     async def _key_of(self, request: Request) -> ApiKey:
         values = Headers(scope=request.scope).getlist("authorization")
@@ -118,6 +128,19 @@ class GateMiddleware:
                 await http_problem_answer(request, error)(scope, receive, send)
                 return
         await self._app(scope, receive, send)
+
+
+def _check_local(request: Request) -> None:
+    """Raises:
+    ExposedWithoutKeysError: the request came from another machine, or a page from elsewhere made it.
+    """
+    server = request.scope.get("server")
+    if not is_local(server):
+        raise ExposedWithoutKeysError("over a loopback address")
+    # Browsers do not ask over Unix sockets; what does, a proxy, names the service as its own clients do.
+    if server is not None and server[1] is not None:
+        headers = Headers(scope=request.scope)
+        check_origin(request.method, headers.getlist("host"), headers.getlist("origin"))
 
 
 def _needed(request: Request) -> Permission:

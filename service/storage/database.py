@@ -20,7 +20,7 @@ from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 
 from lalaloc_core.errors import ConfigError
-from service.errors import StoreUnavailableError
+from service.errors import StoreBusyError, StoreUnavailableError
 from service.telemetry import LOGGER_NAME
 
 _WRITER = "lalaloc_writer"
@@ -59,6 +59,10 @@ class Database:
             event.listen(self._engine, "connect", _prepare_sqlite)
             event.listen(self._engine, "begin", _begin_sqlite)
         self.engine_for_writing: Engine = self._engine.execution_options(**{_WRITER: True})
+        # What is read in one transaction belongs together; on SQLite it does so anyway.
+        snapshot = {"isolation_level": "REPEATABLE READ"} if self.is_postgresql else {}
+        self._engine_for_reading: Engine = self._engine.execution_options(**snapshot)
+        self._answered_s = -float("inf")
 
     def close(self) -> None:
         """Give all connections back."""
@@ -66,12 +70,13 @@ class Database:
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
-        """A transaction that only reads.
+        """A transaction that only reads, and sees the database as it is at its first statement.
 
         Raises:
             StoreUnavailableError: the database cannot be reached, or did not answer in time.
+            StoreBusyError: it answers, but no connection became free in time.
         """
-        with self._transaction(self._engine) as connection:
+        with self._transaction(self._engine_for_reading) as connection:
             yield connection
 
     @contextmanager
@@ -79,7 +84,7 @@ class Database:
         """A transaction that writes; on SQLite it waits for other writers when it begins, not half-way through.
 
         Raises:
-            StoreUnavailableError: as for `reading`.
+            StoreUnavailableError, StoreBusyError: as for `reading`.
         """
         with self._transaction(self.engine_for_writing) as connection:
             yield connection
@@ -93,16 +98,27 @@ class Database:
             return cast(extract("epoch", func.clock_timestamp()), Double)
         return literal(time.time())
 
+    def answered_since(self, moment_s: float) -> bool:
+        """Whether a transaction was completed after a moment (`monotonic`)."""
+        return self._answered_s >= moment_s
+
     def insert(self, table: Any) -> Any:
         """An INSERT that knows `ON CONFLICT`; both databases have it, in the same words."""
         return postgresql.insert(table) if self.is_postgresql else sqlite.insert(table)
 
     @contextmanager
     def _transaction(self, engine: Engine) -> Iterator[Connection]:
+        begin_s = time.monotonic()
         try:
             with engine.begin() as connection:
                 yield connection
-        except (OperationalError, InterfaceError, PoolTimeoutError) as error:
+            self._answered_s = time.monotonic()
+        except PoolTimeoutError as error:
+            # Others were answered meanwhile; or it is gone, and those who asked first still wait for it.
+            if self.answered_since(begin_s):
+                raise StoreBusyError() from error
+            raise _unavailable(error) from error
+        except (OperationalError, InterfaceError) as error:
             raise _unavailable(error) from error
         except DBAPIError as error:
             if error.connection_invalidated:

@@ -48,7 +48,7 @@ class Idempotency:
                 created_at=now,
             )
             if connection.scalar(statement.on_conflict_do_nothing().returning(_COLUMNS.token)) == token:
-                return Fresh(token, resumed=False)
+                return Fresh(token)
             return self._repeated(connection, own, body_sha256, until_s)
 
     def finish(self, tenant: str, route: str, key: str, token: str, answer: StoredAnswer) -> None:
@@ -59,10 +59,13 @@ class Idempotency:
             connection.execute(update(IDEMPOTENCY).where(*own).values(**values))
 
     def abandon(self, tenant: str, route: str, key: str, token: str) -> None:
-        """Say that the request was not carried out after all; the next one is."""
+        """Say that the request was not seen through; the next one is, at once and under the same token.
+
+        The token stays because something may have been stored under it, whatever its owner believes.
+        """
         own = (*_where(tenant, route, key), _COLUMNS.token == token, _COLUMNS.status.is_(None))
         with self._database.writing() as connection:
-            connection.execute(delete(IDEMPOTENCY).where(*own))
+            connection.execute(update(IDEMPOTENCY).where(*own).values(lease_until_s=0.0))
 
     def purge(self) -> int:
         """Drop what is older than a day; returns how many."""
@@ -75,7 +78,7 @@ class Idempotency:
     ) -> Claim:
         row = connection.execute(select(IDEMPOTENCY).where(*own).with_for_update()).one_or_none()
         if row is None:
-            # Abandoned between two statements: as good as still in work, the caller tries again.
+            # Purged between two statements: as good as still in work, the caller tries again.
             return InProgress()
         if row.body_sha256 != body_sha256:
             return Conflict()
@@ -83,7 +86,7 @@ class Idempotency:
             return StoredAnswer(row.status, json.loads(row.headers), row.body)
         ran_out = _COLUMNS.lease_until_s < self._database.now_s()
         taken = connection.execute(update(IDEMPOTENCY).where(*own, ran_out).values(lease_until_s=until_s))
-        return Fresh(row.token, resumed=True) if taken.rowcount == 1 else InProgress()
+        return Fresh(row.token) if taken.rowcount == 1 else InProgress()
 
 
 def _where(tenant: str, route: str, key: str) -> list[ColumnElement[bool]]:

@@ -13,7 +13,7 @@ from typing import Any
 from sqlalchemy import Connection, Row, and_, delete, func, or_, select, text, update
 
 from lalaloc_core.floorplan import FloorPlan, PlanLimits
-from service.errors import RevisionMismatchError, TooManyFloorPlansError, UnknownFloorPlanError
+from service.errors import RevisionMismatchError, ServiceError, TooManyFloorPlansError, UnknownFloorPlanError
 from service.lru import BoundedCache
 from service.storage.chunks import read_chunks, write_chunks
 from service.storage.database import Database
@@ -59,7 +59,7 @@ class Plans:
 
         Args:
             plan_id: a new one, or that of an upload that is repeated; never a caller's choice.
-            limit: most plans that are stored, of all tenants together.
+            limit: most plans that the tenant may have.
 
         Raises:
             TooManyFloorPlansError: there are `limit` already.
@@ -71,7 +71,8 @@ class Plans:
                 connection.execute(text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": _COUNT_LOCK})
             if (stored := self._record(connection, _current_head(tenant, plan_id))) is not None:
                 return stored
-            if (connection.scalar(select(func.count()).select_from(FLOORPLANS)) or 0) >= limit:
+            own = select(func.count()).select_from(FLOORPLANS).where(FLOORPLANS.c.tenant == tenant)
+            if (connection.scalar(own) or 0) >= limit:
                 raise TooManyFloorPlansError(limit)
             values = {"id": plan_id, "tenant": tenant, "created_at": now, **_head(record)}
             connection.execute(FLOORPLANS.insert(), values)
@@ -136,13 +137,24 @@ class Plans:
         return self._one(_select_heads(current=False).where(REVISIONS.c.id == revision_id))
 
     def original(self, tenant: str, plan_id: str) -> bytes | None:
-        """The bytes that the current revision of a plan was uploaded as."""
-        query = select(FLOORPLANS.c.revision_id).where(FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
+        """The bytes that the current revision of a plan was uploaded as.
+
+        Raises:
+            ServiceError: what is stored are others.
+        """
+        query = (
+            select(REVISIONS.c.id, REVISIONS.c.original_sha256)
+            .join_from(FLOORPLANS, REVISIONS, FLOORPLANS.c.revision_id == REVISIONS.c.id)
+            .where(FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
+        )
         with self._database.reading() as connection:
-            revision_id = connection.scalar(query)
-            if revision_id is None:
+            row = connection.execute(query).one_or_none()
+            if row is None:
                 return None
-            return b"".join(read_chunks(connection, ORIGINAL_CHUNKS, {"revision_id": revision_id}))
+            content = b"".join(read_chunks(connection, ORIGINAL_CHUNKS, {"revision_id": row.id}))
+        if hashlib.sha256(content).hexdigest() != row.original_sha256:
+            raise ServiceError(f"the original of floor plan '{plan_id}' at revision '{row.id}' is damaged")
+        return content
 
     def list(
         self, tenant: str, *, limit: int, after: Cursor | None = None, name: str | None = None

@@ -123,13 +123,11 @@ class Fresh:
     """The request is to be carried out.
 
     Attributes:
-        token: 32 hexadecimal digits that stay the same when another process takes over from one that died half-way:
-            what is made under this id is made once.
-        resumed: whether that is so, and something may have been made already.
+        token: 32 hexadecimal digits that stay the same when the request is taken over from an attempt that failed or
+            whose process died half-way: what is made under this id is made once.
     """
 
     token: str
-    resumed: bool
 
 
 @dataclass(frozen=True)

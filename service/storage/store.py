@@ -51,6 +51,10 @@ class Store:
         self.idempotency = Idempotency(database)
         self.keys = ApiKeys(database)
 
+    def answered_since(self, moment_s: float) -> bool:
+        """Whether the database answered anybody after a moment (`monotonic`); who waits since then finds it busy."""
+        return self._database.answered_since(moment_s)
+
     def close(self) -> None:
         """Give all connections back."""
         self._database.close()

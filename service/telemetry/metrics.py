@@ -47,7 +47,6 @@ class Telemetry:
         self.answers = self.counter(
             "lalaloc_localise_answers", "Queries answered, by the stage that answered.", ["stage"]
         )
-        self.lpo_restarts = self.counter("lalaloc_lpo_restarts", "LPO workers that had to be replaced.")
         self.lpo_missed = self.counter(
             "lalaloc_lpo_missed", "LPO jobs without an answer in time, by reason.", ["reason"]
         )
@@ -83,8 +82,6 @@ class Telemetry:
     def note_restart(self, pool: str) -> None:
         """Count that a worker process of a pool has to be replaced."""
         self.pool_restarts.labels(pool).inc()
-        if pool == "lpo":
-            self.lpo_restarts.inc()
 
     @contextmanager
     def timed(self, histogram: Histogram) -> Iterator[None]:

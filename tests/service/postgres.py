@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pwd
 import shutil
+import signal
 import socket
 import subprocess
 import tempfile
@@ -50,6 +51,31 @@ class PostgresServer:
             connection.exec_driver_sql(f"CREATE SCHEMA {name} AUTHORIZATION {name}")
         engine.dispose()
         return self.url(name)
+
+    @contextmanager
+    def locked(self, url: str, table: str) -> Iterator[None]:
+        """Inside the block, whoever reads or writes a table of a database of `new_database` waits."""
+        engine = sqlalchemy.create_engine(url.replace("postgresql:", "postgresql+psycopg:"))
+        with engine.connect() as connection:
+            connection.exec_driver_sql(f"LOCK TABLE {table}")
+            yield
+        engine.dispose()
+
+    @contextmanager
+    def silent(self) -> Iterator[None]:
+        """Inside the block it does not answer, nor does it close a connection: all its processes stand still."""
+        postmaster = int((self.folder / "postmaster.pid").read_text(encoding="ascii").split()[0])
+        # It first, so that no more of them come.
+        stopped = [postmaster]
+        os.kill(postmaster, signal.SIGSTOP)
+        try:
+            for pid in _children(postmaster):
+                os.kill(pid, signal.SIGSTOP)
+                stopped.append(pid)
+            yield
+        finally:
+            for pid in reversed(stopped):
+                os.kill(pid, signal.SIGCONT)
 
     def start(self) -> None:
         """Start it, or start it again."""
@@ -101,6 +127,11 @@ def _run(command: list[str | Path]) -> None:
         done = subprocess.run(command, user=_user(), cwd="/", stdout=output, stderr=output, check=False)
         output.seek(0)
         assert done.returncode == 0, f"{command[0]} failed: {output.read().decode(errors='replace')}"
+
+
+def _children(pid: int) -> list[int]:
+    listing = subprocess.run(["ps", "-o", "pid=", "--ppid", str(pid)], capture_output=True, text=True, check=False)
+    return [int(line) for line in listing.stdout.split()]
 
 
 def _user() -> str | None:

@@ -29,8 +29,8 @@ def small(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iter
 def _open_upload(client: httpx.Client, path: str = "/floorplans") -> Iterator[socket.socket]:
     """An upload whose body does not come."""
     with socket.create_connection((client.base_url.host, client.base_url.port or 80), timeout=10.0) as connection:
-        head = f"POST {path} HTTP/1.1\r\nHost: test\r\nContent-Type: application/json\r\nContent-Length: 100000\r\n\r\n"
-        connection.sendall(head.encode() + b"{")
+        head = f"POST {path} HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
+        connection.sendall(f"{head}Content-Length: 100000\r\n\r\n{{".encode())
         yield connection
 
 
@@ -97,7 +97,7 @@ def test_a_client_that_hangs_up_frees_its_place(small: httpx.Client, panorama: b
     preparing = upload(small, HALL, wait=False)
     body, content_type = _multipart(preparing, panorama)
     with socket.create_connection((small.base_url.host, small.base_url.port or 80), timeout=10.0) as connection:
-        lines = ["POST /localise HTTP/1.1", "Host: test", f"Content-Type: {content_type}"]
+        lines = ["POST /localise HTTP/1.1", "Host: localhost", f"Content-Type: {content_type}"]
         head = "\r\n".join([*lines, f"Content-Length: {len(body)}", "", ""])
         connection.sendall(head.encode() + body)
         wait_for(lambda: _in_flight(small) == 1)

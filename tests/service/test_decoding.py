@@ -8,7 +8,6 @@ import multiprocessing
 import os
 import signal
 import struct
-import time
 import zlib
 from concurrent.futures import ThreadPoolExecutor
 from multiprocessing.process import BaseProcess
@@ -94,10 +93,9 @@ def test_a_picture_over_which_decoders_stall_is_refused_and_the_next_one_is_answ
         problem = assert_problem(localise(client, plan_id, slow, **QUICK), 422, "invalid-panorama")
         assert "longer than 0.2 s (decode_stall_s)" in problem["detail"]
         assert restarts(client) == 2.0
-        begin = time.monotonic()
+        ready(client)
         assert_problem(localise(client, plan_id, slow, **QUICK), 422, "invalid-panorama")
-        assert time.monotonic() - begin < 2.0, "what killed two decoders is not tried again"
-        assert restarts(client) == 2.0
+        assert restarts(client) == 4.0, "it may have been the machine that was slow, so it is tried again"
         assert localise(client, plan_id, panorama, **QUICK).status_code == 200
 
 
@@ -106,7 +104,6 @@ def test_more_panoramas_than_may_wait_are_refused_at_once(start_app: StartApp, t
         plan_id = upload(client)
         ready(client)
         os.kill(decoder(), signal.SIGSTOP)
-        # Different bytes: the same picture would count as the one that made the decoder stall.
         pictures = [panorama + bytes([i]) for i in range(4)]
         answers = [threads.submit(localise, client, plan_id, picture, **QUICK) for picture in pictures]
         codes = sorted(answer.result().status_code for answer in answers)

@@ -15,8 +15,10 @@ import httpx
 from service.app import create_app
 from service.events import PlanEvents
 from service.settings import Settings
-from tests.service.conftest import FLAT, StartApp, assert_problem, serve, upload, wait_for
+from service.storage.store import Store
+from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, serve, upload, wait_for
 from tests.service.postgres import PostgresServer
+from tests.service.test_security import bearer, id_of, make_key
 
 HALL = {"ceiling_height_m": 3.0, "rooms": [{"name": "hall", "polygon": [[0, 0], [40, 0], [40, 40], [0, 40]]}]}
 SLOW: dict[str, Any] = {"grid_step_m": 0.1, "max_grid_poses": 10**6}
@@ -166,6 +168,27 @@ def test_silence_is_broken_by_comments(tiny_bundle: Path, tmp_path: Path) -> Non
 
         chunks = asyncio.run(read())
         assert chunks.count(b": heartbeat\n\n") >= 3
+
+
+def test_a_stream_does_not_outlive_the_key_of_its_caller(
+    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path
+) -> None:
+    with start_app(tmp_path, api_keys=True, key_cache_s=0.1, **SLOW) as client:
+        store = Store(database_of(tmp_path))
+        other, key = make_key(store), make_key(store)
+        client.headers.update(bearer(other))
+        plan_id = upload(client, HALL, wait=False)
+        with client.stream("GET", f"/floorplans/{plan_id}/events", headers=bearer(key)) as response:
+            chunks = response.iter_raw()
+            # It lasts for as long as the key does.
+            end = monotonic() + 2.5
+            while monotonic() < end:
+                next(chunks)
+            store.keys.revoke(id_of(key))
+            begin = monotonic()
+            assert b"event: ready" not in b"".join(chunks)
+            assert monotonic() - begin < 3.0
+        store.close()
 
 
 def test_what_another_replica_computes_is_followed_here(

@@ -187,7 +187,8 @@ def test_an_upload_that_stalls_is_ended(start_app: StartApp, tmp_path: Path) -> 
         address = (client.base_url.host, client.base_url.port)
         with socket.create_connection(address, timeout=10.0) as connection:
             connection.sendall(
-                b"POST /floorplans HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nContent-Length: 50\r\n\r\n{"
+                b"POST /floorplans HTTP/1.1\r\nHost: localhost\r\n"
+                b"Content-Type: application/json\r\nContent-Length: 50\r\n\r\n{"
             )
             assert b"408" in connection.recv(4096).split(b"\r\n")[0]
 

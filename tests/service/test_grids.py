@@ -25,6 +25,7 @@ from service.errors import (
     OverloadedError,
     PlanNotReadyError,
     StoppingError,
+    StoreBusyError,
     StoreUnavailableError,
     UnknownFloorPlanError,
 )
@@ -48,6 +49,9 @@ PLAN = FloorPlan.from_dict(FLAT)
 HALL = FloorPlan.from_dict(
     {"ceiling_height_m": 3.0, "rooms": [{"name": "hall", "polygon": [[0, 0], [20, 0], [20, 20], [0, 20]]}]}
 )
+LARGE_HALL = FloorPlan.from_dict(
+    {"ceiling_height_m": 3.0, "rooms": [{"name": "hall", "polygon": [[0, 0], [30, 0], [30, 30], [0, 30]]}]}
+)
 
 
 class CountingEncoders(Encoders):
@@ -56,6 +60,7 @@ class CountingEncoders(Encoders):
     def __init__(self, bundle: Bundle) -> None:
         super().__init__(bundle, threads=1)
         self.embedded = 0
+        self.pause_s = 0.0
         self.go_on = threading.Event()
         self.go_on.set()
 
@@ -64,6 +69,7 @@ class CountingEncoders(Encoders):
         result = super().poses(*arguments, **named)
         self.embedded += len(result[0])
         assert self.go_on.wait(30.0)
+        time.sleep(self.pause_s)
         return result
 
 
@@ -331,6 +337,39 @@ def test_gone_plans_and_old_revisions_are_dropped_from_memory_on_every_replica(
     assert grids.revisions() == known.revisions() == {records["kept"].revision_id}
 
 
+def test_revisions_that_were_replaced_on_another_replica_are_not_computed_any_more(
+    open_store: OpenStore, make_grids: MakeGrids, encoders: CountingEncoders
+) -> None:
+    store, elsewhere = open_store(), open_store()
+    grids, known = make_grids(store), KnownPlans(store, limit_bytes=2**20, max_age_s=600.0)
+    encoders.go_on.clear()
+    # The first one has begun, the others wait.
+    futures = [grids.compute(_add(store, HALL), 1.5)]
+    wait_for(lambda: encoders.embedded > 0)
+    for _ in range(3):
+        record = elsewhere.plans.add_revision("default", "p", HALL, original=b"", keep=5)
+        futures.append(grids.compute(record, 1.5))
+    Caretaker(store, grids, known, sweep_s=5.0).sweep()
+    encoders.go_on.set()
+    assert len(futures.pop().result(60.0).poses) == 1521
+    assert [type(future.exception(30.0)) for future in futures] == [PlanNotReadyError] * 3
+    assert encoders.embedded <= 256 + 1521
+
+
+def test_the_job_of_a_replaced_revision_ends_although_another_replica_is_at_it(
+    open_store: OpenStore, make_grids: MakeGrids
+) -> None:
+    store = open_store()
+    grids, record = make_grids(store), _add(store)
+    store.leases.claim(grids.key(record.revision_id, 1.5), "another replica", 60.0)
+    future = grids.compute(record, 1.5)
+    wait_for(lambda: len(grids._jobs.elsewhere()) == 1)
+    store.plans.add_revision("default", "p", PLAN, original=b"", keep=5)
+    grids.cancel(record.revision_id)
+    grids.look_elsewhere()
+    assert isinstance(future.exception(30.0), PlanNotReadyError)
+
+
 # A large grid in the background
 
 
@@ -345,6 +384,26 @@ def test_small_grids_overtake_a_large_one(store: Store, make_grids: MakeGrids, e
     quick.result(30.0)
     assert not slow.done()
     assert slow.result(60.0) is not None
+
+
+def test_a_large_grid_keeps_its_lease_while_a_small_one_overtakes_it(
+    store: Store, make_grids: MakeGrids, encoders: CountingEncoders
+) -> None:
+    grids = make_grids(store, grid_lease_s=2.0)
+    large, small = _add(store, LARGE_HALL, "large"), _add(store, HALL, "small")
+    encoders.go_on.clear()
+    slow = grids.compute(large, 1.5)
+    wait_for(lambda: encoders.embedded > 0)
+    quick = grids.compute(small, 1.5)
+    # Six chunks, which take longer than the lease lasts.
+    encoders.pause_s = 0.5
+    encoders.go_on.set()
+    while not quick.done():
+        assert not store.leases.claim(grids.key(large.revision_id, 1.5), "another replica", 60.0)
+        time.sleep(0.1)
+    encoders.pause_s = 0.0
+    assert not slow.done()
+    assert len(slow.result(60.0).poses) > 2000
 
 
 def test_what_waits_is_bounded_and_a_plans_own_grid_has_a_place_of_its_own(
@@ -420,6 +479,22 @@ def test_plans_that_were_read_lately_are_known_while_the_database_is_away(
     store.plans.delete("default", "p")
     time.sleep(1.1)
     assert known.get("default", "p") is None
+    store.close()
+
+
+def test_a_database_that_is_busy_is_no_reason_to_go_by_what_was_read_lately(tmp_path: Path) -> None:
+    store = Store(f"sqlite:///{tmp_path / 'test.sqlite3'}", connections=1, wait_s=0.05)
+    known = KnownPlans(store, limit_bytes=2**20, max_age_s=600.0)
+    record = _add(store)
+    assert known.get("default", "p") == record
+    with store._database.reading():
+        # As if others were answered all the while.
+        store._database._answered_s = float("inf")
+        for _ in range(2):
+            with pytest.raises(StoreBusyError):
+                known.get("default", "p")
+        store._database._answered_s = 0.0
+        assert known.get("default", "p") == record
     store.close()
 
 

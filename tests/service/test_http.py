@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from time import monotonic
 
 import httpx
 import pytest
@@ -13,7 +15,8 @@ from service.admission import EXEMPT
 from service.app import create_app
 from service.openapi import openapi_text
 from service.runtime import Runtime, runtime_of
-from tests.service.conftest import assert_problem, localise, serve, upload, wait_for
+from tests.service.conftest import StartApp, assert_problem, localise, serve, upload, wait_for
+from tests.service.postgres import PostgresServer
 
 ROOT = Path(__file__).parents[2]
 
@@ -66,6 +69,23 @@ def test_without_workers_the_service_is_ready_when_it_is_up(client: httpx.Client
     assert response.json()["ready"] is True
     assert response.json()["lpo_pool"]["workers"] == 0
     assert response.json()["decode_pool"]["workers"] == 1
+
+
+def test_reads_that_wait_do_not_hold_up_health(start_app: StartApp, postgres: PostgresServer, tmp_path: Path) -> None:
+    url = postgres.new_database()
+    with (
+        # More than the framework has threads.
+        start_app(tmp_path, database_url=url, max_reads=60, database_wait_s=5.0) as client,
+        ThreadPoolExecutor(60) as readers,
+        postgres.locked(url, "floorplans"),
+    ):
+        for _ in range(60):
+            readers.submit(client.get, "/floorplans")
+        end = monotonic() + 3.0
+        while monotonic() < end:
+            begin = monotonic()
+            assert httpx.get(f"{client.base_url}/readyz").status_code == 200
+            assert monotonic() - begin < 1.5
 
 
 def test_metrics_count_requests_by_route_and_queries_by_stage(client: httpx.Client, panorama: bytes) -> None:

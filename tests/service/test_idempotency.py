@@ -2,26 +2,43 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import socket
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import httpx
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from sqlalchemy import select
+from starlette.requests import Request
+from starlette.responses import Response
 
+from lalaloc_core.errors import InvalidPanoramaError
 from lalaloc_core.floorplan import FloorPlan
-from service.idempotency import parts_sha256
+from service.errors import (
+    DecoderNotReadyError,
+    PlanFailedError,
+    StoreUnavailableError,
+    UnknownFloorPlanError,
+    UploadTimeoutError,
+)
+from service.idempotency import Once, parts_sha256
+from service.storage.grids import StoredGrids
 from service.storage.records import Fresh
 from service.storage.store import Store
+from service.storage.tables import IDEMPOTENCY
+from service.threads import BoundedReads
 from service.uploads import Parts
+from service.workers import JobLostError
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, upload, wait_for
 
 CONTENT = json.dumps(FLAT).encode()
+NOTHING = Parts({}, {})
 
 
 def _keyed(key: str) -> dict[str, str]:
@@ -181,7 +198,7 @@ def test_what_a_process_that_died_had_stored_is_found_by_the_next(
 
 def test_an_upload_whose_client_hangs_up_is_carried_out_once(own: httpx.Client) -> None:
     head = (
-        "POST /floorplans HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\nIdempotency-Key: a\r\n"
+        "POST /floorplans HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\nIdempotency-Key: a\r\n"
         f"Content-Length: {len(CONTENT)}\r\n\r\n"
     )
     address = (own.base_url.host, own.base_url.port or 0)
@@ -218,6 +235,109 @@ def test_a_query_whose_client_hangs_up_may_be_sent_again_at_once(
         wait_for(lambda: "lalaloc_requests_in_flight 0.0" in client.get("/metrics").text)
         client.delete(f"/floorplans/{plan_id}")
         assert_problem(_query(client, "a", plan_id, panorama), 404, "unknown-floorplan")
+
+
+def test_what_is_stored_is_answered_for_whatever_becomes_of_the_database(
+    own: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def away(*_arguments: Any) -> NoReturn:
+        raise StoreUnavailableError()
+
+    # What follows the commit: how far the grid is.
+    monkeypatch.setattr(StoredGrids, "poses", away)
+    created = _post(own, "a")
+    assert (created.status_code, created.json()["status"]) == (201, "ready")
+    replaced = own.put(created.headers["location"], json=FLAT, headers={"If-Match": created.headers["etag"]})
+    assert (replaced.status_code, replaced.json()["revision_number"]) == (200, 2)
+    monkeypatch.undo()
+    for answer in (replaced, own.get(created.headers["location"])):
+        assert answer.headers["etag"] == replaced.headers["etag"]
+        assert answer.json()["grid"]["poses"] == 110
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Iterator[Store]:
+    opened = Store(f"sqlite:///{tmp_path / 'test.sqlite3'}")
+    yield opened
+    opened.close()
+
+
+def _once(store: Store) -> Once:
+    scope = {"type": "http", "method": "POST", "path": "/x", "headers": [(b"idempotency-key", b"a")], "state": {}}
+    return Once(store.idempotency, Request(scope), "default", "POST /x")
+
+
+def test_an_upload_that_failed_after_it_was_stored_is_found_when_it_is_sent_again(store: Store) -> None:
+    failures = iter([StoreUnavailableError(), None])
+
+    def work(token: str) -> Response:
+        store.plans.add("default", token, FloorPlan.from_json(CONTENT), original=CONTENT, limit=10)
+        if (failure := next(failures)) is not None:
+            raise failure
+        return Response(token)
+
+    with pytest.raises(StoreUnavailableError):
+        _once(store).run(NOTHING, work)
+    answer = _once(store).run(NOTHING, work)
+    assert [summary.id for summary in store.plans.list("default", limit=10)] == [bytes(answer.body).decode()]
+
+
+def _poisoned() -> Exception:
+    error = InvalidPanoramaError("twice that took longer")
+    error.__cause__ = JobLostError("poisoned")
+    return error
+
+
+@pytest.mark.parametrize(
+    ("refusal", "kept"),
+    [
+        (InvalidPanoramaError("no picture"), True),
+        (UnknownFloorPlanError("x"), True),
+        (_poisoned(), False),
+        (PlanFailedError("x", "internal error"), False),
+        (DecoderNotReadyError(), False),
+        (UploadTimeoutError("too slow"), False),
+    ],
+)
+def test_only_refusals_that_the_request_is_to_blame_for_are_kept(store: Store, refusal: Exception, kept: bool) -> None:
+    def refuse(_token: str) -> Response:
+        raise refusal
+
+    if kept:
+        first = _once(store).run(NOTHING, refuse)
+        assert _once(store).run(NOTHING, lambda token: Response(token)).body == first.body
+        return
+    with pytest.raises(type(refusal)):
+        _once(store).run(NOTHING, refuse)
+    assert _once(store).run(NOTHING, lambda _token: Response("done")).body == b"done"
+
+
+@pytest.mark.parametrize("leaves", [True, False], ids=["hangs up", "is told to come again"])
+def test_who_is_gone_before_their_claim_is_made_leaves_none(store: Store, leaves: bool) -> None:
+    async def never() -> Response:
+        raise AssertionError("it has not begun")
+
+    async def ask() -> None:
+        reads = BoundedReads(threads=1, most=4, wait_s=30.0 if leaves else 0.2)
+        # Whoever writes waits meanwhile.
+        with store._database.writing():
+            asking = asyncio.create_task(_once(store).run_async(NOTHING, never, reads))
+            await asyncio.sleep(0.3)
+            asking.cancel()
+            with pytest.raises(asyncio.CancelledError if leaves else StoreUnavailableError):
+                await asking
+        reads.close()
+
+    asyncio.run(ask())
+    claims = store.idempotency
+    wait_for(lambda: _token_of(store) is not None, 10.0)
+    again = Fresh(_token_of(store) or "")
+    wait_for(lambda: claims.begin("default", "POST /x", "a", parts_sha256(NOTHING)) == again, 10.0)
+
+
+def _token_of(store: Store) -> str | None:
+    with store._database.reading() as connection:
+        return connection.scalar(select(IDEMPOTENCY.c.token))
 
 
 PARTS = st.dictionaries(st.text(max_size=3), st.text(max_size=3), max_size=3)

@@ -27,6 +27,7 @@ from lalaloc_core.localise.retrieval import build_grid
 from service.schemas import TimingsAnswer
 from service.settings import Settings
 from tests.service.conftest import FLAT, StartApp, assert_problem, encode_picture, localise, upload, wait_for
+from tests.service.postgres import PostgresServer
 
 # Large enough that its grid takes a while, small enough for the default limits.
 HALL: dict[str, Any] = {
@@ -303,6 +304,55 @@ def test_queries_beyond_the_limit_are_refused_at_once(start_app: StartApp, tmp_p
         assert_problem(refused, 503, "overloaded")
         assert refused.headers["retry-after"] == "1"
         assert waiting.result().status_code == 200
+
+
+def test_a_database_that_hangs_holds_up_no_query_for_a_known_plan(
+    start_app: StartApp, postgres: PostgresServer, tmp_path: Path, panorama: bytes
+) -> None:
+    with start_app(tmp_path, database_url=postgres.new_database(), database_wait_s=1.0) as client:
+        known, unknown = upload(client), upload(client)
+        assert localise(client, known, panorama, refine="none").status_code == 200
+        with postgres.silent():
+            begin = monotonic()
+            for _ in range(8):
+                assert localise(client, known, panorama, refine="none").status_code == 200
+            # Not each of them waits, and those that wait do not take all threads.
+            assert monotonic() - begin < 6.0
+            assert_problem(localise(client, unknown, panorama, refine="none"), 503, "store-unavailable")
+            assert_problem(
+                client.post(
+                    "/localise",
+                    data={"floorplan_id": known},
+                    files={"panorama": ("p.jpg", panorama, "image/jpeg")},
+                    headers={"Idempotency-Key": "silent"},
+                ),
+                503,
+                "store-unavailable",
+            )
+        wait_for(lambda: localise(client, unknown, panorama, refine="none").status_code == 200)
+
+
+def test_uploads_hold_up_no_query(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+    plan = {"ceiling_height_m": 3.0, "rooms": [{"polygon": [[0, 0], [40, 0], [40, 40], [0, 40]]}]}
+    with start_app(tmp_path, inline_grid_poses=10**6) as client:
+        plan_id = upload(client)
+        stop = threading.Event()
+
+        def keep_uploading() -> None:
+            while not stop.is_set():
+                client.post("/floorplans", json=plan)
+
+        with ThreadPoolExecutor(12) as uploaders:
+            for _ in range(12):
+                uploaders.submit(keep_uploading)
+            try:
+                wait_for(lambda: "lalaloc_requests_in_flight 12.0" in client.get("/metrics").text)
+                begin = monotonic()
+                for _ in range(8):
+                    assert localise(client, plan_id, panorama, refine="none").status_code == 200
+                assert monotonic() - begin < 6.0
+            finally:
+                stop.set()
 
 
 def test_deleting_a_plan_ends_the_queries_that_wait_for_it(client: httpx.Client, panorama: bytes) -> None:

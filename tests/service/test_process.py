@@ -138,7 +138,7 @@ def test_workers_killed_at_random_cost_no_query_its_answer(tiny_bundle: Path, tm
         assert {answer.json()["stage"] for answer in answers} == {"lpo", "vdr"}
         wait_for(lambda: _warm(client), 120.0)
         assert localise(client, plan_id, panorama).json()["stage"] == "lpo"
-        assert "lalaloc_lpo_restarts_total 0.0" not in client.get("/metrics").text
+        assert 'lalaloc_pool_restarts_total{pool="lpo"} 0.0' not in client.get("/metrics").text
 
 
 def test_a_killed_service_leaves_no_workers_and_takes_up_what_it_was_preparing(

@@ -8,14 +8,16 @@ import signal
 import socket
 import subprocess
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
 import httpx
 import pytest
 
-from tests.service.conftest import StartApp, localise, upload, wait_for
+from tests.service.conftest import StartApp, assert_problem, localise, upload, wait_for
 from tests.service.postgres import PostgresServer
 
 CONFIGURATION = Path(__file__).parents[2] / "docker" / "nginx.conf"
@@ -79,6 +81,21 @@ def test_two_replicas_behind_the_proxy_are_one_service(
             assert {answer.status_code for answer in answers} == {200}
             assert proxy.delete(f"/floorplans/{plan_id}").status_code == 204
             assert localise(a, plan_id, panorama, heading_deg=0).status_code == 404
+
+
+def test_refusals_take_no_replica_out(start_app: StartApp, postgres: PostgresServer, tmp_path: Path) -> None:
+    shared: dict[str, Any] = {"database_url": postgres.new_database(), "max_reads": 1}
+    with start_app(tmp_path / "a", **shared) as a, start_app(tmp_path / "b", **shared) as b, ExitStack() as readers:
+        waiting = readers.enter_context(ThreadPoolExecutor(2))
+        readers.enter_context(postgres.locked(shared["database_url"], "floorplans"))
+        for replica in (a, b):
+            waiting.submit(replica.get, "/floorplans")
+        for replica in (a, b):
+            wait_for(lambda replica=replica: "lalaloc_reads_in_flight 1.0" in replica.get("/metrics").text)
+        with nginx(tmp_path, [a, b]) as proxy:
+            for _ in range(8):
+                assert_problem(proxy.get("/floorplans"), 503, "overloaded")
+                assert proxy.get("/healthz").status_code == 200
 
 
 def test_the_proxy_lets_through_what_the_service_takes(

@@ -308,6 +308,19 @@ def test_of_many_who_replace_the_same_revision_one_does(client: httpx.Client) ->
 # Deletion and jobs
 
 
+def test_a_revision_that_is_replaced_while_it_is_prepared_is_not_any_longer(
+    start_app: StartApp, tmp_path: Path
+) -> None:
+    large = HALL | {"rooms": [{"name": "hall", "polygon": [[0, 0], [90, 0], [90, 90], [0, 90]]}]}
+    with start_app(tmp_path, **_hall(0.1), max_grid_poses=10**6, sweep_s=3600.0) as client:
+        plan_id = upload(client, large, wait=False)
+        wait_for(lambda: client.get(f"/floorplans/{plan_id}").json()["progress"] > 0.0)
+        assert client.put(f"/floorplans/{plan_id}", json=FLAT).status_code == 200
+        wait_for(lambda: client.get(f"/floorplans/{plan_id}").json()["status"] == "ready")
+        # Long before the first one would have been done.
+        wait_for(lambda: "lalaloc_grids_pending 0.0" in client.get("/metrics").text, 5.0)
+
+
 def test_a_plan_that_is_deleted_while_it_is_prepared_is_not_any_longer(
     start_app: StartApp, tmp_path: Path, panorama: bytes
 ) -> None:

@@ -23,7 +23,7 @@ from starlette.types import Receive, Scope, Send
 
 from lalaloc_core.errors import ConfigError
 from service.app import create_app
-from service.errors import StoreUnavailableError, TooManyRefusedKeysError
+from service.errors import StoreBusyError, StoreUnavailableError, TooManyRefusedKeysError
 from service.security.access import NEEDED, OPEN_PATHS, Permission
 from service.security.exposure import check_address, is_local
 from service.security.key_ring import KeyRing
@@ -493,6 +493,31 @@ def test_a_key_is_trusted_for_ten_minutes_without_the_database_and_not_longer(tm
         store.close()
 
 
+def test_a_database_that_is_busy_is_no_reason_to_trust_a_key(tmp_path: Path) -> None:
+    store = Store(f"sqlite:///{tmp_path / 'keys.sqlite3'}", connections=1, wait_s=0.05)
+    clock_s = [1000.0]
+    ring = KeyRing(store.keys, fresh_s=5.0, clock=lambda: clock_s[0])
+    presented = parse_authorization([f"Bearer {make_key(store)}"])
+    assert presented is not None
+    try:
+        key = asyncio.run(ring.find(presented))
+        assert key is not None
+        wait_for(lambda: store.keys.list()[0].last_used_at is not None)
+        with store._database.reading():
+            # As if others were answered all the while.
+            store._database._answered_s = float("inf")
+            clock_s[0] = 1006.0
+            with pytest.raises(StoreBusyError):
+                asyncio.run(ring.find(presented))
+        # Nor is it left alone for a moment.
+        again = asyncio.run(ring.find(presented))
+        assert again is not None
+        assert again.id == key.id
+    finally:
+        ring.close()
+        store.close()
+
+
 # --- without keys -----------------------------------------------------------------------------------------------------
 
 
@@ -545,6 +570,46 @@ def test_without_keys_others_than_this_machine_are_refused_unless_told_otherwise
             if not allowed:
                 assert_problem(response, 403, "exposed-without-keys")
         assert client.post("/floorplans", json=FLAT).status_code == (201 if allowed else 403)
+
+
+@pytest.mark.parametrize(
+    ("method", "headers", "status"),
+    [
+        ("GET", {}, 200),
+        ("GET", {"Host": "localhost:8000"}, 200),
+        ("GET", {"Host": "127.8.0.1"}, 200),
+        ("GET", {"Host": "[::1]:8000"}, 200),
+        ("GET", {"Host": "evil.example"}, 403),
+        ("GET", {"Host": "localhost.evil.example:8000"}, 403),
+        ("GET", {"Host": "192.168.1.7"}, 403),
+        ("GET", {"Host": "[::1"}, 403),
+        ("GET", {"Host": ""}, 403),
+        ("GET", {"Origin": "https://evil.example"}, 200),
+        ("POST", {"Origin": "http://localhost:3000"}, 201),
+        ("POST", {"Origin": "https://evil.example"}, 403),
+        ("POST", {"Origin": "null"}, 403),
+        ("POST", {"Host": "evil.example"}, 403),
+    ],
+)
+def test_without_keys_pages_from_elsewhere_have_no_say(
+    anonymous: httpx.Client, method: str, headers: dict[str, str], status: int
+) -> None:
+    response = anonymous.request(method, "/floorplans", headers=headers, json=FLAT if method == "POST" else None)
+    assert response.status_code == status
+    if status == 403:
+        assert_problem(response, 403, "exposed-without-keys")
+
+
+def test_with_leave_any_name_and_page_will_do(start_app: StartApp, tmp_path: Path) -> None:
+    with start_app(tmp_path, allow_anonymous=True) as client:
+        elsewhere = {"Host": "plans.example", "Origin": "https://plans.example"}
+        assert client.post("/floorplans", json=FLAT, headers=elsewhere).status_code == 201
+
+
+@pytest.fixture(scope="module")
+def anonymous(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+    with start_app(tmp_path_factory.mktemp("data")) as client:
+        yield client
 
 
 @pytest.mark.parametrize(

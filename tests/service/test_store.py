@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import sqlite3
 import threading
@@ -10,18 +11,27 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Any
+from unittest.mock import ANY
 
 import numpy as np
 import pytest
 from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
-from sqlalchemy import event, func, select, update
+from sqlalchemy import delete, event, func, select, update
 
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.poses import LatentGrid
 from lalaloc_core.sampling import PoseSet
-from service.errors import RevisionMismatchError, StoreUnavailableError, TooManyFloorPlansError, UnknownFloorPlanError
+from service.errors import (
+    RevisionMismatchError,
+    ServiceError,
+    StoreBusyError,
+    StoreUnavailableError,
+    TooManyFloorPlansError,
+    UnknownFloorPlanError,
+)
 from service.storage.chunks import CHUNK_BYTES
 from service.storage.idempotency import KEPT_FOR
 from service.storage.records import ComputedGrid, Conflict, Cursor, Fresh, GridKey, InProgress, StoredAnswer
@@ -137,11 +147,12 @@ def test_a_plan_that_cannot_be_stored_whole_is_not_stored_at_all(store: Store, b
     assert [_rows(store, table) for table in METADATA.sorted_tables] == [0] * len(METADATA.sorted_tables)
 
 
-def test_the_number_of_plans_is_limited_for_all_tenants_together(store: Store) -> None:
+def test_the_number_of_plans_is_limited_for_each_tenant(store: Store) -> None:
     _add(store, tenant="one")
+    store.plans.add("two", "b", PLAN, original=b"{}", limit=1)
     with pytest.raises(TooManyFloorPlansError, match="1 floor plans"):
-        store.plans.add("two", "b", PLAN, original=b"{}", limit=1)
-    assert store.plans.list("two", limit=10) == []
+        store.plans.add("two", "c", PLAN, original=b"{}", limit=1)
+    assert [summary.id for summary in store.plans.list("two", limit=10)] == ["b"]
 
 
 def test_the_limit_holds_when_many_upload_at_once(open_store: OpenStore) -> None:
@@ -169,6 +180,36 @@ def test_a_tenants_plan_does_not_exist_for_others(store: Store) -> None:
     with pytest.raises(UnknownFloorPlanError):
         store.plans.add_revision("two", "p", PLAN, original=b"", keep=5)
     assert store.plans.get("one", "p") is not None
+
+
+@pytest.mark.parametrize("half_way", ["SELECT revisions.document", "SELECT original_chunks"])
+def test_what_is_deleted_while_it_is_read_is_read_whole(open_store: OpenStore, half_way: str) -> None:
+    first, second = open_store(), open_store()
+    original = bytes(CHUNK_BYTES + 1)
+    added = first.plans.add("default", "p", PLAN, original=original, limit=10)
+
+    def delete_elsewhere(*arguments: Any) -> None:
+        if arguments[2].startswith(half_way):
+            first.plans.delete("default", "p")
+
+    event.listen(second._database._engine, "before_cursor_execute", delete_elsewhere)
+    if "chunks" in half_way:
+        assert second.plans.original("default", "p") == original
+    else:
+        assert second.plans.get("default", "p") == dataclasses.replace(added, plan=ANY)
+    assert second.plans.get("default", "p") is None
+
+
+@pytest.mark.parametrize("cut_off", [True, False])
+def test_an_original_that_is_not_what_was_uploaded_is_not_given_out(store: Store, cut_off: bool) -> None:
+    store.plans.add("default", "p", PLAN, original=bytes(CHUNK_BYTES + 1), limit=10)
+    with store._database.writing() as connection:
+        last = ORIGINAL_CHUNKS.c.number == 1
+        connection.execute(
+            delete(ORIGINAL_CHUNKS).where(last) if cut_off else update(ORIGINAL_CHUNKS).where(last).values(content=b"x")
+        )
+    with pytest.raises(ServiceError, match="original of floor plan 'p'"):
+        store.plans.original("default", "p")
 
 
 def test_deleting_a_plan_leaves_nothing_of_it(store: Store) -> None:
@@ -421,7 +462,6 @@ def test_a_request_is_carried_out_once_and_its_answer_kept(open_store: OpenStore
     first, second = open_store(), open_store()
     claim = first.idempotency.begin("t", "POST /floorplans", "k", "body")
     assert isinstance(claim, Fresh)
-    assert not claim.resumed
     assert second.idempotency.begin("t", "POST /floorplans", "k", "body") == InProgress()
     assert second.idempotency.begin("t", "POST /floorplans", "k", "another") == Conflict()
     first.idempotency.finish("t", "POST /floorplans", "k", claim.token, ANSWER)
@@ -437,11 +477,13 @@ def test_an_abandoned_request_may_be_sent_again_an_answered_one_not(store: Store
     store.idempotency.abandon("t", "r", "k", "not the token")
     assert store.idempotency.begin("t", "r", "k", "body") == InProgress()
     store.idempotency.abandon("t", "r", "k", claim.token)
-    again = store.idempotency.begin("t", "r", "k", "another")
-    assert isinstance(again, Fresh)
-    store.idempotency.finish("t", "r", "k", again.token, ANSWER)
-    store.idempotency.abandon("t", "r", "k", again.token)
-    assert store.idempotency.begin("t", "r", "k", "another") == ANSWER
+    assert store.idempotency.begin("t", "r", "k", "another") == Conflict()
+    # Under the same token: something may have been stored under it.
+    assert store.idempotency.begin("t", "r", "k", "body") == claim
+    assert store.idempotency.begin("t", "r", "k", "body") == InProgress()
+    store.idempotency.finish("t", "r", "k", claim.token, ANSWER)
+    store.idempotency.abandon("t", "r", "k", claim.token)
+    assert store.idempotency.begin("t", "r", "k", "body") == ANSWER
 
 
 def test_the_request_of_a_dead_owner_is_taken_over_once_under_the_same_token(open_store: OpenStore) -> None:
@@ -451,7 +493,7 @@ def test_the_request_of_a_dead_owner_is_taken_over_once_under_the_same_token(ope
     time.sleep(0.3)
     with ThreadPoolExecutor(4) as threads:
         claims = list(threads.map(lambda n: stores[n % 2].idempotency.begin("t", "r", "k", "body"), range(4)))
-    assert [claim for claim in claims if claim != InProgress()] == [Fresh(dead.token, resumed=True)]
+    assert [claim for claim in claims if claim != InProgress()] == [Fresh(dead.token)]
 
 
 def test_answers_are_kept_for_a_day(store: Store) -> None:
@@ -595,6 +637,27 @@ def test_what_is_open_is_bounded_and_waiting_for_it_as_well(url: str) -> None:
             store.plans.list("default", limit=1)
         assert time.monotonic() - begin < 2.0
     assert store.plans.list("default", limit=1) == []
+    store.close()
+
+
+def test_a_database_that_answers_others_meanwhile_is_busy_and_not_away(url: str) -> None:
+    store = Store(url, connections=1, wait_s=0.25)
+
+    def use(_number: int) -> StoreUnavailableError | None:
+        try:
+            with store._database.reading():
+                time.sleep(0.1)
+        except StoreUnavailableError as error:
+            return error
+        return None
+
+    with ThreadPoolExecutor(10) as threads:
+        refused = [error for error in threads.map(use, range(10)) if error is not None]
+    assert refused
+    assert all(isinstance(error, StoreBusyError) for error in refused)
+    with store._database.reading(), pytest.raises(StoreUnavailableError) as caught:
+        store.plans.list("default", limit=1)
+    assert not isinstance(caught.value, StoreBusyError)
     store.close()
 
 

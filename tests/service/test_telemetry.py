@@ -140,7 +140,7 @@ def test_a_client_that_hangs_up_is_counted_and_told(client: httpx.Client, log: L
     before = _metric(client, gone)
     with socket.create_connection((client.base_url.host, client.base_url.port or 80)) as connection:
         head = (
-            "POST /floorplans HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
+            "POST /floorplans HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
             "Content-Length: 1000\r\nX-Request-ID: gone-1\r\n\r\n"
         )
         connection.sendall(head.encode() + b"{" * 10)

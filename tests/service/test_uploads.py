@@ -14,7 +14,7 @@ import pytest
 from tests.service.conftest import StartApp, assert_problem
 
 HEAD = (
-    "POST /floorplans HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"
+    "POST /floorplans HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
     "Content-Length: 100000\r\nConnection: close\r\n\r\n"
 )
 

@@ -68,6 +68,10 @@ def _kill(pids: list[int]) -> None:
             os.kill(pid, signal.SIGKILL)
 
 
+def _run(pool: Pool, job: tuple[str, Any], timeout_s: float) -> Any:
+    return asyncio.run(pool.answer(job, timeout_s))
+
+
 def _reason(future: Future[Any]) -> str:
     with pytest.raises(JobLostError) as lost:
         future.result(20.0)
@@ -76,8 +80,8 @@ def _reason(future: Future[Any]) -> str:
 
 def test_every_caller_gets_its_own_answer_and_errors_cost_no_worker(log: Path) -> None:
     with _warm_pool(log, workers=2, queue_limit=100) as pool, ThreadPoolExecutor(8) as threads:
-        answers = [threads.submit(pool.run, ("echo", index), 20.0) for index in range(50)]
-        broken = [threads.submit(pool.run, ("raise", "on purpose"), 20.0) for _ in range(5)]
+        answers = [threads.submit(_run, pool, ("echo", index), 20.0) for index in range(50)]
+        broken = [threads.submit(_run, pool, ("raise", "on purpose"), 20.0) for _ in range(5)]
         assert [answer.result() for answer in answers] == list(range(50))
         assert {_reason(future) for future in broken} == {"fault"}
         assert _count(log, "start") == 2
@@ -113,7 +117,33 @@ def test_a_job_that_kills_two_workers_is_never_tried_again(log: Path) -> None:
             pool.submit(("die", 1), 30.0)
         assert _count(log, "die") == 2
         # Others go on as before.
-        assert pool.run(("echo", 2), 30.0) == 2
+        assert _run(pool, ("echo", 2), 30.0) == 2
+
+
+def test_a_job_over_which_workers_stall_is_given_up_and_tried_anew_when_it_comes_again(log: Path) -> None:
+    with _warm_pool(log, workers=2, stall_s=0.5) as pool:
+        for tries in (2, 4):
+            assert _reason(pool.submit(("sleep", 5.0), 30.0)) == "poisoned"
+            assert _count(log, "sleep") == tries
+            wait_for(lambda: pool.state.ready == 2)
+
+
+def test_a_job_of_which_its_caller_despairs_while_it_is_submitted_is_not_started(log: Path) -> None:
+    async def leave_at_once(pool: Pool) -> None:
+        # Large enough that copying and hashing it takes a while.
+        waiting = asyncio.create_task(pool.answer(("echo", bytes(200_000_000)), 20.0))
+        await asyncio.sleep(0.05)
+        waiting.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await waiting
+
+    with _warm_pool(log) as pool:
+        busy = pool.submit(("sleep", 2.0), 20.0)
+        wait_for(lambda: _count(log, "sleep") == 1)
+        asyncio.run(leave_at_once(pool))
+        busy.result(20.0)
+        assert _run(pool, ("bytes", 1), 20.0) == b"\0"
+        assert _count(log, "echo") == 0
 
 
 def test_killing_at_any_moment_loses_no_answer_and_mixes_up_none(log: Path) -> None:
@@ -128,7 +158,7 @@ def test_killing_at_any_moment_loses_no_answer_and_mixes_up_none(log: Path) -> N
 
     def ask(pool: Pool, size: int) -> str:
         try:
-            return "right" if len(pool.run(("bytes", size), 5.0)) == size else "wrong"
+            return "right" if len(_run(pool, ("bytes", size), 5.0)) == size else "wrong"
         except JobLostError as lost:
             return lost.reason
 
@@ -155,7 +185,7 @@ def test_a_worker_that_stalls_is_replaced_even_in_the_middle_of_a_message(log: P
         os.kill(stalled, signal.SIGSTOP)
         # Larger than what the pipe holds: the supervisor cannot even send it.
         begin = monotonic()
-        assert pool.run(("echo", b"x" * 10_000_000), 20.0) == b"x" * 10_000_000
+        assert _run(pool, ("echo", b"x" * 10_000_000), 20.0) == b"x" * 10_000_000
         assert monotonic() - begin > 1.0
         assert stalled not in _pids()
 
@@ -168,7 +198,7 @@ def test_jobs_that_nobody_waits_for_are_not_started(log: Path) -> None:
         assert cancelled.cancel()
         busy.result(20.0)
         assert _reason(late) == "deadline"
-        assert pool.run(("bytes", 1), 20.0) == b"\0"
+        assert _run(pool, ("bytes", 1), 20.0) == b"\0"
         assert _count(log, "echo") == _count(log, "raise") == 0
 
 
@@ -185,7 +215,7 @@ def test_a_wait_that_is_cancelled_on_the_event_loop_cancels_the_job(log: Path) -
         wait_for(lambda: _count(log, "sleep") == 1)
         asyncio.run(give_up(pool))
         busy.result(20.0)
-        assert asyncio.run(pool.answer(("bytes", 1), 20.0)) == b"\0"
+        assert _run(pool, ("bytes", 1), 20.0) == b"\0"
         assert _count(log, "echo") == 0
 
 
@@ -193,9 +223,9 @@ def test_a_deadline_is_kept_and_the_worker_goes_on(log: Path) -> None:
     with _warm_pool(log) as pool:
         begin = monotonic()
         with pytest.raises(JobLostError, match="deadline"):
-            pool.run(("sleep", 1.0), 0.2)
+            _run(pool, ("sleep", 1.0), 0.2)
         assert monotonic() - begin < 0.7
-        assert pool.run(("echo", 1), 20.0) == 1
+        assert _run(pool, ("echo", 1), 20.0) == 1
         assert _count(log, "start") == 1
 
 
@@ -223,6 +253,8 @@ def test_closing_finishes_what_is_at_work_and_loses_what_waits(log: Path) -> Non
         assert _reason(waiting) == "closing"
         with pytest.raises(JobLostError, match="closing"):
             pool.submit(("echo", 1), 20.0)
+        with pytest.raises(JobLostError, match="closing"):
+            _run(pool, ("echo", 1), 20.0)
 
 
 def test_closing_does_not_wait_longer_than_it_is_told(log: Path) -> None:

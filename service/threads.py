@@ -1,0 +1,75 @@
+"""A few threads of their own for each kind of work that waits, so that one kind never fills those of another."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextvars import copy_context
+from typing import Any, ParamSpec, TypeVar
+
+from service.errors import StoreUnavailableError
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+class Threads:
+    """Runs blocking calls for one event loop; what waits for a thread is bounded by who is let in."""
+
+    def __init__(self, name: str, count: int) -> None:
+        self._executor = ThreadPoolExecutor(count, thread_name_prefix=name)
+
+    async def run(self, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """The outcome of a call; one that has begun runs to its end, whether or not its caller waits."""
+        return await asyncio.wrap_future(self.submit(work, *args, **kwargs))
+
+    def submit(self, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
+        """Begin a call in the caller's context, so that what it logs belongs to its request."""
+        return self._executor.submit(copy_context().run, work, *args, **kwargs)
+
+    def close(self, *, wait: bool = True) -> None:
+        """Finish what has begun, drop the rest."""
+        self._executor.shutdown(wait=wait, cancel_futures=True)
+
+
+class BoundedReads:
+    """Reads of the store that nobody waits for longer than a while, also when it hangs instead of failing."""
+
+    def __init__(self, *, threads: int, most: int, wait_s: float) -> None:
+        """
+        Args:
+            most: reads that may be at work or wait for a thread; when the store hangs, these are all that are lost.
+            wait_s: longest wait for one.
+        """
+        self._threads = Threads("lalaloc-reads", threads)
+        self._most = most
+        self._wait_s = wait_s
+        self._begun: set[Future[Any]] = set()
+
+    async def run(self, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """What the store says.
+
+        Raises:
+            StoreUnavailableError: it did not answer in time, or too many reads are waiting for it already.
+        """
+        if len(self._begun) >= self._most:
+            raise StoreUnavailableError()
+        future = self._threads.submit(work, *args, **kwargs)
+        self._begun.add(future)
+        # Also retrieves what was raised after nobody waited any more.
+        loop_future = asyncio.wrap_future(future)
+        loop_future.add_done_callback(lambda done: self._end(future, done))
+        done, _ = await asyncio.wait({loop_future}, timeout=self._wait_s)
+        if not done:
+            raise StoreUnavailableError()
+        return loop_future.result()
+
+    def close(self) -> None:
+        """Drop what waits; what hangs is left behind."""
+        self._threads.close(wait=False)
+
+    def _end(self, future: Future[Any], done: asyncio.Future[Any]) -> None:
+        self._begun.discard(future)
+        if not done.cancelled():
+            done.exception()
