@@ -30,7 +30,8 @@ def _blocks(language: str) -> list[tuple[str, str]]:
 def _commands() -> Iterator[list[str]]:
     """Every command of every shell block, and every command in running text, as words."""
     for _, block in _blocks("sh"):
-        yield from (shlex.split(line, comments=True) for line in block.splitlines() if line.strip())
+        lines = block.replace("\\\n", " ").splitlines()
+        yield from (shlex.split(line, comments=True) for line in lines if line.strip())
     for page in PAGES:
         inline = re.findall(r"`((?:make|lalaloc|\.venv/bin/\w+) [^`]+)`", page.read_text(encoding="utf-8"))
         yield from (shlex.split(command) for command in inline)
