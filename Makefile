@@ -23,8 +23,10 @@ demo: $(STAMP) ## localise the example panoramas over HTTP, write demo.png
 serve: $(STAMP) ## run the service at http://127.0.0.1:8000 with the example plan, data in ./data
 	$(BIN)/python -m examples.serve
 
+# What computes is shared out to processes with one thread each; what serves needs the machine for itself.
 test: lint ## lint, then the tests
-	$(BIN)/python -m pytest
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal --ignore=tests/service --ignore=tests/client
+	$(BIN)/python -m pytest tests/service tests/client
 
 lint: $(STAMP) ## ruff and pyright
 	$(BIN)/ruff check
