@@ -92,7 +92,7 @@ def test_replicas_of_two_models_run_side_by_side(
 
 
 def test_every_setting_that_the_page_names_exists() -> None:
-    named = set(re.findall(r"LALALOC_([A-Z_]+[A-Z])", PAGE))
+    named = set(re.findall(r"LALALOC_([A-Z0-9_]+[A-Z0-9])", PAGE))
     known = {name.upper() for name in Settings.model_fields}
     # Of the compose files.
     assert named - known == {"DATABASE_PASSWORD"}
