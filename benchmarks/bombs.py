@@ -217,6 +217,7 @@ def _raw(url: str, head: str, body: Iterator[bytes]) -> tuple[int, Outcome]:
                 if time.monotonic() < deadline:
                     continue
             except OSError:
+                # The service hung up: its answer, if any, is read below.
                 pass
             break
         connection.settimeout(5.0)
