@@ -9,6 +9,7 @@ and of all its workers rose at most while it did.
 from __future__ import annotations
 
 import io
+import itertools
 import json
 import socket
 import struct
@@ -32,6 +33,8 @@ from examples.launch import running_service
 _MOST_MB = 400.0
 _GIGABYTE = 1 << 30
 _SLOW_S = 90.0
+# How a form begins that the raw uploads below are the file of.
+_PART = b'--b\r\nContent-Disposition: form-data; name="panorama"; filename="p"\r\n\r\n'
 
 
 @dataclass(frozen=True)
@@ -167,7 +170,7 @@ def _webp(width: int, height: int) -> bytes:
 def _animation(frames: int) -> bytes:
     buffer = io.BytesIO()
     # Frames that are alike would be merged.
-    shades = [Image.new("RGB", (16, 8), (k % 256, k // 256, 0)) for k in range(frames)]
+    shades = [Image.new("RGB", (128, 64), (k % 256, k // 256, 0)) for k in range(frames)]
     shades[0].save(buffer, "WEBP", save_all=True, append_images=shades[1:], duration=1, lossless=True, method=0)
     return buffer.getvalue()
 
@@ -182,14 +185,15 @@ def _gigabyte(url: str, *, stated: bool) -> tuple[int, Outcome]:
     """A body of a gigabyte, sent for as long as the service takes it."""
     head = "Content-Length: 1073741824" if stated else "Transfer-Encoding: chunked"
     block = b"a" * (1 << 16)
-    frame = block if stated else b"%x\r\n%s\r\n" % (len(block), block)
-    return _raw(url, head, (frame for _ in range(_GIGABYTE // len(block))))
+    blocks = itertools.chain([_PART], itertools.repeat(block, _GIGABYTE // len(block)))
+    return _raw(url, head, (part if stated else b"%x\r\n%s\r\n" % (len(part), part) for part in blocks))
 
 
 def _slow(url: str) -> tuple[int, Outcome]:
     """A body that comes one byte a second."""
 
     def drops() -> Iterator[bytes]:
+        yield _PART
         while True:
             time.sleep(1.0)
             yield b"a"

@@ -19,6 +19,7 @@ from examples.truth import PLAN_PATH, TruePose, read_poses
 # An answer that is further off was not computed from this panorama and this plan.
 RIGHT_WITHIN_M = 0.5
 _TIMEOUT_S = 60.0
+_BEGIN_WITHIN_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ class Load:
     """So many clients, each of which asks, waits for the reply, and asks again.
 
     Attributes:
-        clients: how many ask at the same time.
+        clients: how many ask at the same time; they connect first, and begin within a second.
         seconds: how long new requests are made.
         after_refusal_s: how long a refused client waits before it asks again, give or take a half.
     """
@@ -95,13 +96,18 @@ def ask_for(url: str, plan_id: str, load: Load, each: Callable[[Reply], None] | 
 
 
 async def _ask_for(url: str, plan_id: str, load: Load, each: Callable[[Reply], None]) -> list[Reply]:
-    asked, end = queries(), time.perf_counter() + load.seconds
+    asked = queries()
     replies: list[Reply] = []
     limits = httpx.Limits(max_connections=None, max_keepalive_connections=None)
     async with httpx.AsyncClient(base_url=url, timeout=_TIMEOUT_S, limits=limits) as client:
 
+        # Connecting takes these clients longer than it takes the service to refuse them.
+        await asyncio.gather(*(client.get("/healthz") for _ in range(load.clients)))
+        end = time.perf_counter() + load.seconds
+
         async def one(number: int) -> None:
             rng = random.Random(number)
+            await asyncio.sleep(_BEGIN_WITHIN_S * number / load.clients)
             for query in itertools.islice(itertools.cycle(asked), number % len(asked), None):
                 if time.perf_counter() >= end:
                     return

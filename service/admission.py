@@ -97,7 +97,7 @@ class AdmissionLimits:
     def of(cls, settings: Settings) -> AdmissionLimits:
         """The limits that the settings give."""
         return cls(
-            requests=settings.max_pending_requests,
+            requests=settings.pending_limit,
             queries=settings.query_limit,
             reads=settings.max_reads,
             streams=settings.max_streams,

@@ -8,6 +8,7 @@ from __future__ import annotations
 import asyncio
 import math
 import os
+import socket
 import threading
 from time import monotonic
 from types import FrameType
@@ -105,6 +106,7 @@ def bounded_protocol(head_deadline_s: float) -> type[asyncio.Protocol]:
 
         def connection_made(self, transport: asyncio.Transport) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
             super().connection_made(transport)
+            _send_at_once(transport)
             self._watch()
 
         def data_received(self, data: bytes) -> None:
@@ -133,3 +135,13 @@ def bounded_protocol(head_deadline_s: float) -> type[asyncio.Protocol]:
                 self._limit = None
 
     return BoundedProtocol
+
+
+def _send_at_once(transport: asyncio.Transport) -> None:
+    """Let the body of an answer not wait until its head is acknowledged, which clients put off by 40 ms.
+
+    asyncio sees to that only where it made the listening socket itself.
+    """
+    connection = transport.get_extra_info("socket")
+    if connection is not None and connection.family in (socket.AF_INET, socket.AF_INET6):
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

@@ -122,8 +122,11 @@ class Settings(BaseSettings):
     upload_bytes_per_s: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] = Field(
         default=8192.0, description="Slowest an upload may be, once it is `upload_idle_s` behind."
     )
-    max_pending_requests: Count = Field(
-        default=32, description="Uploads and queries in work, from the first byte on; more get a 503 at once."
+    max_pending_requests: int = Field(
+        default=0,
+        ge=0,
+        description="Uploads and queries in work, from the first byte on; more get a 503 at once. "
+        "0: 32, or four times the queries that may be in work.",
     )
     max_queries: int = Field(
         default=0,
@@ -219,6 +222,11 @@ class Settings(BaseSettings):
             compute_threads=self.compute_threads,
             onnx_threads=self.onnx_threads,
         )
+
+    @property
+    def pending_limit(self) -> int:
+        """Uploads and queries that may be in work."""
+        return self.max_pending_requests or max(32, 4 * self.query_limit)
 
     @property
     def query_limit(self) -> int:

@@ -17,5 +17,6 @@ async def limits(runtime: Annotated[Runtime, Depends(runtime_of)]) -> LimitsAnsw
     """The limits this service was started with; the error about one names it."""
     settings = runtime.settings
     told = {name: getattr(settings, name) for name in LimitsAnswer.model_fields}
-    # As it is in effect: the setting may leave the number to the service.
-    return LimitsAnswer(**told | {"max_queries": settings.query_limit})
+    # As they are in effect: the settings may leave these numbers to the service.
+    resolved = {"max_queries": settings.query_limit, "max_pending_requests": settings.pending_limit}
+    return LimitsAnswer(**told | resolved)
