@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import io
+import itertools
 import json
 import random
 import sys
@@ -18,6 +19,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -34,6 +36,8 @@ from examples.truth import PLAN_PATH
 
 _HANG_S = 5.0
 _CLIENTS = 4
+# Of one operation in a row.
+_EXAMPLES = 60
 # Events are an endless answer to a right request.
 _LEFT_OUT = r"/events$"
 
@@ -45,6 +49,10 @@ class Outcome:
     statuses: dict[str, Counter[str]] = field(default_factory=dict)
     bad: list[str] = field(default_factory=list)
     slowest_s: float = 0.0
+
+    def sent(self, kind: str) -> int:
+        """How many requests of a kind there were."""
+        return sum(self.statuses.get(kind, Counter()).values())
 
     def note(self, kind: str, send: Callable[[], httpx.Response]) -> None:
         """Send a request and look at the answer."""
@@ -102,23 +110,29 @@ def _described(url: str, requests: int, seed: int, outcome: Outcome) -> None:
     """Requests that follow the API's description, and others that just do not."""
     schema = schemathesis.openapi.from_url(f"{url}/openapi.json").exclude(path_regex=_LEFT_OUT)
     operations = [found.ok() for found in schema.get_all_operations()]  # pyright: ignore[reportAttributeAccessIssue]
-    each = -(-requests // (2 * len(operations)))
-    for operation in operations:
-        for mode in schemathesis.GenerationMode:
+    strategies = [
+        operation.as_strategy(generation_mode=mode) for operation in operations for mode in schemathesis.GenerationMode
+    ]
+    for round_seed in itertools.count(seed):
+        for strategy in strategies:
+            if outcome.sent("described") >= requests:
+                return
 
-            @hypothesis.seed(seed)
+            @hypothesis.seed(round_seed)
             @hypothesis.settings(
-                max_examples=each,
+                max_examples=_EXAMPLES,
                 database=None,
                 deadline=None,
                 phases=[hypothesis.Phase.generate],
                 suppress_health_check=[*hypothesis.HealthCheck],  # pyright: ignore[reportArgumentType]
             )
-            @hypothesis.given(case=operation.as_strategy(generation_mode=mode))
+            @hypothesis.given(case=strategy)
             def send(case: Any) -> None:
                 outcome.note("described", lambda: _sent(case, url))
 
-            send()
+            # Of an operation without parameters there are no wrong requests.
+            with suppress(hypothesis.errors.Unsatisfiable):
+                send()
 
 
 def _sent(case: Any, url: str) -> httpx.Response:
