@@ -100,7 +100,6 @@ async def _ask_for(url: str, plan_id: str, load: Load, each: Callable[[Reply], N
     replies: list[Reply] = []
     limits = httpx.Limits(max_connections=None, max_keepalive_connections=None)
     async with httpx.AsyncClient(base_url=url, timeout=_TIMEOUT_S, limits=limits) as client:
-
         # Connecting takes these clients longer than it takes the service to refuse them.
         await asyncio.gather(*(client.get("/healthz") for _ in range(load.clients)))
         end = time.perf_counter() + load.seconds

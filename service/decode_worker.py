@@ -1,6 +1,7 @@
 """The body of a decoding worker process: the only place of the service that opens pictures it was sent.
 
-From the bytes of an upload to a `Panorama`, or to the `Refusal` of what is none; `service.worker_process` has the rest.
+From the bytes of an upload to a `Panorama`, or to the `Refusal` of what is none; the rest is in
+`service.workers.process`.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from pathlib import Path
 
 from lalaloc_core.errors import InvalidPanoramaError
 from lalaloc_core.localise.images import Panorama, PanoramaLimits, open_panorama, warm_up
-from service.worker_process import serve_jobs
+from service.workers.process import serve_jobs
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,9 @@ from service.decode_worker import Refusal, run_decoder
 from service.errors import DeadlineExceededError, DecoderNotReadyError, OverloadedError, StoppingError
 from service.settings import Settings
 from service.telemetry import Telemetry
-from service.workers import JobLostError, PoolState, WorkerPool, WorkerSpec
+from service.workers.jobs import JobLostError
+from service.workers.pool import PoolState, WorkerPool
+from service.workers.supervisor import WorkerSpec
 
 
 class Decoder:

@@ -21,6 +21,7 @@ from service.grids.grids import Grids
 from service.schemas import PlanEvent
 from service.storage.store import Store
 from service.telemetry import LOGGER_NAME
+from service.threads import BoundedReads
 
 _LOOK_EVERY_S = 0.25
 HEARTBEAT_S = 15.0
@@ -63,10 +64,18 @@ class PlanEvents:
     """Tells followers how far plans are; for one event loop."""
 
     def __init__(
-        self, store: Store, grids: Grids, admission: Admission, *, longest_s: float, heartbeat_s: float
+        self,
+        store: Store,
+        grids: Grids,
+        admission: Admission,
+        reads: BoundedReads,
+        *,
+        longest_s: float,
+        heartbeat_s: float,
     ) -> None:
         """
         Args:
+            reads: where the store is asked how far plans are.
             longest_s: how long a stream lasts at most.
             heartbeat_s: how often something is sent when there is nothing to tell, so that nobody takes it for dead,
                 and how often it is asked whether a caller is still welcome.
@@ -74,6 +83,7 @@ class PlanEvents:
         self._store = store
         self._grids = grids
         self._admission = admission
+        self._reads = reads
         self._longest_s = longest_s
         self._heartbeat_s = heartbeat_s
         self._followers: set[_Follower] = set()
@@ -121,7 +131,7 @@ class PlanEvents:
         while self._followers:
             asked = list(self._followers)
             try:
-                found = await asyncio.to_thread(self._look, {follower.plan_id for follower in asked})
+                found = await self._reads.run(self._look, {follower.plan_id for follower in asked})
                 for follower in asked:
                     follower.tell(found.get(follower.plan_id, PlanEvent(status="deleted")))
             except StoreUnavailableError:

@@ -34,7 +34,7 @@ from service.storage.records import Conflict, Fresh, InProgress, StoredAnswer
 from service.telemetry import LOGGER_NAME
 from service.threads import BoundedReads
 from service.uploads import Parts
-from service.workers import JobLostError
+from service.workers.jobs import JobLostError
 
 HEADER, REPLAYED = "Idempotency-Key", "Idempotency-Replayed"
 MOST_CHARACTERS = 255

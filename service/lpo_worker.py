@@ -1,6 +1,6 @@
 """The body of an LPO worker process: the only place of the service that imports torch.
 
-From `RefinementJob` to `RefinementResult`; `service.worker_process` has the rest.
+From `RefinementJob` to `RefinementResult`; `service.workers.process` has the rest.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from lalaloc_core.bundle import Bundle, Manifest
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.poses import RefinementJob
-from service.worker_process import serve_jobs
+from service.workers.process import serve_jobs
 
 if TYPE_CHECKING:
     from lalaloc_core.localise.optimise import LatentPoseOptimiser

@@ -7,7 +7,9 @@ from lalaloc_core.localise.poses import RefinementJob, RefinementResult
 from service.lpo_worker import run_worker
 from service.settings import Settings
 from service.telemetry import Telemetry
-from service.workers import JobLostError, PoolState, WorkerPool, WorkerSpec
+from service.workers.jobs import JobLostError
+from service.workers.pool import PoolState, WorkerPool
+from service.workers.supervisor import WorkerSpec
 
 # Loading torch takes seconds, on a busy machine many.
 _START_S, _LONGEST_START_S = 5.0, 120.0

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
+from typing import Protocol, TypeVar
 
 import numpy as np
 from fastapi import Request
@@ -37,7 +39,14 @@ _SOONEST_S = 1.0
 _LPO_DRAIN = 0.1
 
 
-@dataclass(frozen=True)
+class _Closable(Protocol):
+    close: Callable[..., None]
+
+
+Closed = TypeVar("Closed", bound=_Closable)
+
+
+@dataclass(frozen=True, kw_only=True)
 class Runtime:
     """Everything that the routes need.
 
@@ -78,67 +87,63 @@ def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack) 
         ConfigError: the data folder or the database cannot be used.
         BundleError: there is no usable model.
     """
-    logger = logging.getLogger(LOGGER_NAME)
+
+    def kept(part: Closed, *arguments: float) -> Closed:
+        cleanup.callback(part.close, *arguments)
+        return part
+
     if settings.otlp_endpoint is not None:
-        telemetry.tracing = Tracing(otlp_exporter(settings.otlp_endpoint), __version__)
-        cleanup.callback(telemetry.tracing.close)
+        telemetry.tracing = kept(Tracing(otlp_exporter(settings.otlp_endpoint), __version__))
     bundle = Bundle.open(settings.bundle)
     telemetry.describe_build(__version__, bundle.manifest.name, bundle.sha256)
-    store = open_store(settings)
-    cleanup.callback(store.close)
-    gate = Gate(store.keys, settings)
-    cleanup.callback(gate.close)
+    store = kept(open_store(settings))
+    gate = kept(Gate(store.keys, settings))
     # The pool first: loading torch in the workers overlaps with loading the model here.
-    pool = LpoPool(bundle, settings, telemetry)
-    cleanup.callback(pool.close, _LPO_DRAIN * settings.stop_deadline_s)
+    pool = kept(LpoPool(bundle, settings, telemetry), _LPO_DRAIN * settings.stop_deadline_s)
     pool.start()
-    decoder = Decoder(bundle.manifest, settings, telemetry)
-    cleanup.callback(decoder.close)
+    decoder = kept(Decoder(bundle.manifest, settings, telemetry))
     decoder.start()
     encoders = Encoders(bundle, threads=settings.cores.onnx_threads)
     _warm_up(encoders)
-    grids = Grids(store, encoders, bundle.sha256, settings, telemetry)
-    cleanup.callback(grids.close)
+    grids = kept(Grids(store, encoders, bundle.sha256, settings, telemetry))
     admission = Admission(AdmissionLimits.of(settings), telemetry)
-    reads = BoundedReads(threads=_READ_THREADS, most=settings.pending_limit, wait_s=settings.database_wait_s)
-    cleanup.callback(reads.close)
-    uploads = Threads("lalaloc-uploads", _UPLOAD_THREADS)
-    cleanup.callback(uploads.close)
-    localiser = Localiser(
-        settings=settings,
-        bundle=bundle,
-        encoders=encoders,
-        grids=grids,
-        pool=pool,
-        decoder=decoder,
-        queries=admission.queries,
-        reads=reads,
-        telemetry=telemetry,
+    reads = kept(BoundedReads(threads=_READ_THREADS, most=settings.pending_limit, wait_s=settings.database_wait_s))
+    uploads = kept(Threads("lalaloc-uploads", _UPLOAD_THREADS))
+    localiser = kept(
+        Localiser(
+            settings=settings,
+            bundle=bundle,
+            encoders=encoders,
+            grids=grids,
+            pool=pool,
+            decoder=decoder,
+            queries=admission.queries,
+            reads=reads,
+            telemetry=telemetry,
+        )
     )
-    cleanup.callback(localiser.close)
     known_plans = KnownPlans(store, limit_bytes=settings.plan_cache_bytes, max_age_s=settings.plan_cache_age_s)
-    caretaker = Caretaker(store, grids, known_plans, sweep_s=settings.sweep_s)
-    cleanup.callback(caretaker.close)
+    caretaker = kept(Caretaker(store, grids, known_plans, sweep_s=settings.sweep_s))
     caretaker.start()
     # Their callers' keys are looked at again as often.
     heartbeat_s = max(min(settings.key_cache_s, HEARTBEAT_S), _SOONEST_S) if settings.api_keys else HEARTBEAT_S
-    events = PlanEvents(store, grids, admission, longest_s=settings.stream_deadline_s, heartbeat_s=heartbeat_s)
-    fields = {"model": bundle.manifest.name, "sha256": bundle.sha256, "grids_to_compute": grids.pending}
-    logger.info("service started", extra={"fields": fields})
+    events = PlanEvents(store, grids, admission, reads, longest_s=settings.stream_deadline_s, heartbeat_s=heartbeat_s)
+    fields = {"model": bundle.manifest.name, "sha256": bundle.sha256, "grids_to_compute": grids.preparing}
+    logging.getLogger(LOGGER_NAME).info("service started", extra={"fields": fields})
     return Runtime(
-        settings,
-        telemetry,
-        store,
-        grids,
-        known_plans,
-        pool,
-        decoder,
-        localiser,
-        admission,
-        gate,
-        events,
-        uploads,
-        reads,
+        settings=settings,
+        telemetry=telemetry,
+        store=store,
+        grids=grids,
+        known_plans=known_plans,
+        pool=pool,
+        decoder=decoder,
+        localiser=localiser,
+        admission=admission,
+        gate=gate,
+        events=events,
+        uploads=uploads,
+        reads=reads,
     )
 
 

@@ -303,7 +303,7 @@ class ReadyAnswer(Answer):
     model: ModelAnswer
     lpo_pool: PoolAnswer
     decode_pool: PoolAnswer
-    plans_preparing: int = Field(description="Latent grids being computed or waiting for it.")
+    plans_preparing: int = Field(description="Plans whose latent grid is being computed, or will be.")
 
 
 class Fault(Answer):

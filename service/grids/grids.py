@@ -114,13 +114,21 @@ class Grids:
         # Of the jobs that are being computed, all by the one thread of `Jobs`.
         self._hearts: list[_Heart] = []
         self._jobs = Jobs(self._work)
+        # Of plans that wait to be taken up, when that was looked at last.
+        self._backlog = 0
         telemetry.gauge("lalaloc_grids_pending", "Latent grids computed or waiting for it.", lambda: self.pending)
+        telemetry.gauge("lalaloc_grids_preparing", "The same, and plans not taken up yet.", lambda: self.preparing)
         telemetry.gauge("lalaloc_grid_cache_bytes", "Latent grids in memory.", lambda: self._cache.bytes)
 
     @property
     def pending(self) -> int:
         """Latent grids being computed or waiting for it."""
         return len(self._jobs)
+
+    @property
+    def preparing(self) -> int:
+        """Those, and the plans in the store that nobody has taken up yet, as of the last `take_up`."""
+        return self.pending + self._backlog
 
     def key(self, revision_id: str, camera_height_m: float) -> GridKey:
         """The key of a revision's grid for this model and grid step."""
@@ -245,13 +253,17 @@ class Grids:
         """Queue the oldest grids that nobody computes, unless there is enough to do; tells whether there are more."""
         if len(self._jobs) >= _TAKEN_UP:
             return True
-        missing = self._store.grids.missing(self._model_sha256, self._settings.grid_step_m, _TAKEN_UP)
+        model = (self._model_sha256, self._settings.grid_step_m)
+        missing = self._store.grids.missing(*model, _TAKEN_UP)
+        more = len(missing) == _TAKEN_UP
+        count = self._store.grids.count_missing(*model) if more else len(missing)
         with suppress(StoppingError, OverloadedError):
             for summary in missing:
                 key = self.key(summary.revision_id, summary.camera_height_m)
                 poses = summary.room_count + int(summary.area_m2 / key.step_m**2)
                 self._jobs.add(key, plan_id=summary.id, poses=poses, on_demand=False)
-        return len(missing) == _TAKEN_UP
+        self._backlog = max(count - len(self._jobs), 0)
+        return more
 
     def look_elsewhere(self) -> None:
         """Note how far other replicas are, and look after grids that they finished or gave up."""

@@ -9,7 +9,7 @@ from prometheus_client import CONTENT_TYPE_LATEST
 
 from service.runtime import Runtime, runtime_of
 from service.schemas import HealthAnswer, PoolAnswer, ReadyAnswer
-from service.workers import PoolState
+from service.workers.pool import PoolState
 
 router = APIRouter(tags=["operations"])
 
@@ -43,7 +43,7 @@ async def readyz(runtime: Annotated[Runtime, Depends(runtime_of)], response: Res
         model=runtime.localiser.model,
         lpo_pool=_pool(runtime.pool.state),
         decode_pool=_pool(runtime.decoder.state),
-        plans_preparing=runtime.grids.pending,
+        plans_preparing=runtime.grids.preparing,
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Table, and_, delete, exists, select, update
+from sqlalchemy import ColumnElement, Connection, Table, and_, delete, exists, func, select, update
 from sqlalchemy.exc import IntegrityError
 
 from lalaloc_core.localise.poses import LatentGrid
@@ -74,28 +74,32 @@ class StoredGrids:
 
     def missing(self, model_sha256: str, step_m: float, limit: int) -> list[PlanSummary]:
         """Plans, oldest first, whose own grid is neither stored, nor computed by anyone, nor failed before."""
+        query = select_summaries().where(*self._is_missing(model_sha256, step_m))
+        query = query.order_by(FLOORPLANS.c.created_at, FLOORPLANS.c.id).limit(limit)
         with self._database.reading() as connection:
-            of_model = (
-                LATENT_GRIDS.c.revision_id == REVISIONS.c.id,
-                LATENT_GRIDS.c.model_sha256 == model_sha256,
-                LATENT_GRIDS.c.step_m == step_m,
-                _is_own_height(LATENT_GRIDS),
-            )
-            leased = (
-                GRID_LEASES.c.revision_id == REVISIONS.c.id,
-                GRID_LEASES.c.model_sha256 == model_sha256,
-                GRID_LEASES.c.step_m == step_m,
-                _is_own_height(GRID_LEASES),
-                GRID_LEASES.c.lease_until_s > self._database.now_s(),
-            )
-            query = (
-                select_summaries()
-                .where(REVISIONS.c.failure.is_(None))
-                .where(~exists().where(*of_model), ~exists().where(*leased))
-                .order_by(FLOORPLANS.c.created_at, FLOORPLANS.c.id)
-                .limit(limit)
-            )
             return [PlanSummary(**row._mapping) for row in connection.execute(query)]
+
+    def count_missing(self, model_sha256: str, step_m: float) -> int:
+        """How many plans `missing` would give without a limit."""
+        query = select_summaries().where(*self._is_missing(model_sha256, step_m))
+        with self._database.reading() as connection:
+            return connection.scalar(select(func.count()).select_from(query.subquery())) or 0
+
+    def _is_missing(self, model_sha256: str, step_m: float) -> list[ColumnElement[bool]]:
+        of_model = (
+            LATENT_GRIDS.c.revision_id == REVISIONS.c.id,
+            LATENT_GRIDS.c.model_sha256 == model_sha256,
+            LATENT_GRIDS.c.step_m == step_m,
+            _is_own_height(LATENT_GRIDS),
+        )
+        leased = (
+            GRID_LEASES.c.revision_id == REVISIONS.c.id,
+            GRID_LEASES.c.model_sha256 == model_sha256,
+            GRID_LEASES.c.step_m == step_m,
+            _is_own_height(GRID_LEASES),
+            GRID_LEASES.c.lease_until_s > self._database.now_s(),
+        )
+        return [REVISIONS.c.failure.is_(None), ~exists().where(*of_model), ~exists().where(*leased)]
 
 
 class GridLeases:

@@ -11,6 +11,8 @@ from service.telemetry.facts import current_facts
 LOGGER_NAME = "lalaloc"
 # The HTTP server's own: its log of accesses holds query strings, and says nothing that ours does not.
 _SERVER, _SERVER_ACCESS = "uvicorn", "uvicorn.access"
+# Warns of what clients send; they are told, and the line of their request says so.
+_FORMS = "python_multipart"
 
 
 class JsonFormatter(logging.Formatter):
@@ -36,7 +38,7 @@ class JsonFormatter(logging.Formatter):
 
 
 def configure_logging(level: str) -> logging.Logger:
-    """Send the service's log, and the HTTP server's, to standard error; calling it again only changes the level."""
+    """Send the service's log, and those of libraries, to standard error; calling it again only changes the level."""
     logger = logging.getLogger(LOGGER_NAME)
     logger.setLevel(level.upper())
     if not any(isinstance(handler.formatter, JsonFormatter) for handler in logger.handlers):
@@ -46,6 +48,10 @@ def configure_logging(level: str) -> logging.Logger:
         logger.propagate = False
         server = logging.getLogger(_SERVER)
         server.handlers, server.propagate = [handler], False
+        # What libraries say, unless whoever runs the app listens already.
+        if not logging.getLogger().handlers:
+            logging.getLogger().addHandler(handler)
     access = logging.getLogger(_SERVER_ACCESS)
     access.handlers, access.propagate = [], False
+    logging.getLogger(_FORMS).setLevel(logging.ERROR)
     return logger

@@ -108,7 +108,7 @@ def store(tmp_path: Path) -> Iterator[Store]:
 
 
 def _add(store: Store, plan: FloorPlan = PLAN, plan_id: str = "p") -> PlanRecord:
-    return store.plans.add("default", plan_id, plan, original=b"{}", limit=10)
+    return store.plans.add("default", plan_id, plan, original=b"{}", limit=20)
 
 
 @pytest.fixture
@@ -320,6 +320,24 @@ def test_what_a_stopped_replica_left_is_taken_up_by_another(
     assert grids.pending == 1
     wait_for(lambda: grids.pending == 0)
     assert grids.find(grids.key(record.revision_id, 1.5)) is not None
+
+
+def test_plans_that_nobody_has_taken_up_yet_count_as_preparing(
+    open_store: OpenStore, make_grids: MakeGrids, encoders: CountingEncoders
+) -> None:
+    store = open_store()
+    for number in range(20):
+        _add(store, plan_id=f"plan {number}")
+    grids = make_grids(store)
+    encoders.go_on.clear()
+    # Sixteen are taken up at a time, and the rest is known of.
+    assert grids.take_up()
+    assert (grids.pending, grids.preparing) == (16, 20)
+    encoders.go_on.set()
+    wait_for(lambda: grids.pending == 0)
+    assert grids.preparing == 4
+    assert not grids.take_up()
+    wait_for(lambda: grids.preparing == 0)
 
 
 def test_gone_plans_and_old_revisions_are_dropped_from_memory_on_every_replica(

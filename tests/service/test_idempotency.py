@@ -34,7 +34,7 @@ from service.storage.store import Store
 from service.storage.tables import IDEMPOTENCY
 from service.threads import BoundedReads
 from service.uploads import Parts
-from service.workers import JobLostError
+from service.workers.jobs import JobLostError
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, upload, wait_for
 
 CONTENT = json.dumps(FLAT).encode()

@@ -23,6 +23,7 @@ TWO_ROOMS = {"rooms": [room(0.0), room(4.0)]}
 
 def test_every_limit_is_a_setting_and_is_told(client: httpx.Client) -> None:
     told = client.get("/limits").json()
+    assert told.keys() == LimitsAnswer.model_fields.keys()
     settings = Settings()
     # Left to the number of cores; this app has no LPO workers.
     resolved = Settings(workers=0, onnx_threads=1)

@@ -17,7 +17,9 @@ from typing import Any
 
 import pytest
 
-from service.workers import JobLostError, WorkerPool, WorkerSpec
+from service.workers.jobs import JobLostError
+from service.workers.pool import WorkerPool
+from service.workers.supervisor import WorkerSpec
 from tests.service import worker_jobs
 from tests.service.conftest import wait_for
 

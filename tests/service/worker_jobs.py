@@ -10,7 +10,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from service.worker_process import serve_jobs
+from service.workers.process import serve_jobs
 
 
 def run(connection: Connection, log: str) -> None:

@@ -1,6 +1,6 @@
 """The inside of a worker process: announce itself, then answer one job at a time until the parent is gone.
 
-`service.workers` starts such processes and watches over them. Imports little, because every worker imports it.
+A `Supervisor` starts such processes and watches over them. Imports little, because every worker imports it.
 """
 
 from __future__ import annotations

@@ -1,0 +1,164 @@
+"""Jobs on their way to workers: a bounded queue, and a memory of those that workers died over."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict, deque
+from collections.abc import Callable
+from concurrent.futures import Future
+from time import monotonic
+from typing import Any, Literal
+
+LostReason = Literal["not-ready", "queue-full", "deadline", "poisoned", "fault", "died", "closing"]
+
+# How soon an idle supervisor notices that its worker was killed.
+_IDLE_CHECK_S = 0.2
+# So many workers may die or stall over one job.
+_TRIES_PER_JOB = 2
+_POISON_MEMORY_S, _POISON_MEMORY = 600.0, 256
+
+
+class JobLostError(Exception):
+    """A job has no answer.
+
+    Attributes:
+        reason: `not-ready`: no worker is warm, nor will be in time. `queue-full`: too many jobs wait already.
+            `deadline`: no answer in time. `poisoned`: workers died or stalled over this job. `fault`: the work raised
+            an error, which the log has. `died`: the worker died, and there is no time for another try. `closing`: the
+            pool shuts down.
+    """
+
+    def __init__(self, reason: LostReason) -> None:
+        self.reason: LostReason = reason
+        super().__init__(f"the job has no answer: {reason}")
+
+
+class Ticket:
+    """One job on its way through the pool."""
+
+    def __init__(self, content: bytes, digest: bytes, deadline: float) -> None:
+        self.content = content
+        self.digest = digest
+        self.deadline = deadline
+        self.deaths = self.stalls = 0
+        self.future: Future[Any] = Future()
+
+    @property
+    def wanted(self) -> bool:
+        """Whether starting it is of use: it has time left, and nobody gave it up."""
+        return monotonic() < self.deadline and not self.future.cancelled()
+
+    def lose(self, reason: LostReason) -> None:
+        """End it without an answer."""
+        # Whoever waited may have given up at this very moment.
+        if self.future.running() or self.future.set_running_or_notify_cancel():
+            self.future.set_exception(JobLostError(reason))
+
+
+class JobQueue:
+    """Jobs that wait for a worker, oldest first; may be used from any thread."""
+
+    def __init__(self, limit: int, served_by: Callable[[float], bool]) -> None:
+        """
+        Args:
+            limit: jobs that may wait, besides those at work.
+            served_by: whether a worker is expected to be warm at a time (`monotonic`).
+        """
+        self._limit = limit
+        self._served_by = served_by
+        self._waiting: deque[Ticket] = deque()
+        self._poisoned: OrderedDict[bytes, float] = OrderedDict()
+        self._changed = threading.Condition()
+        self._closed = False
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    @property
+    def closed(self) -> bool:
+        """Whether there will be no more jobs."""
+        return self._closed
+
+    def put(self, ticket: Ticket) -> None:
+        """Let a job wait.
+
+        Raises:
+            JobLostError: there is no use in waiting.
+        """
+        with self._changed:
+            reason = self._refusal(ticket)
+            if reason is not None:
+                raise JobLostError(reason)
+            self._waiting.append(ticket)
+            self._changed.notify()
+
+    def take(self) -> Ticket | None:
+        """The next job that is still of use, now running; None when none came in a short while."""
+        with self._changed:
+            if not self._waiting and not self._closed:
+                self._changed.wait(_IDLE_CHECK_S)
+            ticket = self._waiting.popleft() if self._waiting else None
+        if ticket is None:
+            return None
+        if monotonic() >= ticket.deadline:
+            ticket.lose("deadline")
+            return None
+        return ticket if ticket.future.running() or ticket.future.set_running_or_notify_cancel() else None
+
+    def give_back(self, ticket: Ticket) -> None:
+        """The worker with this job died or stalled; let another one try, if the job may and has the time."""
+        reason: LostReason | None = None
+        with self._changed:
+            if ticket.deaths + ticket.stalls >= _TRIES_PER_JOB:
+                reason = "poisoned"
+                # A worker may stall because the machine is busy; that says nothing about the next time.
+                if ticket.stalls == 0:
+                    self._ban(ticket.digest)
+            elif self._closed:
+                reason = "closing"
+            elif not ticket.wanted or not self._served_by(ticket.deadline):
+                reason = "died"
+            else:
+                # Past the limit by at most one job per worker, and in front of those that came later.
+                self._waiting.appendleft(ticket)
+                self._changed.notify()
+        if reason is not None:
+            ticket.lose(reason)
+
+    def rest(self, duration_s: float) -> None:
+        """Wait, but not longer than until the queue is closed."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._closed, duration_s)
+
+    def close(self) -> None:
+        """Lose all jobs that wait, and take no more."""
+        with self._changed:
+            self._closed = True
+            waiting = list(self._waiting)
+            self._waiting.clear()
+            self._changed.notify_all()
+        for ticket in waiting:
+            ticket.lose("closing")
+
+    def _refusal(self, ticket: Ticket) -> LostReason | None:
+        if self._closed:
+            return "closing"
+        if not ticket.wanted:
+            return "deadline"
+        if self._poisoned.get(ticket.digest, 0.0) > monotonic():
+            return "poisoned"
+        if not self._served_by(ticket.deadline):
+            return "not-ready"
+        if len(self._waiting) >= self._limit:
+            self._drop_unwanted()
+        return "queue-full" if len(self._waiting) >= self._limit else None
+
+    def _drop_unwanted(self) -> None:
+        for ticket in [ticket for ticket in self._waiting if not ticket.wanted]:
+            self._waiting.remove(ticket)
+            ticket.lose("deadline")
+
+    def _ban(self, digest: bytes) -> None:
+        self._poisoned[digest] = monotonic() + _POISON_MEMORY_S
+        while len(self._poisoned) > _POISON_MEMORY:
+            self._poisoned.popitem(last=False)

@@ -1,0 +1,127 @@
+"""What callers see of a pool: jobs go in, answers or a `JobLostError` come out."""
+
+from __future__ import annotations
+
+import asyncio
+import hashlib
+import pickle
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from time import monotonic
+from typing import Any, Generic, TypeVar
+
+from service.workers.jobs import JobLostError, JobQueue, Ticket
+from service.workers.supervisor import Supervisor, WorkerSpec
+
+Job = TypeVar("Job")
+Answer = TypeVar("Answer")
+
+
+@dataclass(frozen=True)
+class PoolState:
+    """Workers wanted and warm, whether each has been warm once, and why the last start failed."""
+
+    workers: int
+    ready: int
+    warmed_up: bool
+    fault: str | None
+
+
+class WorkerPool(Generic[Job, Answer]):
+    """Bounded queue before some supervised workers; may be used from any thread."""
+
+    def __init__(
+        self,
+        spec: WorkerSpec,
+        *,
+        workers: int,
+        queue_limit: int,
+        on_restart: Callable[[str], None] = lambda _reason: None,
+    ) -> None:
+        """A pool that has not been started.
+
+        Args:
+            queue_limit: jobs that may wait for a worker, besides those at work.
+            on_restart: called with the reason whenever a worker has to be replaced.
+        """
+        self._queue = JobQueue(queue_limit, self._served_by)
+        self._supervisors = [Supervisor(spec, index, self._queue, on_restart) for index in range(workers)]
+        self._submitting = ThreadPoolExecutor(1, thread_name_prefix=f"{spec.name}-submit")
+
+    def start(self) -> None:
+        """Start all workers; returns at once, see `state` for when they are warm."""
+        for supervisor in self._supervisors:
+            supervisor.start()
+
+    @property
+    def state(self) -> PoolState:
+        """How many workers are wanted and warm."""
+        faults = [supervisor.fault for supervisor in self._supervisors if supervisor.fault is not None]
+        return PoolState(
+            workers=len(self._supervisors),
+            ready=sum(supervisor.ready for supervisor in self._supervisors),
+            warmed_up=all(supervisor.warmed_up for supervisor in self._supervisors),
+            fault=faults[0] if faults else None,
+        )
+
+    @property
+    def waiting(self) -> int:
+        """Jobs that wait for a worker."""
+        return len(self._queue)
+
+    @property
+    def closing(self) -> bool:
+        """Whether the pool shuts down."""
+        return self._queue.closed
+
+    def submit(self, job: Job, timeout_s: float) -> Future[Answer]:
+        """Queue a job. Cancelling the future takes it out of the queue again; at work it is finished.
+
+        Returns:
+            a future that gives the answer or raises `JobLostError`; it may do so later than the deadline.
+
+        Raises:
+            JobLostError: there is no use in waiting.
+        """
+        content = pickle.dumps(job, protocol=pickle.HIGHEST_PROTOCOL)
+        ticket = Ticket(content, hashlib.sha256(content).digest(), monotonic() + timeout_s)
+        self._queue.put(ticket)
+        return ticket.future
+
+    async def answer(self, job: Job, timeout_s: float) -> Answer:
+        """The answer to a job, awaited; a job that is no longer awaited is not started.
+
+        Raises:
+            JobLostError: there is none within `timeout_s`.
+        """
+        if self._queue.closed:
+            raise JobLostError("closing")
+        # On a thread: copying and hashing a large job would hold up everybody else.
+        submitted = self._submitting.submit(self.submit, job, timeout_s)
+        try:
+            async with asyncio.timeout(timeout_s):
+                return await asyncio.wrap_future(await asyncio.wrap_future(submitted))
+        except TimeoutError:
+            submitted.add_done_callback(_take_back)
+            raise JobLostError("deadline") from None
+        except asyncio.CancelledError:
+            submitted.add_done_callback(_take_back)
+            raise
+
+    def close(self, drain_s: float = 0.0) -> None:
+        """End all workers and wait for them: jobs at work have `drain_s` to finish, those that wait are lost."""
+        self._queue.close()
+        deadline = monotonic() + drain_s
+        for supervisor in self._supervisors:
+            supervisor.stop(deadline)
+        self._submitting.shutdown()
+
+    def _served_by(self, deadline: float) -> bool:
+        return any(supervisor.expected_ready <= deadline for supervisor in self._supervisors)
+
+
+def _take_back(submitted: Future[Future[Any]]) -> None:
+    """Give up a job whose caller left while it was being submitted, or after."""
+    if not submitted.cancelled() and submitted.exception() is None:
+        submitted.result().cancel()

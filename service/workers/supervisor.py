@@ -1,0 +1,239 @@
+"""A thread that keeps one worker process alive and feeds it."""
+
+from __future__ import annotations
+
+import logging
+import math
+import multiprocessing
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
+from time import monotonic
+from typing import Any
+
+from service.telemetry import LOGGER_NAME
+from service.workers.jobs import JobQueue, Ticket
+from service.workers.process import Answered, Fault, Ready
+
+# A worker that dies this soon after it was warm, or before, is replaced more and more slowly; the first time at once.
+_HEALTHY_S = 5.0
+_FIRST_BACKOFF_S = 0.25
+# Those that got warm may well do so again.
+_LONGEST_BACKOFF_S, _LONGEST_WARM_BACKOFF_S = 30.0, 1.0
+# After so many failed starts in a row, or none that succeeded, nobody waits for the next one.
+_HOPELESS_STARTS = 3
+# How long a killed worker may take to be gone, and how often it is looked at.
+_KILL_S, _JOIN_S = 5.0, 0.2
+
+
+@dataclass(frozen=True)
+class WorkerSpec:
+    """What to run in the processes of a pool.
+
+    Attributes:
+        name: of the processes, in the log, and in the process list.
+        target: called in the worker as `target(connection, *arguments)`; has to be importable there.
+        arguments: picklable.
+        stall_s: a worker busy with one job for longer is killed.
+        start_s: what a start usually takes, until one has been measured.
+        longest_start_s: a worker not warm after that will not come.
+    """
+
+    name: str
+    target: Callable[..., None]
+    arguments: tuple[Any, ...] = ()
+    stall_s: float = 10.0
+    start_s: float = 5.0
+    longest_start_s: float = 120.0
+
+
+class Supervisor:
+    """Keeps one worker process alive and feeds it; everything but `stop` happens on its own thread."""
+
+    def __init__(self, spec: WorkerSpec, index: int, queue: JobQueue, on_restart: Callable[[str], None]) -> None:
+        """
+        Args:
+            index: tells the workers of a pool apart.
+            queue: where jobs come from; closing it ends the thread once its job is done.
+            on_restart: called with the reason whenever the worker has to be replaced.
+        """
+        self.ready = False
+        self.warmed_up = False
+        self.fault: str | None = None
+        self._spec = spec
+        self._index = index
+        self._queue = queue
+        self._on_restart = on_restart
+        self._failed_starts = 0
+        self._start_s = self._spec.start_s
+        self._starts_at = monotonic()
+        self._process: BaseProcess | None = None
+        self._thread = threading.Thread(target=self._run, name=f"{self._spec.name}-supervisor-{index}", daemon=True)
+
+    def start(self) -> None:
+        """Start the thread, and with it the worker."""
+        self._thread.start()
+
+    @property
+    def expected_ready(self) -> float:
+        """When (`monotonic`) the worker will be warm, as far as can be told: as fast as last time, or never."""
+        now = monotonic()
+        if self.ready:
+            return now
+        if self._failed_starts >= _HOPELESS_STARTS or (self._failed_starts and not self.warmed_up):
+            return math.inf
+        expected = self._starts_at + self._start_s
+        # One that is late may well take as long again.
+        return expected if expected > now else now + (now - self._starts_at)
+
+    def stop(self, deadline: float) -> None:
+        """End the worker once its job is done, at the deadline (`monotonic`) in any case; the queue must be closed."""
+        self._thread.join(max(deadline - monotonic(), 0.0))
+        give_up = monotonic() + _KILL_S
+        while self._thread.is_alive() and monotonic() < give_up:
+            # A supervisor that waits for its worker wakes up when the worker ends; it may just have started another.
+            if self._process is not None:
+                self._process.kill()
+            self._thread.join(_JOIN_S)
+
+    def _run(self) -> None:
+        short_lives = 0
+        while not self._queue.closed:
+            begin = monotonic()
+            try:
+                reason = self._live()
+            except Exception as error:
+                self.fault = reason = f"cannot run a worker: {type(error).__name__}: {error}"
+            if self._queue.closed:
+                return
+            self._note_restart(reason)
+            self._failed_starts = 0 if self.fault is None else self._failed_starts + 1
+            short_lives = 0 if monotonic() - begin > self._start_s + _HEALTHY_S else short_lives + 1
+            self._pause(short_lives)
+
+    def _note_restart(self, reason: str) -> None:
+        self._on_restart(reason)
+        fields = {"pool": self._spec.name, "worker": self._index, "reason": reason}
+        logging.getLogger(LOGGER_NAME).warning("worker is replaced", extra={"fields": fields})
+
+    def _pause(self, short_lives: int) -> None:
+        """Back off after so many short lives in a row."""
+        longest_s = _LONGEST_WARM_BACKOFF_S if self.fault is None else _LONGEST_BACKOFF_S
+        # Bounded before it is raised to a power: worker after worker may die for years.
+        pause_s = min(_FIRST_BACKOFF_S * 2.0 ** min(short_lives - 2, 20), longest_s) if short_lives > 1 else 0.0
+        self._starts_at = monotonic() + pause_s
+        self._queue.rest(pause_s)
+
+    def _live(self) -> str:
+        """The life of one worker; returns why it ended."""
+        self._starts_at = monotonic()
+        connection, process = self._launch()
+        try:
+            self.fault = self._await_ready(connection, process)
+            if self.fault is not None:
+                return self.fault
+            self._start_s = monotonic() - self._starts_at
+            self.warmed_up = self.ready = True
+            return self._serve(connection, process)
+        finally:
+            self.ready = False
+            connection.close()
+            process.kill()
+            process.join(_KILL_S)
+
+    def _launch(self) -> tuple[Connection, BaseProcess]:
+        context = multiprocessing.get_context("spawn")
+        ours, theirs = context.Pipe()
+        process = context.Process(
+            target=self._spec.target,
+            args=(theirs, *self._spec.arguments),
+            name=f"lalaloc-{self._spec.name}-{self._index}",
+            daemon=True,
+        )
+        with theirs:
+            # With our copy of its end closed, the pipe breaks when the worker dies.
+            process.start()
+        self._process = process
+        return ours, process
+
+    def _await_ready(self, connection: Connection, process: BaseProcess) -> str | None:
+        """Why the worker did not become ready; None when it did."""
+        with _Watchdog(process, self._spec.longest_start_s) as watchdog:
+            message = _receive(connection)
+        if isinstance(message, Ready):
+            return None
+        if isinstance(message, Fault):
+            return message.reason
+        late = f"the worker did not start within {self._spec.longest_start_s:g} s"
+        return late if watchdog.barked else "the worker died starting"
+
+    def _serve(self, connection: Connection, process: BaseProcess) -> str:
+        """Hand out jobs until the worker dies or stalls, or the queue is closed; returns why it ended."""
+        while not self._queue.closed:
+            if not process.is_alive():
+                return "died idle"
+            ticket = self._queue.take()
+            if ticket is None:
+                continue
+            with _Watchdog(process, self._spec.stall_s) as watchdog:
+                # A worker that died before it had the whole job did not die over it.
+                sent = process.is_alive() and _send(connection, ticket.content)
+                answer = _receive(connection) if sent else None
+            if answer is None:
+                self.ready = False
+                self._starts_at = monotonic()
+                ticket.stalls += watchdog.barked
+                ticket.deaths += sent and not watchdog.barked
+                self._queue.give_back(ticket)
+                return "stalled" if watchdog.barked else "died at work" if sent else "died idle"
+            self._settle(ticket, answer)
+        return "closing"
+
+    def _settle(self, ticket: Ticket, answer: object) -> None:
+        if isinstance(answer, Answered):
+            ticket.future.set_result(answer.value)
+            return
+        reason = answer.reason if isinstance(answer, Fault) else f"unexpected message {type(answer).__name__}"
+        fields = {"pool": self._spec.name, "worker": self._index, "reason": reason}
+        logging.getLogger(LOGGER_NAME).error("job failed", extra={"fields": fields})
+        ticket.lose("fault")
+
+
+class _Watchdog:
+    """Kills a process unless the block ends in time: reads and writes of its pipe then end, even half-way."""
+
+    def __init__(self, process: BaseProcess, limit_s: float) -> None:
+        self.barked = False
+        self._process = process
+        self._timer = threading.Timer(limit_s, self._bark)
+        self._timer.daemon = True
+
+    def __enter__(self) -> _Watchdog:
+        self._timer.start()
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self._timer.cancel()
+
+    def _bark(self) -> None:
+        self.barked = True
+        self._process.kill()
+
+
+def _send(connection: Connection, content: bytes) -> bool:
+    """False when the worker died before it had everything."""
+    try:
+        connection.send_bytes(content)
+    except OSError:
+        return False
+    return True
+
+
+def _receive(connection: Connection) -> object | None:
+    """The worker's next message; None when it died, perhaps in the middle of the message."""
+    try:
+        return connection.recv()
+    except (EOFError, OSError):
+        return None
