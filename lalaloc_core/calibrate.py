@@ -72,7 +72,11 @@ def _by_stage(answers: Answers) -> dict[str, LogisticModel]:
 
 
 def _fit_stage(stage: str, answers: Answers) -> LogisticModel:
-    """Maximum-likelihood logistic model of a stage's pose being within 1 m of the truth."""
+    """Maximum-likelihood logistic model of a stage's pose being within 1 m of the truth.
+
+    What is strange decides, with the rest, in which direction of the signals trust grows. How fast, and from where, is
+    then fitted on the home's own queries alone, whose probabilities are those that must be right.
+    """
     own = [one for one in answers.own if stage in one.signals]
     strange = [one for one in answers.strange if stage in one.signals]
     features = np.array([[1.0, *(one.signals[stage][name] for name in _SIGNALS)] for one in own + strange])
@@ -81,7 +85,13 @@ def _fit_stage(stage: str, answers: Answers) -> LogisticModel:
     weight = np.ones(len(features))
     if strange:
         weight[len(own) :] = _STRANGE_SHARE / (1.0 - _STRANGE_SHARE) * len(own) / len(strange)
-    bias, *weights = _logistic(features, right, weight)
+    direction = _logistic(features, right, weight)
+    if strange:
+        logit = (features @ direction)[: len(own)]
+        offset, slope = _logistic(np.stack([np.ones(len(own)), logit], axis=-1), right[: len(own)], weight[: len(own)])
+        direction = slope * direction
+        direction[0] += offset
+    bias, *weights = direction.tolist()
     return LogisticModel(bias=bias, **dict(zip(_SIGNALS, weights, strict=True)))
 
 
@@ -107,7 +117,7 @@ def _covariance_factors(predictions: Sequence[Prediction]) -> tuple[float | None
 
 def _logistic(
     features: Float[np.ndarray, "n f"], correct: Bool[np.ndarray, "n"], weight: Float[np.ndarray, "n"]
-) -> list[float]:
+) -> Float[np.ndarray, "f"]:
     """Newton's method on the ridge-regularised log likelihood; features are scaled so that one ridge fits all."""
     scale = np.maximum(np.abs(features).max(axis=0), 1e-9)
     scaled = features / scale
@@ -122,4 +132,4 @@ def _logistic(
         weights -= step
         if np.abs(step).max() < 1e-9:
             break
-    return [float(weight) for weight in weights / scale]
+    return weights / scale

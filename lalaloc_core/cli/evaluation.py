@@ -67,6 +67,7 @@ def add_commands(commands: Any) -> None:
     calibrate = commands.add_parser("calibrate", help="fit a bundle's confidence on generated validation homes")
     calibrate.add_argument("--bundle", type=Path, default=_BUNDLE)
     _generator_arguments(calibrate)
+    calibrate.add_argument("--out", type=Path, metavar="DIR", help="keep the answers there, and go on with those there")
     calibrate.set_defaults(run=_calibrate)
 
 
@@ -162,6 +163,8 @@ def _calibrate(arguments: argparse.Namespace) -> None:
             heading_known=known,
             bundle=str(arguments.bundle),
         )
+        if arguments.out is not None:
+            return run_evaluation(RunFolder(arguments.out / f"{whose}-{'known' if known else 'searched'}"), info)
         with tempfile.TemporaryDirectory(prefix="lalaloc-run-") as folder:
             return run_evaluation(RunFolder(Path(folder)), info)
 

@@ -17,9 +17,12 @@ import httpx
 import pytest
 from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
+from sqlalchemy import select
 
+from service.storage.database import Database
+from service.storage.tables import METADATA
 from service.telemetry import LOGGER_NAME
-from tests.service.conftest import StartApp, assert_problem, localise, upload, wait_for
+from tests.service.conftest import DatabaseOf, StartApp, assert_problem, localise, upload, wait_for
 
 MIB = 2**20
 QUICK = {"refine": "none", "top_k": 1}
@@ -158,7 +161,11 @@ class TestBombs:
 
 
 def test_the_place_where_a_panorama_was_taken_is_neither_stored_nor_logged(
-    start_app: StartApp, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    start_app: StartApp,
+    database_of: DatabaseOf,
+    tmp_path: Path,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     exif = Image.Exif()
     exif.get_ifd(0x8825).update({1: "N", 2: tuple(IFDRational(n, 9973) for n in (479_111, 81_003, 7_177))})
@@ -176,6 +183,9 @@ def test_the_place_where_a_panorama_was_taken_is_neither_stored_nor_logged(
     assert b"Ringelnatterweg" in picture.getvalue()
     logged = "".join(str(vars(record)) for record in caplog.records).encode()
     stored = b"".join(file.read_bytes() for file in tmp_path.rglob("*") if file.is_file())
+    with Database(database_of(tmp_path)).reading() as connection:
+        rows = [row for table in METADATA.sorted_tables for row in connection.execute(select(table))]
+    stored += b"".join(value if isinstance(value, bytes) else str(value).encode() for row in rows for value in row)
     assert b"kitchen" in stored
     for trace in (b"Ringelnatterweg", b"479111", struct.pack(">II", 479_111, 9973)):
         assert trace not in stored + logged

@@ -175,11 +175,13 @@ def test_silence_is_broken_by_comments(tiny_bundle: Path, tmp_path: Path) -> Non
 def test_a_stream_does_not_outlive_the_key_of_its_caller(
     start_app: StartApp, database_of: DatabaseOf, tmp_path: Path
 ) -> None:
+    # Three times the hall that takes some seconds.
+    hall = {"ceiling_height_m": 3.0, "rooms": [{"polygon": [[0, 0], [70, 0], [70, 70], [0, 70]]}]}
     with start_app(tmp_path, api_keys=True, key_cache_s=0.1, **SLOW) as client:
         store = Store(database_of(tmp_path))
         other, key = make_key(store), make_key(store)
         client.headers.update(bearer(other))
-        plan_id = upload(client, HALL, wait=False)
+        plan_id = upload(client, hall, wait=False)
         with client.stream("GET", f"/floorplans/{plan_id}/events", headers=bearer(key)) as response:
             chunks = response.iter_raw()
             # It lasts for as long as the key does.
