@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from lalaloc_core.errors import ConfigError
+from lalaloc_core.errors import LaLaLocError
 from service.cli import add_serve_arguments, serve
 from service.settings import settings_table
 
@@ -20,8 +20,8 @@ def main() -> None:
         return
     try:
         serve(arguments)
-    except ConfigError as error:
-        parser.error(str(error))
+    except LaLaLocError as error:
+        parser.exit(1, f"{parser.prog}: {error}\n")
 
 
 if __name__ == "__main__":

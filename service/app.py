@@ -18,6 +18,7 @@ from starlette.types import ASGIApp
 
 from lalaloc_core import __version__
 from service.admission import EXEMPT, REFUSALS, AdmissionMiddleware
+from service.errors import HTTP_PROBLEMS, PROBLEMS
 from service.headers import SecurityHeadersMiddleware
 from service.problems import add_problems, install_problem_handlers
 from service.routes import floorplans, health, limits, localise, pages, plan_events, plan_files
@@ -41,6 +42,9 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         settings: by default read from the environment when the application starts.
     """
     telemetry = Telemetry()
+    # Shown as 0 from the start, so that the first one is a rise.
+    for kind in (*PROBLEMS.values(), *HTTP_PROBLEMS.values()):
+        telemetry.rejections.labels(kind.slug)
     app = FastAPI(
         title="LaLaLoc",
         version=__version__,
@@ -74,12 +78,14 @@ def _layers(app: FastAPI, telemetry: Telemetry, routes: list[BaseRoute]) -> ASGI
 @asynccontextmanager
 async def _lifespan(settings: Settings | None, telemetry: Telemetry, app: FastAPI) -> AsyncIterator[None]:
     settings = settings or Settings.load()
-    configure_logging(settings.log_level)
+    logger = configure_logging(settings.log_level)
     with ExitStack() as cleanup:
         runtime = app.state.runtime = await asyncio.to_thread(start_runtime, settings, telemetry, cleanup)
         app.state.admission = runtime.admission
         app.state.gate = runtime.gate
         yield
+        logger.info("service stops")
+    logger.info("service stopped")
 
 
 def _openapi(app: FastAPI) -> dict[str, Any]:

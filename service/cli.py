@@ -15,6 +15,7 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from datetime import datetime
 
+from lalaloc_core.bundle import Bundle
 from lalaloc_core.errors import ConfigError, LaLaLocError
 from service.security.access import Permission
 from service.security.exposure import check_address
@@ -60,6 +61,7 @@ def serve(arguments: argparse.Namespace) -> int:
     with _listener(arguments.host, arguments.port) as listener:
         host, port = listener.getsockname()[:2]
         check_address(host, settings)
+        _check_parts(settings)
         # Bound already: whoever reads this line can connect, and is answered once the service has started.
         print(f"http://{f'[{host}]' if ':' in host else host}:{port}", flush=True)
         # Takes a second or two, which those who only ask for help or keys need not wait.
@@ -69,6 +71,17 @@ def serve(arguments: argparse.Namespace) -> int:
         app = create_app(settings)
         Server(server_config(app, settings), app, settings).run(sockets=[listener])
     return 0
+
+
+def _check_parts(settings: Settings) -> None:
+    """Open what the service cannot do without, so that who started it is told in a line, and not by its log.
+
+    Raises:
+        BundleError: there is no usable model.
+        ConfigError, StoreUnavailableError: the database cannot be used.
+    """
+    Bundle.open(settings.bundle)
+    open_store(settings).close()
 
 
 def _listener(host: str, port: int) -> socket.socket:

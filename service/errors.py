@@ -211,8 +211,8 @@ class ExposedWithoutKeysError(ServiceError):
 
     def __init__(self, wanted: str) -> None:
         super().__init__(
-            f"API keys are off, so only requests {wanted} are answered; see LALALOC_API_KEYS and "
-            "LALALOC_ALLOW_ANONYMOUS"
+            f"API keys are off, so only requests {wanted} are answered; see LALALOC_API_KEYS, LALALOC_ALLOW_ANONYMOUS "
+            "and LALALOC_ALLOWED_HOSTS"
         )
 
 

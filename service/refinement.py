@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import get_args
+
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.localise.poses import RefinementJob, RefinementResult
 from service.lpo_worker import run_worker
 from service.settings import Settings
 from service.telemetry import Telemetry
-from service.workers.jobs import JobLostError
+from service.workers.jobs import JobLostError, LostReason
 from service.workers.pool import PoolState, WorkerPool
 from service.workers.supervisor import WorkerSpec
 
@@ -35,6 +37,9 @@ class LpoPool:
             queue_limit=settings.lpo_queue,
             on_restart=lambda _reason: telemetry.note_restart("lpo"),
         )
+        # Shown as 0 from the start, so that the first one is a rise.
+        for reason in get_args(LostReason):
+            telemetry.lpo_missed.labels(reason)
         telemetry.gauge("lalaloc_lpo_queue_depth", "LPO jobs waiting for a worker.", lambda: self._workers.waiting)
         telemetry.gauge("lalaloc_lpo_workers_ready", "LPO workers that are warm.", lambda: self.state.ready)
 

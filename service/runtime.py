@@ -95,7 +95,7 @@ def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack) 
     if settings.otlp_endpoint is not None:
         telemetry.tracing = kept(Tracing(otlp_exporter(settings.otlp_endpoint), __version__))
     bundle = Bundle.open(settings.bundle)
-    telemetry.describe_build(__version__, bundle.manifest.name, bundle.sha256)
+    telemetry.describe_build(__version__, bundle.manifest.name, bundle.manifest.version, bundle.sha256)
     store = kept(open_store(settings))
     gate = kept(Gate(store.keys, settings))
     # The pool first: loading torch in the workers overlaps with loading the model here.

@@ -165,7 +165,7 @@ class LocaliseForm(BaseModel):
     refine: Literal["none", "vdr", "lpo"] = Field(
         "lpo", description="How far to refine: nearest grid pose, denser poses around it, or optimised pose."
     )
-    top_k: int = Field(5, ge=1, le=100, description="How many distinct candidates to return, up to `max_top_k`.")
+    top_k: int = Field(5, ge=1, le=100, description="How many distinct candidates to return, at most `max_top_k`.")
 
     @field_validator("heading_deg", "heading_tolerance_deg", "camera_height_m", "top_k", mode="before")
     @classmethod

@@ -96,8 +96,13 @@ class Settings(BaseSettings):
     )
     allow_anonymous: bool = Field(
         default=False,
-        description="Without API keys, answer others than this machine as well: where something else decides who gets "
-        "here.",
+        description="Without API keys, listen to others than this machine as well: where something else decides who "
+        "gets here.",
+    )
+    allowed_hosts: str = Field(
+        default="",
+        description="Without API keys, names besides this machine's that requests may be for (`Host`) and pages come "
+        "from (`Origin`), separated by commas; `*` for any.",
     )
     key_cache_s: Annotated[float, Field(ge=0.0, le=60.0)] = Field(
         default=5.0, description="How long an API key is remembered: a revoked one is refused at most that much later."
@@ -211,6 +216,11 @@ class Settings(BaseSettings):
             return cls()
         except ValidationError as error:
             raise ConfigError("; ".join(_describe(fault) for fault in error.errors())) from error
+
+    @property
+    def allowed_host_names(self) -> frozenset[str]:
+        """The names in `allowed_hosts`, in lower case."""
+        return frozenset(name.strip().lower() for name in self.allowed_hosts.split(",")) - {""}
 
     @property
     def cores(self) -> CoreShares:

@@ -114,21 +114,20 @@ class Grids:
         # Of the jobs that are being computed, all by the one thread of `Jobs`.
         self._hearts: list[_Heart] = []
         self._jobs = Jobs(self._work)
-        # Of plans that wait to be taken up, when that was looked at last.
-        self._backlog = 0
-        telemetry.gauge("lalaloc_grids_pending", "Latent grids computed or waiting for it.", lambda: self.pending)
-        telemetry.gauge("lalaloc_grids_preparing", "The same, and plans not taken up yet.", lambda: self.preparing)
+        self._unprepared = 0
+        telemetry.gauge("lalaloc_grids_pending", "Latent grids computed or waiting for it here.", lambda: self.pending)
+        telemetry.gauge("lalaloc_grids_preparing", "Plans without a latent grid, wherever.", lambda: self.preparing)
         telemetry.gauge("lalaloc_grid_cache_bytes", "Latent grids in memory.", lambda: self._cache.bytes)
 
     @property
     def pending(self) -> int:
-        """Latent grids being computed or waiting for it."""
+        """Latent grids being computed or waiting for it here."""
         return len(self._jobs)
 
     @property
     def preparing(self) -> int:
-        """Those, and the plans in the store that nobody has taken up yet, as of the last `take_up`."""
-        return self.pending + self._backlog
+        """The same here and elsewhere, with plans that nobody has taken up yet, as of the last `take_up`."""
+        return max(self.pending, self._unprepared)
 
     def key(self, revision_id: str, camera_height_m: float) -> GridKey:
         """The key of a revision's grid for this model and grid step."""
@@ -249,21 +248,18 @@ class Grids:
         """The revisions with grids in memory, or with grids that are to be computed."""
         return {key.revision_id for key, _ in self._cache.items()} | self._jobs.revisions()
 
-    def take_up(self) -> bool:
-        """Queue the oldest grids that nobody computes, unless there is enough to do; tells whether there are more."""
+    def take_up(self) -> None:
+        """Queue the oldest grids that nobody computes, unless there is enough to do."""
         if len(self._jobs) >= _TAKEN_UP:
-            return True
+            return
         model = (self._model_sha256, self._settings.grid_step_m)
         missing = self._store.grids.missing(*model, _TAKEN_UP)
-        more = len(missing) == _TAKEN_UP
-        count = self._store.grids.count_missing(*model) if more else len(missing)
+        self._unprepared = self._store.grids.count_unprepared(*model)
         with suppress(StoppingError, OverloadedError):
             for summary in missing:
                 key = self.key(summary.revision_id, summary.camera_height_m)
                 poses = summary.room_count + int(summary.area_m2 / key.step_m**2)
                 self._jobs.add(key, plan_id=summary.id, poses=poses, on_demand=False)
-        self._backlog = max(count - len(self._jobs), 0)
-        return more
 
     def look_elsewhere(self) -> None:
         """Note how far other replicas are, and look after grids that they finished or gave up."""

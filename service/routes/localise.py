@@ -90,6 +90,8 @@ async def localise(request: Request, runtime: Running, tenant: Tenant) -> Respon
         parts = await read_parts(request, limits, files={"panorama"}, fields=set(LocaliseForm.model_fields))
     begin = monotonic()
     form = validate_fields(LocaliseForm, parts.fields)
+    if "top_k" not in form.model_fields_set:
+        form = form.model_copy(update={"top_k": min(form.top_k, settings.max_top_k)})
     if form.top_k > settings.max_top_k:
         fault = f"is {form.top_k}, at most {settings.max_top_k} are allowed (max_top_k)"
         raise InvalidRequestError([("top_k", fault)])

@@ -1,13 +1,15 @@
 """Without API keys the service answers its own machine only, unless it is told otherwise.
 
-A browser on this machine counts as it only under a loopback name, and for changes only with a page from here: names
-of other sites may be made to resolve to 127.0.0.1, and their forms may be sent anywhere.
+Other machines and other names are let in apart from each other: a container is asked over a network of its own, and yet
+only by programs and pages of the machine that it runs on. A browser on this machine counts as it only under a loopback
+name, and for changes only with a page from here: names of other sites may be made to resolve to 127.0.0.1, and their
+forms may be sent anywhere.
 """
 
 from __future__ import annotations
 
 import ipaddress
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from urllib.parse import urlsplit
 
 from lalaloc_core.errors import ConfigError
@@ -34,8 +36,8 @@ def is_local(server: tuple[str, int | None] | None) -> bool:
     return (mapped or address).is_loopback
 
 
-def names_this_machine(authority: str) -> bool:
-    """Whether a host with or without a port is a loopback address, or `localhost`.
+def may_be_named(authority: str, allowed: Set[str] = frozenset()) -> bool:
+    """Whether a host with or without a port is a loopback address, `localhost`, or among those allowed (`*`: any).
 
     A browser that was sent here by the page of another site, under a name that the site controls, says that name.
     """
@@ -43,24 +45,25 @@ def names_this_machine(authority: str) -> bool:
         host = urlsplit(f"//{authority}").hostname or ""
     except ValueError:
         return False
-    return host == "localhost" or is_local((host, 0))
+    return host == "localhost" or is_local((host, 0)) or host in allowed or "*" in allowed
 
 
-def check_origin(method: str, hosts: Sequence[str], origins: Sequence[str]) -> None:
+def check_origin(method: str, hosts: Sequence[str], origins: Sequence[str], allowed: Set[str] = frozenset()) -> None:
     """Refuse what a browser was made to send by a page from elsewhere.
 
     Args:
         hosts: values of `Host`; programs may leave it out, browsers do not.
         origins: values of `Origin`, which browsers send with whatever changes something.
+        allowed: names besides this machine's that will do, `*` for any.
 
     Raises:
-        ExposedWithoutKeysError: another name than this machine's, or a change that a page from elsewhere asked for.
+        ExposedWithoutKeysError: another name, or a change that a page from elsewhere asked for.
     """
-    if not all(names_this_machine(host) for host in hosts):
-        raise ExposedWithoutKeysError("to localhost or a loopback address (Host)")
+    if not all(may_be_named(host, allowed) for host in hosts):
+        raise ExposedWithoutKeysError("to localhost, a loopback address or an allowed name (Host)")
     pages = [origin.partition("://")[2] for origin in origins]
-    if method in _CHANGING and not all(names_this_machine(page) for page in pages):
-        raise ExposedWithoutKeysError("from pages of this machine (Origin)")
+    if method in _CHANGING and not all(may_be_named(page, allowed) for page in pages):
+        raise ExposedWithoutKeysError("from pages of this machine or an allowed name (Origin)")
 
 
 def check_address(host: str, settings: Settings) -> None:

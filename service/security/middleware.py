@@ -46,6 +46,7 @@ class Gate:
     def __init__(self, keys: ApiKeys, settings: Settings) -> None:
         self._needs_keys = settings.api_keys
         self._allow_anonymous = settings.allow_anonymous
+        self._hosts = settings.allowed_host_names
         self._ring = KeyRing(keys, fresh_s=settings.key_cache_s)
         self._rates = Rates(settings)
 
@@ -66,8 +67,7 @@ class Gate:
             HTTPException: there is no such route, or it has no such method.
         """
         if not self._needs_keys:
-            if not self._allow_anonymous:
-                _check_local(request)
+            self._check_local(request)
             return ANYONE
         key = await self._key_of(request)
         note(request, key=key.id, tenant=key.tenant)
@@ -87,6 +87,18 @@ class Gate:
             return await self._ring.find(presented) is not None
         except StoreUnavailableError:
             return False
+
+    def _check_local(self, request: Request) -> None:
+        """Raises:
+        ExposedWithoutKeysError: the request came from another machine, or a page from elsewhere made it.
+        """
+        server = request.scope.get("server")
+        if not self._allow_anonymous and not is_local(server):
+            raise ExposedWithoutKeysError("over a loopback address")
+        # Browsers do not ask over Unix sockets; what does, a proxy, names the service as its own clients do.
+        if server is not None and server[1] is not None:
+            headers = Headers(scope=request.scope)
+            check_origin(request.method, headers.getlist("host"), headers.getlist("origin"), self._hosts)
 
     async def _key_of(self, request: Request) -> ApiKey:
         values = Headers(scope=request.scope).getlist("authorization")
@@ -128,19 +140,6 @@ class GateMiddleware:
                 await http_problem_answer(request, error)(scope, receive, send)
                 return
         await self._app(scope, receive, send)
-
-
-def _check_local(request: Request) -> None:
-    """Raises:
-    ExposedWithoutKeysError: the request came from another machine, or a page from elsewhere made it.
-    """
-    server = request.scope.get("server")
-    if not is_local(server):
-        raise ExposedWithoutKeysError("over a loopback address")
-    # Browsers do not ask over Unix sockets; what does, a proxy, names the service as its own clients do.
-    if server is not None and server[1] is not None:
-        headers = Headers(scope=request.scope)
-        check_origin(request.method, headers.getlist("host"), headers.getlist("origin"))
 
 
 def _needed(request: Request) -> Permission:

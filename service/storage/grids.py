@@ -74,24 +74,6 @@ class StoredGrids:
 
     def missing(self, model_sha256: str, step_m: float, limit: int) -> list[PlanSummary]:
         """Plans, oldest first, whose own grid is neither stored, nor computed by anyone, nor failed before."""
-        query = select_summaries().where(*self._is_missing(model_sha256, step_m))
-        query = query.order_by(FLOORPLANS.c.created_at, FLOORPLANS.c.id).limit(limit)
-        with self._database.reading() as connection:
-            return [PlanSummary(**row._mapping) for row in connection.execute(query)]
-
-    def count_missing(self, model_sha256: str, step_m: float) -> int:
-        """How many plans `missing` would give without a limit."""
-        query = select_summaries().where(*self._is_missing(model_sha256, step_m))
-        with self._database.reading() as connection:
-            return connection.scalar(select(func.count()).select_from(query.subquery())) or 0
-
-    def _is_missing(self, model_sha256: str, step_m: float) -> list[ColumnElement[bool]]:
-        of_model = (
-            LATENT_GRIDS.c.revision_id == REVISIONS.c.id,
-            LATENT_GRIDS.c.model_sha256 == model_sha256,
-            LATENT_GRIDS.c.step_m == step_m,
-            _is_own_height(LATENT_GRIDS),
-        )
         leased = (
             GRID_LEASES.c.revision_id == REVISIONS.c.id,
             GRID_LEASES.c.model_sha256 == model_sha256,
@@ -99,7 +81,16 @@ class StoredGrids:
             _is_own_height(GRID_LEASES),
             GRID_LEASES.c.lease_until_s > self._database.now_s(),
         )
-        return [REVISIONS.c.failure.is_(None), ~exists().where(*of_model), ~exists().where(*leased)]
+        query = select_summaries().where(*_unprepared(model_sha256, step_m), ~exists().where(*leased))
+        query = query.order_by(FLOORPLANS.c.created_at, FLOORPLANS.c.id).limit(limit)
+        with self._database.reading() as connection:
+            return [PlanSummary(**row._mapping) for row in connection.execute(query)]
+
+    def count_unprepared(self, model_sha256: str, step_m: float) -> int:
+        """How many plans have no grid of their own yet, computed by anyone or not, and did not fail."""
+        query = select_summaries().where(*_unprepared(model_sha256, step_m))
+        with self._database.reading() as connection:
+            return connection.scalar(select(func.count()).select_from(query.subquery())) or 0
 
 
 class GridLeases:
@@ -224,3 +215,13 @@ def _make_room(connection: Connection, key: GridKey, *, keep: int, always_keep_m
     # Two are not among them: the plan's own, and the one that is about to be stored.
     surplus = connection.scalars(on_demand.order_by(columns.id.desc()).offset(max(keep - 2, 0))).all()
     connection.execute(delete(LATENT_GRIDS).where(columns.id.in_(surplus)))
+
+
+def _unprepared(model_sha256: str, step_m: float) -> list[ColumnElement[bool]]:
+    own_grid = (
+        LATENT_GRIDS.c.revision_id == REVISIONS.c.id,
+        LATENT_GRIDS.c.model_sha256 == model_sha256,
+        LATENT_GRIDS.c.step_m == step_m,
+        _is_own_height(LATENT_GRIDS),
+    )
+    return [REVISIONS.c.failure.is_(None), ~exists().where(*own_grid)]

@@ -73,11 +73,12 @@ class Telemetry:
         """Add a gauge that is read when metrics are asked for; an app that is started again replaces its gauges."""
         self._gauge(name, meaning).set_function(read)
 
-    def describe_build(self, version: str, model: str, model_sha256: str) -> None:
+    def describe_build(self, version: str, model: str, model_version: str, model_sha256: str) -> None:
         """Say which software answers with which model: a gauge that is 1, for joining with others."""
-        gauge = self._gauge("lalaloc_build_info", "Version and model that answer.", ("version", "model", "sha256"))
+        labels = ("version", "model", "model_version", "sha256")
+        gauge = self._gauge("lalaloc_build_info", "Version and model that answer.", labels)
         gauge.clear()
-        gauge.labels(version, model, model_sha256).set(1.0)
+        gauge.labels(version, model, model_version, model_sha256).set(1.0)
 
     def note_restart(self, pool: str) -> None:
         """Count that a worker process of a pool has to be replaced."""

@@ -177,16 +177,22 @@ def test_the_service_process_never_loads_torch(tiny_bundle: Path, tmp_path: Path
 
 @pytest.mark.parametrize(
     ("variable", "value", "told"),
-    [("LALALOC_WORKER", "2", "unknown setting LALALOC_WORKER"), ("LALALOC_BUNDLE", "no/such", "no model bundle at")],
+    [
+        ("LALALOC_WORKER", "2", "unknown setting LALALOC_WORKER"),
+        ("LALALOC_BUNDLE", "no/such", "no model bundle at"),
+        ("LALALOC_DATABASE_URL", "mysql://somewhere/plans", "mysql"),
+    ],
 )
-def test_a_wrong_setting_stops_the_start_and_is_named(
+def test_a_wrong_setting_stops_the_start_and_is_named_in_a_line(
     tiny_bundle: Path, tmp_path: Path, variable: str, value: str, told: str
 ) -> None:
     environment = environment_of(tiny_bundle, tmp_path) | {variable: value}
     command = [sys.executable, "-m", "service", "--port", "0"]
     done = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode != 0
+    # Nor does it say where it could be reached.
+    assert (done.returncode, done.stdout) == (1, "")
     assert told in done.stderr
+    assert done.stderr.count("\n") == 1
 
 
 def test_the_module_runs_on_a_free_port_and_says_where(tiny_bundle: Path, tmp_path: Path) -> None:

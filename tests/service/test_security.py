@@ -600,10 +600,22 @@ def test_without_keys_pages_from_elsewhere_have_no_say(
         assert_problem(response, 403, "exposed-without-keys")
 
 
-def test_with_leave_any_name_and_page_will_do(start_app: StartApp, tmp_path: Path) -> None:
-    with start_app(tmp_path, allow_anonymous=True) as client:
-        elsewhere = {"Host": "plans.example", "Origin": "https://plans.example"}
-        assert client.post("/floorplans", json=FLAT, headers=elsewhere).status_code == 201
+@pytest.mark.parametrize(
+    ("settings", "status"),
+    [
+        ({"allowed_hosts": "other.example, Plans.Example"}, 201),
+        ({"allowed_hosts": "*"}, 201),
+        ({"allowed_hosts": "other.example"}, 403),
+        # Who may connect is another question than what they may be made to send.
+        ({"allow_anonymous": True}, 403),
+    ],
+)
+def test_other_names_and_pages_will_do_when_they_are_allowed(
+    start_app: StartApp, tmp_path: Path, settings: dict[str, Any], status: int
+) -> None:
+    with start_app(tmp_path, **settings) as client:
+        elsewhere = {"Host": "plans.example:8000", "Origin": "https://plans.example"}
+        assert client.post("/floorplans", json=FLAT, headers=elsewhere).status_code == status
 
 
 @pytest.fixture(scope="module")

@@ -223,10 +223,13 @@ def test_no_header_is_too_odd_to_be_refused(header: str) -> None:
 
 def test_the_build_is_told_and_metrics_of_rooms_are_made_once(client: httpx.Client) -> None:
     model = client.get("/readyz").json()["model"]
-    labels = f'model="{model["name"]}",sha256="{model["sha256"]}",version='
+    labels = f'model="{model["name"]}",model_version="{model["version"]}",sha256="{model["sha256"]}",version='
     text = client.get("/metrics").text
     assert re.search(rf"^lalaloc_build_info{{{labels}\"[^\"]+\"}} 1\.0$", text, re.MULTILINE)
     assert re.search(r"^process_resident_memory_bytes \d", text, re.MULTILINE)
+    # What has not happened yet is there as well, so that the first time is a rise.
+    assert 'lalaloc_rejections_total{reason="overloaded"} 0.0' in text
+    assert 'lalaloc_lpo_missed_total{reason="died"} 0.0' in text
 
 
 def test_labels_stay_bounded_whatever_is_asked_for(client: httpx.Client) -> None:
