@@ -6,9 +6,10 @@ import io
 import os
 import socket
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import cache
+from itertools import cycle
 from pathlib import Path
 from time import monotonic, sleep
 from typing import Any
@@ -34,6 +35,9 @@ FLAT: dict[str, Any] = {
     ],
 }
 
+_DATABASE = os.environ.get("TEST_DATABASE", "sqlite")
+_REPLICAS = 2 if _DATABASE == "replicas" else 1
+
 # From an app's data folder to the address of its database.
 DatabaseOf = Callable[[Path], str]
 StartApp = Callable[..., AbstractContextManager[httpx.Client]]
@@ -44,6 +48,12 @@ def _no_settings_from_outside(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in os.environ:
         if name.upper().startswith("LALALOC_"):
             monkeypatch.delenv(name)
+
+
+@pytest.fixture(autouse=True)
+def _only_what_replicas_share(request: pytest.FixtureRequest) -> None:
+    if _REPLICAS > 1 and request.node.get_closest_marker("one_replica") is not None:
+        pytest.skip("about what each replica has for itself")
 
 
 @pytest.fixture(scope="session")
@@ -64,8 +74,11 @@ def postgres() -> Iterator[PostgresServer]:
 
 @pytest.fixture(scope="session")
 def database_of(request: pytest.FixtureRequest) -> DatabaseOf:
-    """The database that an app started on a data folder uses: SQLite, or PostgreSQL with TEST_DATABASE=postgresql."""
-    if os.environ.get("TEST_DATABASE", "sqlite") == "sqlite":
+    """The database that an app started on a data folder uses: SQLite, or PostgreSQL with TEST_DATABASE=postgresql.
+
+    With TEST_DATABASE=replicas, two apps use the same PostgreSQL database, and take turns in answering.
+    """
+    if _DATABASE == "sqlite":
         return lambda data_dir: f"sqlite:///{data_dir / 'lalaloc.sqlite3'}"
     server = request.getfixturevalue("postgres")
     return cache(lambda _data_dir: server.new_database())
@@ -80,11 +93,31 @@ def start_app(tiny_bundle: Path, database_of: DatabaseOf) -> StartApp:
         if not (url := database_of(data_dir)).startswith("sqlite"):
             overrides = {"database_url": url} | overrides
         values = {"data_dir": data_dir, "bundle": tiny_bundle, "workers": 0, "onnx_threads": 1, "log_level": "error"}
-        app = create_app(Settings(**(values | overrides)))
-        with serve(app) as base_url, httpx.Client(base_url=base_url, timeout=30.0) as client:
-            yield client
+        settings = Settings(**(values | overrides))
+        with ExitStack() as stack:
+            urls = [stack.enter_context(serve(create_app(settings))) for _ in range(_REPLICAS)]
+            turns = InTurn(urls) if _REPLICAS > 1 else None
+            yield stack.enter_context(httpx.Client(base_url=urls[0], timeout=30.0, transport=turns))
 
     return start
+
+
+class InTurn(httpx.BaseTransport):
+    """Sends one request to the first of some addresses, the next one to the second, and so on."""
+
+    def __init__(self, urls: Sequence[str]) -> None:
+        self._urls = cycle([httpx.URL(url) for url in urls])
+        self._transport = httpx.HTTPTransport()
+
+    def handle_request(self, request: httpx.Request) -> httpx.Response:
+        """Send a request."""
+        url = next(self._urls)
+        request.url = request.url.copy_with(host=url.host, port=url.port)
+        return self._transport.handle_request(request)
+
+    def close(self) -> None:
+        """Close all connections."""
+        self._transport.close()
 
 
 @pytest.fixture(scope="module")

@@ -14,6 +14,8 @@ import pytest
 from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upload, wait_for
 from tests.service.test_localise import HALL
 
+pytestmark = pytest.mark.one_replica
+
 PLACES = 3
 
 

@@ -75,6 +75,7 @@ def black(width: int, height: int, kind: str, **options: object) -> bytes:
     return buffer.getvalue()
 
 
+@pytest.mark.one_replica
 def test_a_killed_decoder_costs_no_query_its_answer(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
     with start_app(tmp_path) as client:
         plan_id = upload(client)
@@ -86,6 +87,7 @@ def test_a_killed_decoder_costs_no_query_its_answer(start_app: StartApp, tmp_pat
     assert decoders() == [], "the pool left a process behind"
 
 
+@pytest.mark.one_replica
 def test_a_picture_over_which_decoders_stall_is_refused_and_the_next_one_is_answered(
     start_app: StartApp, tmp_path: Path, panorama: bytes
 ) -> None:

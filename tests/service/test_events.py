@@ -114,6 +114,7 @@ def test_there_is_no_stream_about_nothing(client: httpx.Client) -> None:
         assert_problem(client.get(f"/floorplans/{plan_id}/events"), 404, "unknown-floorplan")
 
 
+@pytest.mark.one_replica
 def test_streams_are_bounded_in_number_and_a_client_that_goes_frees_its_place(
     start_app: StartApp, tmp_path: Path
 ) -> None:

@@ -88,6 +88,7 @@ def test_reads_that_wait_do_not_hold_up_health(start_app: StartApp, postgres: Po
             assert monotonic() - begin < 1.5
 
 
+@pytest.mark.one_replica
 def test_metrics_count_requests_by_route_and_queries_by_stage(client: httpx.Client, panorama: bytes) -> None:
     plan_id = upload(client)
     localise(client, plan_id, panorama, refine="vdr")

@@ -295,6 +295,7 @@ def test_a_query_that_cannot_be_computed_in_time_is_ended(start_app: StartApp, t
         assert_problem(response, 504, "deadline-exceeded")
 
 
+@pytest.mark.one_replica
 def test_queries_beyond_the_limit_are_refused_at_once(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
     with start_app(tmp_path, max_pending_requests=1) as client, ThreadPoolExecutor(1) as threads:
         plan_id = upload(client, HALL, wait=False)
@@ -306,6 +307,7 @@ def test_queries_beyond_the_limit_are_refused_at_once(start_app: StartApp, tmp_p
         assert waiting.result().status_code == 200
 
 
+@pytest.mark.one_replica
 def test_a_database_that_hangs_holds_up_no_query_for_a_known_plan(
     start_app: StartApp, postgres: PostgresServer, tmp_path: Path, panorama: bytes
 ) -> None:

@@ -366,6 +366,7 @@ def test_the_api_description_says_what_each_operation_needs_and_how_it_refuses()
 # --- rates ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.one_replica
 def test_a_key_may_send_so_many_requests_a_minute_and_is_told_when_to_go_on(
     start_app: StartApp, database_of: DatabaseOf, tmp_path: Path
 ) -> None:
@@ -402,6 +403,7 @@ def test_a_burst_is_cut_short(start_app: StartApp, database_of: DatabaseOf, tmp_
         store.close()
 
 
+@pytest.mark.one_replica
 @pytest.mark.parametrize("kind", ["unknown", "malformed"])
 def test_a_client_with_many_invalid_keys_is_not_listened_to_but_keys_that_work_are(
     start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, kind: str
@@ -443,6 +445,7 @@ def test_counters_of_client_addresses_are_bounded_and_a_network_counts_as_one() 
 # --- the database away ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.one_replica
 def test_known_keys_go_on_working_while_the_database_is_away(
     start_app: StartApp, postgres: PostgresServer, tmp_path: Path, panorama: bytes
 ) -> None:

@@ -112,6 +112,7 @@ def test_the_path_of_a_plan_is_its_route_and_its_id_a_field(client: httpx.Client
     assert (line["route"], line["plan"]) == ("/floorplans/{floorplan_id}", None)
 
 
+@pytest.mark.one_replica
 def test_what_was_refused_tells_why_and_how_far_it_came(client: httpx.Client, log: Log) -> None:
     plan_id = upload(client)
     refusals = 'lalaloc_rejections_total{reason="invalid-panorama"}'
@@ -135,6 +136,7 @@ def test_what_is_refused_before_it_is_routed_has_its_route_all_the_same(
     assert "very-secret" not in log.text
 
 
+@pytest.mark.one_replica
 def test_a_client_that_hangs_up_is_counted_and_told(client: httpx.Client, log: Log) -> None:
     gone = 'lalaloc_disconnects_total{route="/floorplans"}'
     before = _metric(client, gone)
