@@ -100,8 +100,11 @@ def main() -> int:
                     os.kill(service.process.pid, signal.SIGKILL)
                     service.process.wait()
                     continue
-                for one in work:
-                    one.result()
+                try:
+                    for one in work:
+                        one.result()
+                finally:
+                    clients.shutdown(wait=False, cancel_futures=True)
                 report = _look(service.url, uploads, names, Path(data))
     print(json.dumps(report, indent=2))
     return int(not all(report["holds"].values()))
@@ -144,6 +147,7 @@ def _look(url: str, uploads: Uploads, names: list[str], data: Path) -> dict[str,
             ),
             "every answered plan is usable": usable == len(uploads.answered) == len(names),
             "nothing else is stored": stored.keys() == set(names) and not doubled,
+            "uploads were cut off": uploads.repeated > 0,
             "nothing is half-written": not any(orphans.values()) and sound == "ok",
         },
     }

@@ -2,8 +2,8 @@
 
     python -m benchmarks.throughput --seconds 20
 
-Prints a Markdown table. `one` is one process with one optimiser, `two` is two replicas of half the threads each on one
-SQLite database, behind the same port: what `uvicorn --workers 2` runs.
+Prints a Markdown table. `one` is one process with its workers, `two` is two such replicas on one SQLite database, behind
+the same port: what `uvicorn --workers 2` runs. Where there are more than two cores, each of two has half the workers.
 """
 
 from __future__ import annotations
@@ -23,15 +23,23 @@ from pathlib import Path
 import httpx
 
 from benchmarks.load import Load, ask_for, faults, per_second, percentiles_ms, upload_example_plan
+from service.settings import Settings
 
 ROOT = Path(__file__).resolve().parent.parent
 _START_S, _STOP_S = 120.0, 40.0
 _CLIENTS = (1, 2, 4, 8, 16)
 # Nobody is refused: what is measured is how requests wait for each other.
 _SHARED = {"LALALOC_LOG_LEVEL": "error", "LALALOC_MAX_QUERIES": "64", "LALALOC_LPO_QUEUE": "64"}
+_SHARES = Settings().cores
 SETTINGS = {
     "one": (1, {}),
-    "two": (2, {"LALALOC_WORKER_THREADS": "1", "LALALOC_ONNX_THREADS": "1", "LALALOC_COMPUTE_THREADS": "1"}),
+    "two": (
+        2,
+        {
+            "LALALOC_WORKERS": str(max(_SHARES.workers // 2, 1)),
+            "LALALOC_COMPUTE_THREADS": str(max(_SHARES.compute_threads // 2, 1)),
+        },
+    ),
 }
 
 

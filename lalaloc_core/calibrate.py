@@ -25,7 +25,10 @@ from lalaloc_core.metrics import Accuracy
 _STRANGE_SHARE = 0.1
 # A weak pull to zero keeps the fit finite when the queries are perfectly separable.
 _RIDGE = 1e-2
-_ITERATIONS = 50
+# How strongly offset and slope are held where they are: when hardly an answer is wrong, nothing tells how sure answers
+# may look, and what is strange must not gain by that.
+_RESCALE_RIDGE = np.array([1.0, 16.0])
+_ITERATIONS, _CONVERGED = 50, 1e-9
 # Medians of the chi-squared distribution with one and with two degrees of freedom.
 _MEDIAN_CHI2 = {1: 0.4549, 2: 1.3863}
 _SIGNALS = ("log_odds", "cost", "uncertainty", "latent_distance")
@@ -85,11 +88,14 @@ def _fit_stage(stage: str, answers: Answers) -> LogisticModel:
     weight = np.ones(len(features))
     if strange:
         weight[len(own) :] = _STRANGE_SHARE / (1.0 - _STRANGE_SHARE) * len(own) / len(strange)
-    direction = _logistic(features, right, weight)
+    # Features are scaled so that one ridge fits all.
+    scale = np.maximum(np.abs(features).max(axis=0), 1e-9)
+    direction = _logistic(features, right, weight, ridge=_RIDGE * scale**2)
     if strange:
         logit = (features @ direction)[: len(own)]
-        offset, slope = _logistic(np.stack([np.ones(len(own)), logit], axis=-1), right[: len(own)], weight[: len(own)])
-        direction = slope * direction
+        about = np.stack([np.ones(len(own)), logit], axis=-1)
+        offset, slope = _logistic(about, right[: len(own)], weight[: len(own)], ridge=_RESCALE_RIDGE, base=logit)
+        direction = (1.0 + slope) * direction
         direction[0] += offset
     bias, *weights = direction.tolist()
     return LogisticModel(bias=bias, **dict(zip(_SIGNALS, weights, strict=True)))
@@ -116,20 +122,25 @@ def _covariance_factors(predictions: Sequence[Prediction]) -> tuple[float | None
 
 
 def _logistic(
-    features: Float[np.ndarray, "n f"], correct: Bool[np.ndarray, "n"], weight: Float[np.ndarray, "n"]
+    features: Float[np.ndarray, "n f"],
+    correct: Bool[np.ndarray, "n"],
+    weight: Float[np.ndarray, "n"],
+    *,
+    ridge: Float[np.ndarray, "f"],
+    base: Float[np.ndarray, "n"] | float = 0.0,
 ) -> Float[np.ndarray, "f"]:
-    """Newton's method on the ridge-regularised log likelihood; features are scaled so that one ridge fits all."""
-    scale = np.maximum(np.abs(features).max(axis=0), 1e-9)
-    scaled = features / scale
+    """Weights of features that are added to the log odds `base`, by Newton's method on the penalised log likelihood.
+
+    Args:
+        ridge: how strongly each weight is pulled to zero.
+    """
     weights = np.zeros(features.shape[1])
     for _ in range(_ITERATIONS):
-        probability = 1.0 / (1.0 + np.exp(-np.clip(scaled @ weights, -30.0, 30.0)))
-        gradient = scaled.T @ (weight * (probability - correct)) + _RIDGE * weights
-        hessian = (scaled * (weight * probability * (1.0 - probability))[:, None]).T @ scaled + _RIDGE * np.eye(
-            len(weights)
-        )
+        probability = 1.0 / (1.0 + np.exp(-np.clip(base + features @ weights, -30.0, 30.0)))
+        gradient = features.T @ (weight * (probability - correct)) + ridge * weights
+        hessian = (features * (weight * probability * (1.0 - probability))[:, None]).T @ features + np.diag(ridge)
         step = np.linalg.solve(hessian, gradient)
         weights -= step
-        if np.abs(step).max() < 1e-9:
+        if (np.abs(step) * np.sqrt(ridge)).max() < _CONVERGED:
             break
-    return weights / scale
+    return weights

@@ -42,6 +42,12 @@ class Decoder:
             "lalaloc_decode_workers_ready", "Decoding workers that are warm.", lambda: self._pool.state.ready
         )
 
+        telemetry.gauge(
+            "lalaloc_decode_workers_resident_bytes",
+            "Memory of all decoding workers.",
+            lambda: self._pool.resident_bytes,
+        )
+
     def start(self) -> None:
         """Start all workers; returns at once."""
         self._pool.start()

@@ -43,6 +43,10 @@ class LpoPool:
         telemetry.gauge("lalaloc_lpo_queue_depth", "LPO jobs waiting for a worker.", lambda: self._workers.waiting)
         telemetry.gauge("lalaloc_lpo_workers_ready", "LPO workers that are warm.", lambda: self.state.ready)
 
+        telemetry.gauge(
+            "lalaloc_lpo_workers_resident_bytes", "Memory of all LPO workers.", lambda: self._workers.resident_bytes
+        )
+
     def start(self) -> None:
         """Start all workers; returns at once, see `state` for when they are warm."""
         self._workers.start()

@@ -127,7 +127,9 @@ def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack) 
     caretaker.start()
     # Their callers' keys are looked at again as often.
     heartbeat_s = max(min(settings.key_cache_s, HEARTBEAT_S), _SOONEST_S) if settings.api_keys else HEARTBEAT_S
-    events = PlanEvents(store, grids, admission, reads, longest_s=settings.stream_deadline_s, heartbeat_s=heartbeat_s)
+    # One look at a time, which takes no thread from queries while the database is silent.
+    looks = kept(BoundedReads(threads=1, most=1, wait_s=settings.database_wait_s))
+    events = PlanEvents(store, grids, admission, looks, longest_s=settings.stream_deadline_s, heartbeat_s=heartbeat_s)
     fields = {"model": bundle.manifest.name, "sha256": bundle.sha256, "grids_to_compute": grids.preparing}
     logging.getLogger(LOGGER_NAME).info("service started", extra={"fields": fields})
     return Runtime(

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Self
 
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, field_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from lalaloc_core.errors import ConfigError
@@ -21,6 +22,11 @@ _DEFAULT_BUNDLE = Path(__file__).resolve().parent.parent / "models" / "default"
 Count = Annotated[int, Field(ge=1)]
 Seconds = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Metres = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+
+
+_HOST_NAME = re.compile(r"|\*|[A-Za-z0-9._-]+|[0-9A-Fa-f:]*:[0-9A-Fa-f:.]*")
+# Requests that may be uploading, besides queries in work.
+_UPLOADS = 28
 
 
 class Settings(BaseSettings):
@@ -131,7 +137,7 @@ class Settings(BaseSettings):
         default=0,
         ge=0,
         description="Uploads and queries in work, from the first byte on; more get a 503 at once. "
-        "0: 32, or four times the queries that may be in work.",
+        "0: 28 more than queries may be in work.",
     )
     max_queries: int = Field(
         default=0,
@@ -201,6 +207,14 @@ class Settings(BaseSettings):
     max_pixels: Count = Field(default=100_000_000, description="Pixels of a panorama.")
     max_top_k: Annotated[int, Field(ge=1, le=100)] = Field(default=10, description="Candidates of an answer.")
 
+    @field_validator("allowed_hosts")
+    @classmethod
+    def _names_only(cls, value: str) -> str:
+        for name in value.split(","):
+            if not _HOST_NAME.fullmatch(name.strip()):
+                raise ValueError(f"'{name.strip()}' is neither a bare name or address nor *, without scheme and port")
+        return value
+
     @classmethod
     def load(cls) -> Self:
         """Read the settings from the environment; an empty variable counts as not set.
@@ -236,7 +250,7 @@ class Settings(BaseSettings):
     @property
     def pending_limit(self) -> int:
         """Uploads and queries that may be in work."""
-        return self.max_pending_requests or max(32, 4 * self.query_limit)
+        return self.max_pending_requests or self.query_limit + _UPLOADS
 
     @property
     def query_limit(self) -> int:

@@ -149,6 +149,7 @@ def _worst(arguments: argparse.Namespace) -> None:
 def _calibrate(arguments: argparse.Namespace) -> None:
     from lalaloc_core.bundle import Bundle
     from lalaloc_core.calibrate import Answers, calibrate
+    from lalaloc_core.evaluation.building import describe_model
     from lalaloc_core.evaluation.predictions import Prediction, RunFolder, RunInfo
     from lalaloc_core.evaluation.run import run_evaluation
 
@@ -162,6 +163,7 @@ def _calibrate(arguments: argparse.Namespace) -> None:
             generated=generated,
             heading_known=known,
             bundle=str(arguments.bundle),
+            model=describe_model(arguments.bundle),
         )
         if arguments.out is not None:
             return run_evaluation(RunFolder(arguments.out / f"{whose}-{'known' if known else 'searched'}"), info)

@@ -56,6 +56,7 @@ class Caretaker:
 
     def _run(self) -> None:
         sweep_at = purge_at = monotonic()
+        more = True
         while not self._stop.wait(min(_POLL_S, self._sweep_s)):
             try:
                 self._grids.look_elsewhere()
@@ -64,8 +65,8 @@ class Caretaker:
                     sweep_at = monotonic() + self._sweep_s
                     self.sweep()
                 # A backlog, as after a new model, goes on as soon as what was taken up is done.
-                if due or (self._grids.pending == 0 and self._grids.preparing > 0):
-                    self._grids.take_up()
+                if due or (more and self._grids.pending == 0):
+                    more = self._grids.take_up()
                 if monotonic() >= purge_at:
                     purge_at = monotonic() + _PURGE_EVERY_S
                     self._store.idempotency.purge()

@@ -248,10 +248,10 @@ class Grids:
         """The revisions with grids in memory, or with grids that are to be computed."""
         return {key.revision_id for key, _ in self._cache.items()} | self._jobs.revisions()
 
-    def take_up(self) -> None:
-        """Queue the oldest grids that nobody computes, unless there is enough to do."""
+    def take_up(self) -> bool:
+        """Queue the oldest grids that nobody computes, unless there is enough to do; tells whether more may be left."""
         if len(self._jobs) >= _TAKEN_UP:
-            return
+            return True
         model = (self._model_sha256, self._settings.grid_step_m)
         missing = self._store.grids.missing(*model, _TAKEN_UP)
         self._unprepared = self._store.grids.count_unprepared(*model)
@@ -260,6 +260,7 @@ class Grids:
                 key = self.key(summary.revision_id, summary.camera_height_m)
                 poses = summary.room_count + int(summary.area_m2 / key.step_m**2)
                 self._jobs.add(key, plan_id=summary.id, poses=poses, on_demand=False)
+        return len(missing) == _TAKEN_UP
 
     def look_elsewhere(self) -> None:
         """Note how far other replicas are, and look after grids that they finished or gave up."""

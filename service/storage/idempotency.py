@@ -14,30 +14,32 @@ from service.storage.records import Claim, Conflict, Fresh, InProgress, StoredAn
 from service.storage.tables import IDEMPOTENCY
 
 KEPT_FOR = timedelta(hours=24)
-# After a crash, callers wait for as long. An owner that takes longer and lives is overtaken under its own token, which
-# costs double work, but stores nothing twice.
-_LEASE_S = 15.0
+# After a crash, callers wait for as long at least.
+LEAST_LEASE_S = 15.0
 _COLUMNS = IDEMPOTENCY.c
 
 
 class Idempotency:
     """Answers by (tenant, route, key), for a day."""
 
-    def __init__(self, database: Database) -> None:
-        self._database = database
-
-    def begin(self, tenant: str, route: str, key: str, body_sha256: str, *, lease_s: float = _LEASE_S) -> Claim:
-        """Say that a request is about to be carried out.
-
+    def __init__(self, database: Database, lease_s: float = LEAST_LEASE_S) -> None:
+        """
         Args:
-            lease_s: how long it may take; after that its owner counts as dead, and the next one takes over.
+            lease_s: how long a request may take; after that its owner counts as dead, and the next one takes over. An
+                owner that lives is overtaken under its own token: work is done twice, and nothing stored twice.
+        """
+        self._database = database
+        self._lease_s = lease_s
+
+    def begin(self, tenant: str, route: str, key: str, body_sha256: str) -> Claim:
+        """Say that a request is about to be carried out.
 
         Returns:
             Fresh to whoever is to carry it out, and then calls `finish` or `abandon`; else why not to.
         """
         own = _where(tenant, route, key)
         token, now = uuid.uuid4().hex, datetime.now(UTC)
-        until_s = self._database.now_s() + lease_s
+        until_s = self._database.now_s() + self._lease_s
         with self._database.writing() as connection:
             expired = _COLUMNS.created_at < now - KEPT_FOR
             connection.execute(delete(IDEMPOTENCY).where(*own, expired))
@@ -55,9 +57,9 @@ class Idempotency:
             return self._repeated(connection, own, body_sha256, until_s)
 
     def finish(self, tenant: str, route: str, key: str, token: str, answer: StoredAnswer) -> None:
-        """Keep the answer; whoever sends the same request again gets it."""
+        """Keep the answer, unless one is kept already; whoever sends the same request again gets it."""
         values = {"status": answer.status, "headers": json.dumps(answer.headers), "body": answer.body}
-        own = (*_where(tenant, route, key), _COLUMNS.token == token)
+        own = (*_where(tenant, route, key), _COLUMNS.token == token, _COLUMNS.status.is_(None))
         with self._database.writing() as connection:
             connection.execute(update(IDEMPOTENCY).where(*own).values(**values))
 

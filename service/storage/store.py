@@ -11,9 +11,11 @@ from service.settings import Settings
 from service.storage.api_keys import ApiKeys
 from service.storage.database import Database
 from service.storage.grids import GridLeases, StoredGrids
-from service.storage.idempotency import Idempotency
+from service.storage.idempotency import LEAST_LEASE_S, Idempotency
 from service.storage.migration import migrate
 from service.storage.plans import Plans
+
+_CLAIM_MARGIN_S = 5.0
 
 
 class Store:
@@ -29,12 +31,13 @@ class Store:
         keys: API keys.
     """
 
-    def __init__(self, url: str, *, connections: int = 8, wait_s: float = 2.0) -> None:
+    def __init__(self, url: str, *, connections: int = 8, wait_s: float = 2.0, claim_s: float = LEAST_LEASE_S) -> None:
         """Connect, and bring the schema up to date.
 
         Args:
             connections: most connections that are open at a time.
             wait_s: longest wait for one of them.
+            claim_s: longest that a request with an idempotency key may take.
 
         Raises:
             ConfigError: not a usable database URL, or the database cannot be opened.
@@ -48,7 +51,7 @@ class Store:
         self.plans = Plans(database)
         self.grids = StoredGrids(database)
         self.leases = GridLeases(database)
-        self.idempotency = Idempotency(database)
+        self.idempotency = Idempotency(database, claim_s)
         self.keys = ApiKeys(database)
 
     def answered_since(self, moment_s: float) -> bool:
@@ -72,5 +75,9 @@ def open_store(settings: Settings) -> Store:
         except OSError as error:
             raise ConfigError(f"cannot create the data folder '{settings.data_dir}': {error.strerror}") from error
     return Store(
-        settings.resolved_database_url, connections=settings.database_connections, wait_s=settings.database_wait_s
+        settings.resolved_database_url,
+        connections=settings.database_connections,
+        wait_s=settings.database_wait_s,
+        # A query that is computed still must not be computed once more.
+        claim_s=max(LEAST_LEASE_S, settings.request_deadline_s + _CLAIM_MARGIN_S),
     )

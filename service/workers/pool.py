@@ -71,6 +71,11 @@ class WorkerPool(Generic[Job, Answer]):
         return len(self._queue)
 
     @property
+    def resident_bytes(self) -> int:
+        """Memory of all workers."""
+        return sum(supervisor.resident_bytes for supervisor in self._supervisors)
+
+    @property
     def closing(self) -> bool:
         """Whether the pool shuts down."""
         return self._queue.closed

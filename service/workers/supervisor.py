@@ -5,11 +5,13 @@ from __future__ import annotations
 import logging
 import math
 import multiprocessing
+import os
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
+from pathlib import Path
 from time import monotonic
 from typing import Any
 
@@ -87,6 +89,16 @@ class Supervisor:
         expected = self._starts_at + self._start_s
         # One that is late may well take as long again.
         return expected if expected > now else now + (now - self._starts_at)
+
+    @property
+    def resident_bytes(self) -> int:
+        """Memory of the worker; 0 when there is none, or it cannot be told (it can on Linux)."""
+        pid = self._process.pid if self._process is not None else None
+        try:
+            pages = Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1]
+        except (OSError, IndexError):
+            return 0
+        return int(pages) * os.sysconf("SC_PAGE_SIZE")
 
     def stop(self, deadline: float) -> None:
         """End the worker once its job is done, at the deadline (`monotonic`) in any case; the queue must be closed."""

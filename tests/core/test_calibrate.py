@@ -88,6 +88,16 @@ class TestConfidence:
         share = np.mean(position_errors_m(own) < 1.0)
         assert np.mean([confidence(taught, one) for one in own]) == pytest.approx(share, abs=0.002)
 
+    @pytest.mark.parametrize("wrong_log_odds", [None, 0.0, 3.0], ids=["none", "like the others", "surer"])
+    def test_what_is_strange_gains_nothing_where_hardly_an_answer_is_wrong(self, wrong_log_odds: float | None) -> None:
+        rng = np.random.default_rng(0)
+        own = [result(0.2, rng.normal(), cost=0.1) for _ in range(490)]
+        own += [result(3.0, wrong_log_odds, cost=0.1) for _ in range(10) if wrong_log_odds is not None]
+        strange = [result(0.2, rng.normal() - 2.0, cost=0.6) for _ in range(160)]
+        model = fit_confidence(Answers(own=own, strange=strange), Answers(own=own)).known_heading["lpo"]
+        assert np.mean([confidence(model, one) for one in own]) > 0.9
+        assert np.mean([confidence(model, one) for one in strange]) < 0.1
+
     @given(seeds())
     @settings(max_examples=10)
     def test_it_rises_with_the_odds_and_falls_with_cost_and_uncertainty(self, seed: int) -> None:

@@ -11,6 +11,7 @@ from time import monotonic, sleep
 from typing import Any
 
 import httpx
+import pytest
 
 from service.app import create_app
 from service.events import PlanEvents

@@ -316,7 +316,7 @@ def test_what_a_stopped_replica_left_is_taken_up_by_another(
     closing.join(30.0)
     assert isinstance(future.exception(), StoppingError)
     grids = make_grids(second, CountingEncoders(bundle))
-    grids.take_up()
+    assert not grids.take_up()
     assert grids.pending == 1
     wait_for(lambda: grids.pending == 0)
     assert grids.find(grids.key(record.revision_id, 1.5)) is not None
@@ -331,7 +331,7 @@ def test_plans_that_nobody_has_taken_up_yet_count_as_preparing(
     grids = make_grids(store)
     encoders.go_on.clear()
     # Sixteen are taken up at a time, and the rest is known of.
-    grids.take_up()
+    assert grids.take_up()
     assert (grids.pending, grids.preparing) == (16, 20)
     encoders.go_on.set()
     wait_for(lambda: grids.pending == 0)

@@ -29,6 +29,7 @@ from service.errors import (
 )
 from service.idempotency import Once, parts_sha256
 from service.storage.grids import StoredGrids
+from service.storage.idempotency import Idempotency
 from service.storage.records import Fresh
 from service.storage.store import Store
 from service.storage.tables import IDEMPOTENCY
@@ -178,7 +179,7 @@ def test_what_a_process_that_died_had_stored_is_found_by_the_next(
         store = Store(database_of(tmp_path))
         # As the one that died left it: the plan is stored, the answer is not.
         digest = parts_sha256(Parts({}, {"file": CONTENT}))
-        claim = store.idempotency.begin("default", "POST /floorplans", "a", digest, lease_s=1.0)
+        claim = Idempotency(store._database, lease_s=1.0).begin("default", "POST /floorplans", "a", digest)
         assert isinstance(claim, Fresh)
         plan_id = claim.token
         headers = _keyed("a") | {"Content-Type": "application/json"}

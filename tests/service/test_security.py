@@ -621,6 +621,13 @@ def test_other_names_and_pages_will_do_when_they_are_allowed(
         assert client.post("/floorplans", json=FLAT, headers=elsewhere).status_code == status
 
 
+@pytest.mark.parametrize("name", ["plans.example:8443", "https://plans.example", "*.example", "[2001:db8::1]", "a b"])
+def test_an_allowed_name_that_could_never_match_is_refused(name: str) -> None:
+    with pytest.raises(ValueError, match="neither a bare name or address nor"):
+        Settings(allowed_hosts=f"localhost,{name}")
+    Settings(allowed_hosts="plans.example, 192.0.2.7,2001:db8::1,*")
+
+
 @pytest.fixture(scope="module")
 def anonymous(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
     with start_app(tmp_path_factory.mktemp("data")) as client:

@@ -33,7 +33,7 @@ from service.errors import (
     UnknownFloorPlanError,
 )
 from service.storage.chunks import CHUNK_BYTES
-from service.storage.idempotency import KEPT_FOR
+from service.storage.idempotency import KEPT_FOR, Idempotency
 from service.storage.records import ComputedGrid, Conflict, Cursor, Fresh, GridKey, InProgress, StoredAnswer
 from service.storage.store import Store
 from service.storage.tables import GRID_CHUNKS, GRID_LEASES, IDEMPOTENCY, LATENT_GRIDS, METADATA, ORIGINAL_CHUNKS
@@ -490,12 +490,16 @@ def test_an_abandoned_request_may_be_sent_again_an_answered_one_not(store: Store
 
 def test_the_request_of_a_dead_owner_is_taken_over_once_under_the_same_token(open_store: OpenStore) -> None:
     stores = [open_store(), open_store()]
-    dead = stores[0].idempotency.begin("t", "r", "k", "body", lease_s=0.2)
+    dead = Idempotency(stores[0]._database, lease_s=0.2).begin("t", "r", "k", "body")
     assert isinstance(dead, Fresh)
     time.sleep(0.3)
     with ThreadPoolExecutor(4) as threads:
         claims = list(threads.map(lambda n: stores[n % 2].idempotency.begin("t", "r", "k", "body"), range(4)))
     assert [claim for claim in claims if claim != InProgress()] == [Fresh(dead.token)]
+    # Should the dead one have lived, its answer no longer counts.
+    stores[0].idempotency.finish("t", "r", "k", dead.token, ANSWER)
+    stores[1].idempotency.finish("t", "r", "k", dead.token, dataclasses.replace(ANSWER, body=b"late"))
+    assert stores[0].idempotency.begin("t", "r", "k", "body") == ANSWER
 
 
 def test_answers_are_kept_for_a_day(store: Store) -> None:
