@@ -2,8 +2,8 @@
 
     python -m benchmarks.throughput --seconds 20
 
-Prints a Markdown table. `one` is one process with its workers, `two` is two such replicas on one SQLite database, behind
-the same port: what `uvicorn --workers 2` runs. Where there are more than two cores, each of two has half the workers.
+Prints a Markdown table. `one` is one process with its workers, `two` is two such replicas on one SQLite database and
+behind the same port: what `uvicorn --workers 2` runs. Where there are more cores than two, each has half the workers.
 """
 
 from __future__ import annotations
