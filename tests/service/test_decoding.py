@@ -24,6 +24,8 @@ from service.storage.tables import METADATA
 from service.telemetry import LOGGER_NAME
 from tests.service.conftest import DatabaseOf, StartApp, assert_problem, localise, upload, wait_for
 
+pytestmark = pytest.mark.one_replica
+
 MIB = 2**20
 QUICK = {"refine": "none", "top_k": 1}
 
@@ -75,7 +77,6 @@ def black(width: int, height: int, kind: str, **options: object) -> bytes:
     return buffer.getvalue()
 
 
-@pytest.mark.one_replica
 def test_a_killed_decoder_costs_no_query_its_answer(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
     with start_app(tmp_path) as client:
         plan_id = upload(client)
@@ -87,7 +88,6 @@ def test_a_killed_decoder_costs_no_query_its_answer(start_app: StartApp, tmp_pat
     assert decoders() == [], "the pool left a process behind"
 
 
-@pytest.mark.one_replica
 def test_a_picture_over_which_decoders_stall_is_refused_and_the_next_one_is_answered(
     start_app: StartApp, tmp_path: Path, panorama: bytes
 ) -> None:
