@@ -539,6 +539,7 @@ def test_two_replicas_serve_the_same_plans(postgres_app: Any, panorama: bytes) -
         wait_for(lambda: "lalaloc_grid_cache_bytes 0.0" in one.get("/metrics").text)
 
 
+@pytest.mark.one_replica
 def test_localise_goes_on_while_the_database_is_away(
     postgres_app: Any, postgres: PostgresServer, panorama: bytes
 ) -> None:
@@ -586,6 +587,7 @@ def test_a_rounded_height_is_near_and_always_below_the_ceiling(asked_m: float) -
     assert query_height_m(record, height_m) == pytest.approx(height_m)
 
 
+@pytest.mark.one_replica
 def test_a_new_model_recomputes_the_grids(
     start_app: StartApp, tiny_bundle: Path, tmp_path: Path, panorama: bytes
 ) -> None:
