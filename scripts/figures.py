@@ -15,6 +15,7 @@ from lalaloc_core.reproduce.tables import TABLES
 ROOT = Path(__file__).resolve().parent.parent
 BENCH = ROOT / "docs" / "bench.json"
 SIZES = ROOT / "docs" / "encoder_sizes.json"
+IDEAS = ROOT / "docs" / "encoder_ideas.json"
 PAPER_TABLES = ROOT / "docs" / "tables"
 MANIFEST = ROOT / "models" / "default" / "manifest.json"
 
@@ -70,13 +71,13 @@ def evidence_table() -> str:
     return "\n".join(rows)
 
 
-def sizes_table() -> str:
-    """Sizes of the image encoder that were compared, as a Markdown table."""
+def variants_table(path: Path) -> str:
+    """Variants of the image encoder that were compared, as a Markdown table."""
     rows = [
         "| variant | input | channels | parameters | panoramas | ms | latent | profile | likelihood |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
-    for name, one in json.loads(SIZES.read_text(encoding="utf-8")).items():
+    for name, one in json.loads(path.read_text(encoding="utf-8")).items():
         cells = [name, one["input"], ", ".join(map(str, one["widths"])), f"{one['parameters'] / 1e6:.1f} M"]
         cells += [f"{one['panoramas']:,}", f"{one['latency_ms']:.0f}"]
         rows.append(_row(*cells, *(f"{one[by]['within_100']:.1%}" for by in ("latent", "profile", "likelihood"))))

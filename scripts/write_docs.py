@@ -10,7 +10,15 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from scripts.figures import evidence_table, figures_table, paper_tables, sizes_table, training_table
+from scripts.figures import (
+    IDEAS,
+    SIZES,
+    evidence_table,
+    figures_table,
+    paper_tables,
+    training_table,
+    variants_table,
+)
 from service.settings import PREFIX, Settings
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -33,7 +41,8 @@ def documents() -> dict[Path, str]:
             "evidence": evidence_table(),
             "paper": paper_tables(),
             "training": training_table(),
-            "sizes": sizes_table(),
+            "sizes": variants_table(SIZES),
+            "ideas": variants_table(IDEAS),
         },
         ROOT / "docs" / "architecture.md": {f"files of {package}": file_map(package) for package in _PACKAGES},
     }

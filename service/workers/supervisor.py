@@ -22,8 +22,8 @@ from service.workers.process import Answered, Fault, Ready
 # A worker that dies this soon after it was warm, or before, is replaced more and more slowly; the first time at once.
 _HEALTHY_S = 5.0
 _FIRST_BACKOFF_S = 0.25
-# Those that got warm may well do so again.
-_LONGEST_BACKOFF_S, _LONGEST_WARM_BACKOFF_S = 30.0, 1.0
+# Those that got warm may well do so again, also when one of them was killed while it started.
+_LONGEST_BACKOFF_S, _LONGEST_BACKOFF_ONCE_WARM_S, _LONGEST_WARM_BACKOFF_S = 30.0, 5.0, 1.0
 # After so many failed starts in a row, or none that succeeded, nobody waits for the next one.
 _HOPELESS_STARTS = 3
 # How long a killed worker may take to be gone, and how often it is looked at.
@@ -132,7 +132,9 @@ class Supervisor:
 
     def _pause(self, short_lives: int) -> None:
         """Back off after so many short lives in a row."""
-        longest_s = _LONGEST_WARM_BACKOFF_S if self.fault is None else _LONGEST_BACKOFF_S
+        longest_s = _LONGEST_BACKOFF_ONCE_WARM_S if self.warmed_up else _LONGEST_BACKOFF_S
+        if self.fault is None:
+            longest_s = _LONGEST_WARM_BACKOFF_S
         # Bounded before it is raised to a power: worker after worker may die for years.
         pause_s = min(_FIRST_BACKOFF_S * 2.0 ** min(short_lives - 2, 20), longest_s) if short_lives > 1 else 0.0
         self._starts_at = monotonic() + pause_s
