@@ -29,6 +29,7 @@ def _bench(arguments: argparse.Namespace) -> None:
     groups = arguments.only or _GROUPS
     report = run_bench(arguments.bundle, groups, homes=arguments.homes, textures=arguments.textures)
     if arguments.out is not None:
-        before = json.loads(arguments.out.read_text(encoding="utf-8")) if arguments.only else {}
+        keep = bool(arguments.only) and arguments.out.exists()
+        before = json.loads(arguments.out.read_text(encoding="utf-8")) if keep else {}
         arguments.out.write_text(json.dumps(before | report, indent=2) + "\n", encoding="utf-8")
     print_json(report)
