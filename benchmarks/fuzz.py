@@ -36,6 +36,8 @@ from examples.launch import running_service
 from examples.truth import PLAN_PATH
 
 _HANG_S = 5.0
+# A line of a stack trace. Not a word: those that are searched for turn up in requests, and then in answers about them.
+_TRACE = re.compile(r"line \d+, in ")
 _CLIENTS = 4
 # Of one operation in a row.
 _EXAMPLES = 60
@@ -73,7 +75,7 @@ class Outcome:
         self.slowest_s = max(self.slowest_s, seconds)
         self.statuses.setdefault(kind, Counter())[str(answer.status_code)] += 1
         deliberate = answer.status_code == httpx.codes.SERVICE_UNAVAILABLE and "retry-after" in answer.headers
-        if (answer.status_code >= 500 and not deliberate) or "Traceback" in answer.text:
+        if (answer.status_code >= 500 and not deliberate) or _TRACE.search(answer.text):
             self.bad.append(f"{kind}: {answer.status_code} {answer.text[:300]}")
         if seconds > _HANG_S:
             self.bad.append(f"{kind}: took {seconds:.1f} s")
