@@ -25,7 +25,7 @@ from lalaloc_core.evaluation.report.plan import INK, Cells, draw_camera, draw_di
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.evidence import latent_distances
-from lalaloc_core.localise.images import read_panorama
+from lalaloc_core.panorama.images import read_panorama
 from service.settings import Settings
 
 _CELL_M = 0.1

@@ -17,10 +17,10 @@ from starlette.routing import BaseRoute, Route
 from starlette.types import ASGIApp
 
 from lalaloc_core import __version__
-from service.admission import EXEMPT, REFUSALS, AdmissionMiddleware
 from service.errors import HTTP_PROBLEMS, PROBLEMS
-from service.headers import SecurityHeadersMiddleware
-from service.problems import add_problems, install_problem_handlers
+from service.http.admission import EXEMPT, REFUSALS, AdmissionMiddleware
+from service.http.headers import SecurityHeadersMiddleware
+from service.http.problems import add_problems, install_problem_handlers
 from service.routes import floorplans, health, limits, localise, pages, plan_events, plan_files
 from service.runtime import start_runtime
 from service.schemas import FloorPlanDocument, PlanEvent, Problem

@@ -66,7 +66,7 @@ def serve(arguments: argparse.Namespace) -> int:
         print(f"http://{f'[{host}]' if ':' in host else host}:{port}", flush=True)
         # Takes a second or two, which those who only ask for help or keys need not wait.
         from service.app import create_app
-        from service.server import Server, server_config
+        from service.http.server import Server, server_config
 
         app = create_app(settings)
         Server(server_config(app, settings), app, settings).run(sockets=[listener])

@@ -14,14 +14,14 @@ from fastapi import Request
 from lalaloc_core import __version__
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.localise.encoders import Encoders
-from service.admission import Admission, AdmissionLimits
-from service.decoding import Decoder
-from service.events import HEARTBEAT_S, PlanEvents
 from service.grids.caretaker import Caretaker
 from service.grids.grids import Grids
 from service.grids.known_plans import KnownPlans
-from service.localiser import Localiser
-from service.refinement import LpoPool
+from service.http.admission import Admission, AdmissionLimits
+from service.http.events import HEARTBEAT_S, PlanEvents
+from service.query.decoding import Decoder
+from service.query.localiser import Localiser
+from service.query.refinement import LpoPool
 from service.security.middleware import Gate
 from service.settings import Settings
 from service.storage.store import Store, open_store

@@ -13,7 +13,7 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.floorplan import PlanLimits
-from lalaloc_core.localise.images import PanoramaLimits
+from lalaloc_core.panorama.images import PanoramaLimits
 from service.cores import CoreShares, share_cores, usable_cores
 
 PREFIX = "LALALOC_"

@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image, UnidentifiedImageError
 
 from lalaloc_core.errors import DatasetError, InvalidPanoramaError
-from lalaloc_core.localise.images import PanoramaLimits, read_panorama
+from lalaloc_core.panorama.images import PanoramaLimits, read_panorama
 
 _MM_PER_M = 1000.0
 

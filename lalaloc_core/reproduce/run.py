@@ -24,10 +24,10 @@ from lalaloc_core.evaluation.building import choose_appearance, describe_model
 from lalaloc_core.evaluation.predictions import Prediction, RunFolder, RunInfo, write_atomically
 from lalaloc_core.evaluation.run import run_evaluation
 from lalaloc_core.evaluation.score import Estimate, Scores, score
+from lalaloc_core.reproduce.ablations import train_ablation
 from lalaloc_core.reproduce.render import draw_vogel_samples, markdown
 from lalaloc_core.reproduce.result import Budget, Figure, RowResult, TableResult
 from lalaloc_core.reproduce.table import SHIPPED, Ask, Column, Row, Table
-from lalaloc_core.training.ablations import train_ablation
 
 # Queries per row: enough to tell methods apart at a small budget, and few enough that times are taken one at a time.
 _SMALL_LIMIT = 75

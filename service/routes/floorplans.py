@@ -8,8 +8,6 @@ from fastapi import APIRouter, Query, Request, Response, status
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
-from service.conditional import conditional_answer, expected_revision
-from service.cursors import cursor_text, parse_cursor
 from service.errors import (
     IdempotencyInProgressError,
     IdempotencyKeyReusedError,
@@ -26,9 +24,12 @@ from service.errors import (
     UploadTooLargeError,
 )
 from service.grids.grids import GridState
-from service.idempotency import Once
-from service.plan_answers import list_entries, plan_representation, plan_state
-from service.problems import problem_responses
+from service.http.conditional import conditional_answer, expected_revision
+from service.http.cursors import cursor_text, parse_cursor
+from service.http.idempotency import Once
+from service.http.problems import problem_responses
+from service.http.uploads import JSON, MULTIPART, Parts, UploadLimits, media_type, read_body, read_parts
+from service.routes.plan_answers import list_entries, plan_representation, plan_state
 from service.routes.requested import (
     IDEMPOTENCY_KEY,
     IF_NONE_MATCH,
@@ -43,7 +44,6 @@ from service.runtime import Runtime
 from service.schemas import FloorPlanAnswer, FloorPlanDocument, FloorPlanList
 from service.storage.records import ComputedGrid, Cursor, PlanRecord
 from service.telemetry import note
-from service.uploads import JSON, MULTIPART, Parts, UploadLimits, media_type, read_body, read_parts
 
 router = APIRouter(prefix="/floorplans", tags=["floor plans"])
 

@@ -26,12 +26,12 @@ from service.errors import (
     UploadTimeoutError,
     UploadTooLargeError,
 )
-from service.idempotency import Once
-from service.problems import problem_responses
+from service.http.idempotency import Once
+from service.http.problems import problem_responses
+from service.http.uploads import JSON, MULTIPART, UploadLimits, media_type, read_parts, validate_fields
 from service.routes.requested import IDEMPOTENCY_KEY, Running, Tenant, known_plan
 from service.schemas import LocaliseAnswer, LocaliseForm
 from service.telemetry import note
-from service.uploads import JSON, MULTIPART, UploadLimits, media_type, read_parts, validate_fields
 
 router = APIRouter(tags=["localisation"])
 

@@ -9,8 +9,8 @@ from fastapi import APIRouter, Request, Response
 from fastapi.responses import StreamingResponse
 
 from service.errors import InvalidRequestError, StoreUnavailableError, UnknownFloorPlanError
-from service.events import EventStream
-from service.problems import problem_responses
+from service.http.events import EventStream
+from service.http.problems import problem_responses
 from service.routes.requested import Running, Tenant, stored_plan
 from service.telemetry import note
 

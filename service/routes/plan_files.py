@@ -7,15 +7,15 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import Field
 
-from service.conditional import conditional_answer, content_etag
 from service.errors import InvalidRequestError, StoreUnavailableError, UnknownFloorPlanError
+from service.http.conditional import conditional_answer, content_etag
+from service.http.problems import problem_responses
+from service.http.uploads import JSON
 from service.preview.mesh import plan_glb
 from service.preview.svg import Marker, plan_svg
-from service.problems import problem_responses
 from service.routes.requested import IF_NONE_MATCH, NOT_MODIFIED, Running, Tenant, stored_plan
 from service.storage.records import PlanRecord
 from service.telemetry import note
-from service.uploads import JSON
 
 router = APIRouter(prefix="/floorplans", tags=["floor plans"])
 

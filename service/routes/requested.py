@@ -10,7 +10,7 @@ from fastapi import Depends, Request
 
 from service.errors import StoreUnavailableError, UnknownFloorPlanError
 from service.grids.known_plans import KnownPlans
-from service.idempotency import HEADER, MOST_CHARACTERS
+from service.http.idempotency import HEADER, MOST_CHARACTERS
 from service.runtime import Runtime, runtime_of
 from service.security.access import caller_of
 from service.storage.plans import Plans

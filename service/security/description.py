@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from service.problems import add_problems
+from service.http.problems import add_problems
 from service.security.access import NEEDED
 from service.security.middleware import REFUSALS
 

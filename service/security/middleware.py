@@ -15,7 +15,7 @@ from service.errors import (
     TooManyRefusedKeysError,
     UnauthenticatedError,
 )
-from service.problems import http_problem_answer, problem_answer
+from service.http.problems import http_problem_answer, problem_answer
 from service.security.access import ANYONE, OPEN_PATHS, Caller, Permission, permissions_needed, put_caller
 from service.security.exposure import check_origin, is_local
 from service.security.key_ring import KeyRing

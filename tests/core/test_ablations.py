@@ -14,9 +14,9 @@ from lalaloc_core.bundle import DECODER_WEIGHTS, IMAGE_ONNX, MANIFEST_NAME, Bund
 from lalaloc_core.data.generated import GeneratedScenes
 from lalaloc_core.errors import BundleError, CheckpointError, ConfigError
 from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.reproduce import ablations
+from lalaloc_core.reproduce.ablations import ABLATIONS, BASE, BUDGETS, Budget, train_ablation
 from lalaloc_core.sampling import TripletSampling
-from lalaloc_core.training import ablations
-from lalaloc_core.training.ablations import ABLATIONS, BASE, BUDGETS, Budget, train_ablation
 from lalaloc_core.training.checkpoint import Checkpoint
 from lalaloc_core.training.config import TrainConfig
 from lalaloc_core.training.data import TrainingData

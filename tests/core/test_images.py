@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from PIL import Image, ImageChops
 
 from lalaloc_core.errors import InvalidPanoramaError
-from lalaloc_core.localise.images import NEUTRAL, PanoramaLimits, open_panorama, read_panorama
+from lalaloc_core.panorama.images import NEUTRAL, PanoramaLimits, open_panorama, read_panorama
 
 HEIGHT, WIDTH = 32, 64
 LOSSLESS = {"PNG": {}, "WEBP": {"lossless": True}}

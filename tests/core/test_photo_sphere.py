@@ -17,9 +17,9 @@ from PIL.PngImagePlugin import PngInfo
 
 from lalaloc_core.conventions import column_azimuths, row_elevations
 from lalaloc_core.errors import InvalidPanoramaError
-from lalaloc_core.localise.images import NEUTRAL, Panorama, open_panorama
-from lalaloc_core.localise.levelling import level
-from lalaloc_core.localise.photo_sphere import PhotoSphere, read_photo_sphere
+from lalaloc_core.panorama.images import NEUTRAL, Panorama, open_panorama
+from lalaloc_core.panorama.levelling import level
+from lalaloc_core.panorama.photo_sphere import PhotoSphere, read_photo_sphere
 
 HEIGHT, WIDTH = 64, 128
 FULL_HEIGHT, FULL_WIDTH = 512, 1024

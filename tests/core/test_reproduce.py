@@ -12,11 +12,11 @@ from lalaloc_core.errors import RunError
 from lalaloc_core.evaluation.building import build_method
 from lalaloc_core.evaluation.predictions import RunInfo
 from lalaloc_core.evaluation.score import Scores, StageScores
+from lalaloc_core.reproduce.ablations import ABLATIONS
 from lalaloc_core.reproduce.render import draw_vogel_samples, markdown
 from lalaloc_core.reproduce.result import Figure, RowResult, TableResult
 from lalaloc_core.reproduce.table import COLUMN_TITLES, SHIPPED
 from lalaloc_core.reproduce.tables import TABLES
-from lalaloc_core.training.ablations import ABLATIONS
 
 
 def result(dataset: str = "synthetic scenes (seed 0)", budget: str = "small") -> TableResult:

@@ -14,7 +14,7 @@ import httpx
 import pytest
 
 from service.app import create_app
-from service.events import PlanEvents
+from service.http.events import PlanEvents
 from service.settings import Settings
 from service.storage.store import Store
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, serve, upload, wait_for

@@ -11,8 +11,8 @@ import httpx
 import pytest
 import yaml
 
-from service.admission import EXEMPT
 from service.app import create_app
+from service.http.admission import EXEMPT
 from service.openapi import openapi_text
 from service.runtime import Runtime, runtime_of
 from tests.service.conftest import StartApp, assert_problem, localise, serve, upload, wait_for

@@ -27,14 +27,14 @@ from service.errors import (
     UnknownFloorPlanError,
     UploadTimeoutError,
 )
-from service.idempotency import Once, parts_sha256
+from service.http.idempotency import Once, parts_sha256
+from service.http.uploads import Parts
 from service.storage.grids import StoredGrids
 from service.storage.idempotency import Idempotency
 from service.storage.records import Fresh
 from service.storage.store import Store
 from service.storage.tables import IDEMPOTENCY
 from service.threads import BoundedReads
-from service.uploads import Parts
 from service.workers.jobs import JobLostError
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, upload, wait_for
 

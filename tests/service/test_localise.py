@@ -22,8 +22,8 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise import pipeline
 from lalaloc_core.localise.confidence import Signals
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.images import read_panorama
 from lalaloc_core.localise.retrieval import build_grid
+from lalaloc_core.panorama.images import read_panorama
 from service.schemas import TimingsAnswer
 from service.settings import Settings
 from tests.service.conftest import FLAT, StartApp, assert_problem, encode_picture, localise, upload, wait_for

@@ -20,8 +20,8 @@ import pytest
 
 from lalaloc_core.bundle import LAYOUT_WEIGHTS, Bundle
 from lalaloc_core.localise.poses import RefinementJob, RefinementResult
-from service.lpo_worker import warm_up_job
-from service.refinement import LpoPool
+from service.query.lpo_worker import warm_up_job
+from service.query.refinement import LpoPool
 from service.settings import Settings
 from service.telemetry import Telemetry
 from tests.service.conftest import wait_for

@@ -9,7 +9,7 @@ import threading
 import httpx
 from fastapi import FastAPI
 
-from service.server import Server, bounded_protocol, server_config
+from service.http.server import Server, bounded_protocol, server_config
 from service.settings import Settings
 from tests.service.conftest import wait_for
 

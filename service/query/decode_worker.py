@@ -14,7 +14,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 from lalaloc_core.errors import InvalidPanoramaError
-from lalaloc_core.localise.images import Panorama, PanoramaLimits, open_panorama, warm_up
+from lalaloc_core.panorama.images import Panorama, PanoramaLimits, open_panorama, warm_up
 from service.workers.process import serve_jobs
 
 

@@ -8,7 +8,7 @@ from typing import Literal
 
 from lalaloc_core.conventions import TWO_PI, heading_from_degrees
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.images import Panorama
+from lalaloc_core.panorama.images import Panorama
 from service.schemas import LocaliseForm
 
 HeadingSource = Literal["given", "panorama", "searched"]

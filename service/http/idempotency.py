@@ -28,12 +28,12 @@ from service.errors import (
     StoreUnavailableError,
     UnknownFloorPlanError,
 )
-from service.problems import problem_answer
+from service.http.problems import problem_answer
+from service.http.uploads import Parts
 from service.storage.idempotency import Idempotency
 from service.storage.records import Conflict, Fresh, InProgress, StoredAnswer
 from service.telemetry import LOGGER_NAME
 from service.threads import BoundedReads
-from service.uploads import Parts
 from service.workers.jobs import JobLostError
 
 HEADER, REPLAYED = "Idempotency-Key", "Idempotency-Replayed"

@@ -19,8 +19,8 @@ from jaxtyping import UInt8
 from PIL import ExifTags, Image, ImageChops, UnidentifiedImageError
 
 from lalaloc_core.errors import InvalidPanoramaError
-from lalaloc_core.localise.levelling import level
-from lalaloc_core.localise.photo_sphere import PhotoSphere, SpherePart, read_photo_sphere
+from lalaloc_core.panorama.levelling import level
+from lalaloc_core.panorama.photo_sphere import PhotoSphere, SpherePart, read_photo_sphere
 
 FORMATS = ("JPEG", "PNG", "WEBP")
 # What stands where a picture shows nothing: the mean that encoders subtract.

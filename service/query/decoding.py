@@ -9,9 +9,9 @@ from time import monotonic
 
 from lalaloc_core.bundle import Manifest
 from lalaloc_core.errors import InvalidPanoramaError
-from lalaloc_core.localise.images import Panorama
-from service.decode_worker import Refusal, run_decoder
+from lalaloc_core.panorama.images import Panorama
 from service.errors import DeadlineExceededError, DecoderNotReadyError, OverloadedError, StoppingError
+from service.query.decode_worker import Refusal, run_decoder
 from service.settings import Settings
 from service.telemetry import Telemetry
 from service.workers.jobs import JobLostError

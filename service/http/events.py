@@ -15,9 +15,9 @@ from time import monotonic
 from starlette.responses import StreamingResponse
 from starlette.types import Receive, Scope, Send
 
-from service.admission import Admission
 from service.errors import StoreUnavailableError
 from service.grids.grids import Grids
+from service.http.admission import Admission
 from service.schemas import PlanEvent
 from service.storage.store import Store
 from service.telemetry import LOGGER_NAME

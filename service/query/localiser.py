@@ -17,16 +17,16 @@ from lalaloc_core.conventions import heading_to_degrees
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.covariance import spread_of
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.images import Panorama
 from lalaloc_core.localise.pipeline import Localisation, StageClock, localise_steps, next_step, panorama_heading
 from lalaloc_core.localise.poses import Candidate, LatentGrid, Query
-from service.admission import Places
-from service.decoding import Decoder
+from lalaloc_core.panorama.images import Panorama
 from service.errors import DeadlineExceededError, PlanFailedError, PlanNotReadyError
 from service.grids.grids import Grids
 from service.grids.heights import query_height_m
-from service.heading import HeadingSource, KnownHeading, known_heading
-from service.refinement import LpoPool
+from service.http.admission import Places
+from service.query.decoding import Decoder
+from service.query.heading import HeadingSource, KnownHeading, known_heading
+from service.query.refinement import LpoPool
 from service.schemas import CandidateAnswer, LocaliseAnswer, LocaliseForm, ModelAnswer, Position, TimingsAnswer
 from service.settings import Settings
 from service.storage.records import PlanRecord

@@ -6,7 +6,7 @@ from typing import get_args
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.localise.poses import RefinementJob, RefinementResult
-from service.lpo_worker import run_worker
+from service.query.lpo_worker import run_worker
 from service.settings import Settings
 from service.telemetry import Telemetry
 from service.workers.jobs import JobLostError, LostReason

@@ -17,7 +17,7 @@ from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.errors import DeadlineExceededError, OverloadedError, StoppingError
-from service.problems import problem_answer
+from service.http.problems import problem_answer
 from service.settings import Settings
 from service.telemetry import Telemetry
 

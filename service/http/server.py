@@ -18,7 +18,7 @@ import uvicorn
 from fastapi import FastAPI
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from service.admission import Admission, AdmissionLimits
+from service.http.admission import Admission, AdmissionLimits
 from service.settings import Settings
 
 # Heads of requests; larger ones get a 400.

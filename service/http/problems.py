@@ -22,9 +22,9 @@ from service.errors import (
     UnsupportedMediaError,
     problem_kind,
 )
+from service.http.uploads import describe_fault
 from service.schemas import Fault, Problem
 from service.telemetry import note, request_id_of
-from service.uploads import describe_fault
 
 PROBLEM_JSON = "application/problem+json"
 _HIDDEN = "something went wrong in the service; its log has the details under this request_id"

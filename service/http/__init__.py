@@ -1,0 +1,4 @@
+"""What stands between the socket and a route: places for requests, uploads, idempotency, events, errors, headers.
+
+Begin with `admission.py`.
+"""
