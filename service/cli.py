@@ -17,9 +17,9 @@ from datetime import datetime
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.errors import ConfigError, LaLaLocError
-from service.security.access import Permission
 from service.security.exposure import check_address
 from service.security.keys import hash_of, key_text, new_secret
+from service.security.permissions import Permission
 from service.settings import Settings
 from service.storage.records import ApiKey
 from service.storage.store import Store, open_store

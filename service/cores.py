@@ -10,7 +10,7 @@ _CGROUPS = Path("/sys/fs/cgroup")
 _OWN_CGROUP = Path("/proc/self/cgroup")
 # A query keeps an LPO worker busy for about twice as long as it keeps the service's own threads.
 _SHARE_OF_WORKERS = 0.6
-_MOST_WORKERS = 64
+_MAX_WORKERS = 64
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ def share_cores(
     """
     worker_threads, onnx_threads = worker_threads or 1, onnx_threads or 1
     if workers is None:
-        workers = min(max(int(_SHARE_OF_WORKERS * cores) // worker_threads, 1), _MOST_WORKERS)
+        workers = min(max(int(_SHARE_OF_WORKERS * cores) // worker_threads, 1), _MAX_WORKERS)
     if not compute_threads:
         compute_threads = max((cores - workers * worker_threads) // onnx_threads, 1)
     return CoreShares(workers, worker_threads, compute_threads, onnx_threads)

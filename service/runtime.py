@@ -14,16 +14,16 @@ from fastapi import Request
 from lalaloc_core import __version__
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.localise.encoders import Encoders
-from service.grids.caretaker import Caretaker
 from service.grids.grids import Grids
-from service.grids.known_plans import KnownPlans
+from service.grids.sweeper import Sweeper
 from service.http.admission import Admission, AdmissionLimits
 from service.http.events import HEARTBEAT_S, PlanEvents
 from service.query.decoding import Decoder
 from service.query.localiser import Localiser
 from service.query.refinement import LpoPool
-from service.security.middleware import Gate
+from service.security.access_control import AccessControl
 from service.settings import Settings
+from service.storage.plan_cache import PlanCache
 from service.storage.store import Store, open_store
 from service.telemetry import LOGGER_NAME, Telemetry
 from service.telemetry.tracing import Tracing, otlp_exporter
@@ -59,12 +59,12 @@ class Runtime:
     telemetry: Telemetry
     store: Store
     grids: Grids
-    known_plans: KnownPlans
+    plan_cache: PlanCache
     pool: LpoPool
     decoder: Decoder
     localiser: Localiser
     admission: Admission
-    gate: Gate
+    access_control: AccessControl
     events: PlanEvents
     uploads: Threads
     reads: BoundedReads
@@ -76,7 +76,7 @@ class Runtime:
 
 
 def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack) -> Runtime:
-    """Open the store, load and warm the model, start the LPO pool, and take up unfinished grids.
+    """Open the store, load and warm the model, start the LPO pool, and queue unfinished grids.
 
     Blocks for as long as the model loads; the pool warms up in the background.
 
@@ -97,7 +97,7 @@ def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack) 
     bundle = Bundle.open(settings.bundle)
     telemetry.describe_build(__version__, bundle.manifest.name, bundle.manifest.version, bundle.sha256)
     store = kept(open_store(settings))
-    gate = kept(Gate(store.keys, settings))
+    access_control = kept(AccessControl(store.keys, settings))
     # The pool first: loading torch in the workers overlaps with loading the model here.
     pool = kept(LpoPool(bundle, settings, telemetry), _LPO_DRAIN * settings.stop_deadline_s)
     pool.start()
@@ -107,7 +107,9 @@ def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack) 
     _warm_up(encoders)
     grids = kept(Grids(store, encoders, bundle.sha256, settings, telemetry))
     admission = Admission(AdmissionLimits.of(settings), telemetry)
-    reads = kept(BoundedReads(threads=_READ_THREADS, most=settings.pending_limit, wait_s=settings.database_wait_s))
+    reads = kept(
+        BoundedReads(threads=_READ_THREADS, max_pending=settings.pending_limit, wait_s=settings.database_wait_s)
+    )
     uploads = kept(Threads("lalaloc-uploads", _UPLOAD_THREADS))
     localiser = kept(
         Localiser(
@@ -122,14 +124,14 @@ def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack) 
             telemetry=telemetry,
         )
     )
-    known_plans = KnownPlans(store, limit_bytes=settings.plan_cache_bytes, max_age_s=settings.plan_cache_age_s)
-    caretaker = kept(Caretaker(store, grids, known_plans, sweep_s=settings.sweep_s))
-    caretaker.start()
+    plan_cache = PlanCache(store, limit_bytes=settings.plan_cache_bytes, max_age_s=settings.plan_cache_age_s)
+    sweeper = kept(Sweeper(store, grids, plan_cache, sweep_s=settings.sweep_s))
+    sweeper.start()
     # Their callers' keys are looked at again as often.
     heartbeat_s = max(min(settings.key_cache_s, HEARTBEAT_S), _SOONEST_S) if settings.api_keys else HEARTBEAT_S
     # One look at a time, which takes no thread from queries while the database is silent.
-    looks = kept(BoundedReads(threads=1, most=1, wait_s=settings.database_wait_s))
-    events = PlanEvents(store, grids, admission, looks, longest_s=settings.stream_deadline_s, heartbeat_s=heartbeat_s)
+    looks = kept(BoundedReads(threads=1, max_pending=1, wait_s=settings.database_wait_s))
+    events = PlanEvents(store, grids, admission, looks, max_s=settings.stream_deadline_s, heartbeat_s=heartbeat_s)
     fields = {"model": bundle.manifest.name, "sha256": bundle.sha256, "grids_to_compute": grids.preparing}
     logging.getLogger(LOGGER_NAME).info("service started", extra={"fields": fields})
     return Runtime(
@@ -137,12 +139,12 @@ def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack) 
         telemetry=telemetry,
         store=store,
         grids=grids,
-        known_plans=known_plans,
+        plan_cache=plan_cache,
         pool=pool,
         decoder=decoder,
         localiser=localiser,
         admission=admission,
-        gate=gate,
+        access_control=access_control,
         events=events,
         uploads=uploads,
         reads=reads,

@@ -36,14 +36,14 @@ class Threads:
 class BoundedReads:
     """Reads of the store that nobody waits for longer than a while, also when it hangs instead of failing."""
 
-    def __init__(self, *, threads: int, most: int, wait_s: float) -> None:
+    def __init__(self, *, threads: int, max_pending: int, wait_s: float) -> None:
         """
         Args:
-            most: reads that may be at work or wait for a thread; when the store hangs, these are all that are lost.
+            max_pending: reads that may be at work or wait for a thread; no more are lost when the store hangs.
             wait_s: longest wait for one.
         """
         self._threads = Threads("lalaloc-reads", threads)
-        self._most = most
+        self._max_pending = max_pending
         self._wait_s = wait_s
         self._begun: set[Future[Any]] = set()
 
@@ -53,7 +53,7 @@ class BoundedReads:
         Raises:
             StoreUnavailableError: it did not answer in time, or too many reads are waiting for it already.
         """
-        if len(self._begun) >= self._most:
+        if len(self._begun) >= self._max_pending:
             raise StoreUnavailableError()
         future = self._threads.submit(work, *args, **kwargs)
         self._begun.add(future)

@@ -46,33 +46,27 @@ LAYERS = {
     "lalaloc_core.cli": 11,
     # Below everything: it may import nothing of the rest.
     "lalaloc_client": 0,
-    "service.cores": 20,
-    "service.settings": 20,
-    "service.errors": 20,
-    "service.schemas": 20,
-    "service.telemetry": 20,
-    "service.preview": 20,
-    "service.threads": 20,
-    "service.lru": 20,
-    "service.workers": 21,
-    # What runs in the workers loads nothing of what watches over them.
-    "service.workers.process": 20,
-    "service.storage": 21,
-    "service.grids": 22,
-    "service.http": 23,
-    "service.query": 24,
-    "service.query.lpo_worker": 21,
-    "service.query.decode_worker": 21,
-    "service.security": 24,
-    "service.runtime": 25,
-    "service.routes": 26,
-    "service.app": 27,
-    "service.openapi": 27,
-    "service.cli": 27,
-    "service.__main__": 27,
+}
+# The service's layers lie above all of the core's, lowest first.
+SERVICE_LAYERS = (
+    # `workers` is what runs in worker processes: it loads nothing of what watches over them.
+    "cores settings errors schemas threads lru telemetry preview workers",
+    "pools storage",
+    "grids security",
+    "http",
+    "query http.middleware",
+    "runtime",
+    "routes",
+    "app cli openapi __main__",
+)
+_LOWEST_OF_SERVICE = 20
+LAYERS |= {
+    f"service.{name}": _LOWEST_OF_SERVICE + index
+    for index, names in enumerate(SERVICE_LAYERS)
+    for name in names.split()
 }
 # Importing these loads torch; importing anything else must not.
-TORCH_ROOMS = (
+TORCH_MODULES = (
     "lalaloc_core.nets",
     "lalaloc_core.synth",
     "lalaloc_core.training",
@@ -86,8 +80,6 @@ TORCH_ROOMS = (
     "lalaloc_core.export",
     "lalaloc_core.bench",
 )
-
-
 OURS = ("lalaloc_core", "service", "lalaloc_client")
 
 
@@ -138,8 +130,8 @@ def _folder(module: str) -> str:
     return module if module in PACKAGES else module.rpartition(".")[0]
 
 
-def _in_torch_room(module: str) -> bool:
-    return any(module == room or module.startswith(room + ".") for room in TORCH_ROOMS)
+def _loads_torch(module: str) -> bool:
+    return any(module == room or module.startswith(room + ".") for room in TORCH_MODULES)
 
 
 def _reaches_torch(module: str, seen: set[str]) -> bool:
@@ -169,13 +161,13 @@ def test_the_layer_table_names_no_module_that_is_gone() -> None:
     assert [name for name in LAYERS if name not in MODULES] == []
 
 
-@pytest.mark.parametrize("module", [name for name in MODULES if not _in_torch_room(name)])
+@pytest.mark.parametrize("module", [name for name in MODULES if not _loads_torch(name)])
 def test_no_module_outside_the_torch_rooms_imports_torch_when_it_is_imported(module: str) -> None:
     assert not _reaches_torch(module, set())
 
 
 def test_every_torch_room_is_one() -> None:
-    lazy = [room for room in TORCH_ROOMS if not any(_reaches_torch(m, set()) for m in MODULES if m.startswith(room))]
+    lazy = [room for room in TORCH_MODULES if not any(_reaches_torch(m, set()) for m in MODULES if m.startswith(room))]
     assert lazy == [], "these could be opened to the numpy side"
 
 
@@ -191,7 +183,7 @@ def test_importing_the_numpy_side_leaves_torch_unloaded(package: str) -> None:
     names = [
         name
         for name in MODULES
-        if name.split(".")[0] == package and not _in_torch_room(name) and not name.endswith("__main__")
+        if name.split(".")[0] == package and not _loads_torch(name) and not name.endswith("__main__")
     ]
     program = (
         f"import importlib, sys\nfor name in {names!r}:\n    importlib.import_module(name)\n"

@@ -25,9 +25,9 @@ from service.errors import (
     StoreUnavailableError,
     UnknownFloorPlanError,
 )
-from service.grids.courtesy import QueriesInWork
 from service.grids.embedding import embed, grid_bytes
 from service.grids.jobs import Job, Jobs
+from service.grids.throttle import BackgroundThrottle
 from service.lru import BoundedCache
 from service.schemas import PlanStatus
 from service.settings import Settings
@@ -35,8 +35,8 @@ from service.storage.records import ComputedGrid, GridKey, PlanRecord, PlanSumma
 from service.storage.store import Store
 from service.telemetry import LOGGER_NAME, Telemetry
 
-# Plans that are taken up at a time, so that replicas share a backlog.
-_TAKEN_UP = 16
+# Plans whose missing grids are queued at a time, so that replicas share a backlog.
+_BATCH = 16
 # Uploads compute small grids in turns; one that would wait for longer leaves its grid to the background.
 _INLINE_WAIT_S = 1.0
 # How long a finished grid is kept at hand while the database is away.
@@ -66,23 +66,23 @@ class _LeaseLostError(Exception):
     """Another replica took the work over, or the plan is gone."""
 
 
-class _Heart:
+class _LeaseHeartbeat:
     """Renews the lease of a job now and then.
 
     Attributes:
-        stopped: whether the lease is another's.
+        lost: whether the lease is another's.
     """
 
     def __init__(self, renew: Callable[[], bool], every_s: float) -> None:
         self._renew = renew
         self._every_s = every_s
         self._beat_at = monotonic()
-        self.stopped = False
+        self.lost = False
 
     def beat(self) -> None:
         """Renew the lease if it is time."""
-        if not self.stopped and monotonic() >= self._beat_at:
-            self.stopped = not self._renew()
+        if not self.lost and monotonic() >= self._beat_at:
+            self.lost = not self._renew()
             self._beat_at = monotonic() + self._every_s
 
 
@@ -106,13 +106,13 @@ class Grids:
         self._model_sha256 = model_sha256
         self._settings = settings
         self._telemetry = telemetry
-        self.queries = QueriesInWork()
+        self.throttle = BackgroundThrottle()
         self._owner = uuid.uuid4().hex
         self._cache: BoundedCache[GridKey, LatentGrid] = BoundedCache(settings.grid_cache_bytes, grid_bytes)
         self._loading = threading.Lock()
         self._inline = threading.Lock()
         # Of the jobs that are being computed, all by the one thread of `Jobs`.
-        self._hearts: list[_Heart] = []
+        self._heartbeats: list[_LeaseHeartbeat] = []
         self._jobs = Jobs(self._work)
         self._unprepared = 0
         telemetry.gauge("lalaloc_grids_pending", "Latent grids computed or waiting for it here.", lambda: self.pending)
@@ -126,7 +126,7 @@ class Grids:
 
     @property
     def preparing(self) -> int:
-        """The same here and elsewhere, with plans that nobody has taken up yet, as of the last `take_up`."""
+        """The same here and elsewhere, with plans whose grid nobody has queued yet, as of the last `queue_missing`."""
         return max(self.pending, self._unprepared)
 
     def key(self, revision_id: str, camera_height_m: float) -> GridKey:
@@ -176,7 +176,7 @@ class Grids:
                     self._encoders,
                     step_m=self._settings.grid_step_m,
                     camera_height_m=millimetres(plan.camera_height_m) / 1000.0,
-                    after_chunk=lambda _progress, worked_s: self.queries.make_way(worked_s),
+                    after_chunk=lambda _progress, worked_s: self.throttle.pause(worked_s),
                 )
             return ComputedGrid(model_sha256=self._model_sha256, grid=grid)
         except Exception:
@@ -186,12 +186,12 @@ class Grids:
         finally:
             self._inline.release()
 
-    def follow_up(self, record: PlanRecord, prepared: ComputedGrid | None) -> None:
+    def on_plan_stored(self, record: PlanRecord, prepared: ComputedGrid | None) -> None:
         """After a plan was stored: keep the grid that was stored with it at hand, or have it computed."""
         if prepared is not None:
             self._remember(prepared.key(record.revision_id), prepared.grid)
             return
-        # What cannot be queued now is taken up later, here or by another replica.
+        # What cannot be queued now is queued later, here or by another replica.
         with suppress(StoppingError, OverloadedError):
             self.compute(record, record.plan.camera_height_m)
 
@@ -201,13 +201,13 @@ class Grids:
         Raises:
             StoreUnavailableError: it is not in memory, and the database is away.
         """
-        grid = self.at_hand(key)
+        grid = self.cached(key)
         if grid is not None:
             return grid
         self._telemetry.grid_cache_misses.inc()
         return self._load(key)
 
-    def at_hand(self, key: GridKey) -> LatentGrid | None:
+    def cached(self, key: GridKey) -> LatentGrid | None:
         """A grid that is in memory."""
         grid = self._cache.get(key)
         if grid is not None:
@@ -248,23 +248,23 @@ class Grids:
         """The revisions with grids in memory, or with grids that are to be computed."""
         return {key.revision_id for key, _ in self._cache.items()} | self._jobs.revisions()
 
-    def take_up(self) -> bool:
+    def queue_missing(self) -> bool:
         """Queue the oldest grids that nobody computes, unless there is enough to do; tells whether more may be left."""
-        if len(self._jobs) >= _TAKEN_UP:
+        if len(self._jobs) >= _BATCH:
             return True
         model = (self._model_sha256, self._settings.grid_step_m)
-        missing = self._store.grids.missing(*model, _TAKEN_UP)
+        missing = self._store.grids.missing(*model, _BATCH)
         self._unprepared = self._store.grids.count_unprepared(*model)
         with suppress(StoppingError, OverloadedError):
             for summary in missing:
                 key = self.key(summary.revision_id, summary.camera_height_m)
                 poses = summary.room_count + int(summary.area_m2 / key.step_m**2)
                 self._jobs.add(key, plan_id=summary.id, poses=poses, on_demand=False)
-        return len(missing) == _TAKEN_UP
+        return len(missing) == _BATCH
 
-    def look_elsewhere(self) -> None:
+    def poll_remote(self) -> None:
         """Note how far other replicas are, and look after grids that they finished or gave up."""
-        jobs = self._jobs.elsewhere()
+        jobs = self._jobs.remote()
         if not jobs:
             return
         revision_ids = [job.key.revision_id for job in jobs]
@@ -277,7 +277,7 @@ class Grids:
                 job.progress = progress
 
     def close(self) -> None:
-        """Stop computing; what was not finished is taken up by another replica, or at the next start."""
+        """Stop computing; what was not finished is left to another replica, or at the next start."""
         self._jobs.close()
 
     def _estimate(self, plan: FloorPlan) -> int:
@@ -301,7 +301,7 @@ class Grids:
         try:
             outcome = self._load(job.key) or self._compute(job)
         except _LeaseLostError:
-            job.elsewhere = True
+            job.remote = True
             return
         except Exception as error:
             outcome = error
@@ -330,28 +330,28 @@ class Grids:
         return grid
 
     def _embed(self, job: Job, plan: FloorPlan) -> LatentGrid:
-        heart = _Heart(lambda: self._renew(job), self._settings.grid_lease_s / _HEARTBEATS)
+        heartbeat = _LeaseHeartbeat(lambda: self._renew(job), self._settings.grid_lease_s / _HEARTBEATS)
 
         def after_chunk(progress: float, worked_s: float) -> None:
             job.progress = progress
             # A small grid may be computed between two chunks of a large one, whose lease must last meanwhile.
-            for beating in self._hearts:
-                beating.beat()
-            if heart.stopped:
+            for other in self._heartbeats:
+                other.beat()
+            if heartbeat.lost:
                 # Leases go with their plans; if this one has, the job fails when it is looked at again.
                 raise _LeaseLostError
             if progress < 1.0:
-                self._jobs.let_pass(job)
-                self.queries.make_way(worked_s)
+                self._jobs.preempt(job)
+                self.throttle.pause(worked_s)
             if job.cancelled.is_set():
                 raise self._why_cancelled(job)
 
         height_m = job.key.camera_height_m
-        self._hearts.append(heart)
+        self._heartbeats.append(heartbeat)
         try:
             return embed(plan, self._encoders, step_m=job.key.step_m, camera_height_m=height_m, after_chunk=after_chunk)
         finally:
-            self._hearts.pop()
+            self._heartbeats.pop()
 
     def _why_cancelled(self, job: Job) -> Exception:
         if self._jobs.closing.is_set():

@@ -1,6 +1,6 @@
 """Grids that are to be computed: by one thread here, or by another replica, whichever took the lease.
 
-A job waits in the queue, is computed here under a lease, or is *elsewhere*: another replica has the lease, and the
+A job waits in the queue, is computed here under a lease, or is *remote*: another replica has the lease, and the
 store is asked now and then how far it is. A lease that ran out puts the job back into the queue. Small grids go first,
 also before the rest of a large one that has begun.
 """
@@ -16,9 +16,9 @@ from lalaloc_core.localise.poses import LatentGrid
 from service.errors import OverloadedError, StoppingError
 from service.storage.records import GridKey
 
-# More are not queued: whoever asks is told, and what has no grid is found again by `Grids.take_up`.
-MOST_JOBS = 256
-MOST_ON_DEMAND = 16
+# More are not queued: whoever asks is told, and what has no grid is found again by `Grids.queue_missing`.
+MAX_JOBS = 256
+MAX_ON_DEMAND = 16
 # A grid of so many poses takes a moment, and does not wait behind larger ones.
 _SMALL_POSES = 2000
 
@@ -31,8 +31,8 @@ class Job:
         poses: about how many it has.
         on_demand: whether a query asked for it, for a camera height that is not the plan's own.
         cancelled: set to end the work.
-        progress: share that is done, 0 to 1, here or elsewhere.
-        elsewhere: whether another replica computes it.
+        progress: share that is done, 0 to 1, here or there.
+        remote: whether another replica computes it.
     """
 
     key: GridKey
@@ -42,7 +42,7 @@ class Job:
     future: Future[LatentGrid] = field(default_factory=Future)
     cancelled: threading.Event = field(default_factory=threading.Event)
     progress: float = 0.0
-    elsewhere: bool = False
+    remote: bool = False
 
 
 class Jobs:
@@ -52,7 +52,7 @@ class Jobs:
         """Start the thread.
 
         Args:
-            work: computes a job and ends it with `end`, or leaves it `elsewhere`; must not raise.
+            work: computes a job and ends it with `end`, or leaves it `remote`; must not raise.
         """
         self._work = work
         self._changed = threading.Condition()
@@ -82,10 +82,10 @@ class Jobs:
                 return job
             if self.closing.is_set():
                 raise StoppingError()
-            if on_demand and sum(other.on_demand for other in self._jobs.values()) >= MOST_ON_DEMAND:
-                raise OverloadedError(MOST_ON_DEMAND)
-            if len(self._jobs) >= MOST_JOBS:
-                raise OverloadedError(MOST_JOBS)
+            if on_demand and sum(other.on_demand for other in self._jobs.values()) >= MAX_ON_DEMAND:
+                raise OverloadedError(MAX_ON_DEMAND)
+            if len(self._jobs) >= MAX_JOBS:
+                raise OverloadedError(MAX_JOBS)
             job = Job(key, plan_id, poses, on_demand)
             # Others may wait for the same future: nobody can cancel it for them.
             job.future.set_running_or_notify_cancel()
@@ -103,15 +103,15 @@ class Jobs:
         else:
             job.future.set_result(outcome)
 
-    def elsewhere(self) -> list[Job]:
+    def remote(self) -> list[Job]:
         """The jobs that other replicas have the lease of."""
         with self._changed:
-            return [job for job in self._jobs.values() if job.elsewhere]
+            return [job for job in self._jobs.values() if job.remote]
 
     def requeue(self, job: Job) -> None:
-        """Look after a job that was elsewhere."""
+        """Queue a job that was remote: its lease has run out."""
         with self._changed:
-            job.elsewhere = False
+            job.remote = False
             self._queued.append(job)
             self._changed.notify()
 
@@ -127,7 +127,7 @@ class Jobs:
                 if job.key.revision_id == revision_id:
                     job.cancelled.set()
 
-    def let_pass(self, large: Job) -> None:
+    def preempt(self, large: Job) -> None:
         """Compute one of the small grids that wait, between two chunks of a large one."""
         if large.poses > _SMALL_POSES and (job := self._next(_SMALL_POSES)) is not None:
             self._work(job)
@@ -153,11 +153,11 @@ class Jobs:
             if (job := self._next()) is not None:
                 self._work(job)
 
-    def _next(self, most_poses: int | None = None) -> Job | None:
+    def _next(self, max_poses: int | None = None) -> Job | None:
         """Take the smallest job from the queue."""
         with self._changed:
             job = min(self._queued, key=lambda job: job.poses, default=None)
-            if job is None or (most_poses is not None and job.poses > most_poses):
+            if job is None or (max_poses is not None and job.poses > max_poses):
                 return None
             self._queued.remove(job)
             return job

@@ -1,4 +1,4 @@
-"""What stands between the socket and a route: places for requests, uploads, idempotency, events, errors, headers.
+"""What stands between the socket and a route: slots for requests, uploads, idempotency, events, errors, headers.
 
 Begin with `admission.py`.
 """

@@ -32,10 +32,10 @@ _LAST_BYTES_S = 5.0
 _FINAL = frozenset({"ready", "failed", "deleted"})
 
 
-Welcome = Callable[[], Awaitable[bool]]
+StillAuthorised = Callable[[], Awaitable[bool]]
 
 
-async def _everybody() -> bool:
+async def _always() -> bool:
     return True
 
 
@@ -44,17 +44,17 @@ class EventStream(StreamingResponse):
 
     media_type = "text/event-stream"
 
-    def __init__(self, events: AsyncGenerator[bytes], longest_s: float) -> None:
+    def __init__(self, events: AsyncGenerator[bytes], max_s: float) -> None:
         # Proxies must pass each event on as it comes.
         super().__init__(events, headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"})
         self._events = events
-        self._longest_s = longest_s
+        self._max_s = max_s
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Send it."""
         try:
             with suppress(TimeoutError):
-                async with asyncio.timeout(self._longest_s + _LAST_BYTES_S):
+                async with asyncio.timeout(self._max_s + _LAST_BYTES_S):
                     await super().__call__(scope, receive, send)
         finally:
             await self._events.aclose()
@@ -70,52 +70,52 @@ class PlanEvents:
         admission: Admission,
         reads: BoundedReads,
         *,
-        longest_s: float,
+        max_s: float,
         heartbeat_s: float,
     ) -> None:
         """
         Args:
             reads: where the store is asked how far plans are.
-            longest_s: how long a stream lasts at most.
+            max_s: how long a stream lasts at most.
             heartbeat_s: how often something is sent when there is nothing to tell, so that nobody takes it for dead,
-                and how often it is asked whether a caller is still welcome.
+                and how often it is asked whether a caller is still authorised.
         """
         self._store = store
         self._grids = grids
         self._admission = admission
         self._reads = reads
-        self._longest_s = longest_s
+        self._max_s = max_s
         self._heartbeat_s = heartbeat_s
-        self._followers: set[_Follower] = set()
+        self._subscribers: set[_Subscriber] = set()
         self._watch: asyncio.Task[None] | None = None
 
-    def answer(self, plan_id: str, welcome: Welcome = _everybody) -> EventStream:
+    def answer(self, plan_id: str, still_authorised: StillAuthorised = _always) -> EventStream:
         """The stream of a plan that there is.
 
         Args:
-            welcome: asked after every heartbeat's time whether the caller, let in once, still would be.
+            still_authorised: asked after every heartbeat's time whether the caller, authorised once, still is.
         """
-        return EventStream(self.stream(plan_id, welcome), self._longest_s)
+        return EventStream(self.stream(plan_id, still_authorised), self._max_s)
 
-    async def stream(self, plan_id: str, welcome: Welcome = _everybody) -> AsyncGenerator[bytes]:
+    async def stream(self, plan_id: str, still_authorised: StillAuthorised = _always) -> AsyncGenerator[bytes]:
         """Events as they go over the wire, until the plan is in a final state, time is up, or the service stops."""
-        follower = _Follower(plan_id)
-        self._followers.add(follower)
+        subscriber = _Subscriber(plan_id)
+        self._subscribers.add(subscriber)
         if self._watch is None or self._watch.done():
             # It outlives the request that it begins with, and must not log as that.
-            self._watch = asyncio.create_task(self._look_after_all(), context=Context())
+            self._watch = asyncio.create_task(self._poll_all(), context=Context())
         try:
             yield f"retry: {_ASK_AGAIN_MS}\n\n".encode()
-            until = monotonic() + self._longest_s
+            until = monotonic() + self._max_s
             ask_at = monotonic() + self._heartbeat_s
             while (left_s := until - monotonic()) > 0.0 and not self._admission.stopping:
                 if monotonic() >= ask_at:
-                    if not await welcome():
+                    if not await still_authorised():
                         return
                     ask_at = monotonic() + self._heartbeat_s
                 try:
                     async with asyncio.timeout(min(left_s, self._heartbeat_s)):
-                        event = await follower.next()
+                        event = await subscriber.next()
                 except TimeoutError:
                     yield b": heartbeat\n\n"
                     continue
@@ -125,23 +125,23 @@ class PlanEvents:
                 if event.status in _FINAL:
                     return
         finally:
-            self._followers.discard(follower)
+            self._subscribers.discard(subscriber)
 
-    async def _look_after_all(self) -> None:
-        while self._followers:
-            asked = list(self._followers)
+    async def _poll_all(self) -> None:
+        while self._subscribers:
+            asked = list(self._subscribers)
             try:
-                found = await self._reads.run(self._look, {follower.plan_id for follower in asked})
-                for follower in asked:
-                    follower.tell(found.get(follower.plan_id, PlanEvent(status="deleted")))
+                found = await self._reads.run(self._look, {subscriber.plan_id for subscriber in asked})
+                for subscriber in asked:
+                    subscriber.tell(found.get(subscriber.plan_id, PlanEvent(status="deleted")))
             except StoreUnavailableError:
                 # Followers go on waiting.
                 pass
             except Exception:
                 logging.getLogger(LOGGER_NAME).exception("looking after followed plans failed")
             if self._admission.stopping:
-                for follower in list(self._followers):
-                    follower.tell(None)
+                for subscriber in list(self._subscribers):
+                    subscriber.tell(None)
             await asyncio.sleep(_LOOK_EVERY_S)
 
     def _look(self, plan_ids: set[str]) -> dict[str, PlanEvent]:
@@ -158,7 +158,7 @@ class PlanEvents:
         }
 
 
-class _Follower:
+class _Subscriber:
     """One stream; what it was not told yet is overtaken by what comes after."""
 
     def __init__(self, plan_id: str) -> None:

@@ -30,15 +30,15 @@ from service.errors import (
 )
 from service.http.problems import problem_answer
 from service.http.uploads import Parts
+from service.pools.jobs import JobLostError
 from service.storage.idempotency import Idempotency
 from service.storage.records import Conflict, Fresh, InProgress, StoredAnswer
 from service.telemetry import LOGGER_NAME
 from service.threads import BoundedReads
-from service.workers.jobs import JobLostError
 
 HEADER, REPLAYED = "Idempotency-Key", "Idempotency-Replayed"
-MOST_CHARACTERS = 255
-_KEY = re.compile(rf"[\x21-\x7e]{{1,{MOST_CHARACTERS}}}")
+MAX_KEY_CHARACTERS = 255
+_KEY = re.compile(rf"[\x21-\x7e]{{1,{MAX_KEY_CHARACTERS}}}")
 # What the request itself is to blame for, and will be tomorrow. Others are not kept, whatever their status.
 _FOR_GOOD = (
     InvalidFloorPlanError,
@@ -50,7 +50,7 @@ _FOR_GOOD = (
 )
 
 
-class Once:
+class IdempotentRequest:
     """One request, with a key or without."""
 
     def __init__(self, claims: Idempotency, request: Request, tenant: str, route: str) -> None:
@@ -210,6 +210,6 @@ def _key_of(request: Request) -> str | None:
     if not values:
         return None
     if len(values) > 1 or not _KEY.fullmatch(values[0]):
-        fault = f"is '{', '.join(values)[:100]}', not one key of 1 to {MOST_CHARACTERS} visible ASCII characters"
+        fault = f"is '{', '.join(values)[:100]}', not one key of 1 to {MAX_KEY_CHARACTERS} visible ASCII characters"
         raise InvalidRequestError([(HEADER, fault)])
     return values[0]

@@ -78,14 +78,14 @@ class Server(uvicorn.Server):
         if ended or self._stopping_since is None:
             return ended
         waited_s = monotonic() - self._stopping_since
-        longest_s = _FOR_REQUESTS * self._settings.stop_deadline_s
-        if waited_s < min(self._settings.stop_notice_s, longest_s):
+        max_s = _FOR_REQUESTS * self._settings.stop_deadline_s
+        if waited_s < min(self._settings.stop_notice_s, max_s):
             return False
         admission = self._admission
         if admission is None:
             return True
         admission.stop()
-        return admission.idle or waited_s >= longest_s
+        return admission.idle or waited_s >= max_s
 
     @property
     def _admission(self) -> Admission | None:

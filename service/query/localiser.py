@@ -23,7 +23,7 @@ from lalaloc_core.panorama.images import Panorama
 from service.errors import DeadlineExceededError, PlanFailedError, PlanNotReadyError
 from service.grids.grids import Grids
 from service.grids.heights import query_height_m
-from service.http.admission import Places
+from service.http.admission import Slots
 from service.query.decoding import Decoder
 from service.query.heading import HeadingSource, KnownHeading, known_heading
 from service.query.refinement import LpoPool
@@ -51,7 +51,7 @@ class Localiser:
         grids: Grids,
         pool: LpoPool,
         decoder: Decoder,
-        queries: Places,
+        queries: Slots,
         reads: BoundedReads,
         telemetry: Telemetry,
     ) -> None:
@@ -89,7 +89,7 @@ class Localiser:
             StoreUnavailableError: the grid is not in memory, and the database is away or silent.
             OverloadedError: too many queries are computed or wait for it, or grids to be computed on demand.
         """
-        with self._queries.one():
+        with self._queries.hold():
             return await self._answer(record, form, content, begin, clock)
 
     async def _answer(
@@ -117,7 +117,7 @@ class Localiser:
         """Run CPU work on a thread; past the deadline it is not started, or its outcome dropped."""
 
         def run() -> T:
-            with self._grids.queries.one():
+            with self._grids.throttle.query():
                 return work()
 
         try:
@@ -129,7 +129,7 @@ class Localiser:
     async def _grid(self, record: PlanRecord, height_m: float, deadline: float) -> LatentGrid:
         """The plan's grid for a camera height, computed on demand, waited for until the deadline."""
         key = self._grids.key(record.revision_id, height_m)
-        grid = self._grids.at_hand(key)
+        grid = self._grids.cached(key)
         if grid is None:
             # Not on the threads that compute: a database that hangs would hold them up.
             grid = await self._reads.run(self._grids.find, key)
@@ -142,7 +142,7 @@ class Localiser:
         begin = monotonic()
         try:
             async with asyncio.timeout(max(deadline - begin, 0.0)):
-                with self._queries.lent():
+                with self._queries.released():
                     return await asyncio.wrap_future(future)
         except TimeoutError as error:
             raise PlanNotReadyError(record.id, monotonic() - begin, self._grids.progress(key)) from error

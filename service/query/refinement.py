@@ -6,15 +6,15 @@ from typing import get_args
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.localise.poses import RefinementJob, RefinementResult
-from service.query.lpo_worker import run_worker
+from service.pools.jobs import JobLostError, LostReason
+from service.pools.pool import PoolState, WorkerPool
+from service.pools.supervisor import WorkerSpec
 from service.settings import Settings
 from service.telemetry import Telemetry
-from service.workers.jobs import JobLostError, LostReason
-from service.workers.pool import PoolState, WorkerPool
-from service.workers.supervisor import WorkerSpec
+from service.workers.lpo import run_worker
 
 # Loading torch takes seconds, on a busy machine many.
-_START_S, _LONGEST_START_S = 5.0, 120.0
+_START_S, _MAX_START_S = 5.0, 120.0
 
 
 class LpoPool:
@@ -29,7 +29,7 @@ class LpoPool:
             arguments=(str(bundle.folder.resolve()), bundle.sha256, cores.worker_threads),
             stall_s=settings.lpo_stall_s,
             start_s=_START_S,
-            longest_start_s=_LONGEST_START_S,
+            max_start_s=_MAX_START_S,
         )
         self._workers: WorkerPool[RefinementJob, RefinementResult] = WorkerPool(
             spec,

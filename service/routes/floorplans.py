@@ -26,11 +26,10 @@ from service.errors import (
 from service.grids.grids import GridState
 from service.http.conditional import conditional_answer, expected_revision
 from service.http.cursors import cursor_text, parse_cursor
-from service.http.idempotency import Once
+from service.http.idempotency import IdempotentRequest
 from service.http.problems import problem_responses
 from service.http.uploads import JSON, MULTIPART, Parts, UploadLimits, media_type, read_body, read_parts
-from service.routes.plan_answers import list_entries, plan_representation, plan_state
-from service.routes.requested import (
+from service.routes.dependencies import (
     IDEMPOTENCY_KEY,
     IF_NONE_MATCH,
     NOT_MODIFIED,
@@ -40,6 +39,7 @@ from service.routes.requested import (
     is_id,
     stored_plan,
 )
+from service.routes.plan_answers import list_entries, plan_representation, plan_state
 from service.runtime import Runtime
 from service.schemas import FloorPlanAnswer, FloorPlanDocument, FloorPlanList
 from service.storage.records import ComputedGrid, Cursor, PlanRecord
@@ -48,7 +48,7 @@ from service.telemetry import note
 router = APIRouter(prefix="/floorplans", tags=["floor plans"])
 
 _FILE = "file"
-_MOST_LISTED = 500
+_MAX_LISTED = 500
 _NO_CONTROLS = r"^[^\x00-\x1f\x7f]*$"
 _DOCUMENT: dict[str, Any] = {"$ref": "#/components/schemas/FloorPlanDocument"}
 _BODY = {
@@ -102,7 +102,7 @@ async def create_floorplan(request: Request, runtime: Running, tenant: Tenant) -
     A small one is `ready` with the answer; the latent grid of a larger one is computed in the background (see `status`
     and `progress`, and `/events`).
     """
-    once = Once(runtime.store.idempotency, request, tenant, "POST /floorplans")
+    idempotent = IdempotentRequest(runtime.store.idempotency, request, tenant, "POST /floorplans")
     content = await _uploaded_plan(request, runtime)
 
     def store(token: str) -> Response:
@@ -110,17 +110,17 @@ async def create_floorplan(request: Request, runtime: Running, tenant: Tenant) -
         limit = runtime.settings.max_floorplans
         record = runtime.store.plans.add(tenant, token, plan, original=content, limit=limit, grid=grid)
         if record.plan is plan:
-            runtime.grids.follow_up(record, grid)
+            runtime.grids.on_plan_stored(record, grid)
             # Not asked for: what is stored is answered for, whatever becomes of the database.
             state = GridState.after_upload(grid)
         else:
             # It was stored before, and may have been replaced since, and then has another grid.
-            runtime.grids.follow_up(record, None)
+            runtime.grids.on_plan_stored(record, None)
             state = plan_state(record, runtime.grids)
         return _written(request, record, state, runtime, status.HTTP_201_CREATED)
 
     # One call from the claim to the answer: a client that hangs up meanwhile does not leave it half-way.
-    return await runtime.uploads.run(once.run, Parts({}, {_FILE: content}), store)
+    return await runtime.uploads.run(idempotent.run, Parts({}, {_FILE: content}), store)
 
 
 @router.get("", summary="List floor plans", responses=problem_responses(InvalidRequestError, StoreUnavailableError))
@@ -131,7 +131,7 @@ def list_floorplans(
         str | None,
         Query(max_length=200, pattern=_NO_CONTROLS, description="Only plans with this in their name, in any case."),
     ] = None,
-    limit: Annotated[int, Query(ge=1, le=_MOST_LISTED, description="How many to return.")] = 100,
+    limit: Annotated[int, Query(ge=1, le=_MAX_LISTED, description="How many to return.")] = 100,
     cursor: Annotated[str | None, Query(description="The `next_cursor` of the page before.")] = None,
 ) -> FloorPlanList:
     """Stored floor plans, newest first.
@@ -196,8 +196,8 @@ async def replace_floorplan(floorplan_id: str, request: Request, runtime: Runnin
         )
         # First, so that it is not in the way of the new grid; queries in work may still need the one in memory.
         runtime.grids.cancel(current.revision_id)
-        runtime.grids.follow_up(record, grid)
-        runtime.known_plans.drop({current.revision_id})
+        runtime.grids.on_plan_stored(record, grid)
+        runtime.plan_cache.drop({current.revision_id})
         return _written(request, record, GridState.after_upload(grid), runtime, status.HTTP_200_OK)
 
     return await runtime.uploads.run(store)
@@ -223,7 +223,7 @@ def delete_floorplan(floorplan_id: str, request: Request, runtime: Running, tena
     if not runtime.store.plans.delete(tenant, record.id, expected=expected):
         raise UnknownFloorPlanError(floorplan_id)
     runtime.grids.forget({record.revision_id})
-    runtime.known_plans.drop({record.revision_id})
+    runtime.plan_cache.drop({record.revision_id})
 
 
 def _at_revision(current: PlanRecord, revision_id: str, runtime: Runtime) -> PlanRecord:

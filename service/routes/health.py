@@ -7,9 +7,9 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Response, status
 from prometheus_client import CONTENT_TYPE_LATEST
 
+from service.pools.pool import PoolState
 from service.runtime import Runtime, runtime_of
 from service.schemas import HealthAnswer, PoolAnswer, ReadyAnswer
-from service.workers.pool import PoolState
 
 router = APIRouter(tags=["operations"])
 

@@ -26,10 +26,10 @@ from service.errors import (
     UploadTimeoutError,
     UploadTooLargeError,
 )
-from service.http.idempotency import Once
+from service.http.idempotency import IdempotentRequest
 from service.http.problems import problem_responses
 from service.http.uploads import JSON, MULTIPART, UploadLimits, media_type, read_parts, validate_fields
-from service.routes.requested import IDEMPOTENCY_KEY, Running, Tenant, known_plan
+from service.routes.dependencies import IDEMPOTENCY_KEY, Running, Tenant, plan_for_query
 from service.schemas import LocaliseAnswer, LocaliseForm
 from service.telemetry import note
 
@@ -81,7 +81,7 @@ async def localise(request: Request, runtime: Running, tenant: Tenant) -> Respon
     the one before it, with `"stage": "vdr"`.
     """
     settings = runtime.settings
-    once = Once(runtime.store.idempotency, request, tenant, "POST /localise")
+    idempotent = IdempotentRequest(runtime.store.idempotency, request, tenant, "POST /localise")
     media_type(request, (MULTIPART,))
     limits = UploadLimits.of(settings, "max_panorama_bytes")
     clock = StageClock()
@@ -97,10 +97,10 @@ async def localise(request: Request, runtime: Running, tenant: Tenant) -> Respon
         raise InvalidRequestError([("top_k", fault)])
 
     async def answer() -> Response:
-        record = await known_plan(tenant, form.floorplan_id, runtime)
+        record = await plan_for_query(tenant, form.floorplan_id, runtime)
         note(request, plan=record.id, revision=record.revision_id)
         found = await runtime.localiser.answer(record, form, parts.files["panorama"], begin, clock)
         note(request, stage=found.stage)
         return Response(found.model_dump_json(), media_type=JSON)
 
-    return await once.run_async(parts, answer, runtime.reads)
+    return await idempotent.run_async(parts, answer, runtime.reads)

@@ -11,7 +11,7 @@ from fastapi.responses import StreamingResponse
 from service.errors import InvalidRequestError, StoreUnavailableError, UnknownFloorPlanError
 from service.http.events import EventStream
 from service.http.problems import problem_responses
-from service.routes.requested import Running, Tenant, stored_plan
+from service.routes.dependencies import Running, Tenant, stored_plan
 from service.telemetry import note
 
 router = APIRouter(prefix="/floorplans", tags=["floor plans"])
@@ -38,4 +38,4 @@ async def follow_floorplan(floorplan_id: str, request: Request, runtime: Running
     """
     record = await asyncio.to_thread(stored_plan, tenant, floorplan_id, runtime.store.plans)
     note(request, plan=record.id, revision=record.revision_id)
-    return runtime.events.answer(record.id, partial(runtime.gate.knows, request))
+    return runtime.events.answer(record.id, partial(runtime.access_control.still_authorised, request))

@@ -13,7 +13,7 @@ from service.http.problems import problem_responses
 from service.http.uploads import JSON
 from service.preview.mesh import plan_glb
 from service.preview.svg import Marker, plan_svg
-from service.routes.requested import IF_NONE_MATCH, NOT_MODIFIED, Running, Tenant, stored_plan
+from service.routes.dependencies import IF_NONE_MATCH, NOT_MODIFIED, Running, Tenant, stored_plan
 from service.storage.records import PlanRecord
 from service.telemetry import note
 

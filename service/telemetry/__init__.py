@@ -3,13 +3,11 @@
 from service.telemetry.facts import RequestFacts, note, request_id_of
 from service.telemetry.logs import LOGGER_NAME, configure_logging
 from service.telemetry.metrics import Telemetry
-from service.telemetry.middleware import TelemetryMiddleware
 
 __all__ = [
     "LOGGER_NAME",
     "RequestFacts",
     "Telemetry",
-    "TelemetryMiddleware",
     "configure_logging",
     "note",
     "request_id_of",

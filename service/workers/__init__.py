@@ -1,13 +1,5 @@
-"""Pools of supervised worker processes, for work that may take long, eat memory, or crash.
+"""The programs that run in worker processes: `decode.py` opens uploaded pictures, `lpo.py` optimises poses.
 
-A worker process answers one job at a time over a pipe of its own. A supervising thread starts it, feeds it, kills it
-when it stalls, and replaces it when it dies. What happens to a worker reaches callers only as a `JobLostError`.
-
-    pool = WorkerPool(WorkerSpec("decode", run_decoder, (limits,), stall_s=10.0), workers=2, queue_limit=16)
-    pool.start()
-    answer = await pool.answer(job, timeout_s=5.0)      # cancelling it cancels the job
-
-with `run_decoder(connection, limits)` a function of a module that calls `process.serve_jobs`. `pool` is what callers
-see, `jobs` the queue, `supervisor` the thread over each worker, and `process` the inside of the worker itself, which
-imports none of the others.
+Begin with `process.py`, the loop that both run in. `service.pools` starts such processes and watches over them; nothing
+of it is loaded in them, and nothing is re-exported here, as every worker would load it.
 """

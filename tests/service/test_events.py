@@ -166,7 +166,7 @@ def test_silence_is_broken_by_comments(tiny_bundle: Path, tmp_path: Path) -> Non
 
         async def read() -> list[bytes]:
             events = PlanEvents(
-                runtime.store, runtime.grids, runtime.admission, runtime.reads, longest_s=0.5, heartbeat_s=0.05
+                runtime.store, runtime.grids, runtime.admission, runtime.reads, max_s=0.5, heartbeat_s=0.05
             )
             return [chunk async for chunk in events.stream(plan_id)]
 

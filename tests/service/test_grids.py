@@ -29,15 +29,15 @@ from service.errors import (
     StoreUnavailableError,
     UnknownFloorPlanError,
 )
-from service.grids.caretaker import Caretaker
-from service.grids.courtesy import QueriesInWork
 from service.grids.embedding import grid_bytes
 from service.grids.grids import Grids
 from service.grids.heights import query_height_m
-from service.grids.jobs import MOST_ON_DEMAND
-from service.grids.known_plans import KnownPlans
+from service.grids.jobs import MAX_ON_DEMAND
+from service.grids.sweeper import Sweeper
+from service.grids.throttle import BackgroundThrottle
 from service.lru import BoundedCache
 from service.settings import Settings
+from service.storage.plan_cache import PlanCache
 from service.storage.records import PlanRecord
 from service.storage.store import Store
 from service.telemetry import Telemetry
@@ -222,7 +222,7 @@ def test_replicas_compute_a_grid_once_and_see_how_far_it_is(
     first_future = first.compute(record, 1.5)
     wait_for(lambda: first_encoders.embedded > 0)
     second_future = second.compute(record, 1.5)
-    wait_for(lambda: len(second._jobs.elsewhere()) == 1)
+    wait_for(lambda: len(second._jobs.remote()) == 1)
     first_encoders.go_on.set()
     wait_for(lambda: first.progress(first.key(record.revision_id, 1.5)) > 0.0 or first_future.done())
     summary = second_store.plans.list("default", limit=1)[0]
@@ -235,7 +235,7 @@ def test_replicas_compute_a_grid_once_and_see_how_far_it_is(
 
 
 def _looked(grids: Grids) -> bool:
-    grids.look_elsewhere()
+    grids.poll_remote()
     return False
 
 
@@ -258,8 +258,8 @@ def test_the_lease_of_a_dead_replica_is_taken_over(
     grids, record = make_grids(store), _add(store)
     store.leases.claim(grids.key(record.revision_id, 1.5), "dead", 1.0)
     future = grids.compute(record, 1.5)
-    wait_for(lambda: len(grids._jobs.elsewhere()) == 1)
-    grids.look_elsewhere()
+    wait_for(lambda: len(grids._jobs.remote()) == 1)
+    grids.poll_remote()
     assert encoders.embedded == 0
     wait_for(lambda: _looked(grids) or future.done())
     assert len(future.result(30.0).poses) == encoders.embedded
@@ -277,7 +277,7 @@ def test_a_replica_that_was_thought_dead_gives_way(
     time.sleep(0.3)
     assert store.leases.claim(key, "another replica", 60.0)
     encoders.go_on.set()
-    wait_for(lambda: len(grids._jobs.elsewhere()) == 1)
+    wait_for(lambda: len(grids._jobs.remote()) == 1)
     assert encoders.embedded < 1521
     grid = build_grid(HALL, encoders, step_m=0.5, camera_height_m=1.5)
     assert store.grids.put(key, grid, keep=8, always_keep_mm=1500)
@@ -316,7 +316,7 @@ def test_what_a_stopped_replica_left_is_taken_up_by_another(
     closing.join(30.0)
     assert isinstance(future.exception(), StoppingError)
     grids = make_grids(second, CountingEncoders(bundle))
-    assert not grids.take_up()
+    assert not grids.queue_missing()
     assert grids.pending == 1
     wait_for(lambda: grids.pending == 0)
     assert grids.find(grids.key(record.revision_id, 1.5)) is not None
@@ -331,20 +331,20 @@ def test_plans_that_nobody_has_taken_up_yet_count_as_preparing(
     grids = make_grids(store)
     encoders.go_on.clear()
     # Sixteen are taken up at a time, and the rest is known of.
-    assert grids.take_up()
+    assert grids.queue_missing()
     assert (grids.pending, grids.preparing) == (16, 20)
     encoders.go_on.set()
     wait_for(lambda: grids.pending == 0)
     # One that another replica computes, dead or alive, is not done either.
     key = grids.key(store.grids.missing("m1", 0.5, 1)[0].revision_id, 1.5)
     store.leases.claim(key, "another replica", 60.0)
-    grids.take_up()
+    grids.queue_missing()
     assert (grids.pending, grids.preparing) == (3, 4)
     wait_for(lambda: grids.pending == 0)
     store.leases.release(key, "another replica")
-    grids.take_up()
+    grids.queue_missing()
     wait_for(lambda: grids.pending == 0)
-    grids.take_up()
+    grids.queue_missing()
     assert grids.preparing == 0
 
 
@@ -352,14 +352,14 @@ def test_gone_plans_and_old_revisions_are_dropped_from_memory_on_every_replica(
     open_store: OpenStore, make_grids: MakeGrids
 ) -> None:
     store, elsewhere = open_store(), open_store()
-    grids, known = make_grids(store), KnownPlans(store, limit_bytes=2**20, max_age_s=600.0)
+    grids, known = make_grids(store), PlanCache(store, limit_bytes=2**20, max_age_s=600.0)
     records = {name: _add(store, plan_id=name) for name in ("deleted", "changed", "kept")}
     for name, record in records.items():
         grids.compute(record, 1.5).result(30.0)
         assert known.get("default", name) == record
     elsewhere.plans.delete("default", "deleted")
     elsewhere.plans.add_revision("default", "changed", PLAN, original=b"", keep=5)
-    Caretaker(store, grids, known, sweep_s=5.0).sweep()
+    Sweeper(store, grids, known, sweep_s=5.0).sweep()
     assert grids.revisions() == known.revisions() == {records["kept"].revision_id}
 
 
@@ -367,7 +367,7 @@ def test_revisions_that_were_replaced_on_another_replica_are_not_computed_any_mo
     open_store: OpenStore, make_grids: MakeGrids, encoders: CountingEncoders
 ) -> None:
     store, elsewhere = open_store(), open_store()
-    grids, known = make_grids(store), KnownPlans(store, limit_bytes=2**20, max_age_s=600.0)
+    grids, known = make_grids(store), PlanCache(store, limit_bytes=2**20, max_age_s=600.0)
     encoders.go_on.clear()
     # The first one has begun, the others wait.
     futures = [grids.compute(_add(store, HALL), 1.5)]
@@ -375,7 +375,7 @@ def test_revisions_that_were_replaced_on_another_replica_are_not_computed_any_mo
     for _ in range(3):
         record = elsewhere.plans.add_revision("default", "p", HALL, original=b"", keep=5)
         futures.append(grids.compute(record, 1.5))
-    Caretaker(store, grids, known, sweep_s=5.0).sweep()
+    Sweeper(store, grids, known, sweep_s=5.0).sweep()
     encoders.go_on.set()
     assert len(futures.pop().result(60.0).poses) == 1521
     assert [type(future.exception(30.0)) for future in futures] == [PlanNotReadyError] * 3
@@ -389,10 +389,10 @@ def test_the_job_of_a_replaced_revision_ends_although_another_replica_is_at_it(
     grids, record = make_grids(store), _add(store)
     store.leases.claim(grids.key(record.revision_id, 1.5), "another replica", 60.0)
     future = grids.compute(record, 1.5)
-    wait_for(lambda: len(grids._jobs.elsewhere()) == 1)
+    wait_for(lambda: len(grids._jobs.remote()) == 1)
     store.plans.add_revision("default", "p", PLAN, original=b"", keep=5)
     grids.cancel(record.revision_id)
-    grids.look_elsewhere()
+    grids.poll_remote()
     assert isinstance(future.exception(30.0), PlanNotReadyError)
 
 
@@ -437,8 +437,8 @@ def test_what_waits_is_bounded_and_a_plans_own_grid_has_a_place_of_its_own(
 ) -> None:
     grids, record = make_grids(store), _add(store)
     encoders.go_on.clear()
-    asked = [grids.compute(record, 1.0 + 0.02 * number) for number in range(MOST_ON_DEMAND)]
-    with pytest.raises(OverloadedError, match=str(MOST_ON_DEMAND)):
+    asked = [grids.compute(record, 1.0 + 0.02 * number) for number in range(MAX_ON_DEMAND)]
+    with pytest.raises(OverloadedError, match=str(MAX_ON_DEMAND)):
         grids.compute(record, 2.2)
     own = grids.compute(record, 1.5)
     encoders.go_on.set()
@@ -460,18 +460,18 @@ def test_work_on_a_revision_that_was_replaced_ends(
 
 
 def test_the_background_pauses_for_queries_but_not_for_good() -> None:
-    queries = QueriesInWork()
-    with queries.one(), queries.one():
+    queries = BackgroundThrottle()
+    with queries.query(), queries.query():
         begin = time.monotonic()
-        queries.make_way(0.05)
+        queries.pause(0.05)
         assert 0.19 < time.monotonic() - begin < 5.0
-        waiting = threading.Thread(target=queries.make_way, args=(60.0,))
+        waiting = threading.Thread(target=queries.pause, args=(60.0,))
         begin = time.monotonic()
         waiting.start()
     waiting.join(10.0)
     assert time.monotonic() - begin < 0.9
     begin = time.monotonic()
-    queries.make_way(60.0)
+    queries.pause(60.0)
     assert time.monotonic() - begin < 0.5
 
 
@@ -483,8 +483,8 @@ def test_plans_that_were_read_lately_are_known_while_the_database_is_away(
 ) -> None:
     store = Store(postgres.new_database())
     grids, record = make_grids(store), _add(store)
-    known = KnownPlans(store, limit_bytes=2**20, max_age_s=600.0)
-    forgetful = KnownPlans(store, limit_bytes=2**20, max_age_s=0.0)
+    known = PlanCache(store, limit_bytes=2**20, max_age_s=600.0)
+    forgetful = PlanCache(store, limit_bytes=2**20, max_age_s=0.0)
     assert known.get("default", "p") == forgetful.get("default", "p") == record
     grids.compute(record, 1.5).result(30.0)
     _add(store, plan_id="q")
@@ -510,7 +510,7 @@ def test_plans_that_were_read_lately_are_known_while_the_database_is_away(
 
 def test_a_database_that_is_busy_is_no_reason_to_go_by_what_was_read_lately(tmp_path: Path) -> None:
     store = Store(f"sqlite:///{tmp_path / 'test.sqlite3'}", connections=1, wait_s=0.05)
-    known = KnownPlans(store, limit_bytes=2**20, max_age_s=600.0)
+    known = PlanCache(store, limit_bytes=2**20, max_age_s=600.0)
     record = _add(store)
     assert known.get("default", "p") == record
     with store._database.reading():

@@ -27,15 +27,15 @@ from service.errors import (
     UnknownFloorPlanError,
     UploadTimeoutError,
 )
-from service.http.idempotency import Once, parts_sha256
+from service.http.idempotency import IdempotentRequest, parts_sha256
 from service.http.uploads import Parts
+from service.pools.jobs import JobLostError
 from service.storage.grids import StoredGrids
 from service.storage.idempotency import Idempotency
 from service.storage.records import Fresh
 from service.storage.store import Store
 from service.storage.tables import IDEMPOTENCY
 from service.threads import BoundedReads
-from service.workers.jobs import JobLostError
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, upload, wait_for
 
 CONTENT = json.dumps(FLAT).encode()
@@ -263,9 +263,9 @@ def store(tmp_path: Path) -> Iterator[Store]:
     opened.close()
 
 
-def _once(store: Store) -> Once:
+def _idempotent(store: Store) -> IdempotentRequest:
     scope = {"type": "http", "method": "POST", "path": "/x", "headers": [(b"idempotency-key", b"a")], "state": {}}
-    return Once(store.idempotency, Request(scope), "default", "POST /x")
+    return IdempotentRequest(store.idempotency, Request(scope), "default", "POST /x")
 
 
 def test_an_upload_that_failed_after_it_was_stored_is_found_when_it_is_sent_again(store: Store) -> None:
@@ -278,8 +278,8 @@ def test_an_upload_that_failed_after_it_was_stored_is_found_when_it_is_sent_agai
         return Response(token)
 
     with pytest.raises(StoreUnavailableError):
-        _once(store).run(NOTHING, work)
-    answer = _once(store).run(NOTHING, work)
+        _idempotent(store).run(NOTHING, work)
+    answer = _idempotent(store).run(NOTHING, work)
     assert [summary.id for summary in store.plans.list("default", limit=10)] == [bytes(answer.body).decode()]
 
 
@@ -305,12 +305,12 @@ def test_only_refusals_that_the_request_is_to_blame_for_are_kept(store: Store, r
         raise refusal
 
     if kept:
-        first = _once(store).run(NOTHING, refuse)
-        assert _once(store).run(NOTHING, lambda token: Response(token)).body == first.body
+        first = _idempotent(store).run(NOTHING, refuse)
+        assert _idempotent(store).run(NOTHING, lambda token: Response(token)).body == first.body
         return
     with pytest.raises(type(refusal)):
-        _once(store).run(NOTHING, refuse)
-    assert _once(store).run(NOTHING, lambda _token: Response("done")).body == b"done"
+        _idempotent(store).run(NOTHING, refuse)
+    assert _idempotent(store).run(NOTHING, lambda _token: Response("done")).body == b"done"
 
 
 @pytest.mark.parametrize("leaves", [True, False], ids=["hangs up", "is told to come again"])
@@ -319,10 +319,10 @@ def test_who_is_gone_before_their_claim_is_made_leaves_none(store: Store, leaves
         raise AssertionError("it has not begun")
 
     async def ask() -> None:
-        reads = BoundedReads(threads=1, most=4, wait_s=30.0 if leaves else 0.2)
+        reads = BoundedReads(threads=1, max_pending=4, wait_s=30.0 if leaves else 0.2)
         # Whoever writes waits meanwhile.
         with store._database.writing():
-            asking = asyncio.create_task(_once(store).run_async(NOTHING, never, reads))
+            asking = asyncio.create_task(_idempotent(store).run_async(NOTHING, never, reads))
             await asyncio.sleep(0.3)
             asking.cancel()
             with pytest.raises(asyncio.CancelledError if leaves else StoreUnavailableError):

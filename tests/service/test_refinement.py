@@ -20,10 +20,10 @@ import pytest
 
 from lalaloc_core.bundle import LAYOUT_WEIGHTS, Bundle
 from lalaloc_core.localise.poses import RefinementJob, RefinementResult
-from service.query.lpo_worker import warm_up_job
 from service.query.refinement import LpoPool
 from service.settings import Settings
 from service.telemetry import Telemetry
+from service.workers.lpo import warm_up_job
 from tests.service.conftest import wait_for
 
 

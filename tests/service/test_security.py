@@ -24,11 +24,11 @@ from starlette.types import Receive, Scope, Send
 from lalaloc_core.errors import ConfigError
 from service.app import create_app
 from service.errors import StoreBusyError, StoreUnavailableError, TooManyRefusedKeysError
-from service.security.access import NEEDED, OPEN_PATHS, Permission
 from service.security.exposure import check_address, is_local
-from service.security.key_ring import KeyRing
+from service.security.key_cache import KeyCache
 from service.security.keys import PresentedKey, hash_of, key_text, new_secret, parse_authorization
-from service.security.limits import Rates
+from service.security.permissions import NEEDED, OPEN_PATHS, Permission
+from service.security.rate_limits import RateLimits
 from service.settings import Settings
 from service.storage.store import Store
 from service.telemetry import LOGGER_NAME
@@ -427,7 +427,7 @@ def test_a_client_with_many_invalid_keys_is_not_listened_to_but_keys_that_work_a
 
 def test_counters_of_client_addresses_are_bounded_and_a_network_counts_as_one() -> None:
     async def count() -> int:
-        rates = Rates(Settings(refused_keys_per_minute=1))
+        rates = RateLimits(Settings(refused_keys_per_minute=1))
         await rates.count_refused("2001:db8:1:2::1")
         with pytest.raises(TooManyRefusedKeysError):
             await rates.check_refused("2001:db8:1:2:ffff::2")
@@ -473,7 +473,7 @@ def test_known_keys_go_on_working_while_the_database_is_away(
 def test_a_key_is_trusted_for_ten_minutes_without_the_database_and_not_longer(tmp_path: Path) -> None:
     store = Store(f"sqlite:///{tmp_path / 'keys.sqlite3'}", connections=1, wait_s=0.05)
     clock_s = [1000.0]
-    ring = KeyRing(store.keys, fresh_s=5.0, clock=lambda: clock_s[0])
+    ring = KeyCache(store.keys, fresh_s=5.0, clock=lambda: clock_s[0])
     presented = parse_authorization([f"Bearer {make_key(store)}"])
     assert presented is not None
     try:
@@ -499,7 +499,7 @@ def test_a_key_is_trusted_for_ten_minutes_without_the_database_and_not_longer(tm
 def test_a_database_that_is_busy_is_no_reason_to_trust_a_key(tmp_path: Path) -> None:
     store = Store(f"sqlite:///{tmp_path / 'keys.sqlite3'}", connections=1, wait_s=0.05)
     clock_s = [1000.0]
-    ring = KeyRing(store.keys, fresh_s=5.0, clock=lambda: clock_s[0])
+    ring = KeyCache(store.keys, fresh_s=5.0, clock=lambda: clock_s[0])
     presented = parse_authorization([f"Bearer {make_key(store)}"])
     assert presented is not None
     try:

@@ -14,7 +14,7 @@ from service.storage.store import Store
 _LEFT_ALONE_S = 1.0
 
 
-class KnownPlans:
+class PlanCache:
     """Finds plans for queries; safe to share between threads."""
 
     def __init__(self, store: Store, *, limit_bytes: int, max_age_s: float) -> None:
@@ -37,7 +37,7 @@ class KnownPlans:
             StoreUnavailableError: the database is away, and the plan was not read lately.
             StoreBusyError: too many use it.
         """
-        if (known := self.while_away(tenant, plan_id)) is not None:
+        if (known := self.during_outage(tenant, plan_id)) is not None:
             return known
         key = (tenant, plan_id)
         try:
@@ -46,7 +46,7 @@ class KnownPlans:
             # It is there, and the plan may be gone.
             raise
         except StoreUnavailableError:
-            self.note_silence()
+            self.note_outage()
             known = self._lately(key)
             if known is None:
                 raise
@@ -57,11 +57,11 @@ class KnownPlans:
             self._known.put(key, (record, monotonic()))
         return record
 
-    def while_away(self, tenant: str, plan_id: str) -> PlanRecord | None:
+    def during_outage(self, tenant: str, plan_id: str) -> PlanRecord | None:
         """A plan that was read lately, if the database was away a moment ago; from memory, at once."""
         return self._lately((tenant, plan_id)) if monotonic() < self._away_until else None
 
-    def note_silence(self) -> None:
+    def note_outage(self) -> None:
         """The database does not answer: leave it alone for a moment."""
         self._away_until = monotonic() + _LEFT_ALONE_S
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from time import monotonic
 from typing import Any, Generic, TypeVar
 
-from service.workers.jobs import JobLostError, JobQueue, Ticket
-from service.workers.supervisor import Supervisor, WorkerSpec
+from service.pools.jobs import JobLostError, JobQueue, Ticket
+from service.pools.supervisor import Supervisor, WorkerSpec
 
 Job = TypeVar("Job")
 Answer = TypeVar("Answer")

@@ -21,7 +21,7 @@ _ADDRESS_COUNTERS = 1024
 _IPV6_NETWORK_BITS = 64
 
 
-class Rates:
+class RateLimits:
     """Counts over a sliding window; for one event loop."""
 
     def __init__(self, settings: Settings) -> None:

@@ -9,10 +9,10 @@ from typing import Annotated, Any
 from fastapi import Depends, Request
 
 from service.errors import StoreUnavailableError, UnknownFloorPlanError
-from service.grids.known_plans import KnownPlans
-from service.http.idempotency import HEADER, MOST_CHARACTERS
+from service.http.idempotency import HEADER, MAX_KEY_CHARACTERS
 from service.runtime import Runtime, runtime_of
-from service.security.access import caller_of
+from service.security.permissions import caller_of
+from service.storage.plan_cache import PlanCache
 from service.storage.plans import Plans
 from service.storage.records import PlanRecord
 
@@ -27,7 +27,7 @@ Running = Annotated[Runtime, Depends(runtime_of)]
 Tenant = Annotated[str, Depends(_tenant_of)]
 
 
-def stored_plan(tenant: str, floorplan_id: str, plans: Plans | KnownPlans) -> PlanRecord:
+def stored_plan(tenant: str, floorplan_id: str, plans: Plans | PlanCache) -> PlanRecord:
     """A stored plan of a tenant.
 
     Raises:
@@ -40,7 +40,7 @@ def stored_plan(tenant: str, floorplan_id: str, plans: Plans | KnownPlans) -> Pl
     return record
 
 
-async def known_plan(tenant: str, floorplan_id: str, runtime: Runtime) -> PlanRecord:
+async def plan_for_query(tenant: str, floorplan_id: str, runtime: Runtime) -> PlanRecord:
     """A plan for a query: as the database has it, or as it was read lately when the database is away or silent.
 
     Raises:
@@ -48,17 +48,17 @@ async def known_plan(tenant: str, floorplan_id: str, runtime: Runtime) -> PlanRe
         StoreUnavailableError: the database is away, and the plan was not read lately; or too many use it.
     """
     begin_s = monotonic()
-    known = runtime.known_plans.while_away(tenant, floorplan_id)
+    known = runtime.plan_cache.during_outage(tenant, floorplan_id)
     if known is not None:
         return known
     try:
-        return await runtime.reads.run(stored_plan, tenant, floorplan_id, runtime.known_plans)
+        return await runtime.reads.run(stored_plan, tenant, floorplan_id, runtime.plan_cache)
     except StoreUnavailableError:
         if runtime.store.answered_since(begin_s):
             # It is there, and the plan may be gone.
             raise
-        runtime.known_plans.note_silence()
-        known = runtime.known_plans.while_away(tenant, floorplan_id)
+        runtime.plan_cache.note_outage()
+        known = runtime.plan_cache.during_outage(tenant, floorplan_id)
         if known is None:
             raise
         return known
@@ -76,8 +76,8 @@ def header(name: str, description: str) -> dict[str, Any]:
 
 IDEMPOTENCY_KEY = header(
     HEADER,
-    f"1 to {MOST_CHARACTERS} visible ASCII characters. The same key with the same content within 24 hours is the same "
-    "request, and answered alike, with `Idempotency-Replayed: true`.",
+    f"1 to {MAX_KEY_CHARACTERS} visible ASCII characters. The same key with the same content within 24 hours is the "
+    "same request, and answered alike, with `Idempotency-Replayed: true`.",
 )
 IF_NONE_MATCH = header("If-None-Match", "Entity tags that the caller has, or `*`; with one of them the answer is 304.")
 NOT_MODIFIED: dict[int | str, dict[str, Any]] = {304: {"description": "The caller has this representation."}}

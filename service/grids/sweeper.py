@@ -8,7 +8,7 @@ from time import monotonic
 
 from service.errors import StoreUnavailableError
 from service.grids.grids import Grids
-from service.grids.known_plans import KnownPlans
+from service.storage.plan_cache import PlanCache
 from service.storage.store import Store
 from service.telemetry import LOGGER_NAME
 
@@ -18,21 +18,21 @@ _POLL_S = 0.5
 _PURGE_EVERY_S = 3600.0
 
 
-class Caretaker:
+class Sweeper:
     """A thread with a few cheap queries every now and then; a database that is away is tried again."""
 
-    def __init__(self, store: Store, grids: Grids, known: KnownPlans, *, sweep_s: float) -> None:
+    def __init__(self, store: Store, grids: Grids, known: PlanCache, *, sweep_s: float) -> None:
         self._store = store
         self._grids = grids
         self._known = known
         self._sweep_s = sweep_s
         self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="caretaker", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="sweeper", daemon=True)
 
     def start(self) -> None:
         """Try once more what failed under an earlier start, then look after things until `close`."""
         self._store.plans.clear_failures()
-        self._grids.take_up()
+        self._grids.queue_missing()
         self._thread.start()
 
     def close(self) -> None:
@@ -59,14 +59,14 @@ class Caretaker:
         more = True
         while not self._stop.wait(min(_POLL_S, self._sweep_s)):
             try:
-                self._grids.look_elsewhere()
+                self._grids.poll_remote()
                 due = monotonic() >= sweep_at
                 if due:
                     sweep_at = monotonic() + self._sweep_s
                     self.sweep()
-                # A backlog, as after a new model, goes on as soon as what was taken up is done.
+                # A backlog, as after a new model, goes on as soon as what was queued is done.
                 if due or (more and self._grids.pending == 0):
-                    more = self._grids.take_up()
+                    more = self._grids.queue_missing()
                 if monotonic() >= purge_at:
                     purge_at = monotonic() + _PURGE_EVERY_S
                     self._store.idempotency.purge()

@@ -15,15 +15,15 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
+from service.pools.jobs import JobQueue, Ticket
 from service.telemetry import LOGGER_NAME
-from service.workers.jobs import JobQueue, Ticket
 from service.workers.process import Answered, Fault, Ready
 
 # A worker that dies this soon after it was warm, or before, is replaced more and more slowly; the first time at once.
 _HEALTHY_S = 5.0
 _FIRST_BACKOFF_S = 0.25
 # Those that got warm may well do so again, also when one of them was killed while it started.
-_LONGEST_BACKOFF_S, _LONGEST_BACKOFF_ONCE_WARM_S, _LONGEST_WARM_BACKOFF_S = 30.0, 5.0, 1.0
+_MAX_BACKOFF_S, _MAX_BACKOFF_ONCE_WARM_S, _MAX_WARM_BACKOFF_S = 30.0, 5.0, 1.0
 # After so many failed starts in a row, or none that succeeded, nobody waits for the next one.
 _HOPELESS_STARTS = 3
 # How long a killed worker may take to be gone, and how often it is looked at.
@@ -40,7 +40,7 @@ class WorkerSpec:
         arguments: picklable.
         stall_s: a worker busy with one job for longer is killed.
         start_s: what a start usually takes, until one has been measured.
-        longest_start_s: a worker not warm after that will not come.
+        max_start_s: a worker not warm after that will not come.
     """
 
     name: str
@@ -48,7 +48,7 @@ class WorkerSpec:
     arguments: tuple[Any, ...] = ()
     stall_s: float = 10.0
     start_s: float = 5.0
-    longest_start_s: float = 120.0
+    max_start_s: float = 120.0
 
 
 class Supervisor:
@@ -132,11 +132,11 @@ class Supervisor:
 
     def _pause(self, short_lives: int) -> None:
         """Back off after so many short lives in a row."""
-        longest_s = _LONGEST_BACKOFF_ONCE_WARM_S if self.warmed_up else _LONGEST_BACKOFF_S
+        max_s = _MAX_BACKOFF_ONCE_WARM_S if self.warmed_up else _MAX_BACKOFF_S
         if self.fault is None:
-            longest_s = _LONGEST_WARM_BACKOFF_S
+            max_s = _MAX_WARM_BACKOFF_S
         # Bounded before it is raised to a power: worker after worker may die for years.
-        pause_s = min(_FIRST_BACKOFF_S * 2.0 ** min(short_lives - 2, 20), longest_s) if short_lives > 1 else 0.0
+        pause_s = min(_FIRST_BACKOFF_S * 2.0 ** min(short_lives - 2, 20), max_s) if short_lives > 1 else 0.0
         self._starts_at = monotonic() + pause_s
         self._queue.rest(pause_s)
 
@@ -174,14 +174,14 @@ class Supervisor:
 
     def _await_ready(self, connection: Connection, process: BaseProcess) -> str | None:
         """Why the worker did not become ready; None when it did."""
-        with _Watchdog(process, self._spec.longest_start_s) as watchdog:
+        with _Watchdog(process, self._spec.max_start_s) as watchdog:
             message = _receive(connection)
         if isinstance(message, Ready):
             return None
         if isinstance(message, Fault):
             return message.reason
-        late = f"the worker did not start within {self._spec.longest_start_s:g} s"
-        return late if watchdog.barked else "the worker died starting"
+        late = f"the worker did not start within {self._spec.max_start_s:g} s"
+        return late if watchdog.expired else "the worker died starting"
 
     def _serve(self, connection: Connection, process: BaseProcess) -> str:
         """Hand out jobs until the worker dies or stalls, or the queue is closed; returns why it ended."""
@@ -198,10 +198,10 @@ class Supervisor:
             if answer is None:
                 self.ready = False
                 self._starts_at = monotonic()
-                ticket.stalls += watchdog.barked
-                ticket.deaths += sent and not watchdog.barked
+                ticket.stalls += watchdog.expired
+                ticket.deaths += sent and not watchdog.expired
                 self._queue.give_back(ticket)
-                return "stalled" if watchdog.barked else "died at work" if sent else "died idle"
+                return "stalled" if watchdog.expired else "died at work" if sent else "died idle"
             self._settle(ticket, answer)
         return "closing"
 
@@ -219,9 +219,9 @@ class _Watchdog:
     """Kills a process unless the block ends in time: reads and writes of its pipe then end, even half-way."""
 
     def __init__(self, process: BaseProcess, limit_s: float) -> None:
-        self.barked = False
+        self.expired = False
         self._process = process
-        self._timer = threading.Timer(limit_s, self._bark)
+        self._timer = threading.Timer(limit_s, self._expire)
         self._timer.daemon = True
 
     def __enter__(self) -> _Watchdog:
@@ -231,8 +231,8 @@ class _Watchdog:
     def __exit__(self, *_error: object) -> None:
         self._timer.cancel()
 
-    def _bark(self) -> None:
-        self.barked = True
+    def _expire(self) -> None:
+        self.expired = True
         self._process.kill()
 
 

@@ -38,7 +38,7 @@ class _Known:
     ask_again_s: float
 
 
-class KeyRing:
+class KeyCache:
     """Looks keys up."""
 
     def __init__(self, keys: ApiKeys, *, fresh_s: float, clock: Callable[[], float] = time.monotonic) -> None:

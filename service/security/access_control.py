@@ -5,7 +5,7 @@ from __future__ import annotations
 from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
-from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import Scope
 
 from service.errors import (
     ExposedWithoutKeysError,
@@ -15,18 +15,17 @@ from service.errors import (
     TooManyRefusedKeysError,
     UnauthenticatedError,
 )
-from service.http.problems import http_problem_answer, problem_answer
-from service.security.access import ANYONE, OPEN_PATHS, Caller, Permission, permissions_needed, put_caller
 from service.security.exposure import check_origin, is_local
-from service.security.key_ring import KeyRing
+from service.security.key_cache import KeyCache
 from service.security.keys import parse_authorization
-from service.security.limits import Rates
+from service.security.permissions import ANYONE, Caller, Permission, permissions_needed
+from service.security.rate_limits import RateLimits
 from service.settings import Settings
 from service.storage.api_keys import ApiKeys
 from service.storage.records import ApiKey
 from service.telemetry import note
 
-# What `GateMiddleware` refuses with, besides 404 and 405.
+# What `AccessControlMiddleware` refuses with, besides 404 and 405.
 REFUSALS = (
     UnauthenticatedError,
     InsufficientScopeError,
@@ -40,21 +39,21 @@ _MALFORMED = "the Authorization header does not hold one API key; it reads `Bear
 _REFUSED = "the API key is not known here, or was revoked"
 
 
-class Gate:
+class AccessControl:
     """Lets the requests of one running app in, or refuses them."""
 
     def __init__(self, keys: ApiKeys, settings: Settings) -> None:
         self._needs_keys = settings.api_keys
         self._allow_anonymous = settings.allow_anonymous
         self._hosts = settings.allowed_host_names
-        self._ring = KeyRing(keys, fresh_s=settings.key_cache_s)
-        self._rates = Rates(settings)
+        self._keys = KeyCache(keys, fresh_s=settings.key_cache_s)
+        self._rates = RateLimits(settings)
 
     def close(self) -> None:
         """Stop looking up keys."""
-        self._ring.close()
+        self._keys.close()
 
-    async def let_in(self, request: Request) -> Caller:
+    async def authorise(self, request: Request) -> Caller:
         """Who sent a request to anything but health.
 
         Raises:
@@ -78,13 +77,13 @@ class Gate:
             raise InsufficientScopeError(needed, caller.permissions)
         return caller
 
-    async def knows(self, request: Request) -> bool:
+    async def still_authorised(self, request: Request) -> bool:
         """Whether the key of a request that was let in is still valid; true where there are no keys."""
         presented = parse_authorization(Headers(scope=request.scope).getlist("authorization"))
         if not self._needs_keys or presented is None:
             return not self._needs_keys
         try:
-            return await self._ring.find(presented) is not None
+            return await self._keys.find(presented) is not None
         except StoreUnavailableError:
             return False
 
@@ -110,36 +109,13 @@ class Gate:
             await self._rates.count_refused(client)
             raise UnauthenticatedError(_MALFORMED)
         # Many clients may share an address, so keys that work are not held up by those that do not.
-        if not self._ring.remembers(presented):
+        if not self._keys.remembers(presented):
             await self._rates.check_refused(client)
-        key = await self._ring.find(presented)
+        key = await self._keys.find(presented)
         if key is None:
             await self._rates.count_refused(client)
             raise UnauthenticatedError(_REFUSED)
         return key
-
-
-class GateMiddleware:
-    """Asks the running app's gate about every request, and tells the routes who called."""
-
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Handle one request."""
-        # An app that has not been started, or is used without its lifespan, has nothing to guard.
-        gate: Gate | None = getattr(scope["app"].state, "gate", None)
-        if scope["type"] == "http" and gate is not None and _path(scope) not in OPEN_PATHS:
-            request = Request(scope)
-            try:
-                put_caller(scope, await gate.let_in(request))
-            except REFUSALS as error:
-                await problem_answer(request, error)(scope, receive, send)
-                return
-            except HTTPException as error:
-                await http_problem_answer(request, error)(scope, receive, send)
-                return
-        await self._app(scope, receive, send)
 
 
 def _needed(request: Request) -> Permission:
@@ -148,7 +124,7 @@ def _needed(request: Request) -> Permission:
     Raises:
         HTTPException: there is no such route, or it has no such method.
     """
-    methods = permissions_needed(_path(request.scope))
+    methods = permissions_needed(routed_path(request.scope))
     if not methods:
         raise HTTPException(404)
     # Where there is HEAD, it is GET without its body.
@@ -158,7 +134,7 @@ def _needed(request: Request) -> Permission:
     return methods[method]
 
 
-def _path(scope: Scope) -> str:
+def routed_path(scope: Scope) -> str:
     """The path as routes know it: without the prefix that a proxy put before it."""
     path, prefix = scope["path"], scope.get("root_path", "")
     return path[len(prefix) :] if prefix and path.startswith(f"{prefix}/") else path

@@ -17,9 +17,9 @@ from typing import Any
 
 import pytest
 
-from service.workers.jobs import JobLostError
-from service.workers.pool import WorkerPool
-from service.workers.supervisor import WorkerSpec
+from service.pools.jobs import JobLostError
+from service.pools.pool import WorkerPool
+from service.pools.supervisor import WorkerSpec
 from tests.service import worker_jobs
 from tests.service.conftest import wait_for
 
@@ -282,7 +282,7 @@ def test_workers_that_cannot_start_are_tried_less_and_less_often(log: Path) -> N
 
 def test_a_worker_that_never_gets_ready_is_given_up(log: Path) -> None:
     slow = {"target": worker_jobs.run_slow_start, "arguments": (str(log), 60.0)}
-    with _pool(log, longest_start_s=1.0, **slow) as pool:
+    with _pool(log, max_start_s=1.0, **slow) as pool:
         wait_for(lambda: pool.state.fault is not None)
         assert pool.state.fault == "the worker did not start within 1 s"
 

@@ -1,0 +1,56 @@
+"""The API description: what the framework knows of the routes, with what middlewares and hand-written parts add."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fastapi import FastAPI
+from fastapi.openapi.utils import get_openapi
+
+from service.http import admission
+from service.http.problems import add_problems
+from service.schemas import FloorPlanDocument, PlanEvent, Problem
+from service.security import access_control
+from service.security.permissions import NEEDED
+
+_KEY = "api_key"
+
+
+def describe_api(app: FastAPI) -> dict[str, Any]:
+    """The OpenAPI document of the app, made once."""
+    if app.openapi_schema is None:
+        document = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
+        schemas = document["components"]["schemas"]
+        # Those that only hand-written parts of the description refer to.
+        for model in (FloorPlanDocument, PlanEvent, Problem):
+            schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
+            schemas |= schema.pop("$defs", {})
+            schemas[model.__name__] = schema
+        document["components"]["schemas"] = dict(sorted(schemas.items()))
+        for path, operations in document["paths"].items():
+            if path not in admission.EXEMPT:
+                for operation in operations.values():
+                    add_problems(operation, *admission.REFUSALS)
+        _describe_keys(document)
+        app.openapi_schema = document
+    return app.openapi_schema
+
+
+def _describe_keys(document: dict[str, Any]) -> None:
+    """Add what each operation needs while keys are on, and how it refuses."""
+    document["components"]["securitySchemes"] = {
+        _KEY: {
+            "type": "http",
+            "scheme": "bearer",
+            "bearerFormat": "lalaloc_<id>_<secret>",
+            "description": "An API key, where they are switched on (`LALALOC_API_KEYS`). Operations name the scope "
+            "that the key needs: `read`, `localise` or `write`. Floor plans belong to the key's tenant; those of "
+            "another are as if they did not exist.",
+        }
+    }
+    for path, operations in document["paths"].items():
+        for method, operation in operations.items():
+            needed = NEEDED.get((method.upper(), path))
+            if needed is not None:
+                operation["security"] = [{_KEY: [needed.value]}]
+                add_problems(operation, *access_control.REFUSALS)
