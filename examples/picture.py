@@ -21,11 +21,11 @@ from examples.truth import FOLDER, TruePose
 from lalaloc_client import Candidate, Localisation
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import heading_from_degrees
-from lalaloc_core.evaluation.report.plan import INK, Cells, draw_camera, draw_distances, draw_plan, halo
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.evidence import latent_distances
 from lalaloc_core.panorama.images import read_panorama
+from lalaloc_core.report.plan import INK, Cells, draw_camera, draw_distances, draw_plan, halo
 from service.settings import Settings
 
 _CELL_M = 0.1

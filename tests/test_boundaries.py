@@ -31,16 +31,13 @@ LAYERS = {
     "lalaloc_core.unfamiliar": 3,
     "lalaloc_core.localise": 4,
     "lalaloc_core.data": 5,
-    "lalaloc_core.training": 6,
-    "lalaloc_core.methods": 6,
-    "lalaloc_core.evaluation": 7,
-    "lalaloc_core.evaluation.report": 8,
-    # Draws with the report's tools.
-    "lalaloc_core.evaluation.worst": 9,
-    "lalaloc_core.calibrate": 8,
-    "lalaloc_core.export": 8,
-    # A run ends with its export, so this file stands above it.
-    "lalaloc_core.training.run": 9,
+    "lalaloc_core.data.synthetic": 6,
+    "lalaloc_core.training": 7,
+    "lalaloc_core.methods": 7,
+    "lalaloc_core.evaluation": 8,
+    "lalaloc_core.calibrate": 9,
+    "lalaloc_core.export": 9,
+    "lalaloc_core.report": 9,
     "lalaloc_core.reproduce": 10,
     "lalaloc_core.bench": 10,
     "lalaloc_core.cli": 11,
@@ -66,18 +63,17 @@ LAYERS |= {
     for name in names.split()
 }
 # Importing these loads torch; importing anything else must not.
-TORCH_MODULES = (
+TORCH_PACKAGES = (
     "lalaloc_core.nets",
     "lalaloc_core.synth",
-    "lalaloc_core.training",
     "lalaloc_core.localise.optimise",
-    "lalaloc_core.data.generated",
-    "lalaloc_core.data.strangers",
-    "lalaloc_core.data.synthesise",
+    "lalaloc_core.data.synthetic",
+    "lalaloc_core.training",
     "lalaloc_core.methods",
     "lalaloc_core.evaluation",
-    "lalaloc_core.reproduce",
+    "lalaloc_core.report",
     "lalaloc_core.export",
+    "lalaloc_core.reproduce",
     "lalaloc_core.bench",
 )
 OURS = ("lalaloc_core", "service", "lalaloc_client")
@@ -130,8 +126,8 @@ def _folder(module: str) -> str:
     return module if module in PACKAGES else module.rpartition(".")[0]
 
 
-def _loads_torch(module: str) -> bool:
-    return any(module == room or module.startswith(room + ".") for room in TORCH_MODULES)
+def _in_torch_package(module: str) -> bool:
+    return any(module == package or module.startswith(package + ".") for package in TORCH_PACKAGES)
 
 
 def _reaches_torch(module: str, seen: set[str]) -> bool:
@@ -161,13 +157,13 @@ def test_the_layer_table_names_no_module_that_is_gone() -> None:
     assert [name for name in LAYERS if name not in MODULES] == []
 
 
-@pytest.mark.parametrize("module", [name for name in MODULES if not _loads_torch(name)])
-def test_no_module_outside_the_torch_rooms_imports_torch_when_it_is_imported(module: str) -> None:
+@pytest.mark.parametrize("module", [name for name in MODULES if not _in_torch_package(name)])
+def test_no_module_outside_the_torch_packages_imports_torch_when_it_is_imported(module: str) -> None:
     assert not _reaches_torch(module, set())
 
 
-def test_every_torch_room_is_one() -> None:
-    lazy = [room for room in TORCH_MODULES if not any(_reaches_torch(m, set()) for m in MODULES if m.startswith(room))]
+def test_every_torch_package_is_one() -> None:
+    lazy = [name for name in TORCH_PACKAGES if not any(_reaches_torch(m, set()) for m in MODULES if m.startswith(name))]
     assert lazy == [], "these could be opened to the numpy side"
 
 
@@ -183,7 +179,7 @@ def test_importing_the_numpy_side_leaves_torch_unloaded(package: str) -> None:
     names = [
         name
         for name in MODULES
-        if name.split(".")[0] == package and not _loads_torch(name) and not name.endswith("__main__")
+        if name.split(".")[0] == package and not _in_torch_package(name) and not name.endswith("__main__")
     ]
     program = (
         f"import importlib, sys\nfor name in {names!r}:\n    importlib.import_module(name)\n"

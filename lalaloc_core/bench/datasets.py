@@ -12,7 +12,7 @@ from typing import Any
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.data.structured3d import Structured3D
-from lalaloc_core.data.synthesise import PICTURES_PER_ROOM, Synthesis, share_out, synthesise
+from lalaloc_core.data.synthetic.writing import PICTURES_PER_ROOM, Synthesis, share_out, synthesise
 from lalaloc_core.evaluation.predictions import RunFolder, RunInfo
 from lalaloc_core.evaluation.run import run_evaluation
 

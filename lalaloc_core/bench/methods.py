@@ -11,7 +11,7 @@ import numpy as np
 from lalaloc_core.bench.homes import home_of_area
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.data.dataset import Camera
-from lalaloc_core.data.generated import RenderedPhotograph, Studio
+from lalaloc_core.data.synthetic.generated import RenderedPhotograph, Studio
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.methods.icp import Icp
 from lalaloc_core.methods.lalaloc import LaLaLoc, local_refiner

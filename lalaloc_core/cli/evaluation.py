@@ -135,13 +135,13 @@ def _score(arguments: argparse.Namespace) -> None:
 
 
 def _report(arguments: argparse.Namespace) -> None:
-    from lalaloc_core.evaluation.report import write_report
+    from lalaloc_core.report import write_report
 
     write_report(arguments.runs, arguments.out, pictures=arguments.pictures)
 
 
 def _worst(arguments: argparse.Namespace) -> None:
-    from lalaloc_core.evaluation.worst import write_worst
+    from lalaloc_core.report.worst import write_worst
 
     print_json(write_worst(arguments.folder, arguments.out, arguments.count))
 

@@ -33,7 +33,7 @@ def add_commands(commands: Any) -> None:
 
 
 def _synth(arguments: argparse.Namespace) -> None:
-    from lalaloc_core.data.synthesise import Synthesis, share_out, synthesise
+    from lalaloc_core.data.synthetic.writing import Synthesis, share_out, synthesise
 
     settings = Synthesis(root=arguments.out, seed=arguments.seed, height=arguments.height, textures=arguments.textures)
     numbers = share_out(arguments.scenes, arguments.split)

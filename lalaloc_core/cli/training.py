@@ -79,7 +79,7 @@ def _train(arguments: argparse.Namespace) -> None:
     import torch
 
     from lalaloc_core.data.opening import open_dataset
-    from lalaloc_core.data.unfamiliar import UnfamiliarScenes
+    from lalaloc_core.data.synthetic.unfamiliar import UnfamiliarScenes
     from lalaloc_core.training.config import PRESETS
     from lalaloc_core.training.data import TrainingData
     from lalaloc_core.training.run import train_end_to_end, train_image, train_layout
@@ -142,7 +142,7 @@ def _settings(pairs: list[str]) -> dict[str, Any]:
 
 
 def _export(arguments: argparse.Namespace) -> None:
-    from lalaloc_core.training.run import export_run
+    from lalaloc_core.export.run import export_run
 
     pairs = [note.partition("=") for note in arguments.note]
     notes = {"hardware": platform.machine(), **{key: value for key, _, value in pairs}}

@@ -11,9 +11,9 @@ import torch
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.configuration import build_config
 from lalaloc_core.data.dataset import Appearance, Dataset
-from lalaloc_core.data.generated import GeneratedScenes
 from lalaloc_core.data.opening import open_dataset
-from lalaloc_core.data.strangers import StrangeScenes
+from lalaloc_core.data.synthetic.generated import GeneratedScenes
+from lalaloc_core.data.synthetic.mismatched import StrangeScenes
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.evaluation.predictions import RunInfo
 from lalaloc_core.localise.encoders import Encoders
@@ -79,7 +79,7 @@ def build_dataset(info: RunInfo) -> Dataset:
     generator = arguments.pop("generator", "synth")
     if generator == "unfamiliar":
         # Traced by embree, which only the extra `ray` brings.
-        from lalaloc_core.data.unfamiliar import UnfamiliarScenes
+        from lalaloc_core.data.synthetic.unfamiliar import UnfamiliarScenes
 
         return UnfamiliarScenes(**arguments)
     if arguments.get("textures") is not None:

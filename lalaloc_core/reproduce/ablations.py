@@ -17,6 +17,7 @@ import torch
 from lalaloc_core.bundle import MANIFEST_NAME, Bundle
 from lalaloc_core.data.dataset import Dataset
 from lalaloc_core.errors import ConfigError
+from lalaloc_core.export.run import export_run
 from lalaloc_core.nets.resnet import PaperConfig
 from lalaloc_core.sampling import TripletSampling
 from lalaloc_core.training.checkpoint import Checkpoint
@@ -28,7 +29,7 @@ from lalaloc_core.training.config import (
     TrainConfig,
 )
 from lalaloc_core.training.data import TrainingData
-from lalaloc_core.training.run import export_run, train_end_to_end, train_image, train_layout
+from lalaloc_core.training.run import train_end_to_end, train_image, train_layout
 
 Budget = Literal["small", "full"]
 BUDGETS: tuple[Budget, ...] = get_args(Budget)

@@ -9,7 +9,7 @@ from lalaloc_core.synth.lighting import Lighting, draw_backdrop, light_room, rel
 from lalaloc_core.synth.materials import MaterialLibrary
 from lalaloc_core.synth.mirrors import add_mirror, draw_mirror
 from lalaloc_core.synth.openings import Opening
-from lalaloc_core.synth.scene import Fact, Scene
+from lalaloc_core.synth.render_scene import Fact, Scene
 from lalaloc_core.synth.shells import Shells
 from lalaloc_core.synth.shots import Shot
 from lalaloc_core.synth.streams import ScenePart, Streams

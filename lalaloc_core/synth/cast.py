@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lalaloc_core.synth import scene as S
+from lalaloc_core.synth import render_scene as S
 from lalaloc_core.synth.prisms import PrismHits, cross_prisms, gap_behind, resolve_prisms
 
 _CORNER_TOLERANCE = 1e-5

@@ -15,7 +15,7 @@ from lalaloc_core.synth.exposure import NADIR
 from lalaloc_core.synth.furniture import wall_frame
 from lalaloc_core.synth.materials import CATEGORIES, PICTURE_SIZE, MaterialLibrary
 from lalaloc_core.synth.openings import Opening
-from lalaloc_core.synth.scene import Fact, Scene
+from lalaloc_core.synth.render_scene import Fact, Scene
 from lalaloc_core.synth.shots import Shot
 
 FACTS: tuple[Fact, ...] = get_args(Fact)

@@ -14,7 +14,7 @@ from lalaloc_core.floorplan import Room
 from lalaloc_core.synth.furniture import Prism, wall_frame
 from lalaloc_core.synth.openings import Opening
 from lalaloc_core.synth.pieces import Finish
-from lalaloc_core.synth.scene import LIGHT_NORMAL, LIGHT_RGB, SLOT_AMBIENT, SLOT_LIGHT_RGB, Scene
+from lalaloc_core.synth.render_scene import LIGHT_NORMAL, LIGHT_RGB, SLOT_AMBIENT, SLOT_LIGHT_RGB, Scene
 from lalaloc_core.synth.surfaces import BLUE, GLOW, OUTDOORS, RED
 
 Mood = Literal["cold", "raw", "warm"]

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from lalaloc_core.floorplan import Room
 from lalaloc_core.synth.openings import Opening
-from lalaloc_core.synth.scene import (
+from lalaloc_core.synth.render_scene import (
     LIGHT_RGB,
     LIGHT_XYZ,
     PRISM_AX,

@@ -18,7 +18,7 @@ from lalaloc_core.synth.cast import Hits, SceneBatch, trace
 from lalaloc_core.synth.lighting import Mood, relit
 from lalaloc_core.synth.materials import MaterialLibrary
 from lalaloc_core.synth.outdoors import Outdoors
-from lalaloc_core.synth.scene import DECAL_WALL, PRISM_A, PRISM_AX, PRISM_B, PRISM_X, Scene
+from lalaloc_core.synth.render_scene import DECAL_WALL, PRISM_A, PRISM_AX, PRISM_B, PRISM_X, Scene
 from lalaloc_core.synth.shading import Atlas, shade
 from lalaloc_core.synth.shots import Shot, sample_shots
 

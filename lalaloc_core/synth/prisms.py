@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lalaloc_core.synth import scene as S
+from lalaloc_core.synth import render_scene as S
 
 _TINY = 1e-9
 _TIE_M = 1e-5

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lalaloc_core.conventions import TWO_PI, column_azimuths, row_elevations
-from lalaloc_core.synth import scene as S
+from lalaloc_core.synth import render_scene as S
 from lalaloc_core.synth import surfaces as F
 from lalaloc_core.synth.cast import Hits, SceneBatch, cast_own_walls
 from lalaloc_core.synth.materials import PICTURE_SIZE, MaterialLibrary

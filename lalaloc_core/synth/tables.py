@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lalaloc_core.synth.furniture import Prism
-from lalaloc_core.synth.scene import Fact, Scene
+from lalaloc_core.synth.render_scene import Fact, Scene
 from lalaloc_core.synth.shots import Shot
 from lalaloc_core.synth.surfaces import SurfaceTable
 

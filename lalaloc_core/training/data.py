@@ -12,7 +12,7 @@ import torch
 from torch import nn
 
 from lalaloc_core.data.dataset import Appearance, Camera, Dataset, Scene, load_scenes
-from lalaloc_core.data.generated import GeneratedScenes, RenderedPhotograph
+from lalaloc_core.data.synthetic.generated import GeneratedScenes, RenderedPhotograph
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.training.best import Validate
 from lalaloc_core.training.config import TrainConfig

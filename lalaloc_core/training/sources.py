@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float, Int
 
 from lalaloc_core.data.dataset import Camera, Dataset, Scene
-from lalaloc_core.data.generated import Studio
+from lalaloc_core.data.synthetic.generated import Studio
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.sampling import PoseSet, TripletSampling, sample_neighbours, sample_triplets
@@ -26,7 +26,7 @@ from lalaloc_core.synth.panorama import PanoramaRenderer
 from lalaloc_core.synth.shots import sample_shots
 from lalaloc_core.synth.splits import TRAIN, home_of
 from lalaloc_core.training.config import TrainConfig
-from lalaloc_core.training.darkroom import Staged
+from lalaloc_core.training.deferred import Staged
 from lalaloc_core.training.recent import Recent
 
 # Cameras stand at least this far below the ceiling of a neighbour's room.

@@ -14,7 +14,7 @@ from lalaloc_core.nets.resnet import PaperImageEncoder, PaperLayoutEncoder
 from lalaloc_core.nets.ring import RingImageEncoder, RingLayoutEncoder
 from lalaloc_core.training.batches import Batch, receive
 from lalaloc_core.training.config import ImageStageConfig, LayoutStageConfig, OptimiserConfig, TrainConfig
-from lalaloc_core.training.darkroom import Darkroom
+from lalaloc_core.training.deferred import Darkroom
 from lalaloc_core.training.sources import GeneratedSource, Source
 from lalaloc_core.training.stream import PanoramaBatches
 

@@ -14,7 +14,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.training.batches import Batch, Stream, Trouble, fruitful, stacked, worker_share
 from lalaloc_core.training.config import TrainConfig
-from lalaloc_core.training.darkroom import Negative, Negatives, Row, Staged, StagedRow
+from lalaloc_core.training.deferred import Negative, Negatives, Row, Staged, StagedRow
 from lalaloc_core.training.replay import Replay
 from lalaloc_core.training.sources import Group, Source, View
 from lalaloc_core.training.turning import Turn, draw_heading, draw_turn

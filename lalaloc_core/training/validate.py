@@ -21,7 +21,7 @@ from lalaloc_core.nets.resnet import PaperImageEncoder
 from lalaloc_core.sampling import PoseSet, pose_grid
 from lalaloc_core.training import losses
 from lalaloc_core.training.config import TrainConfig
-from lalaloc_core.training.kept_pictures import kept_pictures
+from lalaloc_core.training.picture_cache import kept_pictures
 from lalaloc_core.training.recent import Recent
 from lalaloc_core.training.stream import layouts
 from lalaloc_core.training.turning import Turn, draw_turn

@@ -11,7 +11,7 @@ import safetensors.torch
 import torch
 
 from lalaloc_core.bundle import DECODER_WEIGHTS, IMAGE_ONNX, MANIFEST_NAME, Bundle
-from lalaloc_core.data.generated import GeneratedScenes
+from lalaloc_core.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.errors import BundleError, CheckpointError, ConfigError
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.reproduce import ablations

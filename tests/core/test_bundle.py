@@ -14,7 +14,6 @@ import pytest
 import safetensors.torch
 import torch
 
-from lalaloc_core import export
 from lalaloc_core.bundle import (
     BUNDLE_FILES,
     DECODER_WEIGHTS,
@@ -31,7 +30,8 @@ from lalaloc_core.bundle import (
     write_manifest,
 )
 from lalaloc_core.errors import BundleError, ExportError
-from lalaloc_core.export import PARITY_TOLERANCE, export_bundle
+from lalaloc_core.export import bundle as export
+from lalaloc_core.export.bundle import PARITY_TOLERANCE, export_bundle
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.optimise import LatentPoseOptimiser
 from lalaloc_core.nets import load_decoder

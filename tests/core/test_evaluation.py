@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lalaloc_core.cli import main
-from lalaloc_core.data.generated import GeneratedScenes, RenderedPhotograph
+from lalaloc_core.data.synthetic.generated import GeneratedScenes, RenderedPhotograph
 from lalaloc_core.errors import InvalidInputError, RunError
 from lalaloc_core.evaluation.building import build_dataset, choose_appearance
 from lalaloc_core.evaluation.predictions import PREDICTIONS_FILE, Prediction, RunFolder, RunInfo

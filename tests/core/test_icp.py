@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from scipy.spatial import KDTree
 
 from lalaloc_core.conventions import wrap_angle
-from lalaloc_core.data.generated import GeneratedScenes
+from lalaloc_core.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.errors import DatasetError, InvalidInputError
 from lalaloc_core.methods.icp import Icp, IcpConfig, align, best_motion, merge_cells, scan_of, wall_cloud
 from lalaloc_core.methods.method import Question

@@ -11,7 +11,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lalaloc_core.synth import scene as S
+from lalaloc_core.synth import render_scene as S
 from lalaloc_core.synth.build import build_scene
 from lalaloc_core.synth.exposure import NADIR
 from lalaloc_core.synth.facts import FACTS, facts_of

@@ -25,13 +25,13 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from lalaloc_core.cli import main
-from lalaloc_core.data import synthesise as module
 from lalaloc_core.data.dataset import Split
-from lalaloc_core.data.generated import studio_of
 from lalaloc_core.data.structured3d import FURNITURE, LIGHTING, Structured3D
 from lalaloc_core.data.structured3d_splits import EXCLUDED_BY_PAPER, OFFICIAL, scene_numbers
 from lalaloc_core.data.structured3d_writer import build_annotation, layout_pixels, room_type, write_depth
-from lalaloc_core.data.synthesise import Synthesis, share_out, synthesise
+from lalaloc_core.data.synthetic import writing as module
+from lalaloc_core.data.synthetic.generated import studio_of
+from lalaloc_core.data.synthetic.writing import Synthesis, share_out, synthesise
 from lalaloc_core.errors import DatasetError, InvalidInputError
 from lalaloc_core.render.depth import layout_depth
 from lalaloc_core.render.profile import wall_profile

@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from lalaloc_core.bundle import DECODER_WEIGHTS, IMAGE_ONNX
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.errors import CheckpointError, ConfigError
+from lalaloc_core.export.run import export_run
 from lalaloc_core.metrics import chamfer_distance
 from lalaloc_core.nets import LayoutEncoder
 from lalaloc_core.nets.ring import RingLayoutEncoder
@@ -35,7 +36,7 @@ from lalaloc_core.training.end_to_end import EndToEndStage
 from lalaloc_core.training.image_stage import ImageStage
 from lalaloc_core.training.layout_stage import LayoutStage
 from lalaloc_core.training.loop import run_stage
-from lalaloc_core.training.run import export_run, train_image
+from lalaloc_core.training.run import train_image
 from lalaloc_core.training.sources import GeneratedSource
 from lalaloc_core.training.stages import Stage, build_layout_encoder
 from lalaloc_core.training.stream import LayoutBatches, PanoramaBatches, layouts

@@ -18,7 +18,7 @@ from PIL import Image
 
 from lalaloc_core.cli import main
 from lalaloc_core.data.folder import OwnData
-from lalaloc_core.data.generated import GeneratedScenes
+from lalaloc_core.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.errors import CheckpointError, DatasetError
 from lalaloc_core.sampling import random_poses
 from lalaloc_core.training.batches import Batch, receive

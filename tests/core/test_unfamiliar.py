@@ -14,7 +14,7 @@ import shapely
 from lalaloc_core.cli.evaluation import add_commands
 from lalaloc_core.conventions import column_azimuths
 from lalaloc_core.data.dataset import Appearance, Dataset
-from lalaloc_core.data.unfamiliar import UnfamiliarPhotograph, UnfamiliarScenes
+from lalaloc_core.data.synthetic.unfamiliar import UnfamiliarPhotograph, UnfamiliarScenes
 from lalaloc_core.errors import DatasetError, InvalidInputError
 from lalaloc_core.evaluation.building import build_dataset
 from lalaloc_core.evaluation.predictions import RunInfo

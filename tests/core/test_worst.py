@@ -14,17 +14,17 @@ from lalaloc_core.cli import main
 from lalaloc_core.errors import RunError
 from lalaloc_core.evaluation.failures import Outcome, is_symmetric, outcomes, symmetric_by_chance
 from lalaloc_core.evaluation.predictions import Pose, Prediction, RunFolder, RunInfo
-from lalaloc_core.evaluation.report.sheets import PER_SHEET, Thumbnail, draw_sheet
 from lalaloc_core.evaluation.run import run_evaluation
-from lalaloc_core.evaluation.worst import (
+from lalaloc_core.localise.poses import PredictedProfile, Query
+from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.report.sheets import PER_SHEET, Thumbnail, draw_sheet
+from lalaloc_core.report.worst import (
     SUMMARY_FILE,
     choose_worst,
     predicted_profile_m,
     summarise,
     write_worst,
 )
-from lalaloc_core.localise.poses import PredictedProfile, Query
-from lalaloc_core.render.profile import wall_profile
 from tests.strategies import plan_of, rectangle
 
 # A room from (0, 0) to (6, 4) whose camera stands in its lower left corner.

@@ -17,7 +17,7 @@ import pytest
 from PIL import Image
 
 from lalaloc_core.bundle import Bundle
-from lalaloc_core.data.generated import GeneratedScenes
+from lalaloc_core.data.synthetic.generated import GeneratedScenes
 from tests.service.conftest import StartApp, localise, upload, wait_for
 
 BUNDLE = Path(__file__).parents[2] / "models" / "default"

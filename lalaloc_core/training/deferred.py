@@ -17,7 +17,7 @@ from jaxtyping import Bool, Int, UInt8
 from torch import Tensor
 
 from lalaloc_core.synth.panorama import PanoramaRenderer
-from lalaloc_core.synth.scene import Scene
+from lalaloc_core.synth.render_scene import Scene
 from lalaloc_core.training.batches import Batch, stacked
 from lalaloc_core.training.turning import Turn
 

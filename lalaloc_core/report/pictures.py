@@ -14,9 +14,9 @@ from PIL import Image, ImageDraw
 
 from lalaloc_core.conventions import heading_from_degrees
 from lalaloc_core.evaluation.predictions import Pose
-from lalaloc_core.evaluation.report.plan import Cells, draw_camera, draw_distances, draw_plan, halo
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.report.plan import Cells, draw_camera, draw_distances, draw_plan, halo
 
 PANORAMA_HEIGHT, PANORAMA_WIDTH = 384, 768
 TRUE_COLOUR, FOUND_COLOUR = "#35e0ff", "#ff3b30"

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from lalaloc_core.data.dataset import Appearance, Camera, Photograph, Scene, Split
-from lalaloc_core.data.generated import GeneratedScenes
+from lalaloc_core.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.errors import DatasetError
 
 # One of so many photographs shows no room.

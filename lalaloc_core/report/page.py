@@ -9,10 +9,10 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from lalaloc_core.evaluation.failures import ALIGNMENT_LIMIT_M, Outcome
 from lalaloc_core.evaluation.predictions import RunInfo
-from lalaloc_core.evaluation.report import tables
-from lalaloc_core.evaluation.report.figures import Chart
-from lalaloc_core.evaluation.report.gallery import Gallery
-from lalaloc_core.evaluation.report.reading import Run
+from lalaloc_core.report import tables
+from lalaloc_core.report.figures import Chart
+from lalaloc_core.report.gallery import Gallery
+from lalaloc_core.report.reading import Run
 
 _GROUPS = {
     "best": "Best",
@@ -43,7 +43,7 @@ def render_page(runs: Sequence[Run], charts: Mapping[str, Chart], galleries: Map
         galleries: by number of the run.
     """
     environment = Environment(
-        loader=PackageLoader("lalaloc_core.evaluation.report", "template"),
+        loader=PackageLoader("lalaloc_core.report", "template"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
@@ -52,7 +52,7 @@ def render_page(runs: Sequence[Run], charts: Mapping[str, Chart], galleries: Map
     environment.filters["number"] = tables.number
     environment.filters["percent"] = tables.percent
     environment.filters["distance"] = tables.distance
-    source, _, _ = PackageLoader("lalaloc_core.evaluation.report", "template").get_source(environment, "style.css")
+    source, _, _ = PackageLoader("lalaloc_core.report", "template").get_source(environment, "style.css")
     return environment.get_template("page.html").render(
         title=_title(runs),
         style=source,

@@ -29,10 +29,10 @@ import torch
 from tqdm import tqdm
 
 from lalaloc_core.data.dataset import SPLITS, Split
-from lalaloc_core.data.generated import SPLIT_NUMBERS, studio_of
 from lalaloc_core.data.structured3d import RENDERING_FOLDER, SYNTHETIC_FILE, Structured3D, Synthetic, scene_name
 from lalaloc_core.data.structured3d_splits import scene_numbers
 from lalaloc_core.data.structured3d_writer import room_id, write_annotation, write_camera, write_depth, write_picture
+from lalaloc_core.data.synthetic.generated import SPLIT_NUMBERS, studio_of
 from lalaloc_core.errors import DatasetError, InvalidInputError
 from lalaloc_core.synth.furniture import FURNITURE_LEVELS
 from lalaloc_core.synth.lighting import MOODS

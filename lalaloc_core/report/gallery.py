@@ -12,7 +12,13 @@ from lalaloc_core.errors import LaLaLocError
 from lalaloc_core.evaluation.building import build_dataset, choose_appearance
 from lalaloc_core.evaluation.failures import Outcome, outcomes
 from lalaloc_core.evaluation.predictions import Prediction, RunInfo
-from lalaloc_core.evaluation.report.pictures import (
+from lalaloc_core.evaluation.score import heading_errors_deg, position_errors_m
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.evidence import latent_distances
+from lalaloc_core.methods.lalaloc import encode, read_image
+from lalaloc_core.methods.method import Question
+from lalaloc_core.methods.similarity import ChamferGrid, true_layout
+from lalaloc_core.report.pictures import (
     PANORAMA_HEIGHT,
     PANORAMA_WIDTH,
     DrawnMap,
@@ -20,15 +26,9 @@ from lalaloc_core.evaluation.report.pictures import (
     draw_map,
     draw_panorama,
 )
-from lalaloc_core.evaluation.report.plan import Cells
-from lalaloc_core.evaluation.report.reading import Run
-from lalaloc_core.evaluation.report.reopening import ask_again, find_camera, open_model
-from lalaloc_core.evaluation.score import heading_errors_deg, position_errors_m
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.evidence import latent_distances
-from lalaloc_core.methods.lalaloc import encode, read_image
-from lalaloc_core.methods.method import Question
-from lalaloc_core.methods.similarity import ChamferGrid, true_layout
+from lalaloc_core.report.plan import Cells
+from lalaloc_core.report.reading import Run
+from lalaloc_core.report.reopening import ask_again, find_camera, open_model
 
 PER_GROUP = 3
 BEST, MEDIAN, WORST, MISALIGNED = "best", "median", "worst", "wrong alignment"

@@ -9,11 +9,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from lalaloc_core.evaluation.predictions import write_atomically
-from lalaloc_core.evaluation.report.charts import draw_charts
-from lalaloc_core.evaluation.report.figures import Chart
-from lalaloc_core.evaluation.report.gallery import Gallery, build_gallery
-from lalaloc_core.evaluation.report.page import render_page
-from lalaloc_core.evaluation.report.reading import Run, open_runs
+from lalaloc_core.report.charts import draw_charts
+from lalaloc_core.report.figures import Chart
+from lalaloc_core.report.gallery import Gallery, build_gallery
+from lalaloc_core.report.page import render_page
+from lalaloc_core.report.reading import Run, open_runs
 
 # Of all galleries together; as text they take a third more, and the page is to stay below 5 MB.
 GALLERY_BYTES = 3_400_000

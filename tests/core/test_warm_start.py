@@ -14,18 +14,19 @@ from torch import Tensor, nn
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.cli import main
-from lalaloc_core.data.generated import GeneratedScenes
+from lalaloc_core.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.errors import CheckpointError
-from lalaloc_core.training.beginning import begin_from
+from lalaloc_core.export.run import export_run
 from lalaloc_core.training.checkpoint import Checkpoint
 from lalaloc_core.training.config import PRESETS, TrainConfig
 from lalaloc_core.training.data import TrainingData
 from lalaloc_core.training.image_stage import ImageStage
-from lalaloc_core.training.kept_pictures import kept_pictures
 from lalaloc_core.training.loop import run_stage
-from lalaloc_core.training.run import export_run, train_image, train_layout
+from lalaloc_core.training.picture_cache import kept_pictures
+from lalaloc_core.training.run import train_image, train_layout
 from lalaloc_core.training.sources import GeneratedSource
 from lalaloc_core.training.stages import build_layout_encoder
+from lalaloc_core.training.warm_start import begin_from
 from tests.core.test_training import LineStage, same_weights
 
 CPU = torch.device("cpu")

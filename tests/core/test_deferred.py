@@ -15,7 +15,7 @@ from lalaloc_core.cli import main
 from lalaloc_core.training.batches import Batch, receive
 from lalaloc_core.training.checkpoint import Checkpoint
 from lalaloc_core.training.config import PRESETS, TrainConfig
-from lalaloc_core.training.darkroom import Darkroom, turned
+from lalaloc_core.training.deferred import Darkroom, turned
 from lalaloc_core.training.sources import GeneratedSource
 from lalaloc_core.training.stages import panorama_batches
 from lalaloc_core.training.stream import PanoramaBatches

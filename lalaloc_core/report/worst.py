@@ -23,7 +23,13 @@ from lalaloc_core.errors import LaLaLocError, RunError
 from lalaloc_core.evaluation.building import build_dataset, choose_appearance
 from lalaloc_core.evaluation.failures import Outcome, is_symmetric, outcomes, symmetric_by_chance
 from lalaloc_core.evaluation.predictions import Pose, Prediction, RunFolder, RunInfo, write_atomically
-from lalaloc_core.evaluation.report.pictures import (
+from lalaloc_core.evaluation.score import position_errors_m
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.evidence import EvidenceConfig, profile_costs, targets
+from lalaloc_core.localise.poses import Query
+from lalaloc_core.methods.lalaloc import encode, read_image
+from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.report.pictures import (
     FOUND_COLOUR,
     TRUE_COLOUR,
     Stroke,
@@ -31,21 +37,15 @@ from lalaloc_core.evaluation.report.pictures import (
     layout_lines,
     wall_line,
 )
-from lalaloc_core.evaluation.report.reopening import ask_again, find_camera, open_model
-from lalaloc_core.evaluation.report.sheets import (
+from lalaloc_core.report.reopening import ask_again, find_camera, open_model
+from lalaloc_core.report.sheets import (
     PER_SHEET,
     PICTURE_HEIGHT,
     PICTURE_WIDTH,
     Thumbnail,
     draw_sheet,
 )
-from lalaloc_core.evaluation.report.tables import distance, percent
-from lalaloc_core.evaluation.score import position_errors_m
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.evidence import EvidenceConfig, profile_costs, targets
-from lalaloc_core.localise.poses import Query
-from lalaloc_core.methods.lalaloc import encode, read_image
-from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.report.tables import distance, percent
 
 SUMMARY_FILE = "worst.json"
 PREDICTED_COLOUR = "#ffd60a"

@@ -12,7 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from lalaloc_core.evaluation.failures import Outcome, count_outcomes
-from lalaloc_core.evaluation.report.figures import (
+from lalaloc_core.evaluation.score import position_errors_m
+from lalaloc_core.report.figures import (
     MUTED,
     PAPER,
     SERIES,
@@ -22,9 +23,8 @@ from lalaloc_core.evaluation.report.figures import (
     finish,
     line_styles,
 )
-from lalaloc_core.evaluation.report.reading import Run
-from lalaloc_core.evaluation.report.times import TOTAL, stage_times
-from lalaloc_core.evaluation.score import position_errors_m
+from lalaloc_core.report.reading import Run
+from lalaloc_core.report.times import TOTAL, stage_times
 
 CURVE_LIMITS_M = (0.001, 20.0)
 CONFIDENCE_BINS = 20
