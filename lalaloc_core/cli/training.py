@@ -43,7 +43,7 @@ def add_commands(commands: Any) -> None:
         "--from",
         type=Path,
         metavar="DIR",
-        dest="begin",
+        dest="init_from",
         help="begin with the weights of a bundle or of another run, instead of fresh ones",
     )
     train.add_argument("--resume", action="store_true", help="go on from the checkpoint in --out")
@@ -90,7 +90,7 @@ def _train(arguments: argparse.Namespace) -> None:
         raise InvalidInputError("--skip-bad is for --data")
     if arguments.data is not None and arguments.render is not None:
         raise InvalidInputError("--render is for generated homes, not for --data")
-    if arguments.begin is not None and (arguments.resume or arguments.stage == "end-to-end"):
+    if arguments.init_from is not None and (arguments.resume or arguments.stage == "end-to-end"):
         raise InvalidInputError("--from is for a run of one stage that begins, neither for --resume nor for end-to-end")
     config = PRESETS[arguments.preset].with_settings(_settings(arguments.settings))
     # End-to-end training takes its schedule from the image stage.
@@ -116,15 +116,15 @@ def _train(arguments: argparse.Namespace) -> None:
         dataset=None if arguments.data is None else open_dataset(arguments.data),
         skip_bad=arguments.skip_bad,
         textures=arguments.textures,
-        staged=arguments.data is None and render == "device",
+        deferred=arguments.data is None and render == "device",
         validation_scenes=arguments.validation_homes,
         unfamiliar=None if arguments.data is not None else UnfamiliarScenes(homes=unfamiliar_homes),
     )
     train: Callable[..., Any] = {"layout": train_layout, "image": train_image, "end-to-end": train_end_to_end}[
         arguments.stage
     ]
-    begin = {} if arguments.begin is None else {"begin": arguments.begin}
-    train(config, arguments.out, device=device, data=data, workers=arguments.workers, resume=arguments.resume, **begin)
+    init = {} if arguments.init_from is None else {"init_from": arguments.init_from}
+    train(config, arguments.out, device=device, data=data, workers=arguments.workers, resume=arguments.resume, **init)
 
 
 def _settings(pairs: list[str]) -> dict[str, Any]:

@@ -42,13 +42,13 @@ def export_run(
     last_layout = last and (layout_only or (teacher / f"{JOINT}.pt").exists())
     layout = checkpoint_with("layout", teacher, last=last_layout)
     image = None if layout_only else checkpoint_with("image", folder, last=last)
-    training: dict[str, Any] = {layout.stage: _told(layout, teacher, last=last_layout)}
+    training: dict[str, Any] = {layout.stage: _summary(layout, teacher, last=last_layout)}
     image_encoder = None
     if image is not None:
         check_same_networks(image.config, layout.config, str(teacher))
         image_encoder = build_image_encoder(image.config)
-        image_encoder.load_state_dict(image.best_weights["image_encoder"])
-        training[image.stage] = {**_told(image, folder, last=last), "panoramas": panoramas(image)}
+        image_encoder.load_state_dict(image.inference_weights["image_encoder"])
+        training[image.stage] = {**_summary(image, folder, last=last), "panoramas": panoramas(image)}
     return export_bundle(
         out,
         (image or layout).config,
@@ -61,16 +61,16 @@ def export_run(
     )
 
 
-def _told(checkpoint: Checkpoint, folder: Path, *, last: bool) -> dict[str, Any]:
+def _summary(checkpoint: Checkpoint, folder: Path, *, last: bool) -> dict[str, Any]:
     """What a manifest says of a stage; steps and minutes are those until the chosen checkpoint."""
-    told: dict[str, Any] = {"steps": checkpoint.step, "minutes": round(checkpoint.seconds / 60.0, 1)}
-    told |= checkpoint.metrics
+    summary: dict[str, Any] = {"steps": checkpoint.step, "minutes": round(checkpoint.seconds / 60.0, 1)}
+    summary |= checkpoint.metrics
     path = folder / f"{checkpoint.stage}.pt"
     if best_path(path).exists():
         chosen = {"checkpoint": "last" if last else "best by validation"}
-        told |= {**chosen, "minutes_of_run": round(Checkpoint.load(path).seconds / 60.0, 1)}
+        summary |= {**chosen, "minutes_of_run": round(Checkpoint.load(path).seconds / 60.0, 1)}
     if checkpoint.data:
-        told["data"] = checkpoint.data
+        summary["data"] = checkpoint.data
     if checkpoint.begun_from:
-        told |= {"begun_from": checkpoint.begun_from, **totals(checkpoint)}
-    return told
+        summary |= {"begun_from": checkpoint.begun_from, **totals(checkpoint)}
+    return summary

@@ -22,7 +22,7 @@ from lalaloc_core.localise.poses import Candidate, LatentGrid, Query, Refinement
 from lalaloc_core.localise.retrieval import retrieve, suppress
 from lalaloc_core.localise.vogel import resample
 
-Stage = Literal["retrieval", "vdr", "lpo"]
+SearchStage = Literal["retrieval", "vdr", "lpo"]
 Refine = Literal["none", "vdr", "lpo"]
 # Runs pose optimisation; None when it could not answer (in time).
 Refiner = Callable[[RefinementJob], RefinementResult | None]
@@ -69,9 +69,9 @@ class Localisation:
     """
 
     candidates: list[Candidate]
-    stage: Stage
-    signals: dict[Stage, Signals]
-    best: dict[Stage, Candidate] = field(default_factory=dict)
+    stage: SearchStage
+    signals: dict[SearchStage, Signals]
+    best: dict[SearchStage, Candidate] = field(default_factory=dict)
     timings_ms: dict[str, float] = field(default_factory=dict)
 
 
@@ -158,15 +158,15 @@ def localise_steps(
     """`localise` for who waits for the optimiser elsewhere: stops where poses are to be optimised; see `next_step`."""
     config = config or LocaliseConfig()
     clock = clock or StageClock()
-    stage: Stage = "retrieval"
+    stage: SearchStage = "retrieval"
     starts = config.starts(query)
     with clock.stage("retrieve"):
         # Refined candidates may meet and become one; spare ones then take the free places.
         wanted = max(top_k, starts) + starts
         candidates = retrieve(grid, query, top_k=wanted, separation_m=config.separation_m, evidence=config.evidence)
-    best: dict[Stage, Candidate] = {"retrieval": candidates[0]}
+    best: dict[SearchStage, Candidate] = {"retrieval": candidates[0]}
     # Of a number of candidates that does not depend on how many are asked for.
-    signals: dict[Stage, Signals] = {
+    signals: dict[SearchStage, Signals] = {
         "retrieval": signals_of(query, candidates[: 2 * starts], complete=len(candidates) < 2 * starts)
     }
     if refine in ("vdr", "lpo") and config.vdr_candidates:

@@ -9,7 +9,7 @@ from lalaloc_core.synth.lighting import Lighting, draw_backdrop, light_room, rel
 from lalaloc_core.synth.materials import MaterialLibrary
 from lalaloc_core.synth.mirrors import add_mirror, draw_mirror
 from lalaloc_core.synth.openings import Opening
-from lalaloc_core.synth.render_scene import Fact, Scene
+from lalaloc_core.synth.render_scene import Fact, RenderScene
 from lalaloc_core.synth.shells import Shells
 from lalaloc_core.synth.shots import Shot
 from lalaloc_core.synth.streams import ScenePart, Streams
@@ -19,7 +19,7 @@ from lalaloc_core.synth.tables import SceneTables
 from lalaloc_core.synth.windows import add_curtains, add_radiator, add_window
 
 
-def build_scene(shot: Shot, materials: MaterialLibrary) -> Scene:
+def build_scene(shot: Shot, materials: MaterialLibrary) -> RenderScene:
     """The scene that a shot sees, everything that is random about it drawn from the shot's seed."""
     scene = _Builder(shot, materials).build()
     return scene if shot.lighting is None else relit(scene, shot.lighting)
@@ -47,7 +47,7 @@ class _Builder:
         )
         self._facts: set[Fact] = set()
 
-    def build(self) -> Scene:
+    def build(self) -> RenderScene:
         streams, tables, rng = self._streams, self._tables, self._rng
         streams.begin(ScenePart.MOOD)
         lighting = Lighting(rng, neutral=streams.is_staged, bright=self._is_bright)

@@ -22,7 +22,7 @@ _MAX_DECALS_PER_COLUMN = 10
 
 @dataclass(frozen=True, eq=False)
 class SceneBatch:
-    """Scenes padded to one size and stacked; see `Scene` for the fields."""
+    """Scenes padded to one size and stacked; see `RenderScene` for the fields."""
 
     camera_height_m: Float[Tensor, "b"]
     heading: Float[Tensor, "b"]

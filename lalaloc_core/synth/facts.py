@@ -15,7 +15,7 @@ from lalaloc_core.synth.exposure import NADIR
 from lalaloc_core.synth.furniture import wall_frame
 from lalaloc_core.synth.materials import CATEGORIES, PICTURE_SIZE, MaterialLibrary
 from lalaloc_core.synth.openings import Opening
-from lalaloc_core.synth.render_scene import Fact, Scene
+from lalaloc_core.synth.render_scene import Fact, RenderScene
 from lalaloc_core.synth.shots import Shot
 
 FACTS: tuple[Fact, ...] = get_args(Fact)
@@ -59,7 +59,7 @@ def _facts_of_place(shot: Shot) -> set[Fact]:
     return {fact for fact, true in holds.items() if true}
 
 
-def _facts_of_picture(shot: Shot, scene: Scene) -> set[Fact]:
+def _facts_of_picture(shot: Shot, scene: RenderScene) -> set[Fact]:
     holds: dict[Fact, bool] = {
         "nadir_patch": bool(scene.exposure[NADIR] > 0.0),
         "sun_patch": _sees_sun(shot, scene.sun),

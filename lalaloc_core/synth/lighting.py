@@ -14,7 +14,7 @@ from lalaloc_core.floorplan import Room
 from lalaloc_core.synth.furniture import Prism, wall_frame
 from lalaloc_core.synth.openings import Opening
 from lalaloc_core.synth.pieces import Finish
-from lalaloc_core.synth.render_scene import LIGHT_NORMAL, LIGHT_RGB, SLOT_AMBIENT, SLOT_LIGHT_RGB, Scene
+from lalaloc_core.synth.render_scene import LIGHT_NORMAL, LIGHT_RGB, SLOT_AMBIENT, SLOT_LIGHT_RGB, RenderScene
 from lalaloc_core.synth.surfaces import BLUE, GLOW, OUTDOORS, RED
 
 Mood = Literal["cold", "raw", "warm"]
@@ -90,7 +90,7 @@ def light_room(
     return np.array(lights + rows).reshape(-1, 8), prisms, sun
 
 
-def relit(scene: Scene, mood: Mood) -> Scene:
+def relit(scene: RenderScene, mood: Mood) -> RenderScene:
     """The same scene, shape and materials, in another light; `raw` is the neutral light that it was built with."""
     lamp, sky = np.array(_LAMP_TINTS[mood]), np.array(_SKY_TINTS[mood])
     lights, slots, surfaces = scene.lights.copy(), scene.slots.copy(), scene.surfaces.copy()

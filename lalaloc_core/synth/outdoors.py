@@ -30,7 +30,7 @@ class Outdoors:
     def colour(
         self, backdrop: Float[Tensor, "n 10"], direction: Float[Tensor, "n 2"], slope: Float[Tensor, "n"]
     ) -> Float[Tensor, "n 3"]:
-        """Colour seen along rays; `backdrop` as in `Scene`, one row per ray."""
+        """Colour seen along rays; `backdrop` as in `RenderScene`, one row per ray."""
         azimuth = torch.atan2(direction[:, 0], direction[:, 1]) / TWO_PI
         turn = azimuth + backdrop[:, 8]
         column = (turn.remainder(1.0) * _SIZE).long().clamp(max=_SIZE - 1)

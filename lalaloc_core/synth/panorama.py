@@ -18,7 +18,7 @@ from lalaloc_core.synth.cast import Hits, SceneBatch, trace
 from lalaloc_core.synth.lighting import Mood, relit
 from lalaloc_core.synth.materials import MaterialLibrary
 from lalaloc_core.synth.outdoors import Outdoors
-from lalaloc_core.synth.render_scene import DECAL_WALL, PRISM_A, PRISM_AX, PRISM_B, PRISM_X, Scene
+from lalaloc_core.synth.render_scene import DECAL_WALL, PRISM_A, PRISM_AX, PRISM_B, PRISM_X, RenderScene
 from lalaloc_core.synth.shading import Atlas, shade
 from lalaloc_core.synth.shots import Shot, sample_shots
 
@@ -76,12 +76,12 @@ class PanoramaRenderer:
         return self.render_scenes([build_scene(shot, self._materials) for shot in shots])
 
     @torch.no_grad()
-    def render_scenes(self, scenes: Sequence[Scene]) -> UInt8[Tensor, "b h w 3"]:
+    def render_scenes(self, scenes: Sequence[RenderScene]) -> UInt8[Tensor, "b h w 3"]:
         """Photograph scenes that were built elsewhere, such as in worker processes, with the same materials."""
         step = self._scenes_at_once
         return torch.cat([self._render_at_once(scenes[k : k + step]) for k in range(0, len(scenes), step)])
 
-    def _render_at_once(self, scenes: Sequence[Scene]) -> UInt8[Tensor, "b h w 3"]:
+    def _render_at_once(self, scenes: Sequence[RenderScene]) -> UInt8[Tensor, "b h w 3"]:
         batch = stack_scenes(scenes, self._device)
         direction = self._directions(batch)
         return self._photograph(batch, trace(batch, direction, self._slope), direction)
@@ -138,7 +138,7 @@ def _shrink(radiance: Float[Tensor, "b h w 3"], factor: tuple[int, int]) -> Floa
     return torch.nn.functional.avg_pool2d(planes, factor).permute(0, 2, 3, 1)
 
 
-def stack_scenes(scenes: Sequence[Scene], device: torch.device) -> SceneBatch:
+def stack_scenes(scenes: Sequence[RenderScene], device: torch.device) -> SceneBatch:
     """Pad the tables of scenes to one length and stack them."""
 
     def stack(name: str, dtype: torch.dtype = torch.float32) -> Tensor:

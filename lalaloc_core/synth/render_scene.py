@@ -39,7 +39,7 @@ SLOT_LIGHT_XYZ, SLOT_LIGHT_RGB, SLOT_AMBIENT = slice(3, 6), slice(6, 9), slice(9
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class RenderScene:
     """Everything that one picture is made of.
 
     Attributes:

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lalaloc_core.synth.furniture import Prism
-from lalaloc_core.synth.render_scene import Fact, Scene
+from lalaloc_core.synth.render_scene import Fact, RenderScene
 from lalaloc_core.synth.shots import Shot
 from lalaloc_core.synth.surfaces import SurfaceTable
 
@@ -18,7 +18,7 @@ _JAMB_OVERLAP_M = 1e-4
 
 
 class Decal(NamedTuple):
-    """A rectangle on a wall: the columns of `Scene.decals`."""
+    """A rectangle on a wall: the columns of `RenderScene.decals`."""
 
     wall: int
     s0: float
@@ -31,7 +31,7 @@ class Decal(NamedTuple):
 
 
 class SceneTables:
-    """Collects the tables of one scene; see `Scene` for their rows.
+    """Collects the tables of one scene; see `RenderScene` for their rows.
 
     Args:
         camera_m: camera position (2,) in the plan frame.
@@ -41,8 +41,8 @@ class SceneTables:
         walls_m: ends of the walls in the plan frame; those of the own room come first.
         wall_surfaces: their surfaces.
         decals: later ones cover earlier ones.
-        prisms: rows of `Scene.prisms`, relative to the camera.
-        slots: rows of `Scene.slots`.
+        prisms: rows of `RenderScene.prisms`, relative to the camera.
+        slots: rows of `RenderScene.slots`.
     """
 
     def __init__(self, camera_m: Float[np.ndarray, "2"], surfaces: SurfaceTable) -> None:
@@ -56,7 +56,7 @@ class SceneTables:
         self.slots: list[list[float]] = []
 
     def add_wall(self, ends_m: Float[np.ndarray, "4"], owner: int, surface: int) -> int:
-        """A wall, with its row of `Scene.wall_owner`; returns its index."""
+        """A wall, with its row of `RenderScene.wall_owner`; returns its index."""
         self.walls_m.append(ends_m)
         self._wall_owners.append(owner)
         self.wall_surfaces.append(surface)
@@ -133,9 +133,9 @@ class SceneTables:
         backdrop: Float[np.ndarray, "10"],
         exposure: Float[np.ndarray, "24"],
         facts: Iterable[Fact],
-    ) -> Scene:
-        """The finished scene; see `Scene` for what it has besides the tables."""
-        return Scene(
+    ) -> RenderScene:
+        """The finished scene; see `RenderScene` for what it has besides the tables."""
+        return RenderScene(
             camera_height_m=shot.camera_height_m,
             heading=shot.heading,
             walls_m=np.array(self.walls_m) - np.tile(self.camera_m, 2),

@@ -21,7 +21,7 @@ Batch = dict[str, torch.Tensor]
 
 
 @dataclass(frozen=True)
-class Trouble:
+class LoadFailure:
     """A file that could not be used; `fatal` when training cannot go on without it."""
 
     error: DatasetError
@@ -38,23 +38,23 @@ def worker_share() -> tuple[int, int]:
     return (0, 1) if info is None else (info.id, info.num_workers)
 
 
-def fruitful(draw: Callable[[int], _Drawn | None], first: int, patience: int) -> Iterator[_Drawn]:
+def non_empty(draw: Callable[[int], _Drawn | None], first: int, patience: int) -> Iterator[_Drawn]:
     """What `draw` makes of this worker's share of the visits from number `first` on, without those that give nothing.
 
     Raises:
         DatasetError: `patience` visits in a row gave nothing.
     """
     worker, workers = worker_share()
-    vain = 0
+    empty = 0
     for visit in itertools.count(first + worker, workers):
         drawn = draw(visit)
         if drawn is not None:
-            vain = 0
+            empty = 0
             yield drawn
             continue
-        vain += 1
-        if vain >= patience:
-            raise DatasetError(f"{vain} scenes in a row gave nothing to train on: none is usable and large enough")
+        empty += 1
+        if empty >= patience:
+            raise DatasetError(f"{empty} scenes in a row gave nothing to train on: none is usable and large enough")
 
 
 def stacked(rows: list[dict[str, np.ndarray]]) -> Batch:
@@ -62,7 +62,7 @@ def stacked(rows: list[dict[str, np.ndarray]]) -> Batch:
     return {key: torch.from_numpy(np.stack([row[key] for row in rows])) for key in rows[0]}
 
 
-def receive(stream: Stream, workers: int) -> Iterator[Any]:
+def load_batches(stream: Stream, workers: int) -> Iterator[Any]:
     """Batches from `workers` processes with one thread each; 0 makes them in this process.
 
     What could not be used is logged with its number, once.
@@ -73,13 +73,13 @@ def receive(stream: Stream, workers: int) -> Iterator[Any]:
     options: dict[str, Any] = {}
     if workers:
         options = {"multiprocessing_context": "spawn", "worker_init_fn": _single_thread, "prefetch_factor": 6}
-    yield from _received(DataLoader(stream, batch_size=None, num_workers=workers, **options))
+    yield from _loaded(DataLoader(stream, batch_size=None, num_workers=workers, **options))
 
 
-def _received(items: Iterable[Any]) -> Iterator[Any]:
+def _loaded(items: Iterable[Any]) -> Iterator[Any]:
     left_out: set[str] = set()
     for item in items:
-        if not isinstance(item, Trouble):
+        if not isinstance(item, LoadFailure):
             yield item
         elif item.fatal:
             raise item.error

@@ -10,7 +10,7 @@ from pathlib import Path
 from torch import nn
 
 from lalaloc_core.training.checkpoint import Checkpoint
-from lalaloc_core.training.stages import Stage
+from lalaloc_core.training.stages import TrainingStage
 
 Validate = Callable[[dict[str, nn.Module]], dict[str, float]]
 _LIKELIHOOD, _ACCURACY, _TIE_BREAKER = "val_nll", "val_within_1m", "val_median_cm"
@@ -33,7 +33,7 @@ class BestCheckpoint:
         validate: scores what was kept once more, because validation scenes may have changed when a run resumes.
     """
 
-    def __init__(self, path: Path, stage: Stage, validate: Validate | None, *, resume: bool) -> None:
+    def __init__(self, path: Path, stage: TrainingStage, validate: Validate | None, *, resume: bool) -> None:
         self._path = path
         self._score: tuple[float, ...] | None = None
         if not resume:
@@ -42,7 +42,7 @@ class BestCheckpoint:
             kept = Checkpoint.load(path, stage=stage.name)
             modules = {name: copy.deepcopy(module).eval() for name, module in stage.modules.items()}
             for name, module in modules.items():
-                module.load_state_dict(kept.best_weights[name])
+                module.load_state_dict(kept.inference_weights[name])
             self._score = _score(validate(modules))
 
     def consider(self, checkpoint: Checkpoint) -> None:

@@ -39,7 +39,7 @@ class Checkpoint:
     begun_from: dict[str, Any] = field(default_factory=dict)
 
     @property
-    def best_weights(self) -> dict[str, dict[str, torch.Tensor]]:
+    def inference_weights(self) -> dict[str, dict[str, torch.Tensor]]:
         """What to validate and ship: the averaged weights where there are any."""
         return self.averaged or self.weights
 

@@ -15,9 +15,9 @@ from lalaloc_core.sampling import TripletSampling
 
 Architecture = Literal["ring", "paper"]
 Turns = Literal["any", "quarters", "none"]
-_MOST_RAYS = 8
+_MAX_RAYS = 8
 # Of the spread; errors are cut off at three times that, and no camera stands lower than a metre or so.
-_LARGEST_HEIGHT_ERROR_M = 0.2
+_MAX_HEIGHT_ERROR_M = 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,17 +156,17 @@ class TrainConfig:
         image = self.image
         if not any((image.l2_weight, image.log_ratio_weight, image.kd_weight, image.ring_weight)):
             raise ConfigError("config.image: the weights of all losses on the latent are 0, nothing is learnt")
-        if len(image.supersample) != 2 or not all(1 <= rays <= _MOST_RAYS for rays in image.supersample):
-            raise ConfigError(f"config.image.supersample is {image.supersample}, it must be two of 1 to {_MOST_RAYS}")
+        if len(image.supersample) != 2 or not all(1 <= rays <= _MAX_RAYS for rays in image.supersample):
+            raise ConfigError(f"config.image.supersample is {image.supersample}, it must be two of 1 to {_MAX_RAYS}")
         for name in ("uses_per_panorama", "replay_panoramas"):
             if getattr(image, name) < 1:
                 raise ConfigError(f"config.image.{name} is {getattr(image, name)}, it must be at least 1")
         if not 0.0 <= image.photometric <= 1.0:
             raise ConfigError(f"config.image.photometric is {image.photometric:g}, it must lie within 0 and 1")
-        if not 0.0 <= image.camera_height_error_m <= _LARGEST_HEIGHT_ERROR_M:
+        if not 0.0 <= image.camera_height_error_m <= _MAX_HEIGHT_ERROR_M:
             raise ConfigError(
                 f"config.image.camera_height_error_m is {image.camera_height_error_m:g}, "
-                f"it must lie within 0 and {_LARGEST_HEIGHT_ERROR_M:g} m"
+                f"it must lie within 0 and {_MAX_HEIGHT_ERROR_M:g} m"
             )
         for part in ("layout", "image"):
             optimiser = getattr(self, part).optimiser

@@ -32,7 +32,7 @@ class TrainingData:
         skip_bad: pass over files of the data set that cannot be used, naming each once.
         textures: folder of material pictures for the generator; without it all are procedural.
         validation_scenes: at most this many, spread evenly over the split.
-        staged: the generator's panoramas are photographed on the device that trains, not where homes are made.
+        deferred: the generator's panoramas are rendered on the device that trains, not where homes are made.
         unfamiliar: scenes that are nothing like those trained on; image validation reports those of their validation
             split as well, and nothing is chosen by them.
     """
@@ -40,14 +40,14 @@ class TrainingData:
     dataset: Dataset | None = None
     skip_bad: bool = False
     textures: Path | None = None
-    staged: bool = False
+    deferred: bool = False
     validation_scenes: int = 50
     unfamiliar: Dataset | None = None
 
     def source(self, config: TrainConfig) -> Source:
         """What training looks at."""
         if self.dataset is None:
-            return GeneratedSource(config, self.textures, self.staged)
+            return GeneratedSource(config, self.textures, self.deferred)
         return SceneSource(config, self.dataset, self.skip_bad)
 
     def validation(self, config: TrainConfig) -> list[Scene]:
@@ -90,8 +90,8 @@ class TrainingData:
         """
         usual = None if self.dataset is None else self.dataset.appearances[0]
         problems: list[DatasetError] | None = [] if self.skip_bad else None
-        kept = folder / "validation.npz" if folder is not None and self.dataset is None else None
-        familiar = ImageValidation(config, scenes, layout_encoder, device, usual, problems, kept=kept)
+        cache = folder / "validation.npz" if folder is not None and self.dataset is None else None
+        familiar = ImageValidation(config, scenes, layout_encoder, device, usual, problems, cache=cache)
         _log(problems)
         if self.unfamiliar is None:
             return familiar
@@ -102,7 +102,7 @@ class TrainingData:
             device,
             self.unfamiliar.appearances[0],
             prefix="unfamiliar",
-            kept=None if folder is None else folder / "unfamiliar.npz",
+            cache=None if folder is None else folder / "unfamiliar.npz",
         )
         return lambda modules: familiar(modules) | others(modules)
 
@@ -115,7 +115,7 @@ def _log(problems: list[DatasetError] | None) -> None:
 def _with_levels(scene: Scene) -> Scene:
     """A generated scene whose photographs say how full the rooms were drawn."""
 
-    def told(camera: Camera) -> Camera:
+    def with_level(camera: Camera) -> Camera:
         photographs = {
             Appearance(photograph.shot.furniture): photograph
             for photograph in camera.photographs.values()
@@ -123,4 +123,4 @@ def _with_levels(scene: Scene) -> Scene:
         }
         return dataclasses.replace(camera, photographs=photographs)
 
-    return dataclasses.replace(scene, cameras=tuple(told(camera) for camera in scene.cameras))
+    return dataclasses.replace(scene, cameras=tuple(with_level(camera) for camera in scene.cameras))

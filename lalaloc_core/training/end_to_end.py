@@ -29,6 +29,7 @@ class EndToEndStage:
     """
 
     name = "end-to-end"
+    teacher = None
 
     def __init__(self, config: TrainConfig, source: Source) -> None:
         if config.architecture != "paper":
@@ -48,6 +49,11 @@ class EndToEndStage:
     def settings(self) -> ImageStageConfig:
         """Schedule, batch and the weight of the latent distance; the rest is in `config.layout`."""
         return self.config.image
+
+    @property
+    def ema_decay(self) -> float:
+        """Decay per step of the averaged weights."""
+        return self.settings.ema_decay
 
     @property
     def data(self) -> dict[str, Any]:

@@ -40,6 +40,11 @@ class ImageStage:
         return self.config.image
 
     @property
+    def ema_decay(self) -> float:
+        """Decay per step of the averaged weights."""
+        return self.settings.ema_decay
+
+    @property
     def data(self) -> dict[str, Any]:
         """What is trained on."""
         return self.source.data

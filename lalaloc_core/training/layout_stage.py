@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import Tensor, nn
 
-from lalaloc_core.training.batches import Batch, receive
+from lalaloc_core.training.batches import Batch, load_batches
 from lalaloc_core.training.config import LayoutStageConfig, TrainConfig
 from lalaloc_core.training.objective import LayoutObjective
 from lalaloc_core.training.sources import Source
@@ -19,6 +19,8 @@ class LayoutStage:
     """Stage 1: the layout encoder learns that latent distance means structural difference."""
 
     name = "layout"
+    teacher = None
+    ema_decay = 0.0
 
     def __init__(self, config: TrainConfig, source: Source) -> None:
         self.config = config
@@ -44,7 +46,7 @@ class LayoutStage:
         """Triplet batches; a resumed run goes on with homes, or parts of the epoch, that it has not seen."""
         # Twice the homes of a step: some are too small to give triplets.
         first = 2 * first_step * self.settings.homes_per_step
-        return receive(LayoutBatches(self.config, self.source, first), workers)
+        return load_batches(LayoutBatches(self.config, self.source, first), workers)
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Weighted losses of a batch by name; their sum is minimised."""

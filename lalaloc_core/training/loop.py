@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import copy
 import csv
 import dataclasses
 import logging
 import math
 import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel
 from tqdm import tqdm
 
 from lalaloc_core.errors import CheckpointError
@@ -20,14 +21,14 @@ from lalaloc_core.training.batches import Batch
 from lalaloc_core.training.best import BestCheckpoint, Validate, best_path
 from lalaloc_core.training.checkpoint import Checkpoint
 from lalaloc_core.training.config import OptimiserConfig, TrainConfig
-from lalaloc_core.training.stages import Stage, build_optimiser
+from lalaloc_core.training.stages import TrainingStage, build_optimiser
 
 _LOG = logging.getLogger(__name__)
 _LOG_EVERY = 20
 
 
 def run_stage(
-    stage: Stage,
+    stage: TrainingStage,
     folder: Path,
     *,
     device: torch.device,
@@ -74,7 +75,7 @@ def run_stage(
             finished = trainer.progress >= 1.0
             if finished or time.monotonic() - last_saved > 60.0 * checkpoint_minutes:
                 if validate is not None:
-                    trainer.metrics = validate(trainer.averaged or stage.modules)
+                    trainer.metrics = validate(trainer.inference_modules)
                     log.write(trainer.step, trainer.seconds, trainer.metrics)
                     _LOG.info("step %d: %s", trainer.step, trainer.metrics)
                 checkpoint = trainer.checkpoint()
@@ -87,21 +88,26 @@ def run_stage(
 class _Trainer:
     """Parameters, optimiser, averages and progress of one stage."""
 
-    def __init__(self, stage: Stage, device: torch.device) -> None:
+    def __init__(self, stage: TrainingStage, device: torch.device) -> None:
         self.stage = stage
         self.device = device
         self.settings = stage.settings
         for module in stage.modules.values():
             module.to(device).train()
-        if isinstance(teacher := getattr(stage, "teacher", None), nn.Module):
-            teacher.to(device)
+        if stage.teacher is not None:
+            stage.teacher.to(device)
         self.optimiser = build_optimiser(stage.modules, self.settings.optimiser)
-        self.decay = getattr(self.settings, "ema_decay", 0.0)
-        self.averaged = {k: copy.deepcopy(m).eval() for k, m in stage.modules.items()} if self.decay else {}
+        self._trained = nn.ModuleDict(stage.modules)
+        self._averaged = _moving_average(self._trained, stage.ema_decay) if stage.ema_decay else None
         self.step = 0
         self.seconds = 0.0
         self.metrics: dict[str, float] = {}
         self.begun_from: dict[str, Any] = {}
+
+    @property
+    def inference_modules(self) -> dict[str, nn.Module]:
+        """What to validate: the modules with averaged weights where averaging is on."""
+        return self.stage.modules if self._averaged is None else dict(self._averaged.module.named_children())
 
     @property
     def progress(self) -> float:
@@ -131,28 +137,17 @@ class _Trainer:
             nn.utils.clip_grad_norm_(parameters, self.settings.optimiser.clip_norm)
         self.optimiser.step()
         self.step += 1
-        self._average()
+        if self._averaged is not None:
+            self._averaged.update_parameters(self._trained)
         return {name: term.item() for name, term in terms.items()}
-
-    @torch.no_grad()
-    def _average(self) -> None:
-        # Early steps would weigh too long at full decay.
-        decay = min(self.decay, (1.0 + self.step) / (10.0 + self.step))
-        for name, average in self.averaged.items():
-            source = self.stage.modules[name].state_dict()
-            for key, value in average.state_dict().items():
-                if value.is_floating_point():
-                    value.lerp_(source[key], 1.0 - decay)
-                else:
-                    value.copy_(source[key])
 
     def checkpoint(self) -> Checkpoint:
         """The present state."""
         return Checkpoint(
             stage=self.stage.name,
             config=self.stage.config,
-            weights={name: module.state_dict() for name, module in self.stage.modules.items()},
-            averaged={name: module.state_dict() for name, module in self.averaged.items()},
+            weights=_states(self.stage.modules),
+            averaged={} if self._averaged is None else _states(self.inference_modules),
             optimiser=self.optimiser.state_dict(),
             step=self.step,
             seconds=self.seconds,
@@ -169,11 +164,34 @@ class _Trainer:
             raise CheckpointError(f"the checkpoint was trained on {checkpoint.data}, not on {self.stage.data}")
         for name, module in self.stage.modules.items():
             module.load_state_dict(checkpoint.weights[name])
-        for name, module in self.averaged.items():
-            module.load_state_dict(checkpoint.averaged[name])
+        if self._averaged is not None:
+            for name, module in self.inference_modules.items():
+                module.load_state_dict(checkpoint.averaged[name])
+            self._averaged.n_averaged.fill_(1 + checkpoint.step)
         self.optimiser.load_state_dict(checkpoint.optimiser)
         self.step, self.seconds, self.metrics = checkpoint.step, checkpoint.seconds, checkpoint.metrics
         self.begun_from = checkpoint.begun_from
+
+
+def _moving_average(modules: nn.ModuleDict, decay: float) -> AveragedModel:
+    """Exponential moving average of all weights and statistics, in evaluation mode; the fresh weights count as one."""
+
+    def update(averaged: Iterable[Tensor], current: Iterable[Tensor], count: Tensor | int) -> None:
+        # Early steps would weigh too long at full decay.
+        share = 1.0 - min(decay, (1.0 + int(count)) / (10.0 + int(count)))
+        for average, value in zip(averaged, current, strict=True):
+            if average.is_floating_point():
+                average.lerp_(value, share)
+            else:
+                average.copy_(value)
+
+    average = AveragedModel(modules, multi_avg_fn=update, use_buffers=True).eval()
+    average.n_averaged.fill_(1)
+    return average
+
+
+def _states(modules: dict[str, nn.Module]) -> dict[str, dict[str, Tensor]]:
+    return {name: module.state_dict() for name, module in modules.items()}
 
 
 def _lasting(config: TrainConfig) -> TrainConfig:

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 # Keeps log and its gradient finite when two latents coincide.
-_SMALLEST_DISTANCE = 1e-4
+_MIN_DISTANCE = 1e-4
 
 
 def log_ratio(
@@ -57,10 +57,10 @@ def ring_distillation(student: Float[Tensor, "b c s"], teacher: Float[Tensor, "b
 def laplace(
     log_profile: Float[Tensor, "b w"], log_scale: Float[Tensor, "b w"], profile_m: Float[Tensor, "b w"]
 ) -> Tensor:
-    """Negative log likelihood of the true log wall profile under the predicted Laplace distributions."""
+    """DeferredBatch log likelihood of the true log wall profile under the predicted Laplace distributions."""
     error = (log_profile - torch.log(profile_m)).abs()
     return (error * torch.exp(-log_scale) + log_scale).mean()
 
 
 def _safe_log(distance: Tensor) -> Tensor:
-    return torch.log(distance.square() + _SMALLEST_DISTANCE**2) / 2.0
+    return torch.log(distance.square() + _MIN_DISTANCE**2) / 2.0

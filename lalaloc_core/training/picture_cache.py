@@ -1,4 +1,4 @@
-"""Pictures that are rendered once for a run and kept in its folder: validation asks with the same ones every time."""
+"""A cache of rendered pictures in a run's folder: validation asks with the same ones every time."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 
-def kept_pictures(
+def cached_pictures(
     path: Path | None, about: list[bytes], make: Callable[[], UInt8[np.ndarray, "n h w 3"]]
 ) -> UInt8[np.ndarray, "n h w 3"]:
     """Pictures from a file, made and written there where it is missing, damaged or of other pictures.

@@ -19,7 +19,7 @@ from lalaloc_core.training.layout_stage import LayoutStage
 from lalaloc_core.training.loop import run_stage
 from lalaloc_core.training.trained import load_layout_encoder_of
 from lalaloc_core.training.validate import LayoutValidation
-from lalaloc_core.training.warm_start import begin_from, check_same_networks, checkpoint_with
+from lalaloc_core.training.warm_start import check_same_networks, checkpoint_with, load_warm_start
 
 ONLINE = TrainingData()
 
@@ -32,12 +32,12 @@ def train_layout(
     data: TrainingData = ONLINE,
     workers: int = 1,
     resume: bool = False,
-    begin: Path | None = None,
+    init_from: Path | None = None,
 ) -> Checkpoint:
     """Stage 1 into `folder`.
 
     Args:
-        begin: a bundle or a run's folder with whose weights to begin; a run that resumes has begun already.
+        init_from: a bundle or a run's folder whose weights training begins with; not for a run that resumes.
 
     Raises:
         CheckpointError: what to begin or to go on with is missing, or has other networks.
@@ -45,7 +45,7 @@ def train_layout(
     """
     torch.manual_seed(config.seed)
     stage = LayoutStage(config, data.source(config))
-    begun_from = None if begin is None else _begin(stage, begin, "layout")
+    begun_from = None if init_from is None else _warm_start(stage, init_from, "layout")
     scenes = data.validation(config)
     validate = LayoutValidation(config, scenes, device) if scenes else None
     return run_stage(
@@ -53,11 +53,11 @@ def train_layout(
     )
 
 
-def _begin(stage: LayoutStage | ImageStage, folder: Path, name: str) -> dict[str, Any]:
-    """Give a stage the weights to begin with; returns what is told of their origin."""
-    beginning = begin_from(folder, name, stage.config)
-    beginning.load_into(stage.modules)
-    return beginning.told
+def _warm_start(stage: LayoutStage | ImageStage, folder: Path, name: str) -> dict[str, Any]:
+    """Initialise a stage with trained weights; returns what checkpoints say of their origin."""
+    found = load_warm_start(folder, name, stage.config)
+    found.load_into(stage.modules)
+    return found.origin
 
 
 def train_image(
@@ -69,12 +69,12 @@ def train_image(
     teacher: Path | None = None,
     workers: int = 1,
     resume: bool = False,
-    begin: Path | None = None,
+    init_from: Path | None = None,
 ) -> Checkpoint:
     """Stage 2 into `folder`, against the layout encoder that stage 1 left there, or in the folder `teacher`.
 
     Args:
-        begin: a bundle or a run's folder with whose image encoder to begin; a run that resumes has begun already.
+        init_from: a bundle or a run's folder whose image encoder training begins with; not for a run that resumes.
             Where `folder` has no layout encoder and no other teacher is named, it gets the one from there.
 
     Raises:
@@ -82,14 +82,14 @@ def train_image(
         DatasetError: a file of the data set cannot be used.
     """
     torch.manual_seed(config.seed + 1)
-    if begin is not None and teacher is None and not (folder / "layout.pt").exists():
-        found = begin_from(begin, "layout", config).checkpoint
+    if init_from is not None and teacher is None and not (folder / "layout.pt").exists():
+        found = load_warm_start(init_from, "layout", config).checkpoint
         dataclasses.replace(found, stage="layout").save(folder / "layout.pt")
     teacher = teacher or folder
     check_same_networks(config, checkpoint_with("layout", teacher).config, str(teacher))
     layout_encoder = load_layout_encoder_of(teacher)
     stage = ImageStage(config, data.source(config), layout_encoder)
-    begun_from = None if begin is None else _begin(stage, begin, "image")
+    begun_from = None if init_from is None else _warm_start(stage, init_from, "image")
     scenes = data.validation(config)
     validate = data.image_validation(config, scenes, layout_encoder, device, folder) if scenes else None
     return run_stage(

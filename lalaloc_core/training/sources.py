@@ -8,14 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
+from cachetools import LRUCache, cachedmethod
 from jaxtyping import Float, Int
 
-from lalaloc_core.data.dataset import Camera, Dataset, Scene
+from lalaloc_core.data.dataset import Appearance, Camera, Dataset, Scene
 from lalaloc_core.data.synthetic.generated import Studio
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
@@ -26,17 +28,16 @@ from lalaloc_core.synth.panorama import PanoramaRenderer
 from lalaloc_core.synth.shots import sample_shots
 from lalaloc_core.synth.splits import TRAIN, home_of
 from lalaloc_core.training.config import TrainConfig
-from lalaloc_core.training.deferred import Staged
-from lalaloc_core.training.recent import Recent
+from lalaloc_core.training.deferred import DeferredScene
 
 # Cameras stand at least this far below the ceiling of a neighbour's room.
 _HEADROOM_M = 0.1
-_LOWEST_CAMERA_M, _HIGHEST_CAMERA_M = 1.0, 1.9
+_MIN_CAMERA_M, _MAX_CAMERA_M = 1.0, 1.9
 _CEILING_CLEARANCE_M = 0.3
 # Share of generated panoramas from thresholds, beside walls, in corridors and closets.
 _HARD_SHARE = 0.25
-_SCENES_KEPT = 256
-_PICTURE_BYTES_KEPT = 1 << 28
+_SCENES_CACHED = 256
+_PICTURE_BYTES_CACHED = 1 << 28
 # Visits in a row without any use after which there is something wrong with the generator.
 _GENERATOR_PATIENCE = 1000
 
@@ -53,14 +54,14 @@ class Group:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class View:
-    """A panorama and the pose it was taken from; `image` is (h, w, 3) RGB bytes, or what is yet to be photographed."""
+    """A panorama and the pose it was taken from; `image` is (h, w, 3) RGB bytes, or a scene yet to be rendered."""
 
     plan: FloorPlan
     position_m: Float[np.ndarray, "2"]
     room_index: int
     heading: float
     camera_height_m: float
-    image: np.ndarray | Staged
+    image: np.ndarray | DeferredScene
 
     def group(self, sampling: TripletSampling, rng: np.random.Generator) -> Group | None:
         """Its pose with neighbours; None where the plan is too small for them."""
@@ -76,11 +77,11 @@ class Source(Protocol):
         patience: visits in a row that may give nothing.
         skip_bad: whether files that cannot be used are passed over.
         problems: errors of what was passed over since this list was last emptied.
-        staged: whether its panoramas are scenes that are yet to be photographed.
+        deferred: whether its panoramas are scenes that are yet to be rendered.
     """
 
     @property
-    def staged(self) -> bool: ...
+    def deferred(self) -> bool: ...
 
     @property
     def data(self) -> dict[str, Any]: ...
@@ -121,12 +122,12 @@ class GeneratedSource:
 
     Attributes:
         textures: folder of material pictures; without it all are procedural.
-        staged: panoramas are scenes, to be photographed by `renderer` elsewhere.
+        deferred: panoramas are scenes, to be rendered by `renderer` elsewhere.
     """
 
     config: TrainConfig
     textures: Path | None = None
-    staged: bool = False
+    deferred: bool = False
     _studio: Studio | None = field(default=None, init=False)
     patience = _GENERATOR_PATIENCE
     skip_bad = False
@@ -159,7 +160,7 @@ class GeneratedSource:
                     position_m=poses.position_m[row],
                     room_index=poses.room_index[row],
                     camera_height_m=float(
-                        rng.uniform(_LOWEST_CAMERA_M, min(_HIGHEST_CAMERA_M, lowest - _CEILING_CLEARANCE_M))
+                        rng.uniform(_MIN_CAMERA_M, min(_MAX_CAMERA_M, lowest - _CEILING_CLEARANCE_M))
                     ),
                 )
             )
@@ -172,10 +173,10 @@ class GeneratedSource:
         # Made where it is needed: it does not travel to worker processes.
         self._studio = self._studio or self._studio_on("cpu")
         scenes = [build_scene(shot, self._studio.materials) for shot in shots]
-        images: Sequence[np.ndarray | Staged]
-        if self.staged:
+        images: Sequence[np.ndarray | DeferredScene]
+        if self.deferred:
             first = visit * stage.shots_per_home
-            images = [Staged(number=first + k, scene=scene) for k, scene in enumerate(scenes)]
+            images = [DeferredScene(number=first + k, scene=scene) for k, scene in enumerate(scenes)]
         else:
             images = list(self._studio.renderer(height, width, stage.supersample).render_scenes(scenes).numpy())
         return [
@@ -191,11 +192,21 @@ class GeneratedSource:
         ]
 
     def renderer(self, device: torch.device) -> PanoramaRenderer:
-        """Photographs staged panoramas as `views` would have."""
+        """Renders deferred panoramas as `views` would have."""
         return self._studio_on(device).renderer(*self.config.image_size, self.config.image.supersample)
 
     def _studio_on(self, device: torch.device | str) -> Studio:
         return Studio(MaterialLibrary.create(np.random.default_rng(self.config.seed), self.textures), device)
+
+
+def _picture_key(
+    _: SceneSource, scene: Scene, camera: Camera, look: Appearance, height: int, width: int
+) -> tuple[Any, ...]:
+    return scene.name, camera.name, look, height, width
+
+
+def _bytes_of(image: np.ndarray) -> int:
+    return image.nbytes
 
 
 @dataclass(eq=False)
@@ -209,15 +220,15 @@ class SceneSource:
     dataset: Dataset
     skip_bad: bool = False
     problems: list[DatasetError] = field(default_factory=list, init=False)
-    staged = False
+    deferred = False
 
     def __post_init__(self) -> None:
         self._names = tuple(self.dataset.scenes("train"))
         if not self._names:
             raise DatasetError(f"{self.dataset.description} has no training scenes")
-        self._scenes: Recent[Scene | None] = Recent(_SCENES_KEPT)
-        self._pictures: Recent[np.ndarray] = Recent(_PICTURE_BYTES_KEPT, _bytes_of)
-        self._orders: Recent[np.ndarray] = Recent(1)
+        self._scenes: LRUCache[str, Scene | None] = LRUCache(_SCENES_CACHED)
+        self._pictures: LRUCache[tuple[Any, ...], np.ndarray] = LRUCache(_PICTURE_BYTES_CACHED, _bytes_of)
+        self._orders: LRUCache[int, np.ndarray] = LRUCache(1)
 
     @property
     def data(self) -> dict[str, Any]:
@@ -267,13 +278,13 @@ class SceneSource:
 
     def _scene(self, visit: int) -> Scene | None:
         epoch, place = divmod(visit, len(self._names))
-        order = self._orders.get(epoch, lambda: self._shuffled(epoch))
-        name = self._names[order[place]]
-        return self._scenes.get(name, lambda: self._load(name))
+        return self._load(self._names[self._shuffled(epoch)[place]])
 
+    @cachedmethod(attrgetter("_orders"))
     def _shuffled(self, epoch: int) -> np.ndarray:
         return np.random.default_rng([8, self.config.seed, epoch]).permutation(len(self._names))
 
+    @cachedmethod(attrgetter("_scenes"))
     def _load(self, name: str) -> Scene | None:
         if not self.skip_bad:
             return self.dataset.load(name)
@@ -292,18 +303,16 @@ class SceneSource:
             return None
         look = looks[rng.integers(len(looks))]
         try:
-            return self._pictures.get(
-                (scene.name, camera.name, look, width), lambda: camera.photographs[look].image(height, width)
-            )
+            return self._read(scene, camera, look, height, width)
         except DatasetError as error:
             if not self.skip_bad:
                 raise
             self.problems.append(error)
             return None
 
-
-def _bytes_of(image: np.ndarray) -> int:
-    return image.nbytes
+    @cachedmethod(attrgetter("_pictures"), key=_picture_key)
+    def _read(self, scene: Scene, camera: Camera, look: Appearance, height: int, width: int) -> np.ndarray:
+        return camera.photographs[look].image(height, width)
 
 
 def _group_around(

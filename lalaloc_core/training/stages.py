@@ -12,20 +12,33 @@ from lalaloc_core.nets import ImageEncoder, LayoutEncoder
 from lalaloc_core.nets.decoder import LayoutDecoder
 from lalaloc_core.nets.resnet import PaperImageEncoder, PaperLayoutEncoder
 from lalaloc_core.nets.ring import RingImageEncoder, RingLayoutEncoder
-from lalaloc_core.training.batches import Batch, receive
+from lalaloc_core.training.batches import Batch, load_batches
 from lalaloc_core.training.config import ImageStageConfig, LayoutStageConfig, OptimiserConfig, TrainConfig
-from lalaloc_core.training.deferred import Darkroom
+from lalaloc_core.training.deferred import DeferredRenderer
 from lalaloc_core.training.sources import GeneratedSource, Source
 from lalaloc_core.training.stream import PanoramaBatches
 
 
 @runtime_checkable
-class Stage(Protocol):
-    """What the training loop needs to know of a stage; `data` says what it is trained on."""
+class TrainingStage(Protocol):
+    """What the training loop needs to know of a stage.
+
+    Attributes:
+        modules: the networks that are trained, by name.
+        teacher: a frozen network that the losses ask, on the device of the others; None for none.
+        ema_decay: decay per step of the averaged weights; 0 turns averaging off.
+        data: what checkpoints and manifests say of what it is trained on.
+    """
 
     name: str
     config: TrainConfig
     modules: dict[str, nn.Module]
+
+    @property
+    def teacher(self) -> nn.Module | None: ...
+
+    @property
+    def ema_decay(self) -> float: ...
 
     @property
     def settings(self) -> LayoutStageConfig | ImageStageConfig: ...
@@ -60,12 +73,12 @@ def panorama_batches(
 
     Args:
         neighbours: whether rows have the layouts of neighbours.
-        device: where staged panoramas are photographed.
+        device: where deferred panoramas are rendered.
     """
     first = first_step * (config.image.batch // config.image.shots_per_home + 1)
-    batches = receive(PanoramaBatches(config, source, neighbours, first), workers)
-    if isinstance(source, GeneratedSource) and source.staged:
-        return Darkroom(source.renderer(device)).developed(batches)
+    batches = load_batches(PanoramaBatches(config, source, neighbours, first), workers)
+    if isinstance(source, GeneratedSource) and source.deferred:
+        return DeferredRenderer(source.renderer(device)).rendered(batches)
     return batches
 
 

@@ -12,9 +12,9 @@ from jaxtyping import Float, Int
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.render.profile import wall_profile
-from lalaloc_core.training.batches import Batch, Stream, Trouble, fruitful, stacked, worker_share
+from lalaloc_core.training.batches import Batch, LoadFailure, Stream, non_empty, stacked, worker_share
 from lalaloc_core.training.config import TrainConfig
-from lalaloc_core.training.deferred import Negative, Negatives, Row, Staged, StagedRow
+from lalaloc_core.training.deferred import DeferredBatch, DeferredBatcher, DeferredRow, DeferredScene, Row
 from lalaloc_core.training.replay import Replay
 from lalaloc_core.training.sources import Group, Source, View
 from lalaloc_core.training.turning import Turn, draw_heading, draw_turn
@@ -35,7 +35,7 @@ class LayoutBatches(Stream):
     source: Source
     first: int = 0
 
-    def __iter__(self) -> Iterator[Batch | Trouble]:
+    def __iter__(self) -> Iterator[Batch | LoadFailure]:
         size = self.config.layout.homes_per_step * self.config.layout.anchors_per_home
         return _batches(self._visit, stacked, self.source, size, self.first)
 
@@ -46,7 +46,7 @@ class LayoutBatches(Stream):
     def _row(self, group: Group, rng: np.random.Generator) -> Row:
         stage, turns = self.config.layout, self.config.turns
         size = len(group.position_m)
-        # One heading for all turns the whole plan; some negatives stand where positives do and look elsewhere.
+        # One heading for all turns the whole plan; some negatives stand where positives do, at another heading.
         chosen, heading = np.arange(size), np.full(size, draw_heading(turns, rng))
         turned = int(stage.turned_share * stage.triplets.negatives)
         if turned:
@@ -67,10 +67,10 @@ class LayoutBatches(Stream):
 class PanoramaBatches(Stream):
     """Stage 2: panoramas with their layouts, turned and mirrored together.
 
-    Each batch holds `image` (b, h, w, 3) uint8, `profile_m` (b, columns), `camera_height_m` (b) as it is told,
+    Each batch holds `image` (b, h, w, 3) uint8, `profile_m` (b, columns), `camera_height_m` (b) as it is given,
     `ceiling_height_m` (b), and where a loss compares with neighbours, `neighbour_profile_m` (b, n, columns) and
-    `neighbour_ceiling_height_m` (b, n), which are turned and mirrored as their panorama is. From a source of staged
-    panoramas come `Negative`s of such batches.
+    `neighbour_ceiling_height_m` (b, n), which are turned and mirrored as their panorama is. From a source
+    whose rendering is deferred come `DeferredBatch`es.
     """
 
     config: TrainConfig
@@ -78,12 +78,12 @@ class PanoramaBatches(Stream):
     neighbours: bool = False
     first: int = 0
 
-    def __iter__(self) -> Iterator[Batch | Negative | Trouble]:
+    def __iter__(self) -> Iterator[Batch | DeferredBatch | LoadFailure]:
         stage, (_, workers) = self.config.image, worker_share()
         replay: Replay[View] = Replay(stage.uses_per_panorama, stage.replay_panoramas // workers)
-        negatives = Negatives(stage.uses_per_panorama)
+        batcher = DeferredBatcher(stage.uses_per_panorama)
 
-        def pictured(visit: int) -> list[Row] | None:
+        def rendered(visit: int) -> list[Row] | None:
             drawn = self._drawn(visit, replay)
             return [
                 row | {"image": turn.picture(view.image)}
@@ -91,22 +91,22 @@ class PanoramaBatches(Stream):
                 if row is not None and isinstance(view.image, np.ndarray)
             ] or None
 
-        def staged(visit: int) -> list[StagedRow] | None:
+        def deferred(visit: int) -> list[DeferredRow] | None:
             rows = []
             for view, turn, row in self._drawn(visit, replay):
-                assert isinstance(view.image, Staged)
+                assert isinstance(view.image, DeferredScene)
                 if row is None:
-                    negatives.lose(view.image)
+                    batcher.drop(view.image)
                 else:
-                    rows.append(StagedRow(view.image, turn, row))
+                    rows.append(DeferredRow(view.image, turn, row))
             return rows or None
 
-        if self.source.staged:
-            return _batches(staged, negatives.pack, self.source, stage.batch, self.first)
-        return _batches(pictured, stacked, self.source, stage.batch, self.first)
+        if self.source.deferred:
+            return _batches(deferred, batcher.pack, self.source, stage.batch, self.first)
+        return _batches(rendered, stacked, self.source, stage.batch, self.first)
 
     def _drawn(self, visit: int, replay: Replay[View]) -> list[tuple[View, Turn, Row | None]]:
-        """What a visit shows, how it is turned, and the rest of its rows: None where neighbours are wanted in vain."""
+        """What a visit shows, how it is turned, and the rest of its rows: None where there are no neighbours."""
         rng = self.source.rng(visit)
         drawn = []
         for new in self.source.views(visit, *self.config.image_size):
@@ -161,22 +161,22 @@ def _batches(
     source: Source,
     size: int,
     first: int,
-) -> Iterator[_Packed | Trouble]:
-    """What the visits from number `first` on draw, `size` to a batch, with what was passed over in between."""
+) -> Iterator[_Packed | LoadFailure]:
+    """What the visits from number `first` on draw, `size` to a batch, with what could not be loaded in between."""
     rows: list[_Drawn] = []
     try:
-        for drawn in fruitful(visit, first, source.patience):
+        for drawn in non_empty(visit, first, source.patience):
             rows += drawn
             if len(rows) >= size:
-                yield from _troubles(source)
+                yield from _failures(source)
                 yield pack(rows[:size])
                 rows = rows[size:]
     except DatasetError as error:
-        yield from _troubles(source)
-        yield Trouble(error, fatal=True)
+        yield from _failures(source)
+        yield LoadFailure(error, fatal=True)
 
 
-def _troubles(source: Source) -> Iterator[Trouble]:
-    """What was passed over since the last time."""
-    yield from [Trouble(error, fatal=False) for error in source.problems]
+def _failures(source: Source) -> Iterator[LoadFailure]:
+    """What could not be loaded since the last time."""
+    yield from [LoadFailure(error, fatal=False) for error in source.problems]
     source.problems.clear()

@@ -8,10 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from cachetools import LRUCache, cachedmethod
 from torch import Tensor, nn
 
 from lalaloc_core.data.dataset import Appearance, Camera, Scene
@@ -21,13 +24,12 @@ from lalaloc_core.nets.resnet import PaperImageEncoder
 from lalaloc_core.sampling import PoseSet, pose_grid
 from lalaloc_core.training import losses
 from lalaloc_core.training.config import TrainConfig
-from lalaloc_core.training.picture_cache import kept_pictures
-from lalaloc_core.training.recent import Recent
+from lalaloc_core.training.picture_cache import cached_pictures
 from lalaloc_core.training.stream import layouts
 from lalaloc_core.training.turning import Turn, draw_turn
 
 _GRID_STEP_M = 0.5
-_FARTHEST = 0.7
+_MAX_LOG_ERROR = 0.7
 _BATCH = 16
 _LAYOUT_BATCH = 256
 
@@ -46,8 +48,8 @@ class _Query:
         return PoseSet(np.asarray(self.camera.position_m)[None], np.array([self.camera.room_index]))
 
     @property
-    def told(self) -> bytes:
-        """Tells this query from others of its kind."""
+    def fingerprint(self) -> bytes:
+        """Distinguishes this query from others of its kind."""
         camera, plan = self.camera, self.scene.plan
         numbers = [*camera.position_m, camera.heading, camera.camera_height_m, self.turn.shift]
         return np.array(numbers).tobytes() + plan.walls_m.tobytes() + plan.ceiling_heights_m.tobytes()
@@ -92,7 +94,7 @@ class ImageValidation:
     """Panorama queries, each camera in its usual look, read once: accuracy of the nearest grid pose.
 
     Nearest by latent, and with architecture `ring` also by the predicted wall profile: the mean |Δ log distance|, each
-    at most `_FARTHEST`, against the layouts of the grid. Reported over all queries and by furniture level.
+    at most `_MAX_LOG_ERROR`, against the layouts of the grid. Reported over all queries and by furniture level.
 
     Args:
         config: sizes.
@@ -102,7 +104,7 @@ class ImageValidation:
         usual: the look to ask with, where a camera was photographed so; else its first.
         problems: photographs that cannot be read are left out and their errors appended here.
         prefix: what the names of all figures begin with.
-        kept: file to keep the pictures in, for photographs that take long to make.
+        cache: file that caches the pictures, for photographs that take long to make.
 
     Raises:
         DatasetError: the first of them where `problems` is None; or none can be read.
@@ -118,7 +120,7 @@ class ImageValidation:
         problems: list[DatasetError] | None = None,
         *,
         prefix: str = "val",
-        kept: Path | None = None,
+        cache: Path | None = None,
     ) -> None:
         self.columns = config.profile_columns
         self.device = device
@@ -145,8 +147,8 @@ class ImageValidation:
             return np.stack(found)
 
         about = [str(config.image_size).encode()]
-        about += [query.told + str(look).encode() for query, look in zip(self.queries, looks, strict=True)]
-        self.images = torch.from_numpy(kept_pictures(kept, about, pictures))
+        about += [query.fingerprint + str(look).encode() for query, look in zip(self.queries, looks, strict=True)]
+        self.images = torch.from_numpy(cached_pictures(cache, about, pictures))
         self.queries = [query for query, good in zip(self.queries, read, strict=True) if good]
         self.levels = np.array([str(look.furniture) for look, good in zip(looks, read, strict=True) if good])
         self._grid_latents: list[Tensor] | None = None
@@ -176,7 +178,7 @@ class ImageValidation:
             scores |= self._scores(
                 "profile_",
                 [
-                    int((profile - layouts.profile_m.log()).abs().clamp_max(_FARTHEST).mean(dim=1).argmin())
+                    int((profile - layouts.profile_m.log()).abs().clamp_max(_MAX_LOG_ERROR).mean(dim=1).argmin())
                     for profile, layouts in zip(torch.cat(profiles), self._layouts, strict=True)
                 ],
             )
@@ -244,16 +246,21 @@ class _Layouts:
 
 
 class _Grids:
-    """Latents of the grids of one encoder; the last is kept, because queries come scene by scene."""
+    """Latents of the grids of one encoder; the last is cached, because queries come scene by scene."""
 
     def __init__(self, encoder: nn.Module, columns: int, device: torch.device) -> None:
         self.encoder, self.columns, self.device = encoder, columns, device
-        self._kept: Recent[Tensor] = Recent(1)
+        self._latents: LRUCache[tuple[Any, ...], Tensor] = LRUCache(1)
 
     def nearest(self, query: _Query, latent: Tensor) -> int:
         """Number of the query's grid pose whose latent is nearest to `latent` (1, d)."""
-        key = (id(query.grid), query.camera.camera_height_m, query.turn.heading)
-        return int(torch.cdist(latent, self._kept.get(key, lambda: self.embed(query, query.grid))).argmin())
+        return int(torch.cdist(latent, self._of_grid(query)).argmin())
+
+    @cachedmethod(
+        attrgetter("_latents"), lambda _, query: (id(query.grid), query.camera.camera_height_m, query.turn.heading)
+    )
+    def _of_grid(self, query: _Query) -> Tensor:
+        return self.embed(query, query.grid)
 
     def embed(self, query: _Query, poses: PoseSet) -> Tensor:
         """Latents (n, d) of the layouts at some poses, seen as the query's camera is turned."""

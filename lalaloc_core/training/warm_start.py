@@ -1,4 +1,4 @@
-"""Where a run begins: with the weights of a bundle or of another run, instead of fresh ones."""
+"""Warm starts: training that begins with the weights of a bundle or of another run, instead of random ones."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ _MODULES["image"] = {"image_encoder": IMAGE_WEIGHTS}
 
 
 @dataclass(frozen=True, kw_only=True)
-class Beginning:
+class WarmStart:
     """Trained weights of one stage.
 
     Attributes:
         checkpoint: the weights, in the form of a stage that trained them.
-        told: what checkpoints and manifests say of their origin; its minutes and panoramas are all that were spent.
+        origin: what checkpoints and manifests say of their origin; its minutes and panoramas are all that were spent.
     """
 
     checkpoint: Checkpoint
-    told: dict[str, Any]
+    origin: dict[str, Any]
 
     def load_into(self, modules: dict[str, nn.Module]) -> None:
         """Give modules these weights; one that was not trained there stays as it is.
@@ -42,14 +42,14 @@ class Beginning:
             CheckpointError: a module has other shapes.
         """
         for name, module in modules.items():
-            if name in self.checkpoint.best_weights:
+            if name in self.checkpoint.inference_weights:
                 try:
-                    module.load_state_dict(self.checkpoint.best_weights[name])
+                    module.load_state_dict(self.checkpoint.inference_weights[name])
                 except RuntimeError as error:
-                    raise CheckpointError(f"cannot begin with the {name} of {self.told}: {error}") from error
+                    raise CheckpointError(f"cannot begin with the {name} of {self.origin}: {error}") from error
 
 
-def begin_from(folder: Path, stage: str, config: TrainConfig) -> Beginning:
+def load_warm_start(folder: Path, stage: str, config: TrainConfig) -> WarmStart:
     """The weights of a stage, "layout" or "image", in a bundle or a run's folder (its best, where that was kept).
 
     Raises:
@@ -62,7 +62,7 @@ def begin_from(folder: Path, stage: str, config: TrainConfig) -> Beginning:
     return found
 
 
-def _of_bundle(bundle: Bundle, stage: str) -> Beginning:
+def _of_bundle(bundle: Bundle, stage: str) -> WarmStart:
     """Of what a bundle was trained with only its networks and totals are taken: older manifests know fewer settings."""
     manifest = bundle.manifest
     weights = {module: _state(bundle.read(file)) for module, file in _MODULES[stage].items() if file in manifest.files}
@@ -73,16 +73,18 @@ def _of_bundle(bundle: Bundle, stage: str) -> Beginning:
     config = TrainConfig.from_dict({"name": manifest.name, "architecture": manifest.architecture})
     config = config.with_networks(sizes)
     spent = manifest.training.get(stage) or manifest.training.get(JOINT) or {}
-    told = {"name": manifest.name, "version": manifest.version, "sha256": bundle.sha256, **_totals_told(spent)}
-    return Beginning(checkpoint=Checkpoint(stage=stage, config=config, weights=weights, begun_from=told), told=told)
+    origin = {"name": manifest.name, "version": manifest.version, "sha256": bundle.sha256, **_totals_of(spent)}
+    return WarmStart(
+        checkpoint=Checkpoint(stage=stage, config=config, weights=weights, begun_from=origin), origin=origin
+    )
 
 
-def _of_run(folder: Path, stage: str) -> Beginning:
+def _of_run(folder: Path, stage: str) -> WarmStart:
     checkpoint = checkpoint_with(stage, folder)
-    told = {"run": folder.resolve().name, **totals(checkpoint)}
+    origin = {"run": folder.resolve().name, **totals(checkpoint)}
     if checkpoint.begun_from:
-        told["begun_from"] = checkpoint.begun_from
-    return Beginning(checkpoint=checkpoint, told=told)
+        origin["begun_from"] = checkpoint.begun_from
+    return WarmStart(checkpoint=checkpoint, origin=origin)
 
 
 def totals(checkpoint: Checkpoint) -> dict[str, float]:
@@ -101,7 +103,7 @@ def panoramas(checkpoint: Checkpoint) -> int:
     return checkpoint.step * image.batch // image.uses_per_panorama
 
 
-def _totals_told(spent: dict[str, Any]) -> dict[str, float]:
+def _totals_of(spent: dict[str, Any]) -> dict[str, float]:
     """What a manifest says of a stage, and of its ancestors where it had any."""
     found = {}
     for name in ("minutes", "panoramas"):

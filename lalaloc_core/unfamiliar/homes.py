@@ -49,7 +49,7 @@ class UnfamiliarHome:
 
 
 @dataclass(frozen=True, eq=False)
-class Stage:
+class TracedHome:
     """A home at one furniture level, ready to be photographed.
 
     Attributes:
@@ -88,7 +88,7 @@ def _furnishing(key: HomeKey, level: Level) -> Furnishing:
 
 
 @lru_cache(maxsize=4)
-def stage_of(key: HomeKey, level: Level) -> Stage:
+def traced_home(key: HomeKey, level: Level) -> TracedHome:
     """The home of a key with its furniture."""
     home, rng = home_of(key), key.rng(2)
     tracer = Tracer([*home.shell, *_furnishing(key, level).parts])
@@ -103,7 +103,7 @@ def stage_of(key: HomeKey, level: Level) -> Stage:
         if name in things:
             lookup[:, k] = len(surfaces)
             surfaces.append(things[name])
-    return Stage(home, tracer, Materials(surfaces, Noise(rng)), lookup[tracer.room, tracer.surface])
+    return TracedHome(home, tracer, Materials(surfaces, Noise(rng)), lookup[tracer.room, tracer.surface])
 
 
 def stands_of(key: HomeKey, count: int) -> list[Stand]:

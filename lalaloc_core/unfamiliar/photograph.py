@@ -9,7 +9,7 @@ from jaxtyping import Float, UInt8
 
 from lalaloc_core.conventions import column_azimuths, row_elevations
 from lalaloc_core.unfamiliar.furnish import Level
-from lalaloc_core.unfamiliar.homes import HomeKey, Stage, Stand, stage_of
+from lalaloc_core.unfamiliar.homes import HomeKey, Stand, TracedHome, traced_home
 from lalaloc_core.unfamiliar.light import Lights
 from lalaloc_core.unfamiliar.sky import Sky
 from lalaloc_core.unfamiliar.tracing import OFFSET_M
@@ -32,18 +32,18 @@ class UnfamiliarShot:
 def render(shot: UnfamiliarShot, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
     """The photograph at a size."""
     rng = shot.key.rng(4, shot.number)
-    stage = stage_of(shot.key, shot.furniture)
-    plan = stage.home.plan.plan
-    lights = Lights.draw(plan, stage.home.openings, Sky.draw(rng), rng)
+    traced = traced_home(shot.key, shot.furniture)
+    plan = traced.home.plan.plan
+    lights = Lights.draw(plan, traced.home.openings, Sky.draw(rng), rng)
     film = _Film.draw(rng)
-    light = _radiance(stage, lights, shot.stand, height, width, rng)
+    light = _radiance(traced, lights, shot.stand, height, width, rng)
     return film.develop(light, rng)
 
 
 def depth_m(shot: UnfamiliarShot, height: int, width: int) -> Float[np.ndarray, "{height} {width}"]:
     """Distance (m) along each pixel's ray to what is seen; NaN for the sky."""
     rays = _rays(shot.stand, height, width)
-    hits = stage_of(shot.key, shot.furniture).tracer.first(_eye(shot.stand, len(rays)), rays)
+    hits = traced_home(shot.key, shot.furniture).tracer.first(_eye(shot.stand, len(rays)), rays)
     return np.where(hits.face < 0, np.nan, hits.distance_m).reshape(height, width)
 
 
@@ -60,24 +60,24 @@ def _rays(stand: Stand, height: int, width: int) -> Float[np.ndarray, "n 3"]:
 
 
 def _radiance(
-    stage: Stage, lights: Lights, stand: Stand, height: int, width: int, rng: np.random.Generator
+    traced: TracedHome, lights: Lights, stand: Stand, height: int, width: int, rng: np.random.Generator
 ) -> Float[np.ndarray, "{height} {width} 3"]:
     """Linear light of every pixel: colour and outlines from four rays, soft light from two of them."""
-    tracer, materials = stage.tracer, stage.materials
+    tracer, materials = traced.tracer, traced.materials
     rays = _rays(stand, 2 * height, 2 * width)
     eye = _eye(stand, len(rays))
     hits = tracer.first(eye, rays)
     met = hits.face >= 0
     point = (eye + np.where(met, hits.distance_m, 1.0)[:, None] * rays).astype(np.float32)
     normal = tracer.normals(hits, rays).astype(np.float32)
-    number = np.where(met, stage.number[hits.face], 0)
+    number = np.where(met, traced.number[hits.face], 0)
     colour = materials.colour(number, point, normal)
     pixels = np.arange(4 * height * width).reshape(height, 2, width, 2)
     soft, sun = np.zeros((2, height, width, 3), np.float32), np.zeros((2, height, width, 3), np.float32)
     for k in (0, 1):
         chosen = pixels[:, k, :, k].ravel()
         room = tracer.room[hits.face[chosen]]
-        lit = lights.soft(tracer, materials, stage.number, room, point[chosen], normal[chosen], rng)
+        lit = lights.soft(tracer, materials, traced.number, room, point[chosen], normal[chosen], rng)
         soft[k] = lit.reshape(height, width, 3)
         sun[k] = lights.sunlight(tracer, point[chosen], normal[chosen]).reshape(height, width, 3)
     corner = pixels[:, 0, :, 0]
@@ -91,11 +91,11 @@ def _radiance(
     chosen = corner.ravel()
     number = np.where(met[chosen], number[chosen], -1)
     light = light.mean(axis=(1, 3))
-    return _reflected(stage, lights, light, number, rays[chosen], point[chosen], normal[chosen])
+    return _reflected(traced, lights, light, number, rays[chosen], point[chosen], normal[chosen])
 
 
 def _reflected(
-    stage: Stage,
+    traced: TracedHome,
     lights: Lights,
     light: np.ndarray,
     number: np.ndarray,
@@ -104,7 +104,7 @@ def _reflected(
     normal: np.ndarray,
 ) -> np.ndarray:
     """Mirror images in mirrors and polished floors, stronger at grazing angles; `number` is -1 for the sky."""
-    tracer, materials = stage.tracer, stage.materials
+    tracer, materials = traced.tracer, traced.materials
     gloss = np.where(number < 0, 0.0, materials.gloss[number])
     shiny = np.flatnonzero(gloss > 0.0)
     if len(shiny) == 0:
@@ -116,7 +116,7 @@ def _reflected(
     seen = tracer.first(start, mirrored)
     met = seen.face >= 0
     there = start + np.where(met, seen.distance_m, 1.0)[:, None] * mirrored
-    image_number, room = stage.number[seen.face], tracer.room[seen.face]
+    image_number, room = traced.number[seen.face], tracer.room[seen.face]
     facing = tracer.normals(seen, mirrored)
     image = materials.colour(image_number, there, facing) * lights.ambient[room] * (1.3 / np.pi)
     image = image + (materials.glow[image_number] * lights.lamp[room].max(axis=1).clip(0, _GLOW))[:, None]

@@ -109,7 +109,7 @@ class TestExport:
         assert {t.data_type for t in large} == {onnx.TensorProto.FLOAT16}
 
     def test_the_decoder_of_training_comes_back_from_the_bundle(self, tiny_bundle: Path, opened_bundle: Bundle) -> None:
-        weights = Checkpoint.load(tiny_bundle.parent / "layout.pt", stage="layout").best_weights["decoder"]
+        weights = Checkpoint.load(tiny_bundle.parent / "layout.pt", stage="layout").inference_weights["decoder"]
         expected = LayoutDecoder(opened_bundle.manifest.latent_size).eval()
         expected.load_state_dict(weights)
         latent = torch.nn.functional.normalize(torch.randn(3, opened_bundle.manifest.latent_size), dim=1)

@@ -1,4 +1,4 @@
-"""Staged panoramas: what the training device photographs is what the workers would have, none is kept too long."""
+"""Deferred rendering: what the training device renders is what the workers would have, none is kept too long."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lalaloc_core.cli import main
-from lalaloc_core.training.batches import Batch, receive
+from lalaloc_core.training.batches import Batch, load_batches
 from lalaloc_core.training.checkpoint import Checkpoint
 from lalaloc_core.training.config import PRESETS, TrainConfig
-from lalaloc_core.training.deferred import Darkroom, turned
+from lalaloc_core.training.deferred import DeferredRenderer, turned
 from lalaloc_core.training.sources import GeneratedSource
 from lalaloc_core.training.stages import panorama_batches
 from lalaloc_core.training.stream import PanoramaBatches
@@ -36,18 +36,18 @@ def config(uses: int) -> TrainConfig:
 
 
 def batches(
-    uses: int, *, staged: bool, neighbours: bool = False, workers: int = 0, textures: Path | None = None
+    uses: int, *, deferred: bool, neighbours: bool = False, workers: int = 0, textures: Path | None = None
 ) -> list[Batch]:
-    source = GeneratedSource(config(uses), textures, staged)
+    source = GeneratedSource(config(uses), textures, deferred)
     found = panorama_batches(source.config, source, neighbours=neighbours, first_step=1, workers=workers, device=CPU)
     return list(itertools.islice(found, 6))
 
 
 @pytest.mark.parametrize(("uses", "neighbours", "workers"), [(1, False, 0), (3, False, 1), (3, True, 0)])
-def test_staged_batches_are_the_same_as_pictured_ones(uses: int, neighbours: bool, workers: int) -> None:
-    pictured = batches(uses, staged=False, neighbours=neighbours, workers=workers)
-    staged = batches(uses, staged=True, neighbours=neighbours, workers=workers)
-    for a, b in zip(pictured, staged, strict=True):
+def test_deferred_batches_are_the_same_as_rendered_ones(uses: int, neighbours: bool, workers: int) -> None:
+    rendered = batches(uses, deferred=False, neighbours=neighbours, workers=workers)
+    deferred = batches(uses, deferred=True, neighbours=neighbours, workers=workers)
+    for a, b in zip(rendered, deferred, strict=True):
         assert a.keys() == b.keys()
         for key in a.keys() - {"image"}:
             assert torch.equal(a[key], b[key])
@@ -56,15 +56,15 @@ def test_staged_batches_are_the_same_as_pictured_ones(uses: int, neighbours: boo
 
 
 def test_pictures_are_developed_once_and_forgotten_after_their_last_use() -> None:
-    source = GeneratedSource(config(3), staged=True)
-    darkroom, shown, seen = Darkroom(source.renderer(CPU)), set(), 0
-    negatives = list(itertools.islice(receive(PanoramaBatches(source.config, source), 0), 40))
-    for negative, _ in zip(negatives, darkroom.developed(negatives), strict=True):
-        assert not shown & negative.scenes.keys()
-        shown |= negative.scenes.keys()
-        seen += len(negative.number)
+    source = GeneratedSource(config(3), deferred=True)
+    renderer, shown, seen = DeferredRenderer(source.renderer(CPU)), set(), 0
+    deferred = list(itertools.islice(load_batches(PanoramaBatches(source.config, source), 0), 40))
+    for batch, _ in zip(deferred, renderer.rendered(deferred), strict=True):
+        assert not shown & batch.scenes.keys()
+        shown |= batch.scenes.keys()
+        seen += len(batch.number)
         # Those that wait for their next use, and those that the next batch has begun with.
-        assert len(darkroom) <= source.config.image.replay_panoramas + source.config.image.batch
+        assert len(renderer) <= source.config.image.replay_panoramas + source.config.image.batch
     assert len(shown) < seen / 2
 
 
@@ -86,7 +86,7 @@ def test_training_learns_the_same_wherever_panoramas_are_rendered(tmp_path: Path
         out = tmp_path / place
         assert main(["train", "layout", "--out", str(out), *common]) == 0
         assert main(["train", "image", "--out", str(out), *common, "--render", place, "--device", "cpu"]) == 0
-        weights.append(Checkpoint.load(out / "image.pt").best_weights["image_encoder"])
+        weights.append(Checkpoint.load(out / "image.pt").inference_weights["image_encoder"])
     for name, value in weights[0].items():
         assert torch.allclose(value.float(), weights[1][name].float(), atol=1e-3), name
 

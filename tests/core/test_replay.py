@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lalaloc_core.errors import ConfigError
-from lalaloc_core.training.batches import Batch, receive
+from lalaloc_core.training.batches import Batch, load_batches
 from lalaloc_core.training.config import PRESETS, TrainConfig
 from lalaloc_core.training.image_stage import ImageStage
 from lalaloc_core.training.photometric import changed
@@ -65,7 +65,7 @@ class TestReplay:
 
 def batches(**image: Any) -> list[Batch]:
     config = TINY.with_settings({f"image.{name}": value for name, value in image.items()})
-    return list(itertools.islice(receive(PanoramaBatches(config, GeneratedSource(config)), 0), 6))
+    return list(itertools.islice(load_batches(PanoramaBatches(config, GeneratedSource(config)), 0), 6))
 
 
 def colours(found: list[Batch]) -> Counter[tuple[int, ...]]:

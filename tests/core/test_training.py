@@ -29,7 +29,7 @@ from lalaloc_core.render.depth import back_project, layout_depth
 from lalaloc_core.sampling import TripletSampling, random_poses
 from lalaloc_core.synth.splits import TEST, TRAIN, VALIDATION, home_of
 from lalaloc_core.training import batches, objective, sources
-from lalaloc_core.training.batches import Batch, receive
+from lalaloc_core.training.batches import Batch, load_batches
 from lalaloc_core.training.checkpoint import Checkpoint
 from lalaloc_core.training.config import PRESETS, ImageStageConfig, OptimiserConfig, TrainConfig, Turns
 from lalaloc_core.training.end_to_end import EndToEndStage
@@ -38,7 +38,7 @@ from lalaloc_core.training.layout_stage import LayoutStage
 from lalaloc_core.training.loop import run_stage
 from lalaloc_core.training.run import train_image
 from lalaloc_core.training.sources import GeneratedSource
-from lalaloc_core.training.stages import Stage, build_layout_encoder
+from lalaloc_core.training.stages import TrainingStage, build_layout_encoder
 from lalaloc_core.training.stream import LayoutBatches, PanoramaBatches, layouts
 from lalaloc_core.training.turning import draw_turn
 from tests.strategies import crooked_flat, seeds
@@ -49,12 +49,12 @@ TINY = PRESETS["tiny"]
 
 def layout_batches(config: TrainConfig = TINY, first: int = 0) -> Iterator[Batch]:
     """Stage 1's batches of generated homes, made in this process."""
-    return receive(LayoutBatches(config, GeneratedSource(config), first), 0)
+    return load_batches(LayoutBatches(config, GeneratedSource(config), first), 0)
 
 
 def panorama_batches(config: TrainConfig = TINY, *, neighbours: bool = False) -> Iterator[Batch]:
     """Stage 2's batches of generated homes, made in this process."""
-    return receive(PanoramaBatches(config, GeneratedSource(config), neighbours), 0)
+    return load_batches(PanoramaBatches(config, GeneratedSource(config), neighbours), 0)
 
 
 def layout_stage(config: TrainConfig = TINY) -> LayoutStage:
@@ -69,6 +69,7 @@ class LineStage:
     """The smallest stage there is: a line through points, its batches a function of the step."""
 
     name = "line"
+    teacher = None
 
     def __init__(self, steps: int = 12, **settings: Any) -> None:
         torch.manual_seed(3)
@@ -79,6 +80,10 @@ class LineStage:
     @property
     def settings(self) -> ImageStageConfig:
         return self.config.image
+
+    @property
+    def ema_decay(self) -> float:
+        return self.settings.ema_decay
 
     @property
     def data(self) -> dict[str, Any]:
@@ -186,8 +191,8 @@ class TestLoop:
     def test_averaged_weights_are_what_is_shipped(self, tmp_path: Path) -> None:
         plain = run_stage(LineStage(), tmp_path / "plain", device=CPU)
         averaged = run_stage(LineStage(ema_decay=0.9), tmp_path / "averaged", device=CPU)
-        assert plain.best_weights is plain.weights
-        assert averaged.best_weights is averaged.averaged
+        assert plain.inference_weights is plain.weights
+        assert averaged.inference_weights is averaged.averaged
         assert not same_weights(averaged.averaged, averaged.weights)
 
 
@@ -364,13 +369,13 @@ class TestStreams:
 
 
 class TestStages:
-    def repeated(self, stage: Stage, monkeypatch: pytest.MonkeyPatch) -> Batch:
+    def repeated(self, stage: TrainingStage, monkeypatch: pytest.MonkeyPatch) -> Batch:
         """Let a stage see one batch over and over."""
         batch = next(stage.batches(0, 0))
         monkeypatch.setattr(stage, "batches", lambda first_step, workers: itertools.repeat(batch))
         return batch
 
-    def total(self, stage: Stage, batch: Batch) -> float:
+    def total(self, stage: TrainingStage, batch: Batch) -> float:
         with torch.no_grad():
             return float(sum(stage.losses(batch).values()))
 

@@ -21,11 +21,10 @@ from lalaloc_core.data.folder import OwnData
 from lalaloc_core.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.errors import CheckpointError, DatasetError
 from lalaloc_core.sampling import random_poses
-from lalaloc_core.training.batches import Batch, receive
+from lalaloc_core.training.batches import Batch, load_batches
 from lalaloc_core.training.checkpoint import Checkpoint
 from lalaloc_core.training.config import PRESETS, TrainConfig
 from lalaloc_core.training.data import TrainingData
-from lalaloc_core.training.recent import Recent
 from lalaloc_core.training.run import train_layout
 from lalaloc_core.training.sources import SceneSource
 from lalaloc_core.training.stream import LayoutBatches, PanoramaBatches, layouts
@@ -65,7 +64,7 @@ def data(tmp_path: Path) -> OwnData:
 
 
 def panoramas(source: SceneSource, *, neighbours: bool = False) -> Iterator[Batch]:
-    return receive(PanoramaBatches(source.config, source, neighbours), 0)
+    return load_batches(PanoramaBatches(source.config, source, neighbours), 0)
 
 
 def greys(batches: Iterator[Batch], count: int) -> list[int]:
@@ -121,7 +120,7 @@ class TestDrawing:
 
     def test_layout_anchors_are_the_cameras_at_their_heights(self, data: OwnData) -> None:
         source = SceneSource(CONFIG, data)
-        batch = next(receive(LayoutBatches(CONFIG, source), 0))
+        batch = next(load_batches(LayoutBatches(CONFIG, source), 0))
         cameras = [camera for name in data.scenes("train") for camera in data.load(name).cameras]
         plan = crooked_flat()
         profiles = layouts(
@@ -175,7 +174,7 @@ class TestBadFiles:
             (data.root / f"scene {number}" / "plan.json").write_text("{}", encoding="utf-8")
         for stream in (LayoutBatches, PanoramaBatches):
             with pytest.raises(DatasetError, match="in a row"):
-                next(receive(stream(CONFIG, SceneSource(CONFIG, data, skip_bad=True)), 0))
+                next(load_batches(stream(CONFIG, SceneSource(CONFIG, data, skip_bad=True)), 0))
 
     def test_a_data_set_without_training_scenes_is_refused(self, tmp_path: Path) -> None:
         with pytest.raises(DatasetError, match="no training scenes"):
@@ -184,7 +183,7 @@ class TestBadFiles:
     def test_errors_of_worker_processes_arrive_whole(self, data: OwnData) -> None:
         (data.root / "scene 3" / "plan.json").write_text("{}", encoding="utf-8")
         with pytest.raises(DatasetError) as raised:
-            for _ in itertools.islice(receive(LayoutBatches(CONFIG, SceneSource(CONFIG, data)), 1), 10):
+            for _ in itertools.islice(load_batches(LayoutBatches(CONFIG, SceneSource(CONFIG, data)), 1), 10):
                 pass
         assert raised.value.path == data.root / "scene 3" / "plan.json"
         assert raised.value.scene == "scene 3"
@@ -256,26 +255,6 @@ class PerfectLayouts(torch.nn.Module):
 
     def forward(self, profile_m: torch.Tensor, camera_m: torch.Tensor, ceiling_m: torch.Tensor) -> torch.Tensor:
         return torch.cat([profile_m, camera_m[:, None], ceiling_m[:, None]], dim=1)
-
-
-class TestRecent:
-    def test_it_keeps_what_was_used_last_up_to_its_limit(self) -> None:
-        made: list[str] = []
-        kept: Recent[str] = Recent(5, len)
-
-        def get(key: str) -> str:
-            return kept.get(key, lambda: made.append(key) or key)
-
-        for key in ("aa", "bb", "aa", "cc", "aa", "bb", "toolarge", "toolarge", "aa"):
-            assert get(key) == key
-        # "bb" left for "cc"; what is larger than the limit is kept alone.
-        assert made == ["aa", "bb", "cc", "bb", "toolarge", "aa"]
-
-    def test_what_cannot_be_made_is_not_kept(self) -> None:
-        kept: Recent[int] = Recent(2)
-        with pytest.raises(ZeroDivisionError):
-            kept.get("key", lambda: 1 // 0)
-        assert kept.get("key", lambda: 7) == 7
 
 
 def test_configurations_of_the_tests_are_valid() -> None:

@@ -22,7 +22,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.render.depth import layout_depth
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.unfamiliar.furnish import LEVELS, Furnishing
-from lalaloc_core.unfamiliar.homes import WALL_MARGIN_M, HomeKey, UnfamiliarHome, home_of, stage_of
+from lalaloc_core.unfamiliar.homes import WALL_MARGIN_M, HomeKey, UnfamiliarHome, home_of, traced_home
 from lalaloc_core.unfamiliar.openings import draw_openings
 from lalaloc_core.unfamiliar.outlines import AREAS_M2, draw_outline
 from lalaloc_core.unfamiliar.plans import MAX_AREA_M2, MAX_ROOMS, MIN_AREA_M2, MIN_ROOMS, draw_plan
@@ -185,7 +185,7 @@ class TestScenes:
         first = scenes.load("test-00001")
         picture = photograph(scenes, "test-00001", 0).image(32, 64)
         home_of.cache_clear()
-        stage_of.cache_clear()
+        traced_home.cache_clear()
         again = scenes.load("test-00001")
         np.testing.assert_array_equal(first.cameras[0].position_m, again.cameras[0].position_m)
         np.testing.assert_array_equal(picture, photograph(scenes, "test-00001", 0).image(32, 64))

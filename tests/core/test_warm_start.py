@@ -22,11 +22,11 @@ from lalaloc_core.training.config import PRESETS, TrainConfig
 from lalaloc_core.training.data import TrainingData
 from lalaloc_core.training.image_stage import ImageStage
 from lalaloc_core.training.loop import run_stage
-from lalaloc_core.training.picture_cache import kept_pictures
+from lalaloc_core.training.picture_cache import cached_pictures
 from lalaloc_core.training.run import train_image, train_layout
 from lalaloc_core.training.sources import GeneratedSource
 from lalaloc_core.training.stages import build_layout_encoder
-from lalaloc_core.training.warm_start import begin_from
+from lalaloc_core.training.warm_start import load_warm_start
 from tests.core.test_training import LineStage, same_weights
 
 CPU = torch.device("cpu")
@@ -35,11 +35,11 @@ FEW = TrainingData(validation_scenes=2)
 SHORT = TINY.with_settings({"image.steps": 2, "layout.steps": 2})
 
 
-def trained(folder: Path, begin: Path, config: TrainConfig = SHORT) -> Checkpoint:
-    return train_image(config, folder, device=CPU, data=FEW, workers=0, begin=begin)
+def trained(folder: Path, init_from: Path, config: TrainConfig = SHORT) -> Checkpoint:
+    return train_image(config, folder, device=CPU, data=FEW, workers=0, init_from=init_from)
 
 
-class TestBeginning:
+class TestWarmStart:
     def test_a_bundle_begun_from_a_bundle_tells_its_ancestry(self, tiny_bundle: Path, tmp_path: Path) -> None:
         parent = Bundle.open(tiny_bundle)
         run = tmp_path / "run"
@@ -69,16 +69,16 @@ class TestBeginning:
 
     def test_a_stage_begins_with_the_weights_it_is_given(self, tiny_bundle: Path) -> None:
         stage = ImageStage(TINY, GeneratedSource(TINY), build_layout_encoder(TINY))
-        beginning = begin_from(tiny_bundle, "image", TINY)
-        beginning.load_into(stage.modules)
-        assert same_weights({"image_encoder": stage.encoder.state_dict()}, beginning.checkpoint.weights)
+        start = load_warm_start(tiny_bundle, "image", TINY)
+        start.load_into(stage.modules)
+        assert same_weights({"image_encoder": stage.encoder.state_dict()}, start.checkpoint.weights)
         assert all(value.dtype != torch.float16 for value in stage.encoder.state_dict().values())
 
     def test_a_run_begins_with_the_best_of_another(self, tiny_bundle: Path, tmp_path: Path) -> None:
         trained(tmp_path / "first", tiny_bundle)
         best = Checkpoint.load(tmp_path / "first" / "image.best.pt")
-        beginning = begin_from(tmp_path / "first", "image", TINY)
-        assert same_weights(beginning.checkpoint.best_weights, best.averaged)
+        start = load_warm_start(tmp_path / "first", "image", TINY)
+        assert same_weights(start.checkpoint.inference_weights, best.averaged)
         second = trained(tmp_path / "second", tmp_path / "first")
         assert second.begun_from["run"] == "first"
         assert second.begun_from["begun_from"]["name"] == "tiny"
@@ -90,7 +90,7 @@ class TestBeginning:
     def test_the_layout_stage_begins_so_too_and_its_encoder_stays_the_teacher(
         self, tiny_bundle: Path, tmp_path: Path
     ) -> None:
-        layout = train_layout(SHORT, tmp_path, device=CPU, data=FEW, workers=0, begin=tiny_bundle)
+        layout = train_layout(SHORT, tmp_path, device=CPU, data=FEW, workers=0, init_from=tiny_bundle)
         assert layout.begun_from["name"] == "tiny"
         assert set(layout.begun_from) == {"name", "version", "sha256", "minutes_in_all"}
         trained(tmp_path, tiny_bundle)
@@ -212,7 +212,7 @@ class TestValidation:
 
         def kept(*about: bytes) -> int:
             make = lambda: np.full((1, 2, 2, 3), next(numbers), dtype=np.uint8)  # noqa: E731
-            return int(kept_pictures(path, list(about), make)[0, 0, 0, 0])
+            return int(cached_pictures(path, list(about), make)[0, 0, 0, 0])
 
         assert [kept(b"a"), kept(b"a"), kept(b"b"), kept(b"b"), kept(b"a")] == [0, 0, 1, 1, 2]
         path.write_bytes(path.read_bytes()[:100])
