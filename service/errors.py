@@ -16,8 +16,10 @@ LaLaLocError
     ├── RevisionMismatchError       the plan has another revision than the one expected
     ├── IdempotencyKeyReusedError   the key was sent with another body before
     ├── IdempotencyInProgressError  the same request is being carried out
+    ├── DamagedDataError            what is stored is not what was
     ├── StoreUnavailableError       the database cannot be reached
-    │   └── StoreBusyError          it answers, but all connections to it are in use
+    │   ├── StoreBusyError          it answers, but all connections to it are in use
+    │   └── StoreFullError          it has no room left
     ├── UnauthenticatedError        no valid API key
     ├── InsufficientScopeError      the API key is not good for this
     ├── ExposedWithoutKeysError     asked from elsewhere while there are no API keys
@@ -123,9 +125,14 @@ class PlanTooLargeError(ServiceError):
 
 
 class PlanFailedError(ServiceError):
-    """The plan's latent grid could not be computed."""
+    """The plan's latent grid could not be computed.
+
+    Attributes:
+        reason: why, as the plan itself tells it.
+    """
 
     def __init__(self, plan_id: str, reason: str) -> None:
+        self.reason = reason
         super().__init__(f"floor plan '{plan_id}' could not be prepared: {reason}")
 
 
@@ -175,6 +182,10 @@ class IdempotencyInProgressError(ServiceError):
         super().__init__(f"the request with Idempotency-Key '{key[:64]}' is being carried out; ask again later")
 
 
+class DamagedDataError(ServiceError):
+    """What is stored is not what was, by its digest. It can be replaced and deleted, not read."""
+
+
 class StoreUnavailableError(ServiceError):
     """The database cannot be reached, or did not answer in time."""
 
@@ -192,6 +203,15 @@ class StoreBusyError(StoreUnavailableError):
 
     def __init__(self) -> None:
         super().__init__("too many requests use the database at the moment")
+
+
+class StoreFullError(StoreUnavailableError):
+    """The database answers, but has no room left for what is to be stored."""
+
+    retry_after_s = 60
+
+    def __init__(self) -> None:
+        super().__init__("the disk of the database is full, nothing can be stored until there is room")
 
 
 class UnauthenticatedError(ServiceError):
@@ -308,6 +328,7 @@ PROBLEMS: dict[type[Exception], ProblemKind] = {
     IdempotencyInProgressError: ProblemKind(409, "idempotency-in-progress", "Request already in work"),
     StoreUnavailableError: ProblemKind(503, "store-unavailable", "Storage unavailable"),
     StoreBusyError: ProblemKind(503, "store-unavailable", "Storage unavailable"),
+    StoreFullError: ProblemKind(507, "store-full", "Storage full"),
     UnauthenticatedError: ProblemKind(401, "unauthenticated", "API key needed"),
     InsufficientScopeError: ProblemKind(403, "insufficient-scope", "API key not good for this"),
     ExposedWithoutKeysError: ProblemKind(403, "exposed-without-keys", "Only answered on its own machine"),
@@ -317,6 +338,7 @@ PROBLEMS: dict[type[Exception], ProblemKind] = {
     DecoderNotReadyError: ProblemKind(503, "decoder-not-ready", "Decoder not ready"),
     DeadlineExceededError: ProblemKind(504, "deadline-exceeded", "Deadline exceeded"),
     StoppingError: ProblemKind(503, "stopping", "Shutting down"),
+    DamagedDataError: INTERNAL,
     ServiceError: INTERNAL,
     LaLaLocError: INTERNAL,
     ConfigError: INTERNAL,

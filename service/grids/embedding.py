@@ -7,6 +7,7 @@ from time import perf_counter
 
 import numpy as np
 
+from lalaloc_core.errors import InvalidPoseError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.poses import LatentGrid
@@ -30,6 +31,9 @@ def embed(
     Args:
         after_chunk: called with the share that is done (0 to 1) and the seconds that the last chunk took; what it
             raises ends the work.
+
+    Raises:
+        InvalidPoseError: the networks have no latents for this plan at this camera height.
     """
     poses = pose_grid(plan, step_m)
     rays = encoders.manifest.profile_columns * plan.walls_m.shape[1]
@@ -39,6 +43,8 @@ def embed(
         begin = perf_counter()
         part = PoseSet(poses.position_m[first : first + chunk], poses.room_index[first : first + chunk])
         latent, profile_m = encoders.poses(plan, part, np.zeros(len(part)), camera_height_m)
+        if not (np.isfinite(latent).all() and np.isfinite(profile_m).all()):
+            raise InvalidPoseError(f"the model has no latents at camera_height_m {camera_height_m:g}")
         latents.append(latent.astype(np.float32, copy=False))
         profiles_m.append(profile_m.astype(np.float32, copy=False))
         after_chunk(min(first + chunk, len(poses)) / len(poses), perf_counter() - begin)

@@ -19,6 +19,7 @@ from lalaloc_core.localise.poses import LatentGrid
 from lalaloc_core.sampling import grid_size
 from service.errors import (
     OverloadedError,
+    PlanFailedError,
     PlanNotReadyError,
     PlanTooLargeError,
     StoppingError,
@@ -45,6 +46,8 @@ _KEEP_TRYING_S, _TRY_EVERY_S = 60.0, 1.0
 _ABANDONED = (UnknownFloorPlanError, PlanNotReadyError, StoppingError, StoreUnavailableError)
 # Progress is told, and the lease renewed, so many times while it lasts.
 _HEARTBEATS = 8.0
+# So many replicas, or lives of one, may begin a grid without any of them finishing it.
+_MOST_ATTEMPTS = 5
 
 
 @dataclass(frozen=True)
@@ -315,13 +318,17 @@ class Grids:
         if record is None:
             raise UnknownFloorPlanError(job.plan_id)
         self.check_size(record.plan)
-        if not self._store.leases.claim(job.key, self._owner, self._settings.grid_lease_s):
+        attempts = self._store.leases.claim(job.key, self._owner, self._settings.grid_lease_s)
+        if attempts is None:
             raise _LeaseLostError
         # Whoever had the lease until now may have finished.
         grid = self._load(job.key)
         if grid is not None:
             self._store.leases.release(job.key, self._owner)
             return grid
+        if attempts > _MOST_ATTEMPTS:
+            reason = f"its latent grid was begun {_MOST_ATTEMPTS} times and never finished"
+            raise PlanFailedError(job.plan_id, reason)
         with self._telemetry.timed(self._telemetry.grid_seconds):
             grid = self._embed(job, record.plan)
         if not self._put(job, grid, always_keep_mm=millimetres(record.plan.camera_height_m)):
@@ -356,7 +363,7 @@ class Grids:
     def _why_cancelled(self, job: Job) -> Exception:
         if self._jobs.closing.is_set():
             return StoppingError()
-        if self._store.plans.by_revision(job.key.revision_id) is None:
+        if not self._store.plans.is_kept(job.key.revision_id):
             return UnknownFloorPlanError(job.plan_id)
         # The plan has another revision by now, which the next query finds.
         return PlanNotReadyError(job.plan_id, 0.0, 0.0)
@@ -387,13 +394,18 @@ class Grids:
             logger.error("latent grid failed", exc_info=error, extra={"fields": {"floorplan": job.plan_id}})
         try:
             if not job.on_demand and not isinstance(error, _ABANDONED):
-                # Only errors raised on purpose have a text that is fit for users.
-                reason = str(error) if isinstance(error, LaLaLocError) else "internal error"
-                self._store.plans.set_failure(job.key.revision_id, reason)
+                self._store.plans.set_failure(job.key.revision_id, _reason(error))
             self._store.leases.release(job.key, self._owner)
         except Exception:
             # The lease runs out, and whoever takes it over fails in the same way.
             logger.exception("cannot record the failure", extra={"fields": {"floorplan": job.plan_id}})
+
+
+def _reason(error: Exception) -> str:
+    """Why a grid failed, in a text that is fit for users: that of errors which are raised on purpose."""
+    if isinstance(error, PlanFailedError):
+        return error.reason
+    return str(error) if isinstance(error, LaLaLocError) else "internal error"
 
 
 def _state(failure: str | None, poses: int | None, elsewhere: float | None, job: Job | None) -> GridState:

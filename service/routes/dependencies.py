@@ -14,7 +14,7 @@ from service.runtime import Runtime, runtime_of
 from service.security.permissions import caller_of
 from service.storage.plan_cache import PlanCache
 from service.storage.plans import Plans
-from service.storage.records import PlanRecord
+from service.storage.records import PlanRecord, PlanSummary
 
 _ID = re.compile(r"[0-9a-f]{32}")
 
@@ -38,6 +38,19 @@ def stored_plan(tenant: str, floorplan_id: str, plans: Plans | PlanCache) -> Pla
     if record is None:
         raise UnknownFloorPlanError(floorplan_id)
     return record
+
+
+def plan_summary(tenant: str, floorplan_id: str, plans: Plans) -> PlanSummary:
+    """A stored plan of a tenant without its rooms: whoever replaces or deletes it need not be able to read it.
+
+    Raises:
+        UnknownFloorPlanError: there is none.
+        StoreUnavailableError: the database is away.
+    """
+    summary = plans.summary(tenant, floorplan_id) if is_id(floorplan_id) else None
+    if summary is None:
+        raise UnknownFloorPlanError(floorplan_id)
+    return summary
 
 
 async def plan_for_query(tenant: str, floorplan_id: str, runtime: Runtime) -> PlanRecord:

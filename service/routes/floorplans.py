@@ -37,6 +37,7 @@ from service.routes.dependencies import (
     Tenant,
     header,
     is_id,
+    plan_summary,
     stored_plan,
 )
 from service.routes.plan_answers import list_entries, plan_representation, plan_state
@@ -184,7 +185,7 @@ async def replace_floorplan(floorplan_id: str, request: Request, runtime: Runnin
 
     Queries in work are answered by the revision that they began with, and say which (`floorplan_revision`).
     """
-    current = await runtime.uploads.run(stored_plan, tenant, floorplan_id, runtime.store.plans)
+    current = await runtime.uploads.run(plan_summary, tenant, floorplan_id, runtime.store.plans)
     expected = expected_revision(request, current.id, current.revision_id)
     content = await _uploaded_plan(request, runtime)
 
@@ -217,13 +218,13 @@ def delete_floorplan(floorplan_id: str, request: Request, runtime: Running, tena
 
     A latent grid that is being computed is not any more.
     """
-    record = stored_plan(tenant, floorplan_id, runtime.store.plans)
-    note(request, plan=record.id, revision=record.revision_id)
-    expected = expected_revision(request, record.id, record.revision_id)
-    if not runtime.store.plans.delete(tenant, record.id, expected=expected):
+    current = plan_summary(tenant, floorplan_id, runtime.store.plans)
+    note(request, plan=current.id, revision=current.revision_id)
+    expected = expected_revision(request, current.id, current.revision_id)
+    if not runtime.store.plans.delete(tenant, current.id, expected=expected):
         raise UnknownFloorPlanError(floorplan_id)
-    runtime.grids.forget({record.revision_id})
-    runtime.plan_cache.drop({record.revision_id})
+    runtime.grids.forget({current.revision_id})
+    runtime.plan_cache.drop({current.revision_id})
 
 
 def _at_revision(current: PlanRecord, revision_id: str, runtime: Runtime) -> PlanRecord:

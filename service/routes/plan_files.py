@@ -13,7 +13,7 @@ from service.http.problems import problem_responses
 from service.http.uploads import JSON
 from service.preview.mesh import plan_glb
 from service.preview.svg import Marker, plan_svg
-from service.routes.dependencies import IF_NONE_MATCH, NOT_MODIFIED, Running, Tenant, stored_plan
+from service.routes.dependencies import IF_NONE_MATCH, NOT_MODIFIED, Running, Tenant, plan_summary, stored_plan
 from service.storage.records import PlanRecord
 from service.telemetry import note
 
@@ -39,8 +39,9 @@ _CONDITIONAL = {"parameters": [IF_NONE_MATCH]}
 )
 def get_original(floorplan_id: str, request: Request, runtime: Running, tenant: Tenant) -> Response:
     """The bytes that were uploaded, unchanged; of the current revision."""
-    record = _noted(request, stored_plan(tenant, floorplan_id, runtime.store.plans))
-    content = runtime.store.plans.original(tenant, record.id)
+    current = plan_summary(tenant, floorplan_id, runtime.store.plans)
+    note(request, plan=current.id, revision=current.revision_id)
+    content = runtime.store.plans.original(tenant, current.id)
     if content is None:
         raise UnknownFloorPlanError(floorplan_id)
     return conditional_answer(request, content, JSON, content_etag(content))

@@ -13,7 +13,21 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Double, Engine, cast, create_engine, event, extract, func, literal
+from sqlalchemy import (
+    Column,
+    ColumnElement,
+    Connection,
+    Double,
+    Engine,
+    and_,
+    cast,
+    create_engine,
+    event,
+    extract,
+    func,
+    literal,
+    or_,
+)
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
@@ -27,6 +41,8 @@ _WRITER = "lalaloc_writer"
 _SQLITE_WAIT_MS = 5000
 # The server ends what takes longer, so that a stuck statement or lock never holds a connection for good.
 _STATEMENT_MS, _LOCK_MS, _IDLE_MS = 30_000, 10_000, 60_000
+# How far apart two looks at the clock may be, of whom one waits for a lock in between, or sets the clock right.
+_CLOCK_SLACK_S = 10.0
 # A server that does not answer any more counts as gone after this.
 _SILENCE_MS = 5000
 
@@ -97,6 +113,16 @@ class Database:
         if self.is_postgresql:
             return cast(extract("epoch", func.clock_timestamp()), Double)
         return literal(time.time())
+
+    def is_live(self, until_s: Column[float], length_s: Column[float]) -> ColumnElement[bool]:
+        """Whether a lease holds: one that ends later than if it began now was taken by a clock that was ahead.
+
+        Args:
+            until_s: column of the moment that it ends at, by `now_s`.
+            length_s: column of how long it is; where that is not known, nothing is too late.
+        """
+        now_s = self.now_s()
+        return and_(until_s > now_s, or_(length_s.is_(None), until_s <= now_s + length_s + _CLOCK_SLACK_S))
 
     def answered_since(self, moment_s: float) -> bool:
         """Whether a transaction was completed after a moment (`monotonic`)."""

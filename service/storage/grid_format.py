@@ -6,7 +6,9 @@ positions (float64, n·2), latents (float32, n·d), profiles (float32, n·w), ro
 
 from __future__ import annotations
 
+import hashlib
 import struct
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,7 +20,16 @@ _MAGIC = b"LLG1"
 _POSE_BYTES, _VALUE_BYTES, _ROOM_BYTES = 16, 4, 4
 
 
-def pack(grid: LatentGrid) -> bytes:
+@dataclass(frozen=True)
+class PackedGrid:
+    """A grid as a blob, with the number of its poses and the digest of the blob."""
+
+    poses: int
+    content: bytes
+    sha256: str
+
+
+def pack(grid: LatentGrid) -> PackedGrid:
     """The blob of a grid."""
     count, latent_size = grid.latents.shape
     header = _HEADER.pack(_MAGIC, count, latent_size, grid.profile_m.shape[1])
@@ -28,11 +39,17 @@ def pack(grid: LatentGrid) -> bytes:
         grid.profile_m.astype("<f4", copy=False),
         grid.poses.room_index.astype("<i4", copy=False),
     )
-    return b"".join((header, *(np.ascontiguousarray(array).data.cast("B") for array in arrays)))
+    content = b"".join((header, *(np.ascontiguousarray(array).data.cast("B") for array in arrays)))
+    return PackedGrid(count, content, digest_of(content))
+
+
+def digest_of(content: bytes | bytearray) -> str:
+    """The digest of a blob, as it is stored."""
+    return hashlib.sha256(content).hexdigest()
 
 
 def unpack(content: bytes | bytearray, *, step_m: float, camera_height_m: float) -> LatentGrid | None:
-    """The grid in a blob, as read-only views of it; None when the blob is not one."""
+    """The grid in a blob, as read-only views of it; None when the blob is not one, or has numbers that are none."""
     if len(content) < _HEADER.size:
         return None
     magic, count, latent_size, columns = _HEADER.unpack_from(content)
@@ -48,4 +65,6 @@ def unpack(content: bytes | bytearray, *, step_m: float, camera_height_m: float)
         return array.reshape(count, width)
 
     position_m, latents, profile_m = take("<f8", 2), take("<f4", latent_size), take("<f4", columns)
+    if not all(np.isfinite(array).all() for array in (position_m, latents, profile_m)):
+        return None
     return LatentGrid(PoseSet(position_m, take("<i4", 1)[:, 0]), latents, profile_m, step_m, camera_height_m)

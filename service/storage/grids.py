@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,9 +12,10 @@ from sqlalchemy.exc import IntegrityError
 from lalaloc_core.localise.poses import LatentGrid
 from service.storage.chunks import read_exactly, write_chunks
 from service.storage.database import Database
-from service.storage.grid_format import pack, unpack
+from service.storage.grid_format import PackedGrid, digest_of, pack, unpack
 from service.storage.records import GridKey, PlanSummary
 from service.storage.tables import FLOORPLANS, GRID_CHUNKS, GRID_LEASES, LATENT_GRIDS, REVISIONS
+from service.telemetry import LOGGER_NAME
 
 
 class StoredGrids:
@@ -23,16 +25,23 @@ class StoredGrids:
         self._database = database
 
     def get(self, key: GridKey) -> LatentGrid | None:
-        """A grid, None when it is not stored (or not readable, then it has to be computed again)."""
+        """A grid, None when it is not stored (or not as it was computed, then it has to be computed again)."""
+        columns = LATENT_GRIDS.c
         with self._database.reading() as connection:
-            query = select(LATENT_GRIDS.c.id, LATENT_GRIDS.c.size_bytes).where(*_where(LATENT_GRIDS, key))
+            query = select(columns.id, columns.size_bytes, columns.sha256).where(
+                *_where(LATENT_GRIDS, key), _has_digest()
+            )
             row = connection.execute(query).one_or_none()
             if row is None:
                 return None
             content = read_exactly(connection, GRID_CHUNKS, {"grid_id": row.id}, row.size_bytes)
-        if content is None:
-            return None
-        return unpack(content, step_m=key.step_m, camera_height_m=key.camera_height_m)
+        grid = None
+        if content is not None and digest_of(content) == row.sha256:
+            grid = unpack(content, step_m=key.step_m, camera_height_m=key.camera_height_m)
+        if grid is None:
+            fields = {"revision": key.revision_id, "camera_height_mm": key.camera_height_mm}
+            logging.getLogger(LOGGER_NAME).error("a stored latent grid is damaged", extra={"fields": fields})
+        return grid
 
     def poses(
         self, model_sha256: str, step_m: float, revision_ids: Sequence[str] | None = None
@@ -40,7 +49,7 @@ class StoredGrids:
         """Poses of the stored grids of a model, by revision and camera height (mm); of all revisions, or some."""
         columns = LATENT_GRIDS.c
         query = select(columns.revision_id, columns.camera_height_mm, columns.poses).where(
-            columns.model_sha256 == model_sha256, columns.step_m == step_m
+            columns.model_sha256 == model_sha256, columns.step_m == step_m, _has_digest()
         )
         if revision_ids is not None:
             query = query.where(columns.revision_id.in_(revision_ids))
@@ -59,7 +68,7 @@ class StoredGrids:
         Returns:
             False when the revision is gone, then nothing is stored.
         """
-        content = memoryview(pack(grid))
+        packed = pack(grid)
         with self._database.writing() as connection:
             # Whoever stores grids of one revision takes turns.
             lock = select(REVISIONS.c.id).where(REVISIONS.c.id == key.revision_id).with_for_update(key_share=True)
@@ -69,7 +78,7 @@ class StoredGrids:
             connection.execute(delete(LATENT_GRIDS).where(*_where(LATENT_GRIDS, key)))
             _drop_older_models(connection, key)
             _make_room(connection, key, keep=keep, always_keep_mm=always_keep_mm)
-            insert_grid(connection, key, len(grid.poses), content)
+            insert_grid(connection, key, packed)
         return True
 
     def missing(self, model_sha256: str, step_m: float, limit: int) -> list[PlanSummary]:
@@ -79,7 +88,7 @@ class StoredGrids:
             GRID_LEASES.c.model_sha256 == model_sha256,
             GRID_LEASES.c.step_m == step_m,
             _is_own_height(GRID_LEASES),
-            GRID_LEASES.c.lease_until_s > self._database.now_s(),
+            self._database.is_live(GRID_LEASES.c.lease_until_s, GRID_LEASES.c.length_s),
         )
         query = select_summaries().where(*_unprepared(model_sha256, step_m), ~exists().where(*leased))
         query = query.order_by(FLOORPLANS.c.created_at, FLOORPLANS.c.id).limit(limit)
@@ -99,32 +108,34 @@ class GridLeases:
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def claim(self, key: GridKey, owner: str, lease_s: float) -> bool:
+    def claim(self, key: GridKey, owner: str, lease_s: float) -> int | None:
         """Take the lease on a grid, if nobody has it or it has run out.
 
         Returns:
-            False when another owner has it, or the revision is gone.
+            how often the lease was taken, this time included, since somebody finished the grid or gave the lease back;
+            None when another owner has it, or the revision is gone.
         """
+        columns = GRID_LEASES.c
         until_s = self._database.now_s() + lease_s
-        values = {"owner": owner, "lease_until_s": until_s, "progress": 0.0}
-        statement = self._database.insert(GRID_LEASES).values(**_columns(key), **values)
+        values = {"owner": owner, "lease_until_s": until_s, "length_s": lease_s, "progress": 0.0}
+        statement = self._database.insert(GRID_LEASES).values(**_columns(key), **values, attempts=1)
         statement = statement.on_conflict_do_update(
             index_elements=list(GRID_LEASES.primary_key),
-            set_=values,
-            where=(GRID_LEASES.c.lease_until_s < self._database.now_s()) | (GRID_LEASES.c.owner == owner),
+            set_=values | {"attempts": columns.attempts + 1},
+            where=~self._database.is_live(columns.lease_until_s, columns.length_s) | (columns.owner == owner),
         )
         try:
             with self._database.writing() as connection:
-                return connection.scalar(statement.returning(GRID_LEASES.c.owner)) == owner
+                return connection.scalar(statement.returning(columns.attempts))
         except IntegrityError:
-            return False
+            return None
 
     def renew(self, key: GridKey, owner: str, lease_s: float, progress: float) -> bool:
         """Keep a lease and say how far the grid is; False when it is no longer the owner's, or the revision is gone."""
         statement = (
             update(GRID_LEASES)
             .where(*_where(GRID_LEASES, key), GRID_LEASES.c.owner == owner)
-            .values(lease_until_s=self._database.now_s() + lease_s, progress=progress)
+            .values(lease_until_s=self._database.now_s() + lease_s, length_s=lease_s, progress=progress)
         )
         with self._database.writing() as connection:
             return connection.execute(statement).rowcount == 1
@@ -141,17 +152,22 @@ class GridLeases:
             columns.model_sha256 == model_sha256,
             columns.step_m == step_m,
             columns.revision_id.in_(revision_ids),
-            columns.lease_until_s > self._database.now_s(),
+            self._database.is_live(columns.lease_until_s, columns.length_s),
         )
         with self._database.reading() as connection:
             return {(row.revision_id, row.camera_height_mm): row.progress for row in connection.execute(query)}
 
 
-def insert_grid(connection: Connection, key: GridKey, poses: int, content: memoryview) -> None:
+def insert_grid(connection: Connection, key: GridKey, packed: PackedGrid) -> None:
     """Write a packed grid within a transaction."""
-    values = {**_columns(key), "poses": poses, "size_bytes": len(content)}
+    values = {
+        **_columns(key),
+        "poses": packed.poses,
+        "size_bytes": len(packed.content),
+        "sha256": packed.sha256,
+    }
     grid_id = connection.scalar(LATENT_GRIDS.insert().values(values).returning(LATENT_GRIDS.c.id))
-    write_chunks(connection, GRID_CHUNKS, {"grid_id": grid_id}, content)
+    write_chunks(connection, GRID_CHUNKS, {"grid_id": grid_id}, memoryview(packed.content))
 
 
 def select_summaries() -> Any:
@@ -181,6 +197,11 @@ def _columns(key: GridKey) -> dict[str, Any]:
 
 def _where(table: Table, key: GridKey) -> list[ColumnElement[bool]]:
     return [table.c[name] == value for name, value in _columns(key).items()]
+
+
+def _has_digest() -> ColumnElement[bool]:
+    """Whether a row of the table of grids counts: an earlier version of the service, beside this one, writes none."""
+    return LATENT_GRIDS.c.sha256.is_not(None)
 
 
 def _is_own_height(table: Table) -> ColumnElement[bool]:
@@ -222,6 +243,7 @@ def _unprepared(model_sha256: str, step_m: float) -> list[ColumnElement[bool]]:
         LATENT_GRIDS.c.revision_id == REVISIONS.c.id,
         LATENT_GRIDS.c.model_sha256 == model_sha256,
         LATENT_GRIDS.c.step_m == step_m,
+        _has_digest(),
         _is_own_height(LATENT_GRIDS),
     )
     return [REVISIONS.c.failure.is_(None), ~exists().where(*own_grid)]

@@ -50,6 +50,7 @@ class Idempotency:
                 body_sha256=body_sha256,
                 token=token,
                 lease_until_s=until_s,
+                lease_s=self._lease_s,
                 created_at=now,
             )
             if connection.scalar(statement.on_conflict_do_nothing().returning(_COLUMNS.token)) == token:
@@ -89,8 +90,9 @@ class Idempotency:
             return Conflict()
         if row.status is not None:
             return StoredAnswer(row.status, json.loads(row.headers), row.body)
-        ran_out = _COLUMNS.lease_until_s < self._database.now_s()
-        taken = connection.execute(update(IDEMPOTENCY).where(*own, ran_out).values(lease_until_s=until_s))
+        ran_out = ~self._database.is_live(_COLUMNS.lease_until_s, _COLUMNS.lease_s)
+        values = {"lease_until_s": until_s, "lease_s": self._lease_s}
+        taken = connection.execute(update(IDEMPOTENCY).where(*own, ran_out).values(**values))
         return Fresh(row.token) if taken.rowcount == 1 else InProgress()
 
 

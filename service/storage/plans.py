@@ -3,36 +3,53 @@
 from __future__ import annotations
 
 import hashlib
-import json
-import math
+import logging
 import uuid
 from collections.abc import Collection
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Any
 
 from sqlalchemy import Connection, Row, and_, delete, func, or_, select, text, update
 
-from lalaloc_core.floorplan import FloorPlan, PlanLimits
-from service.errors import RevisionMismatchError, ServiceError, TooManyFloorPlansError, UnknownFloorPlanError
+from lalaloc_core.floorplan import FloorPlan
+from service.errors import DamagedDataError, RevisionMismatchError, TooManyFloorPlansError, UnknownFloorPlanError
 from service.lru import BoundedCache
 from service.storage.chunks import read_chunks, write_chunks
 from service.storage.database import Database
-from service.storage.grid_format import pack
+from service.storage.grid_format import PackedGrid, pack
 from service.storage.grids import insert_grid, select_summaries
-from service.storage.records import ComputedGrid, Cursor, PlanRecord, PlanSummary
+from service.storage.plan_document import PlanDocument
+from service.storage.records import ComputedGrid, Cursor, GridKey, PlanRecord, PlanSummary
 from service.storage.tables import FLOORPLANS, LATENT_GRIDS, ORIGINAL_CHUNKS, REVISIONS
+from service.telemetry import LOGGER_NAME
 
-# A stored plan was valid under the limits of its day; tighter limits must not make it unreadable.
-_STORED_LIMITS = PlanLimits(
-    max_rooms=10**9,
-    max_vertices_per_room=10**9,
-    max_plan_vertices=10**9,
-    max_extent_m=math.inf,
-    max_area_m2=math.inf,
-)
 _PARSED_BYTES = 64 * 2**20
 # Uploads take turns on PostgreSQL, so that the number of plans is exact; differs from the lock of `migration`.
 _COUNT_LOCK = 5_210_002
+
+
+@dataclass(frozen=True)
+class _Content:
+    """What is stored of a revision besides its row, made before the transaction that stores it."""
+
+    document: PlanDocument
+    original: bytes
+    original_sha256: str
+    grid: tuple[GridKey, PackedGrid] | None
+
+    @classmethod
+    def of(cls, record: PlanRecord, original: bytes, grid: ComputedGrid | None) -> _Content:
+        packed = None if grid is None else (grid.key(record.revision_id), pack(grid.grid))
+        return cls(PlanDocument.of(record.plan), original, hashlib.sha256(original).hexdigest(), packed)
+
+
+@dataclass(frozen=True)
+class _Found:
+    """A plan as the database has it, with the plan itself where it is in memory, else with its document."""
+
+    row: Row[Any]
+    plan: FloorPlan | PlanDocument
 
 
 class Plans:
@@ -66,17 +83,20 @@ class Plans:
         """
         now = datetime.now(UTC)
         record = _record(plan, plan_id=plan_id, tenant=tenant, number=1, created_at=now, updated_at=now)
+        content = _Content.of(record, original, grid)
         with self._database.writing() as connection:
             if self._database.is_postgresql:
                 connection.execute(text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": _COUNT_LOCK})
-            if (stored := self._record(connection, _current_head(tenant, plan_id))) is not None:
-                return stored
-            own = select(func.count()).select_from(FLOORPLANS).where(FLOORPLANS.c.tenant == tenant)
-            if (connection.scalar(own) or 0) >= limit:
-                raise TooManyFloorPlansError(limit)
-            values = {"id": plan_id, "tenant": tenant, "created_at": now, **_head(record)}
-            connection.execute(FLOORPLANS.insert(), values)
-            _insert_revision(connection, record, original, grid)
+            stored = self._find(connection, _current_head(tenant, plan_id))
+            if stored is None:
+                own = select(func.count()).select_from(FLOORPLANS).where(FLOORPLANS.c.tenant == tenant)
+                if (connection.scalar(own) or 0) >= limit:
+                    raise TooManyFloorPlansError(limit)
+                values = {"id": plan_id, "tenant": tenant, "created_at": now, **_head(record)}
+                connection.execute(FLOORPLANS.insert(), values)
+                _insert_revision(connection, record, content)
+        if stored is not None:
+            return self._record(stored)
         self._parsed.put(record.revision_id, plan)
         return record
 
@@ -103,6 +123,8 @@ class Plans:
             RevisionMismatchError: it has another revision than the one expected.
         """
         now = datetime.now(UTC)
+        record = _record(plan, plan_id=plan_id, tenant=tenant, number=0, created_at=now, updated_at=now)
+        content = _Content.of(record, original, grid)
         with self._database.writing() as connection:
             query = select(FLOORPLANS).where(FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
             row = connection.execute(query.with_for_update()).one_or_none()
@@ -112,10 +134,8 @@ class Plans:
                 raise RevisionMismatchError(plan_id, expected, row.revision_id)
             own = REVISIONS.c.plan_id == plan_id
             number = (connection.scalar(select(func.max(REVISIONS.c.number)).where(own)) or 0) + 1
-            record = _record(
-                plan, plan_id=plan_id, tenant=tenant, number=number, created_at=row.created_at, updated_at=now
-            )
-            _insert_revision(connection, record, original, grid)
+            record = replace(record, revision=number, created_at=row.created_at)
+            _insert_revision(connection, record, content)
             connection.execute(update(FLOORPLANS).where(FLOORPLANS.c.id == plan_id).values(**_head(record)))
             connection.execute(delete(REVISIONS).where(own, REVISIONS.c.number <= number - keep))
             old = select(REVISIONS.c.id).where(own, REVISIONS.c.number < number - 1)
@@ -136,11 +156,21 @@ class Plans:
         """A plan at some revision, whoever's it is: for work on grids, which knows no tenants."""
         return self._one(_select_heads(current=False).where(REVISIONS.c.id == revision_id))
 
+    def is_kept(self, revision_id: str) -> bool:
+        """Whether there is a revision, whosever it is."""
+        with self._database.reading() as connection:
+            return connection.scalar(select(REVISIONS.c.id).where(REVISIONS.c.id == revision_id)) is not None
+
+    def summary(self, tenant: str, plan_id: str) -> PlanSummary | None:
+        """A plan at its current revision without its rooms, which may be damaged."""
+        query = select_summaries().where(FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
+        return next(iter(self._summaries(query)), None)
+
     def original(self, tenant: str, plan_id: str) -> bytes | None:
         """The bytes that the current revision of a plan was uploaded as.
 
         Raises:
-            ServiceError: what is stored are others.
+            DamagedDataError: what is stored are others.
         """
         query = (
             select(REVISIONS.c.id, REVISIONS.c.original_sha256)
@@ -153,7 +183,7 @@ class Plans:
                 return None
             content = b"".join(read_chunks(connection, ORIGINAL_CHUNKS, {"revision_id": row.id}))
         if hashlib.sha256(content).hexdigest() != row.original_sha256:
-            raise ServiceError(f"the original of floor plan '{plan_id}' at revision '{row.id}' is damaged")
+            raise _damaged("original", plan_id, row.id)
         return content
 
     def list(
@@ -216,22 +246,33 @@ class Plans:
 
     def _one(self, query: Any) -> PlanRecord | None:
         with self._database.reading() as connection:
-            return self._record(connection, query)
+            found = self._find(connection, query)
+        return None if found is None else self._record(found)
 
-    def _record(self, connection: Connection, query: Any) -> PlanRecord | None:
+    def _find(self, connection: Connection, query: Any) -> _Found | None:
+        """What there is of a plan; its document, which is long, only where the plan is not in memory."""
         row = connection.execute(query).one_or_none()
         if row is None:
             return None
-        plan = self._parsed.get(row.revision_id) or self._parse(connection, row)
-        return PlanRecord(**row._mapping, plan=plan)
+        if (plan := self._parsed.get(row.revision_id)) is not None:
+            return _Found(row, plan)
+        columns = REVISIONS.c
+        query = select(columns.document, columns.document_sha256, columns.warnings).where(columns.id == row.revision_id)
+        return _Found(row, PlanDocument(**connection.execute(query).one()._mapping))
 
-    def _parse(self, connection: Connection, row: Row[Any]) -> FloorPlan:
-        """The plan of a revision that is not in memory; documents are long, so they are fetched for this alone."""
-        document = connection.scalar(select(REVISIONS.c.document).where(REVISIONS.c.id == row.revision_id))
-        assert document is not None
-        plan = FloorPlan.from_json(document, _STORED_LIMITS)
-        self._parsed.put(row.revision_id, plan)
-        return plan
+    def _record(self, found: _Found) -> PlanRecord:
+        """Read a plan; outside of transactions, as that takes a while.
+
+        Raises:
+            DamagedDataError: the document is not what was stored.
+        """
+        row, plan = found.row, found.plan
+        if isinstance(plan, PlanDocument):
+            plan = plan.plan()
+            if plan is None:
+                raise _damaged("document", row.id, row.revision_id)
+            self._parsed.put(row.revision_id, plan)
+        return PlanRecord(**row._mapping, plan=plan)
 
 
 def plan_bytes(plan: FloorPlan) -> int:
@@ -265,24 +306,29 @@ def _head(record: PlanRecord) -> dict[str, Any]:
     }
 
 
-def _insert_revision(connection: Connection, record: PlanRecord, original: bytes, grid: ComputedGrid | None) -> None:
+def _damaged(part: str, plan_id: str, revision_id: str) -> DamagedDataError:
+    fields = {"floorplan": plan_id, "revision": revision_id}
+    logging.getLogger(LOGGER_NAME).error(f"the stored {part} of a floor plan is damaged", extra={"fields": fields})
+    return DamagedDataError(f"the {part} of floor plan '{plan_id}' at revision '{revision_id}' is damaged")
+
+
+def _insert_revision(connection: Connection, record: PlanRecord, content: _Content) -> None:
     plan = record.plan
     values = {
         "id": record.revision_id,
         "plan_id": record.id,
         "number": record.revision,
         "created_at": record.updated_at,
-        "document": json.dumps(plan.to_dict()),
-        "original_sha256": hashlib.sha256(original).hexdigest(),
+        **content.document.columns(),
+        "original_sha256": content.original_sha256,
         "room_count": len(plan.rooms),
         "area_m2": plan.area_m2,
         "camera_height_m": plan.camera_height_m,
     }
     connection.execute(REVISIONS.insert(), values)
-    write_chunks(connection, ORIGINAL_CHUNKS, {"revision_id": record.revision_id}, memoryview(original))
-    if grid is not None:
-        key = grid.key(record.revision_id)
-        insert_grid(connection, key, len(grid.grid.poses), memoryview(pack(grid.grid)))
+    write_chunks(connection, ORIGINAL_CHUNKS, {"revision_id": record.revision_id}, memoryview(content.original))
+    if content.grid is not None:
+        insert_grid(connection, *content.grid)
 
 
 def _current_head(tenant: str, plan_id: str) -> Any:

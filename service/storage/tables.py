@@ -70,6 +70,9 @@ REVISIONS = Table(
     Column("number", Integer, nullable=False),
     Column("created_at", Moment, nullable=False),
     Column("document", Text, nullable=False),
+    # Nothing where an earlier version of the service stored the plan.
+    Column("document_sha256", String(64)),
+    Column("warnings", Text),
     Column("original_sha256", String(64), nullable=False),
     Column("room_count", Integer, nullable=False),
     Column("area_m2", Double, nullable=False),
@@ -96,6 +99,8 @@ LATENT_GRIDS = Table(
     Column("camera_height_mm", Integer, nullable=False),
     Column("poses", Integer, nullable=False),
     Column("size_bytes", Integer, nullable=False),
+    # Nothing where an earlier version of the service stored it, beside this one: then it does not count as stored.
+    Column("sha256", String(64)),
     UniqueConstraint("revision_id", "model_sha256", "step_m", "camera_height_mm", name="latent_grid_key"),
 )
 
@@ -117,7 +122,11 @@ GRID_LEASES = Table(
     Column("owner", String(32), nullable=False),
     # Seconds since 1970 by the clock that all owners share, see `Database.now_s`.
     Column("lease_until_s", Double, nullable=False),
+    # Nothing where an earlier version of the service took it, beside this one.
+    Column("length_s", Double),
     Column("progress", Double, nullable=False),
+    # How often the grid was begun, since it was last finished or given up.
+    Column("attempts", Integer, nullable=False, server_default="1"),
 )
 
 API_KEYS = Table(
@@ -143,6 +152,8 @@ IDEMPOTENCY = Table(
     Column("body_sha256", String(64), nullable=False),
     Column("token", String(32), nullable=False),
     Column("lease_until_s", Double, nullable=False),
+    # Nothing where an earlier version of the service took it.
+    Column("lease_s", Double),
     Column("created_at", Moment, nullable=False),
     Column("status", Integer),
     Column("headers", Text),

@@ -23,6 +23,7 @@ from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.retrieval import build_grid
 from service.errors import (
     OverloadedError,
+    PlanFailedError,
     PlanNotReadyError,
     StoppingError,
     StoreBusyError,
@@ -263,6 +264,42 @@ def test_the_lease_of_a_dead_replica_is_taken_over(
     assert encoders.embedded == 0
     wait_for(lambda: _looked(grids) or future.done())
     assert len(future.result(30.0).poses) == encoders.embedded
+
+
+def test_a_grid_that_nobody_ever_finishes_fails_after_a_few_attempts(
+    open_store: OpenStore, make_grids: MakeGrids, encoders: CountingEncoders
+) -> None:
+    store = open_store()
+    grids, record = make_grids(store), _add(store)
+    key = grids.key(record.revision_id, 1.5)
+    # As replicas do that lose their lease each time, or their life.
+    for number in range(5):
+        assert store.leases.claim(key, f"replica {number % 2}", 0.001)
+        time.sleep(0.01)
+    with pytest.raises(PlanFailedError, match="begun 5 times"):
+        grids.compute(record, 1.5).result(30.0)
+    assert encoders.embedded == 0
+    state = grids.states(store.plans.list("default", limit=1))[0]
+    assert (state.status, state.reason) == ("failed", "its latent grid was begun 5 times and never finished")
+    # The next start tries again.
+    store.plans.clear_failures()
+    assert len(grids.compute(record, 1.5).result(30.0).poses) == encoders.embedded
+
+
+def test_a_grid_without_numbers_fails_and_is_not_stored(store: Store, make_grids: MakeGrids, bundle: Bundle) -> None:
+    class Overflowing(CountingEncoders):
+        def poses(self, *arguments: Any, **named: Any) -> Any:
+            latent, profile_m = super().poses(*arguments, **named)
+            latent[-1, 0] = np.nan
+            return latent, profile_m
+
+    record = _add(store)
+    grids = make_grids(store, Overflowing(bundle))
+    with pytest.raises(InvalidPoseError, match=r"no latents at camera_height_m 1\.5"):
+        grids.compute(record, 1.5).result(30.0)
+    assert grids.prepare(PLAN) is None
+    state = grids.states(store.plans.list("default", limit=1))[0]
+    assert state.status == "failed"
 
 
 def test_a_replica_that_was_thought_dead_gives_way(

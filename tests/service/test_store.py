@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
+import math
 import sqlite3
+import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -25,6 +28,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.poses import LatentGrid
 from lalaloc_core.sampling import PoseSet
 from service.errors import (
+    DamagedDataError,
     RevisionMismatchError,
     ServiceError,
     StoreBusyError,
@@ -34,9 +38,18 @@ from service.errors import (
 )
 from service.storage.chunks import CHUNK_BYTES
 from service.storage.idempotency import KEPT_FOR, Idempotency
+from service.storage.plan_document import PlanDocument
 from service.storage.records import ComputedGrid, Conflict, Cursor, Fresh, GridKey, InProgress, StoredAnswer
 from service.storage.store import Store
-from service.storage.tables import GRID_CHUNKS, GRID_LEASES, IDEMPOTENCY, LATENT_GRIDS, METADATA, ORIGINAL_CHUNKS
+from service.storage.tables import (
+    GRID_CHUNKS,
+    GRID_LEASES,
+    IDEMPOTENCY,
+    LATENT_GRIDS,
+    METADATA,
+    ORIGINAL_CHUNKS,
+    REVISIONS,
+)
 from tests.service.conftest import FLAT
 from tests.service.postgres import PostgresServer
 
@@ -198,6 +211,65 @@ def test_what_is_deleted_while_it_is_read_is_read_whole(open_store: OpenStore, h
     else:
         assert second.plans.get("default", "p") == dataclasses.replace(added, plan=ANY)
     assert second.plans.get("default", "p") is None
+
+
+def test_a_plan_is_read_when_the_database_is_done_with_it(
+    open_store: OpenStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _add(open_store(), "p")
+    store, in_use = open_store(), []
+    read = PlanDocument.plan
+
+    def watched(document: PlanDocument) -> FloorPlan | None:
+        in_use.append(store._database._engine.pool.checkedout())  # pyright: ignore[reportAttributeAccessIssue]
+        return read(document)
+
+    monkeypatch.setattr(PlanDocument, "plan", watched)
+    assert store.plans.get("default", "p") is not None
+    repeated = open_store()
+    repeated.plans.add("default", "p", PLAN, original=b"{}", limit=10)
+    assert in_use == [0, 0]
+
+
+def test_what_was_odd_about_a_plan_is_kept_and_not_looked_for_again(open_store: OpenStore) -> None:
+    plan = dataclasses.replace(PLAN, warnings=("as found at the upload",))
+    open_store().plans.add("default", "p", plan, original=b"{}", limit=10)
+    found = open_store().plans.get("default", "p")
+    assert found is not None
+    assert found.plan.warnings == plan.warnings
+
+
+def test_a_plan_of_an_earlier_version_is_read_and_looked_at_again(open_store: OpenStore) -> None:
+    rooms = [{"name": name, "polygon": [[0, 0], [4, 0], [4, 3], [0, 3]]} for name in ("one", "other")]
+    plan = FloorPlan.from_dict({"ceiling_height_m": 2.5, "rooms": rooms})
+    store = open_store()
+    store.plans.add("default", "p", plan, original=b"{}", limit=10)
+    with store._database.writing() as connection:
+        connection.execute(update(REVISIONS).values(document_sha256=None, warnings=None))
+    found = open_store().plans.get("default", "p")
+    assert found is not None
+    assert found.plan.warnings == plan.warnings != ()
+
+
+@pytest.mark.parametrize("damage", [lambda text: text.replace("4.0", "4.5", 1), lambda text: text[:-1]])
+def test_a_plan_that_is_not_what_was_validated_is_not_given_out(
+    open_store: OpenStore, damage: Callable[[str], str]
+) -> None:
+    store = open_store()
+    _add(store, "p")
+    with store._database.writing() as connection:
+        document = connection.scalar(select(REVISIONS.c.document))
+        assert document is not None
+        connection.execute(update(REVISIONS).values(document=damage(document)))
+    again = open_store()
+    with pytest.raises(DamagedDataError, match="document of floor plan 'p'"):
+        again.plans.get("default", "p")
+    summary = again.plans.summary("default", "p")
+    assert summary is not None
+    assert again.plans.original("default", "p") == b"{}"
+    again.plans.add_revision("default", "p", PLAN, original=b"{}", keep=5)
+    assert again.plans.get("default", "p") is not None
+    assert again.plans.delete("default", "p")
 
 
 @pytest.mark.parametrize("cut_off", [True, False])
@@ -369,8 +441,12 @@ def test_a_grid_of_a_deleted_plan_is_not_stored(store: Store) -> None:
         lambda content: b"NOPE" + content[4:],
         lambda content: content[:4] + b"\x08" + content[5:],
         lambda content: b"",
+        # The first coordinate of the first pose.
+        lambda content: content[:16] + struct.pack("<d", math.nan) + content[24:],
+        # The last value of the last profile, before the numbers of rooms.
+        lambda content: content[: -7 * 4 - 4] + struct.pack("<f", math.inf) + content[-7 * 4 :],
     ],
-    ids=["cut off", "too long", "another format", "more poses", "empty"],
+    ids=["cut off", "too long", "another format", "more poses", "empty", "no number", "infinite"],
 )
 def test_a_damaged_grid_counts_as_not_stored_and_may_be_stored_again(
     store: Store, damage: Callable[[bytes], bytes]
@@ -382,14 +458,72 @@ def test_a_damaged_grid_counts_as_not_stored_and_may_be_stored_again(
         assert content is not None
         damaged = damage(bytes(content))
         connection.execute(update(GRID_CHUNKS).values(content=damaged))
-        # What it says of its size agrees, so that the content itself is looked at.
-        connection.execute(update(LATENT_GRIDS).values(size_bytes=len(damaged)))
+        # What is said of its size and digest agrees, so that the content itself is looked at.
+        digest = hashlib.sha256(damaged).hexdigest()
+        connection.execute(update(LATENT_GRIDS).values(size_bytes=len(damaged), sha256=digest))
     assert store.grids.get(key) is None
     assert _put(store, key)
     assert store.grids.get(key) is not None
 
 
+def test_a_grid_with_other_numbers_than_were_computed_is_not_read(store: Store) -> None:
+    key = _key(_add(store))
+    _put(store, key)
+    with store._database.writing() as connection:
+        content = connection.scalar(select(GRID_CHUNKS.c.content))
+        assert content is not None
+        # Two poses change places: as good a grid as before, but of another plan.
+        swapped = content[:16] + content[32:48] + content[16:32] + content[48:]
+        connection.execute(update(GRID_CHUNKS).values(content=swapped))
+    assert store.grids.get(key) is None
+    assert _put(store, key)
+    assert store.grids.get(key) is not None
+
+
+def test_a_grid_that_an_earlier_version_stores_beside_this_one_is_computed_again(store: Store) -> None:
+    key = _key(_add(store))
+    _put(store, key)
+    with store._database.writing() as connection:
+        connection.execute(update(LATENT_GRIDS).values(sha256=None))
+    assert store.grids.get(key) is None
+    assert store.grids.poses("m1", 0.5) == {}
+    assert [summary.revision_id for summary in store.grids.missing("m1", 0.5, 10)] == [key.revision_id]
+    assert store.grids.count_unprepared("m1", 0.5) == 1
+    assert _put(store, key)
+    assert store.grids.get(key) is not None
+
+
 # Leases
+
+
+def test_a_lease_from_a_clock_that_was_ahead_is_dead(store: Store) -> None:
+    key = _key(_add(store))
+    store.leases.claim(key, "ahead", 60.0)
+    two_days_s = 2 * 24 * 3600.0
+    with store._database.writing() as connection:
+        connection.execute(update(GRID_LEASES).values(lease_until_s=GRID_LEASES.c.lease_until_s + two_days_s))
+    assert store.leases.progress("m1", 0.5, [key.revision_id]) == {}
+    assert [summary.revision_id for summary in store.grids.missing("m1", 0.5, 10)] == [key.revision_id]
+    assert store.leases.claim(key, "me", 60.0) == 2
+    assert store.leases.claim(key, "other", 60.0) is None
+
+
+def test_a_lease_of_an_earlier_version_holds_until_it_ends(store: Store) -> None:
+    key = _key(_add(store))
+    store.leases.claim(key, "earlier", 60.0)
+    with store._database.writing() as connection:
+        connection.execute(update(GRID_LEASES).values(length_s=None))
+    assert store.leases.claim(key, "me", 60.0) is None
+
+
+def test_a_lease_counts_how_often_it_was_taken_until_it_is_given_back(store: Store) -> None:
+    key, counts = _key(_add(store)), []
+    for owner in ("one", "two", "one"):
+        counts.append(store.leases.claim(key, owner, 0.001))
+        time.sleep(0.01)
+    assert counts == [1, 2, 3]
+    store.leases.release(key, "one")
+    assert store.leases.claim(key, "two", 60.0) == 1
 
 
 def test_a_lease_is_one_owners_until_it_runs_out(open_store: OpenStore) -> None:
@@ -414,7 +548,7 @@ def test_of_many_who_claim_at_once_one_gets_the_lease(open_store: OpenStore) -> 
 
     def claim(number: int) -> bool:
         start.wait(10.0)
-        return stores[number % 2].leases.claim(key, f"owner {number}", 60.0)
+        return stores[number % 2].leases.claim(key, f"owner {number}", 60.0) is not None
 
     with ThreadPoolExecutor(8) as threads:
         assert sum(threads.map(claim, range(8))) == 1
@@ -535,6 +669,16 @@ def test_keys_are_found_by_hash_until_revoked(store: Store) -> None:
     assert [key.revoked_at is None for key in store.keys.list()] == [False, True]
 
 
+def test_a_claim_from_a_clock_that_was_ahead_is_dead(store: Store) -> None:
+    claim = store.idempotency.begin("t", "r", "k", "body")
+    assert isinstance(claim, Fresh)
+    assert isinstance(store.idempotency.begin("t", "r", "k", "body"), InProgress)
+    with store._database.writing() as connection:
+        connection.execute(update(IDEMPOTENCY).values(lease_until_s=IDEMPOTENCY.c.lease_until_s + 48 * 3600.0))
+    assert store.idempotency.begin("t", "r", "k", "body") == claim
+    assert isinstance(store.idempotency.begin("t", "r", "k", "body"), InProgress)
+
+
 # The database itself
 
 
@@ -577,6 +721,35 @@ CREATE TABLE {grids} (
     FOREIGN KEY(plan_id) REFERENCES floorplans (id) ON DELETE CASCADE
 );
 """
+
+
+def test_grids_of_the_schema_before_are_computed_again_and_the_rest_stays(store: Store, url: str) -> None:
+    revision_id = _add(store, "p")
+    _put(store, _key(revision_id))
+    store.idempotency.begin("t", "r", "k", "body")
+    with store._database.writing() as connection:
+        for table, column in (
+            ("latent_grids", "sha256"),
+            ("revisions", "document_sha256"),
+            ("revisions", "warnings"),
+            ("grid_leases", "length_s"),
+            ("grid_leases", "attempts"),
+            ("idempotency", "lease_s"),
+        ):
+            connection.exec_driver_sql(f"ALTER TABLE {table} DROP COLUMN {column}")
+        connection.exec_driver_sql("UPDATE alembic_version SET version_num = '0001'")
+    store.close()
+    moved = Store(url)
+    assert _rows(moved, LATENT_GRIDS) == _rows(moved, GRID_CHUNKS) == 0
+    assert [summary.id for summary in moved.grids.missing("m1", 0.5, 10)] == ["p"]
+    record = moved.plans.get("default", "p")
+    assert record is not None
+    assert record.plan.to_dict() == PLAN.to_dict()
+    assert isinstance(moved.idempotency.begin("t", "r", "k", "body"), InProgress)
+    with moved._database.reading() as connection:
+        context = MigrationContext.configure(connection, opts={"compare_type": True})
+        assert compare_metadata(context, METADATA) == []
+    moved.close()
 
 
 @pytest.mark.parametrize("grids", ["latent_grids", "latent_grids_2"])
