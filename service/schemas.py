@@ -269,6 +269,7 @@ class LimitsAnswer(Answer):
     max_grid_poses: int = Field(description="Poses that a plan's latent grid may have.")
     max_panorama_bytes: int = Field(description="Upload of a panorama.")
     max_pixels: int = Field(description="Pixels of a panorama.")
+    max_scans: int = Field(description="Scans of a panorama that is a progressive JPEG.")
     max_top_k: int = Field(description="Candidates of an answer.")
     max_pending_requests: int = Field(description="Uploads and queries in flight.")
     max_queries: int = Field(description="Queries in work; more get a 503 at once.")

@@ -205,6 +205,9 @@ class Settings(BaseSettings):
     )
     max_panorama_bytes: Count = Field(default=40 * 2**20, description="Upload of a panorama.")
     max_pixels: Count = Field(default=100_000_000, description="Pixels of a panorama.")
+    max_scans: Count = Field(
+        default=20, description="Scans of a panorama that is a progressive JPEG; encoders write 3 to 12."
+    )
     max_top_k: Annotated[int, Field(ge=1, le=100)] = Field(default=10, description="Candidates of an answer.")
 
     @field_validator("allowed_hosts")
@@ -276,7 +279,7 @@ class Settings(BaseSettings):
     @property
     def panorama_limits(self) -> PanoramaLimits:
         """Limits of panoramas in the terms of the core."""
-        return PanoramaLimits(max_pixels=self.max_pixels)
+        return PanoramaLimits(max_pixels=self.max_pixels, max_scans=self.max_scans)
 
 
 def settings_table() -> str:

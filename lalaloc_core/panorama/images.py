@@ -19,6 +19,8 @@ from jaxtyping import UInt8
 from PIL import ExifTags, Image, ImageChops, UnidentifiedImageError
 
 from lalaloc_core.errors import InvalidPanoramaError
+from lalaloc_core.file_kinds import kind_of
+from lalaloc_core.panorama.jpeg import count_scans
 from lalaloc_core.panorama.levelling import level
 from lalaloc_core.panorama.photo_sphere import PhotoSphere, SpherePart, read_photo_sphere
 
@@ -45,11 +47,16 @@ _SIDEWAYS = {5, 6, 7, 8}
 
 @dataclass(frozen=True, kw_only=True)
 class PanoramaLimits:
-    """What a panorama may be; checked on the file's header, before its pixels are allocated."""
+    """What a panorama may be; checked on the file's header, before its pixels are allocated.
+
+    Attributes:
+        max_scans: of a progressive JPEG; encoders write 3 to 12.
+        aspect_tolerance: share by which a full sphere may be off twice as wide as high; stitchers round.
+    """
 
     max_pixels: int = 100_000_000
+    max_scans: int = 20
     min_height: int = 64
-    # Stitchers round; a picture this close to 2:1 is still a full sphere.
     aspect_tolerance: float = 0.01
 
 
@@ -77,15 +84,16 @@ def open_panorama(content: bytes, *, height: int, width: int, limits: PanoramaLi
     """Decode an equirectangular JPEG, PNG or WebP and scale it to `height` x `width` RGB; the first one of several.
 
     Raises:
-        InvalidPanoramaError: empty, not one of the formats, damaged, too large, or neither the full sphere nor a part
-            of it that its metadata tell.
+        InvalidPanoramaError: empty, not one of the formats, damaged, too large, of too many scans, or neither the full
+            sphere nor a part of it that its metadata tell.
     """
     limits = limits or PanoramaLimits()
     if not content:
         raise InvalidPanoramaError("the panorama is empty")
     _check_webp_size(content, limits)
-    with _named_errors(limits), Image.open(io.BytesIO(content), formats=FORMATS) as image:
+    with _named_errors(content, limits), Image.open(io.BytesIO(content), formats=FORMATS) as image:
         _check_pixels(*image.size, limits)
+        _check_scans(content, limits)
         orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
         upright = _turned(image.size, orientation)
         sphere = read_photo_sphere(image.info.get("xmp"), width=upright[0], height=upright[1])
@@ -110,7 +118,7 @@ def warm_up(*, height: int, width: int) -> None:
 
 
 @contextmanager
-def _named_errors(limits: PanoramaLimits) -> Iterator[None]:
+def _named_errors(content: bytes, limits: PanoramaLimits) -> Iterator[None]:
     try:
         with warnings.catch_warnings():
             # Our own pixel limit, checked on the header, replaces Pillow's warning; damaged metadata do not matter.
@@ -119,13 +127,21 @@ def _named_errors(limits: PanoramaLimits) -> Iterator[None]:
     except InvalidPanoramaError:
         raise
     except UnidentifiedImageError as error:
-        raise InvalidPanoramaError(f"the panorama is not a readable {', '.join(FORMATS)} picture") from error
+        raise InvalidPanoramaError(_unreadable(content)) from error
     except Image.DecompressionBombError as error:
         raise InvalidPanoramaError(f"the panorama has more than {limits.max_pixels} pixels (max_pixels)") from error
     except MemoryError as error:
         raise InvalidPanoramaError("the panorama needs more memory than there is to decode it") from error
     except (OSError, SyntaxError, ValueError, EOFError) as error:
         raise InvalidPanoramaError(f"the panorama is damaged: {error}") from error
+
+
+def _unreadable(content: bytes) -> str:
+    formats = f"{', '.join(FORMATS[:-1])} or {FORMATS[-1]}"
+    kind = kind_of(content)
+    if kind is None or any(name in kind.upper() for name in FORMATS):
+        return f"the panorama is not a readable {formats} picture"
+    return f"the panorama is {kind}, which is not read here: save or export it as {formats}"
 
 
 def _check_webp_size(content: bytes, limits: PanoramaLimits) -> None:
@@ -151,6 +167,15 @@ def _check_pixels(width: int, height: int, limits: PanoramaLimits) -> None:
         )
 
 
+def _check_scans(content: bytes, limits: PanoramaLimits) -> None:
+    """Each scan of a JPEG goes over all of its pixels once more."""
+    if count_scans(content, limits.max_scans) > limits.max_scans:
+        raise InvalidPanoramaError(
+            f"the panorama is a JPEG of more than {limits.max_scans} scans (max_scans); saved anew it has one "
+            "to a dozen"
+        )
+
+
 def _check_shape(width: int, height: int, sphere: PhotoSphere, limits: PanoramaLimits) -> None:
     if sphere.refusal is not None:
         raise InvalidPanoramaError(f"the panorama cannot be used by its photo sphere metadata: {sphere.refusal}")
@@ -162,7 +187,8 @@ def _check_shape(width: int, height: int, sphere: PhotoSphere, limits: PanoramaL
     if sphere.part is None and abs(width / height - 2.0) > 2.0 * limits.aspect_tolerance:
         fault = "" if sphere.fault is None else f"; its photo sphere metadata do not help: {sphere.fault}"
         raise InvalidPanoramaError(
-            f"the panorama is {width} x {height}; a full 360° panorama is exactly twice as wide as high{fault}"
+            f"the panorama is {width} x {height}; a full 360° panorama is twice as wide as high, give or take "
+            f"{limits.aspect_tolerance:.0%}{fault}"
         )
 
 

@@ -191,7 +191,7 @@ class TestBadFiles:
         path = root / "home" / "hall.png"
         Image.fromarray(np.zeros((64, 64, 3), np.uint8)).save(path)
         scene = OwnData(root).load("home")
-        with pytest.raises(DatasetError, match="64 x 64; a full 360° panorama is exactly twice as wide") as caught:
+        with pytest.raises(DatasetError, match="64 x 64; a full 360° panorama is twice as wide") as caught:
             scene.photograph(scene.cameras[0], Appearance()).image(64, 128)
         assert (caught.value.scene, caught.value.room, caught.value.path) == ("home", "hall.png", path)
 

@@ -16,6 +16,7 @@ from PIL import Image, ImageChops
 
 from lalaloc_core.errors import InvalidPanoramaError
 from lalaloc_core.panorama.images import NEUTRAL, PanoramaLimits, open_panorama, read_panorama
+from lalaloc_core.panorama.jpeg import count_scans
 
 HEIGHT, WIDTH = 32, 64
 LOSSLESS = {"PNG": {}, "WEBP": {"lossless": True}}
@@ -53,6 +54,14 @@ def png(width: int, height: int, rows: bytes, *, depth: int = 8, colour_type: in
 
     header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, depth, colour_type, 0, 0, 0))
     return b"\x89PNG\r\n\x1a\n" + header + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+
+
+def of_scans(width: int, height: int, added: int) -> bytes:
+    """A grey progressive JPEG of six scans, the last of them repeated; each more is a few dozen bytes."""
+    content = encoded(Image.new("L", (width, height), 90), "JPEG", progressive=True)
+    # A scan begins with its Huffman table.
+    begin = content.rindex(b"\xff\xc4", 0, content.rindex(b"\xff\xda"))
+    return content[:-2] + added * content[begin:-2] + content[-2:]
 
 
 def grey_16_bit(values: np.ndarray) -> bytes:
@@ -218,6 +227,49 @@ class TestAccepted:
         assert read(encoded(picture(height=640), "JPEG"), limits).shape == (HEIGHT, WIDTH, 3)
 
 
+class TestScans:
+    @pytest.mark.parametrize(("options", "scans"), [({}, 1), ({"progressive": True}, 10)])
+    @pytest.mark.parametrize("restarts", [0, 1])
+    def test_scans_are_those_of_the_encoder_s_script(self, options: dict[str, bool], scans: int, restarts: int) -> None:
+        noise = Image.fromarray(np.random.default_rng(0).integers(0, 256, (128, 256, 3), dtype=np.uint8))
+        content = encoded(noise, "JPEG", quality=95, restart_marker_rows=restarts, **options)
+        assert count_scans(content, 100) == scans
+        assert count_scans(content, 4) == min(scans, 5)
+        # What hides in metadata and behind the end is none of the picture's.
+        thumbnail = Image.Exif()
+        thumbnail[0x010E] = "\xff\xda" * 50
+        assert count_scans(encoded(noise, "JPEG", exif=thumbnail, **options), 100) == scans
+        assert count_scans(content + content[2:], 100) == scans
+
+    @pytest.mark.parametrize("added", [0, 1, 10])
+    def test_as_many_scans_as_the_decoder_goes_over_are_counted(self, added: int) -> None:
+        assert count_scans(of_scans(256, 128, added), 100) == 6 + added
+        assert read(of_scans(256, 128, added)).shape == (HEIGHT, WIDTH, 3)
+
+    def test_the_limit_is_what_is_still_read(self) -> None:
+        limits = PanoramaLimits(max_scans=8)
+        read(of_scans(256, 128, 2), limits)
+        with pytest.raises(InvalidPanoramaError, match=r"more than 8 scans"):
+            read(of_scans(256, 128, 3), limits)
+
+    @pytest.mark.parametrize("unit", [b"\xff\x00", b"\xff\xff", b"\xff\xd0", b"\xff\x01", b"\xff\xe0\0\2", b"\0"])
+    def test_counting_takes_time_in_proportion_to_the_file(self, unit: bytes) -> None:
+        def seconds(size: int) -> float:
+            content = b"\xff\xd8\xff\xda\0\2" + unit * (size // len(unit))
+            took = []
+            for _ in range(5):
+                begin = time.process_time()
+                count_scans(content, 20)
+                took.append(time.process_time() - begin)
+            return min(took)
+
+        assert seconds(4_000_000) < 2.5 * seconds(2_000_000) + 1e-3
+
+    @given(st.binary(max_size=200))
+    def test_any_bytes_have_a_number_of_scans(self, tail: bytes) -> None:
+        assert 0 <= count_scans(b"\xff\xd8" + tail, 5) <= 6
+
+
 class TestRefused:
     @pytest.mark.parametrize(
         ("content", "reason"),
@@ -225,10 +277,18 @@ class TestRefused:
             (b"", "empty"),
             (b"hello", "not a readable"),
             (b"\x89PNG\r\n\x1a\n", "not a readable|damaged"),
-            (encoded(picture(), "GIF"), "not a readable"),
-            (encoded(picture(), "BMP"), "not a readable"),
-            (encoded(picture(), "TIFF"), "not a readable"),
-            (encoded(Image.new("RGB", (256, 512))), "twice as wide"),
+            (
+                encoded(picture(), "GIF"),
+                "is a GIF picture, which is not read here: save or export it as JPEG, PNG or WEBP",
+            ),
+            (encoded(picture(), "BMP"), "is a BMP picture"),
+            (encoded(picture(), "TIFF"), "is a TIFF picture"),
+            (b"\0\0\0\x24ftypheic\0\0\0\0mif1heic", "is a HEIC picture"),
+            (b"\0\0\0\x1cftypavif", "is an AVIF picture"),
+            (b"\0\0\0\x1cftypisom", "is a video"),
+            (b"%PDF-1.7", "is a PDF document"),
+            (b' {"name": "x", "type" : "FeatureCollection", "features": []}', "is GeoJSON"),
+            (encoded(Image.new("RGB", (256, 512))), "256 x 512; .* is twice as wide as high, give or take 1%$"),
             (encoded(Image.new("RGB", (256, 256))), "twice as wide"),
             (encoded(Image.new("RGB", (256, 64))), "twice as wide"),
             (encoded(Image.new("RGB", (530, 256))), "twice as wide"),
@@ -253,6 +313,15 @@ class TestRefused:
         begin = time.perf_counter()
         with pytest.raises(InvalidPanoramaError, match=r"pixels|damaged"):
             read(png_header(width, height))
+        assert time.perf_counter() - begin < 1.0
+
+    def test_a_jpeg_of_many_scans_is_refused_before_it_is_decoded(self) -> None:
+        content = of_scans(14_000, 7_000, 400)
+        assert len(content) < 700_000
+        begin = time.perf_counter()
+        with pytest.raises(InvalidPanoramaError, match=r"a JPEG of more than 20 scans \(max_scans\)"):
+            read(content)
+        # Decoding it takes most of a minute.
         assert time.perf_counter() - begin < 1.0
 
     @pytest.mark.parametrize("kind", [b"VP8X", b"VP8L", b"VP8 "])

@@ -146,12 +146,12 @@ def serve(app: FastAPI) -> Iterator[str]:
             assert not thread.is_alive(), "the app did not stop"
 
 
-def encode_picture(width: int, height: int, picture_format: str) -> bytes:
+def encode_picture(width: int, height: int, picture_format: str, **options: Any) -> bytes:
     """A smooth picture as encoded bytes."""
     x, y = np.meshgrid(np.linspace(0.0, 6.28, width), np.linspace(0.0, 3.14, height))
     channels = [127.0 + 120.0 * np.sin(x + phase) * np.sin(y) for phase in (0.0, 2.0, 4.0)]
     buffer = io.BytesIO()
-    Image.fromarray(np.stack(channels, axis=-1).astype(np.uint8)).save(buffer, picture_format)
+    Image.fromarray(np.stack(channels, axis=-1).astype(np.uint8)).save(buffer, picture_format, **options)
     return buffer.getvalue()
 
 

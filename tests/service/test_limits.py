@@ -63,7 +63,8 @@ def test_more_plans_than_allowed_are_refused_by_the_limit_s_name(start_app: Star
 
 
 def test_a_query_over_a_limit_is_refused_by_its_name(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
-    with start_app(tmp_path, max_pixels=100_000, max_top_k=3, max_panorama_bytes=100_000) as client:
+    many_scans = encode_picture(256, 128, "JPEG", progressive=True)
+    with start_app(tmp_path, max_pixels=100_000, max_scans=9, max_top_k=3, max_panorama_bytes=100_000) as client:
         plan_id = upload(client)
         # Who asks for no number gets no more than are allowed.
         allowed = localise(client, plan_id, encode_picture(256, 128, "JPEG"))
@@ -71,6 +72,7 @@ def test_a_query_over_a_limit_is_refused_by_its_name(start_app: StartApp, tmp_pa
         assert len(allowed.json()["candidates"]) <= 3
         refusals = {
             "max_pixels": localise(client, plan_id, panorama, top_k=3),
+            "max_scans": localise(client, plan_id, many_scans, top_k=3),
             "max_top_k": localise(client, plan_id, panorama, top_k=4),
             "max_panorama_bytes": localise(client, plan_id, bytes(100_001), top_k=3),
         }

@@ -187,7 +187,8 @@ def _png_header(width: int, height: int) -> bytes:
 
 BAD_PICTURES = {
     "empty": (b"", "empty"),
-    "no picture": (b"GIF89a but not really", "not a readable"),
+    "no picture": (b"\x89PNG but not really", "not a readable"),
+    "GIF": (b"GIF89a", "is a GIF picture"),
     "truncated": (encode_picture(512, 256, "JPEG")[:3000], "damaged"),
     "bomb": (_png_header(20_000, 10_000), "pixels"),
     "twelve thousand wide": (_png_header(16_000, 8_000), "16000 x 8000"),
