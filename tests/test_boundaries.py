@@ -23,6 +23,7 @@ LAYERS = {
     "lalaloc_core.floorplan": 1,
     "lalaloc_core.sampling": 1,
     "lalaloc_core.metrics": 1,
+    "lalaloc_core.azimuths": 1,
     "lalaloc_core.bundle": 1,
     "lalaloc_core.panorama": 2,
     "lalaloc_core.render": 2,

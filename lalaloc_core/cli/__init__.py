@@ -9,7 +9,7 @@ import argparse
 import logging
 import sys
 
-from lalaloc_core.cli import evaluation, measuring, reproduction, synthesis, training
+from lalaloc_core.cli import evaluation, measuring, photographs, reproduction, synthesis, training
 from lalaloc_core.errors import InvalidInputError, LaLaLocError
 
 
@@ -31,6 +31,6 @@ def main(argv: list[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="lalaloc", description="Localise panoramas in floor plans.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for room in (synthesis, training, evaluation, reproduction, measuring):
+    for room in (synthesis, training, evaluation, photographs, reproduction, measuring):
         room.add_commands(commands)
     return parser

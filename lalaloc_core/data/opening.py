@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from lalaloc_core.data.annotated import AnnotatedPhotographs, annotation_files
 from lalaloc_core.data.dataset import Dataset
 from lalaloc_core.data.folder import PLAN_FILE, OwnData
 from lalaloc_core.data.structured3d import Structured3D
@@ -30,12 +31,15 @@ def open_dataset(root: Path) -> Dataset:
         found["ZInD"] = Zind(root)
     if next(root.glob(f"*/{PLAN_FILE}"), None) is not None:
         found["own data"] = OwnData(root)
+    if annotation_files(root):
+        found["annotated photographs"] = AnnotatedPhotographs(root)
     if len(found) > 1:
         raise DatasetError(f"the folder holds several data sets: {', '.join(found)}", path=root)
     if not found:
         raise DatasetError(
             "no data set here; looked for folders 'scene_00000' (Structured3D), "
-            f"'{PARTITION_FILE}' or '*/{DATA_FILE}' (ZInD), and '*/{PLAN_FILE}' (own data)",
+            f"'{PARTITION_FILE}' or '*/{DATA_FILE}' (ZInD), '*/{PLAN_FILE}' (own data), and "
+            "'*.json' with 'photograph' and 'polygon' (annotated photographs)",
             path=root,
         )
     return next(iter(found.values()))

@@ -54,6 +54,7 @@ class Prediction:
         layout_hit: whether retrieval chose the grid pose whose layout is nearest the truth by Chamfer distance
             (Layout R@1); None for methods that do not retrieve.
         pose_hit: whether it chose the nearest grid pose (Pose R@1).
+        room_rank: of the best candidate in the true room, from 1; None where none is in it, or the method ranks none.
         signals: by stage, what speaks for its pose and against it; see `localise.confidence`.
         information: curvature of the cost at the answer, by x and y (m) and, where it was searched, heading (radians).
         confidence: probability, by the model, of being within 1 m.
@@ -69,6 +70,7 @@ class Prediction:
     stages: dict[str, Pose] = field(default_factory=dict)
     layout_hit: bool | None = None
     pose_hit: bool | None = None
+    room_rank: int | None = None
     signals: dict[str, dict[str, float]] = field(default_factory=dict)
     information: tuple[tuple[float, ...], ...] | None = None
     confidence: float | None = None

@@ -196,6 +196,7 @@ class _Examiner:
             stages={stage: _pose(found) for stage, found in answer.stages.items()},
             layout_hit=self._layout_hit(question, answer),
             pose_hit=self._pose_hit(camera, answer),
+            room_rank=answer.rooms.index(camera.room_index) + 1 if camera.room_index in answer.rooms else None,
             signals=answer.signals,
             information=None if answer.information is None else tuple(map(tuple, answer.information.tolist())),
             confidence=answer.confidence,

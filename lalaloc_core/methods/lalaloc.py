@@ -65,6 +65,8 @@ class LaLaLoc:
             self.encoders,
             query,
             refine=self._refine,
+            # All that are refined; how many are returned changes nothing about the search.
+            top_k=self._config.starts(query),
             refiner=self._refiner,
             config=self._config,
         )
@@ -74,6 +76,7 @@ class LaLaLoc:
         model = self.encoders.manifest.confidence if calibrated else None
         return Answer(
             stages={stage: found_pose(query, candidate) for stage, candidate in found.best.items()},
+            rooms=tuple(candidate.room_index for candidate in found.candidates),
             retrieved=grid_index(grid, found.best["retrieval"]),
             signals=signals,
             information=found.best[found.stage].information,

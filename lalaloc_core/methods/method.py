@@ -77,6 +77,7 @@ class Answer:
 
     Attributes:
         stages: the best pose after each stage, in order; the last is the answer. Empty: no answer.
+        rooms: room of each distinct candidate, best first; empty for methods that rank none.
         retrieved: number of the grid pose that retrieval chose; None for methods that do not retrieve.
         signals: by stage, what speaks for its pose and against it; see `localise.confidence`.
         information: curvature of the cost at the answer, see `localise.poses.Candidate`.
@@ -85,6 +86,7 @@ class Answer:
     """
 
     stages: dict[str, Found] = field(default_factory=dict)
+    rooms: tuple[int, ...] = ()
     retrieved: int | None = None
     signals: dict[str, dict[str, float]] = field(default_factory=dict)
     information: Float[np.ndarray, "p p"] | None = None

@@ -19,7 +19,7 @@ from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.report.plan import Cells, draw_camera, draw_distances, draw_plan, halo
 
 PANORAMA_HEIGHT, PANORAMA_WIDTH = 384, 768
-TRUE_COLOUR, FOUND_COLOUR = "#35e0ff", "#ff3b30"
+TRUE_COLOUR, FOUND_COLOUR, PREDICTED_COLOUR = "#35e0ff", "#ff3b30", "#ffd60a"
 _EDGE = (20, 24, 30)
 # Lines are drawn this much larger and scaled down, which smooths them.
 _OVERSAMPLING = 3

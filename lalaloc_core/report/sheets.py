@@ -21,7 +21,7 @@ _PAPER, _INK = "white", "#20242c"
 
 @dataclass(frozen=True, eq=False)
 class Thumbnail:
-    """A picture of `PICTURE_HEIGHT` x `PICTURE_WIDTH` and the lines below it; what does not fit is cut."""
+    """A picture and the lines below it; what does not fit is cut."""
 
     picture: Image.Image
     caption: Sequence[str]
@@ -32,10 +32,12 @@ def draw_sheet(title: str, key: Mapping[str, str], thumbnails: Sequence[Thumbnai
 
     Args:
         key: what each colour of the pictures' lines means, by colour.
-        thumbnails: at most `PER_SHEET`, row by row.
+        thumbnails: row by row, their pictures all of one size.
     """
-    assert len(thumbnails) <= PER_SHEET, f"{len(thumbnails)} pictures do not fit on a sheet of {PER_SHEET}"
-    cell_width, cell_height = PICTURE_WIDTH + _GAP, PICTURE_HEIGHT + _TEXT_LINES * _LINE + _GAP
+    width, height = thumbnails[0].picture.size if thumbnails else (PICTURE_WIDTH, PICTURE_HEIGHT)
+    assert all(one.picture.size == (width, height) for one in thumbnails), "pictures of a sheet are all of one size"
+    cell_width, cell_height = width + _GAP, height + _TEXT_LINES * _LINE + _GAP
+    characters = _CHARACTERS * width // PICTURE_WIDTH
     rows = -(-len(thumbnails) // COLUMNS)
     sheet = Image.new("RGB", (COLUMNS * cell_width + _GAP, _HEADER + rows * cell_height + _GAP), _PAPER)
     draw = ImageDraw.Draw(sheet)
@@ -51,7 +53,7 @@ def draw_sheet(title: str, key: Mapping[str, str], thumbnails: Sequence[Thumbnai
         row, column = divmod(index, COLUMNS)
         left, top = _GAP + column * cell_width, _HEADER + row * cell_height
         sheet.paste(thumbnail.picture, (left, top))
-        lines = [part for line in thumbnail.caption for part in textwrap.wrap(line, _CHARACTERS)]
+        lines = [part for line in thumbnail.caption for part in textwrap.wrap(line, characters)]
         for place, line in enumerate(lines[:_TEXT_LINES]):
-            draw.text((left, top + PICTURE_HEIGHT + place * _LINE + 1), line, font=font, fill=_INK)
+            draw.text((left, top + height + place * _LINE + 1), line, font=font, fill=_INK)
     return sheet

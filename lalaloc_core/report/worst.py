@@ -31,6 +31,7 @@ from lalaloc_core.methods.lalaloc import encode, read_image
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.report.pictures import (
     FOUND_COLOUR,
+    PREDICTED_COLOUR,
     TRUE_COLOUR,
     Stroke,
     draw_strokes,
@@ -48,7 +49,6 @@ from lalaloc_core.report.sheets import (
 from lalaloc_core.report.tables import distance, percent
 
 SUMMARY_FILE = "worst.json"
-PREDICTED_COLOUR = "#ffd60a"
 _KEY = {TRUE_COLOUR: "true layout", FOUND_COLOUR: "found layout", PREDICTED_COLOUR: "predicted walls' floor line"}
 
 

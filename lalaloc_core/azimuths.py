@@ -1,0 +1,158 @@
+"""What is said of a photograph azimuth by azimuth, against the truth: walls, how sure one is of them, what is in them.
+
+Formulas alone, so that training can validate with them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+# Shares of the errors that a predicted Laplace distribution promises to hold within its quantiles.
+QUANTILES = (0.5, 0.8, 0.9, 0.95)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class AzimuthMeasures:
+    """One photograph; of several outlines that can be defended, the one that the prediction is nearer to.
+
+    Attributes:
+        outline: number of that outline.
+        log_error: (w,) predicted less true log distance of the wall; infinite where the prediction is not a number.
+        log_scale: (w,) predicted log scale of `log_error`, of a Laplace distribution.
+        confusion: azimuths by true (row) and predicted class; None where no classes were predicted.
+    """
+
+    outline: int
+    log_error: Float[np.ndarray, "w"]
+    log_scale: Float[np.ndarray, "w"]
+    confusion: Int[np.ndarray, "c c"] | None = None
+
+    @property
+    def median_error(self) -> float:
+        """Median of |Δ log d|."""
+        return float(np.median(np.abs(self.log_error)))
+
+    @property
+    def error_90(self) -> float:
+        """|Δ log d| that nine in ten azimuths are below."""
+        return float(np.quantile(np.abs(self.log_error), 0.9, method="higher"))
+
+    @property
+    def bias(self) -> float:
+        """Median of Δ log d: positive where walls are predicted too far."""
+        return float(np.median(self.log_error))
+
+    @property
+    def scale_ratio(self) -> float:
+        """How many times larger errors are than their predicted scale says, in the median."""
+        return float(np.median(self._normalised) / np.log(2.0))
+
+    @property
+    def within(self) -> Float[np.ndarray, "q"]:
+        """Share of the errors within each of `QUANTILES` of what was predicted; they are right if they are equal."""
+        limits = -np.log1p(-np.array(QUANTILES))
+        return (self._normalised[:, None] <= limits).mean(axis=0)
+
+    @property
+    def _normalised(self) -> Float[np.ndarray, "w"]:
+        return np.abs(self.log_error) * np.exp(-self.log_scale)
+
+
+@dataclass(frozen=True, kw_only=True)
+class ClassScores:
+    """Classes per azimuth; None where a class never occurs, or is never predicted.
+
+    Attributes:
+        balanced_accuracy: mean recall of the classes that occur.
+    """
+
+    balanced_accuracy: float
+    recall: Mapping[str, float | None]
+    precision: Mapping[str, float | None]
+
+
+@dataclass(frozen=True, kw_only=True)
+class AzimuthSummary:
+    """Several photographs.
+
+    Attributes:
+        median_error: median over the photographs of their medians of |Δ log d|.
+        error_90: median over the photographs of what nine in ten of their azimuths are below.
+        scale_ratio: median over the photographs.
+        within: by quantile, the share of all azimuths whose error lies within it.
+        classes: over all azimuths; None where none were predicted.
+    """
+
+    n: int
+    median_error: float
+    error_90: float
+    scale_ratio: float
+    within: Mapping[str, float]
+    classes: ClassScores | None = None
+
+
+def measure_azimuths(
+    profiles_m: Sequence[Float[np.ndarray, "w"]],
+    log_profile: Float[np.ndarray, "w"],
+    log_scale: Float[np.ndarray, "w"],
+    true_classes: Int[np.ndarray, "w"] | None = None,
+    class_scores: Float[np.ndarray, "w c"] | None = None,
+) -> AzimuthMeasures:
+    """Compare a prediction with an annotation.
+
+    Args:
+        profiles_m: the true wall profile (m), of each outline that can be defended.
+        log_profile: predicted log wall profile (m), as wide.
+        log_scale: predicted log scale.
+        true_classes: code of every azimuth; wanted with `class_scores`.
+        class_scores: predicted log probabilities, or any score that is largest for the likeliest class.
+    """
+    errors = [np.nan_to_num(log_profile - np.log(one), nan=np.inf) for one in profiles_m]
+    outline = int(np.argmin([np.median(np.abs(error)) for error in errors]))
+    confusion = None
+    if class_scores is not None:
+        assert true_classes is not None
+        confusion = np.zeros((class_scores.shape[1],) * 2, dtype=int)
+        np.add.at(confusion, (true_classes, class_scores.argmax(axis=1)), 1)
+    return AzimuthMeasures(outline=outline, log_error=errors[outline], log_scale=log_scale, confusion=confusion)
+
+
+def summarise_azimuths(measures: Sequence[AzimuthMeasures], classes: Sequence[str]) -> AzimuthSummary:
+    """Figures over photographs, all of which count the same, but for `within` and `classes`.
+
+    Args:
+        measures: at least one.
+        classes: names of the classes by code.
+    """
+    within = np.mean([one.within for one in measures], axis=0)
+    confusions = [one.confusion for one in measures if one.confusion is not None]
+    return AzimuthSummary(
+        n=len(measures),
+        median_error=float(np.median([one.median_error for one in measures])),
+        error_90=float(np.median([one.error_90 for one in measures])),
+        scale_ratio=float(np.median([one.scale_ratio for one in measures])),
+        within={f"{quantile:g}": float(share) for quantile, share in zip(QUANTILES, within, strict=True)},
+        classes=score_classes(np.sum(confusions, axis=0), classes) if confusions else None,
+    )
+
+
+def score_classes(confusion: Int[np.ndarray, "c c"], classes: Sequence[str]) -> ClassScores:
+    """Scores of a table of counts by true (row) and predicted class."""
+    right, occurs, predicted = (
+        counts.tolist() for counts in (np.diag(confusion), confusion.sum(axis=1), confusion.sum(axis=0))
+    )
+    recall = {name: _share(right[k], occurs[k]) for k, name in enumerate(classes)}
+    known = [share for share in recall.values() if share is not None]
+    return ClassScores(
+        balanced_accuracy=float(np.mean(known)) if known else float("nan"),
+        recall=recall,
+        precision={name: _share(right[k], predicted[k]) for k, name in enumerate(classes)},
+    )
+
+
+def _share(part: int, whole: int) -> float | None:
+    return part / whole if whole else None

@@ -1,0 +1,53 @@
+"""What a model reads from annotated photographs: walls and openings per azimuth, and how right that is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from lalaloc_core.azimuths import AzimuthMeasures, measure_azimuths
+from lalaloc_core.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph
+from lalaloc_core.errors import BundleError
+from lalaloc_core.localise.encoders import Encoders
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ReadPhotograph:
+    """One photograph and what the model says of it.
+
+    Attributes:
+        profile_m: (w,) predicted wall profile.
+        class_scores: (w, classes) predicted log probabilities; None where the model predicts none.
+    """
+
+    photograph: AnnotatedPhotograph
+    profile_m: Float[np.ndarray, "w"]
+    class_scores: Float[np.ndarray, "w c"] | None
+    measures: AzimuthMeasures
+
+
+def read_photographs(encoders: Encoders, photographs: Sequence[AnnotatedPhotograph]) -> list[ReadPhotograph]:
+    """What a model says of each photograph, and how right it is.
+
+    Raises:
+        BundleError: the model predicts no wall profile.
+        DatasetError: a photograph cannot be read.
+    """
+    manifest = encoders.manifest
+    read = []
+    for one in photographs:
+        image = one.photograph.image(manifest.image_height, manifest.image_width)
+        query = encoders.query(image, 0.0, CAMERA_HEIGHT_M)
+        if query.profile is None:
+            raise BundleError(f"model '{manifest.name}' predicts no wall profile, which is what is measured")
+        log_m, log_scale = query.profile.log_m[0], query.profile.log_scale[0]
+        measures = measure_azimuths(
+            [one.profile_m(outline, len(log_m)) for outline in range(len(one.outlines))],
+            log_m,
+            log_scale,
+        )
+        read.append(ReadPhotograph(photograph=one, profile_m=np.exp(log_m), class_scores=None, measures=measures))
+    return read

@@ -1,0 +1,394 @@
+"""Annotated photographs: reading them, galleries of rooms like theirs, and what is measured on both."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+from PIL import Image
+
+from lalaloc_core.azimuths import QUANTILES, measure_azimuths, score_classes, summarise_azimuths
+from lalaloc_core.cli import main
+from lalaloc_core.conventions import TWO_PI, column_azimuths
+from lalaloc_core.data.annotated import GALLERIES, AnnotatedPhotographs, GalleryKey
+from lalaloc_core.data.annotations import CAMERA_HEIGHT_M, CLASSES, AnnotatedPhotograph, read_annotation
+from lalaloc_core.data.drawn_rooms import DrawnOpening, DrawnRoom
+from lalaloc_core.data.opening import open_dataset
+from lalaloc_core.data.room_gallery import GALLERY_ROOMS, build_gallery
+from lalaloc_core.errors import DatasetError, InvalidInputError
+from lalaloc_core.evaluation.galleries import answers_in_galleries, describe_answers, score_galleries
+from lalaloc_core.evaluation.photograph_reading import read_photographs
+from lalaloc_core.evaluation.predictions import Pose, Prediction
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.report.photographs import FIGURES_FILE, SHEET_FILE, evaluate_photographs
+
+REAL = Path(__file__).parents[3] / "shared" / "real" / "annotated"
+WIDTH = 256
+# A room 4 wide and 3 deep in camera heights; the camera stands 1 from its left wall, 1 from the wall behind it.
+POLYGON = [[-1.0, -1.0], [3.0, -1.0], [3.0, 2.0], [-1.0, 2.0]]
+
+
+def column_of(x: float, y: float) -> float:
+    return (np.arctan2(x, y) / TWO_PI + 0.5) * WIDTH
+
+
+def opening(kind: str, *line: list[float]) -> dict[str, Any]:
+    return {"kind": kind, "columns": [column_of(*line[0]), column_of(*line[1])], "line": list(line)}
+
+
+def annotation(name: str, **changes: Any) -> dict[str, Any]:
+    return {
+        "photograph": f"{name}.png",
+        "room_type": "bedroom",
+        "quality": "good",
+        "polygon": POLYGON,
+        "ceiling_above_camera": 0.8,
+        "openings": [
+            opening("window", [0.0, 2.0], [2.0, 2.0]),
+            # Behind the camera, so that it goes over the picture's border.
+            opening("door", [0.5, -1.0], [-0.5, -1.0]),
+        ],
+        "notes": "",
+    } | changes
+
+
+def write(root: Path, name: str, **changes: Any) -> Path:
+    document = annotation(name, **changes)
+    pixels = np.random.default_rng(len(name)).integers(0, 255, (WIDTH // 2, WIDTH, 3)).astype(np.uint8)
+    Image.fromarray(pixels).save(root / f"{name}.png")
+    path = root / f"{name}.json"
+    path.write_text(json.dumps(document))
+    return path
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    """Three photographs, one of them with two outlines and one too poor to count."""
+    write(tmp_path, "hall", alternative_polygon=[[-1.0, -1.0], [5.0, -1.0], [5.0, 2.0], [-1.0, 2.0]])
+    write(tmp_path, "den", quality="poor", openings=[], ceiling_above_camera=None)
+    write(
+        tmp_path,
+        "nook",
+        polygon=[[-2.0, -1.5], [2.0, -1.5], [2.0, 0.5], [0.5, 0.5], [0.5, 1.5], [-2.0, 1.5]],
+        openings=[],
+    )
+    return tmp_path
+
+
+class TestReading:
+    def test_lengths_are_those_for_the_camera_height_that_is_assumed(self, root: Path) -> None:
+        one = read_annotation(root / "hall.json")
+        assert np.allclose(one.outlines[0].polygon_m, CAMERA_HEIGHT_M * np.array(POLYGON))
+        assert one.outlines[0].ceiling_height_m == pytest.approx(1.8 * CAMERA_HEIGHT_M)
+        assert one.has_flat_ceiling
+        assert not read_annotation(root / "den.json").has_flat_ceiling
+        # The centre column looks along +y, columns further right clockwise of it.
+        profile_m = one.profile_m(0, 64)
+        ahead, right = profile_m[31:33].mean(), profile_m[47:49].mean()
+        assert (ahead, right) == (pytest.approx(2.0 * 1.5, rel=0.01), pytest.approx(3.0 * 1.5, rel=0.01))
+
+    def test_classes_follow_the_columns_also_over_the_border(self, root: Path) -> None:
+        classes = read_annotation(root / "hall.json").classes(WIDTH)
+        door, window = CLASSES.index("door"), CLASSES.index("window")
+        assert classes[WIDTH // 2 + 5] == window
+        assert classes[WIDTH // 2 - 5] == 0
+        assert classes[0] == classes[-1] == door
+        assert np.count_nonzero(classes == door) == pytest.approx(2 * np.arctan(0.5) / TWO_PI * WIDTH, abs=2)
+        assert np.count_nonzero(classes == window) == pytest.approx(np.pi / 4 / TWO_PI * WIDTH, abs=2)
+
+    def test_the_narrower_of_two_openings_in_one_direction_is_the_one_that_shows(self, tmp_path: Path) -> None:
+        openings = [opening("door", [0.0, 2.0], [0.5, 2.0]), opening("passage", [-0.5, 2.0], [2.0, 2.0])]
+        one = read_annotation(write(tmp_path, "wide", openings=openings))
+        assert [CLASSES[code] for code in one.classes(WIDTH)[WIDTH // 2 - 4 : WIDTH // 2 + 4]] == ["passage"] * 4 + [
+            "door"
+        ] * 4
+
+    def test_an_alternative_outline_keeps_the_openings_that_lie_on_it(self, tmp_path: Path) -> None:
+        alternative = [[-1.0, -1.0], [3.0, -1.0], [3.0, 2.5], [-1.0, 2.5]]
+        first, second = read_annotation(write(tmp_path, "hall", alternative_polygon=alternative)).outlines
+        assert [one.kind for one in first.openings] == ["window", "door"]
+        assert [one.kind for one in second.openings] == ["door"]
+
+    @pytest.mark.parametrize(
+        ("changes", "reason"),
+        [
+            ({"colour": "red"}, "unknown key 'colour'"),
+            ({"quality": "superb"}, "quality is 'superb', it must be one of good, fair, poor"),
+            ({"photograph": "../hall.png"}, "it must be a path below"),
+            ({"photograph": "lost.png"}, "photograph 'lost.png' cannot be read"),
+            ({"photograph": "hall.json"}, "not a readable picture"),
+            ({"ceiling_above_camera": -1.0}, "ceiling_above_camera is -1.0"),
+            ({"polygon": [[1.0, 1.0], [2.0, 1.0], [2.0, 2.0]]}, "the camera at (0, 0) stands outside"),
+            ({"polygon": [[-1, -1], [1, 1], [1, -1], [-1, 1.5]]}, "crosses itself"),
+            ({"polygon": [[-1, -1], [400, -1], [1, 1]]}, "more than 60 camera heights away"),
+            ({"polygon": [[-1, -1], [1, -1], ["1", 1]]}, "it must be two numbers"),
+            ({"openings": [{"kind": "door", "columns": [0, 9]}]}, "keys columns, kind, line"),
+            ({"openings": [opening("hatch", [0.0, 2.0], [1.0, 2.0])]}, "kind is 'hatch'"),
+            ({"openings": [opening("door", [0.0, 1.5], [1.0, 1.5])]}, "more than 0.1 off the outline"),
+            (
+                {"openings": [opening("door", [0.0, 2.0], [1.0, 2.0]) | {"columns": [128, 170]}]},
+                "seen at the columns 128, 147, but its columns are 128, 170; they may differ by 3",
+            ),
+            ({"openings": [opening("door", [0.0, 2.0], [1.0, 2.0]) | {"columns": [128, 257]}]}, "to the width, 256"),
+            ({"notes": 7}, "notes must be text"),
+        ],
+    )
+    def test_what_cannot_be_is_refused_with_the_value(self, root: Path, changes: dict[str, Any], reason: str) -> None:
+        document = annotation("hall", **changes)
+        (root / "hall.json").write_text(json.dumps(document))
+        with pytest.raises(DatasetError) as caught:
+            read_annotation(root / "hall.json")
+        assert reason in str(caught.value)
+        assert "hall" in str(caught.value)
+
+    def test_a_missing_key_is_named(self, root: Path) -> None:
+        document = annotation("hall")
+        del document["quality"]
+        (root / "hall.json").write_text(json.dumps(document))
+        with pytest.raises(DatasetError, match="the key 'quality' is missing"):
+            read_annotation(root / "hall.json")
+
+
+class TestDrawnRooms:
+    ROOM = DrawnRoom(
+        name="r",
+        polygon_m=np.array([[-1.0, -1.0], [3.0, -1.0], [3.0, 2.0], [-1.0, 2.0]]),
+        ceiling_height_m=2.5,
+        openings=(DrawnOpening("door", np.array([[0.0, 2.0], [1.0, 2.0]])),),
+    )
+
+    @pytest.mark.parametrize("angle", [0.3, -0.5, 0.7])
+    def test_the_main_direction_undoes_a_turn(self, angle: float) -> None:
+        assert self.ROOM.turned(angle).main_direction == pytest.approx(angle)
+
+    @pytest.mark.parametrize("change", ["turned", "scaled", "mirrored", "moved"])
+    def test_openings_stay_on_the_outline_which_stays_counter_clockwise(self, change: str) -> None:
+        room = {
+            "turned": self.ROOM.turned(0.4),
+            "scaled": self.ROOM.scaled(1.3),
+            "mirrored": self.ROOM.mirrored(),
+            "moved": self.ROOM.moved(np.array([3.0, -2.0])),
+        }[change]
+        shape = shapely.Polygon(room.polygon_m)
+        assert shape.exterior.is_ccw
+        assert shapely.distance(shape.exterior, shapely.points(room.openings[0].line_m)).max() < 1e-9
+        assert room.size_m == pytest.approx(self.ROOM.size_m * (1.3 if change == "scaled" else 1.0))
+
+
+class TestGalleries:
+    def test_the_camera_sees_in_the_plan_what_was_drawn_on_the_photograph(self, root: Path) -> None:
+        dataset = AnnotatedPhotographs(root)
+        for name in dataset.scenes("test"):
+            key = GalleryKey.of_scene(name)
+            assert key is not None
+            one = next(p for p in dataset.photographs if p.name == key.photograph)
+            scene = dataset.load(name)
+            (camera,) = scene.cameras
+            seen_m = wall_profile(
+                camera.position_m[None], np.array([camera.heading]), scene.plan.walls_m[[camera.room_index]], 64
+            )[0]
+            assert np.allclose(seen_m, one.profile_m(key.outline, 64), rtol=1e-6)
+
+    def test_rooms_lie_apart_along_the_axes_and_are_alike(self, root: Path) -> None:
+        scene = AnnotatedPhotographs(root).load("hall-0")
+        rooms = scene.plan.rooms
+        own = rooms[scene.cameras[0].room_index]
+        assert len(rooms) == GALLERY_ROOMS
+        assert scene.plan.warnings == ()
+        nearest_m = [min(a.shape.distance(b.shape) for b in rooms if b is not a) for a in rooms]
+        assert min(nearest_m) >= 1.0 - 1e-9
+        ratios = np.array([np.sqrt(room.area_m2 / own.area_m2) for room in rooms if "home" in room.name])
+        assert len(ratios) == GALLERY_ROOMS - 3
+        assert np.abs(ratios - 1.0).max() <= 0.1 + 1e-9
+        edges = np.roll(own.polygon_m, -1, axis=0) - own.polygon_m
+        assert np.abs(edges).min(axis=1).max() < 1e-9
+
+    def test_the_same_question_is_the_same_plan_and_another_is_another(self, root: Path) -> None:
+        first, again = (AnnotatedPhotographs(root).load("hall-1") for _ in range(2))
+        assert first.plan.to_dict() == again.plan.to_dict()
+        assert first.plan.to_dict() != AnnotatedPhotographs(root).load("hall-2").plan.to_dict()
+
+    def test_both_outlines_are_asked_for_among_the_same_others(self, root: Path) -> None:
+        dataset = AnnotatedPhotographs(root)
+        first, second = dataset.load("hall-0"), dataset.load("hall-0-alternative")
+        own = first.cameras[0].room_index
+        assert own == second.cameras[0].room_index
+        for index, (a, b) in enumerate(zip(first.plan.rooms, second.plan.rooms, strict=True)):
+            assert a.area_m2 == pytest.approx(b.area_m2) or index == own
+
+    def test_own_size_of_generated_rooms_follows_the_room_that_they_are_to_be_like(self) -> None:
+        small, large = TestDrawnRooms.ROOM, TestDrawnRooms.ROOM.scaled(2.0)
+        gallery = build_gallery(large, [], 1.5, np.random.default_rng(0), like=small)
+        areas = np.array([room.area_m2 for room in gallery.plan.rooms])
+        assert areas[gallery.room_index] == pytest.approx(4.0 * small.size_m**2)
+        assert np.delete(areas, gallery.room_index).max() < 1.3 * small.size_m**2
+
+    def test_a_folder_of_them_opens_as_a_data_set_of_test_scenes(self, root: Path) -> None:
+        dataset = open_dataset(root)
+        assert isinstance(dataset, AnnotatedPhotographs)
+        assert dataset.scenes("train") == dataset.scenes("validation") == []
+        # One photograph has two outlines, and one is too poor to be asked for.
+        assert len(dataset.scenes("test")) == 3 * GALLERIES
+        assert list(dataset.scenes("test"))[:3] == ["hall-0", "hall-0-alternative", "nook-0"]
+
+    @pytest.mark.parametrize("name", ["hall", "hall-x", "cellar-0", "nook-0-alternative"])
+    def test_there_are_no_other_scenes(self, root: Path, name: str) -> None:
+        with pytest.raises(DatasetError, match="no such gallery"):
+            AnnotatedPhotographs(root).load(name)
+
+    def test_an_empty_folder_is_refused(self, tmp_path: Path) -> None:
+        with pytest.raises(DatasetError, match="no annotated photographs"):
+            AnnotatedPhotographs(tmp_path).scenes("test")
+
+
+class TestAzimuths:
+    def test_errors_that_are_laplace_distributed_as_predicted_are_calibrated(self) -> None:
+        rng = np.random.default_rng(0)
+        scale = rng.uniform(0.05, 0.5, 20_000)
+        measures = measure_azimuths([np.ones(20_000)], rng.laplace(0.0, scale), np.log(scale))
+        assert measures.within == pytest.approx(QUANTILES, abs=0.01)
+        assert measures.scale_ratio == pytest.approx(1.0, abs=0.03)
+        assert measure_azimuths([np.ones(20_000)], rng.laplace(0.0, 3.0 * scale), np.log(scale)).scale_ratio > 2.8
+
+    def test_the_better_of_two_outlines_counts(self) -> None:
+        near, far = np.full(8, 2.0), np.full(8, 5.0)
+        measures = measure_azimuths([far, near], np.log(np.full(8, 2.2)), np.zeros(8))
+        assert measures.outline == 1
+        assert measures.median_error == measures.bias == pytest.approx(np.log(1.1))
+
+    def test_no_number_is_an_infinite_error(self) -> None:
+        log_profile = np.where(np.arange(8) < 5, np.nan, 0.0)
+        measures = measure_azimuths([np.ones(8)], log_profile, np.zeros(8))
+        assert np.isinf(measures.median_error)
+        assert measures.within == pytest.approx([3 / 8] * 4)
+
+    def test_classes_are_scored_by_class(self) -> None:
+        truth = np.array([0, 0, 0, 0, 1, 1, 2, 2])
+        said = np.array([0, 0, 0, 1, 1, 0, 2, 2])
+        scores = np.eye(4)[said]
+        measures = measure_azimuths([np.ones(8)], np.zeros(8), np.zeros(8), truth, scores)
+        assert measures.confusion is not None
+        classes = score_classes(measures.confusion, CLASSES)
+        assert classes.recall == {"wall": 0.75, "door": 0.5, "window": 1.0, "passage": None}
+        assert classes.precision == {"wall": 0.75, "door": 0.5, "window": 1.0, "passage": None}
+        # A class that never occurs is not asked for.
+        assert classes.balanced_accuracy == pytest.approx(0.75)
+        assert summarise_azimuths([measures, measures], CLASSES).classes == classes
+
+
+def answer(scene: str, *, room: int, x_m: float, rank: int | None, confidence: float = 0.5) -> Prediction:
+    return Prediction(
+        scene=scene,
+        camera="hall",
+        room="hall",
+        camera_height_m=1.5,
+        truth=Pose(x_m=0.0, y_m=0.0, room_index=3, heading_deg=0.0),
+        stages={"lpo": Pose(x_m=x_m, y_m=0.0, room_index=room, heading_deg=0.0)},
+        room_rank=rank,
+        confidence=confidence,
+    )
+
+
+class TestGalleryScores:
+    @pytest.fixture
+    def photographs(self, root: Path) -> tuple[AnnotatedPhotograph, ...]:
+        return AnnotatedPhotographs(root).photographs
+
+    def test_located_is_the_right_room_and_near(self, photographs: tuple[AnnotatedPhotograph, ...]) -> None:
+        # The hall is 6 m by 4.5 m, so a tenth of its size is more than half a metre.
+        near, far, elsewhere = 0.51, 0.53, 0.1
+        predictions = [
+            answer("hall-0", room=3, x_m=near, rank=1),
+            answer("hall-1", room=3, x_m=far, rank=1),
+            answer("hall-2", room=4, x_m=elsewhere, rank=3),
+        ]
+        scores = score_galleries(answers_in_galleries(predictions, photographs))
+        assert (scores.located, scores.right_room, scores.among_3) == pytest.approx((1 / 3, 2 / 3, 1.0))
+        assert scores.by_photograph == {"hall": pytest.approx(1 / 3)}
+        assert describe_answers(answers_in_galleries(predictions, photographs), "hall") == "1 of 3 (ranks 1, 3)"
+        assert describe_answers([], "den") == "not asked"
+
+    def test_of_two_outlines_the_better_answer_counts(self, photographs: tuple[AnnotatedPhotograph, ...]) -> None:
+        predictions = [
+            answer("hall-0", room=4, x_m=9.0, rank=None),
+            answer("hall-0-alternative", room=3, x_m=0.1, rank=1, confidence=0.9),
+        ]
+        (only,) = answers_in_galleries(predictions, photographs)
+        assert (only.located, only.outline, only.confidence) == (True, 1, 0.9)
+        assert score_galleries([only]).calibration_error == pytest.approx(0.1)
+
+    def test_no_answer_is_a_miss(self, photographs: tuple[AnnotatedPhotograph, ...]) -> None:
+        missing = Prediction(
+            scene="nook-0",
+            camera="nook",
+            room="nook",
+            camera_height_m=1.5,
+            truth=Pose(x_m=0.0, y_m=0.0, room_index=0, heading_deg=0.0),
+        )
+        (only,) = answers_in_galleries([missing], photographs)
+        assert not only.located
+        assert np.isinf(only.error_m)
+
+
+class TestEvaluating:
+    def test_reading_compares_with_what_the_encoder_says(self, root: Path, encoders: Encoders) -> None:
+        photographs = AnnotatedPhotographs(root).photographs
+        for read, one in zip(read_photographs(encoders, photographs), photographs, strict=True):
+            image = one.photograph.image(encoders.manifest.image_height, encoders.manifest.image_width)
+            profile_m, left_over = encoders.profile(image, 0.0, CAMERA_HEIGHT_M)
+            assert left_over == 0.0
+            azimuth = column_azimuths(len(profile_m))
+            polygon = one.outlines[read.measures.outline].polygon_m
+            walls = np.concatenate([polygon, np.roll(polygon, -1, axis=0)], axis=1)[None]
+            # One ray at a time, by turning a camera of one column.
+            true_m = [wall_profile(np.zeros((1, 2)), np.array([a]), walls, 1)[0, 0] for a in azimuth]
+            assert np.allclose(read.measures.log_error, np.log(profile_m) - np.log(true_m), atol=1e-5)
+
+    def test_one_command_prints_measures_and_draws(
+        self, root: Path, tiny_bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        out = tmp_path / "out"
+        command = ["photographs", "--data", str(root), "--bundle", str(tiny_bundle), "--galleries", "1"]
+        assert main([*command, "--workers", "0", "--out", str(out)]) == 0
+        printed = capsys.readouterr().out
+        figures = json.loads((out / FIGURES_FILE).read_text())
+        assert figures["azimuths"]["n"] == 2
+        assert figures["galleries"]["known"]["galleries"] == 2
+        assert [one["name"] for one in figures["photographs"]] == ["den", "hall", "nook"]
+        # Each was asked once, with the better of two outlines; the poor one was not.
+        assert [len(one["galleries"]["unknown"]) for one in figures["photographs"]] == [0, 1, 1]
+        assert f"| median of the median error of log distance | {figures['azimuths']['median_error']:.3f} |" in printed
+        assert "not asked" in printed
+        with Image.open(out / SHEET_FILE) as sheet:
+            assert sheet.width > 4 * 512
+        # Whoever asks again goes on with the answers that are there.
+        assert main([*command, "--workers", "0", "--out", str(out)]) == 0
+        assert json.loads((out / FIGURES_FILE).read_text()) == figures
+
+    def test_poor_photographs_alone_are_no_figures(self, tmp_path: Path, tiny_bundle: Path) -> None:
+        write(tmp_path, "den", quality="poor")
+        with pytest.raises(InvalidInputError, match="all 1 photographs"):
+            evaluate_photographs(tmp_path, tiny_bundle, tmp_path / "out", galleries=1, workers=0)
+
+
+@pytest.mark.skipif(not REAL.exists(), reason="the annotated photographs are not here")
+class TestRealPhotographs:
+    def test_all_can_be_read_and_asked_for(self) -> None:
+        dataset = AnnotatedPhotographs(REAL)
+        assert len(dataset.photographs) == 22
+        assert sum(one.counts for one in dataset.photographs) == 19
+        for key in dataset.keys(galleries=1):
+            scene = dataset.load(key.scene)
+            assert scene.plan.warnings == ()
+            (camera,) = scene.cameras
+            assert scene.plan.room_index_at(camera.position_m[None])[0] == camera.room_index
+
+    def test_openings_and_outlines_agree(self) -> None:
+        for one in AnnotatedPhotographs(REAL).photographs:
+            # All that is drawn lies on the outline, so every class has some columns.
+            assert set(one.classes(1024)) == {0, *(code for code, _, _ in one.class_spans)}
