@@ -19,6 +19,30 @@ Array = Any
 
 TWO_PI = 2.0 * math.pi
 
+# What a horizontal ray meets at eye height; its place is its code, in plans, renderer, networks and search alike.
+OPENING_CLASSES = ("wall", "door", "window", "passage")
+WALL_CODE, DOOR_CODE, WINDOW_CODE, PASSAGE_CODE = range(len(OPENING_CLASSES))
+
+# What a room is for; the place is the code. docs/conventions.md says what each covers.
+ROOM_TYPES = (
+    "unknown",
+    "bedroom",
+    "living",
+    "kitchen",
+    "dining",
+    "bathroom",
+    "corridor",
+    "entrance",
+    "closet",
+    "storage",
+    "laundry",
+    "garage",
+    "stairs",
+    "balcony",
+    "office",
+    "meeting",
+)
+
 
 def column_azimuths(columns: int) -> Float[np.ndarray, "columns"]:
     """Azimuth (radians, relative to the heading) of each pixel column's centre: ((j + 0.5) / W - 0.5) 2π."""

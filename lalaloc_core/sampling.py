@@ -50,10 +50,10 @@ def pose_grid(plan: FloorPlan, step_m: float) -> PoseSet:
         xs = np.arange(np.ceil(x_min / step_m), np.floor(x_max / step_m) + 1) * step_m
         ys = np.arange(np.ceil(y_min / step_m), np.floor(y_max / step_m) + 1) * step_m
         lattice = np.stack(np.meshgrid(xs, ys, indexing="ij"), axis=-1).reshape(-1, 2)
-        inside = shapely.contains_xy(room.shape.buffer(-WALL_MARGIN_M), lattice[:, 0], lattice[:, 1])
+        inside = shapely.contains_xy(room.free_floor(WALL_MARGIN_M), lattice[:, 0], lattice[:, 1])
         chosen = lattice[inside]
         if len(chosen) == 0:
-            chosen = np.array(shapely.maximum_inscribed_circle(room.shape, 0.01).coords[:1])
+            chosen = room.inmost_point()[None]
         positions.append(chosen)
         rooms.append(np.full(len(chosen), index))
     return PoseSet(np.concatenate(positions), np.concatenate(rooms))
@@ -65,7 +65,7 @@ def random_poses(plan: FloorPlan, count: int, rng: np.random.Generator, margin_m
     Raises:
         InvalidInputError: no room is wide enough for the margin.
     """
-    inner = [room.shape.buffer(-margin_m) for room in plan.rooms]
+    inner = [room.free_floor(margin_m) for room in plan.rooms]
     areas = np.array([shape.area for shape in inner])
     if not areas.sum() > 0.0:
         raise InvalidInputError(f"no room leaves a margin of {margin_m:g} m to its walls")

@@ -21,7 +21,7 @@ LAYERS = {
     "lalaloc_core.file_kinds": 0,
     "lalaloc_core.configuration": 1,
     "lalaloc_core.floorplan": 1,
-    "lalaloc_core.sampling": 1,
+    "lalaloc_core.sampling": 2,
     "lalaloc_core.metrics": 1,
     "lalaloc_core.azimuths": 1,
     "lalaloc_core.bundle": 1,

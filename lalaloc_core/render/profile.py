@@ -9,7 +9,7 @@ in position and heading almost everywhere.
 from __future__ import annotations
 
 from array_api_compat import array_namespace, device
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from lalaloc_core.conventions import Array, column_azimuths
 
@@ -32,6 +32,23 @@ def cast_rays(
         distances; inf where a ray hits nothing, which happens only outside a closed room.
     """
     xp = array_namespace(origin_m, azimuth, walls_m)
+    return xp.min(_crossings(origin_m, azimuth, walls_m), axis=2)
+
+
+def nearest_walls(
+    origin_m: Float[Array, "b 2"], azimuth: Float[Array, "b c"], walls_m: Float[Array, "b n 4"]
+) -> tuple[Float[Array, "b c"], Int[Array, "b c"]]:
+    """As `cast_rays`, with the index of the wall that each ray meets; of walls at one distance, any."""
+    xp = array_namespace(origin_m, azimuth, walls_m)
+    crossings = _crossings(origin_m, azimuth, walls_m)
+    return xp.min(crossings, axis=2), xp.argmin(crossings, axis=2)
+
+
+def _crossings(
+    origin_m: Float[Array, "b 2"], azimuth: Float[Array, "b c"], walls_m: Float[Array, "b n 4"]
+) -> Float[Array, "b c n"]:
+    """Distance (m) along every ray to every wall; inf where it misses it."""
+    xp = array_namespace(origin_m, azimuth, walls_m)
     direction_x = xp.sin(azimuth)[:, :, None]
     direction_y = xp.cos(azimuth)[:, :, None]
     start_x = walls_m[:, None, :, 0] - origin_m[:, 0][:, None, None]
@@ -47,7 +64,7 @@ def cast_rays(
     t = (start_x * edge_y - start_y * edge_x) / determinant
     s = (start_x * direction_y - start_y * direction_x) / determinant
     hit = ~parallel & (t > 0.0) & (s >= -_CORNER_TOLERANCE) & (s <= 1.0 + _CORNER_TOLERANCE)
-    return xp.min(xp.where(hit, t, xp.full_like(t, xp.inf)), axis=2)
+    return xp.where(hit, t, xp.full_like(t, xp.inf))
 
 
 def wall_profile(

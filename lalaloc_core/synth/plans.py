@@ -1,4 +1,4 @@
-"""Procedural homes: a floor plan, and the doors and windows that the plan's format leaves out."""
+"""Procedural homes: a floor plan, and what its photographs need to know of doors and windows beyond it."""
 
 from __future__ import annotations
 
@@ -9,11 +9,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.floorplan import FloorPlan, room_type_of
 from lalaloc_core.synth.openings import Opening, OpeningKind, place_openings
 from lalaloc_core.synth.partition import Cell, inner_outline, partition, reshape_room
 
 __all__ = ["Home", "HomeConfig", "Opening", "OpeningKind", "generate_home"]
+
+
+# Plans do not say which doors are open.
+_PLAN_KINDS = {"door_open": "door", "door_shut": "door", "opening": "passage", "window": "window"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -39,7 +43,7 @@ class HomeConfig:
 
 @dataclass(frozen=True, eq=False)
 class Home:
-    """A floor plan with the openings in its walls."""
+    """A floor plan, with the openings in its walls as each room sees them; the plan has them, too."""
 
     plan: FloorPlan
     openings: tuple[Opening, ...]
@@ -70,7 +74,7 @@ def generate_home(rng: np.random.Generator, config: HomeConfig = HomeConfig()) -
     openings = place_openings(
         names, polygons, ceilings, [cell.outline_m for cell in cells], max_gap_m=thickness + 0.01, rng=rng
     )
-    plan = _plan(names, _place_in_frame(polygons, config, rng), ceilings)
+    plan = _plan(names, _place_in_frame(polygons, config, rng), ceilings, openings)
     return Home(plan, openings)
 
 
@@ -132,9 +136,42 @@ def _place_in_frame(
     return [polygon @ turn.T + offset for polygon in polygons_m]
 
 
-def _plan(names: Sequence[str], polygons_m: Sequence[np.ndarray], ceilings_m: Sequence[float]) -> FloorPlan:
+def _plan(
+    names: Sequence[str],
+    polygons_m: Sequence[np.ndarray],
+    ceilings_m: Sequence[float],
+    openings: Sequence[Opening],
+) -> FloorPlan:
+    ids = [name.replace(" ", "-") for name in names]
     rooms = [
-        {"name": name, "polygon": polygon.tolist(), "ceiling_height_m": ceiling}
-        for name, polygon, ceiling in zip(names, polygons_m, ceilings_m, strict=True)
+        {
+            "id": key,
+            "name": name,
+            "type": room_type_of(name),
+            "polygon": polygon.tolist(),
+            "ceiling_height_m": ceiling,
+        }
+        for key, name, polygon, ceiling in zip(ids, names, polygons_m, ceilings_m, strict=True)
     ]
-    return FloorPlan.from_dict({"name": "synthetic home", "rooms": rooms})
+    entries = [
+        {
+            "kind": _PLAN_KINDS[opening.kind],
+            "line": _line(opening, polygons_m[opening.room]),
+            "sill_m": opening.sill_m,
+            "head_m": opening.head_m,
+            "rooms": [ids[room] for room in (opening.room, opening.neighbour) if room >= 0],
+        }
+        for opening in openings
+        # One entry serves both rooms.
+        if opening.neighbour < 0 or opening.room < opening.neighbour
+    ]
+    document = {"name": "synthetic home", "rooms": rooms, "openings": entries}
+    return FloorPlan.from_dict(document | {"opening_kinds": ["door", "window", "passage"]})
+
+
+def _line(opening: Opening, polygon_m: Float[np.ndarray, "n 2"]) -> list[list[float]]:
+    """Both ends of an opening on the wall of its room."""
+    start = polygon_m[opening.wall]
+    along = polygon_m[(opening.wall + 1) % len(polygon_m)] - start
+    along = along / np.linalg.norm(along)
+    return [(start + at * along).tolist() for at in (opening.start_m, opening.end_m)]

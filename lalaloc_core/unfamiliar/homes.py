@@ -12,7 +12,7 @@ from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.unfamiliar.furnish import Furnishing, Level
 from lalaloc_core.unfamiliar.geometry import Part
-from lalaloc_core.unfamiliar.openings import Opening, draw_openings
+from lalaloc_core.unfamiliar.openings import Opening, draw_openings, with_openings
 from lalaloc_core.unfamiliar.palette import room_surfaces, thing_surfaces
 from lalaloc_core.unfamiliar.plans import UnfamiliarPlan, draw_plan
 from lalaloc_core.unfamiliar.shell import shell_parts
@@ -78,7 +78,7 @@ def home_of(key: HomeKey) -> UnfamiliarHome:
     rng = key.rng(0)
     plan = draw_plan(rng, f"unfamiliar {key.index}")
     openings = draw_openings(plan, rng)
-    return UnfamiliarHome(plan, tuple(openings), tuple(shell_parts(plan.plan, openings, rng)))
+    return UnfamiliarHome(with_openings(plan, openings), tuple(openings), tuple(shell_parts(plan.plan, openings, rng)))
 
 
 @lru_cache(maxsize=4)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 import shapely
 from jaxtyping import Float
 
-from lalaloc_core.floorplan import Room
+from lalaloc_core.floorplan import FloorPlan, Room
 from lalaloc_core.unfamiliar.plans import UnfamiliarPlan
 
 OpeningKind = Literal["open door", "shut door", "arch", "passage", "front door", "window"]
@@ -18,6 +19,15 @@ _Taken = dict[tuple[int, int], list[tuple[float, float]]]
 _CORNER_M = 0.1
 _OUTLOOK_M = 1.6
 _OUTER_WALL_M = 0.28
+_MAX_WALL_M = 0.4
+_PLAN_KINDS = {
+    "open door": "door",
+    "shut door": "door",
+    "front door": "door",
+    "arch": "passage",
+    "passage": "passage",
+    "window": "window",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +101,27 @@ def draw_openings(plan: UnfamiliarPlan, rng: np.random.Generator) -> list[Openin
     for wall in outer:
         openings += _draw_windows(wall, rooms, plan, taken, rng)
     return openings
+
+
+def with_openings(plan: UnfamiliarPlan, openings: Sequence[Opening]) -> UnfamiliarPlan:
+    """The plan with its openings drawn in."""
+    rooms = plan.plan.rooms
+    entries = [
+        {
+            "kind": _PLAN_KINDS[opening.kind],
+            "line": [opening.wall.point_m(at).tolist() for at in (opening.left_m, opening.right_m)],
+            "sill_m": opening.sill_m,
+            "head_m": opening.top_m,
+            "rooms": [rooms[wall.room].id for wall in (opening.wall, opening.behind) if wall is not None],
+        }
+        for opening in openings
+    ]
+    document = plan.plan.to_dict() | {
+        "openings": entries,
+        "opening_kinds": ["door", "window", "passage"],
+        "opening_tolerance_m": _MAX_WALL_M,
+    }
+    return replace(plan, plan=FloorPlan.from_dict(document))
 
 
 def _draw_doors(plan: UnfamiliarPlan, walls: list[Wall], taken: _Taken, rng: np.random.Generator) -> list[Opening]:
@@ -218,7 +249,7 @@ def _contact(first: Wall, second: Wall) -> list[tuple[Wall, Wall, float, float, 
     apart = float((second.start_m - first.start_m) @ first.outward)
     far = float((second.start_m - first.start_m) @ first.along)
     low, high = max(0.0, far - second.length_m), min(first.length_m, far)
-    return [(first, second, low, high, apart)] if 0.03 < apart < 0.4 and high - low > 0.95 else []
+    return [(first, second, low, high, apart)] if 0.03 < apart < _MAX_WALL_M and high - low > 0.95 else []
 
 
 def _has_outlook(wall: Wall, rooms: tuple[Room, ...]) -> bool:

@@ -20,6 +20,10 @@ _STORED_LIMITS = PlanLimits(
     max_rooms=10**9,
     max_vertices_per_room=10**9,
     max_plan_vertices=10**9,
+    max_openings=10**9,
+    max_openings_per_room=10**9,
+    max_walls_per_opening=10**9,
+    max_coordinate_m=math.inf,
     max_extent_m=math.inf,
     max_area_m2=math.inf,
 )

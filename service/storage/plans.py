@@ -276,8 +276,8 @@ class Plans:
 
 
 def plan_bytes(plan: FloorPlan) -> int:
-    """About how much memory a plan takes: its walls as the renderer wants them, and its corners three times over."""
-    return plan.walls_m.nbytes + 3 * sum(room.polygon_m.nbytes for room in plan.rooms) + 2000 * len(plan.rooms)
+    """About how much memory a plan takes: its geometry as the renderer wants it, and its corners three times over."""
+    return plan.geometry.nbytes + 3 * sum(room.polygon_m.nbytes for room in plan.rooms) + 2000 * len(plan.rooms)
 
 
 def _record(

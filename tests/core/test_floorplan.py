@@ -79,7 +79,7 @@ def test_a_room_without_a_name_is_called_by_its_number() -> None:
         ([[0, 0], [2, 2], [2, 0], [0, 2]], "crosses itself"),
         ([[0, 0], [4, 0], [4, 4], [2, 4], [2, 0], [1, 0], [1, 4], [0, 4]], "crosses itself"),
         (rectangle(0.4, 0.4), "0.2 m²"),
-        ([[0, 0], [1, 0], [2, 0]], "crosses itself"),
+        ([[0, 0], [1, 0], [2, 0]], "lie on one line"),
         ([[0, 0], [0, 0], [1, 0], [0, 0]], "distinct"),
         ([[0, 0], [1, 1]], "at least three"),
         ([[0, 0], [3, 0], [3, math.nan]], "finite"),

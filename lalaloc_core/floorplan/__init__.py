@@ -1,0 +1,21 @@
+"""Floor plans: validated, immutable rooms as closed polygons, with the openings in their walls."""
+
+from lalaloc_core.floorplan.geometry import PlanGeometry, pad_walls
+from lalaloc_core.floorplan.limits import DEFAULT_LIMITS, PlanLimits
+from lalaloc_core.floorplan.openings import Opening, OpeningFace
+from lalaloc_core.floorplan.plan import DEFAULT_CAMERA_HEIGHT_M, FloorPlan
+from lalaloc_core.floorplan.rooms import Room
+from lalaloc_core.floorplan.types import room_type_of
+
+__all__ = [
+    "DEFAULT_CAMERA_HEIGHT_M",
+    "DEFAULT_LIMITS",
+    "FloorPlan",
+    "Opening",
+    "OpeningFace",
+    "PlanGeometry",
+    "PlanLimits",
+    "Room",
+    "pad_walls",
+    "room_type_of",
+]

@@ -1,0 +1,62 @@
+"""Plans as JSON text: strictly, in time that grows with the text and no faster."""
+
+from __future__ import annotations
+
+import json
+import re
+from typing import Any
+
+import numpy as np
+
+from lalaloc_core.errors import InvalidFloorPlanError
+
+_OPENING, _CLOSING = np.frombuffer(b"[{", np.uint8), np.frombuffer(b"]}", np.uint8)
+# A string that nobody ends reaches to the end of the text. So a match that begins never fails, nothing is looked at
+# twice, and the time is linear; with the closing quote required, each quote of such a string would be tried anew.
+_JSON_STRING = re.compile(r'"[^"\\]*+(?:\\.[^"\\]*+)*+(?:"|\\?\Z)', re.DOTALL)
+# More digits than any finite number of metres has. Python reads thousands, in time that grows with their square.
+_MOST_DIGITS = 1000
+_DIGITS = re.compile(rf"(?<![0-9])[0-9]{{{_MOST_DIGITS + 1},}}")
+
+
+def read_json(text: str | bytes, max_depth: int) -> Any:
+    """The value of a JSON text.
+
+    Raises:
+        InvalidFloorPlanError: not JSON, nested too deep, a key twice in one object, or a number of too many digits.
+    """
+    try:
+        if isinstance(text, bytes):
+            text = text.decode(json.detect_encoding(text), "surrogatepass")
+        structure = _JSON_STRING.sub("", text)
+        _check_depth(structure, max_depth)
+        _check_digits(structure)
+        return json.loads(text, object_pairs_hook=_object)
+    except InvalidFloorPlanError:
+        raise
+    except (ValueError, RecursionError) as error:
+        raise InvalidFloorPlanError(f"not valid JSON: {error}") from error
+
+
+def _check_depth(structure: str, max_depth: int) -> None:
+    """Refuse deep nesting before it is parsed; `structure` is the text without its strings."""
+    characters = np.frombuffer(structure.encode("utf-8", "surrogatepass"), np.uint8)
+    steps = np.isin(characters, _OPENING).astype(np.int64) - np.isin(characters, _CLOSING)
+    depth = int(np.cumsum(steps).max(initial=0))
+    if depth > max_depth:
+        raise InvalidFloorPlanError(f"the JSON is nested {depth} deep, at most {max_depth} is allowed (max_depth)")
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in found:
+            raise InvalidFloorPlanError(f"the key '{key[:50]}' stands twice in one object")
+        found[key] = value
+    return found
+
+
+def _check_digits(structure: str) -> None:
+    found = _DIGITS.search(structure)
+    if found is not None:
+        raise InvalidFloorPlanError(f"a number has {len(found[0])} digits, at most {_MOST_DIGITS} are read")

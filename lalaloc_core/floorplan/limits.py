@@ -1,0 +1,36 @@
+"""How large a floor plan may be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, kw_only=True)
+class PlanLimits:
+    """What a floor plan may be; anything outside is refused with the value, the limit and the limit's name.
+
+    A room's vertices are those of its outline and its holes, and one for each free-standing wall;
+    `max_plan_vertices` are those of all rooms. `max_depth` is of objects and lists within each other.
+    """
+
+    max_rooms: int = 500
+    max_vertices_per_room: int = 500
+    max_plan_vertices: int = 100_000
+    max_openings: int = 2000
+    # Pieces of openings on the walls of one room, and walls that one opening may lie on.
+    max_openings_per_room: int = 100
+    max_walls_per_opening: int = 32
+    max_extent_m: float = 1000.0
+    max_area_m2: float = 200_000.0
+    # Up to here a double tells nanometres apart; a hundred times farther out areas and distances begin to lose metres.
+    max_coordinate_m: float = 1e7
+    max_depth: int = 8
+    max_name_length: int = 200
+    min_room_area_m2: float = 0.2
+    min_ceiling_height_m: float = 1.0
+    max_ceiling_height_m: float = 20.0
+    # Two rooms that share more floor than this overlap; less is rounding of the drawing.
+    overlap_tolerance_m2: float = 0.01
+
+
+DEFAULT_LIMITS = PlanLimits()

@@ -1,0 +1,276 @@
+"""Openings in walls: from one line on the plan to a piece of wall in every room that it serves.
+
+A door between two rooms is one entry of the plan. Rooms are the inner faces of their walls, a wall's thickness apart,
+so an opening is projected at right angles onto every wall that is nearly parallel and near enough. In each room only
+the nearest of several walls, one behind the other, has it.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import shapely
+from jaxtyping import Float
+
+from lalaloc_core.conventions import OPENING_CLASSES
+from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan.limits import PlanLimits
+from lalaloc_core.floorplan.rooms import Room
+
+DEFAULT_OPENING_TOLERANCE_M = 0.35
+# A wall is nearly parallel up to 15 degrees.
+_LEAST_COSINE = float(np.cos(np.radians(15.0)))
+# What is shorter on a wall is the end of an opening that lies beside it; half of a narrow opening is never that.
+_SHORTEST_PIECE_M = 0.1
+# Openings that share less than this of a wall touch.
+_TOUCHING_M = 0.01
+_ROUNDING_M = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Opening:
+    """A door, window or passage, as the plan has it.
+
+    Attributes:
+        kind: `door`, `window` or `passage` (an opening without a leaf).
+        line_m: (2, 2) its two ends.
+        sill_m, head_m: heights of its lower and upper edge over the floor; None where the plan does not say.
+        name: what the user calls it.
+        rooms: ids of the only rooms that it belongs to; None for all whose wall it lies on.
+    """
+
+    kind: str
+    line_m: Float[np.ndarray, "2 2"]
+    sill_m: float | None = None
+    head_m: float | None = None
+    name: str | None = None
+    rooms: tuple[str, ...] | None = None
+
+    @property
+    def code(self) -> int:
+        """The place of its kind in `conventions.OPENING_CLASSES`."""
+        return OPENING_CLASSES.index(self.kind)
+
+
+@dataclass(frozen=True, kw_only=True)
+class OpeningFace:
+    """The piece of one wall of one room that an opening takes up, with one room behind it.
+
+    Attributes:
+        opening: index of the opening in the plan.
+        room: index of the room.
+        wall: index of the wall in the room's `walls_m`.
+        start, end: where it begins and ends, as shares of the wall's length.
+        behind: index of the room behind, the room itself at a free-standing wall, -1 where the plan shows none.
+        exit_wall: index of the wall of the room behind that the opening leads through, -1 without one.
+        exit_start, exit_end: the piece of that wall.
+    """
+
+    opening: int
+    room: int
+    wall: int
+    start: float
+    end: float
+    behind: int = -1
+    exit_wall: int = -1
+    exit_start: float = 0.0
+    exit_end: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Contact:
+    """An opening on a wall: between which shares of the opening's line, how far off, and on which side the room is."""
+
+    room: int
+    wall: int
+    low: float
+    high: float
+    away_m: float
+    side: int
+
+
+class _Walls:
+    """The walls of all rooms in one table, found by their place."""
+
+    def __init__(self, rooms: Sequence[Room]) -> None:
+        counts = [len(room.walls_m) for room in rooms]
+        self.room = np.repeat(np.arange(len(rooms)), counts)
+        self.number = np.concatenate([np.arange(count) for count in counts])
+        ends = np.concatenate([room.walls_m for room in rooms])
+        self.is_free_standing = self.number >= np.repeat(
+            [n - len(r.inner_walls_m) for n, r in zip(counts, rooms, strict=True)], counts
+        )
+        self.start, self.edge = ends[:, :2], ends[:, 2:] - ends[:, :2]
+        self.length_m = np.hypot(*self.edge.T)
+        self._first = np.concatenate([[0], np.cumsum(counts)])
+        self._tree = shapely.STRtree([shapely.LineString(wall) for wall in ends.reshape(-1, 2, 2)])
+
+    def near(self, line_m: Float[np.ndarray, "2 2"], tolerance_m: float) -> np.ndarray:
+        """Indices of walls whose boxes come near a line."""
+        low, high = line_m.min(axis=0) - tolerance_m, line_m.max(axis=0) + tolerance_m
+        return np.sort(self._tree.query(shapely.box(*low, *high)))
+
+    def shares(self, room: int, wall: int, points_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
+        """Where along a wall points lie, as shares of its length, between 0 and 1."""
+        index = self._first[room] + wall
+        along = (points_m - self.start[index]) @ self.edge[index] / self.length_m[index] ** 2
+        return np.clip(along, 0.0, 1.0)
+
+
+def place_openings(
+    openings: Sequence[Opening], rooms: Sequence[Room], tolerance_m: float, limits: PlanLimits
+) -> tuple[tuple[OpeningFace, ...], tuple[int, ...]]:
+    """Project openings onto the walls that they lie on.
+
+    Args:
+        tolerance_m: how far from a room's wall an opening may be drawn: at least the thickness of a wall.
+
+    Returns:
+        pieces of walls, and the indices of openings that lie on no wall.
+
+    Raises:
+        InvalidFloorPlanError: openings overlap, or there are too many of them on a wall.
+    """
+    if not openings:
+        return (), ()
+    walls = _Walls(rooms)
+    faces: list[OpeningFace] = []
+    lost = []
+    for index, opening in enumerate(openings):
+        contacts = _contacts(index, opening, rooms, walls, tolerance_m, limits)
+        found = [face for contact in contacts for face in _faces(index, opening, contact, contacts, walls)]
+        faces += found
+        if not found:
+            lost.append(index)
+    for room, count in Counter(face.room for face in faces).items():
+        if count > limits.max_openings_per_room:
+            raise InvalidFloorPlanError(
+                f"{count} pieces of openings, at most {limits.max_openings_per_room} are allowed "
+                "(max_openings_per_room)",
+                room=rooms[room].name,
+            )
+    _check_overlaps(openings, faces, rooms)
+    return tuple(faces), tuple(lost)
+
+
+def label(opening: Opening, index: int) -> str:
+    """What to call an opening in a message."""
+    return f"opening {index} ({opening.kind}{f' {opening.name!r}' if opening.name else ''})"
+
+
+def _contacts(
+    index: int, opening: Opening, rooms: Sequence[Room], walls: _Walls, tolerance_m: float, limits: PlanLimits
+) -> list[_Contact]:
+    """Walls that an opening lies on; in each room the nearest one at every place of the opening."""
+    start = opening.line_m[0]
+    along = opening.line_m[1] - start
+    length_m = float(np.hypot(*along))
+    direction = along / length_m
+    near = walls.near(opening.line_m, tolerance_m)
+    if opening.rooms is not None:
+        near = near[np.isin(walls.room[near], [k for k, room in enumerate(rooms) if room.id in opening.rooms])]
+    near = near[np.abs(walls.edge[near] @ direction) >= _LEAST_COSINE * walls.length_m[near]]
+    first = walls.start[near] - start
+    ends = np.stack([first, first + walls.edge[near]], axis=1)
+    at = ends @ direction
+    aside = ends[..., 0] * direction[1] - ends[..., 1] * direction[0]
+    low, high = np.clip(at.min(axis=1), 0.0, length_m), np.clip(at.max(axis=1), 0.0, length_m)
+    # How far off the wall is at both ends of what it shares with the opening.
+    slope = np.divide(aside[:, 1] - aside[:, 0], at[:, 1] - at[:, 0])
+    off_m = aside[:, :1] + slope[:, None] * (np.stack([low, high], axis=1) - at[:, :1])
+    least_m = min(_SHORTEST_PIECE_M, 0.5 * length_m)
+    on = (np.abs(off_m).max(axis=1) <= tolerance_m + _ROUNDING_M) & (high - low >= least_m)
+    if on.sum() > limits.max_walls_per_opening:
+        raise InvalidFloorPlanError(
+            f"{label(opening, index)} lies on {on.sum()} walls, at most {limits.max_walls_per_opening} are allowed "
+            "(max_walls_per_opening)"
+        )
+    away_m = np.abs(off_m).mean(axis=1)
+    contacts: list[_Contact] = []
+    for k in np.flatnonzero(on)[np.argsort(away_m[on], kind="stable")]:
+        wall = near[k]
+        # A room lies to the left of its walls.
+        side = 0 if walls.is_free_standing[wall] else int(np.sign(walls.edge[wall] @ direction))
+        contact = _Contact(
+            int(walls.room[wall]),
+            int(walls.number[wall]),
+            float(low[k] / length_m),
+            float(high[k] / length_m),
+            float(away_m[k]),
+            side,
+        )
+        shared_m = [_shared(contact, other) * length_m for other in contacts if other.room == contact.room]
+        if max(shared_m, default=0.0) <= _TOUCHING_M:
+            contacts.append(contact)
+    return sorted(contacts, key=lambda contact: (contact.room, contact.wall))
+
+
+def _shared(first: _Contact, second: _Contact) -> float:
+    return min(first.high, second.high) - max(first.low, second.low)
+
+
+def _faces(
+    index: int, opening: Opening, contact: _Contact, contacts: Sequence[_Contact], walls: _Walls
+) -> list[OpeningFace]:
+    """A contact cut where the room behind changes."""
+    start, along = opening.line_m[0], opening.line_m[1] - opening.line_m[0]
+    beyond = [contact] if contact.side == 0 else [other for other in contacts if other.side == -contact.side]
+    least = _TOUCHING_M / float(np.hypot(*along))
+    ends_beyond = {at for other in beyond for at in (other.low, other.high)}
+    cuts = {at for at in ends_beyond if contact.low + least < at < contact.high - least}
+    faces = []
+    for low, high in pairwise(sorted({contact.low, contact.high, *cuts})):
+        ends = start + np.array([[low], [high]]) * along
+        own = sorted(walls.shares(contact.room, contact.wall, ends).tolist())
+        middle = 0.5 * (low + high)
+        behind = [other for other in beyond if other.low <= middle <= other.high]
+        face = OpeningFace(opening=index, room=contact.room, wall=contact.wall, start=own[0], end=own[1])
+        if behind:
+            other = min(behind, key=lambda one: one.away_m)
+            leaving = sorted(walls.shares(other.room, other.wall, ends).tolist())
+            face = OpeningFace(
+                opening=index,
+                room=contact.room,
+                wall=contact.wall,
+                start=own[0],
+                end=own[1],
+                behind=other.room,
+                exit_wall=other.wall,
+                exit_start=leaving[0],
+                exit_end=leaving[1],
+            )
+        faces.append(face)
+    return faces
+
+
+def _check_overlaps(openings: Sequence[Opening], faces: Sequence[OpeningFace], rooms: Sequence[Room]) -> None:
+    """Refuse two openings at one place of a wall, unless one is known to stand above the other."""
+    on_wall: dict[tuple[int, int], list[OpeningFace]] = {}
+    for face in faces:
+        on_wall.setdefault((face.room, face.wall), []).append(face)
+    for (room, wall), group in on_wall.items():
+        length_m = float(np.hypot(*(rooms[room].walls_m[wall, 2:] - rooms[room].walls_m[wall, :2])))
+        group.sort(key=lambda face: face.start)
+        for k, face in enumerate(group):
+            for other in group[k + 1 :]:
+                if (min(face.end, other.end) - other.start) * length_m <= _TOUCHING_M:
+                    break
+                first, second = openings[face.opening], openings[other.opening]
+                if face.opening != other.opening and not _is_above(first, second) and not _is_above(second, first):
+                    raise InvalidFloorPlanError(
+                        f"{label(first, face.opening)} and {label(second, other.opening)} overlap",
+                        room=rooms[room].name,
+                    )
+
+
+def _is_above(upper: Opening, lower: Opening) -> bool:
+    return upper.sill_m is not None and lower.head_m is not None and upper.sill_m >= lower.head_m
+
+
+def kinds_that_occur(openings: Collection[Opening]) -> frozenset[str]:
+    """The kinds of some openings."""
+    return frozenset(opening.kind for opening in openings)

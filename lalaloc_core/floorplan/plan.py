@@ -1,0 +1,202 @@
+"""The floor plan: the only map this project needs.
+
+Its rooms are simple polygons in the plan frame (metres), each extruded from the floor to its own ceiling, perhaps with
+holes and free-standing walls. Openings are pieces of their walls: to a ray that looks for walls they are wall.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import shapely
+from jaxtyping import Float, Int
+
+from lalaloc_core.conventions import heading_to_degrees
+from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan.arrays import frozen
+from lalaloc_core.floorplan.checks import check_size, overlap_warnings
+from lalaloc_core.floorplan.geometry import PlanGeometry, build_geometry
+from lalaloc_core.floorplan.heights import (
+    DEFAULT_CAMERA_HEIGHT_M,
+    read_camera_height,
+    read_camera_height_std,
+    read_north,
+)
+from lalaloc_core.floorplan.json_text import read_json
+from lalaloc_core.floorplan.limits import DEFAULT_LIMITS, PlanLimits
+from lalaloc_core.floorplan.opening_reading import read_opening_kinds, read_openings, read_tolerance
+from lalaloc_core.floorplan.openings import DEFAULT_OPENING_TOLERANCE_M, Opening, OpeningFace, label, place_openings
+from lalaloc_core.floorplan.reading import read_ceiling, read_rooms
+from lalaloc_core.floorplan.rooms import Room
+from lalaloc_core.floorplan.values import check_keys, json_kind, read_name
+
+__all__ = ["DEFAULT_CAMERA_HEIGHT_M", "FloorPlan"]
+
+_PLAN_KEYS = {
+    "name",
+    "rooms",
+    "ceiling_height_m",
+    "camera_height_m",
+    "camera_height_std_m",
+    "north_deg",
+    "openings",
+    "opening_kinds",
+    "opening_tolerance_m",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class FloorPlan:
+    """A validated floor plan; build one with `FloorPlan.from_dict` or `FloorPlan.from_json`.
+
+    Attributes:
+        name: what the user calls it.
+        rooms: at least one.
+        camera_height_m: height of the camera assumed for panoramas of this plan.
+        warnings: what is odd but usable, such as overlapping rooms.
+        north: azimuth of true north (radians), None when it is not known.
+        openings: doors, windows and passages.
+        opening_kinds: the kinds of openings that the plan shows completely.
+        opening_tolerance_m: how far from a room's wall its openings may be drawn.
+        opening_faces: the pieces of walls that openings take up.
+        camera_height_std_m: how far off `camera_height_m` may be, one standard deviation; None when it is not said.
+    """
+
+    name: str
+    rooms: tuple[Room, ...]
+    camera_height_m: float = DEFAULT_CAMERA_HEIGHT_M
+    warnings: tuple[str, ...] = ()
+    north: float | None = None
+    openings: tuple[Opening, ...] = ()
+    opening_kinds: frozenset[str] = frozenset()
+    opening_tolerance_m: float = DEFAULT_OPENING_TOLERANCE_M
+    opening_faces: tuple[OpeningFace, ...] = ()
+    camera_height_std_m: float | None = None
+
+    @classmethod
+    def from_json(cls, text: str | bytes, limits: PlanLimits = DEFAULT_LIMITS) -> FloorPlan:
+        """Parse the native JSON format.
+
+        Raises:
+            InvalidFloorPlanError: not JSON, or not a valid plan.
+        """
+        return cls.from_dict(read_json(text, limits.max_depth), limits)
+
+    @classmethod
+    def from_dict(cls, document: Any, limits: PlanLimits = DEFAULT_LIMITS) -> FloorPlan:
+        """Validate a plan in the native format, whose keys stand in docs/conventions.md; unknown ones are refused.
+
+        Raises:
+            InvalidFloorPlanError: names the room and what is wrong.
+        """
+        if not isinstance(document, Mapping):
+            raise InvalidFloorPlanError(f"a plan must be an object, not {json_kind(document)}")
+        check_keys(document, _PLAN_KEYS)
+        name = read_name(document.get("name", "floor plan"), limits, what="the plan's name")
+        ceiling = document.get("ceiling_height_m")
+        default_ceiling_m = None if ceiling is None else read_ceiling(ceiling, None, limits)
+        rooms = read_rooms(document.get("rooms"), default_ceiling_m, limits)
+        check_size(rooms, limits)
+        openings = read_openings(document.get("openings"), rooms, limits)
+        tolerance_m = read_tolerance(document.get("opening_tolerance_m"))
+        faces, lost = place_openings(openings, rooms, tolerance_m, limits)
+        if openings and not faces:
+            raise InvalidFloorPlanError(
+                f"no opening lies on a wall: none is within {tolerance_m:g} m of one (opening_tolerance_m)"
+            )
+        return cls(
+            name=name,
+            rooms=rooms,
+            camera_height_m=read_camera_height(document.get("camera_height_m"), rooms),
+            warnings=(
+                *overlap_warnings(rooms, limits),
+                *(f"{label(openings[k], k)} lies on no wall" for k in lost),
+            ),
+            north=read_north(document.get("north_deg")),
+            openings=openings,
+            opening_kinds=read_opening_kinds(document.get("opening_kinds"), openings),
+            opening_tolerance_m=tolerance_m,
+            opening_faces=faces,
+            camera_height_std_m=read_camera_height_std(document.get("camera_height_std_m")),
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """The plan in the native format; `from_dict` of it gives an equal plan."""
+        document: dict[str, Any] = {"name": self.name, "camera_height_m": self.camera_height_m}
+        if self.camera_height_std_m is not None:
+            document["camera_height_std_m"] = self.camera_height_std_m
+        if self.north is not None:
+            # Rounded, so that degrees which went through radians are the same again.
+            document["north_deg"] = round(heading_to_degrees(self.north), 9) % 360.0
+        if self.openings or self.opening_kinds:
+            document["opening_kinds"] = sorted(self.opening_kinds)
+            document["opening_tolerance_m"] = self.opening_tolerance_m
+        document["rooms"] = [_room_document(room) for room in self.rooms]
+        if self.openings:
+            document["openings"] = [_opening_document(opening) for opening in self.openings]
+        return document
+
+    @property
+    def area_m2(self) -> float:
+        """Sum of the rooms' floor areas."""
+        return sum(room.area_m2 for room in self.rooms)
+
+    @property
+    def bounds_m(self) -> tuple[float, float, float, float]:
+        """(x_min, y_min, x_max, y_max) over all rooms."""
+        corners = np.concatenate([room.polygon_m for room in self.rooms])
+        (x_min, y_min), (x_max, y_max) = corners.min(axis=0), corners.max(axis=0)
+        return float(x_min), float(y_min), float(x_max), float(y_max)
+
+    @cached_property
+    def geometry(self) -> PlanGeometry:
+        """Walls and openings as the renderer takes them."""
+        return build_geometry(self.rooms, self.openings, self.opening_faces)
+
+    @property
+    def walls_m(self) -> Float[np.ndarray, "rooms n 4"]:
+        """Wall segments of every room, padded to one length by repeating each room's first wall.
+
+        Index with a pose's room to get what `render.profile` wants: `plan.walls_m[room_index]`.
+        """
+        return self.geometry.walls_m
+
+    @cached_property
+    def ceiling_heights_m(self) -> Float[np.ndarray, "rooms"]:
+        """Ceiling height of every room."""
+        return frozen(np.array([room.ceiling_height_m for room in self.rooms]))
+
+    def room_index_at(self, position_m: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, "n"]:
+        """Index of the room each position lies in, -1 outside and in holes; of rooms that overlap, the first."""
+        x, y = position_m[:, 0], position_m[:, 1]
+        index = np.full(len(position_m), -1)
+        for room_index in reversed(range(len(self.rooms))):
+            index[shapely.contains_xy(self.rooms[room_index].shape, x, y)] = room_index
+        return index
+
+
+def _room_document(room: Room) -> dict[str, Any]:
+    document: dict[str, Any] = {"id": room.id, "name": room.name}
+    if room.type != "unknown":
+        document["type"] = room.type
+    document["polygon"] = room.polygon_m.tolist()
+    if room.holes_m:
+        document["holes"] = [hole.tolist() for hole in room.holes_m]
+    if len(room.inner_walls_m):
+        document["walls"] = room.inner_walls_m.reshape(-1, 2, 2).tolist()
+    return document | {"ceiling_height_m": room.ceiling_height_m}
+
+
+def _opening_document(opening: Opening) -> dict[str, Any]:
+    document: dict[str, Any] = {"kind": opening.kind, "line": opening.line_m.tolist()}
+    optional = {
+        "sill_m": opening.sill_m,
+        "head_m": opening.head_m,
+        "name": opening.name,
+        "rooms": None if opening.rooms is None else list(opening.rooms),
+    }
+    return document | {key: value for key, value in optional.items() if value is not None}

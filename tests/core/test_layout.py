@@ -1,0 +1,211 @@
+"""What a camera sees along the horizon: against a slow oracle, on homes whose answer is known, and its gradients."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lalaloc_core.conventions import DOOR_CODE, OPENING_CLASSES, PASSAGE_CODE, WALL_CODE, WINDOW_CODE, column_azimuths
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.render.layout import LayoutView, layout_view
+from lalaloc_core.render.oracle import oracle_view
+from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.sampling import random_poses
+from lalaloc_core.synth.plans import generate_home
+from tests.strategies import plan_document, plan_of, rectangle, seeds
+
+COLUMNS = 48
+EYE_M = 1.5
+# Two rooms of 4 x 3 m with a wall of 20 cm, and a door in the middle of it, drawn on its axis.
+TWO_ROOMS = plan_document(rectangle(4.0, 3.0), rectangle(4.0, 3.0, at=(4.2, 0.0)))
+DOOR = {"kind": "door", "line": [[4.1, 1.0], [4.1, 2.0]]}
+
+
+def seen(plan: FloorPlan, at: tuple[float, float], azimuths_deg: list[float], eye_m: float = EYE_M) -> LayoutView:
+    """One ray for each azimuth."""
+    count = len(azimuths_deg)
+    position = np.tile(at, (count, 1)).astype(float)
+    room = plan.room_index_at(position)
+    # With a single column the ray of a pose is the one along its heading.
+    return layout_view(position, np.radians(azimuths_deg), room, plan.geometry, 1, np.full(count, eye_m))
+
+
+@st.composite
+def rows_of_rooms(draw: st.DrawFn) -> FloorPlan:
+    """Rooms in a row, turned by any angle, with openings between them and outwards, columns and stubs of wall."""
+    thickness = draw(st.floats(0.0, 0.3))
+    rooms, openings, x, previous = [], [], 0.0, None
+    for index in range(draw(st.integers(1, 3))):
+        width, depth, base = draw(st.floats(2.5, 6.0)), draw(st.floats(2.5, 6.0)), draw(st.floats(-0.8, 0.8))
+        room = {"name": f"room {index}", "polygon": rectangle(width, depth, at=(x, base))}
+        if draw(st.booleans()):
+            room["holes"] = [rectangle(0.4, 0.3, at=(x + 0.6 * width, base + 0.4 * depth))]
+        if draw(st.booleans()):
+            stub = [[x + 0.3 * width, base + depth], [x + 0.3 * width, base + 0.6 * depth]]
+            room["walls"] = [stub]
+            if draw(st.booleans()):
+                middle = [[stub[0][0], base + 0.9 * depth], [stub[0][0], base + 0.7 * depth]]
+                openings.append({"kind": draw(st.sampled_from(["door", "passage", "window"])), "line": middle})
+        if previous is not None and draw(st.integers(0, 3)):
+            low, high = max(base, previous[0]), min(base + depth, previous[1])
+            begin = low + draw(st.floats(0.05, 0.5)) * (high - low)
+            end = begin + draw(st.floats(0.2, 0.5)) * (high - low)
+            at = x - draw(st.floats(0.0, 1.0)) * thickness
+            openings.append({"kind": draw(st.sampled_from(["door", "passage"])), "line": [[at, begin], [at, end]]})
+        if draw(st.booleans()):
+            heights = {"sill_m": draw(st.sampled_from([0.9, 1.6])), "head_m": 2.1}
+            line = [[x + 0.2 * width, base], [x + 0.5 * width, base]]
+            openings.append({"kind": "window", "line": line, **heights})
+        if draw(st.booleans()):
+            openings.append({"kind": "door", "line": [[x + 0.6 * width, base], [x + 0.8 * width, base - 0.1]]})
+        rooms.append(room)
+        x, previous = x + width + thickness, (base, base + depth)
+    document = {"ceiling_height_m": 2.6, "rooms": rooms, "openings": openings}
+    return FloorPlan.from_dict(_turned(document, draw(st.floats(0.0, 2.0 * math.pi))))
+
+
+def _turned(value, angle):
+    """Every point of a document turned about the origin."""
+    if isinstance(value, dict):
+        return {key: _turned(item, angle) for key, item in value.items()}
+    if isinstance(value, list) and len(value) == 2 and all(isinstance(item, float) for item in value):
+        c, s = math.cos(angle), math.sin(angle)
+        return [c * value[0] - s * value[1], s * value[0] + c * value[1]]
+    return [_turned(item, angle) for item in value] if isinstance(value, list) else value
+
+
+def view_of(plan: FloorPlan, poses, heading, columns=COLUMNS) -> LayoutView:
+    return layout_view(poses.position_m, heading, poses.room_index, plan.geometry, columns, EYE_M)
+
+
+@settings(max_examples=25, deadline=None)
+@given(rows_of_rooms(), seeds())
+def test_the_view_is_what_asking_shapely_ray_by_ray_gives(plan: FloorPlan, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    poses = random_poses(plan, 2, rng, 0.1)
+    heading = rng.uniform(-math.pi, math.pi, 2)
+    view = view_of(plan, poses, heading)
+    # Beside a corner or the end of an opening the last bit decides; such rays prove nothing.
+    around = [view_of(plan, poses, heading + shift) for shift in (-1e-5, 1e-5)]
+    steady = np.ones(view.kind.shape, bool)
+    for other in around:
+        steady &= other.kind == view.kind
+        steady &= np.abs(other.distance_m - view.distance_m) < 5e-3
+        steady &= np.abs(other.behind_m - view.behind_m) < 5e-3
+    assert steady.mean() > 0.8
+    for pose, column in np.argwhere(steady):
+        azimuth = float(heading[pose] + column_azimuths(COLUMNS)[column])
+        expected = oracle_view(plan, int(poses.room_index[pose]), poses.position_m[pose], azimuth, EYE_M)
+        found = (view.distance_m[pose, column], view.kind[pose, column], view.behind_m[pose, column])
+        assert found == pytest.approx(expected, abs=2e-3)
+
+
+@given(seeds())
+@settings(max_examples=10, deadline=None)
+def test_distances_are_those_of_the_wall_profile_and_nothing_is_seen_before_its_wall(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    plan = generate_home(rng).plan
+    poses, heading = random_poses(plan, 4, rng), rng.uniform(-math.pi, math.pi, 4)
+    view = view_of(plan, poses, heading)
+    profile = wall_profile(poses.position_m, heading, plan.walls_m[poses.room_index], COLUMNS)
+    np.testing.assert_array_equal(view.distance_m, profile)
+    assert (view.behind_m >= view.distance_m).all()
+    open_kinds = np.isin(view.kind, [DOOR_CODE, PASSAGE_CODE])
+    np.testing.assert_array_equal(view.behind_m[~open_kinds], view.distance_m[~open_kinds])
+
+
+@given(seeds())
+@settings(max_examples=10, deadline=None)
+def test_torch_gives_what_numpy_gives(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    plan = generate_home(rng).plan
+    poses, heading = random_poses(plan, 4, rng), rng.uniform(-math.pi, math.pi, 4)
+    view = view_of(plan, poses, heading)
+    other = layout_view(
+        torch.tensor(poses.position_m),
+        torch.tensor(heading),
+        torch.tensor(poses.room_index),
+        plan.geometry,
+        COLUMNS,
+        torch.full((4,), EYE_M, dtype=torch.float64),
+    )
+    np.testing.assert_array_equal(other.kind.numpy(), view.kind)
+    np.testing.assert_allclose(other.distance_m.numpy(), view.distance_m, rtol=1e-12)
+    np.testing.assert_allclose(other.behind_m.numpy(), view.behind_m, rtol=1e-9)
+
+
+def test_gradients_of_all_distances_are_right() -> None:
+    plan = FloorPlan.from_dict(TWO_ROOMS | {"openings": [DOOR]})
+    position = torch.tensor([[1.1, 1.3], [6.3, 1.6]], dtype=torch.float64, requires_grad=True)
+    heading = torch.tensor([0.3, 2.0], dtype=torch.float64, requires_grad=True)
+
+    def distances(position_m: torch.Tensor, heading: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        view = layout_view(position_m, heading, torch.tensor([0, 1]), plan.geometry, 16, EYE_M)
+        assert (view.behind_m > view.distance_m).any()
+        return view.distance_m, view.behind_m
+
+    assert torch.autograd.gradcheck(distances, (position, heading))
+
+
+def test_through_a_door_one_sees_the_far_wall_of_the_next_room() -> None:
+    plan = FloorPlan.from_dict(TWO_ROOMS | {"openings": [DOOR]})
+    view = seen(plan, (1.0, 1.5), [90.0, 0.0])
+    assert view.kind[:, 0].tolist() == [DOOR_CODE, WALL_CODE]
+    np.testing.assert_allclose(view.distance_m[:, 0], [3.0, 1.5])
+    np.testing.assert_allclose(view.behind_m[:, 0], [7.2, 1.5])
+    back = seen(plan, (5.2, 1.5), [-90.0])
+    np.testing.assert_allclose([back.distance_m[0, 0], back.behind_m[0, 0]], [1.0, 5.2])
+
+
+def test_a_slanting_ray_ends_in_the_thickness_of_the_wall() -> None:
+    plan = FloorPlan.from_dict(TWO_ROOMS | {"openings": [DOOR]})
+    # It enters 5 cm before the end of the door and would leave 15 cm beyond it.
+    view = seen(plan, (3.0, 0.95), [45.0])
+    assert view.kind[0, 0] == DOOR_CODE
+    assert view.behind_m[0, 0] == view.distance_m[0, 0]
+
+
+@pytest.mark.parametrize("kind", OPENING_CLASSES[1:])
+def test_windows_and_doors_to_the_outdoors_show_nothing_behind(kind: str) -> None:
+    opening = {"kind": kind, "line": [[0.0, 1.0], [0.0, 2.0]]}
+    view = seen(FloorPlan.from_dict(TWO_ROOMS | {"openings": [opening]}), (1.0, 1.5), [-90.0])
+    assert view.kind[0, 0] == OPENING_CLASSES.index(kind)
+    assert view.behind_m[0, 0] == view.distance_m[0, 0] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("eye_m", "code"), [(0.8, WALL_CODE), (1.0, WINDOW_CODE), (2.1, WALL_CODE)])
+def test_an_opening_counts_at_eye_height_only(eye_m: float, code: int) -> None:
+    window = {"kind": "window", "line": [[0.0, 1.0], [0.0, 2.0]], "sill_m": 0.9, "head_m": 2.0}
+    plan = FloorPlan.from_dict(TWO_ROOMS | {"openings": [window]})
+    assert seen(plan, (1.0, 1.5), [-90.0], eye_m).kind[0, 0] == code
+
+
+def test_of_openings_above_each_other_the_one_at_eye_height_is_met() -> None:
+    door = DOOR | {"head_m": 2.0}
+    light = {"kind": "window", "line": DOOR["line"], "sill_m": 2.0, "head_m": 2.4}
+    plan = FloorPlan.from_dict(TWO_ROOMS | {"openings": [light, door]})
+    assert [int(seen(plan, (1.0, 1.5), [90.0], eye).kind[0, 0]) for eye in (1.5, 2.2)] == [DOOR_CODE, WINDOW_CODE]
+
+
+def test_a_room_without_any_opening_has_walls_only() -> None:
+    plan = plan_of(rectangle(4.0, 3.0))
+    view = view_of(plan, random_poses(plan, 3, np.random.default_rng(0)), np.zeros(3))
+    assert (view.kind == WALL_CODE).all()
+    assert (view.behind_m == view.distance_m).all()
+
+
+def test_padding_changes_nothing() -> None:
+    """The first wall is repeated to pad; its door is met all the same, whichever copy a ray is said to meet."""
+    many = [[0.1 * k, 3.0 + 0.01 * (k % 2)] for k in range(40, -1, -1)]
+    document = plan_document(rectangle(4.0, 3.0, at=(0.0, -4.0)), [[0.0, 0.0], [4.0, 0.0], *many])
+    document["openings"] = [{"kind": "door", "line": [[1.0, -4.0], [3.0, -4.0]]}]
+    plan = FloorPlan.from_dict(document)
+    assert plan.geometry.wall_count.tolist() == [4, 43]
+    position = torch.tensor([[2.0, -2.0]], dtype=torch.float64)
+    view = layout_view(position, torch.full((1,), math.pi), torch.tensor([0]), plan.geometry, 1, EYE_M)
+    assert int(view.kind[0, 0]) == DOOR_CODE

@@ -1,0 +1,328 @@
+"""Openings, holes, free-standing walls, types and ids of a plan: what is accepted, where it lands, what is refused."""
+
+from __future__ import annotations
+
+import json
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+
+from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
+from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan import DEFAULT_LIMITS, FloorPlan, PlanLimits, room_type_of
+from lalaloc_core.sampling import pose_grid, random_poses
+from lalaloc_core.synth.plans import generate_home
+from lalaloc_core.unfamiliar.homes import HomeKey, home_of
+from tests.strategies import plan_document, rectangle, seeds
+
+# Two rooms of 4 x 3 m with a wall of 20 cm between them.
+ROOMS = plan_document(rectangle(4.0, 3.0), rectangle(4.0, 3.0, at=(4.2, 0.0)))
+DOOR = {"kind": "door", "line": [[4.1, 1.0], [4.1, 1.9]]}
+
+
+def with_openings(*openings: Any, **extra: Any) -> FloorPlan:
+    return FloorPlan.from_dict(ROOMS | {"openings": list(openings)} | extra)
+
+
+def with_room(limits: PlanLimits = DEFAULT_LIMITS, **extra: Any) -> FloorPlan:
+    document = plan_document(rectangle(4.0, 3.0))
+    document["rooms"][0] |= extra
+    return FloorPlan.from_dict(document, limits)
+
+
+def refused(make: Any, *arguments: Any, **extra: Any) -> str:
+    with pytest.raises(InvalidFloorPlanError) as caught:
+        make(*arguments, **extra)
+    return str(caught.value)
+
+
+def test_one_entry_serves_both_rooms_of_a_wall() -> None:
+    plan = with_openings(DOOR)
+    first, second = plan.opening_faces
+    assert (first.room, first.behind, second.room, second.behind) == (0, 1, 1, 0)
+    np.testing.assert_allclose(plan.geometry.opening_m[0, 0], [4.0, 1.0, 4.0, 1.9])
+    np.testing.assert_allclose(plan.geometry.exit_m[0, 0][[0, 2]], [4.2, 4.2])
+    assert plan.geometry.opening_kind.tolist() == [[1], [1]]
+    assert plan.warnings == ()
+
+
+@pytest.mark.parametrize("at", [4.0, 4.2, 3.9, 4.3])
+def test_an_opening_may_be_drawn_on_either_face_or_a_little_off(at: float) -> None:
+    plan = with_openings(DOOR | {"line": [[at, 1.0], [at, 1.9]]})
+    assert [face.room for face in plan.opening_faces] == [0, 1]
+
+
+def test_the_tolerance_is_the_plans() -> None:
+    door = DOOR | {"line": [[4.0, 1.0], [4.0, 1.9]]}
+    assert len(with_openings(door, opening_tolerance_m=0.1).opening_faces) == 1
+    assert len(with_openings(door, opening_tolerance_m=0.2).opening_faces) == 2
+
+
+def test_an_opening_that_names_its_rooms_is_in_those_only() -> None:
+    plan = with_openings(DOOR | {"rooms": ["room-2"]})
+    assert [(face.room, face.behind) for face in plan.opening_faces] == [(1, -1)]
+
+
+def test_a_passage_to_two_rooms_has_each_behind_its_part() -> None:
+    polygons = [rectangle(4.0, 3.0), rectangle(1.9, 2.0, at=(0.0, 3.1)), rectangle(2.0, 2.0, at=(2.0, 3.1))]
+    document = plan_document(*polygons) | {"openings": [{"kind": "passage", "line": [[0.5, 3.05], [3.5, 3.05]]}]}
+    plan = FloorPlan.from_dict(document)
+    parts = [(face.behind, round(4.0 * (face.end - face.start), 2)) for face in plan.opening_faces if face.room == 0]
+    assert parts == [(1, 1.4), (-1, 0.1), (2, 1.5)]
+
+
+def test_of_two_walls_one_behind_the_other_the_nearer_has_the_opening() -> None:
+    """A recess as deep as a wall is thick."""
+    recessed = [[0, 0], [4, 0], [4, 3], [3, 3], [3, 3.2], [1, 3.2], [1, 3], [0, 3]]
+    document = plan_document(recessed) | {"openings": [{"kind": "window", "line": [[1.2, 3.2], [2.8, 3.2]]}]}
+    assert [face.wall for face in FloorPlan.from_dict(document).opening_faces] == [4]
+
+
+def test_openings_may_touch_but_not_overlap() -> None:
+    beside = {"kind": "window", "line": [[4.0, 1.9], [4.0, 2.5]]}
+    assert len(with_openings(DOOR, beside).openings) == 2
+    over = {"kind": "window", "line": [[4.0, 1.8], [4.0, 2.5]], "name": "hatch"}
+    assert "opening 0 (door) and opening 1 (window 'hatch') overlap" in refused(with_openings, DOOR, over)
+
+
+def test_openings_above_each_other_do_not_overlap() -> None:
+    light = {"kind": "window", "line": DOOR["line"], "sill_m": 2.1, "head_m": 2.4}
+    assert len(with_openings(DOOR | {"head_m": 2.1}, light).openings) == 2
+    assert "overlap" in refused(with_openings, DOOR | {"head_m": 2.2}, light)
+
+
+def test_an_opening_on_no_wall_is_a_warning_and_an_error_where_there_is_no_other() -> None:
+    astray = {"kind": "window", "line": [[2.0, 1.0], [2.0, 2.0]], "name": "skylight"}
+    assert with_openings(DOOR, astray).warnings == ("opening 1 (window 'skylight') lies on no wall",)
+    assert "no opening lies on a wall: none is within 0.35 m" in refused(with_openings, astray)
+
+
+def test_openings_across_a_wall_are_on_no_wall() -> None:
+    assert "no opening lies on a wall" in refused(with_openings, {"kind": "door", "line": [[3.8, 1.0], [4.4, 1.0]]})
+
+
+@pytest.mark.parametrize(
+    ("opening", "reason"),
+    [
+        ("door", "opening 0 must be an object, not a string"),
+        ({"kind": "gate", "line": DOOR["line"]}, "opening 0: the kind is 'gate', it must be one of door, window"),
+        ({"kind": "wall", "line": DOOR["line"]}, "the kind is 'wall'"),
+        ({"line": DOOR["line"]}, "the kind is null"),
+        ({"kind": "door"}, "opening 0: the line must be two points"),
+        ({"kind": "door", "line": [[0, 0], [0, 0]]}, "shorter than 0.01 m"),
+        ({"kind": "door", "line": [[0, 0], [0, "1"]]}, "two numbers"),
+        (DOOR | {"width_m": 1}, "opening 0: unknown key 'width_m'"),
+        (DOOR | {"sill_m": -1}, "sill_m is -1, it must lie between 0 and 20 m"),
+        (DOOR | {"sill_m": 2, "head_m": 1.5}, "sill_m is 2, it must lie below head_m (1.5)"),
+        (DOOR | {"name": ""}, "name must be a non-empty string"),
+        (DOOR | {"rooms": ["attic"]}, "rooms has 'attic', which is no room's id"),
+        (DOOR | {"rooms": "room-1"}, "rooms must be a list, not a string"),
+    ],
+)
+def test_a_bad_opening_is_refused_by_its_number(opening: Any, reason: str) -> None:
+    assert reason in refused(with_openings, opening)
+
+
+def test_kinds_that_are_shown_completely_are_those_that_occur_unless_said() -> None:
+    assert with_openings(DOOR).opening_kinds == {"door"}
+    assert with_openings(DOOR, opening_kinds=["door", "window"]).opening_kinds == {"door", "window"}
+    assert FloorPlan.from_dict(ROOMS).opening_kinds == frozenset()
+    assert FloorPlan.from_dict(ROOMS | {"opening_kinds": ["window"]}).opening_kinds == {"window"}
+    assert "'gate'" in refused(with_openings, DOOR, opening_kinds=["gate"])
+
+
+@pytest.mark.parametrize("value", [0.0, 2.0, "0.3", None])
+def test_a_tolerance_out_of_range_is_refused(value: Any) -> None:
+    if value is None:
+        assert with_openings(DOOR, opening_tolerance_m=None).opening_tolerance_m == 0.35
+    else:
+        assert "opening_tolerance_m" in refused(with_openings, DOOR, opening_tolerance_m=value)
+
+
+def test_too_many_openings_are_refused() -> None:
+    line = [[0.0, 0.5], [0.0, 0.6]]
+    many = {"openings": [{"kind": "window", "line": line}] * 3}
+    assert "3 openings, at most 2" in refused(FloorPlan.from_dict, ROOMS | many, PlanLimits(max_openings=2))
+    windows = [{"kind": "window", "line": [[0.0, 0.5 * k], [0.0, 0.5 * k + 0.4]]} for k in range(6)]
+    message = refused(FloorPlan.from_dict, ROOMS | {"openings": windows}, PlanLimits(max_openings_per_room=5))
+    assert "room 'room 1': 6 pieces of openings, at most 5" in message
+
+
+def test_a_line_along_a_comb_of_walls_is_refused_soon() -> None:
+    teeth = [
+        [x, y]
+        for k in range(40)
+        for x, y in ([0, 0.01 * k], [9, 0.01 * k], [9, 0.01 * k + 0.005], [0, 0.01 * k + 0.005])
+    ]
+    combs = [[[-1, -1], *teeth[2 * k : 2 * k + 60], [-1, 3]] for k in range(3)]
+    document = plan_document(*combs) | {"openings": [{"kind": "window", "line": [[1.0, 0.2], [3.0, 0.2]]}]}
+    assert "walls, at most 32 are allowed (max_walls_per_opening)" in refused(FloorPlan.from_dict, document)
+
+
+def test_holes_are_no_floor_and_their_edges_are_walls() -> None:
+    room = with_room(holes=[rectangle(1.0, 1.0, at=(1.0, 1.0))]).rooms[0]
+    assert room.area_m2 == pytest.approx(11.0)
+    assert len(room.walls_m) == 8
+    plan = with_room(holes=[rectangle(1.0, 1.0, at=(1.0, 1.0))])
+    assert plan.room_index_at(np.array([[1.5, 1.5], [0.5, 0.5]])).tolist() == [-1, 0]
+
+
+@pytest.mark.parametrize(
+    ("extra", "reason"),
+    [
+        ({"holes": [rectangle(1.0, 1.0, at=(3.5, 1.0))]}, "hole 0 does not lie inside the polygon"),
+        ({"holes": [rectangle(2.0, 2.0, at=(0.5, 0.5)), rectangle(2.0, 2.0, at=(1.0, 0.9))]}, "holes cross"),
+        ({"holes": [[[1, 1], [2, 2], [2, 1], [1, 2]]]}, "hole 0 crosses itself"),
+        ({"holes": [[[1, 1], [2, 2], [3, 3]]]}, "all vertices of hole 0 lie on one line"),
+        ({"holes": rectangle(1.0, 1.0)}, "'hole 0' must be a list of at least three"),
+        ({"holes": [rectangle(3.98, 2.98, at=(0.01, 0.01))]}, "the area is"),
+        ({"holes": "none"}, "holes must be a list, not a string"),
+        ({"walls": [[[1, 1], [5, 1]]]}, "wall 0 leaves the room's floor"),
+        ({"walls": [[[1, 1], [1, 1]]]}, "wall 0 is shorter than 0.01 m"),
+        ({"walls": [[1, 1]]}, "wall 0: point 0 must be two numbers"),
+        ({"holes": [rectangle(1.0, 1.0, at=(1, 1))], "walls": [[[0.5, 1.5], [2.5, 1.5]]]}, "wall 0 leaves"),
+        ({"type": "cave"}, "the type is 'cave', it must be one of unknown, bedroom"),
+        ({"type": None}, "the type is null"),
+        ({"id": ""}, "the id must be a non-empty string"),
+        ({"id": 7}, "the id must be a non-empty string"),
+    ],
+)
+def test_what_a_room_cannot_have_is_refused_by_its_name(extra: dict[str, Any], reason: str) -> None:
+    message = refused(with_room, **extra)
+    assert reason in message
+    assert "room 'room 1'" in message
+
+
+def test_edges_of_holes_and_walls_count_as_vertices() -> None:
+    extra = {"holes": [rectangle(1.0, 1.0, at=(1.0, 1.0))], "walls": [[[3.0, 1.0], [3.0, 3.0]]]}
+    assert len(with_room(PlanLimits(max_vertices_per_room=9), **extra).rooms[0].walls_m) == 9
+    assert "9 vertices, at most 8" in refused(with_room, PlanLimits(max_vertices_per_room=8), **extra)
+
+
+def test_poses_keep_off_holes_and_free_standing_walls() -> None:
+    plan = with_room(holes=[rectangle(1.0, 1.0, at=(1.0, 1.0))], walls=[[[3.0, 0.0], [3.0, 3.0]]])
+    for poses in (pose_grid(plan, 0.1), random_poses(plan, 500, np.random.default_rng(0))):
+        x, y = poses.position_m.T
+        assert not ((np.abs(x - 1.5) < 0.64) & (np.abs(y - 1.5) < 0.64)).any()
+        assert (np.abs(x - 3.0) > 0.149).all()
+        assert (x > 3.0).any()
+
+
+def test_a_room_that_is_nothing_but_stubs_still_has_a_pose_off_them() -> None:
+    plan = with_room(walls=[[[0.2 * k, 0.0], [0.2 * k, 3.0]] for k in range(1, 20)])
+    position = pose_grid(plan, 1.0).position_m
+    assert len(position) == 1
+    assert abs(position[0, 0] % 0.2 - 0.1) < 0.06
+
+
+def test_ids_are_made_from_names_and_never_twice() -> None:
+    names = ["Bed room", "bed room!", "Küche", "bed-room-2", "???"]
+    document = plan_document(*[rectangle(1.0, 1.0, at=(2.0 * k, 0.0)) for k in range(5)])
+    for room, name in zip(document["rooms"], names, strict=True):
+        room["name"] = name
+    document["rooms"][4]["id"] = "bed-room"
+    ids = [room.id for room in FloorPlan.from_dict(document).rooms]
+    assert ids == ["bed-room-2", "bed-room-3", "küche", "bed-room-2-2", "bed-room"]
+    document["rooms"][0]["id"] = "bed-room"
+    assert "the id 'bed-room' is that of 2 rooms" in refused(FloorPlan.from_dict, document)
+
+
+def test_every_type_is_read_and_written() -> None:
+    for name in ROOM_TYPES:
+        assert with_room(type=name).rooms[0].type == name
+    assert "type" not in with_room().to_dict()["rooms"][0]
+
+
+@pytest.mark.parametrize(
+    ("label", "kind"),
+    [
+        ("Living room 2", "living"),
+        ("master bedroom", "bedroom"),
+        ("WC", "bathroom"),
+        ("store room", "storage"),
+        ("study", "office"),
+        ("hall", "corridor"),
+        ("undefined", "unknown"),
+        ("", "unknown"),
+    ],
+)
+def test_labels_of_drawings_have_types(label: str, kind: str) -> None:
+    assert room_type_of(label) == kind
+
+
+def test_everything_survives_being_written_and_read() -> None:
+    document = ROOMS | {"openings": [DOOR | {"name": "front", "sill_m": 0.0, "head_m": 2.0, "rooms": ["room-1"]}]}
+    document["rooms"][0] |= {"type": "kitchen", "holes": [rectangle(0.5, 0.5, at=(1, 1))], "walls": [[[3, 0], [3, 1]]]}
+    document |= {"camera_height_std_m": 0.05, "opening_kinds": ["window", "door"], "opening_tolerance_m": 0.25}
+    plan = FloorPlan.from_dict(document)
+    again = FloorPlan.from_json(json.dumps(plan.to_dict()))
+    assert again.to_dict() == plan.to_dict()
+    assert again.opening_faces == plan.opening_faces
+    assert (again.opening_kinds, again.camera_height_std_m) == ({"door", "window"}, 0.05)
+    for name, values in vars(plan.geometry).items():
+        np.testing.assert_array_equal(getattr(again.geometry, name), values)
+        assert not values.flags.writeable
+
+
+@pytest.mark.parametrize("value", [-0.1, 2.5, "0.1", True])
+def test_a_camera_height_that_is_off_by_no_length_is_refused(value: Any) -> None:
+    assert "camera_height_std_m" in refused(with_openings, DOOR, camera_height_std_m=value)
+
+
+@settings(max_examples=10, deadline=None)
+@given(seeds())
+def test_the_plan_of_a_synthetic_home_has_its_openings(seed: int) -> None:
+    home = generate_home(np.random.default_rng(seed))
+    plan, kinds = home.plan, {"door_open": 1, "door_shut": 1, "window": 2, "opening": 3}
+    faces = [(f.room, f.wall, f.behind, plan.openings[f.opening].code) for f in plan.opening_faces]
+    assert sorted(faces) == sorted((o.room, o.wall, o.neighbour, kinds[o.kind]) for o in home.openings)
+    assert plan.warnings == ()
+    assert plan.opening_kinds == frozenset(OPENING_CLASSES[1:])
+    assert all(room.type != "unknown" for room in plan.rooms)
+
+
+@pytest.mark.parametrize("index", range(6))
+def test_the_plan_of_an_unfamiliar_home_has_its_openings(index: int) -> None:
+    home = home_of(HomeKey(0, 3, index))
+    plan = home.plan.plan
+    expected = [(o.wall.room, o.wall.edge, o.behind.room if o.behind else -1) for o in home.openings]
+    expected += [(o.behind.room, o.behind.edge, o.wall.room) for o in home.openings if o.behind]
+    assert sorted((f.room, f.wall, f.behind) for f in plan.opening_faces) == sorted(expected)
+    assert plan.warnings == ()
+    assert [room.type for room in plan.rooms] == [room_type_of(kind) for kind in home.plan.kinds]
+
+
+class TestJson:
+    def test_a_key_that_stands_twice_is_refused(self) -> None:
+        text = json.dumps(ROOMS)[:-1] + ', "name": "other"}'
+        assert "the key 'name' stands twice" in refused(FloorPlan.from_json, text)
+
+    def test_a_number_of_thousands_of_digits_is_refused_in_plain_words(self) -> None:
+        message = refused(FloorPlan.from_json, '{"ceiling_height_m": ' + "9" * 5000 + "}")
+        assert message == "a number has 5000 digits, at most 1000 are read"
+
+    @pytest.mark.parametrize("pattern", ['"' + '\\"' * 100_000, '"' * 200_001, '"' + '\\"' * 100_000 + "\\"])
+    def test_strings_without_an_end_take_time_that_grows_with_the_text(self, pattern: str) -> None:
+        def seconds(text: str) -> float:
+            spent = []
+            for _ in range(5):
+                begin = time.perf_counter()
+                refused(FloorPlan.from_json, text)
+                spent.append(time.perf_counter() - begin)
+            return min(spent)
+
+        half, whole = seconds(pattern[: len(pattern) // 2]), seconds(pattern)
+        assert whole < 3.0 * half + 0.01
+
+    def test_coordinates_too_far_out_are_refused(self) -> None:
+        far = plan_document(rectangle(4.0, 3.0, at=(1e8, 0.0)))
+        assert "at most 10000000 m from the origin (max_coordinate_m)" in refused(FloorPlan.from_dict, far)
+
+    @pytest.mark.parametrize(
+        ("value", "word"), [([], "a list"), ("x", "a string"), (None, "null"), (True, "true"), (1, "a number")]
+    )
+    def test_messages_speak_json(self, value: Any, word: str) -> None:
+        assert f"a plan must be an object, not {word}" in refused(FloorPlan.from_dict, value)
