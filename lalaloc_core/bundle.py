@@ -165,6 +165,15 @@ class Bundle:
         manifest = Manifest.from_json(text)
         return cls(folder, manifest, _digest_of(manifest))
 
+    def check(self) -> None:
+        """Read every file, and believe none.
+
+        Raises:
+            BundleError: one is missing, or altered.
+        """
+        for name in self.manifest.files:
+            self.read(name)
+
     def read(self, name: str) -> bytes:
         """The bytes of one file, checked against the manifest.
 

@@ -80,7 +80,7 @@ def _check_parts(settings: Settings) -> None:
         BundleError: there is no usable model.
         ConfigError, StoreUnavailableError: the database cannot be used.
     """
-    Bundle.open(settings.bundle)
+    Bundle.open(settings.bundle).check()
     open_store(settings).close()
 
 

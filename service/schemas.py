@@ -7,6 +7,8 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
+from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M
+
 PlanStatus = Literal["preparing", "ready", "failed"]
 Finite = Field(allow_inf_nan=False)
 
@@ -52,7 +54,9 @@ class FloorPlanDocument(BaseModel):
 
     name: str = Field("floor plan", description="What to call the plan.")
     ceiling_height_m: float | None = Field(None, gt=0, description="Ceiling of rooms without their own.")
-    camera_height_m: float = Field(1.5, gt=0, description="Height of the camera assumed for panoramas of this plan.")
+    camera_height_m: float = Field(
+        1.5, ge=MIN_CAMERA_HEIGHT_M, description="Height of the camera assumed for panoramas of this plan."
+    )
     north_deg: float | None = Field(
         None, ge=-360, le=360, description="Azimuth of true north: degrees clockwise from the plan's +y."
     )
@@ -160,7 +164,9 @@ class LocaliseForm(BaseModel):
         "model's ring, and refined. 0: it is exact. Needs `heading_deg`.",
     )
     camera_height_m: Annotated[float, Finite] | None = Field(
-        None, gt=0, description="Height of the camera over the floor; left out: the plan's. Rounded to 2 cm."
+        None,
+        ge=MIN_CAMERA_HEIGHT_M,
+        description="Height of the camera over the floor; left out: the plan's. Rounded to 2 cm.",
     )
     refine: Literal["none", "vdr", "lpo"] = Field(
         "lpo", description="How far to refine: nearest grid pose, denser poses around it, or optimised pose."

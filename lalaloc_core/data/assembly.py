@@ -13,14 +13,13 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
+from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M
 from lalaloc_core.data.rings import uncrossed
 from lalaloc_core.errors import DatasetError, InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_CAMERA_HEIGHT_M, DEFAULT_LIMITS, FloorPlan
 
 # An outline that crosses itself is a slip of the drawing when one simple part of it has nearly all of its floor.
 _MIN_SHARE_UNCROSSED = 0.9
-# A camera nearer to the floor is one whose height was given in another unit.
-_MIN_CAMERA_HEIGHT_M = 0.1
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -107,10 +106,10 @@ def pose_fault(
         found = int(plan.room_index_at(position_m[None])[0])
         where = f", in '{plan.rooms[found].name}'" if found >= 0 else ""
         return f"the camera at {at} stands outside its room '{room.name}', {away_m:.3g} m away{where}"
-    if not camera_height_m >= _MIN_CAMERA_HEIGHT_M:
+    if not camera_height_m >= MIN_CAMERA_HEIGHT_M:
         return (
             f"the camera at {at} is {camera_height_m:.3g} m over the floor, "
-            f"at least {_MIN_CAMERA_HEIGHT_M:g} m is needed"
+            f"at least {MIN_CAMERA_HEIGHT_M:g} m is needed"
         )
     if not camera_height_m < room.ceiling_height_m:
         return (

@@ -19,6 +19,7 @@ from fastapi import FastAPI
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from service.http.admission import Admission, AdmissionLimits
+from service.http.descriptors import max_connections_of
 from service.settings import Settings
 
 # Heads of requests; larger ones get a 400.
@@ -29,16 +30,24 @@ _FOR_REQUESTS, _FOR_CONNECTIONS = 0.6, 0.1
 
 
 def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
-    """How the app is served."""
+    """How the app is served.
+
+    Raises:
+        ConfigError: the system allows too few file descriptors.
+    """
     limits = AdmissionLimits.of(settings)
     # The server's own refusal is plain text; ours comes first.
     least = limits.requests + limits.reads + limits.streams + 1
+    max_connections = max_connections_of(max(settings.max_connections, least), settings)
     return uvicorn.Config(
         app,
-        http=bounded_protocol(settings.head_deadline_s),
+        http=bounded_protocol(settings.head_deadline_s, max_connections),
         ws="none",
         log_level="warning",
-        limit_concurrency=max(settings.max_connections, least),
+        # Connections make room for others before; this is for when all of them have a request in work.
+        limit_concurrency=max_connections + 1,
+        # uvicorn would believe whoever connects from this machine what address they come from.
+        proxy_headers="FORWARDED_ALLOW_IPS" in os.environ,
         timeout_keep_alive=math.ceil(settings.keep_alive_s),
         timeout_graceful_shutdown=math.ceil(_FOR_CONNECTIONS * settings.stop_deadline_s),
         h11_max_incomplete_event_size=_MAX_HEAD_BYTES,
@@ -93,8 +102,8 @@ class Server(uvicorn.Server):
         return getattr(self._app.state, "admission", None)
 
 
-def bounded_protocol(head_deadline_s: float) -> type[asyncio.Protocol]:
-    """HTTP/1.1 with a limit on what the server alone sees: heads of requests, and bodies of refused ones."""
+def bounded_protocol(head_deadline_s: float, max_connections: int) -> type[asyncio.Protocol]:
+    """HTTP/1.1 with a limit on what the server alone sees: connections, heads of requests, bodies of refused ones."""
 
     class BoundedProtocol(H11Protocol):
         """Ends a connection that is longer without a request in work than being idle and sending a head may take.
@@ -103,10 +112,13 @@ def bounded_protocol(head_deadline_s: float) -> type[asyncio.Protocol]:
         """
 
         _limit: asyncio.TimerHandle | None = None
+        _idle_since = 0.0
 
         def connection_made(self, transport: asyncio.Transport) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
             super().connection_made(transport)
             _send_at_once(transport)
+            self._idle_since = monotonic()
+            self._make_room()
             self._watch()
 
         def data_received(self, data: bytes) -> None:
@@ -115,15 +127,31 @@ def bounded_protocol(head_deadline_s: float) -> type[asyncio.Protocol]:
 
         def on_response_complete(self) -> None:
             super().on_response_complete()
+            self._idle_since = monotonic()
             self._watch()
 
         def connection_lost(self, exc: Exception | None) -> None:
             super().connection_lost(exc)
             self._unwatch()
 
-        def _watch(self) -> None:
+        def _make_room(self) -> None:
+            """End the connection that is idle for longest if there are too many: another one is in use."""
+            if len(self.connections) <= max_connections:
+                return
+            idle = [one for one in self.connections if isinstance(one, BoundedProtocol) and not one._in_work]
+            oldest = min(idle, key=lambda one: one._idle_since, default=self)
+            if oldest is not self:
+                # Its end is noted in the loop's next round; until then it must not be chosen once more.
+                self.connections.discard(oldest)
+                oldest.transport.abort()
+
+        @property
+        def _in_work(self) -> bool:
             cycle: Any = self.cycle
-            if cycle is not None and not cycle.response_complete:
+            return cycle is not None and not cycle.response_complete
+
+        def _watch(self) -> None:
+            if self._in_work:
                 self._unwatch()
             elif self._limit is None:
                 delay_s = self.timeout_keep_alive + head_deadline_s

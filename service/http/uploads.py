@@ -12,6 +12,7 @@ from typing import Literal, Self, TypeVar
 from fastapi import Request
 from pydantic import BaseModel, ValidationError
 from python_multipart.exceptions import FormParserError
+from python_multipart.multipart import parse_options_header
 from starlette.datastructures import UploadFile
 from starlette.formparsers import MultiPartException, MultiPartParser
 from starlette.requests import ClientDisconnect
@@ -31,6 +32,7 @@ MULTIPART = "multipart/form-data"
 _ENVELOPE_BYTES = 16 * 1024
 _MAX_PARTS = 20
 _MAX_FIELD_BYTES = 4096
+_UTF_8 = b"utf-8"
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -102,8 +104,13 @@ async def read_parts(request: Request, limits: UploadLimits, *, files: set[str],
     Raises:
         UploadTooLargeError, UploadTimeoutError: see the limits.
         MalformedRequestError: not valid multipart.
+        UnsupportedMediaError: in another charset than UTF-8.
         InvalidRequestError: a part is missing, unknown, given twice, or a field where a file belongs.
     """
+    stated = request.headers.get("content-type", "")
+    charset = parse_options_header(stated)[1].get(b"charset", _UTF_8)
+    if charset.lower() != _UTF_8:
+        raise UnsupportedMediaError(stated, (f"{MULTIPART}; charset=utf-8",))
     parser = MultiPartParser(
         request.headers,
         _counted(request, limits, envelope_bytes=_ENVELOPE_BYTES),
@@ -111,6 +118,8 @@ async def read_parts(request: Request, limits: UploadLimits, *, files: set[str],
         max_fields=_MAX_PARTS,
         max_part_size=_MAX_FIELD_BYTES,
     )
+    # Files stay in memory, which they are bounded for: a disk may be full, and is to have nothing of a panorama.
+    parser.spool_max_size = limits.max_bytes + _ENVELOPE_BYTES
     try:
         async with _in_time(limits):
             form = await parser.parse()

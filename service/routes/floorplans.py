@@ -15,6 +15,7 @@ from service.errors import (
     MalformedRequestError,
     PlanTooLargeError,
     RevisionMismatchError,
+    StoreFullError,
     StoreUnavailableError,
     TooManyFloorPlansError,
     UnknownFloorPlanError,
@@ -84,6 +85,7 @@ _REFUSED_UPLOADS = (
     UploadTooLargeError,
     UploadTimeoutError,
     StoreUnavailableError,
+    StoreFullError,
 )
 
 

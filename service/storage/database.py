@@ -8,6 +8,7 @@ the file stays sound. PostgreSQL keeps them too, unless it is told otherwise.
 from __future__ import annotations
 
 import logging
+import os
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -34,7 +35,7 @@ from sqlalchemy.exc import DBAPIError, InterfaceError, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 
 from lalaloc_core.errors import ConfigError
-from service.errors import StoreBusyError, StoreUnavailableError
+from service.errors import StoreBusyError, StoreFullError, StoreUnavailableError
 from service.telemetry import LOGGER_NAME
 
 _WRITER = "lalaloc_writer"
@@ -43,6 +44,8 @@ _SQLITE_WAIT_MS = 5000
 _STATEMENT_MS, _LOCK_MS, _IDLE_MS = 30_000, 10_000, 60_000
 # How far apart two looks at the clock may be, of whom one waits for a lock in between, or sets the clock right.
 _CLOCK_SLACK_S = 10.0
+# What PostgreSQL calls it.
+_DISK_FULL = "53100"
 # A server that does not answer any more counts as gone after this.
 _SILENCE_MS = 5000
 
@@ -71,8 +74,12 @@ class Database:
             pool_pre_ping=self.is_postgresql,
             connect_args=_postgresql_arguments(parsed, wait_s) if self.is_postgresql else {},
         )
+        self._path = None if self.is_postgresql else parsed.database
+        # Which file that was when it was opened first.
+        self._file: tuple[int, int] | None = None
         if not self.is_postgresql:
             event.listen(self._engine, "connect", _prepare_sqlite)
+            event.listen(self._engine, "connect", self._note_file)
             event.listen(self._engine, "begin", _begin_sqlite)
         self.engine_for_writing: Engine = self._engine.execution_options(**{_WRITER: True})
         # What is read in one transaction belongs together; on SQLite it does so anyway.
@@ -132,9 +139,25 @@ class Database:
         """An INSERT that knows `ON CONFLICT`; both databases have it, in the same words."""
         return postgresql.insert(table) if self.is_postgresql else sqlite.insert(table)
 
+    def _note_file(self, _connection: Any, _record: Any) -> None:
+        self._file = self._file or _identity(self._path)
+
+    def _check_file(self) -> None:
+        """Raises:
+        StoreUnavailableError: the file is gone, and what is written to it with it, although SQLite would go on.
+        """
+        if self._file is not None and _identity(self._path) != self._file:
+            logging.getLogger(LOGGER_NAME).error(
+                "the file of the database is gone", extra={"fields": {"file": self._path}}
+            )
+            raise StoreUnavailableError(
+                "the file of the database was removed or replaced, the service must be restarted"
+            )
+
     @contextmanager
     def _transaction(self, engine: Engine) -> Iterator[Connection]:
         begin_s = time.monotonic()
+        self._check_file()
         try:
             with engine.begin() as connection:
                 yield connection
@@ -192,7 +215,20 @@ def _begin_sqlite(connection: Connection) -> None:
     connection.exec_driver_sql("BEGIN IMMEDIATE" if writer else "BEGIN")
 
 
+def _identity(path: str | None) -> tuple[int, int] | None:
+    """Which file there is under a path, None for none."""
+    try:
+        found = os.stat(path or "")
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino
+
+
 def _unavailable(error: Exception) -> StoreUnavailableError:
-    fields = {"reason": str(getattr(error, "orig", None) or error).strip()[:300]}
-    logging.getLogger(LOGGER_NAME).warning("database unavailable", extra={"fields": fields})
-    return StoreUnavailableError()
+    cause = getattr(error, "orig", None) or error
+    full = getattr(cause, "sqlite_errorname", None) == "SQLITE_FULL" or getattr(cause, "sqlstate", None) == _DISK_FULL
+    fields = {"reason": str(cause).strip()[:300]}
+    logging.getLogger(LOGGER_NAME).warning(
+        "database full" if full else "database unavailable", extra={"fields": fields}
+    )
+    return StoreFullError() if full else StoreUnavailableError()

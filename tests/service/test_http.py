@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import socket
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from time import monotonic
@@ -180,6 +181,22 @@ def test_pages_may_load_what_they_link_to_and_no_one_may_frame_them(client: http
     for link in re.findall(r'(?:src|href)="(/[^"]*)"', response.text):
         assert client.get(link).status_code == 200
     assert response.headers["cache-control"] == "no-cache"
+
+
+@pytest.mark.parametrize("path", ["/floorplans", "/healthz", "/no/such"])
+def test_a_request_whose_length_is_told_twice_is_refused_and_its_connection_closed(
+    client: httpx.Client, path: str
+) -> None:
+    assert client.base_url.port is not None
+    head = f"POST {path} HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
+    smuggled = "GET /limits HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    lengths = "Content-Length: 5\r\nTransfer-Encoding: chunked\r\n\r\n0\r\n\r\n"
+    with socket.create_connection(("127.0.0.1", client.base_url.port), timeout=10.0) as connection:
+        connection.sendall(f"{head}{lengths}{smuggled}".encode())
+        answer = b"".join(iter(lambda: connection.recv(65536), b"")).decode()
+    assert answer.startswith("HTTP/1.1 400 ")
+    assert answer.count("HTTP/1.1 ") == 1
+    assert "both Content-Length and Transfer-Encoding" in answer
 
 
 @pytest.mark.parametrize(("scheme", "told"), [("https", "max-age=31536000"), ("http", None)])

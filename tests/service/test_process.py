@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -193,6 +194,20 @@ def test_a_wrong_setting_stops_the_start_and_is_named_in_a_line(
     assert (done.returncode, done.stdout) == (1, "")
     assert told in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+def test_a_model_with_a_flipped_bit_stops_the_start_and_is_named_in_a_line(tiny_bundle: Path, tmp_path: Path) -> None:
+    damaged = tmp_path / "model"
+    shutil.copytree(tiny_bundle, damaged)
+    network = damaged / "image_encoder.onnx"
+    content = bytearray(network.read_bytes())
+    content[len(content) // 2] ^= 1
+    network.write_bytes(content)
+    environment = environment_of(damaged, tmp_path / "data")
+    command = [sys.executable, "-m", "service", "--port", "0"]
+    done = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, timeout=120, check=False)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1)
+    assert "'image_encoder.onnx' has SHA-256" in done.stderr
 
 
 def test_the_module_runs_on_a_free_port_and_says_where(tiny_bundle: Path, tmp_path: Path) -> None:

@@ -218,7 +218,13 @@ def test_an_unknown_path_and_method_are_told_to_those_with_a_key_only(guarded: G
 def test_a_path_with_a_slash_at_its_end_needs_what_it_leads_to(guarded: Guarded) -> None:
     writer = make_key(guarded.store, scopes=("write",))
     assert guarded.send("GET", "/floorplans/", writer).status_code == 403
-    assert guarded.send("GET", "/floorplans/", guarded.key).headers["location"].endswith("/floorplans")
+    assert guarded.send("GET", "/floorplans/", guarded.key).headers["location"] == "/floorplans"
+
+
+def test_a_redirect_names_no_host(client: httpx.Client) -> None:
+    redirect = client.get("/floorplans/?name=x", headers={"host": "127.0.0.1:99"}, follow_redirects=False)
+    assert redirect.status_code == 307
+    assert redirect.headers["location"] == "/floorplans?name=x"
 
 
 def test_a_route_that_nobody_gave_a_scope_is_not_there(

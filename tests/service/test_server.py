@@ -4,10 +4,17 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import subprocess
+import sys
 import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, contextmanager
 
 import httpx
-from fastapi import FastAPI
+import pytest
+from fastapi import FastAPI, Request
 
 from service.http.server import Server, bounded_protocol, server_config
 from service.settings import Settings
@@ -17,7 +24,7 @@ from tests.service.conftest import wait_for
 def test_the_body_of_an_answer_does_not_wait_for_its_head_to_be_acknowledged() -> None:
     no_delay: list[int] = []
 
-    class Watched(bounded_protocol(5.0)):
+    class Watched(bounded_protocol(5.0, 100)):
         def connection_made(self, transport: asyncio.Transport) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
             super().connection_made(transport)
             connection = transport.get_extra_info("socket")
@@ -38,3 +45,100 @@ def test_the_body_of_an_answer_does_not_wait_for_its_head_to_be_acknowledged() -
             server.should_exit = True
             thread.join(30.0)
     assert no_delay == [1]
+
+
+@contextmanager
+def _served(app: FastAPI, settings: Settings) -> Iterator[int]:
+    """Run an app as the command line does; gives its port."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        server = Server(server_config(app, settings), app, settings)
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+        thread.start()
+        try:
+            wait_for(lambda: server.started)
+            yield listener.getsockname()[1]
+        finally:
+            server.should_exit = True
+            thread.join(30.0)
+
+
+def _app() -> FastAPI:
+    app = FastAPI()
+
+    @app.get("/who")
+    def who(request: Request) -> str:
+        return "" if request.client is None else request.client.host
+
+    return app
+
+
+def test_idle_connections_make_room_for_new_ones() -> None:
+    settings = Settings(max_connections=1, max_reads=4, max_streams=4, max_pending_requests=11)
+    # What may be in work at once, and one more.
+    most = 4 + 4 + 11 + 1
+    with _served(_app(), settings) as port, ExitStack() as stack:
+        address = ("127.0.0.1", port)
+        idle = [stack.enter_context(socket.create_connection(address, timeout=10.0)) for _ in range(3 * most)]
+        begin = time.monotonic()
+        for _ in range(3):
+            assert httpx.get(f"http://127.0.0.1:{port}/who", timeout=10.0).status_code == 200
+        assert time.monotonic() - begin < 5.0
+        # Those that were idle for longest are gone, the latest are not.
+        assert idle[0].recv(1) == b""
+        idle[-1].setblocking(False)
+        with pytest.raises(BlockingIOError):
+            idle[-1].recv(1)
+
+
+def test_a_connection_with_a_request_in_work_makes_no_room() -> None:
+    app, go_on = _app(), threading.Event()
+
+    @app.get("/slow")
+    def slow() -> str:
+        assert go_on.wait(30.0)
+        return "done"
+
+    settings = Settings(max_connections=1, max_reads=1, max_streams=1, max_pending_requests=1)
+    with _served(app, settings) as port, ExitStack() as stack, ThreadPoolExecutor(1) as threads:
+        answer = threads.submit(httpx.get, f"http://127.0.0.1:{port}/slow", timeout=30.0)
+        time.sleep(0.3)
+        for _ in range(20):
+            stack.enter_context(socket.create_connection(("127.0.0.1", port), timeout=10.0))
+        assert httpx.get(f"http://127.0.0.1:{port}/who", timeout=10.0).status_code == 200
+        go_on.set()
+        assert answer.result(30.0).json() == "done"
+
+
+@pytest.mark.parametrize(("proxies", "told"), [(None, "127.0.0.1"), ("127.0.0.1", "203.0.113.7")])
+def test_an_address_is_believed_of_proxies_that_were_named_and_of_nobody_else(
+    monkeypatch: pytest.MonkeyPatch, proxies: str | None, told: str
+) -> None:
+    monkeypatch.delenv("FORWARDED_ALLOW_IPS", raising=False)
+    if proxies is not None:
+        monkeypatch.setenv("FORWARDED_ALLOW_IPS", proxies)
+    with _served(_app(), Settings()) as port:
+        answer = httpx.get(f"http://127.0.0.1:{port}/who", headers={"x-forwarded-for": "203.0.113.7"})
+    assert answer.json() == told
+
+
+def test_the_limit_of_descriptors_is_raised_and_connections_stay_below_it() -> None:
+    code = (
+        "import resource, sys\n"
+        "resource.setrlimit(resource.RLIMIT_NOFILE, (int(sys.argv[1]), int(sys.argv[2])))\n"
+        "from lalaloc_core.errors import ConfigError\n"
+        "from service.http.descriptors import max_connections_of\n"
+        "from service.settings import Settings\n"
+        "try:\n"
+        "    print(max_connections_of(1024, Settings()), resource.getrlimit(resource.RLIMIT_NOFILE)[0])\n"
+        "except ConfigError as error:\n"
+        "    print(error)\n"
+    )
+
+    def told(soft: int, hard: int) -> str:
+        command = [sys.executable, "-c", code, str(soft), str(hard)]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+    assert told(256, 4096) == "1024 1240"
+    assert told(256, 1024) == "808 1024"
+    assert told(2048, 4096) == "1024 2048"
+    assert "128 file descriptors, at least 232 are needed" in told(128, 128)

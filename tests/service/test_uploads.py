@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import socket
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -11,7 +13,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from tests.service.conftest import StartApp, assert_problem
+from tests.service.conftest import FLAT, StartApp, assert_problem
 
 HEAD = (
     "POST /floorplans HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/json\r\n"
@@ -71,6 +73,33 @@ def test_a_slow_body_that_is_fast_enough_arrives(start_app: StartApp, tmp_path: 
     with start_app(tmp_path, upload_idle_s=0.5, upload_bytes_per_s=1000.0) as client:
         response = client.post("/floorplans", content=trickle(), headers={"content-type": "application/json"})
         assert_problem(response, 422, "invalid-floorplan")
+
+
+_FORM = b'--BB\r\nContent-Disposition: form-data; name="file"; filename="p"\r\n\r\n%s\r\n--BB--\r\n'
+
+
+@pytest.mark.parametrize("charset", ["punycode", "undefined", "utf-16", "no-such", ""])
+def test_a_form_in_another_charset_than_utf_8_is_refused(client: httpx.Client, charset: str) -> None:
+    media = f"multipart/form-data; boundary=BB; charset={charset}"
+    response = client.post("/floorplans", content=_FORM % b"{}", headers={"content-type": media})
+    problem = assert_problem(response, 415, "unsupported-media")
+    assert "send multipart/form-data; charset=utf-8" in problem["detail"]
+
+
+def test_a_form_may_say_that_it_is_utf_8(client: httpx.Client) -> None:
+    content = _FORM % json.dumps(FLAT).encode()
+    headers = {"content-type": 'multipart/form-data; boundary=BB; charset="UTF-8"'}
+    assert client.post("/floorplans", content=content, headers=headers).status_code == 201
+
+
+def test_a_large_form_needs_no_room_on_a_disk(
+    client: httpx.Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # As full as a disk can be.
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "not there"))
+    content = json.dumps(FLAT).encode() + b" " * 1_500_000
+    headers = {"content-type": "multipart/form-data; boundary=BB"}
+    assert client.post("/floorplans", content=_FORM % content, headers=headers).status_code == 201
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from contextlib import suppress
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.errors import DeadlineExceededError, OverloadedError, StoppingError
+from service.errors import DeadlineExceededError, MalformedRequestError, OverloadedError, StoppingError
 from service.http.admission import EXEMPT, Admission, is_stream
 from service.http.problems import problem_answer
 
@@ -23,6 +23,9 @@ class AdmissionMiddleware:
         """Handle one request."""
         # An app that has not been started, or is used without its lifespan, has no slots.
         admission: Admission | None = getattr(scope["app"].state, "admission", None)
+        if scope["type"] == "http" and _framed_twice(scope):
+            await self._refuse_framing(scope, receive, send)
+            return
         if scope["type"] != "http" or scope["path"] in EXEMPT or admission is None:
             await self._app(scope, receive, send)
             return
@@ -31,6 +34,13 @@ class AdmissionMiddleware:
                 await self._handle(admission, scope, receive, send)
         except (OverloadedError, StoppingError) as error:
             await problem_answer(Request(scope), error)(scope, receive, send)
+
+    async def _refuse_framing(self, scope: Scope, receive: Receive, send: Send) -> None:
+        error = MalformedRequestError("the request has both Content-Length and Transfer-Encoding, it must have one")
+        answer = problem_answer(Request(scope), error)
+        # Where the body ends is not agreed on, so nothing that follows on this connection is another request.
+        answer.headers["Connection"] = "close"
+        await answer(scope, receive, send)
 
     async def _handle(self, admission: Admission, scope: Scope, receive: Receive, send: Send) -> None:
         client = _Client(receive, send)
@@ -47,6 +57,11 @@ class AdmissionMiddleware:
             if not client.answered:
                 error = DeadlineExceededError(admission.limits.deadline_s)
                 await problem_answer(Request(scope), error)(scope, receive, send)
+
+
+def _framed_twice(scope: Scope) -> bool:
+    """Whether the body's length is told in two ways, and a proxy may have believed the other one (RFC 9112, 6.1)."""
+    return {b"content-length", b"transfer-encoding"} <= {name for name, _ in scope["headers"]}
 
 
 class _Client:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from urllib.parse import urlsplit, urlunsplit
+
 from starlette.datastructures import MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -31,9 +33,16 @@ class SecurityHeadersMiddleware:
                 headers = MutableHeaders(scope=message)
                 for name, value in _ALWAYS.items():
                     headers.setdefault(name, value)
+                if (target := headers.get("location")) is not None:
+                    headers["location"] = _without_host(target)
                 # Behind a proxy the server takes the scheme from X-Forwarded-Proto of proxies that it trusts.
                 if scope["scheme"] == "https":
                     headers.setdefault("Strict-Transport-Security", f"max-age={_ONE_YEAR_S}")
             await send(message)
 
         await self._app(scope, receive, send_with_headers if scope["type"] == "http" else send)
+
+
+def _without_host(target: str) -> str:
+    """A redirect within the service: the framework's name the host that the request named, whoever made that up."""
+    return urlunsplit(urlsplit(target)._replace(scheme="", netloc=""))
