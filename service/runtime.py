@@ -18,6 +18,7 @@ from service.grids.grids import Grids
 from service.grids.sweeper import Sweeper
 from service.http.admission import Admission, AdmissionLimits
 from service.http.events import HEARTBEAT_S, PlanEvents
+from service.preview.drawings import Drawings
 from service.query.decoding import Decoder
 from service.query.localiser import Localiser
 from service.query.refinement import LpoPool
@@ -33,6 +34,8 @@ from service.threads import BoundedReads, Threads
 _READ_THREADS = 4
 # Small grids are computed on them: more would take the cores from queries.
 _UPLOAD_THREADS = 2
+# Drawings in memory, and revisions that wait to be drawn.
+_DRAWINGS_BYTES, _MAX_DRAWN = 32 * 2**20, 16
 # With keys that are not remembered, streams still look no more often.
 _SOONEST_S = 1.0
 # Share of the time for stopping that LPO jobs may go on in.
@@ -53,6 +56,7 @@ class Runtime:
     Attributes:
         uploads: threads that check, prepare and store plans.
         reads: what queries read of the store.
+        drawings: drawings and meshes of plans.
     """
 
     settings: Settings
@@ -68,6 +72,7 @@ class Runtime:
     events: PlanEvents
     uploads: Threads
     reads: BoundedReads
+    drawings: Drawings
 
     @property
     def ready(self) -> bool:
@@ -148,6 +153,7 @@ def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack) 
         events=events,
         uploads=uploads,
         reads=reads,
+        drawings=kept(Drawings(limit_bytes=_DRAWINGS_BYTES, max_waiting=_MAX_DRAWN)),
     )
 
 

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from html import escape
 
 import numpy as np
-import shapely
 
 from lalaloc_core.floorplan import FloorPlan, Room
+from service.preview.labels import label_place
 
 _MARGIN_M = 0.5
 _FILLS = ("#eef4fb", "#f7f1e6", "#eef7ee", "#f8eef4", "#f2f0fa", "#f4f6ea")
@@ -29,13 +29,16 @@ class Marker:
     covariance_m2: tuple[float, float, float] | None = None
 
 
-def plan_svg(plan: FloorPlan, marker: Marker | None = None) -> str:
+def plan_svg(plan: FloorPlan, marker: Marker | None = None, *, rooms: str | None = None) -> str:
     """The plan with the names and areas of its rooms and a scale bar; one SVG unit is one metre.
 
     The view box is the plan's bounds with a margin, its y axis pointing down: plan point (x, y) is drawn at (x, -y).
+
+    Args:
+        rooms: what `draw_rooms` made of it before.
     """
-    x_min, y_min, x_max, y_max = plan.bounds_m
-    width, height = x_max - x_min + 2 * _MARGIN_M, y_max - y_min + 3 * _MARGIN_M
+    x_min, y_min, _, y_max = plan.bounds_m
+    width, height = _size_m(plan)
     extent = max(width, height)
     scale = 1000.0 / extent
     lines = [
@@ -43,12 +46,7 @@ def plan_svg(plan: FloorPlan, marker: Marker | None = None) -> str:
         f'viewBox="{x_min - _MARGIN_M:.3f} {-y_max - _MARGIN_M:.3f} {width:.3f} {height:.3f}" '
         'font-family="sans-serif" text-anchor="middle">',
         f"<title>{_text(plan.name)}</title>",
-        '<g stroke="#333" stroke-linejoin="round">',
-        *(_outline(room, _FILLS[index % len(_FILLS)], extent) for index, room in enumerate(plan.rooms)),
-        "</g>",
-        '<g fill="#222">',
-        *(_label(room, extent) for room in plan.rooms),
-        "</g>",
+        draw_rooms(plan) if rooms is None else rooms,
         _scale_bar(x_min, y_min, width, extent),
     ]
     if marker is not None:
@@ -57,16 +55,35 @@ def plan_svg(plan: FloorPlan, marker: Marker | None = None) -> str:
     return "\n".join(lines)
 
 
+def draw_rooms(plan: FloorPlan) -> str:
+    """Outlines, names and areas of all rooms: what takes its time, and is the same wherever a camera stands."""
+    extent = max(_size_m(plan))
+    lines = [
+        '<g stroke="#333" stroke-linejoin="round">',
+        *(_outline(room, _FILLS[index % len(_FILLS)], extent) for index, room in enumerate(plan.rooms)),
+        "</g>",
+        '<g fill="#222">',
+        *(_label(room, extent) for room in plan.rooms),
+        "</g>",
+    ]
+    return "\n".join(lines)
+
+
+def _size_m(plan: FloorPlan) -> tuple[float, float]:
+    """Width and height of the drawing, margins included."""
+    x_min, y_min, x_max, y_max = plan.bounds_m
+    return x_max - x_min + 2 * _MARGIN_M, y_max - y_min + 3 * _MARGIN_M
+
+
 def _outline(room: Room, fill: str, extent_m: float) -> str:
     points = " ".join(f"{x:.3f},{-y:.3f}" for x, y in room.polygon_m)
     return f'<polygon points="{points}" fill="{fill}" stroke-width="{extent_m / 250:.4f}"/>'
 
 
 def _label(room: Room, extent_m: float) -> str:
-    """Name and area at the middle of the largest circle in the room, small enough to fit."""
-    circle = shapely.maximum_inscribed_circle(room.shape, tolerance=0.05)
-    (x, y), _ = circle.coords
-    size = min(extent_m / 40.0, 2.6 * circle.length / max(len(room.name), 6))
+    """Name and area at the middle of a large circle in the room, small enough to fit."""
+    x, y, radius_m = label_place(room)
+    size = min(extent_m / 40.0, 2.6 * radius_m / max(len(room.name), 6))
     return (
         f'<text x="{x:.3f}" y="{-y:.3f}" font-size="{size:.4f}">{_text(room.name)}'
         f'<tspan x="{x:.3f}" dy="1.2em" font-size="{0.8 * size:.4f}" fill="#666">{room.area_m2:.1f} m²</tspan></text>'

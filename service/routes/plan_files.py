@@ -6,13 +6,13 @@ from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 from pydantic import Field
+from starlette.concurrency import run_in_threadpool
 
 from service.errors import InvalidRequestError, StoreUnavailableError, UnknownFloorPlanError
 from service.http.conditional import conditional_answer, content_etag
 from service.http.problems import problem_responses
 from service.http.uploads import JSON
-from service.preview.mesh import plan_glb
-from service.preview.svg import Marker, plan_svg
+from service.preview.svg import Marker
 from service.routes.dependencies import IF_NONE_MATCH, NOT_MODIFIED, Running, Tenant, plan_summary, stored_plan
 from service.storage.records import PlanRecord
 from service.telemetry import note
@@ -54,7 +54,7 @@ def get_original(floorplan_id: str, request: Request, runtime: Running, tenant: 
     openapi_extra=_CONDITIONAL,
     responses={200: {"content": {_SVG: {"schema": {"type": "string"}}}}, **NOT_MODIFIED, **_PROBLEMS},
 )
-def get_preview(
+async def get_preview(
     floorplan_id: str,
     request: Request,
     runtime: Running,
@@ -77,11 +77,11 @@ def get_preview(
     """The plan with the names of its rooms, optionally with a camera drawn in; one SVG unit is one metre."""
     if (x_m is None) != (y_m is None):
         raise InvalidRequestError([("y_m" if y_m is None else "x_m", "is missing; x_m and y_m belong together")])
-    record = _noted(request, stored_plan(tenant, floorplan_id, runtime.store.plans))
     marker = None
     if x_m is not None and y_m is not None:
         marker = Marker(x_m=x_m, y_m=y_m, heading_deg=heading_deg, covariance_m2=_covariance(covariance_m2))
-    content = plan_svg(record.plan, marker).encode()
+    record = _noted(request, await run_in_threadpool(stored_plan, tenant, floorplan_id, runtime.store.plans))
+    content = await runtime.drawings.svg(record, marker)
     # An SVG can carry scripts; ours never does, and must not be talked into it.
     policy = {"Content-Security-Policy": "default-src 'none'"}
     return conditional_answer(request, content, _SVG, content_etag(content), policy)
@@ -98,9 +98,10 @@ def get_preview(
         **_PROBLEMS,
     },
 )
-def get_mesh(floorplan_id: str, request: Request, runtime: Running, tenant: Tenant) -> Response:
+async def get_mesh(floorplan_id: str, request: Request, runtime: Running, tenant: Tenant) -> Response:
     """Floor, walls and ceiling of every room as binary glTF, in metres and y-up."""
-    content = plan_glb(_noted(request, stored_plan(tenant, floorplan_id, runtime.store.plans)).plan)
+    record = _noted(request, await run_in_threadpool(stored_plan, tenant, floorplan_id, runtime.store.plans))
+    content = await runtime.drawings.glb(record)
     return conditional_answer(request, content, _GLB, content_etag(content))
 
 
