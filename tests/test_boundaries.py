@@ -49,9 +49,9 @@ LAYERS = {
 # The service's layers lie above all of the core's, lowest first.
 SERVICE_LAYERS = (
     # `workers` is what runs in worker processes: it loads nothing of what watches over them.
-    "cores settings errors schemas threads lru telemetry preview workers",
+    "cores settings errors schemas threads lru telemetry workers",
     "pools storage",
-    "grids security",
+    "grids preview security",
     "http",
     "query http.middleware",
     "runtime",

@@ -43,6 +43,6 @@ def _farthest(shape: shapely.Polygon, places: Float[np.ndarray, "n 2"]) -> tuple
     inside = shapely.contains_xy(shape, places[:, 0], places[:, 1])
     inside[0] = True
     places = places[inside]
-    distance_m = shapely.distance(shapely.points(places), shape.boundary)
+    distance_m = np.asarray(shapely.distance(shapely.points(places), shape.boundary))
     chosen = int(distance_m.argmax())
     return places[chosen], float(distance_m[chosen])
