@@ -9,8 +9,8 @@ read for a camera `CAMERA_HEIGHT_M` over the floor.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, cast, get_args
 
@@ -19,20 +19,21 @@ import shapely
 from jaxtyping import Float, Int
 from PIL import Image, UnidentifiedImageError
 
-from lalaloc_core.conventions import TWO_PI, wrap_angle
+from lalaloc_core.conventions import OPENING_CLASSES, TWO_PI, wrap_angle
 from lalaloc_core.data.assembly import inside, is_number, read_json
-from lalaloc_core.data.drawn_rooms import DrawnKind, DrawnOpening, DrawnRoom
+from lalaloc_core.data.drawn_rooms import DrawnKind, DrawnOpening, DrawnRoom, plan_of_rooms
 from lalaloc_core.data.photographs import FilePhotograph
 from lalaloc_core.errors import DatasetError, InvalidFloorPlanError
-from lalaloc_core.floorplan import FloorPlan, Room
-from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.floorplan import FloorPlan, room_type_of
+from lalaloc_core.render.profile import nearest_walls, wall_profile
 
-# What an azimuth shows at eye height; the place is the code.
-CLASSES = ("wall", "door", "window", "passage")
 CAMERA_HEIGHT_M = 1.5
 # Where a ceiling is not flat: how far over the camera it is taken to be, in camera heights.
 _USUAL_CEILING = 1.2
 Quality = Literal["good", "fair", "poor"]
+# A kind of opening, and the columns of its left and right edge as shares of the picture's width; the left one is the
+# larger where the picture's border lies between.
+ClassSpan = tuple[DrawnKind, float, float]
 
 _REQUIRED = {"photograph", "quality", "polygon", "ceiling_above_camera", "openings"}
 _OPTIONAL = {"alternative_polygon", "room_type", "notes"}
@@ -42,6 +43,9 @@ _MOST_VERTICES, _MOST_OPENINGS = 200, 100
 _FARTHEST, _OFF_THE_WALL = 60.0, 0.1
 # An opening's columns and its line say the same twice; they may differ by this share of the picture's width.
 _COLUMN_TOLERANCE = 0.01
+# An opening is looked for with so many rays between its edges. It is on a wall that at least so many of them meet, and
+# it is that of another outline where it is met within this (m) of the same place.
+_RAYS, _LEAST_SHARE, _SAME_PLACE_M = 64, 0.2, 0.05
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -51,8 +55,7 @@ class AnnotatedPhotograph:
     Attributes:
         outlines: the room, and, where another outline can be defended as well, that one.
         has_flat_ceiling: whether the outlines' ceiling height was seen; else it is a usual one.
-        class_spans: code in `CLASSES`, and columns of the left and the right edge as shares of the picture's width;
-            the left one is the larger where the picture's border lies between.
+        class_spans: the openings as they are seen.
     """
 
     name: str
@@ -60,7 +63,7 @@ class AnnotatedPhotograph:
     quality: Quality
     outlines: tuple[DrawnRoom, ...]
     has_flat_ceiling: bool
-    class_spans: tuple[tuple[int, float, float], ...]
+    class_spans: tuple[ClassSpan, ...]
     notes: str = ""
 
     @property
@@ -70,17 +73,14 @@ class AnnotatedPhotograph:
 
     def profile_m(self, outline: int, columns: int) -> Float[np.ndarray, "{columns}"]:
         """Wall profile (m) of an outline, by column of the picture."""
-        polygon = self.outlines[outline].polygon_m
-        walls = np.concatenate([polygon, np.roll(polygon, -1, axis=0)], axis=1)
-        return wall_profile(np.zeros((1, 2)), np.zeros(1), walls[None], columns)[0]
+        return wall_profile(np.zeros((1, 2)), np.zeros(1), self.outlines[outline].walls_m[None], columns)[0]
 
     def classes(self, columns: int) -> Int[np.ndarray, "{columns}"]:
-        """Code in `CLASSES` of what each column of the picture shows; of the first outline."""
+        """Code in `conventions.OPENING_CLASSES` of what each column of the picture shows; of the first outline."""
         at = (np.arange(columns) + 0.5) / columns
         classes = np.zeros(columns, dtype=int)
-        # The narrower last: a door beside a passage that reaches behind it stays a door.
-        for code, left, right in sorted(self.class_spans, key=lambda span: -((span[2] - span[1]) % 1.0)):
-            classes[(at - left) % 1.0 < (right - left) % 1.0] = code
+        for kind, left, right in self.class_spans:
+            classes[(at - left) % 1.0 < (right - left) % 1.0] = OPENING_CLASSES.index(kind)
         return classes
 
 
@@ -106,26 +106,23 @@ def read_annotation(path: Path) -> AnnotatedPhotograph:
     quality = document["quality"]
     if quality not in get_args(Quality):
         raise reader.error(f"quality is {quality!r}, it must be one of {', '.join(get_args(Quality))}")
-    ceiling_height_m = reader.ceiling_height_m(document["ceiling_above_camera"])
-    drawn = [reader.room(document["polygon"], "polygon", ceiling_height_m)]
-    if document.get("alternative_polygon") is not None:
-        drawn.append(reader.room(document["alternative_polygon"], "alternative_polygon", ceiling_height_m))
-    openings, spans = reader.openings(document["openings"], drawn[0], width)
-    outlines = tuple(
-        DrawnRoom(
-            name=path.stem,
-            polygon_m=room.polygon_m,
-            ceiling_height_m=ceiling_height_m,
-            openings=tuple(one for one in openings if _lies_on(room, one)),
-            room_type=reader.text(document, "room_type") or None,
-        )
-        for room in drawn
+    spans = reader.openings(document["openings"], width)
+    room = DrawnRoom(
+        name=path.stem,
+        polygon_m=reader.polygon(document["polygon"], "polygon"),
+        ceiling_height_m=reader.ceiling_height_m(document["ceiling_above_camera"]),
+        room_type=room_type_of(reader.text(document, "room_type")),
     )
+    polygons = {"polygon": room.polygon_m}
+    if document.get("alternative_polygon") is not None:
+        polygons["alternative_polygon"] = reader.polygon(document["alternative_polygon"], "alternative_polygon")
+    outlines = [reader.outline(replace(room, polygon_m=polygon), room, spans, key) for key, polygon in polygons.items()]
+    reader.check_lines(document["openings"], outlines[0])
     return AnnotatedPhotograph(
         name=path.stem,
         photograph=photograph,
         quality=cast(Quality, quality),
-        outlines=outlines,
+        outlines=tuple(outlines),
         has_flat_ceiling=document["ceiling_above_camera"] is not None,
         class_spans=spans,
         notes=reader.text(document, "notes"),
@@ -175,39 +172,54 @@ class _Reader:
             raise self.error(f"photograph '{named}' cannot be read: {error}") from error
         return FilePhotograph(path=path, scene=self._path.stem, room=named), width
 
-    def room(self, raw: Any, key: str, ceiling_height_m: float) -> Room:
-        """An outline, validated as floor plans are, with the camera inside."""
-        polygon = self._points(raw, key, 3, _MOST_VERTICES) * CAMERA_HEIGHT_M
-        document = {"name": self._path.stem, "polygon": polygon.tolist(), "ceiling_height_m": ceiling_height_m}
+    def polygon(self, raw: Any, key: str) -> Float[np.ndarray, "n 2"]:
+        """An outline (m), validated as rooms of floor plans are, with the camera inside."""
+        polygon_m = self._points(raw, key, 3, _MOST_VERTICES) * CAMERA_HEIGHT_M
+        shape = {"name": self._path.stem, "polygon": polygon_m.tolist(), "ceiling_height_m": 2.0 * CAMERA_HEIGHT_M}
         try:
-            (room,) = FloorPlan.from_dict({"rooms": [document]}).rooms
+            (room,) = FloorPlan.from_dict({"rooms": [shape]}).rooms
         except InvalidFloorPlanError as error:
             raise self.error(f"{key}: {error.reason} (for a camera {CAMERA_HEIGHT_M:g} m over the floor)") from error
         if not room.shape.contains(shapely.Point(0.0, 0.0)):
             raise self.error(f"{key}: the camera at (0, 0) stands outside of it")
-        return room
+        return room.polygon_m
 
-    def openings(
-        self, raw: Any, room: Room, width: int
-    ) -> tuple[tuple[DrawnOpening, ...], tuple[tuple[int, float, float], ...]]:
-        """Openings as lines, and as codes with the columns that they take up, as shares of the width."""
+    def outline(self, room: DrawnRoom, seen: DrawnRoom, spans: Sequence[ClassSpan], key: str) -> DrawnRoom:
+        """A room with those openings, seen in the outline of another, that lie in both outlines."""
+        drawn = replace(room, openings=tuple(piece for span in spans for piece in _pieces(room, seen, span)))
+        try:
+            plan_of_rooms(self._path.stem, [drawn], CAMERA_HEIGHT_M)
+        except InvalidFloorPlanError as error:
+            raise self.error(f"{key}: {error.reason} (for a camera {CAMERA_HEIGHT_M:g} m over the floor)") from error
+        return drawn
+
+    def openings(self, raw: Any, width: int) -> tuple[ClassSpan, ...]:
+        """Kinds of openings with the columns that they take up, as shares of the width."""
         if not isinstance(raw, list) or len(raw) > _MOST_OPENINGS:
             raise self.error(f"openings must be a list of at most {_MOST_OPENINGS}")
-        openings, spans = [], []
+        spans = []
         for number, one in enumerate(raw):
             what = f"opening {number}"
             if not isinstance(one, Mapping) or set(one) != _OPENING_KEYS:
                 raise self.error(f"{what} must be an object with the keys {', '.join(sorted(_OPENING_KEYS))}")
             if one["kind"] not in get_args(DrawnKind):
                 raise self.error(f"{what}: kind is {one['kind']!r}, it must be one of {', '.join(get_args(DrawnKind))}")
-            opening = DrawnOpening(one["kind"], self._points(one["line"], f"{what}: line", 2, 2) * CAMERA_HEIGHT_M)
-            if not _lies_on(room, opening):
-                raise self.error(f"{what}: an end of its line is more than {_OFF_THE_WALL:g} off the outline")
             left, right = self._columns(one["columns"], what, width)
-            self._check_sides(opening, (left, right), what, width)
-            openings.append(opening)
-            spans.append((CLASSES.index(one["kind"]), left, right))
-        return tuple(openings), tuple(spans)
+            line = self._points(one["line"], f"{what}: line", 2, 2)
+            self._check_sides(line, (left, right), what, width)
+            spans.append((one["kind"], left, right))
+        return tuple(spans)
+
+    def check_lines(self, raw: list[Any], outline: DrawnRoom) -> None:
+        """Check that openings which were read begin and end on the outline."""
+        ring = shapely.LinearRing(outline.polygon_m / CAMERA_HEIGHT_M)
+        for number, one in enumerate(raw):
+            away = float(shapely.distance(ring, shapely.points(np.array(one["line"]))).max())
+            if away > _OFF_THE_WALL:
+                raise self.error(
+                    f"opening {number}: an end of its line is {away:.2g} off the outline, at most {_OFF_THE_WALL:g} is "
+                    "allowed"
+                )
 
     def _columns(self, raw: Any, what: str, width: int) -> tuple[float, float]:
         if (
@@ -218,8 +230,8 @@ class _Reader:
             raise self.error(f"{what}: columns are {raw!r}, they must be two numbers from 0 to the width, {width}")
         return raw[0] / width, raw[1] / width
 
-    def _check_sides(self, opening: DrawnOpening, sides: tuple[float, float], what: str, width: int) -> None:
-        seen = np.arctan2(opening.line_m[:, 0], opening.line_m[:, 1]) / TWO_PI + 0.5
+    def _check_sides(self, line: Float[np.ndarray, "2 2"], sides: tuple[float, float], what: str, width: int) -> None:
+        seen = np.arctan2(line[:, 0], line[:, 1]) / TWO_PI + 0.5
         away = np.abs(wrap_angle(TWO_PI * (seen - np.array(sides)))) / TWO_PI
         if away.max() > _COLUMN_TOLERANCE:
             shown, said = (", ".join(f"{share * width:.0f}" for share in pair) for pair in (seen, sides))
@@ -242,6 +254,25 @@ class _Reader:
         return np.array(raw, dtype=np.float64)
 
 
-def _lies_on(room: Room, opening: DrawnOpening) -> bool:
-    ends = shapely.points(opening.line_m)
-    return bool(shapely.distance(room.shape.exterior, ends).max() <= _OFF_THE_WALL * CAMERA_HEIGHT_M)
+def _pieces(room: DrawnRoom, seen: DrawnRoom, span: ClassSpan) -> list[DrawnOpening]:
+    """The pieces of a room's walls that an opening takes up, as far as they are seen.
+
+    Its edges may be those of something before it, so its line is no piece of a wall.
+    """
+    kind, left, right = span
+    share = left + (right - left) % 1.0 * (np.arange(_RAYS) + 0.5) / _RAYS
+    azimuth = TWO_PI * (share - 0.5)
+    place, wall = _met(room, azimuth)
+    same = np.linalg.norm(place - _met(seen, azimuth)[0], axis=1) <= _SAME_PLACE_M
+    pieces = []
+    for number in np.unique(wall[same]):
+        met = place[same & (wall == number)]
+        if len(met) >= _LEAST_SHARE * _RAYS:
+            pieces.append(DrawnOpening(kind, met[[0, -1]]))
+    return pieces
+
+
+def _met(room: DrawnRoom, azimuth: Float[np.ndarray, "n"]) -> tuple[Float[np.ndarray, "n 2"], Int[np.ndarray, "n"]]:
+    """Where rays from the camera meet a room's walls, and which."""
+    distance_m, wall = nearest_walls(np.zeros((1, 2)), azimuth[None], room.walls_m[None])
+    return distance_m[0, :, None] * np.stack([np.sin(azimuth), np.cos(azimuth)], axis=1), wall[0]

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import shapely
 from jaxtyping import Float
 
+from lalaloc_core.conventions import ROOM_TYPES
+from lalaloc_core.floorplan import FloorPlan
+
 DrawnKind = Literal["door", "window", "passage"]
+# Openings are drawn on their walls, but for rounding.
+_ON_THE_WALL_M = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,14 +32,14 @@ class DrawnRoom:
 
     Attributes:
         polygon_m: counter-clockwise, not closed.
-        room_type: what the room is for, in the words of whoever drew it; None where nothing is said.
+        room_type: one of `conventions.ROOM_TYPES`.
     """
 
     name: str
     polygon_m: Float[np.ndarray, "n 2"]
     ceiling_height_m: float
     openings: tuple[DrawnOpening, ...] = ()
-    room_type: str | None = None
+    room_type: str = ROOM_TYPES[0]
 
     @property
     def size_m(self) -> float:
@@ -75,6 +81,43 @@ class DrawnRoom:
         openings = tuple(replace(one, line_m=one.line_m + by_m) for one in self.openings)
         return replace(self, polygon_m=self.polygon_m + by_m, openings=openings)
 
+    @property
+    def walls_m(self) -> Float[np.ndarray, "n 4"]:
+        """Wall segments (x0, y0, x1, y1), one per edge of the polygon."""
+        return np.concatenate([self.polygon_m, np.roll(self.polygon_m, -1, axis=0)], axis=1)
+
     def _mapped(self, matrix: Float[np.ndarray, "2 2"]) -> DrawnRoom:
         openings = tuple(replace(one, line_m=one.line_m @ matrix.T) for one in self.openings)
         return replace(self, polygon_m=self.polygon_m @ matrix.T, openings=openings)
+
+
+def plan_of_rooms(name: str, rooms: Sequence[DrawnRoom], camera_height_m: float) -> FloorPlan:
+    """A floor plan of rooms where they were drawn, which shows all of their openings.
+
+    Raises:
+        InvalidFloorPlanError: an outline cannot be a room's, or openings overlap.
+    """
+    numbered = [(f"room-{number}", room) for number, room in enumerate(rooms)]
+    return FloorPlan.from_dict(
+        {
+            "name": name,
+            "camera_height_m": camera_height_m,
+            "rooms": [
+                {
+                    "id": key,
+                    "name": room.name,
+                    "type": room.room_type,
+                    "polygon": room.polygon_m.tolist(),
+                    "ceiling_height_m": room.ceiling_height_m,
+                }
+                for key, room in numbered
+            ],
+            "openings": [
+                {"kind": opening.kind, "line": opening.line_m.tolist(), "rooms": [key]}
+                for key, room in numbered
+                for opening in room.openings
+            ],
+            "opening_kinds": list(get_args(DrawnKind)),
+            "opening_tolerance_m": _ON_THE_WALL_M,
+        }
+    )

@@ -8,16 +8,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import cast
 
 import numpy as np
 from jaxtyping import Float
 
 from lalaloc_core.conventions import wrap_angle
-from lalaloc_core.data.drawn_rooms import DrawnKind, DrawnOpening, DrawnRoom
+from lalaloc_core.data.drawn_rooms import DrawnKind, DrawnOpening, DrawnRoom, plan_of_rooms
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.synth.openings import OpeningKind
-from lalaloc_core.synth.plans import Home, generate_home
+from lalaloc_core.synth.plans import generate_home
 
 GALLERY_ROOMS = 20
 # At most so many of the others are rooms that somebody drew; the rest are generated.
@@ -32,12 +31,6 @@ _POOL = 7
 _PER_ROW = 5
 # Rooms of a plan lie a wall apart; these a good deal more, so that no door belongs to two of them.
 _GAP_M = 1.0
-_KINDS: dict[OpeningKind, DrawnKind] = {
-    "door_shut": "door",
-    "door_open": "door",
-    "opening": "passage",
-    "window": "window",
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +73,7 @@ def build_gallery(
     places = _side_by_side([turned[k] for k in order], rng)
     placed = [turned[k].moved(place) for k, place in zip(order, places, strict=True)]
     room_index = int(np.flatnonzero(order == 0)[0])
-    plan = FloorPlan.from_dict({"name": f"gallery of {own.name}", "camera_height_m": camera_height_m} | _rooms(placed))
+    plan = plan_of_rooms(f"gallery of {own.name}", placed, camera_height_m)
     # Azimuth grows clockwise, angles counter-clockwise.
     return RoomGallery(plan, room_index, places[room_index], float(wrap_angle(-turns[0])))
 
@@ -90,27 +83,27 @@ def _generated() -> tuple[tuple[DrawnRoom, ...], Float[np.ndarray, "n 2"]]:
     """Rooms of generated homes, their names made unique, and their shapes."""
     homes = [generate_home(np.random.default_rng([_POOL, number])) for number in range(_POOL_HOMES)]
     rooms = tuple(
-        _drawn(f"{room.name}, home {number}", home, index)
+        _drawn(f"{room.name}, home {number}", home.plan, index)
         for number, home in enumerate(homes)
         for index, room in enumerate(home.plan.rooms)
     )
     return rooms, np.stack([_shape(room) for room in rooms])
 
 
-def _drawn(name: str, home: Home, index: int) -> DrawnRoom:
-    room = home.plan.rooms[index]
+def _drawn(name: str, plan: FloorPlan, index: int) -> DrawnRoom:
+    room = plan.rooms[index]
     openings = []
-    for opening in home.openings:
-        if opening.room == index:
-            start, end = room.walls_m[opening.wall].reshape(2, 2)
-            along = (end - start) / np.linalg.norm(end - start)
-            ends = start + np.array([[opening.start_m], [opening.end_m]]) * along
-            openings.append(DrawnOpening(_KINDS[opening.kind], ends))
+    for face in plan.opening_faces:
+        if face.room == index:
+            start, end = room.walls_m[face.wall].reshape(2, 2)
+            line_m = start + np.array([[face.start], [face.end]]) * (end - start)
+            openings.append(DrawnOpening(cast(DrawnKind, plan.openings[face.opening].kind), line_m))
     return DrawnRoom(
         name=name,
         polygon_m=room.polygon_m,
         ceiling_height_m=room.ceiling_height_m,
         openings=tuple(openings),
+        room_type=room.type,
     )
 
 
@@ -137,13 +130,3 @@ def _side_by_side(rooms: Sequence[DrawnRoom], rng: np.random.Generator) -> list[
             right_m = corner[0] + room.extent_m[0] + _GAP_M
         top_m += max(room.extent_m[1] for room in row) + _GAP_M + 0.5
     return moves
-
-
-def _rooms(placed: Sequence[DrawnRoom]) -> dict[str, Any]:
-    """Rooms as a plan's document has them."""
-    return {
-        "rooms": [
-            {"name": room.name, "polygon": room.polygon_m.tolist(), "ceiling_height_m": room.ceiling_height_m}
-            for room in placed
-        ]
-    }

@@ -10,10 +10,12 @@ import numpy as np
 from lalaloc_core.data.annotated import GalleryKey
 from lalaloc_core.data.annotations import AnnotatedPhotograph
 from lalaloc_core.evaluation.predictions import Prediction
-from lalaloc_core.evaluation.score import expected_calibration_error, position_errors_m
+from lalaloc_core.evaluation.score import expected_calibration_error, heading_errors_deg, position_errors_m
 
 # A position is right within this distance, or within this share of the room's size (the root of its area).
 NEAR_M, NEAR_SHARE = 0.5, 0.1
+# A room that is the same when it is turned round has two headings for one position.
+_TURNED_DEG = 10.0
 # Rank of a room that is not among the answer's candidates.
 _NOT_RANKED = 1_000
 
@@ -24,6 +26,7 @@ class GalleryAnswer:
 
     Attributes:
         located: the right room and the right position in it.
+        turned: located, but with a heading that is off by more than 10°.
         rank: of the best candidate in the right room, from 1; None where no candidate is in it.
         within_1m: what `confidence` is the probability of.
     """
@@ -32,6 +35,7 @@ class GalleryAnswer:
     gallery: int
     outline: int
     located: bool
+    turned: bool
     right_room: bool
     rank: int | None
     error_m: float
@@ -49,6 +53,7 @@ class GalleryScores:
     """Shares over all galleries of all photographs.
 
     Attributes:
+        turned: share in which the position is right, but the heading is not.
         among_3: share in which the right room is among the first three candidates.
         calibration_error: expected calibration error of "within 1 m"; None without confidences.
         by_photograph: share of its galleries in which each photograph was located.
@@ -57,6 +62,7 @@ class GalleryScores:
     photographs: int
     galleries: int
     located: float
+    turned: float
     right_room: float
     among_3: float
     calibration_error: float | None
@@ -69,18 +75,21 @@ def answers_in_galleries(
     """One answer for every gallery of every photograph, in order."""
     known = {one.name: one for one in photographs}
     errors_m = np.nan_to_num(position_errors_m(predictions), nan=np.inf)
+    turned_deg = heading_errors_deg(predictions)
     best: dict[tuple[str, int], GalleryAnswer] = {}
-    for prediction, error_m in zip(predictions, errors_m, strict=True):
+    for prediction, error_m, off_deg in zip(predictions, errors_m, turned_deg, strict=True):
         key = GalleryKey.of_scene(prediction.scene)
         assert key is not None, f"'{prediction.scene}' is no gallery"
         size_m = known[key.photograph].outlines[key.outline].size_m
         found = prediction.answer
         right_room = found is not None and found.room_index == prediction.truth.room_index
+        located = right_room and bool(error_m < max(NEAR_M, NEAR_SHARE * size_m))
         answer = GalleryAnswer(
             photograph=key.photograph,
             gallery=key.gallery,
             outline=key.outline,
-            located=right_room and bool(error_m < max(NEAR_M, NEAR_SHARE * size_m)),
+            located=located,
+            turned=located and bool(off_deg > _TURNED_DEG),
             right_room=right_room,
             rank=prediction.room_rank,
             error_m=float(error_m),
@@ -105,6 +114,7 @@ def score_galleries(answers: Sequence[GalleryAnswer]) -> GalleryScores:
         photographs=len(names),
         galleries=len(answers),
         located=float(np.mean([one.located for one in answers])),
+        turned=float(np.mean([one.turned for one in answers])),
         right_room=float(np.mean([one.right_room for one in answers])),
         among_3=float(np.mean([one.rank is not None and one.rank <= 3 for one in answers])),
         calibration_error=error,

@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Int
 from PIL import Image
 
-from lalaloc_core.data.annotations import CAMERA_HEIGHT_M, CLASSES
+from lalaloc_core.conventions import OPENING_CLASSES
+from lalaloc_core.data.annotations import CAMERA_HEIGHT_M
 from lalaloc_core.evaluation.galleries import GalleryAnswer, describe_answers
 from lalaloc_core.evaluation.photograph_reading import ReadPhotograph
 from lalaloc_core.report.pictures import PREDICTED_COLOUR, TRUE_COLOUR, Stroke, draw_strokes, wall_line
@@ -72,7 +73,9 @@ def _bars(classes: Int[np.ndarray, "w"], row: float) -> list[Stroke]:
     """A bar for every stretch of columns of one class, along a row of the picture; walls have none."""
     edges = [0, *(np.flatnonzero(np.diff(classes)) + 1).tolist(), len(classes)]
     return [
-        Stroke([np.array([[first, row], [last, row]])], _CLASS_COLOURS[CLASSES[classes[first]]], _BAR_WIDTH, 8.0)
+        Stroke(
+            [np.array([[first, row], [last, row]])], _CLASS_COLOURS[OPENING_CLASSES[classes[first]]], _BAR_WIDTH, 8.0
+        )
         for first, last in pairwise(edges)
         if classes[first]
     ]

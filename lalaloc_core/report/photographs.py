@@ -15,8 +15,8 @@ from typing import Any
 
 from lalaloc_core.azimuths import ClassScores, summarise_azimuths
 from lalaloc_core.bundle import Bundle
+from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.data.annotated import AnnotatedPhotographs
-from lalaloc_core.data.annotations import CLASSES
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.evaluation.building import describe_model
 from lalaloc_core.evaluation.galleries import (
@@ -53,7 +53,7 @@ class PhotographResults:
         scores = {heading: dataclasses.asdict(score_galleries(some)) for heading, some in self.answers.items()}
         return without_infinity(
             {
-                "azimuths": dataclasses.asdict(summarise_azimuths(counting, CLASSES)),
+                "azimuths": dataclasses.asdict(summarise_azimuths(counting, OPENING_CLASSES)),
                 "galleries": scores,
                 "photographs": [self._figures_of(one) for one in self.read],
             }
@@ -78,7 +78,7 @@ class PhotographResults:
 
     def markdown(self) -> str:
         """The figures as two tables: all photographs together, and each of them."""
-        azimuths = summarise_azimuths([one.measures for one in self.read if one.photograph.counts], CLASSES)
+        azimuths = summarise_azimuths([one.measures for one in self.read if one.photograph.counts], OPENING_CLASSES)
         within = ", ".join(f"{percent(share)} within {float(q):.0%}" for q, share in azimuths.within.items())
         rows = [
             ("photographs, good or fair", str(azimuths.n)),
@@ -92,6 +92,7 @@ class PhotographResults:
             scores = score_galleries(some)
             rows += [
                 (f"galleries, heading {heading}: located", f"{percent(scores.located)} of {scores.galleries}"),
+                ("… located, but turned by more than 10°", percent(scores.turned)),
                 ("… right room", percent(scores.right_room)),
                 ("… right room among the first three candidates", percent(scores.among_3)),
                 ("… expected calibration error of confidence", _number(scores.calibration_error)),
@@ -160,7 +161,8 @@ def _classes(classes: ClassScores | None) -> str:
     if classes is None:
         return "none predicted"
     found = (
-        f"{name}s {_share(classes.recall[name])} found, {_share(classes.precision[name])} right" for name in CLASSES
+        f"{name}s {_share(classes.recall[name])} found, {_share(classes.precision[name])} right"
+        for name in OPENING_CLASSES
     )
     return f"{percent(classes.balanced_accuracy)} ({'; '.join(found)})"
 

@@ -13,9 +13,9 @@ from PIL import Image
 
 from lalaloc_core.azimuths import QUANTILES, measure_azimuths, score_classes, summarise_azimuths
 from lalaloc_core.cli import main
-from lalaloc_core.conventions import TWO_PI, column_azimuths
+from lalaloc_core.conventions import OPENING_CLASSES, TWO_PI, column_azimuths
 from lalaloc_core.data.annotated import GALLERIES, AnnotatedPhotographs, GalleryKey
-from lalaloc_core.data.annotations import CAMERA_HEIGHT_M, CLASSES, AnnotatedPhotograph, read_annotation
+from lalaloc_core.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph, read_annotation
 from lalaloc_core.data.drawn_rooms import DrawnOpening, DrawnRoom
 from lalaloc_core.data.opening import open_dataset
 from lalaloc_core.data.room_gallery import GALLERY_ROOMS, build_gallery
@@ -24,6 +24,7 @@ from lalaloc_core.evaluation.galleries import answers_in_galleries, describe_ans
 from lalaloc_core.evaluation.photograph_reading import read_photographs
 from lalaloc_core.evaluation.predictions import Pose, Prediction
 from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.render.layout import layout_view
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.report.photographs import FIGURES_FILE, SHEET_FILE, evaluate_photographs
 
@@ -94,25 +95,28 @@ class TestReading:
 
     def test_classes_follow_the_columns_also_over_the_border(self, root: Path) -> None:
         classes = read_annotation(root / "hall.json").classes(WIDTH)
-        door, window = CLASSES.index("door"), CLASSES.index("window")
+        door, window = OPENING_CLASSES.index("door"), OPENING_CLASSES.index("window")
         assert classes[WIDTH // 2 + 5] == window
         assert classes[WIDTH // 2 - 5] == 0
         assert classes[0] == classes[-1] == door
         assert np.count_nonzero(classes == door) == pytest.approx(2 * np.arctan(0.5) / TWO_PI * WIDTH, abs=2)
         assert np.count_nonzero(classes == window) == pytest.approx(np.pi / 4 / TWO_PI * WIDTH, abs=2)
 
-    def test_the_narrower_of_two_openings_in_one_direction_is_the_one_that_shows(self, tmp_path: Path) -> None:
-        openings = [opening("door", [0.0, 2.0], [0.5, 2.0]), opening("passage", [-0.5, 2.0], [2.0, 2.0])]
-        one = read_annotation(write(tmp_path, "wide", openings=openings))
-        assert [CLASSES[code] for code in one.classes(WIDTH)[WIDTH // 2 - 4 : WIDTH // 2 + 4]] == ["passage"] * 4 + [
-            "door"
-        ] * 4
-
     def test_an_alternative_outline_keeps_the_openings_that_lie_on_it(self, tmp_path: Path) -> None:
         alternative = [[-1.0, -1.0], [3.0, -1.0], [3.0, 2.5], [-1.0, 2.5]]
         first, second = read_annotation(write(tmp_path, "hall", alternative_polygon=alternative)).outlines
         assert [one.kind for one in first.openings] == ["window", "door"]
         assert [one.kind for one in second.openings] == ["door"]
+
+    def test_an_opening_lies_on_its_wall_also_where_its_edge_is_that_of_a_corner_before_it(
+        self, tmp_path: Path
+    ) -> None:
+        # A pier before the wall ahead, whose corner at (1/2, 3/2) is where the window is seen to end.
+        polygon = [[-2.0, -1.0], [2.0, -1.0], [2.0, 2.0], [1.0, 2.0], [1.0, 1.5], [0.5, 1.5], [0.5, 2.0], [-2.0, 2.0]]
+        line = [-1.0, 2.0], [0.5, 1.5]
+        one = read_annotation(write(tmp_path, "corner", polygon=polygon, openings=[opening("window", *line)]))
+        (piece,) = one.outlines[0].openings
+        assert piece.line_m / CAMERA_HEIGHT_M == pytest.approx(np.array([[-1.0, 2.0], [0.5, 2.0]]), abs=0.05)
 
     @pytest.mark.parametrize(
         ("changes", "reason"),
@@ -129,12 +133,16 @@ class TestReading:
             ({"polygon": [[-1, -1], [1, -1], ["1", 1]]}, "it must be two numbers"),
             ({"openings": [{"kind": "door", "columns": [0, 9]}]}, "keys columns, kind, line"),
             ({"openings": [opening("hatch", [0.0, 2.0], [1.0, 2.0])]}, "kind is 'hatch'"),
-            ({"openings": [opening("door", [0.0, 1.5], [1.0, 1.5])]}, "more than 0.1 off the outline"),
+            ({"openings": [opening("door", [0.0, 1.5], [1.0, 1.5])]}, "is 0.5 off the outline, at most 0.1 is allowed"),
             (
                 {"openings": [opening("door", [0.0, 2.0], [1.0, 2.0]) | {"columns": [128, 170]}]},
                 "seen at the columns 128, 147, but its columns are 128, 170; they may differ by 3",
             ),
             ({"openings": [opening("door", [0.0, 2.0], [1.0, 2.0]) | {"columns": [128, 257]}]}, "to the width, 256"),
+            (
+                {"openings": [opening("door", [0.0, 2.0], [1.0, 2.0]), opening("window", [0.5, 2.0], [2.0, 2.0])]},
+                "(window) and opening 0 (door) overlap",
+            ),
             ({"notes": 7}, "notes must be text"),
         ],
     )
@@ -193,6 +201,20 @@ class TestGalleries:
                 camera.position_m[None], np.array([camera.heading]), scene.plan.walls_m[[camera.room_index]], 64
             )[0]
             assert np.allclose(seen_m, one.profile_m(key.outline, 64), rtol=1e-6)
+
+    def test_the_camera_meets_in_the_plan_what_the_photograph_shows(self, root: Path) -> None:
+        dataset = AnnotatedPhotographs(root)
+        scene, one = dataset.load("hall-0"), read_annotation(root / "hall.json")
+        (camera,) = scene.cameras
+        plan, rooms = scene.plan, np.array([camera.room_index])
+        view = layout_view(
+            camera.position_m[None], np.array([camera.heading]), rooms, plan.geometry, WIDTH, camera.camera_height_m
+        )
+        assert np.count_nonzero(view.kind[0] != one.classes(WIDTH)) <= 6
+        assert plan.opening_kinds == {"door", "window", "passage"}
+        assert plan.rooms[camera.room_index].type == "bedroom"
+        # The others have openings of their own.
+        assert {face.room for face in plan.opening_faces} > set(rooms)
 
     def test_rooms_lie_apart_along_the_axes_and_are_alike(self, root: Path) -> None:
         scene = AnnotatedPhotographs(root).load("hall-0")
@@ -273,22 +295,24 @@ class TestAzimuths:
         scores = np.eye(4)[said]
         measures = measure_azimuths([np.ones(8)], np.zeros(8), np.zeros(8), truth, scores)
         assert measures.confusion is not None
-        classes = score_classes(measures.confusion, CLASSES)
+        classes = score_classes(measures.confusion, OPENING_CLASSES)
         assert classes.recall == {"wall": 0.75, "door": 0.5, "window": 1.0, "passage": None}
         assert classes.precision == {"wall": 0.75, "door": 0.5, "window": 1.0, "passage": None}
         # A class that never occurs is not asked for.
         assert classes.balanced_accuracy == pytest.approx(0.75)
-        assert summarise_azimuths([measures, measures], CLASSES).classes == classes
+        assert summarise_azimuths([measures, measures], OPENING_CLASSES).classes == classes
 
 
-def answer(scene: str, *, room: int, x_m: float, rank: int | None, confidence: float = 0.5) -> Prediction:
+def answer(
+    scene: str, *, room: int, x_m: float, rank: int | None, confidence: float = 0.5, heading_deg: float = 0.0
+) -> Prediction:
     return Prediction(
         scene=scene,
         camera="hall",
         room="hall",
         camera_height_m=1.5,
         truth=Pose(x_m=0.0, y_m=0.0, room_index=3, heading_deg=0.0),
-        stages={"lpo": Pose(x_m=x_m, y_m=0.0, room_index=room, heading_deg=0.0)},
+        stages={"lpo": Pose(x_m=x_m, y_m=0.0, room_index=room, heading_deg=heading_deg)},
         room_rank=rank,
         confidence=confidence,
     )
@@ -321,6 +345,15 @@ class TestGalleryScores:
         (only,) = answers_in_galleries(predictions, photographs)
         assert (only.located, only.outline, only.confidence) == (True, 1, 0.9)
         assert score_galleries([only]).calibration_error == pytest.approx(0.1)
+
+    def test_a_room_taken_the_wrong_way_round_is_told(self, photographs: tuple[AnnotatedPhotograph, ...]) -> None:
+        predictions = [
+            answer("hall-0", room=3, x_m=0.1, rank=1, heading_deg=178.0),
+            answer("hall-1", room=3, x_m=0.1, rank=1, heading_deg=355.0),
+            answer("hall-2", room=4, x_m=0.1, rank=2, heading_deg=178.0),
+        ]
+        scores = score_galleries(answers_in_galleries(predictions, photographs))
+        assert (scores.located, scores.turned) == pytest.approx((2 / 3, 1 / 3))
 
     def test_no_answer_is_a_miss(self, photographs: tuple[AnnotatedPhotograph, ...]) -> None:
         missing = Prediction(
@@ -390,5 +423,6 @@ class TestRealPhotographs:
 
     def test_openings_and_outlines_agree(self) -> None:
         for one in AnnotatedPhotographs(REAL).photographs:
-            # All that is drawn lies on the outline, so every class has some columns.
-            assert set(one.classes(1024)) == {0, *(code for code, _, _ in one.class_spans)}
+            shown = {kind for kind, _, _ in one.class_spans}
+            assert {OPENING_CLASSES[code] for code in one.classes(1024)} == shown | {"wall"}
+            assert {piece.kind for piece in one.outlines[0].openings} == shown
