@@ -3,36 +3,41 @@
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict
 from collections.abc import Callable
 from typing import Generic, TypeVar
+
+from cachetools import Cache, LRUCache
 
 K = TypeVar("K")
 V = TypeVar("V")
 
 
-class BoundedCache(Generic[K, V]):
-    """Values by key, up to a number of bytes; safe to share between threads.
+class _CountingLruCache(LRUCache[K, V]):
+    """Counts what it drops to make room."""
 
-    Attributes:
-        bytes: what the values in it take.
-    """
+    evictions = 0
+
+    def popitem(self) -> tuple[K, V]:
+        self.evictions += 1
+        return super().popitem()
+
+
+class BoundedCache(Generic[K, V]):
+    """`cachetools.LRUCache` with what it leaves to its user: a lock, and values that are larger than all of it."""
 
     def __init__(self, limit_bytes: int, size: Callable[[V], int]) -> None:
-        self._limit_bytes = limit_bytes
-        self._size = size
-        self._values: OrderedDict[K, tuple[V, int]] = OrderedDict()
+        self._values: _CountingLruCache[K, V] = _CountingLruCache(limit_bytes, size)
         self._lock = threading.Lock()
-        self.bytes = 0
+
+    @property
+    def bytes(self) -> int:
+        """What the values in it take."""
+        return int(self._values.currsize)
 
     def get(self, key: K) -> V | None:
         """A value, which now counts as used."""
         with self._lock:
-            found = self._values.get(key)
-            if found is None:
-                return None
-            self._values.move_to_end(key)
-            return found[0]
+            return self._values.get(key)
 
     def put(self, key: K, value: V) -> int:
         """Keep a value; one that is larger than the whole cache is not kept, and pushes nothing out.
@@ -40,30 +45,25 @@ class BoundedCache(Generic[K, V]):
         Returns:
             how many others had to make room.
         """
-        size, evicted = self._size(value), 0
         with self._lock:
-            self._remove(key)
-            if size > self._limit_bytes:
-                return 0
-            self._values[key] = (value, size)
-            self.bytes += size
-            while self.bytes > self._limit_bytes:
-                _, (_, dropped) = self._values.popitem(last=False)
-                self.bytes -= dropped
-                evicted += 1
-        return evicted
+            self._values.pop(key, None)
+            before = self._values.evictions
+            if self._values.getsizeof(value) <= self._values.maxsize:
+                self._values[key] = value
+            return self._values.evictions - before
 
     def drop(self, unwanted: Callable[[K, V], bool]) -> None:
         """Forget some of the values."""
         with self._lock:
-            for key in [key for key, (value, _) in self._values.items() if unwanted(key, value)]:
-                self._remove(key)
+            for key, value in self._items():
+                if unwanted(key, value):
+                    del self._values[key]
 
     def items(self) -> list[tuple[K, V]]:
-        """Keys and values as they are now, least recently used first; none of them counts as used by that."""
+        """Keys and values as they are now; none of them counts as used by that."""
         with self._lock:
-            return [(key, value) for key, (value, _) in self._values.items()]
+            return self._items()
 
-    def _remove(self, key: K) -> None:
-        _, size = self._values.pop(key, (None, 0))
-        self.bytes -= size
+    def _items(self) -> list[tuple[K, V]]:
+        # Looked up past the least-recently-used order, which would count each as used.
+        return [(key, Cache.__getitem__(self._values, key)) for key in self._values]

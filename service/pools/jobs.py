@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import threading
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from time import monotonic
 from typing import Any, Literal
+
+from cachetools import TTLCache
 
 LostReason = Literal["not-ready", "queue-full", "deadline", "poisoned", "fault", "died", "closing"]
 
@@ -67,7 +69,7 @@ class JobQueue:
         self._limit = limit
         self._served_by = served_by
         self._waiting: deque[Ticket] = deque()
-        self._poisoned: OrderedDict[bytes, float] = OrderedDict()
+        self._poisoned: TTLCache[bytes, bool] = TTLCache(_POISON_MEMORY, _POISON_MEMORY_S, monotonic)
         self._changed = threading.Condition()
         self._closed = False
 
@@ -113,7 +115,7 @@ class JobQueue:
                 reason = "poisoned"
                 # A worker may stall because the machine is busy; that says nothing about the next time.
                 if ticket.stalls == 0:
-                    self._ban(ticket.digest)
+                    self._poisoned[ticket.digest] = True
             elif self._closed:
                 reason = "closing"
             elif not ticket.wanted or not self._served_by(ticket.deadline):
@@ -145,7 +147,7 @@ class JobQueue:
             return "closing"
         if not ticket.wanted:
             return "deadline"
-        if self._poisoned.get(ticket.digest, 0.0) > monotonic():
+        if ticket.digest in self._poisoned:
             return "poisoned"
         if not self._served_by(ticket.deadline):
             return "not-ready"
@@ -157,8 +159,3 @@ class JobQueue:
         for ticket in [ticket for ticket in self._waiting if not ticket.wanted]:
             self._waiting.remove(ticket)
             ticket.lose("deadline")
-
-    def _ban(self, digest: bytes) -> None:
-        self._poisoned[digest] = monotonic() + _POISON_MEMORY_S
-        while len(self._poisoned) > _POISON_MEMORY:
-            self._poisoned.popitem(last=False)
