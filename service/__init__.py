@@ -1,0 +1,17 @@
+"""The HTTP service. `app.py` is the application and `runtime.py` its parts; a query begins in `routes/localise.py`.
+
+http/       what stands between the socket and a route: slots, uploads, idempotency, errors; middleware/ is part of it
+security/   API keys, scopes, rates, and what holds while there are no keys
+routes/     the HTTP routes
+query/      what answers a panorama
+grids/      latent grids of plans, computed once for all replicas
+storage/    what persists: plans, grids, keys, kept answers
+pools/      worker processes, kept alive and fed
+workers/    the programs that run in them
+telemetry/  metrics, logs and traces
+preview/    drawings and meshes of plans
+web/        the web pages
+
+Beside them: `settings.py`, `schemas.py` (what the API takes and answers), `errors.py` (what errors mean over HTTP),
+`cores.py` (who gets how many), `threads.py`, `lru.py`, and the command lines `cli.py`, `openapi.py`, `__main__.py`.
+"""

@@ -17,12 +17,14 @@ from starlette.types import ASGIApp
 from lalaloc_core import __version__
 from service.errors import HTTP_PROBLEMS, PROBLEMS
 from service.http.api_description import describe_api
-from service.http.middleware.access_control import AccessControlMiddleware
-from service.http.middleware.admission import AdmissionMiddleware
-from service.http.middleware.security_headers import SecurityHeadersMiddleware
-from service.http.middleware.telemetry import TelemetryMiddleware
+from service.http.middleware import (
+    AccessControlMiddleware,
+    AdmissionMiddleware,
+    SecurityHeadersMiddleware,
+    TelemetryMiddleware,
+)
 from service.http.problems import install_problem_handlers
-from service.routes import floorplans, health, limits, localise, pages, plan_events, plan_files
+from service.routes import ROUTERS
 from service.runtime import start_runtime
 from service.settings import Settings
 from service.telemetry import Telemetry, configure_logging
@@ -53,12 +55,10 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         redoc_url=None,
     )
     install_problem_handlers(app)
-    modules = (floorplans, plan_files, plan_events, localise, health, limits, pages)
-    routers = [module.router for module in modules]
-    for router in routers:
+    for router in ROUTERS:
         app.include_router(router)
     app.openapi = partial(describe_api, app)
-    routes = [route for router in routers for route in router.routes]
+    routes = [route for router in ROUTERS for route in router.routes]
     app.build_middleware_stack = partial(_layers, app, telemetry, routes)
     return app
 

@@ -17,12 +17,11 @@ from datetime import datetime
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.errors import ConfigError, LaLaLocError
-from service.security.exposure import check_address
+from service.security import Permission, check_address
 from service.security.keys import hash_of, key_text, new_secret
-from service.security.permissions import Permission
 from service.settings import Settings
+from service.storage import Store, open_store
 from service.storage.records import ApiKey
-from service.storage.store import Store, open_store
 
 # Connections that the kernel accepts while the service is busy; it answers all of them, if only with a 503.
 _BACKLOG = 1024

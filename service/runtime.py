@@ -14,18 +14,14 @@ from fastapi import Request
 from lalaloc_core import __version__
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.localise.encoders import Encoders
-from service.grids.grids import Grids
-from service.grids.sweeper import Sweeper
-from service.http.admission import Admission, AdmissionLimits
+from service.grids import Grids, Sweeper
+from service.http import Admission, AdmissionLimits
 from service.http.events import HEARTBEAT_S, PlanEvents
-from service.preview.drawings import Drawings
-from service.query.decoding import Decoder
-from service.query.localiser import Localiser
-from service.query.refinement import LpoPool
-from service.security.access_control import AccessControl
+from service.preview import Drawings
+from service.query import Decoder, Localiser, LpoPool
+from service.security import AccessControl
 from service.settings import Settings
-from service.storage.plan_cache import PlanCache
-from service.storage.store import Store, open_store
+from service.storage import PlanCache, Store, open_store
 from service.telemetry import LOGGER_NAME, Telemetry
 from service.telemetry.tracing import Tracing, otlp_exporter
 from service.threads import BoundedReads, Threads

@@ -32,8 +32,8 @@ from service.grids.throttle import BackgroundThrottle
 from service.lru import BoundedCache
 from service.schemas import PlanStatus
 from service.settings import Settings
+from service.storage import Store
 from service.storage.records import ComputedGrid, GridKey, PlanRecord, PlanSummary, millimetres
-from service.storage.store import Store
 from service.telemetry import LOGGER_NAME, Telemetry
 
 # Plans whose missing grids are queued at a time, so that replicas share a backlog.

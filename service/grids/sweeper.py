@@ -8,8 +8,7 @@ from time import monotonic
 
 from service.errors import StoreUnavailableError
 from service.grids.grids import Grids
-from service.storage.plan_cache import PlanCache
-from service.storage.store import Store
+from service.storage import PlanCache, Store
 from service.telemetry import LOGGER_NAME
 
 # Revisions that one query asks about.

@@ -1,4 +1,12 @@
 """What stands between the socket and a route: slots for requests, uploads, idempotency, events, errors, headers.
 
-Begin with `admission.py`.
+Begin with `admission.py`, which says how much may be in work, and `middleware/`, which every request passes. Routes use
+`uploads.py` for bodies, `conditional.py`, `cursors.py` and `idempotency.py` for what their headers and parameters ask,
+`events.py` for streams and `problems.py` for errors. `server.py` runs the app, `api_description.py` describes it.
 """
+
+from service.http.admission import Admission, AdmissionLimits
+from service.http.events import PlanEvents
+from service.http.idempotency import IdempotentRequest
+
+__all__ = ["Admission", "AdmissionLimits", "IdempotentRequest", "PlanEvents"]

@@ -16,10 +16,10 @@ from starlette.responses import StreamingResponse
 from starlette.types import Receive, Scope, Send
 
 from service.errors import StoreUnavailableError
-from service.grids.grids import Grids
+from service.grids import Grids
 from service.http.admission import Admission
 from service.schemas import PlanEvent
-from service.storage.store import Store
+from service.storage import Store
 from service.telemetry import LOGGER_NAME
 from service.threads import BoundedReads
 

@@ -30,7 +30,7 @@ from service.errors import (
 )
 from service.http.problems import problem_answer
 from service.http.uploads import Parts
-from service.pools.jobs import JobLostError
+from service.pools import JobLostError
 from service.storage.idempotency import Idempotency
 from service.storage.records import Conflict, Fresh, InProgress, StoredAnswer
 from service.telemetry import LOGGER_NAME

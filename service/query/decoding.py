@@ -11,9 +11,7 @@ from lalaloc_core.bundle import Manifest
 from lalaloc_core.errors import InvalidPanoramaError
 from lalaloc_core.panorama.images import Panorama
 from service.errors import DeadlineExceededError, DecoderNotReadyError, OverloadedError, StoppingError
-from service.pools.jobs import JobLostError
-from service.pools.pool import PoolState, WorkerPool
-from service.pools.supervisor import WorkerSpec
+from service.pools import JobLostError, PoolState, WorkerPool, WorkerSpec
 from service.settings import Settings
 from service.telemetry import Telemetry
 from service.workers.decode import Refusal, run_decoder

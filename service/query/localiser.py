@@ -21,8 +21,7 @@ from lalaloc_core.localise.pipeline import Localisation, StageClock, localise_st
 from lalaloc_core.localise.poses import Candidate, LatentGrid, Query
 from lalaloc_core.panorama.images import Panorama
 from service.errors import DeadlineExceededError, PlanFailedError, PlanNotReadyError
-from service.grids.grids import Grids
-from service.grids.heights import query_height_m
+from service.grids import Grids, query_height_m
 from service.http.admission import Slots
 from service.query.decoding import Decoder
 from service.query.heading import HeadingSource, KnownHeading, known_heading

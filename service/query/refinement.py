@@ -6,9 +6,7 @@ from typing import get_args
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.localise.poses import RefinementJob, RefinementResult
-from service.pools.jobs import JobLostError, LostReason
-from service.pools.pool import PoolState, WorkerPool
-from service.pools.supervisor import WorkerSpec
+from service.pools import JobLostError, LostReason, PoolState, WorkerPool, WorkerSpec
 from service.settings import Settings
 from service.telemetry import Telemetry
 from service.workers.lpo import run_worker

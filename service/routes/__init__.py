@@ -1,1 +1,12 @@
-"""The HTTP routes; each module makes one router."""
+"""The HTTP routes: each module makes one router.
+
+Begin with `localise.py`, the query. `dependencies.py` has what routes about plans share, `plan_answers.py` says plans
+in the words of the API.
+"""
+
+from service.routes import floorplans, health, limits, localise, pages, plan_events, plan_files
+
+# In the order in which the API description has them.
+ROUTERS = tuple(module.router for module in (floorplans, plan_files, plan_events, localise, health, limits, pages))
+
+__all__ = ["ROUTERS"]

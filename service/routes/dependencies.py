@@ -11,8 +11,8 @@ from fastapi import Depends, Request
 from service.errors import StoreUnavailableError, UnknownFloorPlanError
 from service.http.idempotency import HEADER, MAX_KEY_CHARACTERS
 from service.runtime import Runtime, runtime_of
-from service.security.permissions import caller_of
-from service.storage.plan_cache import PlanCache
+from service.security import caller_of
+from service.storage import PlanCache
 from service.storage.plans import Plans
 from service.storage.records import PlanRecord, PlanSummary
 

@@ -24,10 +24,10 @@ from service.errors import (
     UploadTimeoutError,
     UploadTooLargeError,
 )
-from service.grids.grids import GridState
+from service.grids import GridState
+from service.http import IdempotentRequest
 from service.http.conditional import conditional_answer, expected_revision
 from service.http.cursors import cursor_text, parse_cursor
-from service.http.idempotency import IdempotentRequest
 from service.http.problems import problem_responses
 from service.http.uploads import JSON, MULTIPART, Parts, UploadLimits, media_type, read_body, read_parts
 from service.routes.dependencies import (

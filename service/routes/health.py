@@ -7,7 +7,7 @@ from typing import Annotated
 from fastapi import APIRouter, Depends, Response, status
 from prometheus_client import CONTENT_TYPE_LATEST
 
-from service.pools.pool import PoolState
+from service.pools import PoolState
 from service.runtime import Runtime, runtime_of
 from service.schemas import HealthAnswer, PoolAnswer, ReadyAnswer
 

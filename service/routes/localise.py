@@ -26,7 +26,7 @@ from service.errors import (
     UploadTimeoutError,
     UploadTooLargeError,
 )
-from service.http.idempotency import IdempotentRequest
+from service.http import IdempotentRequest
 from service.http.problems import problem_responses
 from service.http.uploads import JSON, MULTIPART, UploadLimits, media_type, read_parts, validate_fields
 from service.routes.dependencies import IDEMPOTENCY_KEY, Running, Tenant, plan_for_query

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from lalaloc_core.sampling import grid_size
-from service.grids.grids import Grids, GridState
+from service.grids import Grids, GridState
 from service.http.conditional import plan_etag
 from service.schemas import BoundsAnswer, FloorPlanAnswer, FloorPlanSummary, GridAnswer, RoomAnswer
 from service.storage.records import PlanRecord, PlanSummary

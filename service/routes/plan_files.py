@@ -12,7 +12,7 @@ from service.errors import InvalidRequestError, StoreUnavailableError, UnknownFl
 from service.http.conditional import conditional_answer, content_etag
 from service.http.problems import problem_responses
 from service.http.uploads import JSON
-from service.preview.svg import Marker
+from service.preview import Marker
 from service.routes.dependencies import IF_NONE_MATCH, NOT_MODIFIED, Running, Tenant, plan_summary, stored_plan
 from service.storage.records import PlanRecord
 from service.telemetry import note

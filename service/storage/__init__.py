@@ -9,6 +9,11 @@
     api_keys         tenant, name, hash, scopes, rate, created_at, revoked_at, last_used_at
     idempotency      (tenant, route, key) -> digest of the body, and the answer once there is one
 
-What is indented goes with what it hangs on, so that deleting a plan is one statement and final. `migrations` makes the
-tables; `tables` says what they look like now.
+Begin with `store.py`, then `plans.py`. What is indented goes with what it hangs on, so that deleting a plan is one
+statement and final. `migrations` makes the tables; `tables` says what they look like now.
 """
+
+from service.storage.plan_cache import PlanCache
+from service.storage.store import Store, open_store
+
+__all__ = ["PlanCache", "Store", "open_store"]
