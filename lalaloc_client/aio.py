@@ -5,15 +5,19 @@ from __future__ import annotations
 import asyncio
 import os
 from collections.abc import AsyncIterator, Mapping
+from contextlib import aclosing
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import httpx
+from httpx_sse import EventSource
 
 from lalaloc_client import operations, requests
-from lalaloc_client.connection import http_options
-from lalaloc_client.model import FloorPlan, FloorPlanSummary, Localisation, Readiness
+from lalaloc_client.connection import http_options, request_to_send
+from lalaloc_client.errors import NotFoundError
+from lalaloc_client.events import Followed, check_stream
+from lalaloc_client.model import FloorPlan, FloorPlanSummary, Localisation, PlanEvent, Readiness
 from lalaloc_client.operations import Patience, Reply, Steps, Wait
-from lalaloc_client.requests import Document, Refine, Request
+from lalaloc_client.requests import Covariance, Document, Refine, Request
 from lalaloc_client.retry import RetryPolicy
 
 if TYPE_CHECKING:
@@ -73,6 +77,51 @@ class AsyncClient:
         """See `Client.delete_floorplan`."""
         await self._run(operations.delete(floorplan_id, self._patience))
 
+    async def original(self, floorplan_id: str) -> bytes:
+        """See `Client.original`."""
+        return await self._run(operations.content(requests.original_request(floorplan_id), self._patience))
+
+    async def preview(
+        self,
+        floorplan_id: str,
+        *,
+        x_m: float | None = None,
+        y_m: float | None = None,
+        heading_deg: float | None = None,
+        covariance_m2: Covariance | None = None,
+    ) -> str:
+        """See `Client.preview`."""
+        request = requests.preview_request(
+            floorplan_id, x_m=x_m, y_m=y_m, heading_deg=heading_deg, covariance_m2=covariance_m2
+        )
+        return (await self._run(operations.content(request, self._patience))).decode()
+
+    async def mesh(self, floorplan_id: str) -> bytes:
+        """See `Client.mesh`."""
+        return await self._run(operations.content(requests.mesh_request(floorplan_id), self._patience))
+
+    async def events(self, floorplan_id: str) -> AsyncIterator[PlanEvent]:
+        """See `Client.events`."""
+        request = requests.events_request(floorplan_id)
+        followed = Followed()
+        while not followed.over:
+            try:
+                response = await self._run(operations.stream(request, self._patience))
+            except NotFoundError as error:
+                yield followed.deleted(error)
+                return
+            async with aclosing(response):
+                check_stream(response)
+                try:
+                    async for message in EventSource(response).aiter_sse():
+                        if (event := followed.take(message)) is not None:
+                            yield event
+                except httpx.TransportError:
+                    # As good as ended: what is missed comes first on the next one.
+                    pass
+            if not followed.over:
+                await self._do(followed.pause())
+
     async def wait_until_ready(self, floorplan_id: str, *, timeout_s: float = 300.0) -> FloorPlan:
         """See `Client.wait_until_ready`."""
         return await self._run(operations.ready_plan(floorplan_id, timeout_s, self._patience))
@@ -124,10 +173,9 @@ class AsyncClient:
             await asyncio.sleep(step.duration_s)
             return Reply()
         try:
-            return Reply(
-                await self._http.request(
-                    step.method, step.path, params=step.params, headers=step.headers, content=step.content
-                )
-            )
+            response = await self._http.send(request_to_send(self._http, step), stream=step.streamed)
+            if step.streamed and response.status_code not in step.answers:
+                await response.aread()
+            return Reply(response)
         except httpx.TransportError as error:
             return Reply(failure=error)

@@ -5,15 +5,19 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterator, Mapping
+from contextlib import closing
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import httpx
+from httpx_sse import EventSource
 
 from lalaloc_client import operations, requests
-from lalaloc_client.connection import http_options
-from lalaloc_client.model import FloorPlan, FloorPlanSummary, Localisation, Readiness
+from lalaloc_client.connection import http_options, request_to_send
+from lalaloc_client.errors import NotFoundError
+from lalaloc_client.events import Followed, check_stream
+from lalaloc_client.model import FloorPlan, FloorPlanSummary, Localisation, PlanEvent, Readiness
 from lalaloc_client.operations import Patience, Reply, Steps, Wait
-from lalaloc_client.requests import Document, Refine, Request
+from lalaloc_client.requests import Covariance, Document, Refine, Request
 from lalaloc_client.retry import RetryPolicy
 
 if TYPE_CHECKING:
@@ -89,6 +93,60 @@ class Client:
         """Delete a plan with everything that was made of it."""
         self._run(operations.delete(floorplan_id, self._patience))
 
+    def original(self, floorplan_id: str) -> bytes:
+        """The file that a plan's current revision was uploaded as, to the byte."""
+        return self._run(operations.content(requests.original_request(floorplan_id), self._patience))
+
+    def preview(
+        self,
+        floorplan_id: str,
+        *,
+        x_m: float | None = None,
+        y_m: float | None = None,
+        heading_deg: float | None = None,
+        covariance_m2: Covariance | None = None,
+    ) -> str:
+        """A plan as an SVG drawing, on which one unit is one metre.
+
+        Args:
+            x_m, y_m: draw a camera here.
+            heading_deg: its heading, as in `Localisation`.
+            covariance_m2: of its position, as in `Localisation`: the ellipse that holds 95 % is drawn.
+        """
+        request = requests.preview_request(
+            floorplan_id, x_m=x_m, y_m=y_m, heading_deg=heading_deg, covariance_m2=covariance_m2
+        )
+        return self._run(operations.content(request, self._patience)).decode()
+
+    def mesh(self, floorplan_id: str) -> bytes:
+        """Floor, walls and ceilings of a plan as binary glTF (GLB), in metres and y-up."""
+        return self._run(operations.content(requests.mesh_request(floorplan_id), self._patience))
+
+    def events(self, floorplan_id: str) -> Iterator[PlanEvent]:
+        """How far a plan is, told as it happens, until it is ready, failed or deleted.
+
+        A stream that breaks off, or that the service ends after a while, is asked for anew.
+        """
+        request = requests.events_request(floorplan_id)
+        followed = Followed()
+        while not followed.over:
+            try:
+                response = self._run(operations.stream(request, self._patience))
+            except NotFoundError as error:
+                yield followed.deleted(error)
+                return
+            with closing(response):
+                check_stream(response)
+                try:
+                    for message in EventSource(response).iter_sse():
+                        if (event := followed.take(message)) is not None:
+                            yield event
+                except httpx.TransportError:
+                    # As good as ended: what is missed comes first on the next one.
+                    pass
+            if not followed.over:
+                self._do(followed.pause())
+
     def wait_until_ready(self, floorplan_id: str, *, timeout_s: float = 300.0) -> FloorPlan:
         """The plan, once its latent grid is computed.
 
@@ -152,10 +210,9 @@ class Client:
             time.sleep(step.duration_s)
             return Reply()
         try:
-            return Reply(
-                self._http.request(
-                    step.method, step.path, params=step.params, headers=step.headers, content=step.content
-                )
-            )
+            response = self._http.send(request_to_send(self._http, step), stream=step.streamed)
+            if step.streamed and response.status_code not in step.answers:
+                response.read()
+            return Reply(response)
         except httpx.TransportError as error:
             return Reply(failure=error)

@@ -6,6 +6,11 @@ from typing import Any
 
 import httpx
 
+from lalaloc_client.requests import Request
+
+# A stream that says nothing for longer is dead: heartbeats come every 15 s.
+_SILENCE_S = 30.0
+
 
 def http_options(base_url: str, api_key: str | None, timeout_s: float) -> dict[str, Any]:
     """Options of httpx's clients.
@@ -25,3 +30,14 @@ def http_options(base_url: str, api_key: str | None, timeout_s: float) -> dict[s
             raise ValueError("api_key must be printable ASCII without spaces, and not empty")
         headers["Authorization"] = f"Bearer {api_key}"
     return {"base_url": address, "headers": headers, "timeout": timeout_s}
+
+
+def request_to_send(http: httpx.Client | httpx.AsyncClient, request: Request) -> httpx.Request:
+    """A request as httpx sends it."""
+    made = http.build_request(
+        request.method, request.path, params=request.params, headers=request.headers, content=request.content
+    )
+    if request.streamed:
+        timeout: dict[str, Any] = made.extensions["timeout"]
+        timeout["read"] = max(timeout["read"], _SILENCE_S)
+    return made

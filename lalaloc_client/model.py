@@ -111,6 +111,28 @@ class FloorPlanPage:
 
 
 @dataclass(frozen=True)
+class PlanEvent:
+    """How far a plan is at some moment.
+
+    Attributes:
+        status: `preparing`, then `ready`, `failed` or `deleted`, after which nothing comes.
+        progress: share of its latent grid that is computed, 0 to 1; None of a plan that is deleted.
+        revision: the current one; a plan may get another meanwhile.
+        reason: why it failed.
+    """
+
+    status: str
+    progress: float | None = None
+    revision: str | None = None
+    reason: str | None = None
+
+    @property
+    def final(self) -> bool:
+        """Whether it is the last one."""
+        return self.status in ("ready", "failed", "deleted")
+
+
+@dataclass(frozen=True)
 class Candidate:
     """One possible pose; candidates are ranked by `cost`, lower is better."""
 

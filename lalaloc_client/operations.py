@@ -23,7 +23,7 @@ from lalaloc_client.errors import (
     ProblemError,
     problem_class,
 )
-from lalaloc_client.model import FloorPlan, FloorPlanPage, Localisation, Readiness, parse
+from lalaloc_client.model import FloorPlan, FloorPlanPage, Localisation, PlanEvent, Readiness, parse
 from lalaloc_client.requests import Request, delete_request, limits_request, plan_request, ready_request
 from lalaloc_client.retry import RetryPolicy, may_retry, retry_after_s
 
@@ -44,7 +44,7 @@ class Wait:
 
 @dataclass(frozen=True)
 class Reply:
-    """What came of sending a request: an answer that was read to its end, or the error."""
+    """What came of sending a request: an answer, read to its end unless it is a stream, or the error."""
 
     response: httpx.Response | None = None
     failure: httpx.TransportError | None = None
@@ -124,6 +124,16 @@ def localisation(request: Request, patience: Patience) -> Steps[Localisation]:
     return parse(Localisation, _json((yield from send(request, patience)).response))
 
 
+def content(request: Request, patience: Patience) -> Steps[bytes]:
+    """Send a request that is answered with a file."""
+    return (yield from send(request, patience)).response.content
+
+
+def stream(request: Request, patience: Patience) -> Steps[httpx.Response]:
+    """Send a request whose answer is read as it comes; whoever gets it closes it."""
+    return (yield from send(request, patience)).response
+
+
 def delete(floorplan_id: str, patience: Patience) -> Steps[None]:
     """Delete a plan."""
     yield from send(delete_request(floorplan_id), patience)
@@ -182,6 +192,15 @@ def problem_of(response: httpx.Response) -> ProblemError:
         request_id=document.get("request_id") or response.headers.get("x-request-id"),
         faults=[(str(one.get("field")), str(one.get("message"))) for one in faults or [] if isinstance(one, dict)],
     )
+
+
+def plan_event(data: str) -> PlanEvent:
+    """What a message of a plan's event stream says."""
+    try:
+        document = json.loads(data)
+    except ValueError as error:
+        raise MalformedAnswerError(f"the event is not JSON: {data[:_SHOWN_CHARACTERS]!r}") from error
+    return parse(PlanEvent, document, "event")
 
 
 def _asked_s(response: httpx.Response) -> float | None:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 Document = Mapping[str, Any] | bytes | str | os.PathLike[str]
 Refine = Literal["none", "vdr", "lpo"]
+Covariance = tuple[tuple[float, float], tuple[float, float]]
 
 _JSON = "application/json"
 _JPEG_QUALITY = 95
@@ -34,17 +35,20 @@ class Request:
     """One request to the service.
 
     Attributes:
+        params: of the URL; a list is given once for each of its items.
         safety: what sending it twice may do.
         answers: statuses that are an answer, and not a failure.
+        streamed: whether the answer is read as it comes, and may last.
     """
 
     method: str
     path: str
-    params: Mapping[str, str] = field(default_factory=dict)
+    params: Mapping[str, str | list[str]] = field(default_factory=dict)
     headers: Mapping[str, str] = field(default_factory=dict)
     content: bytes = b""
     safety: Safety = Safety.ANY
     answers: frozenset[int] = frozenset({200, 201, 204})
+    streamed: bool = False
 
 
 def upload_request(document: Document, idempotency_key: str | None) -> Request:
@@ -65,6 +69,50 @@ def replace_request(floorplan_id: str, document: Document, if_match: str | None)
 def plan_request(floorplan_id: str) -> Request:
     """Look at a plan."""
     return Request("GET", _plan_path(floorplan_id))
+
+
+def original_request(floorplan_id: str) -> Request:
+    """The file that a plan was uploaded as."""
+    return Request("GET", f"{_plan_path(floorplan_id)}/original")
+
+
+def preview_request(
+    floorplan_id: str,
+    *,
+    x_m: float | None,
+    y_m: float | None,
+    heading_deg: float | None,
+    covariance_m2: Covariance | None,
+) -> Request:
+    """A drawing of a plan, with a camera in it where its position is given.
+
+    Raises:
+        ValueError: half a position, or a heading or a covariance without one; or a number that is not finite.
+    """
+    if (x_m is None) != (y_m is None):
+        raise ValueError(f"x_m is {x_m} and y_m is {y_m}, they belong together")
+    if x_m is None and not (heading_deg is None and covariance_m2 is None):
+        raise ValueError("heading_deg and covariance_m2 need a position, x_m and y_m")
+    _check_finite({"x_m": x_m, "y_m": y_m, "heading_deg": heading_deg})
+    given = {"x_m": x_m, "y_m": y_m, "heading_deg": heading_deg}
+    params: dict[str, str | list[str]] = {name: str(value) for name, value in given.items() if value is not None}
+    if covariance_m2 is not None:
+        (xx, xy), (_, yy) = covariance_m2
+        _check_finite({"covariance_m2 (xx)": xx, "covariance_m2 (xy)": xy, "covariance_m2 (yy)": yy})
+        params["covariance_m2"] = [str(xx), str(xy), str(yy)]
+    headers = {"Accept": "image/svg+xml"}
+    return Request("GET", f"{_plan_path(floorplan_id)}/preview.svg", params=params, headers=headers)
+
+
+def mesh_request(floorplan_id: str) -> Request:
+    """A mesh of a plan."""
+    return Request("GET", f"{_plan_path(floorplan_id)}/mesh.glb", headers={"Accept": "model/gltf-binary"})
+
+
+def events_request(floorplan_id: str) -> Request:
+    """How far a plan is, told as it happens."""
+    headers = {"Accept": "text/event-stream", "Cache-Control": "no-store"}
+    return Request("GET", f"{_plan_path(floorplan_id)}/events", headers=headers, streamed=True)
 
 
 def delete_request(floorplan_id: str) -> Request:
@@ -97,9 +145,7 @@ def localise_request(
         "refine": refine,
         "top_k": top_k,
     }
-    for name, value in given.items():
-        if isinstance(value, float) and not math.isfinite(value):
-            raise ValueError(f"{name} is {value}, it must be a finite number")
+    _check_finite(given)
     fields = {name: str(value) for name, value in given.items() if value is not None}
     picture = _picture(panorama)
     # Made of the content, so that the same query is the same bytes.
@@ -123,6 +169,12 @@ def limits_request() -> Request:
 def ready_request() -> Request:
     """Whether the service can answer; 503 says that it cannot yet."""
     return Request("GET", "/readyz", answers=frozenset({200, 503}))
+
+
+def _check_finite(given: Mapping[str, object]) -> None:
+    for name, value in given.items():
+        if isinstance(value, float) and not math.isfinite(value):
+            raise ValueError(f"{name} is {value}, it must be a finite number")
 
 
 def _plan_path(floorplan_id: str) -> str:

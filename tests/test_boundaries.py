@@ -169,11 +169,11 @@ def test_every_torch_package_is_one() -> None:
     assert lazy == [], "these could be opened to the numpy side"
 
 
-def test_the_client_needs_nothing_but_httpx() -> None:
+def test_the_client_needs_nothing_but_httpx_and_its_event_streams() -> None:
     modules = [name for name in MODULES if name.split(".")[0] == "lalaloc_client"]
     loaded = {name for module in modules for name in _imported(module, _at_import_time(_tree(module)))}
     tops = {name.split(".")[0] for name in loaded} - sys.stdlib_module_names
-    assert tops == {"httpx", "lalaloc_client"}
+    assert tops == {"httpx", "httpx_sse", "lalaloc_client"}
 
 
 @pytest.mark.parametrize("package", ["lalaloc_core", "service"])

@@ -101,6 +101,12 @@ class _Blocking:
 
         return self._runner.run(collect())
 
+    def events(self, *arguments: Any, **options: Any) -> list[Any]:
+        async def collect() -> list[Any]:
+            return [event async for event in self._client.events(*arguments, **options)]
+
+        return self._runner.run(collect())
+
     def __getattr__(self, name: str) -> Callable[..., Any]:
         method = getattr(self._client, name)
         return lambda *arguments, **options: self._runner.run(method(*arguments, **options))

@@ -62,6 +62,41 @@ def test_a_plan_is_replaced_unless_it_has_changed(service: Any, panorama: bytes)
     assert answer.floorplan_revision == second.revision == service.floorplan(first.id).revision
 
 
+def test_what_there_is_of_a_plan_is_downloaded(service: Any, tmp_path: Path) -> None:
+    (tmp_path / "flat.json").write_text(json.dumps(FLAT, indent=3))
+    plan_id = service.upload_floorplan(tmp_path / "flat.json").id
+    assert service.original(plan_id) == (tmp_path / "flat.json").read_bytes()
+    assert service.mesh(plan_id).startswith(b"glTF")
+    empty = service.preview(plan_id)
+    assert empty.startswith("<svg")
+    assert "camera" not in empty
+    marked = service.preview(plan_id, x_m=1.25, y_m=2.0, heading_deg=90.0, covariance_m2=((0.2, 0.01), (0.01, 0.1)))
+    assert 'class="camera" transform="translate(1.2500 -2.0000)"' in marked
+    assert "rotate(90.000)" in marked
+    assert "<ellipse" in marked
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"x_m": 1.0}, "x_m is 1.0 and y_m is None"),
+        ({"heading_deg": 20.0}, "need a position"),
+        ({"x_m": 1.0, "y_m": float("nan")}, "y_m is nan"),
+    ],
+)
+def test_half_a_camera_is_not_drawn(service: Any, options: dict[str, float], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        service.preview("p", **options)
+
+
+def test_a_plan_is_followed_until_it_is_ready(service: Any) -> None:
+    plan = service.upload_floorplan(FLAT)
+    last = list(service.events(plan.id))[-1]
+    assert (last.status, last.progress, last.revision, last.final) == ("ready", 1.0, plan.revision, True)
+    with pytest.raises(NotFoundError):
+        list(service.events("0" * 32))
+
+
 def test_the_same_upload_twice_is_one_plan(service: Any) -> None:
     key = uuid.uuid4().hex
     one, other = (service.upload_floorplan(FLAT, idempotency_key=key) for _ in range(2))

@@ -1,0 +1,56 @@
+"""Following a plan over streams that end, break off, or are none."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from lalaloc_client import MalformedAnswerError, PlanEvent, RetryPolicy
+from tests.client.conftest import FailingServer, MakeClient, Planned
+
+_HALF, _DONE = {"status": "preparing", "progress": 0.5}, {"status": "ready", "progress": 1.0}
+
+
+def _stream(*events: dict[str, Any], missing_bytes: int = 0) -> Planned:
+    """A stream of events; with bytes missing it breaks off."""
+    text = "retry: 1\n\n" + "".join(f"event: x\ndata: {json.dumps(event)}\n\n: heartbeat\n\n" for event in events)
+    size = {"Content-Length": str(len(text) + missing_bytes)}
+    return Planned(200, text.encode(), {"Content-Type": "text/event-stream; charset=utf-8", **size})
+
+
+def _followed(failing: FailingServer, make_client: MakeClient, *planned: Planned) -> list[PlanEvent]:
+    failing.plan = list(planned)
+    with make_client(failing.url, retry=RetryPolicy(attempts=2, first_s=0.0)) as client:
+        return list(client.events("p"))
+
+
+@pytest.mark.parametrize("missing_bytes", [0, 10], ids=["ends", "breaks off"])
+def test_a_stream_that_ends_early_is_asked_for_anew(
+    failing: FailingServer, make_client: MakeClient, missing_bytes: int
+) -> None:
+    first = _stream(_HALF, missing_bytes=missing_bytes)
+    # A server that closes the connection half-way.
+    first.headers["Connection"] = "close"
+    found = _followed(failing, make_client, first, Planned(503, {}, {"Retry-After": "0"}), _stream(_HALF, _DONE))
+    # What was told once is not told again.
+    assert found == [PlanEvent("preparing", 0.5), PlanEvent("ready", 1.0)]
+    assert [seen.path for seen in failing.seen] == ["/floorplans/p/events"] * 3
+
+
+def test_a_plan_that_goes_between_two_streams_is_deleted(failing: FailingServer, make_client: MakeClient) -> None:
+    found = _followed(failing, make_client, _stream(_HALF), Planned(404, {}))
+    assert found == [PlanEvent("preparing", 0.5), PlanEvent("deleted")]
+
+
+@pytest.mark.parametrize(
+    "planned",
+    [Planned(200, b"<html>", {"Content-Type": "text/html"}), _stream({"progress": 0.5})],
+    ids=["another page", "an event without status"],
+)
+def test_what_is_no_stream_of_events_is_an_error(
+    failing: FailingServer, make_client: MakeClient, planned: Planned
+) -> None:
+    with pytest.raises(MalformedAnswerError):
+        _followed(failing, make_client, planned)
