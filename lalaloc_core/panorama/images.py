@@ -23,6 +23,7 @@ from lalaloc_core.file_kinds import kind_of
 from lalaloc_core.panorama.jpeg import count_scans
 from lalaloc_core.panorama.levelling import level
 from lalaloc_core.panorama.photo_sphere import PhotoSphere, SpherePart, read_photo_sphere
+from lalaloc_core.panorama.pieces import check_pieces
 
 FORMATS = ("JPEG", "PNG", "WEBP")
 # What stands where a picture shows nothing: the mean that encoders subtract.
@@ -84,13 +85,14 @@ def open_panorama(content: bytes, *, height: int, width: int, limits: PanoramaLi
     """Decode an equirectangular JPEG, PNG or WebP and scale it to `height` x `width` RGB; the first one of several.
 
     Raises:
-        InvalidPanoramaError: empty, not one of the formats, damaged, too large, of too many scans, or neither the full
-            sphere nor a part of it that its metadata tell.
+        InvalidPanoramaError: empty, not one of the formats, damaged, too large, of too many pieces or scans, or neither
+            the full sphere nor a part of it that its metadata tell.
     """
     limits = limits or PanoramaLimits()
     if not content:
         raise InvalidPanoramaError("the panorama is empty")
     _check_webp_size(content, limits)
+    check_pieces(content)
     with _named_errors(content, limits), Image.open(io.BytesIO(content), formats=FORMATS) as image:
         _check_pixels(*image.size, limits)
         _check_scans(content, limits)

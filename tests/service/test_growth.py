@@ -1,0 +1,141 @@
+"""Requests are read in time that grows with their size and no faster, whatever is in them."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable
+from contextlib import suppress
+
+import pytest
+from starlette.requests import Request
+from starlette.types import Message
+
+from lalaloc_core.errors import LaLaLocError
+from service.http.conditional import expected_revision
+from service.http.cursors import parse_cursor
+from service.http.idempotency import _key_of
+from service.http.uploads import UploadLimits, read_parts
+from service.security.exposure import may_be_named
+from service.security.keys import parse_authorization
+from service.telemetry.trace_context import parse_traceparent
+from tests.growth import assert_no_worse_than_linear
+
+# As long as heads of requests may be, and a bit.
+_HEAD = 12_000
+_LIMITS = UploadLimits(max_bytes=100_000_000, name="max_panorama_bytes", deadline_s=60.0, idle_s=60.0, bytes_per_s=1.0)
+_UPLOAD_CHUNK = 65_536
+
+
+def _request(name: str, value: str) -> Request:
+    headers = [(name.encode(), value.encode("latin-1"))]
+    return Request({"type": "http", "method": "GET", "path": "/", "query_string": b"", "headers": headers})
+
+
+_TAGS: dict[str, Callable[[int], str]] = {
+    "tags": lambda size: ",".join(['"a"'] * (size // 4)),
+    "commas": lambda size: "," * size,
+    "blanks": lambda size: '"a"' + " " * size + "x",
+    "commas and blanks": lambda size: '"a"' + ", " * (size // 2) + "x",
+    "weak": lambda size: "W/" * (size // 2),
+    "open": lambda size: '"' + "a" * size,
+    "quotes": lambda size: '"' * size,
+}
+
+
+@pytest.mark.parametrize("kind", _TAGS)
+def test_entity_tags(kind: str) -> None:
+    def work_of(size: int) -> Callable[[], None]:
+        request = _request("if-match", _TAGS[kind](size))
+
+        def work() -> None:
+            with suppress(LaLaLocError):
+                expected_revision(request, "p", "r")
+
+        return work
+
+    assert_no_worse_than_linear(work_of, _HEAD)
+
+
+_PARSED: dict[str, Callable[[str], object]] = {
+    "traceparent": lambda text: parse_traceparent(["01-" + "1" * 32 + "-" + "2" * 16 + "-01" + text]),
+    "cursor": parse_cursor,
+    "authorization": lambda text: parse_authorization(["Bearer " + text]),
+    "host": may_be_named,
+    "idempotency key": lambda text: _key_of(_request("idempotency-key", text)),
+}
+
+
+@pytest.mark.parametrize("unit", ["a", "-", "_", " ", ":", "[", "1.", "%0a", "@", "-a"])
+@pytest.mark.parametrize("kind", _PARSED)
+def test_what_heads_have(kind: str, unit: str) -> None:
+    def work_of(size: int) -> Callable[[], None]:
+        text = unit * (size // len(unit))
+
+        def work() -> None:
+            with suppress(LaLaLocError):
+                _PARSED[kind](text)
+
+        return work
+
+    assert_no_worse_than_linear(work_of, _HEAD)
+
+
+_PART = b'--b\r\nContent-Disposition: form-data; name="panorama"; filename="p"\r\n\r\n'
+_BODIES: dict[str, Callable[[int], bytes]] = {
+    "plain": lambda size: _PART + b"a" * size,
+    "boundary's letter": lambda size: _PART + b"b" * size,
+    "line ends": lambda size: _PART + b"\r\n" * (size // 2),
+    "returns": lambda size: _PART + b"\r" * size,
+    "nearly boundaries": lambda size: _PART + b"\r\n--" * (size // 4),
+    "nearly the end": lambda size: _PART + b"\r\n--a" * (size // 5),
+    "dashes": lambda size: _PART + b"-" * size,
+    "before the first": lambda size: b"-" * size,
+    "after the last": lambda size: _PART + b"\r\n--b--\r\n" + b"a" * size,
+    "one header": lambda size: _PART[:-2] + b"X-A: " + b"a" * size,
+    "many headers": lambda size: _PART[:-2] + b"X-A: a\r\n" * (size // 8),
+    "parts": lambda size: b'--b\r\nContent-Disposition: form-data; name="x"\r\n\r\n\r\n' * (size // 50),
+    "parameters": lambda size: b"--b\r\nContent-Disposition: form-data" + b"; a=b" * (size // 5) + b"\r\n\r\n",
+    "escapes": lambda size: b'--b\r\nContent-Disposition: form-data; name="' + b'\\"' * (size // 2) + b"\r\n\r\n",
+}
+
+
+@pytest.mark.parametrize("chunk", [_UPLOAD_CHUNK, 512])
+@pytest.mark.parametrize("kind", _BODIES)
+def test_forms(kind: str, chunk: int) -> None:
+    def work_of(size: int) -> Callable[[], None]:
+        body = _BODIES[kind](size)
+
+        async def read() -> None:
+            pieces = iter([body[at : at + chunk] for at in range(0, len(body), chunk)])
+
+            async def receive() -> Message:
+                piece = next(pieces, None)
+                return {"type": "http.request", "body": piece or b"", "more_body": piece is not None}
+
+            headers = [(b"content-type", b"multipart/form-data; boundary=b")]
+            scope = {"type": "http", "method": "POST", "path": "/", "query_string": b"", "headers": headers}
+            with suppress(LaLaLocError):
+                await read_parts(Request(scope, receive), _LIMITS, files={"panorama"}, fields={"x"})
+
+        return lambda: asyncio.run(read())
+
+    assert_no_worse_than_linear(work_of, 300_000)
+
+
+@pytest.mark.parametrize("unit", [";", "; a=b", '; a="', "\\", '"', "=", "; charset", " "])
+def test_the_type_of_a_body(unit: str) -> None:
+    async def read(media: str) -> None:
+        headers = [(b"content-type", media.encode())]
+        scope = {"type": "http", "method": "POST", "path": "/", "query_string": b"", "headers": headers}
+
+        async def receive() -> Message:
+            return {"type": "http.request", "body": b"", "more_body": False}
+
+        with suppress(LaLaLocError):
+            await read_parts(Request(scope, receive), _LIMITS, files=set(), fields=set())
+
+    def work_of(size: int) -> Callable[[], None]:
+        media = "multipart/form-data; boundary=b" + unit * (size // len(unit))
+        return lambda: asyncio.run(read(media))
+
+    assert_no_worse_than_linear(work_of, _HEAD)
