@@ -15,7 +15,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from lalaloc_core.configuration import build_config
 from lalaloc_core.errors import BundleError
+from lalaloc_core.files import atomic_write
 
 MANIFEST_NAME = "manifest.json"
 FORMAT_VERSION = 2
@@ -68,15 +70,6 @@ class ConfidenceModel:
         model = (self.known_heading if heading_known else self.searched_heading).get(stage)
         return None if model is None else model.probability(**signals)
 
-    @classmethod
-    def from_dict(cls, raw: dict[str, Any]) -> ConfidenceModel:
-        """Rebuild from plain data; unknown keys are a `TypeError`."""
-        stages = {
-            name: {stage: LogisticModel(**model) for stage, model in raw[name].items()}
-            for name in ("known_heading", "searched_heading")
-        }
-        return cls(**{**raw, **stages})
-
 
 @dataclass(frozen=True, kw_only=True)
 class FileEntry:
@@ -125,7 +118,7 @@ class Manifest:
 
     @classmethod
     def from_json(cls, text: str) -> Manifest:
-        """Parse strictly: unknown or missing keys are errors.
+        """Parse strictly: unknown or missing keys and values of a wrong type are errors.
 
         Raises:
             BundleError: not a manifest of this format version.
@@ -134,11 +127,8 @@ class Manifest:
             raw = json.loads(text)
             if raw.get("format_version") != FORMAT_VERSION:
                 raise BundleError(f"manifest format {raw.get('format_version')!r}, this code reads {FORMAT_VERSION}")
-            raw["files"] = {name: FileEntry(**entry) for name, entry in raw["files"].items()}
-            if raw["confidence"] is not None:
-                raw["confidence"] = ConfidenceModel.from_dict(raw["confidence"])
-            return cls(**raw)
-        except (ValueError, TypeError, KeyError, AttributeError) as error:
+            return build_config(cls, raw, path="manifest")
+        except (ValueError, AttributeError) as error:
             raise BundleError(f"not a valid {MANIFEST_NAME}: {error}") from error
 
 
@@ -201,9 +191,7 @@ def write_manifest(folder: Path, manifest: Manifest) -> Bundle:
             content = path.read_bytes()
             files[path.name] = FileEntry(bytes=len(content), sha256=hashlib.sha256(content).hexdigest())
     complete = dataclasses.replace(manifest, files=files)
-    temporary = folder / (MANIFEST_NAME + ".part")
-    temporary.write_text(complete.to_json(), encoding="utf-8")
-    temporary.replace(folder / MANIFEST_NAME)
+    atomic_write(folder / MANIFEST_NAME, complete.to_json())
     return Bundle(folder, complete, _digest_of(complete))
 
 

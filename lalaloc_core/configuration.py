@@ -1,50 +1,63 @@
-"""Frozen dataclasses from plain data, strictly: configurations travel inside checkpoints and bundles."""
+"""Dataclasses from plain data, strictly: configurations, manifests and results travel as JSON and in checkpoints.
+
+Read by pydantic, which checks every value against the dataclass's own annotations: no key may be unknown, no type is
+converted but whole numbers where a float is wanted, tuples have their length, and every arm of a union is tried.
+"""
 
 from __future__ import annotations
 
-import dataclasses
-import types
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
+import json
+from functools import cache
+from typing import Any, TypeVar
+
+from pydantic import TypeAdapter, ValidationError
+from pydantic_core import ErrorDetails
 
 from lalaloc_core.errors import ConfigError
 
+_Kind = TypeVar("_Kind")
 
-def build_config(kind: type[Any], raw: Any, *, path: str = "config") -> Any:
-    """Build a frozen dataclass from plain data, refusing unknown keys and wrong types.
+
+def build_config(kind: type[_Kind], raw: Any, *, path: str = "config") -> _Kind:
+    """Build a dataclass from plain data: what JSON knows, and tuples.
+
+    Args:
+        path: what errors call `raw`.
 
     Raises:
-        ConfigError: names the path of the offending key.
+        ConfigError: names the path of the offending key, its value and what it must be.
     """
-    if not isinstance(raw, dict):
-        raise ConfigError(f"{path} must be a mapping, not {type(raw).__name__}")
-    hints = get_type_hints(kind)
-    unknown = sorted(set(raw) - set(hints))
-    if unknown:
-        raise ConfigError(f"{path} has no key '{unknown[0]}', known are {', '.join(sorted(hints))}")
     try:
-        return kind(**{name: _convert(hints[name], value, f"{path}.{name}") for name, value in raw.items()})
+        # As JSON, because that has one kind of sequence: checkpoints keep tuples, files have lists.
+        return _adapter(kind).validate_json(json.dumps(raw), strict=True, extra="forbid")
+    except ValidationError as error:
+        raise _explained(error.errors()[0], path) from error
     except TypeError as error:
-        raise ConfigError(f"{path}: {error}") from error
+        raise ConfigError(f"{path} is no plain data: {error}") from error
 
 
-def _convert(hint: Any, value: Any, path: str) -> Any:
-    if hint is Any:
-        return value
-    if dataclasses.is_dataclass(hint):
-        return build_config(hint, value, path=path)  # type: ignore[arg-type]
-    origin = get_origin(hint)
-    if origin is Literal:
-        if value in get_args(hint):
-            return value
-        raise ConfigError(f"{path} is {value!r}, it must be one of {', '.join(map(repr, get_args(hint)))}")
-    if origin in (Union, types.UnionType):
-        return None if value is None else _convert(next(a for a in get_args(hint) if a is not type(None)), value, path)
-    if origin is tuple and isinstance(value, list | tuple):
-        return tuple(_convert(get_args(hint)[0], item, path) for item in value)
-    if origin is dict and isinstance(value, dict):
-        return {key: _convert(get_args(hint)[1], item, f"{path}.{key}") for key, item in value.items()}
-    if hint is float and isinstance(value, int) and not isinstance(value, bool):
-        return float(value)
-    if isinstance(hint, type) and isinstance(value, hint) and not (hint is int and isinstance(value, bool)):
-        return value
-    raise ConfigError(f"{path} is {value!r}, it must be of type {getattr(hint, '__name__', hint)}")
+@cache
+def _adapter(kind: type[Any]) -> Any:
+    return TypeAdapter(kind)
+
+
+def _explained(problem: ErrorDetails, path: str) -> ConfigError:
+    """The error in this project's words."""
+    cause = problem.get("ctx", {}).get("error")
+    if isinstance(cause, ConfigError):
+        # Raised by the dataclass itself, about values that do not go together.
+        return cause
+    where, kind = [path, *problem["loc"]], problem["type"]
+    if kind == "unexpected_keyword_argument":
+        return ConfigError(f"{_joined(where[:-1])} has no key '{where[-1]}'")
+    if kind == "missing" and isinstance(where[-1], int):
+        return ConfigError(f"{_joined(where[:-1])} is {problem['input']!r}: it has too few items")
+    if kind == "missing":
+        return ConfigError(f"{_joined(where[:-1])} lacks the key '{where[-1]}'")
+    if kind.startswith("dataclass"):
+        return ConfigError(f"{_joined(where)} must be a mapping, not {type(problem['input']).__name__}")
+    return ConfigError(f"{_joined(where)} is {problem['input']!r}: {problem['msg'].removeprefix('Value error, ')}")
+
+
+def _joined(where: list[str | int]) -> str:
+    return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in where).removeprefix(".")

@@ -19,6 +19,7 @@ LAYERS = {
     "lalaloc_core.errors": 0,
     "lalaloc_core.conventions": 0,
     "lalaloc_core.file_kinds": 0,
+    "lalaloc_core.files": 0,
     "lalaloc_core.configuration": 1,
     "lalaloc_core.floorplan": 1,
     "lalaloc_core.sampling": 2,

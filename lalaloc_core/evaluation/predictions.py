@@ -21,6 +21,7 @@ from typing import Any, Literal
 from lalaloc_core.configuration import build_config
 from lalaloc_core.data.dataset import Split
 from lalaloc_core.errors import ConfigError, RunError
+from lalaloc_core.files import atomic_write
 from lalaloc_core.methods.method import QueryKind
 
 RUN_FILE = "run.json"
@@ -149,7 +150,7 @@ class RunFolder:
     def write_info(self, info: RunInfo) -> None:
         """Record what is asked."""
         self.path.mkdir(parents=True, exist_ok=True)
-        write_atomically(self.path / RUN_FILE, json.dumps(dataclasses.asdict(info), indent=2) + "\n")
+        atomic_write(self.path / RUN_FILE, json.dumps(dataclasses.asdict(info), indent=2) + "\n")
 
     def read_predictions(self) -> list[Prediction]:
         """Every complete answer; a last line that an interruption cut short is left out.
@@ -174,7 +175,7 @@ class RunFolder:
 
     def replace(self, predictions: Iterable[Prediction]) -> None:
         """Replace the file's content, atomically."""
-        write_atomically(self.path / PREDICTIONS_FILE, _lines(predictions))
+        atomic_write(self.path / PREDICTIONS_FILE, _lines(predictions))
 
     def _parse(self, line: str, number: int) -> Prediction:
         try:
@@ -201,10 +202,3 @@ def without_infinity(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [without_infinity(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def write_atomically(path: Path, text: str) -> None:
-    """Write a text file so that a crash leaves the previous one."""
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text(text, encoding="utf-8")
-    temporary.replace(path)

@@ -23,8 +23,8 @@ from lalaloc_core.evaluation.predictions import (
     Prediction,
     RunFolder,
     without_infinity,
-    write_atomically,
 )
+from lalaloc_core.files import atomic_write
 
 _RESAMPLES = 1000
 _COVERAGE = 0.95
@@ -149,7 +149,7 @@ def score_run(folder: RunFolder) -> dict[str, Any]:
     info = folder.read_info()
     scores = without_infinity(dataclasses.asdict(score(folder.read_predictions())))
     report = {"label": info.label, "dataset": info.dataset, "skipped": len(info.skipped), **scores}
-    write_atomically(folder.path / SCORES_FILE, json.dumps(report, indent=2, allow_nan=False) + "\n")
+    atomic_write(folder.path / SCORES_FILE, json.dumps(report, indent=2, allow_nan=False) + "\n")
     return report
 
 

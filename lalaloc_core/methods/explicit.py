@@ -9,8 +9,11 @@ with.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from operator import attrgetter
+from typing import Any
 
 import numpy as np
+from cachetools import LRUCache, cachedmethod
 from jaxtyping import Float, UInt8
 
 from lalaloc_core.errors import InvalidInputError
@@ -20,7 +23,7 @@ from lalaloc_core.localise.pipeline import LocaliseConfig, StageClock
 from lalaloc_core.localise.poses import RefinementJob
 from lalaloc_core.localise.vogel import disc_poses
 from lalaloc_core.methods.alignment import DepthAligner
-from lalaloc_core.methods.kept import KeptPerPlan
+from lalaloc_core.methods.caching import GRIDS_CACHED, grid_key
 from lalaloc_core.methods.lalaloc import read_image
 from lalaloc_core.methods.method import Answer, Found, Question
 from lalaloc_core.methods.similarity import layouts_at
@@ -40,7 +43,7 @@ class ExplicitLayout:
         self._config = config or LocaliseConfig()
         self._columns = encoders.manifest.profile_columns
         self._aligner = DepthAligner(rows=_ROWS, columns=self._columns, config=schedule)
-        self._grids: KeptPerPlan[_RenderedPoses] = KeptPerPlan()
+        self._grids: LRUCache[Any, _RenderedPoses] = LRUCache(GRIDS_CACHED)
 
     def answer(self, question: Question) -> Answer:
         """Predict the layout, retrieve, re-sample and align.
@@ -51,10 +54,8 @@ class ExplicitLayout:
         """
         if not question.heading_known:
             raise InvalidInputError("localisation by an explicit layout needs the heading")
-        plan, height, clock = question.plan, question.camera.camera_height_m, StageClock()
-        grid = self._grids.get(
-            plan, (height, question.grid_step_m), lambda: self._rendered(question, question.grid, heading=0.0)
-        )
+        plan, clock = question.plan, StageClock()
+        grid = self._grid(question)
         image = read_image(self._encoders, question)
         with clock.stage("encode"):
             profile_m, heading = self._profile(question, image)
@@ -80,6 +81,10 @@ class ExplicitLayout:
         if image is None:
             return question.true_profile(self._columns), 0.0
         return self._encoders.profile(image, question.camera.heading, question.camera.camera_height_m)
+
+    @cachedmethod(attrgetter("_grids"), key=grid_key)
+    def _grid(self, question: Question) -> _RenderedPoses:
+        return self._rendered(question, question.grid, heading=0.0)
 
     def _rendered(self, question: Question, poses: PoseSet, heading: float) -> _RenderedPoses:
         profile, camera, ceiling = layouts_at(

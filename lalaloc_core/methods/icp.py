@@ -14,8 +14,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from operator import attrgetter
+from typing import Any
 
 import numpy as np
+from cachetools import LRUCache, cachedmethod
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
@@ -23,7 +26,7 @@ from lalaloc_core.conventions import column_azimuths, row_elevations, wrap_angle
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.pipeline import StageClock
-from lalaloc_core.methods.kept import KeptPerPlan
+from lalaloc_core.methods.caching import GRIDS_CACHED, plan_key
 from lalaloc_core.methods.method import Answer, Found, Question
 
 
@@ -69,7 +72,11 @@ class Icp:
 
     def __init__(self, config: IcpConfig | None = None) -> None:
         self.config = config or IcpConfig()
-        self._trees: KeptPerPlan[KDTree] = KeptPerPlan()
+        self._trees: LRUCache[Any, KDTree] = LRUCache(GRIDS_CACHED)
+
+    @cachedmethod(attrgetter("_trees"), key=plan_key)
+    def _tree(self, question: Question) -> KDTree:
+        return KDTree(wall_cloud(question.plan, self.config))
 
     def answer(self, question: Question) -> Answer:
         """Align the scan from every pose of the grid.
@@ -84,7 +91,7 @@ class Icp:
         if not question.heading_known:
             raise InvalidInputError("ICP needs the heading of its scan")
         plan, clock = question.plan, StageClock()
-        tree = self._trees.get(plan, None, lambda: KDTree(wall_cloud(plan, self.config)))
+        tree = self._tree(question)
         points = self._scan(question)
         if len(points) == 0:
             return Answer()

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+from operator import attrgetter
+from typing import Any
 
 import numpy as np
 import torch
+from cachetools import LRUCache, cachedmethod
 from jaxtyping import UInt8
 
 from lalaloc_core.bundle import Bundle
@@ -22,7 +25,7 @@ from lalaloc_core.localise.pipeline import (
     panorama_heading,
 )
 from lalaloc_core.localise.poses import Candidate, LatentGrid, PredictedProfile, Query
-from lalaloc_core.methods.kept import KeptPerPlan
+from lalaloc_core.methods.caching import GRIDS_CACHED, grid_key
 from lalaloc_core.methods.method import Answer, Found, Question
 from lalaloc_core.sampling import PoseSet
 
@@ -50,7 +53,7 @@ class LaLaLoc:
         self._refine: Refine = refine
         self._refiner = refiner
         self._config = config or LocaliseConfig()
-        self._grids: KeptPerPlan[LatentGrid] = KeptPerPlan()
+        self._grids: LRUCache[Any, LatentGrid] = LRUCache(GRIDS_CACHED)
 
     def answer(self, question: Question) -> Answer:
         """Encode the query and run the service's search."""
@@ -86,15 +89,12 @@ class LaLaLoc:
             timings_ms={**clock.timings_ms, **found.timings_ms},
         )
 
+    @cachedmethod(attrgetter("_grids"), key=grid_key)
     def grid(self, question: Question) -> LatentGrid:
-        """Latents of the question's grid at its camera height; the last few are kept."""
-        height, step_m, poses = question.camera.camera_height_m, question.grid_step_m, question.grid
-
-        def embed() -> LatentGrid:
-            latents, profile_m = self.encoders.poses(question.plan, poses, np.zeros(len(poses)), height)
-            return LatentGrid(poses, latents, profile_m, step_m, height)
-
-        return self._grids.get(question.plan, (height, step_m), embed)
+        """Latents of the question's grid at its camera height; the last few are cached."""
+        height, poses = question.camera.camera_height_m, question.grid
+        latents, profile_m = self.encoders.poses(question.plan, poses, np.zeros(len(poses)), height)
+        return LatentGrid(poses, latents, profile_m, question.grid_step_m, height)
 
 
 def local_refiner(bundle: Bundle, config: LpoConfig | None = None) -> Refiner:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from operator import attrgetter
+from typing import Any
+
 import numpy as np
+from cachetools import LRUCache, cachedmethod
 
 from lalaloc_core.localise.pipeline import StageClock
-from lalaloc_core.methods.kept import KeptPerPlan
+from lalaloc_core.methods.caching import GRIDS_CACHED, grid_key
 from lalaloc_core.methods.method import Answer, Found, Question
 from lalaloc_core.methods.similarity import LayoutGrid, LayoutMetric, layout_grid, true_layout
 
@@ -18,7 +22,7 @@ class SimilarityRetrieval:
 
     def __init__(self, metric: LayoutMetric = "chamfer") -> None:
         self.metric: LayoutMetric = metric
-        self._grids: KeptPerPlan[LayoutGrid] = KeptPerPlan()
+        self._grids: LRUCache[Any, LayoutGrid] = LRUCache(GRIDS_CACHED)
 
     def answer(self, question: Question) -> Answer:
         """Retrieve with the true layout."""
@@ -28,13 +32,9 @@ class SimilarityRetrieval:
             index = grid.nearest(true_layout(question, grid.columns))
         return _retrieved(question, index, clock)
 
+    @cachedmethod(attrgetter("_grids"), key=grid_key)
     def _grid(self, question: Question) -> LayoutGrid:
-        height = question.camera.camera_height_m
-        return self._grids.get(
-            question.plan,
-            (height, question.grid_step_m),
-            lambda: layout_grid(self.metric, question.plan, question.grid, height),
-        )
+        return layout_grid(self.metric, question.plan, question.grid, question.camera.camera_height_m)
 
 
 class PoseOracle:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from lalaloc_core.evaluation.predictions import write_atomically
+from lalaloc_core.files import atomic_write
 from lalaloc_core.report.charts import draw_charts
 from lalaloc_core.report.figures import Chart
 from lalaloc_core.report.gallery import Gallery, build_gallery
@@ -34,7 +34,7 @@ def write_report(runs: Sequence[Path], out: Path, *, pictures: Path | None = Non
     charts = draw_charts(opened)
     galleries = _build_galleries(opened)
     out.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(out, render_page(opened, charts, galleries))
+    atomic_write(out, render_page(opened, charts, galleries))
     if pictures is not None:
         _write_pictures(pictures, charts, galleries)
 
@@ -57,17 +57,11 @@ def _build_galleries(runs: Sequence[Run]) -> dict[int, Gallery]:
 def _write_pictures(folder: Path, charts: Mapping[str, Chart], galleries: Mapping[int, Gallery]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for chart in charts.values():
-        _write(folder / f"{chart.name}.svg", chart.svg.encode())
-        _write(folder / f"{chart.name}.png", chart.png())
+        atomic_write(folder / f"{chart.name}.svg", chart.svg.encode())
+        atomic_write(folder / f"{chart.name}.png", chart.png())
     for number, gallery in galleries.items():
         for group, cards in gallery.groups.items():
             for place, card in enumerate(cards, start=1):
                 for picture in card.pictures:
                     name = f"run-{number}-{group.replace(' ', '-')}-{place}-{picture.file_name}"
-                    _write(folder / name, picture.content)
-
-
-def _write(path: Path, content: bytes) -> None:
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_bytes(content)
-    temporary.replace(path)
+                    atomic_write(folder / name, picture.content)

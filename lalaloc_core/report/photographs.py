@@ -26,8 +26,9 @@ from lalaloc_core.evaluation.galleries import (
     score_galleries,
 )
 from lalaloc_core.evaluation.photograph_reading import ReadPhotograph, read_photographs
-from lalaloc_core.evaluation.predictions import RunFolder, RunInfo, without_infinity, write_atomically
+from lalaloc_core.evaluation.predictions import RunFolder, RunInfo, without_infinity
 from lalaloc_core.evaluation.run import run_evaluation
+from lalaloc_core.files import atomic_write
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.report.photograph_sheet import draw_photographs
 from lalaloc_core.report.tables import percent
@@ -147,7 +148,7 @@ def evaluate_photographs(
         answers[heading] = answers_in_galleries(predictions, dataset.photographs)
     results = PhotographResults(read=read, answers=answers)
     figures = {"command": command, "model": describe_model(bundle), **results.figures()}
-    write_atomically(out / FIGURES_FILE, json.dumps(figures, indent=2, allow_nan=False) + "\n")
+    atomic_write(out / FIGURES_FILE, json.dumps(figures, indent=2, allow_nan=False) + "\n")
     draw_photographs(f"{len(read)} photographs, model {bundle}", read, answers).save(out / SHEET_FILE)
     return results
 

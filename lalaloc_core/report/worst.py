@@ -22,8 +22,9 @@ from lalaloc_core.data.dataset import Camera, Scene
 from lalaloc_core.errors import LaLaLocError, RunError
 from lalaloc_core.evaluation.building import build_dataset, choose_appearance
 from lalaloc_core.evaluation.failures import Outcome, is_symmetric, outcomes, symmetric_by_chance
-from lalaloc_core.evaluation.predictions import Pose, Prediction, RunFolder, RunInfo, write_atomically
+from lalaloc_core.evaluation.predictions import Pose, Prediction, RunFolder, RunInfo
 from lalaloc_core.evaluation.score import position_errors_m
+from lalaloc_core.files import atomic_write
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.evidence import EvidenceConfig, profile_costs, targets
 from lalaloc_core.localise.poses import Query
@@ -139,7 +140,7 @@ def write_worst(run: Path, out: Path, count: int) -> dict[str, Any]:
         draw_sheet(title, _KEY, part).save(out / pages[-1])
     summary = {"pages": pages, "left_out": left_out, **summarise(predictions, chosen, queries)}
     content = {**summary, "worst": [dataclasses.asdict(query) for query in queries]}
-    write_atomically(out / SUMMARY_FILE, json.dumps(content, indent=2, allow_nan=False) + "\n")
+    atomic_write(out / SUMMARY_FILE, json.dumps(content, indent=2, allow_nan=False) + "\n")
     return summary
 
 

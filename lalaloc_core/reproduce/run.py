@@ -21,9 +21,10 @@ import torch
 
 from lalaloc_core.data.opening import open_dataset
 from lalaloc_core.evaluation.building import choose_appearance, describe_model
-from lalaloc_core.evaluation.predictions import Prediction, RunFolder, RunInfo, write_atomically
+from lalaloc_core.evaluation.predictions import Prediction, RunFolder, RunInfo
 from lalaloc_core.evaluation.run import run_evaluation
 from lalaloc_core.evaluation.score import Estimate, Scores, score
+from lalaloc_core.files import atomic_write
 from lalaloc_core.reproduce.ablations import train_ablation
 from lalaloc_core.reproduce.render import draw_vogel_samples, markdown
 from lalaloc_core.reproduce.result import Budget, Figure, RowResult, TableResult
@@ -76,8 +77,8 @@ class Workbench:
         )
         folder = self.out / "tables"
         folder.mkdir(parents=True, exist_ok=True)
-        write_atomically(folder / f"{table.name}.json", result.to_json())
-        write_atomically(folder / f"{table.name}.md", markdown(result))
+        atomic_write(folder / f"{table.name}.json", result.to_json())
+        atomic_write(folder / f"{table.name}.md", markdown(result))
         if table.form == "figure":
             draw_vogel_samples(result, folder / f"{table.name}.png")
         return result

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 
 from lalaloc_core.errors import CheckpointError
+from lalaloc_core.files import replacing
 from lalaloc_core.training.config import TrainConfig
 
 
@@ -46,9 +47,8 @@ class Checkpoint:
     def save(self, path: Path) -> None:
         """Write atomically: a crash leaves the previous file."""
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_suffix(".part")
-        torch.save({**vars(self), "config": self.config.to_dict()}, temporary)
-        temporary.replace(path)
+        with replacing(path) as part:
+            torch.save({**vars(self), "config": self.config.to_dict()}, part)
 
     @classmethod
     def load(cls, path: Path, *, stage: str | None = None) -> Checkpoint:

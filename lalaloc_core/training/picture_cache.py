@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import UInt8
+
+from lalaloc_core.files import replacing
 
 
 def cached_pictures(
@@ -34,8 +35,6 @@ def cached_pictures(
         pass
     pictures = make()
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".part")
-    with temporary.open("wb") as file:
+    with replacing(path) as part, part.open("wb") as file:
         np.savez(file, digest=np.array(digest), pictures=pictures)
-    os.replace(temporary, path)
     return pictures

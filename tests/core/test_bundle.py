@@ -206,6 +206,11 @@ class TestReading:
             {"confidence": {"known_heading": {}, "searched_heading": {"lpo": {"bias": 1.0}}}},
             {"confidence": {"known_heading": {}, "searched_heading": {}, "margin": 1.0}},
             {"confidence": "high"},
+            {"image_height": "128"},
+            {"image_height": 128.5},
+            {"latent_size": None},
+            {"image_mean": [0.5, "0.5", 0.5]},
+            {"name": 3},
         ],
     )
     def test_a_manifest_with_anything_unknown_or_missing_is_refused(self, copied: Path, changes: dict) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from lalaloc_core.configuration import build_config
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.training.config import PRESETS, OptimiserConfig, TrainConfig
 from lalaloc_core.training.loop import learning_rate
@@ -52,7 +53,9 @@ def test_whole_numbers_are_fine_where_a_float_is_wanted() -> None:
         (["layout", "minutes"], "long", r"config\.layout\.minutes is 'long'"),
         (["layout"], [], r"config\.layout must be a mapping"),
         (["ring", "image_widths"], 3, r"config\.ring\.image_widths is 3"),
-        (["ring", "image_widths"], [8, "x"], r"config\.ring\.image_widths is 'x'"),
+        (["ring", "image_widths"], [8, "x"], r"config\.ring\.image_widths\[1\] is 'x'"),
+        (["image", "supersample"], [1, 2, 1, 2], r"config\.image\.supersample is \[1, 2, 1, 2\]"),
+        (["image", "supersample"], [1], r"config\.image\.supersample is \[1\]: it has too few items"),
         (["layout", "triplets", "positives"], 1.5, r"config\.layout\.triplets\.positives"),
     ],
 )
@@ -64,6 +67,24 @@ def test_what_is_unknown_or_of_a_wrong_type_is_refused_by_its_path(path: list[st
     inner[path[-1]] = value
     with pytest.raises(ConfigError, match=message):
         TrainConfig.from_dict(raw)
+
+
+@dataclasses.dataclass(frozen=True)
+class Sized:
+    """A size as one number, as (rows, columns), or by name."""
+
+    size: int | tuple[int, int] | str | None
+
+
+@pytest.mark.parametrize("size", [3, (2, 4), "small", None])
+def test_every_arm_of_a_union_is_tried(size: Any) -> None:
+    assert build_config(Sized, {"size": size}) == Sized(size)
+
+
+@pytest.mark.parametrize("size", [1.5, (2, 4, 6), (2,), True, {"rows": 2}])
+def test_what_no_arm_of_a_union_takes_is_refused(size: Any) -> None:
+    with pytest.raises(ConfigError, match=r"config\.size"):
+        build_config(Sized, {"size": size})
 
 
 def test_a_missing_key_without_default_is_refused() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -11,7 +12,6 @@ from hypothesis import given, settings
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.methods import similarity
-from lalaloc_core.methods.kept import KeptPerPlan
 from lalaloc_core.methods.oracle import PoseOracle, SimilarityRetrieval
 from lalaloc_core.methods.similarity import (
     LAYOUT_METRICS,
@@ -227,20 +227,12 @@ class TestRetrieval:
         assert SimilarityRetrieval().answer(question).retrieved == 0
 
 
-class TestKeeping:
-    def test_the_last_few_are_kept_and_no_more(self) -> None:
-        kept: KeptPerPlan[object] = KeptPerPlan(limit=2)
-        plan, made = crooked_flat(), []
-
-        def make() -> object:
-            made.append(object())
-            return made[-1]
-
-        first = kept.get(plan, 1.4, make)
-        assert kept.get(plan, 1.4, make) is first
-        kept.get(plan, 1.5, make)
-        assert kept.get(plan, 1.4, make) is first
-        kept.get(crooked_flat(), 1.4, make)
-        kept.get(plan, 1.6, make)
-        assert len(made) == 4
-        assert kept.get(plan, 1.4, make) is not first
+def test_grids_are_cached_by_plan_and_camera_height() -> None:
+    plan, method = crooked_flat(), SimilarityRetrieval()
+    first = question_at(plan, (1.0, 1.0))
+    grid = method._grid(first)
+    assert method._grid(first) is grid
+    assert method._grid(dataclasses.replace(first, plan=crooked_flat())) is not grid
+    raised = dataclasses.replace(first.camera, camera_height_m=first.camera.camera_height_m + 0.1)
+    assert method._grid(dataclasses.replace(first, camera=raised)) is not grid
+    assert method._grid(first) is grid

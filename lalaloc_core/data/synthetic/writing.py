@@ -34,6 +34,7 @@ from lalaloc_core.data.structured3d_splits import scene_numbers
 from lalaloc_core.data.structured3d_writer import room_id, write_annotation, write_camera, write_depth, write_picture
 from lalaloc_core.data.synthetic.generated import SPLIT_NUMBERS, studio_of
 from lalaloc_core.errors import DatasetError, InvalidInputError
+from lalaloc_core.files import PART_SUFFIX, atomic_write
 from lalaloc_core.synth.furniture import FURNITURE_LEVELS
 from lalaloc_core.synth.lighting import MOODS
 from lalaloc_core.synth.materials import CATEGORIES
@@ -44,7 +45,6 @@ from lalaloc_core.synth.splits import home_of
 PICTURES_PER_ROOM = len(FURNITURE_LEVELS) * len(MOODS)
 _MIN_HEIGHT, _MAX_HEIGHT = 16, 4096
 _SCENE = re.compile(r"scene_\d+")
-_PART = ".part"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -156,7 +156,7 @@ class _Job:
     @property
     def part(self) -> Path:
         """The scene while it is incomplete."""
-        return self.settings.root / (scene_name(self.number) + _PART)
+        return self.settings.root / (scene_name(self.number) + PART_SUFFIX)
 
 
 def _write_scene(job: _Job, stop: Event | None = None) -> int:
@@ -211,9 +211,7 @@ def _claim(settings: Synthesis) -> None:
         foreign = next((entry.name for entry in root.iterdir() if _SCENE.fullmatch(entry.name)), None)
         if foreign is not None:
             raise DatasetError(f"holds '{foreign}' but no {SYNTHETIC_FILE}: its scenes are not synthetic", path=root)
-        temporary = path.with_name(path.name + _PART)
-        temporary.write_text(json.dumps(dataclasses.asdict(marker)) + "\n", encoding="utf-8")
-        temporary.replace(path)
+        atomic_write(path, json.dumps(dataclasses.asdict(marker)) + "\n")
     elif found != marker:
         before, now = dataclasses.asdict(found), dataclasses.asdict(marker)
         differences = [f"{key} {before[key]!r}, not {now[key]!r}" for key in before if before[key] != now[key]]
