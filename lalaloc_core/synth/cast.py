@@ -12,8 +12,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lalaloc_core.synth import render_scene as S
+from lalaloc_core.synth.exposure import Exposure
 from lalaloc_core.synth.prisms import PrismHits, cross_prisms, gap_behind, resolve_prisms
+from lalaloc_core.synth.render_scene import Backdrop, Decals, Lights, Prisms, Slots, Sun
+from lalaloc_core.synth.surfaces import Surfaces
 
 _CORNER_TOLERANCE = 1e-5
 _TINY = 1e-9
@@ -22,21 +24,25 @@ _MAX_DECALS_PER_COLUMN = 10
 
 @dataclass(frozen=True, eq=False)
 class SceneBatch:
-    """Scenes padded to one size and stacked; see `RenderScene` for the fields."""
+    """Scenes padded to one size and stacked; see `RenderScene` for the fields, tables of rows (b, n)."""
 
     camera_height_m: Float[Tensor, "b"]
     heading: Float[Tensor, "b"]
     walls_m: Float[Tensor, "b n 4"]
     wall_owner: Int[Tensor, "b n"]
     wall_surface: Int[Tensor, "b n"]
-    decals: Float[Tensor, "b d 8"]
-    prisms: Float[Tensor, "b p 11"]
-    surfaces: Float[Tensor, "b s 12"]
-    slots: Float[Tensor, "b r 12"]
-    lights: Float[Tensor, "b l 8"]
-    sun: Float[Tensor, "b 14"]
-    backdrop: Float[Tensor, "b 10"]
-    exposure: Float[Tensor, "b 24"]
+    decals: Decals
+    prisms: Prisms
+    surfaces: Surfaces
+    slots: Slots
+    lights: Lights
+    sun: Sun
+    backdrop: Backdrop
+    exposure: Exposure
+
+    def __getitem__(self, index: Tensor) -> SceneBatch:
+        """A batch of some of the scenes."""
+        return SceneBatch(**{name: getattr(self, name)[index] for name in SceneBatch.__dataclass_fields__})
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,14 +72,45 @@ class Hits:
 
 
 @dataclass(frozen=True, eq=False)
+class _Crossings:
+    """Per column and wall: distance (inf: missed), metres along the wall, and whether the ray leaves the room there."""
+
+    distance_m: Float[Tensor, "b c n"]
+    along_m: Float[Tensor, "b c n"]
+    leaving: Bool[Tensor, "b c n"]
+
+
+@dataclass(frozen=True, eq=False)
 class _WallHits:
     """Per column: distance, wall index, metres along the wall, surface and unit normal."""
 
+    distance_m: Float[Tensor, "b c"]
+    wall: Int[Tensor, "b c"]
+    along_m: Float[Tensor, "b c"]
+    surface: Int[Tensor, "b c"]
+    normal: Float[Tensor, "b c 2"]
+
+
+@dataclass(frozen=True, eq=False)
+class _ShellHits:
+    """What the rays hit of walls, floors and ceilings, before furniture; (b, c, h) unless said otherwise.
+
+    Attributes:
+        vertical: z of the normal, 0 on walls.
+        is_beyond: 1 for what is seen through a hole, whose walls have the normals `beyond_normal`; else 0.
+        own: walls of the own room.
+        beyond_normal: (b, c, 2) of the walls that columns with a hole end at.
+        end_m: (b, c) horizontal distance at which each column ends.
+    """
+
     distance_m: Tensor
-    wall: Tensor
-    along_m: Tensor
     surface: Tensor
-    normal: Tensor
+    slot: Tensor
+    vertical: Tensor
+    is_beyond: Tensor
+    own: _WallHits
+    beyond_normal: Tensor
+    end_m: Tensor
 
 
 def trace(batch: SceneBatch, direction: Float[Tensor, "b c 2"], slope: Float[Tensor, "h"]) -> Hits:
@@ -84,98 +121,97 @@ def trace(batch: SceneBatch, direction: Float[Tensor, "b c 2"], slope: Float[Ten
         direction: horizontal unit vector of each column.
         slope: tangent of each row's elevation.
     """
-    eye = batch.camera_height_m
-    t, s, leaving = _cross_walls(batch.walls_m, direction)
-    own = _nearest(batch, t, s, direction, (batch.wall_owner == 0)[:, None])
-    up = slope > 0.0
-    ceiling = batch.slots[:, 0, S.SLOT_CEILING]
-    plane = torch.where(up, (ceiling - eye)[:, None], eye[:, None]) / slope.abs()
-    distance = torch.minimum(own.distance_m[:, :, None], plane[:, None])
-    is_wall = own.distance_m[:, :, None] <= plane[:, None]
-    z = slope * distance + eye[:, None, None]
-    horizontal = torch.where(
-        up, batch.slots[:, 0, S.SLOT_CEILING_SURFACE, None], batch.slots[:, 0, S.SLOT_FLOOR_SURFACE, None]
-    ).long()
-    surface = torch.where(is_wall, own.surface[:, :, None], horizontal[:, None])
-    vertical = torch.where(is_wall, 0.0, torch.where(up, -1.0, 1.0))
-    decal = _decals_at(batch, own.wall, own.along_m)
-    surface, hole = _paint(batch, decal, z, is_wall, surface)
-    slot = torch.zeros_like(surface)
-    code = torch.zeros_like(surface)
-    limit, behind = own.distance_m, own.normal
-    item, column = (hole >= 0).any(dim=2).nonzero(as_tuple=True)
-    columns = (item, column)
-    if len(item):
-        beyond = _look_through(batch, columns, t, s, leaving, direction, slope, own, hole[columns])
-        through = beyond.hole
-        for whole, part in (
-            (distance, beyond.distance_m),
-            (surface, beyond.surface),
-            (vertical, beyond.vertical),
-            (slot, beyond.slot),
-            (code, beyond.code),
-        ):
-            whole[columns] = torch.where(through, part.to(whole.dtype), whole[columns])
-        limit, behind = limit.clone(), behind.clone()
-        limit[columns] = torch.maximum(limit[columns], beyond.wall_m)
-        behind[columns] = beyond.normal
-    prisms = cross_prisms(batch.prisms, direction, limit)
-    return _merge(batch, distance, surface, slot, code, vertical, own, behind, prisms, direction, limit, slope)
+    shell = _trace_shell(batch, direction, slope)
+    return _before(batch, shell, cross_prisms(batch.prisms, direction, shell.end_m), direction, slope)
 
 
 def cast_own_walls(
     walls_m: Float[Tensor, "b n 4"], owner: Int[Tensor, "b n"], direction: Float[Tensor, "b c 2"]
 ) -> Float[Tensor, "b c"]:
     """Horizontal distance to the walls of the camera's own room."""
-    t, _, _ = _cross_walls(walls_m, direction)
-    return torch.where((owner == 0)[:, None], t, torch.inf).min(dim=2).values
+    distance = _cross_walls(walls_m, direction).distance_m
+    return torch.where((owner == 0)[:, None], distance, torch.inf).min(dim=2).values
 
 
-def _merge(
-    batch: SceneBatch,
-    distance: Tensor,
-    surface: Tensor,
-    slot: Tensor,
-    code: Tensor,
-    vertical: Tensor,
-    own: _WallHits,
-    behind_normal: Tensor,
-    prisms: PrismHits,
-    direction: Tensor,
-    limit: Tensor,
-    slope: Tensor,
+def _trace_shell(batch: SceneBatch, direction: Float[Tensor, "b c 2"], slope: Float[Tensor, "h"]) -> _ShellHits:
+    eye, room = batch.camera_height_m, batch.slots[:, 0]
+    crossings = _cross_walls(batch.walls_m, direction)
+    own = _nearest(batch, crossings, direction, (batch.wall_owner == 0)[:, None])
+    up = slope > 0.0
+    plane = torch.where(up, (room.ceiling_m - eye)[:, None], eye[:, None]) / slope.abs()
+    distance = torch.minimum(own.distance_m[:, :, None], plane[:, None])
+    is_wall = own.distance_m[:, :, None] <= plane[:, None]
+    z = slope * distance + eye[:, None, None]
+    horizontal = torch.where(up, room.ceiling_surface[:, None], room.floor_surface[:, None]).long()
+    surface = torch.where(is_wall, own.surface[:, :, None], horizontal[:, None])
+    vertical = torch.where(is_wall, 0.0, torch.where(up, -1.0, 1.0))
+    surface, hole = _paint(batch, _decals_at(batch, own.wall, own.along_m), z, is_wall, surface)
+    slot, is_beyond = torch.zeros_like(surface), torch.zeros_like(surface)
+    shell = _ShellHits(distance, surface, slot, vertical, is_beyond, own, own.normal.clone(), own.distance_m.clone())
+    item, column = (hole >= 0).any(dim=2).nonzero(as_tuple=True)
+    columns = (item, column)
+    if len(item):
+        _put_beyond(shell, columns, _look_through(batch, columns, crossings, direction, slope, own, hole[columns]))
+    return shell
+
+
+def _put_beyond(shell: _ShellHits, columns: tuple[Tensor, Tensor], beyond: _Beyond) -> None:
+    """Replace what columns hit by what they see through their holes, in place."""
+    for whole, part in (
+        (shell.distance_m, beyond.distance_m),
+        (shell.surface, beyond.surface),
+        (shell.vertical, beyond.vertical),
+        (shell.slot, beyond.slot),
+        (shell.is_beyond, torch.ones_like(beyond.slot)),
+    ):
+        whole[columns] = torch.where(beyond.hole, part.to(whole.dtype), whole[columns])
+    shell.end_m[columns] = torch.maximum(shell.end_m[columns], beyond.wall_m)
+    shell.beyond_normal[columns] = beyond.normal
+
+
+def _before(
+    batch: SceneBatch, shell: _ShellHits, prisms: PrismHits, direction: Float[Tensor, "b c 2"], slope: Tensor
 ) -> Hits:
-    """Put the prisms before what was hit so far."""
-    hit_m, nearest = resolve_prisms(prisms, distance, slope, batch.camera_height_m)
+    """The prisms before what was hit so far."""
+    own_m, own_normal = shell.own.distance_m[:, :, None], shell.own.normal
+    hit_m, nearest = resolve_prisms(prisms, shell.distance_m, slope, batch.camera_height_m)
     furniture = nearest >= 0
-    code = torch.where(furniture, nearest + 2, code)
-    normals = torch.cat([own.normal[:, :, None], behind_normal[:, :, None], prisms.normal], dim=2)
+    # Normals to choose from: of the own walls, of those beyond a hole, of the prisms.
+    normals = torch.cat([own_normal[:, :, None], shell.beyond_normal[:, :, None], prisms.normal], dim=2)
+    chosen = torch.where(furniture, nearest + 2, shell.is_beyond)
     place = nearest.clamp(min=0)
     index = prisms.index.gather(2, place)
-    rows = batch.prisms[:, :, S.PRISM_SURFACE].long()
-    prism_surface = rows[:, None].expand(-1, index.shape[1], -1).gather(2, index)
-    surface = torch.where(furniture, prism_surface, surface)
+    prism_surface = batch.prisms.surface.long()[:, None].expand(-1, index.shape[1], -1).gather(2, index)
+    surface = torch.where(furniture, prism_surface, shell.surface)
     up = torch.where(slope > 0.0, -1.0, 1.0)
     is_side = prisms.enter_m.gather(2, place) >= hit_m
-    vertical = torch.where(furniture, torch.where(is_side, 0.0, up), vertical)
+    vertical = torch.where(furniture, torch.where(is_side, 0.0, up), shell.vertical)
     flat = (vertical != 0.0).float()
     normal = torch.stack(
         [
-            normals[..., 0].gather(2, code) * (1.0 - flat),
-            normals[..., 1].gather(2, code) * (1.0 - flat),
+            normals[..., 0].gather(2, chosen) * (1.0 - flat),
+            normals[..., 1].gather(2, chosen) * (1.0 - flat),
             vertical,
         ],
         dim=-1,
     )
     # Furniture in the own room before a hole; beyond the hole it shares the slot of what lies behind it.
-    slot = torch.where(furniture & (hit_m < own.distance_m[:, :, None]), 0, slot)
-    incidence = (own.normal * direction).sum(dim=-1).abs()[:, :, None]
-    wall_gap = torch.where(vertical == 0.0, 10.0, ((own.distance_m[:, :, None] - hit_m).abs() * incidence))
-    return Hits(hit_m, surface, slot, normal, furniture, gap_behind(prisms, distance), wall_gap, limit)
+    slot = torch.where(furniture & (hit_m < own_m), 0, shell.slot)
+    incidence = (own_normal * direction).sum(dim=-1).abs()[:, :, None]
+    wall_gap = torch.where(vertical == 0.0, 10.0, (own_m - hit_m).abs() * incidence)
+    return Hits(
+        distance_m=hit_m,
+        surface=surface,
+        slot=slot,
+        normal=normal,
+        furniture=furniture,
+        gap_m=gap_behind(prisms, shell.distance_m),
+        wall_gap_m=wall_gap,
+        column_end_m=shell.end_m,
+    )
 
 
-def _cross_walls(walls_m: Tensor, direction: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Per column and wall: distance (inf: missed), metres along the wall, and whether the ray leaves the room there."""
+def _cross_walls(walls_m: Float[Tensor, "b n 4"], direction: Float[Tensor, "b c 2"]) -> _Crossings:
     dx, dy = direction[:, :, None, 0], direction[:, :, None, 1]
     x, y = walls_m[:, None, :, 0], walls_m[:, None, :, 1]
     ex, ey = walls_m[:, None, :, 2] - x, walls_m[:, None, :, 3] - y
@@ -185,14 +221,17 @@ def _cross_walls(walls_m: Tensor, direction: Tensor) -> tuple[Tensor, Tensor, Te
     t = (x * ey - y * ex) * inverse
     s = (x * dy - y * dx) * inverse
     hit = ~parallel & (t > 0.0) & (s >= -_CORNER_TOLERANCE) & (s <= 1.0 + _CORNER_TOLERANCE)
-    return torch.where(hit, t, torch.inf), s * torch.sqrt(ex**2 + ey**2), determinant > 0.0
+    return _Crossings(torch.where(hit, t, torch.inf), s * torch.sqrt(ex**2 + ey**2), determinant > 0.0)
 
 
-def _nearest(batch: SceneBatch, t: Tensor, s: Tensor, direction: Tensor, candidate: Tensor) -> _WallHits:
-    distance, wall = torch.where(candidate, t, torch.inf).min(dim=2)
-    along = s.gather(2, wall[:, :, None])[:, :, 0]
+def _nearest(batch: SceneBatch, crossings: _Crossings, direction: Tensor, candidate: Tensor) -> _WallHits:
+    distance, wall = torch.where(candidate, crossings.distance_m, torch.inf).min(dim=2)
     return _WallHits(
-        distance, wall, along, batch.wall_surface.gather(1, wall), _facing_normal(batch.walls_m, wall, direction)
+        distance_m=distance,
+        wall=wall,
+        along_m=crossings.along_m.gather(2, wall[:, :, None])[:, :, 0],
+        surface=batch.wall_surface.gather(1, wall),
+        normal=_facing_normal(batch.walls_m, wall, direction),
     )
 
 
@@ -206,13 +245,9 @@ def _facing_normal(walls_m: Tensor, wall: Tensor, direction: Tensor) -> Tensor:
 
 def _decals_at(batch: SceneBatch, wall: Tensor, along_m: Tensor) -> Int[Tensor, "b c k"]:
     """Indices of the decals that a column's wall hit may meet, in painting order; -1 pads."""
-    decals = batch.decals
-    on = (
-        (decals[:, None, :, S.DECAL_WALL] == wall[:, :, None])
-        & (decals[:, None, :, S.DECAL_S0] <= along_m[:, :, None])
-        & (decals[:, None, :, S.DECAL_S1] >= along_m[:, :, None])
-    )
-    order = torch.where(on, torch.arange(decals.shape[1], device=decals.device), -1)
+    decals = batch.decals[:, None]
+    on = (decals.wall == wall[:, :, None]) & (decals.s0_m <= along_m[:, :, None]) & (decals.s1_m >= along_m[:, :, None])
+    order = torch.where(on, torch.arange(on.shape[2], device=on.device), -1)
     most = min(int(on.sum(dim=2).max()), _MAX_DECALS_PER_COLUMN)
     return order.topk(most, dim=2).values.flip(2)
 
@@ -224,11 +259,11 @@ def _paint(
     hole = torch.full_like(surface, -1)
     for k in range(decal.shape[2]):
         index = decal[:, :, k]
-        rows = batch.decals.gather(1, index.clamp(min=0)[:, :, None].expand(-1, -1, batch.decals.shape[2]))
-        rows = torch.where((index >= 0)[:, :, None], rows, torch.tensor(-1.0, device=rows.device))
-        inside = is_wall & (z >= rows[:, :, S.DECAL_Z0, None]) & (z <= rows[:, :, S.DECAL_Z1, None])
-        surface = torch.where(inside, rows[:, :, S.DECAL_SURFACE, None].long(), surface)
-        is_hole = torch.where(rows[:, :, S.DECAL_SLOT] >= 0.0, index, -1)
+        rows = batch.decals.rows.gather(1, index.clamp(min=0)[:, :, None].expand(-1, -1, Decals.WIDTH))
+        met = Decals(torch.where((index >= 0)[:, :, None], rows, torch.tensor(-1.0, device=rows.device)))
+        inside = is_wall & (z >= met.z0_m[:, :, None]) & (z <= met.z1_m[:, :, None])
+        surface = torch.where(inside, met.surface[:, :, None].long(), surface)
+        is_hole = torch.where(met.slot >= 0.0, index, -1)
         hole = torch.where(inside, is_hole[:, :, None], hole)
     return surface, hole
 
@@ -242,7 +277,6 @@ class _Beyond:
     surface: Tensor
     vertical: Tensor
     slot: Tensor
-    code: Tensor
     wall_m: Tensor  # (m,) horizontal distance at which the column ends
     normal: Tensor  # (m, 2)
 
@@ -250,9 +284,7 @@ class _Beyond:
 def _look_through(
     batch: SceneBatch,
     columns: tuple[Tensor, Tensor],
-    t: Tensor,
-    s: Tensor,
-    leaving: Tensor,
+    crossings: _Crossings,
     direction: Tensor,
     slope: Tensor,
     own: _WallHits,
@@ -260,17 +292,17 @@ def _look_through(
 ) -> _Beyond:
     item, _ = columns
     decal = hole.max(dim=1).values
-    row = batch.decals[item, decal]
-    slot = row[:, S.DECAL_SLOT].long()
+    opening = batch.decals[item, decal]
+    slot = opening.slot.long()
     room = batch.slots[item, slot]
     eye = batch.camera_height_m[item]
     near = own.distance_m[columns]
     incidence = (own.normal[columns] * direction[columns]).sum(dim=-1).abs().clamp(min=1e-3)
-    far = near + row[:, S.DECAL_DEPTH] / incidence
+    far = near + opening.depth_m / incidence
 
     owner = batch.wall_owner[item]
-    wall_t = t[columns]
-    inner = (owner == slot[:, None]) & leaving[columns] & (wall_t > near[:, None] + 1e-4)
+    wall_t = crossings.distance_m[columns]
+    inner = (owner == slot[:, None]) & crossings.leaving[columns] & (wall_t > near[:, None] + 1e-4)
     jamb = (owner == -1 - decal[:, None]) & (wall_t <= far[:, None] + 1e-3)
     distance, wall = torch.where(inner | jamb, wall_t, torch.inf).min(dim=1)
     is_jamb = jamb.gather(1, wall[:, None])[:, 0]
@@ -278,7 +310,7 @@ def _look_through(
     distance = torch.where(distance.isfinite(), distance, far)
 
     up = slope > 0.0
-    head, ceiling = row[:, S.DECAL_Z1] - eye, room[:, S.SLOT_CEILING] - eye
+    head, ceiling = opening.z1_m - eye, room.ceiling_m - eye
     soffit = torch.where(up, head[:, None] / slope, torch.inf)
     plane = torch.where(up, ceiling[:, None], eye[:, None]) / slope.abs()
     in_soffit = soffit < far[:, None]
@@ -288,20 +320,19 @@ def _look_through(
     z = slope * hit + eye[:, None]
 
     surface = batch.wall_surface[item, wall][:, None].expand_as(hit)
-    trim = row[:, S.DECAL_SURFACE].long()[:, None]
-    flat = torch.where(up, room[:, S.SLOT_CEILING_SURFACE, None], room[:, S.SLOT_FLOOR_SURFACE, None]).long()
+    trim = opening.surface.long()[:, None]
+    flat = torch.where(up, room.ceiling_surface[:, None], room.floor_surface[:, None]).long()
     surface = torch.where(is_wall, surface, torch.where(in_soffit, trim, flat))
-    sub = SceneBatch(**{name: getattr(batch, name)[item] for name in SceneBatch.__dataclass_fields__})
-    along = s[columns].gather(1, wall[:, None])
+    sub = batch[item]
+    along = crossings.along_m[columns].gather(1, wall[:, None])
     painted = _decals_at(sub, wall[:, None], along)
     surface, _ = _paint(sub, painted, z[:, None], is_wall[:, None], surface[:, None])
     return _Beyond(
-        hole >= 0,
-        hit,
-        surface[:, 0],
-        torch.where(is_wall, 0.0, torch.where(up, -1.0, 1.0)),
-        torch.where(is_jamb[:, None] & is_wall, 0, slot[:, None]).expand_as(hit),
-        torch.ones_like(hole),
-        distance,
-        _facing_normal(sub.walls_m, wall[:, None], direction[columns][:, None])[:, 0],
+        hole=hole >= 0,
+        distance_m=hit,
+        surface=surface[:, 0],
+        vertical=torch.where(is_wall, 0.0, torch.where(up, -1.0, 1.0)),
+        slot=torch.where(is_jamb[:, None] & is_wall, 0, slot[:, None]).expand_as(hit),
+        wall_m=distance,
+        normal=_facing_normal(sub.walls_m, wall[:, None], direction[columns][:, None])[:, 0],
     )

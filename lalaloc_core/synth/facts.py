@@ -11,11 +11,10 @@ import shapely
 import torch
 
 from lalaloc_core.synth.build import build_scene
-from lalaloc_core.synth.exposure import NADIR
 from lalaloc_core.synth.furniture import wall_frame
 from lalaloc_core.synth.materials import CATEGORIES, PICTURE_SIZE, MaterialLibrary
 from lalaloc_core.synth.openings import Opening
-from lalaloc_core.synth.render_scene import Fact, RenderScene
+from lalaloc_core.synth.render_scene import Fact, RenderScene, Sun
 from lalaloc_core.synth.shots import Shot
 
 FACTS: tuple[Fact, ...] = get_args(Fact)
@@ -61,7 +60,7 @@ def _facts_of_place(shot: Shot) -> set[Fact]:
 
 def _facts_of_picture(shot: Shot, scene: RenderScene) -> set[Fact]:
     holds: dict[Fact, bool] = {
-        "nadir_patch": bool(scene.exposure[NADIR] > 0.0),
+        "nadir_patch": bool(scene.exposure.nadir > 0.0),
         "sun_patch": _sees_sun(shot, scene.sun),
     }
     return {fact for fact, true in holds.items() if true}
@@ -78,17 +77,18 @@ def _segment(shot: Shot, opening: Opening) -> shapely.LineString:
     return shapely.LineString([start + along * opening.start_m, start + along * opening.end_m])
 
 
-def _sees_sun(shot: Shot, sun: np.ndarray) -> bool:
+def _sees_sun(shot: Shot, sun: Sun) -> bool:
     """Whether some of the sunlight that falls through the window lands where the camera sees it, furniture aside."""
-    if not sun[11:14].any():
+    if not sun.colour.any():
         return False
     room = shot.home.plan.rooms[shot.room_index].shape
     inner, camera = room.buffer(-1e-3), shapely.Point(shot.position_m)
     middle = (np.arange(_SUN_SAMPLES) + 0.5) / _SUN_SAMPLES
-    for s in sun[7] + middle * (sun[8] - sun[7]):
-        foot = sun[3:5] + shot.position_m + sun[5:7] * s
-        for z in sun[9] + middle * (sun[10] - sun[9]):
-            landing = _end_inside(room, foot, foot - sun[0:2] * (z / sun[2]))
+    toward, rise = sun.direction[:2], sun.direction[2]
+    for s in sun.s0_m + middle * (sun.s1_m - sun.s0_m):
+        foot = sun.wall_start_m + shot.position_m + sun.wall_along * s
+        for z in sun.z0_m + middle * (sun.z1_m - sun.z0_m):
+            landing = _end_inside(room, foot, foot - toward * (z / rise))
             if inner.buffer(2e-3).covers(shapely.LineString([camera, landing])):
                 return True
     return False

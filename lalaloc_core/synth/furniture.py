@@ -226,18 +226,18 @@ def place(piece: Piece, centre_m: Float[np.ndarray, "2"], axis: Float[np.ndarray
     cx, cy = float(centre_m[0]), float(centre_m[1])
     return [
         Prism(
-            cx + ax * part.x - ay * part.y,
-            cy + ay * part.x + ax * part.y,
-            ax,
-            ay,
-            part.half_x,
-            part.half_y,
-            part.z0,
-            part.z1,
-            part.finish,
-            number,
-            part.round,
-            piece.label,
+            x=cx + ax * part.x - ay * part.y,
+            y=cy + ay * part.x + ax * part.y,
+            axis_x=ax,
+            axis_y=ay,
+            half_a=part.half_x,
+            half_b=part.half_y,
+            z0=part.z0,
+            z1=part.z1,
+            finish=part.finish,
+            piece=number,
+            round=part.round,
+            label=piece.label,
         )
         for part in piece.parts
     ]

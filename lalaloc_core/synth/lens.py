@@ -9,32 +9,32 @@ from jaxtyping import Float
 from torch import Tensor
 
 from lalaloc_core.conventions import TWO_PI
-from lalaloc_core.synth import exposure as E
+from lalaloc_core.synth.exposure import Exposure
 
 # Width (radians) over which one lens is blended into the other.
 _BLEND = 0.05
 
 
-def lens_gain(exposure: Float[Tensor, "b 24"], rows: int, columns: int) -> Float[Tensor, "b h w"]:
+def lens_gain(exposure: Exposure, rows: int, columns: int) -> Float[Tensor, "b h w"]:
     """Factor on the light of each pixel: darker towards the rims of the lenses, one lens brighter than the other."""
-    azimuth, elevation = _angles(rows, columns, exposure)
-    from_seam = azimuth - exposure[:, E.SEAM, None]
+    azimuth, elevation = _angles(rows, columns, exposure.rows)
+    from_seam = azimuth - exposure.seam[:, None]
     # The axes of the lenses lie at right angles to the seam.
     from_axis = torch.acos((elevation.cos()[None, :, None] * from_seam.sin().abs()[:, None]).clamp(max=1.0))
-    rim = 1.0 - exposure[:, E.VIGNETTE, None, None] * (from_axis * (2.0 / math.pi)) ** 3
-    return rim * (1.0 + exposure[:, E.SEAM_STEP, None] * _second_lens(from_seam))[:, None]
+    rim = 1.0 - exposure.vignette[:, None, None] * (from_axis * (2.0 / math.pi)) ** 3
+    return rim * (1.0 + exposure.seam_step[:, None] * _second_lens(from_seam))[:, None]
 
 
-def tilt(picture: Float[Tensor, "b h w 3"], exposure: Float[Tensor, "b 24"]) -> Float[Tensor, "b h w 3"]:
-    """The picture of a camera with `ROLL` and `PITCH`, whose second lens is shifted by `SEAM_SHIFT`, resampled."""
+def tilt(picture: Float[Tensor, "b h w 3"], exposure: Exposure) -> Float[Tensor, "b h w 3"]:
+    """The picture of a camera with roll and pitch, whose second lens is shifted, resampled."""
     rows, columns = picture.shape[1:3]
-    azimuth, elevation = _angles(rows, columns, exposure)
-    shift = exposure[:, E.SEAM_SHIFT, None] * _second_lens(azimuth - exposure[:, E.SEAM, None])
+    azimuth, elevation = _angles(rows, columns, exposure.rows)
+    shift = exposure.seam_shift[:, None] * _second_lens(azimuth - exposure.seam[:, None])
     raised = elevation[None, :, None] + shift[:, None]
     right = azimuth.sin()[None, None] * raised.cos()
     ahead = azimuth.cos()[None, None] * raised.cos()
     up = raised.sin()
-    roll, pitch = exposure[:, E.ROLL, None, None], exposure[:, E.PITCH, None, None]
+    roll, pitch = exposure.roll[:, None, None], exposure.pitch[:, None, None]
     right, up = right * roll.cos() + up * roll.sin(), up * roll.cos() - right * roll.sin()
     ahead, up = ahead * pitch.cos() - up * pitch.sin(), up * pitch.cos() + ahead * pitch.sin()
     # One column more on either side, so that sampling goes around.

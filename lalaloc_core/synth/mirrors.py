@@ -3,23 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from lalaloc_core.floorplan import Room
 from lalaloc_core.synth.openings import Opening
-from lalaloc_core.synth.render_scene import (
-    LIGHT_RGB,
-    LIGHT_XYZ,
-    PRISM_AX,
-    PRISM_AY,
-    PRISM_OPAQUE,
-    PRISM_X,
-    PRISM_Y,
-    SLOT_LIGHT_RGB,
-    SLOT_LIGHT_XYZ,
-)
+from lalaloc_core.synth.render_scene import Lights, Prisms, Slots
 from lalaloc_core.synth.style import HouseStyle
 from lalaloc_core.synth.tables import SceneTables
 
@@ -31,13 +22,19 @@ _CLEARANCE_M = 0.15
 _NARROWEST_M = 0.35
 _DEPTH_M = 0.004
 
-Rectangle = tuple[int, float, float, float, float]
+
+class Mirror(NamedTuple):
+    """Where a mirror hangs: wall, start and end along it, lower and upper edge (m)."""
+
+    wall: int
+    s0_m: float
+    s1_m: float
+    z0_m: float
+    z1_m: float
 
 
-def draw_mirror(
-    room: Room, openings: Sequence[Opening], rng: np.random.Generator, *, is_bare: bool
-) -> Rectangle | None:
-    """Wall, start and end along it, lower and upper edge (m) of a mirror between the openings; None for no mirror."""
+def draw_mirror(room: Room, openings: Sequence[Opening], rng: np.random.Generator, *, is_bare: bool) -> Mirror | None:
+    """Where a mirror hangs between the openings; None for no mirror."""
     chance = _CHANCE.get(room.name.split()[0], _OTHERS) * (_BARE_SHARE if is_bare else 1.0)
     if rng.random() > chance:
         return None
@@ -57,17 +54,17 @@ def draw_mirror(
             stands = rng.random() < 0.4
             low = rng.uniform(0.03, 0.3) if stands else rng.uniform(0.8, 1.15)
             high = min(rng.uniform(1.6, 2.3), room.ceiling_height_m - 0.1)
-            return int(wall), float(start), float(start + width), float(low), float(high)
+            return Mirror(int(wall), float(start), float(start + width), float(low), float(high))
     return None
 
 
 def add_mirror(
     tables: SceneTables,
     style: HouseStyle,
-    mirror: Rectangle,
+    mirror: Mirror,
     room: Room,
-    prisms: Iterable[tuple[float, ...]],
-    lights: Float[np.ndarray, "l 8"],
+    prisms: Iterable[Float[np.ndarray, "11"]],
+    lights: Lights,
     rng: np.random.Generator,
 ) -> None:
     """Hang a mirror, behind which the room is built once more, reflected; its doors are dark.
@@ -90,8 +87,8 @@ def add_mirror(
     for decal in [decal for decal in tables.decals if decal.wall < count]:
         length = tables.wall_length_m(decal.wall)
         seen = style.gloom if decal.slot >= 0 else decal.surface
-        tables.add_decal(first + decal.wall, length - decal.s1, length - decal.s0, decal.z0, decal.z1, seen)
-    tables.prisms += [tuple(relative.prism(np.array(prism)).tolist()) for prism in prisms]
+        tables.add_decal(first + decal.wall, length - decal.s1_m, length - decal.s0_m, decal.z0_m, decal.z1_m, seen)
+    tables.prisms += [relative.prism(Prisms(prism)).rows for prism in prisms]
     if rng.random() < 0.6:
         border = rng.uniform(0.02, 0.08)
         frame = tables.surfaces.add_finish("wood")
@@ -99,15 +96,14 @@ def add_mirror(
     tables.add_decal(wall, s0, s1, z0, z1, style.handle, slot=slot, depth_m=_DEPTH_M)
 
 
-def _reflected_slot(own: list[float], lights: Float[np.ndarray, "l 8"], relative: Reflection) -> list[float]:
+def _reflected_slot(own: Float[np.ndarray, "12"], lights: Lights, relative: Reflection) -> Float[np.ndarray, "12"]:
     """The room's slot with its brightest light where the mirror shows it."""
-    slot = np.array(own, dtype=float)
-    if len(lights):
-        brightest = lights[lights[:, LIGHT_RGB].sum(axis=1).argmax()]
-        x, y, z = brightest[LIGHT_XYZ]
-        slot[SLOT_LIGHT_XYZ] = [*relative.point(np.array([x, y])), z]
-        slot[SLOT_LIGHT_RGB] = brightest[LIGHT_RGB]
-    return slot.tolist()
+    slot = Slots(own.copy())
+    if len(lights.rows):
+        brightest = lights[lights.colour.sum(axis=1).argmax()]
+        slot.light_m = np.append(relative.point(brightest.xy_m), brightest.z_m)
+        slot.light_colour = brightest.colour
+    return slot.rows
 
 
 class Reflection:
@@ -131,10 +127,10 @@ class Reflection:
         """Where a wall is seen; its ends change places, so that the room stays on its left."""
         return np.concatenate([self.point(ends_m[2:]), self.point(ends_m[:2])])
 
-    def prism(self, row: Float[np.ndarray, "11"]) -> Float[np.ndarray, "11"]:
-        """Where a prism is seen; it casts no shadow."""
-        seen = row.copy()
-        seen[[PRISM_X, PRISM_Y]] = self.point(seen[[PRISM_X, PRISM_Y]])
-        seen[[PRISM_AX, PRISM_AY]] = self._matrix @ seen[[PRISM_AX, PRISM_AY]]
-        seen[PRISM_OPAQUE] = 0.0
+    def prism(self, prism: Prisms) -> Prisms:
+        """Where a prism (a single row) is seen; it casts no shadow."""
+        seen = prism.copy()
+        seen.centre_m = self.point(seen.centre_m)
+        seen.axis = self._matrix @ seen.axis
+        seen.is_opaque = 0.0
         return seen

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.synth.patterns import smooth_noise
+from lalaloc_core.synth.render_scene import Backdrop
 
 _SIZE = 256
 
@@ -28,16 +29,16 @@ class Outdoors:
         self._outline = torch.tensor(outline, dtype=torch.float32, device=device)
 
     def colour(
-        self, backdrop: Float[Tensor, "n 10"], direction: Float[Tensor, "n 2"], slope: Float[Tensor, "n"]
+        self, backdrop: Backdrop, direction: Float[Tensor, "n 2"], slope: Float[Tensor, "n"]
     ) -> Float[Tensor, "n 3"]:
-        """Colour seen along rays; `backdrop` as in `RenderScene`, one row per ray."""
+        """Colour seen along rays; `backdrop` has one row per ray."""
         azimuth = torch.atan2(direction[:, 0], direction[:, 1]) / TWO_PI
-        turn = azimuth + backdrop[:, 8]
+        turn = azimuth + backdrop.turn
         column = (turn.remainder(1.0) * _SIZE).long().clamp(max=_SIZE - 1)
         fine_column = ((4.0 * turn).remainder(1.0) * _SIZE).long().clamp(max=_SIZE - 1)
-        row = ((slope.atan() * (4.0 / math.pi) + backdrop[:, 9]).remainder(1.0) * _SIZE).long()
+        row = ((slope.atan() * (4.0 / math.pi) + backdrop.lift).remainder(1.0) * _SIZE).long()
         mottle = self._mottle[row.clamp(max=_SIZE - 1), fine_column]
-        horizon = backdrop[:, 6] + backdrop[:, 7] * self._outline[column]
+        horizon = backdrop.horizon + backdrop.ruggedness * self._outline[column]
         sky = ((slope - horizon) / 0.06).clamp(0.0, 1.0)[:, None]
-        ground = backdrop[:, 3:6] * torch.exp(0.5 * mottle)[:, None]
-        return sky * backdrop[:, 0:3] + (1.0 - sky) * ground.clamp(max=1.0)
+        ground = backdrop.ground * torch.exp(0.5 * mottle)[:, None]
+        return sky * backdrop.sky + (1.0 - sky) * ground.clamp(max=1.0)

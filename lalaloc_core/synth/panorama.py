@@ -15,18 +15,25 @@ from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.synth.build import build_scene
 from lalaloc_core.synth.camera import develop
 from lalaloc_core.synth.cast import Hits, SceneBatch, trace
+from lalaloc_core.synth.columns import Table
+from lalaloc_core.synth.exposure import Exposure
 from lalaloc_core.synth.lighting import Mood, relit
 from lalaloc_core.synth.materials import MaterialLibrary
 from lalaloc_core.synth.outdoors import Outdoors
-from lalaloc_core.synth.render_scene import DECAL_WALL, PRISM_A, PRISM_AX, PRISM_B, PRISM_X, RenderScene
+from lalaloc_core.synth.render_scene import Backdrop, Decals, Lights, Prisms, RenderScene, Slots, Sun
 from lalaloc_core.synth.shading import Atlas, shade
 from lalaloc_core.synth.shots import Shot, sample_shots
+from lalaloc_core.synth.surfaces import Surfaces
 
 __all__ = ["PanoramaRenderer", "Shot", "sample_shots"]
 
 # Small batches stay in a CPU's caches, large ones fill a GPU.
 _PIXELS_AT_ONCE = {"cpu": 1 << 17}
 _PIXELS_AT_ONCE_ELSEWHERE = 1 << 21
+# What tables are padded with: walls of no room, decals on no wall, and a small box far away.
+_NO_ROOM = -(10**6)
+_ON_NO_WALL = Decals.row(wall=-1.0)
+_FAR_AWAY = Prisms.row(x_m=1e6, axis_x=1.0, half_a_m=1.0, half_b_m=1.0)
 
 
 class PanoramaRenderer:
@@ -141,10 +148,11 @@ def _shrink(radiance: Float[Tensor, "b h w 3"], factor: tuple[int, int]) -> Floa
 def stack_scenes(scenes: Sequence[RenderScene], device: torch.device) -> SceneBatch:
     """Pad the tables of scenes to one length and stack them."""
 
-    def stack(name: str, dtype: torch.dtype = torch.float32) -> Tensor:
-        rows = [np.asarray(getattr(scene, name)) for scene in scenes]
+    def stack(name: str, dtype: torch.dtype = torch.float32, padding: np.ndarray | int = 0) -> Tensor:
+        values = [getattr(scene, name) for scene in scenes]
+        rows = [value.rows if isinstance(value, Table) else value for value in values]
         padded = np.zeros((len(rows), max(1, *(len(row) for row in rows)), *rows[0].shape[1:]))
-        padded[:] = _PADDING.get(name, np.zeros(1))
+        padded[:] = padding
         for target, row in zip(padded, rows, strict=True):
             target[: len(row)] = row
         return torch.from_numpy(padded).to(device=device, dtype=dtype)
@@ -156,35 +164,14 @@ def stack_scenes(scenes: Sequence[RenderScene], device: torch.device) -> SceneBa
         camera_height_m=scalars("camera_height_m"),
         heading=scalars("heading"),
         walls_m=stack("walls_m"),
-        wall_owner=stack("wall_owner", torch.long),
+        wall_owner=stack("wall_owner", torch.long, _NO_ROOM),
         wall_surface=stack("wall_surface", torch.long),
-        decals=stack("decals"),
-        prisms=stack("prisms"),
-        surfaces=stack("surfaces"),
-        slots=stack("slots"),
-        lights=stack("lights"),
-        sun=stack("sun"),
-        backdrop=stack("backdrop"),
-        exposure=stack("exposure"),
+        decals=Decals(stack("decals", padding=_ON_NO_WALL)),
+        prisms=Prisms(stack("prisms", padding=_FAR_AWAY)),
+        surfaces=Surfaces(stack("surfaces")),
+        slots=Slots(stack("slots")),
+        lights=Lights(stack("lights")),
+        sun=Sun(stack("sun")),
+        backdrop=Backdrop(stack("backdrop")),
+        exposure=Exposure(stack("exposure")),
     )
-
-
-def _padding_prism() -> np.ndarray:
-    """A small box far away."""
-    row = np.zeros(11)
-    row[[PRISM_X, PRISM_AX, PRISM_A, PRISM_B]] = 1e6, 1.0, 1.0, 1.0
-    return row
-
-
-def _padding_decal() -> np.ndarray:
-    """A decal on no wall."""
-    row = np.zeros(8)
-    row[DECAL_WALL] = -1.0
-    return row
-
-
-_PADDING = {
-    "wall_owner": np.array([-(10**6)]),
-    "prisms": _padding_prism(),
-    "decals": _padding_decal(),
-}

@@ -10,23 +10,24 @@ from torch import Tensor
 
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.synth import exposure as E
+from lalaloc_core.synth.exposure import Exposure
 
 
-def cover_poles(picture: Float[Tensor, "b h w 3"], exposure: Float[Tensor, "b 24"]) -> Float[Tensor, "b h w 3"]:
+def cover_poles(picture: Float[Tensor, "b h w 3"], exposure: Exposure) -> Float[Tensor, "b h w 3"]:
     """Lay the patches of `exposure` over nadir and zenith of encoded pictures; those without one stay as they are."""
-    covered = ((exposure[:, E.NADIR] > 0.0) | (exposure[:, E.ZENITH] > 0.0)).nonzero(as_tuple=True)[0]
+    covered = ((exposure.nadir > 0.0) | (exposure.zenith > 0.0)).nonzero(as_tuple=True)[0]
     if len(covered):
         picture[covered] = _cover(picture[covered], exposure[covered])
     return picture
 
 
-def _cover(picture: Float[Tensor, "b h w 3"], exposure: Float[Tensor, "b 24"]) -> Float[Tensor, "b h w 3"]:
+def _cover(picture: Float[Tensor, "b h w 3"], exposure: Exposure) -> Float[Tensor, "b h w 3"]:
     rows, columns = picture.shape[1:3]
     polar = ((torch.arange(rows, device=picture.device) + 0.5) / rows * math.pi).flip(0)[None, :, None]
     azimuth = ((torch.arange(columns, device=picture.device) + 0.5) / columns * TWO_PI)[None, None]
-    reach = exposure[:, E.NADIR, None, None]
-    tone = exposure[:, E.NADIR_TONE, None, None, None]
-    kind, turned = exposure[:, E.NADIR_KIND, None, None], azimuth - exposure[:, E.NADIR_TURN, None, None]
+    reach = exposure.nadir[:, None, None]
+    tone = exposure.nadir_tone[:, None, None, None]
+    kind, turned = exposure.nadir_kind[:, None, None], azimuth - exposure.nadir_turn[:, None, None]
     share = polar / reach.clamp(min=1e-6)
     inside = share < 1.0
 
@@ -54,8 +55,8 @@ def _cover(picture: Float[Tensor, "b h w 3"], exposure: Float[Tensor, "b 24"]) -
     body = (from_body.abs() < 0.28 - 0.12 * share) | (share < 0.2)
     cloth = tone * picture.new_tensor([0.5, 0.55, 0.7])
     where(inside & body & (kind == E.PERSON), cloth.expand_as(picture))
-    at_zenith = (math.pi - polar) < exposure[:, E.ZENITH, None, None]
-    where(at_zenith, exposure[:, E.ZENITH_TONE, None, None, None].expand_as(picture))
+    at_zenith = (math.pi - polar) < exposure.zenith[:, None, None]
+    where(at_zenith, exposure.zenith_tone[:, None, None, None].expand_as(picture))
     return picture
 
 

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from lalaloc_core.synth import render_scene as S
+from lalaloc_core.synth.render_scene import Prisms
 
 _TINY = 1e-9
 _TIE_M = 1e-5
@@ -27,19 +27,17 @@ class PrismHits:
     normal: Float[Tensor, "b c k 2"]
 
 
-def cross_prisms(
-    prisms: Float[Tensor, "b p 11"], direction: Float[Tensor, "b c 2"], limit_m: Float[Tensor, "b c"]
-) -> PrismHits:
+def cross_prisms(prisms: Prisms, direction: Float[Tensor, "b c 2"], limit_m: Float[Tensor, "b c"]) -> PrismHits:
     """Intersect every column with the footprints of the prisms and keep the nearest ones before `limit_m`."""
-    field = [prisms[:, None, :, k] for k in range(S.PRISM_Z0)]
-    x, y, ax, ay, a, b = field
+    each = prisms[:, None]
+    x, y, ax, ay, a, b = each.x_m, each.y_m, each.axis_x, each.axis_y, each.half_a_m, each.half_b_m
     dx, dy = direction[:, :, None, 0], direction[:, :, None, 1]
     # The ray in the prism's own frame, scaled so that the footprint is the unit square or the unit disc.
     u, v = -(x * ax + y * ay) / a, -(y * ax - x * ay) / b
     du, dv = (dx * ax + dy * ay) / a, (dy * ax - dx * ay) / b
     box_enter, box_leave, through_u = _cross_square(u, v, du, dv)
     disc_enter, disc_leave = _cross_disc(u, v, du, dv)
-    is_round = prisms[:, None, :, S.PRISM_ROUND] > 0.5
+    is_round = each.is_round > 0.5
     enter, leave = torch.where(is_round, disc_enter, box_enter), torch.where(is_round, disc_leave, box_leave)
     valid = (enter < leave) & (leave > 0.0) & (enter < limit_m[:, :, None])
     most = min(max(int(valid.sum(dim=2).max()), 1), _MAX_PRISMS_PER_COLUMN)
@@ -49,10 +47,10 @@ def cross_prisms(
     enter = torch.where(valid, enter, torch.inf).gather(2, index)
     leave = torch.where(valid, leave, -torch.inf).gather(2, index)
 
-    def pick(column: int) -> Tensor:
-        return prisms[:, None, :, column].expand(-1, index.shape[1], -1).gather(2, index)
+    def pick(column: Tensor) -> Tensor:
+        return column.expand(-1, index.shape[1], -1).gather(2, index)
 
-    ax, ay, a, b = pick(S.PRISM_AX), pick(S.PRISM_AY), pick(S.PRISM_A), pick(S.PRISM_B)
+    ax, ay, a, b = pick(ax), pick(ay), pick(a), pick(b)
     du, dv, through_u = du.gather(2, index), dv.gather(2, index), through_u.gather(2, index)
     start = torch.where(enter.isfinite(), enter, 0.0)
     u = u.expand_as(valid).gather(2, index) + start * du
@@ -63,7 +61,7 @@ def cross_prisms(
     length = torch.sqrt(nu**2 + nv**2) + _TINY
     nu, nv = nu / length, nv / length
     normal = torch.stack([nu * ax - nv * ay, nu * ay + nv * ax], dim=-1)
-    return PrismHits(enter, leave, pick(S.PRISM_Z0), pick(S.PRISM_Z1), index, normal)
+    return PrismHits(enter, leave, pick(each.z0_m), pick(each.z1_m), index, normal)
 
 
 def _cross_square(u: Tensor, v: Tensor, du: Tensor, dv: Tensor) -> tuple[Tensor, Tensor, Tensor]:

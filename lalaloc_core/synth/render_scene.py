@@ -1,4 +1,4 @@
-"""One shot's scene as plain arrays: walls, decals on walls, prisms, surfaces, lights, and how the camera exposes.
+"""One shot's scene as arrays: walls, decals on walls, prisms, surfaces, lights, and how the camera exposes.
 
 Lengths are metres relative to the camera's position in the plan (so that single precision suffices); heights are
 relative to the floor. The camera's own room has slot 0; rooms seen through its doors follow.
@@ -11,6 +11,10 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
+
+from lalaloc_core.synth.columns import Column, Table
+from lalaloc_core.synth.exposure import Exposure
+from lalaloc_core.synth.surfaces import Surfaces
 
 Fact = Literal[
     "open_door",
@@ -28,14 +32,100 @@ Fact = Literal[
     "large_room",
 ]
 
-# Columns of the tables below.
-DECAL_WALL, DECAL_S0, DECAL_S1, DECAL_Z0, DECAL_Z1, DECAL_SURFACE, DECAL_SLOT, DECAL_DEPTH = range(8)
-PRISM_X, PRISM_Y, PRISM_AX, PRISM_AY, PRISM_A, PRISM_B, PRISM_Z0, PRISM_Z1, PRISM_ROUND, PRISM_SURFACE, PRISM_OPAQUE = (
-    range(11)
-)
-LIGHT_XYZ, LIGHT_RGB, LIGHT_NORMAL = slice(0, 3), slice(3, 6), slice(6, 8)
-SLOT_CEILING, SLOT_FLOOR_SURFACE, SLOT_CEILING_SURFACE = range(3)
-SLOT_LIGHT_XYZ, SLOT_LIGHT_RGB, SLOT_AMBIENT = slice(3, 6), slice(6, 9), slice(9, 12)
+
+class Decals(Table):
+    """Rectangles on walls; later ones cover earlier ones.
+
+    Attributes:
+        wall: index of the wall, -1 for none.
+        s0_m, s1_m: start and end along it.
+        z0_m, z1_m: lower and upper edge over the floor.
+        surface: row of the surfaces; of a hole, what its cheeks are made of.
+        slot: room behind it if it is a hole, else -1.
+        depth_m: of a hole.
+    """
+
+    WIDTH = 8
+    wall, s0_m, s1_m, z0_m, z1_m, surface, slot, depth_m = map(Column, range(8))
+
+
+class Prisms(Table):
+    """Vertical boxes and elliptic cylinders.
+
+    Attributes:
+        x_m, y_m: centre; both as `centre_m`.
+        axis_x, axis_y: unit vector of the first axis, both as `axis`; the second is that turned by +90°.
+        half_a_m, half_b_m: half extents along the two axes.
+        z0_m, z1_m: lower and upper end over the floor.
+        is_round: 1 for a cylinder.
+        surface: row of the surfaces.
+        is_opaque: 1 for what casts shadows.
+    """
+
+    WIDTH = 11
+    x_m, y_m, axis_x, axis_y, half_a_m, half_b_m, z0_m, z1_m, is_round, surface, is_opaque = map(Column, range(11))
+    centre_m, axis = Column(0, 2), Column(2, 2)
+
+
+class Slots(Table):
+    """Rooms: that of the camera, then those seen through its doors.
+
+    Attributes:
+        ceiling_m: height of the ceiling.
+        floor_surface, ceiling_surface: rows of the surfaces.
+        light_m, light_colour: position, and colour times power, of the one lamp of a room that is seen through a door.
+        ambient: light from everywhere.
+    """
+
+    WIDTH = 12
+    ceiling_m, floor_surface, ceiling_surface = map(Column, range(3))
+    light_m, light_colour, ambient = Column(3, 3), Column(6, 3), Column(9, 3)
+
+
+class Lights(Table):
+    """Lamps and windows of the own room.
+
+    Attributes:
+        position_m: all three coordinates; `xy_m` and `z_m` are parts of it.
+        colour: times the power.
+        normal: horizontal unit normal of a window; (0, 0) for a lamp, which shines everywhere.
+    """
+
+    WIDTH = 8
+    position_m, xy_m, z_m = Column(0, 3), Column(0, 2), Column(2)
+    colour, normal = Column(3, 3), Column(6, 2)
+
+
+class Sun(Table):
+    """Sunlight through one window; all 0 for none.
+
+    Attributes:
+        direction: unit vector to the sun.
+        wall_start_m, wall_along: a point of the window's wall and the unit vector along it.
+        s0_m, s1_m: start and end of the window along the wall.
+        z0_m, z1_m: its lower and upper edge.
+        colour: times the power.
+    """
+
+    WIDTH = 14
+    direction, wall_start_m, wall_along = Column(0, 3), Column(3, 2), Column(5, 2)
+    s0_m, s1_m, z0_m, z1_m = map(Column, range(7, 11))
+    colour = Column(11, 3)
+
+
+class Backdrop(Table):
+    """The outdoors.
+
+    Attributes:
+        sky, ground: colours.
+        horizon: slope (tangent of the elevation) of the mean outline of what stands before the sky.
+        ruggedness: how far the outline rises and falls, as a slope.
+        turn, lift: shares of a full turn by which outline and mottle are shifted.
+    """
+
+    WIDTH = 10
+    sky, ground = Column(0, 3), Column(3, 3)
+    horizon, ruggedness, turn, lift = map(Column, range(6, 10))
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,18 +138,7 @@ class RenderScene:
         walls_m: segments (x0, y0, x1, y1), room interior to their left.
         wall_owner: slot of the room that a wall belongs to; -1 - d for the jambs of the hole that is decal d.
         wall_surface: row of `surfaces`.
-        decals: rectangles on walls, later ones cover earlier ones: wall, start and end along it, z-range, surface,
-            slot of the room behind it if it is a hole (else -1), depth of the hole (m).
-        prisms: boxes and elliptic cylinders: centre, first axis, half extents, z-range, whether round, surface, whether
-            it casts shadows.
-        surfaces: see `surfaces`.
-        slots: per room: ceiling height, floor and ceiling surface, position and colour of a lamp, ambient light.
-        lights: lamps and windows of the own room: position, colour times power, horizontal normal of a window (0, 0
-            for a lamp, which shines everywhere).
-        sun: sunlight through one window: direction to the sun (3), window's wall (4: point, unit vector along),
-            window rectangle (s0, s1, z0, z1), colour (3).
-        backdrop: the outdoors: sky (3), ground (3), horizon slope, ruggedness, two phases.
-        exposure: see `exposure`.
+        sun, backdrop, exposure: tables of a single row.
         facts: what was drawn of what is worth knowing about a picture; `facts` knows more.
     """
 
@@ -68,12 +147,12 @@ class RenderScene:
     walls_m: Float[np.ndarray, "n 4"]
     wall_owner: Int[np.ndarray, "n"]
     wall_surface: Int[np.ndarray, "n"]
-    decals: Float[np.ndarray, "d 8"]
-    prisms: Float[np.ndarray, "p 11"]
-    surfaces: Float[np.ndarray, "s 12"]
-    slots: Float[np.ndarray, "r 12"]
-    lights: Float[np.ndarray, "l 8"]
-    sun: Float[np.ndarray, "14"]
-    backdrop: Float[np.ndarray, "10"]
-    exposure: Float[np.ndarray, "24"]
+    decals: Decals
+    prisms: Prisms
+    surfaces: Surfaces
+    slots: Slots
+    lights: Lights
+    sun: Sun
+    backdrop: Backdrop
+    exposure: Exposure
     facts: frozenset[Fact] = frozenset()

@@ -9,12 +9,12 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from lalaloc_core.conventions import TWO_PI, column_azimuths, row_elevations
-from lalaloc_core.synth import render_scene as S
-from lalaloc_core.synth import surfaces as F
 from lalaloc_core.synth.cast import Hits, SceneBatch, cast_own_walls
 from lalaloc_core.synth.materials import PICTURE_SIZE, MaterialLibrary
 from lalaloc_core.synth.outdoors import Outdoors
 from lalaloc_core.synth.prisms import cross_prisms, resolve_prisms
+from lalaloc_core.synth.render_scene import Prisms
+from lalaloc_core.synth.surfaces import Surfaces
 
 _SHADOW_COLUMNS, _SHADOW_ROWS = 80, 40
 _LEVELS = int(math.log2(PICTURE_SIZE)) + 1
@@ -65,37 +65,38 @@ def shade(
     x, y = direction[:, :, None, 0] * d, direction[:, :, None, 1] * d
     z = slope * d + batch.camera_height_m[:, None, None]
     point = (x, y, z)
-    rows = _gather_rows(batch.surfaces, hits.surface)
-    albedo = _albedo(rows, hits, point, slope, atlas)
+    surface = _surface_of(batch.surfaces, hits.surface)
+    albedo = _albedo(surface, hits, point, slope, atlas)
     light = _direct_light(batch, hits, point)
     light += _ambient(batch, hits, point)
     _add_sunlight(batch, hits, point, light)
-    glow = rows[..., F.GLOW, None]
+    glow = surface.glow[..., None]
     radiance = albedo.mul_(torch.where(glow > 0.0, glow, light))
-    item, column, row = (rows[..., F.OUTDOORS] > 0.5).nonzero(as_tuple=True)
+    item, column, row = (surface.is_outdoors > 0.5).nonzero(as_tuple=True)
     seen = outdoors.colour(batch.backdrop[item], direction[item, column], slope[row])
     radiance[item, column, row] = seen * glow[item, column, row]
-    return _add_reflections(batch, hits, radiance, rows[..., F.GLOSS], slope)
+    return _add_reflections(batch, hits, radiance, surface.gloss, slope)
 
 
-def _gather_rows(table: Float[Tensor, "b s f"], index: Int[Tensor, "b c h"]) -> Float[Tensor, "b c h f"]:
-    batch, size, fields = table.shape
+def _surface_of(surfaces: Surfaces, index: Int[Tensor, "b c h"]) -> Surfaces:
+    """The surface of every pixel: rows (b, c, h, 12)."""
+    batch, size, width = surfaces.rows.shape
     flat = index + (torch.arange(batch, device=index.device) * size)[:, None, None]
-    return table.reshape(-1, fields)[flat.reshape(-1)].reshape(*index.shape, fields)
+    return Surfaces(surfaces.rows.reshape(-1, width)[flat.reshape(-1)].reshape(*index.shape, width))
 
 
 def _albedo(
-    rows: Tensor, hits: Hits, point: tuple[Tensor, Tensor, Tensor], slope: Tensor, atlas: Atlas
+    surface: Surfaces, hits: Hits, point: tuple[Tensor, Tensor, Tensor], slope: Tensor, atlas: Atlas
 ) -> Float[Tensor, "b c h 3"]:
     x, y, z = point
     nx, ny, nz = hits.normal.unbind(-1)
     flat = nz != 0.0
     u = torch.where(flat, x, y * nx - x * ny)
     v = torch.where(flat, y, -z)
-    scale, cosine, sine = rows[..., F.SCALE], rows[..., F.COSINE], rows[..., F.SINE]
+    scale, cosine, sine = surface.scale, surface.cosine, surface.sine
     u, v = (
-        scale * (cosine * u - sine * v) + rows[..., F.SHIFT_U],
-        scale * (sine * u + cosine * v) + rows[..., F.SHIFT_V],
+        scale * (cosine * u - sine * v) + surface.shift_u,
+        scale * (sine * u + cosine * v) + surface.shift_v,
     )
     distance = hits.distance_m * torch.sqrt(1.0 + slope**2)
     # How much of the surface a pixel covers grows with distance and where it is seen at a grazing angle.
@@ -103,26 +104,27 @@ def _albedo(
     # Rays may be denser along one axis than along the other: their mean density counts.
     pitch = math.pi * math.sqrt(2.0 / (slope.shape[0] * hits.distance_m.shape[1]))
     footprint = distance * scale * (PICTURE_SIZE * pitch) / torch.sqrt(grazing)
-    colour = atlas.sample(rows[..., F.PICTURE].int(), u, v, footprint)
-    return (colour * rows[..., F.RED : F.BLUE + 1]).clamp(max=0.95)
+    colour = atlas.sample(surface.picture.int(), u, v, footprint)
+    return (colour * surface.tint).clamp(max=0.95)
 
 
 def _direct_light(batch: SceneBatch, hits: Hits, point: tuple[Tensor, Tensor, Tensor]) -> Float[Tensor, "b c h 3"]:
     nx, ny, nz = hits.normal.unbind(-1)
     maps = _shadow_maps(batch)
     received = []
-    for k in range(batch.lights.shape[1]):
-        light = batch.lights[:, k, :, None, None]
-        to = [light[:, axis] - point[axis] for axis in range(3)]
+    for k in range(batch.lights.rows.shape[1]):
+        light = batch.lights[:, k, None, None]
+        to = [light.position_m[..., axis] - point[axis] for axis in range(3)]
         square = to[0] ** 2 + to[1] ** 2 + to[2] ** 2
         distance = torch.sqrt(square)
         lambert = (to[0] * nx + to[1] * ny + to[2] * nz).clamp(min=0.0)
         # A window shines forwards: the more obliquely, the less. A lamp (normal 0) shines everywhere.
-        is_lamp = ((light[:, 6] == 0.0) & (light[:, 7] == 0.0)).float()
-        forwards = (-(to[0] * light[:, 6] + to[1] * light[:, 7])).clamp(min=0.0) / distance + is_lamp
+        ahead_x, ahead_y = light.normal.unbind(-1)
+        is_lamp = ((ahead_x == 0.0) & (ahead_y == 0.0)).float()
+        forwards = (-(to[0] * ahead_x + to[1] * ahead_y)).clamp(min=0.0) / distance + is_lamp
         spread = distance * (square + _SOURCE_SIZE_M2)
         received.append(_visibility(maps[:, k], to, distance) * lambert * forwards / spread)
-    colour = batch.lights[:, :, S.LIGHT_RGB]
+    colour = batch.lights.colour
     light = torch.bmm(torch.stack(received, dim=-1).flatten(1, 2), colour).reshape(hits.normal.shape)
     return _light_beyond(batch, hits, point, light)
 
@@ -133,30 +135,30 @@ def _light_beyond(
     """Replace the light of rooms seen through doors by that of their own single lamp, without shadows."""
     beyond = hits.slot.nonzero(as_tuple=True)
     room = batch.slots[beyond[0], hits.slot[beyond]]
-    to = room[:, S.SLOT_LIGHT_XYZ] - torch.stack([axis[beyond] for axis in point], dim=-1)
+    to = room.light_m - torch.stack([axis[beyond] for axis in point], dim=-1)
     square = (to**2).sum(dim=-1)
     lambert = ((to * hits.normal[beyond]).sum(dim=-1) / torch.sqrt(square + 1e-6)).clamp(min=0.0)
-    light[beyond] = (lambert / (square + _SOURCE_SIZE_M2))[:, None] * room[:, S.SLOT_LIGHT_RGB]
+    light[beyond] = (lambert / (square + _SOURCE_SIZE_M2))[:, None] * room.light_colour
     return light
 
 
 def _shadow_maps(batch: SceneBatch) -> Float[Tensor, "b l 2 rows columns"]:
     """Mean and mean square of the distance that light travels from each lamp (variance shadow maps)."""
-    count, lights = batch.lights.shape[:2]
-    device = batch.lights.device
+    count, lights = batch.lights.rows.shape[:2]
+    device = batch.lights.rows.device
     azimuth = torch.tensor(column_azimuths(_SHADOW_COLUMNS), dtype=torch.float32, device=device)
     elevation = torch.tensor(row_elevations(_SHADOW_ROWS), dtype=torch.float32, device=device)
     slope = elevation.tan()
     direction = torch.stack([azimuth.sin(), azimuth.cos()], dim=-1).expand(count * lights, -1, -1)
-    position = batch.lights[:, :, :2].reshape(-1, 2)
+    position = batch.lights.xy_m.reshape(-1, 2)
     walls = batch.walls_m.repeat_interleave(lights, 0) - position.repeat(1, 2)[:, None]
     owner = batch.wall_owner.repeat_interleave(lights, 0)
-    prisms = batch.prisms.repeat_interleave(lights, 0).clone()
-    prisms[..., :2] -= position[:, None]
+    prisms = Prisms(batch.prisms.rows.repeat_interleave(lights, 0).clone())
+    prisms.centre_m -= position[:, None]
     # What casts no shadow is moved out of the way.
-    prisms[..., S.PRISM_X] += torch.where(prisms[..., S.PRISM_OPAQUE] > 0.5, 0.0, 1e6)
+    prisms.x_m += torch.where(prisms.is_opaque > 0.5, 0.0, 1e6)
     wall_m = cast_own_walls(walls, owner, direction)
-    height = batch.lights[:, :, 2].reshape(-1)
+    height = batch.lights.z_m.reshape(-1)
     limit = torch.minimum(wall_m[:, :, None], (height[:, None] / slope.abs())[:, None])
     distance, _ = resolve_prisms(cross_prisms(prisms, direction, wall_m), limit, slope, height)
     travel = (distance * torch.sqrt(1.0 + slope**2)).clamp(max=30.0)
@@ -192,18 +194,19 @@ def _add_sunlight(
     batch: SceneBatch, hits: Hits, point: tuple[Tensor, Tensor, Tensor], light: Float[Tensor, "b c h 3"]
 ) -> None:
     """Add the patch of sun that a window throws."""
-    sun = batch.sun[:, :, None, None]
-    from_x, from_y = sun[:, 3] - point[0], sun[:, 4] - point[1]
-    ax, ay = sun[:, 5], sun[:, 6]
-    speed = sun[:, 0] * ay - sun[:, 1] * ax
+    sun = batch.sun[:, None, None]
+    (start_x, start_y), (ax, ay) = sun.wall_start_m.unbind(-1), sun.wall_along.unbind(-1)
+    toward_x, toward_y, rise = sun.direction.unbind(-1)
+    from_x, from_y = start_x - point[0], start_y - point[1]
+    speed = toward_x * ay - toward_y * ax
     travel = (from_x * ay - from_y * ax) / torch.where(speed.abs() < 1e-6, 1e-6, speed)
-    along = (travel * sun[:, 0] - from_x) * ax + (travel * sun[:, 1] - from_y) * ay
-    z = point[2] + travel * sun[:, 2]
-    falls = (along > sun[:, 7]) & (along < sun[:, 8]) & (z > sun[:, 9]) & (z < sun[:, 10]) & (travel > 0.0)
+    along = (travel * toward_x - from_x) * ax + (travel * toward_y - from_y) * ay
+    z = point[2] + travel * rise
+    falls = (along > sun.s0_m) & (along < sun.s1_m) & (z > sun.z0_m) & (z < sun.z1_m) & (travel > 0.0)
     lit = (falls & (hits.slot == 0)).nonzero(as_tuple=True)
-    row = batch.sun[lit[0]]
-    lambert = (hits.normal[lit] * row[:, 0:3]).sum(dim=-1, keepdim=True).clamp(min=0.0)
-    light[lit] += lambert * row[:, 11:14]
+    shining = batch.sun[lit[0]]
+    lambert = (hits.normal[lit] * shining.direction).sum(dim=-1, keepdim=True).clamp(min=0.0)
+    light[lit] += lambert * shining.colour
 
 
 def _ambient(batch: SceneBatch, hits: Hits, point: tuple[Tensor, Tensor, Tensor]) -> Float[Tensor, "b c h 3"]:
@@ -211,10 +214,11 @@ def _ambient(batch: SceneBatch, hits: Hits, point: tuple[Tensor, Tensor, Tensor]
     beyond = hits.slot.nonzero(as_tuple=True)
     room = batch.slots[beyond[0], hits.slot[beyond]]
     z, nz = point[2], hits.normal[..., 2]
-    ceiling = batch.slots[:, 0, S.SLOT_CEILING, None, None].expand_as(z).clone()
-    ceiling[beyond] = room[:, S.SLOT_CEILING]
-    ambient = batch.slots[:, 0, None, None, S.SLOT_AMBIENT].expand_as(hits.normal).clone()
-    ambient[beyond] = room[:, S.SLOT_AMBIENT]
+    own = batch.slots[:, 0, None, None]
+    ceiling = own.ceiling_m.expand_as(z).clone()
+    ceiling[beyond] = room.ceiling_m
+    ambient = own.ambient.expand_as(hits.normal).clone()
+    ambient[beyond] = room.ambient
     upright = nz == 0.0
     floor_gap, ceiling_gap = z.clamp(min=0.0), (ceiling - z).clamp(min=0.0)
     edge = torch.where(upright, torch.minimum(floor_gap, ceiling_gap), 10.0)

@@ -9,6 +9,7 @@ import numpy as np
 from lalaloc_core.floorplan import Room
 from lalaloc_core.synth.furniture import wall_frame
 from lalaloc_core.synth.lighting import Lighting
+from lalaloc_core.synth.render_scene import Slots
 from lalaloc_core.synth.streams import ScenePart, Streams
 from lalaloc_core.synth.style import HouseStyle
 from lalaloc_core.synth.surfaces import Colour, bright, paint, pale, vivid
@@ -50,7 +51,15 @@ class Shells:
         floor = self._floor_of(room_index, room, colour)
         streams.begin(ScenePart.ACCENT, room_index)
         lamp = lighting.of_room_beyond(room, tables.camera_m)
-        tables.slots.append([room.ceiling_height_m, float(floor), float(ceiling), *lamp])
+        slot_row = Slots.row(
+            ceiling_m=room.ceiling_height_m,
+            floor_surface=floor,
+            ceiling_surface=ceiling,
+            light_m=lamp.position_m,
+            light_colour=lamp.colour,
+            ambient=lamp.ambient,
+        )
+        tables.slots.append(slot_row)
         accented = int(rng.integers(len(room.walls_m)))
         streams.begin(ScenePart.TRIM, room_index)
         first = len(tables.walls_m)

@@ -7,16 +7,34 @@ import math
 import numpy as np
 from jaxtyping import Float
 
+from lalaloc_core.synth.columns import Column, Table
 from lalaloc_core.synth.materials import MaterialCategory, MaterialLibrary
 from lalaloc_core.synth.pieces import Finish
 
 Colour = Float[np.ndarray, "3"]
 
-# Columns of a surface row.
-PICTURE, SCALE, COSINE, SINE, RED, GREEN, BLUE, GLOSS, GLOW, OUTDOORS, SHIFT_U, SHIFT_V = range(12)
-
 _WOODY: tuple[Finish, ...] = ("wood", "stone")
 _PLAIN_FINISHES: tuple[Finish, ...] = ("white", "metal", "dark", "ceramic", "glow", "paint")
+
+
+class Surfaces(Table):
+    """What the surfaces of a scene look like.
+
+    Attributes:
+        picture: number of the material's picture.
+        scale: pictures per metre.
+        cosine, sine: of the angle by which the picture is turned.
+        tint: factor on its colours.
+        gloss: share of light reflected like a mirror.
+        glow: when positive the surface emits its colour times this instead of reflecting light.
+        is_outdoors: 1 for the view through a window.
+        shift_u, shift_v: by which the picture is moved, as shares of it.
+    """
+
+    WIDTH = 12
+    picture, scale, cosine, sine = map(Column, range(4))
+    tint = Column(4, 3)
+    gloss, glow, is_outdoors, shift_u, shift_v = map(Column, range(7, 12))
 
 
 class SurfaceTable:
@@ -26,7 +44,7 @@ class SurfaceTable:
         self._materials = materials
         self._means = mean_colours
         self._rng = rng
-        self.rows: list[list[float]] = []
+        self.rows: list[Float[np.ndarray, "12"]] = []
 
     def add(
         self,
@@ -61,14 +79,24 @@ class SurfaceTable:
         return self._append(picture, colour / self._means[picture], scale=0.5, angle=0.0, gloss=gloss, glow=glow)
 
     def _append(self, picture: int, tint: Colour, *, scale: float, angle: float, gloss: float, glow: float) -> int:
-        self.rows.append(
-            [picture, scale, math.cos(angle), math.sin(angle), *tint, gloss, glow, 0.0, *self._rng.random(2)]
+        shift_u, shift_v = self._rng.random(2)
+        row = Surfaces.row(
+            picture=picture,
+            scale=scale,
+            cosine=math.cos(angle),
+            sine=math.sin(angle),
+            tint=tint,
+            gloss=gloss,
+            glow=glow,
+            shift_u=shift_u,
+            shift_v=shift_v,
         )
+        self.rows.append(row)
         return len(self.rows) - 1
 
     def add_outdoors(self, glow: float) -> int:
         """The view through a window."""
-        self.rows.append([0.0, 1.0, 1.0, 0.0, 1.0, 1.0, 1.0, 0.0, glow, 1.0, 0.0, 0.0])
+        self.rows.append(Surfaces.row(scale=1.0, cosine=1.0, tint=1.0, glow=glow, is_outdoors=1.0))
         return len(self.rows) - 1
 
     def add_floor(self, walls: Colour, direction: float, *, plain: bool = False) -> int:

@@ -8,23 +8,24 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from lalaloc_core.synth.exposure import Exposure
 from lalaloc_core.synth.furniture import Prism
-from lalaloc_core.synth.render_scene import Fact, RenderScene
+from lalaloc_core.synth.render_scene import Backdrop, Decals, Fact, Lights, Prisms, RenderScene, Slots, Sun
 from lalaloc_core.synth.shots import Shot
-from lalaloc_core.synth.surfaces import SurfaceTable
+from lalaloc_core.synth.surfaces import Surfaces, SurfaceTable
 
 # How far a jamb reaches beyond both ends of its hole.
 _JAMB_OVERLAP_M = 1e-4
 
 
 class Decal(NamedTuple):
-    """A rectangle on a wall: the columns of `RenderScene.decals`."""
+    """A rectangle on a wall, see `render_scene.Decals`."""
 
     wall: int
-    s0: float
-    s1: float
-    z0: float
-    z1: float
+    s0_m: float
+    s1_m: float
+    z0_m: float
+    z1_m: float
     surface: int
     slot: int = -1
     depth_m: float = 0.0
@@ -41,8 +42,8 @@ class SceneTables:
         walls_m: ends of the walls in the plan frame; those of the own room come first.
         wall_surfaces: their surfaces.
         decals: later ones cover earlier ones.
-        prisms: rows of `RenderScene.prisms`, relative to the camera.
-        slots: rows of `RenderScene.slots`.
+        prisms: rows of `render_scene.Prisms`, relative to the camera.
+        slots: rows of `render_scene.Slots`.
     """
 
     def __init__(self, camera_m: Float[np.ndarray, "2"], surfaces: SurfaceTable) -> None:
@@ -52,8 +53,8 @@ class SceneTables:
         self.wall_surfaces: list[int] = []
         self._wall_owners: list[int] = []
         self.decals: list[Decal] = []
-        self.prisms: list[tuple[float, ...]] = []
-        self.slots: list[list[float]] = []
+        self.prisms: list[Float[np.ndarray, "11"]] = []
+        self.slots: list[Float[np.ndarray, "12"]] = []
 
     def add_wall(self, ends_m: Float[np.ndarray, "4"], owner: int, surface: int) -> int:
         """A wall, with its row of `RenderScene.wall_owner`; returns its index."""
@@ -85,8 +86,20 @@ class SceneTables:
     def add_prism(self, prism: Prism, surface: int, *, opaque: bool = True) -> None:
         """A box or cylinder with a surface of its finish; an `opaque` one casts shadows."""
         x, y = self.camera_m
-        values = (prism.x - x, prism.y - y, prism.axis_x, prism.axis_y, prism.half_a, prism.half_b, prism.z0, prism.z1)
-        self._append_prism((*values, prism.round, surface, opaque))
+        row = Prisms.row(
+            x_m=prism.x - x,
+            y_m=prism.y - y,
+            axis_x=prism.axis_x,
+            axis_y=prism.axis_y,
+            half_a_m=prism.half_a,
+            half_b_m=prism.half_b,
+            z0_m=prism.z0,
+            z1_m=prism.z1,
+            is_round=prism.round,
+            surface=surface,
+            is_opaque=opaque,
+        )
+        self.prisms.append(row)
 
     def add_box(
         self,
@@ -99,7 +112,17 @@ class SceneTables:
         surface: int,
     ) -> None:
         """A box that casts shadows; centre in the plan frame, the first half extent along `axis`."""
-        self._append_prism((*(centre_m - self.camera_m), *axis, half_a, half_b, z0, z1, False, surface, True))
+        row = Prisms.row(
+            centre_m=centre_m - self.camera_m,
+            axis=axis,
+            half_a_m=half_a,
+            half_b_m=half_b,
+            z0_m=z0,
+            z1_m=z1,
+            surface=surface,
+            is_opaque=True,
+        )
+        self.prisms.append(row)
 
     def add_pieces(self, prisms: Iterable[Prism]) -> None:
         """Furniture; the parts of a piece that have one finish share a surface."""
@@ -118,7 +141,7 @@ class SceneTables:
             ends = self.walls_m[hole.wall]
             along = (ends[2:] - ends[:2]) / np.hypot(*(ends[2:] - ends[:2]))
             outward = np.array([along[1], -along[0]])
-            for s in (hole.s0, hole.s1):
+            for s in (hole.s0_m, hole.s1_m):
                 near = ends[:2] + along * s
                 # Reaching back into the room a little closes the gap that rounding may leave.
                 back, front = near - outward * _JAMB_OVERLAP_M, near + outward * (hole.depth_m + _JAMB_OVERLAP_M)
@@ -128,10 +151,10 @@ class SceneTables:
         self,
         shot: Shot,
         *,
-        lights: Float[np.ndarray, "l 8"],
-        sun: Float[np.ndarray, "14"],
-        backdrop: Float[np.ndarray, "10"],
-        exposure: Float[np.ndarray, "24"],
+        lights: Lights,
+        sun: Sun,
+        backdrop: Backdrop,
+        exposure: Exposure,
         facts: Iterable[Fact],
     ) -> RenderScene:
         """The finished scene; see `RenderScene` for what it has besides the tables."""
@@ -141,16 +164,13 @@ class SceneTables:
             walls_m=np.array(self.walls_m) - np.tile(self.camera_m, 2),
             wall_owner=np.array(self._wall_owners),
             wall_surface=np.array(self.wall_surfaces),
-            decals=np.array(self.decals, dtype=float).reshape(-1, len(Decal._fields)),
-            prisms=np.array(self.prisms, dtype=float).reshape(-1, 11),
-            surfaces=np.array(self.surfaces.rows),
-            slots=np.array(self.slots),
+            decals=Decals.stacked([Decals.row(**decal._asdict()) for decal in self.decals]),
+            prisms=Prisms.stacked(self.prisms),
+            surfaces=Surfaces.stacked(self.surfaces.rows),
+            slots=Slots.stacked(self.slots),
             lights=lights,
             sun=sun,
             backdrop=backdrop,
             exposure=exposure,
             facts=frozenset(facts),
         )
-
-    def _append_prism(self, values: Iterable[float | int]) -> None:
-        self.prisms.append(tuple(float(value) for value in values))

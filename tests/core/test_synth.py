@@ -239,7 +239,7 @@ def test_the_camera_is_inside_nothing(materials: MaterialLibrary, seed: int) -> 
     rng = np.random.default_rng(seed)
     for shot in sample_shots(generate_home(rng), 2, rng, "full"):
         scene = build_scene(shot, materials)
-        x, y, ax, ay, a, b, z0, z1, *_ = scene.prisms.T
+        x, y, ax, ay, a, b, z0, z1, *_ = scene.prisms.rows.T
         inside = (np.abs(x * ax + y * ay) <= a) & (np.abs(y * ax - x * ay) <= b)
         inside &= (z0 <= shot.camera_height_m) & (shot.camera_height_m <= z1)
         assert not inside.any()

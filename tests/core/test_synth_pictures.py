@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.synth import exposure as E
 from lalaloc_core.synth.camera import develop
-from lalaloc_core.synth.exposure import draw_exposure, draw_staged_exposure
+from lalaloc_core.synth.exposure import Exposure, draw_exposure, draw_staged_exposure
 from lalaloc_core.synth.jpeg import compress
 from lalaloc_core.synth.lens import lens_gain, tilt
 from lalaloc_core.synth.materials import MaterialLibrary
@@ -27,12 +26,9 @@ ROWS, COLUMNS = 64, 128
 seeds = st.integers(0, 2**32 - 1)
 
 
-def settings_row(**values: float) -> torch.Tensor:
+def camera(**settings: float) -> Exposure:
     """One row of an otherwise neutral exposure."""
-    row = torch.zeros(1, E.EXPOSURE_COLUMNS, dtype=torch.float64)
-    for name, value in values.items():
-        row[0, getattr(E, name)] = value
-    return row
+    return Exposure(torch.from_numpy(Exposure.row(**settings))[None])
 
 
 def noise_picture(seed: int = 0) -> torch.Tensor:
@@ -49,17 +45,17 @@ def noise_picture(seed: int = 0) -> torch.Tensor:
 @settings(max_examples=10, deadline=None)
 def test_a_level_camera_with_one_lens_changes_nothing(seed: int) -> None:
     picture = noise_picture(seed)
-    assert torch.allclose(tilt(picture, settings_row(SEAM=seed % 6)), picture, atol=1e-9)
-    assert torch.equal(lens_gain(settings_row(SEAM=seed % 6), ROWS, COLUMNS), torch.ones(1, ROWS, COLUMNS).double())
+    assert torch.allclose(tilt(picture, camera(seam=seed % 6)), picture, atol=1e-9)
+    assert torch.equal(lens_gain(camera(seam=seed % 6), ROWS, COLUMNS), torch.ones(1, ROWS, COLUMNS).double())
 
 
-@pytest.mark.parametrize(("axis", "column"), [("PITCH", 64), ("ROLL", 96)])
+@pytest.mark.parametrize(("axis", "column"), [("pitch", 64), ("roll", 96)])
 def test_a_tilt_raises_what_is_seen_along_one_direction_and_lowers_it_opposite(axis: str, column: int) -> None:
     elevation = ((0.5 - (torch.arange(ROWS) + 0.5) / ROWS) * math.pi).double()
     picture = elevation[None, :, None, None].expand(1, ROWS, COLUMNS, 3).clone()
     angle = math.radians(2.0)
     # Each pixel holds the elevation that it shows.
-    shown = tilt(picture, settings_row(**{axis: angle}))[0, ROWS // 2 - 4 : ROWS // 2 + 4, :, 0]
+    shown = tilt(picture, camera(**{axis: angle}))[0, ROWS // 2 - 4 : ROWS // 2 + 4, :, 0]
     change = (shown - picture[0, ROWS // 2 - 4 : ROWS // 2 + 4, :, 0]).mean(dim=0)
     opposite = (column + COLUMNS // 2) % COLUMNS
     assert abs(abs(float(change[column])) - angle) < 0.05 * angle
@@ -68,8 +64,8 @@ def test_a_tilt_raises_what_is_seen_along_one_direction_and_lowers_it_opposite(a
 
 
 def test_a_turned_seam_moves_with_the_picture() -> None:
-    straight = lens_gain(settings_row(SEAM_STEP=0.2, VIGNETTE=0.3), ROWS, COLUMNS)
-    turned = lens_gain(settings_row(SEAM_STEP=0.2, VIGNETTE=0.3, SEAM=math.pi / 2.0), ROWS, COLUMNS)
+    straight = lens_gain(camera(seam_step=0.2, vignette=0.3), ROWS, COLUMNS)
+    turned = lens_gain(camera(seam_step=0.2, vignette=0.3, seam=math.pi / 2.0), ROWS, COLUMNS)
     assert torch.allclose(straight.roll(COLUMNS // 4, dims=2), turned, atol=1e-6)
     assert float(straight.max() / straight.min()) > 1.2
 
@@ -81,8 +77,8 @@ def test_a_turned_seam_moves_with_the_picture() -> None:
 @pytest.mark.parametrize("radius_deg", [12.0, 30.0])
 def test_a_patch_stays_below_its_reach(kind: int, radius_deg: float) -> None:
     picture = noise_picture()
-    row = settings_row(NADIR=math.radians(radius_deg), NADIR_KIND=kind, NADIR_TONE=0.05, NADIR_TURN=1.0)
-    covered = cover_poles(picture.clone(), row)
+    stand = camera(nadir=math.radians(radius_deg), nadir_kind=kind, nadir_tone=0.05, nadir_turn=1.0)
+    covered = cover_poles(picture.clone(), stand)
     below = round(radius_deg / 180.0 * ROWS)
     assert torch.equal(covered[:, : ROWS - below - 1], picture[:, : ROWS - below - 1])
     assert not torch.equal(covered[:, -2:], picture[:, -2:])
@@ -90,7 +86,7 @@ def test_a_patch_stays_below_its_reach(kind: int, radius_deg: float) -> None:
 
 def test_without_a_patch_nothing_is_covered() -> None:
     picture = noise_picture()
-    assert torch.equal(cover_poles(picture.clone(), settings_row()), picture)
+    assert torch.equal(cover_poles(picture.clone(), camera()), picture)
 
 
 # Compression
@@ -118,23 +114,24 @@ def test_compression_loses_about_what_a_jpeg_file_loses(quality: int, rows: int)
 @given(seed=seeds)
 @settings(max_examples=30, deadline=None)
 def test_cameras_stay_within_their_limits_and_staged_ones_have_no_flaws(seed: int) -> None:
-    row = draw_exposure(np.random.default_rng(seed), bright=seed % 2 == 0)
-    assert np.abs(row[[E.ROLL, E.PITCH]]).max() <= math.radians(2.0) + 1e-9
-    assert row[E.JPEG] == 0.0 or 50.0 <= row[E.JPEG] <= 95.0
-    assert 0.0 <= row[E.NADIR] <= math.radians(65.0)
+    drawn = draw_exposure(np.random.default_rng(seed), bright=seed % 2 == 0)
+    assert max(abs(drawn.roll), abs(drawn.pitch)) <= math.radians(2.0) + 1e-9
+    assert drawn.jpeg == 0.0 or 50.0 <= drawn.jpeg <= 95.0
+    assert 0.0 <= drawn.nadir <= math.radians(65.0)
     staged = draw_staged_exposure(np.random.default_rng(seed))
-    assert not staged[[E.ROLL, E.PITCH, E.NADIR, E.ZENITH, E.SEAM_STEP, E.SEAM_SHIFT, E.JPEG]].any()
+    flaws = (staged.roll, staged.pitch, staged.nadir, staged.zenith, staged.seam_step, staged.seam_shift, staged.jpeg)
+    assert not any(flaws)
 
 
 @given(seed=seeds)
 @settings(max_examples=10, deadline=None)
 def test_a_picture_is_developed_alike_in_any_batch(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    rows = torch.from_numpy(np.stack([draw_exposure(rng) for _ in range(4)])).float()
+    cameras = Exposure(torch.from_numpy(np.stack([draw_exposure(rng).rows for _ in range(4)])).float())
     radiance = torch.rand(4, ROWS, COLUMNS, 3, generator=torch.Generator().manual_seed(seed % 1000))
     noise = torch.zeros(ROWS, COLUMNS, 3)
-    together = develop(radiance.clone(), rows, noise)
-    alone = torch.cat([develop(radiance[k : k + 1].clone(), rows[k : k + 1], noise) for k in range(4)])
+    together = develop(radiance.clone(), cameras, noise)
+    alone = torch.cat([develop(radiance[k : k + 1].clone(), cameras[k : k + 1], noise) for k in range(4)])
     # Rounding to bytes may fall either way.
     assert float(((together.int() - alone.int()).abs() > 1).float().mean()) < 0.01
 

@@ -40,6 +40,7 @@ from lalaloc_core.synth.furniture import FURNITURE_LEVELS
 from lalaloc_core.synth.lighting import MOODS
 from lalaloc_core.synth.materials import MaterialLibrary
 from lalaloc_core.synth.plans import Home, generate_home
+from lalaloc_core.synth.render_scene import RenderScene
 from lalaloc_core.synth.shots import POSE_MARGIN_M, stage_rooms
 from lalaloc_core.synth.splits import TEST, TRAIN, home_of
 
@@ -374,14 +375,20 @@ def test_pictures_in_several_lights_are_the_same_as_one_by_one() -> None:
         np.testing.assert_array_equal(renderer.depth_m([alone])[0].numpy(), depth_m.numpy())
 
 
+def floors_and_ceilings(scene: RenderScene) -> np.ndarray:
+    """Surfaces (2, rooms, columns) of every room's floor and ceiling."""
+    used = np.stack([scene.slots.floor_surface, scene.slots.ceiling_surface]).astype(int)
+    return scene.surfaces.rows[used]
+
+
 def test_materials_are_the_same_however_a_room_is_furnished_and_lit(materials: MaterialLibrary) -> None:
     home, rng = home_of(TEST, SEED, 3250)
     for shot in stage_rooms(home, rng):
         seen = []
         for furniture, lighting in itertools.product(FURNITURE_LEVELS, MOODS):
             scene = build_scene(dataclasses.replace(shot, furniture=furniture, lighting=lighting), materials)
-            flat = scene.slots[:, 1:3].astype(int)
-            seen.append((scene.walls_m, scene.surfaces[scene.wall_surface], scene.surfaces[flat], scene.lights[:, :3]))
+            walls = scene.surfaces.rows[scene.wall_surface]
+            seen.append((scene.walls_m, walls, floors_and_ceilings(scene), scene.lights.position_m))
         for other in seen[1:]:
             for first, second in zip(seen[0], other, strict=True):
                 np.testing.assert_array_equal(first, second)
@@ -399,8 +406,7 @@ def test_a_room_has_the_same_materials_from_the_next_room(materials: MaterialLib
             if opening.room == shot.room_index and opening.kind in ("door_open", "opening") and opening.neighbour >= 0
         ]
         for slot, room in enumerate(dict.fromkeys(behind), start=1):
-            own = scenes[room].surfaces[scenes[room].slots[0, 1:3].astype(int)]
-            np.testing.assert_array_equal(scene.surfaces[scene.slots[slot, 1:3].astype(int)], own)
+            np.testing.assert_array_equal(floors_and_ceilings(scene)[:, slot], floors_and_ceilings(scenes[room])[:, 0])
             pairs += 1
     assert pairs > 1
 
