@@ -19,10 +19,10 @@ from lalaloc_core.bundle import LAYOUT_WEIGHTS, Bundle
 from lalaloc_core.data.synthetic.generated import GeneratedScenes, RenderedPhotograph
 from lalaloc_core.nets import load_layout_encoder
 from lalaloc_core.nets.ring import RingLayoutEncoder
+from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.sampling import pose_grid, random_poses
 from lalaloc_core.training.config import PRESETS
 from lalaloc_core.training.sources import GeneratedSource
-from lalaloc_core.training.stream import layouts
 
 COLUMNS = 128
 FULL_HEIGHT, FULL_WIDTH = 256, 512
@@ -52,7 +52,7 @@ def render_shard(task: tuple[int, Path, Path]) -> None:
             others = random_poses(view.plan, OTHER_POSES, source.rng(visit))
             room = np.append(view.room_index, others.room_index)
             position = np.concatenate([np.asarray(view.position_m)[None], others.position_m])
-            profile = layouts(view.plan, position, room, np.full(len(room), view.heading), COLUMNS)
+            profile = profiles_at(view.plan, position, room, np.full(len(room), view.heading), COLUMNS, np.float32)
             images.append(view.image)
             rows.append((profile, view.camera_height_m, view.plan.ceiling_heights_m[room]))
     profile, camera, ceiling = (np.stack(part).astype(np.float32) for part in zip(*rows, strict=True))
@@ -72,7 +72,7 @@ def render_validation(task: tuple[Path, Path]) -> None:
         for camera in scene.cameras:
             room = np.append(camera.room_index, grid.room_index)
             position = np.concatenate([np.asarray(camera.position_m)[None], grid.position_m])
-            profile = layouts(scene.plan, position, room, np.full(len(room), camera.heading), COLUMNS)
+            profile = profiles_at(scene.plan, position, room, np.full(len(room), camera.heading), COLUMNS, np.float32)
             ceiling = scene.plan.ceiling_heights_m[room].astype(np.float32)
             height = torch.full((len(grid),), camera.camera_height_m)
             latents.append(teacher(torch.from_numpy(profile[1:]), height, torch.from_numpy(ceiling[1:])).numpy())

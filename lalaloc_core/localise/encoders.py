@@ -13,7 +13,7 @@ from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.errors import BundleError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.poses import PredictedProfile, Query
-from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.sampling import PoseSet
 
 # Larger batches fall out of the cache and gain nothing.
@@ -74,12 +74,8 @@ class Encoders:
 
     def profiles(self, plan: FloorPlan, poses: PoseSet, heading: Float[np.ndarray, "b"]) -> Float[np.ndarray, "b c"]:
         """Wall profiles (m) of poses of a plan, as wide as the layout encoder takes them."""
-        return wall_profile(
-            poses.position_m.astype(np.float32),
-            heading.astype(np.float32),
-            plan.walls_m[poses.room_index].astype(np.float32),
-            self.manifest.profile_columns,
-        )
+        columns = self.manifest.profile_columns
+        return profiles_at(plan, poses.position_m, poses.room_index, heading, columns, np.float32)
 
     def query(
         self,

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from lalaloc_core.data.dataset import Camera, Photograph
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.sampling import PoseSet
 
 # "layout": the query is the true layout, as if seen without error; "panorama": a photograph, or its depth for ICP.
@@ -46,8 +46,8 @@ class Question:
 
     def true_profile(self, columns: int) -> Float[np.ndarray, "{columns}"]:
         """Wall profile (m) of the true pose at heading 0: what a layout query knows, and what the oracle may use."""
-        walls = self.plan.walls_m[self.camera.room_index]
-        return wall_profile(self.camera.position_m[None], np.zeros(1), walls[None], columns)[0]
+        room = np.array([self.camera.room_index])
+        return profiles_at(self.plan, self.camera.position_m[None], room, np.zeros(1), columns)[0]
 
     def require_photograph(self) -> Photograph:
         """The photograph of a panorama query.

@@ -20,7 +20,7 @@ from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.methods.method import Question
 from lalaloc_core.render.depth import back_project, layout_depth
-from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.sampling import PoseSet
 
 LayoutMetric = Literal["edges", "depth", "relative-depth", "chamfer"]
@@ -60,7 +60,7 @@ def layouts_at(
 ) -> tuple[Float[np.ndarray, "n {columns}"], Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
     """Wall profiles, camera and ceiling heights (m) of poses, all with one heading."""
     rooms = poses.room_index
-    profile = wall_profile(poses.position_m, np.full(len(poses), heading), plan.walls_m[rooms], columns)
+    profile = profiles_at(plan, poses.position_m, rooms, np.full(len(poses), heading), columns)
     return profile, np.full(len(poses), camera_height_m), plan.ceiling_heights_m[rooms]
 
 

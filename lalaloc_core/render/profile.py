@@ -8,6 +8,8 @@ in position and heading almost everywhere.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 from array_api_compat import array_namespace, device
 from jaxtyping import Float, Int
 
@@ -55,16 +57,42 @@ def _crossings(
     start_y = walls_m[:, None, :, 1] - origin_m[:, 1][:, None, None]
     edge_x = walls_m[:, None, :, 2] - walls_m[:, None, :, 0]
     edge_y = walls_m[:, None, :, 3] - walls_m[:, None, :, 1]
+    return cross_walls((direction_x, direction_y), (start_x, start_y), (edge_x, edge_y)).distance_m
 
-    # Solve origin + t * direction = start + s * edge by Cramer's rule.
+
+class Crossings(NamedTuple):
+    """Where rays cross the lines through walls.
+
+    Attributes:
+        distance_m: along the ray; inf where it misses the wall itself, or meets it behind its origin.
+        share: how far along the wall, 0 at its start and 1 at its end.
+        determinant: of the linear system that was solved; positive where the ray leaves a room to the wall's left.
+    """
+
+    distance_m: Array
+    share: Array
+    determinant: Array
+
+
+def cross_walls(direction: tuple[Array, Array], start_m: tuple[Array, Array], edge_m: tuple[Array, Array]) -> Crossings:
+    """Cross rays with walls; all arguments are (x, y) components, of shapes that broadcast against each other.
+
+    Args:
+        direction: unit vectors of the rays.
+        start_m: from the ray's origin to the wall's start.
+        edge_m: from the wall's start to its end.
+    """
+    (direction_x, direction_y), (start_x, start_y), (edge_x, edge_y) = direction, start_m, edge_m
+    xp = array_namespace(direction_x, start_x)
+    # Solve t * direction = start + s * edge by Cramer's rule.
     determinant = direction_x * edge_y - direction_y * edge_x
     parallel = xp.abs(determinant) < _PARALLEL
     # Not dividing by zero in the unused branch keeps NaN out of the gradients.
-    determinant = xp.where(parallel, xp.ones_like(determinant), determinant)
-    t = (start_x * edge_y - start_y * edge_x) / determinant
-    s = (start_x * direction_y - start_y * direction_x) / determinant
+    inverse = 1.0 / xp.where(parallel, xp.ones_like(determinant), determinant)
+    t = (start_x * edge_y - start_y * edge_x) * inverse
+    s = (start_x * direction_y - start_y * direction_x) * inverse
     hit = ~parallel & (t > 0.0) & (s >= -_CORNER_TOLERANCE) & (s <= 1.0 + _CORNER_TOLERANCE)
-    return xp.where(hit, t, xp.full_like(t, xp.inf))
+    return Crossings(xp.where(hit, t, xp.full_like(t, xp.inf)), s, determinant)
 
 
 def wall_profile(

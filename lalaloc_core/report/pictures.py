@@ -15,7 +15,7 @@ from PIL import Image, ImageDraw
 from lalaloc_core.conventions import heading_from_degrees
 from lalaloc_core.evaluation.predictions import Pose
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.report.plan import Cells, draw_camera, draw_distances, draw_plan, halo
 
 PANORAMA_HEIGHT, PANORAMA_WIDTH = 384, 768
@@ -106,7 +106,7 @@ def layout_lines(
 ) -> list[Float[np.ndarray, "{width} 2"]]:
     """Where the floor and the ceiling of a pose's room meet its walls, as pixels (x, y) of its panorama."""
     position_m, heading = np.array([[pose.x_m, pose.y_m]]), np.array([heading_from_degrees(pose.heading_deg)])
-    profile = wall_profile(position_m, heading, plan.walls_m[[pose.room_index]], width)[0]
+    profile = profiles_at(plan, position_m, np.array([pose.room_index]), heading, width)[0]
     over_floor, under_ceiling = camera_height_m, float(plan.ceiling_heights_m[pose.room_index]) - camera_height_m
     return [wall_line(profile, rise_m, height) for rise_m in (-over_floor, under_ceiling)]
 

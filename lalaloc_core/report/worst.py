@@ -29,7 +29,7 @@ from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.evidence import EvidenceConfig, profile_costs, targets
 from lalaloc_core.localise.poses import Query
 from lalaloc_core.methods.lalaloc import encode, read_image
-from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.report.pictures import (
     FOUND_COLOUR,
     PREDICTED_COLOUR,
@@ -288,5 +288,5 @@ def _distance_bias(query: Query, scene: Scene, truth: Pose) -> float:
 def _log_profile(query: Query, scene: Scene, pose: Pose, columns: int) -> Float[np.ndarray, "1 {columns}"]:
     """Log wall profile (m) of a pose, turned as the query's first hypothesis is."""
     heading = np.array([heading_from_degrees(pose.heading_deg) - query.roll[0]])
-    walls = scene.plan.walls_m[[pose.room_index]]
-    return np.log(wall_profile(np.array([[pose.x_m, pose.y_m]]), heading, walls, columns))
+    position_m, room = np.array([[pose.x_m, pose.y_m]]), np.array([pose.room_index])
+    return np.log(profiles_at(scene.plan, position_m, room, heading, columns))

@@ -12,12 +12,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from lalaloc_core.render.profile import cross_walls
 from lalaloc_core.synth.exposure import Exposure
 from lalaloc_core.synth.prisms import PrismHits, cross_prisms, gap_behind, resolve_prisms
 from lalaloc_core.synth.render_scene import Backdrop, Decals, Lights, Prisms, Slots, Sun
 from lalaloc_core.synth.surfaces import Surfaces
 
-_CORNER_TOLERANCE = 1e-5
 _TINY = 1e-9
 _MAX_DECALS_PER_COLUMN = 10
 
@@ -212,16 +212,14 @@ def _before(
 
 
 def _cross_walls(walls_m: Float[Tensor, "b n 4"], direction: Float[Tensor, "b c 2"]) -> _Crossings:
-    dx, dy = direction[:, :, None, 0], direction[:, :, None, 1]
     x, y = walls_m[:, None, :, 0], walls_m[:, None, :, 1]
     ex, ey = walls_m[:, None, :, 2] - x, walls_m[:, None, :, 3] - y
-    determinant = dx * ey - dy * ex
-    parallel = determinant.abs() < 1e-12
-    inverse = 1.0 / torch.where(parallel, 1.0, determinant)
-    t = (x * ey - y * ex) * inverse
-    s = (x * dy - y * dx) * inverse
-    hit = ~parallel & (t > 0.0) & (s >= -_CORNER_TOLERANCE) & (s <= 1.0 + _CORNER_TOLERANCE)
-    return _Crossings(torch.where(hit, t, torch.inf), s * torch.sqrt(ex**2 + ey**2), determinant > 0.0)
+    crossings = cross_walls((direction[:, :, None, 0], direction[:, :, None, 1]), (x, y), (ex, ey))
+    return _Crossings(
+        distance_m=crossings.distance_m,
+        along_m=crossings.share * torch.sqrt(ex**2 + ey**2),
+        leaving=crossings.determinant > 0.0,
+    )
 
 
 def _nearest(batch: SceneBatch, crossings: _Crossings, direction: Tensor, candidate: Tensor) -> _WallHits:

@@ -7,11 +7,9 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-from jaxtyping import Float, Int
 
 from lalaloc_core.errors import DatasetError
-from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.training.batches import Batch, LoadFailure, Stream, non_empty, stacked, worker_share
 from lalaloc_core.training.config import TrainConfig
 from lalaloc_core.training.deferred import DeferredBatch, DeferredBatcher, DeferredRow, DeferredScene, Row
@@ -53,7 +51,9 @@ class LayoutBatches(Stream):
             chosen[size - turned :] = rng.integers(0, 1 + stage.triplets.positives, turned)
             heading[size - turned :] = [draw_heading(turns, rng) for _ in range(turned)]
         room = group.room_index[chosen]
-        profile = layouts(group.plan, group.position_m[chosen], room, heading, self.config.profile_columns)
+        profile = profiles_at(
+            group.plan, group.position_m[chosen], room, heading, self.config.profile_columns, np.float32
+        )
         if turns != "none" and rng.random() < 0.5:
             profile = profile[:, ::-1].copy()
         return {
@@ -123,7 +123,7 @@ class PanoramaBatches(Stream):
                 return None
             position, room = group.position_m, group.room_index
         heading = np.full(len(position), turn.heading)
-        profile = turn.profile(layouts(view.plan, position, room, heading, self.config.profile_columns))
+        profile = turn.profile(profiles_at(view.plan, position, room, heading, self.config.profile_columns, np.float32))
         ceiling = view.plan.ceiling_heights_m[room].astype(np.float32)
         row = {
             "profile_m": profile[0],
@@ -137,22 +137,6 @@ class PanoramaBatches(Stream):
     def _height_error_m(self, rng: np.random.Generator) -> float:
         spread = self.config.image.camera_height_error_m
         return float(np.clip(rng.normal(0.0, spread), -3.0 * spread, 3.0 * spread)) if spread else 0.0
-
-
-def layouts(
-    plan: FloorPlan,
-    position_m: Float[np.ndarray, "n 2"],
-    room_index: Int[np.ndarray, "n"],
-    heading: Float[np.ndarray, "n"],
-    columns: int,
-) -> Float[np.ndarray, "n {columns}"]:
-    """Wall profiles (m) of some poses of a plan, in single precision."""
-    return wall_profile(
-        position_m.astype(np.float32),
-        heading.astype(np.float32),
-        plan.walls_m[room_index].astype(np.float32),
-        columns,
-    )
 
 
 def _batches(

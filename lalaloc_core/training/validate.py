@@ -21,11 +21,11 @@ from lalaloc_core.data.dataset import Appearance, Camera, Scene
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.metrics import Accuracy
 from lalaloc_core.nets.resnet import PaperImageEncoder
+from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.sampling import PoseSet, pose_grid
 from lalaloc_core.training import losses
 from lalaloc_core.training.config import TrainConfig
 from lalaloc_core.training.picture_cache import cached_pictures
-from lalaloc_core.training.stream import layouts
 from lalaloc_core.training.turning import Turn, draw_turn
 
 _GRID_STEP_M = 0.5
@@ -233,7 +233,7 @@ class _Layouts:
     def of(cls, query: _Query, poses: PoseSet, columns: int, device: torch.device) -> _Layouts:
         plan = query.scene.plan
         heading = np.full(len(poses), query.turn.heading)
-        profile = torch.from_numpy(layouts(plan, poses.position_m, poses.room_index, heading, columns))
+        profile = torch.from_numpy(profiles_at(plan, poses.position_m, poses.room_index, heading, columns, np.float32))
         ceiling = torch.tensor(plan.ceiling_heights_m[poses.room_index], dtype=torch.float32)
         camera = torch.full((len(poses),), query.camera.camera_height_m)
         return cls(profile.to(device), camera.to(device), ceiling.to(device))
