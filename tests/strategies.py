@@ -30,6 +30,18 @@ def l_shape(width_m: float, depth_m: float, cut_width_m: float, cut_depth_m: flo
     return [[0.0, 0.0], [width_m, 0.0], [width_m, y], [x, y], [x, depth_m], [0.0, depth_m]]
 
 
+def spiral(corners: int) -> Polygon:
+    """A room that is wound up: the centre of its largest circle is looked for nearly everywhere."""
+    turns, half = corners // 40, corners // 2
+
+    def arm(offset_m: float) -> list[list[float]]:
+        angles = [0.6 + k * (2.0 * math.pi * turns - 0.6) / (half - 1) for k in range(half)]
+        radii = [angle / (2.0 * math.pi) + offset_m for angle in angles]
+        return [[r * math.cos(a), r * math.sin(a)] for r, a in zip(radii, angles, strict=True)]
+
+    return [*arm(0.3), *reversed(arm(0.0))]
+
+
 def plan_document(*polygons: Any, ceiling_m: float = 2.5, **extra: Any) -> dict[str, Any]:
     """A plan in the native format with rooms "room 1", "room 2" and so on; `extra` replaces or adds keys."""
     rooms = [{"name": f"room {index + 1}", "polygon": polygon} for index, polygon in enumerate(polygons)]

@@ -12,6 +12,7 @@ from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.conventions import ROOM_TYPES
 from lalaloc_core.floorplan.arrays import frozen, ring_edges
+from lalaloc_core.floorplan.inmost import inmost_place
 
 # No camera stands on a free-standing wall, however thin: what is kept of the floor where no margin fits.
 _WALL_CORE_M = 1e-3
@@ -72,11 +73,11 @@ class Room:
         return floor.difference(segments.buffer(margin_m))
 
     def inmost_point(self) -> Float[np.ndarray, "2"]:
-        """The place farthest from all walls, to a centimetre."""
+        """A place about as far from all walls as any."""
         floor = self.shape
         if len(self.inner_walls_m):
             floor = shapely.MultiPolygon(polygons_of(self.free_floor(_WALL_CORE_M)))
-        return np.array(shapely.maximum_inscribed_circle(floor, 0.01).coords[0])
+        return inmost_place(floor)[0]
 
 
 def polygons_of(shape: shapely.Geometry) -> list[shapely.Polygon]:

@@ -9,7 +9,7 @@ from html import escape
 import numpy as np
 
 from lalaloc_core.floorplan import FloorPlan, Room
-from service.preview.labels import label_place
+from lalaloc_core.floorplan.inmost import inmost_place
 
 _MARGIN_M = 0.5
 _FILLS = ("#eef4fb", "#f7f1e6", "#eef7ee", "#f8eef4", "#f2f0fa", "#f4f6ea")
@@ -82,7 +82,7 @@ def _outline(room: Room, fill: str, extent_m: float) -> str:
 
 def _label(room: Room, extent_m: float) -> str:
     """Name and area at the middle of a large circle in the room, small enough to fit."""
-    x, y, radius_m = label_place(room)
+    (x, y), radius_m = inmost_place(room.shape)
     size = min(extent_m / 40.0, 2.6 * radius_m / max(len(room.name), 6))
     return (
         f'<text x="{x:.3f}" y="{-y:.3f}" font-size="{size:.4f}">{_text(room.name)}'

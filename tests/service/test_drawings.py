@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import math
 import threading
 from collections.abc import Coroutine, Iterator
 from contextlib import suppress
@@ -11,20 +10,17 @@ from datetime import UTC, datetime
 from typing import Any
 
 import pytest
-import shapely
-from hypothesis import given, settings
 
 from lalaloc_core.floorplan import FloorPlan
 from service.errors import OverloadedError
 from service.preview import drawings as module
 from service.preview.drawings import Drawings
-from service.preview.labels import label_place
 from service.preview.mesh import plan_glb
 from service.preview.svg import Marker, draw_rooms, plan_svg
 from service.storage.records import PlanRecord
 from tests.growth import assert_no_worse_than_linear
 from tests.service.conftest import FLAT
-from tests.strategies import plans
+from tests.strategies import plan_of, spiral
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
 
@@ -121,31 +117,8 @@ def test_what_waits_is_bounded_and_what_nobody_waits_for_is_not_begun(drawings: 
     assert pen.drawn == 2
 
 
-@settings(max_examples=40, deadline=None)
-@given(plans())
-def test_a_label_lies_in_its_room_and_about_as_far_from_its_walls_as_can_be(plan: FloorPlan) -> None:
-    for room in plan.rooms:
-        x, y, radius_m = label_place(room)
-        assert room.shape.buffer(1e-9).contains(shapely.Point(x, y))
-        assert radius_m == pytest.approx(room.shape.boundary.distance(shapely.Point(x, y)))
-        assert radius_m > 0.8 * shapely.maximum_inscribed_circle(room.shape, 0.01).length
-
-
-def _spiral(corners: int) -> dict[str, Any]:
-    """A room that is wound up: the centre of its largest circle is looked for nearly everywhere."""
-    turns = corners // 40
-
-    def arm(offset_m: float) -> list[list[float]]:
-        angles = [0.6 + k * (2.0 * math.pi * turns - 0.6) / (corners // 2 - 1) for k in range(corners // 2)]
-        radii = [angle / (2.0 * math.pi) + offset_m for angle in angles]
-        return [[r * math.cos(a), r * math.sin(a)] for r, a in zip(radii, angles, strict=True)]
-
-    return {"polygon": [*arm(0.3), *reversed(arm(0.0))]}
-
-
 def test_the_time_for_a_drawing_grows_with_the_plan_and_no_faster() -> None:
     def draw(corners: int) -> Any:
-        plan = FloorPlan.from_dict({"ceiling_height_m": 2.5, "rooms": [_spiral(corners)] * 6})
-        return lambda: draw_rooms(plan)
+        return lambda: draw_rooms(plan_of(*[spiral(corners)] * 6))
 
     assert_no_worse_than_linear(draw, 240)
