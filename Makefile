@@ -1,6 +1,7 @@
 # LaLaLoc: `make demo` shows it, `make serve` runs it, `make test` checks it.
 
 PYTHON ?= python3
+PORT ?= 8000
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
@@ -20,8 +21,8 @@ $(STAMP): pyproject.toml constraints.txt scripts/setup.sh scripts/install_torch.
 demo: $(STAMP) ## localise the example panoramas over HTTP, write demo.png
 	$(BIN)/python -m examples.demo
 
-serve: $(STAMP) ## run the service at http://127.0.0.1:8000 with the example plan, data in ./data
-	$(BIN)/python -m examples.serve
+serve: $(STAMP) ## run the service at http://127.0.0.1:8000 (PORT=8001: there) with the example plan, data in ./data
+	$(BIN)/python -m examples.serve --port $(PORT)
 
 # What computes is shared out to processes with one thread each; what serves needs the machine for itself.
 test: lint ## lint, then the tests

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import signal
 import sys
+from collections.abc import Sequence
 
 from examples.launch import ServiceFailedError, running_service
 from examples.truth import PLAN_PATH
 from lalaloc_client import Client, ClientError, FloorPlan
 
-_PORT = 8000
 _PLAN_TIMEOUT_S = 120.0
 
 
-def main() -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Serve; 0 when interrupted, the service's own status when it ended by itself."""
+    parser = argparse.ArgumentParser(prog="python -m examples.serve", description=__doc__)
+    parser.add_argument("--port", type=int, default=8000, help="where to listen, 0 for a free port (default: 8000)")
+    port = parser.parse_args(arguments).port
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        with running_service(_PORT, {}) as service:
+        with running_service(port, {}) as service:
             with Client(service.url) as client:
                 plan = load_example_plan(client)
             print(f"ready: {service.url} (plan '{plan.name}': {plan.id}); stop with Ctrl-C", flush=True)

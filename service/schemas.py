@@ -5,12 +5,30 @@ from __future__ import annotations
 from datetime import datetime
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
 from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M
 
 PlanStatus = Literal["preparing", "ready", "failed"]
 Finite = Field(allow_inf_nan=False)
+
+
+def _rounded(digits: int) -> AfterValidator:
+    # Without the minus of what rounds to zero.
+    return AfterValidator(lambda value: round(value, digits) + 0.0)
+
+
+# What is measured or computed is told in millimetres, mm² and hundredths of a degree: what comes after says nothing.
+# What was uploaded, and what was set, is told as it was.
+Metres = Annotated[float, _rounded(3)]
+SquareMetres = Annotated[float, _rounded(3)]
+Variance = Annotated[float, _rounded(6)]
+HeadingDeg = Annotated[float, AfterValidator(lambda value: round(value, 2) % 360.0)]
+Degrees = Annotated[float, Field(ge=0), _rounded(2)]
+Milliseconds = Annotated[float, _rounded(2)]
+# From 0 to 1: how much is done, and probabilities.
+Share = Annotated[float, Field(ge=0, le=1), _rounded(4)]
+Score = Annotated[float, _rounded(4)]
 
 HEADING_MEANING = "azimuth of the panorama's centre column, clockwise from the plan's +y seen from above"
 _LATENT_DISTANCE = Field(ge=0, le=2, description="Distance of the pose's layout to the panorama's latent.")
@@ -67,7 +85,7 @@ class RoomAnswer(Answer):
     """One room of a stored plan."""
 
     name: str
-    area_m2: float = Field(description="Floor area.")
+    area_m2: SquareMetres = Field(description="Floor area.")
     ceiling_height_m: float = Field(description="Height of the ceiling over the floor.")
     vertices: int = Field(description="Corners of the polygon.")
 
@@ -82,10 +100,10 @@ class GridAnswer(Answer):
 class BoundsAnswer(Answer):
     """Smallest axis-parallel box around the plan."""
 
-    x_min_m: float
-    y_min_m: float
-    x_max_m: float
-    y_max_m: float
+    x_min_m: Metres
+    y_min_m: Metres
+    x_max_m: Metres
+    y_max_m: Metres
 
 
 class FloorPlanAnswer(Answer):
@@ -99,10 +117,10 @@ class FloorPlanAnswer(Answer):
         description="`preparing` while the latent grid is computed, then `ready` or `failed`; `superseded` for a "
         "revision that is not the current one."
     )
-    progress: float = Field(ge=0, le=1, description="Share of the latent grid that is computed.")
+    progress: Share = Field(description="Share of the latent grid that is computed.")
     reason: str | None = Field(description="Why the plan failed, null unless it did.")
     rooms: list[RoomAnswer]
-    area_m2: float = Field(description="Sum of the rooms' floor areas.")
+    area_m2: SquareMetres = Field(description="Sum of the rooms' floor areas.")
     bounds: BoundsAnswer
     camera_height_m: float = Field(description="Camera height assumed for panoramas of this plan.")
     grid: GridAnswer
@@ -118,9 +136,9 @@ class FloorPlanSummary(Answer):
     revision: str
     name: str
     status: PlanStatus
-    progress: float = Field(ge=0, le=1)
+    progress: Share
     rooms: int = Field(description="Number of rooms.")
-    area_m2: float
+    area_m2: SquareMetres
     created_at: datetime
     updated_at: datetime
 
@@ -136,8 +154,8 @@ class PlanEvent(Answer):
     """How far a floor plan is; one event of a stream."""
 
     status: PlanStatus | Literal["deleted"]
-    progress: float | None = Field(
-        default=None, ge=0, le=1, description="Share of the latent grid that is computed; not of a deleted plan."
+    progress: Share | None = Field(
+        default=None, description="Share of the latent grid that is computed; not of a deleted plan."
     )
     revision: str | None = Field(default=None, description="The current revision; a plan may get another meanwhile.")
     reason: str | None = Field(default=None, description="Why the plan failed.")
@@ -188,36 +206,36 @@ class LocaliseForm(BaseModel):
         return value
 
 
-Pair = Annotated[list[float], Field(min_length=2, max_length=2)]
+Pair = Annotated[list[Variance], Field(min_length=2, max_length=2)]
 Covariance = Annotated[list[Pair], Field(min_length=2, max_length=2)]
 
 
 class Position(Answer):
     """A point of the plan frame."""
 
-    x_m: float = Field(description="To the right on the drawing.")
-    y_m: float = Field(description="Up on the drawing.")
+    x_m: Metres = Field(description="To the right on the drawing.")
+    y_m: Metres = Field(description="Up on the drawing.")
 
 
 class CandidateAnswer(Answer):
     """One possible pose; no two candidates are closer than 1 m."""
 
     position: Position
-    heading_deg: float = Field(ge=0, lt=360, description=f"The {HEADING_MEANING}.")
+    heading_deg: HeadingDeg = Field(ge=0, lt=360, description=f"The {HEADING_MEANING}.")
     room: str = Field(description="Name of the room the position lies in.")
-    cost: float = _COST
-    latent_distance: float = _LATENT_DISTANCE
+    cost: Score = _COST
+    latent_distance: Score = _LATENT_DISTANCE
 
 
 class TimingsAnswer(Answer):
     """Milliseconds per stage, 0 where a stage did not run."""
 
-    decode: float
-    encode: float
-    retrieve: float
-    vdr: float
-    lpo: float
-    total: float = Field(description="From the complete upload to the answer, waits included.")
+    decode: Milliseconds
+    encode: Milliseconds
+    retrieve: Milliseconds
+    vdr: Milliseconds
+    lpo: Milliseconds
+    total: Milliseconds = Field(description="From the complete upload to the answer, waits included.")
 
 
 class ModelAnswer(Answer):
@@ -234,11 +252,9 @@ class LocaliseAnswer(Answer):
     floorplan_id: str
     floorplan_revision: str = Field(description="The plan's revision that was searched.")
     position: Position
-    heading_deg: float = Field(ge=0, lt=360, description=f"The {HEADING_MEANING}.")
+    heading_deg: HeadingDeg = Field(ge=0, lt=360, description=f"The {HEADING_MEANING}.")
     room: str
-    confidence: float | None = Field(
-        ge=0,
-        le=1,
+    confidence: Share | None = Field(
         description="Probability that the position is right within 1 m, as fitted for this `stage`, and for a heading "
         "given exactly or searched; null for a model without it.",
     )
@@ -251,12 +267,12 @@ class LocaliseAnswer(Answer):
         "what the panorama does not tell, as in a corridor, that of a place anywhere in the room. Null unless `stage` "
         "is `lpo`, and for a model without it."
     )
-    heading_std_deg: float | None = Field(
-        ge=0, description="Standard deviation of the heading where it was searched; null where `covariance_m2` is."
+    heading_std_deg: Degrees | None = Field(
+        description="Standard deviation of the heading where it was searched; null where `covariance_m2` is."
     )
-    cost: float = _COST
-    latent_distance: float = _LATENT_DISTANCE
-    camera_height_m: float = Field(description="Camera height the panorama was compared at.")
+    cost: Score = _COST
+    latent_distance: Score = _LATENT_DISTANCE
+    camera_height_m: Metres = Field(description="Camera height the panorama was compared at.")
     candidates: list[CandidateAnswer] = Field(description="Best first; the first one is the answer.")
     timings_ms: TimingsAnswer
     model: ModelAnswer

@@ -150,7 +150,7 @@ class PlanEvents:
         return {
             summary.id: PlanEvent(
                 status=state.status,
-                progress=round(state.progress, 4),
+                progress=state.progress,
                 revision=summary.revision_id,
                 reason=state.reason,
             )

@@ -17,6 +17,8 @@ _FILLS = ("#eef4fb", "#f7f1e6", "#eef7ee", "#f8eef4", "#f2f0fa", "#f4f6ea")
 _BAR_SHARE = 0.2
 # 95 % of a normal distribution in the plane lie within so many standard deviations: the root of -2 log 0.05.
 _ELLIPSE_STDS = 2.4477
+# Of the drawing's size: room for the scale bar's label; the camera's radius; and how many radii its wedge reaches.
+_LABEL_SHARE, _CAMERAS_PER_EXTENT, _CAMERA_REACH = 0.04, 80.0, 5.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -32,22 +34,24 @@ class Marker:
 def plan_svg(plan: FloorPlan, marker: Marker | None = None, *, rooms: str | None = None) -> str:
     """The plan with the names and areas of its rooms and a scale bar; one SVG unit is one metre.
 
-    The view box is the plan's bounds with a margin, its y axis pointing down: plan point (x, y) is drawn at (x, -y).
+    The view box is the plan's bounds with a margin, and the camera; its y axis points down: plan point (x, y) is drawn
+    at (x, -y).
 
     Args:
         rooms: what `draw_rooms` made of it before.
     """
-    x_min, y_min, _, y_max = plan.bounds_m
-    width, height = _size_m(plan)
-    extent = max(width, height)
-    scale = 1000.0 / extent
+    x_min, y_min, _, _ = plan.bounds_m
+    plan_width, plan_height = _size_m(plan)
+    extent = max(plan_width, plan_height)
+    left, top, width, height = _view_box(plan, marker)
+    scale = 1000.0 / max(width, height)
     lines = [
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{width * scale:.0f}" height="{height * scale:.0f}" '
-        f'viewBox="{x_min - _MARGIN_M:.3f} {-y_max - _MARGIN_M:.3f} {width:.3f} {height:.3f}" '
+        f'viewBox="{left:.3f} {top:.3f} {width:.3f} {height:.3f}" '
         'font-family="sans-serif" text-anchor="middle">',
         f"<title>{_text(plan.name)}</title>",
         draw_rooms(plan) if rooms is None else rooms,
-        _scale_bar(x_min, y_min, width, extent),
+        _scale_bar(x_min, y_min, plan_width, extent),
     ]
     if marker is not None:
         lines.append(_camera(marker, extent))
@@ -72,7 +76,21 @@ def draw_rooms(plan: FloorPlan) -> str:
 def _size_m(plan: FloorPlan) -> tuple[float, float]:
     """Width and height of the drawing, margins included."""
     x_min, y_min, x_max, y_max = plan.bounds_m
-    return x_max - x_min + 2 * _MARGIN_M, y_max - y_min + 3 * _MARGIN_M
+    width, height = x_max - x_min + 2 * _MARGIN_M, y_max - y_min + 2 * _MARGIN_M
+    # Below the plan there is the scale bar with its label, which grows with the plan.
+    return width, height + max(_MARGIN_M, _LABEL_SHARE * max(width, height))
+
+
+def _view_box(plan: FloorPlan, marker: Marker | None) -> tuple[float, float, float, float]:
+    """Left, top, width and height of what is seen, y pointing down."""
+    width, height = _size_m(plan)
+    left, top = plan.bounds_m[0] - _MARGIN_M, -plan.bounds_m[3] - _MARGIN_M
+    right, bottom = left + width, top + height
+    if marker is not None:
+        reach = max(width, height) / _CAMERAS_PER_EXTENT * _CAMERA_REACH
+        left, right = min(left, marker.x_m - reach), max(right, marker.x_m + reach)
+        top, bottom = min(top, -marker.y_m - reach), max(bottom, -marker.y_m + reach)
+    return left, top, right - left, bottom - top
 
 
 def _outline(room: Room, fill: str, extent_m: float) -> str:
@@ -94,10 +112,11 @@ def _scale_bar(x_min: float, y_min: float, width_m: float, extent_m: float) -> s
     length = 10.0 ** math.floor(math.log10(_BAR_SHARE * width_m))
     length *= max(factor for factor in (1, 2, 5) if factor == 1 or factor * length <= _BAR_SHARE * width_m)
     y = -y_min + _MARGIN_M
+    size = min(extent_m / 50.0, width_m / 8.0)
     return (
         f'<g class="scale"><path d="M{x_min:.3f} {y:.3f}h{length:g}" stroke="#333" '
         f'stroke-width="{extent_m / 200:.4f}"/>'
-        f'<text x="{x_min + length / 2:.3f}" y="{y + extent_m / 40:.3f}" font-size="{extent_m / 50:.4f}">{length:g} m'
+        f'<text x="{x_min:.3f}" y="{y + extent_m / 40:.3f}" font-size="{size:.4f}" text-anchor="start">{length:g} m'
         "</text></g>"
     )
 
@@ -109,7 +128,7 @@ def _text(name: str) -> str:
 
 def _camera(marker: Marker, extent_m: float) -> str:
     """A dot, a wedge that opens towards the heading, and the ellipse that holds 95 % of its covariance."""
-    radius = extent_m / 80.0
+    radius = extent_m / _CAMERAS_PER_EXTENT
     wedge = ""
     if marker.heading_deg is not None:
         # SVG turns clockwise, as azimuths do; the wedge is drawn looking up, along the plan's +y.

@@ -193,17 +193,13 @@ class Localiser:
             room=best.room,
             confidence=model and model.probability(found.stage, signals, heading_known=query.heading_known),
             covariance_m2=None if spread is None else spread.position_m2.tolist(),
-            heading_std_deg=None
-            if spread is None or spread.heading_std is None
-            else round(math.degrees(spread.heading_std), 3),
+            heading_std_deg=None if spread is None or spread.heading_std is None else math.degrees(spread.heading_std),
             stage=found.stage,
             cost=best.cost,
             latent_distance=best.latent_distance,
-            camera_height_m=round(height_m, 3),
+            camera_height_m=height_m,
             candidates=candidates,
-            timings_ms=TimingsAnswer(
-                **{name: round(timings_ms.get(name, 0.0), 2) for name in TimingsAnswer.model_fields}
-            ),
+            timings_ms=TimingsAnswer(**{name: timings_ms.get(name, 0.0) for name in TimingsAnswer.model_fields}),
             model=self.model,
         )
 
@@ -214,10 +210,10 @@ def model_answer(bundle: Bundle) -> ModelAnswer:
 
 
 def _candidate(plan: FloorPlan, query: Query, candidate: Candidate) -> CandidateAnswer:
-    """A candidate in the words of the API: tenths of millimetres, thousandths of degrees."""
+    """A candidate in the words of the API."""
     return CandidateAnswer(
-        position=Position(x_m=round(candidate.x_m, 4), y_m=round(candidate.y_m, 4)),
-        heading_deg=round(heading_to_degrees(panorama_heading(query, candidate)), 3) % 360.0,
+        position=Position(x_m=candidate.x_m, y_m=candidate.y_m),
+        heading_deg=heading_to_degrees(panorama_heading(query, candidate)),
         room=plan.rooms[candidate.room_index].name,
         cost=candidate.cost,
         latent_distance=min(max(candidate.latent_distance, 0.0), 2.0),

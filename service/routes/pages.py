@@ -48,6 +48,12 @@ def style() -> Response:
     return _page("style.css", "text/css")
 
 
+@router.get("/favicon.ico")
+def icon() -> Response:
+    """What browsers show beside the title, and ask for also where no page names it."""
+    return _page("icon.svg", "image/svg+xml")
+
+
 def _page(name: str, media_type: str) -> Response:
     content = (files("service") / "web" / name).read_bytes()
     return Response(content, media_type=media_type, headers=_HEADERS)

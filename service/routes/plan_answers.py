@@ -37,7 +37,7 @@ def list_entries(summaries: list[PlanSummary], grids: Grids) -> list[FloorPlanSu
             status=state.status,
             progress=state.progress,
             rooms=summary.room_count,
-            area_m2=round(summary.area_m2, 3),
+            area_m2=summary.area_m2,
             created_at=summary.created_at,
             updated_at=summary.updated_at,
         )
@@ -59,13 +59,13 @@ def _answer(record: PlanRecord, state: GridState, step_m: float, *, superseded: 
         rooms=[
             RoomAnswer(
                 name=room.name,
-                area_m2=round(room.area_m2, 3),
+                area_m2=room.area_m2,
                 ceiling_height_m=room.ceiling_height_m,
                 vertices=len(room.polygon_m),
             )
             for room in plan.rooms
         ],
-        area_m2=round(plan.area_m2, 3),
+        area_m2=plan.area_m2,
         bounds=BoundsAnswer(x_min_m=x_min, y_min_m=y_min, x_max_m=x_max, y_max_m=y_max),
         camera_height_m=plan.camera_height_m,
         grid=GridAnswer(step_m=step_m, poses=grid_size(plan, step_m) if state.poses is None else state.poses),

@@ -8,6 +8,7 @@ from fastapi import APIRouter, Query, Request, Response
 from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
+from lalaloc_core.floorplan import FloorPlan
 from service.errors import InvalidRequestError, StoreUnavailableError, UnknownFloorPlanError
 from service.http.conditional import conditional_answer, content_etag
 from service.http.problems import problem_responses
@@ -81,6 +82,8 @@ async def get_preview(
     if x_m is not None and y_m is not None:
         marker = Marker(x_m=x_m, y_m=y_m, heading_deg=heading_deg, covariance_m2=_covariance(covariance_m2))
     record = _noted(request, await run_in_threadpool(stored_plan, tenant, floorplan_id, runtime.store.plans))
+    if marker is not None:
+        _check_near(marker, record.plan)
     content = await runtime.drawings.svg(record, marker)
     # An SVG can carry scripts; ours never does, and must not be talked into it.
     policy = {"Content-Security-Policy": "default-src 'none'"}
@@ -108,6 +111,22 @@ async def get_mesh(floorplan_id: str, request: Request, runtime: Running, tenant
 def _noted(request: Request, record: PlanRecord) -> PlanRecord:
     note(request, plan=record.id, revision=record.revision_id)
     return record
+
+
+def _check_near(marker: Marker, plan: FloorPlan) -> None:
+    """Raises:
+    InvalidRequestError: a camera so far from the plan that nothing would be seen of either.
+    """
+    x_min, y_min, x_max, y_max = plan.bounds_m
+    beyond_m = max(x_max - x_min, y_max - y_min)
+    ranges = (("x_m", marker.x_m, x_min, x_max), ("y_m", marker.y_m, y_min, y_max))
+    faults = [
+        (name, f"is {value:g}, it must lie from {least - beyond_m:g} to {most + beyond_m:g}: near the plan")
+        for name, value, least, most in ranges
+        if not least - beyond_m <= value <= most + beyond_m
+    ]
+    if faults:
+        raise InvalidRequestError(faults)
 
 
 def _covariance(given: list[float] | None) -> tuple[float, float, float] | None:

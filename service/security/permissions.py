@@ -34,6 +34,7 @@ NEEDED: Mapping[tuple[str, str], Permission] = {
     ("GET", "/web/try.js"): Permission.READ,
     ("GET", "/web/docs.js"): Permission.READ,
     ("GET", "/web/style.css"): Permission.READ,
+    ("GET", "/favicon.ico"): Permission.READ,
     ("GET", "/metrics"): Permission.READ,
     ("GET", "/limits"): Permission.READ,
     ("GET", "/floorplans"): Permission.READ,

@@ -7,6 +7,13 @@ function node(tag, text, ...children) {
   return made;
 }
 
+// Descriptions are Markdown, of which they use code between backticks and nothing else.
+function prose(tag, text) {
+  const made = document.createElement(tag);
+  (text || "").split("`").forEach((part, index) => { if (part) made.append(index % 2 ? node("code", part) : part); });
+  return made;
+}
+
 function typeOf(schema) {
   if (!schema) return "";
   if (schema.$ref) return schema.$ref.split("/").pop();
@@ -19,7 +26,7 @@ function typeOf(schema) {
 function fields(properties, required) {
   const rows = Object.entries(properties).map(([name, schema]) => node("tr", "",
     node("td", name + (required.includes(name) ? " *" : "")), node("td", typeOf(schema)),
-    node("td", schema.description || "")));
+    prose("td", schema.description)));
   return node("table", "", ...rows);
 }
 
@@ -29,7 +36,7 @@ function operation(method, path, described) {
   const verb = node("span", method.toUpperCase());
   verb.className = "method";
   summary.append(verb, `${path}  ${described.summary || ""}`);
-  details.append(summary, node("p", described.description || ""));
+  details.append(summary, prose("p", described.description));
   const parameters = described.parameters || [];
   if (parameters.length) {
     const properties = Object.fromEntries(parameters.map((parameter) =>
@@ -42,7 +49,7 @@ function operation(method, path, described) {
   }
   const answers = Object.entries(described.responses).map(([status, answer]) => {
     const media = Object.entries(answer.content || {}).map(([name, { schema }]) => `${name} ${typeOf(schema)}`);
-    return node("tr", "", node("td", status), node("td", answer.description), node("td", media.join(", ")));
+    return node("tr", "", node("td", status), prose("td", answer.description), node("td", media.join(", ")));
   });
   details.append(node("p", "Answers:"), node("table", "", ...answers));
   return details;
@@ -50,7 +57,7 @@ function operation(method, path, described) {
 
 async function show() {
   const api = await (await fetch("/openapi.json")).json();
-  document.getElementById("description").textContent = api.info.description;
+  document.getElementById("description").append(prose("span", api.info.description));
   for (const [path, methods] of Object.entries(api.paths)) {
     for (const [method, described] of Object.entries(methods)) {
       document.getElementById("operations").append(operation(method, path, described));
@@ -58,7 +65,7 @@ async function show() {
   }
   for (const [name, schema] of Object.entries(api.components.schemas)) {
     document.getElementById("schemas").append(node("details", "", node("summary", name),
-      node("p", schema.description || ""), fields(schema.properties || {}, schema.required || [])));
+      prose("p", schema.description), fields(schema.properties || {}, schema.required || [])));
   }
 }
 

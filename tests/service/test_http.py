@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import re
+import shutil
 import socket
+import subprocess
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from time import monotonic
@@ -129,12 +132,23 @@ def test_every_operation_but_health_says_that_it_may_be_refused_for_now(client: 
     assert "HTTPValidationError" not in document["components"]["schemas"]
 
 
-@pytest.mark.parametrize("path", ["/", "/docs", "/web/try.js", "/web/docs.js", "/web/style.css"])
+@pytest.mark.parametrize("path", ["/", "/docs", "/web/try.js", "/web/docs.js", "/web/style.css", "/favicon.ico"])
 def test_pages_load_nothing_from_elsewhere(client: httpx.Client, path: str) -> None:
     response = client.get(path)
     assert response.status_code == 200
     assert "default-src 'none'" in response.headers["content-security-policy"]
-    assert not re.search(r"https?://|//cdn", response.text)
+    assert not re.search(r"https?://(?!www\.w3\.org/2000/svg\b)|//cdn", response.text)
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="node is not installed")
+def test_the_documentation_shows_code_as_code(client: httpx.Client, tmp_path: Path) -> None:
+    (tmp_path / "docs.js").write_text(client.get("/web/docs.js").text)
+    (tmp_path / "openapi.json").write_text(client.get("/openapi.json").text)
+    command = ["node", ROOT / "tests" / "service" / "docs_page.js", tmp_path / "docs.js", tmp_path / "openapi.json"]
+    shown = json.loads(subprocess.run(command, capture_output=True, check=True, timeout=60.0).stdout)
+    assert "Localise a panorama" in " ".join(shown["text"])
+    assert {"status", "If-Match", "application/problem+json"} & set(shown["code"])
+    assert [text for text in shown["text"] + shown["code"] if "`" in text] == []
 
 
 _EVERYWHERE = {

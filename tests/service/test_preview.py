@@ -64,6 +64,34 @@ def test_the_camera_is_drawn_at_its_position_and_turned_clockwise() -> None:
     assert wedge.attrib["transform"] == "rotate(90.000)"
 
 
+@pytest.mark.parametrize("size_m", [(400.0, 3.0), (3.0, 400.0), (400.0, 300.0), (3.0, 2.0)])
+def test_the_scale_and_its_label_lie_within_the_drawing(size_m: tuple[float, float]) -> None:
+    (width, height) = size_m
+    corners = [[0, 0], [width, 0], [width, height], [0, height]]
+    document = {"ceiling_height_m": 2.5, "rooms": [{"name": "hall", "polygon": corners}]}
+    root = ElementTree.fromstring(plan_svg(FloorPlan.from_dict(document)))
+    left, top, seen_width, seen_height = (float(value) for value in root.attrib["viewBox"].split())
+    (scale,) = [group for group in root.iter(f"{SVG}g") if group.get("class") == "scale"]
+    label = next(scale.iter(f"{SVG}text"))
+    size = float(label.attrib["font-size"])
+    # Letters reach a quarter of their size below the line, and are at most as wide as high.
+    assert top + height < float(label.attrib["y"]) < top + seen_height - size / 4.0
+    assert left <= float(label.attrib["x"]) < left + seen_width - size * len(str(label.text))
+    assert size >= 0.01 * min(seen_width, seen_height)
+
+
+@given(st.floats(-30.0, 40.0), st.floats(-30.0, 40.0))
+def test_a_camera_outside_of_the_plan_is_seen_as_well(x_m: float, y_m: float) -> None:
+    plan = FloorPlan.from_dict(FLAT)
+    root = ElementTree.fromstring(plan_svg(plan, Marker(x_m=x_m, y_m=y_m, heading_deg=0.0)))
+    left, top, width, height = (float(value) for value in root.attrib["viewBox"].split())
+    assert left < x_m < left + width
+    assert top < -y_m < top + height
+    x_min, y_min, x_max, y_max = plan.bounds_m
+    assert left < x_min < x_max < left + width
+    assert top < -y_max < -y_min < top + height
+
+
 @pytest.mark.parametrize("document", [FLAT, L_ROOM], ids=["flat", "concave"])
 def test_the_mesh_encloses_the_plans_volume_seen_from_inside(document: dict) -> None:
     plan = FloorPlan.from_dict(document)

@@ -169,8 +169,16 @@ def test_no_line_tells_a_key_or_a_query(client: httpx.Client, log: Log, panorama
     assert "very-secret" not in log.text
 
 
+@pytest.mark.parametrize("path", ["/healthz", "/readyz", "/metrics"])
+def test_probes_are_told_to_whoever_debugs_alone(client: httpx.Client, log: Log, path: str) -> None:
+    client.get(path, headers={"x-request-id": "probe"})
+    client.get("/limits", headers={"x-request-id": "other"})
+    assert {line["level"] for line in log.of_request("probe")} == {"debug"}
+    assert {line["level"] for line in log.of_request("other")} == {"info"}
+
+
 def test_a_valid_trace_goes_on_in_the_answer_and_the_log(client: httpx.Client, log: Log) -> None:
-    response = client.get("/healthz", headers={"traceparent": f"00-{TRACE}-{SPAN}-01"})
+    response = client.get("/limits", headers={"traceparent": f"00-{TRACE}-{SPAN}-01"})
     version, trace_id, span_id, flags = response.headers["traceparent"].split("-")
     assert (version, trace_id, flags) == ("00", TRACE, "01")
     assert span_id != SPAN

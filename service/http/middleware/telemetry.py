@@ -22,6 +22,8 @@ from service.telemetry.tracing import OpenSpan
 _METHODS = {"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"}
 _REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
 _PLAN_ID = re.compile(r"[0-9a-f]{32}")
+# Asked every few seconds for as long as the service runs, whatever they answer.
+_PROBES = frozenset({"/healthz", "/readyz", "/metrics"})
 # What nginx logs for a client that closed the connection before there was any answer.
 _CLIENT_CLOSED = 499
 
@@ -104,7 +106,8 @@ class TelemetryMiddleware:
             "tenant": facts.tenant,
             "span_id": facts.trace.span_id,
         }
-        logging.getLogger(LOGGER_NAME).info("request", extra={"fields": fields})
+        level = logging.DEBUG if route in _PROBES else logging.INFO
+        logging.getLogger(LOGGER_NAME).log(level, "request", extra={"fields": fields})
 
     def _template(self, scope: Scope) -> str:
         """The route's template: real paths would make a new time series per floor plan."""
