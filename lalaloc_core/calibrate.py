@@ -22,11 +22,11 @@ from lalaloc_core.metrics import Accuracy
 
 # Of all that is fitted on, photographs of something else than the plan's home weigh so much: enough to tell them, too
 # little to make answers about the home itself look less sure than they are.
-_STRANGE_SHARE = 0.1
+_MISMATCHED_SHARE = 0.1
 # A weak pull to zero keeps the fit finite when the queries are perfectly separable.
 _RIDGE = 1e-2
 # How strongly offset and slope are held where they are: when hardly an answer is wrong, nothing tells how sure answers
-# may look, and what is strange must not gain by that.
+# may look, and mismatched photographs must not gain by that.
 _RESCALE_RIDGE = np.array([1.0, 16.0])
 _ITERATIONS, _CONVERGED = 50, 1e-9
 # Medians of the chi-squared distribution with one and with two degrees of freedom.
@@ -40,11 +40,11 @@ class Answers:
 
     Attributes:
         own: to photographs of the plan's home.
-        strange: to photographs of anything else, which no answer is right about.
+        mismatched: to photographs of anything else, which no answer is right about.
     """
 
     own: Sequence[Prediction]
-    strange: Sequence[Prediction] = ()
+    mismatched: Sequence[Prediction] = ()
 
 
 def fit_confidence(known: Answers, searched: Answers) -> ConfidenceModel:
@@ -77,21 +77,21 @@ def _by_stage(answers: Answers) -> dict[str, LogisticModel]:
 def _fit_stage(stage: str, answers: Answers) -> LogisticModel:
     """Maximum-likelihood logistic model of a stage's pose being within 1 m of the truth.
 
-    What is strange decides, with the rest, in which direction of the signals trust grows. How fast, and from where, is
-    then fitted on the home's own queries alone, whose probabilities are those that must be right.
+    Mismatched photographs decide, with the rest, in which direction of the signals trust grows. How fast, and from
+    where, is then fitted on the home's own queries alone, whose probabilities are those that must be right.
     """
     own = [one for one in answers.own if stage in one.signals]
-    strange = [one for one in answers.strange if stage in one.signals]
-    features = np.array([[1.0, *(one.signals[stage][name] for name in _SIGNALS)] for one in own + strange])
+    mismatched = [one for one in answers.mismatched if stage in one.signals]
+    features = np.array([[1.0, *(one.signals[stage][name] for name in _SIGNALS)] for one in own + mismatched])
     distance = [np.hypot(one.stages[stage].x_m - one.truth.x_m, one.stages[stage].y_m - one.truth.y_m) for one in own]
-    right = np.append(np.array(distance) < RIGHT_WITHIN_M, np.zeros(len(strange), bool))
+    right = np.append(np.array(distance) < RIGHT_WITHIN_M, np.zeros(len(mismatched), bool))
     weight = np.ones(len(features))
-    if strange:
-        weight[len(own) :] = _STRANGE_SHARE / (1.0 - _STRANGE_SHARE) * len(own) / len(strange)
+    if mismatched:
+        weight[len(own) :] = _MISMATCHED_SHARE / (1.0 - _MISMATCHED_SHARE) * len(own) / len(mismatched)
     # Features are scaled so that one ridge fits all.
     scale = np.maximum(np.abs(features).max(axis=0), 1e-9)
     direction = _logistic(features, right, weight, ridge=_RIDGE * scale**2)
-    if strange:
+    if mismatched:
         logit = (features @ direction)[: len(own)]
         about = np.stack([np.ones(len(own)), logit], axis=-1)
         offset, slope = _logistic(about, right[: len(own)], weight[: len(own)], ridge=_RESCALE_RIDGE, base=logit)

@@ -13,7 +13,7 @@ from lalaloc_core.floorplan import FloorPlan
 
 # Cameras do not stand in walls; grid poses keep this distance where the room allows it.
 WALL_MARGIN_M = 0.15
-_SMALLEST_RADIUS_M = 1e-3
+_MIN_RADIUS_M = 1e-3
 # Twice the negatives wanted are drawn at a time; where fewer than one in twelve is far enough, the plan is too small.
 _NEGATIVE_ROUNDS = 6
 
@@ -180,5 +180,5 @@ def _sample_near(
         result.room_index[missing[found]] = room[found]
         missing = missing[~found]
         radius[missing] *= 0.7
-        missing = missing[radius[missing] > _SMALLEST_RADIUS_M]
+        missing = missing[radius[missing] > _MIN_RADIUS_M]
     return result

@@ -8,8 +8,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from lalaloc_core.reproduce.render import markdown
 from lalaloc_core.reproduce.result import TableResult
+from lalaloc_core.reproduce.result_tables import markdown
 from lalaloc_core.reproduce.tables import TABLES
 
 ROOT = Path(__file__).resolve().parent.parent

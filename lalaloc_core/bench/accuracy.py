@@ -14,8 +14,8 @@ from lalaloc_core.evaluation.score import StageScores, score
 from lalaloc_core.methods.method import QueryKind
 
 # Homes of what is not among the first figures, and of the comparison of evidence, which asks the same six times.
-_MOST_HOMES_OF_MINOR = 100
-_MOST_HOMES_PER_EVIDENCE = 50
+_MAX_HOMES_OF_MINOR = 100
+_MAX_HOMES_PER_EVIDENCE = 50
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +50,7 @@ def bench_accuracy(bundle: Bundle, homes: int, textures: Path | None) -> dict[st
 
 def bench_evidence(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
     """What poses are compared by: the latent, the predicted wall profile, or both; heading known and unknown."""
-    homes = min(homes, _MOST_HOMES_PER_EVIDENCE)
+    homes = min(homes, _MAX_HOMES_PER_EVIDENCE)
     return {
         heading: {
             evidence: _summary(
@@ -63,7 +63,7 @@ def bench_evidence(bundle: Bundle, homes: int, textures: Path | None) -> dict[st
 
 
 def _answers(bundle: Bundle, exam: _Exam, homes: int, textures: Path | None) -> list[Prediction]:
-    homes = min(homes, _MOST_HOMES_OF_MINOR) if exam.minor else homes
+    homes = min(homes, _MAX_HOMES_OF_MINOR) if exam.minor else homes
     generated: dict[str, Any] = {"homes": homes, "furniture": exam.furniture}
     if exam.unfamiliar:
         generated["generator"] = "unfamiliar"

@@ -1,4 +1,4 @@
-"""The command line, `lalaloc`; each module here adds the commands of one room of the project.
+"""The command line, `lalaloc`; each module here adds one group of commands.
 
 Commands import what they run when they run it, so that `lalaloc --help` loads no network.
 """
@@ -31,6 +31,6 @@ def main(argv: list[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="lalaloc", description="Localise panoramas in floor plans.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for room in (synthesis, training, evaluation, photographs, reproduction, measuring):
-        room.add_commands(commands)
+    for group in (synthesis, training, evaluation, photographs, reproduction, measuring):
+        group.add_commands(commands)
     return parser

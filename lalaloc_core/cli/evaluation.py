@@ -16,12 +16,12 @@ from lalaloc_core.data.dataset import SPLITS
 from lalaloc_core.errors import InvalidInputError
 
 # So many homes that calibration asks with their own photographs for one that it asks with those of others.
-_PER_STRANGE_HOME = 3
+_PER_MISMATCHED_HOME = 3
 _BUNDLE = Path("models/default")
 
 
 def add_commands(commands: Any) -> None:
-    """Add this room's commands to the parser."""
+    """Add these commands to the parser."""
     evaluate = commands.add_parser(
         "evaluate", help="answer the queries of a data set, or of generated homes, and score the answers"
     )
@@ -171,13 +171,14 @@ def _calibrate(arguments: argparse.Namespace) -> None:
             return run_evaluation(RunFolder(Path(folder)), info)
 
     own = _generated(arguments, None)
-    strange = own | {"generator": "strangers", "homes": max(arguments.homes // _PER_STRANGE_HOME, 1)}
+    mismatched = own | {"generator": "mismatched", "homes": max(arguments.homes // _PER_MISMATCHED_HOME, 1)}
     known, searched = (
-        Answers(own=asked(own, heading, "own"), strange=asked(strange, heading, "strange")) for heading in (True, False)
+        Answers(own=asked(own, heading, "own"), mismatched=asked(mismatched, heading, "mismatched"))
+        for heading in (True, False)
     )
     description = (
         f"{len(known.own)} panoramas of {arguments.homes} generated validation homes, all furniture levels; confidence "
-        f"besides on {len(known.strange)} photographs of others or of no room"
+        f"besides on {len(known.mismatched)} photographs of others or of no room"
     )
     bundle = calibrate(Bundle.open(arguments.bundle), known, searched, description)
     print_json(bundle.manifest.metrics)

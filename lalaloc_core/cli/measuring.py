@@ -13,7 +13,7 @@ _GROUPS = ("rendering", "service", "accuracy", "evidence", "methods", "datasets"
 
 
 def add_commands(commands: Any) -> None:
-    """Add this room's commands to the parser."""
+    """Add these commands to the parser."""
     bench = commands.add_parser("bench", help="measure the figures of docs/results.md and print them as JSON")
     bench.add_argument("--bundle", type=Path, default=Path("models/default"))
     bench.add_argument("--homes", type=int, default=250, help="test homes per accuracy figure, 4 queries each")

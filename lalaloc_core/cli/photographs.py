@@ -13,7 +13,7 @@ from lalaloc_core.data.annotated import GALLERIES
 
 
 def add_commands(commands: Any) -> None:
-    """Add this room's commands to the parser."""
+    """Add these commands to the parser."""
     photographs = commands.add_parser(
         "photographs", help="measure a model on annotated photographs of real rooms, and draw what it reads there"
     )

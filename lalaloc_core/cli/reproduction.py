@@ -13,7 +13,7 @@ from lalaloc_core.errors import InvalidInputError
 
 
 def add_commands(commands: Any) -> None:
-    """Add this room's commands to the parser."""
+    """Add these commands to the parser."""
     reproduce = commands.add_parser("reproduce", help="run a table of the paper, with the paper's figures beside ours")
     reproduce.add_argument("--list", action="store_true", dest="only_list", help="list the tables and end")
     reproduce.add_argument("--table", action="append", default=[], metavar="NAME", help="a table; again for more")
@@ -45,7 +45,7 @@ def _reproduce(arguments: argparse.Namespace) -> None:
     if arguments.data is None:
         raise InvalidInputError("--data is missing: Structured3D, or what `lalaloc synth` writes")
 
-    from lalaloc_core.reproduce.render import markdown
+    from lalaloc_core.reproduce.result_tables import markdown
     from lalaloc_core.reproduce.run import Workbench
 
     workbench = Workbench(

@@ -14,7 +14,7 @@ _INTERRUPTED = 130
 
 
 def add_commands(commands: Any) -> None:
-    """Add this room's commands to the parser."""
+    """Add these commands to the parser."""
     synth = commands.add_parser("synth", help="write synthetic scenes in Structured3D's layout")
     synth.add_argument("--scenes", type=int, required=True, help="how many there shall be; those that are stay")
     synth.add_argument("--out", type=Path, required=True, help="folder of the data set")

@@ -21,7 +21,7 @@ _PER_UNFAMILIAR_HOME = 3
 
 
 def add_commands(commands: Any) -> None:
-    """Add this room's commands to the parser."""
+    """Add these commands to the parser."""
     train = commands.add_parser("train", help="train a stage: the layout encoder, then the image encoder")
     train.add_argument("stage", choices=("layout", "image", "end-to-end"), help="end-to-end is both stages at once")
     train.add_argument("--preset", default="ring", choices=("ring", "paper", "tiny"))

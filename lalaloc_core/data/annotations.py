@@ -38,14 +38,14 @@ ClassSpan = tuple[DrawnKind, float, float]
 _REQUIRED = {"photograph", "quality", "polygon", "ceiling_above_camera", "openings"}
 _OPTIONAL = {"alternative_polygon", "room_type", "notes"}
 _OPENING_KEYS = {"kind", "columns", "line"}
-_MOST_VERTICES, _MOST_OPENINGS = 200, 100
+_MAX_VERTICES, _MAX_OPENINGS = 200, 100
 # In camera heights: the largest coordinate, and how far off the outline the ends of an opening may be drawn.
-_FARTHEST, _OFF_THE_WALL = 60.0, 0.1
+_MAX_REACH, _OFF_THE_WALL = 60.0, 0.1
 # An opening's columns and its line say the same twice; they may differ by this share of the picture's width.
 _COLUMN_TOLERANCE = 0.01
 # An opening is looked for with so many rays between its edges. It is on a wall that at least so many of them meet, and
 # it is that of another outline where it is met within this (m) of the same place.
-_RAYS, _LEAST_SHARE, _SAME_PLACE_M = 64, 0.2, 0.05
+_RAYS, _MIN_SHARE, _SAME_PLACE_M = 64, 0.2, 0.05
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -148,8 +148,8 @@ class _Reader:
 
     def ceiling_height_m(self, raw: Any) -> float:
         """Height of the ceiling over the floor; a usual one where none is given."""
-        if raw is not None and not (is_number(raw) and 0.0 < raw <= _FARTHEST):
-            raise self.error(f"ceiling_above_camera is {raw!r}, it must be null or above 0 and at most {_FARTHEST:g}")
+        if raw is not None and not (is_number(raw) and 0.0 < raw <= _MAX_REACH):
+            raise self.error(f"ceiling_above_camera is {raw!r}, it must be null or above 0 and at most {_MAX_REACH:g}")
         return CAMERA_HEIGHT_M * (1.0 + (_USUAL_CEILING if raw is None else float(raw)))
 
     def text(self, document: Mapping[str, Any], key: str) -> str:
@@ -174,7 +174,7 @@ class _Reader:
 
     def polygon(self, raw: Any, key: str) -> Float[np.ndarray, "n 2"]:
         """An outline (m), validated as rooms of floor plans are, with the camera inside."""
-        polygon_m = self._points(raw, key, 3, _MOST_VERTICES) * CAMERA_HEIGHT_M
+        polygon_m = self._points(raw, key, 3, _MAX_VERTICES) * CAMERA_HEIGHT_M
         shape = {"name": self._path.stem, "polygon": polygon_m.tolist(), "ceiling_height_m": 2.0 * CAMERA_HEIGHT_M}
         try:
             (room,) = FloorPlan.from_dict({"rooms": [shape]}).rooms
@@ -195,8 +195,8 @@ class _Reader:
 
     def openings(self, raw: Any, width: int) -> tuple[ClassSpan, ...]:
         """Kinds of openings with the columns that they take up, as shares of the width."""
-        if not isinstance(raw, list) or len(raw) > _MOST_OPENINGS:
-            raise self.error(f"openings must be a list of at most {_MOST_OPENINGS}")
+        if not isinstance(raw, list) or len(raw) > _MAX_OPENINGS:
+            raise self.error(f"openings must be a list of at most {_MAX_OPENINGS}")
         spans = []
         for number, one in enumerate(raw):
             what = f"opening {number}"
@@ -246,9 +246,9 @@ class _Reader:
         for point in raw:
             if not isinstance(point, list) or len(point) != 2 or not all(map(is_number, point)):
                 raise self.error(f"{what}: a point is {str(point)[:50]}, it must be two numbers [x, y]")
-            if max(map(abs, point)) > _FARTHEST:
+            if max(map(abs, point)) > _MAX_REACH:
                 raise self.error(
-                    f"{what}: a point is {str(point)[:50]}, more than {_FARTHEST:g} camera heights away; "
+                    f"{what}: a point is {str(point)[:50]}, more than {_MAX_REACH:g} camera heights away; "
                     "are lengths in camera heights?"
                 )
         return np.array(raw, dtype=np.float64)
@@ -267,7 +267,7 @@ def _pieces(room: DrawnRoom, seen: DrawnRoom, span: ClassSpan) -> list[DrawnOpen
     pieces = []
     for number in np.unique(wall[same]):
         met = place[same & (wall == number)]
-        if len(met) >= _LEAST_SHARE * _RAYS:
+        if len(met) >= _MIN_SHARE * _RAYS:
             pieces.append(DrawnOpening(kind, met[[0, -1]]))
     return pieces
 

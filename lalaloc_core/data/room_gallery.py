@@ -20,7 +20,7 @@ from lalaloc_core.synth.plans import generate_home
 
 GALLERY_ROOMS = 20
 # At most so many of the others are rooms that somebody drew; the rest are generated.
-_MOST_DRAWN = 9
+_MAX_DRAWN = 9
 # How much larger or smaller than drawn, and than the own room where they are generated, the others are made.
 _RESCALED = 0.1
 # Generated rooms that are the most alike; those of a gallery are drawn from them.
@@ -54,12 +54,12 @@ def build_gallery(
 
     Args:
         own: with the camera at its origin, looking along +y.
-        others: drawn rooms; those most alike in size and shape are taken, up to `_MOST_DRAWN` of them, and rescaled
+        others: drawn rooms; those most alike in size and shape are taken, up to `_MAX_DRAWN` of them, and rescaled
             within `_RESCALED`. The rest are generated rooms of a like shape, scaled to the size within as much.
         like: what the others are to be like; None: the own room.
     """
     like = like or own
-    drawn = sorted(others, key=lambda room: _unlike(like, room))[:_MOST_DRAWN]
+    drawn = sorted(others, key=lambda room: _unlike(like, room))[:_MAX_DRAWN]
     generated, shapes = _generated()
     pool = [generated[k] for k in np.argsort(np.abs(shapes - _shape(like)).sum(axis=1), kind="stable")[:_ALIKE]]
     chosen = rng.choice(len(pool), GALLERY_ROOMS - 1 - len(drawn), replace=False)

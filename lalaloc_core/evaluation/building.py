@@ -13,7 +13,7 @@ from lalaloc_core.configuration import build_config
 from lalaloc_core.data.dataset import Appearance, Dataset
 from lalaloc_core.data.opening import open_dataset
 from lalaloc_core.data.synthetic.generated import GeneratedScenes
-from lalaloc_core.data.synthetic.mismatched import StrangeScenes
+from lalaloc_core.data.synthetic.mismatched import MismatchedScenes
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.evaluation.predictions import RunInfo
 from lalaloc_core.localise.encoders import Encoders
@@ -85,7 +85,8 @@ def build_dataset(info: RunInfo) -> Dataset:
     if arguments.get("textures") is not None:
         arguments["textures"] = Path(arguments["textures"])
     homes = GeneratedScenes(**arguments)
-    return StrangeScenes(homes) if generator == "strangers" else homes
+    # Runs of earlier versions say "strangers".
+    return MismatchedScenes(homes) if generator in ("mismatched", "strangers") else homes
 
 
 def build_method(info: RunInfo) -> Method:

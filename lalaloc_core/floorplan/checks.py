@@ -12,7 +12,7 @@ from lalaloc_core.floorplan.limits import PlanLimits
 from lalaloc_core.floorplan.rooms import Room
 
 # Looking for overlaps ends after so many found, or so many pairs looked at: their number grows with the square.
-_MOST_OVERLAPS, _MOST_PAIRS = 20, 5000
+_MAX_OVERLAPS, _MAX_PAIRS = 20, 5000
 
 
 def check_size(rooms: Sequence[Room], limits: PlanLimits) -> None:
@@ -44,7 +44,7 @@ def overlap_warnings(rooms: Sequence[Room], limits: PlanLimits) -> tuple[str, ..
     pairs = sorted((int(i), int(j)) for i, j in zip(first, second, strict=True) if i < j)
     warnings: list[str] = []
     for looked_at, (i, j) in enumerate(pairs):
-        if len(warnings) == _MOST_OVERLAPS or looked_at == _MOST_PAIRS:
+        if len(warnings) == _MAX_OVERLAPS or looked_at == _MAX_PAIRS:
             warnings.append("more rooms may overlap, the rest was not looked at")
             break
         shared = float(shapely.intersection(shapes[i], shapes[j]).area)

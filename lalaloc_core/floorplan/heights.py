@@ -11,7 +11,7 @@ from lalaloc_core.floorplan.rooms import Room
 from lalaloc_core.floorplan.values import read_number, read_number_between
 
 DEFAULT_CAMERA_HEIGHT_M = 1.5
-_LARGEST_STD_M = 2.0
+_MAX_STD_M = 2.0
 
 
 def read_camera_height(value: Any, rooms: Sequence[Room]) -> float:
@@ -27,7 +27,7 @@ def read_camera_height(value: Any, rooms: Sequence[Room]) -> float:
 
 def read_camera_height_std(value: Any) -> float | None:
     """The standard deviation of the camera's height (m), None when it is not said."""
-    return None if value is None else read_number_between(value, "camera_height_std_m", 0.0, _LARGEST_STD_M, " m")
+    return None if value is None else read_number_between(value, "camera_height_std_m", 0.0, _MAX_STD_M, " m")
 
 
 def read_north(degrees: Any) -> float | None:

@@ -15,8 +15,8 @@ _OPENING, _CLOSING = np.frombuffer(b"[{", np.uint8), np.frombuffer(b"]}", np.uin
 # twice, and the time is linear; with the closing quote required, each quote of such a string would be tried anew.
 _JSON_STRING = re.compile(r'"[^"\\]*+(?:\\.[^"\\]*+)*+(?:"|\\?\Z)', re.DOTALL)
 # More digits than any finite number of metres has. Python reads thousands, in time that grows with their square.
-_MOST_DIGITS = 1000
-_DIGITS = re.compile(rf"(?<![0-9])[0-9]{{{_MOST_DIGITS + 1},}}")
+_MAX_DIGITS = 1000
+_DIGITS = re.compile(rf"(?<![0-9])[0-9]{{{_MAX_DIGITS + 1},}}")
 
 
 def read_json(text: str | bytes, max_depth: int) -> Any:
@@ -59,4 +59,4 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 def _check_digits(structure: str) -> None:
     found = _DIGITS.search(structure)
     if found is not None:
-        raise InvalidFloorPlanError(f"a number has {len(found[0])} digits, at most {_MOST_DIGITS} are read")
+        raise InvalidFloorPlanError(f"a number has {len(found[0])} digits, at most {_MAX_DIGITS} are read")

@@ -23,9 +23,9 @@ from lalaloc_core.floorplan.rooms import Room
 
 DEFAULT_OPENING_TOLERANCE_M = 0.35
 # A wall is nearly parallel up to 15 degrees.
-_LEAST_COSINE = float(np.cos(np.radians(15.0)))
+_MIN_COSINE = float(np.cos(np.radians(15.0)))
 # What is shorter on a wall is the end of an opening that lies beside it; half of a narrow opening is never that.
-_SHORTEST_PIECE_M = 0.1
+_MIN_PIECE_M = 0.1
 # Openings that share less than this of a wall touch.
 _TOUCHING_M = 0.01
 _ROUNDING_M = 1e-6
@@ -173,7 +173,7 @@ def _contacts(
     near = walls.near(opening.line_m, tolerance_m)
     if opening.rooms is not None:
         near = near[np.isin(walls.room[near], [k for k, room in enumerate(rooms) if room.id in opening.rooms])]
-    near = near[np.abs(walls.edge[near] @ direction) >= _LEAST_COSINE * walls.length_m[near]]
+    near = near[np.abs(walls.edge[near] @ direction) >= _MIN_COSINE * walls.length_m[near]]
     first = walls.start[near] - start
     ends = np.stack([first, first + walls.edge[near]], axis=1)
     at = ends @ direction
@@ -182,7 +182,7 @@ def _contacts(
     # How far off the wall is at both ends of what it shares with the opening.
     slope = np.divide(aside[:, 1] - aside[:, 0], at[:, 1] - at[:, 0])
     off_m = aside[:, :1] + slope[:, None] * (np.stack([low, high], axis=1) - at[:, :1])
-    least_m = min(_SHORTEST_PIECE_M, 0.5 * length_m)
+    least_m = min(_MIN_PIECE_M, 0.5 * length_m)
     on = (np.abs(off_m).max(axis=1) <= tolerance_m + _ROUNDING_M) & (high - low >= least_m)
     if on.sum() > limits.max_walls_per_opening:
         raise InvalidFloorPlanError(

@@ -117,13 +117,13 @@ def read_segment(raw: Any, what: str, limits: PlanLimits, room: str | None) -> F
     if not isinstance(raw, list | tuple) or len(raw) != 2:
         raise InvalidFloorPlanError(f"{what} must be two points [[x, y], [x, y]]", room=room)
     points = read_points(raw, limits, room, f"{what}: point")
-    if float(np.hypot(*(points[1] - points[0]))) < _SHORTEST_SEGMENT_M:
-        raise InvalidFloorPlanError(f"{what} is shorter than {_SHORTEST_SEGMENT_M:g} m", room=room)
+    if float(np.hypot(*(points[1] - points[0]))) < _MIN_SEGMENT_M:
+        raise InvalidFloorPlanError(f"{what} is shorter than {_MIN_SEGMENT_M:g} m", room=room)
     return points
 
 
 # Shorter than any opening or stub of wall, longer than the rounding of a drawing.
-_SHORTEST_SEGMENT_M = 0.01
+_MIN_SEGMENT_M = 0.01
 
 
 def _is_finite(value: int | float) -> bool:

@@ -19,7 +19,7 @@ _INDEPENDENT = 16.0
 # An answer is right within this distance.
 RIGHT_WITHIN_M = 1.0
 # No posterior over a handful of candidates is surer than this, either way.
-_MOST_LOG_ODDS = 6.0
+_MAX_LOG_ODDS = 6.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,9 +56,9 @@ def signals_of(query: Query, candidates: Sequence[Candidate], *, complete: bool)
     rivals = log_likelihood[~here]
     if not complete:
         rivals = np.append(rivals, log_likelihood.min() + np.log(len(cost)))
-    against = np.logaddexp.reduce(rivals) if len(rivals) else -_MOST_LOG_ODDS
+    against = np.logaddexp.reduce(rivals) if len(rivals) else -_MAX_LOG_ODDS
     return Signals(
-        log_odds=float(np.clip(-against, -_MOST_LOG_ODDS, _MOST_LOG_ODDS)),
+        log_odds=float(np.clip(-against, -_MAX_LOG_ODDS, _MAX_LOG_ODDS)),
         cost=float(cost[best]),
         uncertainty=0.0 if query.profile is None else float(query.profile.log_scale.mean()),
         latent_distance=candidates[best].latent_distance,

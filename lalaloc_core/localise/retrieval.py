@@ -13,7 +13,7 @@ from lalaloc_core.localise.poses import Candidate, LatentGrid, Query
 from lalaloc_core.sampling import pose_grid
 
 # Poses times hypotheses whose profiles are compared; of larger grids, the poses with the nearest latents.
-_MOST_PAIRS = 200_000
+_MAX_PAIRS = 200_000
 # The best pairs, which are looked at for distinct candidates; more if they hold too few.
 _FIRST_RANKED = 4096
 # Two candidates at one place are distinct if they are turned against each other by this much (radians).
@@ -37,8 +37,8 @@ def retrieve(
     poses = np.arange(len(grid.poses))
     cost = distance
     if evidence.compares_profiles(query):
-        if hypotheses * len(poses) > _MOST_PAIRS:
-            most = max(_MOST_PAIRS // hypotheses, top_k)
+        if hypotheses * len(poses) > _MAX_PAIRS:
+            most = max(_MAX_PAIRS // hypotheses, top_k)
             poses = np.argpartition(distance.min(axis=0), most)[:most] if most < len(poses) else poses
         log_profile = np.log(grid.profile_m[poses])
         centre, precision = targets(query, np.arange(hypotheses), evidence.grid_reach * grid.step_m, evidence)

@@ -25,7 +25,7 @@ class DepthAligner:
         Args:
             rows: rows of the images.
             columns: columns of the wall profiles that are cast.
-            thinning: the images have every so manieth of these columns.
+            thinning: the images have every n-th of these columns.
             config: margins and Adam's schedule.
         """
 

@@ -38,7 +38,7 @@ class VdrDecode:
         # What the paper compares with is the latent alone.
         self._config = replace(config or LocaliseConfig(), evidence=EvidenceConfig(use_profile=False))
         self._decoder = decoder.eval().requires_grad_(False)
-        # Training shows the decoder every so manieth column of the encoder's wall profile.
+        # Training shows the decoder every n-th column of the encoder's wall profile.
         columns = encoders.manifest.profile_columns
         thinning = max(columns // DECODED_WIDTH, 1)
         self._width = len(range(0, columns, thinning))

@@ -26,8 +26,8 @@ from lalaloc_core.evaluation.run import run_evaluation
 from lalaloc_core.evaluation.score import Estimate, Scores, score
 from lalaloc_core.files import atomic_write
 from lalaloc_core.reproduce.ablations import train_ablation
-from lalaloc_core.reproduce.render import draw_vogel_samples, markdown
 from lalaloc_core.reproduce.result import Budget, Figure, RowResult, TableResult
+from lalaloc_core.reproduce.result_tables import draw_vogel_samples, markdown
 from lalaloc_core.reproduce.table import SHIPPED, Ask, Column, Row, Table
 
 # Queries per row: enough to tell methods apart at a small budget, and few enough that times are taken one at a time.

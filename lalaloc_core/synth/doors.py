@@ -15,7 +15,7 @@ from lalaloc_core.synth.style import HouseStyle
 from lalaloc_core.synth.tables import SceneTables
 
 # What is no wall's thickness between two rooms is taken for the usual one.
-_USUAL_DEPTH_M, _DEEPEST_M = 0.12, 0.6
+_USUAL_DEPTH_M, _MAX_DEPTH_M = 0.12, 0.6
 # Leaves and holes begin below the floor: no crack is seen.
 _BELOW_M = -1.0
 _HANDLE_M = 1.0
@@ -66,7 +66,7 @@ def _hole_depth(room: Room, neighbour: Room, opening: Opening) -> float:
     middle, _, inwards = _frame_of(room, opening)
     ray = shapely.LineString([middle, middle - inwards])
     depth = float(shapely.distance(shapely.Point(middle), shapely.intersection(ray, neighbour.shape)))
-    return depth if 0.0 < depth < _DEEPEST_M else _USUAL_DEPTH_M
+    return depth if 0.0 < depth < _MAX_DEPTH_M else _USUAL_DEPTH_M
 
 
 def _frame_of(

@@ -15,8 +15,8 @@ from lalaloc_core.synth.pieces import Finish, Part, Piece
 from lalaloc_core.synth.pieces_living import wardrobe_run
 from lalaloc_core.synth.pieces_service import COUNTER_DEPTH_M, bathtub, counter_run, shower, toilet, washbasin
 
-_SHORTEST_RUN_M = 1.2
-_LONGEST_RUN_M = 6.0
+_MIN_RUN_M = 1.2
+_MAX_RUN_M = 6.0
 _TALL_UNIT_M = 0.6
 
 
@@ -53,20 +53,20 @@ def kitchen(
         ceiling_m: height of the ceiling.
         rng: source of randomness.
     """
-    usable = [stretch for stretch in stretches if stretch.length_m > _SHORTEST_RUN_M]
+    usable = [stretch for stretch in stretches if stretch.length_m > _MIN_RUN_M]
     if not usable:
         return []
     weights = np.array([stretch.length_m for stretch in usable])
     main = usable[int(rng.choice(len(usable), p=weights / weights.sum()))]
-    length = min(main.length_m, _LONGEST_RUN_M)
+    length = min(main.length_m, _MAX_RUN_M)
     if rng.random() < 0.4:
-        length = rng.uniform(_SHORTEST_RUN_M, length)
+        length = rng.uniform(_MIN_RUN_M, length)
     start = main.start_m if rng.random() < 0.5 else main.end_m - length
     body: Finish = ("white", "wood", "paint")[int(rng.integers(3))]
     height = rng.uniform(0.85, 0.95)
     has_wall_units = rng.random() < 0.75 and not main.has_window
     placed = []
-    if length > _SHORTEST_RUN_M + _TALL_UNIT_M and rng.random() < 0.5 and not main.has_window:
+    if length > _MIN_RUN_M + _TALL_UNIT_M and rng.random() < 0.5 and not main.has_window:
         # A tall unit or a fridge closes the run on one side.
         top = min(rng.uniform(1.9, 2.4), ceiling_m - 0.02)
         tall = _tall_unit(body, top)

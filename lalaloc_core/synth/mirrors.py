@@ -19,7 +19,7 @@ _CHANCE = {"bathroom": 0.4, "corridor": 0.22, "bedroom": 0.25, "living": 0.15, "
 _OTHERS = 0.05
 _BARE_SHARE = 0.4
 _CLEARANCE_M = 0.15
-_NARROWEST_M = 0.35
+_MIN_WIDTH_M = 0.35
 _DEPTH_M = 0.004
 
 
@@ -42,9 +42,9 @@ def draw_mirror(room: Room, openings: Sequence[Opening], rng: np.random.Generato
     for wall in rng.permutation(len(lengths))[:4]:
         length = float(lengths[wall])
         widest = min(3.0, length - 2.0 * _CLEARANCE_M)
-        if widest < _NARROWEST_M:
+        if widest < _MIN_WIDTH_M:
             continue
-        width = rng.uniform(_NARROWEST_M, widest)
+        width = rng.uniform(_MIN_WIDTH_M, widest)
         start = rng.uniform(_CLEARANCE_M, length - _CLEARANCE_M - width)
         free = all(
             hole.wall != wall or start > hole.end_m + _CLEARANCE_M or start + width < hole.start_m - _CLEARANCE_M

@@ -14,7 +14,7 @@ from lalaloc_core.synth.tables import SceneTables
 
 _HALF_DEPTH_M = 0.05
 _CURTAIN_FROM_WALL_M, _RADIATOR_FROM_WALL_M = 0.07, 0.06
-_NARROWEST_HALF_M = 0.02
+_MIN_HALF_WIDTH_M = 0.02
 
 
 def add_window(tables: SceneTables, style: HouseStyle, wall: int, window: Opening, rng: np.random.Generator) -> None:
@@ -76,7 +76,7 @@ def _hang(
     start, along, inwards = wall_frame(room, wall)
     length = float(np.hypot(*(room.walls_m[wall, 2:] - room.walls_m[wall, :2])))
     half_m = min(half_m, s, length - s)
-    if half_m <= _NARROWEST_HALF_M:
+    if half_m <= _MIN_HALF_WIDTH_M:
         return
     centre = start + along * s + inwards * from_wall_m
     footprint = rectangle(centre, along, half_m, _HALF_DEPTH_M)

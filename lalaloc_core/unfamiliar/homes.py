@@ -23,7 +23,7 @@ from lalaloc_core.unfamiliar.tracing import Tracer
 _FAMILY = 0x0DD
 WALL_MARGIN_M = 0.25
 _FURNITURE_MARGIN_M = 0.12
-_LOWEST_M, _HIGHEST_M = 1.1, 1.8
+_MIN_CAMERA_M, _MAX_CAMERA_M = 1.1, 1.8
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ def stands_of(key: HomeKey, count: int) -> list[Stand]:
                 position_m=_inside(free[room], rng),
                 room_index=int(room),
                 heading=float(rng.uniform(0.0, 2 * np.pi)),
-                camera_height_m=float(min(rng.uniform(_LOWEST_M, _HIGHEST_M), ceiling - 0.3)),
+                camera_height_m=float(min(rng.uniform(_MIN_CAMERA_M, _MAX_CAMERA_M), ceiling - 0.3)),
             )
         )
     return stands

@@ -23,7 +23,7 @@ AREAS_M2: Mapping[RoomKind, tuple[float, float]] = {
     "study": (6.0, 13.0),
 }
 # Edges shorter than this are no wall anybody would build, and a room must hold a disc of this radius.
-_SHORTEST_EDGE_M = 0.18
+_MIN_EDGE_M = 0.18
 _INNER_RADIUS_M = 0.42
 
 
@@ -156,4 +156,4 @@ def _is_sound(shape: shapely.Polygon, area_m2: tuple[float, float]) -> bool:
     corners = np.array(shape.exterior.coords)
     shortest = np.linalg.norm(np.diff(corners, axis=0), axis=1).min()
     core = shape.buffer(-_INNER_RADIUS_M)
-    return bool(shortest >= _SHORTEST_EDGE_M) and isinstance(core, shapely.Polygon) and not core.is_empty
+    return bool(shortest >= _MIN_EDGE_M) and isinstance(core, shapely.Polygon) and not core.is_empty

@@ -77,26 +77,28 @@ class TestConfidence:
         # Of the home's own photographs none tells that a poor fit is bad: all have the same cost.
         rng = np.random.default_rng(0)
         own = [result(0.2 if rng.random() < 0.9 else 3.0, rng.uniform(-3.0, 4.0)) for _ in range(400)]
-        strange = [result(0.2, rng.uniform(-3.0, 4.0), cost=0.6) for _ in range(100)]
+        mismatched = [result(0.2, rng.uniform(-3.0, 4.0), cost=0.6) for _ in range(100)]
         plain, taught = (
-            fit_confidence(Answers(own=own, strange=others), Answers(own=own)).known_heading["lpo"]
-            for others in ([], strange)
+            fit_confidence(Answers(own=own, mismatched=others), Answers(own=own)).known_heading["lpo"]
+            for others in ([], mismatched)
         )
-        assert np.mean([confidence(plain, one) for one in strange]) > 0.5
-        assert np.mean([confidence(taught, one) for one in strange]) < 0.1
+        assert np.mean([confidence(plain, one) for one in mismatched]) > 0.5
+        assert np.mean([confidence(taught, one) for one in mismatched]) < 0.1
         # Answers about the home itself are told as right as they are.
         share = np.mean(position_errors_m(own) < 1.0)
         assert np.mean([confidence(taught, one) for one in own]) == pytest.approx(share, abs=0.002)
 
     @pytest.mark.parametrize("wrong_log_odds", [None, 0.0, 3.0], ids=["none", "like the others", "surer"])
-    def test_what_is_strange_gains_nothing_where_hardly_an_answer_is_wrong(self, wrong_log_odds: float | None) -> None:
+    def test_mismatched_photographs_gain_nothing_where_hardly_an_answer_is_wrong(
+        self, wrong_log_odds: float | None
+    ) -> None:
         rng = np.random.default_rng(0)
         own = [result(0.2, rng.normal(), cost=0.1) for _ in range(490)]
         own += [result(3.0, wrong_log_odds, cost=0.1) for _ in range(10) if wrong_log_odds is not None]
-        strange = [result(0.2, rng.normal() - 2.0, cost=0.6) for _ in range(160)]
-        model = fit_confidence(Answers(own=own, strange=strange), Answers(own=own)).known_heading["lpo"]
+        mismatched = [result(0.2, rng.normal() - 2.0, cost=0.6) for _ in range(160)]
+        model = fit_confidence(Answers(own=own, mismatched=mismatched), Answers(own=own)).known_heading["lpo"]
         assert np.mean([confidence(model, one) for one in own]) > 0.9
-        assert np.mean([confidence(model, one) for one in strange]) < 0.1
+        assert np.mean([confidence(model, one) for one in mismatched]) < 0.1
 
     @given(seeds())
     @settings(max_examples=10)

@@ -5,18 +5,18 @@ from __future__ import annotations
 import numpy as np
 
 from lalaloc_core.data.synthetic.generated import GeneratedScenes
-from lalaloc_core.data.synthetic.mismatched import OpenAir, StrangeScenes
+from lalaloc_core.data.synthetic.mismatched import MismatchedScenes, OpenAir
 
 HOMES = GeneratedScenes(homes=2, shots_per_home=4, furniture=None)
 LOOK = HOMES.appearances[0]
 
 
 def test_cameras_are_the_homes_own_and_see_the_next_home() -> None:
-    strange, own = StrangeScenes(HOMES).load("validation-00001"), HOMES.load("validation-00001")
+    mismatched, own = MismatchedScenes(HOMES).load("validation-00001"), HOMES.load("validation-00001")
     # The next one is there beyond the last that is asked about, too.
     other = HOMES.load("validation-00002")
-    assert strange.plan.to_dict() == own.plan.to_dict()
-    for k, (camera, mine, theirs) in enumerate(zip(strange.cameras, own.cameras, other.cameras, strict=True)):
+    assert mismatched.plan.to_dict() == own.plan.to_dict()
+    for k, (camera, mine, theirs) in enumerate(zip(mismatched.cameras, own.cameras, other.cameras, strict=True)):
         assert np.array_equal(camera.position_m, mine.position_m)
         assert (camera.room_index, camera.heading) == (mine.room_index, mine.heading)
         if k == 3:

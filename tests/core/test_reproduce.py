@@ -13,8 +13,8 @@ from lalaloc_core.evaluation.building import build_method
 from lalaloc_core.evaluation.predictions import RunInfo
 from lalaloc_core.evaluation.score import Scores, StageScores
 from lalaloc_core.reproduce.ablations import ABLATIONS
-from lalaloc_core.reproduce.render import draw_vogel_samples, markdown
 from lalaloc_core.reproduce.result import Figure, RowResult, TableResult
+from lalaloc_core.reproduce.result_tables import draw_vogel_samples, markdown
 from lalaloc_core.reproduce.table import COLUMN_TITLES, SHIPPED
 from lalaloc_core.reproduce.tables import TABLES
 

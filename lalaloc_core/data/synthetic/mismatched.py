@@ -21,7 +21,7 @@ _ROOMLESS = 4
 
 
 @dataclass(frozen=True)
-class StrangeScenes:
+class MismatchedScenes:
     """Generated homes whose cameras show what the cameras of the next home see, and one in four the open air.
 
     Poses and heights are those of the home's own cameras: where a camera stands has nothing to do with what it shows.
