@@ -5,6 +5,8 @@ from lalaloc_client import Client
 with Client("http://127.0.0.1:8000") as service:
     plan = service.wait_until_ready(service.upload_floorplan("flat.json").id)
     answer = service.localise(plan.id, "kitchen.jpg", heading_deg=250)
+
+Begin with `client.py`; `operations.py` is what both clients do, without doing it.
 """
 
 from lalaloc_client.aio import AsyncClient

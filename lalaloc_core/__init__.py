@@ -1,6 +1,24 @@
 """LaLaLoc: where in this floor plan was this panorama taken?
 
-Importing this package imports neither torch nor onnxruntime; modules that need them say so.
+    floorplan/   plans: validated rooms and openings        sampling.py  camera poses in a plan
+    panorama/    pictures as files                          bundle.py    a model on disk
+    render/      the layout renderer                        conventions.py  axes, units, pixels
+    nets/        the networks in torch                      metrics.py, azimuths.py  distances and scores
+    localise/    the search: evidence, retrieval, optimiser calibrate.py fits confidence
+    synth/       the generator of training data
+    unfamiliar/  another generator, for reporting only
+    data/        data sets
+    training/    training
+    export/      from a training run to a bundle
+    methods/     what is compared: LaLaLoc, ICP, oracles
+    evaluation/  asking and scoring
+    report/      pages and sheets to look at
+    reproduce/   the paper's tables
+    bench/       the figures of docs/results.md
+    cli/         the command line
+
+Begin with `localise/pipeline.py`, the path of a query. Importing this package imports neither torch nor onnxruntime;
+modules that need them say so.
 """
 
 __version__ = "0.1.0"

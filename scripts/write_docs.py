@@ -44,7 +44,7 @@ def documents() -> dict[Path, str]:
             "sizes": variants_table(SIZES),
             "ideas": variants_table(IDEAS),
         },
-        ROOT / "docs" / "architecture.md": {f"files of {package}": file_map(package) for package in _PACKAGES},
+        ROOT / "docs" / "architecture.md": {"folders": folder_map()},
     }
     return {path: _filled(path.read_text(encoding="utf-8"), contents) for path, contents in parts.items()}
 
@@ -61,14 +61,15 @@ def settings_table() -> str:
     return "\n".join(rows)
 
 
-def file_map(package: str) -> str:
-    """Every module of a package, with the first paragraph of its docstring, as a Markdown table."""
-    rows = ["| file | what it is |", "|---|---|"]
-    for path in sorted((ROOT / package).rglob("*.py"), key=lambda path: (path.parent, path.name)):
-        docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
-        if docstring:
+def folder_map() -> str:
+    """Every package, what its docstring says it is for and where to begin, as a Markdown table."""
+    rows = ["| folder | what it is for | begin with |", "|---|---|---|"]
+    for package in _PACKAGES:
+        for path in sorted((ROOT / package).rglob("__init__.py"), key=lambda path: path.parent):
+            docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
             summary = " ".join(docstring.split("\n\n")[0].split()).replace("|", "\\|")
-            rows.append(f"| `{path.relative_to(ROOT)}` | {summary} |")
+            begin = re.search(r"Begin with `([^`]+)`", docstring)
+            rows.append(f"| `{path.parent.relative_to(ROOT)}/` | {summary} | {f'`{begin[1]}`' if begin else ''} |")
     return "\n".join(rows)
 
 

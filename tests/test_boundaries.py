@@ -156,6 +156,11 @@ def test_every_module_imports_only_from_lower_layers_or_its_own_folder(module: s
         assert target_layer < layer or neighbour, f"{module} (layer {layer}) imports {target} (layer {target_layer})"
 
 
+@pytest.mark.parametrize("package", sorted(PACKAGES))
+def test_every_package_says_what_it_is_for(package: str) -> None:
+    assert ast.get_docstring(_tree(package))
+
+
 def test_the_layer_table_names_no_module_that_is_gone() -> None:
     assert [name for name in LAYERS if name not in MODULES] == []
 

@@ -1,6 +1,7 @@
 """The command line, `lalaloc`; each module here adds one group of commands.
 
-Commands import what they run when they run it, so that `lalaloc --help` loads no network.
+Begin with `evaluation.py`, which has the most of them. Commands import what they run when they run it, so that
+`lalaloc --help` loads no network.
 """
 
 from __future__ import annotations

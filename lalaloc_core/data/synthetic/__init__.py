@@ -1,1 +1,12 @@
-"""Data sets that are drawn, not read: generated homes, and the same asked with photographs of others."""
+"""Data sets that are drawn, not read, and writing them to disk.
+
+Begin with `generated.py`, homes of the generator rendered when they are looked at. `mismatched.py` asks them with
+photographs of others, for calibration; `unfamiliar.py` draws the out-of-family homes, which need the extra `ray`;
+`writing.py` is `lalaloc synth`.
+"""
+
+from lalaloc_core.data.synthetic.generated import GeneratedScenes
+from lalaloc_core.data.synthetic.mismatched import MismatchedScenes
+from lalaloc_core.data.synthetic.writing import Synthesis, synthesise
+
+__all__ = ["GeneratedScenes", "MismatchedScenes", "Synthesis", "synthesise"]
