@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,10 +35,15 @@ def grid_size(plan: FloorPlan, step_m: float) -> int:
     return len(plan.rooms) + int(plan.area_m2 / step_m**2)
 
 
-def pose_grid(plan: FloorPlan, step_m: float) -> PoseSet:
+def pose_grid(plan: FloorPlan, step_m: float, after_room: Callable[[], None] = lambda: None) -> PoseSet:
     """Poses on the lattice of multiples of `step_m`, clipped to the rooms.
 
     A room too small or narrow for any lattice point gets one pose well inside it, so that no room is missing.
+
+    Args:
+        plan: the plan.
+        step_m: distance of neighbouring poses.
+        after_room: called when the poses of a room are found; what it raises ends the work.
 
     Raises:
         InvalidInputError: `step_m` is not positive.
@@ -56,6 +62,7 @@ def pose_grid(plan: FloorPlan, step_m: float) -> PoseSet:
             chosen = room.inmost_point()[None]
         positions.append(chosen)
         rooms.append(np.full(len(chosen), index))
+        after_room()
     return PoseSet(np.concatenate(positions), np.concatenate(rooms))
 
 

@@ -29,13 +29,13 @@ def embed(
     """Sample, render and embed the grid of a plan.
 
     Args:
-        after_chunk: called with the share that is done (0 to 1) and the seconds that the last chunk took; what it
-            raises ends the work.
+        after_chunk: called with the share that is done (0 to 1) and the seconds that the last chunk took, and with 0
+            when the poses of another room are found; what it raises ends the work.
 
     Raises:
         InvalidPoseError: the networks have no latents for this plan at this camera height.
     """
-    poses = pose_grid(plan, step_m)
+    poses = pose_grid(plan, step_m, after_room=lambda: after_chunk(0.0, 0.0))
     rays = encoders.manifest.profile_columns * plan.walls_m.shape[1]
     chunk = min(max(_CAST_AT_ONCE // rays, _MIN_CHUNK), _MAX_CHUNK)
     latents, profiles_m = [], []

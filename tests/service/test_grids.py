@@ -30,7 +30,7 @@ from service.errors import (
     StoreUnavailableError,
     UnknownFloorPlanError,
 )
-from service.grids.embedding import grid_bytes
+from service.grids.embedding import embed, grid_bytes
 from service.grids.grids import Grids
 from service.grids.heights import query_height_m
 from service.grids.jobs import MAX_ON_DEMAND
@@ -300,6 +300,23 @@ def test_a_grid_without_numbers_fails_and_is_not_stored(store: Store, make_grids
     assert grids.prepare(PLAN) is None
     state = grids.states(store.plans.list("default", limit=1))[0]
     assert state.status == "failed"
+
+
+def test_a_lease_is_kept_and_may_be_lost_while_poses_are_looked_for(bundle: Bundle) -> None:
+    square = [[0, 0], [2, 0], [2, 2], [0, 2]]
+    rooms = [{"name": f"{k}", "polygon": [[x + 3 * k, y] for x, y in square]} for k in range(5)]
+    plan, told = FloorPlan.from_dict({"ceiling_height_m": 2.5, "rooms": rooms}), []
+
+    def lose_after_three(progress: float, _worked_s: float) -> None:
+        told.append(progress)
+        if len(told) == 3:
+            raise StoppingError
+
+    encoders = CountingEncoders(bundle)
+    with pytest.raises(StoppingError):
+        embed(plan, encoders, step_m=0.5, camera_height_m=1.5, after_chunk=lose_after_three)
+    assert told == [0.0] * 3
+    assert encoders.embedded == 0
 
 
 def test_a_replica_that_was_thought_dead_gives_way(
