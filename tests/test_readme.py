@@ -10,8 +10,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from lalaloc_core.cli import main as lalaloc
+from lalaloc_core.data.annotations import read_annotation
 from lalaloc_core.floorplan import FloorPlan
 from scripts.write_docs import documents
 from service.schemas import LocaliseAnswer
@@ -76,12 +78,16 @@ def test_generated_parts_are_up_to_date() -> None:
     assert stale == [], "run `make docs`"
 
 
-def test_every_json_example_is_what_the_code_reads_or_writes() -> None:
+def test_every_json_example_is_what_the_code_reads_or_writes(tmp_path: Path) -> None:
     kinds = set()
     for page, block in _blocks("json"):
         document = json.loads(block)
         if "rooms" in document:
             FloorPlan.from_dict(document)
+        elif "photograph" in document:
+            Image.new("RGB", (1024, 512)).save(tmp_path / document["photograph"])
+            (tmp_path / "example.json").write_text(block, encoding="utf-8")
+            assert read_annotation(tmp_path / "example.json").counts
         else:
             LocaliseAnswer.model_validate(document)
         kinds.add(page)
