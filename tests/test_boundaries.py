@@ -28,6 +28,13 @@ LAYERS = {
     "lalaloc_core.bundle": 1,
     "lalaloc_core.panorama": 2,
     "lalaloc_core.render": 2,
+    "lalaloc_core.plans.model": 2,
+    "lalaloc_core.plans.drawing": 3,
+    "lalaloc_core.plans.picture": 4,
+    "lalaloc_core.plans.formats": 5,
+    "lalaloc_core.plans.exports": 6,
+    # Chooses among the formats.
+    "lalaloc_core.plans": 7,
     "lalaloc_core.nets": 3,
     "lalaloc_core.synth": 3,
     # Beside synth and apart from it: neither may import the other.

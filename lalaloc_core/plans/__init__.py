@@ -1,0 +1,32 @@
+"""Floor plans as people have them: read from the files of drawing, building and mapping tools, and written to them.
+
+`import_plan` and `import_plans` take the bytes of a file and find out by its content what it is. Every importer gives a
+document in the native format (docs/conventions.md) and a report of what it used and what is likely wrong.
+"""
+
+from lalaloc_core.plans.exporting import EXPORT_FORMATS, ExportFormat, export_plan
+from lalaloc_core.plans.importing import FORMATS, detect_format, import_plan, import_plans
+from lalaloc_core.plans.model.assemble import ImportedPlan
+from lalaloc_core.plans.model.limits import DEFAULT_IMPORT_LIMITS, ImportLimits
+from lalaloc_core.plans.model.options import ImportOptions, KnownDistance
+from lalaloc_core.plans.model.report import ImportReport, LayerUse
+from lalaloc_core.plans.model.sketch import Anchor, Level
+
+__all__ = [
+    "DEFAULT_IMPORT_LIMITS",
+    "EXPORT_FORMATS",
+    "FORMATS",
+    "Anchor",
+    "ExportFormat",
+    "ImportLimits",
+    "ImportOptions",
+    "ImportReport",
+    "ImportedPlan",
+    "KnownDistance",
+    "LayerUse",
+    "Level",
+    "detect_format",
+    "export_plan",
+    "import_plan",
+    "import_plans",
+]

@@ -1,0 +1,1 @@
+"""Importers, a module for each format of files."""

@@ -1,0 +1,129 @@
+"""The native format, with `units`: plans that were written in feet or millimetres are converted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.plans.model.assemble import ImportedPlan
+from lalaloc_core.plans.model.checks import USUAL_CEILING_M, check_document, likely_unit
+from lalaloc_core.plans.model.limits import Budget
+from lalaloc_core.plans.model.options import METRES_PER_UNIT, ImportOptions
+from lalaloc_core.plans.model.report import Notebook
+
+FORMAT = "native"
+# Lengths of the format. With `units`, a key may stand without its ending and is in that unit.
+_LENGTHS = ("ceiling_height_m", "camera_height_m", "camera_height_std_m", "sill_m", "head_m")
+
+
+def import_native(document: Any, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
+    """A plan in the native format.
+
+    `units` and `y_axis` ("down") may stand in the document, or come as options, which win. Keys that end in `_m` are
+    always metres; the same keys without it (`ceiling_height`) and all coordinates are in `units`.
+
+    Raises:
+        InvalidFloorPlanError: names the room and what is wrong.
+    """
+    if not isinstance(document, Mapping):
+        raise InvalidFloorPlanError("a plan must be an object")
+    plan = dict(document)
+    units = _choice(options.units or plan.pop("units", None) or "m")
+    plan.pop("units", None)
+    y_axis = options.y_axis or plan.pop("y_axis", None) or "up"
+    plan.pop("y_axis", None)
+    if y_axis not in ("up", "down"):
+        raise InvalidFloorPlanError(f"y_axis is {str(y_axis)[:50]!r}, known are up, down")
+    if options.name is not None:
+        plan["name"] = options.name
+    if options.ceiling_height_m is not None:
+        plan.setdefault("ceiling_height_m", options.ceiling_height_m)
+    notebook = Notebook()
+    factor = METRES_PER_UNIT[units]
+    y_factor = -factor if y_axis == "down" else factor
+    if factor != 1.0 or y_factor != factor:
+        plan = _converted(plan, factor, y_factor)
+        notebook.notes.append(f"coordinates were converted from {units}" if factor != 1.0 else "y was turned over")
+    _refuse_other_units(plan)
+    parsed = FloorPlan.from_dict(plan)
+    rooms = plan["rooms"]
+    budget.spend(len(rooms))
+    notebook.use("rooms", "rooms", len(rooms))
+    for opening in plan.get("openings") or ():
+        notebook.use("openings", str(opening["kind"]))
+    notebook.warnings.extend(check_document(parsed.to_dict()))
+    report = notebook.close(FORMAT, factor, "units" if "units" in document or options.units else "the format: metres")
+    return (ImportedPlan(plan, report),)
+
+
+def _choice(units: Any) -> str:
+    if units not in METRES_PER_UNIT:
+        raise InvalidFloorPlanError(f"units is {str(units)[:50]!r}, known are {', '.join(METRES_PER_UNIT)}")
+    return units
+
+
+def _converted(document: dict[str, Any], factor: float, y_factor: float) -> dict[str, Any]:
+    """The plan in metres. What is no number stays as it is: the format's own checks say what is wrong with it."""
+    plan = _lengths(document, factor)
+    rooms = plan.get("rooms")
+    if isinstance(rooms, list):
+        plan["rooms"] = [_room(room, factor, y_factor) if isinstance(room, Mapping) else room for room in rooms]
+    openings = plan.get("openings")
+    if isinstance(openings, list):
+        plan["openings"] = [
+            _lengths(opening, factor) | _scaled_keys(opening, ("line",), factor, y_factor)
+            if isinstance(opening, Mapping)
+            else opening
+            for opening in openings
+        ]
+    if y_factor < 0.0 and isinstance(plan.get("north_deg"), int | float) and not isinstance(plan["north_deg"], bool):
+        # Turned over, what was clockwise from +y on the drawing is clockwise from its new +y after half a turn.
+        plan["north_deg"] = (180.0 - plan["north_deg"]) % 360.0
+    return plan
+
+
+def _room(room: Mapping[str, Any], factor: float, y_factor: float) -> dict[str, Any]:
+    return _lengths(room, factor) | _scaled_keys(room, ("polygon", "holes", "walls"), factor, y_factor)
+
+
+def _lengths(document: Mapping[str, Any], factor: float) -> dict[str, Any]:
+    plan = dict(document)
+    for key in _LENGTHS:
+        short = key.removesuffix("_m")
+        if short not in plan:
+            continue
+        if key in plan:
+            raise InvalidFloorPlanError(f"'{short}' and '{key}' say the same, give one of them")
+        value = plan.pop(short)
+        plan[key] = value * factor if isinstance(value, int | float) and not isinstance(value, bool) else value
+    return plan
+
+
+def _scaled_keys(document: Mapping[str, Any], keys: tuple[str, ...], factor: float, y_factor: float) -> dict[str, Any]:
+    return {key: _scaled(document[key], factor, y_factor) for key in keys if key in document}
+
+
+def _scaled(value: Any, factor: float, y_factor: float) -> Any:
+    if not isinstance(value, list | tuple):
+        return value
+    if len(value) == 2 and all(isinstance(number, int | float) and not isinstance(number, bool) for number in value):
+        return [value[0] * factor, value[1] * y_factor]
+    return [_scaled(item, factor, y_factor) for item in value]
+
+
+def _refuse_other_units(plan: Mapping[str, Any]) -> None:
+    """A ceiling of 2500 "metres" is refused by the format; here the refusal names the unit it was meant in."""
+    rooms = plan.get("rooms")
+    places = [plan, *(room for room in rooms if isinstance(room, Mapping))] if isinstance(rooms, list) else [plan]
+    for place in places:
+        height = place.get("ceiling_height_m")
+        if isinstance(height, bool) or not isinstance(height, int | float) or height <= 20.0:
+            continue
+        unit = likely_unit(float(height), USUAL_CEILING_M)
+        if unit is not None:
+            raise InvalidFloorPlanError(
+                f"ceiling_height_m is {height:g}, at most 20 m is allowed; it looks like {unit}: "
+                f'write it as \'ceiling_height\' beside "units": "{unit}"'
+            )

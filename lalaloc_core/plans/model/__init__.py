@@ -1,0 +1,1 @@
+"""What all importers share: options, limits, the sketch that they fill in, and the plan that becomes of it."""

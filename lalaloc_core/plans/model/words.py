@@ -1,0 +1,121 @@
+"""What the names of layers, blocks, classes and rooms speak of, in the languages that drawings are named in.
+
+Layer names are whatever an office is used to: AIA codes (`A-DOOR`), English, German, French, Spanish, Italian, Dutch.
+"""
+
+from __future__ import annotations
+
+import re
+import unicodedata
+from collections.abc import Mapping
+from typing import Literal
+
+from lalaloc_core.floorplan.types import room_type_of
+
+Role = Literal["door", "window", "passage", "obstacle", "wall", "room", "text", "ignored"]
+
+# Looked at in this order: "A-WALL-DOOR" is doors, "window dimensions" none of either.
+_ROLES: tuple[tuple[Role, str], ...] = (
+    (
+        "ignored",
+        "furniture furnishing furn mobel moebel mobilier mobiliario arredi meubel meubles dim dims dimension "
+        "dimensions dimensiones bemassung massketten masse cotation cotes cotas quote grid grids axis axes "
+        "achse achsen title titleblock viewport defpoints border rahmen legend sanitary sanitar sanitaires "
+        "plumbing electrical elec lights appliance appliances equipment equip symbol symbols northarrow north "
+        "scale stair stairs treppe treppen escalier escaleras flor ceiling clng",
+    ),
+    (
+        "door",
+        "door doors doorway dr tur turen tuer tueren porte portes puerta puertas porta porte porten deur "
+        "deuren dorr dor dorer ovi haustur haustuer innentur innentuer zimmertur zimmertuer",
+    ),
+    (
+        "window",
+        "window windows win glaz glazing fenster fenetre fenetres ventana ventanas finestra finestre janela "
+        "janelas raam ramen okno fonster vindu vindue ikkuna verglasung baie baies",
+    ),
+    (
+        "passage",
+        "opening openings passage passages durchgang durchgange offnung offnungen ouverture ouvertures vano",
+    ),
+    (
+        "obstacle",
+        "column columns col cols pillar pillars stutze stutzen stuetze stuetzen pfeiler saule saulen poteau "
+        "poteaux columna columnas pilar pilares colonna colonne shaft shafts schacht schachte gaine gaines "
+        "kiosk fixture elevator lift aufzug",
+    ),
+    (
+        "wall",
+        "wall walls wand wande waende mauer mauern mauerwerk mur murs cloison cloisons porteur porteurs muro "
+        "muros pared paredes parete pareti tabique muur muren vagg vegg seina partition partitions aussenwand "
+        "aussenwande innenwand innenwande trennwand",
+    ),
+    (
+        "room",
+        "room rooms space spaces area areas zone zones zimmer raum raume raeume raumflachen flache flachen "
+        "piece pieces local locaux habitacion habitaciones estancia estancias stanza stanze locale locali "
+        "ruimte ruimten kamer kamers rum rom unit units",
+    ),
+    (
+        "text",
+        "text texts texte label labels name names iden note notes annotation anno beschriftung",
+    ),
+)
+_ROLE_OF: dict[str, Role] = {word: role for role, words in reversed(_ROLES) for word in words.split()}
+_ORDER: list[Role] = [role for role, _ in _ROLES]
+# German joins words: "Zimmertür", "Gipskartonwand", "Dachfenster".
+_ENDINGS: Mapping[str, Role] = {"tur": "door", "tuer": "door", "turen": "door", "fenster": "window", "wand": "wall",
+                                "wande": "wall", "waende": "wall", "mauer": "wall", "zimmer": "room"}  # fmt: skip
+# Room words of other languages, as the English ones that `room_type_of` knows.
+_ENGLISH: Mapping[str, str] = {
+    word: english
+    for english, words in {
+        "bathroom": "bad badezimmer dusche gastewc sdb salle_de_bain toilettes toilette bano aseo bagno badkamer kph",
+        "bedroom": "schlafzimmer kinderzimmer gastezimmer chambre dormitorio camera slaapkamer mh",
+        "living": "wohnzimmer wohnen stube salon sejour soggiorno woonkamer livingroom oh",
+        "kitchen": "kuche kueche kochen cuisine cocina cucina keuken keittio",
+        "dining": "esszimmer essen comedor pranzo eetkamer diningroom",
+        "corridor": "flur gang diele korridor couloir pasillo corridoio hal gangway circulation",
+        "entrance": "eingang windfang entree vestibulo ingresso foyer et",
+        "closet": "ankleide dressing garderobe vestidor wic",
+        "storage": "abstellraum abstellkammer keller lager speis debarras cave trastero ripostiglio berging",
+        "laundry": "waschkuche hauswirtschaftsraum hwr buanderie lavadero lavanderia",
+        "stairs": "treppe treppenhaus escalier escalera scala trap",
+        "balcony": "balkon terrasse loggia balcon terraza balcone",
+        "office": "buro buero arbeitszimmer bureau despacho ufficio kantoor",
+        "meeting": "besprechung sitzungszimmer reunion riunione",
+        "hall": "saal aula halle",
+    }.items()
+    for word in words.split()
+}
+
+
+def words_of(text: str) -> list[str]:
+    """Lower-case words without accents; "A-DOOR_Frame", "LivingRoom" and "Außentür" are split as people read them."""
+    spaced = re.sub(r"(?<=[a-zß-öø-ÿ])(?=[A-ZÀ-Þ])", " ", text)
+    folded = unicodedata.normalize("NFKD", spaced.replace("ß", "ss")).encode("ascii", "ignore").decode().casefold()
+    return re.findall(r"[a-z]+", folded)
+
+
+def role_of(text: str) -> Role | None:
+    """What a layer, block or class of this name holds; None where the name does not say."""
+    found = {role for word in words_of(text) if (role := _role_of_word(word)) is not None}
+    return next((role for role in _ORDER if role in found), None)
+
+
+def type_of_room(label: str | None) -> str | None:
+    """The type of a room of this name or class in the plan's vocabulary, None where it is not known."""
+    if not label:
+        return None
+    # Only whole words: "et" of a Finnish plan is not to be found in "sheet".
+    words = words_of(label)
+    joined = "".join(words)
+    english = [_ENGLISH.get(word, word) for word in (*words, joined)]
+    found = room_type_of(" ".join(english))
+    return None if found == "unknown" else found
+
+
+def _role_of_word(word: str) -> Role | None:
+    if word in _ROLE_OF:
+        return _ROLE_OF[word]
+    return next((role for ending, role in _ENDINGS.items() if word.endswith(ending) and len(word) > len(ending)), None)

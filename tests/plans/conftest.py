@@ -1,0 +1,67 @@
+"""A small flat of three rooms that the tests of formats draw, each in its own way."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import shapely
+from shapely.geometry.base import BaseGeometry
+
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.plans import ImportedPlan
+
+# Two rooms above a corridor, walls of 10 cm; a door to each room, a window, a column, a free-standing wall.
+FLAT = {
+    "name": "Flat",
+    "ceiling_height_m": 2.5,
+    "rooms": [
+        {"name": "bedroom", "type": "bedroom", "polygon": [[0, 2], [4, 2], [4, 5], [0, 5]],
+         "holes": [[[3, 4], [3.4, 4], [3.4, 4.4], [3, 4.4]]]},
+        {"name": "living room", "type": "living", "polygon": [[4.1, 2], [9, 2], [9, 5], [4.1, 5]],
+         "walls": [[[6.5, 3.2], [7.5, 3.2]]]},
+        {"name": "corridor", "type": "corridor", "polygon": [[0, 0], [9, 0], [9, 1.9], [0, 1.9]]},
+    ],
+    "openings": [
+        {"kind": "door", "line": [[1, 1.95], [1.9, 1.95]]},
+        {"kind": "door", "line": [[5, 1.95], [5.9, 1.95]]},
+        {"kind": "window", "line": [[1, 5], [2.5, 5]]},
+        {"kind": "passage", "line": [[4.05, 2.5], [4.05, 3.7]]},
+    ],
+}  # fmt: skip
+
+
+@pytest.fixture
+def flat() -> FloorPlan:
+    return FloorPlan.from_dict(json.loads(json.dumps(FLAT)))
+
+
+def shapes(document: dict) -> list[shapely.Polygon]:
+    """The rooms of a document as polygons."""
+    return [shapely.Polygon(room["polygon"], room.get("holes")) for room in document["rooms"]]
+
+
+def lines(document: dict, kind: str) -> list[shapely.LineString]:
+    """The openings of a kind as lines."""
+    return [shapely.LineString(opening["line"]) for opening in document.get("openings", []) if opening["kind"] == kind]
+
+
+def assert_same_plan(found: ImportedPlan, expected: dict, *, within_m: float = 2e-3, shift: bool = False) -> None:
+    """Rooms, holes and openings lie where they should, in any order; with `shift`, anywhere as a whole."""
+    ours, theirs = shapes(found.document), shapes(expected)
+    move = (0.0, 0.0)
+    if shift:
+        a, b = shapely.union_all(ours).bounds, shapely.union_all(theirs).bounds
+        move = (b[0] - a[0], b[1] - a[1])
+
+    def moved(shape: BaseGeometry) -> BaseGeometry:
+        return shapely.transform(shape, lambda points: points + move)
+
+    assert len(ours) == len(theirs)
+    for room in theirs:
+        assert min(shapely.hausdorff_distance(moved(other), room) for other in ours) <= within_m
+    for kind in ("door", "window", "passage"):
+        told, truth = lines(found.document, kind), lines(expected, kind)
+        assert len(told) == len(truth), kind
+        for line in truth:
+            assert min(shapely.hausdorff_distance(moved(other), line) for other in told) <= within_m

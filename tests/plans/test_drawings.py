@@ -1,0 +1,172 @@
+"""SVG and DXF as real tools write them: CubiCasa's classes, walls only, blocks, layers in three languages."""
+
+from __future__ import annotations
+
+import io
+from itertools import pairwise
+
+import pytest
+from ezdxf.filemanagement import new as new_dxf
+
+from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.plans import ImportOptions, import_plan
+from lalaloc_core.plans.model.words import role_of, type_of_room
+from tests.plans.conftest import lines, shapes
+
+CUBICASA = b"""<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1000 600"><g id="Model"><g class="Floor">
+<g id="Wall" class="Wall External"><polygon points="0,0 1000,0 1000,20 0,20"/>
+  <g id="Window" class="Window Regular"><polygon points="100,0 250,0 250,20 100,20"/></g></g>
+<g id="Wall" class="Wall"><polygon points="490,20 500,20 500,580 490,580"/>
+  <g id="Door" class="Door Swing Beside"><polygon points="490,200 500,200 500,290 490,290"/>
+    <g id="Panel"><path d="M490,200 L400,200 A90,90 0 0 0 490,290"/></g></g></g>
+<g id="Space" class="Space Bedroom"><polygon points="20,20 490,20 490,580 20,580"/>
+  <g class="SpaceDimensionsLabel"><text x="200" y="320">4.7 m x 5.6 m</text></g></g>
+<g id="Space" class="Space LivingRoom"><polygon points="500,20 980,20 980,580 500,580"/></g>
+<g class="FixedFurniture BaseCabinet"><polygon points="900,20 980,20 980,100 900,100"/></g></g></g></svg>"""
+
+WALLS = b"""<svg xmlns="http://www.w3.org/2000/svg" width="210mm" height="100mm" viewBox="0 0 210 100">
+<text x="5" y="95">Scale 1:100</text><g transform="translate(5 5) scale(.5)"><g id="walls" fill="none" stroke="black">
+<path d="M10,10 h200 v120 h-200 z M14,14 h92 v40 h4 v-40 h96 v112 h-96 v-52 h-4 v52 h-92 z"/></g>
+<path fill="none" stroke="black" d="M110,54 h20 A20,20 0 0 1 110,74"/>
+<text x="50" y="80">Schlafzimmer</text><text x="160" y="80">Kitchen</text></g></svg>"""
+
+
+def test_cubicasa_classes_are_understood():
+    plan = import_plan(CUBICASA, ImportOptions(metres_per_pixel=0.01))
+    assert [room["type"] for room in plan.document["rooms"]] == ["bedroom", "living"]
+    assert [room.area for room in shapes(plan.document)] == pytest.approx([26.32, 26.88])
+    (door,), (window,) = lines(plan.document, "door"), lines(plan.document, "window")
+    # Midway in the wall, and on the inner face of the outer wall; y points up.
+    assert sorted(door.coords) == [(4.95, -2.9), (4.95, -2.0)]
+    assert sorted(window.coords) == [(1.0, -0.2), (2.5, -0.2)]
+    used = {(use.layer, use.used_as) for use in plan.report.layers}
+    assert ("FixedFurniture BaseCabinet", "ignored") in used
+
+
+def test_walls_enclose_rooms_and_a_swing_is_a_door():
+    plan = import_plan(WALLS)
+    assert plan.report.scale_source == "1:100, as is written in the drawing"
+    assert {(room["name"], room["type"]) for room in plan.document["rooms"]} == {
+        ("Schlafzimmer", "bedroom"),
+        ("Kitchen", "kitchen"),
+    }
+    assert sorted(room.area for room in shapes(plan.document)) == pytest.approx([4.6 * 5.6, 4.8 * 5.6], rel=1e-3)
+    (door,) = lines(plan.document, "door")
+    assert door.length == pytest.approx(1.0, abs=0.01)
+
+
+def test_a_svg_without_a_scale_is_asked_for_it():
+    with pytest.raises(InvalidFloorPlanError, match=r"give scale \(1:100\), metres_per_pixel .* or known_distance"):
+        import_plan(CUBICASA)
+
+
+def test_layers_choose_what_is_taken():
+    plan = import_plan(CUBICASA, ImportOptions(metres_per_pixel=0.01, layers=("space bedroom",)))
+    assert len(plan.document["rooms"]) == 1
+    assert "openings" not in plan.document
+
+
+def _dxf(document) -> bytes:
+    text = io.StringIO()
+    document.write(text)
+    return text.getvalue().encode()
+
+
+def _german_walls(insunits: int = 4):
+    """Walls as single lines of both faces, in millimetres; a door that swings, a window as three lines."""
+    document = new_dxf()
+    document.header["$INSUNITS"] = insunits
+    space = document.modelspace()
+    faces = [
+        [(0, 0), (10000, 0), (10000, 6000), (0, 6000), (0, 0)],
+        [(2000, 0), (2000, 300), (300, 300), (300, 5700), (5000, 5700), (5000, 1900), (5100, 1900), (5100, 5700),
+         (9700, 5700), (9700, 300), (5100, 300), (5100, 1000), (5000, 1000), (5000, 300), (3500, 300), (3500, 0)],
+    ]  # fmt: skip
+    for face in faces:
+        for start, end in pairwise(face):
+            space.add_line(start, end, dxfattribs={"layer": "WAND"})
+    for y in (0, 150, 300):
+        space.add_line((2000, y), (3500, y), dxfattribs={"layer": "Fenster"})
+    space.add_arc((5000, 1000), 900, 90, 180, dxfattribs={"layer": "TÜREN"})
+    space.add_line((5000, 1000), (4100, 1000), dxfattribs={"layer": "TÜREN"})
+    space.add_text("Küche", dxfattribs={"layer": "TEXT"}).set_placement((2000, 3000))
+    space.add_mtext("Wohnen\\P24.5 m²", dxfattribs={"layer": "TEXT", "insert": (7000, 3000)})
+    space.add_lwpolyline([(8000, 3000), (9000, 3000), (9000, 4000)], close=True, dxfattribs={"layer": "MÖBEL"})
+    return document
+
+
+def test_german_wall_lines_become_rooms():
+    plan = import_plan(_dxf(_german_walls()))
+    assert {(room["name"], room["type"]) for room in plan.document["rooms"]} == {
+        ("Küche", "kitchen"),
+        ("Wohnen", "living"),
+    }
+    assert sorted(room.area for room in shapes(plan.document)) == pytest.approx([4.6 * 5.4, 4.7 * 5.4], rel=1e-3)
+    (door,), (window,) = lines(plan.document, "door"), lines(plan.document, "window")
+    assert door.length == pytest.approx(0.9, abs=0.01)
+    assert window.length == pytest.approx(1.5, abs=0.01)
+    used = {(use.layer, use.used_as) for use in plan.report.layers}
+    assert {("WAND", "lines: wall"), ("MÖBEL", "ignored"), ("TÜREN", "swings of doors")} <= used
+
+
+def test_a_dxf_without_a_unit_is_refused_with_the_likely_one():
+    with pytest.raises(InvalidFloorPlanError, match=r"\$INSUNITS is 0.*looks like mm: units=mm"):
+        import_plan(_dxf(_german_walls(insunits=0)))
+    assert len(import_plan(_dxf(_german_walls(insunits=0)), ImportOptions(units="mm")).document["rooms"]) == 2
+
+
+def test_a_wrong_unit_is_told():
+    with pytest.raises(InvalidFloorPlanError):
+        import_plan(_dxf(_german_walls(insunits=6)))  # Ten kilometres are no plan.
+    document = _german_walls(insunits=5)
+    (warning,) = import_plan(_dxf(document)).report.warnings
+    assert "the usual room's side is 7" in warning
+
+
+def test_binary_dxf_is_read():
+    stream = io.BytesIO()
+    _german_walls().write(stream, fmt="bin")
+    assert len(import_plan(stream.getvalue()).document["rooms"]) == 2
+
+
+def test_french_polylines_and_blocks_in_feet():
+    document = new_dxf()
+    document.header["$INSUNITS"] = 2
+    space = document.modelspace()
+    door = document.blocks.new("PORTE_90")
+    door.add_line((0, 0), (0, 3))
+    door.add_arc((0, 0), 3, 0, 90)
+    window = document.blocks.new("FENETRE")
+    window.add_lwpolyline([(0, 0), (4, 0), (4, 0.5), (0, 0.5)], close=True)
+    for x0, x1 in ((0, 12), (12.5, 20)):
+        ring = [(x0, 0), (x1, 0), (x1, 10), (x0, 10)]
+        space.add_lwpolyline(ring, close=True, dxfattribs={"layer": "PIÈCES"})
+    space.add_blockref("PORTE_90", (12.25, 3), dxfattribs={"rotation": 90})
+    space.add_blockref("FENETRE", (3, -0.6))
+    space.add_text("Chambre 1", dxfattribs={"layer": "PIÈCES"}).set_placement((4, 4))
+    plan = import_plan(_dxf(document))
+    assert plan.document["rooms"][0]["type"] == "bedroom"
+    assert shapes(plan.document)[0].area == pytest.approx(120 * 0.3048**2, rel=1e-3)
+    (leaf,), (pane,) = lines(plan.document, "door"), lines(plan.document, "window")
+    assert leaf.length == pytest.approx(3 * 0.3048, rel=1e-3)
+    assert pane.length == pytest.approx(4 * 0.3048, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("layer", "role"),
+    [
+        ("A-DOOR", "door"), ("TÜREN", "door"), ("Zimmertür", "door"), ("portes", "door"), ("mur porteur", "wall"),
+        ("A-GLAZ", "window"), ("Dachfenster", "window"), ("Außenwände", "wall"), ("A-WALL-PATT", "wall"),
+        ("STÜTZEN", "obstacle"), ("Pièces", "room"), ("MÖBEL", "ignored"), ("DOOR-DIMENSIONS", "ignored"), ("0", None),
+    ],
+)  # fmt: skip
+def test_what_layers_are_named_after(layer: str, role: str | None):
+    assert role_of(layer) == role
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("Küche", "kitchen"), ("Chambre 2", "bedroom"), ("LivingRoom", "living"), ("Bad/WC", "bathroom"), ("X17", None)],
+)
+def test_what_rooms_are_named_after(name: str, kind: str | None):
+    assert type_of_room(name) == kind

@@ -1,0 +1,155 @@
+"""IFC: a model that is made here, and the sample model of buildingSMART where it lies beside the project."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyproj
+import pytest
+
+from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.plans import ImportedPlan, ImportOptions, import_plan, import_plans
+from tests.plans.conftest import lines, shapes
+
+ifcopenshell = pytest.importorskip("ifcopenshell")
+
+_NAME = Path("shared", "plans", "Ifc2x3_Duplex_Architecture.ifc")
+DUPLEX = next((parent / _NAME for parent in Path(__file__).parents if (parent / _NAME).exists()), None)
+
+
+class _Model:
+    """An IFC 4 model in millimetres, of one storey."""
+
+    def __init__(self) -> None:
+        self.file: Any = ifcopenshell.file(schema="IFC4")
+        make = self.file.create_entity
+        units = make("IfcUnitAssignment", [make("IfcSIUnit", None, "LENGTHUNIT", "MILLI", "METRE")])
+        self.context = make("IfcGeometricRepresentationContext", None, "Model", 3, 1e-5, self.placement((0, 0, 0)))
+        self.project = make("IfcProject", ifcopenshell.guid.new(), UnitsInContext=units)
+        self.project.RepresentationContexts = [self.context]
+        self.storey = make("IfcBuildingStorey", ifcopenshell.guid.new(), Name="EG", Elevation=0.0)
+        make("IfcRelAggregates", ifcopenshell.guid.new(), RelatingObject=self.project, RelatedObjects=[self.storey])
+
+    def placement(self, at: tuple[float, float, float]) -> Any:
+        point = self.file.create_entity("IfcCartesianPoint", [float(value) for value in at])
+        return self.file.create_entity("IfcAxis2Placement3D", point)
+
+    def prism(self, kind: str, ring: list[tuple[float, float]], low: float, height: float, **says: object) -> Any:
+        """An element that is an outline, extruded."""
+        make = self.file.create_entity
+        points = [make("IfcCartesianPoint", [float(x), float(y)]) for x, y in [*ring, ring[0]]]
+        profile = make("IfcArbitraryClosedProfileDef", "AREA", None, make("IfcPolyline", points))
+        up = make("IfcDirection", [0.0, 0.0, 1.0])
+        solid = make("IfcExtrudedAreaSolid", profile, self.placement((0, 0, low)), up, float(height))
+        shape = make("IfcShapeRepresentation", self.context, "Body", "SweptSolid", [solid])
+        element = make(kind, ifcopenshell.guid.new(), **says)
+        element.Representation = make("IfcProductDefinitionShape", None, None, [shape])
+        element.ObjectPlacement = make("IfcLocalPlacement", None, self.placement((0, 0, 0)))
+        return element
+
+    def spaces(self, *spaces: Any) -> None:
+        self.file.create_entity(
+            "IfcRelAggregates", ifcopenshell.guid.new(), RelatingObject=self.storey, RelatedObjects=list(spaces)
+        )
+
+    def contain(self, *elements: Any) -> None:
+        self.file.create_entity(
+            "IfcRelContainedInSpatialStructure",
+            ifcopenshell.guid.new(),
+            RelatedElements=list(elements),
+            RelatingStructure=self.storey,
+        )
+
+    def content(self) -> bytes:
+        return self.file.to_string().encode()
+
+
+def _box(x0: float, y0: float, x1: float, y1: float) -> list[tuple[float, float]]:
+    return [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
+
+
+def _flat() -> _Model:
+    model = _Model()
+    model.spaces(
+        model.prism("IfcSpace", _box(0, 0, 4000, 3000), 0, 2600, LongName="Küche"),
+        model.prism("IfcSpace", _box(4100, 0, 9000, 3000), 0, 2600, LongName="Wohnen"),
+        model.prism("IfcSpace", _box(500, 2500, 900, 2900), 0, 2600, LongName="Schacht"),
+    )
+    hole = model.prism("IfcOpeningElement", _box(4000, 1000, 4100, 1900), 0, 2100)
+    door = model.file.create_entity("IfcDoor", ifcopenshell.guid.new(), Name="T1")
+    model.file.create_entity(
+        "IfcRelFillsElement", ifcopenshell.guid.new(), RelatingOpeningElement=hole, RelatedBuildingElement=door
+    )
+    window = model.prism("IfcWindow", _box(6000, -300, 7500, 0), 900, 1200)
+    column = model.prism("IfcColumn", _box(7000, 2000, 7300, 2300), 0, 2600)
+    model.contain(door, window, column)
+    return model
+
+
+def test_spaces_doors_windows_columns_and_shafts():
+    plan = import_plan(_flat().content())
+    assert [(room["name"], room["type"]) for room in plan.document["rooms"]] == [
+        ("Küche", "kitchen"),
+        ("Wohnen", "living"),
+    ]
+    assert [room.area for room in shapes(plan.document)] == pytest.approx([12.0 - 0.16, 14.7 - 0.09], abs=1e-3)
+    assert plan.document["ceiling_height_m"] == pytest.approx(2.6)
+    (door,), (window,) = lines(plan.document, "door"), lines(plan.document, "window")
+    assert sorted(door.coords) == [(4.05, 1.0), (4.05, 1.9)]
+    assert sorted(window.coords) == [(6.0, 0.0), (7.5, 0.0)]
+    glass = next(opening for opening in plan.document["openings"] if opening["kind"] == "window")
+    assert (glass["sill_m"], glass["head_m"]) == (0.9, 2.1)
+    assert plan.report.metres_per_unit == pytest.approx(1e-3)
+    plan.plan()
+
+
+def test_a_map_conversion_says_where_and_which_way():
+    model = _flat()
+    make = model.file.create_entity
+    crs = make("IfcProjectedCRS", "EPSG:25832")
+    # Turned by 30° counter-clockwise against the grid.
+    turn = np.radians(30.0)
+    make("IfcMapConversion", model.context, crs, 691000.0, 5334000.0, 510.0, float(np.cos(turn)), float(np.sin(turn)))
+    plan = import_plan(model.content())
+    lon, lat = pyproj.Transformer.from_crs("EPSG:25832", "EPSG:4326", always_xy=True).transform(691000.0, 5334000.0)
+    assert plan.anchor is not None
+    assert (plan.anchor.longitude, plan.anchor.latitude) == pytest.approx((lon, lat), abs=1e-9)
+    assert plan.anchor.altitude_m == 510.0
+    # East of the zone's meridian grid north lies a little east of true north: meridian convergence.
+    convergence = pyproj.Proj("EPSG:25832").get_factors(lon, lat).meridian_convergence
+    assert plan.document["north_deg"] == pytest.approx(30.0 - convergence, abs=0.01)
+
+
+def test_a_model_without_spaces_says_what_to_do():
+    with pytest.raises(InvalidFloorPlanError, match=r"no IfcSpace .* export it with rooms"):
+        import_plan(_Model().content())
+
+
+@pytest.fixture(scope="module")
+def duplex() -> tuple[ImportedPlan, ...]:
+    if DUPLEX is None:
+        pytest.skip("the sample model is not here")
+    return import_plans(DUPLEX.read_bytes())
+
+
+def test_the_duplex_has_a_plan_per_storey(duplex: tuple[ImportedPlan, ...]):
+    assert [plan.level.name for plan in duplex] == ["Level 1", "Level 2", "Roof"]  # type: ignore[union-attr]
+    assert [plan.level.number for plan in duplex] == [0.0, 1.0, 2.0]  # type: ignore[union-attr]
+    assert [len(plan.document["rooms"]) for plan in duplex] == [10, 10, 1]
+    ground, first = duplex[0], duplex[1]
+    assert (len(lines(ground.document, "door")), len(lines(ground.document, "window"))) == (6, 4)
+    assert len(lines(first.document, "door")) == 8
+    # Kitchen and living room of both flats have nothing between them.
+    assert sum(line.length > 5.0 for line in lines(ground.document, "passage")) == 2
+    assert ground.anchor is not None
+    assert (ground.anchor.latitude, ground.anchor.longitude) == pytest.approx((41.8744, -87.6394), abs=1e-4)
+    for plan in duplex:
+        plan.plan()
+
+
+def test_one_storey_of_the_duplex(duplex: tuple[ImportedPlan, ...]):
+    assert DUPLEX is not None
+    plan = import_plan(DUPLEX.read_bytes(), ImportOptions(level="Level 2"))
+    assert plan.document == duplex[1].document
