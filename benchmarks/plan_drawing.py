@@ -1,0 +1,308 @@
+"""Floor plans drawn as people draw them: generated homes in five styles, with what the drawing shows as the truth."""
+
+from __future__ import annotations
+
+import io
+import math
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
+
+import cv2
+import numpy as np
+import shapely
+from jaxtyping import Float, UInt8
+from PIL import Image
+from shapely.geometry.base import BaseGeometry
+
+from lalaloc_core.synth.plans import Home, HomeConfig, generate_home
+
+Style = Literal["thin", "thick", "hatched", "coloured", "scanned"]
+STYLES: tuple[Style, ...] = get_args(Style)
+# What nobody can tell from a drawing: rooms that are joined by more than this without a symbol are one.
+WIDEST_BARE_OPENING_M = 1.9
+_MARGIN_M = 1.5
+_PIXELS_PER_M = {"thin": 80.0, "thick": 80.0, "hatched": 80.0, "coloured": 80.0, "scanned": 60.0}
+_HOME = HomeConfig(rotated_share=0.0, sheared_share=0.0, rooms=(3, 9), area_m2=(30.0, 140.0))
+_PALE = ((250, 240, 220), (226, 240, 250), (232, 246, 228), (250, 232, 238), (246, 246, 236))
+_SHIFT = 4
+
+
+@dataclass(frozen=True)
+class DrawnOpening:
+    """An opening that a drawing shows: its quadrilateral in the wall, and its middle line."""
+
+    kind: Literal["door", "window", "passage"]
+    shape: shapely.Polygon
+    start: tuple[float, float]
+    end: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnPlan:
+    """A picture and the truth, in metres from its lower left corner."""
+
+    picture: UInt8[np.ndarray, "h w 3"]
+    metres_per_pixel: float
+    rooms: list[shapely.Polygon]
+    openings: list[DrawnOpening]
+
+    def png(self) -> bytes:
+        """The picture as a file."""
+        stream = io.BytesIO()
+        Image.fromarray(self.picture).save(stream, "PNG")
+        return stream.getvalue()
+
+    def jpeg(self, quality: int = 60) -> bytes:
+        """The picture as a scanner saves it."""
+        stream = io.BytesIO()
+        Image.fromarray(self.picture).save(stream, "JPEG", quality=quality)
+        return stream.getvalue()
+
+
+@dataclass(frozen=True, eq=False)
+class _Model:
+    """What is drawn, in metres with the origin at the lower left corner of the sheet."""
+
+    rooms: list[shapely.Polygon]
+    names: list[str]
+    openings: list[DrawnOpening]
+    walls: BaseGeometry
+    size_m: tuple[float, float]
+
+
+def draw_plan(style: Style, seed: int) -> DrawnPlan:
+    """A generated home in one of the styles; the same for the same seed."""
+    rng = np.random.default_rng([seed, STYLES.index(style)])
+    thickness = float(rng.uniform(0.1, 0.25))
+    model = _model(generate_home(rng, replace(_HOME, wall_thickness_m=(thickness, thickness))), thickness)
+    sheet = _Sheet(model, _PIXELS_PER_M[style])
+    if style == "coloured":
+        sheet.colour(rng)
+    if style in ("coloured", "scanned"):
+        sheet.furnish(rng)
+        sheet.letter()
+        sheet.dimension()
+    sheet.draw_walls(style, rng)
+    sheet.draw_openings()
+    picture = sheet.picture
+    rooms, openings = _as_seen(model)
+    if style == "scanned":
+        degrees = float(rng.uniform(1.0, 4.0) * rng.choice([-1.0, 1.0]))
+        picture = _scan(picture, degrees, rng)
+        # The importer turns the drawing straight about the sheet's centre; so the truth stays as it was drawn.
+    return DrawnPlan(picture, 1.0 / sheet.pixels_per_m, rooms, openings)
+
+
+def _model(home: Home, thickness: float) -> _Model:
+    corners = np.concatenate([room.polygon_m for room in home.plan.rooms])
+    origin = corners.min(axis=0) - _MARGIN_M - thickness
+    size = corners.max(axis=0) + _MARGIN_M + thickness - origin
+    rooms = [shapely.transform(room.shape, lambda points: points - origin) for room in home.plan.rooms]
+    inside = shapely.unary_union(rooms)
+    openings = _openings(home, origin, thickness, inside)
+    walls = shapely.unary_union([room.buffer(thickness, join_style="mitre") for room in rooms]).difference(inside)
+    walls = walls.difference(
+        shapely.unary_union([opening.shape.buffer(1e-4, join_style="mitre") for opening in openings])
+    )
+    return _Model(rooms, [room.name for room in home.plan.rooms], openings, walls, (float(size[0]), float(size[1])))
+
+
+def _openings(home: Home, origin: np.ndarray, thickness: float, inside: BaseGeometry) -> list[DrawnOpening]:
+    found: list[DrawnOpening] = []
+    for opening in home.openings:
+        x0, y0, x1, y1 = home.plan.rooms[opening.room].walls_m[opening.wall]
+        along = np.array([x1 - x0, y1 - y0]) / math.hypot(x1 - x0, y1 - y0)
+        outward = np.array([along[1], -along[0]])
+        start = np.array([x0, y0]) + along * opening.start_m - origin
+        end = np.array([x0, y0]) + along * opening.end_m - origin
+        shape = shapely.Polygon([start, end, end + thickness * outward, start + thickness * outward])
+        kind = {"door_shut": "door", "door_open": "door", "window": "window", "opening": "passage"}[opening.kind]
+        # A door between two rooms is listed by both; and what would cut into a third room is not drawn.
+        seen = any(shapely.intersection(shape, other.shape).area > 0.1 * shape.area for other in found)
+        if seen or shapely.intersection(shape, inside).area > 0.02 * shape.area:
+            continue
+        middle = 0.5 * thickness * outward
+        a, b = start + middle, end + middle
+        found.append(DrawnOpening(kind, shape, (float(a[0]), float(a[1])), (float(b[0]), float(b[1]))))  # type: ignore[arg-type]
+    return found
+
+
+def _as_seen(model: _Model) -> tuple[list[shapely.Polygon], list[DrawnOpening]]:
+    """Rooms and openings as a drawing shows them: wide bare openings join rooms."""
+    wide = [o for o in model.openings if o.kind == "passage" and math.dist(o.start, o.end) > WIDEST_BARE_OPENING_M]
+    joined = shapely.unary_union([*model.rooms, *(o.shape.buffer(1e-3, join_style="mitre") for o in wide)])
+    parts = [part for part in shapely.get_parts(joined) if isinstance(part, shapely.Polygon)]
+    return parts, [opening for opening in model.openings if opening not in wide]
+
+
+class _Sheet:
+    """A drawing that comes into being."""
+
+    def __init__(self, model: _Model, pixels_per_m: float) -> None:
+        self._model, self.pixels_per_m = model, pixels_per_m
+        columns, rows = (math.ceil(size * pixels_per_m) for size in model.size_m)
+        # The sheet is a whole number of pixels high; its lower edge is the truth's origin.
+        self._rows = rows
+        self.picture = np.full((rows, columns, 3), 255, np.uint8)
+
+    def colour(self, rng: np.random.Generator) -> None:
+        for room in self._model.rooms:
+            self._fill(room, _PALE[int(rng.integers(len(_PALE)))])
+
+    def furnish(self, rng: np.random.Generator) -> None:
+        """Boxes along walls, tables with chairs, beds; none where a door swings."""
+        swings = [o.shape.buffer(math.dist(o.start, o.end)) for o in self._model.openings if o.kind == "door"]
+        for room in self._model.rooms:
+            taken: list[BaseGeometry] = list(swings)
+            x0, y0, x1, y1 = room.bounds
+            for _ in range(12):
+                width, depth = rng.uniform(0.4, 2.0), rng.uniform(0.35, 0.95)
+                if rng.random() < 0.5:
+                    width, depth = depth, width
+                x, y = rng.uniform(x0, x1), rng.uniform(y0, y1)
+                if rng.random() < 0.7:  # Against a wall.
+                    x = x0 + 0.06 if rng.random() < 0.5 else x1 - 0.06 - width
+                piece = shapely.box(x, y, x + width, y + depth)
+                if room.buffer(-0.05).contains(piece) and not any(piece.intersects(other) for other in taken):
+                    taken.append(piece.buffer(0.15))
+                    self._piece(piece, rng)
+
+    def _piece(self, piece: shapely.Polygon, rng: np.random.Generator) -> None:
+        x0, y0, x1, y1 = piece.bounds
+        kind = rng.integers(3)
+        if kind == 0:
+            radius = round(0.45 * min(x1 - x0, y1 - y0) * self.pixels_per_m)
+            cv2.circle(
+                self.picture, self._pixel((0.5 * (x0 + x1), 0.5 * (y0 + y1))), radius, (90, 90, 90), 1, cv2.LINE_AA
+            )
+        else:
+            self._outline(piece, (90, 90, 90), 1)
+        if kind == 2:
+            self._outline(shapely.box(x0 + 0.08, y0 + 0.08, 0.5 * (x0 + x1), y1 - 0.08), (90, 90, 90), 1)
+
+    def letter(self) -> None:
+        for room, name in zip(self._model.rooms, self._model.names, strict=True):
+            at = shapely.maximum_inscribed_circle(room, 0.05).coords[0]
+            size = 0.006 * self.pixels_per_m
+            (width, height), _ = cv2.getTextSize(name, cv2.FONT_HERSHEY_SIMPLEX, size, 1)
+            x, y = self._pixel((at[0], at[1]))
+            cv2.putText(
+                self.picture,
+                name,
+                (x - width // 2, y + height // 2),
+                cv2.FONT_HERSHEY_SIMPLEX,
+                size,
+                (40, 40, 40),
+                1,
+                cv2.LINE_AA,
+            )
+            cv2.putText(
+                self.picture,
+                f"{room.area:.1f} m2",
+                (x - width // 2, y + 2 * height),
+                cv2.FONT_HERSHEY_SIMPLEX,
+                0.8 * size,
+                (40, 40, 40),
+                1,
+                cv2.LINE_AA,
+            )
+
+    def dimension(self) -> None:
+        """Dimension lines below and to the left, with ticks and numbers."""
+        x0, y0, x1, y1 = shapely.unary_union(self._model.rooms).bounds
+        for (ax, ay), (bx, by), length in (
+            ((x0, y0 - 0.9), (x1, y0 - 0.9), x1 - x0),
+            ((x0 - 0.9, y0), (x0 - 0.9, y1), y1 - y0),
+        ):
+            self._line((ax, ay), (bx, by), (60, 60, 60), 1)
+            for x, y in ((ax, ay), (bx, by)):
+                self._line((x - 0.1, y - 0.1), (x + 0.1, y + 0.1), (60, 60, 60), 1)
+            at = self._pixel((0.5 * (ax + bx) + 0.05, 0.5 * (ay + by) + 0.08))
+            cv2.putText(self.picture, f"{length:.2f}", at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (60, 60, 60), 1, cv2.LINE_AA)
+
+    def draw_walls(self, style: Style, rng: np.random.Generator) -> None:
+        parts = [part for part in shapely.get_parts(self._model.walls) if part.area > 1e-4]
+        if style in ("thick", "scanned", "coloured"):
+            tone = int(rng.integers(45, 95)) if style == "coloured" else 0
+            for part in parts:
+                self._fill(part, (tone, tone, tone))
+            return
+        if style == "hatched":
+            self._hatch(parts, spacing_m=0.09)
+        for part in parts:
+            self._outline(part, (0, 0, 0), 2)
+
+    def _hatch(self, parts: list[BaseGeometry], spacing_m: float) -> None:
+        walls = shapely.unary_union(parts)
+        width, height = self._model.size_m
+        offsets = np.arange(-height, width, spacing_m * math.sqrt(2.0))
+        lines = shapely.multilinestrings([[(x, 0.0), (x + height, height)] for x in offsets])
+        for line in shapely.get_parts(shapely.intersection(lines, walls)):
+            if isinstance(line, shapely.LineString):
+                self._line(line.coords[0], line.coords[-1], (0, 0, 0), 1)
+
+    def draw_openings(self) -> None:
+        for opening in self._model.openings:
+            if opening.kind == "window":
+                self._outline(opening.shape, (0, 0, 0), 1)
+                self._line(opening.start, opening.end, (0, 0, 0), 1)
+            elif opening.kind == "door":
+                self._door(opening)
+
+    def _door(self, opening: DrawnOpening) -> None:
+        """Leaf and arc, into the room that the opening belongs to; wide doors have two leaves."""
+        corners = np.asarray(opening.shape.exterior.coords)[:2]
+        start, end = corners
+        width = float(np.linalg.norm(end - start))
+        along = (end - start) / width
+        inward = np.array([-along[1], along[0]])
+        leaves = [(start, along, width)] if width <= 1.3 else [(start, along, 0.5 * width), (end, -along, 0.5 * width)]
+        for hinge, direction, radius in leaves:
+            self._line(hinge, hinge + radius * inward, (0, 0, 0), 1)
+            angles = np.linspace(0.0, 0.5 * np.pi, 25)[:, None]
+            arc = hinge + radius * (np.cos(angles) * direction + np.sin(angles) * inward)
+            self._strokes(arc, (0, 0, 0), 1, closed=False)
+
+    def _fill(self, shape: BaseGeometry, colour: tuple[int, int, int]) -> None:
+        for part in shapely.get_parts(shape):
+            rings = [self._fixed(np.asarray(ring.coords)) for ring in (part.exterior, *part.interiors)]
+            cv2.fillPoly(self.picture, rings, colour, cv2.LINE_AA, _SHIFT)
+
+    def _outline(self, shape: BaseGeometry, colour: tuple[int, int, int], width: int) -> None:
+        for part in shapely.get_parts(shape):
+            for ring in (part.exterior, *part.interiors):
+                self._strokes(np.asarray(ring.coords), colour, width, closed=True)
+
+    def _line(self, start: object, end: object, colour: tuple[int, int, int], width: int) -> None:
+        self._strokes(np.array([start, end], dtype=float), colour, width, closed=False)
+
+    def _strokes(
+        self, points: Float[np.ndarray, "n 2"], colour: tuple[int, int, int], width: int, *, closed: bool
+    ) -> None:
+        cv2.polylines(self.picture, [self._fixed(points)], closed, colour, width, cv2.LINE_AA, _SHIFT)
+
+    def _fixed(self, points: Float[np.ndarray, "n 2"]) -> np.ndarray:
+        """Pixel centres are whole numbers to OpenCV, with four bits behind the point."""
+        pixels = (
+            np.column_stack([points[:, 0], self._rows / self.pixels_per_m - points[:, 1]]) * self.pixels_per_m - 0.5
+        )
+        return np.round(pixels * 2**_SHIFT).astype(np.int32)
+
+    def _pixel(self, point: tuple[float, float]) -> tuple[int, int]:
+        x, y = self._fixed(np.array([point]))[0] / 2**_SHIFT
+        return round(x), round(y)
+
+
+def _scan(picture: UInt8[np.ndarray, "h w 3"], degrees: float, rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
+    """Skewed, out of focus, unevenly lit, with noise, on paper that is not white."""
+    rows, columns = picture.shape[:2]
+    turn = cv2.getRotationMatrix2D((0.5 * columns - 0.5, 0.5 * rows - 0.5), degrees, 1.0)
+    turned = cv2.warpAffine(picture, turn, (columns, rows), flags=cv2.INTER_AREA, borderValue=(255, 255, 255))
+    soft = cv2.GaussianBlur(turned, (0, 0), float(rng.uniform(0.6, 1.0))).astype(np.float64)
+    x, y = np.meshgrid(np.linspace(-1, 1, columns), np.linspace(-1, 1, rows))
+    tilt = rng.uniform(-0.12, 0.12, 2)
+    light = 0.86 + tilt[0] * x + tilt[1] * y - 0.08 * (x**2 + y**2)
+    noisy = (25.0 + 0.9 * soft) * light[..., None] + rng.normal(0.0, 6.0, soft.shape[:2])[..., None]
+    speckles = rng.random((rows, columns)) < 2e-4
+    noisy[speckles] = rng.uniform(0, 120, (int(speckles.sum()), 1))
+    return np.clip(noisy, 0, 255).astype(np.uint8)

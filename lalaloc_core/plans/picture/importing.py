@@ -1,0 +1,87 @@
+"""PNG and JPEG files."""
+
+from __future__ import annotations
+
+import io
+import warnings
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image, ImageOps
+
+from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.plans.drawing.scale import drawing_scale
+from lalaloc_core.plans.model.assemble import ImportedPlan, assemble
+from lalaloc_core.plans.model.limits import Budget
+from lalaloc_core.plans.model.options import ImportOptions
+from lalaloc_core.plans.model.report import Notebook
+from lalaloc_core.plans.picture.sketching import sketch_picture
+
+FORMAT = "picture"
+_SMALLEST_PX = 64
+# A picture of more metres than that has a wrong scale, and would be drawn over the heads of all limits.
+_LARGEST_M = 1000.0
+
+
+def import_picture(content: bytes, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
+    """The plan that a picture shows, as a draft.
+
+    Raises:
+        InvalidFloorPlanError: no picture that can be read, or nothing says how long a pixel is.
+    """
+    gray, paper_m_per_pixel = _open(content, budget)
+    factor, source = drawing_scale(options, "the picture", paper_m_per_unit=paper_m_per_pixel)
+    rows, columns = gray.shape
+    if max(rows, columns) * factor > _LARGEST_M:
+        raise InvalidFloorPlanError(
+            f"the picture is {columns * factor:.0f} m by {rows * factor:.0f} m at {factor:g} m per pixel, at most "
+            f"{_LARGEST_M:g} m are read; is the scale right?"
+        )
+    notebook = Notebook()
+    sketch = sketch_picture(gray, factor, notebook, budget)
+    if not sketch.rooms:
+        raise InvalidFloorPlanError(
+            f"no walls that enclose a room were found in the picture, which is {columns * factor:.1f} m by "
+            f"{rows * factor:.1f} m at {factor:g} m per pixel; is the scale right, and are the walls dark or "
+            "drawn with two lines?"
+        )
+    return (
+        assemble(sketch, notebook, options, format=FORMAT, metres_per_unit=factor, scale_source=source, is_draft=True),
+    )
+
+
+def _open(content: bytes, budget: Budget) -> tuple[UInt8[np.ndarray, "h w"], float | None]:
+    """(grey picture on white paper, length of a pixel on paper where the file says)."""
+    limit = budget.limits.max_pixels
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            with Image.open(io.BytesIO(content), formats=("PNG", "JPEG")) as picture:
+                width, height = picture.size
+                if width * height > limit:
+                    raise InvalidFloorPlanError(
+                        f"the picture has {width} x {height} pixels, at most {limit} are read (max_pixels)"
+                    )
+                if min(width, height) < _SMALLEST_PX:
+                    raise InvalidFloorPlanError(
+                        f"the picture has {width} x {height} pixels, at least {_SMALLEST_PX} each way are needed"
+                    )
+                dpi = picture.info.get("dpi")
+                upright = ImageOps.exif_transpose(picture)
+                flat = Image.new("RGBA", upright.size, "white")
+                flat.alpha_composite(upright.convert("RGBA"))
+                gray = np.asarray(flat.convert("L"))
+    except InvalidFloorPlanError:
+        raise
+    except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError, Image.DecompressionBombWarning,
+            TypeError, ZeroDivisionError) as error:  # fmt: skip
+        raise InvalidFloorPlanError(f"the picture cannot be read: {error}") from error
+    return gray, _paper(dpi)
+
+
+def _paper(dpi: object) -> float | None:
+    """Metres of paper per pixel; 72 and 96 are what programs write that do not know."""
+    if not isinstance(dpi, tuple) or not dpi:
+        return None
+    value = float(dpi[0])
+    return 0.0254 / value if 97.0 <= value <= 2400.0 else None

@@ -1,0 +1,130 @@
+"""From a grey picture to ink: even light, straight lines, black and white."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+# Lengths of what is looked at, in metres: finer pictures are made coarser, and light is evened out over so much.
+FINEST_M = 0.01
+_LIGHT_M = 1.2
+_MOST_SKEW_DEG = 10.0
+_SKEW_PIXELS = 700
+# Lines are thinner than this, and stand out by so much of 255, or so many times the noise.
+_LINE_M, _FAINTEST, _OVER_NOISE = 0.07, 40.0, 8.0
+# Where Otsu's threshold may lie: pale floors are no ink, pencil is.
+_THRESHOLD = (95.0, 205.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Ink:
+    """Black and white: True where something is drawn.
+
+    Attributes:
+        mask: what is dark; rows from the top.
+        gray: what it was made of, lines straight and paper white.
+        lines: what is dark, and every line that is darker than what is around it, however faint.
+        metres_per_pixel: of this mask, not of the picture it came from.
+        skew_deg: by how much the picture was turned (clockwise as seen) to make its lines straight.
+        size: rows and columns of the picture before it was turned, at this resolution.
+    """
+
+    gray: UInt8[np.ndarray, "h w"]
+    mask: Bool[np.ndarray, "h w"]
+    lines: Bool[np.ndarray, "h w"]
+    metres_per_pixel: float
+    skew_deg: float
+    size: tuple[int, int]
+
+    def to_plan(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        """Metres from pixel coordinates (column, row; of edges, not centres): y up, the centre stays in its place."""
+        rows, columns = self.mask.shape
+        shift = np.array([0.5 * (columns - self.size[1]), 0.5 * (rows - self.size[0])])
+        x, y = (np.asarray(points, dtype=float) - shift).T
+        return np.column_stack([x, self.size[0] - y]) * self.metres_per_pixel
+
+    def to_pixels(self, points_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        """Pixel coordinates (column, row) of places in the plan; the inverse of `to_plan`."""
+        rows, columns = self.mask.shape
+        shift = np.array([0.5 * (columns - self.size[1]), 0.5 * (rows - self.size[0])])
+        x, y = (np.asarray(points_m, dtype=float) / self.metres_per_pixel).T
+        return np.column_stack([x, self.size[0] - y]) + shift
+
+
+def read_ink(gray: UInt8[np.ndarray, "h w"], metres_per_pixel: float) -> Ink:
+    """Even out light, turn lines straight, and threshold.
+
+    Args:
+        gray: rows from the top, 255 is white.
+        metres_per_pixel: of this picture.
+    """
+    if metres_per_pixel < FINEST_M:
+        factor = metres_per_pixel / FINEST_M
+        rows, columns = (max(1, round(size * factor)) for size in gray.shape)
+        gray = cv2.resize(gray, (columns, rows), interpolation=cv2.INTER_AREA).astype(np.uint8)
+        metres_per_pixel = FINEST_M
+    even = _even_light(gray, metres_per_pixel)
+    threshold, _ = cv2.threshold(even, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
+    threshold = float(np.clip(threshold, *_THRESHOLD))
+    skew_deg = find_skew(even < threshold)
+    if skew_deg:
+        even = _turned(even, skew_deg)
+    mask = even < threshold
+    size = (int(gray.shape[0]), int(gray.shape[1]))
+    return Ink(even, mask, mask | _faint_lines(even, metres_per_pixel), metres_per_pixel, skew_deg, size)
+
+
+def _faint_lines(even: UInt8[np.ndarray, "h w"], metres_per_pixel: float) -> Bool[np.ndarray, "h w"]:
+    """Thin lines that are darker than what lies beside them by more than the noise of the paper."""
+    soft = cv2.GaussianBlur(even, (0, 0), 0.6)
+    noise = 1.48 * float(np.median(np.abs(soft.astype(np.int16) - cv2.medianBlur(soft, 5))))
+    size = max(5, round(_LINE_M / metres_per_pixel) | 1)
+    depth = cv2.morphologyEx(soft, cv2.MORPH_BLACKHAT, np.ones((size, size), np.uint8))
+    return depth > max(_FAINTEST, _OVER_NOISE * noise)
+
+
+def _even_light(gray: UInt8[np.ndarray, "h w"], metres_per_pixel: float) -> UInt8[np.ndarray, "h w"]:
+    """The picture over the brightness of its paper: what is brightest around, smoothed."""
+    size = max(3, round(_LIGHT_M / metres_per_pixel)) | 1
+    coarse = 8
+    small = cv2.resize(gray, None, fx=1.0 / coarse, fy=1.0 / coarse, interpolation=cv2.INTER_AREA)
+    kernel = np.ones((max(3, size // coarse) | 1,) * 2, np.uint8)
+    paper = cv2.GaussianBlur(cv2.dilate(small, kernel), (0, 0), max(1.0, 0.3 * size / coarse))
+    paper = cv2.resize(paper, gray.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    even = 255.0 * gray.astype(np.float32) / np.maximum(paper.astype(np.float32), 60.0)
+    return np.clip(even, 0, 255).astype(np.uint8)
+
+
+def find_skew(ink: Bool[np.ndarray, "h w"]) -> float:
+    """Degrees by which a drawing must be turned so that most of its lines run along rows and columns.
+
+    Rows and columns are then the most uneven: the angle of the largest energy of differences of their sums.
+    """
+    factor = min(1.0, _SKEW_PIXELS / max(ink.shape))
+    small = cv2.resize(ink.astype(np.float32), None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+
+    def energy(degrees: float) -> float:
+        turned = _turned(small, degrees, fill=0.0)
+        return sum(float(np.sum(np.diff(turned.sum(axis=axis)) ** 2)) for axis in (0, 1))
+
+    best = 0.0
+    for step, reach in ((1.0, _MOST_SKEW_DEG), (0.25, 1.0), (0.05, 0.25)):
+        candidates = best + np.arange(-reach, reach + 0.5 * step, step)
+        best = float(max(candidates, key=lambda degrees: energy(float(degrees))))
+    # Less than that is not seen, and a straight drawing stays as sharp as it is.
+    return best if abs(best) >= 0.15 and energy(best) > 1.02 * energy(0.0) else 0.0
+
+
+def _turned(picture: np.ndarray, degrees: float, fill: float = 255.0) -> np.ndarray:
+    """The picture turned about its centre, on a canvas that holds all of it."""
+    rows, columns = picture.shape
+    angle = math.radians(abs(degrees))
+    wide = math.ceil(columns * math.cos(angle) + rows * math.sin(angle))
+    high = math.ceil(rows * math.cos(angle) + columns * math.sin(angle))
+    matrix = cv2.getRotationMatrix2D((0.5 * columns - 0.5, 0.5 * rows - 0.5), degrees, 1.0)
+    matrix[:, 2] += 0.5 * (wide - columns), 0.5 * (high - rows)
+    return cv2.warpAffine(picture, matrix, (wide, high), flags=cv2.INTER_LINEAR, borderValue=fill)

@@ -1,0 +1,140 @@
+"""Which ink is wall: dark and thick, or two lines and what lies between them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import shapely
+from jaxtyping import Bool, Int
+
+from lalaloc_core.plans.model.geometry import polygons_of
+from lalaloc_core.plans.picture.ink import Ink
+
+# Lengths in metres.
+_THINNEST_M = 0.055
+# White between the two lines of a wall is no wider; the sector of a door's swing is.
+_WIDEST_CAVITY_M = 0.42
+_SMALL_M = 1.2
+_STRAIGHT_M, _STRAIGHT_PX = 0.012, 1.3
+# Walls are alike in thickness; a chair, a letter or a basin is not.
+_ALIKE = (0.6, 1.6)
+
+
+@dataclass(frozen=True, eq=False)
+class WallMask:
+    """Walls as pixels.
+
+    Attributes:
+        mask: True in walls.
+        thickness_m: of the usual wall.
+        cavities: labels of the white areas inside the walls, 0 elsewhere; None where walls are dark.
+    """
+
+    mask: Bool[np.ndarray, "h w"]
+    thickness_m: float
+    cavities: Int[np.ndarray, "h w"] | None
+
+
+def dark_walls(ink: Ink) -> WallMask | None:
+    """Walls that are filled: what stays of the ink when thin lines are taken away."""
+    return _walls(ink, ink.mask, None)
+
+
+def outlined_walls(ink: Ink) -> WallMask | None:
+    """Walls that are drawn with two lines, hatched or not: the ink, and the narrow white areas that it encloses."""
+    white = (~ink.mask).astype(np.uint8)
+    count, found = cv2.connectedComponents(white, connectivity=4)
+    labels = np.asarray(found, dtype=np.int32)
+    depth = cv2.distanceTransform(white, cv2.DIST_L2, 5)
+    deepest = np.zeros(count)
+    np.maximum.at(deepest, labels.ravel(), depth.ravel())
+    is_cavity = 2.0 * deepest * ink.metres_per_pixel <= _WIDEST_CAVITY_M
+    is_cavity[0] = False
+    return _walls(ink, ink.mask | is_cavity[labels], np.where(is_cavity[labels], labels, 0))
+
+
+def _walls(ink: Ink, filled: Bool[np.ndarray, "h w"], cavities: Int[np.ndarray, "h w"] | None) -> WallMask | None:
+    size = max(3, round(_THINNEST_M / ink.metres_per_pixel))
+    thick = cv2.morphologyEx(filled.astype(np.uint8), cv2.MORPH_OPEN, np.ones((size, size), np.uint8))
+    thickness = _usual_thickness(thick) * ink.metres_per_pixel
+    if not thickness:
+        return None
+    kept = _without_furniture(thick, thickness / ink.metres_per_pixel, ink.metres_per_pixel)
+    return WallMask(kept, thickness, cavities) if kept.any() else None
+
+
+def _usual_thickness(mask: np.ndarray) -> float:
+    """Thickness of walls in pixels: the median over the middle lines of what is large; 0 where there is nothing."""
+    depth = cv2.distanceTransform(mask, cv2.DIST_L2, 5)
+    ridge = (depth > 0.0) & (depth >= cv2.dilate(depth, np.ones((3, 3), np.uint8)) - 1e-3)
+    values = depth[ridge].astype(np.float64)
+    return 2.0 * float(np.median(values)) - 1.0 if len(values) and not mask.all() else 0.0
+
+
+def _without_furniture(mask: np.ndarray, thickness: float, metres_per_pixel: float) -> Bool[np.ndarray, "h w"]:
+    """Small pieces stay only where they are as thick as a wall, corners between two windows included."""
+    count, found, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
+    labels = np.asarray(found, dtype=np.int32)
+    depth = cv2.distanceTransform(mask, cv2.DIST_L2, 5)
+    deepest = np.zeros(count)
+    np.maximum.at(deepest, labels.ravel(), depth.ravel())
+    is_large = stats[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1) * metres_per_pixel >= _SMALL_M
+    # A corner is deeper than its two walls are thick, by the half of a diagonal.
+    thick = 2.0 * deepest - 1.0
+    keep = is_large | ((thick >= _ALIKE[0] * thickness) & (thick <= _ALIKE[1] * thickness))
+    keep[0] = False
+    return keep[labels]
+
+
+def bodies_of(walls: WallMask, ink: Ink) -> list[shapely.Polygon]:
+    """Walls as polygons in plan metres, straightened."""
+    contours, hierarchy = cv2.findContours(walls.mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    if hierarchy is None:
+        return []
+    straight = max(_STRAIGHT_PX * ink.metres_per_pixel, _STRAIGHT_M)
+    holes: dict[int, list[np.ndarray]] = {}
+    for index, (_, _, _, parent) in enumerate(hierarchy.reshape(-1, 4)):
+        if parent >= 0:
+            holes.setdefault(int(parent), []).append(contours[index])
+    found: list[shapely.Polygon] = []
+    for index, (_, _, _, parent) in enumerate(hierarchy.reshape(-1, 4)):
+        if parent >= 0 or len(contours[index]) < 3:
+            continue
+        inner = [ring for hole in holes.get(index, []) if len(ring := _ring(hole, ink)) >= 3]
+        shell = shapely.Polygon(_ring(contours[index], ink), inner)
+        # Contours run through the centres of a wall's own pixels; the wall reaches half a pixel farther.
+        grown = [part.buffer(0.5 * ink.metres_per_pixel, join_style="mitre") for part in polygons_of(shell)]
+        found += [straightened(part) for shape in grown for part in polygons_of(shape.simplify(straight))]
+    return found
+
+
+def _ring(contour: np.ndarray, ink: Ink) -> np.ndarray:
+    return ink.to_plan(contour.reshape(-1, 2) + 0.5)
+
+
+def straightened(shape: shapely.Polygon, tolerance_deg: float = 6.0, reach_m: float = 0.06) -> shapely.Polygon:
+    """A polygon whose edges that nearly run along the axes do so exactly; the same where that would spoil it."""
+    rings = [
+        _straight_ring(np.asarray(ring.coords)[:-1], tolerance_deg, reach_m)
+        for ring in (shape.exterior, *shape.interiors)
+    ]
+    straight = shapely.Polygon(rings[0], rings[1:])
+    if not straight.is_valid or abs(straight.area - shape.area) > 0.05 * shape.area:
+        return shape
+    return straight
+
+
+def _straight_ring(points: np.ndarray, tolerance_deg: float, reach_m: float) -> np.ndarray:
+    points = points.copy()
+    steps = np.roll(points, -1, axis=0) - points
+    slope = np.tan(np.radians(tolerance_deg))
+    for axis in (0, 1):
+        along, across = np.abs(steps[:, 1 - axis]), np.abs(steps[:, axis])
+        flat = (across <= slope * along) | ((across < reach_m) & (along > 2.0 * across))
+        for index in np.flatnonzero(flat):
+            other = (index + 1) % len(points)
+            middle = 0.5 * (points[index, axis] + points[other, axis])
+            points[[index, other], axis] = middle
+    return points

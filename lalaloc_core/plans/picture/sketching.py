@@ -1,0 +1,142 @@
+"""From a grey picture of known scale to rooms and openings, with what is unsure about them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import shapely
+from jaxtyping import UInt8
+
+from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.plans.drawing.walls import Enclosed, Gap, WallConfig, enclose
+from lalaloc_core.plans.model.limits import Budget
+from lalaloc_core.plans.model.report import Notebook
+from lalaloc_core.plans.model.sketch import Sketch, SketchedOpening, SketchedRoom
+from lalaloc_core.plans.picture.gaps import GapReader, Seen
+from lalaloc_core.plans.picture.ink import Ink, read_ink
+from lalaloc_core.plans.picture.masks import WallMask, bodies_of, dark_walls, outlined_walls, straightened
+from lalaloc_core.plans.picture.panes import windows_in_walls
+
+# In pictures windows are gaps in dark walls, and wider than doors; what has no symbol is no opening when it is wide.
+_CONFIG = WallConfig(widest_gap=3.6, narrowest_gap=0.4, thinnest=0.04)
+_WIDEST_BARE_GAP_M = 1.9
+_SMALLEST_ROOM_M2 = 1.0
+_LARGEST_ISLAND_M2 = 2.0
+# Dark walls are the surer reading: outlines must enclose so much more to be preferred.
+_MORE = 1.6
+_SURE = 0.85
+_COARSE_M = 0.03
+_THICKEST_WALL_M = 1.2
+
+
+@dataclass(frozen=True, eq=False)
+class _Reading:
+    walls: WallMask
+    enclosed: Enclosed
+    seen: dict[int, Seen]
+    is_dark: bool
+
+    @property
+    def area_m2(self) -> float:
+        return float(sum(room.area for room in self.enclosed.rooms))
+
+
+def sketch_picture(
+    gray: UInt8[np.ndarray, "h w"], metres_per_pixel: float, notebook: Notebook, budget: Budget
+) -> Sketch:
+    """Rooms are what walls enclose; gaps in walls are doors, windows and passages by what is drawn in them.
+
+    Walls are read twice, as what is dark and thick, and as what lies between two lines; the reading that encloses
+    more is taken.
+
+    Args:
+        gray: rows from the top, 255 is white.
+        metres_per_pixel: of the picture.
+
+    Raises:
+        InvalidFloorPlanError: walls of a thickness that no house has: the scale is wrong.
+    """
+    ink = read_ink(gray, metres_per_pixel)
+    budget.check_time()
+    readings = [_read(walls, ink, is_dark, budget) for walls, is_dark in _hypotheses(ink) if walls is not None]
+    if not readings:
+        notebook.use("ink", "nothing that could be walls", 1)
+        return Sketch()
+    best = readings[0]
+    for other in readings[1:]:
+        if other.area_m2 > _MORE * best.area_m2:
+            best = other
+    notebook.use("ink", "walls", len(shapely.get_parts(best.enclosed.walls)))
+    if best.walls.thickness_m > _THICKEST_WALL_M:
+        raise InvalidFloorPlanError(
+            f"the walls would be {best.walls.thickness_m:.2f} m thick at {metres_per_pixel:g} m per pixel, at most "
+            f"{_THICKEST_WALL_M:g} m are; is the scale right?"
+        )
+    _tell(best, ink, metres_per_pixel, notebook)
+    rooms = [SketchedRoom(straightened(_without_islands(room, notebook))) for room in best.enclosed.rooms]
+    return Sketch(rooms=rooms, openings=_openings(best, ink, notebook))
+
+
+def _hypotheses(ink: Ink) -> Sequence[tuple[WallMask | None, bool]]:
+    return (dark_walls(ink), True), (outlined_walls(ink), False)
+
+
+def _read(walls: WallMask, ink: Ink, is_dark: bool, budget: Budget) -> _Reading:
+    reader = GapReader(ink)
+    seen: dict[int, Seen] = {}
+
+    def accept(gap: Gap) -> bool:
+        seen[id(gap)] = found = reader.look(gap)
+        return found.kind != "nothing" or (gap.is_sure and gap.width <= _WIDEST_BARE_GAP_M)
+
+    enclosed = enclose(bodies_of(walls, ink), [], (), _CONFIG, budget.check_time, accept)
+    rooms = [room for room in enclosed.rooms if room.area >= _SMALLEST_ROOM_M2]
+    return _Reading(walls, Enclosed(rooms, enclosed.gaps, enclosed.walls), seen, is_dark)
+
+
+def _without_islands(room: shapely.Polygon, notebook: Notebook) -> shapely.Polygon:
+    """Letters and furniture that were taken for walls stand in rooms; so may columns, which are lost with them."""
+    small = [ring for ring in room.interiors if shapely.Polygon(ring).area <= _LARGEST_ISLAND_M2]
+    if small:
+        notebook.unsure.append(f"{len(small)} dark shapes inside a room were taken for furniture, not for columns")
+    large = [ring for ring in room.interiors if shapely.Polygon(ring).area > _LARGEST_ISLAND_M2]
+    return shapely.Polygon(room.exterior, large)
+
+
+def _openings(reading: _Reading, ink: Ink, notebook: Notebook) -> list[SketchedOpening]:
+    """Gaps by what was seen in them, and windows that are drawn into walls."""
+    found = []
+    outside = shapely.unary_union([room.buffer(0.05) for room in reading.enclosed.rooms])
+    for gap in reading.enclosed.gaps:
+        seen = reading.seen[id(gap)]
+        # What leads from nowhere to nowhere is a gap between strokes of something else.
+        if not outside.intersects(gap.shape):
+            continue
+        kind = "passage" if seen.kind == "nothing" else seen.kind
+        found.append(SketchedOpening(kind, gap.start, gap.end))
+        if seen.kind == "nothing" or seen.sureness < _SURE:
+            where = f"({gap.start[0]:.2f}, {gap.start[1]:.2f})"
+            notebook.unsure.append(f"a gap of {gap.width:.2f} m at {where} was taken for a {kind}: {_why(seen)}")
+    if not reading.is_dark:
+        found += windows_in_walls(reading.walls, ink)
+    return found
+
+
+def _why(seen: Seen) -> str:
+    if seen.kind == "nothing":
+        return "nothing is drawn in it"
+    return f"{seen.sureness:.0%} of its symbol is drawn"
+
+
+def _tell(reading: _Reading, ink: Ink, metres_per_pixel: float, notebook: Notebook) -> None:
+    what = "dark and thick" if reading.is_dark else "drawn with two lines"
+    notebook.notes.append(f"walls are {what}, usually {reading.walls.thickness_m:.2f} m thick")
+    if ink.skew_deg:
+        notebook.notes.append(f"the picture was turned by {ink.skew_deg:.2f}° to be straight")
+    notebook.notes.append("lettering is not read: name the rooms")
+    if metres_per_pixel > _COARSE_M:
+        notebook.unsure.append(
+            f"a pixel is {100 * metres_per_pixel:.1f} cm, walls are a few pixels thick: a larger picture reads better"
+        )

@@ -1,0 +1,151 @@
+"""Plans from pictures and PDF pages, in five styles of drawing; `benchmarks/plan_pictures.py` measures many."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from benchmarks.plan_drawing import STYLES, DrawnPlan, Style, draw_plan
+from benchmarks.plan_pictures import Score, f1, score_plan, table
+from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.plans import ImportOptions, KnownDistance, import_plan
+from lalaloc_core.plans.picture.ink import find_skew
+from tests.plans.conftest import lines, shapes
+
+# Homes that are read well in every style; the benchmark has those that are not.
+SEED = {"thin": 0, "thick": 1, "hatched": 0, "coloured": 3, "scanned": 3}
+
+
+@pytest.fixture(scope="module")
+def drawn() -> dict[Style, DrawnPlan]:
+    return {style: draw_plan(style, SEED[style]) for style in STYLES}
+
+
+@pytest.mark.parametrize("style", STYLES)
+def test_rooms_doors_and_windows_are_found(drawn: dict[Style, DrawnPlan], style: Style):
+    plan = drawn[style]
+    score = Score()
+    score_plan(plan, plan.jpeg() if style == "scanned" else plan.png(), score)
+    assert score.rooms_found == score.rooms == len(plan.rooms)
+    assert f1(score.door) >= 0.8
+    assert f1(score.window) >= 0.8
+    assert f"| {style} | {score.rooms} | 100.0% |" in table({style: score})
+
+
+def test_a_picture_is_a_draft_that_says_what_it_is_unsure_of(drawn: dict[Style, DrawnPlan]):
+    plan = import_plan(drawn["thick"].png(), ImportOptions(metres_per_pixel=drawn["thick"].metres_per_pixel))
+    assert plan.report.is_draft
+    assert plan.report.scale_source == "option metres_per_pixel"
+    assert any("ceiling height" in line for line in plan.report.unsure)
+    assert any("lettering is not read" in line for line in plan.report.notes)
+
+
+def test_a_scale_is_never_assumed(drawn: dict[Style, DrawnPlan]):
+    with pytest.raises(InvalidFloorPlanError, match="does not say how long anything is"):
+        import_plan(drawn["thick"].png())
+
+
+def test_a_known_distance_is_a_scale(drawn: dict[Style, DrawnPlan]):
+    plan = drawn["thick"]
+    known = KnownDistance((10.0, 10.0), (10.0, 110.0), 100.0 * plan.metres_per_pixel)
+    by_distance = import_plan(plan.png(), ImportOptions(known_distance=known))
+    by_pixel = import_plan(plan.png(), ImportOptions(metres_per_pixel=plan.metres_per_pixel))
+    assert by_distance.document == by_pixel.document
+
+
+def test_the_resolution_of_a_scan_and_its_scale_on_paper_are_a_scale(drawn: dict[Style, DrawnPlan]):
+    plan = drawn["thick"]
+    # 80 pixels to a metre are 1:125 at 254 dots per inch.
+    stream = io.BytesIO()
+    Image.fromarray(plan.picture).save(stream, "PNG", dpi=(254, 254))
+    by_paper = import_plan(stream.getvalue(), ImportOptions(scale=125.0))
+    assert by_paper.report.metres_per_unit == pytest.approx(plan.metres_per_pixel, rel=1e-3)
+    with pytest.raises(InvalidFloorPlanError, match="no size on paper"):
+        import_plan(plan.png(), ImportOptions(scale=125.0))
+
+
+@pytest.mark.parametrize("factor", [0.02, 30.0])
+def test_a_wrong_scale_finds_nothing_or_is_told(drawn: dict[Style, DrawnPlan], factor: float):
+    plan = drawn["thick"]
+    options = ImportOptions(metres_per_pixel=factor * plan.metres_per_pixel)
+    with pytest.raises(InvalidFloorPlanError, match="is the scale right"):
+        import_plan(plan.png(), options)
+
+
+def test_an_empty_page_says_what_was_looked_for():
+    stream = io.BytesIO()
+    Image.new("RGB", (400, 300), "white").save(stream, "PNG")
+    with pytest.raises(InvalidFloorPlanError, match="no walls that enclose a room"):
+        import_plan(stream.getvalue(), ImportOptions(metres_per_pixel=0.01))
+
+
+@pytest.mark.parametrize("degrees", [-6.0, 0.0, 2.5])
+def test_skew_is_found(degrees: float):
+    page = Image.new("L", (600, 400), 0)
+    for x in (100, 300, 480):
+        page.paste(255, (x, 60, x + 8, 340))
+    page.paste(255, (100, 60, 488, 68))
+    turned = np.asarray(page.rotate(degrees, Image.Resampling.BICUBIC)) > 128
+    assert find_skew(turned) == pytest.approx(-degrees, abs=0.15)
+
+
+def _vector_pdf() -> bytes:
+    """Walls as filled outlines, a door and lettering, at 1:100 on a page."""
+    centimetre = 72 / 2.54
+    content = f"{centimetre:.5f} 0 0 {centimetre:.5f} 28 28 cm 0 g\n"
+    for x, y, w, h in [
+        (0, 0, 9.3, 0.15), (0, 5.15, 9.3, 0.15), (0, 0, 0.15, 5.3), (9.15, 0, 0.15, 5.3),
+        (4.5, 0, 0.1, 1.5), (4.5, 2.4, 0.1, 2.8),
+    ]:  # fmt: skip
+        content += f"{x} {y} {w} {h} re f\n"
+    content += "0.02 w 4.6 1.5 m 5.5 1.5 l S 5.5 1.5 m 5.5 1.997 5.097 2.4 4.6 2.4 c S\n"
+    for text, x in (("Kitchen", 1.5), ("Wohnzimmer", 6.5), ("1:100", 0.2)):
+        content += f"BT /F1 0.4 Tf {x} {2.5 if x > 1 else -0.6} Td ({text}) Tj ET\n"
+    for line in range(8):
+        content += f"7 {4 + 0.1 * line:.1f} m 8 {4 + 0.1 * line:.1f} l S\n"
+    objects = [
+        "<< /Type /Catalog /Pages 2 0 R >>",
+        "<< /Type /Pages /Kids [3 0 R] /Count 1 >>",
+        "<< /Type /Page /Parent 2 0 R /MediaBox [0 0 400 300] /Contents 4 0 R "
+        "/Resources << /Font << /F1 5 0 R >> >> >>",
+        f"<< /Length {len(content)} >>\nstream\n{content}endstream",
+        "<< /Type /Font /Subtype /Type1 /BaseFont /Helvetica >>",
+    ]
+    out, offsets = "%PDF-1.4\n", []
+    for number, body in enumerate(objects, 1):
+        offsets.append(len(out))
+        out += f"{number} 0 obj\n{body}\nendobj\n"
+    start = len(out)
+    out += f"xref\n0 {len(objects) + 1}\n0000000000 65535 f \n" + "".join(
+        f"{offset:010} 00000 n \n" for offset in offsets
+    )
+    return f"{out}trailer << /Size {len(objects) + 1} /Root 1 0 R >>\nstartxref\n{start}\n%%EOF\n".encode()
+
+
+def test_a_pdf_that_is_drawn_is_read_as_a_drawing():
+    plan = import_plan(_vector_pdf())
+    assert plan.report.scale_source == "1:100, as is written in the drawing"
+    assert plan.report.is_draft
+    assert {(room["name"], room["type"]) for room in plan.document["rooms"]} == {
+        ("Kitchen", "kitchen"),
+        ("Wohnzimmer", "living"),
+    }
+    assert sorted(room.area for room in shapes(plan.document)) == pytest.approx([4.35 * 5.0, 4.55 * 5.0], rel=5e-3)
+    (door,) = lines(plan.document, "door")
+    assert door.length == pytest.approx(0.9, abs=0.02)
+
+
+def test_a_scanned_pdf_is_read_as_a_picture(drawn: dict[Style, DrawnPlan]):
+    plan = drawn["thick"]
+    stream = io.BytesIO()
+    Image.fromarray(plan.picture).save(stream, "PDF", resolution=254.0)
+    imported = import_plan(stream.getvalue(), ImportOptions(scale=125.0))
+    assert len(imported.document["rooms"]) == len(plan.rooms)
+    assert "page 1 was read as a picture" in imported.report.notes
+    with pytest.raises(InvalidFloorPlanError, match="page is 2, the PDF has 1"):
+        import_plan(stream.getvalue(), ImportOptions(scale=125.0, page=2))
+    with pytest.raises(InvalidFloorPlanError, match="the PDF does not say how long"):
+        import_plan(stream.getvalue())
