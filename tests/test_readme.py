@@ -60,7 +60,8 @@ def test_every_lalaloc_command_has_the_options_it_is_shown_with(
     command: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as ended:
-        lalaloc([command[1], "--help"])
+        # `plan` has commands of its own.
+        lalaloc([*command[1 : 3 if command[1] == "plan" else 2], "--help"])
     assert ended.value.code == 0
     shown = capsys.readouterr().out
     assert [word for word in command[2:] if word.startswith("--") and word not in shown] == []

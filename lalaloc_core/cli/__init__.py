@@ -10,7 +10,7 @@ import argparse
 import logging
 import sys
 
-from lalaloc_core.cli import evaluation, measuring, photographs, reproduction, synthesis, training
+from lalaloc_core.cli import evaluation, measuring, photographs, plans, reproduction, synthesis, training
 from lalaloc_core.errors import InvalidInputError, LaLaLocError
 
 
@@ -32,6 +32,6 @@ def main(argv: list[str] | None = None) -> int:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="lalaloc", description="Localise panoramas in floor plans.")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for group in (synthesis, training, evaluation, photographs, reproduction, measuring):
+    for group in (synthesis, training, evaluation, photographs, plans, reproduction, measuring):
         group.add_commands(commands)
     return parser

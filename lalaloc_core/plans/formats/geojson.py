@@ -301,7 +301,7 @@ def _role(feature: _Feature) -> Role:
 def _opening_role(says: Mapping[str, Any], category: str) -> Role:
     """IMDF's openings are doors, or ways without one (`door` is null); of windows it knows nothing."""
     said = role_of(str(says.get("kind") or category))
-    if said is not None and said in ("door", "window", "passage"):
+    if said == "door" or said == "window" or said == "passage":
         return said
     return "passage" if "door" in says and says["door"] is None else "door"
 

@@ -196,7 +196,7 @@ def _add_shape(element: Any, place: _Place, drawing: Drawing, notebook: Notebook
     name = _name_of(element, place)
     fill: Any = element.fill
     is_filled = fill is not None and fill.value is not None and fill.opacity > 0.2
-    is_dark = bool(is_filled and 0.299 * fill.red + 0.587 * fill.green + 0.114 * fill.blue < _DARK)
+    is_dark = bool(is_filled and _luminance(fill) < _DARK)
     width = element.stroke_width if element.stroke is not None and element.stroke.value is not None else 0.0
     shells: list[shapely.Polygon] = []
     for points, closed, curves in _outlines(svgelements.Path(element), budget):
@@ -213,6 +213,10 @@ def _add_shape(element: Any, place: _Place, drawing: Drawing, notebook: Notebook
     for shape in _with_holes(shells):
         drawing.areas.append(Area(shape, place.layer, place.role, name, place.kind, is_dark))
         notebook.use(place.layer, f"areas: {place.role or 'perhaps rooms'}")
+
+
+def _luminance(colour: Any) -> float:
+    return 0.299 * colour.red + 0.587 * colour.green + 0.114 * colour.blue
 
 
 def _outlines(path: svgelements.Path, budget: Budget) -> Iterator[tuple[np.ndarray, bool, list[np.ndarray]]]:
