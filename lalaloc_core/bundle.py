@@ -84,12 +84,16 @@ class Manifest:
     """What a bundle is and how it came to be.
 
     Attributes:
-        architecture: "ring" or "paper".
+        architecture: "ring", "trunk" or "paper".
         layout_config: arguments that rebuild the layout encoder in torch (for LPO).
         profile_columns: azimuth columns the layout encoder expects.
         image_height, image_width: pixels the image encoder expects; pixel values are raw uint8 RGB and the
             normalisation stated in `image_mean` and `image_std` happens inside the network.
         ring_sectors: azimuth sectors of the ring, 0 for an architecture without one.
+        image_config: arguments that rebuild the image encoder in torch, where they are not those of the layout encoder.
+        opening_classes: what the image encoder tells apart at each azimuth; none where it tells nothing of the kind.
+        opening_prior: the classes' shares that its probabilities presume; dividing by them leaves likelihoods.
+        room_types: types of rooms that it tells apart, and `room_type_prior` their shares in what it was trained on.
         confidence: fitted on validation queries; None leaves answers without a trained confidence.
         training: commands, seeds, hardware, counts of how the model was trained.
         metrics: validation figures with their n.
@@ -106,6 +110,11 @@ class Manifest:
     image_std: list[float]
     latent_size: int
     ring_sectors: int
+    image_config: dict[str, Any] = field(default_factory=dict)
+    opening_classes: list[str] = field(default_factory=list)
+    opening_prior: list[float] = field(default_factory=list)
+    room_types: list[str] = field(default_factory=list)
+    room_type_prior: list[float] = field(default_factory=list)
     confidence: ConfidenceModel | None = None
     training: dict[str, Any] = field(default_factory=dict)
     metrics: dict[str, Any] = field(default_factory=dict)

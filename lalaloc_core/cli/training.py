@@ -24,7 +24,7 @@ def add_commands(commands: Any) -> None:
     """Add these commands to the parser."""
     train = commands.add_parser("train", help="train a stage: the layout encoder, then the image encoder")
     train.add_argument("stage", choices=("layout", "image", "end-to-end"), help="end-to-end is both stages at once")
-    train.add_argument("--preset", default="ring", choices=("ring", "paper", "tiny"))
+    train.add_argument("--preset", default="ring", choices=("ring", "trunk", "paper", "tiny", "tiny-trunk"))
     train.add_argument("--out", type=Path, required=True, help="folder of the run, shared by both stages")
     train.add_argument("--data", type=Path, metavar="DIR", help="a data set; default: homes drawn while training")
     train.add_argument("--skip-bad", action="store_true", help="pass over files that cannot be used, naming each once")
@@ -46,6 +46,19 @@ def add_commands(commands: Any) -> None:
         dest="init_from",
         help="begin with the weights of a bundle or of another run, instead of fresh ones",
     )
+    train.add_argument(
+        "--layout-from",
+        type=Path,
+        metavar="DIR",
+        help="image stage: a bundle or another run whose layout encoder to follow, where --out has none",
+    )
+    train.add_argument(
+        "--photographs",
+        type=Path,
+        metavar="DIR",
+        help="image stage: panoramas without labels, whose doors and windows --teacher tells (preset trunk)",
+    )
+    train.add_argument("--teacher", type=Path, metavar="FILE", help="TensorFlow Lite segmenter of ADE20K's classes")
     train.add_argument("--resume", action="store_true", help="go on from the checkpoint in --out")
     train.add_argument("--device", help="cpu or cuda; default: cuda where there is one")
     train.add_argument("--workers", type=int, default=1, help="processes that make batches; 0: none")
@@ -92,6 +105,10 @@ def _train(arguments: argparse.Namespace) -> None:
         raise InvalidInputError("--render is for generated homes, not for --data")
     if arguments.init_from is not None and (arguments.resume or arguments.stage == "end-to-end"):
         raise InvalidInputError("--from is for a run of one stage that begins, neither for --resume nor for end-to-end")
+    image_only = {"--layout-from": "layout_from", "--photographs": "photographs", "--teacher": "teacher"}
+    for option, name in image_only.items():
+        if arguments.stage != "image" and getattr(arguments, name) is not None:
+            raise InvalidInputError(f"{option} is for the stage 'image', not for '{arguments.stage}'")
     config = PRESETS[arguments.preset].with_settings(_settings(arguments.settings))
     # End-to-end training takes its schedule from the image stage.
     part = "layout" if arguments.stage == "layout" else "image"
@@ -119,12 +136,15 @@ def _train(arguments: argparse.Namespace) -> None:
         deferred=arguments.data is None and render == "device",
         validation_scenes=arguments.validation_homes,
         unfamiliar=None if arguments.data is not None else UnfamiliarScenes(homes=unfamiliar_homes),
+        photographs=arguments.photographs,
+        teacher=arguments.teacher,
     )
     train: Callable[..., Any] = {"layout": train_layout, "image": train_image, "end-to-end": train_end_to_end}[
         arguments.stage
     ]
-    init = {} if arguments.init_from is None else {"init_from": arguments.init_from}
-    train(config, arguments.out, device=device, data=data, workers=arguments.workers, resume=arguments.resume, **init)
+    optional = {name: getattr(arguments, name) for name in ("init_from", "layout_from")}
+    given = {name: value for name, value in optional.items() if value is not None}
+    train(config, arguments.out, device=device, data=data, workers=arguments.workers, resume=arguments.resume, **given)
 
 
 def _settings(pairs: list[str]) -> dict[str, Any]:

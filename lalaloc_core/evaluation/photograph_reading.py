@@ -20,7 +20,7 @@ class ReadPhotograph:
 
     Attributes:
         profile_m: (w,) predicted wall profile.
-        class_scores: (w, classes) predicted log probabilities; None where the model predicts none.
+        class_scores: (w, classes) predicted log likelihoods but for a constant; None where the model predicts none.
     """
 
     photograph: AnnotatedPhotograph
@@ -44,10 +44,15 @@ def read_photographs(encoders: Encoders, photographs: Sequence[AnnotatedPhotogra
         if query.profile is None:
             raise BundleError(f"model '{manifest.name}' predicts no wall profile, which is what is measured")
         log_m, log_scale = query.profile.log_m[0], query.profile.log_scale[0]
+        # Relative to the shares of the classes, as poses are compared: every class counts alike in what is reported.
+        openings = query.openings
+        scores = None if openings is None else openings.log_probability[0] - np.log(openings.prior)
         measures = measure_azimuths(
             [one.profile_m(outline, len(log_m)) for outline in range(len(one.outlines))],
             log_m,
             log_scale,
+            one.classes(len(log_m)),
+            scores,
         )
-        read.append(ReadPhotograph(photograph=one, profile_m=np.exp(log_m), class_scores=None, measures=measures))
+        read.append(ReadPhotograph(photograph=one, profile_m=np.exp(log_m), class_scores=scores, measures=measures))
     return read

@@ -33,9 +33,12 @@ from lalaloc_core.bundle import (
     Manifest,
 )
 from lalaloc_core.bundle import write_manifest as _write_manifest
+from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.errors import ExportError
-from lalaloc_core.nets import ImageEncoder, LayoutEncoder, resnet, ring
+from lalaloc_core.nets import ImageEncoder, LayoutEncoder, resnet, ring, trunk
 from lalaloc_core.nets.decoder import LayoutDecoder
+from lalaloc_core.nets.trunk_encoder import TrunkImageEncoder
+from lalaloc_core.training import losses
 from lalaloc_core.training.config import TrainConfig
 
 PARITY_TOLERANCE = 1e-4
@@ -74,7 +77,8 @@ def export_bundle(
         if decoder is not None:
             _save_weights(decoder, work / DECODER_WEIGHTS)
         parity = _export_networks(work, config, layout_encoder, image_encoder)
-        manifest = _manifest(config, name, version, {**(training or {}), "parity_max_abs_difference": parity})
+        told = {**(training or {}), "parity_max_abs_difference": parity}
+        manifest = _manifest(config, image_encoder, name, version, told)
         folder.mkdir(parents=True, exist_ok=True)
         # Without its manifest nothing is a bundle, until all files are written.
         for name in (MANIFEST_NAME, *BUNDLE_FILES):
@@ -102,9 +106,11 @@ def _export_networks(
     if isinstance(layout_encoder, ring.RingLayoutEncoder):
         features = layout_encoder.ring(*layout.values())
         differences.append(_export(work / HEAD_ONNX, layout_encoder.head, {"ring": features}, ["latent"]))
-    if isinstance(image_encoder, ring.RingImageEncoder):
+    if isinstance(image_encoder, ring.RingImageEncoder | TrunkImageEncoder):
         inputs = {"image": image, "camera_height_m": heights(1.0, 1.9)}
         outputs = ["ring", "log_profile", "log_scale"]
+        if isinstance(image_encoder, TrunkImageEncoder):
+            outputs += ["opening_logits", "log_ceiling", "log_ceiling_scale", "room_type_logits"]
         differences.append(_export(work / IMAGE_ONNX, _RingOutputs(image_encoder), inputs, outputs))
     elif image_encoder is not None:
         differences.append(_export(work / IMAGE_ONNX, image_encoder, {"image": image}, ["latent"]))
@@ -114,13 +120,17 @@ def _export_networks(
 class _RingOutputs(nn.Module):
     """The image encoder's features as a plain tuple, which is what ONNX knows."""
 
-    def __init__(self, encoder: ring.RingImageEncoder) -> None:
+    def __init__(self, encoder: ring.RingImageEncoder | TrunkImageEncoder) -> None:
         super().__init__()
         self.encoder = encoder
 
-    def forward(self, image: Tensor, camera_height_m: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, image: Tensor, camera_height_m: Tensor) -> tuple[Tensor, ...]:
         features = self.encoder(image, camera_height_m)
-        return features.ring, features.log_profile, features.log_scale
+        told = (features.ring, features.log_profile, features.log_scale)
+        seen = features.structure
+        if seen is None:
+            return told
+        return (*told, seen.opening_logits, seen.log_ceiling, seen.log_ceiling_scale, seen.room_type_logits)
 
 
 def _export(path: Path, module: nn.Module, inputs: dict[str, Tensor], outputs: list[str]) -> float:
@@ -205,10 +215,21 @@ def _store_in_half(model: onnx.ModelProto) -> None:
     model.graph.node.extend(nodes)
 
 
-def _manifest(config: TrainConfig, name: str, version: str, training: dict[str, Any]) -> Manifest:
-    is_ring = config.architecture == "ring"
-    sizes = config.ring if is_ring else config.paper
-    statistics = ring if is_ring else resnet
+def _manifest(
+    config: TrainConfig, image_encoder: ImageEncoder | None, name: str, version: str, training: dict[str, Any]
+) -> Manifest:
+    sizes = config.layout_sizes
+    statistics = {"ring": ring, "trunk": trunk, "paper": resnet}[config.architecture]
+    structure: dict[str, Any] = {}
+    if isinstance(image_encoder, TrunkImageEncoder):
+        prior = losses.opening_prior(image_encoder.opening_share, config.image.opening_balance)
+        structure = {
+            "image_config": dataclasses.asdict(config.trunk),
+            "opening_classes": list(OPENING_CLASSES),
+            "opening_prior": prior.tolist(),
+            "room_types": list(ROOM_TYPES),
+            "room_type_prior": image_encoder.room_type_share.tolist(),
+        }
     height, width = config.image_size
     return Manifest(
         name=name,
@@ -221,6 +242,7 @@ def _manifest(config: TrainConfig, name: str, version: str, training: dict[str, 
         image_mean=list(statistics.IMAGE_MEAN),
         image_std=list(statistics.IMAGE_STD),
         latent_size=sizes.latent_size,
-        ring_sectors=config.ring.sectors if is_ring else 0,
+        ring_sectors=config.ring.sectors if config.has_ring else 0,
+        **structure,
         training={**training, "config": config.to_dict()},
     )

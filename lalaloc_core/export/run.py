@@ -45,7 +45,7 @@ def export_run(
     training: dict[str, Any] = {layout.stage: _summary(layout, teacher, last=last_layout)}
     image_encoder = None
     if image is not None:
-        check_same_networks(image.config, layout.config, str(teacher))
+        check_same_networks("layout", image.config, layout.config, str(teacher))
         image_encoder = build_image_encoder(image.config)
         image_encoder.load_state_dict(image.inference_weights["image_encoder"])
         training[image.stage] = {**_summary(image, folder, last=last), "panoramas": panoramas(image)}

@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import onnxruntime
 from jaxtyping import Float, Int, UInt8
 
-from lalaloc_core.bundle import HEAD_ONNX, IMAGE_ONNX, LAYOUT_ONNX, Bundle
-from lalaloc_core.conventions import TWO_PI, wrap_angle
+from lalaloc_core.bundle import HEAD_ONNX, IMAGE_ONNX, LAYOUT_ONNX, Bundle, Manifest
+from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, TWO_PI, wrap_angle
 from lalaloc_core.errors import BundleError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.poses import PredictedProfile, Query
+from lalaloc_core.localise.poses import (
+    PredictedCeiling,
+    PredictedOpenings,
+    PredictedProfile,
+    PredictedRoomType,
+    Query,
+    rolled,
+)
 from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.sampling import PoseSet
 
@@ -21,6 +29,9 @@ _LAYOUT_BATCH = 256
 # An architecture without a ring has to see the panorama turned, once per heading.
 _HEADINGS_WITHOUT_RING = 32
 _PROFILE_OUTPUTS = ["log_profile", "log_scale"]
+_STRUCTURE_OUTPUTS = ["opening_logits", "log_ceiling", "log_ceiling_scale", "room_type_logits"]
+# These have a value for every azimuth column.
+_BY_COLUMN = ("log_profile", "log_scale", "opening_logits")
 
 
 class Encoders:
@@ -33,7 +44,7 @@ class Encoders:
             threads: intra-op threads per session, 0 for one per core.
 
         Raises:
-            BundleError: a file is missing or altered.
+            BundleError: a file is missing or altered, or the model knows other classes of openings or types of rooms.
         """
         self.manifest = bundle.manifest
         self._layout = _session(bundle.read(LAYOUT_ONNX), threads)
@@ -44,6 +55,9 @@ class Encoders:
         self._image_takes_height = any(node.name == "camera_height_m" for node in inputs)
         outputs = [] if self._image is None else self._image.get_outputs()
         self.predicts_profile = {node.name for node in outputs}.issuperset(_PROFILE_OUTPUTS)
+        self.predicts_structure = {node.name for node in outputs}.issuperset(_STRUCTURE_OUTPUTS)
+        if self.predicts_structure:
+            _check_classes(self.manifest)
         self._head = _session(bundle.read(HEAD_ONNX), threads) if self.manifest.ring_sectors else None
 
     def layouts(
@@ -94,7 +108,7 @@ class Encoders:
             heading_tolerance: how far (radians) the true heading may be from `heading`; with it there are hypotheses
                 for the sectors within that, and the heading is refined.
         """
-        turned, rolled, frame_heading = (image, 0.0, 0.0) if heading is None else _undo_heading(image, heading)
+        turned, rolled_away, frame_heading = (image, 0.0, 0.0) if heading is None else _undo_heading(image, heading)
         steps = self.manifest.ring_sectors or _HEADINGS_WITHOUT_RING
         if heading is None:
             shifts = np.arange(steps)
@@ -102,8 +116,16 @@ class Encoders:
             most = min(math.ceil(heading_tolerance / TWO_PI * steps), (steps - 1) // 2)
             shifts = np.arange(-most, most + 1)
         exact = heading is not None and heading_tolerance == 0.0
-        latents, profile = self._hypotheses(turned, camera_height_m, shifts, steps)
-        return Query(latents, rolled + shifts * (TWO_PI / steps), frame_heading, heading_known=exact, profile=profile)
+        roll = rolled_away + shifts * (TWO_PI / steps)
+        if self._head is None:
+            latents = self._turned_latents(turned, camera_height_m, shifts, steps)
+            return Query(latents, roll, frame_heading, heading_known=exact)
+        # One forward of the image, then roll its ring: rolling a ring is turning the camera.
+        seen = self._seen(turned, camera_height_m)
+        ring = np.ascontiguousarray(rolled(seen["ring"].T, shifts).transpose(0, 2, 1))
+        latents = _array(self._head.run(["latent"], {"ring": ring})[0])
+        told = self._told(seen, shifts, steps) if self.predicts_profile else {}
+        return Query(latents, roll, frame_heading, heading_known=exact, **told)
 
     def profile(
         self, image: UInt8[np.ndarray, "h w 3"], heading: float, camera_height_m: float
@@ -125,36 +147,40 @@ class Encoders:
             )
         return np.exp(query.profile.log_m[0]), query.frame_heading
 
-    def _hypotheses(
+    def _turned_latents(
         self, image: UInt8[np.ndarray, "h w 3"], camera_height_m: float, shifts: Int[np.ndarray, "k"], steps: int
-    ) -> tuple[Float[np.ndarray, "k d"], PredictedProfile | None]:
-        """Latents and wall profiles of a panorama turned to the right by each of some numbers of `steps`."""
-        if self._head is None:
-            width = image.shape[1]
-            turned = (np.roll(image, int(shift) * width // steps, axis=1) for shift in shifts)
-            latents = [self._run_image(view[None], camera_height_m, ["latent"])[0] for view in turned]
-            return np.concatenate(latents), None
-        # One forward of the image, then roll its ring: rolling a ring is turning the camera.
-        ring, profile = self._ring(image, camera_height_m)
-        source = (np.arange(steps)[None, :] - shifts[:, None]) % steps
-        rolled = np.ascontiguousarray(np.moveaxis(ring[:, source], 0, 1))
-        if profile is not None:
-            log_m, log_scale = profile
-            profile = PredictedProfile.rolled(log_m, log_scale, shifts * (len(log_m) // steps))
-        return _array(self._head.run(["latent"], {"ring": rolled})[0]), profile
+    ) -> Float[np.ndarray, "k d"]:
+        """Latents of a panorama turned to the right by each of some numbers of `steps`, for want of a ring."""
+        width = image.shape[1]
+        turned = (np.roll(image, int(shift) * width // steps, axis=1) for shift in shifts)
+        return np.concatenate([self._run_image(view[None], camera_height_m, ["latent"])[0] for view in turned])
 
-    def _ring(
-        self, image: UInt8[np.ndarray, "h w 3"], camera_height_m: float
-    ) -> tuple[Float[np.ndarray, "c s"], tuple[Float[np.ndarray, "p"], Float[np.ndarray, "p"]] | None]:
-        """The ring of a panorama, and the log wall profile and log scale where the network predicts them.
+    def _seen(self, image: UInt8[np.ndarray, "h w 3"], camera_height_m: float) -> dict[str, np.ndarray]:
+        """The outputs of the image encoder for a panorama: its ring (c, s), and everything else by its name.
 
-        They are averaged with what it predicts of the mirrored panorama: two views of one room err less than one.
+        All but the ring are averaged with what is predicted of the mirrored panorama: two views of one room err less
+        than one. What has azimuth columns is mirrored back.
         """
         if not self.predicts_profile:
-            return self._run_image(image[None], camera_height_m, ["ring"])[0][0], None
-        views = np.stack([image, image[:, ::-1]])
-        ring, log_m, log_scale = self._run_image(views, camera_height_m, ["ring", *_PROFILE_OUTPUTS])
-        return ring[0], (0.5 * (log_m[0] + log_m[1, ::-1]), 0.5 * (log_scale[0] + log_scale[1, ::-1]))
+            return {"ring": self._run_image(image[None], camera_height_m, ["ring"])[0][0]}
+        names = [*_PROFILE_OUTPUTS, *(_STRUCTURE_OUTPUTS if self.predicts_structure else [])]
+        ring, *others = self._run_image(np.stack([image, image[:, ::-1]]), camera_height_m, ["ring", *names])
+        averaged = {}
+        for name, (value, mirrored) in zip(names, others, strict=True):
+            averaged[name] = 0.5 * (value + (mirrored[::-1] if name in _BY_COLUMN else mirrored))
+        return {"ring": ring[0], **averaged}
+
+    def _told(self, seen: dict[str, np.ndarray], shifts: Int[np.ndarray, "k"], steps: int) -> dict[str, Any]:
+        """What a query says of the layout, for panoramas turned to the right by each of some numbers of `steps`."""
+        columns = shifts * (len(seen["log_profile"]) // steps)
+        told: dict[str, Any] = {"profile": PredictedProfile.rolled(seen["log_profile"], seen["log_scale"], columns)}
+        if self.predicts_structure:
+            openings = rolled(_log_softmax(seen["opening_logits"]), columns)
+            told["openings"] = PredictedOpenings(openings, np.array(self.manifest.opening_prior))
+            told["ceiling"] = PredictedCeiling(float(seen["log_ceiling"]), float(seen["log_ceiling_scale"]))
+            types = _log_softmax(seen["room_type_logits"])
+            told["room_type"] = PredictedRoomType(types, np.array(self.manifest.room_type_prior))
+        return told
 
     def _run_image(
         self, images: UInt8[np.ndarray, "b h w 3"], camera_height_m: float, outputs: list[str]
@@ -175,6 +201,22 @@ def _undo_heading(image: UInt8[np.ndarray, "h w 3"], heading: float) -> tuple[UI
     # Column j of the result is column j - shift of the input, which looks `shift` pixels more to the left.
     turned = np.roll(image, shift, axis=1)
     return turned, shift * pixel, float(wrap_angle(heading - shift * pixel))
+
+
+def _check_classes(manifest: Manifest) -> None:
+    """Codes mean the same everywhere, so a model must have been trained with them."""
+    for name, mine in (("opening_classes", OPENING_CLASSES), ("room_types", ROOM_TYPES)):
+        theirs = getattr(manifest, name)
+        if theirs != list(mine):
+            raise BundleError(f"model '{manifest.name}' has the {name} {theirs}, this code knows {list(mine)}")
+    for name, classes in (("opening_prior", OPENING_CLASSES), ("room_type_prior", ROOM_TYPES)):
+        if len(getattr(manifest, name)) != len(classes):
+            raise BundleError(f"model '{manifest.name}': {name} has not one value for each of {list(classes)}")
+
+
+def _log_softmax(logits: Float[np.ndarray, "*n c"]) -> Float[np.ndarray, "*n c"]:
+    shifted = logits - logits.max(axis=-1, keepdims=True)
+    return shifted - np.log(np.exp(shifted).sum(axis=-1, keepdims=True))
 
 
 def _array(value: object) -> np.ndarray:

@@ -38,9 +38,48 @@ class PredictedProfile:
         cls, log_m: Float[np.ndarray, "w"], log_scale: Float[np.ndarray, "w"], shifts: Int[np.ndarray, "k"]
     ) -> PredictedProfile:
         """One prediction, moved to the right by so many columns for each hypothesis."""
-        columns = len(log_m)
-        source = (np.arange(columns)[None, :] - shifts[:, None]) % columns
-        return cls(log_m[source], log_scale[source])
+        return cls(rolled(log_m, shifts), rolled(log_scale, shifts))
+
+
+def rolled(values: Float[np.ndarray, "w *c"], shifts: Int[np.ndarray, "k"]) -> Float[np.ndarray, "k w *c"]:
+    """What was said of the azimuth columns, moved to the right by so many columns for each hypothesis."""
+    columns = len(values)
+    return values[(np.arange(columns)[None, :] - shifts[:, None]) % columns]
+
+
+@dataclass(frozen=True, eq=False)
+class PredictedOpenings:
+    """What is met at each azimuth at eye height, for every hypothesis of how the panorama is turned.
+
+    Attributes:
+        log_probability: (k, w, c) by class, in the order of `conventions.OPENING_CLASSES`.
+        prior: (c,) the shares of the classes that the probabilities presume; dividing by them leaves likelihoods but
+            for a factor.
+    """
+
+    log_probability: Float[np.ndarray, "k w c"]
+    prior: Float[np.ndarray, "c"]
+
+
+@dataclass(frozen=True)
+class PredictedCeiling:
+    """Laplace distribution of the log of the ceiling's height above the camera (m): its centre and log scale."""
+
+    log_m: float
+    log_scale: float
+
+
+@dataclass(frozen=True, eq=False)
+class PredictedRoomType:
+    """What the room is for.
+
+    Attributes:
+        log_probability: (t,) by type, in the order of `conventions.ROOM_TYPES`.
+        prior: (t,) the shares of the types that the probabilities presume.
+    """
+
+    log_probability: Float[np.ndarray, "t"]
+    prior: Float[np.ndarray, "t"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +96,8 @@ class Query:
         frame_heading: radians; what whole-pixel rolling could not remove, 0 when the heading is unknown.
         heading_known: whether the heading was given exactly; if not, it is searched over and refined.
         profile: what the image encoder says of the walls; None where it predicts no wall profile.
+        openings, ceiling, room_type: what it says of doors, windows and passages, of the ceiling, and of what the room
+            is for; None where it predicts nothing of the kind.
     """
 
     latents: Float[np.ndarray, "k d"]
@@ -64,6 +105,9 @@ class Query:
     frame_heading: float
     heading_known: bool
     profile: PredictedProfile | None = None
+    openings: PredictedOpenings | None = None
+    ceiling: PredictedCeiling | None = None
+    room_type: PredictedRoomType | None = None
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The networks of both architectures, and loading a layout encoder or a decoder from a bundle's weights."""
+"""The networks of all architectures, and loading a layout encoder or a decoder from a bundle's weights."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from lalaloc_core.errors import BundleError
 from lalaloc_core.nets.decoder import LayoutDecoder
 from lalaloc_core.nets.resnet import PaperConfig, PaperImageEncoder, PaperLayoutEncoder
 from lalaloc_core.nets.ring import RingConfig, RingImageEncoder, RingLayoutEncoder
+from lalaloc_core.nets.trunk_encoder import TrunkImageEncoder
 
 LayoutEncoder = RingLayoutEncoder | PaperLayoutEncoder
-ImageEncoder = RingImageEncoder | PaperImageEncoder
+ImageEncoder = RingImageEncoder | TrunkImageEncoder | PaperImageEncoder
 
 
 def load_layout_encoder(architecture: str, config: dict[str, Any], weights: bytes) -> LayoutEncoder:
@@ -25,12 +26,12 @@ def load_layout_encoder(architecture: str, config: dict[str, Any], weights: byte
         ValueError: unknown architecture, or a configuration that is not one (`ConfigError`).
         RuntimeError: the weights do not fit.
     """
-    if architecture == "ring":
+    if architecture in ("ring", "trunk"):
         encoder: LayoutEncoder = RingLayoutEncoder(build_config(RingConfig, config))
     elif architecture == "paper":
         encoder = PaperLayoutEncoder(build_config(PaperConfig, config))
     else:
-        raise ValueError(f"unknown architecture '{architecture}', known are 'ring' and 'paper'")
+        raise ValueError(f"unknown architecture '{architecture}', known are 'ring', 'trunk' and 'paper'")
     _load_weights(encoder, weights)
     return encoder
 

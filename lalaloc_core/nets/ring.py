@@ -16,6 +16,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
+from lalaloc_core.nets.mixer import MixerBlock
+
 # Distances outside are clamped before they become features: no camera stands nearer, no room is larger.
 _NEAREST_M = 0.05
 _FARTHEST_M = 50.0
@@ -158,35 +160,21 @@ class _ImageBlock(nn.Module):
         return functional.relu(self.conv2(functional.relu(self.conv1(x))) + self.shortcut(x))
 
 
-class _MixerBlock(nn.Module):
-    """Attention over the sectors, with a learnt bias by their circular offset, and a feed-forward layer.
+@dataclass(frozen=True)
+class StructureFeatures:
+    """What an image encoder says of a panorama besides the distance of the walls.
 
-    What furniture hides is inferred from the rest of the room. Offsets, not positions, keep it true that rolling
-    the panorama rolls the ring.
+    Attributes:
+        opening_logits: (b, w, classes) of what is met at each azimuth, in the order of `conventions.OPENING_CLASSES`.
+        log_ceiling: (b) log of the ceiling's height above the camera (m).
+        log_ceiling_scale: (b) log of the scale of the Laplace distribution of `log_ceiling`'s error.
+        room_type_logits: (b, types) in the order of `conventions.ROOM_TYPES`.
     """
 
-    def __init__(self, config: RingConfig) -> None:
-        super().__init__()
-        width = config.mixer_width
-        self.heads = config.mixer_heads
-        self.norm1 = nn.LayerNorm(width)
-        self.qkv = nn.Linear(width, 3 * width)
-        self.bias = nn.Parameter(torch.zeros(config.mixer_heads, config.sectors))
-        self.out = nn.Linear(width, width)
-        self.norm2 = nn.LayerNorm(width)
-        self.feed = nn.Sequential(nn.Linear(width, 2 * width), nn.GELU(), nn.Linear(2 * width, width))
-        sector = torch.arange(config.sectors)
-        self.register_buffer("offset", (sector[None, :] - sector[:, None]) % config.sectors, persistent=False)
-        self.offset: Tensor
-
-    def forward(self, x: Float[Tensor, "b s c"]) -> Float[Tensor, "b s c"]:
-        batch, sectors, width = x.shape
-        qkv = self.qkv(self.norm1(x)).reshape(batch, sectors, 3, self.heads, width // self.heads)
-        query, key, value = qkv.permute(2, 0, 3, 1, 4).unbind(0)
-        scores = query @ key.transpose(-1, -2) * (width // self.heads) ** -0.5 + self.bias[:, self.offset]
-        mixed = (scores.softmax(dim=-1) @ value).transpose(1, 2).reshape(batch, sectors, width)
-        x = x + self.out(mixed)
-        return x + self.feed(self.norm2(x))
+    opening_logits: Tensor
+    log_ceiling: Tensor
+    log_ceiling_scale: Tensor
+    room_type_logits: Tensor
 
 
 @dataclass(frozen=True)
@@ -197,11 +185,21 @@ class ImageFeatures:
         ring: (b, c, s) features to be compared with the layout encoder's.
         log_profile: (b, w) log of the predicted wall profile (m).
         log_scale: (b, w) log of the scale of the Laplace distribution of `log_profile`'s error.
+        structure: what an encoder that tells openings, ceiling and type of the room says of them.
     """
 
     ring: Tensor
     log_profile: Tensor
     log_scale: Tensor
+    structure: StructureFeatures | None = None
+
+
+def first_of(seen: ImageFeatures, count: int) -> ImageFeatures:
+    """What was said of the first `count` panoramas of a batch."""
+    structure = seen.structure
+    if structure is not None:
+        structure = StructureFeatures(**{name: value[:count] for name, value in vars(structure).items()})
+    return ImageFeatures(seen.ring[:count], seen.log_profile[:count], seen.log_scale[:count], structure)
 
 
 class RingImageEncoder(nn.Module):
@@ -224,7 +222,10 @@ class RingImageEncoder(nn.Module):
             raise ValueError(f"the image encoder ends at {width} sectors, {config.sectors} are wanted")
         self.stages = nn.Sequential(*stages)
         self.squeeze = nn.Linear(inputs * height + 1, config.mixer_width)
-        self.mixer = nn.Sequential(*(_MixerBlock(config) for _ in range(config.mixer_blocks)))
+        mixers = (
+            MixerBlock(config.mixer_width, config.mixer_heads, config.sectors) for _ in range(config.mixer_blocks)
+        )
+        self.mixer = nn.Sequential(*mixers)
         self.norm = nn.LayerNorm(config.mixer_width)
         self.to_ring = nn.Linear(config.mixer_width, config.channels)
         self.per_sector = config.profile_columns // config.sectors

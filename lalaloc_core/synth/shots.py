@@ -57,6 +57,7 @@ def sample_shots(
     *,
     by_room_share: float = 0.0,
     hard_share: float = 0.0,
+    unusual_heights_m: tuple[float, float] = (1.0, 1.9),
 ) -> list[Shot]:
     """Draw shots uniform over a home's floor.
 
@@ -68,6 +69,7 @@ def sample_shots(
         by_room_share: share of shots whose room is drawn first, all rooms alike: more of closets and corridors.
         hard_share: share of shots from places that are rare on the floor and hard to localise: close to a wall, on
             the threshold of an open door, in the narrowest rooms.
+        unusual_heights_m: camera heights, evenly between, of the quarter that is not taken from 1.3 to 1.7 m.
     """
     poses = random_poses(home.plan, count, rng, POSE_MARGIN_M)
     by_room = np.flatnonzero(rng.random(count) < by_room_share)
@@ -80,7 +82,7 @@ def sample_shots(
     shots = []
     for position, room in zip(poses.position_m, poses.room_index, strict=True):
         usual = rng.random() < 0.75
-        height = rng.uniform(1.3, 1.7) if usual else rng.uniform(1.0, 1.9)
+        height = rng.uniform(1.3, 1.7) if usual else rng.uniform(*unusual_heights_m)
         ceiling = home.plan.rooms[room].ceiling_height_m
         shots.append(
             Shot(

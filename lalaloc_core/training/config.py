@@ -11,11 +11,14 @@ from lalaloc_core.errors import ConfigError
 from lalaloc_core.nets.decoder import DECODED_WIDTH
 from lalaloc_core.nets.resnet import PaperConfig
 from lalaloc_core.nets.ring import RingConfig
+from lalaloc_core.nets.trunk import TrunkConfig
+from lalaloc_core.nets.trunk_encoder import TrunkEncoderConfig
 from lalaloc_core.sampling import TripletSampling
 
-Architecture = Literal["ring", "paper"]
+Architecture = Literal["ring", "trunk", "paper"]
 Turns = Literal["any", "quarters", "none"]
 _MAX_RAYS = 8
+_OF_TRUNK = ("pretrained", "opening_weight", "ceiling_weight", "room_type_weight", "photograph_weight")
 # Of the spread; errors are cut off at three times that, and no camera stands lower than a metre or so.
 _MAX_HEIGHT_ERROR_M = 0.2
 
@@ -29,6 +32,8 @@ class OptimiserConfig:
             at the full rate and falls to 1 % at the end, as 1 - √, so that a run may be prolonged before it falls.
         warmup: share in which the rate rises, from 5 %.
         decay: share in which a trapezoid falls.
+        trunk_factor: the rate of a pretrained trunk in units of everything else's; the lower, the nearer it stays to
+            what it knew.
     """
 
     kind: Literal["adamw", "sgd"] = "adamw"
@@ -41,6 +46,7 @@ class OptimiserConfig:
     milestones: tuple[float, ...] = (0.5, 0.75)
     gamma: float = 0.1
     clip_norm: float = 1.0
+    trunk_factor: float = 1.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,6 +108,15 @@ class ImageStageConfig:
         kd_weight: weight of the same loss with the layout encoder's distances in place of the Chamfer distances.
         ring_weight: weight of distilling ring features (architecture `ring`).
         profile_weight: weight of the Laplace likelihood of the wall profile (architecture `ring`).
+        optics: strength, 0 to 1, of random changes by lens and file: blur, vignetting, seams, tone curves, JPEG.
+        pretrained: begin with the trunk's weights of ImageNet (architecture `trunk`).
+        opening_weight: weight of the cross entropy of what is met at each azimuth (architecture `trunk`, like the
+            following).
+        opening_balance: 0 lets every azimuth count alike in it, 1 every class, whatever its share of the azimuths.
+        ceiling_weight: weight of the Laplace likelihood of the ceiling's height.
+        room_type_weight: weight of the cross entropy of the room's type.
+        photograph_weight: weight of following a teacher's maps on photographs without labels, where there are any.
+        photographs_per_batch: how many of them are added to each batch.
         ema_decay: decay per step of the averaged weights that are validated and shipped; 0 turns it off.
     """
 
@@ -120,6 +135,14 @@ class ImageStageConfig:
     kd_weight: float = 0.0
     ring_weight: float = 0.0
     profile_weight: float = 0.0
+    optics: float = 0.0
+    pretrained: bool = False
+    opening_weight: float = 0.0
+    opening_balance: float = 0.5
+    ceiling_weight: float = 0.0
+    room_type_weight: float = 0.0
+    photograph_weight: float = 0.0
+    photographs_per_batch: int = 4
     ema_decay: float = 0.0
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
 
@@ -138,6 +161,7 @@ class TrainConfig:
     seed: int = 0
     turns: Turns = "any"
     ring: RingConfig = field(default_factory=RingConfig)
+    trunk: TrunkEncoderConfig = field(default_factory=TrunkEncoderConfig)
     paper: PaperConfig = field(default_factory=PaperConfig)
     layout: LayoutStageConfig = field(default_factory=LayoutStageConfig)
     image: ImageStageConfig = field(default_factory=ImageStageConfig)
@@ -161,8 +185,20 @@ class TrainConfig:
         for name in ("uses_per_panorama", "replay_panoramas"):
             if getattr(image, name) < 1:
                 raise ConfigError(f"config.image.{name} is {getattr(image, name)}, it must be at least 1")
-        if not 0.0 <= image.photometric <= 1.0:
-            raise ConfigError(f"config.image.photometric is {image.photometric:g}, it must lie within 0 and 1")
+        for name in ("photometric", "optics", "opening_balance"):
+            if not 0.0 <= getattr(image, name) <= 1.0:
+                raise ConfigError(f"config.image.{name} is {getattr(image, name):g}, it must lie within 0 and 1")
+        if self.architecture != "trunk":
+            for name in _OF_TRUNK:
+                if getattr(image, name):
+                    raise ConfigError(
+                        f"config.image.{name} is {getattr(image, name)}, but only architecture 'trunk' has what it is "
+                        f"for, and this is '{self.architecture}'"
+                    )
+        if image.photographs_per_batch < 1:
+            raise ConfigError(
+                f"config.image.photographs_per_batch is {image.photographs_per_batch}, at least 1 is needed"
+            )
         if not 0.0 <= image.camera_height_error_m <= _MAX_HEIGHT_ERROR_M:
             raise ConfigError(
                 f"config.image.camera_height_error_m is {image.camera_height_error_m:g}, "
@@ -209,28 +245,94 @@ class TrainConfig:
             part[keys[-1]] = value
         return self.from_dict(raw)
 
-    def with_networks(self, sizes: RingConfig | PaperConfig) -> TrainConfig:
-        """The same with other sizes of the architecture that they are sizes of."""
-        return dataclasses.replace(self, **{"ring" if isinstance(sizes, RingConfig) else "paper": sizes})
+    def with_networks(self, *sizes: RingConfig | TrunkEncoderConfig | PaperConfig) -> TrainConfig:
+        """The same with other sizes of the networks that they are sizes of."""
+        names = {RingConfig: "ring", TrunkEncoderConfig: "trunk", PaperConfig: "paper"}
+        return dataclasses.replace(self, **{names[type(part)]: part for part in sizes})
+
+    @property
+    def has_ring(self) -> bool:
+        """Whether both branches meet in features around the horizon."""
+        return self.architecture != "paper"
+
+    @property
+    def layout_sizes(self) -> RingConfig | PaperConfig:
+        """Sizes of the layout branch."""
+        return self.ring if self.has_ring else self.paper
+
+    @property
+    def image_sizes(self) -> RingConfig | TrunkEncoderConfig | PaperConfig:
+        """Sizes of the image encoder."""
+        return self.trunk if self.architecture == "trunk" else self.layout_sizes
 
     @property
     def latent_size(self) -> int:
         """Dimensions of the latent."""
-        return self.ring.latent_size if self.architecture == "ring" else self.paper.latent_size
+        return self.layout_sizes.latent_size
 
     @property
     def profile_columns(self) -> int:
         """Azimuth columns that the layout encoder expects."""
-        return self.ring.profile_columns if self.architecture == "ring" else self.paper.profile_columns
+        return self.layout_sizes.profile_columns
 
     @property
     def image_size(self) -> tuple[int, int]:
         """(height, width) that the image encoder expects."""
-        sizes = self.ring if self.architecture == "ring" else self.paper
-        return sizes.image_height, sizes.image_width
+        return self.image_sizes.image_height, self.image_sizes.image_width
 
 
 PAPER_SGD = OptimiserConfig(kind="sgd", learning_rate=0.01, schedule="steps", warmup=0.0, clip_norm=0.0)
+
+_RING_LAYOUT = LayoutStageConfig(
+    triplets=TripletSampling(positives=4, negatives=8),
+    all_pairs=True,
+    turned_share=0.25,
+    decode_weight=0.3,
+    decode_anchors_only=True,
+    cloud_rows=8,
+    cloud_columns=32,
+    scale_weight=0.1,
+    optimiser=OptimiserConfig(learning_rate=2e-3),
+)
+
+# For tests.
+_TINY = TrainConfig(
+    name="tiny",
+    ring=RingConfig(
+        sectors=16,
+        channels=8,
+        profile_columns=32,
+        layout_width=16,
+        layout_dilations=(1,),
+        image_height=32,
+        image_width=64,
+        image_stem=8,
+        image_widths=(8, 12),
+        image_blocks=(1, 1),
+        mixer_width=16,
+        mixer_blocks=1,
+        mixer_heads=2,
+    ),
+    trunk=TrunkEncoderConfig(
+        image_height=32,
+        image_width=64,
+        trunk=TrunkConfig(stem=8, widths=(8, 8, 8, 8, 8, 8, 8), repeats=(1, 1, 1, 1, 1, 1, 1), frozen_stages=1),
+        squeezed=(8, 8, 8, 8),
+        mixer_width=16,
+        mixer_blocks=1,
+        mixer_heads=2,
+    ),
+    layout=LayoutStageConfig(
+        steps=40,
+        homes_per_step=2,
+        anchors_per_home=2,
+        triplets=TripletSampling(positives=2, negatives=4),
+        all_pairs=True,
+        decode_anchors_only=True,
+        scale_weight=0.1,
+    ),
+    image=ImageStageConfig(steps=12, batch=8, ring_weight=1.0, profile_weight=0.5, ema_decay=0.9),
+)
 
 # The paper counts epochs over Structured3D; its 18,000 or so training panoramas give these numbers of steps.
 PRESETS: dict[str, TrainConfig] = {
@@ -247,17 +349,7 @@ PRESETS: dict[str, TrainConfig] = {
     ),
     "ring": TrainConfig(
         name="ring",
-        layout=LayoutStageConfig(
-            triplets=TripletSampling(positives=4, negatives=8),
-            all_pairs=True,
-            turned_share=0.25,
-            decode_weight=0.3,
-            decode_anchors_only=True,
-            cloud_rows=8,
-            cloud_columns=32,
-            scale_weight=0.1,
-            optimiser=OptimiserConfig(learning_rate=2e-3),
-        ),
+        layout=_RING_LAYOUT,
         image=ImageStageConfig(
             photometric=1.0,
             camera_height_error_m=0.02,
@@ -267,32 +359,42 @@ PRESETS: dict[str, TrainConfig] = {
             optimiser=OptimiserConfig(learning_rate=1.5e-3),
         ),
     ),
-    "tiny": TrainConfig(
-        name="tiny",
-        ring=RingConfig(
-            sectors=16,
-            channels=8,
-            profile_columns=32,
-            layout_width=16,
-            layout_dilations=(1,),
-            image_height=32,
-            image_width=64,
-            image_stem=8,
-            image_widths=(8, 12),
-            image_blocks=(1, 1),
-            mixer_width=16,
-            mixer_blocks=1,
-            mixer_heads=2,
+    # The layout branch is that of `ring`.
+    "trunk": TrainConfig(
+        name="trunk",
+        architecture="trunk",
+        layout=_RING_LAYOUT,
+        image=ImageStageConfig(
+            photometric=1.0,
+            optics=1.0,
+            supersample=(2, 2),
+            uses_per_panorama=4,
+            replay_panoramas=1024,
+            pretrained=True,
+            ring_weight=0.5,
+            profile_weight=1.0,
+            opening_weight=1.0,
+            ceiling_weight=0.2,
+            room_type_weight=0.1,
+            photograph_weight=0.3,
+            ema_decay=0.998,
+            optimiser=OptimiserConfig(learning_rate=1.5e-3, schedule="trapezoid", warmup=0.03, trunk_factor=0.15),
         ),
-        layout=LayoutStageConfig(
-            steps=40,
-            homes_per_step=2,
-            anchors_per_home=2,
-            triplets=TripletSampling(positives=2, negatives=4),
-            all_pairs=True,
-            decode_anchors_only=True,
-            scale_weight=0.1,
+    ),
+    "tiny": _TINY,
+    "tiny-trunk": dataclasses.replace(
+        _TINY,
+        name="tiny-trunk",
+        architecture="trunk",
+        image=dataclasses.replace(
+            _TINY.image,
+            optics=1.0,
+            opening_weight=1.0,
+            ceiling_weight=0.2,
+            room_type_weight=0.1,
+            photograph_weight=0.3,
+            photographs_per_batch=2,
+            optimiser=OptimiserConfig(trunk_factor=0.3),
         ),
-        image=ImageStageConfig(steps=12, batch=8, ring_weight=1.0, profile_weight=0.5, ema_decay=0.9),
     ),
 }

@@ -13,9 +13,10 @@ from torch import nn
 
 from lalaloc_core.data.dataset import Appearance, Camera, Dataset, Scene, load_scenes
 from lalaloc_core.data.synthetic.generated import GeneratedScenes, RenderedPhotograph
-from lalaloc_core.errors import DatasetError
+from lalaloc_core.errors import ConfigError, DatasetError
 from lalaloc_core.training.best import Validate
 from lalaloc_core.training.config import TrainConfig
+from lalaloc_core.training.photographs import Photographs, load_photographs
 from lalaloc_core.training.sources import GeneratedSource, SceneSource, Source
 from lalaloc_core.training.validate import ImageValidation
 
@@ -35,6 +36,8 @@ class TrainingData:
         deferred: the generator's panoramas are rendered on the device that trains, not where homes are made.
         unfamiliar: scenes that are nothing like those trained on; image validation reports those of their validation
             split as well, and nothing is chosen by them.
+        photographs: folder of panoramas without labels that the image stage learns from as well.
+        teacher: what tells doors and windows in them, see `training.photographs`.
     """
 
     dataset: Dataset | None = None
@@ -43,12 +46,32 @@ class TrainingData:
     deferred: bool = False
     validation_scenes: int = 50
     unfamiliar: Dataset | None = None
+    photographs: Path | None = None
+    teacher: Path | None = None
 
     def source(self, config: TrainConfig) -> Source:
         """What training looks at."""
         if self.dataset is None:
             return GeneratedSource(config, self.textures, self.deferred)
         return SceneSource(config, self.dataset, self.skip_bad)
+
+    def load_photographs(self, config: TrainConfig) -> Photographs | None:
+        """The photographs with what the teacher sees in them; None where none are to be learnt from.
+
+        Raises:
+            ConfigError: photographs without a teacher or the reverse, an architecture that tells no openings, or a
+                teacher that cannot be run.
+            DatasetError: a photograph cannot be read.
+        """
+        if self.photographs is None and self.teacher is None:
+            return None
+        if self.photographs is None or self.teacher is None:
+            raise ConfigError("photographs and their teacher are given together or not at all")
+        if config.architecture != "trunk":
+            raise ConfigError(
+                f"architecture '{config.architecture}' tells no openings, it cannot learn from photographs"
+            )
+        return load_photographs(self.photographs, self.teacher, *config.image_size)
 
     def validation(self, config: TrainConfig) -> list[Scene]:
         """Validation scenes, none where the data set has none.

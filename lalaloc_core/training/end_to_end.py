@@ -34,8 +34,11 @@ class EndToEndStage:
     def __init__(self, config: TrainConfig, source: Source) -> None:
         if config.architecture != "paper":
             raise ConfigError(f"config.architecture is '{config.architecture}', end-to-end training knows 'paper' only")
-        if config.image.photometric:
-            raise ConfigError(f"config.image.photometric is {config.image.photometric:g}, end-to-end training has none")
+        for name in ("photometric", "optics"):
+            if getattr(config.image, name):
+                raise ConfigError(
+                    f"config.image.{name} is {getattr(config.image, name):g}, end-to-end training has none"
+                )
         self.config = config
         self.source = source
         layout_encoder, decoder = build_layout_encoder(config), build_decoder(config)

@@ -10,12 +10,14 @@ import torch
 from torch import Tensor, nn
 
 from lalaloc_core.nets import LayoutEncoder
-from lalaloc_core.nets.ring import RingLayoutEncoder
+from lalaloc_core.nets.ring import ImageFeatures, RingLayoutEncoder, StructureFeatures, first_of
+from lalaloc_core.nets.trunk_encoder import TrunkImageEncoder
 from lalaloc_core.training import losses
 from lalaloc_core.training.batches import Batch
 from lalaloc_core.training.config import ImageStageConfig, TrainConfig
 from lalaloc_core.training.objective import anchors_with_neighbours, chamfer_to_anchors, embed
-from lalaloc_core.training.photometric import changed
+from lalaloc_core.training.photographs import Photographs
+from lalaloc_core.training.photometric import changed, optics
 from lalaloc_core.training.sources import Source
 from lalaloc_core.training.stages import build_image_encoder, panorama_batches
 
@@ -25,13 +27,20 @@ class ImageStage:
 
     name = "image"
 
-    def __init__(self, config: TrainConfig, source: Source, layout_encoder: LayoutEncoder) -> None:
+    def __init__(
+        self,
+        config: TrainConfig,
+        source: Source,
+        layout_encoder: LayoutEncoder,
+        photographs: Photographs | None = None,
+    ) -> None:
         self.config = config
+        self.photographs = photographs
         self.source = source
         self.teacher = layout_encoder.eval().requires_grad_(False)
         self.encoder = build_image_encoder(config)
         self.modules: dict[str, nn.Module] = {"image_encoder": self.encoder}
-        self._generator: torch.Generator | None = None
+        self._generators: dict[torch.device, torch.Generator] = {}
         self._first_step = 0
 
     @property
@@ -47,11 +56,13 @@ class ImageStage:
     @property
     def data(self) -> dict[str, Any]:
         """What is trained on."""
-        return self.source.data
+        if self.photographs is None:
+            return self.source.data
+        return {**self.source.data, "photographs": len(self.photographs.images)}
 
     def batches(self, first_step: int, workers: int) -> Iterator[Batch]:
         """Panorama batches, see `panorama_batches`."""
-        self._first_step, self._generator = first_step, None
+        self._first_step, self._generators = first_step, {}
         return panorama_batches(
             self.config,
             self.source,
@@ -65,13 +76,15 @@ class ImageStage:
         """Weighted losses of a batch by name; their sum is minimised."""
         layout = (batch["profile_m"], batch["camera_height_m"], batch["ceiling_height_m"])
         stage, terms = self.settings, {}
-        image = self._seen(batch["image"])
         if isinstance(self.teacher, RingLayoutEncoder):
             with torch.no_grad():
                 ring = self.teacher.ring(*layout)
                 target = self.teacher.head(ring)
-            seen = self.encoder(image, batch["camera_height_m"])
+            seen, photographed = self._encoded(batch)
             latent = self.teacher.head(seen.ring)
+            if seen.structure is not None:
+                terms |= self._structural(seen.structure, batch)
+            terms |= photographed
             if stage.ring_weight:
                 terms["ring"] = stage.ring_weight * losses.ring_distillation(seen.ring, ring)
             if stage.profile_weight:
@@ -80,21 +93,58 @@ class ImageStage:
         else:
             with torch.no_grad():
                 target = self.teacher(*layout)
-            latent = self.encoder(image)
+            latent = self.encoder(self._seen(batch["image"]))
         if stage.l2_weight:
             terms["l2"] = stage.l2_weight * losses.l2(latent, target)
         if stage.log_ratio_weight or stage.kd_weight:
             terms |= self._relational(latent.float(), target.float(), batch)
         return terms
 
+    def _encoded(self, batch: Batch) -> tuple[ImageFeatures, dict[str, Tensor]]:
+        """What the encoder says of a batch's panoramas, and the loss on photographs, which it sees along with them."""
+        stage, image, height = self.settings, batch["image"], batch["camera_height_m"]
+        if self.photographs is None or not stage.photograph_weight:
+            return self.encoder(self._seen(image), height), {}
+        count, columns = stage.photographs_per_batch, self.config.profile_columns
+        others, taught = self.photographs.draw(count, columns, self._randomness(torch.device("cpu")))
+        together = torch.cat([image, others.to(image.device)])
+        # How high real cameras stood is not known, and openings do not depend on it.
+        seen = self.encoder(self._seen(together), torch.cat([height, height.new_ones(count)]))
+        assert seen.structure is not None
+        loss = losses.followed_maps(seen.structure.opening_logits[len(image) :], taught.to(image.device))
+        return first_of(seen, len(image)), {"photographs": stage.photograph_weight * loss}
+
+    def _structural(self, seen: StructureFeatures, batch: Batch) -> dict[str, Tensor]:
+        """Losses on what is met at each azimuth, the ceiling and the type of the room."""
+        stage, kind, room_type = self.settings, batch["opening_kind"], batch["room_type"]
+        assert isinstance(self.encoder, TrunkImageEncoder)
+        self.encoder.count(kind, room_type)
+        terms = {}
+        if stage.opening_weight:
+            share = self.encoder.opening_share
+            loss = losses.opening(seen.opening_logits, kind, share, stage.opening_balance)
+            terms["opening"] = stage.opening_weight * loss
+        if stage.ceiling_weight:
+            above_m = batch["ceiling_height_m"] - batch["camera_height_m"]
+            loss = losses.ceiling(seen.log_ceiling, seen.log_ceiling_scale, above_m)
+            terms["ceiling"] = stage.ceiling_weight * loss
+        if stage.room_type_weight:
+            terms["room_type"] = stage.room_type_weight * losses.room_type(seen.room_type_logits, room_type)
+        return terms
+
     def _seen(self, image: Tensor) -> Tensor:
         """Pictures with the photometric changes that are asked for; what is drawn depends on seed and first step."""
-        if not self.settings.photometric:
-            return image
-        if self._generator is None:
+        if self.settings.photometric:
+            image = changed(image, self.settings.photometric, self._randomness(image.device))
+        if self.settings.optics:
+            image = optics(image.float(), self.settings.optics, self._randomness(image.device))
+        return image
+
+    def _randomness(self, device: torch.device) -> torch.Generator:
+        if device not in self._generators:
             seed = int(np.random.default_rng([9, self.config.seed, self._first_step]).integers(1 << 62))
-            self._generator = torch.Generator(image.device).manual_seed(seed)
-        return changed(image, self.settings.photometric, self._generator)
+            self._generators[device] = torch.Generator(device).manual_seed(seed)
+        return self._generators[device]
 
     def _relational(self, latent: Tensor, target: Tensor, batch: Batch) -> dict[str, Tensor]:
         """Losses on the distances of the neighbours' layouts to the panorama."""

@@ -123,7 +123,7 @@ class _Trainer:
             FloatingPointError: the loss is not finite; the last checkpoint is still good.
         """
         for group in self.optimiser.param_groups:
-            group["lr"] = learning_rate(self.settings.optimiser, min(self.progress, 1.0))
+            group["lr"] = group.get("factor", 1.0) * learning_rate(self.settings.optimiser, min(self.progress, 1.0))
         batch = {key: value.to(self.device, non_blocking=True) for key, value in batch.items()}
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.device.type == "cuda"):
             terms = self.stage.losses(batch)
@@ -133,7 +133,7 @@ class _Trainer:
         self.optimiser.zero_grad(set_to_none=True)
         total.backward()
         if self.settings.optimiser.clip_norm:
-            parameters = [p for module in self.stage.modules.values() for p in module.parameters()]
+            parameters = [p for group in self.optimiser.param_groups for p in group["params"]]
             nn.utils.clip_grad_norm_(parameters, self.settings.optimiser.clip_norm)
         self.optimiser.step()
         self.step += 1

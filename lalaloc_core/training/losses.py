@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn import functional
+
+from lalaloc_core.conventions import OPENING_CLASSES
 
 # Keeps log and its gradient finite when two latents coincide.
 _MIN_DISTANCE = 1e-4
+# A class that is hardly ever seen does not get all the weight.
+_MIN_SHARE = 1e-3
+# Cameras touch no ceiling.
+_MIN_ABOVE_M = 0.05
 
 
 def log_ratio(
@@ -60,6 +67,55 @@ def laplace(
     """DeferredBatch log likelihood of the true log wall profile under the predicted Laplace distributions."""
     error = (log_profile - torch.log(profile_m)).abs()
     return (error * torch.exp(-log_scale) + log_scale).mean()
+
+
+def opening(
+    logits: Float[Tensor, "b w c"], kind: Int[Tensor, "b w"], share: Float[Tensor, "c"], balance: float
+) -> Tensor:
+    """Cross entropy of what is met at each azimuth; kinds below 0 are not known and do not count.
+
+    Classes weigh `share ** -balance`. The distributions that are learnt so are those of a world in which the classes'
+    shares are `opening_prior`.
+    """
+    weight = share.clamp_min(_MIN_SHARE) ** -balance
+    return _weighted(logits.flatten(0, 1), kind.flatten(), weight)
+
+
+def opening_prior(share: Float[Tensor, "c"], balance: float) -> Float[Tensor, "c"]:
+    """The classes' shares in the world that `opening` pretends to be in."""
+    weighted = share.clamp_min(_MIN_SHARE) ** (1.0 - balance)
+    return weighted / weighted.sum()
+
+
+def room_type(logits: Float[Tensor, "b c"], kind: Int[Tensor, "b"]) -> Tensor:
+    """Cross entropy of the rooms' types; those below 0 are not known and do not count."""
+    return _weighted(logits, kind, None)
+
+
+def _weighted(logits: Float[Tensor, "n c"], kind: Int[Tensor, "n"], weight: Tensor | None) -> Tensor:
+    if not bool((kind >= 0).any()):
+        return 0.0 * logits.sum()
+    return functional.cross_entropy(logits, kind.long(), weight, ignore_index=-1)
+
+
+def ceiling(log_ceiling: Float[Tensor, "b"], log_scale: Float[Tensor, "b"], above_m: Float[Tensor, "b"]) -> Tensor:
+    """Negative log likelihood of the ceiling's true height above the camera (m)."""
+    error = (log_ceiling - torch.log(above_m.clamp_min(_MIN_ABOVE_M))).abs()
+    return (error * torch.exp(-log_scale) + log_scale).mean()
+
+
+def followed_maps(logits: Float[Tensor, "b w c"], taught: Float[Tensor, "b w 2"]) -> Tensor:
+    """Cross entropy to a teacher's shares of (door, window) in each column.
+
+    The teacher knows no passages: the rest may be wall or passage as the student likes.
+    """
+    log_probability = torch.log_softmax(logits, dim=2)
+    door, window = (OPENING_CLASSES.index(kind) for kind in ("door", "window"))
+    others = [code for code in range(len(OPENING_CLASSES)) if code not in (door, window)]
+    rest = torch.logsumexp(log_probability[..., others], dim=2)
+    left = (1.0 - taught.sum(dim=2)).clamp_min(0.0)
+    seen = taught[..., 0] * log_probability[..., door] + taught[..., 1] * log_probability[..., window] + left * rest
+    return -seen.mean()
 
 
 def _safe_log(distance: Tensor) -> Tensor:

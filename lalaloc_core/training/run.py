@@ -9,6 +9,8 @@ from typing import Any
 import torch
 
 from lalaloc_core.data.dataset import Scene
+from lalaloc_core.nets.trunk import load_pretrained
+from lalaloc_core.nets.trunk_encoder import TrunkImageEncoder
 from lalaloc_core.training.best import Validate
 from lalaloc_core.training.checkpoint import Checkpoint
 from lalaloc_core.training.config import TrainConfig
@@ -70,25 +72,31 @@ def train_image(
     workers: int = 1,
     resume: bool = False,
     init_from: Path | None = None,
+    layout_from: Path | None = None,
 ) -> Checkpoint:
     """Stage 2 into `folder`, against the layout encoder that stage 1 left there, or in the folder `teacher`.
 
     Args:
         init_from: a bundle or a run's folder whose image encoder training begins with; not for a run that resumes.
             Where `folder` has no layout encoder and no other teacher is named, it gets the one from there.
+        layout_from: a bundle or a run's folder whose layout encoder `folder` gets where it has none.
 
     Raises:
         CheckpointError: stage 1 has not run there, or for other networks.
         DatasetError: a file of the data set cannot be used.
     """
     torch.manual_seed(config.seed + 1)
-    if init_from is not None and teacher is None and not (folder / "layout.pt").exists():
-        found = load_warm_start(init_from, "layout", config).checkpoint
+    origin = layout_from or init_from
+    if origin is not None and teacher is None and not (folder / "layout.pt").exists():
+        found = load_warm_start(origin, "layout", config).checkpoint
         dataclasses.replace(found, stage="layout").save(folder / "layout.pt")
     teacher = teacher or folder
-    check_same_networks(config, checkpoint_with("layout", teacher).config, str(teacher))
+    check_same_networks("layout", config, checkpoint_with("layout", teacher).config, str(teacher))
     layout_encoder = load_layout_encoder_of(teacher)
-    stage = ImageStage(config, data.source(config), layout_encoder)
+    stage = ImageStage(config, data.source(config), layout_encoder, data.load_photographs(config))
+    fresh = init_from is None and not resume
+    if fresh and isinstance(stage.encoder, TrunkImageEncoder) and config.image.pretrained:
+        load_pretrained(stage.encoder.trunk)
     begun_from = None if init_from is None else _warm_start(stage, init_from, "image")
     scenes = data.validation(config)
     validate = data.image_validation(config, scenes, layout_encoder, device, folder) if scenes else None

@@ -34,6 +34,8 @@ from lalaloc_core.training.deferred import DeferredScene
 _HEADROOM_M = 0.1
 _MIN_CAMERA_M, _MAX_CAMERA_M = 1.0, 1.9
 _CEILING_CLEARANCE_M = 0.3
+# Of panoramas; lower and higher than photographers usually hold a camera, but they do.
+_CAMERA_HEIGHTS_M = (0.8, 2.2)
 # Share of generated panoramas from thresholds, beside walls, in corridors and closets.
 _HARD_SHARE = 0.25
 _SCENES_CACHED = 256
@@ -169,7 +171,14 @@ class GeneratedSource:
     def views(self, visit: int, height: int, width: int) -> list[View]:
         stage = self.config.image
         home, rng = home_of(TRAIN, self.config.seed, visit)
-        shots = sample_shots(home, stage.shots_per_home, rng, by_room_share=stage.by_room_share, hard_share=_HARD_SHARE)
+        shots = sample_shots(
+            home,
+            stage.shots_per_home,
+            rng,
+            by_room_share=stage.by_room_share,
+            hard_share=_HARD_SHARE,
+            unusual_heights_m=_CAMERA_HEIGHTS_M,
+        )
         # Made where it is needed: it does not travel to worker processes.
         self._studio = self._studio or self._studio_on("cpu")
         scenes = [build_scene(shot, self._studio.materials) for shot in shots]

@@ -12,6 +12,8 @@ from lalaloc_core.nets import ImageEncoder, LayoutEncoder
 from lalaloc_core.nets.decoder import LayoutDecoder
 from lalaloc_core.nets.resnet import PaperImageEncoder, PaperLayoutEncoder
 from lalaloc_core.nets.ring import RingImageEncoder, RingLayoutEncoder
+from lalaloc_core.nets.trunk import Trunk
+from lalaloc_core.nets.trunk_encoder import TrunkImageEncoder
 from lalaloc_core.training.batches import Batch, load_batches
 from lalaloc_core.training.config import ImageStageConfig, LayoutStageConfig, OptimiserConfig, TrainConfig
 from lalaloc_core.training.deferred import DeferredRenderer
@@ -53,12 +55,14 @@ class TrainingStage(Protocol):
 
 def build_layout_encoder(config: TrainConfig) -> LayoutEncoder:
     """A fresh layout encoder of the configured architecture."""
-    return RingLayoutEncoder(config.ring) if config.architecture == "ring" else PaperLayoutEncoder(config.paper)
+    return RingLayoutEncoder(config.ring) if config.has_ring else PaperLayoutEncoder(config.paper)
 
 
 def build_image_encoder(config: TrainConfig) -> ImageEncoder:
     """A fresh image encoder of the configured architecture."""
-    return RingImageEncoder(config.ring) if config.architecture == "ring" else PaperImageEncoder(config.paper)
+    if config.architecture == "trunk":
+        return TrunkImageEncoder(config.trunk, config.ring)
+    return RingImageEncoder(config.ring) if config.has_ring else PaperImageEncoder(config.paper)
 
 
 def build_decoder(config: TrainConfig) -> LayoutDecoder | None:
@@ -84,13 +88,25 @@ def panorama_batches(
 
 def build_optimiser(modules: dict[str, nn.Module], config: OptimiserConfig) -> torch.optim.Optimizer:
     """The optimiser over all parameters; AdamW decays matrices only."""
-    parameters = [p for module in modules.values() for p in module.parameters()]
+    trunks = [part for module in modules.values() for part in module.modules() if isinstance(part, Trunk)]
+    slow = {id(p) for trunk in trunks for p in trunk.parameters()}
+    parameters = [p for module in modules.values() for p in module.parameters() if p.requires_grad]
     if config.kind == "sgd":
-        return torch.optim.SGD(
-            parameters, config.learning_rate, momentum=config.momentum, weight_decay=config.weight_decay
-        )
-    groups = [
-        {"params": [p for p in parameters if p.ndim > 1], "weight_decay": config.weight_decay},
-        {"params": [p for p in parameters if p.ndim <= 1], "weight_decay": 0.0},
-    ]
+        groups = _by_rate(parameters, slow, config, weight_decay=config.weight_decay)
+        return torch.optim.SGD(groups, config.learning_rate, momentum=config.momentum)
+    groups = _by_rate([p for p in parameters if p.ndim > 1], slow, config, weight_decay=config.weight_decay)
+    groups += _by_rate([p for p in parameters if p.ndim <= 1], slow, config, weight_decay=0.0)
     return torch.optim.AdamW(groups, config.learning_rate)
+
+
+def _by_rate(
+    parameters: list[nn.Parameter], slow: set[int], config: OptimiserConfig, *, weight_decay: float
+) -> list[dict[str, Any]]:
+    """Groups of parameters with the factor on the learning rate that each keeps all along."""
+    groups = []
+    for factor, chosen in (
+        (1.0, [p for p in parameters if id(p) not in slow]),
+        (config.trunk_factor, [p for p in parameters if id(p) in slow]),
+    ):
+        groups += [{"params": chosen, "weight_decay": weight_decay, "factor": factor}] if chosen else []
+    return groups

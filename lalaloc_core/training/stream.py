@@ -7,8 +7,12 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
+from jaxtyping import Float, Int
 
+from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, WALL_CODE
 from lalaloc_core.errors import DatasetError
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.render.layout import layout_view
 from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.training.batches import Batch, LoadFailure, Stream, non_empty, stacked, worker_share
 from lalaloc_core.training.config import TrainConfig
@@ -16,6 +20,9 @@ from lalaloc_core.training.deferred import DeferredBatch, DeferredBatcher, Defer
 from lalaloc_core.training.replay import Replay
 from lalaloc_core.training.sources import Group, Source, View
 from lalaloc_core.training.turning import Turn, draw_heading, draw_turn
+
+# Code of a class that is not known; losses pass over it.
+UNKNOWN = -1
 
 _Drawn = TypeVar("_Drawn")
 _Packed = TypeVar("_Packed")
@@ -69,7 +76,9 @@ class PanoramaBatches(Stream):
 
     Each batch holds `image` (b, h, w, 3) uint8, `profile_m` (b, columns), `camera_height_m` (b) as it is given,
     `ceiling_height_m` (b), and where a loss compares with neighbours, `neighbour_profile_m` (b, n, columns) and
-    `neighbour_ceiling_height_m` (b, n), which are turned and mirrored as their panorama is. From a source
+    `neighbour_ceiling_height_m` (b, n), which are turned and mirrored as their panorama is. With architecture `trunk`
+    there are `opening_kind` (b, columns) and `room_type` (b), codes of `conventions`, `UNKNOWN` where the plan says
+    nothing of it. From a source
     whose rendering is deferred come `DeferredBatch`es.
     """
 
@@ -130,13 +139,55 @@ class PanoramaBatches(Stream):
             "camera_height_m": np.float32(view.camera_height_m + self._height_error_m(rng)),
             "ceiling_height_m": ceiling[0],
         }
+        if self.config.architecture == "trunk":
+            row |= self._structure(view, turn)
         if self.neighbours:
             row |= {"neighbour_profile_m": profile[1:], "neighbour_ceiling_height_m": ceiling[1:]}
         return row
 
+    def _structure(self, view: View, turn: Turn) -> Row:
+        room = view.plan.rooms[view.room_index]
+        kind = opening_kinds(
+            view.plan,
+            view.position_m,
+            view.room_index,
+            turn.heading,
+            view.camera_height_m,
+            self.config.profile_columns,
+        )
+        type_code = ROOM_TYPES.index(room.type)
+        # The first type is that of rooms of which the plan does not say.
+        return {"opening_kind": turn.profile(kind), "room_type": np.array(type_code or UNKNOWN)}
+
     def _height_error_m(self, rng: np.random.Generator) -> float:
         spread = self.config.image.camera_height_error_m
         return float(np.clip(rng.normal(0.0, spread), -3.0 * spread, 3.0 * spread)) if spread else 0.0
+
+
+def opening_kinds(
+    plan: FloorPlan,
+    position_m: Float[np.ndarray, "2"],
+    room_index: int,
+    heading: float,
+    camera_height_m: float,
+    columns: int,
+) -> Int[np.ndarray, "{columns}"]:
+    """Code of what a camera meets at each azimuth at eye height.
+
+    `UNKNOWN` for walls of a plan that does not claim to show all openings: there may be one that it leaves out.
+    """
+    view = layout_view(
+        position_m[None].astype(np.float32),
+        np.array([heading], np.float32),
+        np.array([room_index]),
+        plan.geometry,
+        columns,
+        camera_height_m,
+    )
+    kind = view.kind[0].astype(np.int64)
+    if not plan.opening_kinds.issuperset(OPENING_CLASSES[1:]):
+        kind[kind == WALL_CODE] = UNKNOWN
+    return kind
 
 
 def _batches(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Shaped
 
 from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.training.config import Turns
@@ -32,8 +32,8 @@ class Turn:
         turned = np.roll(image, self.shift, axis=1)
         return turned[:, ::-1] if self.mirrored else turned
 
-    def profile(self, profile_m: Float[np.ndarray, "*n columns"]) -> Float[np.ndarray, "*n columns"]:
-        """Mirror wall profiles that were cast at `heading`."""
+    def profile(self, profile_m: Shaped[np.ndarray, "*n columns"]) -> Shaped[np.ndarray, "*n columns"]:
+        """Mirror wall profiles, or what else has azimuth columns, that were cast at `heading`."""
         return profile_m[..., ::-1] if self.mirrored else profile_m
 
 

@@ -15,17 +15,23 @@ from typing import Any
 import numpy as np
 import torch
 from cachetools import LRUCache, cachedmethod
+from jaxtyping import Int
 from torch import Tensor, nn
 
+from lalaloc_core.azimuths import score_classes
+from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.data.dataset import Appearance, Camera, Scene
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.metrics import Accuracy
 from lalaloc_core.nets.resnet import PaperImageEncoder
+from lalaloc_core.nets.ring import ImageFeatures
+from lalaloc_core.nets.trunk_encoder import TrunkImageEncoder
 from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.sampling import PoseSet, pose_grid
 from lalaloc_core.training import losses
 from lalaloc_core.training.config import TrainConfig
 from lalaloc_core.training.picture_cache import cached_pictures
+from lalaloc_core.training.stream import UNKNOWN, opening_kinds
 from lalaloc_core.training.turning import Turn, draw_turn
 
 _GRID_STEP_M = 0.5
@@ -53,6 +59,18 @@ class _Query:
         camera, plan = self.camera, self.scene.plan
         numbers = [*camera.position_m, camera.heading, camera.camera_height_m, self.turn.shift]
         return np.array(numbers).tobytes() + plan.walls_m.tobytes() + plan.ceiling_heights_m.tobytes()
+
+    def opening_kinds(self, columns: int) -> Int[np.ndarray, "{columns}"]:
+        """What the turned photograph shows at each azimuth, see `stream.opening_kinds`."""
+        camera = self.camera
+        return opening_kinds(
+            self.scene.plan,
+            np.asarray(camera.position_m),
+            camera.room_index,
+            self.turn.heading,
+            camera.camera_height_m,
+            columns,
+        )
 
     def distance_m(self) -> np.ndarray:
         """From every grid pose to the camera."""
@@ -94,7 +112,9 @@ class ImageValidation:
     """Panorama queries, each camera in its usual look, read once: accuracy of the nearest grid pose.
 
     Nearest by latent, and with architecture `ring` also by the predicted wall profile: the mean |Δ log distance|, each
-    at most `_MAX_LOG_ERROR`, against the layouts of the grid. Reported over all queries and by furniture level.
+    at most `_MAX_LOG_ERROR`, against the layouts of the grid. Reported over all queries and by furniture level. Beside
+    it the median over the queries of the median |Δ log distance| of the true wall, and with architecture `trunk` the
+    balanced accuracy of the openings.
 
     Args:
         config: sizes.
@@ -123,6 +143,7 @@ class ImageValidation:
         cache: Path | None = None,
     ) -> None:
         self.columns = config.profile_columns
+        self.balance = config.image.opening_balance
         self.device = device
         self.layout_encoder = layout_encoder
         self.prefix = prefix
@@ -183,6 +204,13 @@ class ImageValidation:
                 ],
             )
             scores[f"{self.prefix}_nll"] = sum(answer.nll for answer in seen) / len(self.queries)
+            true = torch.cat([answer.true_profile_m for answer in seen if answer.true_profile_m is not None])
+            error = (torch.cat(profiles) - true.log()).abs().median(dim=1).values
+            scores[f"{self.prefix}_log_error"] = float(error.median())
+        confusions = [answer.confusion for answer in seen if answer.confusion is not None]
+        if confusions:
+            accuracy = score_classes(np.sum(confusions, axis=0), OPENING_CLASSES).balanced_accuracy
+            scores[f"{self.prefix}_opening_accuracy"] = accuracy
         for module, was_training in training:
             module.train(was_training)
         return scores
@@ -209,7 +237,24 @@ class ImageValidation:
         true = torch.cat([_Layouts.of(query, query.pose, self.columns, self.device).profile_m for query in queries])
         nll = float(losses.laplace(features.log_profile, features.log_scale, true))
         latent = layout_encoder.get_submodule("head")(features.ring)
-        return _Answer(latent, features.log_profile, nll * len(queries))
+        return _Answer(
+            latent, features.log_profile, nll * len(queries), true, self._confusion(encoder, features, queries)
+        )
+
+    def _confusion(
+        self, encoder: nn.Module, features: ImageFeatures, queries: list[_Query]
+    ) -> Int[np.ndarray, "c c"] | None:
+        """Azimuths by true and by likeliest class, relative to the classes' shares."""
+        if features.structure is None or not isinstance(encoder, TrunkImageEncoder):
+            return None
+        logits = features.structure.opening_logits
+        prior = losses.opening_prior(encoder.opening_share, self.balance)
+        predicted = (torch.log_softmax(logits, dim=2) - prior.log()).argmax(dim=2).cpu().numpy()
+        true = np.stack([query.opening_kinds(self.columns) for query in queries])
+        confusion = np.zeros((logits.shape[2],) * 2, dtype=int)
+        known = true != UNKNOWN
+        np.add.at(confusion, (true[known], predicted[known]), 1)
+        return confusion
 
 
 @dataclass(frozen=True, eq=False)
@@ -219,6 +264,8 @@ class _Answer:
     latent: Tensor
     log_profile: Tensor | None = None
     nll: float = 0.0
+    true_profile_m: Tensor | None = None
+    confusion: Int[np.ndarray, "c c"] | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,8 +12,6 @@ from torch import Tensor, nn
 from lalaloc_core.bundle import DECODER_WEIGHTS, IMAGE_WEIGHTS, LAYOUT_WEIGHTS, MANIFEST_NAME, Bundle
 from lalaloc_core.configuration import build_config
 from lalaloc_core.errors import BundleError, CheckpointError
-from lalaloc_core.nets.resnet import PaperConfig
-from lalaloc_core.nets.ring import RingConfig
 from lalaloc_core.training.best import best_path
 from lalaloc_core.training.checkpoint import Checkpoint
 from lalaloc_core.training.config import TrainConfig
@@ -58,7 +56,7 @@ def load_warm_start(folder: Path, stage: str, config: TrainConfig) -> WarmStart:
     """
     is_bundle = (folder / MANIFEST_NAME).exists()
     found = _of_bundle(Bundle.open(folder), stage) if is_bundle else _of_run(folder, stage)
-    check_same_networks(config, found.checkpoint.config, str(folder))
+    check_same_networks(stage, config, found.checkpoint.config, str(folder))
     return found
 
 
@@ -68,10 +66,10 @@ def _of_bundle(bundle: Bundle, stage: str) -> WarmStart:
     weights = {module: _state(bundle.read(file)) for module, file in _MODULES[stage].items() if file in manifest.files}
     if not weights:
         raise CheckpointError(f"bundle '{bundle.folder}' has no weights of stage '{stage}'")
-    is_ring = manifest.architecture == "ring"
-    sizes = build_config(RingConfig if is_ring else PaperConfig, manifest.layout_config)
     config = TrainConfig.from_dict({"name": manifest.name, "architecture": manifest.architecture})
-    config = config.with_networks(sizes)
+    config = config.with_networks(build_config(type(config.layout_sizes), manifest.layout_config))
+    if manifest.image_config:
+        config = config.with_networks(build_config(type(config.image_sizes), manifest.image_config))
     spent = manifest.training.get(stage) or manifest.training.get(JOINT) or {}
     origin = {"name": manifest.name, "version": manifest.version, "sha256": bundle.sha256, **_totals_of(spent)}
     return WarmStart(
@@ -121,14 +119,21 @@ def _state(weights: bytes) -> dict[str, Tensor]:
     return {key: value.float() if value.is_floating_point() else value for key, value in state.items()}
 
 
-def check_same_networks(config: TrainConfig, other: TrainConfig, where: str) -> None:
-    """Both must agree on the architecture and its sizes.
+def check_same_networks(stage: str, config: TrainConfig, other: TrainConfig, where: str) -> None:
+    """Both must agree on the networks of a stage; the image stage has those of both branches.
+
+    The layout branches of `ring` and `trunk` are the same.
 
     Raises:
         CheckpointError: names what differs.
     """
-    for part in ("architecture", config.architecture):
-        mine, theirs = getattr(config, part), getattr(other, part)
+    told: dict[str, tuple[object, object]] = {"architecture": (config.architecture, other.architecture)}
+    if stage == "layout" and config.has_ring == other.has_ring:
+        told = {}
+    told["ring" if config.has_ring else config.architecture] = (config.layout_sizes, other.layout_sizes)
+    if stage != "layout":
+        told[config.architecture] = (config.image_sizes, other.image_sizes)
+    for part, (mine, theirs) in told.items():
         if mine != theirs:
             raise CheckpointError(f"'{where}' was trained with {part} {theirs}, this run is configured with {mine}")
 

@@ -109,6 +109,66 @@ class TestOthers:
         assert loss(log_error, shift=-error) == pytest.approx(log_error, abs=1e-4)
 
 
+class TestStructure:
+    """Losses on openings, ceiling and type of the room."""
+
+    def test_classes_weigh_by_their_share_as_the_balance_says(self) -> None:
+        logits, kind = torch.zeros(1, 4, 4), torch.tensor([[0, 0, 0, 1]])
+        logits[..., 1] = -1.0
+        share = torch.tensor([0.75, 0.25, 0.0, 0.0])
+        likelihood = torch.log_softmax(logits[0], dim=1)
+        for balance, weight in ((0.0, 1.0), (1.0, 3.0), (0.5, 3.0**0.5)):
+            expected = -(3.0 * likelihood[0, 0] + weight * likelihood[3, 1]) / (3.0 + weight)
+            torch.testing.assert_close(losses.opening(logits, kind, share, balance), expected)
+
+    @pytest.mark.parametrize("balance", [0.0, 0.5, 1.0])
+    def test_the_best_constant_answer_is_the_prior_that_the_manifest_will_name(self, balance: float) -> None:
+        share = torch.tensor([0.7, 0.15, 0.1, 0.05])
+        kind = torch.repeat_interleave(torch.arange(4), (share * 100).round().long())[None]
+        prior = losses.opening_prior(share, balance)
+        logits = prior.log().expand(1, 100, 4).clone().requires_grad_()
+        losses.opening(logits, kind, share, balance).backward()
+        assert logits.grad is not None
+        torch.testing.assert_close(logits.grad.sum(dim=1), torch.zeros(1, 4), atol=1e-6, rtol=0.0)
+
+    def test_what_is_not_known_does_not_count(self) -> None:
+        logits = torch.randn(2, 3, 4, requires_grad=True)
+        share = torch.full((4,), 0.25)
+        kind = torch.tensor([[1, -1, 2], [-1, -1, -1]])
+        loss = losses.opening(logits, kind, share, 0.5)
+        loss.backward()
+        assert logits.grad is not None
+        assert (logits.grad.abs().sum(dim=2) > 0.0).tolist() == (kind >= 0).tolist()
+        nothing = losses.opening(logits, torch.full((2, 3), -1), share, 0.5) + losses.room_type(
+            logits[:, 0], torch.tensor([-1, -1])
+        )
+        assert nothing.item() == 0.0
+
+    @pytest.mark.parametrize("log_error", [-0.3, 0.0, 0.2])
+    def test_the_ceiling_is_most_likely_at_the_truth(self, log_error: float) -> None:
+        above = torch.tensor([0.8, 1.4])
+        told = (above.log() + log_error).requires_grad_()
+        loss = losses.ceiling(told, torch.full((2,), -2.0), above)
+        best = losses.ceiling(above.log(), torch.full((2,), -2.0), above)
+        assert loss.item() >= best.item()
+        (gradient,) = torch.autograd.grad(loss, told)
+        assert torch.equal(gradient.sign(), torch.full((2,), log_error).sign())
+
+    def test_a_camera_at_the_ceiling_gives_a_finite_loss(self) -> None:
+        assert torch.isfinite(losses.ceiling(torch.zeros(1), torch.zeros(1), torch.tensor([-0.1])))
+
+    def test_following_maps_asks_for_doors_and_windows_and_leaves_passages_free(self) -> None:
+        taught = torch.tensor([[[0.8, 0.1]]])
+        for passage in (0.0, 0.05):
+            probability = torch.tensor([[[0.1 - passage, 0.8, 0.1, passage]]])
+            logits = (probability + 1e-12).log().requires_grad_()
+            (gradient,) = torch.autograd.grad(losses.followed_maps(logits, taught), logits)
+            torch.testing.assert_close(gradient, torch.zeros_like(gradient), atol=1e-6, rtol=0.0)
+        without_door = torch.tensor([[[0.8, 0.1, 0.1, 1e-6]]]).log().requires_grad_()
+        (gradient,) = torch.autograd.grad(losses.followed_maps(without_door, taught), without_door)
+        assert gradient[0, 0, 1] < 0.0 < gradient[0, 0, 0]
+
+
 class TestChamfer:
     @given(seeds(), st.integers(1, 12), st.integers(1, 12))
     def test_it_is_the_brute_force_sum_of_both_directions(self, seed: int, n: int, m: int) -> None:

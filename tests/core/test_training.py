@@ -26,6 +26,7 @@ from lalaloc_core.metrics import chamfer_distance
 from lalaloc_core.nets import LayoutEncoder
 from lalaloc_core.nets.ring import RingLayoutEncoder
 from lalaloc_core.render.depth import back_project, layout_depth
+from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.sampling import TripletSampling, random_poses
 from lalaloc_core.synth.splits import TEST, TRAIN, VALIDATION, home_of
 from lalaloc_core.training import batches, objective, sources
@@ -39,7 +40,7 @@ from lalaloc_core.training.loop import run_stage
 from lalaloc_core.training.run import train_image
 from lalaloc_core.training.sources import GeneratedSource
 from lalaloc_core.training.stages import TrainingStage, build_layout_encoder
-from lalaloc_core.training.stream import LayoutBatches, PanoramaBatches, layouts
+from lalaloc_core.training.stream import LayoutBatches, PanoramaBatches
 from lalaloc_core.training.turning import draw_turn
 from tests.strategies import crooked_flat, seeds
 
@@ -327,7 +328,8 @@ class TestStreams:
         poses = random_poses(plan, 1, rng)
 
         def seen(heading: float, columns: int) -> np.ndarray:
-            return layouts(plan, poses.position_m, poses.room_index, np.array([heading]), columns)[0]
+            heading_of = np.array([heading])
+            return profiles_at(plan, poses.position_m, poses.room_index, heading_of, columns, np.float32)[0]
 
         # A picture that shows the distance to the wall, so that its layout can be read off it.
         image = np.repeat(seen(heading, width)[None, :, None], 3, axis=2)

