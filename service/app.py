@@ -64,11 +64,12 @@ def create_app(settings: Settings | None = None) -> FastAPI:
 
 
 def _layers(app: FastAPI, telemetry: Telemetry, routes: list[BaseRoute]) -> ASGIApp:
-    """The app's layers, outermost first: ids and log, security headers, admission, keys, then the framework's.
+    """The app's layers, outermost first: ids and log, security headers, keys, admission, then the framework's.
 
     Middleware that is added to an app lies inside the layer that answers unexpected errors, and never sees those.
     """
-    admitted = AdmissionMiddleware(AccessControlMiddleware(FastAPI.build_middleware_stack(app)))
+    # Keys first: it is tenants that slots are shared between.
+    admitted = AccessControlMiddleware(AdmissionMiddleware(FastAPI.build_middleware_stack(app)))
     named = [route for route in routes if isinstance(route, Route)]
     return TelemetryMiddleware(SecurityHeadersMiddleware(admitted), telemetry, named)
 

@@ -26,6 +26,7 @@ LaLaLocError
     ├── RateLimitedError            more requests of an API key than allowed
     ├── TooManyRefusedKeysError     more invalid API keys from one client than allowed
     ├── OverloadedError             more requests in flight than allowed
+    │   └── ShareExceededError      more of one tenant than allowed while others may come
     ├── DecoderNotReadyError        panoramas cannot be decoded at the moment
     ├── DeadlineExceededError       the query could not be computed in time
     └── StoppingError               the service is shutting down
@@ -263,6 +264,16 @@ class OverloadedError(ServiceError):
         super().__init__(f"{limit} others are waiting to be answered, no more are taken")
 
 
+class ShareExceededError(OverloadedError):
+    """As many requests of one tenant, or without keys of one client address, are in flight as it may have."""
+
+    def __init__(self, held: int, limit: int, retry_after_s: int = 1) -> None:
+        ServiceError.__init__(
+            self, f"{held} of your requests are in work, no more are taken: the rest of {limit} is left to others"
+        )
+        self.retry_after_s = retry_after_s
+
+
 class DecoderNotReadyError(ServiceError):
     """No process that decodes panoramas is running, nor will be before the request's deadline."""
 
@@ -335,6 +346,7 @@ PROBLEMS: dict[type[Exception], ProblemKind] = {
     RateLimitedError: ProblemKind(429, "rate-limited", "Too many requests"),
     TooManyRefusedKeysError: ProblemKind(429, "too-many-refused-keys", "Too many invalid API keys"),
     OverloadedError: ProblemKind(503, "overloaded", "Overloaded"),
+    ShareExceededError: ProblemKind(503, "overloaded", "Overloaded"),
     DecoderNotReadyError: ProblemKind(503, "decoder-not-ready", "Decoder not ready"),
     DeadlineExceededError: ProblemKind(504, "deadline-exceeded", "Deadline exceeded"),
     StoppingError: ProblemKind(503, "stopping", "Shutting down"),

@@ -21,6 +21,7 @@ from service.preview import Drawings
 from service.query import Decoder, Localiser, LpoPool
 from service.security import AccessControl
 from service.settings import Settings
+from service.sharing import with_spare
 from service.storage import PlanCache, Store, open_store
 from service.telemetry import LOGGER_NAME, Telemetry
 from service.telemetry.tracing import Tracing, otlp_exporter
@@ -28,8 +29,8 @@ from service.threads import BoundedReads, Threads
 
 # Queries read little: their plan, and a grid that is not in memory.
 _READ_THREADS = 4
-# Small grids are computed on them: more would take the cores from queries.
-_UPLOAD_THREADS = 2
+# Small grids are computed on them: more of one tenant would take the cores from queries.
+_UPLOAD_THREADS = with_spare(2)
 # Drawings in memory, and revisions that wait to be drawn.
 _DRAWINGS_BYTES, _MAX_DRAWN = 32 * 2**20, 16
 # With keys that are not remembered, streams still look no more often.

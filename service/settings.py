@@ -15,6 +15,7 @@ from lalaloc_core.errors import ConfigError
 from lalaloc_core.floorplan import PlanLimits
 from lalaloc_core.panorama.images import PanoramaLimits
 from service.cores import CoreShares, share_cores, usable_cores
+from service.sharing import with_spare
 
 PREFIX = "LALALOC_"
 _DEFAULT_BUNDLE = Path(__file__).resolve().parent.parent / "models" / "default"
@@ -26,7 +27,7 @@ Metres = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
 _HOST_NAME = re.compile(r"|\*|[A-Za-z0-9._-]+|[0-9A-Fa-f:]*:[0-9A-Fa-f:.]*")
 # Requests that may be uploading, besides queries in work.
-_UPLOADS = 28
+_UPLOADS = 38
 
 
 class Settings(BaseSettings):
@@ -80,11 +81,13 @@ class Settings(BaseSettings):
     lpo_stall_s: Seconds = Field(default=10.0, description="An LPO worker busy with one job for longer is restarted.")
 
     decode_workers: Annotated[int, Field(ge=1, le=64)] = Field(
-        default=1, description="Processes that decode panoramas, one picture at a time each."
+        default=2,
+        description="Processes that decode panoramas, one picture at a time each; one is always left to other tenants "
+        "than those that have others at work.",
     )
     decode_queue: Count = Field(default=32, description="Panoramas that may wait to be decoded; more get a 503.")
     decode_stall_s: Seconds = Field(
-        default=4.0, description="A process busy with one panorama for longer is replaced; after two the query fails."
+        default=4.0, description="A process busy with one panorama for longer is replaced, and the query fails."
     )
     decode_memory_bytes: Annotated[int, Field(ge=64 * 2**20)] = Field(
         default=2**30, description="Memory that decoding one panorama may need; enforced on Linux."
@@ -137,13 +140,13 @@ class Settings(BaseSettings):
         default=0,
         ge=0,
         description="Uploads and queries in work, from the first byte on; more get a 503 at once. "
-        "0: 28 more than queries may be in work.",
+        "0: 38 more than queries may be in work.",
     )
     max_queries: int = Field(
         default=0,
         ge=0,
         description="Queries, of these, that are computed or wait for it; more get a 503 before they are uploaded. "
-        "0: twice as many as LPO workers and compute threads.",
+        "0: enough for a tenant alone to have twice as many as LPO workers and compute threads.",
     )
     max_reads: Count = Field(default=64, description="Requests in work that change nothing; more get a 503 at once.")
     max_streams: Count = Field(default=64, description="Clients that follow events; more get a 503 at once.")
@@ -258,7 +261,7 @@ class Settings(BaseSettings):
     @property
     def query_limit(self) -> int:
         """Queries that may be computed or wait for it."""
-        return self.max_queries or 2 * (self.cores.workers + self.cores.compute_threads)
+        return self.max_queries or with_spare(2 * (self.cores.workers + self.cores.compute_threads))
 
     @property
     def resolved_database_url(self) -> str:

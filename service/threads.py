@@ -5,10 +5,12 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from contextvars import copy_context
 from typing import Any, ParamSpec, TypeVar
 
 from service.errors import StoreUnavailableError
+from service.sharing import FairTurns
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -18,11 +20,31 @@ class Threads:
     """Runs blocking calls for one event loop; what waits for a thread is bounded by who is let in."""
 
     def __init__(self, name: str, count: int) -> None:
+        """
+        Args:
+            count: how many there are; `run` shares them out between parties.
+        """
         self._executor = ThreadPoolExecutor(count, thread_name_prefix=name)
+        self._turns = FairTurns(count)
 
-    async def run(self, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """The outcome of a call; one that has begun runs to its end, whether or not its caller waits."""
-        return await asyncio.wrap_future(self.submit(work, *args, **kwargs))
+    async def run(self, party: str, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """The outcome of a party's call; one that has begun runs to its end, whether or not its caller waits."""
+        await self._turns.acquire(party)
+        loop = asyncio.get_running_loop()
+
+        def release(_future: Future[T]) -> None:
+            # A loop that is closed has no turns to give.
+            with suppress(RuntimeError):
+                loop.call_soon_threadsafe(self._turns.release, party)
+
+        try:
+            future = self.submit(work, *args, **kwargs)
+        except BaseException:
+            self._turns.release(party)
+            raise
+        # Not when its caller leaves: the thread is busy for longer.
+        future.add_done_callback(release)
+        return await asyncio.wrap_future(future)
 
     def submit(self, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> Future[T]:
         """Begin a call in the caller's context, so that what it logs belongs to its request."""

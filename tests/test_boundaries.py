@@ -57,6 +57,7 @@ LAYERS = {
 # The service's layers lie above all of the core's, lowest first.
 SERVICE_LAYERS = (
     # `workers` is what runs in worker processes: it loads nothing of what watches over them.
+    "sharing",
     "cores settings errors schemas threads lru telemetry workers",
     "pools storage",
     "grids preview security",

@@ -12,8 +12,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from time import monotonic
 
-from service.errors import DeadlineExceededError, OverloadedError, StoppingError
+from service.errors import DeadlineExceededError, OverloadedError, ShareExceededError, StoppingError
 from service.settings import Settings
+from service.sharing import FairTurns, Shares
 from service.telemetry import Telemetry
 
 EXEMPT = frozenset({"/healthz", "/readyz", "/metrics"})
@@ -22,9 +23,15 @@ REFUSALS = (OverloadedError, StoppingError, DeadlineExceededError)
 _READING = frozenset({"GET", "HEAD", "OPTIONS"})
 _QUERIES = "/localise"
 _STREAMS = "/events"
+_READS_AT_A_TIME = 4
 # How much the last request counts in the mean that Retry-After is told by.
 _NEWEST = 0.1
 _MAX_RETRY_AFTER_S = 30
+
+
+def is_read(method: str, path: str) -> bool:
+    """Whether the request changes nothing, and its answer has an end."""
+    return method in _READING and not path.endswith(_STREAMS)
 
 
 def is_stream(method: str, path: str) -> bool:
@@ -33,45 +40,53 @@ def is_stream(method: str, path: str) -> bool:
 
 
 class Slots:
-    """How many requests of one kind may be in work; for one event loop."""
+    """How many requests of one kind may be in work, and of these of one party (`Shares`); for one event loop."""
 
     def __init__(self, limit: int) -> None:
-        self.limit = limit
-        self.in_use = 0
+        self._shares = Shares(limit)
         self._held_s = 0.0
 
+    @property
+    def in_use(self) -> int:
+        """How many are in work."""
+        return self._shares.in_use
+
     @contextmanager
-    def hold(self) -> Iterator[None]:
+    def hold(self, party: str) -> Iterator[None]:
         """Hold a slot.
 
         Raises:
-            OverloadedError: all are in use.
+            OverloadedError: all are in use, or all that the party may have.
         """
-        self.check()
-        self.in_use += 1
+        self.check(party)
+        self._shares.take(party)
         begin = monotonic()
         try:
             yield
         finally:
-            self.in_use -= 1
+            self._shares.give_back(party)
             self._held_s += _NEWEST * (monotonic() - begin - self._held_s)
 
     @contextmanager
-    def released(self) -> Iterator[None]:
+    def released(self, party: str) -> Iterator[None]:
         """Lend the slot that one holds to others while the block only waits."""
-        self.in_use -= 1
+        self._shares.give_back(party)
         try:
             yield
         finally:
             # Whoever was let in is not sent away again: for a while there may be more than the limit.
-            self.in_use += 1
+            self._shares.take(party)
 
-    def check(self) -> None:
+    def check(self, party: str) -> None:
         """Raises:
-        OverloadedError: all are in use; by the time it says, those that hold them will be through.
+        OverloadedError: all are in use, or all that the party may have; by the time it says, those that hold them will
+            be through.
         """
-        if self.in_use >= self.limit:
-            raise OverloadedError(self.limit, min(max(math.ceil(self._held_s), 1), _MAX_RETRY_AFTER_S))
+        if not self._shares.may_take(party):
+            retry_after_s = min(max(math.ceil(self._held_s), 1), _MAX_RETRY_AFTER_S)
+            if self.in_use < self._shares.limit:
+                raise ShareExceededError(self._shares.held_by(party), self._shares.limit, retry_after_s)
+            raise OverloadedError(self._shares.limit, retry_after_s)
 
 
 @dataclass(frozen=True)
@@ -114,6 +129,8 @@ class Admission:
         self.queries = Slots(limits.queries)
         self.reads = Slots(limits.reads)
         self.streams = Slots(limits.streams)
+        # Reads compute a few at a time: more threads would only take the interpreter from queries.
+        self.reading = FairTurns(_READS_AT_A_TIME)
         self.draining = False
         self.stopping = False
         telemetry.gauge(
@@ -141,23 +158,23 @@ class Admission:
         return self.requests.in_use == self.reads.in_use == 0
 
     @contextmanager
-    def slot_for(self, method: str, path: str) -> Iterator[None]:
-        """Hold a slot for a request whose head has arrived.
+    def slot_for(self, party: str, method: str, path: str) -> Iterator[None]:
+        """Hold a slot for a request of a party whose head has arrived.
 
         Raises:
             StoppingError: no more requests are taken.
-            OverloadedError: all slots of its kind are in use.
+            OverloadedError: all slots of its kind are in use, or all that the party may have.
         """
         if self.stopping:
             raise StoppingError()
         if is_stream(method, path):
             slots = self.streams
-        elif method in _READING:
+        elif is_read(method, path):
             slots = self.reads
         else:
             slots = self.requests
             if path == _QUERIES:
                 # A body that nobody could do anything with is not worth reading.
-                self.queries.check()
-        with slots.hold():
+                self.queries.check(party)
+        with slots.hold(party):
             yield

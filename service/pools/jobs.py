@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
 from time import monotonic
@@ -11,11 +10,13 @@ from typing import Any, Literal
 
 from cachetools import TTLCache
 
-LostReason = Literal["not-ready", "queue-full", "deadline", "poisoned", "fault", "died", "closing"]
+from service.sharing import FairQueue, Shares
+
+LostReason = Literal["not-ready", "queue-full", "deadline", "poisoned", "stalled", "fault", "died", "closing"]
 
 # How soon an idle supervisor notices that its worker was killed.
 _IDLE_CHECK_S = 0.2
-# So many workers may die or stall over one job.
+# So many workers may die over one job: the first may have been killed for another reason.
 _TRIES_PER_JOB = 2
 _POISON_MEMORY_S, _POISON_MEMORY = 600.0, 256
 
@@ -25,9 +26,9 @@ class JobLostError(Exception):
 
     Attributes:
         reason: `not-ready`: no worker is warm, nor will be in time. `queue-full`: too many jobs wait already.
-            `deadline`: no answer in time. `poisoned`: workers died or stalled over this job. `fault`: the work raised
-            an error, which the log has. `died`: the worker died, and there is no time for another try. `closing`: the
-            pool shuts down.
+            `deadline`: no answer in time. `poisoned`: workers died over this job. `stalled`: it took a worker longer
+            than it may. `fault`: the work raised an error, which the log has. `died`: the worker died, and there is no
+            time for another try. `closing`: the pool shuts down.
     """
 
     def __init__(self, reason: LostReason) -> None:
@@ -38,11 +39,13 @@ class JobLostError(Exception):
 class Ticket:
     """One job on its way through the pool."""
 
-    def __init__(self, content: bytes, digest: bytes, deadline: float) -> None:
+    def __init__(self, content: bytes, digest: bytes, deadline: float, party: str = "") -> None:
         self.content = content
         self.digest = digest
         self.deadline = deadline
-        self.deaths = self.stalls = 0
+        self.party = party
+        self.deaths = 0
+        self.stalled = False
         self.future: Future[Any] = Future()
 
     @property
@@ -58,17 +61,19 @@ class Ticket:
 
 
 class JobQueue:
-    """Jobs that wait for a worker, oldest first; may be used from any thread."""
+    """Jobs that wait for a worker, oldest first and parties in turn; may be used from any thread."""
 
-    def __init__(self, limit: int, served_by: Callable[[float], bool]) -> None:
+    def __init__(self, limit: int, served_by: Callable[[float], bool], workers: Shares | None = None) -> None:
         """
         Args:
             limit: jobs that may wait, besides those at work.
             served_by: whether a worker is expected to be warm at a time (`monotonic`).
+            workers: those that parties share; None where a party may have all of them.
         """
-        self._limit = limit
         self._served_by = served_by
-        self._waiting: deque[Ticket] = deque()
+        self._workers = workers
+        self._waiting: FairQueue[Ticket] = FairQueue()
+        self._room = Shares(limit)
         self._poisoned: TTLCache[bytes, bool] = TTLCache(_POISON_MEMORY, _POISON_MEMORY_S, monotonic)
         self._changed = threading.Condition()
         self._closed = False
@@ -91,38 +96,56 @@ class JobQueue:
             reason = self._refusal(ticket)
             if reason is not None:
                 raise JobLostError(reason)
-            self._waiting.append(ticket)
+            self._room.take(ticket.party)
+            self._waiting.append(ticket.party, ticket)
             self._changed.notify()
 
     def take(self) -> Ticket | None:
-        """The next job that is still of use, now running; None when none came in a short while."""
+        """The next job that is still of use, now running; None when none came in a short while.
+
+        Its party holds a worker until `release`.
+        """
         with self._changed:
-            if not self._waiting and not self._closed:
+            ticket = self._next()
+            if ticket is None and not self._closed:
                 self._changed.wait(_IDLE_CHECK_S)
-            ticket = self._waiting.popleft() if self._waiting else None
+                ticket = self._next()
         if ticket is None:
             return None
         if monotonic() >= ticket.deadline:
             ticket.lose("deadline")
-            return None
-        return ticket if ticket.future.running() or ticket.future.set_running_or_notify_cancel() else None
+        elif ticket.future.running() or ticket.future.set_running_or_notify_cancel():
+            return ticket
+        self.release(ticket)
+        return None
+
+    def release(self, ticket: Ticket) -> None:
+        """The worker that had this job can take another one, or is not coming back."""
+        if self._workers is not None:
+            with self._changed:
+                self._workers.give_back(ticket.party)
+                # Whichever idle worker looks first: what waits may not have been anybody's to take before.
+                self._changed.notify()
 
     def give_back(self, ticket: Ticket) -> None:
         """The worker with this job died or stalled; let another one try, if the job may and has the time."""
         reason: LostReason | None = None
         with self._changed:
-            if ticket.deaths + ticket.stalls >= _TRIES_PER_JOB:
+            if ticket.stalled:
+                # Not once more: it would take as long again. But when it is sent again it is tried, as a worker may
+                # also stall because the machine is busy.
+                reason = "stalled"
+            elif ticket.deaths >= _TRIES_PER_JOB:
                 reason = "poisoned"
-                # A worker may stall because the machine is busy; that says nothing about the next time.
-                if ticket.stalls == 0:
-                    self._poisoned[ticket.digest] = True
+                self._poisoned[ticket.digest] = True
             elif self._closed:
                 reason = "closing"
             elif not ticket.wanted or not self._served_by(ticket.deadline):
                 reason = "died"
             else:
                 # Past the limit by at most one job per worker, and in front of those that came later.
-                self._waiting.appendleft(ticket)
+                self._room.take(ticket.party)
+                self._waiting.append_first(ticket.party, ticket)
                 self._changed.notify()
         if reason is not None:
             ticket.lose(reason)
@@ -136,8 +159,7 @@ class JobQueue:
         """Lose all jobs that wait, and take no more."""
         with self._changed:
             self._closed = True
-            waiting = list(self._waiting)
-            self._waiting.clear()
+            waiting = self._waiting.drop(lambda _ticket: True)
             self._changed.notify_all()
         for ticket in waiting:
             ticket.lose("closing")
@@ -151,11 +173,21 @@ class JobQueue:
             return "poisoned"
         if not self._served_by(ticket.deadline):
             return "not-ready"
-        if len(self._waiting) >= self._limit:
+        if not self._room.may_take(ticket.party):
             self._drop_unwanted()
-        return "queue-full" if len(self._waiting) >= self._limit else None
+        return None if self._room.may_take(ticket.party) else "queue-full"
+
+    def _next(self) -> Ticket | None:
+        found = self._waiting.take(self._workers.may_take) if self._workers is not None else self._waiting.take()
+        if found is None:
+            return None
+        ticket = found[1]
+        self._room.give_back(ticket.party)
+        if self._workers is not None:
+            self._workers.take(ticket.party)
+        return ticket
 
     def _drop_unwanted(self) -> None:
-        for ticket in [ticket for ticket in self._waiting if not ticket.wanted]:
-            self._waiting.remove(ticket)
+        for ticket in self._waiting.drop(lambda ticket: not ticket.wanted):
+            self._room.give_back(ticket.party)
             ticket.lose("deadline")

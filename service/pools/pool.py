@@ -13,6 +13,10 @@ from typing import Any, Generic, TypeVar
 
 from service.pools.jobs import JobLostError, JobQueue, Ticket
 from service.pools.supervisor import Supervisor, WorkerSpec
+from service.sharing import Shares
+
+# So that nobody waits while large jobs of others are copied.
+_SUBMITTING_THREADS = 8
 
 Job = TypeVar("Job")
 Answer = TypeVar("Answer")
@@ -37,17 +41,19 @@ class WorkerPool(Generic[Job, Answer]):
         *,
         workers: int,
         queue_limit: int,
+        keep_spare: bool = False,
         on_restart: Callable[[str], None] = lambda _reason: None,
     ) -> None:
         """A pool that has not been started.
 
         Args:
             queue_limit: jobs that may wait for a worker, besides those at work.
+            keep_spare: keep a worker free of whoever has others at work: for jobs that may take seconds.
             on_restart: called with the reason whenever a worker has to be replaced.
         """
-        self._queue = JobQueue(queue_limit, self._served_by)
+        self._queue = JobQueue(queue_limit, self._served_by, Shares(workers) if keep_spare else None)
         self._supervisors = [Supervisor(spec, index, self._queue, on_restart) for index in range(workers)]
-        self._submitting = ThreadPoolExecutor(1, thread_name_prefix=f"{spec.name}-submit")
+        self._submitting = ThreadPoolExecutor(_SUBMITTING_THREADS, thread_name_prefix=f"{spec.name}-submit")
 
     def start(self) -> None:
         """Start all workers; returns at once, see `state` for when they are warm."""
@@ -80,8 +86,8 @@ class WorkerPool(Generic[Job, Answer]):
         """Whether the pool shuts down."""
         return self._queue.closed
 
-    def submit(self, job: Job, timeout_s: float) -> Future[Answer]:
-        """Queue a job. Cancelling the future takes it out of the queue again; at work it is finished.
+    def submit(self, job: Job, timeout_s: float, party: str = "") -> Future[Answer]:
+        """Queue a job of a party. Cancelling the future takes it out of the queue again; at work it is finished.
 
         Returns:
             a future that gives the answer or raises `JobLostError`; it may do so later than the deadline.
@@ -90,12 +96,12 @@ class WorkerPool(Generic[Job, Answer]):
             JobLostError: there is no use in waiting.
         """
         content = pickle.dumps(job, protocol=pickle.HIGHEST_PROTOCOL)
-        ticket = Ticket(content, hashlib.sha256(content).digest(), monotonic() + timeout_s)
+        ticket = Ticket(content, hashlib.sha256(content).digest(), monotonic() + timeout_s, party)
         self._queue.put(ticket)
         return ticket.future
 
-    async def answer(self, job: Job, timeout_s: float) -> Answer:
-        """The answer to a job, awaited; a job that is no longer awaited is not started.
+    async def answer(self, job: Job, timeout_s: float, party: str = "") -> Answer:
+        """The answer to a party's job, awaited; a job that is no longer awaited is not started.
 
         Raises:
             JobLostError: there is none within `timeout_s`.
@@ -103,7 +109,7 @@ class WorkerPool(Generic[Job, Answer]):
         if self._queue.closed:
             raise JobLostError("closing")
         # On a thread: copying and hashing a large job would hold up everybody else.
-        submitted = self._submitting.submit(self.submit, job, timeout_s)
+        submitted = self._submitting.submit(self.submit, job, timeout_s, party)
         try:
             async with asyncio.timeout(timeout_s):
                 return await asyncio.wrap_future(await asyncio.wrap_future(submitted))

@@ -72,6 +72,8 @@ class Supervisor:
         self._start_s = self._spec.start_s
         self._starts_at = monotonic()
         self._process: BaseProcess | None = None
+        # The job that the worker has, or had when it died: its party waits for the next worker, and no one else.
+        self._held: Ticket | None = None
         self._thread = threading.Thread(target=self._run, name=f"{self._spec.name}-supervisor-{index}", daemon=True)
 
     def start(self) -> None:
@@ -146,6 +148,8 @@ class Supervisor:
         connection, process = self._launch()
         try:
             self.fault = self._await_ready(connection, process)
+            # Also when the start failed: a worker that never comes must not be held for ever.
+            self._release()
             if self.fault is not None:
                 return self.fault
             self._start_s = monotonic() - self._starts_at
@@ -191,6 +195,7 @@ class Supervisor:
             ticket = self._queue.take()
             if ticket is None:
                 continue
+            self._held = ticket
             with _Watchdog(process, self._spec.stall_s) as watchdog:
                 # A worker that died before it had the whole job did not die over it.
                 sent = process.is_alive() and _send(connection, ticket.content)
@@ -198,12 +203,18 @@ class Supervisor:
             if answer is None:
                 self.ready = False
                 self._starts_at = monotonic()
-                ticket.stalls += watchdog.expired
+                ticket.stalled = watchdog.expired
                 ticket.deaths += sent and not watchdog.expired
                 self._queue.give_back(ticket)
                 return "stalled" if watchdog.expired else "died at work" if sent else "died idle"
+            self._release()
             self._settle(ticket, answer)
         return "closing"
+
+    def _release(self) -> None:
+        if self._held is not None:
+            self._queue.release(self._held)
+            self._held = None
 
     def _settle(self, ticket: Ticket, answer: object) -> None:
         if isinstance(answer, Answered):

@@ -1,6 +1,7 @@
 """Decoding panoramas in worker processes, bounded in memory and time.
 
-A picture that kills such a process gets a second try, and kills nothing else.
+A picture that kills such a process gets a second try, one that takes too long none, and neither harms anything else.
+No party keeps all the processes busy.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ class Decoder:
             ),
             workers=settings.decode_workers,
             queue_limit=settings.decode_queue,
+            keep_spare=True,
             on_restart=lambda _reason: telemetry.note_restart("decode"),
         )
         telemetry.gauge(
@@ -55,11 +57,11 @@ class Decoder:
         """How many workers are wanted and warm."""
         return self._pool.state
 
-    async def decode(self, content: bytes, deadline: float) -> Panorama:
+    async def decode(self, content: bytes, deadline: float, party: str = "") -> Panorama:
         """The panorama in an uploaded file, by a deadline (`monotonic`).
 
         Raises:
-            InvalidPanoramaError: see `open_panorama`; or two workers died or stalled over it.
+            InvalidPanoramaError: see `open_panorama`; or a worker stalled over it, or two died.
             OverloadedError: too many panoramas wait already.
             DeadlineExceededError: it was not decoded in time.
             DecoderNotReadyError: no worker is running, nor will be in time.
@@ -67,7 +69,7 @@ class Decoder:
         """
         timeout_s = max(deadline - monotonic(), 0.0)
         try:
-            answer = await self._pool.answer(content, timeout_s)
+            answer = await self._pool.answer(content, timeout_s, party)
         except JobLostError as error:
             raise self._explained(error) from error
         if isinstance(answer, Refusal):
@@ -82,8 +84,12 @@ class Decoder:
         match error.reason:
             case "poisoned":
                 return InvalidPanoramaError(
-                    "the panorama could not be decoded: twice that took longer than "
-                    f"{self._settings.decode_stall_s:g} s (decode_stall_s), or ended the process that tried"
+                    "the panorama could not be decoded: twice that ended the process that tried"
+                )
+            case "stalled":
+                return InvalidPanoramaError(
+                    f"decoding the panorama took longer than {self._settings.decode_stall_s:g} s (decode_stall_s); a "
+                    "smaller one, or one that is saved anew, takes less"
                 )
             case "fault":
                 return InvalidPanoramaError("the panorama is damaged")

@@ -5,8 +5,6 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from contextvars import copy_context
 from dataclasses import asdict
 from functools import partial
 from time import monotonic
@@ -28,9 +26,10 @@ from service.query.heading import HeadingSource, KnownHeading, known_heading
 from service.query.refinement import LpoPool
 from service.schemas import CandidateAnswer, LocaliseAnswer, LocaliseForm, ModelAnswer, Position, TimingsAnswer
 from service.settings import Settings
+from service.sharing import with_spare
 from service.storage.records import PlanRecord
 from service.telemetry import Telemetry
-from service.threads import BoundedReads
+from service.threads import BoundedReads, Threads
 
 # Kept free of LPO before the request's deadline, to rank and send the answer.
 _ANSWER_S = 0.25
@@ -63,7 +62,7 @@ class Localiser:
         self._queries = queries
         self._reads = reads
         self._telemetry = telemetry
-        self._executor = ThreadPoolExecutor(settings.cores.compute_threads, thread_name_prefix="localise")
+        self._threads = Threads("localise", with_spare(settings.cores.compute_threads))
 
     @property
     def model(self) -> ModelAnswer:
@@ -71,11 +70,12 @@ class Localiser:
         return model_answer(self._bundle)
 
     async def answer(
-        self, record: PlanRecord, form: LocaliseForm, content: bytes, begin: float, clock: StageClock
+        self, record: PlanRecord, form: LocaliseForm, content: bytes, begin: float, clock: StageClock, party: str
     ) -> LocaliseAnswer:
         """Localise an encoded panorama in a stored plan.
 
         Args:
+            party: whose turn it is at decoders and threads; see `service.sharing`.
             begin: when (`monotonic`) the query was there as a whole; its deadline counts from then.
             clock: times the stages, the wait for the plan's grid included, also when they fail.
 
@@ -88,31 +88,31 @@ class Localiser:
             StoreUnavailableError: the grid is not in memory, and the database is away or silent.
             OverloadedError: too many queries are computed or wait for it, or grids to be computed on demand.
         """
-        with self._queries.hold():
-            return await self._answer(record, form, content, begin, clock)
+        with self._queries.hold(party):
+            return await self._answer(record, form, content, begin, clock, party)
 
     async def _answer(
-        self, record: PlanRecord, form: LocaliseForm, content: bytes, begin: float, clock: StageClock
+        self, record: PlanRecord, form: LocaliseForm, content: bytes, begin: float, clock: StageClock, party: str
     ) -> LocaliseAnswer:
         deadline = begin + self._settings.request_deadline_s
         height_m = query_height_m(record, form.camera_height_m)
         # The picture first: a bad one is refused without waiting for the plan.
         with clock.stage("decode"):
-            panorama = await self._decoder.decode(content, deadline)
+            panorama = await self._decoder.decode(content, deadline, party)
         known = known_heading(form, record.plan, panorama, self._settings.compass_tolerance_deg)
-        query = await self._compute(lambda: self._encode(panorama, known, height_m, clock), deadline)
+        query = await self._compute(party, lambda: self._encode(panorama, known, height_m, clock), deadline)
         with clock.stage("grid"):
-            grid = await self._grid(record, height_m, deadline)
-        found = await self._search(record.plan, grid, query, form, deadline, clock)
+            grid = await self._grid(record, height_m, deadline, party)
+        found = await self._search(record.plan, grid, query, form, deadline, clock, party)
         timings_ms = clock.timings_ms | {"total": (monotonic() - begin) * 1e3}
         self._observe(timings_ms, found.stage)
         return self._compose(record, known.source, height_m, query, found, timings_ms)
 
     def close(self) -> None:
         """Finish what is being computed."""
-        self._executor.shutdown(wait=True, cancel_futures=True)
+        self._threads.close()
 
-    async def _compute(self, work: Callable[[], T], deadline: float) -> T:
+    async def _compute(self, party: str, work: Callable[[], T], deadline: float) -> T:
         """Run CPU work on a thread; past the deadline it is not started, or its outcome dropped."""
 
         def run() -> T:
@@ -121,11 +121,11 @@ class Localiser:
 
         try:
             async with asyncio.timeout(max(deadline - monotonic(), 0.0)):
-                return await asyncio.get_running_loop().run_in_executor(self._executor, copy_context().run, run)
+                return await self._threads.run(party, run)
         except TimeoutError as error:
             raise DeadlineExceededError(self._settings.request_deadline_s) from error
 
-    async def _grid(self, record: PlanRecord, height_m: float, deadline: float) -> LatentGrid:
+    async def _grid(self, record: PlanRecord, height_m: float, deadline: float, party: str) -> LatentGrid:
         """The plan's grid for a camera height, computed on demand, waited for until the deadline."""
         key = self._grids.key(record.revision_id, height_m)
         grid = self._grids.cached(key)
@@ -141,7 +141,7 @@ class Localiser:
         begin = monotonic()
         try:
             async with asyncio.timeout(max(deadline - begin, 0.0)):
-                with self._queries.released():
+                with self._queries.released(party):
                     return await asyncio.wrap_future(future)
         except TimeoutError as error:
             raise PlanNotReadyError(record.id, monotonic() - begin, self._grids.progress(key)) from error
@@ -151,15 +151,22 @@ class Localiser:
             return self._encoders.query(panorama.pixels, known.heading, height_m, heading_tolerance=known.tolerance)
 
     async def _search(
-        self, plan: FloorPlan, grid: LatentGrid, query: Query, form: LocaliseForm, deadline: float, clock: StageClock
+        self,
+        plan: FloorPlan,
+        grid: LatentGrid,
+        query: Query,
+        form: LocaliseForm,
+        deadline: float,
+        clock: StageClock,
+        party: str,
     ) -> Localisation:
         """Search on the threads of the localiser, which do something else while LPO is waited for."""
         steps = localise_steps(plan, grid, self._encoders, query, refine=form.refine, top_k=form.top_k, clock=clock)
-        step = await self._compute(partial(next_step, steps, None), deadline)
+        step = await self._compute(party, partial(next_step, steps, None), deadline)
         while not isinstance(step, Localisation):
             timeout_s = min(self._settings.lpo_deadline_s, deadline - monotonic() - _ANSWER_S)
-            result = await self._pool.refine(step, timeout_s)
-            step = await self._compute(partial(next_step, steps, result), deadline)
+            result = await self._pool.refine(step, timeout_s, party)
+            step = await self._compute(party, partial(next_step, steps, result), deadline)
         return step
 
     def _observe(self, timings_ms: dict[str, float], stage: str) -> None:

@@ -54,15 +54,15 @@ class LpoPool:
         """How many workers are wanted and warm."""
         return self._workers.state
 
-    async def refine(self, job: RefinementJob, timeout_s: float) -> RefinementResult | None:
+    async def refine(self, job: RefinementJob, timeout_s: float, party: str = "") -> RefinementResult | None:
         """The result of a job, or None when there is none within `timeout_s`, whatever the reason.
 
-        Cancelling it takes a job that was not started out of the queue.
+        Cancelling it takes a job that was not started out of the queue. Parties take turns.
         """
         if self.state.workers == 0 or timeout_s <= 0.0:
             return None
         try:
-            return await self._workers.answer(job, timeout_s)
+            return await self._workers.answer(job, timeout_s, party)
         except JobLostError as error:
             self._telemetry.lpo_missed.labels(error.reason).inc()
             return None

@@ -20,11 +20,17 @@ _ID = re.compile(r"[0-9a-f]{32}")
 
 
 async def _tenant_of(request: Request) -> str:
-    return caller_of(request).tenant
+    return caller_of(request.scope).tenant
+
+
+async def _party_of(request: Request) -> str:
+    return caller_of(request.scope).party
 
 
 Running = Annotated[Runtime, Depends(runtime_of)]
 Tenant = Annotated[str, Depends(_tenant_of)]
+# With whom the request shares what the service can do at a time; see `service.sharing`.
+Party = Annotated[str, Depends(_party_of)]
 
 
 def stored_plan(tenant: str, floorplan_id: str, plans: Plans | PlanCache) -> PlanRecord:

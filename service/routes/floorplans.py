@@ -34,6 +34,7 @@ from service.routes.dependencies import (
     IDEMPOTENCY_KEY,
     IF_NONE_MATCH,
     NOT_MODIFIED,
+    Party,
     Running,
     Tenant,
     header,
@@ -99,7 +100,7 @@ _REFUSED_UPLOADS = (
         *_REFUSED_UPLOADS, TooManyFloorPlansError, IdempotencyKeyReusedError, IdempotencyInProgressError
     ),
 )
-async def create_floorplan(request: Request, runtime: Running, tenant: Tenant) -> Response:
+async def create_floorplan(request: Request, runtime: Running, tenant: Tenant, party: Party) -> Response:
     """Store a floor plan.
 
     A small one is `ready` with the answer; the latent grid of a larger one is computed in the background (see `status`
@@ -123,7 +124,7 @@ async def create_floorplan(request: Request, runtime: Running, tenant: Tenant) -
         return _written(request, record, state, runtime, status.HTTP_201_CREATED)
 
     # One call from the claim to the answer: a client that hangs up meanwhile does not leave it half-way.
-    return await runtime.uploads.run(idempotent.run, Parts({}, {_FILE: content}), store)
+    return await runtime.uploads.run(party, idempotent.run, Parts({}, {_FILE: content}), store)
 
 
 @router.get("", summary="List floor plans", responses=problem_responses(InvalidRequestError, StoreUnavailableError))
@@ -182,12 +183,14 @@ def get_floorplan(
     openapi_extra={"requestBody": _BODY, "parameters": _UNLESS_CHANGED},
     responses=problem_responses(*_REFUSED_UPLOADS, UnknownFloorPlanError, RevisionMismatchError),
 )
-async def replace_floorplan(floorplan_id: str, request: Request, runtime: Running, tenant: Tenant) -> Response:
+async def replace_floorplan(
+    floorplan_id: str, request: Request, runtime: Running, tenant: Tenant, party: Party
+) -> Response:
     """Store a new revision of a plan that there is.
 
     Queries in work are answered by the revision that they began with, and say which (`floorplan_revision`).
     """
-    current = await runtime.uploads.run(plan_summary, tenant, floorplan_id, runtime.store.plans)
+    current = await runtime.uploads.run(party, plan_summary, tenant, floorplan_id, runtime.store.plans)
     expected = expected_revision(request, current.id, current.revision_id)
     content = await _uploaded_plan(request, runtime)
 
@@ -203,7 +206,7 @@ async def replace_floorplan(floorplan_id: str, request: Request, runtime: Runnin
         runtime.plan_cache.drop({current.revision_id})
         return _written(request, record, GridState.after_upload(grid), runtime, status.HTTP_200_OK)
 
-    return await runtime.uploads.run(store)
+    return await runtime.uploads.run(party, store)
 
 
 @router.delete(

@@ -29,7 +29,7 @@ from service.errors import (
 from service.http import IdempotentRequest
 from service.http.problems import problem_responses
 from service.http.uploads import JSON, MULTIPART, UploadLimits, media_type, read_parts, validate_fields
-from service.routes.dependencies import IDEMPOTENCY_KEY, Running, Tenant, plan_for_query
+from service.routes.dependencies import IDEMPOTENCY_KEY, Party, Running, Tenant, plan_for_query
 from service.schemas import LocaliseAnswer, LocaliseForm
 from service.telemetry import note
 
@@ -74,7 +74,7 @@ def _body_schema() -> dict[str, Any]:
         IdempotencyInProgressError,
     ),
 )
-async def localise(request: Request, runtime: Running, tenant: Tenant) -> Response:
+async def localise(request: Request, runtime: Running, tenant: Tenant, party: Party) -> Response:
     """Find where in a stored floor plan a panorama was taken.
 
     A plan that is still preparing is waited for. When optimisation (`lpo`) cannot answer in time, the answer is
@@ -99,7 +99,7 @@ async def localise(request: Request, runtime: Running, tenant: Tenant) -> Respon
     async def answer() -> Response:
         record = await plan_for_query(tenant, form.floorplan_id, runtime)
         note(request, plan=record.id, revision=record.revision_id)
-        found = await runtime.localiser.answer(record, form, parts.files["panorama"], begin, clock)
+        found = await runtime.localiser.answer(record, form, parts.files["panorama"], begin, clock, party)
         note(request, stage=found.stage)
         return Response(found.model_dump_json(), media_type=JSON)
 

@@ -4,6 +4,7 @@ access_control  what happens to a request: exposure, key, rate, scope, in this o
 ├── exposure        without keys: only over loopback or a Unix socket, unless told otherwise
 ├── keys            making, hashing and reading keys
 ├── key_cache       which keys are valid: the store's, remembered for a few seconds
+├── client_network  which client addresses count as one
 ├── rate_limits     requests per key, and refused keys per client address
 └── permissions     scopes, which route needs which, and on whose behalf a request comes
 

@@ -18,7 +18,7 @@ from service.errors import (
 from service.security.exposure import check_origin, is_local
 from service.security.key_cache import KeyCache
 from service.security.keys import parse_authorization
-from service.security.permissions import ANYONE, Caller, Permission, permissions_needed
+from service.security.permissions import Caller, Permission, anyone, permissions_needed
 from service.security.rate_limits import RateLimits
 from service.settings import Settings
 from service.storage.api_keys import ApiKeys
@@ -67,11 +67,12 @@ class AccessControl:
         """
         if not self._needs_keys:
             self._check_local(request)
-            return ANYONE
+            return anyone(_client_of(request))
         key = await self._key_of(request)
         note(request, key=key.id, tenant=key.tenant)
         await self._rates.count(key)
-        caller = Caller(key.tenant, key.id, frozenset(scope for scope in Permission if scope in key.scopes))
+        scopes = frozenset(scope for scope in Permission if scope in key.scopes)
+        caller = Caller(key.tenant, key.id, scopes, party=key.tenant)
         needed = _needed(request)
         if needed not in caller.permissions:
             raise InsufficientScopeError(needed, caller.permissions)
@@ -103,7 +104,7 @@ class AccessControl:
         values = Headers(scope=request.scope).getlist("authorization")
         if not values:
             raise UnauthenticatedError(_NO_KEY)
-        client = request.client.host if request.client is not None else ""
+        client = _client_of(request)
         presented = parse_authorization(values)
         if presented is None:
             await self._rates.count_refused(client)
@@ -116,6 +117,10 @@ class AccessControl:
             await self._rates.count_refused(client)
             raise UnauthenticatedError(_REFUSED)
         return key
+
+
+def _client_of(request: Request) -> str:
+    return request.client.host if request.client is not None else ""
 
 
 def _needed(request: Request) -> Permission:

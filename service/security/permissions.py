@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
-from fastapi import Request
 from starlette.routing import compile_path
 from starlette.types import Scope
 
+from service.security.client_network import network_of
 from service.storage.records import DEFAULT_TENANT
 
 _SCOPE_KEY = "lalaloc.caller"
@@ -59,15 +59,18 @@ class Caller:
         tenant: whose plans it may see.
         key_id: id of its API key, None where there are no keys.
         permissions: what it may do.
+        party: with whom it shares what the service can do at a time: its tenant, or without keys its client address.
     """
 
     tenant: str
     key_id: str | None
     permissions: frozenset[Permission]
+    party: str
 
 
-# Whoever asks while keys are off.
-ANYONE = Caller(DEFAULT_TENANT, None, frozenset(Permission))
+def anyone(client: str) -> Caller:
+    """Whoever asks while keys are off, from a client address."""
+    return Caller(DEFAULT_TENANT, None, frozenset(Permission), network_of(client))
 
 
 def permissions_needed(path: str) -> dict[str, Permission]:
@@ -83,6 +86,6 @@ def put_caller(scope: Scope, caller: Caller) -> None:
     scope[_SCOPE_KEY] = caller
 
 
-def caller_of(request: Request) -> Caller:
+def caller_of(scope: Scope) -> Caller:
     """The caller of a request that was let in."""
-    return request.scope[_SCOPE_KEY]
+    return scope[_SCOPE_KEY]

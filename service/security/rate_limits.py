@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ipaddress
 import math
 import time
 
@@ -11,14 +10,13 @@ from limits.aio.storage import MemoryStorage
 from limits.aio.strategies import SlidingWindowCounterRateLimiter
 
 from service.errors import RateLimitedError, TooManyRefusedKeysError
+from service.security.client_network import network_of
 from service.settings import Settings
 from service.storage.records import ApiKey
 
 # Client addresses share this many counters, so that their number does not matter. Only an address with refused keys
 # of its own notices that another one fell on the same counter.
 _ADDRESS_COUNTERS = 1024
-# Who has one IPv6 address commonly has all that begin like it.
-_IPV6_NETWORK_BITS = 64
 
 
 class RateLimits:
@@ -74,11 +72,4 @@ class RateLimits:
 
 def _counter_of(client: str) -> str:
     """The counter of a client address. Which others share it differs from process to process, and cannot be told."""
-    try:
-        address = ipaddress.ip_address(client)
-        if address.version == 6:
-            client = str(ipaddress.ip_network((int(address), _IPV6_NETWORK_BITS), strict=False))
-    except ValueError:
-        # A Unix socket has none, and proxies may state anything.
-        pass
-    return str(hash(client) % _ADDRESS_COUNTERS)
+    return str(hash(network_of(client)) % _ADDRESS_COUNTERS)

@@ -119,7 +119,7 @@ def test_there_is_no_stream_about_nothing(client: httpx.Client) -> None:
 def test_streams_are_bounded_in_number_and_a_client_that_goes_frees_its_place(
     start_app: StartApp, tmp_path: Path
 ) -> None:
-    with start_app(tmp_path, max_streams=2, **SLOW) as client:
+    with start_app(tmp_path, max_streams=3, **SLOW) as client:
         plan_id = upload(client, HALL, wait=False)
         url = f"/floorplans/{plan_id}/events"
         with client.stream("GET", url) as first, client.stream("GET", url) as second:

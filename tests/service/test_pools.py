@@ -27,13 +27,16 @@ Pool = WorkerPool[tuple[str, Any], Any]
 
 
 @contextmanager
-def _pool(log: Path, *, workers: int = 1, queue_limit: int = 4, target: Any = None, **spec: Any) -> Iterator[Pool]:
+def _pool(
+    log: Path, *, workers: int = 1, queue_limit: int = 4, keep_spare: bool = False, target: Any = None, **spec: Any
+) -> Iterator[Pool]:
     log.touch()
     arguments = spec.pop("arguments", (str(log),))
     pool: Pool = WorkerPool(
         WorkerSpec("test", target or worker_jobs.run, arguments, **{"stall_s": 5.0, "start_s": 1.0} | spec),
         workers=workers,
         queue_limit=queue_limit,
+        keep_spare=keep_spare,
     )
     pool.start()
     try:
@@ -122,10 +125,10 @@ def test_a_job_that_kills_two_workers_is_never_tried_again(log: Path) -> None:
         assert _run(pool, ("echo", 2), 30.0) == 2
 
 
-def test_a_job_over_which_workers_stall_is_given_up_and_tried_anew_when_it_comes_again(log: Path) -> None:
+def test_a_job_over_which_a_worker_stalls_is_given_up_and_tried_anew_when_it_comes_again(log: Path) -> None:
     with _warm_pool(log, workers=2, stall_s=0.5) as pool:
-        for tries in (2, 4):
-            assert _reason(pool.submit(("sleep", 5.0), 30.0)) == "poisoned"
+        for tries in (1, 2):
+            assert _reason(pool.submit(("sleep", 5.0), 30.0)) == "stalled"
             assert _count(log, "sleep") == tries
             wait_for(lambda: pool.state.ready == 2)
 
@@ -232,7 +235,7 @@ def test_a_deadline_is_kept_and_the_worker_goes_on(log: Path) -> None:
 
 
 def test_a_full_queue_refuses_at_once_and_places_given_up_are_free_again(log: Path) -> None:
-    with _warm_pool(log, queue_limit=2) as pool:
+    with _warm_pool(log, queue_limit=3) as pool:
         pool.submit(("sleep", 1.5), 20.0)
         wait_for(lambda: _count(log, "sleep") == 1)
         first, second = pool.submit(("echo", 1), 20.0), pool.submit(("echo", 2), 20.0)
@@ -243,6 +246,47 @@ def test_a_full_queue_refuses_at_once_and_places_given_up_are_free_again(log: Pa
         first.cancel()
         assert pool.submit(("echo", 4), 20.0).result(20.0) == 4
         assert second.result(20.0) == 2
+
+
+def test_parties_take_turns_at_the_workers(log: Path) -> None:
+    done: list[str] = []
+    with _warm_pool(log, queue_limit=20) as pool:
+        busy = pool.submit(("sleep", 1.0), 20.0, "many")
+        wait_for(lambda: _count(log, "sleep") == 1)
+        for party in ("many", "many", "many", "many", "few", "few", "one"):
+            job = pool.submit(("echo", party), 20.0, party)
+            job.add_done_callback(lambda future: done.append(future.result()))
+        busy.result(20.0)
+        wait_for(lambda: len(done) == 7)
+    assert done == ["many", "few", "one", "many", "few", "many", "many"]
+
+
+def test_one_party_cannot_fill_the_queue(log: Path) -> None:
+    with _warm_pool(log, queue_limit=4) as pool:
+        busy = pool.submit(("sleep", 1.0), 20.0, "many")
+        wait_for(lambda: _count(log, "sleep") == 1)
+        for _ in range(3):
+            pool.submit(("echo", 1), 20.0, "many")
+        with pytest.raises(JobLostError, match="queue-full"):
+            pool.submit(("echo", 1), 20.0, "many")
+        assert pool.submit(("echo", 2), 20.0, "other").result(20.0) == 2
+        busy.result(20.0)
+
+
+def test_a_worker_is_kept_for_others_also_while_one_that_stalled_is_replaced(log: Path) -> None:
+    slow = {"target": worker_jobs.run_slow_start, "arguments": (str(log), 1.0)}
+    with _warm_pool(log, workers=2, queue_limit=20, stall_s=1.5, keep_spare=True, **slow) as pool:
+        lost = [pool.submit(("sleep", 20.0), 60.0, "worst") for _ in range(4)]
+        for stalled in range(2):
+            wait_for(lambda stalled=stalled: _count(log, "sleep") == stalled + 1)
+            # While it is at work, and after that while its worker is replaced.
+            assert pool.submit(("echo", 1), 20.0, "other").result(20.0) == 1
+            assert not lost[stalled].done()
+            assert _reason(lost[stalled]) == "stalled"
+            assert pool.submit(("echo", 2), 20.0, "other").result(20.0) == 2
+            assert _count(log, "sleep") == stalled + 1
+        for future in lost:
+            future.cancel()
 
 
 def test_closing_finishes_what_is_at_work_and_loses_what_waits(log: Path) -> None:

@@ -45,7 +45,7 @@ def bundle(tiny_bundle: Path) -> Bundle:
 @pytest.fixture(scope="module")
 def pool(bundle: Bundle) -> Iterator[LpoPool]:
     """Two workers; every test leaves, or waits for, both of them warm."""
-    with _pool(bundle, workers=2, lpo_queue=4, lpo_stall_s=5.0) as started:
+    with _pool(bundle, workers=2, lpo_queue=6, lpo_stall_s=5.0) as started:
         yield started
 
 
@@ -150,7 +150,7 @@ def test_a_full_queue_means_no_answer_at_once(pool: LpoPool, job: RefinementJob)
     for pid in _workers():
         os.kill(pid, signal.SIGSTOP)
     with ThreadPoolExecutor(6) as threads:
-        # Two jobs are at the workers, four fill the queue.
+        # Two jobs are at the workers, four fill what one party may have of the queue.
         waiting = [threads.submit(_refine, pool, job, 1.5) for _ in range(6)]
         wait_for(lambda: pool._workers.waiting == 4, 1.0)
         begin = monotonic()

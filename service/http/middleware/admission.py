@@ -1,16 +1,20 @@
-"""Gives every request its slot, or refuses it, and notices when its client hangs up."""
+"""Gives every request that was let in its slot, or refuses it, and notices when its client hangs up."""
 
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from contextlib import suppress
 
 from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.errors import DeadlineExceededError, MalformedRequestError, OverloadedError, StoppingError
-from service.http.admission import EXEMPT, Admission, is_stream
+from service.errors import DeadlineExceededError, OverloadedError, StoppingError
+from service.http.admission import EXEMPT, Admission, is_read, is_stream
 from service.http.problems import problem_answer
+from service.security.access_control import routed_path
+from service.security.permissions import caller_of
+from service.sharing import FairTurns
 
 
 class AdmissionMiddleware:
@@ -23,30 +27,24 @@ class AdmissionMiddleware:
         """Handle one request."""
         # An app that has not been started, or is used without its lifespan, has no slots.
         admission: Admission | None = getattr(scope["app"].state, "admission", None)
-        if scope["type"] == "http" and _framed_twice(scope):
-            await self._refuse_framing(scope, receive, send)
-            return
-        if scope["type"] != "http" or scope["path"] in EXEMPT or admission is None:
+        if scope["type"] != "http" or admission is None or (path := routed_path(scope)) in EXEMPT:
             await self._app(scope, receive, send)
             return
         try:
-            with admission.slot_for(scope["method"], scope["path"]):
-                await self._handle(admission, scope, receive, send)
+            party = caller_of(scope).party
+            with admission.slot_for(party, scope["method"], path):
+                await self._handle(admission, party, scope, receive, send)
         except (OverloadedError, StoppingError) as error:
             await problem_answer(Request(scope), error)(scope, receive, send)
 
-    async def _refuse_framing(self, scope: Scope, receive: Receive, send: Send) -> None:
-        error = MalformedRequestError("the request has both Content-Length and Transfer-Encoding, it must have one")
-        answer = problem_answer(Request(scope), error)
-        # Where the body ends is not agreed on, so nothing that follows on this connection is another request.
-        answer.headers["Connection"] = "close"
-        await answer(scope, receive, send)
-
-    async def _handle(self, admission: Admission, scope: Scope, receive: Receive, send: Send) -> None:
+    async def _handle(self, admission: Admission, party: str, scope: Scope, receive: Receive, send: Send) -> None:
+        path = routed_path(scope)
+        turns = admission.reading if is_read(scope["method"], path) else None
         client = _Client(receive, send)
-        limit_s = None if is_stream(scope["method"], scope["path"]) else admission.limits.deadline_s
+        limit_s = None if is_stream(scope["method"], path) else admission.limits.deadline_s
         try:
-            async with asyncio.timeout(limit_s), client:
+            async with asyncio.timeout(limit_s), client, _Turn(turns, party) as turn:
+                client.on_answer = turn.end
                 await self._app(scope, client.receive, client.send)
         except asyncio.CancelledError:
             # The server, stopping, ends what did not finish in time.
@@ -59,9 +57,28 @@ class AdmissionMiddleware:
                 await problem_answer(Request(scope), error)(scope, receive, send)
 
 
-def _framed_twice(scope: Scope) -> bool:
-    """Whether the body's length is told in two ways, and a proxy may have believed the other one (RFC 9112, 6.1)."""
-    return {b"content-length", b"transfer-encoding"} <= {name for name, _ in scope["headers"]}
+class _Turn:
+    """A party's turn to compute an answer, which ends when the answer begins: what is sent may take its time."""
+
+    def __init__(self, turns: FairTurns | None, party: str) -> None:
+        self._turns = turns
+        self._party = party
+        self._held = False
+
+    async def __aenter__(self) -> _Turn:
+        if self._turns is not None:
+            await self._turns.acquire(self._party)
+            self._held = True
+        return self
+
+    async def __aexit__(self, *_error: object) -> None:
+        self.end()
+
+    def end(self) -> None:
+        """Give it back, once."""
+        if self._held and self._turns is not None:
+            self._held = False
+            self._turns.release(self._party)
 
 
 class _Client:
@@ -69,6 +86,7 @@ class _Client:
 
     def __init__(self, receive: Receive, send: Send) -> None:
         self.answered = False
+        self.on_answer: Callable[[], None] = lambda: None
         self._receive = receive
         self._send = send
         self._gone = asyncio.Event()
@@ -103,6 +121,7 @@ class _Client:
     async def send(self, message: Message) -> None:
         """Pass a part of the answer on."""
         self.answered = True
+        self.on_answer()
         await self._send(message)
 
     async def _wait_for_hang_up(self) -> None:

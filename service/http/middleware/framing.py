@@ -1,0 +1,31 @@
+"""Refuses requests whose body's length is told in two ways."""
+
+from __future__ import annotations
+
+from starlette.requests import Request
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from service.errors import MalformedRequestError
+from service.http.problems import problem_answer
+
+
+class FramingMiddleware:
+    """Answers 400 where a proxy before the service may have believed the other of two lengths (RFC 9112, 6.1)."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle one request."""
+        if scope["type"] != "http" or not _framed_twice(scope):
+            await self._app(scope, receive, send)
+            return
+        error = MalformedRequestError("the request has both Content-Length and Transfer-Encoding, it must have one")
+        answer = problem_answer(Request(scope), error)
+        # Where the body ends is not agreed on, so nothing that follows on this connection is another request.
+        answer.headers["Connection"] = "close"
+        await answer(scope, receive, send)
+
+
+def _framed_twice(scope: Scope) -> bool:
+    return {b"content-length", b"transfer-encoding"} <= {name for name, _ in scope["headers"]}

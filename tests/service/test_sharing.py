@@ -1,0 +1,257 @@
+"""What is scarce is shared: no party gets all of it, and those that wait are served in turn."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from time import monotonic, sleep
+
+import httpx
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from service.security.client_network import network_of
+from service.sharing import FairQueue, FairTurns, Shares, with_spare
+from service.threads import Threads
+from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upload, wait_for
+
+WORST = "127.0.0.2"
+
+
+@pytest.mark.parametrize(("limit", "alone"), [(1, 1), (2, 1), (3, 2), (4, 3), (6, 4), (32, 24), (64, 48)])
+def test_alone_a_party_gets_three_quarters_and_leaves_some(limit: int, alone: int) -> None:
+    shares = Shares(limit)
+    while shares.may_take("a"):
+        shares.take("a")
+    assert shares.held_by("a") == shares.in_use == alone
+    assert shares.may_take("b") == (limit > 1)
+
+
+@given(st.integers(1, 100))
+def test_with_a_spare_a_party_gets_what_it_was_meant_to(count: int) -> None:
+    shares = Shares(with_spare(count))
+    while shares.may_take("a"):
+        shares.take("a")
+    assert count <= shares.held_by("a") < shares.limit
+
+
+@given(st.integers(1, 60), st.lists(st.tuples(st.sampled_from("abcd"), st.booleans()), max_size=300))
+def test_whoever_holds_nothing_gets_one_while_any_is_left_and_no_more_than_all_are_given(
+    limit: int, steps: list[tuple[str, bool]]
+) -> None:
+    shares = Shares(limit)
+    for party, takes in steps:
+        if takes and shares.may_take(party):
+            shares.take(party)
+        elif not takes and shares.held_by(party):
+            shares.give_back(party)
+        assert shares.in_use == sum(shares.held_by(one) for one in "abcd") <= limit
+        assert shares.may_take("newcomer") == (shares.in_use < limit)
+
+
+@given(st.integers(8, 200), st.integers(2, 4))
+def test_parties_that_want_all_they_can_get_end_with_about_the_same(limit: int, parties: int) -> None:
+    shares, names = Shares(limit), range(parties)
+    while shares.may_take(0):
+        shares.take(0)
+    # Work ends in the order in which it began, and the place goes to whoever may have it.
+    for _ in range(20 * limit):
+        busiest = max(names, key=shares.held_by)
+        shares.give_back(busiest)
+        for name in sorted(names, key=shares.held_by):
+            if shares.may_take(name):
+                shares.take(name)
+    held = [shares.held_by(name) for name in names]
+    assert max(held) - min(held) <= 2, held
+
+
+@given(st.lists(st.sampled_from("abc"), max_size=40))
+def test_those_that_wait_are_served_one_of_each_and_oldest_first(parties: list[str]) -> None:
+    queue: FairQueue[int] = FairQueue()
+    for number, party in enumerate(parties):
+        queue.append(party, number)
+    served = [queue.take() for _ in parties]
+    assert queue.take() is None
+    for party in "abc":
+        own = [found[1] for found in served if found is not None and found[0] == party]
+        assert own == [number for number, other in enumerate(parties) if other == party]
+    # Whoever has one waits for no more than one of every other.
+    for party in set(parties):
+        first = next(place for place, found in enumerate(served) if found is not None and found[0] == party)
+        assert first < len(set(parties))
+
+
+def test_what_nobody_wants_any_more_is_dropped() -> None:
+    queue: FairQueue[int] = FairQueue()
+    for number in range(6):
+        queue.append("ab"[number % 2], number)
+    queue.append_first("a", 6)
+    assert sorted(queue.drop(lambda number: number in (0, 1, 3, 5))) == [0, 1, 3, 5]
+    assert len(queue) == 3
+    assert [queue.take() for _ in range(4)] == [("a", 6), ("a", 2), ("a", 4), None]
+
+
+def test_turns_go_round_and_one_is_left_to_others() -> None:
+    async def scenario() -> list[str]:
+        turns, order = FairTurns(2), list[str]()
+
+        async def take(party: str) -> None:
+            await turns.acquire(party)
+            order.append(party)
+            await asyncio.sleep(0)
+            turns.release(party)
+
+        await turns.acquire("a")
+        waiting = [asyncio.create_task(take(party)) for party in "aaab"]
+        gone = asyncio.create_task(take("a"))
+        await asyncio.sleep(0)
+        gone.cancel()
+        await asyncio.sleep(0.01)
+        # The other one is not a's to take, so b had it at once.
+        assert order == ["b"]
+        turns.release("a")
+        await asyncio.gather(*waiting)
+        # Given up at the very moment when it came: it goes on to the next.
+        await turns.acquire("a")
+        late = asyncio.create_task(turns.acquire("a"))
+        await asyncio.sleep(0)
+        turns.release("a")
+        late.cancel()
+        await asyncio.gather(late, return_exceptions=True)
+        await asyncio.wait_for(turns.acquire("a"), 1.0)
+        return order
+
+    assert asyncio.run(scenario()) == ["b", "a", "a", "a"]
+
+
+def test_a_thread_whose_caller_left_is_still_its_party_s() -> None:
+    async def scenario() -> None:
+        threads, goes_on = Threads("test", 2), threading.Event()
+        try:
+            left = asyncio.create_task(threads.run("a", goes_on.wait, 20.0))
+            await asyncio.sleep(0.05)
+            left.cancel()
+            second = asyncio.create_task(threads.run("a", lambda: "second"))
+            assert await threads.run("b", lambda: "other") == "other"
+            await asyncio.sleep(0.05)
+            assert not second.done()
+            goes_on.set()
+            assert await second == "second"
+        finally:
+            goes_on.set()
+            threads.close()
+
+    asyncio.run(scenario())
+
+
+@pytest.mark.parametrize(
+    ("address", "network"),
+    [("10.0.0.1", "10.0.0.1"), ("::ffff:10.0.0.1", "10.0.0.1"), ("2001:db8::1:2", "2001:db8::/64"), ("x", "x")],
+)
+def test_the_addresses_of_a_network_count_as_one(address: str, network: str) -> None:
+    assert network_of(address) == network
+
+
+# The running service. Without keys, every client address is a party.
+
+
+@contextmanager
+def _sent(client: httpx.Client, head: str) -> Iterator[socket.socket]:
+    """A request from another address whose answer is not read."""
+    address = (client.base_url.host, client.base_url.port or 80)
+    with socket.socket() as connection:
+        # Next to nothing of the answer fits in.
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        connection.settimeout(10.0)
+        connection.bind((WORST, 0))
+        connection.connect(address)
+        connection.sendall(head.encode("ascii"))
+        yield connection
+
+
+def _gauge(client: httpx.Client, name: str) -> float:
+    lines = client.get("/metrics").text.splitlines()
+    return float(next(line for line in lines if line.startswith(f"{name} ")).split()[1])
+
+
+@pytest.mark.one_replica
+def test_bodies_that_do_not_come_leave_room_for_others(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+    head = "POST /localise HTTP/1.1\r\nHost: localhost\r\nContent-Type: multipart/form-data; boundary=b\r\n"
+    with start_app(tmp_path, max_pending_requests=8) as client, ExitStack() as attack:
+        plan_id = upload(client)
+        for _ in range(10):
+            attack.enter_context(_sent(client, f"{head}Content-Length: 100000\r\n\r\n--b"))
+        wait_for(lambda: _gauge(client, "lalaloc_requests_in_flight") == 6)
+        assert localise(client, plan_id, panorama, refine="none").status_code == 200
+        assert client.post("/floorplans", json=FLAT).status_code == 201
+        with httpx.Client(base_url=client.base_url, transport=httpx.HTTPTransport(local_address=WORST)) as worst:
+            problem = assert_problem(worst.post("/floorplans", json=FLAT), 503, "overloaded")
+            assert (
+                "6 of your requests are in work, no more are taken: the rest of 8 is left to others"
+                in problem["detail"]
+            )
+
+
+@pytest.mark.one_replica
+def test_answers_that_are_not_read_leave_room_for_others(start_app: StartApp, tmp_path: Path) -> None:
+    with start_app(tmp_path, max_reads=8, max_plan_bytes=8 * 2**20) as client, ExitStack() as attack:
+        # White space is kept, and no socket holds as much.
+        content = httpx.Request("POST", "http://x", json=FLAT).read() + b" " * (7 * 2**20)
+        created = client.post("/floorplans", content=content, headers={"Content-Type": "application/json"})
+        path = f"{created.headers['location']}/original"
+        for _ in range(10):
+            attack.enter_context(_sent(client, f"GET {path} HTTP/1.1\r\nHost: localhost\r\n\r\n"))
+        # As many as the address may have, which is more than compute at a time.
+        wait_for(lambda: _gauge(client, "lalaloc_reads_in_flight") == 6)
+        sleep(0.2)
+        assert client.get(path).content == content
+        assert client.get("/floorplans").status_code == 200
+
+
+@pytest.mark.one_replica
+def test_streams_of_one_leave_room_for_others(start_app: StartApp, tmp_path: Path) -> None:
+    hall = {"ceiling_height_m": 3.0, "rooms": [{"polygon": [[0, 0], [40, 0], [40, 40], [0, 40]]}]}
+    settings = {"grid_step_m": 0.1, "inline_grid_poses": 1, "max_grid_poses": 10**6}
+    with start_app(tmp_path, max_streams=4, **settings) as client, ExitStack() as attack:
+        path = f"/floorplans/{upload(client, hall, wait=False)}"
+        for _ in range(6):
+            attack.enter_context(_sent(client, f"GET {path}/events HTTP/1.1\r\nHost: localhost\r\n\r\n"))
+        wait_for(lambda: _gauge(client, "lalaloc_streams") == 3)
+        with client.stream("GET", f"{path}/events") as events:
+            assert events.status_code == 200
+            assert next(events.iter_lines()).startswith("retry")
+        assert client.delete(path).status_code == 204
+
+
+@pytest.mark.one_replica
+def test_a_picture_that_takes_too_long_keeps_no_other_waiting(
+    start_app: StartApp, tmp_path: Path, panorama: bytes
+) -> None:
+    slow = _endless_picture()
+    with start_app(tmp_path, decode_workers=2, decode_stall_s=1.5, max_scans=10_000) as client, ExitStack() as attack:
+        plan_id = upload(client)
+        wait_for(lambda: client.get("/readyz").status_code == 200)
+        request = httpx.Request(
+            "POST", "http://localhost/localise", data={"floorplan_id": plan_id}, files={"panorama": ("p", slow)}
+        )
+        lines = ["POST /localise HTTP/1.1", *(f"{name}: {value}" for name, value in request.headers.items())]
+        for _ in range(3):
+            connection = attack.enter_context(_sent(client, "\r\n".join([*lines, "", ""])))
+            connection.sendall(request.read())
+        wait_for(lambda: _gauge(client, "lalaloc_queries_in_work") >= 2)
+        # Three pictures of 1.5 s and more: one after the other they would be in the way for 4.5 s.
+        begin = monotonic()
+        assert localise(client, plan_id, panorama, refine="none").status_code == 200
+        assert _gauge(client, "lalaloc_queries_in_work") >= 2, f"all were done after {monotonic() - begin:.1f} s"
+
+
+def _endless_picture() -> bytes:
+    """A JPEG of so many scans that decoding it takes most of a minute."""
+    from tests.core.test_images import of_scans
+
+    return of_scans(14_000, 7_000, 400)
