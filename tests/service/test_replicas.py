@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
@@ -24,8 +25,10 @@ CONFIGURATION = Path(__file__).parents[2] / "docker" / "nginx.conf"
 
 
 @contextmanager
-def nginx(folder: Path, replicas: list[httpx.Client]) -> Iterator[httpx.Client]:
-    """Run nginx as configured, but for names and ports."""
+def nginx(
+    folder: Path, replicas: list[httpx.Client], *, read_timeout: str = "30s", status: int = 200
+) -> Iterator[httpx.Client]:
+    """Run nginx as configured, but for names, ports, and how long it waits; ready when health is told with a status."""
     program = shutil.which("nginx") or shutil.which("nginx", path="/usr/sbin")
     if program is None:
         pytest.skip("nginx is not installed; on Debian and Ubuntu the package is nginx-light")
@@ -35,6 +38,8 @@ def nginx(folder: Path, replicas: list[httpx.Client]) -> Iterator[httpx.Client]:
     for number, replica in enumerate(replicas, start=1):
         assert text.count(f"replica-{number}:8000") == 1
         text = text.replace(f"replica-{number}:8000", urlsplit(str(replica.base_url)).netloc)
+    assert "proxy_read_timeout 30s;" in text
+    text = text.replace("proxy_read_timeout 30s;", f"proxy_read_timeout {read_timeout};")
     text = text.replace("listen 8080;", f"listen 127.0.0.1:{port};").replace("/tmp/", f"{folder}/")
     path = folder / "nginx.conf"
     path.write_text(text, encoding="utf-8")
@@ -43,16 +48,16 @@ def nginx(folder: Path, replicas: list[httpx.Client]) -> Iterator[httpx.Client]:
     process = subprocess.Popen([program, "-c", str(path), "-g", options])
     try:
         with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30.0) as client:
-            wait_for(lambda: _listens(client))
+            wait_for(lambda: _listens(client, status))
             yield client
     finally:
         process.send_signal(signal.SIGTERM)
         process.wait(10.0)
 
 
-def _listens(client: httpx.Client) -> bool:
+def _listens(client: httpx.Client, status: int) -> bool:
     try:
-        return client.get("/healthz").status_code == 200
+        return client.get("/healthz").status_code == status
     except httpx.TransportError:
         return False
 
@@ -108,3 +113,67 @@ def test_the_proxy_lets_through_what_the_service_takes(
         answer = proxy.post("/localise", files={"panorama": ("p.jpg", bytes(limit - 1))})
         assert answer.status_code == 422, answer.text
         assert answer.headers["content-type"] == "application/problem+json"
+
+
+def _assert_refused(head: bytes, body: bytes, status: int, slug: str) -> None:
+    """Check that an answer of nginx's own is a complete problem document."""
+    lines = head.decode("ascii").split("\r\n")
+    headers = {name.lower(): value for name, _, value in (line.partition(": ") for line in lines[1:])}
+    problem = json.loads(body)
+    assert int(lines[0].split()[1]) == problem["status"] == status
+    assert headers["content-type"] == "application/problem+json"
+    assert problem["type"] == f"urn:lalaloc:problem:{slug}"
+    assert problem["title"]
+    assert problem["detail"]
+    assert problem["request_id"] == headers["x-request-id"]
+    assert ("retry-after" in headers) == (status in (502, 503, 504))
+
+
+def _answer_to(proxy: httpx.Client, request: bytes) -> tuple[bytes, bytes]:
+    with socket.create_connection((proxy.base_url.host, proxy.base_url.port or 80), timeout=20.0) as connection:
+        connection.sendall(request)
+        received = b""
+        while not received.rstrip().endswith((b"}", b"</html>")):
+            received += (more := connection.recv(65536))
+            assert more, received
+    head, _, body = received.partition(b"\r\n\r\n")
+    return head, body
+
+
+OF_THE_PROXY = {
+    "no request": (b"NONSENSE\r\n\r\n", 400, "malformed-request"),
+    "no host": (b"GET /floorplans HTTP/1.1\r\n\r\n", 400, "malformed-request"),
+    "a long head": (b"GET / HTTP/1.1\r\nHost: x\r\nA: " + b"a" * 40_000 + b"\r\n\r\n", 400, "malformed-request"),
+    "a long address": (b"GET /" + b"a" * 40_000 + b" HTTP/1.1\r\nHost: x\r\n\r\n", 414, "malformed-request"),
+    "a large body": (
+        b"POST /localise HTTP/1.1\r\nHost: x\r\nContent-Length: 99999999\r\n\r\n",
+        413,
+        "upload-too-large",
+    ),
+    "metrics": (b'GET /metrics HTTP/1.1\r\nHost: x\r\nX-Request-ID: a"b\r\n\r\n', 404, "not-found"),
+    "its own page": (b"GET /.problem HTTP/1.1\r\nHost: x\r\n\r\n", 404, "not-found"),
+    "no replica": (b"GET /floorplans HTTP/1.1\r\nHost: x\r\n\r\n", 502, "no-replica"),
+}
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+    """The proxy, without any replica that answers."""
+    with ExitStack() as stack:
+        nobody = [stack.enter_context(httpx.Client(base_url=f"http://127.0.0.1:{port}")) for port in (9, 19)]
+        yield stack.enter_context(nginx(tmp_path_factory.mktemp("nginx"), nobody, status=502))
+
+
+@pytest.mark.parametrize(("request_", "status", "slug"), OF_THE_PROXY.values(), ids=OF_THE_PROXY.keys())
+def test_what_the_proxy_refuses_is_a_problem_document_too(
+    alone: httpx.Client, request_: bytes, status: int, slug: str
+) -> None:
+    _assert_refused(*_answer_to(alone, request_), status, slug)
+
+
+def test_a_replica_that_does_not_answer_is_told_as_a_problem(tmp_path: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent, ExitStack() as stack:
+        url = f"http://127.0.0.1:{silent.getsockname()[1]}"
+        replicas = [stack.enter_context(httpx.Client(base_url=url)) for _ in range(2)]
+        proxy = stack.enter_context(nginx(tmp_path, replicas, read_timeout="200ms", status=504))
+        _assert_refused(*_answer_to(proxy, b"GET /floorplans HTTP/1.1\r\nHost: x\r\n\r\n"), 504, "deadline-exceeded")
