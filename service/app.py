@@ -10,7 +10,7 @@ from collections.abc import AsyncIterator
 from contextlib import ExitStack, asynccontextmanager
 from functools import partial
 
-from fastapi import FastAPI
+from fastapi import Depends, FastAPI
 from starlette.routing import BaseRoute, Route
 from starlette.types import ASGIApp
 
@@ -20,9 +20,13 @@ from service.http.api_description import describe_api
 from service.http.middleware import (
     AccessControlMiddleware,
     AdmissionMiddleware,
+    CorsMiddleware,
+    FramingMiddleware,
+    HeadMiddleware,
     SecurityHeadersMiddleware,
     TelemetryMiddleware,
 )
+from service.http.parameters import check_parameters
 from service.http.problems import install_problem_handlers
 from service.routes import ROUTERS
 from service.runtime import start_runtime
@@ -31,7 +35,9 @@ from service.telemetry import Telemetry, configure_logging
 
 _DESCRIPTION = (
     "Localises 360° panoramas in floor plans. Lengths are metres in the plan frame (x to the right, y up on the "
-    "drawing), headings are degrees clockwise from the plan's +y. Errors are `application/problem+json` (RFC 9457)."
+    "drawing), headings are degrees clockwise from the plan's +y. Errors are `application/problem+json` (RFC 9457). "
+    "Every GET may be a HEAD as well. What a route does not know, part of a form or query parameter, is refused by its "
+    "name."
 )
 
 
@@ -49,6 +55,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         title="LaLaLoc",
         version=__version__,
         description=_DESCRIPTION,
+        dependencies=[Depends(check_parameters)],
         lifespan=partial(_lifespan, settings, telemetry),
         # The stock documentation pages load their scripts from elsewhere; `routes.pages` has one that does not.
         docs_url=None,
@@ -64,14 +71,14 @@ def create_app(settings: Settings | None = None) -> FastAPI:
 
 
 def _layers(app: FastAPI, telemetry: Telemetry, routes: list[BaseRoute]) -> ASGIApp:
-    """The app's layers, outermost first: ids and log, security headers, keys, admission, then the framework's.
+    """The app's layers, outermost first: log, headers, CORS, framing, HEAD, keys, admission, the framework's.
 
     Middleware that is added to an app lies inside the layer that answers unexpected errors, and never sees those.
     """
     # Keys first: it is tenants that slots are shared between.
-    admitted = AccessControlMiddleware(AdmissionMiddleware(FastAPI.build_middleware_stack(app)))
+    admitted = HeadMiddleware(AccessControlMiddleware(AdmissionMiddleware(FastAPI.build_middleware_stack(app))))
     named = [route for route in routes if isinstance(route, Route)]
-    return TelemetryMiddleware(SecurityHeadersMiddleware(admitted), telemetry, named)
+    return TelemetryMiddleware(SecurityHeadersMiddleware(CorsMiddleware(FramingMiddleware(admitted))), telemetry, named)
 
 
 @asynccontextmanager
@@ -80,6 +87,7 @@ async def _lifespan(settings: Settings | None, telemetry: Telemetry, app: FastAP
     logger = configure_logging(settings.log_level)
     with ExitStack() as cleanup:
         runtime = app.state.runtime = await asyncio.to_thread(start_runtime, settings, telemetry, cleanup)
+        app.state.cors_origins = settings.cors_origin_set
         app.state.admission = runtime.admission
         app.state.access_control = runtime.access_control
         yield

@@ -22,6 +22,7 @@ from service.security.keys import hash_of, key_text, new_secret
 from service.settings import Settings
 from service.storage import Store, open_store
 from service.storage.records import ApiKey
+from service.telemetry.tracing import otlp_exporter
 
 # Connections that the kernel accepts while the service is busy; it answers all of them, if only with a 503.
 _BACKLOG = 1024
@@ -77,8 +78,10 @@ def _check_parts(settings: Settings) -> None:
 
     Raises:
         BundleError: there is no usable model.
-        ConfigError, StoreUnavailableError: the database cannot be used.
+        ConfigError, StoreUnavailableError: the database cannot be used, or spans cannot be exported.
     """
+    if settings.otlp_endpoint is not None:
+        otlp_exporter(settings.otlp_endpoint).shutdown()
     Bundle.open(settings.bundle).check()
     open_store(settings).close()
 

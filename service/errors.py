@@ -9,6 +9,7 @@ LaLaLocError
     ├── UploadTooLargeError         more bytes than allowed
     ├── UploadTimeoutError          the upload took too long
     ├── UnsupportedMediaError       a body of a type that is not read here
+    │   └── UnsupportedEncodingError    a compressed body
     ├── PlanTooLargeError           the latent grid would have more poses than allowed
     ├── PlanFailedError             the plan's latent grid could not be computed
     ├── PlanNotReadyError           still preparing at the request's deadline
@@ -113,6 +114,15 @@ class UnsupportedMediaError(ServiceError):
         self.accepted = accepted
         stated = f"content type '{given[:100]}'" if given else "a body without content type"
         super().__init__(f"{stated} is not read here, send {' or '.join(accepted)}")
+
+
+class UnsupportedEncodingError(UnsupportedMediaError):
+    """The body is compressed."""
+
+    def __init__(self, encoding: str) -> None:
+        ServiceError.__init__(
+            self, f"bodies are not read here in Content-Encoding '{encoding[:100]}', send them as they are"
+        )
 
 
 class PlanTooLargeError(ServiceError):
@@ -330,6 +340,7 @@ PROBLEMS: dict[type[Exception], ProblemKind] = {
     UploadTooLargeError: ProblemKind(413, "upload-too-large", "Upload too large"),
     UploadTimeoutError: ProblemKind(408, "upload-timeout", "Upload took too long"),
     UnsupportedMediaError: ProblemKind(415, "unsupported-media", "Unsupported media type"),
+    UnsupportedEncodingError: ProblemKind(415, "unsupported-media", "Unsupported media type"),
     PlanTooLargeError: ProblemKind(422, "floorplan-too-large", "Floor plan too large"),
     PlanFailedError: ProblemKind(409, "floorplan-failed", "Floor plan could not be prepared"),
     PlanNotReadyError: ProblemKind(503, "floorplan-not-ready", "Floor plan still preparing"),

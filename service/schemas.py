@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from datetime import datetime
 from typing import Annotated, Literal
 
@@ -189,13 +190,26 @@ class LocaliseForm(BaseModel):
     refine: Literal["none", "vdr", "lpo"] = Field(
         "lpo", description="How far to refine: nearest grid pose, denser poses around it, or optimised pose."
     )
-    top_k: int = Field(5, ge=1, le=100, description="How many distinct candidates to return, at most `max_top_k`.")
+    top_k: int = Field(
+        5,
+        ge=1,
+        description="How many distinct candidates to return, at most `max_top_k`.",
+        json_schema_extra={"maximum": 100},
+    )
 
     @field_validator("heading_deg", "heading_tolerance_deg", "camera_height_m", "top_k", mode="before")
     @classmethod
     def _plain_number(cls, value: object) -> object:
         if isinstance(value, str) and "_" in value:
             raise ValueError("not a number")
+        return value
+
+    @field_validator("top_k")
+    @classmethod
+    def _as_many_as_allowed(cls, value: int, told: ValidationInfo) -> int:
+        most = (told.context or {}).get("max_top_k", math.inf)
+        if value > most:
+            raise ValueError(f"at most {most} are allowed (max_top_k)")
         return value
 
     @field_validator("heading_tolerance_deg")

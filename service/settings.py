@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Self
 
-from pydantic import Field, ValidationError, field_validator
+from pydantic import Field, ValidationError, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from lalaloc_core.errors import ConfigError
@@ -26,6 +26,8 @@ Metres = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 
 
 _HOST_NAME = re.compile(r"|\*|[A-Za-z0-9._-]+|[0-9A-Fa-f:]*:[0-9A-Fa-f:.]*")
+_ORIGIN = re.compile(r"|\*|https?://(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\])(?::[0-9]{1,5})?")
+_PUBLISHED = re.compile(r"|(?:(?:[0-9.]+|\[[0-9A-Fa-f:.]+\]):)?[0-9]{1,5}")
 # Requests that may be uploading, besides queries in work.
 _UPLOADS = 38
 
@@ -112,6 +114,16 @@ class Settings(BaseSettings):
         default="",
         description="Without API keys, names besides this machine's that requests may be for (`Host`) and pages come "
         "from (`Origin`), separated by commas; `*` for any.",
+    )
+    cors_origins: str = Field(
+        default="",
+        description="Origins whose pages may ask from a browser (CORS), separated by commas, such as "
+        "`https://plans.example`; `*` for any, which needs `api_keys`.",
+    )
+    published_on: str = Field(
+        default="",
+        description="Where the port is published if not where the service listens, as Docker has it: `127.0.0.1:8000`, "
+        "or `8000` for every address. Without API keys, addresses of this machine only, unless `allow_anonymous`.",
     )
     key_cache_s: Annotated[float, Field(ge=0.0, le=60.0)] = Field(
         default=5.0, description="How long an API key is remembered: a revoked one is refused at most that much later."
@@ -221,6 +233,27 @@ class Settings(BaseSettings):
                 raise ValueError(f"'{name.strip()}' is neither a bare name or address nor *, without scheme and port")
         return value
 
+    @field_validator("cors_origins")
+    @classmethod
+    def _origins_only(cls, value: str) -> str:
+        for origin in value.split(","):
+            if not _ORIGIN.fullmatch(origin.strip()):
+                raise ValueError(f"'{origin.strip()}' is neither an origin such as https://plans.example nor *")
+        return value
+
+    @field_validator("published_on")
+    @classmethod
+    def _port_mapping(cls, value: str) -> str:
+        if not _PUBLISHED.fullmatch(value):
+            raise ValueError("neither ADDRESS:PORT, with IPv6 addresses in brackets, nor PORT")
+        return value
+
+    @model_validator(mode="after")
+    def _any_page_needs_keys(self) -> Self:
+        if "*" in self.cors_origin_set and not self.api_keys:
+            raise ValueError("LALALOC_CORS_ORIGINS=* needs LALALOC_API_KEYS=on: any page could change all plans")
+        return self
+
     @classmethod
     def load(cls) -> Self:
         """Read the settings from the environment; an empty variable counts as not set.
@@ -241,6 +274,18 @@ class Settings(BaseSettings):
     def allowed_host_names(self) -> frozenset[str]:
         """The names in `allowed_hosts`, in lower case."""
         return frozenset(name.strip().lower() for name in self.allowed_hosts.split(",")) - {""}
+
+    @property
+    def cors_origin_set(self) -> frozenset[str]:
+        """The origins in `cors_origins`, in lower case."""
+        return frozenset(origin.strip().lower() for origin in self.cors_origins.split(",")) - {""}
+
+    @property
+    def published_host(self) -> str | None:
+        """The address in `published_on`, `0.0.0.0` where it is a port alone; None where nothing is said."""
+        if not self.published_on:
+            return None
+        return self.published_on.rpartition(":")[0].strip("[]") or "0.0.0.0"
 
     @property
     def cores(self) -> CoreShares:
@@ -296,5 +341,8 @@ def settings_table() -> str:
 
 def _describe(fault: Mapping[str, object]) -> str:
     location = fault["loc"]
+    if not location:
+        # About several of them, which it names.
+        return str(fault["msg"]).removeprefix("Value error, ")
     field = str(location[0]) if isinstance(location, tuple) and location else "?"
     return f"{PREFIX}{field.upper()} is {fault['input']!r}: {fault['msg']}"

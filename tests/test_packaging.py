@@ -113,6 +113,18 @@ def test_image_and_compose_name_known_settings_and_one_port() -> None:
     assert [published.split(":")[-1] for published in COMPOSE["ports"]] == [port]
 
 
+def test_what_is_published_for_others_without_keys_has_to_be_asked_for() -> None:
+    environment, (published,) = COMPOSE["environment"], COMPOSE["ports"]
+    assert published == f"{environment['LALALOC_PUBLISHED_ON'].removesuffix(':8000}')}:8000}}:8000"
+    assert environment["LALALOC_PUBLISHED_ON"].startswith("${LALALOC_PUBLISH:-127.0.0.1:")
+    assert environment["LALALOC_ALLOW_ANONYMOUS"] == "${LALALOC_ALLOW_ANONYMOUS:-off}"
+
+
+def test_the_image_can_export_spans() -> None:
+    (extras,) = re.findall(r'pip install .* "\.\[(.*)\]"', DOCKERFILE)
+    assert {"service", "lpo", "otel"} <= set(extras.split(","))
+
+
 def test_the_proxy_and_the_replicas_find_each_other() -> None:
     replicas = {name: service for name, service in REPLICAS.items() if name.startswith("replica-")}
     proxy = (ROOT / "docker" / "nginx.conf").read_text(encoding="utf-8")

@@ -2,7 +2,8 @@
 
 Begin with `admission.py`, which says how much may be in work, and `middleware/`, which every request passes. Routes use
 `uploads.py` for bodies, `conditional.py`, `cursors.py` and `idempotency.py` for what their headers and parameters ask,
-`events.py` for streams and `problems.py` for errors. `server.py` runs the app, `api_description.py` describes it.
+`events.py` for streams, `problems.py` and `faults.py` for errors; `parameters.py` refuses what they do not know.
+`server.py` runs the app, `api_description.py` describes it.
 """
 
 from service.http.admission import Admission, AdmissionLimits

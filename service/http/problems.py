@@ -19,11 +19,14 @@ from service.errors import (
     ProblemKind,
     ServiceError,
     UnauthenticatedError,
+    UnsupportedEncodingError,
     UnsupportedMediaError,
     problem_kind,
 )
-from service.http.uploads import describe_fault
+from service.http.faults import describe_fault
 from service.schemas import Fault, Problem
+from service.security.access_control import routed_path
+from service.security.permissions import permissions_needed
 from service.telemetry import note, request_id_of
 
 PROBLEM_JSON = "application/problem+json"
@@ -71,7 +74,9 @@ def problem_answer(request: Request, error: Exception) -> JSONResponse:
         headers["Retry-After"] = str(error.retry_after_s)
     if isinstance(error, UnauthenticatedError):
         headers["WWW-Authenticate"] = "Bearer"
-    if isinstance(error, UnsupportedMediaError):
+    if isinstance(error, UnsupportedEncodingError):
+        headers["Accept-Encoding"] = "identity"
+    elif isinstance(error, UnsupportedMediaError):
         headers["Accept-Post"] = ", ".join(error.accepted)
     return _answer(
         request,
@@ -88,7 +93,11 @@ def http_problem_answer(request: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, HTTPException)
     kind = HTTP_PROBLEMS.get(error.status_code, ProblemKind(error.status_code, "http-error", "HTTP error"))
     detail = f"{request.method} {request.url.path[:200]}: {error.detail}"
-    return _answer(request, kind, detail, headers=dict(error.headers or {}))
+    headers = dict(error.headers or {})
+    # The framework names the methods of one route of the path, there may be more.
+    if error.status_code == 405 and (methods := [*permissions_needed(routed_path(request.scope))]):
+        headers["Allow"] = ", ".join([*methods, *(["HEAD"] if "GET" in methods else [])])
+    return _answer(request, kind, detail, headers=headers)
 
 
 def _on_invalid_request(request: Request, error: Exception) -> JSONResponse:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator, Mapping
+from collections.abc import AsyncGenerator, Callable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from time import monotonic
@@ -20,10 +20,12 @@ from starlette.requests import ClientDisconnect
 from service.errors import (
     InvalidRequestError,
     MalformedRequestError,
+    UnsupportedEncodingError,
     UnsupportedMediaError,
     UploadTimeoutError,
     UploadTooLargeError,
 )
+from service.http.faults import describe_fault
 from service.settings import Settings
 
 JSON = "application/json"
@@ -75,12 +77,23 @@ class Parts:
     files: dict[str, bytes]
 
 
+Check = Callable[[Mapping[str, str]], list[tuple[str, str]]]
+
+
+def _no_fields(_fields: Mapping[str, str]) -> list[tuple[str, str]]:
+    return []
+
+
 def media_type(request: Request, accepted: tuple[str, ...]) -> str:
     """The body's media type without parameters.
 
     Raises:
         UnsupportedMediaError: it is none of those accepted.
+        UnsupportedEncodingError: it is compressed.
     """
+    for encoding in request.headers.getlist("content-encoding"):
+        if encoding.strip().lower() not in ("", "identity"):
+            raise UnsupportedEncodingError(encoding)
     stated = request.headers.get("content-type", "")
     media = stated.partition(";")[0].strip().lower()
     if media not in accepted:
@@ -98,14 +111,20 @@ async def read_body(request: Request, limits: UploadLimits) -> bytes:
         return b"".join([chunk async for chunk in _counted(request, limits)])
 
 
-async def read_parts(request: Request, limits: UploadLimits, *, files: set[str], fields: set[str]) -> Parts:
+async def read_parts(
+    request: Request, limits: UploadLimits, *, files: set[str], fields: set[str], check: Check = _no_fields
+) -> Parts:
     """A multipart body that must have every one of `files`, and no parts other than `files` and `fields`.
+
+    Args:
+        check: gives what is wrong with the values of fields, which is then told with the rest.
 
     Raises:
         UploadTooLargeError, UploadTimeoutError: see the limits.
         MalformedRequestError: not valid multipart.
         UnsupportedMediaError: in another charset than UTF-8.
-        InvalidRequestError: a part is missing, unknown, given twice, or a field where a file belongs.
+        InvalidRequestError: a part is missing, unknown, given twice, or a field where a file belongs; with what
+            `check` says.
     """
     stated = request.headers.get("content-type", "")
     charset = parse_options_header(stated)[1].get(b"charset", _UTF_8)
@@ -128,40 +147,39 @@ async def read_parts(request: Request, limits: UploadLimits, *, files: set[str],
     except FormParserError as error:
         raise MalformedRequestError(f"not valid {MULTIPART}: {error}") from error
     try:
-        return await _sort(form.multi_items(), limits, files, fields)
+        return await _sort(form.multi_items(), limits, files, fields, check)
     finally:
         await form.close()
 
 
-def validate_fields(model: type[Model], fields: Mapping[str, str]) -> Model:
+def validate_fields(model: type[Model], fields: Mapping[str, str], context: Mapping[str, object]) -> Model:
     """Fields of a form as a model; empty ones count as left out.
+
+    Args:
+        context: what the model's own checks go by.
 
     Raises:
         InvalidRequestError: names every field at fault, its value and the limit.
     """
     try:
-        return model.model_validate({name: value for name, value in fields.items() if value.strip()})
+        return model.model_validate({name: value for name, value in fields.items() if value.strip()}, context=context)
     except ValidationError as error:
         raise InvalidRequestError([describe_fault(fault) for fault in error.errors()]) from error
 
 
-def describe_fault(fault: Mapping[str, object]) -> tuple[str, str]:
-    """(field, message) of one of pydantic's faults; the message states the value."""
-    location = fault.get("loc")
-    parts = [str(part) for part in location] if isinstance(location, tuple) else []
-    if parts and parts[0] in ("body", "query", "path"):
-        parts = parts[1:]
-    message = str(fault.get("msg", "invalid"))
-    value = fault.get("input")
-    if fault.get("type") == "missing":
-        message = "is missing"
-    elif isinstance(value, str | int | float):
-        message = f"is '{str(value)[:100]}': {message[:1].lower()}{message[1:]}"
-    return ".".join(parts) or "body", message
+def faults_of(
+    model: type[BaseModel], fields: Mapping[str, str], context: Mapping[str, object]
+) -> list[tuple[str, str]]:
+    """What `validate_fields` would refuse."""
+    try:
+        validate_fields(model, fields, context)
+    except InvalidRequestError as error:
+        return error.faults
+    return []
 
 
 async def _sort(
-    items: list[tuple[str, UploadFile | str]], limits: UploadLimits, files: set[str], fields: set[str]
+    items: list[tuple[str, UploadFile | str]], limits: UploadLimits, files: set[str], fields: set[str], check: Check
 ) -> Parts:
     faults: list[tuple[str, str]] = []
     found = Parts({}, {})
@@ -186,6 +204,7 @@ async def _sort(
             faults.append((shown, "must be a file (a part with a file name)"))
     given = {name for name, _ in items}
     faults.extend((name, "is missing") for name in sorted(files - given))
+    faults.extend(check(found.fields))
     if faults:
         raise InvalidRequestError(faults)
     return found

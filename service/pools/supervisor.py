@@ -203,7 +203,7 @@ class Supervisor:
             if answer is None:
                 self.ready = False
                 self._starts_at = monotonic()
-                ticket.stalled = watchdog.expired
+                ticket.stalled = sent and watchdog.expired
                 ticket.deaths += sent and not watchdog.expired
                 self._queue.give_back(ticket)
                 return "stalled" if watchdog.expired else "died at work" if sent else "died idle"

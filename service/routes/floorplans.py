@@ -7,6 +7,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Request, Response, status
 
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.file_kinds import kind_of
 from lalaloc_core.floorplan import FloorPlan
 from service.errors import (
     IdempotencyInProgressError,
@@ -254,6 +255,9 @@ async def _uploaded_plan(request: Request, runtime: Runtime) -> bytes:
         content = (await read_parts(request, limits, files={_FILE}, fields=set())).files[_FILE]
     if not content.strip():
         raise InvalidFloorPlanError("the body is empty, a floor plan in JSON is needed")
+    kind = kind_of(content)
+    if kind is not None:
+        raise InvalidFloorPlanError(f"this is {kind}, a floor plan in the JSON that /docs shows is needed")
     return content
 
 

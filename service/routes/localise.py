@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from time import monotonic
 from typing import Any
 
@@ -28,7 +29,7 @@ from service.errors import (
 )
 from service.http import IdempotentRequest
 from service.http.problems import problem_responses
-from service.http.uploads import JSON, MULTIPART, UploadLimits, media_type, read_parts, validate_fields
+from service.http.uploads import JSON, MULTIPART, UploadLimits, faults_of, media_type, read_parts, validate_fields
 from service.routes.dependencies import IDEMPOTENCY_KEY, Party, Running, Tenant, plan_for_query
 from service.schemas import LocaliseAnswer, LocaliseForm
 from service.telemetry import note
@@ -87,14 +88,13 @@ async def localise(request: Request, runtime: Running, tenant: Tenant, party: Pa
     clock = StageClock()
     note(request, clock=clock)
     with clock.stage("upload"):
-        parts = await read_parts(request, limits, files={"panorama"}, fields=set(LocaliseForm.model_fields))
+        known, told = set(LocaliseForm.model_fields), {"max_top_k": settings.max_top_k}
+        check = partial(faults_of, LocaliseForm, context=told)
+        parts = await read_parts(request, limits, files={"panorama"}, fields=known, check=check)
     begin = monotonic()
-    form = validate_fields(LocaliseForm, parts.fields)
+    form = validate_fields(LocaliseForm, parts.fields, told)
     if "top_k" not in form.model_fields_set:
         form = form.model_copy(update={"top_k": min(form.top_k, settings.max_top_k)})
-    if form.top_k > settings.max_top_k:
-        fault = f"is {form.top_k}, at most {settings.max_top_k} are allowed (max_top_k)"
-        raise InvalidRequestError([("top_k", fault)])
 
     async def answer() -> Response:
         record = await plan_for_query(tenant, form.floorplan_id, runtime)

@@ -78,6 +78,11 @@ async def get_preview(
     """The plan with the names of its rooms, optionally with a camera drawn in; one SVG unit is one metre."""
     if (x_m is None) != (y_m is None):
         raise InvalidRequestError([("y_m" if y_m is None else "x_m", "is missing; x_m and y_m belong together")])
+    if x_m is None:
+        of_marker = {"heading_deg": heading_deg, "covariance_m2": covariance_m2}
+        faults = [(name, "needs x_m and y_m") for name, value in of_marker.items() if value is not None]
+        if faults:
+            raise InvalidRequestError(faults)
     marker = None
     if x_m is not None and y_m is not None:
         marker = Marker(x_m=x_m, y_m=y_m, heading_deg=heading_deg, covariance_m2=_covariance(covariance_m2))

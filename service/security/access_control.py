@@ -44,7 +44,10 @@ class AccessControl:
 
     def __init__(self, keys: ApiKeys, settings: Settings) -> None:
         self._needs_keys = settings.api_keys
-        self._allow_anonymous = settings.allow_anonymous
+        # A port that is published on this machine alone is reached over an address of a container's network.
+        published_here = settings.published_host is not None and is_local((settings.published_host, 0))
+        self._allow_anonymous = settings.allow_anonymous or published_here
+        self._pages = settings.cors_origin_set
         self._hosts = settings.allowed_host_names
         self._keys = KeyCache(keys, fresh_s=settings.key_cache_s)
         self._rates = RateLimits(settings)
@@ -98,7 +101,7 @@ class AccessControl:
         # Browsers do not ask over Unix sockets; what does, a proxy, names the service as its own clients do.
         if server is not None and server[1] is not None:
             headers = Headers(scope=request.scope)
-            check_origin(request.method, headers.getlist("host"), headers.getlist("origin"), self._hosts)
+            check_origin(request.method, headers.getlist("host"), headers.getlist("origin"), self._hosts, self._pages)
 
     async def _key_of(self, request: Request) -> ApiKey:
         values = Headers(scope=request.scope).getlist("authorization")

@@ -48,21 +48,28 @@ def may_be_named(authority: str, allowed: Set[str] = frozenset()) -> bool:
     return host == "localhost" or is_local((host, 0)) or host in allowed or "*" in allowed
 
 
-def check_origin(method: str, hosts: Sequence[str], origins: Sequence[str], allowed: Set[str] = frozenset()) -> None:
+def check_origin(
+    method: str,
+    hosts: Sequence[str],
+    origins: Sequence[str],
+    allowed: Set[str] = frozenset(),
+    pages: Set[str] = frozenset(),
+) -> None:
     """Refuse what a browser was made to send by a page from elsewhere.
 
     Args:
         hosts: values of `Host`; programs may leave it out, browsers do not.
         origins: values of `Origin`, which browsers send with whatever changes something.
         allowed: names besides this machine's that will do, `*` for any.
+        pages: whole origins whose pages will do as well.
 
     Raises:
         ExposedWithoutKeysError: another name, or a change that a page from elsewhere asked for.
     """
     if not all(may_be_named(host, allowed) for host in hosts):
         raise ExposedWithoutKeysError("to localhost, a loopback address or an allowed name (Host)")
-    pages = [origin.partition("://")[2] for origin in origins]
-    if method in _CHANGING and not all(may_be_named(page, allowed) for page in pages):
+    strange = [origin for origin in origins if origin.lower() not in pages]
+    if method in _CHANGING and not all(may_be_named(origin.partition("://")[2], allowed) for origin in strange):
         raise ExposedWithoutKeysError("from pages of this machine or an allowed name (Origin)")
 
 
@@ -70,14 +77,16 @@ def check_address(host: str, settings: Settings) -> None:
     """Refuse to listen where others could ask without a key.
 
     Args:
-        host: the numeric address that is listened on; `0.0.0.0` and `::` are all of the machine's.
+        host: the numeric address that is listened on; `0.0.0.0` and `::` are all of the machine's. Where the settings
+            say that the port is published on another one, that counts.
 
     Raises:
         ConfigError: not a loopback address, while there are neither keys nor leave to do without.
     """
-    if not settings.api_keys and not settings.allow_anonymous and not is_local((host, 0)):
+    reached = settings.published_host or host
+    if not settings.api_keys and not settings.allow_anonymous and not is_local((reached, 0)):
         raise ConfigError(
-            f"refusing to listen on {host} without API keys: others than this machine could read, change and delete "
+            f"refusing to listen on {reached} without API keys: others than this machine could read, change and delete "
             "every floor plan. Set LALALOC_API_KEYS=on and make keys with `lalaloc-service keys create`, listen on "
             "127.0.0.1, or, where something else decides who gets here, set LALALOC_ALLOW_ANONYMOUS=on"
         )

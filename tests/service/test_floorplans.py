@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 import json
 from pathlib import Path
@@ -63,6 +64,31 @@ def test_coordinates_that_are_not_finite_are_refused(client: httpx.Client, numbe
 def test_a_body_that_is_not_json_is_refused(client: httpx.Client, body: bytes) -> None:
     response = client.post("/floorplans", content=body, headers={"content-type": "application/json"})
     assert_problem(response, 422, "invalid-floorplan")
+
+
+@pytest.mark.parametrize(
+    ("content", "kind"),
+    [
+        (b"%PDF-1.7 ...", "a PDF document"),
+        (b"\x89PNG\r\n\x1a\n...", "a PNG picture"),
+        (b"PK\x03\x04...", "a ZIP archive"),
+        (b'<?xml version="1.0"?><svg xmlns="http://www.w3.org/2000/svg"/>', "an SVG drawing"),
+        (b'{"type": "FeatureCollection", "features": []}', "GeoJSON"),
+    ],
+)
+def test_a_file_of_another_kind_is_told_what_it_is(client: httpx.Client, content: bytes, kind: str) -> None:
+    problem = assert_problem(client.post("/floorplans", files={"file": ("plan", content)}), 422, "invalid-floorplan")
+    assert problem["detail"].startswith(f"this is {kind}, a floor plan in the JSON")
+
+
+@pytest.mark.parametrize("media", ["application/json", "multipart/form-data; boundary=x"])
+def test_a_compressed_body_is_refused_as_such(client: httpx.Client, media: str) -> None:
+    headers = {"content-type": media, "content-encoding": "gzip"}
+    response = client.post("/floorplans", content=gzip.compress(json.dumps(FLAT).encode()), headers=headers)
+    assert "Content-Encoding 'gzip'" in assert_problem(response, 415, "unsupported-media")["detail"]
+    assert response.headers["accept-encoding"] == "identity"
+    plain = {"content-type": "application/json", "content-encoding": "identity"}
+    assert client.post("/floorplans", content=json.dumps(FLAT).encode(), headers=plain).status_code == 201
 
 
 @pytest.mark.parametrize("content_type", ["text/plain", "application/x-www-form-urlencoded", None])

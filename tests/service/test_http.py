@@ -19,7 +19,8 @@ from service.app import create_app
 from service.http.admission import EXEMPT
 from service.openapi import openapi_text
 from service.runtime import Runtime, runtime_of
-from tests.service.conftest import StartApp, assert_problem, localise, serve, upload, wait_for
+from service.settings import Settings
+from tests.service.conftest import FLAT, StartApp, assert_problem, localise, serve, upload, wait_for
 from tests.service.postgres import PostgresServer
 
 ROOT = Path(__file__).parents[2]
@@ -30,6 +31,100 @@ def test_unknown_routes_and_methods_are_problems_too(client: httpx.Client) -> No
     response = client.put("/localise")
     assert_problem(response, 405, "method-not-allowed")
     assert response.headers["allow"] == "POST"
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "faults"),
+    [
+        ("GET", "/floorplans?offset=2&page=1", {"offset": "known are cursor, limit, name", "page": "unknown"}),
+        ("GET", "/floorplans?limit=1&limit=2", {"limit": "given more than once"}),
+        pytest.param("GET", f"/floorplans?limit={'9' * 5000}", {"limit": "too many digits"}, id="digits"),
+        ("POST", "/floorplans?name=x", {"name": "unknown query parameter, there are none"}),
+        ("POST", "/localise?heading_deg=100", {"heading_deg": "unknown query parameter"}),
+        ("DELETE", "/floorplans/PLAN?force=1", {"force": "unknown"}),
+        ("GET", "/floorplans/PLAN/preview.svg?heading_deg=20", {"heading_deg": "needs x_m and y_m"}),
+        (
+            "GET",
+            "/floorplans/PLAN/preview.svg?covariance_m2=1&covariance_m2=0&covariance_m2=1",
+            {"covariance_m2": "x_m"},
+        ),
+        ("GET", "/floorplans/PLAN/mesh.glb?x_m=1", {"x_m": "unknown"}),
+        ("GET", "/limits?verbose=1", {"verbose": "unknown"}),
+        ("GET", "/healthz?verbose=1", {"verbose": "unknown"}),
+        ("GET", "/?plan=1", {"plan": "unknown"}),
+    ],
+)
+def test_a_query_parameter_that_would_be_ignored_is_refused(
+    client: httpx.Client, method: str, path: str, faults: dict[str, str]
+) -> None:
+    url = path.replace("PLAN", upload(client)) if "PLAN" in path else path
+    problem = assert_problem(client.request(method, url), 422, "invalid-request")
+    told = {fault["field"]: fault["message"] for fault in problem["errors"]}
+    assert told.keys() == faults.keys()
+    assert all(faults[name] in told[name] for name in faults)
+
+
+def test_every_get_may_be_a_head(client: httpx.Client) -> None:
+    plan_id = upload(client)
+    paths = [path for path, operations in client.get("/openapi.json").json()["paths"].items() if "get" in operations]
+    assert len(paths) >= 10
+    changing = {"x-request-id", "date", "traceparent", "content-length", "etag"}
+    wait_for(lambda: client.get("/readyz").status_code == 200)
+    for path in [*paths, "/", "/docs", "/web/style.css", "/openapi.json"]:
+        url = path.replace("{floorplan_id}", plan_id)
+        head = client.head(url)
+        assert (head.status_code, head.content) == (200, b""), url
+        if not path.endswith("/events"):
+            get = client.get(url)
+            assert {name: head.headers[name] for name in head.headers if name not in changing} == {
+                name: get.headers[name] for name in get.headers if name not in changing
+            }
+    assert client.head("/floorplans/none").status_code == 404
+    assert client.head("/no/such/route").status_code == 404
+    refused = client.head("/localise")
+    assert (refused.status_code, refused.headers["allow"], refused.content) == (405, "POST", b"")
+    assert client.delete("/floorplans").headers["allow"].split(", ") == ["GET", "POST", "HEAD"]
+
+
+def test_a_head_of_events_holds_no_stream(client: httpx.Client) -> None:
+    hall = {"ceiling_height_m": 3.0, "rooms": [{"polygon": [[0, 0], [60, 0], [60, 60], [0, 60]]}]}
+    plan_id = upload(client, hall, wait=False)
+    head = client.head(f"/floorplans/{plan_id}/events")
+    assert head.headers["content-type"].startswith("text/event-stream")
+    wait_for(lambda: "lalaloc_streams 0.0" in client.get("/metrics").text, 5.0)
+    assert client.delete(f"/floorplans/{plan_id}").status_code == 204
+
+
+PAGE = {"Origin": "https://plans.example"}
+PREFLIGHT = {"Access-Control-Request-Method": "POST", "Access-Control-Request-Headers": "authorization,idempotency-key"}
+
+
+def test_pages_of_other_sites_are_told_nothing_unless_they_are_named(
+    client: httpx.Client, start_app: StartApp, tmp_path: Path
+) -> None:
+    assert "access-control-allow-origin" not in client.get("/floorplans", headers=PAGE).headers
+    assert client.options("/localise", headers=PAGE | PREFLIGHT).status_code == 405
+    with start_app(tmp_path, cors_origins="https://plans.example, http://localhost:3000") as named:
+        for answer in (named.get("/floorplans", headers=PAGE), named.get("/floorplans/none", headers=PAGE)):
+            assert answer.headers["access-control-allow-origin"] == "https://plans.example"
+            assert "Origin" in answer.headers["vary"]
+            assert "access-control-allow-credentials" not in answer.headers
+        assert named.post("/floorplans", json=FLAT, headers=PAGE).status_code == 201
+        preflight = named.options("/localise", headers=PAGE | PREFLIGHT)
+        assert preflight.status_code == 200
+        assert "POST" in preflight.headers["access-control-allow-methods"]
+        assert "access-control-allow-credentials" not in preflight.headers
+        other = {"Origin": "https://evil.example"}
+        assert "access-control-allow-origin" not in named.get("/floorplans", headers=other).headers
+        assert named.post("/floorplans", json=FLAT, headers=other).status_code == 403
+        assert named.options("/localise", headers=other | PREFLIGHT).status_code == 400
+
+
+@pytest.mark.parametrize("origins", ["plans.example", "https://plans.example/", "https://*.example", "null", "* "])
+def test_origins_that_could_never_match_or_let_everybody_change_plans_are_refused(origins: str) -> None:
+    with pytest.raises(ValueError, match=r"neither an origin such as|needs LALALOC_API_KEYS=on"):
+        Settings(cors_origins=origins)
+    Settings(cors_origins="*", api_keys=True)
 
 
 def test_an_unexpected_error_tells_nothing_but_the_request_id() -> None:
@@ -83,6 +178,7 @@ def test_reads_that_wait_do_not_hold_up_health(start_app: StartApp, postgres: Po
         ThreadPoolExecutor(60) as readers,
         postgres.locked(url, "floorplans"),
     ):
+        wait_for(lambda: client.get("/readyz").status_code == 200)
         for _ in range(60):
             readers.submit(client.get, "/floorplans")
         end = monotonic() + 3.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import shutil
 import struct
 import threading
@@ -113,19 +114,20 @@ BAD_FIELDS = {
     "heading not a number": ({"heading_deg": "nan"}, "heading_deg", "finite"),
     "heading infinite": ({"heading_deg": "-inf"}, "heading_deg", "finite"),
     "heading too large": ({"heading_deg": "360.1"}, "heading_deg", "360"),
-    "heading a word": ({"heading_deg": "north"}, "heading_deg", "north"),
+    "heading a word": ({"heading_deg": "north"}, "heading_deg", "is 'north': not a number"),
     "heading with underscore": ({"heading_deg": "1_0"}, "heading_deg", "1_0"),
     "no candidates": ({"top_k": "0"}, "top_k", "1"),
     "too many candidates": ({"top_k": "11"}, "top_k", "10"),
-    "half a candidate": ({"top_k": "2.5"}, "top_k", "2.5"),
+    "far too many candidates": ({"top_k": "1000"}, "top_k", "is '1000': at most 10 are allowed (max_top_k)"),
+    "half a candidate": ({"top_k": "2.5"}, "top_k", "is '2.5': not a whole number"),
     "unknown stage": ({"refine": "magic"}, "refine", "'lpo'"),
     "tolerance without heading": ({"heading_tolerance_deg": "5"}, "heading_tolerance_deg", "heading_deg"),
     "tolerance negative": ({"heading_deg": "1", "heading_tolerance_deg": "-1"}, "heading_tolerance_deg", "0"),
     "tolerance too large": ({"heading_deg": "1", "heading_tolerance_deg": "46"}, "heading_tolerance_deg", "45"),
     "tolerance not a number": ({"heading_deg": "1", "heading_tolerance_deg": "nan"}, "heading_tolerance_deg", "finite"),
-    "camera in the floor": ({"camera_height_m": "0"}, "camera_height_m", "greater than or equal to 0.1"),
-    "camera height in another unit": ({"camera_height_m": "1e-9"}, "camera_height_m", "is '1e-9': input should be"),
-    "camera height of hardly anything": ({"camera_height_m": "1e-50"}, "camera_height_m", "equal to 0.1"),
+    "camera in the floor": ({"camera_height_m": "0"}, "camera_height_m", "must be at least 0.1"),
+    "camera height in another unit": ({"camera_height_m": "1e-9"}, "camera_height_m", "is '1e-9': must be at least"),
+    "camera height of hardly anything": ({"camera_height_m": "1e-50"}, "camera_height_m", "must be at least 0.1"),
     "camera height not a number": ({"camera_height_m": "nan"}, "camera_height_m", "finite"),
     "unknown field": ({"headng_deg": "90"}, "headng_deg", "heading_deg"),
     "empty plan id": ({"floorplan_id": ""}, "floorplan_id", "missing"),
@@ -141,6 +143,15 @@ def test_a_bad_field_is_refused_by_name_value_and_limit(
     )
     faults = {fault["field"]: fault["message"] for fault in assert_problem(response, 422, "invalid-request")["errors"]}
     assert message in faults[name]
+    assert not re.search("string|float|integer|parse|None|sys", faults[name])
+
+
+def test_everything_that_is_wrong_with_a_form_is_told_at_once(client: httpx.Client, panorama: bytes) -> None:
+    fields = {"headng_deg": "1", "heading_deg": "361", "top_k": "1000", "camera_height_m": "nan", "refine": "all"}
+    response = client.post("/localise", data=fields, files={"picture": ("p.jpg", panorama)})
+    faults = [fault["field"] for fault in assert_problem(response, 422, "invalid-request")["errors"]]
+    expected = {"headng_deg", "picture", "panorama", "floorplan_id"} | (fields.keys() - {"headng_deg"})
+    assert sorted(faults) == sorted(expected)
 
 
 def test_an_empty_optional_field_counts_as_left_out(client: httpx.Client, flat: str, panorama: bytes) -> None:

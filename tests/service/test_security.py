@@ -552,9 +552,17 @@ def test_loopback_and_unix_sockets_are_local(server: tuple[str, int | None] | No
     assert is_local(server) == local
 
 
-@pytest.mark.parametrize(("allowed", "status"), [(False, 403), (True, 200)])
+@pytest.mark.parametrize(
+    ("told", "status"),
+    [
+        ({}, 403),
+        ({"published_on": "0.0.0.0:8000"}, 403),
+        ({"published_on": "127.0.0.1:8000"}, 200),
+        ({"allow_anonymous": True}, 200),
+    ],
+)
 def test_without_keys_others_than_this_machine_are_refused_unless_told_otherwise(
-    tiny_bundle: Path, database_of: DatabaseOf, tmp_path: Path, allowed: bool, status: int
+    tiny_bundle: Path, database_of: DatabaseOf, tmp_path: Path, told: dict[str, Any], status: int
 ) -> None:
     settings = Settings(
         data_dir=tmp_path,
@@ -562,7 +570,7 @@ def test_without_keys_others_than_this_machine_are_refused_unless_told_otherwise
         bundle=tiny_bundle,
         workers=0,
         log_level="error",
-        allow_anonymous=allowed,
+        **told,
     )
     app = create_app(settings)
 
@@ -576,9 +584,9 @@ def test_without_keys_others_than_this_machine_are_refused_unless_told_otherwise
         for path in ("/", "/docs", "/openapi.json", "/metrics", "/limits", "/floorplans"):
             response = client.get(path)
             assert response.status_code == status
-            if not allowed:
+            if status == 403:
                 assert_problem(response, 403, "exposed-without-keys")
-        assert client.post("/floorplans", json=FLAT).status_code == (201 if allowed else 403)
+        assert client.post("/floorplans", json=FLAT).status_code == (201 if status == 200 else 403)
 
 
 @pytest.mark.parametrize(
@@ -650,6 +658,14 @@ def anonymous(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> 
         ("10.1.2.3", {}, True),
         ("0.0.0.0", {"api_keys": True}, False),
         ("0.0.0.0", {"allow_anonymous": True}, False),
+        # What a container listens on is all of its own addresses; what counts is where they are to be had.
+        ("0.0.0.0", {"published_on": "127.0.0.1:8000"}, False),
+        ("0.0.0.0", {"published_on": "[::1]:8000"}, False),
+        ("0.0.0.0", {"published_on": "0.0.0.0:8000"}, True),
+        ("0.0.0.0", {"published_on": "8000"}, True),
+        ("0.0.0.0", {"published_on": "192.0.2.1:80"}, True),
+        ("0.0.0.0", {"published_on": "0.0.0.0:8000", "api_keys": True}, False),
+        ("0.0.0.0", {"published_on": "0.0.0.0:8000", "allow_anonymous": True}, False),
     ],
 )
 def test_an_address_for_others_is_refused_without_keys(host: str, settings: dict[str, Any], refused: bool) -> None:

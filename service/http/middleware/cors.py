@@ -1,0 +1,51 @@
+"""CORS: which pages of other sites may ask from a browser, where the settings name any."""
+
+from __future__ import annotations
+
+from starlette.middleware.cors import CORSMiddleware
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+_METHODS = ("GET", "HEAD", "POST", "PUT", "DELETE")
+_SENT = (
+    "Authorization",
+    "Content-Type",
+    "Idempotency-Key",
+    "If-Match",
+    "If-None-Match",
+    "X-Request-ID",
+    "traceparent",
+)
+_ANSWERED = ("ETag", "Idempotency-Replayed", "Location", "Retry-After", "X-Request-ID")
+_PREFLIGHT_KEPT_S = 600
+
+
+class CorsMiddleware:
+    """The framework's own, once the running app has settings that say for whom.
+
+    Never with credentials: keys are sent as a header by whoever has them, and there are no cookies that a browser could
+    add by itself.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+        self._cors: tuple[frozenset[str], CORSMiddleware] | None = None
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle one request."""
+        origins: frozenset[str] = getattr(scope["app"].state, "cors_origins", frozenset())
+        if scope["type"] != "http" or not origins:
+            await self._app(scope, receive, send)
+            return
+        if self._cors is None or self._cors[0] != origins:
+            self._cors = (
+                origins,
+                CORSMiddleware(
+                    self._app,
+                    allow_origins=sorted(origins),
+                    allow_methods=_METHODS,
+                    allow_headers=_SENT,
+                    expose_headers=_ANSWERED,
+                    max_age=_PREFLIGHT_KEPT_S,
+                ),
+            )
+        await self._cors[1](scope, receive, send)
