@@ -17,11 +17,11 @@ from lalaloc_core.report.pictures import PREDICTED_COLOUR, TRUE_COLOUR, Stroke, 
 from lalaloc_core.report.sheets import Thumbnail, draw_sheet
 
 _HEIGHT, _WIDTH = 256, 512
-_CLASS_COLOURS = {"door": "#ff9f0a", "window": "#2f7bff", "passage": "#2bd158"}
+CLASS_COLOURS = {"door": "#ff9f0a", "window": "#2f7bff", "passage": "#2bd158"}
 # Rows (pixels) of the bars that show the classes along the top of a picture: the true ones, the predicted ones.
 _TRUE_BAR, _PREDICTED_BAR, _BAR_WIDTH = 4.0, 13.0, 6.0
 _KEY = {TRUE_COLOUR: "annotated walls", PREDICTED_COLOUR: "predicted walls"} | {
-    colour: f"{name} (annotated above predicted)" for name, colour in _CLASS_COLOURS.items()
+    colour: f"{name} (annotated above predicted)" for name, colour in CLASS_COLOURS.items()
 }
 
 
@@ -73,9 +73,7 @@ def _bars(classes: Int[np.ndarray, "w"], row: float) -> list[Stroke]:
     """A bar for every stretch of columns of one class, along a row of the picture; walls have none."""
     edges = [0, *(np.flatnonzero(np.diff(classes)) + 1).tolist(), len(classes)]
     return [
-        Stroke(
-            [np.array([[first, row], [last, row]])], _CLASS_COLOURS[OPENING_CLASSES[classes[first]]], _BAR_WIDTH, 8.0
-        )
+        Stroke([np.array([[first, row], [last, row]])], CLASS_COLOURS[OPENING_CLASSES[classes[first]]], _BAR_WIDTH, 8.0)
         for first, last in pairwise(edges)
         if classes[first]
     ]

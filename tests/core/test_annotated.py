@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import shapely
-from PIL import Image
+from PIL import Image, ImageColor
 
 from lalaloc_core.azimuths import QUANTILES, measure_azimuths, score_classes, summarise_azimuths
 from lalaloc_core.cli import main
@@ -21,12 +21,14 @@ from lalaloc_core.data.opening import open_dataset
 from lalaloc_core.data.room_gallery import GALLERY_ROOMS, build_gallery
 from lalaloc_core.errors import DatasetError, InvalidInputError
 from lalaloc_core.evaluation.galleries import answers_in_galleries, describe_answers, score_galleries
-from lalaloc_core.evaluation.photograph_reading import read_photographs
+from lalaloc_core.evaluation.photograph_reading import ReadPhotograph, read_photographs
 from lalaloc_core.evaluation.predictions import Pose, Prediction
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.render.layout import layout_view
 from lalaloc_core.render.profile import wall_profile
-from lalaloc_core.report.photographs import FIGURES_FILE, SHEET_FILE, evaluate_photographs
+from lalaloc_core.report.photograph_sheet import CLASS_COLOURS, draw_photographs
+from lalaloc_core.report.photographs import FIGURES_FILE, SHEET_FILE, PhotographResults, evaluate_photographs
+from lalaloc_core.report.tables import percent
 
 REAL = Path(__file__).parents[3] / "shared" / "real" / "annotated"
 WIDTH = 256
@@ -381,6 +383,28 @@ class TestEvaluating:
             # One ray at a time, by turning a camera of one column.
             true_m = [wall_profile(np.zeros((1, 2)), np.array([a]), walls, 1)[0, 0] for a in azimuth]
             assert np.allclose(read.measures.log_error, np.log(profile_m) - np.log(true_m), atol=1e-5)
+
+    def test_predicted_openings_are_told_and_drawn_below_the_annotated_ones(self, root: Path) -> None:
+        one = read_annotation(root / "hall.json")
+        truth = one.classes(128)
+        # What is annotated as a door is predicted as a window.
+        scores = np.eye(len(OPENING_CLASSES))[np.where(truth == OPENING_CLASSES.index("door"), 2, truth)]
+        profile_m = one.profile_m(0, 128)
+        measures = measure_azimuths([profile_m], np.log(profile_m), np.full(128, -3.0), truth, scores)
+        read = ReadPhotograph(photograph=one, profile_m=profile_m, class_scores=scores, measures=measures)
+        told = PhotographResults(read=[read], answers={}).markdown()
+        assert (
+            f"{percent(2 / 3)} (walls {percent(1.0)} found, {percent(1.0)} right; doors {percent(0.0)} found, –" in told
+        )
+        sheet = np.asarray(draw_photographs("one", [read], {}))
+        colours = {kind: np.array(ImageColor.getrgb(colour)) for kind, colour in CLASS_COLOURS.items()}
+        picture = sheet[26 : 26 + 256, 8 : 8 + 512].astype(int)
+        # The door is seen behind the camera, at the picture's border; the window from its middle on.
+        annotated, predicted = picture[4], picture[13]
+        assert np.abs(annotated[3] - colours["door"]).max() < 30
+        assert np.abs(predicted[3] - colours["window"]).max() < 30
+        assert np.abs(annotated[290] - colours["window"]).max() < 30
+        assert np.abs(predicted[290] - colours["window"]).max() < 30
 
     def test_one_command_prints_measures_and_draws(
         self, root: Path, tiny_bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
