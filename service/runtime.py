@@ -97,7 +97,6 @@ def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack) 
     if settings.otlp_endpoint is not None:
         telemetry.tracing = kept(Tracing(otlp_exporter(settings.otlp_endpoint), __version__))
     bundle = Bundle.open(settings.bundle)
-    telemetry.describe_build(__version__, bundle.manifest.name, bundle.manifest.version, bundle.sha256)
     store = kept(open_store(settings))
     access_control = kept(AccessControl(store.keys, settings))
     # The pool first: loading torch in the workers overlaps with loading the model here.
@@ -105,8 +104,7 @@ def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack) 
     pool.start()
     decoder = kept(Decoder(bundle.manifest, settings, telemetry))
     decoder.start()
-    encoders = Encoders(bundle, threads=settings.cores.onnx_threads)
-    _warm_up(encoders)
+    encoders = _warm_encoders(bundle, settings)
     grids = kept(Grids(store, encoders, bundle.sha256, settings, telemetry))
     admission = Admission(AdmissionLimits.of(settings), telemetry)
     reads = kept(
@@ -129,13 +127,9 @@ def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack) 
     plan_cache = PlanCache(store, limit_bytes=settings.plan_cache_bytes, max_age_s=settings.plan_cache_age_s)
     sweeper = kept(Sweeper(store, grids, plan_cache, sweep_s=settings.sweep_s))
     sweeper.start()
-    # Their callers' keys are looked at again as often.
-    heartbeat_s = max(min(settings.key_cache_s, HEARTBEAT_S), _SOONEST_S) if settings.api_keys else HEARTBEAT_S
     # One look at a time, which takes no thread from queries while the database is silent.
     looks = kept(BoundedReads(threads=1, max_pending=1, wait_s=settings.database_wait_s))
-    events = PlanEvents(store, grids, admission, looks, max_s=settings.stream_deadline_s, heartbeat_s=heartbeat_s)
-    fields = {"model": bundle.manifest.name, "sha256": bundle.sha256, "grids_to_compute": grids.preparing}
-    logging.getLogger(LOGGER_NAME).info("service started", extra={"fields": fields})
+    _tell_start(bundle, grids, telemetry)
     return Runtime(
         settings=settings,
         telemetry=telemetry,
@@ -147,7 +141,7 @@ def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack) 
         localiser=localiser,
         admission=admission,
         access_control=access_control,
-        events=events,
+        events=_plan_events(store, grids, admission, looks, settings),
         uploads=uploads,
         reads=reads,
         drawings=kept(Drawings(limit_bytes=_DRAWINGS_BYTES, max_waiting=_MAX_DRAWN)),
@@ -162,9 +156,26 @@ async def runtime_of(request: Request) -> Runtime:
     return request.app.state.runtime
 
 
-def _warm_up(encoders: Encoders) -> None:
-    """Run every network once; the first run allocates."""
+def _plan_events(
+    store: Store, grids: Grids, admission: Admission, looks: BoundedReads, settings: Settings
+) -> PlanEvents:
+    # Their callers' keys are looked at again as often.
+    heartbeat_s = max(min(settings.key_cache_s, HEARTBEAT_S), _SOONEST_S) if settings.api_keys else HEARTBEAT_S
+    return PlanEvents(store, grids, admission, looks, max_s=settings.stream_deadline_s, heartbeat_s=heartbeat_s)
+
+
+def _tell_start(bundle: Bundle, grids: Grids, telemetry: Telemetry) -> None:
+    manifest = bundle.manifest
+    telemetry.describe_build(__version__, manifest.name, manifest.version, bundle.sha256)
+    fields = {"model": manifest.name, "sha256": bundle.sha256, "grids_to_compute": grids.preparing}
+    logging.getLogger(LOGGER_NAME).info("service started", extra={"fields": fields})
+
+
+def _warm_encoders(bundle: Bundle, settings: Settings) -> Encoders:
+    """The networks, each of which has run once; the first run allocates."""
+    encoders = Encoders(bundle, threads=settings.cores.onnx_threads)
     manifest = encoders.manifest
     image = np.zeros((manifest.image_height, manifest.image_width, 3), np.uint8)
     encoders.query(image, None, 1.5)
     encoders.layouts(np.full((1, manifest.profile_columns), 2.0), np.array([1.5]), np.array([2.5]))
+    return encoders

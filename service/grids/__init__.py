@@ -1,11 +1,12 @@
 """Latent grids of plans: found in memory or in the store, computed by one replica for all of them.
 
-Begin with `grids.py`, which everybody else asks. `jobs.py` is the queue of grids to compute, `embedding.py` computes
-one, `throttle.py` lets queries go first, and `sweeper.py` looks after what other replicas did.
+Begin with `grids.py`, which everybody else asks. `builder.py` computes what `jobs.py` queues, under
+leases; `throttle.py` lets queries go first, and `sweeper.py` looks after what other replicas did.
 """
 
-from service.grids.grids import Grids, GridState
+from service.grids.grids import Grids
 from service.grids.heights import query_height_m
+from service.grids.state import GridState
 from service.grids.sweeper import Sweeper
 
 __all__ = ["GridState", "Grids", "Sweeper", "query_height_m"]

@@ -1,4 +1,4 @@
-"""Computes a latent grid in chunks."""
+"""Computes a latent grid in chunks, and says how large it will be."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from lalaloc_core.errors import InvalidPoseError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.poses import LatentGrid
-from lalaloc_core.sampling import PoseSet, pose_grid
+from lalaloc_core.sampling import PoseSet, grid_size, pose_grid
+from service.errors import PlanTooLargeError
+from service.settings import Settings
 
 # Rays times walls that are cast at once: bounds the memory of a plan with rooms of many corners.
 _CAST_AT_ONCE = 2_000_000
@@ -49,6 +51,17 @@ def embed(
         profiles_m.append(profile_m.astype(np.float32, copy=False))
         after_chunk(min(first + chunk, len(poses)) / len(poses), perf_counter() - begin)
     return LatentGrid(poses, np.concatenate(latents), np.concatenate(profiles_m), step_m, camera_height_m)
+
+
+def check_size(plan: FloorPlan, settings: Settings) -> None:
+    """Refuse a plan whose grid would be too large.
+
+    Raises:
+        PlanTooLargeError: states the estimated number of poses and the limit.
+    """
+    estimate = grid_size(plan, settings.grid_step_m)
+    if estimate > settings.max_grid_poses:
+        raise PlanTooLargeError(estimate, settings.max_grid_poses, settings.grid_step_m)
 
 
 def grid_bytes(grid: LatentGrid) -> int:

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import re
-from time import monotonic
 from typing import Annotated, Any
 
 from fastapi import Depends, Request
 
-from service.errors import StoreUnavailableError, UnknownFloorPlanError
+from service.errors import UnknownFloorPlanError
 from service.http.idempotency import HEADER, MAX_KEY_CHARACTERS
 from service.runtime import Runtime, runtime_of
 from service.security import caller_of
-from service.storage import PlanCache
 from service.storage.plans import Plans
 from service.storage.records import PlanRecord, PlanSummary
 
@@ -33,7 +31,7 @@ Tenant = Annotated[str, Depends(_tenant_of)]
 Party = Annotated[str, Depends(_party_of)]
 
 
-def stored_plan(tenant: str, floorplan_id: str, plans: Plans | PlanCache) -> PlanRecord:
+def stored_plan(tenant: str, floorplan_id: str, plans: Plans) -> PlanRecord:
     """A stored plan of a tenant.
 
     Raises:
@@ -66,21 +64,10 @@ async def plan_for_query(tenant: str, floorplan_id: str, runtime: Runtime) -> Pl
         UnknownFloorPlanError: there is none.
         StoreUnavailableError: the database is away, and the plan was not read lately; or too many use it.
     """
-    begin_s = monotonic()
-    known = runtime.plan_cache.during_outage(tenant, floorplan_id)
-    if known is not None:
-        return known
-    try:
-        return await runtime.reads.run(stored_plan, tenant, floorplan_id, runtime.plan_cache)
-    except StoreUnavailableError:
-        if runtime.store.answered_since(begin_s):
-            # It is there, and the plan may be gone.
-            raise
-        runtime.plan_cache.note_outage()
-        known = runtime.plan_cache.during_outage(tenant, floorplan_id)
-        if known is None:
-            raise
-        return known
+    record = await runtime.plan_cache.find(tenant, floorplan_id, runtime.reads) if is_id(floorplan_id) else None
+    if record is None:
+        raise UnknownFloorPlanError(floorplan_id)
+    return record
 
 
 def is_id(text: str) -> bool:

@@ -1,4 +1,4 @@
-"""Plans as queries need them: read anew for each one, and from memory while the database is away."""
+"""Plans as queries need them: read anew for each one, and from memory while the database is away or silent."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from service.lru import BoundedCache
 from service.storage.plans import plan_bytes
 from service.storage.records import PlanRecord
 from service.storage.store import Store
+from service.threads import BoundedReads
 
 # After a failure the database is left alone for so long by queries that can be answered without it.
 _LEFT_ALONE_S = 1.0
@@ -37,7 +38,7 @@ class PlanCache:
             StoreUnavailableError: the database is away, and the plan was not read lately.
             StoreBusyError: too many use it.
         """
-        if (known := self.during_outage(tenant, plan_id)) is not None:
+        if (known := self._during_outage(tenant, plan_id)) is not None:
             return known
         key = (tenant, plan_id)
         try:
@@ -46,7 +47,7 @@ class PlanCache:
             # It is there, and the plan may be gone.
             raise
         except StoreUnavailableError:
-            self.note_outage()
+            self._note_outage()
             known = self._lately(key)
             if known is None:
                 raise
@@ -57,13 +58,25 @@ class PlanCache:
             self._known.put(key, (record, monotonic()))
         return record
 
-    def during_outage(self, tenant: str, plan_id: str) -> PlanRecord | None:
-        """A plan that was read lately, if the database was away a moment ago; from memory, at once."""
-        return self._lately((tenant, plan_id)) if monotonic() < self._away_until else None
+    async def find(self, tenant: str, plan_id: str, reads: BoundedReads) -> PlanRecord | None:
+        """As `get`, for whoever must not wait for a database that is silent instead of failing.
 
-    def note_outage(self) -> None:
-        """The database does not answer: leave it alone for a moment."""
-        self._away_until = monotonic() + _LEFT_ALONE_S
+        Args:
+            reads: where the database is asked.
+        """
+        if (known := self._during_outage(tenant, plan_id)) is not None:
+            return known
+        begin_s = monotonic()
+        try:
+            return await reads.run(self.get, tenant, plan_id)
+        except StoreUnavailableError:
+            if self._store.answered_since(begin_s):
+                # It is there, and the plan may be gone.
+                raise
+            self._note_outage()
+            if (known := self._during_outage(tenant, plan_id)) is None:
+                raise
+            return known
 
     def revisions(self) -> set[str]:
         """The revisions in memory."""
@@ -72,6 +85,14 @@ class PlanCache:
     def drop(self, revision_ids: set[str]) -> None:
         """Forget plans at revisions that are gone."""
         self._known.drop(lambda _, entry: entry[0].revision_id in revision_ids)
+
+    def _during_outage(self, tenant: str, plan_id: str) -> PlanRecord | None:
+        """A plan that was read lately, if the database was away a moment ago; from memory, at once."""
+        return self._lately((tenant, plan_id)) if monotonic() < self._away_until else None
+
+    def _note_outage(self) -> None:
+        """The database does not answer: leave it alone for a moment."""
+        self._away_until = monotonic() + _LEFT_ALONE_S
 
     def _lately(self, key: tuple[str, str]) -> PlanRecord | None:
         entry = self._known.get(key)

@@ -1,0 +1,179 @@
+"""Computes the grids that are queued, each under its lease, and stores them."""
+
+from __future__ import annotations
+
+import logging
+import uuid
+from time import monotonic
+
+from lalaloc_core.errors import LaLaLocError
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.poses import LatentGrid
+from service.errors import (
+    PlanFailedError,
+    PlanNotReadyError,
+    StoppingError,
+    StoreUnavailableError,
+    UnknownFloorPlanError,
+)
+from service.grids.cache import GridCache
+from service.grids.embedding import check_size, embed
+from service.grids.jobs import Job, Jobs
+from service.grids.leases import LeaseHeartbeat, LeaseLostError
+from service.grids.throttle import BackgroundThrottle
+from service.settings import Settings
+from service.storage import Store
+from service.storage.records import millimetres
+from service.telemetry import LOGGER_NAME, Telemetry
+
+# How long a finished grid is kept at hand while the database is away.
+_KEEP_TRYING_S, _TRY_EVERY_S = 60.0, 1.0
+# Not failures of the plan.
+_ABANDONED = (UnknownFloorPlanError, PlanNotReadyError, StoppingError, StoreUnavailableError)
+# Progress is told, and the lease renewed, so many times while it lasts.
+_HEARTBEATS = 8.0
+# So many replicas, or lives of one, may begin a grid without any of them finishing it.
+_MAX_ATTEMPTS = 5
+
+
+class GridBuilder:
+    """One thread that sees grids through.
+
+    Attributes:
+        jobs: what it works on.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        encoders: Encoders,
+        cache: GridCache,
+        throttle: BackgroundThrottle,
+        settings: Settings,
+        telemetry: Telemetry,
+    ) -> None:
+        """Start the thread.
+
+        Args:
+            cache: where finished grids are kept at hand.
+            throttle: lets queries go first.
+        """
+        self._store = store
+        self._encoders = encoders
+        self._cache = cache
+        self._throttle = throttle
+        self._settings = settings
+        self._telemetry = telemetry
+        self._owner = uuid.uuid4().hex
+        # Of the jobs that are being computed, all by the one thread of `Jobs`.
+        self._heartbeats: list[LeaseHeartbeat] = []
+        self.jobs = Jobs(self._work)
+
+    def _work(self, job: Job) -> None:
+        """See a job through; whatever happens ends up in its future, unless another replica is at it."""
+        try:
+            outcome = self._cache.load(job.key) or self._compute(job)
+        except LeaseLostError:
+            job.remote = True
+            return
+        except Exception as error:
+            outcome = error
+            self._note_failure(job, error)
+        self.jobs.end(job, outcome)
+
+    def _compute(self, job: Job) -> LatentGrid:
+        if job.cancelled.is_set():
+            raise self._why_cancelled(job)
+        record = self._store.plans.by_revision(job.key.revision_id)
+        if record is None:
+            raise UnknownFloorPlanError(job.plan_id)
+        check_size(record.plan, self._settings)
+        attempts = self._store.leases.claim(job.key, self._owner, self._settings.grid_lease_s)
+        if attempts is None:
+            raise LeaseLostError
+        # Whoever had the lease until now may have finished.
+        grid = self._cache.load(job.key)
+        if grid is not None:
+            self._store.leases.release(job.key, self._owner)
+            return grid
+        if attempts > _MAX_ATTEMPTS:
+            reason = f"its latent grid was begun {_MAX_ATTEMPTS} times and never finished"
+            raise PlanFailedError(job.plan_id, reason)
+        with self._telemetry.timed(self._telemetry.grid_seconds):
+            grid = self._embed(job, record.plan)
+        if not self._put(job, grid, always_keep_mm=millimetres(record.plan.camera_height_m)):
+            raise UnknownFloorPlanError(job.plan_id)
+        self._cache.put(job.key, grid)
+        return grid
+
+    def _embed(self, job: Job, plan: FloorPlan) -> LatentGrid:
+        heartbeat = LeaseHeartbeat(lambda: self._renew(job), self._settings.grid_lease_s / _HEARTBEATS)
+
+        def after_chunk(progress: float, worked_s: float) -> None:
+            job.progress = progress
+            # A small grid may be computed between two chunks of a large one, whose lease must last meanwhile.
+            for other in self._heartbeats:
+                other.beat()
+            if heartbeat.lost:
+                # Leases go with their plans; if this one has, the job fails when it is looked at again.
+                raise LeaseLostError
+            if progress < 1.0:
+                self.jobs.preempt(job)
+                self._throttle.pause(worked_s)
+            if job.cancelled.is_set():
+                raise self._why_cancelled(job)
+
+        height_m = job.key.camera_height_m
+        self._heartbeats.append(heartbeat)
+        try:
+            return embed(plan, self._encoders, step_m=job.key.step_m, camera_height_m=height_m, after_chunk=after_chunk)
+        finally:
+            self._heartbeats.pop()
+
+    def _why_cancelled(self, job: Job) -> Exception:
+        if self.jobs.closing.is_set():
+            return StoppingError()
+        if not self._store.plans.is_kept(job.key.revision_id):
+            return UnknownFloorPlanError(job.plan_id)
+        # The plan has another revision by now, which the next query finds.
+        return PlanNotReadyError(job.plan_id, 0.0, 0.0)
+
+    def _renew(self, job: Job) -> bool:
+        try:
+            return self._store.leases.renew(job.key, self._owner, self._settings.grid_lease_s, job.progress)
+        except StoreUnavailableError:
+            # Nobody else can take the lease meanwhile either.
+            return True
+
+    def _put(self, job: Job, grid: LatentGrid, *, always_keep_mm: int) -> bool:
+        """Store a grid; it may have taken minutes, so a database that is away for a moment is waited for."""
+        give_up_at = monotonic() + _KEEP_TRYING_S
+        while True:
+            try:
+                keep = self._settings.max_grids_per_plan
+                return self._store.grids.put(job.key, grid, keep=keep, always_keep_mm=always_keep_mm)
+            except StoreUnavailableError:
+                if monotonic() > give_up_at or job.cancelled.wait(_TRY_EVERY_S):
+                    raise
+
+    def _note_failure(self, job: Job, error: Exception) -> None:
+        logger = logging.getLogger(LOGGER_NAME)
+        if isinstance(error, _ABANDONED):
+            logger.info("latent grid abandoned", extra={"fields": {"floorplan": job.plan_id, "reason": str(error)}})
+        else:
+            logger.error("latent grid failed", exc_info=error, extra={"fields": {"floorplan": job.plan_id}})
+        try:
+            if not job.on_demand and not isinstance(error, _ABANDONED):
+                self._store.plans.set_failure(job.key.revision_id, _reason(error))
+            self._store.leases.release(job.key, self._owner)
+        except Exception:
+            # The lease runs out, and whoever takes it over fails in the same way.
+            logger.exception("cannot record the failure", extra={"fields": {"floorplan": job.plan_id}})
+
+
+def _reason(error: Exception) -> str:
+    """Why a grid failed, in a text that is fit for users: that of errors which are raised on purpose."""
+    if isinstance(error, PlanFailedError):
+        return error.reason
+    return str(error) if isinstance(error, LaLaLocError) else "internal error"

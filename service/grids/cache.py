@@ -1,0 +1,57 @@
+"""Latent grids in memory, before those in the store."""
+
+from __future__ import annotations
+
+import threading
+
+from lalaloc_core.localise.poses import LatentGrid
+from service.grids.embedding import grid_bytes
+from service.lru import BoundedCache
+from service.storage import Store
+from service.storage.records import GridKey
+from service.telemetry import Telemetry
+
+
+class GridCache(BoundedCache[GridKey, LatentGrid]):
+    """Finds grids that were computed before; safe to share between threads."""
+
+    def __init__(self, store: Store, limit_bytes: int, telemetry: Telemetry) -> None:
+        super().__init__(limit_bytes, grid_bytes)
+        self._store = store
+        self._telemetry = telemetry
+        self._loading = threading.Lock()
+
+    def cached(self, key: GridKey) -> LatentGrid | None:
+        """A grid that is in memory."""
+        grid = self.get(key)
+        if grid is not None:
+            self._telemetry.grid_cache_hits.inc()
+        return grid
+
+    def find(self, key: GridKey) -> LatentGrid | None:
+        """A grid from memory or from the store.
+
+        Raises:
+            StoreUnavailableError: it is not in memory, and the database is away.
+        """
+        grid = self.cached(key)
+        if grid is not None:
+            return grid
+        self._telemetry.grid_cache_misses.inc()
+        return self.load(key)
+
+    def load(self, key: GridKey) -> LatentGrid | None:
+        """As `find`, without counting; one at a time, so that many queries for one plan read it once."""
+        with self._loading:
+            grid = self.get(key)
+            if grid is None:
+                grid = self._store.grids.get(key)
+                if grid is not None:
+                    self.put(key, grid)
+            return grid
+
+    def put(self, key: GridKey, value: LatentGrid) -> int:
+        """Keep a grid; see `BoundedCache.put`."""
+        evicted = super().put(key, value)
+        self._telemetry.grid_cache_evictions.inc(evicted)
+        return evicted
