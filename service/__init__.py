@@ -1,4 +1,6 @@
-"""The HTTP service. `app.py` is the application and `runtime.py` its parts; a query begins in `routes/localise.py`.
+"""The HTTP service.
+
+Begin with `app.py`, the application, and `runtime.py`, its parts; a query begins in `routes/localise.py`.
 
 http/       what stands between the socket and a route: slots, uploads, idempotency, errors; middleware/ is part of it
 security/   API keys, scopes, rates, and what holds while there are no keys

@@ -1,7 +1,7 @@
 """Latent grids of plans: found in memory or in the store, computed by one replica for all of them.
 
-Begin with `grids.py`, which everybody else asks. `builder.py` computes what `jobs.py` queues, under
-leases; `throttle.py` lets queries go first, and `sweeper.py` looks after what other replicas did.
+Begin with `grids.py`, which everybody else asks. `builder.py` computes what `jobs.py` queues, under leases;
+`throttle.py` lets queries go first, and `sweeper.py` looks after what other replicas did.
 """
 
 from service.grids.grids import Grids

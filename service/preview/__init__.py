@@ -1,4 +1,7 @@
-"""Pictures of a stored plan. Begin with `drawings.py`, which keeps them; `svg.py` is the drawing, `mesh.py` the GLB."""
+"""Pictures of a stored plan: an SVG drawing and a GLB mesh.
+
+Begin with `drawings.py`, which keeps them; `svg.py` and `mesh.py` make them.
+"""
 
 from service.preview.drawings import Drawings
 from service.preview.svg import Marker

@@ -8,8 +8,8 @@ head              HEAD as GET without a body
 access_control    a caller with a tenant, or 401 and 403
 admission         a slot of what tenants share, or 503 at once
 
-`service.app` stacks them. What they decide by stands in `service.telemetry`, `service.http.admission` and
-`service.security`.
+Begin with `telemetry.py`. `service.app` stacks them. What they decide by stands in `service.telemetry`,
+`service.http.admission` and `service.security`.
 """
 
 from service.http.middleware.access_control import AccessControlMiddleware
