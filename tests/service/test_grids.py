@@ -623,16 +623,17 @@ def test_a_small_plan_is_ready_when_its_upload_is_answered(start_app: StartApp, 
         wait_for(lambda: client.get(f"/floorplans/{plan_id}").json()["status"] == "ready")
 
 
-@given(st.floats(0.001, 3.0))
+@given(st.floats(0.0, 3.0))
 @example(2.399)
+@example(0.1)
 @example(0.001)
 def test_a_rounded_height_is_near_and_always_below_the_ceiling(asked_m: float) -> None:
     now = datetime.now(UTC)
     record = PlanRecord(
         id="p", tenant="t", revision_id="r", revision=1, created_at=now, updated_at=now, plan=PLAN, failure=None
     )
-    if asked_m >= 2.4:
-        with pytest.raises(InvalidPoseError, match=r"2\.4"):
+    if not 0.1 <= asked_m < 2.4:
+        with pytest.raises(InvalidPoseError, match=r"at least 0\.1 and below .*2\.4"):
             query_height_m(record, asked_m)
         return
     height_m = query_height_m(record, asked_m)
