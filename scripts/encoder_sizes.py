@@ -12,7 +12,6 @@ panoramas scored are of validation homes.
 from __future__ import annotations
 
 import argparse
-import copy
 import dataclasses
 import json
 import multiprocessing
@@ -29,6 +28,7 @@ from torch import Tensor, nn
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.nets.ring import RingConfig, RingLayoutEncoder
+from lalaloc_core.training.averaging import moving_average
 from lalaloc_core.training.config import PRESETS, OptimiserConfig
 from lalaloc_core.training.loop import learning_rate
 from lalaloc_core.training.stages import build_optimiser
@@ -84,7 +84,7 @@ def train(stage: RingStage, pool: Pool, minutes: float, seed: int) -> tuple[nn.M
     settings, encoder = stage.settings, stage.ring_encoder
     optimiser = build_optimiser(stage.modules, settings.optimiser)
     parameters = [p for module in stage.modules.values() for p in module.parameters()]
-    averaged, spent, steps = copy.deepcopy(encoder).eval(), 0.0, 0
+    averaged, spent, steps = moving_average(encoder, settings.ema_decay), 0.0, 0
     for batch in pool.batches(settings.batch, seed):
         begin = time.process_time()
         for group in optimiser.param_groups:
@@ -95,14 +95,11 @@ def train(stage: RingStage, pool: Pool, minutes: float, seed: int) -> tuple[nn.M
         nn.utils.clip_grad_norm_(parameters, settings.optimiser.clip_norm)
         optimiser.step()
         steps += 1
-        decay = min(settings.ema_decay, (1.0 + steps) / (10.0 + steps))
-        with torch.no_grad():
-            for mean, value in zip(averaged.state_dict().values(), encoder.state_dict().values(), strict=True):
-                mean.lerp_(value, 1.0 - decay) if mean.is_floating_point() else mean.copy_(value)
+        averaged.update_parameters(encoder)
         spent += time.process_time() - begin
         if spent > 60.0 * minutes:
             break
-    return averaged, steps * settings.batch
+    return averaged.module, steps * settings.batch
 
 
 @torch.no_grad()

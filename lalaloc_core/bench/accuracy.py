@@ -19,10 +19,10 @@ _MAX_HOMES_PER_EVIDENCE = 50
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Exam:
+class _Benchmark:
     """What is asked of the model; `unfamiliar`: in homes that another generator than training's drew.
 
-    Of a `minor` exam fewer homes are asked.
+    Of a `minor` benchmark fewer homes are asked.
     """
 
     kind: QueryKind = "panorama"
@@ -33,19 +33,19 @@ class _Exam:
     minor: bool = False
 
 
-_EXAMS = {
-    "layout": _Exam(kind="layout"),
-    "panorama_full": _Exam(),
-    "panorama_empty": _Exam(furniture="empty", minor=True),
-    "panorama_full_unknown_heading": _Exam(heading_known=False),
-    "out_of_family_full": _Exam(unfamiliar=True, minor=True),
-    "out_of_family_empty": _Exam(unfamiliar=True, furniture="empty", minor=True),
+_BENCHMARKS = {
+    "layout": _Benchmark(kind="layout"),
+    "panorama_full": _Benchmark(),
+    "panorama_empty": _Benchmark(furniture="empty", minor=True),
+    "panorama_full_unknown_heading": _Benchmark(heading_known=False),
+    "out_of_family_full": _Benchmark(unfamiliar=True, minor=True),
+    "out_of_family_empty": _Benchmark(unfamiliar=True, furniture="empty", minor=True),
 }
 
 
 def bench_accuracy(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
     """Accuracy on generated test homes, 4 queries each, and on at most 100 unfurnished and out-of-family ones."""
-    return {name: _summary(_answers(bundle, exam, homes, textures)) for name, exam in _EXAMS.items()}
+    return {name: _summary(_answers(bundle, benchmark, homes, textures)) for name, benchmark in _BENCHMARKS.items()}
 
 
 def bench_evidence(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
@@ -54,7 +54,9 @@ def bench_evidence(bundle: Bundle, homes: int, textures: Path | None) -> dict[st
     return {
         heading: {
             evidence: _summary(
-                _answers(bundle, _Exam(evidence=evidence, heading_known=heading == "known_heading"), homes, textures)
+                _answers(
+                    bundle, _Benchmark(evidence=evidence, heading_known=heading == "known_heading"), homes, textures
+                )
             )
             for evidence in ("latent", "profile", "both")
         }
@@ -62,24 +64,24 @@ def bench_evidence(bundle: Bundle, homes: int, textures: Path | None) -> dict[st
     }
 
 
-def _answers(bundle: Bundle, exam: _Exam, homes: int, textures: Path | None) -> list[Prediction]:
-    homes = min(homes, _MAX_HOMES_OF_MINOR) if exam.minor else homes
-    generated: dict[str, Any] = {"homes": homes, "furniture": exam.furniture}
-    if exam.unfamiliar:
+def _answers(bundle: Bundle, benchmark: _Benchmark, homes: int, textures: Path | None) -> list[Prediction]:
+    homes = min(homes, _MAX_HOMES_OF_MINOR) if benchmark.minor else homes
+    generated: dict[str, Any] = {"homes": homes, "furniture": benchmark.furniture}
+    if benchmark.unfamiliar:
         generated["generator"] = "unfamiliar"
     else:
         generated["textures"] = None if textures is None else str(textures)
     info = RunInfo(
-        label=f"{exam.kind}, {exam.furniture}",
+        label=f"{benchmark.kind}, {benchmark.furniture}",
         method="lalaloc",
-        kind=exam.kind,
-        dataset="out-of-family homes" if exam.unfamiliar else "generated homes",
+        kind=benchmark.kind,
+        dataset="out-of-family homes" if benchmark.unfamiliar else "generated homes",
         split="test",
-        settings={"evidence": exam.evidence},
+        settings={"evidence": benchmark.evidence},
         generated=generated,
         bundle=str(bundle.folder),
-        furniture=exam.furniture if exam.kind == "panorama" else None,
-        heading_known=exam.heading_known,
+        furniture=benchmark.furniture if benchmark.kind == "panorama" else None,
+        heading_known=benchmark.heading_known,
     )
     with tempfile.TemporaryDirectory(prefix="lalaloc-bench-") as folder:
         return run_evaluation(RunFolder(Path(folder)), info)

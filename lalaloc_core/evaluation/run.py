@@ -146,10 +146,10 @@ def _answer_scene(asked: str, name: str) -> tuple[list[Prediction], list[Dataset
     problems: list[DatasetError] | None = [] if info.skip_bad else None
     predictions: list[Prediction] = []
     for scene in load_scenes(session.dataset, [name], problems):
-        examiner = _Examiner(scene, info)
+        evaluator = _SceneEvaluator(scene, info)
         for camera in scene.cameras:
             try:
-                predictions.append(examiner.ask(camera, session.method))
+                predictions.append(evaluator.ask(camera, session.method))
             except DatasetError as error:
                 if problems is None:
                     raise
@@ -157,7 +157,7 @@ def _answer_scene(asked: str, name: str) -> tuple[list[Prediction], list[Dataset
     return predictions, problems or []
 
 
-class _Examiner:
+class _SceneEvaluator:
     """Asks the queries of one scene and compares what was retrieved with what should have been."""
 
     def __init__(self, scene: Scene, info: RunInfo) -> None:

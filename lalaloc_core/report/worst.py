@@ -119,13 +119,13 @@ def write_worst(run: Path, out: Path, count: int) -> dict[str, Any]:
     if not predictions:
         raise RunError(f"the run at '{run}' has no answers yet")
     chosen = choose_worst(predictions, count)
-    examiner = _Examiner(info)
+    analyser = _QueryAnalyser(info)
     queries: list[WorstQuery] = []
     thumbnails: list[Thumbnail] = []
     left_out: list[str] = []
     for prediction in chosen:
         try:
-            query, picture = examiner.examine(prediction)
+            query, picture = analyser.analyse(prediction)
         except (LaLaLocError, OSError) as error:
             left_out.append(str(error))
             continue
@@ -212,7 +212,7 @@ def _mean_confidence(predictions: Sequence[Prediction]) -> float | None:
     return float(np.mean(known)) if known else None
 
 
-class _Examiner:
+class _QueryAnalyser:
     """Data set and model of a run, opened to look at its queries again."""
 
     def __init__(self, info: RunInfo) -> None:
@@ -222,7 +222,7 @@ class _Examiner:
         encoders = None if info.bundle is None else open_model(info)
         self._encoders = encoders if encoders is not None and encoders.predicts_profile else None
 
-    def examine(self, prediction: Prediction) -> tuple[WorstQuery, Image.Image]:
+    def analyse(self, prediction: Prediction) -> tuple[WorstQuery, Image.Image]:
         """What became of a query, and its picture.
 
         Raises:

@@ -28,7 +28,7 @@ from lalaloc_core.files import atomic_write
 from lalaloc_core.reproduce.ablations import train_ablation
 from lalaloc_core.reproduce.result import Budget, Figure, RowResult, TableResult
 from lalaloc_core.reproduce.result_tables import draw_vogel_samples, markdown
-from lalaloc_core.reproduce.table import SHIPPED, Ask, Column, Row, Table
+from lalaloc_core.reproduce.table import SHIPPED, Column, Row, RowQuery, Table
 
 # Queries per row: enough to tell methods apart at a small budget, and few enough that times are taken one at a time.
 _SMALL_LIMIT = 75
@@ -93,7 +93,7 @@ class Workbench:
             workers=1 if self.workers is None else self.workers,
         ).folder
 
-    def _ask(self, table: Table, ask: Ask, bundles: Mapping[str, Path]) -> tuple[RunInfo, list[Prediction]]:
+    def _ask(self, table: Table, ask: RowQuery, bundles: Mapping[str, Path]) -> tuple[RunInfo, list[Prediction]]:
         """The run of a row; tables that ask the same share it, except that times are taken one query at a time."""
         timed = table.form == "times"
         bundle = None if ask.model is None else bundles[ask.model]
@@ -123,7 +123,7 @@ class Workbench:
         return folder.read_info(), predictions
 
 
-def _folder_name(ask: Ask, info: RunInfo, timed: bool) -> str:
+def _folder_name(ask: RowQuery, info: RunInfo, timed: bool) -> str:
     """Readable, and different for everything that asks something else."""
     asked = {
         key: value

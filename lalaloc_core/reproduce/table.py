@@ -30,12 +30,12 @@ COLUMN_TITLES: Mapping[Column, str] = {
 }
 SHARES = frozenset({"layout_recall", "pose_recall", "correct_room", *(c for c in COLUMN_TITLES if c[:6] == "within")})
 
-# A trained model by name: the bundle that ships, or one of the variants in `training.ablations`.
+# A trained model by name: the bundle that ships, or one of the variants in `reproduce.ablations`.
 SHIPPED = "ring"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Ask:
+class RowQuery:
     """What a row asks.
 
     Attributes:
@@ -63,7 +63,7 @@ class Row:
 
     group: str
     name: str
-    ask: Ask
+    ask: RowQuery
     stage: str | None = None
     paper: Mapping[Column, float] = field(default_factory=dict)
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from lalaloc_core.evaluation.predictions import MethodName
 from lalaloc_core.methods.method import QueryKind
-from lalaloc_core.reproduce.table import SHIPPED, Ask, Column, Row, Table
+from lalaloc_core.reproduce.table import SHIPPED, Column, Row, RowQuery, Table
 
 _ACCURACY = ("median_cm", "within_1cm", "within_5cm", "within_10cm", "within_1m")
 _RECALL = ("layout_recall", "pose_recall")
@@ -23,8 +23,8 @@ def _paper(columns: Sequence[Column], *figures: float | None) -> dict[Column, fl
     return {column: figure for column, figure in zip(columns, figures, strict=True) if figure is not None}
 
 
-def _lalaloc(model: str, kind: QueryKind = "panorama", **asked: Any) -> Ask:
-    return Ask(method="lalaloc", model=model, kind=kind, **asked)
+def _lalaloc(model: str, kind: QueryKind = "panorama", **asked: Any) -> RowQuery:
+    return RowQuery(method="lalaloc", model=model, kind=kind, **asked)
 
 
 def _localisation() -> Table:
@@ -33,21 +33,21 @@ def _localisation() -> Table:
         Row(
             group="",
             name="Oracle (nearest layout by Chamfer)",
-            ask=Ask(method="oracle", kind="layout"),
+            ask=RowQuery(method="oracle", kind="layout"),
             paper=_paper(columns, 1.0, 0.911, 20.4, 0.003, 0.0361, 0.135, 0.929),
         ),
         Row(
             group=_LAYOUT,
             name="2D ICP",
-            ask=Ask(method="icp", kind="layout"),
+            ask=RowQuery(method="icp", kind="layout"),
             paper=_paper(columns, None, None, 0.5, 0.879, 0.998, 0.998, 0.999),
         ),
         Row(
             group=_LAYOUT,
             name="Explicit layout + localisation",
-            ask=Ask(method="explicit", kind="layout", model=SHIPPED),
+            ask=RowQuery(method="explicit", kind="layout", model=SHIPPED),
         ),
-        Row(group=_LAYOUT, name="VDR + decode, `ring`", ask=Ask(method="decode", kind="layout", model=SHIPPED)),
+        Row(group=_LAYOUT, name="VDR + decode, `ring`", ask=RowQuery(method="decode", kind="layout", model=SHIPPED)),
         Row(
             group=_LAYOUT,
             name="LaLaLoc `paper`",
@@ -58,16 +58,16 @@ def _localisation() -> Table:
         Row(
             group=_PANORAMA,
             name="2D ICP on furnished depth",
-            ask=Ask(method="icp"),
+            ask=RowQuery(method="icp"),
             paper=_paper(columns, None, None, 21.8, 0.095, 0.264, 0.356, 0.685),
         ),
         Row(
             group=_PANORAMA,
             name="Explicit layout + localisation (paper: HorizonNet)",
-            ask=Ask(method="explicit", model=SHIPPED),
+            ask=RowQuery(method="explicit", model=SHIPPED),
             paper=_paper(columns, 0.724, 0.680, 9.1, 0.033, 0.293, 0.534, 0.774),
         ),
-        Row(group=_PANORAMA, name="VDR + decode, `ring`", ask=Ask(method="decode", model=SHIPPED)),
+        Row(group=_PANORAMA, name="VDR + decode, `ring`", ask=RowQuery(method="decode", model=SHIPPED)),
         Row(
             group=_PANORAMA,
             name="LaLaLoc `paper`",
@@ -93,13 +93,13 @@ def _coarse_grid() -> Table:
         Row(
             group="",
             name="Retrieval oracle",
-            ask=Ask(method="oracle", kind="layout", **coarse),
+            ask=RowQuery(method="oracle", kind="layout", **coarse),
             paper=_paper(columns, 42.7, 0.0, 0.029, 0.757),
         ),
         Row(
             group=_LAYOUT,
             name="2D ICP",
-            ask=Ask(method="icp", kind="layout", **coarse),
+            ask=RowQuery(method="icp", kind="layout", **coarse),
             paper=_paper(columns, 0.7, 0.769, 0.994, 0.996),
         ),
         Row(
@@ -112,7 +112,7 @@ def _coarse_grid() -> Table:
         Row(
             group=_PANORAMA,
             name="2D ICP on furnished depth",
-            ask=Ask(method="icp", **coarse),
+            ask=RowQuery(method="icp", **coarse),
             paper=_paper(columns, 21.7, 0.073, 0.347, 0.694),
         ),
         Row(
@@ -146,7 +146,7 @@ def _furniture() -> Table:
             Row(
                 group=group,
                 name="2D ICP on furnished depth",
-                ask=Ask(method="icp", furniture=level),
+                ask=RowQuery(method="icp", furniture=level),
                 paper={"median_cm": icp},
             ),
             Row(
@@ -180,7 +180,7 @@ def _refinement() -> Table:
         Row(
             group=f"`{model}`",
             name=name,
-            ask=Ask(method=method, model=model, settings=settings),
+            ask=RowQuery(method=method, model=model, settings=settings),
             stage=stage,
             paper=_paper(columns, *paper) if model == "paper" else {},
         )
@@ -225,7 +225,7 @@ def _similarity(name: str, source: str, grid_step_m: float, figures: dict[str, t
         Row(
             group="",
             name="Pose (nearest grid pose)",
-            ask=Ask(method="pose-oracle", **common),
+            ask=RowQuery(method="pose-oracle", **common),
             paper=_paper(columns, *figures["pose"]),
         )
     ]
@@ -233,7 +233,7 @@ def _similarity(name: str, source: str, grid_step_m: float, figures: dict[str, t
         Row(
             group="",
             name=title,
-            ask=Ask(method="similarity", settings={"metric": metric}, **common),
+            ask=RowQuery(method="similarity", settings={"metric": metric}, **common),
             paper=_paper(columns, *figures[metric]),
         )
         for metric, title in titles.items()
@@ -252,7 +252,7 @@ def _oracle(paper: tuple[float, float, float]) -> Row:
     return Row(
         group="",
         name="Oracle (nearest layout by Chamfer)",
-        ask=Ask(method="oracle", kind="layout"),
+        ask=RowQuery(method="oracle", kind="layout"),
         paper=_paper(_RETRIEVAL, *paper),
     )
 
@@ -342,7 +342,7 @@ TABLES: tuple[Table, ...] = (
         split="test",
         columns=("seconds:retrieve", "seconds:vdr", "seconds:lpo", "seconds"),
         rows=(
-            Row(group="", name="2D ICP on furnished depth", ask=Ask(method="icp"), paper={"seconds": 20.1}),
+            Row(group="", name="2D ICP on furnished depth", ask=RowQuery(method="icp"), paper={"seconds": 20.1}),
             Row(
                 group="`paper`",
                 name="LaLaLoc without VDR",

@@ -7,16 +7,15 @@ import dataclasses
 import logging
 import math
 import time
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.optim.swa_utils import AveragedModel
 from tqdm import tqdm
 
 from lalaloc_core.errors import CheckpointError
+from lalaloc_core.training.averaging import moving_average, resume_average
 from lalaloc_core.training.batches import Batch
 from lalaloc_core.training.best import BestCheckpoint, Validate, best_path
 from lalaloc_core.training.checkpoint import Checkpoint
@@ -98,7 +97,7 @@ class _Trainer:
             stage.teacher.to(device)
         self.optimiser = build_optimiser(stage.modules, self.settings.optimiser)
         self._trained = nn.ModuleDict(stage.modules)
-        self._averaged = _moving_average(self._trained, stage.ema_decay) if stage.ema_decay else None
+        self._averaged = moving_average(self._trained, stage.ema_decay) if stage.ema_decay else None
         self.step = 0
         self.seconds = 0.0
         self.metrics: dict[str, float] = {}
@@ -167,27 +166,10 @@ class _Trainer:
         if self._averaged is not None:
             for name, module in self.inference_modules.items():
                 module.load_state_dict(checkpoint.averaged[name])
-            self._averaged.n_averaged.fill_(1 + checkpoint.step)
+            resume_average(self._averaged, checkpoint.step)
         self.optimiser.load_state_dict(checkpoint.optimiser)
         self.step, self.seconds, self.metrics = checkpoint.step, checkpoint.seconds, checkpoint.metrics
         self.begun_from = checkpoint.begun_from
-
-
-def _moving_average(modules: nn.ModuleDict, decay: float) -> AveragedModel:
-    """Exponential moving average of all weights and statistics, in evaluation mode; the fresh weights count as one."""
-
-    def update(averaged: Iterable[Tensor], current: Iterable[Tensor], count: Tensor | int) -> None:
-        # Early steps would weigh too long at full decay.
-        share = 1.0 - min(decay, (1.0 + int(count)) / (10.0 + int(count)))
-        for average, value in zip(averaged, current, strict=True):
-            if average.is_floating_point():
-                average.lerp_(value, share)
-            else:
-                average.copy_(value)
-
-    average = AveragedModel(modules, multi_avg_fn=update, use_buffers=True).eval()
-    average.n_averaged.fill_(1)
-    return average
 
 
 def _states(modules: dict[str, nn.Module]) -> dict[str, dict[str, Tensor]]:
