@@ -20,6 +20,7 @@ from lalaloc_core.cli import main
 from lalaloc_core.data.folder import OwnData
 from lalaloc_core.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.errors import CheckpointError, DatasetError
+from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.sampling import random_poses
 from lalaloc_core.training.batches import Batch, load_batches
 from lalaloc_core.training.checkpoint import Checkpoint
@@ -27,7 +28,7 @@ from lalaloc_core.training.config import PRESETS, TrainConfig
 from lalaloc_core.training.data import TrainingData
 from lalaloc_core.training.run import train_layout
 from lalaloc_core.training.sources import SceneSource
-from lalaloc_core.training.stream import LayoutBatches, PanoramaBatches, layouts
+from lalaloc_core.training.stream import LayoutBatches, PanoramaBatches
 from lalaloc_core.training.validate import ImageValidation, LayoutValidation
 from tests.strategies import crooked_flat
 
@@ -84,12 +85,13 @@ class TestDrawing:
         ):
             scene = data.load(f"scene {grey // 40}")
             camera = scene.cameras[grey % 40 // 10]
-            expected = layouts(
+            expected = profiles_at(
                 scene.plan,
                 np.asarray(camera.position_m)[None],
                 np.array([camera.room_index]),
                 np.array([heading]),
                 CONFIG.profile_columns,
+                np.float32,
             )[0]
             np.testing.assert_allclose(profile, expected, rtol=1e-4)
             assert height.item() == pytest.approx(camera.camera_height_m)
@@ -123,12 +125,13 @@ class TestDrawing:
         batch = next(load_batches(LayoutBatches(CONFIG, source), 0))
         cameras = [camera for name in data.scenes("train") for camera in data.load(name).cameras]
         plan = crooked_flat()
-        profiles = layouts(
+        profiles = profiles_at(
             plan,
             np.stack([camera.position_m for camera in cameras]),
             np.array([camera.room_index for camera in cameras]),
             np.zeros(len(cameras)),
             CONFIG.profile_columns,
+            np.float32,
         )
         for anchor, heights in zip(batch["profile_m"][:, 0].numpy(), batch["camera_height_m"], strict=True):
             distance = np.abs(profiles - anchor).max(axis=1)
