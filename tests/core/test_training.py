@@ -24,7 +24,7 @@ from lalaloc_core.errors import CheckpointError, ConfigError
 from lalaloc_core.export.run import export_run
 from lalaloc_core.metrics import chamfer_distance
 from lalaloc_core.nets import LayoutEncoder
-from lalaloc_core.nets.ring import RingLayoutEncoder
+from lalaloc_core.nets.ring import ImageFeatures, RingLayoutEncoder
 from lalaloc_core.render.depth import back_project, layout_depth
 from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.sampling import TripletSampling, random_poses
@@ -425,7 +425,7 @@ class TestStages:
         stage = image_stage(TINY, teacher)
         batch = next(stage.batches(0, 0))
         profile, camera, ceiling = batch["profile_m"], batch["camera_height_m"], batch["ceiling_height_m"]
-        perfect = SimpleNamespace(
+        perfect = ImageFeatures(
             ring=teacher.ring(profile, camera, ceiling), log_profile=profile.log(), log_scale=torch.zeros_like(profile)
         )
         monkeypatch.setattr(stage, "encoder", lambda image, height: perfect)
