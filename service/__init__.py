@@ -15,5 +15,6 @@ preview/    drawings and meshes of plans
 web/        the web pages
 
 Beside them: `settings.py`, `schemas.py` (what the API takes and answers), `errors.py` (what errors mean over HTTP),
-`cores.py` (who gets how many), `threads.py`, `lru.py`, and the command lines `cli.py`, `openapi.py`, `__main__.py`.
+`cores.py` (which part gets how many), `sharing.py` (that no tenant takes everything), `threads.py`, `lru.py`, and the
+command lines `cli.py`, `openapi.py`, `__main__.py`.
 """

@@ -56,8 +56,8 @@ LAYERS = {
 }
 # The service's layers lie above all of the core's, lowest first.
 SERVICE_LAYERS = (
-    # `workers` is what runs in worker processes: it loads nothing of what watches over them.
     "sharing",
+    # `workers` is what runs in worker processes: it loads nothing of what watches over them.
     "cores settings errors schemas threads lru telemetry workers",
     "pools storage",
     "grids preview security",
