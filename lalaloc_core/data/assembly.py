@@ -13,7 +13,8 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
-from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M
+from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M, ROOM_TYPES
+from lalaloc_core.data.drawn_openings import DrawnOpening, opening_entries
 from lalaloc_core.data.rings import uncrossed
 from lalaloc_core.errors import DatasetError, InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_CAMERA_HEIGHT_M, DEFAULT_LIMITS, FloorPlan
@@ -30,9 +31,18 @@ class Outline:
     polygon_m: Float[np.ndarray, "n 2"]
     ceiling_height_m: float
     warnings: tuple[str, ...] = ()
+    type: str = ROOM_TYPES[0]
 
 
-def assemble_plan(scene: str, outlines: Sequence[Outline], *, path: Path, units: str) -> FloorPlan:
+def assemble_plan(
+    scene: str,
+    outlines: Sequence[Outline],
+    *,
+    path: Path,
+    units: str,
+    openings: Sequence[DrawnOpening] = (),
+    opening_kinds: Sequence[str] = (),
+) -> FloorPlan:
     """A validated plan of a scene's rooms.
 
     A room below the smallest area, and an outline's stray part, are left out with a warning in the plan: neither holds
@@ -42,6 +52,8 @@ def assemble_plan(scene: str, outlines: Sequence[Outline], *, path: Path, units:
         outlines: with different names.
         path: the file they are from, for errors.
         units: how its numbers were read, for errors about sizes: "coordinates are read as millimetres".
+        openings: what cannot be in a plan of them is left out with a warning.
+        opening_kinds: the kinds that the data set draws completely.
 
     Raises:
         DatasetError: the rooms cannot be a plan.
@@ -70,7 +82,13 @@ def assemble_plan(scene: str, outlines: Sequence[Outline], *, path: Path, units:
             )
             continue
         rooms.append(
-            {"name": outline.name, "polygon": polygon_m.tolist(), "ceiling_height_m": outline.ceiling_height_m}
+            {
+                "id": f"{len(rooms)}",
+                "name": outline.name,
+                "type": outline.type,
+                "polygon": polygon_m.tolist(),
+                "ceiling_height_m": outline.ceiling_height_m,
+            }
         )
     if not rooms:
         raise DatasetError(
@@ -83,11 +101,18 @@ def assemble_plan(scene: str, outlines: Sequence[Outline], *, path: Path, units:
     # Every camera of a data set brings its own height; the plan's is only a default that has to fit in.
     lowest_ceiling_m = min(room["ceiling_height_m"] for room in rooms)
     camera_height_m = min(DEFAULT_CAMERA_HEIGHT_M, 0.6 * lowest_ceiling_m)
+    document = {"name": scene, "rooms": rooms, "camera_height_m": camera_height_m}
     try:
-        plan = FloorPlan.from_dict({"name": scene, "rooms": rooms, "camera_height_m": camera_height_m})
+        plan = FloorPlan.from_dict(document)
     except InvalidFloorPlanError as error:
         raise DatasetError(f"{error.reason} ({units})", scene=scene, room=error.room, path=path) from error
-    return dataclasses.replace(plan, warnings=(*warnings, *plan.warnings))
+    entries, faults = opening_entries(openings, {room["name"]: room["id"] for room in rooms})
+    try:
+        plan = FloorPlan.from_dict(document | {"openings": entries, "opening_kinds": list(opening_kinds)})
+    except InvalidFloorPlanError as error:
+        # The rooms alone are a plan, as they were before data sets' openings were read.
+        faults.append(f"all openings are left out: {error}")
+    return dataclasses.replace(plan, warnings=(*warnings, *faults, *plan.warnings))
 
 
 def pose_fault(

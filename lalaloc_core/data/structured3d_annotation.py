@@ -19,12 +19,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import shapely
 from jaxtyping import Float
 
 from lalaloc_core.data.assembly import Outline, assemble_plan, is_number, read_json
+from lalaloc_core.data.drawn_openings import DrawnOpening
 from lalaloc_core.data.rings import OpenRingError, chain_rings, signed_area
 from lalaloc_core.errors import DatasetError
-from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.floorplan import FloorPlan, room_type_of
 
 _MM_PER_M = 1000.0
 # Every other type is a kind of room.
@@ -32,6 +34,8 @@ _OPENINGS = ("door", "window")
 _NOT_ROOMS = (*_OPENINGS, "outwall")
 # Floors and ceilings that rise or fall by more are not level.
 _LEVEL_TOLERANCE_M = 0.05
+# A door's box ends on the walls of its rooms, but for the rounding of the drawing.
+_BESIDE_M = 0.03
 _LISTS = ("semantics", "planes", "junctions", "planeLineMatrix", "lineJunctionMatrix")
 
 
@@ -86,7 +90,16 @@ class _Reader:
                     outline = dataclasses.replace(outline, name=f"{outline.name} ({seen[outline.name]})")
                 outlines.append(outline)
                 heights.append((identity, floor_z_m))
-        plan = assemble_plan(self._scene, outlines, path=self._path, units="coordinates are read as millimetres")
+        openings, faults = self._openings(outlines, [z_m for _, z_m in heights])
+        plan = assemble_plan(
+            self._scene,
+            outlines,
+            path=self._path,
+            units="coordinates are read as millimetres",
+            openings=openings,
+            opening_kinds=_OPENINGS,
+        )
+        plan = dataclasses.replace(plan, warnings=(*plan.warnings, *faults))
         # The plan leaves out rooms that are too small.
         places = {room.name: index for index, room in enumerate(plan.rooms)}
         floors: dict[str, tuple[Floor, ...]] = {}
@@ -118,9 +131,42 @@ class _Reader:
                 polygon_m=corners_m[:, :2],
                 ceiling_height_m=ceiling_z_m - floor_z_m,
                 warnings=(*warnings, *floor_warnings, *ceiling_warnings),
+                type=room_type_of(room),
             )
             found.append((outline, floor_z_m))
         return found
+
+    def _openings(self, outlines: list[Outline], floors_z_m: list[float]) -> tuple[list[DrawnOpening], tuple[str, ...]]:
+        """Doors and windows: boxes between two walls, or single faces; what cannot be read is a warning."""
+        shapes = [shapely.Polygon(outline.polygon_m) for outline in outlines]
+        found, faults = [], []
+        for number, semantic in enumerate(self._document["semantics"]):
+            kind, planes = self._semantic(semantic, number)
+            if kind not in _OPENINGS:
+                continue
+            name = f"{kind} {semantic['ID']}"
+            try:
+                corners_mm = [point for plane in planes for point in self._points_mm(plane, kind, name)]
+            except DatasetError as error:
+                faults.append(f"{name} is left out: {error.reason}")
+                continue
+            if len(corners_mm) < 3:
+                faults.append(f"{name} is left out: it has {len(corners_mm)} corners")
+                continue
+            corners_m = np.array(corners_mm) / _MM_PER_M
+            footprint = shapely.MultiPoint(corners_m[:, :2]).convex_hull
+            beside = [k for k, shape in enumerate(shapes) if shapely.distance(shape, footprint) <= _BESIDE_M]
+            floor_z_m = min((floors_z_m[k] for k in beside), default=min(floors_z_m, default=0.0))
+            found.append(
+                DrawnOpening(
+                    kind=kind,
+                    line_m=_middle_line(footprint),
+                    sill_m=max(0.0, float(corners_m[:, 2].min()) - floor_z_m),
+                    head_m=float(corners_m[:, 2].max()) - floor_z_m,
+                    rooms=tuple(outlines[k].name for k in beside),
+                )
+            )
+        return found, tuple(faults)
 
     def _floor_m(self, plane: int, room: str) -> tuple[Float[np.ndarray, "n 3"], tuple[str, ...]]:
         """Corners of a floor, in order, and what was odd about it."""
@@ -194,6 +240,20 @@ class _Reader:
 
     def _error(self, reason: str, room: str | None = None) -> DatasetError:
         return DatasetError(reason, scene=self._scene, room=room, path=self._path)
+
+
+def _middle_line(footprint: shapely.Geometry) -> Float[np.ndarray, "2 2"]:
+    """The line halfway through a wall's thickness: the middle of the smallest rectangle around, along its long side."""
+    corners = shapely.get_coordinates(shapely.oriented_envelope(footprint))
+    if len(corners) < 5:
+        # A single face is a line from above.
+        return np.stack([corners[0], corners[-1]])
+    sides = np.linalg.norm(np.diff(corners[:3], axis=0), axis=1)
+    one, two, three, four = corners[:4]
+    ends = (
+        ((one + four) / 2.0, (two + three) / 2.0) if sides[0] >= sides[1] else ((one + two) / 2.0, (three + four) / 2.0)
+    )
+    return np.stack(ends)
 
 
 def _level(z_m: Float[np.ndarray, "n"], kind: str, room: str) -> tuple[float, tuple[str, ...]]:

@@ -11,6 +11,7 @@ atan2(-x, y). Negating every x gives the plan frame, and turns the sense of rota
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -24,13 +25,16 @@ from jaxtyping import Float
 from lalaloc_core.conventions import heading_from_degrees
 from lalaloc_core.data.assembly import Outline, assemble_plan, inside, is_number, pose_fault, read_json
 from lalaloc_core.data.dataset import Appearance, Camera, Scene, Split
+from lalaloc_core.data.drawn_openings import DrawnOpening
 from lalaloc_core.data.photographs import FilePhotograph
 from lalaloc_core.errors import DatasetError
-from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.floorplan import FloorPlan, room_type_of
 
 DATA_FILE = "zind_data.json"
 PARTITION_FILE = "zind_partition.json"
 
+# The lists of a layout, and what their entries are in a plan.
+_OPENING_LISTS = {"doors": "door", "openings": "passage", "windows": "window"}
 _PARTITION_KEYS: dict[Split, str] = {"train": "train", "validation": "val", "test": "test"}
 
 
@@ -116,18 +120,24 @@ class _FloorReader:
 
     def scene(self, problems: list[DatasetError] | None) -> Scene:
         outlines: dict[str, Outline] = {}
+        openings: list[DrawnOpening] = []
+        faults: list[str] = []
         for panorama in self._panoramas:
             if panorama.complete_room not in outlines and panorama.data.get("is_primary") is True:
                 layout = panorama.data.get("layout_complete")
                 # Of small rooms seen from outside there may be none.
                 if layout is not None:
                     outlines[panorama.complete_room] = self._outline(panorama, layout)
+                    openings += self._openings(panorama, layout, faults)
         plan = assemble_plan(
             self._scene,
             list(outlines.values()),
             path=self._path,
             units="coordinates are multiplied by scale_meters_per_coordinate",
+            openings=openings,
+            opening_kinds=tuple(_OPENING_LISTS.values()),
         )
+        plan = dataclasses.replace(plan, warnings=(*plan.warnings, *faults))
         places = {room.name: index for index, room in enumerate(plan.rooms)}
         rooms = {room: places[outline.name] for room, outline in outlines.items() if outline.name in places}
         cameras = []
@@ -159,7 +169,32 @@ class _FloorReader:
             name=f"{label} {panorama.complete_room}".strip(),
             polygon_m=transform.to_plan_m(polygon),
             ceiling_height_m=ceiling * transform.unit_m,
+            type=room_type_of(label),
         )
+
+    def _openings(self, panorama: _Panorama, layout: Mapping[str, Any], faults: list[str]) -> Iterator[DrawnOpening]:
+        """Doors, passages and windows of a layout: lists of threes, both ends and the heights from the camera."""
+        transform = self._transform(panorama)
+        camera = self._number(panorama.data, "camera_height", panorama)
+        for key, kind in _OPENING_LISTS.items():
+            flat = layout.get(key, [])
+            if not isinstance(flat, list) or len(flat) % 3:
+                faults.append(f"{panorama.name}: '{key}' is left out, it is no list of threes")
+                continue
+            for number in range(0, len(flat), 3):
+                try:
+                    start, end, heights = (
+                        self._pair(flat[number + k], f"{key} {number // 3}", panorama) for k in range(3)
+                    )
+                except DatasetError as error:
+                    faults.append(f"{panorama.name}: an entry of '{key}' is left out, {error.reason}")
+                    continue
+                yield DrawnOpening(
+                    kind=kind,
+                    line_m=transform.to_plan_m(np.array([start, end])),
+                    sill_m=max(0.0, (camera + heights[0]) * transform.unit_m),
+                    head_m=(camera + heights[1]) * transform.unit_m,
+                )
 
     def _camera(self, panorama: _Panorama, plan: FloorPlan, room_index: int | None) -> Camera:
         if room_index is None:

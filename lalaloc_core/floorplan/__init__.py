@@ -6,7 +6,7 @@ is what only all rooms together can break, `geometry.py` the arrays that the ren
 
 from lalaloc_core.floorplan.geometry import PlanGeometry, pad_walls
 from lalaloc_core.floorplan.limits import DEFAULT_LIMITS, PlanLimits
-from lalaloc_core.floorplan.openings import Opening, OpeningFace
+from lalaloc_core.floorplan.openings import DEFAULT_OPENING_TOLERANCE_M, Opening, OpeningFace
 from lalaloc_core.floorplan.plan import DEFAULT_CAMERA_HEIGHT_M, FloorPlan
 from lalaloc_core.floorplan.rooms import Room
 from lalaloc_core.floorplan.types import room_type_of
@@ -14,6 +14,7 @@ from lalaloc_core.floorplan.types import room_type_of
 __all__ = [
     "DEFAULT_CAMERA_HEIGHT_M",
     "DEFAULT_LIMITS",
+    "DEFAULT_OPENING_TOLERANCE_M",
     "FloorPlan",
     "Opening",
     "OpeningFace",

@@ -1,0 +1,125 @@
+"""Openings of data sets: a plan that was written has them again, and what cannot be read is said."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from lalaloc_core.data.drawn_openings import DrawnOpening, opening_entries
+from lalaloc_core.data.structured3d_annotation import read_annotation
+from lalaloc_core.data.structured3d_writer import build_annotation
+from lalaloc_core.data.zind import Zind
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.synth.plans import generate_home
+from tests.strategies import crooked_flat
+from tests.zind_home import FLOOR, PANORAMAS, write_home
+
+
+def faces_of(plan: FloorPlan) -> list[tuple[int, int, int, str]]:
+    """Where openings are; Structured3D knows no passages, they are doors there."""
+    kinds = {"passage": "door"}
+    return sorted(
+        (face.room, face.wall, face.behind, kinds.get(kind := plan.openings[face.opening].kind, kind))
+        for face in plan.opening_faces
+    )
+
+
+@pytest.mark.parametrize("seed", [0, 4, 9])
+def test_openings_written_in_the_layout_of_structured3d_are_read_again(seed: int, tmp_path: Path) -> None:
+    home = generate_home(np.random.default_rng(seed))
+    path = tmp_path / "annotation_3d.json"
+    path.write_text(json.dumps(build_annotation(home.plan, home.openings)))
+    plan = read_annotation(path, "scene").plan
+    assert faces_of(plan) == faces_of(home.plan)
+    assert plan.opening_kinds == {"door", "window"}
+    assert plan.warnings == ()
+    assert [room.type for room in plan.rooms if room.type != "storage"] == [
+        room.type for room in home.plan.rooms if room.type not in ("storage", "closet")
+    ]
+    heights = sorted((round(o.sill_m or 0.0, 6), round(o.head_m or 0.0, 6)) for o in plan.openings)
+    assert heights == sorted((round(o.sill_m or 0.0, 6), round(o.head_m or 0.0, 6)) for o in home.plan.openings)
+
+
+def test_a_door_that_cannot_be_read_is_a_warning_and_the_rooms_stay(tmp_path: Path) -> None:
+    home = generate_home(np.random.default_rng(0))
+    annotation = build_annotation(home.plan, home.openings)
+    doors = [semantic for semantic in annotation["semantics"] if semantic["type"] == "door"]
+    doors[0]["planeID"] = [10**6]
+    doors[1]["planeID"] = []
+    path = tmp_path / "annotation_3d.json"
+    path.write_text(json.dumps(annotation))
+    plan = read_annotation(path, "scene").plan
+    assert len(plan.rooms) == len(home.plan.rooms)
+    assert len(plan.openings) == len(home.plan.openings) - 2
+    assert f"door {doors[0]['ID']} is left out: 'planeLineMatrix' has no entry 1000000" in plan.warnings[0]
+    assert f"door {doors[1]['ID']} is left out: it has 0 corners" in plan.warnings[1]
+
+
+@pytest.fixture
+def zind(tmp_path: Path) -> Path:
+    """A ZInD home whose first two rooms show the door between them, the first a window as well."""
+    write_home(tmp_path / "0000", crooked_flat(), PANORAMAS, np.random.default_rng(0))
+    path = tmp_path / "0000" / "zind_data.json"
+    document = json.loads(path.read_text())
+    merger = document["merger"][FLOOR]
+
+    def between(room: int, wall: int, begin: float, end: float) -> list[list[float]]:
+        """A piece of a room's wall in the frame of the room's panorama, whose vertices are those of the plan."""
+        (partial,) = merger[f"complete_room_{room + 1:02d}"].values()
+        layout = next(iter(partial.values()))["layout_complete"]
+        one, two = (np.array(layout["vertices"][(wall + k) % len(layout["vertices"])]) for k in (0, 1))
+        return [(one + at * (two - one)).tolist() for at in (begin, end)]
+
+    def layout_of(room: int) -> dict[str, list]:
+        (partial,) = merger[f"complete_room_{room + 1:02d}"].values()
+        return next(iter(partial.values()))["layout_complete"]
+
+    # The right wall of the first room is 2.2 m long, the left wall of the second 2.5 m, both from y = 0.
+    layout_of(0)["doors"] = [*between(0, 1, 0.5 / 2.2, 1.4 / 2.2), [-1.0, 0.35]]
+    layout_of(1)["doors"] = [*between(1, 3, 1.1 / 2.5, 2.0 / 2.5), [-1.0, 0.35]]
+    layout_of(0)["windows"] = [*between(0, 0, 0.2, 0.5), [-0.4, 0.4]]
+    path.write_text(json.dumps(document))
+    return tmp_path
+
+
+def test_openings_of_zind_are_in_the_plan_once(zind: Path) -> None:
+    plan = Zind(zind).load(f"0000/{FLOOR}").plan
+    assert [opening.kind for opening in plan.openings] == ["door", "window"]
+    assert sorted((face.room, face.wall, face.behind) for face in plan.opening_faces) == [
+        (0, 0, -1),
+        (0, 1, 1),
+        (1, 3, 0),
+    ]
+    np.testing.assert_allclose(np.sort(plan.openings[0].line_m[:, 1]), [0.5, 1.4], atol=1e-9)
+    assert plan.openings[1].sill_m == pytest.approx(0.9)
+    assert plan.openings[1].head_m == pytest.approx(2.1)
+    assert plan.opening_kinds == {"door", "window", "passage"}
+    assert plan.warnings == ()
+
+
+def test_damaged_lists_of_zind_are_warnings(zind: Path) -> None:
+    path = zind / "0000" / "zind_data.json"
+    document = json.loads(path.read_text())
+    (partial,) = document["merger"][FLOOR]["complete_room_01"].values()
+    layout = next(iter(partial.values()))["layout_complete"]
+    layout["doors"], layout["windows"] = [[0, 0]], [[0, 0], [1, "x"], [0, 1]]
+    path.write_text(json.dumps(document))
+    plan = Zind(zind).load(f"0000/{FLOOR}").plan
+    assert [opening.kind for opening in plan.openings] == ["door"]
+    assert any("'doors' is left out, it is no list of threes" in warning for warning in plan.warnings)
+    assert any("an entry of 'windows' is left out" in warning for warning in plan.warnings)
+
+
+def test_of_openings_that_overlap_the_first_stays() -> None:
+    def drawn(y0: float, y1: float, x: float = 0.0) -> DrawnOpening:
+        return DrawnOpening(kind="door", line_m=np.array([[x, y0], [x, y1]]))
+
+    entries, warnings = opening_entries([drawn(0, 1), drawn(0.1, 0.9, 0.2), drawn(0.8, 2), drawn(3, 3.01)], {})
+    assert [entry["line"] for entry in entries] == [[[0.0, 0.0], [0.0, 1.0]]]
+    assert [warning.split(" is left out")[1][:20] for warning in warnings] == [
+        ": it overlaps anothe",
+        ": it is shorter than",
+    ]
