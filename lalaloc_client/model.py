@@ -38,12 +38,14 @@ class Bounds:
 
 @dataclass(frozen=True)
 class Room:
-    """One room of a stored plan."""
+    """One room of a stored plan; `id` tells rooms of one name apart."""
 
     name: str
     area_m2: float
     ceiling_height_m: float
     vertices: int
+    id: str | None = None
+    type: str | None = None
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,7 @@ class FloorPlan:
         revision_number: how often the plan was uploaded up to this revision.
         created_at: when it was first uploaded; `updated_at`: when this revision was.
         etag: names this revision, for `replace_floorplan(..., if_match=...)`.
+        plan: the plan itself in the native format.
     """
 
     id: str
@@ -85,6 +88,7 @@ class FloorPlan:
     revision_number: int | None = None
     updated_at: datetime | None = None
     etag: str | None = None
+    plan: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -221,6 +225,8 @@ def _types_of(cls: type) -> dict[str, Any]:
 
 
 def _value(wanted: Any, data: object, where: str) -> Any:
+    if wanted is Any:
+        return data
     origin, arguments = get_origin(wanted), get_args(wanted)
     if origin in (Union, types.UnionType):
         if data is None:

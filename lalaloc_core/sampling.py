@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import shapely
 from jaxtyping import Bool, Float, Int
+from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.floorplan import FloorPlan
@@ -15,6 +16,8 @@ from lalaloc_core.floorplan import FloorPlan
 # Cameras do not stand in walls; grid poses keep this distance where the room allows it.
 WALL_MARGIN_M = 0.15
 _MIN_RADIUS_M = 1e-3
+# Points of a lattice that are looked at together: the box around a slanting corridor holds many more than the corridor.
+_LATTICE_POINTS = 65_536
 # Twice the negatives wanted are drawn at a time; where fewer than one in twelve is far enough, the plan is too small.
 _NEGATIVE_ROUNDS = 6
 
@@ -55,15 +58,27 @@ def pose_grid(plan: FloorPlan, step_m: float, after_room: Callable[[], None] = l
         x_min, y_min, x_max, y_max = room.shape.bounds
         xs = np.arange(np.ceil(x_min / step_m), np.floor(x_max / step_m) + 1) * step_m
         ys = np.arange(np.ceil(y_min / step_m), np.floor(y_max / step_m) + 1) * step_m
-        lattice = np.stack(np.meshgrid(xs, ys, indexing="ij"), axis=-1).reshape(-1, 2)
-        inside = shapely.contains_xy(room.free_floor(WALL_MARGIN_M), lattice[:, 0], lattice[:, 1])
-        chosen = lattice[inside]
+        floor = room.free_floor(WALL_MARGIN_M)
+        shapely.prepare(floor)
+        columns = max(1, _LATTICE_POINTS // max(1, len(ys)))
+        chosen = np.concatenate(
+            [np.empty((0, 2))]
+            + [_lattice_inside(floor, xs[first : first + columns], ys) for first in range(0, len(xs), columns)]
+        )
         if len(chosen) == 0:
             chosen = room.inmost_point()[None]
         positions.append(chosen)
         rooms.append(np.full(len(chosen), index))
         after_room()
     return PoseSet(np.concatenate(positions), np.concatenate(rooms))
+
+
+def _lattice_inside(
+    floor: BaseGeometry, xs: Float[np.ndarray, "c"], ys: Float[np.ndarray, "r"]
+) -> Float[np.ndarray, "n 2"]:
+    """The points of a lattice that lie on a floor."""
+    lattice = np.stack(np.meshgrid(xs, ys, indexing="ij"), axis=-1).reshape(-1, 2)
+    return lattice[shapely.contains_xy(floor, lattice[:, 0], lattice[:, 1])]
 
 
 def random_poses(plan: FloorPlan, count: int, rng: np.random.Generator, margin_m: float = WALL_MARGIN_M) -> PoseSet:

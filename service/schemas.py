@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from datetime import datetime
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, WithJsonSchema, field_validator
 
-from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M
+from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M, OPENING_CLASSES, ROOM_TYPES
 
 PlanStatus = Literal["preparing", "ready", "failed"]
 Finite = Field(allow_inf_nan=False)
@@ -47,18 +47,42 @@ class Answer(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-class RoomDocument(BaseModel):
-    """One room of an uploaded plan."""
+Point = Annotated[list[float], Field(min_length=2, max_length=2)]
+Segment = Annotated[list[Point], Field(min_length=2, max_length=2)]
+Ring = Annotated[list[Point], Field(min_length=3)]
+RoomType = Annotated[str, WithJsonSchema({"type": "string", "enum": [*ROOM_TYPES]})]
+OpeningKind = Annotated[str, WithJsonSchema({"type": "string", "enum": [*OPENING_CLASSES[1:]]})]
 
+
+class RoomDocument(BaseModel):
+    """One room of a plan."""
+
+    id: str | None = Field(None, description="Tells rooms of one name apart; unique, by default made from the name.")
     name: str = Field("", description="Name of the room; by default its number.")
-    polygon: list[Annotated[list[float], Field(min_length=2, max_length=2)]] = Field(
-        min_length=3, description="Corners [x, y] in metres, in either order, x to the right and y up on the drawing."
+    type: RoomType = Field("unknown", description="What the room is for.")
+    polygon: Ring = Field(
+        description="Corners [x, y] in metres, in either order, x to the right and y up on the drawing."
     )
+    holes: list[Ring] = Field([], description="What is no floor inside the polygon, such as columns and shafts.")
+    walls: list[Segment] = Field([], description="Free-standing walls up to the ceiling.")
     ceiling_height_m: float | None = Field(None, gt=0, description="Height of this room's ceiling over its floor.")
 
 
+class OpeningDocument(BaseModel):
+    """A door, window or passage; one entry serves both rooms of a wall."""
+
+    kind: OpeningKind = Field(description="A passage is an opening without a leaf.")
+    line: Segment = Field(description="Both ends, along the wall.")
+    sill_m: float | None = Field(None, ge=0, description="Height of its lower edge over the floor.")
+    head_m: float | None = Field(None, ge=0, description="Height of its upper edge over the floor.")
+    name: str | None = Field(None, description="What to call it.")
+    rooms: list[str] | None = Field(
+        None, description="Ids of the only rooms that it belongs to; by default all whose wall it lies on."
+    )
+
+
 class FloorPlanDocument(BaseModel):
-    """An uploaded floor plan in the native format; coordinates in metres."""
+    """A floor plan in the native format; coordinates in metres."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -79,14 +103,26 @@ class FloorPlanDocument(BaseModel):
     north_deg: float | None = Field(
         None, ge=-360, le=360, description="Azimuth of true north: degrees clockwise from the plan's +y."
     )
-    rooms: list[RoomDocument] = Field(min_length=1, description="Closed rooms; doors count as wall.")
+    camera_height_std_m: float | None = Field(
+        None, ge=0, le=2, description="How far off `camera_height_m` may be: one standard deviation."
+    )
+    rooms: list[RoomDocument] = Field(min_length=1, description="Closed rooms.")
+    openings: list[OpeningDocument] = Field([], description="Doors, windows and passages; they may touch, not overlap.")
+    opening_kinds: list[OpeningKind] | None = Field(
+        None, description="The kinds that the plan shows completely; by default those that occur in it."
+    )
+    opening_tolerance_m: float = Field(
+        0.35, ge=0.01, le=1.5, description="How far from a room's wall an opening may be drawn."
+    )
 
 
 class RoomAnswer(Answer):
     """One room of a stored plan."""
 
+    id: str = Field(description="Tells rooms of one name apart.")
     name: str
-    area_m2: SquareMetres = Field(description="Floor area.")
+    type: RoomType = Field(description="What the room is for.")
+    area_m2: SquareMetres = Field(description="Floor area, without holes.")
     ceiling_height_m: float = Field(description="Height of the ceiling over the floor.")
     vertices: int = Field(description="Corners of the polygon.")
 
@@ -126,6 +162,9 @@ class FloorPlanAnswer(Answer):
     camera_height_m: float = Field(description="Camera height assumed for panoramas of this plan.")
     grid: GridAnswer
     warnings: list[str] = Field(description="What is odd about the plan but usable, such as overlapping rooms.")
+    plan: Annotated[dict[str, Any], WithJsonSchema({"allOf": [{"$ref": "#/components/schemas/FloorPlanDocument"}]})] = (
+        Field(description="The plan itself in the native format.")
+    )
     created_at: datetime = Field(description="When the plan was first uploaded, UTC.")
     updated_at: datetime = Field(description="When this revision was uploaded, UTC.")
 
@@ -302,6 +341,8 @@ class LimitsAnswer(Answer):
     max_plan_vertices: int = Field(description="Vertices of all rooms of a floor plan.")
     max_extent_m: float = Field(description="Width or height of a floor plan.")
     max_area_m2: float = Field(description="Floor area of all rooms of a floor plan.")
+    max_bounds_area_m2: float = Field(description="Area of the boxes around all rooms of a floor plan.")
+    max_openings: int = Field(description="Doors, windows and passages of a floor plan.")
     max_grid_poses: int = Field(description="Poses that a plan's latent grid may have.")
     max_panorama_bytes: int = Field(description="Upload of a panorama.")
     max_pixels: int = Field(description="Pixels of a panorama.")

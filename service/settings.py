@@ -218,6 +218,13 @@ class Settings(BaseSettings):
     max_area_m2: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] = Field(
         default=20_000.0, description="Floor area of all rooms of a floor plan."
     )
+    max_bounds_area_m2: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] = Field(
+        default=200_000.0,
+        description="Area of the boxes around all rooms of a floor plan, which its latent grid is looked for in.",
+    )
+    max_openings: Annotated[int, Field(ge=0)] = Field(
+        default=2000, description="Doors, windows and passages of a floor plan."
+    )
     max_panorama_bytes: Count = Field(default=40 * 2**20, description="Upload of a panorama.")
     max_pixels: Count = Field(default=100_000_000, description="Pixels of a panorama.")
     max_scans: Count = Field(
@@ -322,6 +329,8 @@ class Settings(BaseSettings):
             max_plan_vertices=self.max_plan_vertices,
             max_extent_m=self.max_extent_m,
             max_area_m2=self.max_area_m2,
+            max_bounds_area_m2=self.max_bounds_area_m2,
+            max_openings=self.max_openings,
         )
 
     @property

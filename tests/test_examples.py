@@ -24,6 +24,22 @@ ROOT = Path(__file__).parents[1]
 PLAN = FloorPlan.from_json(PLAN_PATH.read_bytes())
 
 
+def test_the_flat_has_the_openings_that_its_pictures_show() -> None:
+    home, kinds = example_home(), {"door_open": "door", "door_shut": "door", "opening": "passage", "window": "window"}
+    drawn = [
+        (o.room, o.wall, o.neighbour, kinds[o.kind], round(o.end_m - o.start_m, 6), o.sill_m, o.head_m)
+        for o in home.openings
+    ]
+    found = []
+    for face in home.plan.opening_faces:
+        opening, wall = home.plan.openings[face.opening], home.plan.rooms[face.room].walls_m[face.wall]
+        length_m = float(np.hypot(*(wall[2:] - wall[:2]))) * (face.end - face.start)
+        where = (face.room, face.wall, face.behind, opening.kind, round(length_m, 6))
+        found.append((*where, opening.sill_m, opening.head_m))
+    assert sorted(found) == sorted(drawn)
+    assert all(room.type != "unknown" for room in home.plan.rooms)
+
+
 def test_the_flat_is_of_a_usual_size_and_has_no_warnings() -> None:
     assert PLAN.warnings == ()
     assert 60.0 < PLAN.area_m2 < 100.0

@@ -13,6 +13,9 @@ from lalaloc_core.floorplan.rooms import Room
 
 # Looking for overlaps ends after so many found, or so many pairs looked at: their number grows with the square.
 _MAX_OVERLAPS, _MAX_PAIRS = 20, 5000
+# Two combs of two hundred corners may cross ten thousand times: what is looked at is bounded by pairs of walls that may
+# cross, over all pairs of rooms. Counting them is not worth it where there are few.
+_MAX_WORK, _FEW = 100_000, 400
 
 
 def check_size(rooms: Sequence[Room], limits: PlanLimits) -> None:
@@ -34,20 +37,46 @@ def check_size(rooms: Sequence[Room], limits: PlanLimits) -> None:
             f"the floor area is {area_m2:.6g} m², at most {limits.max_area_m2:g} m² is allowed (max_area_m2); "
             "are the coordinates in metres?"
         )
+    boxes_m2 = sum(float(np.prod(np.ptp(room.polygon_m, axis=0))) for room in rooms)
+    if boxes_m2 > limits.max_bounds_area_m2:
+        raise InvalidFloorPlanError(
+            f"the boxes around all rooms cover {boxes_m2:.6g} m², at most {limits.max_bounds_area_m2:g} m² is allowed "
+            "(max_bounds_area_m2)"
+        )
 
 
 def overlap_warnings(rooms: Sequence[Room], limits: PlanLimits) -> tuple[str, ...]:
-    """Pairs of rooms that share floor, the first twenty of them."""
+    """Pairs of rooms that share floor, the first twenty of them, and of pairs that are worth their work only."""
     shapes = [room.shape for room in rooms]
     # Whose boxes meet; whether the rooms themselves do is asked of each pair, and of not too many.
     first, second = shapely.STRtree(shapes).query(shapes)
     pairs = sorted((int(i), int(j)) for i, j in zip(first, second, strict=True) if i < j)
     warnings: list[str] = []
-    for looked_at, (i, j) in enumerate(pairs):
-        if len(warnings) == _MAX_OVERLAPS or looked_at == _MAX_PAIRS:
-            warnings.append("more rooms may overlap, the rest was not looked at")
+    work, is_complete = 0, len(pairs) <= _MAX_PAIRS
+    for i, j in pairs[:_MAX_PAIRS]:
+        if len(warnings) == _MAX_OVERLAPS:
+            is_complete = False
             break
+        cost = _crossing_boxes(rooms[i], rooms[j])
+        # Pairs of simple rooms are always looked at, whatever stands beside them.
+        if cost > _FEW:
+            if work + cost > _MAX_WORK:
+                is_complete = False
+                continue
+            work += cost
         shared = float(shapely.intersection(shapes[i], shapes[j]).area)
         if shared > limits.overlap_tolerance_m2:
             warnings.append(f"rooms '{rooms[i].name}' and '{rooms[j].name}' overlap by {shared:.2f} m²")
+    if not is_complete:
+        warnings.append("more rooms may overlap, the rest was not looked at")
     return tuple(warnings)
+
+
+def _crossing_boxes(first: Room, second: Room) -> int:
+    """Pairs of walls whose boxes meet: what the intersection of two rooms costs, without computing it."""
+    edges = [np.sort(room.walls_m.reshape(-1, 2, 2), axis=1) for room in (first, second)]
+    if len(edges[0]) * len(edges[1]) <= _FEW:
+        return len(edges[0]) * len(edges[1])
+    (low, high), (other_low, other_high) = ((edge[:, None, 0], edge[:, None, 1]) for edge in edges)
+    meet = (low <= other_high.swapaxes(0, 1)).all(-1) & (high >= other_low.swapaxes(0, 1)).all(-1)
+    return int(meet.sum()) + len(edges[0]) + len(edges[1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 
@@ -22,6 +23,8 @@ class PlanLimits:
     max_walls_per_opening: int = 32
     max_extent_m: float = 1000.0
     max_area_m2: float = 200_000.0
+    # Sum of the boxes around the rooms: what a grid of poses looks through.
+    max_bounds_area_m2: float = 2_000_000.0
     # Up to here a double tells nanometres apart; a hundred times farther out areas and distances begin to lose metres.
     max_coordinate_m: float = 1e7
     max_depth: int = 8
@@ -34,3 +37,16 @@ class PlanLimits:
 
 
 DEFAULT_LIMITS = PlanLimits()
+# For plans that were valid under the limits of their day: tighter ones must not make them unreadable.
+NO_LIMITS = PlanLimits(
+    max_rooms=10**9,
+    max_vertices_per_room=10**9,
+    max_plan_vertices=10**9,
+    max_openings=10**9,
+    max_openings_per_room=10**9,
+    max_walls_per_opening=10**9,
+    max_extent_m=math.inf,
+    max_area_m2=math.inf,
+    max_bounds_area_m2=math.inf,
+    max_coordinate_m=math.inf,
+)

@@ -6,7 +6,7 @@ holes and free-standing walls. Openings are pieces of their walls: to a ray that
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -27,7 +27,7 @@ from lalaloc_core.floorplan.heights import (
     read_north,
 )
 from lalaloc_core.floorplan.json_text import read_json
-from lalaloc_core.floorplan.limits import DEFAULT_LIMITS, PlanLimits
+from lalaloc_core.floorplan.limits import DEFAULT_LIMITS, NO_LIMITS, PlanLimits
 from lalaloc_core.floorplan.opening_reading import read_opening_kinds, read_openings, read_tolerance
 from lalaloc_core.floorplan.openings import DEFAULT_OPENING_TOLERANCE_M, Opening, OpeningFace, label, place_openings
 from lalaloc_core.floorplan.reading import read_ceiling, read_rooms
@@ -93,6 +93,24 @@ class FloorPlan:
         Raises:
             InvalidFloorPlanError: names the room and what is wrong.
         """
+        return cls._read(document, limits, None)
+
+    @classmethod
+    def from_stored(cls, text: str, warnings: Sequence[str] | None) -> FloorPlan:
+        """A plan that was valid when its `to_dict` was written, under whatever limits, as JSON.
+
+        What grows faster than the plan is not looked for again.
+
+        Args:
+            warnings: what was found when it was validated; None looks for it now.
+
+        Raises:
+            InvalidFloorPlanError: it is not what `to_dict` wrote.
+        """
+        return cls._read(read_json(text, NO_LIMITS.max_depth), NO_LIMITS, warnings)
+
+    @classmethod
+    def _read(cls, document: Any, limits: PlanLimits, warnings: Sequence[str] | None) -> FloorPlan:
         if not isinstance(document, Mapping):
             raise InvalidFloorPlanError(f"a plan must be an object, not {json_kind(document)}")
         check_keys(document, _PLAN_KEYS)
@@ -108,14 +126,14 @@ class FloorPlan:
             raise InvalidFloorPlanError(
                 f"no opening lies on a wall: none is within {tolerance_m:g} m of one (opening_tolerance_m)"
             )
+        if warnings is None:
+            astray = [f"{label(openings[k], k)} lies on no wall" for k in lost]
+            warnings = (*overlap_warnings(rooms, limits), *astray)
         return cls(
             name=name,
             rooms=rooms,
             camera_height_m=read_camera_height(document.get("camera_height_m"), rooms),
-            warnings=(
-                *overlap_warnings(rooms, limits),
-                *(f"{label(openings[k], k)} lies on no wall" for k in lost),
-            ),
+            warnings=tuple(warnings),
             north=read_north(document.get("north_deg")),
             openings=openings,
             opening_kinds=read_opening_kinds(document.get("opening_kinds"), openings),

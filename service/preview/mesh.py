@@ -1,4 +1,4 @@
-"""A floor plan as a GLB mesh: floor, ceiling and walls of every room.
+"""A floor plan as a GLB mesh: floor, ceiling and walls of every room, and panels where its walls have openings.
 
 glTF is y-up: plan point (x, y, z) becomes (x, z, -y), in metres. All faces look into their room, so a viewer that
 hides back faces shows the inside from wherever one looks.
@@ -14,14 +14,24 @@ from trimesh.visual.material import PBRMaterial
 
 from lalaloc_core.floorplan import FloorPlan, Room
 
-_COLOURS = {"floor": (176, 141, 101, 255), "wall": (226, 222, 214, 255), "ceiling": (247, 247, 247, 255)}
+_COLOURS = {
+    "floor": (176, 141, 101, 255),
+    "wall": (226, 222, 214, 255),
+    "ceiling": (247, 247, 247, 255),
+    "door": (150, 98, 54, 255),
+    "window": (150, 200, 235, 255),
+    "passage": (90, 90, 95, 255),
+}
+# Heights (m) of openings whose plan says none, and how far before the wall their panels stand.
+_USUAL_M = {"door": (0.0, 2.05), "window": (0.9, 2.1), "passage": (0.0, 2.2)}
+_BEFORE_WALL_M = 0.005
 
 
 def plan_glb(plan: FloorPlan) -> bytes:
     """The plan as binary glTF; one node per surface, named `<number of the room>/<room>/<surface>`."""
     scene = trimesh.Scene()
     for index, room in enumerate(plan.rooms):
-        for surface, mesh in _surfaces(room).items():
+        for surface, mesh in (_surfaces(room) | _openings(plan, index)).items():
             material = PBRMaterial(
                 name=surface, baseColorFactor=_COLOURS[surface], metallicFactor=0.0, roughnessFactor=0.9
             )
@@ -41,6 +51,30 @@ def _surfaces(room: Room) -> dict[str, trimesh.Trimesh]:
     }
 
 
+def _openings(plan: FloorPlan, room_index: int) -> dict[str, trimesh.Trimesh]:
+    """Panels on the walls of a room, one mesh for each kind of opening."""
+    room = plan.rooms[room_index]
+    panels: dict[str, list[np.ndarray]] = {}
+    for face in plan.opening_faces:
+        if face.room != room_index:
+            continue
+        opening = plan.openings[face.opening]
+        low, high = _USUAL_M[opening.kind]
+        low = low if opening.sill_m is None else opening.sill_m
+        high = min(high if opening.head_m is None else opening.head_m, room.ceiling_height_m)
+        ends = room.walls_m[face.wall].reshape(2, 2)
+        edge = ends[1] - ends[0]
+        inwards = np.array([-edge[1], edge[0]]) / np.hypot(*edge)
+        start, end = ends[0] + np.array([[face.start], [face.end]]) * edge + _BEFORE_WALL_M * inwards
+        if low < high:
+            panels.setdefault(opening.kind, []).append(np.array([[*start, *end, low, high]]))
+    return {kind: _upright(*_columns(np.concatenate(rows))) for kind, rows in panels.items()}
+
+
+def _columns(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    return rows[:, :2], rows[:, 2:4], rows[:, 4], rows[:, 5]
+
+
 def _facing(corners: np.ndarray, triangles: np.ndarray, z: float, *, up: bool) -> trimesh.Trimesh:
     """A horizontal surface whose triangles all look up, or all down."""
     a, b, c = (corners[triangles[:, k]] for k in range(3))
@@ -51,9 +85,13 @@ def _facing(corners: np.ndarray, triangles: np.ndarray, z: float, *, up: bool) -
 
 
 def _walls(room: Room, height: float) -> trimesh.Trimesh:
-    """One rectangle per edge; the polygon runs counter-clockwise, so its left side is the inside."""
-    start, end = room.walls_m[:, :2], room.walls_m[:, 2:]
-    zero, top = np.zeros(len(start)), np.full(len(start), height)
+    """One rectangle per edge, the room to its left; free-standing walls have one for each side."""
+    walls = np.concatenate([room.walls_m, room.inner_walls_m[:, [2, 3, 0, 1]]])
+    return _upright(walls[:, :2], walls[:, 2:], np.zeros(len(walls)), np.full(len(walls), height))
+
+
+def _upright(start: np.ndarray, end: np.ndarray, zero: np.ndarray, top: np.ndarray) -> trimesh.Trimesh:
+    """Rectangles from one height to another, seen from their left."""
     vertices = np.stack(
         [
             np.column_stack([start, zero]),

@@ -7,12 +7,14 @@ from dataclasses import dataclass
 from html import escape
 
 import numpy as np
+from jaxtyping import Float
 
-from lalaloc_core.floorplan import FloorPlan, Room
+from lalaloc_core.floorplan import FloorPlan, OpeningFace, Room
 from lalaloc_core.floorplan.inmost import inmost_place
 
 _MARGIN_M = 0.5
 _FILLS = ("#eef4fb", "#f7f1e6", "#eef7ee", "#f8eef4", "#f2f0fa", "#f4f6ea")
+_OPENING_COLOURS = {"door": "#b5651d", "window": "#3d9be9", "passage": "#ffffff"}
 # A scale bar of a round length, about this share of the drawing's width.
 _BAR_SHARE = 0.2
 # 95 % of a normal distribution in the plane lie within so many standard deviations: the root of -2 log 0.05.
@@ -60,11 +62,14 @@ def plan_svg(plan: FloorPlan, marker: Marker | None = None, *, rooms: str | None
 
 
 def draw_rooms(plan: FloorPlan) -> str:
-    """Outlines, names and areas of all rooms: what takes its time, and is the same wherever a camera stands."""
+    """Outlines, openings, names and areas of all rooms: what takes its time, the same wherever a camera stands."""
     extent = max(_size_m(plan))
     lines = [
         '<g stroke="#333" stroke-linejoin="round">',
         *(_outline(room, _FILLS[index % len(_FILLS)], extent) for index, room in enumerate(plan.rooms)),
+        "</g>",
+        '<g class="openings">',
+        *(_opening(plan, face, extent) for face in plan.opening_faces),
         "</g>",
         '<g fill="#222">',
         *(_label(room, extent) for room in plan.rooms),
@@ -94,8 +99,41 @@ def _view_box(plan: FloorPlan, marker: Marker | None) -> tuple[float, float, flo
 
 
 def _outline(room: Room, fill: str, extent_m: float) -> str:
-    points = " ".join(f"{x:.3f},{-y:.3f}" for x, y in room.polygon_m)
-    return f'<polygon points="{points}" fill="{fill}" stroke-width="{extent_m / 250:.4f}"/>'
+    """The floor, with holes left white, and free-standing walls."""
+    width = f'stroke-width="{extent_m / 250:.4f}"'
+    rings = [(room.polygon_m, fill), *((hole, "#fff") for hole in room.holes_m)]
+    lines = [f'<polygon points="{_points(ring)}" fill="{colour}" {width}/>' for ring, colour in rings]
+    if len(room.inner_walls_m):
+        path = "".join(f"M{x0:.3f} {-y0:.3f}L{x1:.3f} {-y1:.3f}" for x0, y0, x1, y1 in room.inner_walls_m)
+        lines.append(f'<path class="walls" d="{path}" {width}/>')
+    return "\n".join(lines)
+
+
+def _opening(plan: FloorPlan, face: OpeningFace, extent_m: float) -> str:
+    """A piece of wall in the colour of what is in it, and once for both rooms the gap through the wall's thickness."""
+    own = _piece_m(plan.rooms[face.room], face.wall, face.start, face.end)
+    kind = plan.openings[face.opening].kind
+    parts = []
+    if face.behind > face.room:
+        beyond = _piece_m(plan.rooms[face.behind], face.exit_wall, face.exit_start, face.exit_end)
+        # Walls that face each other run in opposite directions.
+        quad = np.concatenate([own, beyond])
+        parts.append(f'<polygon points="{_points(quad)}" fill="{_OPENING_COLOURS[kind]}" fill-opacity="0.35"/>')
+    (x0, y0), (x1, y1) = own.tolist()
+    parts.append(
+        f'<path class="{kind}" d="M{x0:.3f} {-y0:.3f}L{x1:.3f} {-y1:.3f}" stroke="{_OPENING_COLOURS[kind]}" '
+        f'stroke-width="{extent_m / 160:.4f}"/>'
+    )
+    return "".join(parts)
+
+
+def _piece_m(room: Room, wall: int, start: float, end: float) -> Float[np.ndarray, "2 2"]:
+    ends = room.walls_m[wall].reshape(2, 2)
+    return ends[0] + np.array([[start], [end]]) * (ends[1] - ends[0])
+
+
+def _points(ring_m: Float[np.ndarray, "n 2"]) -> str:
+    return " ".join(f"{x:.3f},{-y:.3f}" for x, y in ring_m)
 
 
 def _label(room: Room, extent_m: float) -> str:

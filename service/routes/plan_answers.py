@@ -58,7 +58,9 @@ def _answer(record: PlanRecord, state: GridState, step_m: float, *, superseded: 
         reason=state.reason,
         rooms=[
             RoomAnswer(
+                id=room.id,
                 name=room.name,
+                type=room.type,
                 area_m2=room.area_m2,
                 ceiling_height_m=room.ceiling_height_m,
                 vertices=len(room.polygon_m),
@@ -70,6 +72,7 @@ def _answer(record: PlanRecord, state: GridState, step_m: float, *, superseded: 
         camera_height_m=plan.camera_height_m,
         grid=GridAnswer(step_m=step_m, poses=grid_size(plan, step_m) if state.poses is None else state.poses),
         warnings=list(plan.warnings),
+        plan=plan.to_dict(),
         created_at=record.created_at,
         updated_at=record.updated_at,
     )

@@ -9,24 +9,10 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import math
 from typing import Any
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.floorplan import FloorPlan, PlanLimits
-
-# A stored plan was valid under the limits of its day; tighter limits must not make it unreadable.
-_STORED_LIMITS = PlanLimits(
-    max_rooms=10**9,
-    max_vertices_per_room=10**9,
-    max_plan_vertices=10**9,
-    max_openings=10**9,
-    max_openings_per_room=10**9,
-    max_walls_per_opening=10**9,
-    max_coordinate_m=math.inf,
-    max_extent_m=math.inf,
-    max_area_m2=math.inf,
-)
+from lalaloc_core.floorplan import FloorPlan
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,10 +44,7 @@ class PlanDocument:
         if self.document_sha256 is not None and _digest_of(self.document) != self.document_sha256:
             return None
         try:
-            plan = FloorPlan.from_json(self.document, _STORED_LIMITS)
-            if self.warnings is None:
-                return plan
-            return dataclasses.replace(plan, warnings=tuple(json.loads(self.warnings)))
+            return FloorPlan.from_stored(self.document, None if self.warnings is None else json.loads(self.warnings))
         except (InvalidFloorPlanError, ValueError, TypeError):
             return None
 

@@ -13,6 +13,7 @@ import httpx
 import pytest
 import trimesh
 
+from lalaloc_core.floorplan import FloorPlan
 from tests.service.conftest import FLAT, StartApp, assert_problem, upload, wait_for
 
 
@@ -111,6 +112,23 @@ def test_a_plan_is_answered_with_what_was_understood(client: httpx.Client) -> No
     assert plan["area_m2"] == 36.0
     assert plan["grid"]["step_m"] == 0.5
     assert plan["bounds"] == {"x_min_m": 0.0, "y_min_m": 0.0, "x_max_m": 9.0, "y_max_m": 6.0}
+
+
+def test_a_plan_is_told_in_the_native_format_and_can_be_uploaded_again(client: httpx.Client) -> None:
+    openings = [{"kind": "window", "line": [[0.5, 0.0], [1.5, 0.0]], "sill_m": 0.9, "head_m": 2.0}]
+    uploaded = client.post("/floorplans", json=FLAT | {"openings": openings, "north_deg": 30}).json()
+    told = client.get(f"/floorplans/{uploaded['id']}").json()
+    plan = told["plan"]
+    assert plan["north_deg"] == 30
+    assert [room["polygon"] for room in plan["rooms"]] == [
+        room.polygon_m.tolist() for room in FloorPlan.from_dict(FLAT).rooms
+    ]
+    assert [{key: opening[key] for key in openings[0]} for opening in plan["openings"]] == openings
+    assert [room["id"] for room in told["rooms"]] == [room["id"] for room in plan["rooms"]]
+    again = client.post("/floorplans", json=plan).json()
+    assert again["plan"] == plan
+    for made in (uploaded, again):
+        client.delete(f"/floorplans/{made['id']}")
 
 
 def test_the_grid_is_computed_in_the_background(client: httpx.Client) -> None:

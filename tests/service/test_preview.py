@@ -129,3 +129,39 @@ def test_the_ellipse_of_a_covariance_is_drawn_along_its_axes_with_y_pointing_up(
     assert float(ellipse.attrib["ry"]) == pytest.approx(math.sqrt(5.991) * 0.1, abs=1e-3)
     turn = float(ellipse.attrib["transform"].removeprefix("rotate(").removesuffix(")"))
     assert turn % 180.0 == pytest.approx(-30.0 % 180.0, abs=1e-2)
+
+
+OPEN_FLAT = {
+    "ceiling_height_m": 2.5,
+    "rooms": [
+        {"polygon": [[0, 0], [4, 0], [4, 3], [0, 3]], "holes": [[[1, 1], [2, 1], [2, 2]]], "walls": [[[3, 3], [3, 2]]]},
+        {"polygon": [[4.2, 0], [8, 0], [8, 3], [4.2, 3]]},
+    ],
+    "openings": [
+        {"kind": "door", "line": [[4.1, 1], [4.1, 1.9]]},
+        {"kind": "window", "line": [[1, 0], [2, 0]], "sill_m": 1.0, "head_m": 2.0},
+    ],
+}
+
+
+def test_openings_holes_and_free_standing_walls_are_drawn() -> None:
+    root = ElementTree.fromstring(plan_svg(FloorPlan.from_dict(OPEN_FLAT)))
+    paths = [(path.get("class"), path.get("d")) for path in root.iter(f"{SVG}path")]
+    assert ("walls", "M3.000 -3.000L3.000 -2.000") in paths
+    assert [kind for kind, _ in paths if kind in ("door", "window")] == ["door", "window", "door"]
+    assert ("window", "M1.000 -0.000L2.000 -0.000") in paths
+    polygons = [polygon.attrib for polygon in root.iter(f"{SVG}polygon")]
+    assert any(polygon["points"].count(" ") == 2 and polygon["fill"] == "#fff" for polygon in polygons)
+    # The doorway through the wall's thickness.
+    assert any("4.000,-1.000" in polygon["points"] and "4.200,-1.000" in polygon["points"] for polygon in polygons)
+
+
+def test_the_mesh_has_a_hole_in_the_floor_walls_from_both_sides_and_panels_at_openings() -> None:
+    plan = FloorPlan.from_dict(OPEN_FLAT)
+    scene = trimesh.load(io.BytesIO(plan_glb(plan)), file_type="glb")
+    assert scene.geometry["1/room 1/floor"].area == pytest.approx(11.5, abs=1e-4)
+    # Outline 14 m, hole 2 + root of 2 m, the stub from both sides 2 m; 2.5 m high.
+    assert scene.geometry["1/room 1/wall"].area == pytest.approx(2.5 * (16.0 + 2.0 + math.sqrt(2.0)), abs=1e-3)
+    assert scene.geometry["1/room 1/window"].area == pytest.approx(1.0, abs=1e-4)
+    assert scene.geometry["2/room 2/door"].area == pytest.approx(0.9 * 2.05, abs=1e-4)
+    assert "2/room 2/window" not in scene.geometry

@@ -1,0 +1,135 @@
+"""Work that plans may ask for: bounded, and growing with the plan."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+
+from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan import FloorPlan, PlanLimits, checks
+from lalaloc_core.sampling import pose_grid
+from tests.growth import assert_no_worse_than_linear
+from tests.strategies import plan_document, rectangle
+
+
+def comb(corners: int, *, upright: bool, shift_m: float) -> list[list[float]]:
+    """A comb of 20 m with thin teeth; two of them, one turned, cross at every pair of teeth."""
+    teeth = corners // 4 - 1
+    step = 20.0 / teeth
+    spine = [[-1.0, 0.0], [-1.0, 21.0]]
+    edge = [
+        [x, y]
+        for k in range(teeth)[::-1]
+        for x, y in ([0, k * step + 0.4 * step], [20, k * step + 0.4 * step], [20, k * step], [0, k * step])
+    ]
+    ring = np.array(spine + edge) + shift_m
+    return (ring if upright else ring[:, ::-1]).tolist()
+
+
+def crossing_combs(rooms: int, corners: int = 200) -> dict[str, Any]:
+    return plan_document(*[comb(corners, upright=k % 2 == 0, shift_m=0.01 * k) for k in range(rooms)])
+
+
+def slivers(count: int) -> dict[str, Any]:
+    """Diagonal rooms of 5 cm across a square of 200 m."""
+    return plan_document(*[[[k, 0], [k + 200, 200], [k + 200.05, 200], [k + 0.05, 0]] for k in range(count)])
+
+
+def test_combs_that_cross_cost_no_more_than_the_budget(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Intersections are asked of pairs until the walls that may cross are used up, however many rooms there are."""
+    asked = []
+    intersection = shapely.intersection
+
+    def counted(first: shapely.Polygon, second: shapely.Polygon) -> shapely.Geometry:
+        asked.append(len(first.exterior.coords) * len(second.exterior.coords))
+        return intersection(first, second)
+
+    monkeypatch.setattr(checks.shapely, "intersection", counted)
+    monkeypatch.setattr(checks, "_MAX_OVERLAPS", 10**6)
+    spent = []
+    for rooms in (8, 16):
+        asked.clear()
+        plan = FloorPlan.from_dict(crossing_combs(rooms))
+        assert plan.warnings[-1] == "more rooms may overlap, the rest was not looked at"
+        spent.append(sum(asked))
+    assert 0 < spent[1] <= 1.5 * spent[0]
+
+
+def test_simple_rooms_are_looked_at_beside_combs_that_are_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    document = crossing_combs(12)
+    document["rooms"] += plan_document(rectangle(2.0, 2.0, at=(50.0, 0.0)), rectangle(2.0, 2.0, at=(51.0, 0.0)))[
+        "rooms"
+    ]
+    document["rooms"][-2]["name"], document["rooms"][-1]["name"] = "left", "right"
+    monkeypatch.setattr(checks, "_MAX_WORK", 1000)
+    assert "rooms 'left' and 'right' overlap by 2.00 m²" in FloorPlan.from_dict(document).warnings
+
+
+def test_a_stored_plan_is_read_without_looking_for_overlaps_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = FloorPlan.from_dict(plan_document(rectangle(3.0, 3.0), rectangle(3.0, 3.0, at=(2.0, 0.0))))
+    text = json.dumps(plan.to_dict())
+    assert FloorPlan.from_stored(text, None).warnings == plan.warnings
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("looked for overlaps")
+
+    monkeypatch.setattr("lalaloc_core.floorplan.plan.overlap_warnings", refuse)
+    again = FloorPlan.from_stored(text, plan.warnings)
+    assert again.warnings == plan.warnings
+    assert again.to_dict() == plan.to_dict()
+
+
+def test_limits_of_today_do_not_hold_for_stored_plans() -> None:
+    far = plan_document(rectangle(4.0, 3.0, at=(1e8, 0.0)))
+    with pytest.raises(InvalidFloorPlanError):
+        FloorPlan.from_dict(far)
+    assert len(FloorPlan.from_stored(json.dumps(far), []).rooms) == 1
+
+
+def test_boxes_around_rooms_are_limited() -> None:
+    message = "the boxes around all rooms cover 120030 m², at most 100000 m² is allowed (max_bounds_area_m2)"
+    with pytest.raises(InvalidFloorPlanError) as caught:
+        FloorPlan.from_dict(slivers(3), PlanLimits(max_bounds_area_m2=100_000.0))
+    assert str(caught.value) == message
+    FloorPlan.from_dict(slivers(2), PlanLimits(max_bounds_area_m2=100_000.0))
+
+
+def test_a_grid_in_slivers_takes_time_by_their_boxes_and_memory_by_none() -> None:
+    plans = {count: FloorPlan.from_dict(slivers(count)) for count in (4, 8)}
+    assert_no_worse_than_linear(lambda count: lambda: pose_grid(plans[count], 0.5), 4)
+
+
+def test_a_lattice_looked_at_in_pieces_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    plan = FloorPlan.from_dict(plan_document(rectangle(7.3, 5.1), [[10, 0], [19, 2], [15, 9]]))
+    whole = pose_grid(plan, 0.1)
+    monkeypatch.setattr("lalaloc_core.sampling._LATTICE_POINTS", 17)
+    pieces = pose_grid(plan, 0.1)
+    np.testing.assert_array_equal(pieces.position_m, whole.position_m)
+    np.testing.assert_array_equal(pieces.room_index, whole.room_index)
+
+
+def spiral(corners: int) -> list[list[float]]:
+    turns = np.linspace(0.5, 1.0, corners // 2)
+    outer = 40.0 * turns[:, None] * np.stack([np.cos(75.0 * turns), np.sin(75.0 * turns)], axis=1)
+    return np.concatenate([outer, 0.99 * outer[::-1]]).tolist()
+
+
+@pytest.mark.parametrize("shape", [spiral, lambda corners: comb(corners, upright=True, shift_m=0.0)])
+def test_checking_one_room_grows_with_its_corners(shape: Any) -> None:
+    def work_of(corners: int) -> Any:
+        document = plan_document(shape(corners))
+        return lambda: FloorPlan.from_dict(document, PlanLimits(max_vertices_per_room=10_000))
+
+    assert_no_worse_than_linear(work_of, 400)
+
+
+def test_coordinates_are_exact_up_to_the_limit() -> None:
+    near = FloorPlan.from_dict(plan_document(rectangle(4.0, 3.0)))
+    far = FloorPlan.from_dict(plan_document(rectangle(4.0, 3.0, at=(9_999_990.0, -9_999_990.0))))
+    assert far.area_m2 == pytest.approx(near.area_m2, abs=1e-6)
+    assert math.isclose(far.rooms[0].walls_m[0, 2] - far.rooms[0].walls_m[0, 0], 4.0, abs_tol=1e-8)
