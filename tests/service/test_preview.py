@@ -148,7 +148,7 @@ def test_openings_holes_and_free_standing_walls_are_drawn() -> None:
     root = ElementTree.fromstring(plan_svg(FloorPlan.from_dict(OPEN_FLAT)))
     paths = [(path.get("class"), path.get("d")) for path in root.iter(f"{SVG}path")]
     assert ("walls", "M3.000 -3.000L3.000 -2.000") in paths
-    assert [kind for kind, _ in paths if kind in ("door", "window")] == ["door", "window", "door"]
+    assert [kind for kind, _ in paths if kind in ("door", "window")] == ["door", "door", "window"]
     assert ("window", "M1.000 -0.000L2.000 -0.000") in paths
     polygons = [polygon.attrib for polygon in root.iter(f"{SVG}polygon")]
     assert any(polygon["points"].count(" ") == 2 and polygon["fill"] == "#fff" for polygon in polygons)
