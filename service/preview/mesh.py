@@ -6,13 +6,15 @@ hides back faces shows the inside from wherever one looks.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import trimesh
 from trimesh.exchange.gltf import export_glb
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from lalaloc_core.floorplan import FloorPlan, Room
+from lalaloc_core.floorplan import FloorPlan, OpeningFace, Room
 
 _COLOURS = {
     "floor": (176, 141, 101, 255),
@@ -30,8 +32,11 @@ _BEFORE_WALL_M = 0.005
 def plan_glb(plan: FloorPlan) -> bytes:
     """The plan as binary glTF; one node per surface, named `<number of the room>/<room>/<surface>`."""
     scene = trimesh.Scene()
+    faces: list[list[OpeningFace]] = [[] for _ in plan.rooms]
+    for face in plan.opening_faces:
+        faces[face.room].append(face)
     for index, room in enumerate(plan.rooms):
-        for surface, mesh in (_surfaces(room) | _openings(plan, index)).items():
+        for surface, mesh in (_surfaces(room) | _openings(plan, room, faces[index])).items():
             material = PBRMaterial(
                 name=surface, baseColorFactor=_COLOURS[surface], metallicFactor=0.0, roughnessFactor=0.9
             )
@@ -51,13 +56,10 @@ def _surfaces(room: Room) -> dict[str, trimesh.Trimesh]:
     }
 
 
-def _openings(plan: FloorPlan, room_index: int) -> dict[str, trimesh.Trimesh]:
+def _openings(plan: FloorPlan, room: Room, faces: Sequence[OpeningFace]) -> dict[str, trimesh.Trimesh]:
     """Panels on the walls of a room, one mesh for each kind of opening."""
-    room = plan.rooms[room_index]
     panels: dict[str, list[np.ndarray]] = {}
-    for face in plan.opening_faces:
-        if face.room != room_index:
-            continue
+    for face in faces:
         opening = plan.openings[face.opening]
         low, high = _USUAL_M[opening.kind]
         low = low if opening.sill_m is None else opening.sill_m
