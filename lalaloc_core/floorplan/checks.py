@@ -51,19 +51,20 @@ def overlap_warnings(rooms: Sequence[Room], limits: PlanLimits) -> tuple[str, ..
     # Whose boxes meet; whether the rooms themselves do is asked of each pair, and of not too many.
     first, second = shapely.STRtree(shapes).query(shapes)
     pairs = sorted((int(i), int(j)) for i, j in zip(first, second, strict=True) if i < j)
+    crossings = _Crossings(rooms)
     warnings: list[str] = []
     work, is_complete = 0, len(pairs) <= _MAX_PAIRS
     for i, j in pairs[:_MAX_PAIRS]:
         if len(warnings) == _MAX_OVERLAPS:
             is_complete = False
             break
-        cost = _crossing_boxes(rooms[i], rooms[j])
         # Pairs of simple rooms are always looked at, whatever stands beside them.
-        if cost > _FEW:
-            if work + cost > _MAX_WORK:
+        if len(rooms[i].walls_m) * len(rooms[j].walls_m) > _FEW:
+            # Counting is work as well: once there was too much of it, it ends.
+            work += crossings.between(i, j) if work <= _MAX_WORK else 0
+            if work > _MAX_WORK:
                 is_complete = False
                 continue
-            work += cost
         shared = float(shapely.intersection(shapes[i], shapes[j]).area)
         if shared > limits.overlap_tolerance_m2:
             warnings.append(f"rooms '{rooms[i].name}' and '{rooms[j].name}' overlap by {shared:.2f} m²")
@@ -72,11 +73,19 @@ def overlap_warnings(rooms: Sequence[Room], limits: PlanLimits) -> tuple[str, ..
     return tuple(warnings)
 
 
-def _crossing_boxes(first: Room, second: Room) -> int:
-    """Pairs of walls whose boxes meet: what the intersection of two rooms costs, without computing it."""
-    edges = [np.sort(room.walls_m.reshape(-1, 2, 2), axis=1) for room in (first, second)]
-    if len(edges[0]) * len(edges[1]) <= _FEW:
-        return len(edges[0]) * len(edges[1])
-    (low, high), (other_low, other_high) = ((edge[:, None, 0], edge[:, None, 1]) for edge in edges)
-    meet = (low <= other_high.swapaxes(0, 1)).all(-1) & (high >= other_low.swapaxes(0, 1)).all(-1)
-    return int(meet.sum()) + len(edges[0]) + len(edges[1])
+class _Crossings:
+    """Counts pairs of walls whose boxes meet: what the intersection of two rooms costs, without computing it."""
+
+    def __init__(self, rooms: Sequence[Room]) -> None:
+        self._rooms = rooms
+        self._trees: dict[int, shapely.STRtree] = {}
+
+    def between(self, first: int, second: int) -> int:
+        pairs = self._tree(first).query(self._tree(second).geometries).shape[1]
+        return len(self._rooms[first].walls_m) + len(self._rooms[second].walls_m) + pairs
+
+    def _tree(self, room: int) -> shapely.STRtree:
+        if room not in self._trees:
+            ends = self._rooms[room].walls_m.reshape(-1, 2, 2)
+            self._trees[room] = shapely.STRtree([shapely.LineString(wall) for wall in ends])
+        return self._trees[room]
