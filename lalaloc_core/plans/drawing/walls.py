@@ -68,6 +68,11 @@ class Gap:
         return math.dist(self.start, self.end)
 
 
+def judge_by_walls(gap: Gap) -> int | None:
+    """Where nothing but walls is known: only what they leave no doubt of."""
+    return 0 if gap.is_sure else None
+
+
 @dataclass(frozen=True, eq=False)
 class Enclosed:
     """What walls enclose."""
@@ -83,7 +88,7 @@ def enclose(
     closers: Sequence[BaseGeometry] = (),
     config: WallConfig = DEFAULT_WALLS,
     tick: Callable[[], None] = lambda: None,
-    accept: Callable[[Gap], bool] = lambda gap: gap.is_sure,
+    judge: Callable[[Gap], int | None] = judge_by_walls,
 ) -> Enclosed:
     """The rooms between walls.
 
@@ -92,7 +97,7 @@ def enclose(
         lines: walls as lines.
         closers: doors and windows that are drawn as areas in the walls.
         tick: called between steps; may raise to end it.
-        accept: whether a gap between two walls is an opening; others stay open.
+        judge: how good a gap between two walls is, the least is the best; None: it is no opening, and stays open.
     """
     faces, loose = _faces(lines, config, tick) if lines else ([], [])
     thin = [face for face in faces if _is_thin(face, config)]
@@ -102,7 +107,7 @@ def enclose(
     leftovers = [line for line in loose if not solid.buffer(0.02).covers(line) and line.length >= config.nib]
     blocked = shapely.unary_union([solid, *closers, *(line.buffer(0.01, cap_style="flat") for line in leftovers)])
     tick()
-    gaps = find_gaps(blocked, config, tick, accept)
+    gaps = find_gaps(blocked, config, tick, judge)
     return Enclosed(_insides([blocked, *(gap.shape for gap in gaps)], config), gaps, solid)
 
 
@@ -110,12 +115,12 @@ def find_gaps(
     walls: BaseGeometry,
     config: WallConfig,
     tick: Callable[[], None] = lambda: None,
-    accept: Callable[[Gap], bool] = lambda gap: gap.is_sure,
+    judge: Callable[[Gap], int | None] = judge_by_walls,
 ) -> list[Gap]:
-    """Openings between ends of walls and what they face, the narrowest first; none overlaps another."""
+    """Openings between ends of walls and what they face, the best and then the narrowest first; none overlaps."""
     parts = [simple for part in polygons_of(walls) for simple in polygons_of(part.simplify(0.004))]
     tree = shapely.STRtree(parts)
-    found: list[tuple[float, Gap]] = []
+    found: list[Gap] = []
     for part in parts:
         oriented = shapely.geometry.polygon.orient(part)
         for ring in (oriented.exterior, *oriented.interiors):
@@ -123,11 +128,11 @@ def find_gaps(
                 tick()
                 gap = _gap_before(wall, parts, tree, config)
                 if gap is not None:
-                    found.append((gap.width, gap))
+                    found.append(gap)
     kept: list[Gap] = []
-    for _, gap in sorted(found, key=lambda item: (not item[1].is_sure, item[0])):
-        apart = all(shapely.intersection(gap.shape, other.shape).area < 0.25 * gap.shape.area for other in kept)
-        if apart and accept(gap):
+    ranked = [(rank, gap.width, gap) for gap in found if (rank := judge(gap)) is not None]
+    for _, _, gap in sorted(ranked, key=lambda item: item[:2]):
+        if all(shapely.intersection(gap.shape, other.shape).area < 0.25 * gap.shape.area for other in kept):
             kept.append(gap)
     return kept
 

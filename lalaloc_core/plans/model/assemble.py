@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import shapely
 from shapely import affinity
+from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_LIMITS, FloorPlan, PlanLimits
@@ -25,6 +26,8 @@ DEFAULT_CEILING_HEIGHT_M = 2.5
 # Rounding of a drawing: vertices this far off a straight wall are not corners, slivers this small are no floor.
 _STRAIGHT_M, _SLIVER_M2 = 0.002, 0.01
 _FAR_M = 10_000.0
+# A tenth of a millimetre is finer than anything that is built.
+_GRID_M, _DECIMALS = 1e-4, 4
 _MOST_NAMED = 5
 
 
@@ -110,7 +113,7 @@ def _clean(room: SketchedRoom, obstacles: list[shapely.Polygon], notebook: Noteb
     for obstacle in obstacles:
         if obstacle.intersects(shape):
             shape = shapely.difference(shape, obstacle)
-    floors = [simple for floor in polygons_of(shape) for simple in polygons_of(floor.simplify(_STRAIGHT_M))]
+    floors = [simple for floor in polygons_of(shape) for simple in _simple(floor.simplify(_STRAIGHT_M))]
     floors = [floor for floor in floors if floor.area >= DEFAULT_LIMITS.min_room_area_m2]
     label = f"room '{room.name}'" if room.name else "a room without a name"
     if not floors and room.shape.area < _SLIVER_M2:
@@ -128,6 +131,18 @@ def _clean(room: SketchedRoom, obstacles: list[shapely.Polygon], notebook: Noteb
         kind = room.type or type_of_room(name)
         cleaned.append(SketchedRoom(shape, name, kind, room.ceiling_height_m, room.id))
     return cleaned
+
+
+def _simple(floor: BaseGeometry) -> list[shapely.Polygon]:
+    """Polygons whose outlines touch themselves nowhere, on the grid that coordinates are written on."""
+    found = []
+    for part in polygons_of(shapely.set_precision(floor, _GRID_M)):
+        if not shapely.Polygon(part.exterior).is_valid:
+            apart = part.buffer(-10.0 * _GRID_M).buffer(10.0 * _GRID_M, join_style="mitre")
+            found += polygons_of(shapely.set_precision(apart, _GRID_M))
+        else:
+            found.append(part)
+    return found
 
 
 def _near_origin(rooms: list[SketchedRoom], notebook: Notebook) -> tuple[list[SketchedRoom], tuple[float, float]]:
@@ -195,8 +210,7 @@ def _ring(ring: shapely.LinearRing) -> list[list[float]]:
 
 
 def _xy(point: tuple[float, ...]) -> list[float]:
-    """A tenth of a millimetre is finer than anything that is built."""
-    return [round(float(point[0]), 4) + 0.0, round(float(point[1]), 4) + 0.0]
+    return [round(float(point[0]), _DECIMALS) + 0.0, round(float(point[1]), _DECIMALS) + 0.0]
 
 
 def _what_was_there(notebook: Notebook) -> str:

@@ -59,8 +59,8 @@ def _walls(ink: Ink, filled: Bool[np.ndarray, "h w"], cavities: Int[np.ndarray, 
     size = max(3, round(_THINNEST_M / ink.metres_per_pixel))
     thick = cv2.morphologyEx(filled.astype(np.uint8), cv2.MORPH_OPEN, np.ones((size, size), np.uint8))
     thickness = _usual_thickness(thick) * ink.metres_per_pixel
-    if not thickness:
-        return None
+    if thickness < _THINNEST_M:
+        return None  # Strokes of a hatch that run together are no walls.
     kept = _without_furniture(thick, thickness / ink.metres_per_pixel, ink.metres_per_pixel)
     return WallMask(kept, thickness, cavities) if kept.any() else None
 

@@ -87,11 +87,13 @@ def _read(walls: WallMask, ink: Ink, is_dark: bool, budget: Budget) -> _Reading:
     reader = GapReader(ink)
     seen: dict[int, Seen] = {}
 
-    def accept(gap: Gap) -> bool:
+    def judge(gap: Gap) -> int | None:
         seen[id(gap)] = found = reader.look(gap)
-        return found.kind != "nothing" or (gap.is_sure and gap.width <= _WIDEST_BARE_GAP_M)
+        if found.kind == "nothing" and not (gap.is_sure and gap.width <= _WIDEST_BARE_GAP_M):
+            return None
+        return ("door", "window", "nothing").index(found.kind)
 
-    enclosed = enclose(bodies_of(walls, ink), [], (), _CONFIG, budget.check_time, accept)
+    enclosed = enclose(bodies_of(walls, ink), [], (), _CONFIG, budget.check_time, judge)
     rooms = [room for room in enclosed.rooms if room.area >= _SMALLEST_ROOM_M2]
     return _Reading(walls, Enclosed(rooms, enclosed.gaps, enclosed.walls), seen, is_dark)
 
