@@ -55,12 +55,14 @@ class Gap:
     """An opening in a wall: the quadrilateral between two jambs, and its middle line along the wall.
 
     `is_sure` is False where the walls alone do not tell: one end is a short nib, or the two are not quite in line.
+    `is_between_ends` tells that both sides are ends of walls, not an end and the face of another.
     """
 
     shape: shapely.Polygon
     start: tuple[float, float]
     end: tuple[float, float]
     is_sure: bool = True
+    is_between_ends: bool = False
 
     @property
     def width(self) -> float:
@@ -186,8 +188,9 @@ def _gap_before(wall: _End, parts: Sequence[shapely.Polygon], tree: shapely.STRt
     width = farthest if farthest - middle <= 0.25 * config.thickest else middle
     if width - nearest > _OUT_OF_LINE_M or not config.narrowest_gap <= width <= config.widest_gap:
         return None
+    is_between_ends = _faces_an_end(wall.start, wall.end, outward, width, tree)
     is_sure = width - nearest <= 0.25 * config.thickest and (
-        wall.nib >= config.nib or _faces_an_end(wall.start, wall.end, outward, width, tree)
+        wall.nib >= config.nib or (is_between_ends and width <= _WIDEST_BETWEEN_NIBS)
     )
     # A little into both walls, so that nothing is left open beside it.
     near, far = -0.02 * outward, (width + 0.02) * outward
@@ -196,7 +199,7 @@ def _gap_before(wall: _End, parts: Sequence[shapely.Polygon], tree: shapely.STRt
         return None
     begin = 0.5 * (wall.start + wall.end)
     reach = begin + width * outward
-    return Gap(shape, (float(begin[0]), float(begin[1])), (float(reach[0]), float(reach[1])), is_sure)
+    return Gap(shape, (float(begin[0]), float(begin[1])), (float(reach[0]), float(reach[1])), is_sure, is_between_ends)
 
 
 def _faces_an_end(
@@ -210,8 +213,7 @@ def _faces_an_end(
     a, b = start + (width + 0.02) * outward, end + (width + 0.02) * outward
     side = 0.12 * (b - a) / np.linalg.norm(b - a)
     outside = shapely.LineString([a - side, a - 0.3 * side]), shapely.LineString([b + 0.3 * side, b + side])
-    is_open = not any(len(tree.query(piece, predicate="intersects")) > 0 for piece in outside)
-    return is_open and width <= _WIDEST_BETWEEN_NIBS
+    return not any(len(tree.query(piece, predicate="intersects")) > 0 for piece in outside)
 
 
 def _faces(

@@ -136,12 +136,12 @@ def _clean(room: SketchedRoom, obstacles: list[shapely.Polygon], notebook: Noteb
 def _simple(floor: BaseGeometry) -> list[shapely.Polygon]:
     """Polygons whose outlines touch themselves nowhere, on the grid that coordinates are written on."""
     found = []
-    for part in polygons_of(shapely.set_precision(floor, _GRID_M)):
-        if not shapely.Polygon(part.exterior).is_valid:
+    for part in polygons_of(shapely.transform(floor, lambda points: points.round(_DECIMALS))):
+        if shapely.Polygon(part.exterior).is_valid:
+            found.append(part)
+        else:
             apart = part.buffer(-10.0 * _GRID_M).buffer(10.0 * _GRID_M, join_style="mitre")
             found += polygons_of(shapely.set_precision(apart, _GRID_M))
-        else:
-            found.append(part)
     return found
 
 

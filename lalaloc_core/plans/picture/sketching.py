@@ -21,7 +21,7 @@ from lalaloc_core.plans.picture.panes import windows_in_walls
 
 # In pictures windows are gaps in dark walls, and wider than doors; what has no symbol is no opening when it is wide.
 _CONFIG = WallConfig(widest_gap=3.6, narrowest_gap=0.4, thinnest=0.04)
-_WIDEST_BARE_GAP_M = 1.9
+_WIDEST_BARE_GAP_M, _WIDEST_BARE_GAP_AT_A_FACE_M = 1.9, 1.1
 _SMALLEST_ROOM_M2 = 1.0
 _LARGEST_ISLAND_M2 = 2.0
 # Dark walls are the surer reading: outlines must enclose so much more to be preferred.
@@ -89,7 +89,8 @@ def _read(walls: WallMask, ink: Ink, is_dark: bool, budget: Budget) -> _Reading:
 
     def judge(gap: Gap) -> int | None:
         seen[id(gap)] = found = reader.look(gap)
-        if found.kind == "nothing" and not (gap.is_sure and gap.width <= _WIDEST_BARE_GAP_M):
+        widest = _WIDEST_BARE_GAP_M if gap.is_between_ends else _WIDEST_BARE_GAP_AT_A_FACE_M
+        if found.kind == "nothing" and not (gap.is_sure and gap.width <= widest):
             return None
         return ("door", "window", "nothing").index(found.kind)
 
