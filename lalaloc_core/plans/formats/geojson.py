@@ -287,6 +287,7 @@ def _role(feature: _Feature) -> Role:
         return "obstacle"
     if kind == "opening":
         return _opening_role(says, category)
+    role: Role
     if kind in _FEATURE_TYPES:
         role = _FEATURE_TYPES[kind]
     elif str(says.get("door") or "no").casefold() != "no":
@@ -294,7 +295,7 @@ def _role(feature: _Feature) -> Role:
     else:
         said = [role_of(str(says[key])) for key in ("kind", "type", "category", "class", "layer") if says.get(key)]
         otherwise: Role = "room" if is_area else "door"
-        role = next((each for each in said if each is not None), otherwise)
+        role = next((each for each in said if each is not None), None) or otherwise
     return "obstacle" if role == "wall" and is_area else role
 
 
