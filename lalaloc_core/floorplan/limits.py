@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M
+
 
 @dataclass(frozen=True, kw_only=True)
 class PlanLimits:
@@ -31,6 +33,7 @@ class PlanLimits:
     max_name_length: int = 200
     min_room_area_m2: float = 0.2
     min_ceiling_height_m: float = 1.0
+    min_camera_height_m: float = MIN_CAMERA_HEIGHT_M
     max_ceiling_height_m: float = 20.0
     # Two rooms that share more floor than this overlap; less is rounding of the drawing.
     overlap_tolerance_m2: float = 0.01
@@ -49,4 +52,5 @@ NO_LIMITS = PlanLimits(
     max_area_m2=math.inf,
     max_bounds_area_m2=math.inf,
     max_coordinate_m=math.inf,
+    min_camera_height_m=0.0,
 )

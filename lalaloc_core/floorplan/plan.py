@@ -132,7 +132,7 @@ class FloorPlan:
         return cls(
             name=name,
             rooms=rooms,
-            camera_height_m=read_camera_height(document.get("camera_height_m"), rooms),
+            camera_height_m=read_camera_height(document.get("camera_height_m"), rooms, limits),
             warnings=tuple(warnings),
             north=read_north(document.get("north_deg")),
             openings=openings,

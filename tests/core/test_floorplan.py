@@ -119,6 +119,8 @@ def test_a_bad_polygon_is_refused_by_the_name_of_its_room(polygon: Any, reason: 
         ({"ceiling_height_m": 25.0}, "between 1 and 20"),
         ({"camera_height_m": 0}, "above 0"),
         ({"camera_height_m": -1.5}, "above 0"),
+        ({"camera_height_m": 1e-50}, "at least 0.1 m"),
+        ({"camera_height_m": 0.09}, "at least 0.1 m"),
         ({"camera_height_m": math.nan}, "finite"),
         ({"camera_height_m": 10**400}, "finite"),
         ({"camera_height_m": "1.5"}, "number"),

@@ -89,6 +89,8 @@ def test_limits_of_today_do_not_hold_for_stored_plans() -> None:
     with pytest.raises(InvalidFloorPlanError):
         FloorPlan.from_dict(far)
     assert len(FloorPlan.from_stored(json.dumps(far), []).rooms) == 1
+    low = {**far, "camera_height_m": 0.05}
+    assert FloorPlan.from_stored(json.dumps(low), []).camera_height_m == 0.05
 
 
 def test_boxes_around_rooms_are_limited() -> None:
