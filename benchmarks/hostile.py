@@ -115,8 +115,10 @@ def _attacks(url: str, plan_id: str) -> Iterator[Attack]:
     combs = _document([_comb(k) for k in range(24)])
     yield Attack("24 rooms that are crossing combs", len(combs), lambda: [_plan(url, combs)])
     yield Attack("... looked at ten times at once", 0, lambda: _together(url, _newest(url), "", 10))
-    slivers = _document([_sliver(k) for k in range(500)])
-    yield Attack("500 slivers across 290 m", len(slivers), lambda: [_plan(url, slivers), _settled(url)])
+    for side_m in (290.0, 19.9):
+        slivers = _document([_sliver(k, side_m) for k in range(500)])
+        name = f"500 slivers across squares of {side_m:g} m"
+        yield Attack(name, len(slivers), lambda slivers=slivers: [_plan(url, slivers), _settled(url)])
     spirals = _document([_spiral(k) for k in range(6)])
     yield Attack("6 rooms that are spirals", len(spirals), lambda: [_plan(url, spirals)])
     yield Attack(
@@ -147,10 +149,10 @@ def _comb(number: int) -> list[Point]:
     return [[y + shift, x + shift] if number % 2 else [x + shift, y + shift] for x, y in comb]
 
 
-def _sliver(number: int) -> list[Point]:
-    """A corridor of 8 mm across a square of 290 m, whose box holds hundreds of thousands of poses."""
-    x = 0.05 * number
-    return [[x, 0.0], [x + 0.008, 0.0], [x + 265.0, 290.0], [x + 264.992, 290.0]]
+def _sliver(number: int, side_m: float) -> list[Point]:
+    """A corridor of a few millimetres across a square, whose poses are looked for in all of the square."""
+    x, width_m = 0.05 * number, 0.25 / side_m
+    return [[x, 0.0], [x + width_m, 0.0], [x + side_m, side_m], [x + side_m - width_m, side_m]]
 
 
 def _spiral(number: int) -> list[Point]:
