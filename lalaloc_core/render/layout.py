@@ -48,7 +48,7 @@ def layout_view(
     Differentiable in position and heading almost everywhere, as far as distances go.
 
     Args:
-        position_m: camera positions, inside their rooms.
+        position_m: camera positions, inside their rooms; in double precision where the plan lies far from its origin.
         heading: azimuth of the centre column, radians.
         room_index: each pose's room.
         geometry: of the plan, `FloorPlan.geometry`.

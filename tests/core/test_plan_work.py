@@ -12,6 +12,7 @@ import shapely
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan, PlanLimits, checks
+from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.sampling import pose_grid
 from tests.growth import assert_no_worse_than_linear
 from tests.strategies import plan_document, rectangle
@@ -135,3 +136,13 @@ def test_coordinates_are_exact_up_to_the_limit() -> None:
     far = FloorPlan.from_dict(plan_document(rectangle(4.0, 3.0, at=(9_999_990.0, -9_999_990.0))))
     assert far.area_m2 == pytest.approx(near.area_m2, abs=1e-6)
     assert math.isclose(far.rooms[0].walls_m[0, 2] - far.rooms[0].walls_m[0, 0], 4.0, abs_tol=1e-8)
+
+
+@pytest.mark.parametrize("offset_m", [1e5, -9.9e6])
+def test_single_precision_is_enough_however_far_out_a_plan_lies(offset_m: float) -> None:
+    plans = [FloorPlan.from_dict(plan_document(rectangle(4.0, 3.0, at=(at, at)))) for at in (0.0, offset_m)]
+    near, far = (
+        profiles_at(plan, np.array([[at + 1.3, at + 1.1]]), np.array([0]), np.zeros(1), 32, np.float32)
+        for plan, at in zip(plans, (0.0, offset_m), strict=True)
+    )
+    np.testing.assert_allclose(far, near, atol=1e-5)
