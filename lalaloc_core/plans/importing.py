@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import time
 from collections.abc import Callable
+from dataclasses import fields, replace
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.json_text import read_json
@@ -27,6 +28,18 @@ _STRANGERS = {
     b"7z\xbc\xaf": "7z: unpack it",
     b"{\\rtf": "RTF",
 }
+# Which options a format's importer looks at, besides those that all do.
+_ALWAYS_HEARD = {"name", "ceiling_height_m"}
+_HEARD = {
+    "native": {"units", "y_axis"},
+    "geojson": {"units", "y_axis", "level", "layers"},
+    "archive": {"level", "layers"},
+    "svg": {"units", "scale", "metres_per_pixel", "known_distance", "layers", "y_axis"},
+    "dxf": {"units", "metres_per_pixel", "known_distance", "layers", "y_axis"},
+    "ifc": {"level"},
+    "pdf": {"scale", "metres_per_pixel", "known_distance", "page"},
+    "picture": {"scale", "metres_per_pixel", "known_distance"},
+}
 _XML_START = re.compile(rb"\s*<(?:\?xml|!--|!DOCTYPE|[A-Za-z])")
 
 
@@ -47,11 +60,22 @@ def import_plans(
         )
     budget = Budget(limits, clock)
     try:
-        return _import(content, options, budget)
+        format = detect_format(content, limits)
+        plans = _import(format, content, options, budget)
     except RecursionError as error:
         raise InvalidFloorPlanError("the file is nested too deep to be read") from error
     except MemoryError as error:
         raise InvalidFloorPlanError("the file takes more memory than there is for one") from error
+    unheard = [f"'{name}' says nothing about a {format} file and was not used" for name in _unheard(format, options)]
+    return tuple(
+        replace(plan, report=replace(plan.report, warnings=(*unheard, *plan.report.warnings))) for plan in plans
+    )
+
+
+def _unheard(format: str, options: ImportOptions) -> list[str]:
+    """Options that were given and that the importer of a format does not look at."""
+    given = [field.name for field in fields(options) if getattr(options, field.name) != field.default]
+    return [name for name in given if name not in _ALWAYS_HEARD and name not in _HEARD[format]]
 
 
 def import_plan(
@@ -104,10 +128,9 @@ def detect_format(content: bytes, limits: ImportLimits = DEFAULT_IMPORT_LIMITS) 
     raise InvalidFloorPlanError(f"the file is of no known format; known are {_known()}")
 
 
-def _import(content: bytes, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
+def _import(format: str, content: bytes, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
     """Importers are loaded when they are needed: each brings a library of its own."""
     limits = budget.limits
-    format = detect_format(content, limits)
     if format == "native":
         from lalaloc_core.plans.formats.native import import_native
 

@@ -57,6 +57,11 @@ def test_the_option_wins_over_what_the_file_says():
     assert _import({**FLAT, "units": "mm"}, units="m").document["rooms"] == json.loads(json.dumps(FLAT["rooms"]))
 
 
+def test_an_option_that_says_nothing_about_a_format_is_told():
+    (warning,) = _import(FLAT, page=3).report.warnings
+    assert warning == "'page' says nothing about a native file and was not used"
+
+
 def test_y_down_turns_the_plan_over_with_its_north():
     plan = {**FLAT, "y_axis": "down", "north_deg": 30.0}
     imported = _import(plan)

@@ -46,6 +46,8 @@ def test_a_picture_is_a_draft_that_says_what_it_is_unsure_of(drawn: dict[Style, 
 def test_a_scale_is_never_assumed(drawn: dict[Style, DrawnPlan]):
     with pytest.raises(InvalidFloorPlanError, match="does not say how long anything is"):
         import_plan(drawn["thick"].png())
+    with pytest.raises(InvalidFloorPlanError, match="does not say how long anything is"):
+        import_plan(drawn["thick"].png(), ImportOptions(units="m"))
 
 
 def test_a_known_distance_is_a_scale(drawn: dict[Style, DrawnPlan]):

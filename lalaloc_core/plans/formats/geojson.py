@@ -293,9 +293,9 @@ def _role(feature: _Feature) -> Role:
     elif str(says.get("door") or "no").casefold() != "no":
         role = "door"
     else:
-        said = [role_of(str(says[key])) for key in ("kind", "type", "category", "class", "layer") if says.get(key)]
-        otherwise: Role = "room" if is_area else "door"
-        role = next((each for each in said if each is not None), None) or otherwise
+        role = "room" if is_area else "door"
+        for key in ("layer", "class", "category", "type", "kind"):
+            role = role_of(str(says.get(key) or "")) or role
     return "obstacle" if role == "wall" and is_area else role
 
 

@@ -5,6 +5,8 @@ A PDF knows no layers that mean anything and no rooms, so what comes of it is a 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from lalaloc_core.errors import InvalidFloorPlanError
@@ -38,7 +40,9 @@ def import_pdf(content: bytes, options: ImportOptions, budget: Budget) -> tuple[
     try:
         found = read_page(page, budget)
         texts = [lettering.text for lettering in found.drawing.letterings]
-        factor, source = drawing_scale(options, "the PDF", paper_m_per_unit=_METRES_PER_POINT, texts=texts)
+        # A unit of the page is a point, whatever somebody says of units.
+        asked = replace(options, units=None)
+        factor, source = drawing_scale(asked, "the PDF", paper_m_per_unit=_METRES_PER_POINT, texts=texts)
         notebook = Notebook()
         sketch = _as_drawing(found, factor, notebook, budget)
         if sketch is None or not sketch.rooms:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import warnings
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import UInt8
@@ -30,7 +31,7 @@ def import_picture(content: bytes, options: ImportOptions, budget: Budget) -> tu
         InvalidFloorPlanError: no picture that can be read, or nothing says how long a pixel is.
     """
     gray, paper_m_per_pixel = _open(content, budget)
-    factor, source = drawing_scale(options, "the picture", paper_m_per_unit=paper_m_per_pixel)
+    factor, source = drawing_scale(replace(options, units=None), "the picture", paper_m_per_unit=paper_m_per_pixel)
     rows, columns = gray.shape
     if max(rows, columns) * factor > _LARGEST_M:
         raise InvalidFloorPlanError(
