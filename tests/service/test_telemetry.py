@@ -77,9 +77,13 @@ def log() -> Iterator[Log]:
     """What is logged from here on."""
     attached = Log()
     logger = logging.getLogger(LOGGER_NAME)
+    # An app that another test started may have set another level for all of this process.
+    level = logger.level
+    logger.setLevel(logging.DEBUG)
     logger.addHandler(attached.handler)
     yield attached
     logger.removeHandler(attached.handler)
+    logger.setLevel(level)
 
 
 def _metric(client: httpx.Client, sample: str) -> float:
