@@ -22,6 +22,7 @@ from lalaloc_client import Candidate, Localisation
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import heading_from_degrees
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.evidence import latent_distances
 from lalaloc_core.panorama.images import read_panorama
@@ -60,7 +61,7 @@ def latent_map(cells: Cells, plan: FloorPlan, encoders: Encoders, truth: TruePos
     """How far the panorama's latent is from that of every cell of the plan, its heading given."""
     manifest = encoders.manifest
     panorama = read_panorama(truth.picture.read_bytes(), height=manifest.image_height, width=manifest.image_width)
-    query = encoders.query(panorama, heading_from_degrees(truth.heading_deg), truth.camera_height_m)
+    query = encoders.query(panorama, heading_from_degrees(truth.heading_deg), CameraHeight(truth.camera_height_m))
     heading = np.full(len(cells.poses), query.frame_heading)
     latents, _ = encoders.poses(plan, cells.poses, heading, truth.camera_height_m)
     return latent_distances(latents, query.latents)[0]

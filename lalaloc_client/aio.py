@@ -134,6 +134,7 @@ class AsyncClient:
         heading_deg: float | None = None,
         heading_tolerance_deg: float | None = None,
         camera_height_m: float | None = None,
+        camera_height_std_m: float | None = None,
         refine: Refine | None = None,
         top_k: int | None = None,
     ) -> Localisation:
@@ -146,6 +147,7 @@ class AsyncClient:
             heading_deg=heading_deg,
             heading_tolerance_deg=heading_tolerance_deg,
             camera_height_m=camera_height_m,
+            camera_height_std_m=camera_height_std_m,
             refine=refine,
             top_k=top_k,
         )

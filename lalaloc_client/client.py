@@ -164,6 +164,7 @@ class Client:
         heading_deg: float | None = None,
         heading_tolerance_deg: float | None = None,
         camera_height_m: float | None = None,
+        camera_height_std_m: float | None = None,
         refine: Refine | None = None,
         top_k: int | None = None,
     ) -> Localisation:
@@ -174,7 +175,8 @@ class Client:
                 picture of PIL, which is sent as JPEG.
             heading_deg: azimuth of the picture's centre column, clockwise from the plan's +y; None: unknown, found.
             heading_tolerance_deg: how far off that may be, up to 45; None: not at all.
-            camera_height_m: over the floor; None: the plan's.
+            camera_height_m: over the floor; None: the plan's, and if it has none, any.
+            camera_height_std_m: standard deviation of that, which is solved for; None: the plan's, or 0.1; 0: exact.
             refine: `none`, `vdr` or `lpo`, how far to go; None: as far as possible.
             top_k: how many candidates; None: as many as the service likes.
         """
@@ -184,6 +186,7 @@ class Client:
             heading_deg=heading_deg,
             heading_tolerance_deg=heading_tolerance_deg,
             camera_height_m=camera_height_m,
+            camera_height_std_m=camera_height_std_m,
             refine=refine,
             top_k=top_k,
         )

@@ -138,13 +138,20 @@ class PlanEvent:
 
 @dataclass(frozen=True)
 class Candidate:
-    """One possible pose; candidates are ranked by `cost`, lower is better."""
+    """One possible pose; candidates are ranked by `cost`, lower is better.
+
+    Attributes:
+        probability: that the camera is within 1 m, and not at a better candidate; None for a model that does not tell.
+        room_id: the room's id in the plan, which is unique as its name need not be.
+    """
 
     position: Position
     heading_deg: float
     room: str
     cost: float
     latent_distance: float
+    probability: float | None = None
+    room_id: str | None = None
 
 
 @dataclass(frozen=True)
@@ -164,6 +171,10 @@ class Localisation:
         heading_deg: azimuth of the panorama's centre column, clockwise from the plan's +y.
         heading_source: `given`, `panorama` (its metadata) or `searched`; None for a service that does not tell.
         confidence: probability that the position is right within 1 m, None for a model that does not tell.
+        heading_confidence: probability that the heading is right within 5°.
+        warnings: what was said and not followed, such as a heading that the panorama contradicts.
+        camera_height_m: the camera height that fits best.
+        room_id: the room's id in the plan.
         stage: the last stage that produced the position: `retrieval`, `vdr` or `lpo`.
         covariance_m2: of the position, given that it is right within 1 m; None unless `stage` is `lpo`.
         heading_std_deg: standard deviation of the heading where it was searched.
@@ -188,6 +199,9 @@ class Localisation:
     model: Model
     floorplan_revision: str | None = None
     heading_source: str | None = None
+    heading_confidence: float | None = None
+    warnings: tuple[str, ...] = ()
+    room_id: str | None = None
 
 
 @dataclass(frozen=True)

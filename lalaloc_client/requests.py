@@ -133,6 +133,7 @@ def localise_request(
     heading_deg: float | None,
     heading_tolerance_deg: float | None,
     camera_height_m: float | None,
+    camera_height_std_m: float | None,
     refine: Refine | None,
     top_k: int | None,
 ) -> Request:
@@ -142,6 +143,7 @@ def localise_request(
         "heading_deg": heading_deg,
         "heading_tolerance_deg": heading_tolerance_deg,
         "camera_height_m": camera_height_m,
+        "camera_height_std_m": camera_height_std_m,
         "refine": refine,
         "top_k": top_k,
     }

@@ -33,7 +33,10 @@ BUNDLE_FILES = (LAYOUT_ONNX, IMAGE_ONNX, HEAD_ONNX, LAYOUT_WEIGHTS, IMAGE_WEIGHT
 
 @dataclass(frozen=True, kw_only=True)
 class LogisticModel:
-    """Probability of "the answer is within 1 m" by the signals of `localise.confidence`."""
+    """Probability that a picture fits its plan by the signals of `localise.confidence`.
+
+    Before there was a posterior, `log_odds` stood for it in this model; models that are fitted now leave it at 0.
+    """
 
     bias: float
     log_odds: float
@@ -46,6 +49,21 @@ class LogisticModel:
         logit = self.bias + self.log_odds * log_odds + self.cost * cost
         logit += self.uncertainty * uncertainty + self.latent_distance * latent_distance
         return 1.0 / (1.0 + math.exp(-max(-30.0, min(30.0, logit))))
+
+
+@dataclass(frozen=True, kw_only=True)
+class EvidenceModel:
+    """How much each term of the evidence may count, fitted on validation queries; see `localise.evidence`.
+
+    Attributes:
+        openings, ceiling, room_type: weights in units of the walls'.
+        temperature: T, how many independent azimuths a cost is worth: likelihoods are `exp(-T cost)`.
+    """
+
+    openings: float = 0.7
+    ceiling: float = 0.05
+    room_type: float = 0.05
+    temperature: float = 16.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,8 +83,8 @@ class ConfidenceModel:
     position_factor_searched: float | None = None
     heading_factor: float | None = None
 
-    def probability(self, stage: str, signals: Mapping[str, float], *, heading_known: bool) -> float | None:
-        """Confidence of an answer; None for a stage that no validation query was answered by."""
+    def fit_probability(self, stage: str, signals: Mapping[str, float], *, heading_known: bool) -> float | None:
+        """Probability that a picture is of the plan at all; None for a stage that no validation query came to."""
         model = (self.known_heading if heading_known else self.searched_heading).get(stage)
         return None if model is None else model.probability(**signals)
 
@@ -95,6 +113,7 @@ class Manifest:
         opening_prior: the classes' shares that its probabilities presume; dividing by them leaves likelihoods.
         room_types: types of rooms that it tells apart, and `room_type_prior` their shares in what it was trained on.
         confidence: fitted on validation queries; None leaves answers without a trained confidence.
+        evidence: weights of what poses are compared by.
         training: commands, seeds, hardware, counts of how the model was trained.
         metrics: validation figures with their n.
     """
@@ -116,6 +135,7 @@ class Manifest:
     room_types: list[str] = field(default_factory=list)
     room_type_prior: list[float] = field(default_factory=list)
     confidence: ConfidenceModel | None = None
+    evidence: EvidenceModel = field(default_factory=EvidenceModel)
     training: dict[str, Any] = field(default_factory=dict)
     metrics: dict[str, Any] = field(default_factory=dict)
     files: dict[str, FileEntry] = field(default_factory=dict)

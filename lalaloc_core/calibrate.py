@@ -1,6 +1,10 @@
-"""Fit what answers say of themselves on validation queries: the probability of "within 1 m", and the covariance.
+"""Fit what answers are weighed by, and what they say of themselves, on validation queries.
 
-Queries are photographs of the plan's home, and some of other homes and of none: what fits nothing must not be trusted.
+* How much each term of the evidence may count, and how sharp the posterior is: what makes the right ones of the
+  candidates the most probable (`fit_evidence`).
+* The probability that a picture fits its plan, with which the posterior makes the probability of "within 1 m", and the
+  covariance (`fit_confidence`). Queries are photographs of the plan's home, and some of other homes and of none: what
+  fits nothing must not be trusted.
 """
 
 from __future__ import annotations
@@ -10,28 +14,28 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from scipy import optimize
 
-from lalaloc_core.bundle import Bundle, ConfidenceModel, LogisticModel, write_manifest
+from lalaloc_core.bundle import Bundle, ConfidenceModel, EvidenceModel, LogisticModel, write_manifest
 from lalaloc_core.conventions import heading_from_degrees, wrap_angle
-from lalaloc_core.evaluation.predictions import Prediction
+from lalaloc_core.evaluation.predictions import Pose, Prediction
 from lalaloc_core.evaluation.score import position_errors_m
-from lalaloc_core.localise.confidence import RIGHT_WITHIN_M
 from lalaloc_core.localise.covariance import marginal_information
+from lalaloc_core.localise.posterior import RIGHT_WITHIN_M, TURNED_APART
 from lalaloc_core.metrics import Accuracy
 
 # Of all that is fitted on, photographs of something else than the plan's home weigh so much: enough to tell them, too
 # little to make answers about the home itself look less sure than they are.
-_MISMATCHED_SHARE = 0.1
+_MISMATCHED_SHARE = 0.15
 # A weak pull to zero keeps the fit finite when the queries are perfectly separable.
 _RIDGE = 1e-2
-# How strongly offset and slope are held where they are: when hardly an answer is wrong, nothing tells how sure answers
-# may look, and mismatched photographs must not gain by that.
-_RESCALE_RIDGE = np.array([1.0, 16.0])
-_ITERATIONS, _CONVERGED = 50, 1e-9
+# A weak pull of the evidence's weights to what they are by default, in units of a query.
+_WEIGHT_RIDGE = 0.5
 # Medians of the chi-squared distribution with one and with two degrees of freedom.
 _MEDIAN_CHI2 = {1: 0.4549, 2: 1.3863}
-_SIGNALS = ("log_odds", "cost", "uncertainty", "latent_distance")
+# Signals of a picture that fits, or not; which place it is, is the posterior's to say.
+_SIGNALS = ("cost", "uncertainty", "latent_distance")
+_TERMS = ("walls", "openings", "ceiling", "room_type")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +64,62 @@ def fit_confidence(known: Answers, searched: Answers) -> ConfidenceModel:
     )
 
 
+def fit_evidence(answers: Sequence[Prediction]) -> EvidenceModel:
+    """Weights of the evidence's terms that make the right ones of all candidates the most probable.
+
+    The likelihood of a choice model over the candidates of each query: where none of them is right, or all are, a query
+    says nothing.
+    """
+    queries = [one for one in (_choice(prediction) for prediction in answers) if one is not None]
+    default = EvidenceModel()
+    start = default.temperature * np.array([1.0, default.openings, default.ceiling, default.room_type])
+    if not queries:
+        return default
+    # Terms that are the same for all candidates of all queries say nothing of their weights.
+    used = np.array([any(np.ptp(terms[:, k]) > 0.0 for terms, _, _ in queries) for k in range(len(_TERMS))])
+
+    def loss(weights: np.ndarray) -> float:
+        total = 0.0
+        for terms, prior, right in queries:
+            score = -(terms @ weights) - prior
+            total += np.logaddexp.reduce(score) - np.logaddexp.reduce(score[right])
+        return total + _WEIGHT_RIDGE * float(np.square(np.log((weights + 0.05) / (start + 0.05)))[used].sum())
+
+    bounds = [(1.0, 64.0)] + [(0.0, 64.0)] * (len(_TERMS) - 1)
+    fitted = optimize.minimize(loss, start, method="L-BFGS-B", bounds=bounds).x
+    fitted = np.where(used, fitted, start)
+    temperature, openings, ceiling, room_type = (float(round(value, 4)) for value in fitted)
+    return EvidenceModel(
+        openings=openings / temperature,
+        ceiling=ceiling / temperature,
+        room_type=room_type / temperature,
+        temperature=temperature,
+    )
+
+
+def _choice(prediction: Prediction) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+    """Terms (n, t), penalties in nats (n) and rightness (n) of a query's candidates; None where they teach nothing."""
+    candidates = [one for one in prediction.candidates if one.terms]
+    right = np.array([_is_right(one.pose, prediction) for one in candidates], dtype=bool)
+    if not right.any() or right.all():
+        return None
+    terms = np.array([[one.terms[name] for name in _TERMS] for one in candidates])
+    return terms, np.array([one.terms["height"] for one in candidates]), right
+
+
+def _is_right(pose: Pose, prediction: Prediction) -> bool:
+    """Whether a pose is within 1 m of the truth and turned alike."""
+    truth = prediction.truth
+    turned = wrap_angle(heading_from_degrees(pose.heading_deg - truth.heading_deg))
+    near = np.hypot(pose.x_m - truth.x_m, pose.y_m - truth.y_m) < RIGHT_WITHIN_M
+    return bool(near and abs(turned) <= TURNED_APART)
+
+
+def store_evidence(bundle: Bundle, evidence: EvidenceModel) -> Bundle:
+    """Store fitted weights in the bundle's manifest."""
+    return write_manifest(bundle.folder, dataclasses.replace(bundle.manifest, evidence=evidence))
+
+
 def calibrate(bundle: Bundle, known: Answers, searched: Answers, description: str) -> Bundle:
     """Store the fitted confidence and the validation figures in the bundle's manifest."""
     metrics = {**bundle.manifest.metrics, "validation_queries": description}
@@ -75,14 +135,12 @@ def _by_stage(answers: Answers) -> dict[str, LogisticModel]:
 
 
 def _fit_stage(stage: str, answers: Answers) -> LogisticModel:
-    """Maximum-likelihood logistic model of a stage's pose being within 1 m of the truth.
-
-    Mismatched photographs decide, with the rest, in which direction of the signals trust grows. How fast, and from
-    where, is then fitted on the home's own queries alone, whose probabilities are those that must be right.
-    """
+    """Maximum-likelihood model of a picture fitting its plan, so that times the posterior the answer is right."""
     own = [one for one in answers.own if stage in one.signals]
     mismatched = [one for one in answers.mismatched if stage in one.signals]
     features = np.array([[1.0, *(one.signals[stage][name] for name in _SIGNALS)] for one in own + mismatched])
+    log_odds = np.array([one.signals[stage]["log_odds"] for one in own + mismatched])
+    posterior = 1.0 / (1.0 + np.exp(-log_odds))
     distance = [np.hypot(one.stages[stage].x_m - one.truth.x_m, one.stages[stage].y_m - one.truth.y_m) for one in own]
     right = np.append(np.array(distance) < RIGHT_WITHIN_M, np.zeros(len(mismatched), bool))
     weight = np.ones(len(features))
@@ -90,15 +148,17 @@ def _fit_stage(stage: str, answers: Answers) -> LogisticModel:
         weight[len(own) :] = _MISMATCHED_SHARE / (1.0 - _MISMATCHED_SHARE) * len(own) / len(mismatched)
     # Features are scaled so that one ridge fits all.
     scale = np.maximum(np.abs(features).max(axis=0), 1e-9)
-    direction = _logistic(features, right, weight, ridge=_RIDGE * scale**2)
-    if mismatched:
-        logit = (features @ direction)[: len(own)]
-        about = np.stack([np.ones(len(own)), logit], axis=-1)
-        offset, slope = _logistic(about, right[: len(own)], weight[: len(own)], ridge=_RESCALE_RIDGE, base=logit)
-        direction = (1.0 + slope) * direction
-        direction[0] += offset
-    bias, *weights = direction.tolist()
-    return LogisticModel(bias=bias, **dict(zip(_SIGNALS, weights, strict=True)))
+
+    def loss(weights: np.ndarray) -> float:
+        logit = np.clip(features @ (weights / scale), -30.0, 30.0)
+        probability = np.clip(posterior / (1.0 + np.exp(-logit)), 1e-9, 1.0 - 1e-9)
+        likelihood = np.where(right, np.log(probability), np.log1p(-probability))
+        return float(_RIDGE * np.square(weights).sum() - (weight * likelihood).sum())
+
+    # Begins with trust in all: without mismatched photographs there is nothing that teaches otherwise.
+    start = np.append(3.0, np.zeros(len(_SIGNALS)))
+    bias, *weights = (optimize.minimize(loss, start, method="L-BFGS-B").x / scale).tolist()
+    return LogisticModel(bias=bias, log_odds=0.0, **dict(zip(_SIGNALS, weights, strict=True)))
 
 
 def _covariance_factors(predictions: Sequence[Prediction]) -> tuple[float | None, float | None]:
@@ -119,28 +179,3 @@ def _covariance_factors(predictions: Sequence[Prediction]) -> tuple[float | None
         float(np.median(position)) / _MEDIAN_CHI2[2] if position else None,
         float(np.median(heading)) / _MEDIAN_CHI2[1] if heading else None,
     )
-
-
-def _logistic(
-    features: Float[np.ndarray, "n f"],
-    correct: Bool[np.ndarray, "n"],
-    weight: Float[np.ndarray, "n"],
-    *,
-    ridge: Float[np.ndarray, "f"],
-    base: Float[np.ndarray, "n"] | float = 0.0,
-) -> Float[np.ndarray, "f"]:
-    """Weights of features that are added to the log odds `base`, by Newton's method on the penalised log likelihood.
-
-    Args:
-        ridge: how strongly each weight is pulled to zero.
-    """
-    weights = np.zeros(features.shape[1])
-    for _ in range(_ITERATIONS):
-        probability = 1.0 / (1.0 + np.exp(-np.clip(base + features @ weights, -30.0, 30.0)))
-        gradient = features.T @ (weight * (probability - correct)) + ridge * weights
-        hessian = (features * (weight * probability * (1.0 - probability))[:, None]).T @ features + np.diag(ridge)
-        step = np.linalg.solve(hessian, gradient)
-        weights -= step
-        if (np.abs(step) * np.sqrt(ridge)).max() < _CONVERGED:
-            break
-    return weights

@@ -13,6 +13,7 @@ from fastapi import Request
 
 from lalaloc_core import __version__
 from lalaloc_core.bundle import Bundle
+from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from service.grids import Grids, Sweeper
 from service.http import Admission, AdmissionLimits
@@ -176,6 +177,6 @@ def _warm_encoders(bundle: Bundle, settings: Settings) -> Encoders:
     encoders = Encoders(bundle, threads=settings.cores.onnx_threads)
     manifest = encoders.manifest
     image = np.zeros((manifest.image_height, manifest.image_width, 3), np.uint8)
-    encoders.query(image, None, 1.5)
+    encoders.query(image, None, CameraHeight(1.5))
     encoders.layouts(np.full((1, manifest.profile_columns), 2.0), np.array([1.5]), np.array([2.5]))
     return encoders

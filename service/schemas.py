@@ -9,6 +9,8 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, WithJsonSchema, field_validator
 
 from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M, OPENING_CLASSES, ROOM_TYPES
+from lalaloc_core.floorplan import MAX_CAMERA_HEIGHT_STD_M
+from lalaloc_core.localise.camera_height import DEFAULT_STD_M, UNKNOWN_RANGE_M
 
 PlanStatus = Literal["preparing", "ready", "failed"]
 Finite = Field(allow_inf_nan=False)
@@ -224,7 +226,15 @@ class LocaliseForm(BaseModel):
     camera_height_m: Annotated[float, Finite] | None = Field(
         None,
         ge=MIN_CAMERA_HEIGHT_M,
-        description="Height of the camera over the floor; left out: the plan's. Rounded to 2 cm.",
+        description="Height of the camera over the floor; left out: the plan's, and where that has none either, any "
+        f"between {UNKNOWN_RANGE_M[0]:g} and {UNKNOWN_RANGE_M[1]:g}.",
+    )
+    camera_height_std_m: Annotated[float, Finite] | None = Field(
+        None,
+        ge=0,
+        le=MAX_CAMERA_HEIGHT_STD_M,
+        description="Standard deviation of the error of the camera height, which is solved for; 0: it is exact. Left "
+        f"out: the plan's, else {DEFAULT_STD_M:g}.",
     )
     refine: Literal["none", "vdr", "lpo"] = Field(
         "lpo", description="How far to refine: nearest grid pose, denser poses around it, or optimised pose."
@@ -236,7 +246,9 @@ class LocaliseForm(BaseModel):
         json_schema_extra={"maximum": 100},
     )
 
-    @field_validator("heading_deg", "heading_tolerance_deg", "camera_height_m", "top_k", mode="before")
+    @field_validator(
+        "heading_deg", "heading_tolerance_deg", "camera_height_m", "camera_height_std_m", "top_k", mode="before"
+    )
     @classmethod
     def _plain_number(cls, value: object) -> object:
         if isinstance(value, str) and "_" in value:
@@ -276,6 +288,11 @@ class CandidateAnswer(Answer):
     position: Position
     heading_deg: HeadingDeg = Field(ge=0, lt=360, description=f"The {HEADING_MEANING}.")
     room: str = Field(description="Name of the room the position lies in.")
+    room_id: str = Field(description="Its `id` in the plan, which is unique.")
+    probability: Share | None = Field(
+        description="Probability that the position is right within 1 m, and no better candidate's is; null for a model "
+        "without confidence.",
+    )
     cost: Score = _COST
     latent_distance: Score = _LATENT_DISTANCE
 
@@ -307,9 +324,16 @@ class LocaliseAnswer(Answer):
     position: Position
     heading_deg: HeadingDeg = Field(ge=0, lt=360, description=f"The {HEADING_MEANING}.")
     room: str
+    room_id: str = Field(description="`id` of the room in the plan, which is unique.")
     confidence: Share | None = Field(
-        description="Probability that the position is right within 1 m, as fitted for this `stage`, and for a heading "
-        "given exactly or searched; null for a model without it.",
+        description="Probability that the position is right within 1 m: that of the panorama being of this plan, "
+        "times the share that this place has in the posterior over all places. Null for a model without it.",
+    )
+    heading_confidence: Share | None = Field(
+        description="Probability that the heading is right within 5°; null where `confidence` is."
+    )
+    warnings: list[str] = Field(
+        description="What was said and not followed, such as a heading that the panorama contradicts."
     )
     heading_source: Literal["given", "panorama", "searched"] = Field(
         description="Where the heading came from: the request, the panorama's metadata, or the search."
@@ -325,7 +349,7 @@ class LocaliseAnswer(Answer):
     )
     cost: Score = _COST
     latent_distance: Score = _LATENT_DISTANCE
-    camera_height_m: Metres = Field(description="Camera height the panorama was compared at.")
+    camera_height_m: Metres = Field(description="The camera height that fits best.")
     candidates: list[CandidateAnswer] = Field(description="Best first; the first one is the answer.")
     timings_ms: TimingsAnswer
     model: ModelAnswer

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import shlex
 import sys
 import tempfile
@@ -148,14 +149,15 @@ def _worst(arguments: argparse.Namespace) -> None:
 
 def _calibrate(arguments: argparse.Namespace) -> None:
     from lalaloc_core.bundle import Bundle
-    from lalaloc_core.calibrate import Answers, calibrate
+    from lalaloc_core.calibrate import Answers, calibrate, fit_evidence, store_evidence
     from lalaloc_core.evaluation.building import describe_model
     from lalaloc_core.evaluation.predictions import Prediction, RunFolder, RunInfo
     from lalaloc_core.evaluation.run import run_evaluation
 
     def asked(generated: dict[str, Any], known: bool, whose: str) -> list[Prediction]:
+        heading = "known" if known else "searched"
         info = RunInfo(
-            label=f"calibration, {whose} homes, heading {'known' if known else 'searched'}",
+            label=f"calibration, {whose} homes, heading {heading}",
             method="lalaloc",
             kind="panorama",
             dataset="generated homes",
@@ -166,12 +168,15 @@ def _calibrate(arguments: argparse.Namespace) -> None:
             model=describe_model(arguments.bundle),
         )
         if arguments.out is not None:
-            return run_evaluation(RunFolder(arguments.out / f"{whose}-{'known' if known else 'searched'}"), info)
+            return run_evaluation(RunFolder(arguments.out / f"{whose}-{heading}"), info)
         with tempfile.TemporaryDirectory(prefix="lalaloc-run-") as folder:
             return run_evaluation(RunFolder(Path(folder)), info)
 
     own = _generated(arguments, None)
     mismatched = own | {"generator": "mismatched", "homes": max(arguments.homes // _PER_MISMATCHED_HOME, 1)}
+    # Weights first: confidence is fitted on answers that were weighed by them.
+    evidence = fit_evidence([one for heading in (True, False) for one in asked(own, heading, "unweighed")])
+    print_json(dataclasses.asdict(store_evidence(Bundle.open(arguments.bundle), evidence).manifest.evidence))
     known, searched = (
         Answers(own=asked(own, heading, "own"), mismatched=asked(mismatched, heading, "mismatched"))
         for heading in (True, False)

@@ -16,6 +16,7 @@ from lalaloc_core.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.data.synthetic.mismatched import MismatchedScenes
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.evaluation.predictions import RunInfo
+from lalaloc_core.localise.camera_height import DEFAULT_STD_M
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.evidence import EvidenceConfig
 from lalaloc_core.localise.optimise import LpoConfig
@@ -23,7 +24,7 @@ from lalaloc_core.localise.pipeline import LocaliseConfig, Refine
 from lalaloc_core.methods.decode import VdrDecode
 from lalaloc_core.methods.explicit import ExplicitLayout
 from lalaloc_core.methods.icp import Icp
-from lalaloc_core.methods.lalaloc import LaLaLoc, local_refiner
+from lalaloc_core.methods.lalaloc import LaLaLoc, StatedHeight, local_refiner
 from lalaloc_core.methods.method import Method
 from lalaloc_core.methods.oracle import PoseOracle, SimilarityRetrieval
 from lalaloc_core.methods.similarity import LayoutMetric
@@ -37,6 +38,10 @@ class LaLaLocSettings:
     Attributes:
         evidence: what poses are compared by: the predicted wall profile, where the model predicts one; the latent; or
             the sum of both.
+        openings, ceiling, room_type, see_through: whether those are compared, where model and plan have them.
+        heading_doubt: probability that a known heading is held to be wrong.
+        camera_height: whether the camera's height is told with a deviation of `camera_height_std_m`, or not at all.
+        camera_height_error_m: by how much it is told wrong.
     """
 
     refine: Refine = "lpo"
@@ -45,6 +50,14 @@ class LaLaLocSettings:
     lpo_candidates: int = 5
     evidence: Literal["profile", "latent", "both"] = "profile"
     optimiser: Literal["levenberg-marquardt", "adam"] = "levenberg-marquardt"
+    openings: bool = True
+    ceiling: bool = True
+    room_type: bool = True
+    see_through: bool = True
+    heading_doubt: float = EvidenceConfig.heading_doubt
+    camera_height: Literal["stated", "unknown"] = "stated"
+    camera_height_std_m: float = DEFAULT_STD_M
+    camera_height_error_m: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,11 +72,6 @@ class NoSettings:
     """Methods without settings."""
 
 
-_EVIDENCE = {
-    "profile": EvidenceConfig(),
-    "latent": EvidenceConfig(use_profile=False),
-    "both": EvidenceConfig(latent_weight=1.0),
-}
 _Settings = TypeVar("_Settings")
 
 
@@ -126,9 +134,22 @@ def _lalaloc(bundle: Bundle, encoders: Encoders, settings: LaLaLocSettings) -> L
         vdr_samples=settings.vdr_samples,
         vdr_candidates=settings.vdr_candidates,
         lpo_candidates=settings.lpo_candidates,
-        evidence=_EVIDENCE[settings.evidence],
+        evidence=EvidenceConfig(
+            use_profile=settings.evidence != "latent",
+            latent_weight=1.0 if settings.evidence == "both" else 0.0,
+            use_openings=settings.openings,
+            use_ceiling=settings.ceiling,
+            use_room_type=settings.room_type,
+            use_see_through=settings.see_through,
+            heading_doubt=settings.heading_doubt,
+        ),
     )
-    return LaLaLoc(encoders, refine=settings.refine, refiner=refiner, config=config)
+    stated = StatedHeight(
+        is_known=settings.camera_height == "stated",
+        error_m=settings.camera_height_error_m,
+        std_m=settings.camera_height_std_m,
+    )
+    return LaLaLoc(encoders, refine=settings.refine, refiner=refiner, config=config, stated=stated)
 
 
 def _settings(kind: type[_Settings], info: RunInfo) -> _Settings:

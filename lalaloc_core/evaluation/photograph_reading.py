@@ -11,6 +11,7 @@ from jaxtyping import Float
 from lalaloc_core.azimuths import AzimuthMeasures, measure_azimuths
 from lalaloc_core.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph
 from lalaloc_core.errors import BundleError
+from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 
 
@@ -40,7 +41,7 @@ def read_photographs(encoders: Encoders, photographs: Sequence[AnnotatedPhotogra
     read = []
     for one in photographs:
         image = one.photograph.image(manifest.image_height, manifest.image_width)
-        query = encoders.query(image, 0.0, CAMERA_HEIGHT_M)
+        query = encoders.query(image, 0.0, CameraHeight(CAMERA_HEIGHT_M, 0.0))
         if query.profile is None:
             raise BundleError(f"model '{manifest.name}' predicts no wall profile, which is what is measured")
         log_m, log_scale = query.profile.log_m[0], query.profile.log_scale[0]

@@ -43,6 +43,15 @@ class Pose:
 
 
 @dataclass(frozen=True, kw_only=True)
+class Rival:
+    """One candidate for an answer: its pose, what each term of the evidence says of it, and its posterior."""
+
+    pose: Pose
+    terms: dict[str, float]
+    probability: float
+
+
+@dataclass(frozen=True, kw_only=True)
 class Prediction:
     """One query and its answer.
 
@@ -58,7 +67,10 @@ class Prediction:
         room_rank: of the best candidate in the true room, from 1; None where none is in it, or the method ranks none.
         signals: by stage, what speaks for its pose and against it; see `localise.confidence`.
         information: curvature of the cost at the answer, by x and y (m) and, where it was searched, heading (radians).
+        candidates: the answer and its rivals, best first, of methods that have any.
         confidence: probability, by the model, of being within 1 m.
+        heading_confidence: probability, by the model, of the heading being right within 5°.
+        found_height_m: the camera height that fits best, where it was solved for.
         timings_ms: per stage.
         facts: what is known to make the photograph hard, in alphabetical order; see `data.dataset.Described`.
     """
@@ -74,7 +86,10 @@ class Prediction:
     room_rank: int | None = None
     signals: dict[str, dict[str, float]] = field(default_factory=dict)
     information: tuple[tuple[float, ...], ...] | None = None
+    candidates: tuple[Rival, ...] = ()
     confidence: float | None = None
+    heading_confidence: float | None = None
+    found_height_m: float | None = None
     timings_ms: dict[str, float] = field(default_factory=dict)
     facts: tuple[str, ...] = ()
 

@@ -26,7 +26,7 @@ from lalaloc_core.conventions import heading_to_degrees
 from lalaloc_core.data.dataset import Appearance, Camera, Dataset, Scene, facts_of_photograph, load_scenes
 from lalaloc_core.errors import DatasetError, RunError
 from lalaloc_core.evaluation.building import build_dataset, build_method
-from lalaloc_core.evaluation.predictions import Pose, Prediction, RunFolder, RunInfo
+from lalaloc_core.evaluation.predictions import Pose, Prediction, Rival, RunFolder, RunInfo
 from lalaloc_core.methods.method import Answer, Found, Method, Question
 from lalaloc_core.methods.similarity import ChamferGrid, true_layout
 from lalaloc_core.sampling import PoseSet, pose_grid
@@ -196,10 +196,15 @@ class _SceneEvaluator:
             stages={stage: _pose(found) for stage, found in answer.stages.items()},
             layout_hit=self._layout_hit(question, answer),
             pose_hit=self._pose_hit(camera, answer),
-            room_rank=answer.rooms.index(camera.room_index) + 1 if camera.room_index in answer.rooms else None,
+            room_rank=answer.rank_of_room(camera.room_index),
             signals=answer.signals,
             information=None if answer.information is None else tuple(map(tuple, answer.information.tolist())),
+            candidates=tuple(
+                Rival(pose=_pose(one.pose), terms=one.terms, probability=one.probability) for one in answer.candidates
+            ),
             confidence=answer.confidence,
+            heading_confidence=answer.heading_confidence,
+            found_height_m=answer.camera_height_m,
             timings_ms=answer.timings_ms,
             facts=tuple(sorted(facts_of_photograph(photograph))),
         )

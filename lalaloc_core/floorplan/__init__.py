@@ -5,6 +5,7 @@ is what only all rooms together can break, `geometry.py` the arrays that the ren
 """
 
 from lalaloc_core.floorplan.geometry import PlanGeometry, pad_walls
+from lalaloc_core.floorplan.heights import MAX_CAMERA_HEIGHT_STD_M
 from lalaloc_core.floorplan.limits import DEFAULT_LIMITS, PlanLimits
 from lalaloc_core.floorplan.openings import DEFAULT_OPENING_TOLERANCE_M, Opening, OpeningFace
 from lalaloc_core.floorplan.plan import DEFAULT_CAMERA_HEIGHT_M, FloorPlan
@@ -15,6 +16,7 @@ __all__ = [
     "DEFAULT_CAMERA_HEIGHT_M",
     "DEFAULT_LIMITS",
     "DEFAULT_OPENING_TOLERANCE_M",
+    "MAX_CAMERA_HEIGHT_STD_M",
     "FloorPlan",
     "Opening",
     "OpeningFace",

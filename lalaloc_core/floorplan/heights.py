@@ -12,7 +12,7 @@ from lalaloc_core.floorplan.rooms import Room
 from lalaloc_core.floorplan.values import read_number, read_number_between
 
 DEFAULT_CAMERA_HEIGHT_M = 1.5
-_MAX_STD_M = 2.0
+MAX_CAMERA_HEIGHT_STD_M = 2.0
 
 
 def read_camera_height(value: Any, rooms: Sequence[Room], limits: PlanLimits) -> float:
@@ -32,7 +32,9 @@ def read_camera_height(value: Any, rooms: Sequence[Room], limits: PlanLimits) ->
 
 def read_camera_height_std(value: Any) -> float | None:
     """The standard deviation of the camera's height (m), None when it is not said."""
-    return None if value is None else read_number_between(value, "camera_height_std_m", 0.0, _MAX_STD_M, " m")
+    if value is None:
+        return None
+    return read_number_between(value, "camera_height_std_m", 0.0, MAX_CAMERA_HEIGHT_STD_M, " m")
 
 
 def read_north(degrees: Any) -> float | None:

@@ -64,6 +64,7 @@ class FloorPlan:
         opening_tolerance_m: how far from a room's wall its openings may be drawn.
         opening_faces: the pieces of walls that openings take up.
         camera_height_std_m: how far off `camera_height_m` may be, one standard deviation; None when it is not said.
+        states_camera_height: whether the plan says `camera_height_m`; if not, cameras may stand at any height.
     """
 
     name: str
@@ -76,6 +77,7 @@ class FloorPlan:
     opening_tolerance_m: float = DEFAULT_OPENING_TOLERANCE_M
     opening_faces: tuple[OpeningFace, ...] = ()
     camera_height_std_m: float | None = None
+    states_camera_height: bool = False
 
     @classmethod
     def from_json(cls, text: str | bytes, limits: PlanLimits = DEFAULT_LIMITS) -> FloorPlan:
@@ -140,11 +142,14 @@ class FloorPlan:
             opening_tolerance_m=tolerance_m,
             opening_faces=faces,
             camera_height_std_m=read_camera_height_std(document.get("camera_height_std_m")),
+            states_camera_height=document.get("camera_height_m") is not None,
         )
 
     def to_dict(self) -> dict[str, Any]:
         """The plan in the native format; `from_dict` of it gives an equal plan."""
-        document: dict[str, Any] = {"name": self.name, "camera_height_m": self.camera_height_m}
+        document: dict[str, Any] = {"name": self.name}
+        if self.states_camera_height:
+            document["camera_height_m"] = self.camera_height_m
         if self.camera_height_std_m is not None:
             document["camera_height_std_m"] = self.camera_height_std_m
         if self.north is not None:

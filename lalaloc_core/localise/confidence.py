@@ -1,24 +1,21 @@
-"""What the confidence of an answer is judged by: the posterior over candidates, the fit, and the predicted uncertainty.
+"""How sure an answer is: the posterior within 1 m of it, times the probability that the picture fits the plan at all.
 
-The candidates are the modes of a posterior over poses, each with a likelihood of `exp(-n c)`, with its cost c and the
-number n of azimuths that err independently. How these signals become a probability is fitted on validation queries
-(`lalaloc_core.calibrate`) and travels with the model (`bundle.ConfidenceModel`).
+Whether it fits is judged by signals that do not compare places: how badly the best one fits, how sure the image encoder
+is, and how far the latents are apart. How these become a probability is fitted on validation queries and on photographs
+of something else (`lalaloc_core.calibrate`), and travels with the model (`bundle.ConfidenceModel`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
 from dataclasses import dataclass
 
-import numpy as np
-
 from lalaloc_core.localise.poses import Candidate, Query
+from lalaloc_core.localise.posterior import RIGHT_WITHIN_M, Posterior
 
-# Neighbouring azimuths err alike: 128 of them are worth about so many.
-_INDEPENDENT = 16.0
-# An answer is right within this distance.
-RIGHT_WITHIN_M = 1.0
-# No posterior over a handful of candidates is surer than this, either way.
+__all__ = ["RIGHT_WITHIN_M", "Signals", "signals_of"]
+
+# No posterior is surer than this, either way.
 _MAX_LOG_ODDS = 6.0
 
 
@@ -27,11 +24,11 @@ class Signals:
     """What speaks for an answer and against it.
 
     Attributes:
-        log_odds: of the candidates within 1 m of the best against all others.
-        cost: how badly the best candidate fits.
+        log_odds: of the camera being within 1 m of the answer, by the posterior.
+        cost: how badly the answer fits.
         uncertainty: mean log of the scales that the image encoder predicts; 0 where it predicts none.
-        latent_distance: of the best candidate. Pictures of no room at all fit anywhere, as nothing is predicted of them
-            with any certainty, but their latents are like no layout's.
+        latent_distance: of the answer. Pictures of no room at all fit anywhere, as nothing is predicted of them with
+            any certainty, but their latents are like no layout's.
     """
 
     log_odds: float
@@ -40,26 +37,13 @@ class Signals:
     latent_distance: float
 
 
-def signals_of(query: Query, candidates: Sequence[Candidate], *, complete: bool) -> Signals:
-    """Signals of the best of some candidates whose costs can be compared.
-
-    Args:
-        complete: whether these are all candidates that there are. If not, as many again, as likely as the least likely
-            of these, stand for the others: where nothing tells places apart, those looked at may all be at one.
-    """
-    cost = np.array([candidate.cost for candidate in candidates])
-    best = int(cost.argmin())
-    position = np.stack([candidate.position_m for candidate in candidates])
-    log_likelihood = -_INDEPENDENT * (cost - cost[best])
-    here = np.linalg.norm(position - position[best], axis=1) < RIGHT_WITHIN_M
-    # Starts that met in one pose are one candidate: of those near the best, the best speaks for all.
-    rivals = log_likelihood[~here]
-    if not complete:
-        rivals = np.append(rivals, log_likelihood.min() + np.log(len(cost)))
-    against = np.logaddexp.reduce(rivals) if len(rivals) else -_MAX_LOG_ODDS
+def signals_of(query: Query, answer: Candidate, posterior: Posterior) -> Signals:
+    """Signals of an answer, the first candidate of the posterior."""
+    mass = min(max(posterior.candidate[0], 1e-9), 1.0 - 1e-9)
+    log_odds = math.log(mass / (1.0 - mass))
     return Signals(
-        log_odds=float(np.clip(-against, -_MAX_LOG_ODDS, _MAX_LOG_ODDS)),
-        cost=float(cost[best]),
+        log_odds=max(-_MAX_LOG_ODDS, min(_MAX_LOG_ODDS, log_odds)),
+        cost=answer.cost,
         uncertainty=0.0 if query.profile is None else float(query.profile.log_scale.mean()),
-        latent_distance=candidates[best].latent_distance,
+        latent_distance=answer.latent_distance,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from lalaloc_core.bundle import HEAD_ONNX, IMAGE_ONNX, LAYOUT_ONNX, Bundle, Mani
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, TWO_PI, wrap_angle
 from lalaloc_core.errors import BundleError
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.poses import (
     PredictedCeiling,
     PredictedOpenings,
@@ -95,14 +97,14 @@ class Encoders:
         self,
         image: UInt8[np.ndarray, "h w 3"],
         heading: float | None,
-        camera_height_m: float,
+        camera_height: CameraHeight,
         *,
         heading_tolerance: float = 0.0,
     ) -> Query:
         """Encode a panorama of the bundle's input size.
 
         Args:
-            camera_height_m: gives the picture its metric scale.
+            camera_height: gives the picture its metric scale.
             heading: azimuth of the centre column (radians); None when unknown, then there is one hypothesis per
                 sector of the ring.
             heading_tolerance: how far (radians) the true heading may be from `heading`; with it there are hypotheses
@@ -110,22 +112,21 @@ class Encoders:
         """
         turned, rolled_away, frame_heading = (image, 0.0, 0.0) if heading is None else _undo_heading(image, heading)
         steps = self.manifest.ring_sectors or _HEADINGS_WITHOUT_RING
-        if heading is None:
-            shifts = np.arange(steps)
-        else:
-            most = min(math.ceil(heading_tolerance / TWO_PI * steps), (steps - 1) // 2)
-            shifts = np.arange(-most, most + 1)
+        every = np.arange(steps)
+        most = min(math.ceil(heading_tolerance / TWO_PI * steps), (steps - 1) // 2)
+        shifts = every if heading is None else np.arange(-most, most + 1)
         exact = heading is not None and heading_tolerance == 0.0
-        roll = rolled_away + shifts * (TWO_PI / steps)
         if self._head is None:
-            latents = self._turned_latents(turned, camera_height_m, shifts, steps)
-            return Query(latents, roll, frame_heading, heading_known=exact)
+            latents = self._turned_latents(turned, camera_height.height_m, shifts, steps)
+            roll = rolled_away + shifts * (TWO_PI / steps)
+            return Query(latents, roll, frame_heading, exact, camera_height)
         # One forward of the image, then roll its ring: rolling a ring is turning the camera.
-        seen = self._seen(turned, camera_height_m)
-        ring = np.ascontiguousarray(rolled(seen["ring"].T, shifts).transpose(0, 2, 1))
-        latents = _array(self._head.run(["latent"], {"ring": ring})[0])
-        told = self._told(seen, shifts, steps) if self.predicts_profile else {}
-        return Query(latents, roll, frame_heading, heading_known=exact, **told)
+        seen = self._seen(turned, camera_height.height_m)
+        query = self._hypotheses(seen, shifts, rolled_away, camera_height)
+        searched = None
+        if heading is not None and self.predicts_profile:
+            searched = self._hypotheses(seen, every, rolled_away, camera_height)
+        return replace(query, frame_heading=frame_heading, heading_known=exact, searched=searched)
 
     def profile(
         self, image: UInt8[np.ndarray, "h w 3"], heading: float, camera_height_m: float
@@ -139,7 +140,7 @@ class Encoders:
         Raises:
             BundleError: the bundle's image encoder predicts no wall profile.
         """
-        query = self.query(image, heading, camera_height_m)
+        query = self.query(image, heading, CameraHeight(camera_height_m, 0.0))
         if query.profile is None:
             raise BundleError(
                 f"model '{self.manifest.name}' (architecture '{self.manifest.architecture}') predicts no wall profile: "
@@ -154,6 +155,17 @@ class Encoders:
         width = image.shape[1]
         turned = (np.roll(image, int(shift) * width // steps, axis=1) for shift in shifts)
         return np.concatenate([self._run_image(view[None], camera_height_m, ["latent"])[0] for view in turned])
+
+    def _hypotheses(
+        self, seen: dict[str, np.ndarray], shifts: Int[np.ndarray, "k"], rolled_away: float, camera_height: CameraHeight
+    ) -> Query:
+        """A query with an unknown heading for a panorama that is turned to the right by some numbers of sectors."""
+        assert self._head is not None
+        steps = seen["ring"].shape[1]
+        ring = np.ascontiguousarray(rolled(seen["ring"].T, shifts).transpose(0, 2, 1))
+        latents = _array(self._head.run(["latent"], {"ring": ring})[0])
+        told = self._told(seen, shifts, steps) if self.predicts_profile else {}
+        return Query(latents, rolled_away + shifts * (TWO_PI / steps), 0.0, False, camera_height, **told)
 
     def _seen(self, image: UInt8[np.ndarray, "h w 3"], camera_height_m: float) -> dict[str, np.ndarray]:
         """The outputs of the image encoder for a panorama: its ring (c, s), and everything else by its name.

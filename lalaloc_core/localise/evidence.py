@@ -1,27 +1,48 @@
-"""How badly a pose fits a panorama: by the latent of its layout, and by its wall profile.
+"""How badly a pose fits a panorama: the sum of what its walls, openings, ceiling and room say.
 
-The image encoder predicts a log wall profile and, for every azimuth, how sure it is of it. The cost of a pose is the
-mean over the azimuths of a negative log likelihood, up to constants, with the heavy tails of a Cauchy distribution,
-because a door that was looked through must cost no more than a door:
+Every term is a negative log likelihood per azimuth, up to constants, and 0 where the picture could not fit better.
+Neighbouring azimuths err alike, so each term has a weight that says how much it may count, fitted on validation
+queries (`lalaloc_core.calibrate`), and is in units of the walls':
 
-    mean_w log(1 + r_w²),   r_w = (log d_w(pose) - μ_w) / (κ s_w),   s_w² = b_w² + (reach / exp μ_w)²
+    cost(pose, δ) = walls + β_o openings + β_c ceiling + β_t room type + penalty(δ) / T
 
-with the predicted μ and b, the tail factor κ, and the `reach`: how far (m) the pose may lie from the camera even if it
-is the best that is looked at, which on a coarse grid is the larger part of the error. A weighted latent distance may be
-added. Models without a predicted profile are compared by latent distance alone.
+* **Walls.** The picture gives a log wall profile μ and, for every azimuth w, a scale b. With the heavy tails of a
+  Cauchy distribution `mean_w log(1 + r_w²)`, `r_w = (log d_w - μ_w - δ) / (κ s_w)`, `s_w² = b_w² + (reach / exp μ_w)²`,
+  the tail factor κ, and the `reach`: how far (m) the pose may lie from the camera even if it is the best looked at.
+  Where the plan has a door or a passage, 1 / (1 + r²) is the mixture of that for the distance d to the opening and of
+  that for what lies behind it.
+* **Openings.** `mean_w log(max_c q_w(c) / q_w(c_w))`, `q_w(c) = ε + (1 - ε) p_w(c) / π(c)`: the probability of the
+  class that the plan shows, in units of how frequent the class is. Kinds that the plan does not claim are wall.
+* **Ceiling.** `log(1 + r²)` of the log height of the room's ceiling above the camera.
+* **Room type.** As openings, once.
+
+A weighted latent distance may be added. Models that predict no wall profile are compared by latent distance alone.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from lalaloc_core.bundle import EvidenceModel
+from lalaloc_core.conventions import OPENING_CLASSES, PASSAGE_CODE, ROOM_TYPES, TWO_PI, WALL_CODE
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.layouts import Layouts
 from lalaloc_core.localise.poses import Query
 
 # A prediction is never trusted beyond this: the scale of log distance of a centimetre at ten metres.
 _SHARPEST = 1e-3
+# A predicted ceiling height is never trusted beyond this, as plans round their ceilings.
+_SHARPEST_CEILING = 0.04
+_LOWEST_CLEARANCE_M = 0.05
+# Logarithms are dear: of so many factors, none above the limit, the product is taken before.
+_FACTORS, _MAX_FACTOR = 4, 1e9
+# Poses whose openings are compared at a time, to bound memory.
+_CHUNK = 4096
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,42 +51,244 @@ class EvidenceConfig:
 
     Attributes:
         use_profile: compare wall profiles where the model predicts them; else latents alone.
+        use_openings, use_ceiling, use_room_type, use_see_through: leave a term out even where model and plan have it.
         latent_weight: weight of the latent distance in the cost of a profile.
         tail: κ.
         grid_reach: reach on a grid, in units of its step; cameras are at most 0.7 of it from the nearest pose.
         fine_reach_m: reach of poses that were re-sampled or optimised.
+        open_door, open_passage: probability that one looks through a door or a passage.
+        floor: ε, the probability that what is said of a class is worth nothing.
+        heading_doubt: probability that a heading that is said to be known is wrong altogether.
     """
 
     use_profile: bool = True
+    use_openings: bool = True
+    use_ceiling: bool = True
+    use_room_type: bool = True
+    use_see_through: bool = True
     latent_weight: float = 0.0
     tail: float = 3.0
     grid_reach: float = 0.6
     fine_reach_m: float = 0.07
+    open_door: float = 0.4
+    open_passage: float = 0.5
+    floor: float = 0.03
+    heading_doubt: float = 0.02
 
     def compares_profiles(self, query: Query) -> bool:
         """Whether this query's poses are compared by their wall profiles."""
         return self.use_profile and query.profile is not None
 
 
-def targets(
-    query: Query, hypothesis: Int[np.ndarray, "*k"], reach_m: float, config: EvidenceConfig
-) -> tuple[Float[np.ndarray, "*k w"], Float[np.ndarray, "*k w"]]:
-    """Predicted log profiles μ of hypotheses, and the precisions 1 / (κ s) that differences are multiplied with."""
+class Terms(NamedTuple):
+    """What each term says of some poses, each (n,), not weighted; `height` is δ's penalty."""
+
+    walls: Float[np.ndarray, "n"]
+    openings: Float[np.ndarray, "n"]
+    ceiling: Float[np.ndarray, "n"]
+    room_type: Float[np.ndarray, "n"]
+    height: Float[np.ndarray, "n"]
+
+    def total(self, weights: EvidenceModel) -> Float[np.ndarray, "n"]:
+        """The cost: terms by their weights."""
+        return (
+            self.walls
+            + weights.openings * self.openings
+            + weights.ceiling * self.ceiling
+            + weights.room_type * self.room_type
+            + self.height / weights.temperature
+        )
+
+
+class Evidence:
+    """Compares poses of one plan with one query.
+
+    Args:
+        reach_m: how far (m) the poses may lie from the camera.
+        weights: of the terms, from the model's bundle.
+        stride: compare every `stride`th azimuth alone.
+    """
+
+    def __init__(
+        self,
+        plan: FloorPlan,
+        query: Query,
+        reach_m: float,
+        weights: EvidenceModel,
+        config: EvidenceConfig,
+        *,
+        stride: int = 1,
+    ) -> None:
+        assert query.profile is not None, "without a predicted profile poses are compared by their latents"
+        self._plan, self._query, self._reach_m = plan, query, reach_m
+        self._weights, self._config, self._stride = weights, config, stride
+        self._centre = query.profile.log_m[:, ::stride].astype(np.float32)
+        self._precision = precisions(query, reach_m, config)[:, ::stride].astype(np.float32)
+
+    def costs(
+        self, layouts: Layouts, hypotheses: Int[np.ndarray, "k"] | None = None
+    ) -> tuple[Float[np.ndarray, "k n"], Float[np.ndarray, "k n"]]:
+        """Cost of every pose under some hypotheses of how the panorama is turned (all), and the δ that gives it."""
+        hypotheses = np.arange(len(self._centre)) if hypotheses is None else hypotheses
+        layouts = layouts.thinned(self._stride) if self._stride > 1 else layouts
+        height = self._query.camera_height
+        # What depends on δ, but on the room only.
+        shared = height.penalty(height.offsets)[:, None] / self._weights.temperature
+        shared = shared + self._weights.ceiling * self._ceilings(height.offsets)
+        best = np.full((len(hypotheses), len(layouts)), np.inf, np.float32)
+        chosen = np.zeros(best.shape, np.intp)
+        for row, hypothesis in enumerate(hypotheses):
+            for j, offset in enumerate(height.offsets):
+                cost = self._walls(layouts, int(hypothesis), float(offset)) + shared[j, layouts.room_index]
+                chosen[row, cost < best[row]] = j
+                np.minimum(best[row], cost, out=best[row])
+        best += self._weights.openings * self._openings(layouts, hypotheses)
+        best += self._weights.room_type * self._room_types[layouts.room_index]
+        return best, height.offsets[chosen]
+
+    def terms(self, layouts: Layouts, hypothesis: Int[np.ndarray, "n"], offset: Float[np.ndarray, "n"]) -> Terms:
+        """What each term says of poses that each have their own hypothesis and δ."""
+        walls, openings = np.zeros(len(layouts)), np.zeros(len(layouts))
+        for index in range(len(layouts)):
+            row = layouts.rows(np.array([index]))
+            walls[index] = self._walls(row, int(hypothesis[index]), float(offset[index]))[0]
+            openings[index] = self._openings(row, hypothesis[[index]])[0, 0]
+        return Terms(
+            walls=walls,
+            openings=openings,
+            ceiling=self._ceilings(offset)[np.arange(len(layouts)), layouts.room_index],
+            room_type=self._room_types[layouts.room_index],
+            height=self._query.camera_height.penalty(offset),
+        )
+
+    def shut_share(self, layouts: Layouts, index: int, hypothesis: int, offset: float) -> Float[np.ndarray, "w"]:
+        """Probability by azimuth that a pose's walls are met, and not what lies behind an opening in them."""
+        share = np.ones(self._centre.shape[1])
+        row = layouts.rows(np.array([index]))
+        if row.seen is None or not self._config.use_see_through:
+            return share
+        at = row.seen.column
+        centre, precision = self._centre[hypothesis, at] + offset, self._precision[hypothesis, at]
+        shut = (1.0 - self._open(row)) / (1.0 + np.square((row.log_profile[0, at] - centre) * precision))
+        opened = self._open(row) / (1.0 + np.square((row.seen.log_behind - centre) * precision))
+        share[at] = shut / (shut + opened)
+        return share
+
+    def _walls(self, layouts: Layouts, hypothesis: int, offset: float) -> Float[np.ndarray, "n"]:
+        centre, precision = self._centre[hypothesis] + np.float32(offset), self._precision[hypothesis]
+        factor = layouts.log_profile - centre
+        factor *= precision
+        np.square(factor, out=factor)
+        factor += 1.0
+        seen = layouts.seen
+        if seen is not None and self._config.use_see_through:
+            behind = np.square((seen.log_behind - centre[seen.column]) * precision[seen.column]) + 1.0
+            opened = self._open(layouts)
+            shut = factor[seen.row, seen.column]
+            factor[seen.row, seen.column] = 1.0 / ((1.0 - opened) / shut + opened / behind)
+        return _mean_log(factor)
+
+    def _open(self, layouts: Layouts) -> Float[np.ndarray, "m"]:
+        """Probability that one looks through each of the openings that are seen."""
+        assert layouts.seen is not None
+        is_passage = layouts.seen.kind == PASSAGE_CODE
+        return np.where(is_passage, self._config.open_passage, self._config.open_door).astype(np.float32)
+
+    def _openings(self, layouts: Layouts, hypotheses: Int[np.ndarray, "k"]) -> Float[np.ndarray, "k n"]:
+        """Cost of the openings of every pose under some hypotheses."""
+        loss = self._opening_loss(hypotheses)
+        cost = np.zeros((len(hypotheses), len(layouts)), np.float32)
+        if loss is None or layouts.kind is None:
+            return cost
+        wall = loss[:, :, WALL_CODE]
+        for first in range(0, len(layouts), _CHUNK):
+            kind = layouts.kind[first : first + _CHUNK]
+            part = cost[:, first : first + _CHUNK]
+            part += wall.sum(axis=1)[:, None]
+            for code in self._claimed:
+                part += (loss[:, :, code] - wall) @ (kind == code).T.astype(np.float32)
+        return cost / loss.shape[1]
+
+    @cached_property
+    def _claimed(self) -> list[int]:
+        """Codes of the kinds of openings that the plan shows completely."""
+        return [OPENING_CLASSES.index(kind) for kind in sorted(self._plan.opening_kinds)]
+
+    def _opening_loss(self, hypotheses: Int[np.ndarray, "k"]) -> Float[np.ndarray, "k w c"] | None:
+        """Cost of each class by azimuth; None where openings are not compared."""
+        predicted = self._query.openings
+        if predicted is None or not self._claimed or not self._config.use_openings:
+            return None
+        probability, prior = np.exp(predicted.log_probability[hypotheses]), predicted.prior.copy()
+        for code in range(len(OPENING_CLASSES)):
+            if code != WALL_CODE and code not in self._claimed:
+                probability[..., WALL_CODE] += probability[..., code]
+                prior[WALL_CODE] += prior[code]
+        probability = _smoothed(probability, self._spread)
+        possible = [WALL_CODE, *self._claimed]
+        loss = -np.log(self._config.floor + (1.0 - self._config.floor) * probability / prior)
+        loss -= loss[..., possible].min(axis=-1, keepdims=True)
+        return loss[:, :: self._stride].astype(np.float32)
+
+    @property
+    def _spread(self) -> float:
+        """How far (radians) openings may appear from where a pose has them: by the reach, at a usual distance."""
+        return float(self._reach_m / np.exp(np.median(self._centre[0])))
+
+    @cached_property
+    def _room_types(self) -> Float[np.ndarray, "r"]:
+        """Cost of the type of every room; rooms of unknown type cost what says nothing."""
+        predicted = self._query.room_type
+        if predicted is None or not self._config.use_room_type:
+            return np.zeros(len(self._plan.rooms))
+        floor = self._config.floor
+        ratio = floor + (1.0 - floor) * np.exp(predicted.log_probability) / np.maximum(predicted.prior, 1e-4)
+        loss = np.log(ratio[1:].max()) - np.log(np.concatenate([[1.0], ratio[1:]]))
+        return np.maximum(loss, 0.0)[[ROOM_TYPES.index(room.type) for room in self._plan.rooms]]
+
+    def _ceilings(self, offset: Float[np.ndarray, "j"]) -> Float[np.ndarray, "j r"]:
+        """Cost of every room's ceiling at each δ."""
+        predicted, height = self._query.ceiling, self._query.camera_height
+        if predicted is None or not self._config.use_ceiling:
+            return np.zeros((len(offset), len(self._plan.rooms)))
+        clearance_m = self._plan.ceiling_heights_m[None] - height.height_m * np.exp(offset)[:, None]
+        difference = np.log(np.maximum(clearance_m, _LOWEST_CLEARANCE_M)) - (predicted.log_m + offset[:, None])
+        scale = self._config.tail * np.hypot(np.exp(predicted.log_scale), _SHARPEST_CEILING)
+        return np.log1p(np.square(difference / scale))
+
+
+def precisions(query: Query, reach_m: float, config: EvidenceConfig) -> Float[np.ndarray, "k w"]:
+    """1 / (κ s), which differences of log distance are multiplied with, for every hypothesis."""
     assert query.profile is not None
-    centre = query.profile.log_m[hypothesis]
-    scale = np.hypot(np.maximum(np.exp(query.profile.log_scale[hypothesis]), _SHARPEST), reach_m * np.exp(-centre))
-    return centre, 1.0 / (config.tail * scale)
-
-
-def profile_costs(
-    log_profile: Float[np.ndarray, "n w"], centre: Float[np.ndarray, "w"], precision: Float[np.ndarray, "w"]
-) -> Float[np.ndarray, "n"]:
-    """Cost of each of some log wall profiles (m) for one prediction."""
-    residual = (log_profile - centre) * precision
-    np.square(residual, out=residual)
-    return np.log1p(residual, out=residual).mean(axis=1)
+    scale = np.maximum(np.exp(query.profile.log_scale), _SHARPEST)
+    return 1.0 / (config.tail * np.hypot(scale, reach_m * np.exp(-query.profile.log_m)))
 
 
 def latent_distances(latents: Float[np.ndarray, "n d"], targets: Float[np.ndarray, "k d"]) -> Float[np.ndarray, "k n"]:
     """Euclidean distance of each target to each latent, both of unit length."""
     return np.sqrt(np.maximum(2.0 - 2.0 * (targets @ latents.T), 0.0))
+
+
+def _mean_log(factor: Float[np.ndarray, "n w"]) -> Float[np.ndarray, "n"]:
+    """Mean of the logarithms of each row, of values from 1 on."""
+    columns = factor.shape[1]
+    if columns % _FACTORS:
+        return np.log(factor).mean(axis=1)
+    np.minimum(factor, _MAX_FACTOR, out=factor)
+    width = columns // _FACTORS
+    product = factor[:, :width].copy()
+    for begin in range(width, columns, width):
+        product *= factor[:, begin : begin + width]
+    return np.log(product).sum(axis=1) / columns
+
+
+def _smoothed(probability: Float[np.ndarray, "k w c"], spread: float) -> Float[np.ndarray, "k w c"]:
+    """Probabilities by azimuth, blurred around the horizon by a Gaussian with a deviation of `spread` radians."""
+    columns = probability.shape[1]
+    deviation = spread / TWO_PI * columns
+    if deviation < 0.3:
+        return probability
+    offset = (np.arange(columns) + columns // 2) % columns - columns // 2
+    kernel = np.exp(-0.5 * np.square(offset / deviation))
+    kernel = (kernel / kernel.sum())[(np.arange(columns)[:, None] - np.arange(columns)[None]) % columns]
+    return np.einsum("vw,kwc->kvc", kernel, probability, optimize=True)

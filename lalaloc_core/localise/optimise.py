@@ -3,7 +3,7 @@
 `min over pose of | Φ_layout(Ω(pose, plan)) - f |₂`, with the closed-form renderer Ω. Where the model predicts a wall
 profile with its uncertainty, the layout's profile is compared with that, by the cost of `localise.evidence`. Two
 optimisers share one evaluation (residuals and their derivatives by forward-mode differentiation, 2 or 3 unknowns
-against 128 residuals):
+against 128 residuals; the log of true over stated camera height is one more where profiles are compared):
 
 * Levenberg-Marquardt (default): under 15 evaluations, and more exact.
 * Adam with the paper's schedule (section A.3): the reference.
@@ -74,17 +74,23 @@ class LpoConfig:
 
 @dataclass(frozen=True)
 class _Evaluation:
-    """Residuals at a pose and their derivatives by its unknowns; `cost` is what Levenberg-Marquardt lowers."""
+    """Residuals at a pose and their derivatives by its unknowns; `cost` is what Levenberg-Marquardt lowers.
+
+    `value` are the unknowns themselves, held at zero with the squares of `stiffness`: a normal prior.
+    """
 
     residual: Float[Tensor, "k d"]
     jacobian: Float[Tensor, "k d p"]
     norm: Norm
+    value: Float[Tensor, "k p"]
+    stiffness: Float[Tensor, "p"]
 
     @property
     def cost(self) -> Float[Tensor, "k"]:
+        held = 0.5 * (self.value * self.stiffness).square().sum(dim=1)
         if self.norm == "cauchy":
-            return 0.5 * self.residual.square().log1p().sum(dim=1)
-        return 0.5 * self.residual.square().sum(dim=1)
+            return 0.5 * self.residual.square().log1p().sum(dim=1) + held
+        return 0.5 * self.residual.square().sum(dim=1) + held
 
     @property
     def weighted(self) -> Float[Tensor, "k d p"]:
@@ -96,7 +102,7 @@ class _Evaluation:
     @property
     def information(self) -> Float[Tensor, "k p p"]:
         """Curvature of `cost` by the unknowns, after Gauss and Newton."""
-        return torch.einsum("kdp,kdq->kpq", self.weighted, self.jacobian)
+        return torch.einsum("kdp,kdq->kpq", self.weighted, self.jacobian) + torch.diag(self.stiffness.square())
 
     @property
     def distance(self) -> Float[Tensor, "k"]:
@@ -105,6 +111,12 @@ class _Evaluation:
         if self.norm == "cauchy":
             return self.residual.square().log1p().mean(dim=1)
         return torch.linalg.vector_norm(self.residual, dim=1)
+
+    @property
+    def slope(self) -> Float[Tensor, "k p"]:
+        """Derivative of `cost` by the unknowns."""
+        held = self.value * self.stiffness.square()
+        return torch.einsum("kdp,kd->kp", self.weighted, self.residual) + held
 
     @property
     def gradient(self) -> Float[Tensor, "k p"]:
@@ -117,6 +129,7 @@ class _Evaluation:
 
     def take_over(self, rows: Tensor, other: _Evaluation, chosen: Tensor) -> None:
         """Replace by those rows of `other`, which holds `rows` of this one, that are `chosen`."""
+        self.value[rows[chosen]] = other.value[chosen]
         self.residual[rows[chosen]] = other.residual[chosen]
         self.jacobian[rows[chosen]] = other.jacobian[chosen]
 
@@ -158,16 +171,18 @@ class PoseOptimiser:
         adam = self.config.method == "adam"
         with torch.no_grad():
             pose, here, converged, evaluations = (_adam if adam else _levenberg_marquardt)(problem, self.config)
-        position, heading = problem.unpack(pose)
+        position, heading, height_offset = problem.unpack(pose)
+        information = here.information if height_offset is None else _without_last(here.information)
         distance = here.distance.cpu().numpy()
         return RefinementResult(
             position_m=position.cpu().numpy().astype(np.float64) + problem.origin,
             heading=heading.cpu().numpy().astype(np.float64),
             cost=distance,
             latent_distance=distance,
-            information=here.information.cpu().numpy(),
+            information=information.cpu().numpy(),
             converged=converged.cpu().numpy(),
             evaluations=np.full(len(distance), evaluations),
+            height_offset=None if height_offset is None else height_offset.cpu().numpy().astype(np.float64),
         )
 
 
@@ -225,7 +240,7 @@ def _log_profile(profile_m: Tensor, _camera_height_m: Tensor, _ceiling_height_m:
 
 
 class _Problem:
-    """The residuals of one job as a function of the unknowns: x, y and, when it is to be found, the heading.
+    """The residuals of one job as a function of the unknowns: x, y, then heading and height offset where wanted.
 
     Positions are relative to each starting pose, so that single precision does not lose millimetres in large plans.
     """
@@ -246,37 +261,51 @@ class _Problem:
         self.ceiling_height_m = tensor(job.ceiling_height_m)
         self.targets = tensor(job.targets)
         self.precision = None if job.precision is None else tensor(job.precision)
-        self.unknowns = 3 if job.optimise_heading else 2
-        self.start = torch.zeros(len(job.targets), self.unknowns, device=device)
+        # Those that move the layout; the camera height is one more behind them.
+        self.moving = 3 if job.optimise_heading else 2
+        self.height_bounds = job.height_bounds
+        stiffness = [0.0] * self.moving
+        start = torch.zeros(len(job.targets), self.moving, device=device)
+        if job.height_offset is not None:
+            start = torch.cat([start, tensor(job.height_offset)[:, None]], dim=1)
+            stiffness.append(job.height_stiffness)
+        self.start = start
+        self.stiffness = torch.tensor(stiffness, device=device)
 
-    def unpack(self, pose: Float[Tensor, "k p"]) -> tuple[Float[Tensor, "k 2"], Float[Tensor, "k"]]:
-        """Position (m, relative to the start) and heading (radians)."""
-        turned = self.heading + pose[:, 2] if self.unknowns == 3 else self.heading
-        return pose[:, :2], turned
+    def unpack(
+        self, pose: Float[Tensor, "k p"]
+    ) -> tuple[Float[Tensor, "k 2"], Float[Tensor, "k"], Float[Tensor, "k"] | None]:
+        """Position (m, relative to the start), heading (radians), and the height's offset where it is solved for."""
+        turned = self.heading + pose[:, 2] if self.moving == 3 else self.heading
+        return pose[:, :2], turned, pose[:, self.moving] if pose.shape[1] > self.moving else None
 
     def evaluate(self, pose: Float[Tensor, "m p"], rows: Tensor) -> _Evaluation:
         """Residuals and Jacobian of these rows of the job, all unknowns at once: each row repeated per unknown."""
         count = len(pose)
 
         def repeat(value: Tensor) -> Tensor:
-            return value[rows].repeat_interleave(self.unknowns, dim=0)
+            return value[rows].repeat_interleave(self.moving, dim=0)
 
         walls, camera, ceiling = map(repeat, (self.walls_m, self.camera_height_m, self.ceiling_height_m))
         start_heading = repeat(self.heading)
 
         def embedded(unknowns: Tensor) -> Tensor:
-            heading = start_heading + unknowns[:, 2] if self.unknowns == 3 else start_heading
+            heading = start_heading + unknowns[:, 2] if self.moving == 3 else start_heading
             profile = wall_profile(unknowns[:, :2], heading, walls, self.columns)
             return self.embedding(profile, camera, ceiling)
 
-        tangent = torch.eye(self.unknowns, device=pose.device).repeat(count, 1)
-        repeated = pose.repeat_interleave(self.unknowns, dim=0)
+        tangent = torch.eye(self.moving, device=pose.device).repeat(count, 1)
+        repeated = pose[:, : self.moving].repeat_interleave(self.moving, dim=0)
         value, derivative = torch.func.jvp(embedded, (repeated,), (tangent,))[:2]
-        residual = value[:: self.unknowns] - self.targets[rows]
-        jacobian = derivative.reshape(count, self.unknowns, -1).transpose(1, 2)
+        residual = value[:: self.moving] - self.targets[rows]
+        jacobian = derivative.reshape(count, self.moving, -1).transpose(1, 2)
+        if pose.shape[1] > self.moving:
+            # The offset is added to the target, the same for all azimuths.
+            residual = residual - pose[:, self.moving, None]
+            jacobian = torch.cat([jacobian, -torch.ones_like(residual)[:, :, None]], dim=2)
         if self.precision is not None:
             residual, jacobian = residual * self.precision[rows], jacobian * self.precision[rows][:, :, None]
-        return _Evaluation(residual, jacobian, self.norm)
+        return _Evaluation(residual, jacobian, self.norm, pose.clone(), self.stiffness)
 
     def stay_inside(
         self, pose: Float[Tensor, "m p"], step: Float[Tensor, "m p"], rows: Tensor, config: LpoConfig
@@ -287,8 +316,17 @@ class _Problem:
         free = cast_rays(pose[:, :2], azimuth[:, None], self.walls_m[rows])[:, 0] - config.margin_m
         allowed = free.clamp(0.0, config.max_step_m)
         scale = torch.where(length > allowed, allowed / length.clamp_min(1e-9), torch.ones_like(length))
-        turn = step[:, 2:].clamp(-config.max_turn, config.max_turn)
-        return torch.cat([step[:, :2] * scale[:, None], turn], dim=1)
+        turn = step[:, 2 : self.moving].clamp(-config.max_turn, config.max_turn)
+        height, (low, high) = pose[:, self.moving :], self.height_bounds
+        return torch.cat(
+            [step[:, :2] * scale[:, None], turn, (height + step[:, self.moving :]).clamp(low, high) - height], dim=1
+        )
+
+
+def _without_last(information: Float[Tensor, "k p p"]) -> Float[Tensor, "k q q"]:
+    """Information about all unknowns but the last, which is integrated out (Schur complement)."""
+    cross, last = information[:, :-1, -1], information[:, -1, -1].clamp_min(1e-9)
+    return information[:, :-1, :-1] - cross[:, :, None] * cross[:, None, :] / last[:, None, None]
 
 
 # Poses, the evaluation there, whether each converged, and the number of evaluations.
@@ -310,7 +348,7 @@ def _levenberg_marquardt(problem: _Problem, config: LpoConfig) -> _Outcome:
         rows = active.nonzero()[:, 0]
         if len(rows) == 0:
             break
-        gradient = torch.einsum("kdp,kd->kp", here.weighted[rows], here.residual[rows])
+        gradient = here.slope[rows]
         hessian = here.information[rows]
         scaling = torch.diagonal(hessian, dim1=1, dim2=2) * damping[rows, None] + 1e-8
         step = -torch.linalg.solve(hessian + torch.diag_embed(scaling), gradient)

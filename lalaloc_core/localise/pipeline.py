@@ -5,21 +5,25 @@ The same code answers over HTTP and in evaluation; only `refine`, who runs the o
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from typing import Literal
 
 import numpy as np
 
+from lalaloc_core.bundle import ConfidenceModel
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.confidence import Signals, signals_of
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.evidence import EvidenceConfig, targets
+from lalaloc_core.localise.evidence import EvidenceConfig
 from lalaloc_core.localise.poses import Candidate, LatentGrid, Query, RefinementJob, RefinementResult
-from lalaloc_core.localise.retrieval import retrieve, suppress
+from lalaloc_core.localise.posterior import Posterior, area_shares, posterior_of
+from lalaloc_core.localise.refinement import refined, refinement_job
+from lalaloc_core.localise.retrieval import contradicted, grid_costs, retrieve, suppress
 from lalaloc_core.localise.vogel import resample
 
 SearchStage = Literal["retrieval", "vdr", "lpo"]
@@ -62,17 +66,44 @@ class Localisation:
     """Distinct candidates, best first, and how they came about.
 
     Attributes:
+        query: what was searched for: the query, or it with an unknown heading where the picture contradicts it.
+        posterior: how probable all places of the grid and the candidates are, given that the picture is of the plan.
         stage: the last stage that ran.
         best: the best candidate after each stage that ran, in order.
         signals: what the confidence of the best candidate after each stage is judged by.
+        heading_contradicted: whether the heading was said, and is not what the picture shows.
         timings_ms: milliseconds per stage.
     """
 
+    query: Query
     candidates: list[Candidate]
+    posterior: Posterior
     stage: SearchStage
     signals: dict[SearchStage, Signals]
+    heading_contradicted: bool = False
     best: dict[SearchStage, Candidate] = field(default_factory=dict)
     timings_ms: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def camera_height_m(self) -> float:
+        """The camera height that fits the answer best."""
+        stated = self.query.camera_height.height_m
+        return stated * math.exp(self.candidates[0].height_offset)
+
+    def fit_probability(self, model: ConfidenceModel) -> float | None:
+        """Probability that the picture is of the plan at all."""
+        known = self.query.heading_known
+        return model.fit_probability(self.stage, asdict(self.signals[self.stage]), heading_known=known)
+
+    def confidence(self, model: ConfidenceModel) -> float | None:
+        """Probability that the answer is right within 1 m; None where the model does not know its stage."""
+        fits = self.fit_probability(model)
+        return None if fits is None else fits * min(self.posterior.candidate[0], 1.0)
+
+    def heading_confidence(self, model: ConfidenceModel) -> float | None:
+        """Probability that the answer's heading is right within 5°."""
+        fits = self.fit_probability(model)
+        return None if fits is None else fits * min(self.posterior.heading, 1.0)
 
 
 Steps = Generator[RefinementJob, RefinementResult | None, Localisation]
@@ -158,17 +189,25 @@ def localise_steps(
     """`localise` for who waits for the optimiser elsewhere: stops where poses are to be optimised; see `next_step`."""
     config = config or LocaliseConfig()
     clock = clock or StageClock()
+    weights, evidence = encoders.manifest.evidence, config.evidence
+    prior = area_shares(grid.poses, np.array([room.area_m2 for room in plan.rooms]))
     stage: SearchStage = "retrieval"
-    starts = config.starts(query)
     with clock.stage("retrieve"):
+        doubted = contradicted(plan, grid, query, weights, evidence)
+        query = query.searched if doubted and query.searched is not None else query
+        starts = config.starts(query)
+        costs = grid_costs(plan, grid, query, weights, evidence)
         # Refined candidates may meet and become one; spare ones then take the free places.
         wanted = max(top_k, starts) + starts
-        candidates = retrieve(grid, query, top_k=wanted, separation_m=config.separation_m, evidence=config.evidence)
+        modes = retrieve(costs, grid, query, top_k=wanted, separation_m=config.separation_m)
+    candidates, ends = list(modes), list[Candidate]()
+
+    def posterior(first: list[Candidate]) -> Posterior:
+        begun = modes[: len(ends)]
+        return posterior_of(costs, prior, query, begun, ends, first, weights.temperature, config.separation_m)
+
     best: dict[SearchStage, Candidate] = {"retrieval": candidates[0]}
-    # Of a number of candidates that does not depend on how many are asked for.
-    signals: dict[SearchStage, Signals] = {
-        "retrieval": signals_of(query, candidates[: 2 * starts], complete=len(candidates) < 2 * starts)
-    }
+    signals: dict[SearchStage, Signals] = {"retrieval": signals_of(query, candidates[0], posterior(candidates[:1]))}
     if refine in ("vdr", "lpo") and config.vdr_candidates:
         with clock.stage("vdr"):
             for index in range(min(config.vdr_candidates, len(candidates))):
@@ -180,66 +219,31 @@ def localise_steps(
                     camera_height_m=grid.camera_height_m,
                     samples=config.vdr_samples,
                     radius_m=config.vdr_radius_steps * grid.step_m,
-                    evidence=config.evidence,
+                    evidence=evidence,
                 )
-            candidates[: config.vdr_candidates] = sorted(candidates[: config.vdr_candidates], key=lambda c: c.cost)
         stage = "vdr"
-        best[stage] = candidates[0]
-        # Costs of re-sampled poses do not compare with those of the grid's.
-        signals[stage] = signals["retrieval"]
+        best[stage] = min(candidates[: config.vdr_candidates], key=lambda candidate: candidate.cost)
+        signals[stage] = signals_of(query, best[stage], posterior([best[stage]]))
     if refine == "lpo":
         with clock.stage("lpo"):
-            job = refinement_job(plan, query, candidates[:starts], grid.camera_height_m, config.evidence)
+            job = refinement_job(plan, query, candidates[:starts], grid.camera_height_m, weights, evidence)
             result = yield job
             if result is not None:
-                moved = [_moved(start, result, index) for index, start in enumerate(candidates[:starts])]
-                moved.sort(key=lambda candidate: candidate.cost)
-                candidates = moved + candidates[starts:]
+                ends = refined(plan, encoders, query, candidates[:starts], result, evidence)
+                candidates = sorted(ends, key=lambda candidate: candidate.cost) + candidates[starts:]
                 stage = "lpo"
                 best[stage] = candidates[0]
-                signals[stage] = signals_of(query, moved, complete=len(candidates) == len(moved))
-    return Localisation(_distinct(candidates, config.separation_m, top_k), stage, signals, best, clock.timings_ms)
+                signals[stage] = signals_of(query, candidates[0], posterior(candidates[:1]))
+    elif stage == "vdr":
+        first = config.vdr_candidates
+        candidates = sorted(candidates[:first], key=lambda candidate: candidate.cost) + candidates[first:]
+    answers = _distinct(candidates, config.separation_m, top_k)
+    return Localisation(query, answers, posterior(answers), stage, signals, doubted, best, clock.timings_ms)
 
 
 def panorama_heading(query: Query, candidate: Candidate) -> float:
     """Azimuth (radians) of the panorama's centre column that a candidate implies."""
     return float(wrap_angle(query.roll[candidate.hypothesis] + candidate.frame_heading))
-
-
-def refinement_job(
-    plan: FloorPlan, query: Query, candidates: list[Candidate], camera_height_m: float, evidence: EvidenceConfig
-) -> RefinementJob:
-    """What the optimiser needs to refine these candidates, each within its own room."""
-    rooms = np.array([candidate.room_index for candidate in candidates])
-    hypotheses = np.array([candidate.hypothesis for candidate in candidates])
-    centre = precision = None
-    if evidence.compares_profiles(query):
-        centre, precision = targets(query, hypotheses, evidence.fine_reach_m, evidence)
-    return RefinementJob(
-        targets=query.latents[hypotheses],
-        position_m=np.stack([candidate.position_m for candidate in candidates]),
-        heading=np.array([candidate.frame_heading for candidate in candidates]),
-        walls_m=plan.walls_m[rooms],
-        camera_height_m=np.full(len(rooms), camera_height_m),
-        ceiling_height_m=plan.ceiling_heights_m[rooms],
-        optimise_heading=not query.heading_known,
-        log_profile=centre,
-        precision=precision,
-        latent_weight=evidence.latent_weight,
-    )
-
-
-def _moved(start: Candidate, result: RefinementResult, index: int) -> Candidate:
-    """A candidate where the optimiser took it."""
-    return replace(
-        start,
-        x_m=float(result.position_m[index, 0]),
-        y_m=float(result.position_m[index, 1]),
-        frame_heading=float(result.heading[index]),
-        cost=float(result.cost[index]),
-        latent_distance=float(result.latent_distance[index]),
-        information=result.information[index],
-    )
 
 
 def _distinct(candidates: list[Candidate], separation_m: float, top_k: int) -> list[Candidate]:

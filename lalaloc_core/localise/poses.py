@@ -2,23 +2,38 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.camera_height import CameraHeight
+from lalaloc_core.localise.layouts import Layouts, layouts_at
 from lalaloc_core.sampling import PoseSet
 
 
 @dataclass(frozen=True, eq=False)
 class LatentGrid:
-    """Poses, latents and wall profiles of one plan for one model, one camera height and one grid step; heading 0."""
+    """Poses, latents and wall profiles of one plan for one model, one camera height and one grid step; heading 0.
+
+    Only latents depend on the camera height: wall profiles serve queries of any.
+    """
 
     poses: PoseSet
     latents: Float[np.ndarray, "n d"]
     profile_m: Float[np.ndarray, "n w"]
     step_m: float
     camera_height_m: float
+    _layouts: list[Layouts] = field(default_factory=list, init=False, repr=False)
+
+    def layouts(self, plan: FloorPlan) -> Layouts:
+        """What the plan shows at the poses; rendered at first use, since grids are stored without openings."""
+        if not self._layouts:
+            heading, columns = np.zeros(len(self.poses)), self.profile_m.shape[1]
+            # Two threads that meet here do the same work twice, and no harm.
+            self._layouts.append(layouts_at(plan, self.poses, heading, columns, profile_m=self.profile_m))
+        return self._layouts[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,19 +110,36 @@ class Query:
         roll: (k,) radians, what was rolled away.
         frame_heading: radians; what whole-pixel rolling could not remove, 0 when the heading is unknown.
         heading_known: whether the heading was given exactly; if not, it is searched over and refined.
+        camera_height: what was stated of it; predictions are in metres for just that height.
         profile: what the image encoder says of the walls; None where it predicts no wall profile.
-        openings, ceiling, room_type: what it says of doors, windows and passages, of the ceiling, and of what the room
-            is for; None where it predicts nothing of the kind.
+        openings, ceiling, room_type: what it says of those, None where it does not.
+        searched: where the heading is known, the same panorama as if it were not, to doubt what was said.
     """
 
     latents: Float[np.ndarray, "k d"]
     roll: Float[np.ndarray, "k"]
     frame_heading: float
     heading_known: bool
+    camera_height: CameraHeight
     profile: PredictedProfile | None = None
     openings: PredictedOpenings | None = None
     ceiling: PredictedCeiling | None = None
     room_type: PredictedRoomType | None = None
+    searched: Query | None = None
+
+    def scaled(self, offset: float) -> Query:
+        """What the panorama says if the camera stood higher by the factor `exp(offset)`."""
+        profile, ceiling = self.profile, self.ceiling
+        return replace(
+            self,
+            profile=None if profile is None else replace(profile, log_m=profile.log_m + offset),
+            ceiling=None if ceiling is None else replace(ceiling, log_m=ceiling.log_m + offset),
+        )
+
+    @property
+    def sector(self) -> float:
+        """Angle (radians) between neighbouring hypotheses; 0 where there is one."""
+        return float(self.roll[1] - self.roll[0]) if len(self.roll) > 1 else 0.0
 
 
 @dataclass(frozen=True)
@@ -120,6 +152,8 @@ class Candidate:
         cost: what candidates are ranked by, see `localise.evidence`; the latent distance where the model predicts no
             wall profile.
         latent_distance: from the latent of its layout to the query's.
+        height_offset: log of true over stated camera height that fits best.
+        terms: what each term of the evidence says of it, by name; empty where poses are compared by latents.
         information: (p, p) curvature of the cost by x, y (m) and, where it was searched, the heading (radians); set by
             the optimiser. Its inverse is the covariance but for a factor.
     """
@@ -131,6 +165,8 @@ class Candidate:
     hypothesis: int
     cost: float
     latent_distance: float
+    height_offset: float = 0.0
+    terms: dict[str, float] = field(default_factory=dict, compare=False)
     information: Float[np.ndarray, "p p"] | None = field(default=None, compare=False)
 
     @property
@@ -148,6 +184,9 @@ class RefinementJob:
         log_profile: (k, w) centres of the predicted log wall profiles (m); None compares latents alone.
         precision: (k, w) factors that turn differences of log distance into residuals.
         latent_weight: weight of the latent distance in the cost of what was optimised by its profile.
+        height_offset: (k,) where to begin with the log of true over stated camera height; None leaves it at 0.
+        height_stiffness: factor that turns that log into a residual, among those of the profile's columns.
+        height_bounds: the least and largest log there is.
     """
 
     targets: Float[np.ndarray, "k d"]
@@ -160,6 +199,9 @@ class RefinementJob:
     log_profile: Float[np.ndarray, "k w"] | None = None
     precision: Float[np.ndarray, "k w"] | None = None
     latent_weight: float = 0.0
+    height_offset: Float[np.ndarray, "k"] | None = None
+    height_stiffness: float = 0.0
+    height_bounds: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +211,8 @@ class RefinementResult:
     Attributes:
         cost: (k,) what was minimised: of profiles as in `localise.evidence`, else the distance of the embeddings.
         latent_distance: (k,) distance of the embeddings.
-        information: (k, p, p) curvature of the cost by the unknowns.
+        information: (k, p, p) curvature of the cost by position and heading, the camera height integrated out.
+        height_offset: (k,) log of true over stated camera height; None where it was not solved for.
     """
 
     position_m: Float[np.ndarray, "k 2"]
@@ -179,3 +222,4 @@ class RefinementResult:
     information: Float[np.ndarray, "k p p"]
     converged: Bool[np.ndarray, "k"]
     evaluations: Int[np.ndarray, "k"]
+    height_offset: Float[np.ndarray, "k"] | None = None

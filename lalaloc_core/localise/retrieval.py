@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float, Int
 
+from lalaloc_core.bundle import EvidenceModel
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.evidence import EvidenceConfig, latent_distances, profile_costs, targets
+from lalaloc_core.localise.evidence import Evidence, EvidenceConfig, latent_distances
 from lalaloc_core.localise.poses import Candidate, LatentGrid, Query
+from lalaloc_core.localise.posterior import TURNED_APART, GridCosts
 from lalaloc_core.sampling import pose_grid
 
-# Poses times hypotheses whose profiles are compared; of larger grids, the poses with the nearest latents.
-_MAX_PAIRS = 200_000
+# Poses times hypotheses times height offsets that are compared in full; of more, the poses that are best by every
+# `_STRIDE`th azimuth.
+_MAX_COMPARISONS = 1_000_000
+_STRIDE = 4
 # The best pairs, which are looked at for distinct candidates; more if they hold too few.
 _FIRST_RANKED = 4096
-# Two candidates at one place are distinct if they are turned against each other by this much (radians).
-_SEPARATION = np.radians(25.0)
 
 
 def build_grid(plan: FloorPlan, encoders: Encoders, *, step_m: float, camera_height_m: float) -> LatentGrid:
@@ -27,30 +32,36 @@ def build_grid(plan: FloorPlan, encoders: Encoders, *, step_m: float, camera_hei
     return LatentGrid(poses, latents, profile_m, step_m, camera_height_m)
 
 
-def retrieve(
-    grid: LatentGrid, query: Query, *, top_k: int, separation_m: float, evidence: EvidenceConfig | None = None
-) -> list[Candidate]:
+def grid_costs(
+    plan: FloorPlan, grid: LatentGrid, query: Query, weights: EvidenceModel, config: EvidenceConfig
+) -> GridCosts:
+    """Cost of every pose of the grid under every hypothesis; of large grids, of the poses that may be the best."""
+    if not config.compares_profiles(query):
+        distance = latent_distances(grid.latents, query.latents)
+        return GridCosts(grid.poses, np.arange(len(grid.poses)), distance, np.zeros_like(distance))
+    layouts, index = grid.layouts(plan), np.arange(len(grid.poses))
+    reach_m = config.grid_reach * grid.step_m
+    comparisons = len(query.roll) * len(query.camera_height.offsets)
+    kept = max(_MAX_COMPARISONS // comparisons, _FIRST_RANKED)
+    if kept < len(index):
+        coarse, _ = Evidence(plan, query, reach_m, weights, config, stride=_STRIDE).costs(layouts)
+        index = np.sort(np.argpartition(coarse.min(axis=0), kept)[:kept])
+        layouts = layouts.rows(index)
+    cost, offset = Evidence(plan, query, reach_m, weights, config).costs(layouts)
+    if config.latent_weight:
+        cost += config.latent_weight * latent_distances(grid.latents[index], query.latents)
+    return GridCosts(grid.poses, index, cost, offset)
+
+
+def retrieve(costs: GridCosts, grid: LatentGrid, query: Query, *, top_k: int, separation_m: float) -> list[Candidate]:
     """The `top_k` best grid poses, best first, no two closer than `separation_m` and turned alike."""
-    evidence = evidence or EvidenceConfig()
-    distance = latent_distances(grid.latents, query.latents)
-    hypotheses = len(query.roll)
-    poses = np.arange(len(grid.poses))
-    cost = distance
-    if evidence.compares_profiles(query):
-        if hypotheses * len(poses) > _MAX_PAIRS:
-            most = max(_MAX_PAIRS // hypotheses, top_k)
-            poses = np.argpartition(distance.min(axis=0), most)[:most] if most < len(poses) else poses
-        log_profile = np.log(grid.profile_m[poses])
-        centre, precision = targets(query, np.arange(hypotheses), evidence.grid_reach * grid.step_m, evidence)
-        cost = np.stack([profile_costs(log_profile, *one) for one in zip(centre, precision, strict=True)])
-        cost += evidence.latent_weight * distance[:, poses]
-    ranked, ranks = np.argsort(cost, axis=None), max(_FIRST_RANKED, top_k)
+    ranked, ranks = np.argsort(costs.cost, axis=None), max(_FIRST_RANKED, top_k)
     while True:
-        hypothesis, column = np.unravel_index(ranked[:ranks], cost.shape)
-        pose = poses[column]
+        hypothesis, column = np.unravel_index(ranked[:ranks], costs.cost.shape)
+        pose = costs.index[column]
         kept = suppress(
             grid.poses.position_m[pose],
-            cost[hypothesis, column],
+            costs.cost[hypothesis, column],
             separation_m=separation_m,
             limit=top_k,
             heading=query.roll[hypothesis],
@@ -59,18 +70,43 @@ def retrieve(
             break
         # On a fine grid the best pairs may all be of a few places.
         ranks *= 4
-    return [
-        Candidate(
-            x_m=float(grid.poses.position_m[pose[index], 0]),
-            y_m=float(grid.poses.position_m[pose[index], 1]),
-            room_index=int(grid.poses.room_index[pose[index]]),
-            frame_heading=query.frame_heading,
-            hypothesis=int(hypothesis[index]),
-            cost=float(cost[hypothesis[index], column[index]]),
-            latent_distance=float(distance[hypothesis[index], pose[index]]),
-        )
-        for index in kept
-    ]
+    return [_candidate(costs, query, grid, int(hypothesis[index]), int(column[index])) for index in kept]
+
+
+def _candidate(costs: GridCosts, query: Query, grid: LatentGrid, hypothesis: int, column: int) -> Candidate:
+    pose = int(costs.index[column])
+    distance = latent_distances(grid.latents[pose][None], query.latents[hypothesis][None])
+    return Candidate(
+        x_m=float(grid.poses.position_m[pose, 0]),
+        y_m=float(grid.poses.position_m[pose, 1]),
+        room_index=int(grid.poses.room_index[pose]),
+        frame_heading=query.frame_heading,
+        hypothesis=hypothesis,
+        cost=float(costs.cost[hypothesis, column]),
+        latent_distance=float(distance[0, 0]),
+        height_offset=float(costs.offset[hypothesis, column]),
+    )
+
+
+def contradicted(
+    plan: FloorPlan, grid: LatentGrid, query: Query, weights: EvidenceModel, config: EvidenceConfig
+) -> bool:
+    """Whether the picture fits another heading so much better that the one that was said must be wrong.
+
+    It is wrong with the probability `heading_doubt`, and then may be any of those that can be searched.
+    """
+    searched = query.searched
+    if searched is None or not config.compares_profiles(query) or not config.heading_doubt:
+        return False
+    layouts, reach_m = grid.layouts(plan), config.grid_reach * grid.step_m
+    said, offset = Evidence(plan, query, reach_m, weights, config, stride=_STRIDE).costs(layouts)
+    # The height that is best at the heading that was said is good enough for a doubt.
+    best = np.unravel_index(said.argmin(), said.shape)
+    height_m = query.camera_height.height_m * float(np.exp(offset[best]))
+    exact = replace(searched.scaled(float(offset[best])), camera_height=CameraHeight(height_m, 0.0))
+    any_heading, _ = Evidence(plan, exact, reach_m, weights, config, stride=_STRIDE).costs(layouts)
+    doubt = np.log((1.0 - config.heading_doubt) / config.heading_doubt * len(searched.roll))
+    return bool(weights.temperature * (said.min() - any_heading.min()) > doubt)
 
 
 def suppress(
@@ -93,7 +129,7 @@ def suppress(
         kept.append(index)
         apart = np.linalg.norm(position_m[remaining] - position_m[index], axis=1) >= separation_m
         if heading is not None:
-            apart |= np.abs(wrap_angle(heading[remaining] - heading[index])) > _SEPARATION
+            apart |= np.abs(wrap_angle(heading[remaining] - heading[index])) > TURNED_APART
             apart[0] = False
         remaining = remaining[apart]
     return kept

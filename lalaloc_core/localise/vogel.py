@@ -11,7 +11,8 @@ from jaxtyping import Float, Int
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.evidence import EvidenceConfig, latent_distances, profile_costs, targets
+from lalaloc_core.localise.evidence import Evidence, EvidenceConfig, latent_distances
+from lalaloc_core.localise.layouts import layouts_at
 from lalaloc_core.localise.poses import Candidate, Query
 from lalaloc_core.sampling import PoseSet
 
@@ -65,11 +66,25 @@ def resample(
     if not query.heading_known:
         # A second low-discrepancy sequence, so that headings and positions are covered together.
         sequence = (number * (math.sqrt(2.0) - 1.0)) % 1.0
-        heading[1:] += (sequence - 0.5) * _sector(query)
-    cost = _costs(plan, encoders, query, candidate.hypothesis, poses, heading, camera_height_m, evidence)
-    best = slice(index := int(cost.argmin()), index + 1)
-    chosen = PoseSet(poses.position_m[best], poses.room_index[best])
-    latent, _ = encoders.poses(plan, chosen, heading[best], camera_height_m)
+        heading[1:] += (sequence - 0.5) * query.sector
+    latents: Float[np.ndarray, "n d"] | None = None
+    target = query.latents[candidate.hypothesis][None]
+    if not evidence.compares_profiles(query) or evidence.latent_weight:
+        latents, _ = encoders.poses(plan, poses, heading, camera_height_m)
+    offset = np.full(len(poses), candidate.height_offset)
+    cost = np.zeros(len(poses)) if latents is None else latent_distances(latents, target)[0]
+    if evidence.compares_profiles(query):
+        layouts = layouts_at(plan, poses, heading, encoders.manifest.profile_columns)
+        compared = Evidence(plan, query, evidence.fine_reach_m, encoders.manifest.evidence, evidence)
+        of_layouts, offsets = compared.costs(layouts, np.array([candidate.hypothesis]))
+        cost, offset = of_layouts[0] + evidence.latent_weight * cost, offsets[0]
+    index = int(cost.argmin())
+    chosen = PoseSet(poses.position_m[[index]], poses.room_index[[index]])
+    if latents is None:
+        # Dear, and here only told.
+        latents, _ = encoders.poses(plan, chosen, heading[[index]], camera_height_m)
+    else:
+        latents = latents[[index]]
     return replace(
         candidate,
         x_m=float(chosen.position_m[0, 0]),
@@ -77,33 +92,6 @@ def resample(
         room_index=int(chosen.room_index[0]),
         frame_heading=float(heading[index]),
         cost=float(cost[index]),
-        latent_distance=float(latent_distances(latent, query.latents[candidate.hypothesis][None])[0, 0]),
+        latent_distance=float(latent_distances(latents, target)[0, 0]),
+        height_offset=float(offset[index]),
     )
-
-
-def _costs(
-    plan: FloorPlan,
-    encoders: Encoders,
-    query: Query,
-    hypothesis: int,
-    poses: PoseSet,
-    heading: Float[np.ndarray, "n"],
-    camera_height_m: float,
-    evidence: EvidenceConfig,
-) -> Float[np.ndarray, "n"]:
-    """Costs of poses under one hypothesis; latents, which are dear, only where they count."""
-
-    def distances() -> Float[np.ndarray, "n"]:
-        latents, _ = encoders.poses(plan, poses, heading, camera_height_m)
-        return latent_distances(latents, query.latents[hypothesis][None])[0]
-
-    if not evidence.compares_profiles(query):
-        return distances()
-    centre, precision = targets(query, np.array(hypothesis), evidence.fine_reach_m, evidence)
-    cost = profile_costs(np.log(encoders.profiles(plan, poses, heading)), centre, precision)
-    return cost + evidence.latent_weight * distances() if evidence.latent_weight else cost
-
-
-def _sector(query: Query) -> float:
-    """Angle (radians) between neighbouring hypotheses."""
-    return float(query.roll[1] - query.roll[0]) if len(query.roll) > 1 else 0.0

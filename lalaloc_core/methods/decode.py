@@ -16,7 +16,8 @@ from torch.nn import functional
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.evidence import EvidenceConfig
 from lalaloc_core.localise.optimise import LpoConfig
-from lalaloc_core.localise.pipeline import LocaliseConfig, StageClock, localise, refinement_job
+from lalaloc_core.localise.pipeline import LocaliseConfig, StageClock, localise
+from lalaloc_core.localise.refinement import refinement_job
 from lalaloc_core.methods.alignment import DepthAligner
 from lalaloc_core.methods.lalaloc import LaLaLoc, encode, found_pose, grid_index, read_image
 from lalaloc_core.methods.method import Answer, Question
@@ -55,7 +56,9 @@ class VdrDecode:
         clock.timings_ms.update(found.timings_ms)
         with clock.stage("decode"):
             start = found.candidates[0]
-            job = refinement_job(plan, query, [start], grid.camera_height_m, self._config.evidence)
+            job = refinement_job(
+                plan, query, [start], grid.camera_height_m, encoders.manifest.evidence, self._config.evidence
+            )
             result = self._aligner.refine(replace(job, targets=self.decode(job.targets)))
         aligned = replace(
             start,

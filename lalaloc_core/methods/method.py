@@ -72,26 +72,44 @@ class Found:
 
 
 @dataclass(frozen=True, kw_only=True)
+class FoundCandidate:
+    """A rival for the answer: its pose, what each term of the evidence says of it, and its posterior probability."""
+
+    pose: Found
+    terms: dict[str, float]
+    probability: float
+
+
+@dataclass(frozen=True, kw_only=True)
 class Answer:
     """What a method found.
 
     Attributes:
         stages: the best pose after each stage, in order; the last is the answer. Empty: no answer.
-        rooms: room of each distinct candidate, best first; empty for methods that rank none.
+        candidates: the answer and its rivals, best first, where the method has any.
         retrieved: number of the grid pose that retrieval chose; None for methods that do not retrieve.
         signals: by stage, what speaks for its pose and against it; see `localise.confidence`.
         information: curvature of the cost at the answer, see `localise.poses.Candidate`.
         confidence: probability of being within 1 m, where the method has a model of it.
+        heading_confidence: probability that the heading is right within 5°, likewise.
+        camera_height_m: the height that fits best, where it was solved for.
         timings_ms: wall-clock per stage.
     """
 
     stages: dict[str, Found] = field(default_factory=dict)
-    rooms: tuple[int, ...] = ()
+    candidates: tuple[FoundCandidate, ...] = ()
     retrieved: int | None = None
     signals: dict[str, dict[str, float]] = field(default_factory=dict)
     information: Float[np.ndarray, "p p"] | None = None
     confidence: float | None = None
+    heading_confidence: float | None = None
+    camera_height_m: float | None = None
     timings_ms: dict[str, float] = field(default_factory=dict)
+
+    def rank_of_room(self, room_index: int) -> int | None:
+        """Rank of the best candidate in a room, from 1; None where there is none."""
+        ranks = [rank for rank, one in enumerate(self.candidates, start=1) if one.pose.room_index == room_index]
+        return ranks[0] if ranks else None
 
 
 @runtime_checkable

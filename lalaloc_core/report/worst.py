@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
+from lalaloc_core.bundle import EvidenceModel
 from lalaloc_core.conventions import TWO_PI, column_azimuths, heading_from_degrees
 from lalaloc_core.data.dataset import Camera, Scene
 from lalaloc_core.errors import LaLaLocError, RunError
@@ -26,7 +27,8 @@ from lalaloc_core.evaluation.predictions import Pose, Prediction, RunFolder, Run
 from lalaloc_core.evaluation.score import position_errors_m
 from lalaloc_core.files import atomic_write
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.evidence import EvidenceConfig, profile_costs, targets
+from lalaloc_core.localise.evidence import Evidence, EvidenceConfig
+from lalaloc_core.localise.layouts import layouts_at
 from lalaloc_core.localise.poses import Query
 from lalaloc_core.methods.lalaloc import encode, read_image
 from lalaloc_core.render.poses import profiles_at
@@ -48,6 +50,7 @@ from lalaloc_core.report.sheets import (
     draw_sheet,
 )
 from lalaloc_core.report.tables import distance, percent
+from lalaloc_core.sampling import PoseSet
 
 SUMMARY_FILE = "worst.json"
 _KEY = {TRUE_COLOUR: "true layout", FOUND_COLOUR: "found layout", PREDICTED_COLOUR: "predicted walls' floor line"}
@@ -239,8 +242,9 @@ class _QueryAnalyser:
             query = self._encode(self._encoders, scene, camera)
             floor = wall_line(predicted_profile_m(query, PICTURE_WIDTH), -height, PICTURE_HEIGHT)
             strokes.append(Stroke([floor], PREDICTED_COLOUR, 1.5, 2.0))
-            fit["true_cost"] = _cost(query, scene, prediction.truth)
-            fit["found_cost"] = None if found is None else _cost(query, scene, found)
+            weights = self._encoders.manifest.evidence
+            fit["true_cost"] = _cost(query, scene, prediction.truth, weights)
+            fit["found_cost"] = None if found is None else _cost(query, scene, found, weights)
             fit["distance_bias"] = _distance_bias(query, scene, prediction.truth)
         errors_m = position_errors_m([prediction])
         first_m = position_errors_m([prediction], next(iter(prediction.stages), None))
@@ -271,11 +275,15 @@ def _layout(scene: Scene, pose: Pose, camera_height_m: float, colour: str, width
     return Stroke(lines, colour, width, width + 1.0)
 
 
-def _cost(query: Query, scene: Scene, pose: Pose) -> float:
-    """How badly the layout of a pose fits the predicted wall profile."""
+def _cost(query: Query, scene: Scene, pose: Pose, weights: EvidenceModel) -> float:
+    """How badly the layout of a pose fits what is predicted."""
+    assert query.profile is not None
     config = EvidenceConfig()
-    centre, precision = targets(query, np.array(0), config.fine_reach_m, config)
-    return float(profile_costs(_log_profile(query, scene, pose, len(centre)), centre, precision)[0])
+    poses = PoseSet(np.array([[pose.x_m, pose.y_m]]), np.array([pose.room_index]))
+    heading = np.array([heading_from_degrees(pose.heading_deg) - query.roll[0]])
+    layouts = layouts_at(scene.plan, poses, heading, query.profile.log_m.shape[1])
+    cost, _ = Evidence(scene.plan, query, config.fine_reach_m, weights, config).costs(layouts, np.array([0]))
+    return float(cost[0, 0])
 
 
 def _distance_bias(query: Query, scene: Scene, truth: Pose) -> float:

@@ -5,8 +5,8 @@ Begin with `grids.py`, which everybody else asks. `builder.py` computes what `jo
 """
 
 from service.grids.grids import Grids
-from service.grids.heights import query_height_m
+from service.grids.heights import check_height_m, grid_height_m
 from service.grids.state import GridState
 from service.grids.sweeper import Sweeper
 
-__all__ = ["GridState", "Grids", "Sweeper", "query_height_m"]
+__all__ = ["GridState", "Grids", "Sweeper", "check_height_m", "grid_height_m"]

@@ -10,22 +10,30 @@ from service.storage.records import PlanRecord
 HEIGHT_STEP_M = 0.02
 
 
-def query_height_m(record: PlanRecord, asked_m: float | None) -> float:
-    """The camera height that a query is compared at: the plan's, or the one asked for, rounded to 2 cm.
+def check_height_m(record: PlanRecord, height_m: float) -> None:
+    """Refuse a camera height that no camera in the plan can have.
 
     Raises:
         InvalidPoseError: not below the lowest ceiling, or too low for any camera.
     """
-    own = record.plan.camera_height_m
-    if asked_m is None or abs(asked_m - own) < HEIGHT_STEP_M / 2.0:
-        return own
     lowest = float(record.plan.ceiling_heights_m.min())
-    if not MIN_CAMERA_HEIGHT_M <= asked_m < lowest:
+    if height_m != record.plan.camera_height_m and not MIN_CAMERA_HEIGHT_M <= height_m < lowest:
         raise InvalidPoseError(
-            f"camera_height_m is {asked_m:g}, it must be at least {MIN_CAMERA_HEIGHT_M:g} and below the plan's lowest "
+            f"camera_height_m is {height_m:g}, it must be at least {MIN_CAMERA_HEIGHT_M:g} and below the plan's lowest "
             f"ceiling ({lowest:g} m)"
         )
-    steps = round(asked_m / HEIGHT_STEP_M)
-    if steps * HEIGHT_STEP_M >= lowest:
+
+
+def grid_height_m(record: PlanRecord, height_m: float, *, latents_alone: bool) -> float:
+    """The camera height of the grid that a query is compared with.
+
+    Wall profiles are the same from every height, so the plan's own grid serves all queries. Only for models that
+    compare latents alone there is one for every height, rounded to 2 cm.
+    """
+    own = record.plan.camera_height_m
+    if not latents_alone or abs(height_m - own) < HEIGHT_STEP_M / 2.0:
+        return own
+    steps = round(height_m / HEIGHT_STEP_M)
+    if steps * HEIGHT_STEP_M >= float(record.plan.ceiling_heights_m.min()):
         steps -= 1
     return steps * HEIGHT_STEP_M

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import Callable
-from dataclasses import asdict
 from functools import partial
 from time import monotonic
 from typing import TypeVar
@@ -13,16 +12,18 @@ from typing import TypeVar
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import heading_to_degrees
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.covariance import spread_of
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.pipeline import Localisation, StageClock, localise_steps, next_step, panorama_heading
 from lalaloc_core.localise.poses import Candidate, LatentGrid, Query
 from lalaloc_core.panorama.images import Panorama
 from service.errors import DeadlineExceededError, PlanFailedError, PlanNotReadyError
-from service.grids import Grids, query_height_m
+from service.grids import Grids, grid_height_m
 from service.http.admission import Slots
+from service.query.camera_height import stated_height
 from service.query.decoding import Decoder
-from service.query.heading import HeadingSource, KnownHeading, known_heading
+from service.query.heading import KnownHeading, known_heading
 from service.query.refinement import LpoPool
 from service.schemas import CandidateAnswer, LocaliseAnswer, LocaliseForm, ModelAnswer, Position, TimingsAnswer
 from service.settings import Settings
@@ -95,18 +96,20 @@ class Localiser:
         self, record: PlanRecord, form: LocaliseForm, content: bytes, begin: float, clock: StageClock, party: str
     ) -> LocaliseAnswer:
         deadline = begin + self._settings.request_deadline_s
-        height_m = query_height_m(record, form.camera_height_m)
+        height = stated_height(form, record)
         # The picture first: a bad one is refused without waiting for the plan.
         with clock.stage("decode"):
             panorama = await self._decoder.decode(content, deadline, party)
         known = known_heading(form, record.plan, panorama, self._settings.compass_tolerance_deg)
-        query = await self._compute(party, lambda: self._encode(panorama, known, height_m, clock), deadline)
+        query = await self._compute(party, lambda: self._encode(panorama, known, height, clock), deadline)
+        latents_alone = not self._encoders.predicts_profile
         with clock.stage("grid"):
-            grid = await self._grid(record, height_m, deadline, party)
+            grid_m = grid_height_m(record, height.height_m, latents_alone=latents_alone)
+            grid = await self._grid(record, grid_m, deadline, party)
         found = await self._search(record.plan, grid, query, form, deadline, clock, party)
         timings_ms = clock.timings_ms | {"total": (monotonic() - begin) * 1e3}
         self._observe(timings_ms, found.stage)
-        return self._compose(record, known.source, height_m, query, found, timings_ms)
+        return self._compose(record, known, found, timings_ms)
 
     def close(self) -> None:
         """Finish what is being computed."""
@@ -146,9 +149,9 @@ class Localiser:
         except TimeoutError as error:
             raise PlanNotReadyError(record.id, monotonic() - begin, self._grids.progress(key)) from error
 
-    def _encode(self, panorama: Panorama, known: KnownHeading, height_m: float, clock: StageClock) -> Query:
+    def _encode(self, panorama: Panorama, known: KnownHeading, height: CameraHeight, clock: StageClock) -> Query:
         with clock.stage("encode"):
-            return self._encoders.query(panorama.pixels, known.heading, height_m, heading_tolerance=known.tolerance)
+            return self._encoders.query(panorama.pixels, known.heading, height, heading_tolerance=known.tolerance)
 
     async def _search(
         self,
@@ -175,36 +178,36 @@ class Localiser:
         self._telemetry.answers.labels(stage).inc()
 
     def _compose(
-        self,
-        record: PlanRecord,
-        source: HeadingSource,
-        height_m: float,
-        query: Query,
-        found: Localisation,
-        timings_ms: dict[str, float],
+        self, record: PlanRecord, known: KnownHeading, found: Localisation, timings_ms: dict[str, float]
     ) -> LocaliseAnswer:
         model = self._bundle.manifest.confidence
-        signals = asdict(found.signals[found.stage])
         answer = found.best[found.stage]
         spread = None
         if model is not None and answer.information is not None:
             spread = spread_of(answer.information, record.plan.rooms[answer.room_index], model)
-        candidates = [_candidate(record.plan, query, candidate) for candidate in found.candidates]
+        fits = None if model is None else found.fit_probability(model)
+        candidates = [
+            _candidate(record.plan, found.query, candidate, None if fits is None else fits * share)
+            for candidate, share in zip(found.candidates, found.posterior.candidate, strict=True)
+        ]
         best = candidates[0]
         return LocaliseAnswer(
             floorplan_id=record.id,
             floorplan_revision=record.revision_id,
             position=best.position,
             heading_deg=best.heading_deg,
-            heading_source=source,
+            heading_source="searched" if found.heading_contradicted else known.source,
             room=best.room,
-            confidence=model and model.probability(found.stage, signals, heading_known=query.heading_known),
+            room_id=best.room_id,
+            confidence=best.probability,
+            heading_confidence=None if fits is None else fits * min(found.posterior.heading, 1.0),
+            warnings=[_contradiction(known)] if found.heading_contradicted else [],
             covariance_m2=None if spread is None else spread.position_m2.tolist(),
             heading_std_deg=None if spread is None or spread.heading_std is None else math.degrees(spread.heading_std),
             stage=found.stage,
             cost=best.cost,
             latent_distance=best.latent_distance,
-            camera_height_m=height_m,
+            camera_height_m=found.camera_height_m,
             candidates=candidates,
             timings_ms=TimingsAnswer(**{name: timings_ms.get(name, 0.0) for name in TimingsAnswer.model_fields}),
             model=self.model,
@@ -216,12 +219,23 @@ def model_answer(bundle: Bundle) -> ModelAnswer:
     return ModelAnswer(name=bundle.manifest.name, version=bundle.manifest.version, sha256=bundle.sha256)
 
 
-def _candidate(plan: FloorPlan, query: Query, candidate: Candidate) -> CandidateAnswer:
+def _contradiction(known: KnownHeading) -> str:
+    """Says that a heading was not followed."""
+    assert known.heading is not None
+    origin = "heading_deg" if known.source == "given" else "the panorama's compass heading"
+    degrees = heading_to_degrees(known.heading)
+    return f"{origin} is {degrees:.4g}, which the panorama contradicts: the heading was searched for instead"
+
+
+def _candidate(plan: FloorPlan, query: Query, candidate: Candidate, probability: float | None) -> CandidateAnswer:
     """A candidate in the words of the API."""
+    room = plan.rooms[candidate.room_index]
     return CandidateAnswer(
         position=Position(x_m=candidate.x_m, y_m=candidate.y_m),
         heading_deg=heading_to_degrees(panorama_heading(query, candidate)),
-        room=plan.rooms[candidate.room_index].name,
+        room=room.name,
+        room_id=room.id,
+        probability=None if probability is None else min(probability, 1.0),
         cost=candidate.cost,
         latent_distance=min(max(candidate.latent_distance, 0.0), 2.0),
     )

@@ -13,6 +13,7 @@ import torch
 from lalaloc_core.bundle import DECODER_WEIGHTS, IMAGE_ONNX, MANIFEST_NAME, Bundle
 from lalaloc_core.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.errors import BundleError, CheckpointError, ConfigError
+from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.reproduce import ablations
 from lalaloc_core.reproduce.ablations import ABLATIONS, BASE, BUDGETS, Budget, train_ablation
@@ -126,7 +127,7 @@ class TestTraining:
         columns = bundle.manifest.profile_columns
         assert encoders.layouts(np.full((2, columns), 2.0), np.full(2, 1.5), np.full(2, 2.5)).shape == (2, 128)
         with pytest.raises(BundleError, match="layout queries only"):
-            encoders.query(np.zeros((64, 128, 3), dtype=np.uint8), 0.0, 1.5)
+            encoders.query(np.zeros((64, 128, 3), dtype=np.uint8), 0.0, CameraHeight(1.5))
         # An export that was interrupted is done again, without training.
         before = written(tmp_path)["layout-log-ratio/layout.pt"]
         (bundle.folder / MANIFEST_NAME).unlink()

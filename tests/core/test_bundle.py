@@ -32,6 +32,7 @@ from lalaloc_core.bundle import (
 from lalaloc_core.errors import BundleError, ExportError
 from lalaloc_core.export import bundle as export
 from lalaloc_core.export.bundle import PARITY_TOLERANCE, export_bundle
+from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.optimise import LatentPoseOptimiser
 from lalaloc_core.nets import load_decoder
@@ -131,7 +132,7 @@ class TestExport:
         encoders = Encoders(bundle, threads=1)
         assert encoders.layouts(np.full((1, 32), 2.0), np.array([1.5]), np.array([2.5])).shape == (1, 128)
         with pytest.raises(BundleError, match="layout queries only"):
-            encoders.query(np.zeros((32, 64, 3), dtype=np.uint8), 0.0, 1.5)
+            encoders.query(np.zeros((32, 64, 3), dtype=np.uint8), 0.0, CameraHeight(1.5))
 
     def test_a_network_that_disagrees_is_not_exported(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(export, "PARITY_TOLERANCE", 0.0)
@@ -148,10 +149,10 @@ class TestExport:
         assert HEAD_ONNX not in bundle.manifest.files
         encoders, optimiser = Encoders(bundle, threads=1), LatentPoseOptimiser.from_bundle(bundle)
         image = np.random.default_rng(0).integers(0, 256, (64, 128, 3), dtype=np.uint8)
-        known = encoders.query(image, 0.0, 1.5)
+        known = encoders.query(image, 0.0, CameraHeight(1.5))
         assert known.latents.shape == (1, 128)
         # Turned by an eighth, the hypothesis of an eighth sees the picture it was.
-        unknown = encoders.query(np.roll(image, -16, axis=1), None, 1.5)
+        unknown = encoders.query(np.roll(image, -16, axis=1), None, CameraHeight(1.5))
         eighth = int(np.abs(unknown.roll - np.pi / 4).argmin())
         np.testing.assert_allclose(unknown.latents[eighth], known.latents[0], atol=1e-5)
         scene = scene_of(crooked_flat(), 2, 0)
@@ -265,14 +266,14 @@ class TestConfidence:
     @pytest.mark.parametrize(("stage", "known", "bias"), [("lpo", True, 1.0), ("vdr", True, 0.0), ("lpo", False, -1.0)])
     def test_it_is_the_documented_formula_of_the_stage(self, stage: str, known: bool, bias: float) -> None:
         logit = bias + 2.0 * 1.5 - 4.0 * 0.2 - 0.5 * -3.0 - 6.0 * 0.1
-        found = self.model.probability(stage, self.signals, heading_known=known)
+        found = self.model.fit_probability(stage, self.signals, heading_known=known)
         assert found == pytest.approx(1.0 / (1.0 + np.exp(-logit)))
 
     def test_a_stage_that_was_never_seen_has_none(self) -> None:
-        assert self.model.probability("vdr", self.signals, heading_known=False) is None
+        assert self.model.fit_probability("vdr", self.signals, heading_known=False) is None
 
     @pytest.mark.parametrize("cost", [0.0, 1e9, -1e9])
     def test_it_stays_a_probability(self, cost: float) -> None:
-        found = self.model.probability("lpo", {**self.signals, "cost": cost}, heading_known=True)
+        found = self.model.fit_probability("lpo", {**self.signals, "cost": cost}, heading_known=True)
         assert found is not None
         assert 0.0 <= found <= 1.0

@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.optimise import LatentPoseOptimiser
 from lalaloc_core.localise.pipeline import localise, panorama_heading
@@ -126,20 +127,20 @@ class TestRealEncoders:
         at_zero = rng.integers(0, 256, (RING.image_height, RING.image_width, 3), dtype=np.uint8)
         # Looking along a heading h to the right brings what stood right of the centre into it: a roll to the left.
         turned = np.roll(at_zero, -sector * RING.image_width // SECTORS, axis=1)
-        straight = encoders.query(at_zero, 0.0, CAMERA_M)
-        unknown = encoders.query(turned, None, CAMERA_M)
+        straight = encoders.query(at_zero, 0.0, CameraHeight(CAMERA_M))
+        unknown = encoders.query(turned, None, CameraHeight(CAMERA_M))
         assert len(unknown.latents) == len(unknown.roll) == SECTORS
         hypothesis = int(np.abs(wrap_angle(unknown.roll - sector * SECTOR)).argmin())
         assert abs(wrap_angle(unknown.roll[hypothesis] - sector * SECTOR)) < 1e-9
         np.testing.assert_allclose(unknown.latents[hypothesis], straight.latents[0], atol=1e-4)
-        known = encoders.query(turned, sector * SECTOR, CAMERA_M)
+        known = encoders.query(turned, sector * SECTOR, CameraHeight(CAMERA_M))
         np.testing.assert_allclose(known.latents[0], straight.latents[0], atol=1e-4)
         assert abs(known.frame_heading) < 1e-9
 
     @given(headings)
     def test_roll_and_frame_heading_of_a_known_heading_add_up_to_it(self, encoders: Encoders, heading: float) -> None:
         image = np.zeros((RING.image_height, RING.image_width, 3), np.uint8)
-        query = encoders.query(image, heading, CAMERA_M)
+        query = encoders.query(image, heading, CameraHeight(CAMERA_M))
         assert query.heading_known
         assert abs(wrap_angle(query.roll[0] + query.frame_heading - heading)) < 1e-9
         assert abs(query.frame_heading) <= math.pi / RING.image_width + 1e-9
@@ -151,7 +152,7 @@ class TestPerfectEncoder:
     def test_a_known_heading_gives_the_latent_of_the_layout_at_the_frame_heading(
         self, perfect: Encoders, flat: FloorPlan, heading: float
     ) -> None:
-        query = perfect.query(photograph(flat, POSE, heading), heading, CAMERA_M)
+        query = perfect.query(photograph(flat, POSE, heading), heading, CameraHeight(CAMERA_M))
         layout, profile_m = perfect.poses(flat, POSE, np.array([query.frame_heading]), CAMERA_M)
         np.testing.assert_allclose(query.latents, layout, atol=2e-3)
         assert query.profile is not None
@@ -162,7 +163,7 @@ class TestPerfectEncoder:
     def test_an_unknown_heading_has_a_hypothesis_with_the_latent_of_the_layout(
         self, perfect: Encoders, flat: FloorPlan, heading: float
     ) -> None:
-        query = perfect.query(photograph(flat, POSE, heading), None, CAMERA_M)
+        query = perfect.query(photograph(flat, POSE, heading), None, CameraHeight(CAMERA_M))
         rest = wrap_angle(heading - query.roll)
         nearest = int(np.abs(rest).argmin())
         assert abs(rest[nearest]) <= SECTOR / 2 + 1e-9
@@ -183,7 +184,7 @@ class TestPerfectEncoder:
         tolerance: float,
     ) -> None:
         image = photograph(flat, POSE, heading)
-        query = perfect.query(image, heading + off * tolerance, CAMERA_M, heading_tolerance=tolerance)
+        query = perfect.query(image, heading + off * tolerance, CameraHeight(CAMERA_M), heading_tolerance=tolerance)
         assert not query.heading_known
         turned = wrap_angle(query.roll + query.frame_heading - (heading + off * tolerance))
         assert tolerance <= np.abs(turned).max() < tolerance + SECTOR
@@ -206,7 +207,7 @@ class TestPerfectEncoder:
     ) -> None:
         position = np.array([[1.37, 1.12], [3.21, 1.63], [0.81, 2.35], [5.12, 0.86], [4.23, 5.04], [1.66, 4.71]][place])
         pose = PoseSet(position[None], flat.room_index_at(position[None]))
-        query = perfect.query(photograph(flat, pose, heading), heading if known else None, CAMERA_M)
+        query = perfect.query(photograph(flat, pose, heading), heading if known else None, CameraHeight(CAMERA_M))
         grid = build_grid(flat, perfect, step_m=0.25, camera_height_m=CAMERA_M)
         best = localise(flat, grid, perfect, query, refiner=optimiser.refine).candidates[0]
         assert best.room_index == pose.room_index[0]

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.optimise import LatentPoseOptimiser
 from lalaloc_core.localise.pipeline import Localisation, LocaliseConfig, Refine, StageClock, localise, panorama_heading
@@ -29,6 +30,7 @@ from lalaloc_core.sampling import PoseSet, random_poses
 from tests.strategies import crooked_flat, plan_of, rectangle, seeds
 
 CAMERA_M = 1.5
+EXACT = CameraHeight(CAMERA_M, 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +47,7 @@ def layout_query(encoders: Encoders, plan: FloorPlan, pose: PoseSet, *, by_profi
     """What a perfect image encoder would make of a panorama of this pose: its latent and, if asked, its profile."""
     latents, profile_m = encoders.poses(plan, pose, np.zeros(1), CAMERA_M)
     profile = PredictedProfile(np.log(profile_m), np.full_like(profile_m, -5.0)) if by_profile else None
-    return Query(latents, np.zeros(1), 0.0, heading_known=True, profile=profile)
+    return Query(latents, np.zeros(1), 0.0, heading_known=True, camera_height=EXACT, profile=profile)
 
 
 def some_pose(plan: FloorPlan, seed: int) -> PoseSet:
@@ -101,7 +103,7 @@ class TestAnswer:
         refine: Refine,
     ) -> None:
         image = np.random.default_rng(seed).integers(0, 256, (32, 64, 3), dtype=np.uint8)
-        query = encoders.query(image, 1.0 if heading_known else None, CAMERA_M)
+        query = encoders.query(image, 1.0 if heading_known else None, CameraHeight(CAMERA_M))
         found = localise(flat, grid, encoders, query, refine=refine, top_k=top_k, refiner=optimiser.refine)
         positions = np.stack([candidate.position_m for candidate in found.candidates])
         assert 1 <= len(positions) <= top_k
@@ -131,7 +133,7 @@ class TestAnswer:
 
     @given(st.floats(-math.pi, math.pi), st.floats(-10.0, 10.0))
     def test_headings_are_wrapped(self, roll: float, frame_heading: float) -> None:
-        query = Query(np.eye(2), np.array([0.0, roll]), 0.0, heading_known=False)
+        query = Query(np.eye(2), np.array([0.0, roll]), 0.0, heading_known=False, camera_height=EXACT)
         heading = panorama_heading(query, Candidate(0.0, 0.0, 0, frame_heading, 1, 0.0, 0.0))
         assert -math.pi <= heading <= math.pi
         assert abs(wrap_angle(heading - roll - frame_heading)) < 1e-9
@@ -193,7 +195,7 @@ class TestStages:
         jobs: list[RefinementJob] = []
         image = np.random.default_rng(0).integers(0, 256, (32, 64, 3), dtype=np.uint8)
         for heading in (None, 0.5):
-            query = encoders.query(image, heading, CAMERA_M)
+            query = encoders.query(image, heading, CameraHeight(CAMERA_M))
             assert query.profile is not None
             localise(flat, grid, encoders, query, refiner=lambda job: jobs.append(job))
             expected = localise(flat, grid, encoders, query, refine="vdr").candidates

@@ -11,15 +11,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jaxtyping import Float
 
+from lalaloc_core.bundle import EvidenceModel
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.evidence import EvidenceConfig, latent_distances, profile_costs, targets
+from lalaloc_core.localise.evidence import EvidenceConfig, latent_distances, precisions
 from lalaloc_core.localise.poses import Candidate, LatentGrid, PredictedProfile, Query
-from lalaloc_core.localise.retrieval import retrieve, suppress
+from lalaloc_core.localise.retrieval import contradicted, grid_costs, retrieve, suppress
 from lalaloc_core.localise.vogel import resample, vogel_disc
 from lalaloc_core.sampling import PoseSet
 from tests.strategies import plan_of, rectangle, seeds
+
+PLAN = plan_of(rectangle(6.0, 6.0))
+EXACT = CameraHeight(1.5, 0.0)
 
 
 def unit(rng: np.random.Generator, *shape: int) -> np.ndarray:
@@ -27,14 +32,21 @@ def unit(rng: np.random.Generator, *shape: int) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def random_grid(seed: int, poses: int = 60) -> LatentGrid:
+def random_grid(seed: int, poses: int = 60, columns: int = 16) -> LatentGrid:
     rng = np.random.default_rng(seed)
     places = PoseSet(rng.uniform(0, 6, (poses, 2)), np.zeros(poses, dtype=int))
-    return LatentGrid(places, unit(rng, poses, 8), rng.uniform(0.5, 5.0, (poses, 16)), 0.5, 1.5)
+    return LatentGrid(places, unit(rng, poses, 8), rng.uniform(0.5, 5.0, (poses, columns)), 0.5, 1.5)
+
+
+def best_places(
+    grid: LatentGrid, query: Query, *, top_k: int, evidence: EvidenceConfig | None = None
+) -> list[Candidate]:
+    costs = grid_costs(PLAN, grid, query, EvidenceModel(), evidence or EvidenceConfig())
+    return retrieve(costs, grid, query, top_k=top_k, separation_m=1.0)
 
 
 def any_heading(latents: np.ndarray) -> Query:
-    return Query(latents, np.arange(len(latents)) * (2.0 * math.pi / len(latents)), 0.0, heading_known=False)
+    return Query(latents, np.arange(len(latents)) * (2.0 * math.pi / len(latents)), 0.0, False, EXACT)
 
 
 def nearest_neighbour_distances(points: np.ndarray) -> np.ndarray:
@@ -104,11 +116,12 @@ class TestRetrieval:
         grid = random_grid(seed)
         query = any_heading(unit(np.random.default_rng(seed + 1), hypotheses, 8))
         distances = latent_distances(grid.latents, query.latents)
-        found = retrieve(grid, query, top_k=5, separation_m=1.0)
-        assert found[0].latent_distance == distances.min()
+        found = best_places(grid, query, top_k=5)
+        assert found[0].latent_distance == pytest.approx(distances.min())
         for candidate in found:
             place = int(np.linalg.norm(grid.poses.position_m - candidate.position_m, axis=1).argmin())
-            assert candidate.cost == candidate.latent_distance == distances[candidate.hypothesis, place]
+            assert candidate.cost == distances[candidate.hypothesis, place]
+            assert candidate.latent_distance == pytest.approx(candidate.cost)
             assert candidate.room_index == grid.poses.room_index[place]
             assert candidate.frame_heading == query.frame_heading
 
@@ -121,13 +134,13 @@ class TestRetrieval:
         latents[np.linalg.norm(position - 2.0, axis=1) < 1.0] = np.eye(8)[0]
         grid = LatentGrid(poses, latents, np.ones((len(position), 4)), 0.1, 1.5)
         query = any_heading(np.repeat(np.eye(8)[:1], 64, axis=0))
-        assert len(retrieve(grid, query, top_k=40, separation_m=1.0)) == 40
+        assert len(best_places(grid, query, top_k=40)) == 40
 
     def test_a_grid_pose_s_own_latent_retrieves_it(self) -> None:
         grid = random_grid(0)
         for index in (0, 17, 59):
             query = any_heading(grid.latents[index : index + 1])
-            best = retrieve(grid, query, top_k=1, separation_m=1.0)[0]
+            best = best_places(grid, query, top_k=1)[0]
             np.testing.assert_array_equal(best.position_m, grid.poses.position_m[index])
 
     def test_a_grid_pose_s_own_profile_retrieves_it_turned_as_it_was(self) -> None:
@@ -135,12 +148,13 @@ class TestRetrieval:
         for index in (0, 17, 59):
             # Hypothesis k undoes a turn by k of 8 sectors, two columns each; the truth is hypothesis 3.
             seen = np.roll(np.log(grid.profile_m[index]), -6)
-            profile = PredictedProfile.rolled(seen, np.full(16, -3.0), 2 * np.arange(8))
+            turned = np.stack([np.roll(seen, 2 * k) for k in range(8)])
+            profile = PredictedProfile(turned, np.full((8, 16), -3.0))
             query = dataclasses.replace(any_heading(unit(np.random.default_rng(1), 8, 8)), profile=profile)
-            best = retrieve(grid, query, top_k=1, separation_m=1.0)[0]
+            best = best_places(grid, query, top_k=1)[0]
             np.testing.assert_array_equal(best.position_m, grid.poses.position_m[index])
             assert best.hypothesis == 3
-            assert best.cost < 1e-9
+            assert best.cost < 1e-6
 
     @given(seeds())
     def test_a_profile_is_ranked_by_its_cost_and_the_latent_by_its_weight(self, seed: int) -> None:
@@ -149,14 +163,56 @@ class TestRetrieval:
             any_heading(unit(rng, 3, 8)), profile=PredictedProfile(rng.normal(size=(3, 16)), rng.normal(size=(3, 16)))
         )
         evidence = EvidenceConfig(latent_weight=0.7)
-        centre, precision = targets(query, np.arange(3), 0.3, evidence)
-        costs = np.stack([profile_costs(np.log(grid.profile_m), *one) for one in zip(centre, precision, strict=True)])
+        assert query.profile is not None
+        residual = np.log(grid.profile_m)[None] - query.profile.log_m[:, None]
+        costs = np.log1p(np.square(residual * precisions(query, 0.3, evidence)[:, None])).mean(axis=2)
         costs += 0.7 * latent_distances(grid.latents, query.latents)
-        best = retrieve(grid, query, top_k=1, separation_m=1.0, evidence=evidence)[0]
-        assert best.cost == pytest.approx(costs.min())
-        assert retrieve(grid, query, top_k=1, separation_m=1.0, evidence=EvidenceConfig(use_profile=False))[
-            0
-        ].cost == pytest.approx(latent_distances(grid.latents, query.latents).min())
+        best = best_places(grid, query, top_k=1, evidence=evidence)[0]
+        assert best.cost == pytest.approx(costs.min(), rel=1e-4)
+        by_latent = best_places(grid, query, top_k=1, evidence=EvidenceConfig(use_profile=False))[0]
+        assert by_latent.cost == pytest.approx(latent_distances(grid.latents, query.latents).min())
+
+    def test_of_a_large_grid_the_best_by_some_azimuths_are_compared_in_full(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        grid, rng = random_grid(0, poses=400), np.random.default_rng(0)
+        seen = np.log(grid.profile_m[[7, 300]]) + rng.normal(scale=0.02, size=(2, 16))
+        query = dataclasses.replace(
+            any_heading(unit(rng, 2, 8)), profile=PredictedProfile(seen, np.full((2, 16), -3.0))
+        )
+        everything = best_places(grid, query, top_k=3)
+        monkeypatch.setattr("lalaloc_core.localise.retrieval._MAX_COMPARISONS", 100)
+        monkeypatch.setattr("lalaloc_core.localise.retrieval._FIRST_RANKED", 50)
+        costs = grid_costs(PLAN, grid, query, EvidenceModel(), EvidenceConfig())
+        assert len(costs.index) == 50
+        assert best_places(grid, query, top_k=3)[:2] == everything[:2]
+
+
+class TestDoubt:
+    @pytest.fixture
+    def grid(self) -> LatentGrid:
+        return random_grid(0, columns=64)
+
+    def query(self, grid: LatentGrid, turned_by: int) -> Query:
+        """A picture of one of the grid's poses, said to look along azimuth 0, that is turned by some sectors of 8."""
+        seen = np.roll(np.log(grid.profile_m[17]), 8 * turned_by)
+        turned = np.stack([np.roll(seen, 8 * k) for k in range(8)])
+        latents = unit(np.random.default_rng(1), 8, 8)
+        searched = dataclasses.replace(any_heading(latents), profile=PredictedProfile(turned, np.full((8, 64), -4.0)))
+        said = PredictedProfile(turned[:1], np.full((1, 64), -4.0))
+        return Query(latents[:1], np.zeros(1), 0.0, True, CameraHeight(1.5), said, searched=searched)
+
+    @pytest.mark.parametrize("turned_by", [0, 3])
+    def test_a_heading_is_doubted_when_the_picture_fits_another_far_better(
+        self, grid: LatentGrid, turned_by: int
+    ) -> None:
+        query = self.query(grid, turned_by)
+        assert contradicted(PLAN, grid, query, EvidenceModel(), EvidenceConfig()) == (turned_by != 0)
+
+    def test_it_is_not_where_nothing_may_be_doubted_or_another_is_hardly_better(self, grid: LatentGrid) -> None:
+        wrong = self.query(grid, 3)
+        assert not contradicted(PLAN, grid, wrong, EvidenceModel(), EvidenceConfig(heading_doubt=0.0))
+        assert not contradicted(PLAN, grid, wrong, EvidenceModel(temperature=0.5), EvidenceConfig())
 
 
 class TestVogelDisc:
@@ -193,7 +249,9 @@ class TestResampling:
     def query(self, x: float, y: float, heading_known: bool = True, heading: float = 0.0) -> Query:
         pose = PoseSet(np.array([[x, y]]), np.array([0]))
         latent, _ = PLACES.poses(self.plan, pose, np.array([heading]), 1.5)
-        return Query(latent, np.zeros(1), 0.0, heading_known) if heading_known else any_heading(latent.repeat(8, 0))
+        return (
+            Query(latent, np.zeros(1), 0.0, heading_known, EXACT) if heading_known else any_heading(latent.repeat(8, 0))
+        )
 
     def candidate(self, query: Query, x: float, y: float) -> Candidate:
         pose = PoseSet(np.array([[x, y]]), np.array([0]))

@@ -17,6 +17,7 @@ from lalaloc_core.bundle import MANIFEST_NAME, Bundle
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.errors import BundleError, ConfigError
 from lalaloc_core.export.bundle import export_bundle
+from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.poses import rolled
 from lalaloc_core.nets.trunk import (
@@ -260,7 +261,7 @@ class TestBundle:
         assert sum(manifest.room_type_prior) == pytest.approx(1.0)
 
     def test_a_query_tells_openings_ceiling_and_type_of_the_room(self, service: Encoders) -> None:
-        query = service.query(panorama(), None, 1.5)
+        query = service.query(panorama(), None, CameraHeight(1.5))
         assert query.openings is not None
         assert query.ceiling is not None
         assert query.room_type is not None
@@ -272,7 +273,7 @@ class TestBundle:
         assert np.isfinite([query.ceiling.log_m, query.ceiling.log_scale]).all()
 
     def test_openings_turn_with_the_hypotheses_as_the_profile_does(self, service: Encoders) -> None:
-        query = service.query(panorama(), None, 1.5)
+        query = service.query(panorama(), None, CameraHeight(1.5))
         assert query.openings is not None
         assert query.profile is not None
         shifts = np.arange(TINY.ring.sectors) * (TINY.profile_columns // TINY.ring.sectors)
@@ -281,7 +282,7 @@ class TestBundle:
         assert not np.allclose(query.openings.log_probability[0], query.openings.log_probability[1])
 
     def test_a_mirrored_panorama_is_told_mirrored(self, service: Encoders) -> None:
-        one, other = (service.query(image, 0.0, 1.5) for image in (panorama(), panorama()[:, ::-1]))
+        one, other = (service.query(image, 0.0, CameraHeight(1.5)) for image in (panorama(), panorama()[:, ::-1]))
         assert one.profile is not None
         assert other.profile is not None
         assert one.openings is not None
@@ -293,7 +294,7 @@ class TestBundle:
         assert other.ceiling.log_m == pytest.approx(one.ceiling.log_m, abs=1e-5)
 
     def test_the_stated_height_is_one_offset(self, service: Encoders) -> None:
-        low, high = (service.query(panorama(), 0.0, height) for height in (1.0, 2.0))
+        low, high = (service.query(panorama(), 0.0, CameraHeight(height)) for height in (1.0, 2.0))
         assert low.profile is not None
         assert high.profile is not None
         np.testing.assert_allclose(high.profile.log_m, low.profile.log_m + np.log(2.0), atol=1e-5)
@@ -320,7 +321,7 @@ class TestBundle:
 class TestOlderModels:
     def test_a_model_without_these_outputs_tells_walls_alone(self, encoders: Encoders) -> None:
         image = np.random.default_rng(0).integers(0, 256, (32, 64, 3), dtype=np.uint8)
-        query = encoders.query(image, None, 1.5)
+        query = encoders.query(image, None, CameraHeight(1.5))
         assert query.profile is not None
         assert (query.openings, query.ceiling, query.room_type) == (None, None, None)
 

@@ -16,6 +16,7 @@ from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.errors import CheckpointError, ConfigError
 from lalaloc_core.export.run import export_run
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.nets.trunk import Trunk
 from lalaloc_core.nets.trunk_encoder import TrunkImageEncoder
@@ -167,7 +168,7 @@ class TestRuns:
         assert int(counted["counted"]) == 3
         assert counted["opening_share"].sum().item() == pytest.approx(1.0, abs=1e-4)
         bundle = Bundle.open(folder / "bundle")
-        query = Encoders(bundle, threads=1).query(np.zeros((*TINY.image_size, 3), np.uint8), None, 1.5)
+        query = Encoders(bundle, threads=1).query(np.zeros((*TINY.image_size, 3), np.uint8), None, CameraHeight(1.5))
         assert query.openings is not None
         expected = losses.opening_prior(checkpoint.averaged["image_encoder"]["opening_share"], 0.5)
         np.testing.assert_allclose(query.openings.prior, expected, rtol=1e-5)

@@ -15,6 +15,7 @@ from lalaloc_core.errors import RunError
 from lalaloc_core.evaluation.failures import Outcome, is_symmetric, outcomes, symmetric_by_chance
 from lalaloc_core.evaluation.predictions import Pose, Prediction, RunFolder, RunInfo
 from lalaloc_core.evaluation.run import run_evaluation
+from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.poses import PredictedProfile, Query
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.report.sheets import PER_SHEET, Thumbnail, draw_sheet
@@ -89,7 +90,8 @@ class TestPredictedWalls:
         here, walls = np.array([[1.0, 1.0]]), PLAN.walls_m[[0]]
         columns = 512
         turned = np.log(wall_profile(here, np.zeros(1), walls, columns))
-        query = Query(np.ones((1, 1)), np.array([heading]), 0.0, True, PredictedProfile(turned, np.zeros_like(turned)))
+        profile = PredictedProfile(turned, np.zeros_like(turned))
+        query = Query(np.ones((1, 1)), np.array([heading]), 0.0, True, CameraHeight(1.5), profile)
         expected = wall_profile(here, np.array([heading]), walls, 128)[0]
         np.testing.assert_allclose(predicted_profile_m(query, 128), expected, rtol=0.02)
 

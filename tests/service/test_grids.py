@@ -32,7 +32,7 @@ from service.errors import (
 )
 from service.grids.embedding import embed, grid_bytes
 from service.grids.grids import Grids
-from service.grids.heights import query_height_m
+from service.grids.heights import check_height_m, grid_height_m
 from service.grids.jobs import MAX_ON_DEMAND
 from service.grids.sweeper import Sweeper
 from service.grids.throttle import BackgroundThrottle
@@ -634,12 +634,14 @@ def test_a_rounded_height_is_near_and_always_below_the_ceiling(asked_m: float) -
     )
     if not 0.1 <= asked_m < 2.4:
         with pytest.raises(InvalidPoseError, match=r"at least 0\.1 and below .*2\.4"):
-            query_height_m(record, asked_m)
+            check_height_m(record, asked_m)
         return
-    height_m = query_height_m(record, asked_m)
+    check_height_m(record, asked_m)
+    assert grid_height_m(record, asked_m, latents_alone=False) == PLAN.camera_height_m
+    height_m = grid_height_m(record, asked_m, latents_alone=True)
     assert 0.0 < height_m < 2.4
     assert abs(height_m - asked_m) <= 0.0201
-    assert query_height_m(record, height_m) == pytest.approx(height_m)
+    assert grid_height_m(record, height_m, latents_alone=True) == pytest.approx(height_m)
 
 
 @pytest.mark.one_replica

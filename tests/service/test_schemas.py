@@ -36,7 +36,15 @@ def test_an_answer_has_no_more_digits_than_say_something(client: httpx.Client, p
 @given(st.floats(0.0, 360.0, exclude_max=True), st.floats(-1e4, 1e4))
 def test_rounding_stays_within_the_limits(heading_deg: float, x_m: float) -> None:
     position = Position(x_m=x_m, y_m=-1e-9)
-    made = CandidateAnswer(position=position, heading_deg=heading_deg, room="x", cost=0.0, latent_distance=2.0)
+    made = CandidateAnswer(
+        position=position,
+        heading_deg=heading_deg,
+        room="x",
+        room_id="x",
+        probability=None,
+        cost=0.0,
+        latent_distance=2.0,
+    )
     assert 0.0 <= made.heading_deg < 360.0
     assert abs((made.heading_deg - heading_deg + 180.0) % 360.0 - 180.0) <= 0.005 + 1e-9
     assert made.position.x_m == pytest.approx(x_m, abs=0.0005 + 1e-9)

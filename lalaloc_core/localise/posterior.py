@@ -1,0 +1,141 @@
+"""How probable places are: the posterior over all grid poses and all ways in which the panorama may be turned.
+
+Each pair of a pose and a hypothesis has the likelihood `exp(-T cost)`, with the temperature T fitted on validation
+queries, and a prior uniform over floor area and over the headings that are searched. Candidates are the modes of the
+posterior. The optimiser tells how far down the cost of a mode goes, which the grid, whose poses are off, cannot: a
+mode's pairs are shifted by what its candidate gained, all others by what candidates gain usually.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from lalaloc_core.conventions import wrap_angle
+from lalaloc_core.localise.poses import Candidate, Query
+from lalaloc_core.sampling import PoseSet
+
+# An answer is right within this distance, and its heading within this angle (radians).
+RIGHT_WITHIN_M = 1.0
+HEADING_WITHIN = np.radians(5.0)
+# Two poses at one place are of different modes if they are turned against each other by this much (radians).
+TURNED_APART = np.radians(25.0)
+# Pairs that are less likely than the best by this factor's logarithm weigh nothing.
+_NEGLIGIBLE = 12.0
+
+
+@dataclass(frozen=True, eq=False)
+class GridCosts:
+    """What retrieval found for every hypothesis and every pose that it compared.
+
+    Attributes:
+        poses: all poses of the grid.
+        index: (n,) which of them were compared; of large grids those that may be the best.
+        cost: (k, n) under every hypothesis.
+        offset: (k, n) the height offset δ that gives it.
+    """
+
+    poses: PoseSet
+    index: Int[np.ndarray, "n"]
+    cost: Float[np.ndarray, "k n"]
+    offset: Float[np.ndarray, "k n"]
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Probabilities, given that the picture was taken in the plan at all.
+
+    Attributes:
+        pose: (n,) probability of every grid pose; they sum to one.
+        candidate: probability of being within 1 m of each candidate and of none before it; at most one in sum.
+        heading: probability that the heading of the first candidate is right within 5°.
+    """
+
+    pose: Float[np.ndarray, "n"]
+    candidate: tuple[float, ...]
+    heading: float
+
+
+def area_shares(poses: PoseSet, areas_m2: Float[np.ndarray, "r"]) -> Float[np.ndarray, "n"]:
+    """Log prior of every pose of a grid: its room's area, shared by the room's poses."""
+    count = np.bincount(poses.room_index, minlength=len(areas_m2))
+    return np.log(areas_m2[poses.room_index] / count[poses.room_index])
+
+
+def posterior_of(
+    grid: GridCosts,
+    prior: Float[np.ndarray, "n"],
+    query: Query,
+    starts: Sequence[Candidate],
+    ends: Sequence[Candidate],
+    candidates: Sequence[Candidate],
+    temperature: float,
+    separation_m: float,
+) -> Posterior:
+    """The posterior once some modes of the grid are refined.
+
+    Args:
+        prior: (n,) log prior of every pose of the grid, up to a constant.
+        starts: candidates as the grid has them.
+        ends: the same after refinement.
+        candidates: what probabilities are wanted of, the answer first.
+    """
+    lowest = float(grid.cost.min())
+    gains = [start.cost - end.cost for start, end in zip(starts, ends, strict=True)]
+    usual = float(np.median(gains)) if gains else 0.0
+    best = min([lowest - usual, *(end.cost for end in ends)])
+    hypothesis, column = np.nonzero(temperature * (grid.cost - max(gains, default=0.0) - best) < _NEGLIGIBLE)
+    cost, pose = grid.cost[hypothesis, column].astype(np.float64), grid.index[column]
+    position = grid.poses.position_m[pose].copy()
+    heading = query.roll[hypothesis] + query.frame_heading
+    mode = _modes(position, heading, starts, query, separation_m)
+    gain = np.full(len(cost), usual)
+    for index, (start, end) in enumerate(zip(starts, ends, strict=True)):
+        member = mode == index
+        gain[member] = gains[index]
+        position[member] += end.position_m - start.position_m
+        heading[member] += end.frame_heading - start.frame_heading
+    log_weight = -temperature * (cost - gain) + prior[pose]
+    weight = np.exp(log_weight - log_weight.max())
+    weight /= weight.sum()
+    by_pose = np.bincount(pose, weight, minlength=len(grid.poses))
+    return Posterior(by_pose, _shares(position, weight, candidates), _heading_share(heading, weight, query, candidates))
+
+
+def _modes(
+    position: Float[np.ndarray, "m 2"],
+    heading: Float[np.ndarray, "m"],
+    starts: Sequence[Candidate],
+    query: Query,
+    separation_m: float,
+) -> Int[np.ndarray, "m"]:
+    """The first candidate that is near each pair and turned alike; -1 where there is none."""
+    mode = np.full(len(position), -1)
+    for index, start in reversed(list(enumerate(starts))):
+        near = np.linalg.norm(position - start.position_m, axis=1) < separation_m
+        turned = wrap_angle(heading - query.roll[start.hypothesis] - start.frame_heading)
+        mode[near & (np.abs(turned) <= TURNED_APART)] = index
+    return mode
+
+
+def _shares(
+    position: Float[np.ndarray, "m 2"], weight: Float[np.ndarray, "m"], candidates: Sequence[Candidate]
+) -> tuple[float, ...]:
+    left, shares = weight.copy(), []
+    for candidate in candidates:
+        near = np.linalg.norm(position - candidate.position_m, axis=1) < RIGHT_WITHIN_M
+        shares.append(float(left[near].sum()))
+        left[near] = 0.0
+    return tuple(shares)
+
+
+def _heading_share(
+    heading: Float[np.ndarray, "m"], weight: Float[np.ndarray, "m"], query: Query, candidates: Sequence[Candidate]
+) -> float:
+    answer = query.roll[candidates[0].hypothesis] + candidates[0].frame_heading
+    # Hypotheses are sectors: one stands for the headings up to half a sector from it.
+    half = 0.5 * query.sector
+    return float(weight[np.abs(wrap_angle(heading - answer)) <= HEADING_WITHIN + half].sum())

@@ -1,0 +1,99 @@
+"""What goes to the optimiser, and what comes back: candidates with all the evidence weighed at their new poses."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from lalaloc_core.bundle import EvidenceModel
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.evidence import Evidence, EvidenceConfig, precisions
+from lalaloc_core.localise.layouts import layouts_at
+from lalaloc_core.localise.poses import Candidate, Query, RefinementJob, RefinementResult
+from lalaloc_core.sampling import PoseSet
+
+
+def refinement_job(
+    plan: FloorPlan,
+    query: Query,
+    candidates: list[Candidate],
+    camera_height_m: float,
+    weights: EvidenceModel,
+    evidence: EvidenceConfig,
+) -> RefinementJob:
+    """What the optimiser needs to refine these candidates, each within its own room.
+
+    It moves poses by their walls alone. An azimuth at which one rather looks through an opening counts as little as it
+    is probable that one sees the wall there.
+    """
+    rooms = np.array([candidate.room_index for candidate in candidates])
+    hypotheses = np.array([candidate.hypothesis for candidate in candidates])
+    job = RefinementJob(
+        targets=query.latents[hypotheses],
+        position_m=np.stack([candidate.position_m for candidate in candidates]),
+        heading=np.array([candidate.frame_heading for candidate in candidates]),
+        walls_m=plan.walls_m[rooms],
+        camera_height_m=np.full(len(rooms), camera_height_m),
+        ceiling_height_m=plan.ceiling_heights_m[rooms],
+        optimise_heading=not query.heading_known,
+        latent_weight=evidence.latent_weight,
+    )
+    if not evidence.compares_profiles(query):
+        return job
+    assert query.profile is not None
+    offsets, height = np.array([candidate.height_offset for candidate in candidates]), query.camera_height
+    columns = query.profile.log_m.shape[1]
+    layouts = layouts_at(plan, PoseSet(job.position_m, rooms), job.heading, columns)
+    compared = Evidence(plan, query, evidence.fine_reach_m, weights, evidence)
+    shut = [compared.shut_share(layouts, k, one.hypothesis, one.height_offset) for k, one in enumerate(candidates)]
+    # The optimiser sums over azimuths what the evidence averages, so the prior is as much stiffer.
+    stiffness = 0.0
+    if not (height.is_exact or height.is_unknown):
+        stiffness = math.sqrt(0.5 * columns / weights.temperature) / height.log_std
+    return replace(
+        job,
+        log_profile=query.profile.log_m[hypotheses],
+        precision=precisions(query, evidence.fine_reach_m, evidence)[hypotheses] * np.sqrt(np.stack(shut)),
+        height_offset=None if height.is_exact else offsets,
+        height_stiffness=stiffness,
+        height_bounds=height.bounds,
+    )
+
+
+def refined(
+    plan: FloorPlan,
+    encoders: Encoders,
+    query: Query,
+    starts: list[Candidate],
+    result: RefinementResult,
+    evidence: EvidenceConfig,
+) -> list[Candidate]:
+    """Candidates where the optimiser took them, with what all the evidence says of them there."""
+    offsets = result.height_offset
+    offsets = np.array([start.height_offset for start in starts]) if offsets is None else offsets
+    cost, terms = result.cost, [{} for _ in starts]
+    if evidence.compares_profiles(query):
+        rooms = np.array([start.room_index for start in starts])
+        hypotheses = np.array([start.hypothesis for start in starts])
+        columns, weights = encoders.manifest.profile_columns, encoders.manifest.evidence
+        layouts = layouts_at(plan, PoseSet(result.position_m, rooms), result.heading, columns)
+        found = Evidence(plan, query, evidence.fine_reach_m, weights, evidence).terms(layouts, hypotheses, offsets)
+        cost = found.total(weights) + evidence.latent_weight * result.latent_distance
+        terms = [{name: float(values[k]) for name, values in found._asdict().items()} for k in range(len(starts))]
+    return [
+        replace(
+            start,
+            x_m=float(result.position_m[k, 0]),
+            y_m=float(result.position_m[k, 1]),
+            frame_heading=float(result.heading[k]),
+            cost=float(cost[k]),
+            latent_distance=float(result.latent_distance[k]),
+            height_offset=float(offsets[k]),
+            terms=terms[k],
+            information=result.information[k],
+        )
+        for k, start in enumerate(starts)
+    ]

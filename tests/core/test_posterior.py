@@ -1,0 +1,110 @@
+"""The posterior over places: mass shared by equals, modes as deep as the optimiser found them."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lalaloc_core.localise.camera_height import CameraHeight
+from lalaloc_core.localise.confidence import Signals, signals_of
+from lalaloc_core.localise.poses import Candidate, PredictedProfile, Query
+from lalaloc_core.localise.posterior import GridCosts, Posterior, area_shares, posterior_of
+from lalaloc_core.sampling import PoseSet
+from tests.strategies import seeds
+
+PLAIN = Query(np.eye(1), np.zeros(1), 0.0, heading_known=True, camera_height=CameraHeight(1.5))
+
+
+def candidate(x_m: float, cost: float, hypothesis: int = 0) -> Candidate:
+    return Candidate(x_m, 0.0, 0, 0.0, hypothesis, cost, 0.3)
+
+
+def along(places: list[float], cost: np.ndarray) -> GridCosts:
+    position = np.stack([places, np.zeros(len(places))], axis=1)
+    poses = PoseSet(position, np.zeros(len(places), int))
+    return GridCosts(poses, np.arange(len(places)), np.atleast_2d(cost), np.zeros_like(np.atleast_2d(cost)))
+
+
+def shares(
+    grid: GridCosts, starts: list[Candidate], ends: list[Candidate] | None = None, query: Query = PLAIN
+) -> Posterior:
+    ends = starts if ends is None else ends
+    answers = sorted(ends, key=lambda one: one.cost)
+    return posterior_of(grid, np.zeros(len(grid.poses)), query, starts, ends, answers, 16.0, 1.0)
+
+
+@pytest.mark.parametrize("copies", [2, 4, 8, 50])
+def test_equal_places_share_the_mass_also_those_that_no_candidate_stands_for(copies: int) -> None:
+    places = [5.0 * k for k in range(copies)]
+    starts = [candidate(x, 0.1) for x in places[:20]]
+    found = shares(along(places, np.full(copies, 0.1)), starts)
+    assert found.candidate == pytest.approx([1.0 / copies] * min(copies, 20))
+    # Refined, all of them gain alike, and so do those that were not looked at.
+    ends = [dataclasses.replace(start, cost=0.02) for start in starts]
+    assert shares(along(places, np.full(copies, 0.1)), starts, ends).candidate[0] == pytest.approx(1.0 / copies)
+
+
+def test_what_refinement_gains_decides_between_modes() -> None:
+    grid = along([0.0, 5.0], np.array([0.20, 0.18]))
+    starts = [candidate(5.0, 0.18), candidate(0.0, 0.20)]
+    ends = [candidate(5.0, 0.17), candidate(0.1, 0.02)]
+    found = shares(grid, starts, ends)
+    assert found.candidate[0] == pytest.approx(1.0 / (1.0 + math.exp(-16.0 * 0.15)), rel=1e-3)
+    assert found.pose[0] == pytest.approx(found.candidate[0])
+
+
+def test_a_corridor_that_looks_alike_all_along_is_one_metre_s_worth_sure() -> None:
+    places = [0.5 * k for k in range(40)]
+    found = shares(along(places, np.full(40, 0.05)), [candidate(x, 0.05) for x in places[::2]])
+    # Of 40 poses 3 lie less than 1 m from one of them.
+    assert found.candidate[0] <= 0.1
+    assert sum(found.candidate) <= 1.0 + 1e-9
+
+
+@given(seeds(), st.integers(1, 12))
+def test_probabilities_are_a_distribution_and_the_better_mode_is_the_likelier(seed: int, count: int) -> None:
+    rng = np.random.default_rng(seed)
+    grid = along(list(rng.uniform(0.0, 9.0, 30)), rng.uniform(0.0, 1.0, (3, 30)))
+    query = dataclasses.replace(PLAIN, latents=np.eye(3), roll=np.array([0.0, 0.4, 0.8]), heading_known=False)
+    starts = [candidate(float(x), c) for x, c in zip(rng.uniform(0, 9, count), rng.uniform(0, 1, count), strict=True)]
+    found = shares(grid, starts, query=query)
+    assert found.pose.sum() == pytest.approx(1.0)
+    assert all(value >= 0.0 for value in found.candidate)
+    assert sum(found.candidate) <= 1.0 + 1e-9
+    assert 0.0 <= found.heading <= 1.0 + 1e-9
+
+
+def test_a_room_that_looks_alike_from_two_sides_has_two_headings() -> None:
+    rolls = np.arange(64) * (2.0 * math.pi / 64)
+    query = Query(np.eye(64), rolls, 0.0, heading_known=False, camera_height=CameraHeight(1.5))
+    cost = np.full((64, 1), 2.0)
+    cost[[0, 32]] = 0.0
+    starts = [candidate(0.0, 0.0), candidate(0.0, 0.0, hypothesis=32)]
+    found = shares(along([0.0], cost), starts, query=query)
+    assert found.candidate[0] == pytest.approx(1.0)
+    assert found.heading == pytest.approx(0.5)
+
+
+def test_every_square_metre_counts_the_same_also_of_rooms_with_a_single_pose() -> None:
+    poses = PoseSet(np.zeros((5, 2)), np.array([0, 0, 0, 0, 1]))
+    np.testing.assert_allclose(np.exp(area_shares(poses, np.array([1.0, 3.0]))), [0.25, 0.25, 0.25, 0.25, 3.0])
+
+
+class TestSignals:
+    def test_they_are_of_the_answer_and_the_prediction(self) -> None:
+        profile = PredictedProfile(np.zeros((2, 4)), np.array([[-3.0, -2.0, -3.0, -2.0]]).repeat(2, axis=0))
+        query = dataclasses.replace(PLAIN, profile=profile)
+        posterior = Posterior(np.ones(1), (0.8,), 1.0)
+        found = signals_of(query, candidate(5.0, 0.4), posterior)
+        expected = Signals(log_odds=math.log(4.0), cost=0.4, uncertainty=-2.5, latent_distance=0.3)
+        assert dataclasses.astuple(found) == pytest.approx(dataclasses.astuple(expected))
+        assert signals_of(PLAIN, candidate(5.0, 0.4), posterior).uncertainty == 0.0
+
+    @pytest.mark.parametrize(("mass", "log_odds"), [(0.0, -6.0), (1.0, 6.0), (1.0 + 1e-12, 6.0)])
+    def test_no_posterior_is_surer_than_it_can_be(self, mass: float, log_odds: float) -> None:
+        assert signals_of(PLAIN, candidate(0.0, 0.2), Posterior(np.ones(1), (mass,), 1.0)).log_odds == log_odds
