@@ -9,7 +9,7 @@ from jaxtyping import Float, Int, UInt8
 
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.render.layout import layout_view
-from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.sampling import PoseSet
 
 # Poses whose openings are looked through at a time, to bound memory.
@@ -81,7 +81,7 @@ def layouts_at(
     position_m, turned = poses.position_m.astype(np.float32), heading.astype(np.float32)
     if not plan.opening_faces:
         if profile_m is None:
-            profile_m = wall_profile(position_m, turned, plan.walls_m[poses.room_index].astype(np.float32), columns)
+            profile_m = profiles_at(plan, poses.position_m, poses.room_index, heading, columns, np.float32)
         return Layouts(np.log(np.asarray(profile_m, np.float32)), poses.room_index)
     shape = (len(poses), columns)
     log_profile, kind = np.empty(shape, np.float32), np.empty(shape, np.uint8)

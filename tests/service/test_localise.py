@@ -21,7 +21,7 @@ from shapely import Point
 from lalaloc_core.bundle import Bundle, ConfidenceModel, LogisticModel, write_manifest
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise import pipeline
-from lalaloc_core.localise.confidence import Signals
+from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.retrieval import build_grid
 from lalaloc_core.panorama.images import read_panorama
@@ -78,7 +78,8 @@ def test_candidates_are_distinct_best_first_and_the_first_is_the_answer(
     positions = np.array([[c["position"]["x_m"], c["position"]["y_m"]] for c in candidates])
     gaps = np.linalg.norm(positions[:, None] - positions[None], axis=-1) + 10.0 * np.eye(len(positions))
     assert gaps.min() >= 1.0 - 1e-3
-    assert {key: answer[key] for key in candidates[0]} == candidates[0]
+    told = {**answer, "probability": answer["confidence"]}
+    assert {key: told[key] for key in candidates[0]} == candidates[0]
 
 
 @pytest.mark.parametrize("top_k", [1, 3, 10])
@@ -229,16 +230,50 @@ def test_a_picture_of_too_many_bytes_is_refused(start_app: StartApp, tmp_path: P
         )
 
 
-def test_another_camera_height_is_searched_at_that_height(client: httpx.Client, flat: str, panorama: bytes) -> None:
-    answer = localise(client, flat, panorama, refine="vdr", camera_height_m=1.713).json()
-    assert answer["camera_height_m"] == 1.72
-    own = localise(client, flat, panorama, refine="vdr", camera_height_m=1.505).json()
-    assert own["camera_height_m"] == 1.5
-    assert own["candidates"] != answer["candidates"]
-    highest = localise(client, flat, panorama, refine="none", camera_height_m=2.399)
-    assert highest.json()["camera_height_m"] == 2.38
+def test_a_camera_height_is_solved_for_unless_it_is_exact(client: httpx.Client, flat: str, panorama: bytes) -> None:
+    exact = localise(client, flat, panorama, refine="vdr", camera_height_m=1.713, camera_height_std_m=0).json()
+    assert exact["camera_height_m"] == 1.713
+    inexact = localise(client, flat, panorama, refine="none", camera_height_m=1.713, camera_height_std_m=0.3).json()
+    assert inexact["candidates"] != exact["candidates"]
+    assert abs(inexact["camera_height_m"] - 1.713) <= 0.5
+    at_most = localise(client, flat, panorama, refine="none", camera_height_m=2.399, camera_height_std_m=0).json()
+    assert at_most["camera_height_m"] == 2.399
     above = assert_problem(localise(client, flat, panorama, camera_height_m=2.4), 422, "invalid-pose")
     assert "2.4 m" in above["detail"]
+
+
+def test_no_height_needs_a_grid_of_its_own(client: httpx.Client, flat: str, panorama: bytes) -> None:
+    for height_m in (1.2, 1.6, 1.9):
+        assert localise(client, flat, panorama, refine="none", camera_height_m=height_m).status_code == 200
+    text = client.get("/metrics").text
+    assert "lalaloc_grids_pending 0.0" in text
+
+
+@pytest.mark.parametrize(("std_m", "limit"), [("-0.1", "0"), ("2.1", "2"), ("nan", "finite")])
+def test_a_deviation_of_the_height_has_limits(
+    client: httpx.Client, flat: str, panorama: bytes, std_m: str, limit: str
+) -> None:
+    problem = assert_problem(localise(client, flat, panorama, camera_height_std_m=std_m), 422, "invalid-request")
+    assert problem["errors"][0]["field"] == "camera_height_std_m"
+    assert limit in problem["errors"][0]["message"]
+
+
+def test_a_plan_that_says_no_camera_height_is_searched_at_any(client: httpx.Client, panorama: bytes) -> None:
+    document = {key: value for key, value in FLAT.items() if key != "camera_height_m"}
+    plan = client.post("/floorplans", json=document).json()["id"]
+    found = localise(client, plan, panorama, refine="none", top_k=10).json()
+    stated = localise(client, plan, panorama, refine="none", top_k=10, camera_height_m=1.5).json()
+    assert 0.8 <= found["camera_height_m"] <= 2.2
+    # More heights to choose from: nothing fits worse.
+    assert found["candidates"][0]["cost"] <= stated["candidates"][0]["cost"] + 1e-6
+
+
+def test_answers_name_rooms_by_their_ids_too(client: httpx.Client, flat: str, panorama: bytes) -> None:
+    answer = localise(client, flat, panorama, refine="none", top_k=10).json()
+    ids = {room["name"]: room["id"] for room in FloorPlan.from_dict(FLAT).to_dict()["rooms"]}
+    assert answer["room_id"] == ids[answer["room"]]
+    assert all(candidate["room_id"] == ids[candidate["room"]] for candidate in answer["candidates"])
+    assert answer["warnings"] == []
 
 
 @pytest.mark.parametrize("heading", [None, 30.0])
@@ -257,23 +292,30 @@ def test_confidence_is_that_of_the_stage_s_signals_however_many_are_asked_for(
         plan_id = upload(client)
         answers = [localise(client, plan_id, panorama, refine="none", top_k=k, **fields).json() for k in (1, 2, 10)]
         unfitted = localise(client, plan_id, panorama, refine="vdr", **fields).json()
-    signals = _retrieval_signals(tiny_bundle, panorama, heading)
-    expected = model.probability("retrieval", dataclasses.asdict(signals), heading_known=heading is not None)
+    found = _retrieved(tiny_bundle, panorama, heading)
+    expected = found.confidence(model)
     assert expected is not None
     assert 0.0 < expected < 1.0
     assert [answer["confidence"] for answer in answers] == pytest.approx([expected] * 3, abs=1e-4)
+    assert [answer["heading_confidence"] for answer in answers] == pytest.approx(
+        [found.heading_confidence(model)] * 3, abs=1e-4
+    )
+    shares = [candidate["probability"] for candidate in answers[-1]["candidates"]]
+    assert shares[0] == answers[-1]["confidence"]
+    assert sum(shares) <= 1.0
     assert unfitted["confidence"] is None
+    assert unfitted["candidates"][0]["probability"] is None
 
 
-def _retrieval_signals(bundle: Path, content: bytes, heading_deg: float | None) -> Signals:
+def _retrieved(bundle: Path, content: bytes, heading_deg: float | None) -> pipeline.Localisation:
     """What the core says of a query of the flat, as far as the first stage."""
     encoders = Encoders(Bundle.open(bundle), threads=1)
     manifest, limits = encoders.manifest, Settings().panorama_limits
     image = read_panorama(content, height=manifest.image_height, width=manifest.image_width, limits=limits)
-    query = encoders.query(image, None if heading_deg is None else np.radians(heading_deg), 1.5)
+    query = encoders.query(image, None if heading_deg is None else np.radians(heading_deg), CameraHeight(1.5))
     plan = FloorPlan.from_dict(FLAT)
     grid = build_grid(plan, encoders, step_m=Settings().grid_step_m, camera_height_m=1.5)
-    return pipeline.localise(plan, grid, encoders, query, refine="none").signals["retrieval"]
+    return pipeline.localise(plan, grid, encoders, query, refine="none")
 
 
 def test_a_model_without_confidence_says_null(client: httpx.Client, flat: str, panorama: bytes) -> None:
