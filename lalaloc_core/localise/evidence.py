@@ -1,8 +1,8 @@
 """How badly a pose fits a panorama: the sum of what its walls, openings, ceiling and room say.
 
-Every term is a negative log likelihood per azimuth, up to constants, and 0 where the picture could not fit better.
-Neighbouring azimuths err alike, so each term has a weight that says how much it may count, fitted on validation
-queries (`lalaloc_core.calibrate`), and is in units of the walls':
+Every term is a negative log likelihood per azimuth, up to constants, and hardly above 0 where the picture fits as well
+as can be. Neighbouring azimuths err alike, so each term has a weight that says how much it may count, fitted on
+validation queries (`lalaloc_core.calibrate`), and is in units of the walls':
 
     cost(pose, δ) = walls + β_o openings + β_c ceiling + β_t room type + penalty(δ) / T
 

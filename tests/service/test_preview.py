@@ -158,7 +158,7 @@ def test_openings_holes_and_free_standing_walls_are_drawn() -> None:
 
 def test_the_mesh_has_a_hole_in_the_floor_walls_from_both_sides_and_panels_at_openings() -> None:
     plan = FloorPlan.from_dict(OPEN_FLAT)
-    scene = trimesh.load(io.BytesIO(plan_glb(plan)), file_type="glb")
+    scene = trimesh.load_scene(io.BytesIO(plan_glb(plan)), file_type="glb")
     assert scene.geometry["1/room 1/floor"].area == pytest.approx(11.5, abs=1e-4)
     # Outline 14 m, hole 2 + root of 2 m, the stub from both sides 2 m; 2.5 m high.
     assert scene.geometry["1/room 1/wall"].area == pytest.approx(2.5 * (16.0 + 2.0 + math.sqrt(2.0)), abs=1e-3)
