@@ -172,3 +172,59 @@ def test_a_heading_of_a_compass_is_corrected(shipped: httpx.Client, shots: list[
         assert answer["heading_std_deg"] > 0.0
         off.append(abs((answer["heading_deg"] - shot.heading_deg + 180.0) % 360.0 - 180.0))
     assert np.median(off) < 0.4 * TOLERANCE_DEG
+
+
+COPIES = 4
+
+
+def copies(plan: dict[str, Any]) -> tuple[dict[str, Any], float]:
+    """A plan of `COPIES` times the same home side by side, and how far apart they are (m)."""
+    corners = np.concatenate([room["polygon"] for room in plan["rooms"]])
+    step_m = float(np.ptp(corners[:, 0])) + 3.0
+
+    def moved(points: list[list[float]], k: int) -> list[list[float]]:
+        return [[x + k * step_m, y] for x, y in points]
+
+    rooms, openings = [], []
+    for k in range(COPIES):
+        rooms += [{**room, "id": f"{room['id']}-{k}", "polygon": moved(room["polygon"], k)} for room in plan["rooms"]]
+        openings += [
+            {key: value for key, value in one.items() if key != "rooms"} | {"line": moved(one["line"], k)}
+            for one in plan.get("openings", [])
+        ]
+    return {**plan, "rooms": rooms, "openings": openings}, step_m
+
+
+def test_of_copies_of_a_home_none_is_surer_than_its_share(
+    shipped: httpx.Client, shots: list[Shot], given: bool
+) -> None:
+    for shot in shots[:3]:
+        plan, step_m = copies(shot.plan)
+        answer = ask(shipped, upload(shipped, plan), shot.picture, shot.heading_deg if given else None, top_k=10)
+        assert answer["confidence"] <= 1.0 / COPIES + 0.05
+        shares = [candidate["probability"] for candidate in answer["candidates"]]
+        assert sum(shares) <= 1.0
+        offset = np.array([answer["position"]["x_m"], answer["position"]["y_m"]]) - shot.position_m
+        offset[0] -= step_m * round(offset[0] / step_m)
+        assert np.hypot(*offset) < 1.0 or answer["confidence"] < 0.2
+
+
+def test_a_heading_that_the_panorama_contradicts_is_said_and_not_followed(
+    shipped: httpx.Client, shots: list[Shot], homes: list[str]
+) -> None:
+    warned = 0
+    for shot, home in list(zip(shots, homes, strict=True))[:6]:
+        answer = ask(shipped, home, shot.picture, (shot.heading_deg + 120.0) % 360.0)
+        if answer["warnings"]:
+            warned += 1
+            assert "contradicts" in answer["warnings"][0]
+            assert answer["heading_source"] == "searched"
+        else:
+            assert answer["confidence"] < 0.5
+    assert warned >= 3
+
+
+def test_a_heading_that_is_right_is_not_doubted(right: list[dict[str, Any]], given: bool) -> None:
+    assert sum(bool(answer["warnings"]) for answer in right) <= 1
+    if given:
+        assert np.median([answer["heading_confidence"] for answer in right]) > 0.7
