@@ -9,8 +9,8 @@ validation queries (`lalaloc_core.calibrate`), and is in units of the walls':
 * **Walls.** The picture gives a log wall profile μ and, for every azimuth w, a scale b. With the heavy tails of a
   Cauchy distribution `mean_w log(1 + r_w²)`, `r_w = (log d_w - μ_w - δ) / (κ s_w)`, `s_w² = b_w² + (reach / exp μ_w)²`,
   the tail factor κ, and the `reach`: how far (m) the pose may lie from the camera even if it is the best looked at.
-  Where the plan has a door or a passage, 1 / (1 + r²) is the mixture of that for the distance d to the opening and of
-  that for what lies behind it.
+  Where the plan has a door or a passage, 1 / (1 + r²) is that for the distance d to the opening, plus that for what
+  lies behind it times the odds that the network looked through, and at most 1.
 * **Openings.** `mean_w log(max_c q_w(c) / q_w(c_w))`, `q_w(c) = ε + (1 - ε) p_w(c) / π(c)`: the probability of the
   class that the plan shows, in units of how frequent the class is. Kinds that the plan does not claim are wall.
 * **Ceiling.** `log(1 + r²)` of the log height of the room's ceiling above the camera.
@@ -56,7 +56,8 @@ class EvidenceConfig:
         tail: κ.
         grid_reach: reach on a grid, in units of its step; cameras are at most 0.7 of it from the nearest pose.
         fine_reach_m: reach of poses that were re-sampled or optimised.
-        open_door, open_passage: probability that one looks through a door or a passage.
+        open_door, open_passage: probability that the prediction is of what lies behind a door or a passage, which the
+            network should look at as wall.
         floor: ε, the probability that what is said of a class is worth nothing.
         heading_doubt: probability that a heading that is said to be known is wrong altogether.
     """
@@ -70,8 +71,8 @@ class EvidenceConfig:
     tail: float = 3.0
     grid_reach: float = 0.6
     fine_reach_m: float = 0.07
-    open_door: float = 0.4
-    open_passage: float = 0.5
+    open_door: float = 0.05
+    open_passage: float = 0.1
     floor: float = 0.03
     heading_doubt: float = 0.02
 
@@ -169,8 +170,8 @@ class Evidence:
             return share
         at = row.seen.column
         centre, precision = self._centre[hypothesis, at] + offset, self._precision[hypothesis, at]
-        shut = (1.0 - self._open(row)) / (1.0 + np.square((row.log_profile[0, at] - centre) * precision))
-        opened = self._open(row) / (1.0 + np.square((row.seen.log_behind - centre) * precision))
+        shut = 1.0 / (1.0 + np.square((row.log_profile[0, at] - centre) * precision))
+        opened = self._open_odds(row) / (1.0 + np.square((row.seen.log_behind - centre) * precision))
         share[at] = shut / (shut + opened)
         return share
 
@@ -183,16 +184,17 @@ class Evidence:
         seen = layouts.seen
         if seen is not None and self._config.use_see_through:
             behind = np.square((seen.log_behind - centre[seen.column]) * precision[seen.column]) + 1.0
-            opened = self._open(layouts)
             shut = factor[seen.row, seen.column]
-            factor[seen.row, seen.column] = 1.0 / ((1.0 - opened) / shut + opened / behind)
+            # Where the wall fits, its being shut in a door costs nothing: networks learn to see the wall there.
+            factor[seen.row, seen.column] = np.maximum(1.0 / (1.0 / shut + self._open_odds(layouts) / behind), 1.0)
         return _mean_log(factor)
 
-    def _open(self, layouts: Layouts) -> Float[np.ndarray, "m"]:
-        """Probability that one looks through each of the openings that are seen."""
+    def _open_odds(self, layouts: Layouts) -> Float[np.ndarray, "m"]:
+        """Odds that one looks through each of the openings that are seen."""
         assert layouts.seen is not None
         is_passage = layouts.seen.kind == PASSAGE_CODE
-        return np.where(is_passage, self._config.open_passage, self._config.open_door).astype(np.float32)
+        open_share = np.where(is_passage, self._config.open_passage, self._config.open_door).astype(np.float32)
+        return open_share / (1.0 - open_share)
 
     def _openings(self, layouts: Layouts, hypotheses: Int[np.ndarray, "k"]) -> Float[np.ndarray, "k n"]:
         """Cost of the openings of every pose under some hypotheses."""

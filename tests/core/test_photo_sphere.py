@@ -168,7 +168,7 @@ class TestParts:
             opened(encoded(FULL[:320, :640], "PNG", packet)).pixels, opened(encoded(FULL[:320, :640])).pixels
         )
         flat = encoded(FULL[:256, :640], "PNG", xmp(**(crop(128, 64, 640, 256) | changes)))
-        with pytest.raises(InvalidPanoramaError, match=f"640 x 256; .* twice as wide as high; .*: .*{reason}"):
+        with pytest.raises(InvalidPanoramaError, match=f"640 x 256; .* twice as wide as high, .*: .*{reason}"):
             opened(flat)
 
     @pytest.mark.parametrize(
