@@ -124,7 +124,8 @@ def _class_map(
 def _segmenter(path: Path) -> Segment:
     """The teacher as a function of pictures of 512 x 512 pixels."""
     try:
-        from ai_edge_litert.interpreter import Interpreter
+        # Of the extra 'trunk' alone, so a type checker may not find it.
+        from ai_edge_litert.interpreter import Interpreter  # pyright: ignore[reportMissingImports]
     except ImportError as error:
         raise ConfigError("a teacher needs the package ai-edge-litert; install the extra 'trunk'") from error
     try:
