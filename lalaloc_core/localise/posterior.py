@@ -3,7 +3,8 @@
 Each pair of a pose and a hypothesis has the likelihood `exp(-T cost)`, with the temperature T fitted on validation
 queries, and a prior uniform over floor area and over the headings that are searched. Candidates are the modes of the
 posterior. The optimiser tells how far down the cost of a mode goes, which the grid, whose poses are off, cannot: a
-mode's pairs are shifted by what its candidate gained, all others by what candidates gain usually.
+mode's pairs are shifted by what its candidate gained, all others by what candidates gain usually, and refined modes
+count as equally wide.
 """
 
 from __future__ import annotations
@@ -99,10 +100,35 @@ def posterior_of(
         position[member] += end.position_m - start.position_m
         heading[member] += end.frame_heading - start.frame_heading
     log_weight = -temperature * (cost - gain) + prior[pose]
+    log_weight += _width_corrections(log_weight, mode, temperature * np.array([end.cost for end in ends]))
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
     by_pose = np.bincount(pose, weight, minlength=len(grid.poses))
     return Posterior(by_pose, _shares(position, weight, candidates), _heading_share(heading, weight, query, candidates))
+
+
+def _width_corrections(
+    log_weight: Float[np.ndarray, "m"], mode: Int[np.ndarray, "m"], depth: Float[np.ndarray, "r"]
+) -> Float[np.ndarray, "m"]:
+    """What makes refined modes as wide as the deepest of them.
+
+    How many poses of a mode fit well is a matter of where the grid's lattice happens to lie: copies of one room would
+    differ in it.
+
+    Args:
+        depth: (r,) negative log likelihood of each refined mode at its end.
+    """
+    correction, members = np.zeros(len(log_weight)), [mode == index for index in range(len(depth))]
+    width = {
+        index: np.logaddexp.reduce(log_weight[member]) + depth[index]
+        for index, member in enumerate(members)
+        if member.any()
+    }
+    if width:
+        deepest = width[min(width, key=lambda index: depth[index])]
+        for index in width:
+            correction[members[index]] = deepest - width[index]
+    return correction
 
 
 def _modes(

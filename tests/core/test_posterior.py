@@ -58,6 +58,14 @@ def test_what_refinement_gains_decides_between_modes() -> None:
     assert found.pose[0] == pytest.approx(found.candidate[0])
 
 
+def test_copies_share_alike_wherever_the_lattice_lies_in_them() -> None:
+    # Two copies: one has its pose right at the place, the other two at half a step from it.
+    grid = along([0.0, 4.75, 5.25], np.array([0.02, 0.10, 0.10]))
+    starts = [candidate(0.0, 0.02), candidate(4.75, 0.10)]
+    ends = [candidate(0.0, 0.01), candidate(5.0, 0.01)]
+    assert shares(grid, starts, ends).candidate == pytest.approx([0.5, 0.5])
+
+
 def test_a_corridor_that_looks_alike_all_along_is_one_metre_s_worth_sure() -> None:
     places = [0.5 * k for k in range(40)]
     found = shares(along(places, np.full(40, 0.05)), [candidate(x, 0.05) for x in places[::2]])

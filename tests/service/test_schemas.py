@@ -26,7 +26,10 @@ def test_an_answer_has_no_more_digits_than_say_something(client: httpx.Client, p
     third = [[0, 0], [4 / 3, 0], [4 / 3, 10 / 3], [0, 10 / 3]]
     plan_id = upload(client, {"ceiling_height_m": 2.5, "rooms": [{"name": "x", "polygon": third}]})
     answers = [localise(client, plan_id, panorama), client.get(f"/floorplans/{plan_id}"), client.get("/floorplans")]
-    numbers = _numbers([json.loads(answer.text) for answer in answers])
+    told = [json.loads(answer.text) for answer in answers]
+    # The plan itself is told as it was sent.
+    assert told[1].pop("plan")["rooms"][0]["polygon"] == third
+    numbers = _numbers(told)
     assert len(numbers) > 20
     assert [number for number in numbers if number != round(number, 6)] == []
     # What was uploaded is told as it was.

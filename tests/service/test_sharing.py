@@ -199,9 +199,9 @@ def test_bodies_that_do_not_come_leave_room_for_others(start_app: StartApp, tmp_
 
 @pytest.mark.one_replica
 def test_answers_that_are_not_read_leave_room_for_others(start_app: StartApp, tmp_path: Path) -> None:
-    with start_app(tmp_path, max_reads=8, max_plan_bytes=8 * 2**20) as client, ExitStack() as attack:
+    with start_app(tmp_path, max_reads=8, max_plan_bytes=32 * 2**20) as client, ExitStack() as attack:
         # White space is kept, and no socket holds as much.
-        content = httpx.Request("POST", "http://x", json=FLAT).read() + b" " * (7 * 2**20)
+        content = httpx.Request("POST", "http://x", json=FLAT).read() + b" " * (30 * 2**20)
         created = client.post("/floorplans", content=content, headers={"Content-Type": "application/json"})
         path = f"{created.headers['location']}/original"
         for _ in range(10):
