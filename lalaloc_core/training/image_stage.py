@@ -134,10 +134,12 @@ class ImageStage:
 
     def _seen(self, image: Tensor) -> Tensor:
         """Pictures with the photometric changes that are asked for; what is drawn depends on seed and first step."""
-        if self.settings.photometric:
-            image = changed(image, self.settings.photometric, self._randomness(image.device))
-        if self.settings.optics:
-            image = optics(image.float(), self.settings.optics, self._randomness(image.device))
+        # In full precision, as what a camera does to a picture is: bfloat16 has no 256 grey levels.
+        with torch.autocast(image.device.type, enabled=False):
+            if self.settings.photometric:
+                image = changed(image, self.settings.photometric, self._randomness(image.device))
+            if self.settings.optics:
+                image = optics(image.float(), self.settings.optics, self._randomness(image.device))
         return image
 
     def _randomness(self, device: torch.device) -> torch.Generator:

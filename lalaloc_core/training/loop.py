@@ -91,6 +91,7 @@ class _Trainer:
         self.stage = stage
         self.device = device
         self.settings = stage.settings
+        self._mixed_precision = device.type == "cuda" or _multiplies_bfloat16()
         for module in stage.modules.values():
             module.to(device).train()
         if stage.teacher is not None:
@@ -124,7 +125,7 @@ class _Trainer:
         for group in self.optimiser.param_groups:
             group["lr"] = group.get("factor", 1.0) * learning_rate(self.settings.optimiser, min(self.progress, 1.0))
         batch = {key: value.to(self.device, non_blocking=True) for key, value in batch.items()}
-        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.device.type == "cuda"):
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self._mixed_precision):
             terms = self.stage.losses(batch)
         total: Tensor = torch.stack(list(terms.values())).sum()
         if not torch.isfinite(total):
@@ -170,6 +171,11 @@ class _Trainer:
         self.optimiser.load_state_dict(checkpoint.optimiser)
         self.step, self.seconds, self.metrics = checkpoint.step, checkpoint.seconds, checkpoint.metrics
         self.begun_from = checkpoint.begun_from
+
+
+def _multiplies_bfloat16() -> bool:
+    """Whether the processor multiplies matrices in bfloat16 itself; where it does not, autocast only costs time."""
+    return bool(torch.cpu.get_capabilities().get("amx_bf16", False))
 
 
 def _states(modules: dict[str, nn.Module]) -> dict[str, dict[str, Tensor]]:
