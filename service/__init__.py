@@ -5,6 +5,7 @@ Begin with `app.py`, the application, and `runtime.py`, its parts; a query begin
 http/       what stands between the socket and a route: slots, uploads, idempotency, errors; middleware/ is part of it
 security/   API keys, scopes, rates, and what holds while there are no keys
 routes/     the HTTP routes
+schemas/    what the API takes and answers
 query/      what answers a panorama
 grids/      latent grids of plans, computed once for all replicas
 storage/    what persists: plans, grids, keys, kept answers
@@ -14,7 +15,7 @@ telemetry/  metrics, logs and traces
 preview/    drawings and meshes of plans
 web/        the web pages
 
-Beside them: `settings.py`, `schemas.py` (what the API takes and answers), `errors.py` (what errors mean over HTTP),
-`cores.py` (which part gets how many), `sharing.py` (that no tenant takes everything), `threads.py`, `lru.py`, and the
-command lines `cli.py`, `openapi.py`, `__main__.py`.
+Beside them: `settings.py`, `errors.py` (what errors mean over HTTP), `cores.py` (which part gets how many),
+`sharing.py` (that no tenant takes everything), `threads.py`, `lru.py`, and the command lines `cli.py`, `openapi.py`,
+`__main__.py`.
 """

@@ -1,75 +1,59 @@
-"""Requests and answers of the HTTP API.
+"""What the HTTP API takes and answers. Units stand in the names: `_m` metres, `_m2` m², `_deg` degrees, `_ms` ms.
 
-Begin with `floorplans.py`.
+fields           the base of all answers, and the types of their numbers: how far each is rounded
+plan_document    a floor plan in the native format
+floorplans       what is told of stored floor plans
+localise_query   what a query says beside the panorama
+localise_answer  where it was taken
+service_state    limits, health, readiness
+problems         errors
+
+Begin with `localise_answer.py`.
 """
 
+from service.schemas.fields import Answer
 from service.schemas.floorplans import (
-    HEADING_MEANING,
-    Answer,
     BoundsAnswer,
-    CandidateAnswer,
-    Covariance,
-    Degrees,
-    Fault,
     FloorPlanAnswer,
-    FloorPlanDocument,
     FloorPlanList,
     FloorPlanSummary,
     GridAnswer,
-    HeadingDeg,
-    HealthAnswer,
-    LimitsAnswer,
-    LocaliseAnswer,
-    LocaliseForm,
-    Metres,
-    Milliseconds,
-    ModelAnswer,
-    OpeningDocument,
-    OpeningKind,
-    Pair,
     PlanEvent,
     PlanStatus,
-    Point,
-    PoolAnswer,
-    Position,
-    Problem,
-    ReadyAnswer,
-    Ring,
     RoomAnswer,
+)
+from service.schemas.localise_answer import CandidateAnswer, LocaliseAnswer, ModelAnswer, Position, TimingsAnswer
+from service.schemas.localise_query import LocaliseForm
+from service.schemas.plan_document import (
+    FloorPlanDocument,
+    OpeningDocument,
+    OpeningKind,
+    Point,
+    Ring,
     RoomDocument,
     RoomType,
-    Score,
     Segment,
-    Share,
-    SquareMetres,
-    TimingsAnswer,
-    Variance,
 )
+from service.schemas.problems import Fault, Problem
+from service.schemas.service_state import HealthAnswer, LimitsAnswer, PoolAnswer, ReadyAnswer
 
 __all__ = [
-    "HEADING_MEANING",
     "Answer",
     "BoundsAnswer",
     "CandidateAnswer",
-    "Covariance",
-    "Degrees",
     "Fault",
     "FloorPlanAnswer",
     "FloorPlanDocument",
     "FloorPlanList",
     "FloorPlanSummary",
     "GridAnswer",
-    "HeadingDeg",
     "HealthAnswer",
     "LimitsAnswer",
     "LocaliseAnswer",
     "LocaliseForm",
-    "Metres",
-    "Milliseconds",
     "ModelAnswer",
     "OpeningDocument",
     "OpeningKind",
-    "Pair",
     "PlanEvent",
     "PlanStatus",
     "Point",
@@ -81,10 +65,6 @@ __all__ = [
     "RoomAnswer",
     "RoomDocument",
     "RoomType",
-    "Score",
     "Segment",
-    "Share",
-    "SquareMetres",
     "TimingsAnswer",
-    "Variance",
 ]

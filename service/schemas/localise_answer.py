@@ -1,0 +1,101 @@
+"""Where a panorama was taken: the answer to a query."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from service.schemas.fields import Answer, Degrees, HeadingDeg, Metres, Milliseconds, Score, Share, Variance
+from service.schemas.localise_query import HEADING_MEANING
+
+_LATENT_DISTANCE = Field(ge=0, le=2, description="Distance of the pose's layout to the panorama's latent.")
+_COST = Field(
+    ge=0,
+    description="What candidates are ranked by: how badly the walls around the pose fit the panorama, without unit, "
+    "lower is better. Candidates that were not refined as far as the first come after those that were, and their "
+    "costs, which allow for the distance of neighbouring poses, do not compare.",
+)
+
+Pair = Annotated[list[Variance], Field(min_length=2, max_length=2)]
+Covariance = Annotated[list[Pair], Field(min_length=2, max_length=2)]
+
+
+class Position(Answer):
+    """A point of the plan frame."""
+
+    x_m: Metres = Field(description="To the right on the drawing.")
+    y_m: Metres = Field(description="Up on the drawing.")
+
+
+class CandidateAnswer(Answer):
+    """One possible pose; no two candidates are closer than 1 m."""
+
+    position: Position
+    heading_deg: HeadingDeg = Field(ge=0, lt=360, description=f"The {HEADING_MEANING}.")
+    room: str = Field(description="Name of the room the position lies in.")
+    room_id: str = Field(description="Its `id` in the plan, which is unique.")
+    probability: Share | None = Field(
+        description="Probability that the position is right within 1 m, and no better candidate's is; null for a model "
+        "without confidence.",
+    )
+    cost: Score = _COST
+    latent_distance: Score = _LATENT_DISTANCE
+
+
+class TimingsAnswer(Answer):
+    """Milliseconds per stage, 0 where a stage did not run."""
+
+    decode: Milliseconds
+    encode: Milliseconds
+    retrieve: Milliseconds
+    vdr: Milliseconds
+    lpo: Milliseconds
+    total: Milliseconds = Field(description="From the complete upload to the answer, waits included.")
+
+
+class ModelAnswer(Answer):
+    """The model that answered."""
+
+    name: str
+    version: str
+    sha256: str = Field(description="Digest over the model's files.")
+
+
+class LocaliseAnswer(Answer):
+    """Where the panorama was taken."""
+
+    floorplan_id: str
+    floorplan_revision: str = Field(description="The plan's revision that was searched.")
+    position: Position
+    heading_deg: HeadingDeg = Field(ge=0, lt=360, description=f"The {HEADING_MEANING}.")
+    room: str
+    room_id: str = Field(description="`id` of the room in the plan, which is unique.")
+    confidence: Share | None = Field(
+        description="Probability that the position is right within 1 m: that of the panorama being of this plan, "
+        "times the share that this place has in the posterior over all places. Null for a model without it.",
+    )
+    heading_confidence: Share | None = Field(
+        description="Probability that the heading is right within 5°; null where `confidence` is."
+    )
+    warnings: list[str] = Field(
+        description="What was said and not followed, such as a heading that the panorama contradicts."
+    )
+    heading_source: Literal["given", "panorama", "searched"] = Field(
+        description="Where the heading came from: the request, the panorama's metadata, or the search."
+    )
+    stage: Literal["retrieval", "vdr", "lpo"] = Field(description="The last stage that produced the position.")
+    covariance_m2: Covariance | None = Field(
+        description="Covariance [[xx, xy], [xy, yy]] of the position in m², given that it is right within 1 m; along "
+        "what the panorama does not tell, as in a corridor, that of a place anywhere in the room. Null unless `stage` "
+        "is `lpo`, and for a model without it."
+    )
+    heading_std_deg: Degrees | None = Field(
+        description="Standard deviation of the heading where it was searched; null where `covariance_m2` is."
+    )
+    cost: Score = _COST
+    latent_distance: Score = _LATENT_DISTANCE
+    camera_height_m: Metres = Field(description="The camera height that fits best.")
+    candidates: list[CandidateAnswer] = Field(description="Best first; the first one is the answer.")
+    timings_ms: TimingsAnswer
+    model: ModelAnswer

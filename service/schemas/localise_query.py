@@ -1,0 +1,83 @@
+"""What a query says beside the panorama."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+
+from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M
+from lalaloc_core.floorplan import MAX_CAMERA_HEIGHT_STD_M
+from lalaloc_core.localise.camera_height import DEFAULT_STD_M, UNKNOWN_RANGE_M
+from service.schemas.fields import Finite
+
+HEADING_MEANING = "azimuth of the panorama's centre column, clockwise from the plan's +y seen from above"
+
+
+class LocaliseForm(BaseModel):
+    """Fields of a query besides the panorama itself; an empty field counts as left out."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    floorplan_id: str = Field(min_length=1, description="Id of the floor plan the panorama was taken in.")
+    heading_deg: Annotated[float, Finite] | None = Field(
+        None,
+        ge=-360,
+        le=360,
+        description=f"The {HEADING_MEANING}; left out: what the panorama's metadata say (`GPano:PoseHeadingDegrees`), "
+        "where the plan has `north_deg`, else unknown and searched over.",
+    )
+    heading_tolerance_deg: Annotated[float, Finite] = Field(
+        0,
+        ge=0,
+        le=45,
+        description="How far off `heading_deg` may be: it is then searched for within that, to the next sector of the "
+        "model's ring, and refined. 0: it is exact. Needs `heading_deg`.",
+    )
+    camera_height_m: Annotated[float, Finite] | None = Field(
+        None,
+        ge=MIN_CAMERA_HEIGHT_M,
+        description="Height of the camera over the floor; left out: the plan's, and where that has none either, any "
+        f"between {UNKNOWN_RANGE_M[0]:g} and {UNKNOWN_RANGE_M[1]:g}.",
+    )
+    camera_height_std_m: Annotated[float, Finite] | None = Field(
+        None,
+        ge=0,
+        le=MAX_CAMERA_HEIGHT_STD_M,
+        description="Standard deviation of the error of the camera height, which is solved for; 0: it is exact. Left "
+        f"out: the plan's, else {DEFAULT_STD_M:g}.",
+    )
+    refine: Literal["none", "vdr", "lpo"] = Field(
+        "lpo", description="How far to refine: nearest grid pose, denser poses around it, or optimised pose."
+    )
+    top_k: int = Field(
+        5,
+        ge=1,
+        description="How many distinct candidates to return, at most `max_top_k`.",
+        json_schema_extra={"maximum": 100},
+    )
+
+    @field_validator(
+        "heading_deg", "heading_tolerance_deg", "camera_height_m", "camera_height_std_m", "top_k", mode="before"
+    )
+    @classmethod
+    def _plain_number(cls, value: object) -> object:
+        if isinstance(value, str) and "_" in value:
+            raise ValueError("not a number")
+        return value
+
+    @field_validator("top_k")
+    @classmethod
+    def _as_many_as_allowed(cls, value: int, told: ValidationInfo) -> int:
+        most = (told.context or {}).get("max_top_k", math.inf)
+        if value > most:
+            raise ValueError(f"at most {most} are allowed (max_top_k)")
+        return value
+
+    @field_validator("heading_tolerance_deg")
+    @classmethod
+    def _of_a_heading(cls, value: float, given: ValidationInfo) -> float:
+        if given.data.get("heading_deg", 0.0) is None:
+            raise ValueError("heading_deg, whose tolerance this is, is missing")
+        return value
