@@ -18,8 +18,8 @@ from lalaloc_core import __version__
 from service.errors import HTTP_PROBLEMS, PROBLEMS
 from service.http.api_description import describe_api
 from service.http.middleware import (
-    AccessControlMiddleware,
     AdmissionMiddleware,
+    AuthorisationMiddleware,
     CorsMiddleware,
     FramingMiddleware,
     HeadMiddleware,
@@ -76,7 +76,7 @@ def _layers(app: FastAPI, telemetry: Telemetry, routes: list[BaseRoute]) -> ASGI
     Middleware that is added to an app lies inside the layer that answers unexpected errors, and never sees those.
     """
     # Keys first: it is tenants that slots are shared between.
-    admitted = HeadMiddleware(AccessControlMiddleware(AdmissionMiddleware(FastAPI.build_middleware_stack(app))))
+    admitted = HeadMiddleware(AuthorisationMiddleware(AdmissionMiddleware(FastAPI.build_middleware_stack(app))))
     named = [route for route in routes if isinstance(route, Route)]
     return TelemetryMiddleware(SecurityHeadersMiddleware(CorsMiddleware(FramingMiddleware(admitted))), telemetry, named)
 

@@ -15,7 +15,7 @@ from lalaloc_core import __version__
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
-from service.grids import Grids, Sweeper
+from service.grids import GridProvider, Sweeper
 from service.http import Admission, AdmissionLimits
 from service.http.events import HEARTBEAT_S, PlanEvents
 from service.preview import Drawings
@@ -60,7 +60,7 @@ class Runtime:
     settings: Settings
     telemetry: Telemetry
     store: Store
-    grids: Grids
+    grids: GridProvider
     plan_cache: PlanCache
     pool: LpoPool
     decoder: Decoder
@@ -106,7 +106,7 @@ def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack) 
     decoder = kept(Decoder(bundle.manifest, settings, telemetry))
     decoder.start()
     encoders = _warm_encoders(bundle, settings)
-    grids = kept(Grids(store, encoders, bundle.sha256, settings, telemetry))
+    grids = kept(GridProvider(store, encoders, bundle.sha256, settings, telemetry))
     admission = Admission(AdmissionLimits.of(settings), telemetry)
     reads = kept(
         BoundedReads(threads=_READ_THREADS, max_pending=settings.pending_limit, wait_s=settings.database_wait_s)
@@ -158,14 +158,14 @@ async def runtime_of(request: Request) -> Runtime:
 
 
 def _plan_events(
-    store: Store, grids: Grids, admission: Admission, looks: BoundedReads, settings: Settings
+    store: Store, grids: GridProvider, admission: Admission, looks: BoundedReads, settings: Settings
 ) -> PlanEvents:
     # Their callers' keys are looked at again as often.
     heartbeat_s = max(min(settings.key_cache_s, HEARTBEAT_S), _SOONEST_S) if settings.api_keys else HEARTBEAT_S
     return PlanEvents(store, grids, admission, looks, max_s=settings.stream_deadline_s, heartbeat_s=heartbeat_s)
 
 
-def _tell_start(bundle: Bundle, grids: Grids, telemetry: Telemetry) -> None:
+def _tell_start(bundle: Bundle, grids: GridProvider, telemetry: Telemetry) -> None:
     manifest = bundle.manifest
     telemetry.describe_build(__version__, manifest.name, manifest.version, bundle.sha256)
     fields = {"model": manifest.name, "sha256": bundle.sha256, "grids_to_compute": grids.preparing}

@@ -58,7 +58,7 @@ LAYERS = {
 SERVICE_LAYERS = (
     "sharing",
     # `workers` is what runs in worker processes: it loads nothing of what watches over them.
-    "cores settings errors schemas threads lru telemetry workers",
+    "cores settings errors schemas threads bounded_cache telemetry workers",
     "pools storage",
     "grids preview security",
     "http",

@@ -17,10 +17,10 @@ from service.errors import (
     StoreUnavailableError,
     UnknownFloorPlanError,
 )
-from service.grids.cache import GridCache
 from service.grids.embedding import check_size, embed
-from service.grids.jobs import Job, Jobs
-from service.grids.leases import LeaseHeartbeat, LeaseLostError
+from service.grids.grid_cache import GridCache
+from service.grids.grid_jobs import Job, Jobs
+from service.grids.lease_heartbeat import LeaseHeartbeat, LeaseLostError
 from service.grids.throttle import BackgroundThrottle
 from service.settings import Settings
 from service.storage import Store

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Self
 
-from service.grids.jobs import Job
+from service.grids.grid_jobs import Job
 from service.schemas import PlanStatus
 from service.storage.records import ComputedGrid
 

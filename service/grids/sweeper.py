@@ -7,7 +7,7 @@ import threading
 from time import monotonic
 
 from service.errors import StoreUnavailableError
-from service.grids.grids import Grids
+from service.grids.grid_provider import GridProvider
 from service.storage import PlanCache, Store
 from service.telemetry import LOGGER_NAME
 
@@ -20,7 +20,7 @@ _PURGE_EVERY_S = 3600.0
 class Sweeper:
     """A thread with a few cheap queries every now and then; a database that is away is tried again."""
 
-    def __init__(self, store: Store, grids: Grids, known: PlanCache, *, sweep_s: float) -> None:
+    def __init__(self, store: Store, grids: GridProvider, known: PlanCache, *, sweep_s: float) -> None:
         self._store = store
         self._grids = grids
         self._known = known
@@ -68,7 +68,7 @@ class Sweeper:
                     more = self._grids.queue_missing()
                 if monotonic() >= purge_at:
                     purge_at = monotonic() + _PURGE_EVERY_S
-                    self._store.idempotency.purge()
+                    self._store.idempotency_keys.purge()
             except StoreUnavailableError:
                 continue
             except Exception:

@@ -7,7 +7,7 @@ from typing import Any
 from fastapi import FastAPI
 from fastapi.openapi.utils import get_openapi
 
-from service.http import admission
+from service.http import admission_control as admission
 from service.http.problems import add_problems
 from service.schemas import FloorPlanDocument, PlanEvent, Problem
 from service.security import access_control

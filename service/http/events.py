@@ -16,8 +16,8 @@ from starlette.responses import StreamingResponse
 from starlette.types import Receive, Scope, Send
 
 from service.errors import StoreUnavailableError
-from service.grids import Grids
-from service.http.admission import Admission
+from service.grids import GridProvider
+from service.http.admission_control import Admission
 from service.schemas import PlanEvent
 from service.storage import Store
 from service.telemetry import LOGGER_NAME
@@ -66,7 +66,7 @@ class PlanEvents:
     def __init__(
         self,
         store: Store,
-        grids: Grids,
+        grids: GridProvider,
         admission: Admission,
         reads: BoundedReads,
         *,

@@ -18,7 +18,7 @@ import uvicorn
 from fastapi import FastAPI
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
-from service.http.admission import Admission, AdmissionLimits
+from service.http.admission_control import Admission, AdmissionLimits
 from service.http.descriptors import max_connections_of
 from service.settings import Settings
 

@@ -8,10 +8,10 @@ when it stalls, and replaces it when it dies. What happens to a worker reaches c
     answer = await pool.answer(job, timeout_s=5.0)      # cancelling it cancels the job
 
 with `run_decoder(connection, limits)` a function of `service.workers`. Begin with `pool.py`, which is what callers see;
-`jobs.py` is the queue, and `supervisor.py` the thread over each worker.
+`job_queue.py` is the queue, and `supervisor.py` the thread over each worker.
 """
 
-from service.pools.jobs import JobLostError, LostReason
+from service.pools.job_queue import JobLostError, LostReason
 from service.pools.pool import PoolState, WorkerPool
 from service.pools.supervisor import WorkerSpec
 

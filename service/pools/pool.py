@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from time import monotonic
 from typing import Any, Generic, TypeVar
 
-from service.pools.jobs import JobLostError, JobQueue, Ticket
+from service.pools.job_queue import JobLostError, JobQueue, Ticket
 from service.pools.supervisor import Supervisor, WorkerSpec
 from service.sharing import Shares
 

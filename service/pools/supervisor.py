@@ -15,7 +15,7 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
-from service.pools.jobs import JobQueue, Ticket
+from service.pools.job_queue import JobQueue, Ticket
 from service.telemetry import LOGGER_NAME
 from service.workers.process import Answered, Fault, Ready
 

@@ -8,8 +8,8 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
 
+from service.bounded_cache import BoundedCache
 from service.errors import OverloadedError
-from service.lru import BoundedCache
 from service.preview.mesh import plan_glb
 from service.preview.svg import Marker, draw_rooms, plan_svg
 from service.storage.records import PlanRecord

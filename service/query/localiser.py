@@ -19,12 +19,12 @@ from lalaloc_core.localise.pipeline import Localisation, StageClock, localise_st
 from lalaloc_core.localise.poses import Candidate, LatentGrid, Query
 from lalaloc_core.panorama.images import Panorama
 from service.errors import DeadlineExceededError, PlanFailedError, PlanNotReadyError
-from service.grids import Grids, grid_height_m
-from service.http.admission import Slots
+from service.grids import GridProvider, grid_height_m
+from service.http.admission_control import Slots
 from service.query.camera_height import stated_height
 from service.query.decoding import Decoder
 from service.query.heading import KnownHeading, known_heading
-from service.query.refinement import LpoPool
+from service.query.lpo_pool import LpoPool
 from service.schemas import CandidateAnswer, LocaliseAnswer, LocaliseForm, ModelAnswer, Position, TimingsAnswer
 from service.settings import Settings
 from service.sharing import with_spare
@@ -47,7 +47,7 @@ class Localiser:
         settings: Settings,
         bundle: Bundle,
         encoders: Encoders,
-        grids: Grids,
+        grids: GridProvider,
         pool: LpoPool,
         decoder: Decoder,
         queries: Slots,

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from fastapi import Depends, Request
 
 from service.errors import UnknownFloorPlanError
-from service.http.idempotency import HEADER, MAX_KEY_CHARACTERS
+from service.http.idempotent_request import HEADER, MAX_KEY_CHARACTERS
 from service.runtime import Runtime, runtime_of
 from service.security import caller_of
 from service.storage.plans import Plans

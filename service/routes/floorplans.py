@@ -107,7 +107,7 @@ async def create_floorplan(request: Request, runtime: Running, tenant: Tenant, p
     A small one is `ready` with the answer; the latent grid of a larger one is computed in the background (see `status`
     and `progress`, and `/events`).
     """
-    idempotent = IdempotentRequest(runtime.store.idempotency, request, tenant, "POST /floorplans")
+    idempotent = IdempotentRequest(runtime.store.idempotency_keys, request, tenant, "POST /floorplans")
     content = await _uploaded_plan(request, runtime)
 
     def store(token: str) -> Response:

@@ -82,7 +82,7 @@ async def localise(request: Request, runtime: Running, tenant: Tenant, party: Pa
     the one before it, with `"stage": "vdr"`.
     """
     settings = runtime.settings
-    idempotent = IdempotentRequest(runtime.store.idempotency, request, tenant, "POST /localise")
+    idempotent = IdempotentRequest(runtime.store.idempotency_keys, request, tenant, "POST /localise")
     media_type(request, (MULTIPART,))
     limits = UploadLimits.of(settings, "max_panorama_bytes")
     clock = StageClock()

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from lalaloc_core.sampling import grid_size
-from service.grids import Grids, GridState
+from service.grids import GridProvider, GridState
 from service.http.conditional import plan_etag
 from service.schemas import BoundsAnswer, FloorPlanAnswer, FloorPlanSummary, GridAnswer, RoomAnswer
 from service.storage.records import PlanRecord, PlanSummary
 
 
-def plan_state(record: PlanRecord, grids: Grids) -> GridState:
+def plan_state(record: PlanRecord, grids: GridProvider) -> GridState:
     """How far a plan's own grid is at this moment."""
     return grids.states([_summary(record)])[0]
 
@@ -27,7 +27,7 @@ def plan_representation(
     return content, plan_etag(record.revision_id, content)
 
 
-def list_entries(summaries: list[PlanSummary], grids: Grids) -> list[FloorPlanSummary]:
+def list_entries(summaries: list[PlanSummary], grids: GridProvider) -> list[FloorPlanSummary]:
     """Plans as a listing has them."""
     return [
         FloorPlanSummary(

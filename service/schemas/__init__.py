@@ -1,30 +1,20 @@
 """What the HTTP API takes and answers. Units stand in the names: `_m` metres, `_m2` m², `_deg` degrees, `_ms` ms.
 
 fields           the base of all answers, and the types of their numbers: how far each is rounded
-plan_document    a floor plan in the native format
-floorplans       what is told of stored floor plans
+native_plan      a floor plan in the native format
+stored_plans     what is told of stored floor plans
 localise_query   what a query says beside the panorama
 localise_answer  where it was taken
 service_state    limits, health, readiness
-problems         errors
+problem_details  errors
 
 Begin with `localise_answer.py`.
 """
 
 from service.schemas.fields import Answer
-from service.schemas.floorplans import (
-    BoundsAnswer,
-    FloorPlanAnswer,
-    FloorPlanList,
-    FloorPlanSummary,
-    GridAnswer,
-    PlanEvent,
-    PlanStatus,
-    RoomAnswer,
-)
 from service.schemas.localise_answer import CandidateAnswer, LocaliseAnswer, ModelAnswer, Position, TimingsAnswer
 from service.schemas.localise_query import LocaliseForm
-from service.schemas.plan_document import (
+from service.schemas.native_plan import (
     FloorPlanDocument,
     OpeningDocument,
     OpeningKind,
@@ -34,8 +24,18 @@ from service.schemas.plan_document import (
     RoomType,
     Segment,
 )
-from service.schemas.problems import Fault, Problem
+from service.schemas.problem_details import Fault, Problem
 from service.schemas.service_state import HealthAnswer, LimitsAnswer, PoolAnswer, ReadyAnswer
+from service.schemas.stored_plans import (
+    BoundsAnswer,
+    FloorPlanAnswer,
+    FloorPlanList,
+    FloorPlanSummary,
+    GridAnswer,
+    PlanEvent,
+    PlanStatus,
+    RoomAnswer,
+)
 
 __all__ = [
     "Answer",

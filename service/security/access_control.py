@@ -25,7 +25,7 @@ from service.storage.api_keys import ApiKeys
 from service.storage.records import ApiKey
 from service.telemetry import note
 
-# What `AccessControlMiddleware` refuses with, besides 404 and 405.
+# What `AuthorisationMiddleware` refuses with, besides 404 and 405.
 REFUSALS = (
     UnauthenticatedError,
     InsufficientScopeError,

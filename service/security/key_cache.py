@@ -11,8 +11,8 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 
+from service.bounded_cache import BoundedCache
 from service.errors import StoreBusyError, StoreUnavailableError
-from service.lru import BoundedCache
 from service.security.keys import PresentedKey
 from service.storage.api_keys import ApiKeys
 from service.storage.records import ApiKey

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from time import monotonic
 
+from service.bounded_cache import BoundedCache
 from service.errors import StoreBusyError, StoreUnavailableError
-from service.lru import BoundedCache
 from service.storage.plans import plan_bytes
 from service.storage.records import PlanRecord
 from service.storage.store import Store

@@ -13,14 +13,14 @@ from typing import Any
 from sqlalchemy import Connection, Row, and_, delete, func, or_, select, text, update
 
 from lalaloc_core.floorplan import FloorPlan
+from service.bounded_cache import BoundedCache
 from service.errors import DamagedDataError, RevisionMismatchError, TooManyFloorPlansError, UnknownFloorPlanError
-from service.lru import BoundedCache
 from service.storage.chunks import read_chunks, write_chunks
 from service.storage.database import Database
 from service.storage.grid_format import PackedGrid, pack
-from service.storage.grids import insert_grid, select_summaries
 from service.storage.plan_document import PlanDocument
 from service.storage.records import ComputedGrid, Cursor, GridKey, PlanRecord, PlanSummary
+from service.storage.stored_grids import insert_grid, select_summaries
 from service.storage.tables import FLOORPLANS, LATENT_GRIDS, ORIGINAL_CHUNKS, REVISIONS
 from service.telemetry import LOGGER_NAME
 

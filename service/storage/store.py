@@ -10,10 +10,10 @@ from lalaloc_core.errors import ConfigError
 from service.settings import Settings
 from service.storage.api_keys import ApiKeys
 from service.storage.database import Database
-from service.storage.grids import GridLeases, StoredGrids
-from service.storage.idempotency import LEAST_LEASE_S, Idempotency
+from service.storage.idempotency_keys import LEAST_LEASE_S, IdempotencyKeys
 from service.storage.migration import migrate
 from service.storage.plans import Plans
+from service.storage.stored_grids import GridLeases, StoredGrids
 
 _CLAIM_MARGIN_S = 5.0
 
@@ -27,7 +27,7 @@ class Store:
         plans: floor plans with revisions and originals.
         grids: their latent grids.
         leases: who computes which grid.
-        idempotency: answers to requests that may be sent twice.
+        idempotency_keys: answers to requests that may be sent twice.
         keys: API keys.
     """
 
@@ -51,7 +51,7 @@ class Store:
         self.plans = Plans(database)
         self.grids = StoredGrids(database)
         self.leases = GridLeases(database)
-        self.idempotency = Idempotency(database, claim_s)
+        self.idempotency_keys = IdempotencyKeys(database, claim_s)
         self.keys = ApiKeys(database)
 
     def answered_since(self, moment_s: float) -> bool:

@@ -21,6 +21,7 @@ from lalaloc_core.errors import InvalidPoseError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.retrieval import build_grid
+from service.bounded_cache import BoundedCache
 from service.errors import (
     OverloadedError,
     PlanFailedError,
@@ -31,12 +32,11 @@ from service.errors import (
     UnknownFloorPlanError,
 )
 from service.grids.embedding import embed, grid_bytes
-from service.grids.grids import Grids
+from service.grids.grid_jobs import MAX_ON_DEMAND
+from service.grids.grid_provider import GridProvider
 from service.grids.heights import check_height_m, grid_height_m
-from service.grids.jobs import MAX_ON_DEMAND
 from service.grids.sweeper import Sweeper
 from service.grids.throttle import BackgroundThrottle
-from service.lru import BoundedCache
 from service.settings import Settings
 from service.storage.plan_cache import PlanCache
 from service.storage.records import PlanRecord
@@ -113,11 +113,11 @@ def _add(store: Store, plan: FloorPlan = PLAN, plan_id: str = "p") -> PlanRecord
 
 
 @pytest.fixture
-def make_grids(encoders: CountingEncoders) -> Iterator[Callable[..., Grids]]:
-    made: list[Grids] = []
+def make_grids(encoders: CountingEncoders) -> Iterator[Callable[..., GridProvider]]:
+    made: list[GridProvider] = []
 
-    def make(store: Store, own_encoders: Encoders | None = None, **settings: Any) -> Grids:
-        made.append(Grids(store, own_encoders or encoders, "m1", Settings(**settings), Telemetry()))
+    def make(store: Store, own_encoders: Encoders | None = None, **settings: Any) -> GridProvider:
+        made.append(GridProvider(store, own_encoders or encoders, "m1", Settings(**settings), Telemetry()))
         return made[-1]
 
     yield make
@@ -125,7 +125,7 @@ def make_grids(encoders: CountingEncoders) -> Iterator[Callable[..., Grids]]:
         grids.close()
 
 
-MakeGrids = Callable[..., Grids]
+MakeGrids = Callable[..., GridProvider]
 OpenStore = Callable[[], Store]
 
 
@@ -195,7 +195,7 @@ def test_a_bounded_cache_counts_right_and_drops_the_least_recently_used(
 
 def test_what_the_cache_did_is_in_the_metrics(store: Store, encoders: Encoders) -> None:
     telemetry = Telemetry()
-    grids = Grids(store, encoders, "m1", Settings(), telemetry)
+    grids = GridProvider(store, encoders, "m1", Settings(), telemetry)
     record = _add(store)
     key = grids.key(record.revision_id, 1.5)
     assert grids.find(key) is None
@@ -235,7 +235,7 @@ def test_replicas_compute_a_grid_once_and_see_how_far_it_is(
     assert second.states([summary])[0].poses == len(grid.poses)
 
 
-def _looked(grids: Grids) -> bool:
+def _looked(grids: GridProvider) -> bool:
     grids.poll_remote()
     return False
 

@@ -13,7 +13,7 @@ from starlette.types import Message
 from lalaloc_core.errors import LaLaLocError
 from service.http.conditional import expected_revision
 from service.http.cursors import parse_cursor
-from service.http.idempotency import _key_of
+from service.http.idempotent_request import _key_of
 from service.http.uploads import UploadLimits, read_parts
 from service.security.exposure import may_be_named
 from service.security.keys import parse_authorization

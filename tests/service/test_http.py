@@ -16,7 +16,7 @@ import pytest
 import yaml
 
 from service.app import create_app
-from service.http.admission import EXEMPT
+from service.http.admission_control import EXEMPT
 from service.openapi import openapi_text
 from service.runtime import Runtime, runtime_of
 from service.settings import Settings

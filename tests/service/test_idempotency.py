@@ -27,13 +27,13 @@ from service.errors import (
     UnknownFloorPlanError,
     UploadTimeoutError,
 )
-from service.http.idempotency import IdempotentRequest, parts_sha256
+from service.http.idempotent_request import IdempotentRequest, parts_sha256
 from service.http.uploads import Parts
-from service.pools.jobs import JobLostError
-from service.storage.grids import StoredGrids
-from service.storage.idempotency import Idempotency
+from service.pools.job_queue import JobLostError
+from service.storage.idempotency_keys import IdempotencyKeys
 from service.storage.records import Fresh
 from service.storage.store import Store
+from service.storage.stored_grids import StoredGrids
 from service.storage.tables import IDEMPOTENCY
 from service.threads import BoundedReads
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, upload, wait_for
@@ -179,7 +179,7 @@ def test_what_a_process_that_died_had_stored_is_found_by_the_next(
         store = Store(database_of(tmp_path))
         # As the one that died left it: the plan is stored, the answer is not.
         digest = parts_sha256(Parts({}, {"file": CONTENT}))
-        claim = Idempotency(store._database, lease_s=1.0).begin("default", "POST /floorplans", "a", digest)
+        claim = IdempotencyKeys(store._database, lease_s=1.0).begin("default", "POST /floorplans", "a", digest)
         assert isinstance(claim, Fresh)
         plan_id = claim.token
         headers = _keyed("a") | {"Content-Type": "application/json"}
@@ -265,7 +265,7 @@ def store(tmp_path: Path) -> Iterator[Store]:
 
 def _idempotent(store: Store) -> IdempotentRequest:
     scope = {"type": "http", "method": "POST", "path": "/x", "headers": [(b"idempotency-key", b"a")], "state": {}}
-    return IdempotentRequest(store.idempotency, Request(scope), "default", "POST /x")
+    return IdempotentRequest(store.idempotency_keys, Request(scope), "default", "POST /x")
 
 
 def test_an_upload_that_failed_after_it_was_stored_is_found_when_it_is_sent_again(store: Store) -> None:
@@ -330,7 +330,7 @@ def test_who_is_gone_before_their_claim_is_made_leaves_none(store: Store, leaves
         reads.close()
 
     asyncio.run(ask())
-    claims = store.idempotency
+    claims = store.idempotency_keys
     wait_for(lambda: _token_of(store) is not None, 10.0)
     again = Fresh(_token_of(store) or "")
     wait_for(lambda: claims.begin("default", "POST /x", "a", parts_sha256(NOTHING)) == again, 10.0)

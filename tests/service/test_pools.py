@@ -17,7 +17,7 @@ from typing import Any
 
 import pytest
 
-from service.pools.jobs import JobLostError
+from service.pools.job_queue import JobLostError
 from service.pools.pool import WorkerPool
 from service.pools.supervisor import WorkerSpec
 from tests.service import worker_jobs

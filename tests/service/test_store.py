@@ -37,7 +37,7 @@ from service.errors import (
     UnknownFloorPlanError,
 )
 from service.storage.chunks import CHUNK_BYTES
-from service.storage.idempotency import KEPT_FOR, Idempotency
+from service.storage.idempotency_keys import KEPT_FOR, IdempotencyKeys
 from service.storage.plan_document import PlanDocument
 from service.storage.records import ComputedGrid, Conflict, Cursor, Fresh, GridKey, InProgress, StoredAnswer
 from service.storage.store import Store
@@ -596,60 +596,60 @@ ANSWER = StoredAnswer(201, {"location": "/floorplans/x"}, b'{"id": "x"}')
 
 def test_a_request_is_carried_out_once_and_its_answer_kept(open_store: OpenStore) -> None:
     first, second = open_store(), open_store()
-    claim = first.idempotency.begin("t", "POST /floorplans", "k", "body")
+    claim = first.idempotency_keys.begin("t", "POST /floorplans", "k", "body")
     assert isinstance(claim, Fresh)
-    assert second.idempotency.begin("t", "POST /floorplans", "k", "body") == InProgress()
-    assert second.idempotency.begin("t", "POST /floorplans", "k", "another") == Conflict()
-    first.idempotency.finish("t", "POST /floorplans", "k", claim.token, ANSWER)
-    assert second.idempotency.begin("t", "POST /floorplans", "k", "body") == ANSWER
-    assert second.idempotency.begin("t", "POST /floorplans", "k", "another") == Conflict()
+    assert second.idempotency_keys.begin("t", "POST /floorplans", "k", "body") == InProgress()
+    assert second.idempotency_keys.begin("t", "POST /floorplans", "k", "another") == Conflict()
+    first.idempotency_keys.finish("t", "POST /floorplans", "k", claim.token, ANSWER)
+    assert second.idempotency_keys.begin("t", "POST /floorplans", "k", "body") == ANSWER
+    assert second.idempotency_keys.begin("t", "POST /floorplans", "k", "another") == Conflict()
     for other in (("u", "POST /floorplans", "k"), ("t", "POST /localise", "k"), ("t", "POST /floorplans", "l")):
-        assert isinstance(second.idempotency.begin(*other, "body"), Fresh)
+        assert isinstance(second.idempotency_keys.begin(*other, "body"), Fresh)
 
 
 def test_an_abandoned_request_may_be_sent_again_an_answered_one_not(store: Store) -> None:
-    claim = store.idempotency.begin("t", "r", "k", "body")
+    claim = store.idempotency_keys.begin("t", "r", "k", "body")
     assert isinstance(claim, Fresh)
-    store.idempotency.abandon("t", "r", "k", "not the token")
-    assert store.idempotency.begin("t", "r", "k", "body") == InProgress()
-    store.idempotency.abandon("t", "r", "k", claim.token)
-    assert store.idempotency.begin("t", "r", "k", "another") == Conflict()
+    store.idempotency_keys.abandon("t", "r", "k", "not the token")
+    assert store.idempotency_keys.begin("t", "r", "k", "body") == InProgress()
+    store.idempotency_keys.abandon("t", "r", "k", claim.token)
+    assert store.idempotency_keys.begin("t", "r", "k", "another") == Conflict()
     # Under the same token: something may have been stored under it.
-    assert store.idempotency.begin("t", "r", "k", "body") == claim
-    assert store.idempotency.begin("t", "r", "k", "body") == InProgress()
-    store.idempotency.finish("t", "r", "k", claim.token, ANSWER)
-    store.idempotency.abandon("t", "r", "k", claim.token)
-    assert store.idempotency.begin("t", "r", "k", "body") == ANSWER
+    assert store.idempotency_keys.begin("t", "r", "k", "body") == claim
+    assert store.idempotency_keys.begin("t", "r", "k", "body") == InProgress()
+    store.idempotency_keys.finish("t", "r", "k", claim.token, ANSWER)
+    store.idempotency_keys.abandon("t", "r", "k", claim.token)
+    assert store.idempotency_keys.begin("t", "r", "k", "body") == ANSWER
 
 
 def test_the_request_of_a_dead_owner_is_taken_over_once_under_the_same_token(open_store: OpenStore) -> None:
     stores = [open_store(), open_store()]
-    dead = Idempotency(stores[0]._database, lease_s=0.2).begin("t", "r", "k", "body")
+    dead = IdempotencyKeys(stores[0]._database, lease_s=0.2).begin("t", "r", "k", "body")
     assert isinstance(dead, Fresh)
     time.sleep(0.3)
     with ThreadPoolExecutor(4) as threads:
-        claims = list(threads.map(lambda n: stores[n % 2].idempotency.begin("t", "r", "k", "body"), range(4)))
+        claims = list(threads.map(lambda n: stores[n % 2].idempotency_keys.begin("t", "r", "k", "body"), range(4)))
     assert [claim for claim in claims if claim != InProgress()] == [Fresh(dead.token)]
     # Should the dead one have lived, its answer no longer counts.
-    stores[0].idempotency.finish("t", "r", "k", dead.token, ANSWER)
-    stores[1].idempotency.finish("t", "r", "k", dead.token, dataclasses.replace(ANSWER, body=b"late"))
-    assert stores[0].idempotency.begin("t", "r", "k", "body") == ANSWER
+    stores[0].idempotency_keys.finish("t", "r", "k", dead.token, ANSWER)
+    stores[1].idempotency_keys.finish("t", "r", "k", dead.token, dataclasses.replace(ANSWER, body=b"late"))
+    assert stores[0].idempotency_keys.begin("t", "r", "k", "body") == ANSWER
 
 
 def test_answers_are_kept_for_a_day(store: Store) -> None:
     for key in ("old", "new"):
-        claim = store.idempotency.begin("t", "r", key, "body")
+        claim = store.idempotency_keys.begin("t", "r", key, "body")
         assert isinstance(claim, Fresh)
-        store.idempotency.finish("t", "r", key, claim.token, ANSWER)
+        store.idempotency_keys.finish("t", "r", key, claim.token, ANSWER)
     with store._database.writing() as connection:
         yesterday = datetime.now(UTC) - KEPT_FOR - timedelta(minutes=1)
         connection.execute(update(IDEMPOTENCY).where(IDEMPOTENCY.c.key == "old").values(created_at=yesterday))
     # Not given out any more, also before it is swept away.
-    assert isinstance(store.idempotency.begin("t", "r", "old", "another"), Fresh)
+    assert isinstance(store.idempotency_keys.begin("t", "r", "old", "another"), Fresh)
     with store._database.writing() as connection:
         connection.execute(update(IDEMPOTENCY).where(IDEMPOTENCY.c.key == "old").values(created_at=yesterday))
-    assert store.idempotency.purge() == 1
-    assert store.idempotency.begin("t", "r", "new", "body") == ANSWER
+    assert store.idempotency_keys.purge() == 1
+    assert store.idempotency_keys.begin("t", "r", "new", "body") == ANSWER
 
 
 def test_keys_are_found_by_hash_until_revoked(store: Store) -> None:
@@ -670,13 +670,13 @@ def test_keys_are_found_by_hash_until_revoked(store: Store) -> None:
 
 
 def test_a_claim_from_a_clock_that_was_ahead_is_dead(store: Store) -> None:
-    claim = store.idempotency.begin("t", "r", "k", "body")
+    claim = store.idempotency_keys.begin("t", "r", "k", "body")
     assert isinstance(claim, Fresh)
-    assert isinstance(store.idempotency.begin("t", "r", "k", "body"), InProgress)
+    assert isinstance(store.idempotency_keys.begin("t", "r", "k", "body"), InProgress)
     with store._database.writing() as connection:
         connection.execute(update(IDEMPOTENCY).values(lease_until_s=IDEMPOTENCY.c.lease_until_s + 48 * 3600.0))
-    assert store.idempotency.begin("t", "r", "k", "body") == claim
-    assert isinstance(store.idempotency.begin("t", "r", "k", "body"), InProgress)
+    assert store.idempotency_keys.begin("t", "r", "k", "body") == claim
+    assert isinstance(store.idempotency_keys.begin("t", "r", "k", "body"), InProgress)
 
 
 # The database itself
@@ -726,7 +726,7 @@ CREATE TABLE {grids} (
 def test_grids_of_the_schema_before_are_computed_again_and_the_rest_stays(store: Store, url: str) -> None:
     revision_id = _add(store, "p")
     _put(store, _key(revision_id))
-    store.idempotency.begin("t", "r", "k", "body")
+    store.idempotency_keys.begin("t", "r", "k", "body")
     with store._database.writing() as connection:
         for table, column in (
             ("latent_grids", "sha256"),
@@ -745,7 +745,7 @@ def test_grids_of_the_schema_before_are_computed_again_and_the_rest_stays(store:
     record = moved.plans.get("default", "p")
     assert record is not None
     assert record.plan.to_dict() == PLAN.to_dict()
-    assert isinstance(moved.idempotency.begin("t", "r", "k", "body"), InProgress)
+    assert isinstance(moved.idempotency_keys.begin("t", "r", "k", "body"), InProgress)
     with moved._database.reading() as connection:
         context = MigrationContext.configure(connection, opts={"compare_type": True})
         assert compare_metadata(context, METADATA) == []

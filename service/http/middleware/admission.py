@@ -10,7 +10,7 @@ from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.errors import DeadlineExceededError, OverloadedError, StoppingError
-from service.http.admission import EXEMPT, Admission, is_read, is_stream
+from service.http.admission_control import EXEMPT, Admission, is_read, is_stream
 from service.http.problems import problem_answer
 from service.security.access_control import routed_path
 from service.security.permissions import caller_of

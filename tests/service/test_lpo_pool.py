@@ -1,4 +1,4 @@
-"""The LPO pool: right answers, and None, soon, whatever happens to its workers; `test_workers` has the rest."""
+"""The LPO pool: right answers, and None, soon, whatever happens to its workers; `test_pools` has the rest."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ import pytest
 
 from lalaloc_core.bundle import LAYOUT_WEIGHTS, Bundle
 from lalaloc_core.localise.poses import RefinementJob, RefinementResult
-from service.query.refinement import LpoPool
+from service.query.lpo_pool import LpoPool
 from service.settings import Settings
 from service.telemetry import Telemetry
 from service.workers.lpo import warm_up_job

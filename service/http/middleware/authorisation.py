@@ -11,7 +11,7 @@ from service.security.access_control import REFUSALS, AccessControl, routed_path
 from service.security.permissions import OPEN_PATHS, put_caller
 
 
-class AccessControlMiddleware:
+class AuthorisationMiddleware:
     """Asks the running app's `AccessControl` about every request, and tells the routes who called."""
 
     def __init__(self, app: ASGIApp) -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import threading
 
 from lalaloc_core.localise.poses import LatentGrid
+from service.bounded_cache import BoundedCache
 from service.grids.embedding import grid_bytes
-from service.lru import BoundedCache
 from service.storage import Store
 from service.storage.records import GridKey
 from service.telemetry import Telemetry

@@ -16,7 +16,7 @@ from lalaloc_core.localise.poses import LatentGrid
 from service.errors import OverloadedError, StoppingError
 from service.storage.records import GridKey
 
-# More are not queued: whoever asks is told, and what has no grid is found again by `Grids.queue_missing`.
+# More are not queued: whoever asks is told, and what has no grid is found again by `GridProvider.queue_missing`.
 MAX_JOBS = 256
 MAX_ON_DEMAND = 16
 # A grid of so many poses takes a moment, and does not wait behind larger ones.

@@ -31,7 +31,7 @@ from service.errors import (
 from service.http.problems import problem_answer
 from service.http.uploads import Parts
 from service.pools import JobLostError
-from service.storage.idempotency import Idempotency
+from service.storage.idempotency_keys import IdempotencyKeys
 from service.storage.records import Conflict, Fresh, InProgress, StoredAnswer
 from service.telemetry import LOGGER_NAME
 from service.threads import BoundedReads
@@ -53,7 +53,7 @@ _FOR_GOOD = (
 class IdempotentRequest:
     """One request, with a key or without."""
 
-    def __init__(self, claims: Idempotency, request: Request, tenant: str, route: str) -> None:
+    def __init__(self, claims: IdempotencyKeys, request: Request, tenant: str, route: str) -> None:
         """
         Args:
             tenant: whose key it is; the same key of another tenant, or for another route, is another key.

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, WithJsonSchema
 
 from service.schemas.fields import Answer, Metres, Share, SquareMetres
-from service.schemas.plan_document import RoomType
+from service.schemas.native_plan import RoomType
 
 PlanStatus = Literal["preparing", "ready", "failed"]
 

@@ -19,7 +19,7 @@ LEAST_LEASE_S = 15.0
 _COLUMNS = IDEMPOTENCY.c
 
 
-class Idempotency:
+class IdempotencyKeys:
     """Answers by (tenant, route, key), for a day."""
 
     def __init__(self, database: Database, lease_s: float = LEAST_LEASE_S) -> None:

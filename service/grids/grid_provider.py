@@ -13,8 +13,8 @@ from lalaloc_core.localise.poses import LatentGrid
 from lalaloc_core.sampling import grid_size
 from service.errors import OverloadedError, StoppingError
 from service.grids.builder import GridBuilder
-from service.grids.cache import GridCache
 from service.grids.embedding import check_size, embed
+from service.grids.grid_cache import GridCache
 from service.grids.state import GridState
 from service.grids.throttle import BackgroundThrottle
 from service.settings import Settings
@@ -28,7 +28,7 @@ _BATCH = 16
 _INLINE_WAIT_S = 1.0
 
 
-class Grids:
+class GridProvider:
     """The latent grids of one model at one grid step.
 
     Attributes:
