@@ -41,6 +41,7 @@ LAYERS = {
     "lalaloc_core.unfamiliar": 3,
     "lalaloc_core.localise": 4,
     "lalaloc_core.data": 5,
+    "lalaloc_core.draw": 5,
     "lalaloc_core.data.synthetic": 6,
     "lalaloc_core.training": 7,
     "lalaloc_core.methods": 7,

@@ -7,7 +7,7 @@ is what only all rooms together can break, `geometry.py` the arrays that the ren
 from lalaloc_core.floorplan.geometry import PlanGeometry, pad_walls
 from lalaloc_core.floorplan.heights import MAX_CAMERA_HEIGHT_STD_M
 from lalaloc_core.floorplan.limits import DEFAULT_LIMITS, PlanLimits
-from lalaloc_core.floorplan.openings import DEFAULT_OPENING_TOLERANCE_M, Opening, OpeningFace
+from lalaloc_core.floorplan.openings import DEFAULT_OPENING_TOLERANCE_M, USUAL_HEIGHTS_M, Opening, OpeningFace
 from lalaloc_core.floorplan.plan import DEFAULT_CAMERA_HEIGHT_M, FloorPlan
 from lalaloc_core.floorplan.rooms import Room
 from lalaloc_core.floorplan.types import room_type_of
@@ -17,6 +17,7 @@ __all__ = [
     "DEFAULT_LIMITS",
     "DEFAULT_OPENING_TOLERANCE_M",
     "MAX_CAMERA_HEIGHT_STD_M",
+    "USUAL_HEIGHTS_M",
     "FloorPlan",
     "Opening",
     "OpeningFace",

@@ -22,6 +22,8 @@ from lalaloc_core.floorplan.limits import PlanLimits
 from lalaloc_core.floorplan.rooms import Room
 
 DEFAULT_OPENING_TOLERANCE_M = 0.35
+# Lower and upper edge (m over the floor) of openings whose plan does not say, to draw them.
+USUAL_HEIGHTS_M = {"door": (0.0, 2.05), "window": (0.9, 2.1), "passage": (0.0, 2.2)}
 # A wall is nearly parallel up to 15 degrees.
 _MIN_COSINE = float(np.cos(np.radians(15.0)))
 # What is shorter on a wall is the end of an opening that lies beside it; half of a narrow opening is never that.

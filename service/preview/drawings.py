@@ -8,10 +8,10 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
 
+from lalaloc_core.draw import Marker, draw_rooms, plan_svg
 from service.bounded_cache import BoundedCache
 from service.errors import OverloadedError
 from service.preview.mesh import plan_glb
-from service.preview.svg import Marker, draw_rooms, plan_svg
 from service.storage.records import PlanRecord
 from service.threads import Threads
 
@@ -47,8 +47,15 @@ class Drawings:
         Raises:
             OverloadedError: too many others are waiting to be drawn.
         """
-        rooms = await self._made((record.revision_id, "rooms"), lambda: draw_rooms(record.plan).encode())
-        return plan_svg(record.plan, marker, rooms=rooms.decode()).encode()
+        return plan_svg(record.plan, marker, rooms=await self.rooms(record)).encode()
+
+    async def rooms(self, record: PlanRecord) -> str:
+        """What `lalaloc_core.draw.draw_rooms` makes of a plan.
+
+        Raises:
+            OverloadedError: too many others are waiting to be drawn.
+        """
+        return (await self._made((record.revision_id, "rooms"), lambda: draw_rooms(record.plan).encode())).decode()
 
     async def glb(self, record: PlanRecord) -> bytes:
         """The mesh of a plan.

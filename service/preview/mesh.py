@@ -14,7 +14,7 @@ from trimesh.exchange.gltf import export_glb
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from lalaloc_core.floorplan import FloorPlan, OpeningFace, Room
+from lalaloc_core.floorplan import USUAL_HEIGHTS_M, FloorPlan, OpeningFace, Room
 
 _COLOURS = {
     "floor": (176, 141, 101, 255),
@@ -24,8 +24,7 @@ _COLOURS = {
     "window": (150, 200, 235, 255),
     "passage": (90, 90, 95, 255),
 }
-# Heights (m) of openings whose plan says none, and how far before the wall their panels stand.
-_USUAL_M = {"door": (0.0, 2.05), "window": (0.9, 2.1), "passage": (0.0, 2.2)}
+# How far before the wall the panels of openings stand.
 _BEFORE_WALL_M = 0.005
 
 
@@ -61,7 +60,7 @@ def _openings(plan: FloorPlan, room: Room, faces: Sequence[OpeningFace]) -> dict
     panels: dict[str, list[np.ndarray]] = {}
     for face in faces:
         opening = plan.openings[face.opening]
-        low, high = _USUAL_M[opening.kind]
+        low, high = USUAL_HEIGHTS_M[opening.kind]
         low = low if opening.sill_m is None else opening.sill_m
         high = min(high if opening.head_m is None else opening.head_m, room.ceiling_height_m)
         ends = room.walls_m[face.wall].reshape(2, 2)

@@ -8,12 +8,12 @@ from fastapi import APIRouter, Query, Request, Response
 from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
+from lalaloc_core.draw import Marker
 from lalaloc_core.floorplan import FloorPlan
 from service.errors import InvalidRequestError, StoreUnavailableError, UnknownFloorPlanError
 from service.http.conditional import conditional_answer, content_etag
 from service.http.problems import problem_responses
 from service.http.uploads import JSON
-from service.preview import Marker
 from service.routes.dependencies import IF_NONE_MATCH, NOT_MODIFIED, Running, Tenant, plan_summary, stored_plan
 from service.storage.records import PlanRecord
 from service.telemetry import note

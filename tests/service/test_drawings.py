@@ -11,12 +11,12 @@ from typing import Any
 
 import pytest
 
+from lalaloc_core.draw import Marker, draw_rooms, plan_svg
 from lalaloc_core.floorplan import FloorPlan
 from service.errors import OverloadedError
 from service.preview import drawings as module
 from service.preview.drawings import Drawings
 from service.preview.mesh import plan_glb
-from service.preview.svg import Marker, draw_rooms, plan_svg
 from service.storage.records import PlanRecord
 from tests.growth import assert_no_worse_than_linear
 from tests.service.conftest import FLAT

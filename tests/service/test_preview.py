@@ -12,10 +12,10 @@ import trimesh
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from lalaloc_core.draw import Marker, plan_svg
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
 from service.preview.mesh import plan_glb
-from service.preview.svg import Marker, plan_svg
 from tests.service.conftest import FLAT
 
 SVG = "{http://www.w3.org/2000/svg}"

@@ -1,0 +1,275 @@
+"""The picture of an answer: the plan with posterior and answer, the photograph with the found layout, or both."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from jaxtyping import UInt8
+from PIL import Image
+
+from lalaloc_core.bundle import ConfidenceModel
+from lalaloc_core.conventions import heading_from_degrees, heading_to_degrees
+from lalaloc_core.draw.canvas import FOUND, INK, MUTED, RULE, TRUE, Number, document, jpeg, shortened, words
+from lalaloc_core.draw.heat import HeatMap, colour_bar, heat_image, posterior_map
+from lalaloc_core.draw.outline import Outline, outline_of
+from lalaloc_core.draw.photograph import photograph_key, photograph_part
+from lalaloc_core.draw.plan import ELLIPSE_STDS, Marker, draw_camera, extent_m, plan_part, shape_of
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.covariance import spread_of
+from lalaloc_core.localise.pipeline import Localisation, panorama_heading
+from lalaloc_core.localise.poses import Candidate, LatentGrid, Query
+
+Picture = Literal["both", "plan", "photograph"]
+PICTURES: tuple[Picture, ...] = get_args(Picture)
+
+_WIDTH, _PAD = 1600.0, 36.0
+# What the photograph is drawn at, and best given in.
+PHOTOGRAPH_SIZE = (1528, 764)
+_HEADER, _KEY, _LEGEND = 104.0, 52.0, 400.0
+# Between them the plan's drawing is as high as its shape asks for.
+_LEAST_PLAN, _MOST_PLAN = 560.0, 1150.0
+# Less probable rivals say nothing.
+_LEAST_RIVAL = 0.001
+_CHARACTERS = 52
+
+
+@dataclass(frozen=True)
+class Rival:
+    """Another place that the photograph may have been taken at."""
+
+    x_m: float
+    y_m: float
+    heading_deg: float
+    room: str
+    probability: float | None
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DrawnAnswer:
+    """What is drawn of an answer.
+
+    Attributes:
+        camera: the answer, with its covariance where there is one.
+        room_index: the room that it lies in.
+        heading_source: where the heading came from, in a word or two.
+        rivals: other candidates, best first.
+        heat: how probable all places are; None leaves the floors white.
+        truth: where the camera really stood, if that is known.
+    """
+
+    plan: FloorPlan
+    camera: Marker
+    room_index: int
+    camera_height_m: float
+    heading_source: str
+    confidence: float | None
+    rivals: tuple[Rival, ...] = ()
+    heat: HeatMap | None = None
+    truth: Marker | None = None
+
+    @property
+    def outline(self) -> Outline:
+        """The layout that the answer says the photograph shows."""
+        position_m = np.array([self.camera.x_m, self.camera.y_m])
+        heading = heading_from_degrees(self.camera.heading_deg or 0.0)
+        return outline_of(self.plan, position_m, self.room_index, heading, self.camera_height_m)
+
+
+def drawn_answer(
+    plan: FloorPlan,
+    grid: LatentGrid,
+    found: Localisation,
+    model: ConfidenceModel | None,
+    heading_source: str,
+    truth: Marker | None = None,
+) -> DrawnAnswer:
+    """What is drawn of what the search found.
+
+    Args:
+        model: turns the posterior into probabilities; None leaves them out.
+        heading_source: where the heading came from, in a word or two.
+    """
+    fits = None if model is None else found.fit_probability(model)
+    best, *others = found.candidates
+    spread = None
+    if model is not None and best.information is not None:
+        spread = spread_of(best.information, plan.rooms[best.room_index], model)
+    covariance = None
+    if spread is not None:
+        (xx, xy), (_, yy) = spread.position_m2.tolist()
+        covariance = (xx, xy, yy)
+    rivals = [
+        Rival(
+            one.x_m,
+            one.y_m,
+            _heading_deg(found.query, one),
+            plan.rooms[one.room_index].name,
+            None if fits is None else fits * share,
+        )
+        for one, share in zip(others, found.posterior.candidate[1:], strict=True)
+    ]
+    return DrawnAnswer(
+        plan=plan,
+        camera=Marker(
+            x_m=best.x_m, y_m=best.y_m, heading_deg=_heading_deg(found.query, best), covariance_m2=covariance
+        ),
+        room_index=best.room_index,
+        camera_height_m=found.camera_height_m,
+        heading_source="searched for" if found.heading_contradicted else heading_source,
+        confidence=None if model is None else found.confidence(model),
+        rivals=tuple(rivals),
+        heat=posterior_map(plan, grid.poses, found.posterior.pose, grid.step_m),
+        truth=truth,
+    )
+
+
+def draw_answer(
+    answer: DrawnAnswer,
+    photograph: UInt8[np.ndarray, "h w 3"] | None = None,
+    picture: Picture = "both",
+    *,
+    title: str | None = None,
+    rooms: str | None = None,
+) -> str:
+    """An answer as an SVG document, 1600 pixels wide.
+
+    Args:
+        photograph: the whole sphere, level, as `panorama.images.open_panorama` gives it; needed unless `picture` is
+            "plan".
+        title: what to say above it; by default the room.
+        rooms: what `draw_rooms` made of the plan before.
+    """
+    room = answer.plan.rooms[answer.room_index].name
+    parts = [_header(answer, title or room, None if title is None else room)]
+    y = _HEADER
+    if picture != "plan":
+        if photograph is None:
+            raise ValueError(f"the picture '{picture}' needs the photograph")
+        (width, height), outline = PHOTOGRAPH_SIZE, answer.outline
+        parts.append(photograph_part(jpeg(_sized(photograph)), "jpeg", outline, (_PAD, y, width, height)))
+        y += height
+        parts.append(photograph_key(outline, _PAD, y + 32))
+        y += _KEY
+    if picture != "photograph":
+        seen = [(one.x_m, one.y_m) for one in (answer.camera, answer.truth) if one is not None]
+        width = _WIDTH - 3 * _PAD - _LEGEND
+        height = min(max(width / shape_of(answer.plan, seen), _LEAST_PLAN), _MOST_PLAN)
+        heat = "" if answer.heat is None else heat_image(answer.heat, answer.plan)
+        marks = _marks(answer)
+        box = (_PAD, y, width, height)
+        parts.append(plan_part(answer.plan, box, marks, seen_m=seen, heat=heat, rooms=rooms))
+        parts.append(_legend(answer, _WIDTH - _PAD - _LEGEND, y, height))
+        y += height
+    return document(_WIDTH, y + _PAD, f"{answer.plan.name}: {room}", parts)
+
+
+def confidence_words(confidence: float) -> str:
+    """How sure an answer is, for people."""
+    for least, said in ((0.95, "almost certain"), (0.8, "very likely"), (0.5, "likely"), (0.2, "doubtful")):
+        if confidence >= least:
+            return said
+    return "hardly more than a guess"
+
+
+def ellipse_m(covariance_m2: tuple[float, float, float]) -> tuple[float, float]:
+    """Half axes (m), the longer one first, of the ellipse that holds 95 % of a covariance (xx, xy, yy)."""
+    xx, xy, yy = covariance_m2
+    minor, major = ELLIPSE_STDS * np.sqrt(np.maximum(np.linalg.eigvalsh([[xx, xy], [xy, yy]]), 0.0))
+    return float(major), float(minor)
+
+
+def _header(answer: DrawnAnswer, title: str, room: str | None) -> str:
+    heading_deg = answer.camera.heading_deg or 0.0
+    said = [] if room is None else [shortened(room, _CHARACTERS)]
+    said += [
+        f"x {answer.camera.x_m:.2f} m, y {answer.camera.y_m:.2f} m",
+        f"heading {heading_deg:.1f}° ({answer.heading_source})",
+        f"camera {answer.camera_height_m:.2f} m over the floor",
+    ]
+    return words(_PAD, 54, shortened(title, _CHARACTERS), 36, more='font-weight="bold"') + words(
+        _PAD, 86, "  ·  ".join(said), 20, fill=MUTED
+    )
+
+
+def _marks(answer: DrawnAnswer) -> str:
+    """Rivals, the truth and the answer over the plan."""
+    extent = extent_m(answer.plan)
+    size = extent / 60.0
+    parts = []
+    for number, rival in reversed(list(enumerate(_shown(answer.rivals), start=2))):
+        parts.append(
+            f'<g class="rival" transform="translate({rival.x_m:.4f} {-rival.y_m:.4f})">'
+            f'<circle r="{0.9 * size:.4f}" fill="#fff" stroke="{FOUND}" stroke-width="{0.16 * size:.4f}"/>'
+            f'<path d="M0 {-0.9 * size:.4f}V{-1.7 * size:.4f}" stroke="{FOUND}" stroke-width="{0.22 * size:.4f}" '
+            f'transform="rotate({rival.heading_deg:.2f})"/>'
+            f'<text y="{0.36 * size:.4f}" font-size="{size:.4f}" fill="{INK}">{number}</text></g>'
+        )
+    if answer.truth is not None:
+        parts.append(_cross(answer.truth.x_m, -answer.truth.y_m, 1.3 * size))
+    return "".join([*parts, draw_camera(answer.camera, extent)])
+
+
+def _legend(answer: DrawnAnswer, x: Number, y: Number, height: Number) -> str:
+    parts, row = [], y + 18
+    if answer.confidence is not None:
+        parts.append(words(x, row + 30, f"{100 * answer.confidence:.1f} %", 46, more='font-weight="bold"'))
+        parts.append(words(x, row + 60, f"within 1 m: {confidence_words(answer.confidence)}", 18, fill=MUTED))
+        row += 96
+    circle = f'<circle cx="{x + 11:.1f}" cy="{row - 6:.1f}" r="9" fill="{FOUND}"/>'
+    parts.append(circle + words(x + 32, row, "found, looking along the wedge", 18))
+    if answer.camera.covariance_m2 is not None:
+        major, minor = ellipse_m(answer.camera.covariance_m2)
+        row += 28
+        parts.append(words(x + 32, row, f"95 % within ± {_length(major)} by ± {_length(minor)}", 16, fill=MUTED))
+    if answer.truth is not None:
+        row += 34
+        off_m = math.hypot(answer.truth.x_m - answer.camera.x_m, answer.truth.y_m - answer.camera.y_m)
+        parts.append(_cross(x + 11, row - 6, 12.0) + words(x + 32, row, f"true, {_length(off_m)} away", 18))
+    rivals = _shown(answer.rivals)
+    row += 48
+    parts.append(words(x, row, "Rivals" if rivals else "No other place comes near", 18, more='font-weight="bold"'))
+    for number, rival in enumerate(rivals, start=2):
+        row += 34
+        share = "" if rival.probability is None else f"{100 * rival.probability:.1f} %"
+        parts.append(
+            f'<circle cx="{x + 11:.1f}" cy="{row - 6:.1f}" r="11" fill="#fff" stroke="{FOUND}" stroke-width="2"/>'
+            + words(x + 11, row - 1, str(number), 13, anchor="middle")
+            + words(x + 32, row, shortened(rival.room, 28), 17)
+            + words(x + _LEGEND, row, share, 17, fill=MUTED, anchor="end")
+        )
+    if answer.heat is not None:
+        parts.append(f'<path d="M{x:.1f} {y + height - 92:.1f}h{_LEGEND:.0f}" stroke="{RULE}"/>')
+        parts.append(colour_bar(answer.heat, x, y + height - 74, _LEGEND))
+    return "".join(parts)
+
+
+def _sized(photograph: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3"]:
+    if photograph.shape[1::-1] == PHOTOGRAPH_SIZE:
+        return photograph
+    return np.asarray(Image.fromarray(photograph).resize(PHOTOGRAPH_SIZE, Image.Resampling.BICUBIC))
+
+
+def _shown(rivals: Sequence[Rival]) -> list[Rival]:
+    return [one for one in rivals if one.probability is None or one.probability >= _LEAST_RIVAL]
+
+
+def _cross(x: Number, y: Number, reach: Number) -> str:
+    both = 2.0 * reach
+    d = f"M{x - reach:.3f} {y - reach:.3f}l{both:.3f} {both:.3f}m0 {-both:.3f}l{-both:.3f} {both:.3f}"
+    return "".join(
+        f'<path class="true" d="{d}" fill="none" stroke="{colour}" stroke-width="{width * reach:.4f}" '
+        'stroke-linecap="round"/>'
+        for colour, width in ((INK, 0.62), (TRUE, 0.36))
+    )
+
+
+def _length(metres: float) -> str:
+    return f"{100 * metres:.0f} cm" if metres < 0.995 else f"{metres:.1f} m"
+
+
+def _heading_deg(query: Query, candidate: Candidate) -> float:
+    return heading_to_degrees(panorama_heading(query, candidate))

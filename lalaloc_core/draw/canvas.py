@@ -1,0 +1,114 @@
+"""The parts that every drawing is made of: text, numbers, pictures in pictures, and pixels of it all."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Iterable
+from html import escape
+from pathlib import Path
+
+import numpy as np
+import resvg_py
+from jaxtyping import Float, UInt8
+from PIL import Image
+
+INK, MUTED, RULE, PAPER = "#20242c", "#5a6472", "#d5dbe1", "#ffffff"
+# What is found, and what is true; both are told apart from each other and from the heat map by all who see little
+# colour (vermilion and sky blue of Okabe and Ito's palette).
+FOUND, TRUE = "#d55e00", "#56b4e9"
+# Pixels of a drawing: whole numbers where they were written down, others where they were computed.
+Number = int | float
+Box = tuple[Number, Number, Number, Number]
+
+FONT_FAMILY = "DejaVu Sans, Verdana, sans-serif"
+
+_FONTS = [str(path) for path in sorted((Path(__file__).parent / "fonts").glob("*.ttf"))]
+_JPEG_QUALITY = 90
+
+
+def document(width: Number, height: Number, title: str, parts: Iterable[str]) -> str:
+    """A drawing as a document of its own; sizes are pixels."""
+    return "\n".join(
+        [
+            f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:.0f}" height="{height:.0f}" '
+            f'viewBox="0 0 {width:.0f} {height:.0f}" font-family="{FONT_FAMILY}">',
+            f"<title>{xml_text(title)}</title>",
+            f'<rect width="{width:.0f}" height="{height:.0f}" fill="{PAPER}"/>',
+            *parts,
+            "</svg>\n",
+        ]
+    )
+
+
+def rasterise(svg: str, *, width: int | None = None) -> bytes:
+    """A drawing as PNG.
+
+    Letters are those of the fonts that come along, in Latin, Greek, Cyrillic and a few more scripts; others are drawn
+    as boxes.
+
+    Args:
+        svg: a drawing of this package; nothing that it refers to outside of itself is loaded.
+        width: pixels; by default what the drawing says.
+    """
+    return resvg_py.svg_to_bytes(
+        svg_string=svg, width=width, skip_system_fonts=True, font_files=_FONTS, sans_serif_family="DejaVu Sans"
+    )
+
+
+def pixels(svg: str) -> Image.Image:
+    """A drawing as an RGB picture."""
+    with Image.open(io.BytesIO(rasterise(svg))) as image:
+        return image.convert("RGB")
+
+
+def xml_text(text: str) -> str:
+    """Text as XML; the two characters that XML cannot hold, and plans may, are replaced."""
+    return escape(text.replace("\ufffe", "\ufffd").replace("\uffff", "\ufffd"))
+
+
+def words(
+    x: Number, y: Number, text: str, size: Number, *, fill: str = INK, anchor: str = "start", more: str = ""
+) -> str:
+    """A line of text; `y` is that of its base line."""
+    return (
+        f'<text x="{x:.1f}" y="{y:.1f}" font-size="{size:g}" fill="{fill}" text-anchor="{anchor}" {more}>'
+        f"{xml_text(text)}</text>"
+    )
+
+
+def shortened(text: str, characters: int) -> str:
+    """Text that is no longer than so many characters."""
+    return text if len(text) <= characters else text[: max(characters - 1, 1)] + "…"
+
+
+def path(lines: Iterable[Float[np.ndarray, "_ 2"]], digits: int = 1) -> str:
+    """Lines of points as the `d` of an SVG path."""
+    parts = []
+    for line in lines:
+        first, *others = (f"{x:.{digits}f} {y:.{digits}f}" for x, y in line.tolist())
+        parts.append(f"M{first}" + "".join(f"L{point}" for point in others))
+    return "".join(parts)
+
+
+def image(content: bytes, kind: str, box: Box, more: str = "") -> str:
+    """An encoded picture in a box (x, y, width, height), stretched to fill it."""
+    x, y, width, height = box
+    return (
+        f'<image x="{x:.4f}" y="{y:.4f}" width="{width:.4f}" height="{height:.4f}" preserveAspectRatio="none" '
+        f'{more} href="data:image/{kind};base64,{base64.b64encode(content).decode()}"/>'
+    )
+
+
+def png(values: UInt8[np.ndarray, "h w c"]) -> bytes:
+    """Pixels as PNG."""
+    buffer = io.BytesIO()
+    Image.fromarray(values).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+def jpeg(values: UInt8[np.ndarray, "h w 3"]) -> bytes:
+    """Pixels as JPEG."""
+    buffer = io.BytesIO()
+    Image.fromarray(values).save(buffer, "JPEG", quality=_JPEG_QUALITY)
+    return buffer.getvalue()

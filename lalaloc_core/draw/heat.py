@@ -1,0 +1,186 @@
+"""Heat maps over a plan: a value for every place, in colours that are told apart by all who see little colour.
+
+The darker, the nearer to what is looked for. Scales are logarithmic, as in the paper's figure of layout distances: what
+matters is how many times as near, or as probable, a place is.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from lalaloc_core.draw.canvas import MUTED, RULE, Number, image, png, words, xml_text
+from lalaloc_core.draw.plan import floor_path
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.sampling import PoseSet
+
+# ColorBrewer's YlGnBu, which is safe for the colour-blind and still a scale when it is printed in grey.
+_COLOURS = ["#ffffe5", "#f7fcb9", "#d9f0a3", "#a6dba0", "#5cc2b0", "#2fa4c0", "#2a7ab9", "#27509b", "#132a6b"]
+# So many cells along the longer side of a plan, and none smaller than this.
+_CELLS, _LEAST_CELL_M = 220, 0.04
+# Rounds of growing known values into cells and lattice points that have none.
+_GROWN = 4
+# Bilinear, which is fast, where drawn by resvg; browsers do it anyway.
+_SMOOTH = 'style="image-rendering: smooth"'
+# Of probabilities: what is less probable than the best place by this factor has the lightest colour.
+_DECADES = 5
+
+
+@dataclass(frozen=True, eq=False)
+class Cells:
+    """A plan cut into square cells.
+
+    Attributes:
+        poses: the middles of the cells that lie in rooms.
+        room: the room of each cell, -1 outside, rows from below.
+        extent_m: (left, right, bottom, top) of all cells.
+    """
+
+    poses: PoseSet
+    room: Int[np.ndarray, "rows columns"]
+    extent_m: tuple[float, float, float, float]
+
+    @classmethod
+    def of(cls, plan: FloorPlan, size_m: float | None = None) -> Cells:
+        """Cut a plan; by default into as many cells as are seen."""
+        x_min, y_min, x_max, y_max = plan.bounds_m
+        size_m = size_m or max(max(x_max - x_min, y_max - y_min) / _CELLS, _LEAST_CELL_M)
+        # One empty cell all around, for the edges to grow into.
+        xs = np.arange(x_min - 0.5 * size_m, x_max + size_m, size_m)
+        ys = np.arange(y_min - 0.5 * size_m, y_max + size_m, size_m)
+        x, y = np.meshgrid(xs, ys)
+        position_m = np.stack([x.ravel(), y.ravel()], axis=1)
+        room = plan.room_index_at(position_m)
+        half = 0.5 * size_m
+        extent_m = (float(xs[0] - half), float(xs[-1] + half), float(ys[0] - half), float(ys[-1] + half))
+        return cls(PoseSet(position_m[room >= 0], room[room >= 0]), room.reshape(x.shape), extent_m)
+
+    def spread(self, values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "rows columns"]:
+        """Values of `poses` in their places, grown by a cell into what lies in no room; NaN farther outside."""
+        spread = np.full(self.room.shape, np.nan)
+        spread[self.room >= 0] = values
+        return _grown(spread)
+
+
+@dataclass(frozen=True, eq=False)
+class HeatMap:
+    """How dark every cell is.
+
+    Attributes:
+        shade: of `cells.poses`, from 0 (lightest) to 1.
+        title: what the colours stand for.
+        ticks: words for some shades, along the bar that explains them.
+    """
+
+    cells: Cells
+    shade: Float[np.ndarray, "n"]
+    title: str
+    ticks: tuple[tuple[float, str], ...]
+
+
+def distance_map(cells: Cells, distance: Float[np.ndarray, "n"], title: str) -> HeatMap:
+    """A map of distances, the least the darkest."""
+    low = max(float(distance.min()), 1e-3)
+    high = max(float(distance.max()), 1.001 * low)
+    shade = 1.0 - np.log(np.maximum(distance, low) / low) / math.log(high / low)
+    ticks = tuple((1.0 - share, f"{low * (high / low) ** share:.2g}") for share in (0.0, 1 / 3, 2 / 3, 1.0))
+    return HeatMap(cells, shade, title, ticks)
+
+
+def posterior_map(plan: FloorPlan, poses: PoseSet, probability: Float[np.ndarray, "n"], step_m: float) -> HeatMap:
+    """A map of how probable every place is beside the most probable one.
+
+    Args:
+        poses: those of a grid, on the multiples of `step_m` but for rooms that hold none.
+        probability: of each.
+    """
+    cells = Cells.of(plan)
+    best = max(float(probability.max()), np.finfo(float).tiny)
+    with np.errstate(divide="ignore"):
+        shade = np.maximum(1.0 + np.log10(probability / best) / _DECADES, 0.0)
+    between = np.zeros(len(cells.poses))
+    for room in np.unique(poses.room_index):
+        inside, known = cells.poses.room_index == room, poses.room_index == room
+        if inside.any():
+            between[inside] = _interpolated(
+                poses.position_m[known] / step_m, shade[known], cells.poses.position_m[inside] / step_m
+            )
+    exponents = "⁰¹²³⁴⁵"
+    ticks = [(1.0, "1"), *((1.0 - k / _DECADES, f"10⁻{exponents[k]}") for k in range(1, _DECADES + 1))]
+    return HeatMap(cells, between, "probability beside the best place", tuple(ticks))
+
+
+def heat_image(heat: HeatMap, plan: FloorPlan) -> str:
+    """The map as a part of a drawing in metres, y pointing down, cut to the plan's floor."""
+    colours = np.full((*heat.cells.room.shape, 4), 0, np.uint8)
+    shades = heat.cells.spread(np.clip(heat.shade, 0.0, 1.0))
+    known = ~np.isnan(shades)
+    colours[known, :3] = _colours_of(shades[known])
+    colours[known, 3] = 255
+    left, right, bottom, top = heat.cells.extent_m
+    box = (left, -top, right - left, top - bottom)
+    return (
+        f'<clipPath id="lalaloc-floor"><path d="{floor_path(plan)}" clip-rule="evenodd"/></clipPath>'
+        f'<g clip-path="url(#lalaloc-floor)">{image(png(colours[::-1]), "png", box, _SMOOTH)}</g>'
+    )
+
+
+def colour_bar(heat: HeatMap, x: Number, y: Number, width: Number) -> str:
+    """What the colours stand for: a title, a bar and its ticks, about 62 pixels high; `y` is its upper edge."""
+    stops = "".join(
+        f'<stop offset="{index / (len(_COLOURS) - 1):.4f}" stop-color="{colour}"/>'
+        for index, colour in enumerate(_COLOURS)
+    )
+    parts = [
+        f'<linearGradient id="lalaloc-scale">{stops}</linearGradient>',
+        words(x, y + 14, heat.title, 15, fill=MUTED),
+        f'<rect x="{x:.1f}" y="{y + 24:.1f}" width="{width:.1f}" height="14" fill="url(#lalaloc-scale)" '
+        f'stroke="{RULE}"/>',
+    ]
+    for shade, label in heat.ticks:
+        place = x + shade * width
+        anchor = "start" if shade < 0.05 else "end" if shade > 0.95 else "middle"
+        parts.append(
+            f'<path d="M{place:.1f} {y + 38:.1f}v5" stroke="{MUTED}"/>'
+            f'<text x="{place:.1f}" y="{y + 58:.1f}" font-size="14" fill="{MUTED}" text-anchor="{anchor}">'
+            f"{xml_text(label)}</text>"
+        )
+    return "".join(parts)
+
+
+def _colours_of(shade: Float[np.ndarray, "n"]) -> UInt8[np.ndarray, "n 3"]:
+    anchors = np.array([[int(colour[k : k + 2], 16) for k in (1, 3, 5)] for colour in _COLOURS], float)
+    place = np.linspace(0.0, 1.0, len(anchors))
+    return np.stack([np.interp(shade, place, anchors[:, k]) for k in range(3)], axis=1).round().astype(np.uint8)
+
+
+def _interpolated(
+    lattice: Float[np.ndarray, "n 2"], value: Float[np.ndarray, "n"], wanted: Float[np.ndarray, "m 2"]
+) -> Float[np.ndarray, "m"]:
+    """Values between points of a lattice with spacing 1; 0 where none is near."""
+    node = np.rint(lattice).astype(int)
+    low = np.minimum(node.min(axis=0), np.floor(wanted.min(axis=0)).astype(int)) - 1
+    high = np.maximum(node.max(axis=0), np.floor(wanted.max(axis=0)).astype(int)) + 2
+    table = np.full(high - low + 1, np.nan)
+    table[tuple((node - low).T)] = value
+    for _ in range(_GROWN):
+        table = _grown(table)
+    table = np.nan_to_num(table)
+    corner = np.floor(wanted).astype(int)
+    share, (i, j) = wanted - corner, (corner - low).T
+    lower = table[i, j] * (1.0 - share[:, 0]) + table[i + 1, j] * share[:, 0]
+    upper = table[i, j + 1] * (1.0 - share[:, 0]) + table[i + 1, j + 1] * share[:, 0]
+    return lower * (1.0 - share[:, 1]) + upper * share[:, 1]
+
+
+def _grown(table: Float[np.ndarray, "r c"]) -> Float[np.ndarray, "r c"]:
+    """What is known, and the mean of the neighbours that are known where nothing is."""
+    padded = np.pad(table, 1, constant_values=np.nan)
+    neighbours = np.stack([padded[1:-1, :-2], padded[1:-1, 2:], padded[:-2, 1:-1], padded[2:, 1:-1]])
+    known = ~np.isnan(neighbours)
+    count = known.sum(axis=0)
+    mean = np.where(count > 0, np.where(known, neighbours, 0.0).sum(axis=0) / np.maximum(count, 1), np.nan)
+    return np.where(np.isnan(table), mean, table)

@@ -1,0 +1,162 @@
+"""What of a layout is drawn into a photograph: where walls meet floor and ceiling, corners, doors and windows.
+
+In closed form from the plan, like everything that is compared: a pose, a camera height, and the room's walls.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from lalaloc_core.conventions import TWO_PI, column_azimuths, wrap_angle
+from lalaloc_core.floorplan import USUAL_HEIGHTS_M, FloorPlan, OpeningFace
+from lalaloc_core.render.profile import nearest_walls
+
+_COLUMNS = 1024
+# Rays this far (radians) to either side of a corner meet the one wall and the other.
+_BESIDE = 1e-6
+# Rooms of more walls than this have none of them: their corners are as sharp as the columns are fine.
+_SHARP_WALLS = 256
+# Rays times walls that are crossed at a time.
+_CROSSINGS = 2**20
+# Walls that run on within this angle have no corner between them.
+_STRAIGHT = math.radians(8.0)
+_POINTS_PER_OPENING = 33
+# By this share farther away something is hidden.
+_HIDDEN = 2e-3
+
+Line = Float[np.ndarray, "_ 2"]
+
+
+@dataclass(frozen=True, eq=False)
+class DrawnOpening:
+    """An opening, or the part of it that is seen: a closed line around it."""
+
+    kind: str
+    line: Line
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """Lines of a layout in a panorama, as shares (x, y) of its width and height, y pointing down.
+
+    Attributes:
+        floor, ceiling: where the walls end, from the left edge of the panorama to the right one.
+        corners: (k, 2, 2) the edges between walls, from the floor to the ceiling.
+        openings: doors, windows and passages that are seen.
+    """
+
+    floor: Line
+    ceiling: Line
+    corners: Float[np.ndarray, "k 2 2"]
+    openings: tuple[DrawnOpening, ...]
+
+
+def outline_of(
+    plan: FloorPlan, position_m: Float[np.ndarray, "2"], room_index: int, heading: float, camera_height_m: float
+) -> Outline:
+    """The outline of a room as a camera in it sees it.
+
+    Args:
+        heading: azimuth (radians) of the panorama's centre column.
+        camera_height_m: over the floor; what lies higher than the ceiling is drawn as if it lay just below it.
+    """
+    walls_m = plan.walls_m[room_index][: plan.geometry.wall_count[room_index]]
+    ends = np.concatenate([walls_m[:, :2], walls_m[:, 2:]]) - position_m
+    corner = wrap_angle(np.arctan2(ends[:, 0], ends[:, 1]) - heading)
+    edges = np.array([-math.pi, math.pi])
+    beside = [corner - _BESIDE, corner + _BESIDE] if len(walls_m) <= _SHARP_WALLS else []
+    azimuth = np.sort(np.concatenate([column_azimuths(_COLUMNS), edges, *beside]))
+    azimuth = azimuth[(azimuth >= -math.pi) & (azimuth <= math.pi)]
+    distance_m, wall = _met(position_m, azimuth + heading, walls_m)
+    seen = np.isfinite(distance_m)
+    azimuth, distance_m, wall = azimuth[seen], distance_m[seen], wall[seen]
+    above_m = max(float(plan.ceiling_heights_m[room_index]) - camera_height_m, 0.01)
+    turns = _turns(walls_m, wall, distance_m)
+    near_m = np.minimum(distance_m[:-1], distance_m[1:])[turns]
+    at = azimuth[:-1][turns]
+    corners = np.stack([points_at(at, near_m, -camera_height_m), points_at(at, near_m, above_m)], axis=1)
+    openings = [
+        drawn
+        for face in plan.opening_faces
+        if face.room == room_index
+        for drawn in _opening(plan, face, position_m, heading, camera_height_m, walls_m)
+    ]
+    return Outline(
+        points_at(azimuth, distance_m, -camera_height_m),
+        points_at(azimuth, distance_m, above_m),
+        corners,
+        tuple(openings),
+    )
+
+
+def points_at(
+    azimuth: Float[np.ndarray, "n"], distance_m: Float[np.ndarray, "n"], rise_m: Float[np.ndarray, "n"] | float
+) -> Line:
+    """Where points appear in a panorama, as shares of its width and height.
+
+    Args:
+        azimuth: radians, relative to the heading, in [-π, π].
+        distance_m: along the floor.
+        rise_m: above the camera.
+    """
+    return np.stack([azimuth / TWO_PI + 0.5, 0.5 - np.arctan2(rise_m, distance_m) / math.pi], axis=-1)
+
+
+def _met(
+    position_m: Float[np.ndarray, "2"], azimuth: Float[np.ndarray, "n"], walls_m: Float[np.ndarray, "w 4"]
+) -> tuple[Float[np.ndarray, "n"], Int[np.ndarray, "n"]]:
+    """How far off the wall is that each ray meets, and which one; a part of the rays at a time, to bound memory."""
+    parts = np.array_split(azimuth, -(-len(azimuth) * len(walls_m) // _CROSSINGS))
+    met = [nearest_walls(position_m[None], part[None], walls_m[None]) for part in parts]
+    return np.concatenate([distance[0] for distance, _ in met]), np.concatenate([wall[0] for _, wall in met])
+
+
+def _turns(
+    walls_m: Float[np.ndarray, "w 4"], wall: Int[np.ndarray, "n"], distance_m: Float[np.ndarray, "n"]
+) -> Bool[np.ndarray, "n-1"]:
+    """Between which neighbouring rays there is a corner: another wall that is turned, or farther away."""
+    edge = walls_m[:, 2:] - walls_m[:, :2]
+    along = np.arctan2(edge[:, 0], edge[:, 1])
+    first, second = wall[:-1], wall[1:]
+    bend = np.abs(wrap_angle(along[first] - along[second]))
+    jump = np.abs(np.log(distance_m[:-1] / distance_m[1:])) > 0.02
+    return (first != second) & ((np.minimum(bend, math.pi - bend) > _STRAIGHT) | jump)
+
+
+def _opening(
+    plan: FloorPlan,
+    face: OpeningFace,
+    position_m: Float[np.ndarray, "2"],
+    heading: float,
+    camera_height_m: float,
+    walls_m: Float[np.ndarray, "w 4"],
+) -> list[DrawnOpening]:
+    opening = plan.openings[face.opening]
+    usual_sill_m, usual_head_m = USUAL_HEIGHTS_M[opening.kind]
+    low_m = usual_sill_m if opening.sill_m is None else opening.sill_m
+    high_m = usual_head_m if opening.head_m is None else opening.head_m
+    high_m = min(high_m, float(plan.ceiling_heights_m[face.room]))
+    if not low_m < high_m:
+        return []
+    start, end = plan.rooms[face.room].walls_m[face.wall].reshape(2, 2)
+    share = np.linspace(face.start, face.end, _POINTS_PER_OPENING)[:, None]
+    offset = start + share * (end - start) - position_m
+    azimuth, distance_m = np.arctan2(offset[:, 0], offset[:, 1]), np.hypot(*offset.T)
+    met_m, _ = _met(position_m, azimuth, walls_m)
+    visible = (distance_m > 0.0) & (distance_m <= met_m * (1.0 + _HIDDEN) + 1e-3)
+    relative = wrap_angle(azimuth - heading)
+    # The panorama's edges part what crosses them.
+    parts = np.split(np.arange(len(relative)), np.flatnonzero(np.abs(np.diff(relative)) > math.pi) + 1)
+    drawn = []
+    for part in parts:
+        for run in np.split(part, np.flatnonzero(~visible[part])):
+            run = run[visible[run]]
+            if len(run) > 1:
+                lower = points_at(relative[run], distance_m[run], low_m - camera_height_m)
+                upper = points_at(relative[run], distance_m[run], high_m - camera_height_m)
+                drawn.append(DrawnOpening(opening.kind, np.concatenate([lower, upper[::-1], lower[:1]])))
+    return drawn

@@ -1,0 +1,98 @@
+"""Photographs with lines in them: the outline of a layout, or walls as a network reads them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image
+
+from lalaloc_core.draw.canvas import INK, Box, Number, document, image, path, pixels, png, words
+from lalaloc_core.draw.outline import Outline
+
+# Told apart by all who see little colour, on bright walls and dark furniture alike.
+WALL_COLOUR = "#ffb000"
+OPENING_COLOURS = {"door": "#dc267f", "window": "#4f7dff", "passage": "#ffffff"}
+
+
+@dataclass(frozen=True, eq=False)
+class Stroke:
+    """Lines of pixels (x, y) in one colour, `width` pixels broad, on a dark edge of `edge_width`."""
+
+    lines: Sequence[Float[np.ndarray, "_ 2"]]
+    colour: str
+    width: float
+    edge_width: float
+
+
+def draw_strokes(photograph: UInt8[np.ndarray, "h w 3"], strokes: Sequence[Stroke]) -> Image.Image:
+    """A picture with lines over it, the last ones on top."""
+    height, width, _ = photograph.shape
+    whole = image(png(photograph), "png", (0.0, 0.0, width, height), 'image-rendering="optimizeSpeed"')
+    return pixels(document(width, height, "", [whole, *(_stroke(stroke) for stroke in strokes)]))
+
+
+def wall_line(profile_m: Float[np.ndarray, "w"], rise_m: float, height: int) -> Float[np.ndarray, "w 2"]:
+    """Where the walls of a profile pass a level `rise_m` above the camera, as pixels (x, y) of a panorama."""
+    x = np.arange(len(profile_m)) + 0.5
+    return np.stack([x, (0.5 - np.arctan2(rise_m, profile_m) / np.pi) * height], axis=1)
+
+
+def wall_stroke(
+    outline: Outline, size: tuple[int, int], colour: str = WALL_COLOUR, width: float = 2.0, edge_width: float = 3.0
+) -> Stroke:
+    """Floor line, ceiling line and corners of an outline in a picture of a size (width, height)."""
+    return Stroke(
+        [line * size for line in (outline.floor, outline.ceiling, *outline.corners)], colour, width, edge_width
+    )
+
+
+def photograph_part(content: bytes, kind: str, outline: Outline, box: Box) -> str:
+    """A photograph with a layout in it as a part of a larger drawing.
+
+    Args:
+        content: the encoded picture, and its `kind`: "jpeg" or "png"; as many pixels as the box has.
+        box: x, y, width and height.
+    """
+    x, y, width, height = box
+    size = np.array([width, height])
+    # Of the width, so that lines look alike in every size.
+    line = width / 480.0
+    # Pixels that are drawn as they are: smoothing them takes a second.
+    parts = [image(content, kind, (0.0, 0.0, width, height), 'image-rendering="optimizeSpeed"')]
+    for opening in outline.openings:
+        d, colour = path([opening.line * size]), OPENING_COLOURS[opening.kind]
+        parts.append(
+            f'<path class="{opening.kind}" d="{d}" fill="{colour}" fill-opacity="0.18" stroke="{INK}" '
+            f'stroke-width="{1.6 * line:.2f}" stroke-linejoin="round"/>'
+            f'<path d="{d}" fill="none" stroke="{colour}" stroke-width="{0.9 * line:.2f}" stroke-linejoin="round"/>'
+        )
+    parts.append(_stroke(wall_stroke(outline, (round(width), round(height)), WALL_COLOUR, line, 1.8 * line)))
+    return f'<g class="photograph" transform="translate({x:.1f} {y:.1f})">{"".join(parts)}</g>'
+
+
+def photograph_key(outline: Outline, x: Number, y: Number) -> str:
+    """What the lines in a photograph are; `y` is the base line of its words."""
+    kinds = sorted({opening.kind for opening in outline.openings}, key=list(OPENING_COLOURS).index)
+    parts = []
+    for name, colour in (
+        ("where the plan has the walls", WALL_COLOUR),
+        *((kind + "s", OPENING_COLOURS[kind]) for kind in kinds),
+    ):
+        parts.append(
+            f'<rect x="{x:.1f}" y="{y - 13:.1f}" width="26" height="13" rx="3" fill="{colour}" stroke="{INK}"/>'
+            + words(x + 36, y, name, 17)
+        )
+        x += 36 + 9.8 * len(name) + 34
+    return "".join(parts)
+
+
+def _stroke(stroke: Stroke) -> str:
+    d = path([line for line in stroke.lines if len(line) > 1], 2)
+    return "".join(
+        f'<path class="layout" d="{d}" fill="none" stroke="{colour}" stroke-width="{width:.2f}" '
+        'stroke-linejoin="round" stroke-linecap="round"/>'
+        for colour, width in ((INK, stroke.edge_width), (stroke.colour, stroke.width))
+    )

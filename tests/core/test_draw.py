@@ -1,0 +1,223 @@
+"""Pictures show what was found where it is: lines in the photograph, colours and marks on the plan."""
+
+from __future__ import annotations
+
+import io
+import math
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from lalaloc_core.conventions import TWO_PI, column_azimuths, wrap_angle
+from lalaloc_core.draw import DrawnAnswer, Marker, Picture, Rival, draw_answer, rasterise
+from lalaloc_core.draw.answer import confidence_words, ellipse_m
+from lalaloc_core.draw.heat import Cells, HeatMap, distance_map, heat_image, posterior_map
+from lalaloc_core.draw.outline import outline_of
+from lalaloc_core.draw.photograph import Stroke, draw_strokes, wall_line
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.render.poses import profiles_at
+from lalaloc_core.sampling import pose_grid
+
+SVG = "{http://www.w3.org/2000/svg}"
+PLAN = FloorPlan.from_dict(
+    {
+        "name": "Flat <&>",
+        "ceiling_height_m": 2.5,
+        "rooms": [
+            {"name": "hall", "polygon": [[0, 0], [4, 0], [4, 6], [0, 6]]},
+            {"name": "<kitchen> & more", "polygon": [[4.1, 0], [8, 0], [8, 2], [6, 2], [6, 6], [4.1, 6]]},
+        ],
+        "openings": [
+            {"kind": "door", "line": [[4.05, 4], [4.05, 5]]},
+            {"kind": "window", "line": [[1, 6], [3, 6]], "sill_m": 1.0, "head_m": 2.0},
+            {"kind": "passage", "line": [[1, 0], [3, 0]]},
+        ],
+    }
+)
+EYE_M = 1.5
+MIDDLE = np.array([2.0, 3.0])
+
+
+def answer(**changes: Any) -> DrawnAnswer:
+    values: dict = {
+        "plan": PLAN,
+        "camera": Marker(x_m=2.0, y_m=3.0, heading_deg=30.0, covariance_m2=(0.04, 0.0, 0.01)),
+        "room_index": 0,
+        "camera_height_m": EYE_M,
+        "heading_source": "given",
+        "confidence": 0.7,
+        "rivals": (Rival(5.0, 4.0, 210.0, "<kitchen> & more", 0.2), Rival(7.0, 1.0, 0.0, "hall", 0.0)),
+    }
+    return DrawnAnswer(**(values | changes))
+
+
+@pytest.mark.parametrize("heading", [0.0, 1.0, 4.0])
+@pytest.mark.parametrize("room", [0, 1])
+def test_walls_are_drawn_where_the_renderer_has_them(room: int, heading: float) -> None:
+    position_m = np.array([MIDDLE, [5.0, 1.0]][room])
+    outline = outline_of(PLAN, position_m, room, heading, EYE_M)
+    columns = 512
+    profile_m = profiles_at(PLAN, position_m[None], np.array([room]), np.array([heading]), columns)[0]
+    for line, rise_m in ((outline.floor, -EYE_M), (outline.ceiling, 1.0)):
+        expected = wall_line(profile_m, rise_m, 256) / [columns, 256]
+        drawn = np.interp(expected[:, 0], line[:, 0], line[:, 1])
+        # Beside corners one is as good as the other.
+        assert np.quantile(np.abs(drawn - expected[:, 1]), 0.98) < 1e-4
+        assert line[0, 0] == pytest.approx(0.0)
+        assert line[-1, 0] == pytest.approx(1.0)
+
+
+def test_corners_stand_where_the_plan_has_them_and_nowhere_else() -> None:
+    heading = 0.7
+    outline = outline_of(PLAN, MIDDLE, 0, heading, EYE_M)
+    offset = PLAN.rooms[0].polygon_m - MIDDLE
+    azimuth = np.sort(wrap_angle(np.arctan2(offset[:, 0], offset[:, 1]) - heading))
+    np.testing.assert_allclose(np.sort(outline.corners[:, 0, 0]), azimuth / TWO_PI + 0.5, atol=1e-4)
+    distance_m = float(np.hypot(*offset[0]))
+    np.testing.assert_allclose(outline.corners[:, 0, 1], 0.5 + math.atan(EYE_M / distance_m) / math.pi, atol=1e-4)
+    np.testing.assert_allclose(outline.corners[:, 1, 1], 0.5 - math.atan(1.0 / distance_m) / math.pi, atol=1e-4)
+
+
+def test_openings_are_drawn_at_their_heights_and_those_at_the_pictures_edge_twice() -> None:
+    outline = outline_of(PLAN, MIDDLE, 0, 0.0, EYE_M)
+    kinds = [opening.kind for opening in outline.openings]
+    # The passage lies behind: half of it at either edge.
+    assert sorted(kinds) == ["door", "passage", "passage", "window"]
+    window = next(one.line for one in outline.openings if one.kind == "window")
+    assert window[:, 0].min() == pytest.approx(0.5 - math.atan(1 / 3) / TWO_PI)
+    assert window[:, 0].max() == pytest.approx(0.5 + math.atan(1 / 3) / TWO_PI)
+    # In its middle it is three metres away, half a metre below the eye and as much above it.
+    assert window[:, 1].max() == pytest.approx(0.5 + math.atan(0.5 / 3) / math.pi, abs=1e-4)
+    assert window[:, 1].min() == pytest.approx(0.5 - math.atan(0.5 / 3) / math.pi, abs=1e-4)
+    for one in outline.openings:
+        assert np.abs(np.diff(one.line[:, 0])).max() < 0.1, "no line runs across the whole picture"
+        np.testing.assert_array_equal(one.line[0], one.line[-1])
+
+
+def test_what_another_wall_hides_is_not_drawn() -> None:
+    document = PLAN.to_dict()
+    document["rooms"][1]["walls"] = [[[4.8, 3.6], [4.8, 5.6]]]
+    hidden = FloorPlan.from_dict(document)
+    position_m = np.array([5.6, 4.6])
+    assert [one.kind for one in outline_of(PLAN, position_m, 1, 0.0, EYE_M).openings] == ["door"]
+    assert outline_of(hidden, position_m, 1, 0.0, EYE_M).openings == ()
+
+
+def test_a_round_room_has_no_corners() -> None:
+    azimuth = column_azimuths(480)
+    ring = np.stack([3.0 * np.sin(azimuth), 3.0 * np.cos(azimuth)], axis=1)[::-1]
+    plan = FloorPlan.from_dict({"ceiling_height_m": 2.5, "rooms": [{"name": "round", "polygon": ring.tolist()}]})
+    outline = outline_of(plan, np.zeros(2), 0, 0.0, EYE_M)
+    assert len(outline.corners) == 0
+    np.testing.assert_allclose(outline.floor[:, 1], 0.5 + math.atan(0.5) / math.pi, atol=1e-5)
+
+
+def test_the_most_probable_place_is_the_darkest_and_what_is_hopeless_is_the_lightest() -> None:
+    poses = pose_grid(PLAN, 0.5)
+    probability = np.full(len(poses), 1e-9)
+    best = int(np.linalg.norm(poses.position_m - [1.0, 4.0], axis=1).argmin())
+    probability[best] = 0.9
+    heat = posterior_map(PLAN, poses, probability, 0.5)
+    distance_m = np.linalg.norm(heat.cells.poses.position_m - poses.position_m[best], axis=1)
+    assert heat.shade[distance_m.argmin()] == pytest.approx(1.0, abs=0.15)
+    assert heat.shade[distance_m < 0.2].min() > heat.shade[distance_m > 0.8].max()
+    assert heat.shade[distance_m > 0.8].max() == 0.0
+    assert heat.shade[heat.cells.poses.room_index == 1].max() == 0.0, "walls part the colours of rooms"
+
+
+def test_between_two_poses_the_shade_is_between_theirs() -> None:
+    poses = pose_grid(PLAN, 0.5)
+    # A tenth for every metre to the right.
+    heat = posterior_map(PLAN, poses, 10.0 ** (poses.position_m[:, 0] - 4.0) + 0.0, 0.5)
+    inside = heat.cells.poses.room_index == 0
+    x_m, best_m = heat.cells.poses.position_m[inside, 0], poses.position_m[:, 0].max()
+    between = (x_m > 0.5) & (x_m < 3.5)
+    np.testing.assert_allclose(heat.shade[inside][between], np.maximum(1 + (x_m - best_m)[between] / 5, 0), atol=0.02)
+
+
+def test_a_map_of_distances_is_darkest_where_they_are_least() -> None:
+    cells = Cells.of(PLAN, 0.2)
+    distance_m = 0.1 + np.linalg.norm(cells.poses.position_m - MIDDLE, axis=1)
+    heat = distance_map(cells, distance_m, "distance (m)")
+    assert heat.shade.argmax() == distance_m.argmin()
+    assert (heat.shade.min(), heat.shade.max()) == pytest.approx((0.0, 1.0))
+    assert distance_map(cells, np.ones(len(cells.poses)), "all alike").shade == pytest.approx(1.0)
+
+
+def colours(heat: HeatMap) -> np.ndarray:
+    size = Cells.of(PLAN, 0.05).room.shape
+    drawn = (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 -6 8 6" width="{size[1]}">{heat_image(heat, PLAN)}</svg>'
+    )
+    with Image.open(io.BytesIO(rasterise(drawn))) as picture:
+        return np.asarray(picture.convert("RGBA"))
+
+
+def test_colours_lie_on_the_floors_alone() -> None:
+    cells = Cells.of(PLAN, 0.1)
+    shown = colours(HeatMap(cells, np.ones(len(cells.poses)), "", ()))
+    height, width = shown.shape[:2]
+    rows, columns = np.mgrid[:height, :width]
+    x_m, y_m = (columns.ravel() + 0.5) / width * 8.0, 6.0 - (rows.ravel() + 0.5) / height * 6.0
+    inside = PLAN.room_index_at(np.stack([x_m, y_m], axis=1)) >= 0
+    opaque = shown[..., 3].ravel() > 127
+    assert (opaque == inside).mean() > 0.98
+
+
+def test_strokes_lie_over_the_picture_and_leave_the_rest_of_it() -> None:
+    photograph = np.full((64, 128, 3), 200, np.uint8)
+    line = np.array([[10.0, 32.0], [118.0, 32.0]])
+    drawn = np.asarray(draw_strokes(photograph, [Stroke([line], "#ff0000", 2.0, 4.0)]))
+    assert drawn.shape == photograph.shape
+    assert (drawn[:28] == 200).all()
+    np.testing.assert_array_equal(drawn[32, 64], [255, 0, 0])
+
+
+@pytest.mark.parametrize("picture", ["both", "plan", "photograph"])
+def test_an_answer_is_drawn_with_all_that_belongs_to_it(picture: Picture) -> None:
+    heat = posterior_map(PLAN, poses := pose_grid(PLAN, 0.5), np.full(len(poses), 1.0 / len(poses)), 0.5)
+    photograph = np.full((128, 256, 3), 90, np.uint8)
+    drawn = draw_answer(answer(heat=heat, truth=Marker(x_m=2.2, y_m=3.0)), photograph, picture)
+    root = ElementTree.fromstring(drawn)
+    classes = [element.get("class") for element in root.iter()]
+    words = " ".join(text.strip() for text in root.itertext())
+    assert ("layout" in classes) == (picture != "plan")
+    assert ("camera" in classes) == ("rival" in classes) == ("true" in classes) == (picture != "photograph")
+    assert "x 2.00 m, y 3.00 m" in words
+    assert "heading 30.0° (given)" in words
+    if picture != "photograph":
+        assert classes.count("rival") == 1, "what is as good as impossible is no rival"
+        assert {"70.0 %", "within 1 m: likely", "true, 20 cm away", "20.0 %"} <= {
+            text.strip() for text in root.itertext()
+        }
+    with Image.open(io.BytesIO(rasterise(drawn))) as image:
+        assert image.format == "PNG"
+        assert image.width == 1600
+        assert image.height == int(root.attrib["height"])
+
+
+def test_a_picture_of_the_photograph_needs_one() -> None:
+    with pytest.raises(ValueError, match="'both' needs the photograph"):
+        draw_answer(answer())
+    assert "<image" not in draw_answer(answer(), picture="plan")
+
+
+def test_a_model_without_confidence_leaves_it_out() -> None:
+    bare = answer(confidence=None, rivals=(Rival(5.0, 4.0, 210.0, "kitchen", None),))
+    words = " ".join(ElementTree.fromstring(draw_answer(bare, picture="plan")).itertext())
+    assert "within 1 m" not in words
+    assert "kitchen" in words
+
+
+def test_an_ellipse_has_the_axes_of_its_covariance() -> None:
+    assert ellipse_m((0.01, 0.0, 0.04)) == pytest.approx((0.4895, 0.2448), abs=1e-3)
+    turned = ellipse_m((0.025, 0.015, 0.025))
+    assert turned == pytest.approx((0.4895, 0.2448), abs=1e-3)
+
+
+def test_confidence_has_words() -> None:
+    said = [confidence_words(value) for value in (1.0, 0.9, 0.6, 0.3, 0.0)]
+    assert len(set(said)) == 5
