@@ -64,7 +64,7 @@ def ring_distillation(student: Float[Tensor, "b c s"], teacher: Float[Tensor, "b
 def laplace(
     log_profile: Float[Tensor, "b w"], log_scale: Float[Tensor, "b w"], profile_m: Float[Tensor, "b w"]
 ) -> Tensor:
-    """DeferredBatch log likelihood of the true log wall profile under the predicted Laplace distributions."""
+    """Negative log likelihood of the true log wall profile under the predicted Laplace distributions."""
     error = (log_profile - torch.log(profile_m)).abs()
     return (error * torch.exp(-log_scale) + log_scale).mean()
 
