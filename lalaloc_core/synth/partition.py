@@ -18,6 +18,9 @@ Range = tuple[float, float]
 
 _MIN_SIDE_M = 1.5
 _MIN_CLEAR_WIDTH_M = 0.75
+_WING_WALL_M: Range = (0.08, 0.25)
+_WING_REACH_M: Range = (0.4, 1.8)
+_TRIES = 4
 
 
 @dataclass(frozen=True)
@@ -77,6 +80,16 @@ def reshape_room(
             changed = _bump(polygon_m, edge, rng, width_m=(0.8, 3.0), depth_m=(0.1, 0.7))
         if changed is not None and _is_roomy(changed):
             polygon_m = changed
+    return polygon_m
+
+
+def with_wing_wall(polygon_m: Float[np.ndarray, "n 2"], rng: np.random.Generator) -> Float[np.ndarray, "m 2"]:
+    """A thin wall that ends in the middle of the room, as in open-plan homes; as it was where there is no space."""
+    for _ in range(_TRIES):
+        edge = int(rng.integers(len(polygon_m)))
+        changed = _bump(polygon_m, edge, rng, width_m=_WING_WALL_M, depth_m=_WING_REACH_M)
+        if changed is not None and _is_roomy(changed):
+            return changed
     return polygon_m
 
 

@@ -11,9 +11,9 @@ from jaxtyping import Float
 
 from lalaloc_core.floorplan import FloorPlan, room_type_of
 from lalaloc_core.synth.openings import Opening, OpeningKind, place_openings
-from lalaloc_core.synth.partition import Cell, inner_outline, partition, reshape_room
+from lalaloc_core.synth.partition import Cell, inner_outline, partition, reshape_room, with_wing_wall
 
-__all__ = ["Home", "HomeConfig", "Opening", "OpeningKind", "generate_home"]
+__all__ = ["VARIED_HOMES", "Home", "HomeConfig", "Opening", "OpeningKind", "generate_home"]
 
 
 # Plans do not say which doors are open.
@@ -38,7 +38,14 @@ class HomeConfig:
     rotated_share: float = 0.3
     sheared_share: float = 0.1
     mixed_ceilings_share: float = 0.25
+    # Share of rooms with a wall that ends in the middle of the room.
+    wing_wall_share: float = 0.0
     offset_m: float = 10.0
+
+
+# What networks learn from is more varied than what they are measured on, as real homes are: high rooms, walls that end
+# in the middle of a room, open plans.
+VARIED_HOMES = HomeConfig(ceiling_height_m=(2.1, 4.8), wing_wall_share=0.2, open_plan_share=0.2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +75,10 @@ def generate_home(rng: np.random.Generator, config: HomeConfig = HomeConfig()) -
     for cell in cells:
         polygon = inner_outline(cell.outline_m, 0.5 * thickness)
         changes = 0 if rng.random() < 0.4 else int(rng.integers(1, 4))
-        polygons.append(reshape_room(polygon, rng, changes))
+        polygon = reshape_room(polygon, rng, changes)
+        if config.wing_wall_share and rng.random() < config.wing_wall_share:
+            polygon = with_wing_wall(polygon, rng)
+        polygons.append(polygon)
     names = _name_rooms([_area(polygon) for polygon in polygons], [cell.corridor for cell in cells], rng)
     ceilings = _ceilings(names, config, rng)
     openings = place_openings(

@@ -35,7 +35,7 @@ _HEADROOM_M = 0.1
 _MIN_CAMERA_M, _MAX_CAMERA_M = 1.0, 1.9
 _CEILING_CLEARANCE_M = 0.3
 # Of panoramas; lower and higher than photographers usually hold a camera, but they do.
-_CAMERA_HEIGHTS_M = (0.8, 2.2)
+_CAMERA_HEIGHTS_M = (0.5, 2.2)
 # Share of generated panoramas from thresholds, beside walls, in corridors and closets.
 _HARD_SHARE = 0.25
 _SCENES_CACHED = 256

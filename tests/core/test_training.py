@@ -277,8 +277,8 @@ class TestStreams:
 
     def test_turned_negatives_are_other_headings_of_the_anchor_s_surroundings(self) -> None:
         layout = dataclasses.replace(TINY.layout, turned_share=0.5)
-        batch = next(layout_batches(dataclasses.replace(TINY, layout=layout)))
-        profile = batch["profile_m"].sort(dim=2).values
+        batches = layout_batches(dataclasses.replace(TINY, layout=layout))
+        profile = torch.cat([next(batches)["profile_m"] for _ in range(6)]).sort(dim=2).values
         # Turning changes the order of the columns, not the distances: so near a place looks alike when sorted.
         change = (profile[:, 1:] - profile[:, :1]).abs().median(dim=2).values
         negatives = layout.triplets.positives
