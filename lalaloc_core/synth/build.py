@@ -42,6 +42,8 @@ class _Builder:
         surfaces = SurfaceTable(materials, materials.mean_colours, self._streams.materials)
         self._tables = SceneTables(shot.position_m, surfaces)
         self._style = draw_style(surfaces, self._rng)
+        if shot.is_night:
+            surfaces.darken_outdoors(self._style.outdoors)
         self._shells = Shells(
             self._tables, self._style, self._streams, is_bright=self._is_bright, is_bare=self._is_bare
         )
@@ -51,6 +53,8 @@ class _Builder:
         streams, tables, rng = self._streams, self._tables, self._rng
         streams.begin(ScenePart.MOOD)
         lighting = Lighting(rng, neutral=streams.is_staged, bright=self._is_bright)
+        if self._shot.is_night:
+            lighting.fall_dark()
         self._add_room(0, self._shot.room_index, lighting)
         in_room = list(tables.prisms)
         for slot, room_index in enumerate(self._slot_rooms[1:], start=1):

@@ -108,6 +108,8 @@ def place_openings(
     cells_m: Sequence[Float[np.ndarray, "_ 2"]],
     max_gap_m: float,
     rng: np.random.Generator,
+    *,
+    french_window_share: float,
 ) -> tuple[Opening, ...]:
     """Furnish the walls of a home with doors, openings and windows that do not touch each other.
 
@@ -118,10 +120,11 @@ def place_openings(
         cells_m: the gross cells; whatever lies outside all of them is outdoors.
         max_gap_m: largest distance of two walls that share a door.
         rng: source of randomness.
+        french_window_share: share of windows that reach down to the floor.
     """
     walls = _Walls(polygons_m)
     openings = _connect_rooms(walls, names, ceilings_m, max_gap_m, rng)
-    openings += _windows(walls, names, ceilings_m, cells_m, rng)
+    openings += _windows(walls, names, ceilings_m, cells_m, rng, french_window_share)
     openings += _blind_doors(walls, {opening.room for opening in openings if opening.kind != "window"}, rng)
     return tuple(openings)
 
@@ -199,6 +202,7 @@ def _windows(
     ceilings_m: Sequence[float],
     cells_m: Sequence[Float[np.ndarray, "_ 2"]],
     rng: np.random.Generator,
+    french_share: float,
 ) -> list[Opening]:
     outward = np.stack([walls.along[:, 1], -walls.along[:, 0]], axis=1)
     probe = walls.start[:, None] + walls.along[:, None] * (
@@ -220,7 +224,7 @@ def _windows(
             if not walls.is_free((room, edge), start, start + width):
                 continue
             walls.take((room, edge), start, start + width)
-            sill = rng.uniform(0.0, 0.08) if rng.random() < 0.25 else rng.uniform(0.5, 1.2)
+            sill = rng.uniform(0.0, 0.08) if rng.random() < french_share else rng.uniform(0.5, 1.2)
             head = rng.uniform(max(sill + 0.5, 1.8), ceilings_m[room] - 0.08)
             openings.append(
                 Opening(

@@ -40,12 +40,16 @@ class HomeConfig:
     mixed_ceilings_share: float = 0.25
     # Share of rooms with a wall that ends in the middle of the room.
     wing_wall_share: float = 0.0
+    # Share of windows that reach down to the floor.
+    french_window_share: float = 0.25
     offset_m: float = 10.0
 
 
 # What networks learn from is more varied than what they are measured on, as real homes are: high rooms, walls that end
-# in the middle of a room, open plans.
-VARIED_HOMES = HomeConfig(ceiling_height_m=(2.1, 4.8), wing_wall_share=0.2, open_plan_share=0.2)
+# in the middle of a room, open plans, windows that one may take for doors.
+VARIED_HOMES = HomeConfig(
+    ceiling_height_m=(2.1, 4.8), wing_wall_share=0.2, open_plan_share=0.2, french_window_share=0.4
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +86,13 @@ def generate_home(rng: np.random.Generator, config: HomeConfig = HomeConfig()) -
     names = _name_rooms([_area(polygon) for polygon in polygons], [cell.corridor for cell in cells], rng)
     ceilings = _ceilings(names, config, rng)
     openings = place_openings(
-        names, polygons, ceilings, [cell.outline_m for cell in cells], max_gap_m=thickness + 0.01, rng=rng
+        names,
+        polygons,
+        ceilings,
+        [cell.outline_m for cell in cells],
+        max_gap_m=thickness + 0.01,
+        rng=rng,
+        french_window_share=config.french_window_share,
     )
     plan = _plan(names, _place_in_frame(polygons, config, rng), ceilings, openings)
     return Home(plan, openings)

@@ -37,6 +37,7 @@ class Shot:
         seed: decides materials, furniture, light and camera settings.
         lighting: the colour of all light; None draws one. With it the shot is *staged*: shots of one home that have
             the same seed show the same materials, whatever their furniture and lighting, and there is no tripod.
+        is_night: dark outdoors, and lamps on.
     """
 
     home: Home
@@ -47,6 +48,7 @@ class Shot:
     furniture: FurnitureLevel
     seed: int
     lighting: Mood | None = None
+    is_night: bool = False
 
 
 def sample_shots(
@@ -58,6 +60,7 @@ def sample_shots(
     by_room_share: float = 0.0,
     hard_share: float = 0.0,
     unusual_heights_m: tuple[float, float] = (1.0, 1.9),
+    night_share: float = 0.0,
 ) -> list[Shot]:
     """Draw shots uniform over a home's floor.
 
@@ -70,6 +73,7 @@ def sample_shots(
         hard_share: share of shots from places that are rare on the floor and hard to localise: close to a wall, on
             the threshold of an open door, in the narrowest rooms.
         unusual_heights_m: camera heights, evenly between, of the quarter that is not taken from 1.3 to 1.7 m.
+        night_share: share of shots at night, with black windows.
     """
     poses = random_poses(home.plan, count, rng, POSE_MARGIN_M)
     by_room = np.flatnonzero(rng.random(count) < by_room_share)
@@ -93,6 +97,7 @@ def sample_shots(
                 camera_height_m=float(min(height, ceiling - _CEILING_CLEARANCE_M)),
                 furniture=level or FURNITURE_LEVELS[int(rng.choice(3, p=_LEVEL_SHARES))],
                 seed=int(rng.integers(1 << 62)),
+                is_night=bool(night_share) and rng.random() < night_share,
             )
         )
     return shots

@@ -99,6 +99,10 @@ class SurfaceTable:
         self.rows.append(Surfaces.row(scale=1.0, cosine=1.0, tint=1.0, glow=glow, is_outdoors=1.0))
         return len(self.rows) - 1
 
+    def darken_outdoors(self, index: int) -> None:
+        """Make the view through a window that of the night."""
+        Surfaces(self.rows[index]).glow = math.exp(self._rng.uniform(math.log(0.004), math.log(0.12)))
+
     def add_floor(self, walls: Colour, direction: float, *, plain: bool = False) -> int:
         """A floor: mostly with a picture's own colours, sometimes as the walls; laid along `direction` (radians).
 

@@ -38,6 +38,8 @@ _CEILING_CLEARANCE_M = 0.3
 _CAMERA_HEIGHTS_M = (0.5, 2.2)
 # Share of generated panoramas from thresholds, beside walls, in corridors and closets.
 _HARD_SHARE = 0.25
+# Share of those taken at night.
+_NIGHT_SHARE = 0.12
 _SCENES_CACHED = 256
 _PICTURE_BYTES_CACHED = 1 << 28
 # Visits in a row without any use after which there is something wrong with the generator.
@@ -178,6 +180,7 @@ class GeneratedSource:
             by_room_share=stage.by_room_share,
             hard_share=_HARD_SHARE,
             unusual_heights_m=_CAMERA_HEIGHTS_M,
+            night_share=_NIGHT_SHARE,
         )
         # Made where it is needed: it does not travel to worker processes.
         self._studio = self._studio or self._studio_on("cpu")

@@ -26,6 +26,8 @@ from lalaloc_core.synth.gallery import contact_sheet
 from lalaloc_core.synth.materials import MaterialLibrary
 from lalaloc_core.synth.panorama import PanoramaRenderer, sample_shots
 from lalaloc_core.synth.plans import Home, generate_home
+from lalaloc_core.synth.splits import TEST, TRAIN
+from lalaloc_core.synth.splits import home_of as home_of_split
 
 ROWS, COLUMNS = 64, 128
 seeds = st.integers(0, 2**32 - 1)
@@ -108,6 +110,46 @@ def test_the_same_seed_gives_the_same_home_and_others_differ() -> None:
     assert first.plan.to_dict() == again.plan.to_dict()
     assert first.openings == again.openings
     assert first.plan.to_dict() != other.plan.to_dict()
+
+
+def test_homes_to_learn_from_are_more_varied_than_those_to_measure_on() -> None:
+    varied, usual = ([home_of_split(split, 0, index)[0] for index in range(40)] for split in (TRAIN, TEST))
+
+    def highest(homes: list[Home]) -> float:
+        return max(room.ceiling_height_m for home in homes for room in home.plan.rooms)
+
+    def to_the_floor(homes: list[Home]) -> float:
+        sills = [opening.sill_m for home in homes for opening in home.openings if opening.kind == "window"]
+        return float(np.mean(np.array(sills) < 0.1))
+
+    def wing_walls(homes: list[Home]) -> int:
+        """Walls that end free: an edge as short as a wall is thick, and a long way into the room."""
+        count = 0
+        for room in (room for home in homes for room in home.plan.rooms):
+            lengths = np.hypot(*(room.walls_m[:, 2:] - room.walls_m[:, :2]).T)
+            count += sum(
+                lengths[k] < 0.26 and min(lengths[k - 1], lengths[(k + 1) % len(lengths)]) > 0.75
+                for k in range(len(lengths))
+            )
+        return count
+
+    assert highest(usual) <= 3.5 < highest(varied)
+    assert to_the_floor(varied) > to_the_floor(usual)
+    assert wing_walls(varied) > 2 * wing_walls(usual)
+
+
+def test_at_night_windows_are_dark_and_lamps_are_on() -> None:
+    home, rng = home_of(3), np.random.default_rng(3)
+    materials = MaterialLibrary.create(np.random.default_rng(0))
+    assert not any(shot.is_night for shot in sample_shots(home, 8, rng))
+    for shot in sample_shots(home, 4, rng, night_share=1.0):
+        scene, by_day = (build_scene(dataclasses.replace(shot, is_night=night), materials) for night in (True, False))
+        outdoors = scene.surfaces.is_outdoors > 0
+        assert outdoors.any()
+        assert scene.surfaces.glow[outdoors].max() < 0.15 < by_day.surfaces.glow[outdoors].min()
+        # No window gives light, whose rows have a normal; lamps have none.
+        assert not scene.lights.normal.any()
+        assert scene.lights.colour.any()
 
 
 def test_homes_are_varied() -> None:
