@@ -180,6 +180,50 @@ def scenes(draw: st.DrawFn, count: int = 3) -> Scene:
     return scene_of(plan_of(draw(room_polygons()), ceiling_m=draw(st.floats(2.1, 4.0))), count, draw(_seeds))
 
 
+@st.composite
+def rows_of_rooms(draw: st.DrawFn) -> FloorPlan:
+    """Rooms in a row, turned by any angle, with openings between them and outwards, columns and stubs of wall."""
+    thickness = draw(st.floats(0.0, 0.3))
+    rooms, openings, x, previous = [], [], 0.0, None
+    for index in range(draw(st.integers(1, 3))):
+        width, depth, base = draw(st.floats(2.5, 6.0)), draw(st.floats(2.5, 6.0)), draw(st.floats(-0.8, 0.8))
+        room = {"name": f"room {index}", "polygon": rectangle(width, depth, at=(x, base))}
+        if draw(st.booleans()):
+            room["holes"] = [rectangle(0.4, 0.3, at=(x + 0.6 * width, base + 0.4 * depth))]
+        if draw(st.booleans()):
+            stub = [[x + 0.3 * width, base + depth], [x + 0.3 * width, base + 0.6 * depth]]
+            room["walls"] = [stub]
+            if draw(st.booleans()):
+                middle = [[stub[0][0], base + 0.9 * depth], [stub[0][0], base + 0.7 * depth]]
+                openings.append({"kind": draw(st.sampled_from(["door", "passage", "window"])), "line": middle})
+        if previous is not None and draw(st.integers(0, 3)):
+            low, high = max(base, previous[0]), min(base + depth, previous[1])
+            begin = low + draw(st.floats(0.05, 0.5)) * (high - low)
+            end = begin + draw(st.floats(0.2, 0.5)) * (high - low)
+            at = x - draw(st.floats(0.0, 1.0)) * thickness
+            openings.append({"kind": draw(st.sampled_from(["door", "passage"])), "line": [[at, begin], [at, end]]})
+        if draw(st.booleans()):
+            heights = {"sill_m": draw(st.sampled_from([0.9, 1.6])), "head_m": 2.1}
+            line = [[x + 0.2 * width, base], [x + 0.5 * width, base]]
+            openings.append({"kind": "window", "line": line, **heights})
+        if draw(st.booleans()):
+            openings.append({"kind": "door", "line": [[x + 0.6 * width, base], [x + 0.8 * width, base - 0.1]]})
+        rooms.append(room)
+        x, previous = x + width + thickness, (base, base + depth)
+    document = {"ceiling_height_m": 2.6, "rooms": rooms, "openings": openings}
+    return FloorPlan.from_dict(_turned(document, draw(st.floats(0.0, 2.0 * math.pi))))
+
+
+def _turned(value: Any, angle: float) -> Any:
+    """Every point of a document turned about the origin."""
+    if isinstance(value, dict):
+        return {key: _turned(item, angle) for key, item in value.items()}
+    if isinstance(value, list) and len(value) == 2 and all(isinstance(item, float) for item in value):
+        c, s = math.cos(angle), math.sin(angle)
+        return [c * value[0] - s * value[1], s * value[0] + c * value[1]]
+    return [_turned(item, angle) for item in value] if isinstance(value, list) else value
+
+
 def seeds() -> st.SearchStrategy[int]:
     """Seeds of numpy generators."""
     return _seeds

@@ -40,6 +40,7 @@ LAYERS = {
     # Beside synth and apart from it: neither may import the other.
     "lalaloc_core.unfamiliar": 3,
     "lalaloc_core.localise": 4,
+    "lalaloc_core.localise.optimise": 5,
     "lalaloc_core.data": 5,
     "lalaloc_core.draw": 5,
     "lalaloc_core.data.synthetic": 6,

@@ -1,7 +1,7 @@
 """The search: from an encoded panorama to a pose. The same code serves and is evaluated.
 
 Begin with `pipeline.py`, the path of a query: `retrieval.py` compares it with the plan's grid, `vogel.py` samples more
-poses around the best, `optimise.py` moves them (LPO, the only module here that imports torch), `confidence.py` and
+poses around the best, `optimise/` moves them (LPO, all here that imports torch), `confidence.py` and
 `covariance.py` say how sure the answer is. `evidence.py` is what poses are compared by, `encoders.py` runs the networks
 on onnxruntime. Worker processes load parts of this, so only plain values are re-exported.
 """

@@ -1,8 +1,9 @@
 """The layout renderer: what a camera sees of a plan's bare walls, floor and ceiling, in closed form.
 
 Begin with `profile.py`, which casts rays at walls; `depth.py` adds floor and ceiling, `layout.py` openings and what
-lies behind them, `poses.py` does it for poses of a plan. The same lines run on numpy and on torch. `oracle.py` is the
-slow check of them, which needs the extra `ray` and is not re-exported. Photographs are rendered by `synth`.
+lies behind them, `poses.py` does it for poses of a plan, `gradient.py` tells how walls change as a pose moves. The same
+lines run on numpy and on torch. `oracle.py` is the slow check of them, which needs the extra `ray` and is not
+re-exported. Photographs are rendered by `synth`.
 """
 
 from lalaloc_core.render.depth import back_project, layout_depth

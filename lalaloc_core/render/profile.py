@@ -18,6 +18,8 @@ from lalaloc_core.conventions import Array, column_azimuths
 # A ray may miss both of two adjoining walls at their common corner by rounding; widen each wall by this share.
 _CORNER_TOLERANCE = 1e-5
 _PARALLEL = 1e-12
+# A wall whose line passes the origin nearer than this (m, times the wall's length) is seen edge-on, so not at all.
+_EDGE_ON = 1e-9
 
 
 def cast_rays(
@@ -34,7 +36,7 @@ def cast_rays(
         distances; inf where a ray hits nothing, which happens only outside a closed room.
     """
     xp = array_namespace(origin_m, azimuth, walls_m)
-    return xp.min(_crossings(origin_m, azimuth, walls_m), axis=2)
+    return _distance(xp.max(inverse_crossings(origin_m, azimuth, walls_m).inverse_m, axis=1))
 
 
 def nearest_walls(
@@ -42,22 +44,58 @@ def nearest_walls(
 ) -> tuple[Float[Array, "b c"], Int[Array, "b c"]]:
     """As `cast_rays`, with the index of the wall that each ray meets; of walls at one distance, any."""
     xp = array_namespace(origin_m, azimuth, walls_m)
-    crossings = _crossings(origin_m, azimuth, walls_m)
-    return xp.min(crossings, axis=2), xp.argmin(crossings, axis=2)
+    inverse_m = inverse_crossings(origin_m, azimuth, walls_m).inverse_m
+    return _distance(xp.max(inverse_m, axis=1)), xp.argmax(inverse_m, axis=1)
 
 
-def _crossings(
+def _distance(inverse_m: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """What the inverse is of; inf of what is not positive."""
+    xp = array_namespace(inverse_m)
+    meets = inverse_m > 0.0
+    # Not dividing by zero in the unused branch keeps NaN out of the gradients.
+    distance_m = 1.0 / xp.where(meets, inverse_m, xp.ones_like(inverse_m))
+    return xp.where(meets, distance_m, xp.full_like(distance_m, xp.inf))
+
+
+class InverseCrossings(NamedTuple):
+    """Where rays meet walls.
+
+    Attributes:
+        inverse_m: (b, n, c) inverse of the distance (1/m) to every wall along every ray; 0 or less where it misses.
+        edge_x, edge_y: (b, n) of the vectors e / (p × e), by which inverse distances are made; a wall goes from p,
+            counted from the origin, to p + e.
+    """
+
+    inverse_m: Array
+    edge_x: Array
+    edge_y: Array
+
+
+def inverse_crossings(
     origin_m: Float[Array, "b 2"], azimuth: Float[Array, "b c"], walls_m: Float[Array, "b n 4"]
-) -> Float[Array, "b c n"]:
-    """Distance (m) along every ray to every wall; inf where it misses it."""
+) -> InverseCrossings:
+    """Where every ray meets every wall; see `cast_rays` for the arguments.
+
+    A ray along the unit vector u meets the line from p to p + e after 1 / d = (u × e) / (p × e), with
+    v × w = v_x w_y - v_y w_x, and the wall itself if p and p + e lie on both sides of it. All three cross products are
+    linear in u, so one product of matrices gives them for all rays and walls.
+    """
     xp = array_namespace(origin_m, azimuth, walls_m)
-    direction_x = xp.sin(azimuth)[:, :, None]
-    direction_y = xp.cos(azimuth)[:, :, None]
-    start_x = walls_m[:, None, :, 0] - origin_m[:, 0][:, None, None]
-    start_y = walls_m[:, None, :, 1] - origin_m[:, 1][:, None, None]
-    edge_x = walls_m[:, None, :, 2] - walls_m[:, None, :, 0]
-    edge_y = walls_m[:, None, :, 3] - walls_m[:, None, :, 1]
-    return cross_walls((direction_x, direction_y), (start_x, start_y), (edge_x, edge_y)).distance_m
+    start_x, start_y = walls_m[:, :, 0] - origin_m[:, :1], walls_m[:, :, 1] - origin_m[:, 1:]
+    edge_x, edge_y = walls_m[:, :, 2] - walls_m[:, :, 0], walls_m[:, :, 3] - walls_m[:, :, 1]
+    area = start_x * edge_y - start_y * edge_x
+    edge_on = xp.abs(area) < _EDGE_ON
+    inverse_area = 1.0 / xp.where(edge_on, xp.ones_like(area), area)
+    inverse_area = xp.where(edge_on, xp.zeros_like(area), inverse_area)
+    by_x, by_y = edge_x * inverse_area, edge_y * inverse_area
+    low, high = -_CORNER_TOLERANCE, 1.0 + _CORNER_TOLERANCE
+    crossed_x = xp.concat([by_x, start_x + low * edge_x, start_x + high * edge_x], axis=1)
+    crossed_y = xp.concat([by_y, start_y + low * edge_y, start_y + high * edge_y], axis=1)
+    direction = xp.stack([xp.sin(azimuth), xp.cos(azimuth)], axis=1)
+    products = xp.stack([crossed_y, -crossed_x], axis=2) @ direction
+    count = walls_m.shape[1]
+    inverse_m, begins, ends = products[:, :count], products[:, count : 2 * count], products[:, 2 * count :]
+    return InverseCrossings(xp.where(begins * ends <= 0.0, inverse_m, xp.zeros_like(inverse_m)), by_x, by_y)
 
 
 class Crossings(NamedTuple):

@@ -1,0 +1,128 @@
+"""The optimiser of a model: from a job to refined poses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from lalaloc_core.bundle import LAYOUT_WEIGHTS, Bundle
+from lalaloc_core.errors import BundleError, ConfigError
+from lalaloc_core.localise.optimise.config import LpoConfig
+from lalaloc_core.localise.optimise.descent import adam, levenberg_marquardt
+from lalaloc_core.localise.optimise.problem import Embedding, Norm, Problem
+from lalaloc_core.localise.poses import RefinementJob, RefinementResult
+from lalaloc_core.nets import LayoutEncoder, load_layout_encoder
+from lalaloc_core.nets.ring import RingLayoutEncoder
+from lalaloc_core.render.profile import wall_profile
+
+
+class PoseOptimiser:
+    """Refines poses until what an embedding makes of their layouts is nearest to the targets."""
+
+    def __init__(
+        self,
+        embedding: Embedding | None,
+        columns: int,
+        *,
+        norm: Norm = "l2",
+        config: LpoConfig | None = None,
+        device: torch.device | None = None,
+    ) -> None:
+        """Choose what is compared, and how.
+
+        Args:
+            embedding: what is compared with a job's targets; None: the log wall profile itself.
+            columns: azimuth columns of the wall profiles that the embedding takes.
+
+        Raises:
+            ConfigError: Levenberg-Marquardt is asked to minimise absolute differences.
+        """
+        self.config = config or LpoConfig()
+        if norm == "l1" and self.config.method != "adam":
+            raise ConfigError(f"optimiser '{self.config.method}' needs a smooth cost; norm '{norm}' needs 'adam'")
+        self._embedding = embedding
+        self._columns = columns
+        self._norm: Norm = norm
+        self._device = device or torch.device("cpu")
+
+    def refine(self, job: RefinementJob) -> RefinementResult:
+        """Refine every starting pose of a job within its own room by its `targets`, and `precision` where it has some.
+
+        Both distances of the result are by this optimiser's norm.
+        """
+        problem = Problem(self._embedding, self._columns, self._norm, job, self._device)
+        descend = adam if self.config.method == "adam" else levenberg_marquardt
+        with torch.no_grad():
+            pose, here, converged, evaluations = descend(problem, self.config)
+        position, heading, height_offset = problem.unpack(pose)
+        information = here.information if height_offset is None else _without_last(here.information)
+        distance = here.distance.cpu().numpy()
+        return RefinementResult(
+            position_m=position.cpu().numpy().astype(np.float64) + problem.origin,
+            heading=heading.cpu().numpy().astype(np.float64),
+            cost=distance,
+            latent_distance=distance,
+            information=information.cpu().numpy(),
+            converged=converged.cpu().numpy(),
+            evaluations=np.full(len(distance), evaluations),
+            height_offset=None if height_offset is None else height_offset.cpu().numpy().astype(np.float64),
+        )
+
+
+class LatentPoseOptimiser:
+    """Refines poses with one layout encoder, by predicted wall profiles where a job has them."""
+
+    def __init__(self, layout_encoder: LayoutEncoder, config: LpoConfig | None = None) -> None:
+        layout_encoder = layout_encoder.eval().requires_grad_(False)
+        self.encoder = layout_encoder.fused() if isinstance(layout_encoder, RingLayoutEncoder) else layout_encoder
+        self._device = next(layout_encoder.parameters()).device
+        self._config = config or LpoConfig()
+        self._columns = self.encoder.config.profile_columns
+
+    @classmethod
+    def from_bundle(cls, bundle: Bundle, config: LpoConfig | None = None) -> LatentPoseOptimiser:
+        """Load the layout encoder of a bundle.
+
+        Raises:
+            BundleError: weights are missing, altered, or do not fit the manifest's configuration.
+        """
+        manifest = bundle.manifest
+        try:
+            encoder = load_layout_encoder(manifest.architecture, manifest.layout_config, bundle.read(LAYOUT_WEIGHTS))
+        except (RuntimeError, ValueError, TypeError) as error:
+            raise BundleError(f"bundle '{bundle.folder}': layout encoder does not load: {error}") from error
+        return cls(encoder, config)
+
+    def refine(self, job: RefinementJob) -> RefinementResult:
+        """Refine every starting pose of a job within its own room."""
+        if job.log_profile is None or job.precision is None:
+            return self._optimiser(self.encoder, "l2").refine(replace(job, precision=None))
+        by_profile = replace(job, targets=job.log_profile)
+        result = self._optimiser(None, "cauchy").refine(by_profile)
+        distance = self._latent_distance(job, result)
+        return replace(result, cost=result.cost + job.latent_weight * distance, latent_distance=distance)
+
+    def _optimiser(self, embedding: Embedding | None, norm: Norm) -> PoseOptimiser:
+        return PoseOptimiser(embedding, self._columns, norm=norm, config=self._config, device=self._device)
+
+    @torch.no_grad()
+    def _latent_distance(self, job: RefinementJob, result: RefinementResult) -> Float[np.ndarray, "k"]:
+        """How far the latents of the refined poses are from the query's."""
+
+        def tensor(array: np.ndarray) -> Tensor:
+            return torch.tensor(array, dtype=torch.float32, device=self._device)
+
+        relative = tensor(job.walls_m - np.tile(result.position_m, 2)[:, None, :])
+        profile = wall_profile(torch.zeros_like(relative[:, 0, :2]), tensor(result.heading), relative, self._columns)
+        latent = self.encoder(profile, tensor(job.camera_height_m), tensor(job.ceiling_height_m))
+        return torch.linalg.vector_norm(latent - tensor(job.targets), dim=1).cpu().numpy()
+
+
+def _without_last(information: Float[Tensor, "k p p"]) -> Float[Tensor, "k q q"]:
+    """Information about all unknowns but the last, which is integrated out (Schur complement)."""
+    cross, last = information[:, :-1, -1], information[:, -1, -1].clamp_min(1e-9)
+    return information[:, :-1, :-1] - cross[:, :, None] * cross[:, None, :] / last[:, None, None]

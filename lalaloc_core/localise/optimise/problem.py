@@ -1,0 +1,184 @@
+"""What is optimised: the residuals of a job as a function of the unknowns, and all that both optimisers ask of them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from lalaloc_core.localise.optimise.config import LpoConfig
+from lalaloc_core.localise.poses import RefinementJob
+from lalaloc_core.render.gradient import Sensitivity, log_distance_gradient, log_profile_gradient
+
+# What is compared with the targets (k, d): a function of wall profiles (k, columns), camera and ceiling heights (k,).
+Embedding = Callable[[Tensor, Tensor, Tensor], Tensor]
+# The distance that is minimised: Euclidean, the mean absolute difference, or the mean of log(1 + r²).
+Norm = Literal["l2", "l1", "cauchy"]
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Poses with all that the optimisers need of their residuals r and the derivatives J by the unknowns.
+
+    Attributes:
+        cost: (k,) what Levenberg-Marquardt lowers: half the sum of r², or of log(1 + r²), and half the squares of the
+            unknowns that are held at zero by a normal prior, in units of its deviation.
+        slope: (k, p) its derivative.
+        information: (k, p, p) its curvature, after Gauss and Newton.
+        distance: (k,) the distance by the norm, without what holds the unknowns.
+        gradient: (k, p) its derivative.
+    """
+
+    cost: Float[Tensor, "k"]
+    slope: Float[Tensor, "k p"]
+    information: Float[Tensor, "k p p"]
+    distance: Float[Tensor, "k"]
+    gradient: Float[Tensor, "k p"]
+
+    def rows(self, index: Int[Tensor, "m"]) -> Evaluation:
+        """Some of the poses alone."""
+        return Evaluation(*(value[index] for value in vars(self).values()))
+
+    def take_over(self, index: Int[Tensor, "m"], other: Evaluation) -> None:
+        """Replace these rows by those of `other`."""
+        for name, value in vars(self).items():
+            value[index] = getattr(other, name)
+
+
+class Problem:
+    """The residuals of one job as a function of the unknowns: x, y, then heading and height offset where wanted.
+
+    Positions are relative to each starting pose, so that single precision does not lose millimetres in large plans.
+    """
+
+    def __init__(
+        self, embedding: Embedding | None, columns: int, norm: Norm, job: RefinementJob, device: torch.device
+    ) -> None:
+        """State a problem.
+
+        Args:
+            embedding: None compares the log wall profiles themselves.
+        """
+
+        def tensor(array: np.ndarray) -> Tensor:
+            return torch.as_tensor(array, dtype=torch.float32, device=device)
+
+        self._embedding = embedding
+        self._columns = columns
+        self.norm: Norm = norm
+        self.origin = job.position_m
+        self._walls_m = tensor(job.walls_m - np.tile(job.position_m, 2)[:, None, :])
+        self._heading = tensor(job.heading)
+        self._camera_height_m = tensor(job.camera_height_m)
+        self._ceiling_height_m = tensor(job.ceiling_height_m)
+        self._targets = tensor(job.targets)
+        self._precision = None if job.precision is None else tensor(job.precision)
+        # Those that move the layout; the camera height is one more behind them.
+        self._moving = 3 if job.optimise_heading else 2
+        self._height_bounds = job.height_bounds
+        stiffness = [0.0] * self._moving
+        start = torch.zeros(len(job.targets), self._moving, device=device)
+        if job.height_offset is not None:
+            start = torch.cat([start, tensor(job.height_offset)[:, None]], dim=1)
+            stiffness.append(job.height_stiffness)
+        self.start = start
+        # Squared, as it is never needed otherwise.
+        self._stiffness = torch.tensor(stiffness, device=device).square()
+
+    def unpack(
+        self, pose: Float[Tensor, "k p"]
+    ) -> tuple[Float[Tensor, "k 2"], Float[Tensor, "k"], Float[Tensor, "k"] | None]:
+        """Position (m, relative to the start), heading (radians), and the height's offset where it is solved for."""
+        turned = self._heading + pose[:, 2] if self._moving == 3 else self._heading
+        return pose[:, :2], turned, pose[:, self._moving] if pose.shape[1] > self._moving else None
+
+    def rows(self, index: Int[Tensor, "m"]) -> Problem:
+        """The problem of some of the poses alone."""
+        part = object.__new__(Problem)
+        part.__dict__.update(self.__dict__)
+        for name in ("_walls_m", "_heading", "_camera_height_m", "_ceiling_height_m", "_targets", "_precision"):
+            value = getattr(self, name)
+            setattr(part, name, None if value is None else value[index])
+        part.start, part.origin = self.start[index], self.origin[index.cpu().numpy()]
+        return part
+
+    def evaluate(self, pose: Float[Tensor, "k p"]) -> Evaluation:
+        """Residuals at these poses, and what they change by."""
+        position_m, heading, height_offset = self.unpack(pose)
+        layout = log_profile_gradient(position_m, heading, self._walls_m, self._columns)
+        value, jacobian = self._embedded(layout)
+        residual = value - self._targets
+        if height_offset is not None:
+            # The offset is added to the target, the same for all azimuths.
+            residual = residual - height_offset[:, None]
+            jacobian = torch.cat([jacobian, torch.full_like(residual, -1.0)[:, None]], dim=1)
+        if self._precision is not None:
+            residual, jacobian = residual * self._precision, jacobian * self._precision[:, None]
+        return self._weighed(pose, residual, jacobian)
+
+    def _embedded(self, layout: Sensitivity) -> tuple[Float[Tensor, "k d"], Float[Tensor, "k m d"]]:
+        """What the embedding makes of layouts, and its derivatives by the unknowns that move them."""
+        by_pose = layout.by_pose[:, : self._moving]
+        if self._embedding is None:
+            return layout.log_m, by_pose
+        profile_m = layout.log_m.exp()
+        count = len(profile_m)
+
+        def repeat(value: Tensor) -> Tensor:
+            return value.repeat_interleave(self._moving, dim=0)
+
+        camera, ceiling = repeat(self._camera_height_m), repeat(self._ceiling_height_m)
+        embedding = self._embedding
+        tangent = (by_pose * profile_m[:, None]).flatten(0, 1)
+        value, derivative = torch.func.jvp(
+            lambda profile: embedding(profile, camera, ceiling), (repeat(profile_m),), (tangent,)
+        )[:2]
+        return value[:: self._moving], derivative.reshape(count, self._moving, -1)
+
+    def _weighed(
+        self, pose: Float[Tensor, "k p"], residual: Float[Tensor, "k d"], jacobian: Float[Tensor, "k p d"]
+    ) -> Evaluation:
+        """Costs by the norm; that of Cauchy by squares that are weighted anew everywhere."""
+        held = pose * self._stiffness
+        prior = 0.5 * (pose * held).sum(dim=1)
+        if self.norm == "cauchy":
+            factor = 1.0 + residual.square()
+            total, weight = factor.log().sum(dim=1), 1.0 / factor
+            pull = _by_unknown(jacobian, residual * weight)
+            distance, gradient = total / residual.shape[1], 2.0 * pull / residual.shape[1]
+            information = (jacobian * weight[:, None]) @ jacobian.mT
+        else:
+            total = residual.square().sum(dim=1)
+            pull, information = _by_unknown(jacobian, residual), jacobian @ jacobian.mT
+            if self.norm == "l1":
+                distance = residual.abs().mean(dim=1)
+                gradient = _by_unknown(jacobian, residual.sign()) / residual.shape[1]
+            else:
+                distance = total.sqrt()
+                gradient = pull / distance.clamp_min(1e-9)[:, None]
+        information = information + torch.diag(self._stiffness)
+        return Evaluation(0.5 * total + prior, pull + held, information, distance, gradient)
+
+    def stay_inside(
+        self, pose: Float[Tensor, "k p"], step: Float[Tensor, "k p"], config: LpoConfig
+    ) -> Float[Tensor, "k p"]:
+        """The step, shortened where it is too long or would come closer to a wall than the margin."""
+        length = torch.linalg.vector_norm(step[:, :2], dim=1)
+        azimuth = torch.atan2(step[:, 0], step[:, 1])
+        free = log_distance_gradient(pose[:, :2], azimuth[:, None], self._walls_m).log_m[:, 0].exp() - config.margin_m
+        allowed = free.clamp(0.0, config.max_step_m)
+        scale = torch.where(length > allowed, allowed / length.clamp_min(1e-9), torch.ones_like(length))
+        turn = step[:, 2 : self._moving].clamp(-config.max_turn, config.max_turn)
+        height, (low, high) = pose[:, self._moving :], self._height_bounds
+        return torch.cat(
+            [step[:, :2] * scale[:, None], turn, (height + step[:, self._moving :]).clamp(low, high) - height], dim=1
+        )
+
+
+def _by_unknown(jacobian: Float[Tensor, "k p d"], values: Float[Tensor, "k d"]) -> Float[Tensor, "k p"]:
+    return (jacobian @ values[:, :, None])[:, :, 0]

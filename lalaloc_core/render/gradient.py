@@ -1,0 +1,69 @@
+"""The wall profile with its derivatives by position and heading, both in closed form.
+
+A ray of azimuth a that meets the wall from p to p + e, both counted from the camera, is as long as
+
+    d = (p × e) / (u × e),    u = (sin a, cos a),    v × w = v_x w_y - v_y w_x
+
+Which wall it meets is settled by the forward pass, and the derivatives follow from that wall alone:
+
+    ∂ log d / ∂x = -e_y / (p × e)    ∂ log d / ∂y = e_x / (p × e)    ∂ log d / ∂heading = -(u' × e) / (u × e)
+
+with u' = (cos a, -sin a). The same holds for the wall that is seen through an opening, as the ray goes on straight.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from array_api_compat import array_namespace, device
+from jaxtyping import Float
+
+from lalaloc_core.conventions import Array, column_azimuths
+from lalaloc_core.render.profile import inverse_crossings
+
+# Rays that meet nothing, of poses outside any room, are as long as this (m), so that nothing becomes infinite.
+_FARTHEST_M = 1e6
+
+
+class Sensitivity(NamedTuple):
+    """Log wall profiles and what they change by.
+
+    Attributes:
+        log_m: (b, c) logs of the distances (m) to the nearest walls.
+        by_pose: (b, 3, c) their derivatives by x and y (m) and by the heading (radians).
+        wall: (b, c) index of the wall that each ray meets.
+    """
+
+    log_m: Array
+    by_pose: Array
+    wall: Array
+
+
+def log_profile_gradient(
+    position_m: Float[Array, "b 2"], heading: Float[Array, "b"], walls_m: Float[Array, "b n 4"], columns: int
+) -> Sensitivity:
+    """What `log(wall_profile(...))` is and how it changes, for the cost of little more than the profile.
+
+    Args:
+        position_m: camera positions, inside the room that `walls_m` closes.
+        heading: azimuth of the centre column, radians.
+        walls_m: wall segments (x0, y0, x1, y1) of each pose's own room; repeat one to pad.
+        columns: number of azimuth columns.
+    """
+    xp = array_namespace(position_m, heading, walls_m)
+    relative = xp.asarray(column_azimuths(columns), dtype=position_m.dtype, device=device(position_m))
+    return log_distance_gradient(position_m, heading[:, None] + relative[None, :], walls_m)
+
+
+def log_distance_gradient(
+    origin_m: Float[Array, "b 2"], azimuth: Float[Array, "b c"], walls_m: Float[Array, "b n 4"]
+) -> Sensitivity:
+    """As `log_profile_gradient`, along any azimuths (radians)."""
+    xp = array_namespace(origin_m, azimuth, walls_m)
+    crossings = inverse_crossings(origin_m, azimuth, walls_m)
+    wall = xp.argmax(crossings.inverse_m, axis=1)
+    inverse_m = xp.clip(xp.max(crossings.inverse_m, axis=1), 1.0 / _FARTHEST_M)
+    edge_x = xp.take_along_axis(crossings.edge_x, wall, axis=1)
+    edge_y = xp.take_along_axis(crossings.edge_y, wall, axis=1)
+    turned = -(xp.cos(azimuth) * edge_y + xp.sin(azimuth) * edge_x) / inverse_m
+    return Sensitivity(-xp.log(inverse_m), xp.stack([-edge_y, edge_x, turned], axis=1), wall)
