@@ -23,7 +23,7 @@ from service.query import Decoder, Localiser, LpoPool
 from service.security import AccessControl
 from service.settings import Settings
 from service.sharing import with_spare
-from service.storage import PlanCache, Store, open_store
+from service.storage import PlanLookup, Store, open_store
 from service.telemetry import LOGGER_NAME, Telemetry
 from service.telemetry.tracing import Tracing, otlp_exporter
 from service.threads import BoundedReads, Threads
@@ -61,7 +61,7 @@ class Runtime:
     telemetry: Telemetry
     store: Store
     grids: GridProvider
-    plan_cache: PlanCache
+    plan_lookup: PlanLookup
     pool: LpoPool
     decoder: Decoder
     localiser: Localiser
@@ -125,8 +125,7 @@ def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack) 
             telemetry=telemetry,
         )
     )
-    plan_cache = PlanCache(store, limit_bytes=settings.plan_cache_bytes, max_age_s=settings.plan_cache_age_s)
-    sweeper = kept(Sweeper(store, grids, plan_cache, sweep_s=settings.sweep_s))
+    sweeper = kept(Sweeper(store, grids, sweep_s=settings.sweep_s))
     sweeper.start()
     # One look at a time, which takes no thread from queries while the database is silent.
     looks = kept(BoundedReads(threads=1, max_pending=1, wait_s=settings.database_wait_s))
@@ -136,7 +135,7 @@ def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack) 
         telemetry=telemetry,
         store=store,
         grids=grids,
-        plan_cache=plan_cache,
+        plan_lookup=PlanLookup(store, max_age_s=settings.plan_cache_age_s),
         pool=pool,
         decoder=decoder,
         localiser=localiser,

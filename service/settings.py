@@ -194,7 +194,10 @@ class Settings(BaseSettings):
         description="How often plans that are gone are dropped from memory, and grids that nobody computes taken up.",
     )
     plan_cache_bytes: int = Field(
-        default=64 * 2**20, ge=0, description="Floor plans kept in memory, to localise while the database is away."
+        default=64 * 2**20,
+        ge=0,
+        description="Floor plans kept in memory, so that they are not read anew for every query, and to localise while "
+        "the database is away. 0: none is kept.",
     )
     plan_cache_age_s: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] = Field(
         default=600.0, description="How long a plan in memory is trusted while the database is away."

@@ -8,7 +8,7 @@ from time import monotonic
 
 from service.errors import StoreUnavailableError
 from service.grids.grid_provider import GridProvider
-from service.storage import PlanCache, Store
+from service.storage import Store
 from service.telemetry import LOGGER_NAME
 
 # Revisions that one query asks about.
@@ -20,10 +20,9 @@ _PURGE_EVERY_S = 3600.0
 class Sweeper:
     """A thread with a few cheap queries every now and then; a database that is away is tried again."""
 
-    def __init__(self, store: Store, grids: GridProvider, known: PlanCache, *, sweep_s: float) -> None:
+    def __init__(self, store: Store, grids: GridProvider, *, sweep_s: float) -> None:
         self._store = store
         self._grids = grids
-        self._known = known
         self._sweep_s = sweep_s
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="sweeper", daemon=True)
@@ -45,13 +44,13 @@ class Sweeper:
 
         Grids of theirs that are being computed, or wait for it, are not any more.
         """
-        in_memory = sorted(self._grids.revisions() | self._known.revisions())
+        in_memory = sorted(self._grids.revisions() | self._store.plan_cache.revisions())
         for first in range(0, len(in_memory), _AT_ONCE):
             asked = in_memory[first : first + _AT_ONCE]
             gone = set(asked) - self._store.plans.current(asked)
             if gone:
                 self._grids.forget(gone)
-                self._known.drop(gone)
+                self._store.plan_cache.forget_revisions(gone)
 
     def _run(self) -> None:
         sweep_at = purge_at = monotonic()

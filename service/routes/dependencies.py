@@ -64,7 +64,7 @@ async def plan_for_query(tenant: str, floorplan_id: str, runtime: Runtime) -> Pl
         UnknownFloorPlanError: there is none.
         StoreUnavailableError: the database is away, and the plan was not read lately; or too many use it.
     """
-    record = await runtime.plan_cache.find(tenant, floorplan_id, runtime.reads) if is_id(floorplan_id) else None
+    record = await runtime.plan_lookup.find(tenant, floorplan_id, runtime.reads) if is_id(floorplan_id) else None
     if record is None:
         raise UnknownFloorPlanError(floorplan_id)
     return record

@@ -204,7 +204,6 @@ async def replace_floorplan(
         # First, so that it is not in the way of the new grid; queries in work may still need the one in memory.
         runtime.grids.cancel(current.revision_id)
         runtime.grids.on_plan_stored(record, grid)
-        runtime.plan_cache.drop({current.revision_id})
         return _written(request, record, GridState.after_upload(grid), runtime, status.HTTP_200_OK)
 
     return await runtime.uploads.run(party, store)
@@ -230,7 +229,6 @@ def delete_floorplan(floorplan_id: str, request: Request, runtime: Running, tena
     if not runtime.store.plans.delete(tenant, current.id, expected=expected):
         raise UnknownFloorPlanError(floorplan_id)
     runtime.grids.forget({current.revision_id})
-    runtime.plan_cache.drop({current.revision_id})
 
 
 def _at_revision(current: PlanRecord, revision_id: str, runtime: Runtime) -> PlanRecord:

@@ -13,7 +13,7 @@ Begin with `store.py`, then `plans.py`. What is indented goes with what it hangs
 statement and final. `migrations` makes the tables; `tables` says what they look like now.
 """
 
-from service.storage.plan_cache import PlanCache
+from service.storage.plan_lookup import PlanLookup
 from service.storage.store import Store, open_store
 
-__all__ = ["PlanCache", "Store", "open_store"]
+__all__ = ["PlanLookup", "Store", "open_store"]

@@ -13,18 +13,17 @@ from typing import Any
 from sqlalchemy import Connection, Row, and_, delete, func, or_, select, text, update
 
 from lalaloc_core.floorplan import FloorPlan
-from service.bounded_cache import BoundedCache
 from service.errors import DamagedDataError, RevisionMismatchError, TooManyFloorPlansError, UnknownFloorPlanError
 from service.storage.chunks import read_chunks, write_chunks
 from service.storage.database import Database
 from service.storage.grid_format import PackedGrid, pack
+from service.storage.plan_cache import PlanCache
 from service.storage.plan_document import PlanDocument
 from service.storage.records import ComputedGrid, Cursor, GridKey, PlanRecord, PlanSummary
 from service.storage.stored_grids import insert_grid, select_summaries
 from service.storage.tables import FLOORPLANS, LATENT_GRIDS, ORIGINAL_CHUNKS, REVISIONS
 from service.telemetry import LOGGER_NAME
 
-_PARSED_BYTES = 64 * 2**20
 # Uploads take turns on PostgreSQL, so that the number of plans is exact; differs from the lock of `migration`.
 _COUNT_LOCK = 5_210_002
 
@@ -55,10 +54,13 @@ class _Found:
 class Plans:
     """Plans of all tenants; another tenant's plan is one that does not exist."""
 
-    def __init__(self, database: Database) -> None:
+    def __init__(self, database: Database, cache: PlanCache) -> None:
+        """
+        Args:
+            cache: is told of every plan that is read or stored at its current revision.
+        """
         self._database = database
-        # A revision never changes, so its id stands for it.
-        self._parsed: BoundedCache[str, FloorPlan] = BoundedCache(_PARSED_BYTES, plan_bytes)
+        self._cache = cache
 
     def add(
         self,
@@ -96,8 +98,8 @@ class Plans:
                 connection.execute(FLOORPLANS.insert(), values)
                 _insert_revision(connection, record, content)
         if stored is not None:
-            return self._record(stored)
-        self._parsed.put(record.revision_id, plan)
+            record = self._record(stored)
+        self._cache.put(record)
         return record
 
     def add_revision(
@@ -140,12 +142,17 @@ class Plans:
             connection.execute(delete(REVISIONS).where(own, REVISIONS.c.number <= number - keep))
             old = select(REVISIONS.c.id).where(own, REVISIONS.c.number < number - 1)
             connection.execute(delete(LATENT_GRIDS).where(LATENT_GRIDS.c.revision_id.in_(old)))
-        self._parsed.put(record.revision_id, plan)
+        self._cache.put(record)
         return record
 
     def get(self, tenant: str, plan_id: str) -> PlanRecord | None:
         """A plan at its current revision."""
-        return self._one(_current_head(tenant, plan_id))
+        record = self._one(_current_head(tenant, plan_id))
+        if record is None:
+            self._cache.forget(tenant, plan_id)
+        else:
+            self._cache.put(record)
+        return record
 
     def get_revision(self, tenant: str, plan_id: str, revision_id: str) -> PlanRecord | None:
         """A plan at any revision that is kept."""
@@ -222,7 +229,9 @@ class Plans:
             revision_id = connection.scalar(query)
             if revision_id is not None and expected not in (None, revision_id):
                 raise RevisionMismatchError(plan_id, expected, revision_id)
-            return connection.execute(delete(FLOORPLANS).where(*own)).rowcount == 1
+            deleted = connection.execute(delete(FLOORPLANS).where(*own)).rowcount == 1
+        self._cache.forget(tenant, plan_id)
+        return deleted
 
     def set_failure(self, revision_id: str, reason: str) -> None:
         """Record why a revision's latent grid could not be computed."""
@@ -254,7 +263,7 @@ class Plans:
         row = connection.execute(query).one_or_none()
         if row is None:
             return None
-        if (plan := self._parsed.get(row.revision_id)) is not None:
+        if (plan := self._cache.plan(row.tenant, row.id, row.revision_id)) is not None:
             return _Found(row, plan)
         columns = REVISIONS.c
         query = select(columns.document, columns.document_sha256, columns.warnings).where(columns.id == row.revision_id)
@@ -271,13 +280,7 @@ class Plans:
             plan = plan.plan()
             if plan is None:
                 raise _damaged("document", row.id, row.revision_id)
-            self._parsed.put(row.revision_id, plan)
         return PlanRecord(**row._mapping, plan=plan)
-
-
-def plan_bytes(plan: FloorPlan) -> int:
-    """About how much memory a plan takes: its geometry as the renderer wants it, and its corners three times over."""
-    return plan.geometry.nbytes + 3 * sum(room.polygon_m.nbytes for room in plan.rooms) + 2000 * len(plan.rooms)
 
 
 def _record(

@@ -12,6 +12,7 @@ from service.storage.api_keys import ApiKeys
 from service.storage.database import Database
 from service.storage.idempotency_keys import LEAST_LEASE_S, IdempotencyKeys
 from service.storage.migration import migrate
+from service.storage.plan_cache import PlanCache
 from service.storage.plans import Plans
 from service.storage.stored_grids import GridLeases, StoredGrids
 
@@ -25,19 +26,29 @@ class Store:
 
     Attributes:
         plans: floor plans with revisions and originals.
+        plan_cache: of these, those in memory.
         grids: their latent grids.
         leases: who computes which grid.
         idempotency_keys: answers to requests that may be sent twice.
         keys: API keys.
     """
 
-    def __init__(self, url: str, *, connections: int = 8, wait_s: float = 2.0, claim_s: float = LEAST_LEASE_S) -> None:
+    def __init__(
+        self,
+        url: str,
+        *,
+        connections: int = 8,
+        wait_s: float = 2.0,
+        claim_s: float = LEAST_LEASE_S,
+        plan_cache_bytes: int = 64 * 2**20,
+    ) -> None:
         """Connect, and bring the schema up to date.
 
         Args:
             connections: most connections that are open at a time.
             wait_s: longest wait for one of them.
             claim_s: longest that a request with an idempotency key may take.
+            plan_cache_bytes: about how much memory parsed plans may take; 0: none is kept.
 
         Raises:
             ConfigError: not a usable database URL, or the database cannot be opened.
@@ -48,7 +59,8 @@ class Store:
         except (ArgumentError, CommandError, RevisionError, ImportError, OSError, SQLAlchemyError) as error:
             raise ConfigError(f"cannot open the database: {error}") from error
         self._database = database
-        self.plans = Plans(database)
+        self.plan_cache = PlanCache(plan_cache_bytes)
+        self.plans = Plans(database, self.plan_cache)
         self.grids = StoredGrids(database)
         self.leases = GridLeases(database)
         self.idempotency_keys = IdempotencyKeys(database, claim_s)
@@ -80,4 +92,5 @@ def open_store(settings: Settings) -> Store:
         wait_s=settings.database_wait_s,
         # A query that is computed still must not be computed once more.
         claim_s=max(LEAST_LEASE_S, settings.request_deadline_s + _CLAIM_MARGIN_S),
+        plan_cache_bytes=settings.plan_cache_bytes,
     )

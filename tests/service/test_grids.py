@@ -38,7 +38,7 @@ from service.grids.heights import check_height_m, grid_height_m
 from service.grids.sweeper import Sweeper
 from service.grids.throttle import BackgroundThrottle
 from service.settings import Settings
-from service.storage.plan_cache import PlanCache
+from service.storage.plan_lookup import PlanLookup
 from service.storage.records import PlanRecord
 from service.storage.store import Store
 from service.telemetry import Telemetry
@@ -406,22 +406,22 @@ def test_gone_plans_and_old_revisions_are_dropped_from_memory_on_every_replica(
     open_store: OpenStore, make_grids: MakeGrids
 ) -> None:
     store, elsewhere = open_store(), open_store()
-    grids, known = make_grids(store), PlanCache(store, limit_bytes=2**20, max_age_s=600.0)
+    grids = make_grids(store)
     records = {name: _add(store, plan_id=name) for name in ("deleted", "changed", "kept")}
     for name, record in records.items():
         grids.compute(record, 1.5).result(30.0)
-        assert known.get("default", name) == record
+        assert store.plans.get("default", name) == record
     elsewhere.plans.delete("default", "deleted")
     elsewhere.plans.add_revision("default", "changed", PLAN, original=b"", keep=5)
-    Sweeper(store, grids, known, sweep_s=5.0).sweep()
-    assert grids.revisions() == known.revisions() == {records["kept"].revision_id}
+    Sweeper(store, grids, sweep_s=5.0).sweep()
+    assert grids.revisions() == store.plan_cache.revisions() == {records["kept"].revision_id}
 
 
 def test_revisions_that_were_replaced_on_another_replica_are_not_computed_any_more(
     open_store: OpenStore, make_grids: MakeGrids, encoders: CountingEncoders
 ) -> None:
     store, elsewhere = open_store(), open_store()
-    grids, known = make_grids(store), PlanCache(store, limit_bytes=2**20, max_age_s=600.0)
+    grids = make_grids(store)
     encoders.go_on.clear()
     # The first one has begun, the others wait.
     futures = [grids.compute(_add(store, HALL), 1.5)]
@@ -429,7 +429,7 @@ def test_revisions_that_were_replaced_on_another_replica_are_not_computed_any_mo
     for _ in range(3):
         record = elsewhere.plans.add_revision("default", "p", HALL, original=b"", keep=5)
         futures.append(grids.compute(record, 1.5))
-    Sweeper(store, grids, known, sweep_s=5.0).sweep()
+    Sweeper(store, grids, sweep_s=5.0).sweep()
     encoders.go_on.set()
     assert len(futures.pop().result(60.0).poses) == 1521
     assert [type(future.exception(30.0)) for future in futures] == [PlanNotReadyError] * 3
@@ -535,18 +535,26 @@ def test_the_background_pauses_for_queries_but_not_for_good() -> None:
 def test_plans_that_were_read_lately_are_known_while_the_database_is_away(
     postgres: PostgresServer, make_grids: MakeGrids
 ) -> None:
-    store = Store(postgres.new_database())
+    url = postgres.new_database()
+    store, elsewhere, without_memory = Store(url), Store(url), Store(url, plan_cache_bytes=0)
     grids, record = make_grids(store), _add(store)
-    known = PlanCache(store, limit_bytes=2**20, max_age_s=600.0)
-    forgetful = PlanCache(store, limit_bytes=2**20, max_age_s=0.0)
-    assert known.get("default", "p") == forgetful.get("default", "p") == record
+    known = PlanLookup(store, max_age_s=600.0)
+    forgetful = PlanLookup(store, max_age_s=0.0)
+    without = PlanLookup(without_memory, max_age_s=600.0)
+    assert all(plans.get("default", "p") == record for plans in (known, forgetful, without))
     grids.compute(record, 1.5).result(30.0)
-    _add(store, plan_id="q")
+    _add(elsewhere, plan_id="q")
     postgres.stop()
     try:
         assert known.get("default", "p") == record
         assert grids.find(grids.key(record.revision_id, 1.5)) is not None
-        for plans, tenant, plan_id in ((known, "default", "q"), (known, "other", "p"), (forgetful, "default", "p")):
+        unknown = (
+            (known, "default", "q"),
+            (known, "other", "p"),
+            (forgetful, "default", "p"),
+            (without, "default", "p"),
+        )
+        for plans, tenant, plan_id in [*unknown, (without, "default", "p")]:
             with pytest.raises(StoreUnavailableError):
                 plans.get(tenant, plan_id)
         with pytest.raises(StoreUnavailableError):
@@ -559,12 +567,13 @@ def test_plans_that_were_read_lately_are_known_while_the_database_is_away(
     store.plans.delete("default", "p")
     time.sleep(1.1)
     assert known.get("default", "p") is None
-    store.close()
+    for opened in (store, elsewhere, without_memory):
+        opened.close()
 
 
 def test_a_database_that_is_busy_is_no_reason_to_go_by_what_was_read_lately(tmp_path: Path) -> None:
     store = Store(f"sqlite:///{tmp_path / 'test.sqlite3'}", connections=1, wait_s=0.05)
-    known = PlanCache(store, limit_bytes=2**20, max_age_s=600.0)
+    known = PlanLookup(store, max_age_s=600.0)
     record = _add(store)
     assert known.get("default", "p") == record
     with store._database.reading():
