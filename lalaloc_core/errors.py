@@ -5,6 +5,7 @@ LaLaLocError
 │   ├── InvalidFloorPlanError    a plan cannot be what it says; names the room
 │   ├── InvalidPanoramaError     a picture that is not a usable 360° panorama
 │   ├── InvalidPoseError         a position, heading or height outside its limits
+│   ├── InvalidHintError         what is said to be known of a place cannot be; names the hint
 │   └── DatasetError             a data set's file is missing, damaged or impossible; names scene, room and path
 ├── ConfigError                  unknown key or value of a wrong type in a configuration
 ├── BundleError                  a model bundle is missing, incomplete or was altered
@@ -47,6 +48,19 @@ class InvalidPanoramaError(InvalidInputError):
 
 class InvalidPoseError(InvalidInputError):
     """A position, heading or height lies outside its limits."""
+
+
+class InvalidHintError(InvalidInputError):
+    """What is said to be known of a place beforehand cannot be meant.
+
+    Attributes:
+        hint: name of the hint at fault.
+        reason: what is wrong, with value and limit.
+    """
+
+    def __init__(self, hint: str, reason: str) -> None:
+        self.hint, self.reason = hint, reason
+        super().__init__(f"{hint}: {reason}")
 
 
 class DatasetError(InvalidInputError):

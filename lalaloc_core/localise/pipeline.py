@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from operator import attrgetter
 from typing import Literal
 
 import numpy as np
@@ -20,10 +21,11 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.confidence import Signals, signals_of
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.evidence import EvidenceConfig
+from lalaloc_core.localise.hints import NO_HINTS, HintName, Hints
 from lalaloc_core.localise.poses import Candidate, LatentGrid, Query, RefinementJob, RefinementResult
 from lalaloc_core.localise.posterior import Posterior, area_shares, posterior_of
 from lalaloc_core.localise.refinement import refined, refinement_job
-from lalaloc_core.localise.retrieval import contradicted, grid_costs, retrieve, suppress
+from lalaloc_core.localise.retrieval import contradicted, grid_costs, missed_hints, retrieve, suppress
 from lalaloc_core.localise.vogel import resample
 
 SearchStage = Literal["retrieval", "vdr", "lpo"]
@@ -72,6 +74,7 @@ class Localisation:
         best: the best candidate after each stage that ran, in order.
         signals: what the confidence of the best candidate after each stage is judged by.
         heading_contradicted: whether the heading was said, and is not what the picture shows.
+        hints_missed: hints that do not hold at the answer; of strict ones, those that the picture contradicts.
         timings_ms: milliseconds per stage.
     """
 
@@ -81,6 +84,7 @@ class Localisation:
     stage: SearchStage
     signals: dict[SearchStage, Signals]
     heading_contradicted: bool = False
+    hints_missed: tuple[HintName, ...] = ()
     best: dict[SearchStage, Candidate] = field(default_factory=dict)
     timings_ms: dict[str, float] = field(default_factory=dict)
 
@@ -142,6 +146,7 @@ def localise(
     refiner: Refiner | None = None,
     config: LocaliseConfig | None = None,
     clock: StageClock | None = None,
+    hints: Hints = NO_HINTS,
 ) -> Localisation:
     """Find an encoded panorama in a plan.
 
@@ -150,10 +155,16 @@ def localise(
         refine: how far to go; "lpo" without a `refiner`, or with one that returns None, ends at "vdr".
         top_k: how many distinct candidates to return.
         clock: times the stages; by default one of their own.
+        hints: what is known of the place beforehand; strict ones forbid doubts of a known heading, too.
+
+    Raises:
+        InvalidHintError: the hints cannot be meant for the plan, or strict ones leave nothing of it.
     """
     if refiner is None and refine == "lpo":
         refine = "vdr"
-    steps = localise_steps(plan, grid, encoders, query, refine=refine, top_k=top_k, config=config, clock=clock)
+    steps = localise_steps(
+        plan, grid, encoders, query, refine=refine, top_k=top_k, config=config, clock=clock, hints=hints
+    )
     result: RefinementResult | None = None
     while True:
         step = next_step(steps, result)
@@ -185,6 +196,7 @@ def localise_steps(
     top_k: int = 5,
     config: LocaliseConfig | None = None,
     clock: StageClock | None = None,
+    hints: Hints = NO_HINTS,
 ) -> Steps:
     """`localise` for who waits for the optimiser elsewhere: stops where poses are to be optimised; see `next_step`."""
     config = config or LocaliseConfig()
@@ -192,11 +204,12 @@ def localise_steps(
     weights, evidence = encoders.manifest.evidence, config.evidence
     prior = area_shares(grid.poses, np.array([room.area_m2 for room in plan.rooms]))
     stage: SearchStage = "retrieval"
+    hints.check(plan)
     with clock.stage("retrieve"):
-        doubted = contradicted(plan, grid, query, weights, evidence)
+        doubted = not hints.strict and contradicted(plan, grid, query, weights, evidence)
         query = query.searched if doubted and query.searched is not None else query
         starts = config.starts(query)
-        costs = grid_costs(plan, grid, query, weights, evidence)
+        costs = grid_costs(plan, grid, query, weights, evidence, hints)
         # Refined candidates may meet and become one; spare ones then take the free places.
         wanted = max(top_k, starts) + starts
         modes = retrieve(costs, grid, query, top_k=wanted, separation_m=config.separation_m)
@@ -220,25 +233,29 @@ def localise_steps(
                     samples=config.vdr_samples,
                     radius_m=config.vdr_radius_steps * grid.step_m,
                     evidence=evidence,
+                    hints=hints,
                 )
         stage = "vdr"
-        best[stage] = min(candidates[: config.vdr_candidates], key=lambda candidate: candidate.cost)
+        best[stage] = min(candidates[: config.vdr_candidates], key=attrgetter("total_cost"))
         signals[stage] = signals_of(query, best[stage], posterior([best[stage]]))
     if refine == "lpo":
         with clock.stage("lpo"):
             job = refinement_job(plan, query, candidates[:starts], grid.camera_height_m, weights, evidence)
             result = yield job
             if result is not None:
-                ends = refined(plan, encoders, query, candidates[:starts], result, evidence)
-                candidates = sorted(ends, key=lambda candidate: candidate.cost) + candidates[starts:]
+                ends = refined(plan, encoders, query, candidates[:starts], result, evidence, hints)
+                candidates = sorted(ends, key=attrgetter("total_cost")) + candidates[starts:]
                 stage = "lpo"
                 best[stage] = candidates[0]
                 signals[stage] = signals_of(query, candidates[0], posterior(candidates[:1]))
     elif stage == "vdr":
         first = config.vdr_candidates
-        candidates = sorted(candidates[:first], key=lambda candidate: candidate.cost) + candidates[first:]
+        candidates = sorted(candidates[:first], key=attrgetter("total_cost")) + candidates[first:]
     answers = _distinct(candidates, config.separation_m, top_k)
-    return Localisation(query, answers, posterior(answers), stage, signals, doubted, best, clock.timings_ms)
+    missed = hints.missed(answers[0].position_m, answers[0].room_index)
+    if hints.strict:
+        missed = missed_hints(plan, costs, weights, hints)
+    return Localisation(query, answers, posterior(answers), stage, signals, doubted, missed, best, clock.timings_ms)
 
 
 def panorama_heading(query: Query, candidate: Candidate) -> float:

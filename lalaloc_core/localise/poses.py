@@ -149,10 +149,11 @@ class Candidate:
     Attributes:
         frame_heading: heading (radians) of the layout in the frame of `Query` hypothesis number `hypothesis`;
             the panorama's heading is `query.roll[hypothesis] + frame_heading`.
-        cost: what candidates are ranked by, see `localise.evidence`; the latent distance where the model predicts no
-            wall profile.
+        cost: how badly the layout fits, see `localise.evidence`; the latent distance where the model predicts no wall
+            profile.
         latent_distance: from the latent of its layout to the query's.
         height_offset: log of true over stated camera height that fits best.
+        hint_cost: what hints have against the place, in units of the cost; see `localise.hints`.
         terms: what each term of the evidence says of it, by name; empty where poses are compared by latents.
         information: (p, p) curvature of the cost by x, y (m) and, where it was searched, the heading (radians); set by
             the optimiser. Its inverse is the covariance but for a factor.
@@ -166,6 +167,7 @@ class Candidate:
     cost: float
     latent_distance: float
     height_offset: float = 0.0
+    hint_cost: float = 0.0
     terms: dict[str, float] = field(default_factory=dict, compare=False)
     information: Float[np.ndarray, "p p"] | None = field(default=None, compare=False)
 
@@ -173,6 +175,11 @@ class Candidate:
     def position_m(self) -> Float[np.ndarray, "2"]:
         """(x, y) as an array."""
         return np.array([self.x_m, self.y_m])
+
+    @property
+    def total_cost(self) -> float:
+        """What candidates are ranked by: the cost, and what hints have against the place."""
+        return self.cost + self.hint_cost
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,8 @@
 """How probable places are: the posterior over all grid poses and all ways in which the panorama may be turned.
 
 Each pair of a pose and a hypothesis has the likelihood `exp(-T cost)`, with the temperature T fitted on validation
-queries, and a prior uniform over floor area and over the headings that are searched. Candidates are the modes of the
+queries, and a prior uniform over floor area and over the headings that are searched, times that of hints, which costs
+contain here. Candidates are the modes of the
 posterior. The optimiser tells how far down the cost of a mode goes, which the grid, whose poses are off, cannot: a
 mode's pairs are shifted by what its candidate gained, all others by what candidates gain usually, and refined modes
 count as equally wide.
@@ -11,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -37,12 +39,19 @@ class GridCosts:
         index: (n,) which of them were compared; of large grids those that may be the best.
         cost: (k, n) under every hypothesis.
         offset: (k, n) the height offset δ that gives it.
+        hint_cost: (n,) what hints have against the pose, in units of the cost; None where there are no hints.
     """
 
     poses: PoseSet
     index: Int[np.ndarray, "n"]
     cost: Float[np.ndarray, "k n"]
     offset: Float[np.ndarray, "k n"]
+    hint_cost: Float[np.ndarray, "n"] | None = None
+
+    @cached_property
+    def total(self) -> Float[np.ndarray, "k n"]:
+        """What poses are ranked by: the cost with that of hints."""
+        return self.cost if self.hint_cost is None else self.cost + self.hint_cost
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,12 +93,12 @@ def posterior_of(
         ends: the same after refinement.
         candidates: what probabilities are wanted of, the answer first.
     """
-    lowest = float(grid.cost.min())
-    gains = [start.cost - end.cost for start, end in zip(starts, ends, strict=True)]
+    lowest = float(grid.total.min())
+    gains = [start.total_cost - end.total_cost for start, end in zip(starts, ends, strict=True)]
     usual = float(np.median(gains)) if gains else 0.0
-    best = min([lowest - usual, *(end.cost for end in ends)])
-    hypothesis, column = np.nonzero(temperature * (grid.cost - max(gains, default=0.0) - best) < _NEGLIGIBLE)
-    cost, pose = grid.cost[hypothesis, column].astype(np.float64), grid.index[column]
+    best = min([lowest - usual, *(end.total_cost for end in ends)])
+    hypothesis, column = np.nonzero(temperature * (grid.total - max(gains, default=0.0) - best) < _NEGLIGIBLE)
+    cost, pose = grid.total[hypothesis, column].astype(np.float64), grid.index[column]
     position = grid.poses.position_m[pose].copy()
     heading = query.roll[hypothesis] + query.frame_heading
     mode = _modes(position, heading, starts, query, separation_m)
@@ -100,7 +109,7 @@ def posterior_of(
         position[member] += end.position_m - start.position_m
         heading[member] += end.frame_heading - start.frame_heading
     log_weight = -temperature * (cost - gain) + prior[pose]
-    log_weight += _width_corrections(log_weight, mode, temperature * np.array([end.cost for end in ends]))
+    log_weight += _width_corrections(log_weight, mode, temperature * np.array([end.total_cost for end in ends]))
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
     by_pose = np.bincount(pose, weight, minlength=len(grid.poses))

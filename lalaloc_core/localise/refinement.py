@@ -6,11 +6,13 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Bool
 
 from lalaloc_core.bundle import EvidenceModel
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.evidence import Evidence, EvidenceConfig, precisions
+from lalaloc_core.localise.hints import NO_HINTS, Hints
 from lalaloc_core.localise.layouts import layouts_at
 from lalaloc_core.localise.poses import Candidate, Query, RefinementJob, RefinementResult
 from lalaloc_core.sampling import PoseSet
@@ -70,13 +72,20 @@ def refined(
     starts: list[Candidate],
     result: RefinementResult,
     evidence: EvidenceConfig,
+    hints: Hints = NO_HINTS,
 ) -> list[Candidate]:
-    """Candidates where the optimiser took them, with what all the evidence says of them there."""
+    """Candidates where the optimiser took them, with what all the evidence says of them there.
+
+    One that left what strict hints allow stays where it was.
+    """
+    temperature = encoders.manifest.evidence.temperature
+    rooms = np.array([start.room_index for start in starts])
+    result, left = _kept_inside(starts, result, ~np.isfinite(hints.penalty(plan, result.position_m, rooms)))
+    against = hints.penalty(plan, result.position_m, rooms) / temperature
     offsets = result.height_offset
     offsets = np.array([start.height_offset for start in starts]) if offsets is None else offsets
     cost, terms = result.cost, [{} for _ in starts]
     if evidence.compares_profiles(query):
-        rooms = np.array([start.room_index for start in starts])
         hypotheses = np.array([start.hypothesis for start in starts])
         columns, weights = encoders.manifest.profile_columns, encoders.manifest.evidence
         layouts = layouts_at(plan, PoseSet(result.position_m, rooms), result.heading, columns)
@@ -92,8 +101,33 @@ def refined(
             cost=float(cost[k]),
             latent_distance=float(result.latent_distance[k]),
             height_offset=float(offsets[k]),
+            hint_cost=float(against[k]),
             terms=terms[k],
-            information=result.information[k],
+            information=None if left[k] else result.information[k],
         )
         for k, start in enumerate(starts)
     ]
+
+
+def _kept_inside(
+    starts: list[Candidate], result: RefinementResult, left: Bool[np.ndarray, "k"]
+) -> tuple[RefinementResult, Bool[np.ndarray, "k"]]:
+    """The result with those that have left what is allowed where they began, and which these are."""
+    if not left.any():
+        return result, left
+    began = np.stack([start.position_m for start in starts])
+    heading = np.array([start.frame_heading for start in starts])
+    cost = np.array([start.cost for start in starts])
+    distance = np.array([start.latent_distance for start in starts])
+    offset = result.height_offset
+    if offset is not None:
+        offset = np.where(left, [start.height_offset for start in starts], offset)
+    kept = replace(
+        result,
+        position_m=np.where(left[:, None], began, result.position_m),
+        heading=np.where(left, heading, result.heading),
+        cost=np.where(left, cost, result.cost),
+        latent_distance=np.where(left, distance, result.latent_distance),
+        height_offset=offset,
+    )
+    return kept, left

@@ -9,13 +9,15 @@ from jaxtyping import Float, Int
 
 from lalaloc_core.bundle import EvidenceModel
 from lalaloc_core.conventions import wrap_angle
+from lalaloc_core.errors import InvalidHintError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.evidence import Evidence, EvidenceConfig, latent_distances
+from lalaloc_core.localise.hints import NO_HINTS, HintName, Hints
 from lalaloc_core.localise.poses import Candidate, LatentGrid, Query
 from lalaloc_core.localise.posterior import TURNED_APART, GridCosts
-from lalaloc_core.sampling import pose_grid
+from lalaloc_core.sampling import PoseSet, pose_grid
 
 # Poses times hypotheses times height offsets that are compared in full; of more, the poses that are best by every
 # `_STRIDE`th azimuth.
@@ -33,35 +35,86 @@ def build_grid(plan: FloorPlan, encoders: Encoders, *, step_m: float, camera_hei
 
 
 def grid_costs(
-    plan: FloorPlan, grid: LatentGrid, query: Query, weights: EvidenceModel, config: EvidenceConfig
+    plan: FloorPlan,
+    grid: LatentGrid,
+    query: Query,
+    weights: EvidenceModel,
+    config: EvidenceConfig,
+    hints: Hints = NO_HINTS,
 ) -> GridCosts:
-    """Cost of every pose of the grid under every hypothesis; of large grids, of the poses that may be the best."""
+    """Cost of every pose of the grid under every hypothesis; of large grids, of the poses that may be the best.
+
+    Raises:
+        InvalidHintError: no pose of the grid is left.
+    """
+    against = _hint_costs(plan, grid, weights, hints)
     if not config.compares_profiles(query):
         distance = latent_distances(grid.latents, query.latents)
-        return GridCosts(grid.poses, np.arange(len(grid.poses)), distance, np.zeros_like(distance))
+        return GridCosts(grid.poses, np.arange(len(grid.poses)), distance, np.zeros_like(distance), against)
     layouts, index = grid.layouts(plan), np.arange(len(grid.poses))
     reach_m = config.grid_reach * grid.step_m
     comparisons = len(query.roll) * len(query.camera_height.offsets)
     kept = max(_MAX_COMPARISONS // comparisons, _FIRST_RANKED)
     if kept < len(index):
         coarse, _ = Evidence(plan, query, reach_m, weights, config, stride=_STRIDE).costs(layouts)
-        index = np.sort(np.argpartition(coarse.min(axis=0), kept)[:kept])
+        index = _shortlist(coarse.min(axis=0), kept, against, _hint_costs(plan, grid, weights, hints.doubted))
         layouts = layouts.rows(index)
     cost, offset = Evidence(plan, query, reach_m, weights, config).costs(layouts)
     if config.latent_weight:
         cost += config.latent_weight * latent_distances(grid.latents[index], query.latents)
-    return GridCosts(grid.poses, index, cost, offset)
+    return GridCosts(grid.poses, index, cost, offset, None if against is None else against[index])
+
+
+def missed_hints(plan: FloorPlan, costs: GridCosts, weights: EvidenceModel, hints: Hints) -> tuple[HintName, ...]:
+    """The hints that would not hold where the picture fits best, if they were no fences."""
+    doubted = _penalties(plan, costs.poses, weights, hints.doubted)[costs.index]
+    pose = costs.index[int((costs.cost + doubted).min(axis=0).argmin())]
+    return hints.missed(costs.poses.position_m[pose], int(costs.poses.room_index[pose]))
+
+
+def _penalties(plan: FloorPlan, poses: PoseSet, weights: EvidenceModel, hints: Hints) -> Float[np.ndarray, "n"]:
+    """What hints have against poses, in units of the cost."""
+    return hints.penalty(plan, poses.position_m, poses.room_index) / weights.temperature
+
+
+def _hint_costs(
+    plan: FloorPlan, grid: LatentGrid, weights: EvidenceModel, hints: Hints
+) -> Float[np.ndarray, "n"] | None:
+    if hints.are_none:
+        return None
+    against = _penalties(plan, grid.poses, weights, hints)
+    if np.isfinite(against).any():
+        return against
+    raise InvalidHintError(
+        "strict",
+        f"none of the {len(against)} places that are compared, {grid.step_m:g} m apart, is where all hints hold: "
+        "allow for more, or leave strict out",
+    )
+
+
+def _shortlist(
+    cost: Float[np.ndarray, "n"],
+    kept: int,
+    against: Float[np.ndarray, "n"] | None,
+    doubted: Float[np.ndarray, "n"] | None,
+) -> Int[np.ndarray, "m"]:
+    """The poses that may be the best, in rising order: by the hints, and if those were no fences."""
+    if against is None or doubted is None:
+        return np.sort(np.argpartition(cost, kept)[:kept])
+    strictly = np.argpartition(cost + against, kept)[:kept]
+    return np.union1d(strictly[np.isfinite(against[strictly])], np.argpartition(cost + doubted, kept)[:kept])
 
 
 def retrieve(costs: GridCosts, grid: LatentGrid, query: Query, *, top_k: int, separation_m: float) -> list[Candidate]:
     """The `top_k` best grid poses, best first, no two closer than `separation_m` and turned alike."""
-    ranked, ranks = np.argsort(costs.cost, axis=None), max(_FIRST_RANKED, top_k)
+    ranked, ranks = np.argsort(costs.total, axis=None), max(_FIRST_RANKED, top_k)
+    ranked = ranked[: np.isfinite(costs.total).sum()]
     while True:
-        hypothesis, column = np.unravel_index(ranked[:ranks], costs.cost.shape)
+        hypothesis, column = np.unravel_index(ranked[:ranks], costs.total.shape)
         pose = costs.index[column]
         kept = suppress(
             grid.poses.position_m[pose],
-            costs.cost[hypothesis, column],
+            costs.total[hypothesis, column],
             separation_m=separation_m,
             limit=top_k,
             heading=query.roll[hypothesis],
@@ -85,6 +138,7 @@ def _candidate(costs: GridCosts, query: Query, grid: LatentGrid, hypothesis: int
         cost=float(costs.cost[hypothesis, column]),
         latent_distance=float(distance[0, 0]),
         height_offset=float(costs.offset[hypothesis, column]),
+        hint_cost=0.0 if costs.hint_cost is None else float(costs.hint_cost[column]),
     )
 
 

@@ -12,6 +12,7 @@ from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.evidence import Evidence, EvidenceConfig, latent_distances
+from lalaloc_core.localise.hints import NO_HINTS, Hints
 from lalaloc_core.localise.layouts import layouts_at
 from lalaloc_core.localise.poses import Candidate, Query
 from lalaloc_core.sampling import PoseSet
@@ -50,6 +51,7 @@ def resample(
     samples: int,
     radius_m: float,
     evidence: EvidenceConfig | None = None,
+    hints: Hints = NO_HINTS,
 ) -> Candidate:
     """The best pose of a Vogel disc around `candidate`, clipped to the rooms; the candidate itself if none is better.
 
@@ -78,7 +80,8 @@ def resample(
         compared = Evidence(plan, query, evidence.fine_reach_m, encoders.manifest.evidence, evidence)
         of_layouts, offsets = compared.costs(layouts, np.array([candidate.hypothesis]))
         cost, offset = of_layouts[0] + evidence.latent_weight * cost, offsets[0]
-    index = int(cost.argmin())
+    against = hints.penalty(plan, poses.position_m, poses.room_index) / encoders.manifest.evidence.temperature
+    index = int((cost + against).argmin())
     chosen = PoseSet(poses.position_m[[index]], poses.room_index[[index]])
     if latents is None:
         # Dear, and here only told.
@@ -94,4 +97,5 @@ def resample(
         cost=float(cost[index]),
         latent_distance=float(latent_distances(latents, target)[0, 0]),
         height_offset=float(offset[index]),
+        hint_cost=float(against[index]),
     )
