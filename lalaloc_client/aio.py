@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import aclosing
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -135,6 +135,10 @@ class AsyncClient:
         heading_tolerance_deg: float | None = None,
         camera_height_m: float | None = None,
         camera_height_std_m: float | None = None,
+        near: Mapping[str, float] | None = None,
+        radius_m: float | None = None,
+        rooms: Sequence[str] | None = None,
+        strict: bool | None = None,
         refine: Refine | None = None,
         top_k: int | None = None,
     ) -> Localisation:
@@ -150,6 +154,10 @@ class AsyncClient:
             camera_height_std_m=camera_height_std_m,
             refine=refine,
             top_k=top_k,
+            near=near,
+            radius_m=radius_m,
+            rooms=rooms,
+            strict=strict,
         )
         return await self._run(operations.localisation(request, self._patience))
 

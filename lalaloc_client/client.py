@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -165,6 +165,10 @@ class Client:
         heading_tolerance_deg: float | None = None,
         camera_height_m: float | None = None,
         camera_height_std_m: float | None = None,
+        near: Mapping[str, float] | None = None,
+        radius_m: float | None = None,
+        rooms: Sequence[str] | None = None,
+        strict: bool | None = None,
         refine: Refine | None = None,
         top_k: int | None = None,
     ) -> Localisation:
@@ -177,6 +181,10 @@ class Client:
             heading_tolerance_deg: how far off that may be, up to 45; None: not at all.
             camera_height_m: over the floor; None: the plan's, and if it has none, any.
             camera_height_std_m: standard deviation of that, which is solved for; None: the plan's, or 0.1; 0: exact.
+            near: where the camera stood, about: {"x_m": 3.5, "y_m": 2.0}, in the plan.
+            radius_m: how far from there it may have stood; needed with `near`.
+            rooms: ids or names of rooms in one of which it stood.
+            strict: whether nothing else is looked at than what hints and heading say; None: they may be wrong.
             refine: `none`, `vdr` or `lpo`, how far to go; None: as far as possible.
             top_k: how many candidates; None: as many as the service likes.
         """
@@ -189,6 +197,10 @@ class Client:
             camera_height_std_m=camera_height_std_m,
             refine=refine,
             top_k=top_k,
+            near=near,
+            radius_m=radius_m,
+            rooms=rooms,
+            strict=strict,
         )
         return self._run(operations.localisation(request, self._patience))
 

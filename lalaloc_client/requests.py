@@ -9,7 +9,7 @@ import math
 import os
 import re
 import uuid
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -136,6 +136,10 @@ def localise_request(
     camera_height_std_m: float | None,
     refine: Refine | None,
     top_k: int | None,
+    near: Mapping[str, float] | None,
+    radius_m: float | None,
+    rooms: Sequence[str] | None,
+    strict: bool | None,
 ) -> Request:
     """A query; it stores nothing, so asking twice is as good as once."""
     given = {
@@ -146,8 +150,13 @@ def localise_request(
         "camera_height_std_m": camera_height_std_m,
         "refine": refine,
         "top_k": top_k,
+        "radius_m": radius_m,
+        "strict": strict,
+        "near": None if near is None else json.dumps(dict(near)),
+        # Text alone would be taken for a room by each of its letters.
+        "rooms": None if rooms is None else json.dumps([rooms] if isinstance(rooms, str) else list(rooms)),
     }
-    _check_finite(given)
+    _check_finite({**given, **{f"near['{name}']": value for name, value in (near or {}).items()}})
     fields = {name: str(value) for name, value in given.items() if value is not None}
     picture = _picture(panorama)
     # Made of the content, so that the same query is the same bytes.

@@ -45,6 +45,7 @@ from lalaloc_core.errors import (
     DatasetError,
     ExportError,
     InvalidFloorPlanError,
+    InvalidHintError,
     InvalidInputError,
     InvalidPanoramaError,
     InvalidPoseError,
@@ -331,6 +332,7 @@ INTERNAL = ProblemKind(500, "internal", "Internal error", public=False)
 PROBLEMS: dict[type[Exception], ProblemKind] = {
     InvalidFloorPlanError: ProblemKind(422, "invalid-floorplan", "Invalid floor plan"),
     InvalidPanoramaError: ProblemKind(422, "invalid-panorama", "Invalid panorama"),
+    InvalidHintError: ProblemKind(422, "invalid-hint", "Hint that the plan contradicts"),
     InvalidPoseError: ProblemKind(422, "invalid-pose", "Invalid position, heading or height"),
     InvalidInputError: ProblemKind(422, "invalid-request", "Invalid request"),
     MalformedRequestError: ProblemKind(400, "malformed-request", "Malformed request"),

@@ -80,7 +80,9 @@ def resample(
         compared = Evidence(plan, query, evidence.fine_reach_m, encoders.manifest.evidence, evidence)
         of_layouts, offsets = compared.costs(layouts, np.array([candidate.hypothesis]))
         cost, offset = of_layouts[0] + evidence.latent_weight * cost, offsets[0]
-    against = hints.penalty(plan, poses.position_m, poses.room_index) / encoders.manifest.evidence.temperature
+    against = np.zeros(len(poses))
+    if not hints.are_none:
+        against = hints.penalty(plan, poses.position_m, poses.room_index) / encoders.manifest.evidence.temperature
     index = int((cost + against).argmin())
     chosen = PoseSet(poses.position_m[[index]], poses.room_index[[index]])
     if latents is None:

@@ -20,6 +20,7 @@ _WORDS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
     "int_type": lambda _: "not a whole number",
     "int_from_float": lambda _: "not a whole number",
     "int_parsing_size": lambda _: "too many digits",
+    "bool_parsing": lambda _: "must be true or false",
     "finite_number": lambda _: "must be finite",
     "greater_than_equal": lambda told: f"must be at least {_number(told['ge'])}",
     "greater_than": lambda told: f"must be more than {_number(told['gt'])}",

@@ -19,7 +19,7 @@ from contextlib import suppress
 from starlette.requests import Request
 from starlette.responses import Response
 
-from lalaloc_core.errors import InvalidFloorPlanError, InvalidPanoramaError, InvalidPoseError
+from lalaloc_core.errors import InvalidFloorPlanError, InvalidHintError, InvalidPanoramaError, InvalidPoseError
 from service.errors import (
     IdempotencyInProgressError,
     IdempotencyKeyReusedError,
@@ -42,6 +42,7 @@ _KEY = re.compile(rf"[\x21-\x7e]{{1,{MAX_KEY_CHARACTERS}}}")
 # What the request itself is to blame for, and will be tomorrow. Others are not kept, whatever their status.
 _FOR_GOOD = (
     InvalidFloorPlanError,
+    InvalidHintError,
     InvalidPanoramaError,
     InvalidPoseError,
     InvalidRequestError,

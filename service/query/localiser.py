@@ -15,7 +15,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.covariance import spread_of
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.pipeline import Localisation, StageClock, localise_steps, next_step, panorama_heading
+from lalaloc_core.localise.pipeline import Localisation, StageClock, Steps, localise_steps, next_step, panorama_heading
 from lalaloc_core.localise.poses import Candidate, LatentGrid, Query
 from lalaloc_core.panorama.images import Panorama
 from service.errors import DeadlineExceededError, PlanFailedError, PlanNotReadyError
@@ -24,6 +24,7 @@ from service.http.admission_control import Slots
 from service.query.camera_height import stated_height
 from service.query.decoding import Decoder
 from service.query.heading import KnownHeading, known_heading
+from service.query.hints import hint_warnings, stated_hints
 from service.query.lpo_pool import LpoPool
 from service.schemas import CandidateAnswer, LocaliseAnswer, LocaliseForm, ModelAnswer, Position, TimingsAnswer
 from service.settings import Settings
@@ -83,6 +84,7 @@ class Localiser:
         Raises:
             InvalidPanoramaError, DecoderNotReadyError, StoppingError: see `Decoder.decode`.
             InvalidPoseError: a camera height above the ceiling.
+            InvalidHintError: hints that are not of this plan, or leave nothing of it.
             PlanFailedError: the plan's grid could not be computed.
             PlanNotReadyError: the grid was not finished by the deadline.
             DeadlineExceededError: the rest was not.
@@ -96,20 +98,27 @@ class Localiser:
         self, record: PlanRecord, form: LocaliseForm, content: bytes, begin: float, clock: StageClock, party: str
     ) -> LocaliseAnswer:
         deadline = begin + self._settings.request_deadline_s
-        height = stated_height(form, record)
+        height, hints = stated_height(form, record), stated_hints(form, record.plan)
         # The picture first: a bad one is refused without waiting for the plan.
         with clock.stage("decode"):
             panorama = await self._decoder.decode(content, deadline, party)
         known = known_heading(form, record.plan, panorama, self._settings.compass_tolerance_deg)
+        # Looking at many rooms takes a while.
+        await self._compute(party, partial(hints.check, record.plan), deadline)
         query = await self._compute(party, lambda: self._encode(panorama, known, height, clock), deadline)
         latents_alone = not self._encoders.predicts_profile
         with clock.stage("grid"):
             grid_m = grid_height_m(record, height.height_m, latents_alone=latents_alone)
             grid = await self._grid(record, grid_m, deadline, party)
-        found = await self._search(record.plan, grid, query, form, deadline, clock, party)
+        steps = localise_steps(
+            record.plan, grid, self._encoders, query, refine=form.refine, top_k=form.top_k, clock=clock, hints=hints
+        )
+        found = await self._finished(steps, deadline, party)
         timings_ms = clock.timings_ms | {"total": (monotonic() - begin) * 1e3}
         self._observe(timings_ms, found.stage)
-        return self._compose(record, known, found, timings_ms)
+        warnings = [_contradiction(known)] if found.heading_contradicted else []
+        warnings += hint_warnings(hints, found, record.plan)
+        return self._compose(record, known, found, warnings, timings_ms)
 
     def close(self) -> None:
         """Finish what is being computed."""
@@ -153,18 +162,8 @@ class Localiser:
         with clock.stage("encode"):
             return self._encoders.query(panorama.pixels, known.heading, height, heading_tolerance=known.tolerance)
 
-    async def _search(
-        self,
-        plan: FloorPlan,
-        grid: LatentGrid,
-        query: Query,
-        form: LocaliseForm,
-        deadline: float,
-        clock: StageClock,
-        party: str,
-    ) -> Localisation:
-        """Search on the threads of the localiser, which do something else while LPO is waited for."""
-        steps = localise_steps(plan, grid, self._encoders, query, refine=form.refine, top_k=form.top_k, clock=clock)
+    async def _finished(self, steps: Steps, deadline: float, party: str) -> Localisation:
+        """Run a search on the threads of the localiser, which do something else while LPO is waited for."""
         step = await self._compute(party, partial(next_step, steps, None), deadline)
         while not isinstance(step, Localisation):
             timeout_s = min(self._settings.lpo_deadline_s, deadline - monotonic() - _ANSWER_S)
@@ -178,7 +177,12 @@ class Localiser:
         self._telemetry.answers.labels(stage).inc()
 
     def _compose(
-        self, record: PlanRecord, known: KnownHeading, found: Localisation, timings_ms: dict[str, float]
+        self,
+        record: PlanRecord,
+        known: KnownHeading,
+        found: Localisation,
+        warnings: list[str],
+        timings_ms: dict[str, float],
     ) -> LocaliseAnswer:
         model = self._bundle.manifest.confidence
         answer = found.best[found.stage]
@@ -201,7 +205,7 @@ class Localiser:
             room_id=best.room_id,
             confidence=best.probability,
             heading_confidence=None if fits is None else fits * min(found.posterior.heading, 1.0),
-            warnings=[_contradiction(known)] if found.heading_contradicted else [],
+            warnings=warnings,
             covariance_m2=None if spread is None else spread.position_m2.tolist(),
             heading_std_deg=None if spread is None or spread.heading_std is None else math.degrees(spread.heading_std),
             stage=found.stage,

@@ -8,7 +8,7 @@ from typing import Any
 
 from fastapi import APIRouter, Request, Response
 
-from lalaloc_core.errors import InvalidPanoramaError, InvalidPoseError
+from lalaloc_core.errors import InvalidHintError, InvalidPanoramaError, InvalidPoseError
 from lalaloc_core.localise.pipeline import StageClock
 from service.errors import (
     DeadlineExceededError,
@@ -56,6 +56,7 @@ def _body_schema() -> dict[str, Any]:
     response_model=LocaliseAnswer,
     openapi_extra=_body_schema(),
     responses=problem_responses(
+        InvalidHintError,
         InvalidPanoramaError,
         InvalidPoseError,
         InvalidRequestError,

@@ -4,6 +4,7 @@ fields           the base of all answers, and the types of their numbers: how fa
 native_plan      a floor plan in the native format
 stored_plans     what is told of stored floor plans
 localise_query   what a query says beside the panorama
+hint_fields      what it says of where the camera stood
 localise_answer  where it was taken
 service_state    limits, health, readiness
 problem_details  errors

@@ -12,9 +12,9 @@ from service.schemas.localise_query import HEADING_MEANING
 _LATENT_DISTANCE = Field(ge=0, le=2, description="Distance of the pose's layout to the panorama's latent.")
 _COST = Field(
     ge=0,
-    description="What candidates are ranked by: how badly the walls around the pose fit the panorama, without unit, "
-    "lower is better. Candidates that were not refined as far as the first come after those that were, and their "
-    "costs, which allow for the distance of neighbouring poses, do not compare.",
+    description="What candidates are ranked by, together with hints: how badly the walls around the pose fit the "
+    "panorama, without unit, lower is better. Candidates that were not refined as far as the first come after those "
+    "that were, and their costs, which allow for the distance of neighbouring poses, do not compare.",
 )
 
 Pair = Annotated[list[Variance], Field(min_length=2, max_length=2)]
@@ -79,7 +79,7 @@ class LocaliseAnswer(Answer):
         description="Probability that the heading is right within 5°; null where `confidence` is."
     )
     warnings: list[str] = Field(
-        description="What was said and not followed, such as a heading that the panorama contradicts."
+        description="What was said and not followed, such as a heading or a hint that the panorama contradicts."
     )
     heading_source: Literal["given", "panorama", "searched"] = Field(
         description="Where the heading came from: the request, the panorama's metadata, or the search."

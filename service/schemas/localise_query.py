@@ -5,20 +5,19 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+from pydantic import Field, ValidationInfo, field_validator
 
 from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M
 from lalaloc_core.floorplan import MAX_CAMERA_HEIGHT_STD_M
 from lalaloc_core.localise.camera_height import DEFAULT_STD_M, UNKNOWN_RANGE_M
 from service.schemas.fields import Finite
+from service.schemas.hint_fields import HintFields
 
 HEADING_MEANING = "azimuth of the panorama's centre column, clockwise from the plan's +y seen from above"
 
 
-class LocaliseForm(BaseModel):
+class LocaliseForm(HintFields):
     """Fields of a query besides the panorama itself; an empty field counts as left out."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     floorplan_id: str = Field(min_length=1, description="Id of the floor plan the panorama was taken in.")
     heading_deg: Annotated[float, Finite] | None = Field(

@@ -1,0 +1,124 @@
+"""Hints of a query: what they may be, and that they reach the search."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.camera_height import CameraHeight
+from lalaloc_core.localise.hints import Hints, Near
+from lalaloc_core.localise.pipeline import Localisation
+from lalaloc_core.localise.poses import Candidate, Query
+from lalaloc_core.localise.posterior import Posterior
+from service.query.hints import hint_warnings
+from tests.service.conftest import FLAT, assert_problem, localise, upload
+from tests.strategies import rectangle
+
+PLAN: dict[str, Any] = FLAT | {
+    "rooms": [
+        {"name": "Bedroom", "polygon": rectangle(4.0, 3.0)},
+        {"name": "Bedroom", "polygon": rectangle(4.0, 3.0, at=(5.0, 0.0))},
+        {"name": "hall", "polygon": rectangle(9.0, 1.5, at=(0.0, 4.0))},
+    ]
+}
+
+
+@pytest.fixture(scope="module")
+def plan_id(client: httpx.Client) -> str:
+    return upload(client, PLAN)
+
+
+@pytest.mark.parametrize(
+    ("rooms", "possible"),
+    [
+        ("hall", {"hall"}),
+        ("Bedroom", {"bedroom", "bedroom-2"}),
+        (json.dumps(["bedroom-2"]), {"bedroom-2"}),
+        (json.dumps(["hall", "bedroom"]), {"hall", "bedroom"}),
+    ],
+)
+@pytest.mark.parametrize("refine", ["none", "lpo"])
+def test_strict_rooms_are_the_only_ones(
+    client: httpx.Client, plan_id: str, panorama: bytes, rooms: str, possible: set[str], refine: str
+) -> None:
+    response = localise(client, plan_id, panorama, rooms=rooms, strict="true", refine=refine)
+    assert response.status_code == 200, response.text
+    assert {one["room_id"] for one in response.json()["candidates"]} <= possible
+
+
+def test_a_strict_point_is_the_centre_of_all_answers(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
+    fields = {"near": json.dumps({"x_m": 6.0, "y_m": 1.0}), "radius_m": 1.2}
+    answer = localise(client, plan_id, panorama, strict="true", **fields).json()
+    for candidate in answer["candidates"]:
+        assert np.hypot(candidate["position"]["x_m"] - 6.0, candidate["position"]["y_m"] - 1.0) <= 1.2 + 1e-3
+
+
+def test_a_hint_makes_the_places_that_it_is_of_likelier(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
+    def rooms_found(**fields: Any) -> list[str]:
+        found = localise(client, plan_id, panorama, refine="none", **fields).json()
+        return [candidate["room_id"] for candidate in found["candidates"]]
+
+    free, hinted = rooms_found(), rooms_found(rooms="hall")
+    assert hinted.index("hall") <= free.index("hall")
+    assert hinted.count("hall") >= free.count("hall")
+
+
+@pytest.mark.parametrize(
+    ("fields", "field", "message"),
+    [
+        ({"near": "7,2", "radius_m": 3}, "near", "not a JSON object"),
+        ({"near": "[1, 2]", "radius_m": 3}, "near", "not a JSON object"),
+        ({"near": "[" * 2000, "radius_m": 3}, "near", "not a JSON object"),
+        ({"near": '{"x_m": 1}', "radius_m": 3}, "near.y_m", "is missing"),
+        ({"near": '{"x_m": 1, "y_m": NaN}', "radius_m": 3}, "near.y_m", "must be finite"),
+        ({"near": '{"x_m": 1, "y_m": 2}'}, "radius_m", "is missing"),
+        ({"radius_m": 3}, "radius_m", "near, around which it is, is missing"),
+        ({"near": '{"x_m": 1, "y_m": 2}', "radius_m": 0}, "radius_m", "must be at least 0.1"),
+        ({"near": '{"x_m": 1, "y_m": 2}', "radius_m": 1001}, "radius_m", "must be at most 1000"),
+        ({"rooms": "[]"}, "rooms", "1 are needed"),
+        ({"rooms": "[1]"}, "rooms.0", "valid string"),
+        ({"rooms": '["hall"'}, "rooms", "not a JSON array"),
+        ({"rooms": "hall", "strict": "maybe"}, "strict", "must be true or false"),
+    ],
+)
+def test_hints_that_are_none_are_told(
+    client: httpx.Client, plan_id: str, panorama: bytes, fields: dict[str, Any], field: str, message: str
+) -> None:
+    problem = assert_problem(localise(client, plan_id, panorama, **fields), 422, "invalid-request")
+    assert [(fault["field"], message in fault["message"]) for fault in problem["errors"]] == [(field, True)]
+
+
+@pytest.mark.parametrize(
+    ("fields", "detail"),
+    [
+        ({"rooms": "attic"}, "rooms: the plan has no room 'attic', it has 'bedroom', 'bedroom-2', 'hall'"),
+        ({"near": '{"x_m": -7, "y_m": 1}', "radius_m": 3}, "near: (-7, 1) is 7 m from the nearest room of the plan"),
+        ({"near": '{"x_m": 4.5, "y_m": 1}', "radius_m": 0.51, "strict": "true"}, "strict: none of the"),
+    ],
+)
+def test_hints_that_the_plan_contradicts_are_told(
+    client: httpx.Client, plan_id: str, panorama: bytes, fields: dict[str, Any], detail: str
+) -> None:
+    problem = assert_problem(localise(client, plan_id, panorama, **fields), 422, "invalid-hint")
+    assert detail in problem["detail"]
+
+
+def test_what_is_overruled_is_said_with_both_values() -> None:
+    plan = FloorPlan.from_dict(PLAN)
+    query = Query(np.eye(1), np.zeros(1), 0.0, heading_known=True, camera_height=CameraHeight(1.5))
+    answer = Candidate(1.0, 4.5, 2, 0.0, 0, 0.1, 0.2)
+    posterior = Posterior(np.ones(1), (1.0,), 1.0)
+    hints = Hints(near=Near(6.0, 4.5, 3.0), rooms=frozenset({0, 1}))
+    found = Localisation(query, [answer], posterior, "lpo", {}, hints_missed=("near", "rooms"))
+    assert hint_warnings(hints, found, plan) == [
+        "near is within 3 m of (6, 4.5), which the panorama contradicts: the answer is 5.0 m from there",
+        "rooms is 'bedroom', 'bedroom-2', which the panorama contradicts: the answer lies in room 'hall'",
+    ]
+    strict = hint_warnings(replace(hints, strict=True), replace(found, hints_missed=("near",)), plan)
+    assert strict == ["near is within 3 m of (6, 4.5), which the panorama contradicts: it was followed, being strict"]
