@@ -5,6 +5,7 @@ LaLaLocError
     ├── MalformedRequestError       a body that does not follow its media type
     ├── InvalidRequestError         a field that is missing, unknown or outside its limits
     ├── UnknownFloorPlanError       no floor plan with this id
+    ├── UnknownVenueError           no venue with this id
     ├── UnknownRevisionError        no such revision of the floor plan
     ├── UploadTooLargeError         more bytes than allowed
     ├── UploadTimeoutError          the upload took too long
@@ -14,7 +15,9 @@ LaLaLocError
     ├── PlanFailedError             the plan's latent grid could not be computed
     ├── PlanNotReadyError           still preparing at the request's deadline
     ├── TooManyFloorPlansError      the tenant has as many as allowed
-    ├── RevisionMismatchError       the plan has another revision than the one expected
+    ├── TooManyVenuesError          the tenant has as many as allowed
+    ├── VenueNotReadyError          no plan of the venue can be asked about yet
+    ├── RevisionMismatchError       the plan or venue has another revision than the one expected
     ├── IdempotencyKeyReusedError   the key was sent with another body before
     ├── IdempotencyInProgressError  the same request is being carried out
     ├── DamagedDataError            what is stored is not what was
@@ -87,6 +90,13 @@ class UnknownFloorPlanError(ServiceError):
 
     def __init__(self, plan_id: str) -> None:
         super().__init__(f"there is no floor plan '{plan_id[:64]}'")
+
+
+class UnknownVenueError(ServiceError):
+    """No venue has this id."""
+
+    def __init__(self, venue_id: str) -> None:
+        super().__init__(f"there is no venue '{venue_id[:64]}'")
 
 
 class UnknownRevisionError(ServiceError):
@@ -166,16 +176,34 @@ class TooManyFloorPlansError(ServiceError):
         super().__init__(f"{limit} floor plans are stored, no more are allowed (max_floorplans); delete some")
 
 
+class TooManyVenuesError(ServiceError):
+    """The tenant has as many venues as allowed."""
+
+    def __init__(self, limit: int) -> None:
+        super().__init__(f"{limit} venues are stored, no more are allowed (max_venues); delete some")
+
+
+class VenueNotReadyError(ServiceError):
+    """None of the venue's plans has a latent grid yet."""
+
+    retry_after_s = 5
+
+    def __init__(self, venue_id: str, plans: int, waited_s: float) -> None:
+        super().__init__(
+            f"none of the {plans} floor plans of venue '{venue_id}' is ready (after waiting {waited_s:.1f} s)"
+        )
+
+
 class RevisionMismatchError(ServiceError):
-    """The plan has another revision than the one that the caller expects.
+    """The plan or venue has another revision than the one that the caller expects.
 
     Attributes:
         current: id of the revision that it has.
     """
 
-    def __init__(self, plan_id: str, expected: str, current: str) -> None:
+    def __init__(self, of_id: str, expected: str, current: str, *, what: str = "floor plan") -> None:
         self.current = current
-        super().__init__(f"floor plan '{plan_id}' has revision '{current}', not '{expected[:64]}'")
+        super().__init__(f"{what} '{of_id}' has revision '{current}', not '{expected[:64]}'")
 
 
 class IdempotencyKeyReusedError(ServiceError):
@@ -338,6 +366,7 @@ PROBLEMS: dict[type[Exception], ProblemKind] = {
     MalformedRequestError: ProblemKind(400, "malformed-request", "Malformed request"),
     InvalidRequestError: ProblemKind(422, "invalid-request", "Invalid request"),
     UnknownFloorPlanError: ProblemKind(404, "unknown-floorplan", "Unknown floor plan"),
+    UnknownVenueError: ProblemKind(404, "unknown-venue", "Unknown venue"),
     UnknownRevisionError: ProblemKind(404, "unknown-revision", "Unknown revision"),
     UploadTooLargeError: ProblemKind(413, "upload-too-large", "Upload too large"),
     UploadTimeoutError: ProblemKind(408, "upload-timeout", "Upload took too long"),
@@ -347,6 +376,8 @@ PROBLEMS: dict[type[Exception], ProblemKind] = {
     PlanFailedError: ProblemKind(409, "floorplan-failed", "Floor plan could not be prepared"),
     PlanNotReadyError: ProblemKind(503, "floorplan-not-ready", "Floor plan still preparing"),
     TooManyFloorPlansError: ProblemKind(507, "too-many-floorplans", "Too many floor plans"),
+    TooManyVenuesError: ProblemKind(507, "too-many-venues", "Too many venues"),
+    VenueNotReadyError: ProblemKind(503, "venue-not-ready", "Venue still preparing"),
     RevisionMismatchError: ProblemKind(412, "revision-mismatch", "Another revision than expected"),
     IdempotencyKeyReusedError: ProblemKind(422, "idempotency-key-reused", "Idempotency key used for something else"),
     IdempotencyInProgressError: ProblemKind(409, "idempotency-in-progress", "Request already in work"),

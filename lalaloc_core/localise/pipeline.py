@@ -9,7 +9,7 @@ import math
 import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from operator import attrgetter
 from typing import Literal
 
@@ -44,6 +44,7 @@ class LocaliseConfig:
         profile_candidates: how many are optimised by their wall profiles, which is cheaper.
         profile_candidates_turned: the same where the heading is searched: rooms look alike from several sides.
         separation_m: candidates nearer than this to a better one are dropped; retrieval keeps those turned otherwise.
+        by_probability: rank the answers by how probable they are instead of by cost, as places of several plans are.
         evidence: what poses are compared by.
     """
 
@@ -54,6 +55,7 @@ class LocaliseConfig:
     profile_candidates: int = 10
     profile_candidates_turned: int = 20
     separation_m: float = 1.0
+    by_probability: bool = False
     evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
 
     def starts(self, query: Query) -> int:
@@ -251,16 +253,33 @@ def localise_steps(
     elif stage == "vdr":
         first = config.vdr_candidates
         candidates = sorted(candidates[:first], key=attrgetter("total_cost")) + candidates[first:]
-    answers = _distinct(candidates, config.separation_m, top_k)
+    wanted = max(top_k, starts) if config.by_probability else top_k
+    answers = _distinct(candidates, config.separation_m, wanted)
+    found = posterior(answers)
+    if config.by_probability:
+        answers, found = _by_probability(answers, found, top_k, posterior)
+        best[stage] = answers[0]
+        signals[stage] = signals_of(query, answers[0], found)
     missed = hints.missed(answers[0].position_m, answers[0].room_index)
     if hints.strict:
         missed = missed_hints(plan, costs, weights, hints)
-    return Localisation(query, answers, posterior(answers), stage, signals, doubted, missed, best, clock.timings_ms)
+    return Localisation(query, answers, found, stage, signals, doubted, missed, best, clock.timings_ms)
 
 
 def panorama_heading(query: Query, candidate: Candidate) -> float:
     """Azimuth (radians) of the panorama's centre column that a candidate implies."""
     return float(wrap_angle(query.roll[candidate.hypothesis] + candidate.frame_heading))
+
+
+def _by_probability(
+    answers: list[Candidate], found: Posterior, top_k: int, posterior: Callable[[list[Candidate]], Posterior]
+) -> tuple[list[Candidate], Posterior]:
+    """The most probable answers, the most probable first, with the posterior that they were ranked by."""
+    shares = found.candidate
+    order = sorted(range(len(answers)), key=lambda index: -shares[index])[:top_k]
+    ranked = [answers[index] for index in order]
+    # The heading is that of the first one.
+    return ranked, replace(found, candidate=tuple(shares[index] for index in order), heading=posterior(ranked).heading)
 
 
 def _distinct(candidates: list[Candidate], separation_m: float, top_k: int) -> list[Candidate]:

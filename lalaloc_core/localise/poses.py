@@ -27,6 +27,21 @@ class LatentGrid:
     camera_height_m: float
     _layouts: list[Layouts] = field(default_factory=list, init=False, repr=False)
 
+    @classmethod
+    def with_layouts(
+        cls,
+        poses: PoseSet,
+        latents: Float[np.ndarray, "n d"],
+        profile_m: Float[np.ndarray, "n w"],
+        step_m: float,
+        camera_height_m: float,
+        layouts: Layouts,
+    ) -> LatentGrid:
+        """A grid whose layouts are rendered already."""
+        grid = cls(poses, latents, profile_m, step_m, camera_height_m)
+        grid._layouts.append(layouts)
+        return grid
+
     def layouts(self, plan: FloorPlan) -> Layouts:
         """What the plan shows at the poses; rendered at first use, since grids are stored without openings."""
         if not self._layouts:

@@ -6,6 +6,8 @@
         ├── latent_grids     model, grid step, camera height, poses
         │   └── grid_chunks      the arrays as one blob, 1 MiB each
         └── grid_leases      who computes which grid, until when, how far
+    venues           id, tenant, name, revision, anchor, created_at, updated_at
+    └── venue_plans      floor plan, level, name
     api_keys         tenant, name, hash, scopes, rate, created_at, revoked_at, last_used_at
     idempotency      (tenant, route, key) -> digest of the body, and the answer once there is one
 

@@ -2,6 +2,9 @@
 
 4 bytes "LLG1", then the numbers of poses, latent values and profile columns as little-endian uint32;
 positions (float64, n·2), latents (float32, n·d), profiles (float32, n·w), room indices (int32, n).
+
+The prototypes of a plan likewise: "LLP1", their number and that of azimuths, log profiles (float16, n·a), log areas
+(float32, n).
 """
 
 from __future__ import annotations
@@ -13,20 +16,24 @@ from dataclasses import dataclass
 import numpy as np
 
 from lalaloc_core.localise.poses import LatentGrid
+from lalaloc_core.localise.prototypes import Prototypes, prototypes_of
 from lalaloc_core.sampling import PoseSet
 
 _HEADER = struct.Struct("<4s3I")
 _MAGIC = b"LLG1"
+_PROTOTYPES_HEADER = struct.Struct("<4s2I")
+_PROTOTYPES_MAGIC = b"LLP1"
 _POSE_BYTES, _VALUE_BYTES, _ROOM_BYTES = 16, 4, 4
 
 
 @dataclass(frozen=True)
 class PackedGrid:
-    """A grid as a blob, with the number of its poses and the digest of the blob."""
+    """A grid as a blob, with the number of its poses, the digest of the blob, and its prototypes as another one."""
 
     poses: int
     content: bytes
     sha256: str
+    prototypes: bytes
 
 
 def pack(grid: LatentGrid) -> PackedGrid:
@@ -40,7 +47,29 @@ def pack(grid: LatentGrid) -> PackedGrid:
         grid.poses.room_index.astype("<i4", copy=False),
     )
     content = b"".join((header, *(np.ascontiguousarray(array).data.cast("B") for array in arrays)))
-    return PackedGrid(count, content, digest_of(content))
+    return PackedGrid(count, content, digest_of(content), pack_prototypes(prototypes_of(grid)))
+
+
+def pack_prototypes(prototypes: Prototypes) -> bytes:
+    """The blob of a plan's prototypes."""
+    count, azimuths = prototypes.log_profile.shape
+    header = _PROTOTYPES_HEADER.pack(_PROTOTYPES_MAGIC, count, azimuths)
+    profile, area = prototypes.log_profile.astype("<f2"), prototypes.log_area.astype("<f4")
+    return b"".join((header, profile.tobytes(), area.tobytes()))
+
+
+def unpack_prototypes(content: bytes, *, step_m: float) -> Prototypes | None:
+    """The prototypes in a blob, as read-only views of it; None when it is none, or has numbers that are none."""
+    if len(content) < _PROTOTYPES_HEADER.size:
+        return None
+    magic, count, azimuths = _PROTOTYPES_HEADER.unpack_from(content)
+    if magic != _PROTOTYPES_MAGIC or len(content) != _PROTOTYPES_HEADER.size + count * (2 * azimuths + 4):
+        return None
+    log_profile = np.frombuffer(content, "<f2", count * azimuths, _PROTOTYPES_HEADER.size).reshape(count, azimuths)
+    log_area = np.frombuffer(content, "<f4", count, len(content) - 4 * count)
+    if not (count and np.isfinite(log_profile).all() and np.isfinite(log_area).all()):
+        return None
+    return Prototypes(log_profile, log_area, step_m)
 
 
 def digest_of(content: bytes | bytearray) -> str:

@@ -22,6 +22,7 @@ from service.storage.plan_document import PlanDocument
 from service.storage.records import ComputedGrid, Cursor, GridKey, PlanRecord, PlanSummary
 from service.storage.stored_grids import insert_grid, select_summaries
 from service.storage.tables import FLOORPLANS, LATENT_GRIDS, ORIGINAL_CHUNKS, REVISIONS
+from service.storage.venues import take_out_of_venues
 from service.telemetry import LOGGER_NAME
 
 # Uploads take turns on PostgreSQL, so that the number of plans is exact; differs from the lock of `migration`.
@@ -215,7 +216,7 @@ class Plans:
         return self._summaries(select_summaries().where(FLOORPLANS.c.id.in_(plan_ids)))
 
     def delete(self, tenant: str, plan_id: str, *, expected: str | None = None) -> bool:
-        """Delete a plan with all its revisions, originals and grids; False when there was none.
+        """Delete a plan with all its revisions, originals and grids, and take it out of its venues; False without one.
 
         Args:
             expected: id of the revision that it must have; None for any.
@@ -229,6 +230,8 @@ class Plans:
             revision_id = connection.scalar(query)
             if revision_id is not None and expected not in (None, revision_id):
                 raise RevisionMismatchError(plan_id, expected, revision_id)
+            if revision_id is not None:
+                take_out_of_venues(connection, plan_id)
             deleted = connection.execute(delete(FLOORPLANS).where(*own)).rowcount == 1
         self._cache.forget(tenant, plan_id)
         return deleted

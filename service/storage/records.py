@@ -83,6 +83,65 @@ class PlanSummary:
 
 
 @dataclass(frozen=True)
+class VenueAnchor:
+    """Where on Earth the origin of a venue's plans lies, WGS84; `north_deg` is the azimuth of true north in them."""
+
+    latitude: float
+    longitude: float
+    altitude_m: float | None = None
+    north_deg: float = 0.0
+
+
+@dataclass(frozen=True)
+class VenueMember:
+    """A plan of a venue: its level, and what it is called there, None for the plan's own name."""
+
+    plan_id: str
+    level: float = 0.0
+    name: str | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class VenueRecord:
+    """A stored venue.
+
+    Attributes:
+        revision_id: changes with its name, its anchor and its plans.
+        revision: number of the revision, from 1.
+        plans: how many it has.
+        created_at: when the venue was first stored.
+        updated_at: when the revision was.
+    """
+
+    id: str
+    tenant: str
+    revision_id: str
+    revision: int
+    name: str
+    anchor: VenueAnchor | None
+    plans: int
+    created_at: datetime
+    updated_at: datetime
+
+
+@dataclass(frozen=True)
+class VenueCounts:
+    """How many plans a venue has, and how many of them can be asked about, or never will."""
+
+    plans: int
+    ready: int
+    failed: int
+
+
+@dataclass(frozen=True)
+class VenuePlace:
+    """A place in the list of a venue's plans: after this one."""
+
+    level: float
+    plan_id: str
+
+
+@dataclass(frozen=True)
 class Cursor:
     """A place in a listing: after this plan."""
 

@@ -15,6 +15,7 @@ from service.storage.migration import migrate
 from service.storage.plan_cache import PlanCache
 from service.storage.plans import Plans
 from service.storage.stored_grids import GridLeases, StoredGrids
+from service.storage.venues import Venues
 
 _CLAIM_MARGIN_S = 5.0
 
@@ -27,6 +28,7 @@ class Store:
     Attributes:
         plans: floor plans with revisions and originals.
         plan_cache: of these, those in memory.
+        venues: which of them belong together.
         grids: their latent grids.
         leases: who computes which grid.
         idempotency_keys: answers to requests that may be sent twice.
@@ -61,6 +63,7 @@ class Store:
         self._database = database
         self.plan_cache = PlanCache(plan_cache_bytes)
         self.plans = Plans(database, self.plan_cache)
+        self.venues = Venues(database)
         self.grids = StoredGrids(database)
         self.leases = GridLeases(database)
         self.idempotency_keys = IdempotencyKeys(database, claim_s)

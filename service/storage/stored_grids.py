@@ -10,12 +10,16 @@ from sqlalchemy import ColumnElement, Connection, Table, and_, delete, exists, f
 from sqlalchemy.exc import IntegrityError
 
 from lalaloc_core.localise.poses import LatentGrid
+from lalaloc_core.localise.prototypes import Prototypes
 from service.storage.chunks import read_exactly, write_chunks
 from service.storage.database import Database
-from service.storage.grid_format import PackedGrid, digest_of, pack, unpack
+from service.storage.grid_format import PackedGrid, digest_of, pack, pack_prototypes, unpack, unpack_prototypes
 from service.storage.records import GridKey, PlanSummary
 from service.storage.tables import FLOORPLANS, GRID_CHUNKS, GRID_LEASES, LATENT_GRIDS, REVISIONS
 from service.telemetry import LOGGER_NAME
+
+# Grids in one statement.
+_AT_ONCE = 1000
 
 
 class StoredGrids:
@@ -29,7 +33,7 @@ class StoredGrids:
         columns = LATENT_GRIDS.c
         with self._database.reading() as connection:
             query = select(columns.id, columns.size_bytes, columns.sha256).where(
-                *_where(LATENT_GRIDS, key), _has_digest()
+                *_where(LATENT_GRIDS, key), has_digest()
             )
             row = connection.execute(query).one_or_none()
             if row is None:
@@ -43,13 +47,34 @@ class StoredGrids:
             logging.getLogger(LOGGER_NAME).error("a stored latent grid is damaged", extra={"fields": fields})
         return grid
 
+    def prototypes(self, grid_ids: Sequence[int]) -> dict[int, Prototypes]:
+        """Prototypes of stored grids by the grids' ids, those that there are."""
+        found: dict[int, Prototypes] = {}
+        columns = LATENT_GRIDS.c
+        for first in range(0, len(grid_ids), _AT_ONCE):
+            query = select(columns.id, columns.step_m, columns.prototypes).where(
+                columns.id.in_(grid_ids[first : first + _AT_ONCE]), columns.prototypes.is_not(None)
+            )
+            with self._database.reading() as connection:
+                rows = connection.execute(query).all()
+            for row in rows:
+                if (prototypes := unpack_prototypes(row.prototypes, step_m=row.step_m)) is not None:
+                    found[row.id] = prototypes
+        return found
+
+    def put_prototypes(self, grid_id: int, prototypes: Prototypes) -> None:
+        """Store the prototypes of a grid that an earlier version of the service stored without."""
+        statement = update(LATENT_GRIDS).where(LATENT_GRIDS.c.id == grid_id)
+        with self._database.writing() as connection:
+            connection.execute(statement.values(prototypes=pack_prototypes(prototypes)))
+
     def poses(
         self, model_sha256: str, step_m: float, revision_ids: Sequence[str] | None = None
     ) -> dict[tuple[str, int], int]:
         """Poses of the stored grids of a model, by revision and camera height (mm); of all revisions, or some."""
         columns = LATENT_GRIDS.c
         query = select(columns.revision_id, columns.camera_height_mm, columns.poses).where(
-            columns.model_sha256 == model_sha256, columns.step_m == step_m, _has_digest()
+            columns.model_sha256 == model_sha256, columns.step_m == step_m, has_digest()
         )
         if revision_ids is not None:
             query = query.where(columns.revision_id.in_(revision_ids))
@@ -87,7 +112,7 @@ class StoredGrids:
             GRID_LEASES.c.revision_id == REVISIONS.c.id,
             GRID_LEASES.c.model_sha256 == model_sha256,
             GRID_LEASES.c.step_m == step_m,
-            _is_own_height(GRID_LEASES),
+            is_own_height(GRID_LEASES),
             self._database.is_live(GRID_LEASES.c.lease_until_s, GRID_LEASES.c.length_s),
         )
         query = select_summaries().where(*_unprepared(model_sha256, step_m), ~exists().where(*leased))
@@ -165,6 +190,7 @@ def insert_grid(connection: Connection, key: GridKey, packed: PackedGrid) -> Non
         "poses": packed.poses,
         "size_bytes": len(packed.content),
         "sha256": packed.sha256,
+        "prototypes": packed.prototypes,
     }
     grid_id = connection.scalar(LATENT_GRIDS.insert().values(values).returning(LATENT_GRIDS.c.id))
     write_chunks(connection, GRID_CHUNKS, {"grid_id": grid_id}, memoryview(packed.content))
@@ -199,12 +225,12 @@ def _where(table: Table, key: GridKey) -> list[ColumnElement[bool]]:
     return [table.c[name] == value for name, value in _columns(key).items()]
 
 
-def _has_digest() -> ColumnElement[bool]:
+def has_digest() -> ColumnElement[bool]:
     """Whether a row of the table of grids counts: an earlier version of the service, beside this one, writes none."""
     return LATENT_GRIDS.c.sha256.is_not(None)
 
 
-def _is_own_height(table: Table) -> ColumnElement[bool]:
+def is_own_height(table: Table) -> ColumnElement[bool]:
     """Whether a row is for the plan's own camera height; half a millimetre more or less is the same one."""
     return and_(
         table.c.camera_height_mm >= REVISIONS.c.camera_height_m * 1000.0 - 0.501,
@@ -243,7 +269,7 @@ def _unprepared(model_sha256: str, step_m: float) -> list[ColumnElement[bool]]:
         LATENT_GRIDS.c.revision_id == REVISIONS.c.id,
         LATENT_GRIDS.c.model_sha256 == model_sha256,
         LATENT_GRIDS.c.step_m == step_m,
-        _has_digest(),
-        _is_own_height(LATENT_GRIDS),
+        has_digest(),
+        is_own_height(LATENT_GRIDS),
     )
     return [REVISIONS.c.failure.is_(None), ~exists().where(*own_grid)]

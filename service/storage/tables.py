@@ -101,6 +101,8 @@ LATENT_GRIDS = Table(
     Column("size_bytes", Integer, nullable=False),
     # Nothing where an earlier version of the service stored it, beside this one: then it does not count as stored.
     Column("sha256", String(64)),
+    # What the first look at a venue goes by; nothing where an earlier version stored the grid.
+    Column("prototypes", LargeBinary),
     UniqueConstraint("revision_id", "model_sha256", "step_m", "camera_height_mm", name="latent_grid_key"),
 )
 
@@ -127,6 +129,38 @@ GRID_LEASES = Table(
     Column("progress", Double, nullable=False),
     # How often the grid was begun, since it was last finished or given up.
     Column("attempts", Integer, nullable=False, server_default="1"),
+)
+
+VENUES = Table(
+    "venues",
+    METADATA,
+    Column("id", String(32), primary_key=True),
+    Column("tenant", String(64), nullable=False),
+    Column("name", Text, nullable=False),
+    # As of floor plans.
+    Column("folded_name", Text, nullable=False),
+    Column("revision_id", String(32), nullable=False),
+    Column("number", Integer, nullable=False),
+    # The anchor, all of it or nothing but for the altitude.
+    Column("latitude", Double),
+    Column("longitude", Double),
+    Column("altitude_m", Double),
+    Column("north_deg", Double),
+    Column("created_at", Moment, nullable=False),
+    Column("updated_at", Moment, nullable=False),
+    Index("venues_by_tenant_and_age", "tenant", "created_at", "id"),
+)
+
+VENUE_PLANS = Table(
+    "venue_plans",
+    METADATA,
+    Column("venue_id", String(32), ForeignKey("venues.id", ondelete="CASCADE"), primary_key=True),
+    Column("plan_id", String(32), ForeignKey("floorplans.id", ondelete="CASCADE"), primary_key=True),
+    Column("level", Double, nullable=False),
+    # Nothing where the plan is called by its own name.
+    Column("name", Text),
+    Index("venue_plans_by_plan", "plan_id"),
+    Index("venue_plans_by_level", "venue_id", "level", "plan_id"),
 )
 
 API_KEYS = Table(
