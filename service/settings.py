@@ -203,6 +203,11 @@ class Settings(BaseSettings):
         default=600.0, description="How long a plan in memory is trusted while the database is away."
     )
     grid_cache_bytes: int = Field(default=256 * 2**20, ge=0, description="Latent grids kept in memory.")
+    venue_cache_bytes: int = Field(
+        default=128 * 2**20,
+        ge=0,
+        description="Prototypes of floor plans kept in memory, which choose among the plans of large venues.",
+    )
     max_grids_per_plan: Annotated[int, Field(ge=2)] = Field(
         default=8, description="Stored latent grids (camera heights) per plan; the oldest on-demand one makes room."
     )
@@ -228,6 +233,9 @@ class Settings(BaseSettings):
     max_openings: Annotated[int, Field(ge=0)] = Field(
         default=2000, description="Doors, windows and passages of a floor plan."
     )
+    max_venues: Count = Field(default=1000, description="Stored venues per tenant.")
+    max_venue_plans: Count = Field(default=10_000, description="Floor plans of a venue.")
+    max_venue_bytes: Count = Field(default=4 * 2**20, description="Description of a venue: its list of plans, mostly.")
     max_panorama_bytes: Count = Field(default=40 * 2**20, description="Upload of a panorama.")
     max_pixels: Count = Field(default=100_000_000, description="Pixels of a panorama.")
     max_scans: Count = Field(

@@ -10,6 +10,7 @@ from contextlib import suppress
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.poses import LatentGrid
+from lalaloc_core.localise.prototypes import Prototypes, prototypes_of
 from lalaloc_core.sampling import grid_size
 from service.errors import OverloadedError, StoppingError
 from service.grids.builder import GridBuilder
@@ -66,6 +67,11 @@ class GridProvider:
     def preparing(self) -> int:
         """The same here and elsewhere, with plans whose grid nobody has queued yet, as of the last `queue_missing`."""
         return max(self.pending, self._unprepared)
+
+    @property
+    def model(self) -> tuple[str, float]:
+        """What grids are kept by beside revision and height: the digest of the model, and the grid step (m)."""
+        return self._model_sha256, self._settings.grid_step_m
 
     def key(self, revision_id: str, camera_height_m: float) -> GridKey:
         """The key of a revision's grid for this model and grid step."""
@@ -138,6 +144,15 @@ class GridProvider:
             StoreUnavailableError: it is not in memory, and the database is away.
         """
         return self._cache.find(key)
+
+    def make_prototypes(self, key: GridKey, grid_id: int) -> Prototypes | None:
+        """Make and store the prototypes of a grid that was stored without; None when it is gone."""
+        grid = self.find(key)
+        if grid is None:
+            return None
+        prototypes = prototypes_of(grid)
+        self._store.grids.put_prototypes(grid_id, prototypes)
+        return prototypes
 
     def cached(self, key: GridKey) -> LatentGrid | None:
         """A grid that is in memory."""

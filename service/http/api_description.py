@@ -9,7 +9,7 @@ from fastapi.openapi.utils import get_openapi
 
 from service.http import admission_control as admission
 from service.http.problems import add_problems
-from service.schemas import FloorPlanDocument, PlanEvent, Problem
+from service.schemas import FloorPlanDocument, PlanEvent, Problem, VenueChangeDocument, VenueDocument
 from service.security import access_control
 from service.security.permissions import NEEDED
 
@@ -22,7 +22,7 @@ def describe_api(app: FastAPI) -> dict[str, Any]:
         document = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
         schemas = document["components"]["schemas"]
         # Those that only hand-written parts of the description refer to.
-        for model in (FloorPlanDocument, PlanEvent, Problem):
+        for model in (FloorPlanDocument, PlanEvent, Problem, VenueDocument, VenueChangeDocument):
             schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
             schemas |= schema.pop("$defs", {})
             schemas[model.__name__] = schema

@@ -3,7 +3,8 @@
 Every tag is a strong one: the same tag means the same bytes. That of a plan's representation is
 `"<revision id>.<digest of the bytes>"`, as status and progress change while the revision stays. Whoever replaces or
 deletes a plan cares about the revision and not about progress, so `If-Match` is compared with the part before the dot:
-it holds for every tag that the current revision ever had, and for the plain `"<revision id>"`.
+it holds for every tag that the current revision ever had, and for the plain `"<revision id>"`. Venues have tags of the
+same kind.
 """
 
 from __future__ import annotations
@@ -63,8 +64,8 @@ def conditional_answer(
     return Response(content, media_type=media_type, headers=common)
 
 
-def expected_revision(request: Request, plan_id: str, revision_id: str) -> str | None:
-    """Whether a request may change a plan at its current revision.
+def expected_revision(request: Request, of_id: str, revision_id: str, *, what: str = "floor plan") -> str | None:
+    """Whether a request may change a plan, or a venue, at its current revision.
 
     Returns:
         the revision that it must still have when it is changed, None when any is well.
@@ -75,12 +76,12 @@ def expected_revision(request: Request, plan_id: str, revision_id: str) -> str |
     """
     wanted, unwanted = _tags(request, "If-Match"), _tags(request, "If-None-Match")
     if unwanted is not None and (unwanted.any or revision_id in _revisions(unwanted.all)):
-        raise RevisionMismatchError(plan_id, "any other (If-None-Match)", revision_id)
+        raise RevisionMismatchError(of_id, "any other (If-None-Match)", revision_id, what=what)
     if wanted is None or wanted.any:
         return None
     named = _revisions(wanted.strong)
     if revision_id not in named:
-        raise RevisionMismatchError(plan_id, ", ".join(sorted(named)) or "a weak tag", revision_id)
+        raise RevisionMismatchError(of_id, ", ".join(sorted(named)) or "a weak tag", revision_id, what=what)
     return revision_id
 
 

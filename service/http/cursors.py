@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import base64
+import math
 import re
 import struct
 from datetime import UTC, datetime, timedelta
 
 from service.errors import InvalidRequestError
-from service.storage.records import Cursor
+from service.storage.records import Cursor, VenuePlace
 
 # Microseconds since 1970 and the 16 bytes of an id: 24 bytes are 32 characters without padding.
 _LAYOUT = struct.Struct(">Q16s")
+# A level, and the 16 bytes of an id.
+_VENUE_LAYOUT = struct.Struct(">d16s")
 _TEXT = re.compile(r"[A-Za-z0-9_-]{32}")
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _MICROSECOND = timedelta(microseconds=1)
@@ -34,4 +37,26 @@ def parse_cursor(text: str) -> Cursor:
         moment, plan_id = _LAYOUT.unpack(base64.urlsafe_b64decode(text))
         if moment <= _LAST:
             return Cursor(_EPOCH + moment * _MICROSECOND, plan_id.hex())
-    raise InvalidRequestError([("cursor", f"is '{text[:100]}', not the next_cursor of a listing")])
+    raise _no_cursor(text)
+
+
+def venue_cursor_text(place: VenuePlace) -> str:
+    """A place in the plans of a venue as text."""
+    return base64.urlsafe_b64encode(_VENUE_LAYOUT.pack(place.level, bytes.fromhex(place.plan_id))).decode("ascii")
+
+
+def parse_venue_cursor(text: str) -> VenuePlace:
+    """The place in the plans of a venue that a text stands for.
+
+    Raises:
+        InvalidRequestError: it is not one that `venue_cursor_text` makes.
+    """
+    if _TEXT.fullmatch(text):
+        level, plan_id = _VENUE_LAYOUT.unpack(base64.urlsafe_b64decode(text))
+        if math.isfinite(level):
+            return VenuePlace(level, plan_id.hex())
+    raise _no_cursor(text)
+
+
+def _no_cursor(text: str) -> InvalidRequestError:
+    return InvalidRequestError([("cursor", f"is '{text[:100]}', not the next_cursor of a listing")])

@@ -58,7 +58,7 @@ class UploadLimits:
     bytes_per_s: float
 
     @classmethod
-    def of(cls, settings: Settings, name: Literal["max_plan_bytes", "max_panorama_bytes"]) -> Self:
+    def of(cls, settings: Settings, name: Literal["max_plan_bytes", "max_panorama_bytes", "max_venue_bytes"]) -> Self:
         """As set for one kind of upload."""
         return cls(
             max_bytes=getattr(settings, name),

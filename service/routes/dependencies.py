@@ -87,3 +87,9 @@ IDEMPOTENCY_KEY = header(
 )
 IF_NONE_MATCH = header("If-None-Match", "Entity tags that the caller has, or `*`; with one of them the answer is 304.")
 NOT_MODIFIED: dict[int | str, dict[str, Any]] = {304: {"description": "The caller has this representation."}}
+UNLESS_CHANGED = [
+    header("If-Match", "Entity tags of the revision that it must still have, or `*`; 412 when it has another."),
+    header("If-None-Match", "Entity tags of revisions that it must not have; 412 when it has one of them."),
+]
+# What a filter by name may be.
+NO_CONTROLS = r"^[^\x00-\x1f\x7f]*$"

@@ -34,11 +34,12 @@ from service.http.uploads import JSON, MULTIPART, Parts, UploadLimits, media_typ
 from service.routes.dependencies import (
     IDEMPOTENCY_KEY,
     IF_NONE_MATCH,
+    NO_CONTROLS,
     NOT_MODIFIED,
+    UNLESS_CHANGED,
     Party,
     Running,
     Tenant,
-    header,
     is_id,
     plan_summary,
     stored_plan,
@@ -53,7 +54,6 @@ router = APIRouter(prefix="/floorplans", tags=["floor plans"])
 
 _FILE = "file"
 _MAX_LISTED = 500
-_NO_CONTROLS = r"^[^\x00-\x1f\x7f]*$"
 _DOCUMENT: dict[str, Any] = {"$ref": "#/components/schemas/FloorPlanDocument"}
 _BODY = {
     "required": True,
@@ -74,10 +74,6 @@ _BODY = {
         },
     },
 }
-_UNLESS_CHANGED = [
-    header("If-Match", "Entity tags of the revision that the plan must still have, or `*`; 412 when it has another."),
-    header("If-None-Match", "Entity tags of revisions that the plan must not have; 412 when it has one of them."),
-]
 _REFUSED_UPLOADS = (
     InvalidFloorPlanError,
     InvalidRequestError,
@@ -134,7 +130,7 @@ def list_floorplans(
     tenant: Tenant,
     name: Annotated[
         str | None,
-        Query(max_length=200, pattern=_NO_CONTROLS, description="Only plans with this in their name, in any case."),
+        Query(max_length=200, pattern=NO_CONTROLS, description="Only plans with this in their name, in any case."),
     ] = None,
     limit: Annotated[int, Query(ge=1, le=_MAX_LISTED, description="How many to return.")] = 100,
     cursor: Annotated[str | None, Query(description="The `next_cursor` of the page before.")] = None,
@@ -181,7 +177,7 @@ def get_floorplan(
     "/{floorplan_id}",
     summary="Replace a floor plan",
     response_model=FloorPlanAnswer,
-    openapi_extra={"requestBody": _BODY, "parameters": _UNLESS_CHANGED},
+    openapi_extra={"requestBody": _BODY, "parameters": UNLESS_CHANGED},
     responses=problem_responses(*_REFUSED_UPLOADS, UnknownFloorPlanError, RevisionMismatchError),
 )
 async def replace_floorplan(
@@ -213,7 +209,7 @@ async def replace_floorplan(
     "/{floorplan_id}",
     status_code=status.HTTP_204_NO_CONTENT,
     summary="Delete a floor plan",
-    openapi_extra={"parameters": _UNLESS_CHANGED},
+    openapi_extra={"parameters": UNLESS_CHANGED},
     responses=problem_responses(
         UnknownFloorPlanError, RevisionMismatchError, InvalidRequestError, StoreUnavailableError
     ),
@@ -221,7 +217,7 @@ async def replace_floorplan(
 def delete_floorplan(floorplan_id: str, request: Request, runtime: Running, tenant: Tenant) -> None:
     """Delete a floor plan with all its revisions, the files they were uploaded as, and their latent grids, for good.
 
-    A latent grid that is being computed is not any more.
+    A latent grid that is being computed is not any more. The venues that the plan belongs to get a revision without it.
     """
     current = plan_summary(tenant, floorplan_id, runtime.store.plans)
     note(request, plan=current.id, revision=current.revision_id)

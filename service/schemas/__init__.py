@@ -6,6 +6,7 @@ stored_plans     what is told of stored floor plans
 localise_query   what a query says beside the panorama
 hint_fields      what it says of where the camera stood
 localise_answer  where it was taken
+venues           floor plans that belong together
 service_state    limits, health, readiness
 problem_details  errors
 
@@ -36,6 +37,18 @@ from service.schemas.stored_plans import (
     PlanEvent,
     PlanStatus,
     RoomAnswer,
+)
+from service.schemas.venues import (
+    VenueAnchorAnswer,
+    VenueAnchorDocument,
+    VenueAnswer,
+    VenueChangeDocument,
+    VenueDocument,
+    VenueList,
+    VenuePlanAnswer,
+    VenuePlanDocument,
+    VenuePlanList,
+    VenueSummary,
 )
 
 __all__ = [
@@ -68,4 +81,14 @@ __all__ = [
     "RoomType",
     "Segment",
     "TimingsAnswer",
+    "VenueAnchorAnswer",
+    "VenueAnchorDocument",
+    "VenueAnswer",
+    "VenueChangeDocument",
+    "VenueDocument",
+    "VenueList",
+    "VenuePlanAnswer",
+    "VenuePlanDocument",
+    "VenuePlanList",
+    "VenueSummary",
 ]

@@ -46,6 +46,13 @@ NEEDED: Mapping[tuple[str, str], Permission] = {
     ("GET", "/floorplans/{floorplan_id}/original"): Permission.READ,
     ("GET", "/floorplans/{floorplan_id}/preview.svg"): Permission.READ,
     ("GET", "/floorplans/{floorplan_id}/mesh.glb"): Permission.READ,
+    ("GET", "/venues"): Permission.READ,
+    ("POST", "/venues"): Permission.WRITE,
+    ("GET", "/venues/{venue_id}"): Permission.READ,
+    ("PUT", "/venues/{venue_id}"): Permission.WRITE,
+    ("PATCH", "/venues/{venue_id}"): Permission.WRITE,
+    ("DELETE", "/venues/{venue_id}"): Permission.WRITE,
+    ("GET", "/venues/{venue_id}/plans"): Permission.READ,
     ("POST", "/localise"): Permission.LOCALISE,
 }
 _PATTERNS = {path: compile_path(path)[0] for _, path in NEEDED}

@@ -13,6 +13,7 @@ from typing import Any
 from sqlalchemy import Connection, Row, and_, delete, func, or_, select, text, update
 
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.camera_height import DEFAULT_STD_M
 from service.errors import DamagedDataError, RevisionMismatchError, TooManyFloorPlansError, UnknownFloorPlanError
 from service.storage.chunks import read_chunks, write_chunks
 from service.storage.database import Database
@@ -330,11 +331,19 @@ def _insert_revision(connection: Connection, record: PlanRecord, content: _Conte
         "room_count": len(plan.rooms),
         "area_m2": plan.area_m2,
         "camera_height_m": plan.camera_height_m,
+        "camera_height_std_m": _height_std_m(plan),
     }
     connection.execute(REVISIONS.insert(), values)
     write_chunks(connection, ORIGINAL_CHUNKS, {"revision_id": record.revision_id}, memoryview(content.original))
     if content.grid is not None:
         insert_grid(connection, *content.grid)
+
+
+def _height_std_m(plan: FloorPlan) -> float | None:
+    """How far off the camera height of a plan may be; None where it is any."""
+    if plan.camera_height_std_m is not None:
+        return plan.camera_height_std_m
+    return DEFAULT_STD_M if plan.states_camera_height else None
 
 
 def _current_head(tenant: str, plan_id: str) -> Any:

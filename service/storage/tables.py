@@ -77,6 +77,8 @@ REVISIONS = Table(
     Column("room_count", Integer, nullable=False),
     Column("area_m2", Double, nullable=False),
     Column("camera_height_m", Double, nullable=False),
+    # Nothing where cameras may stand at any height, or an earlier version of the service stored the plan.
+    Column("camera_height_std_m", Double),
     Column("failure", Text),
     UniqueConstraint("plan_id", "number", name="revisions_of_plan"),
 )

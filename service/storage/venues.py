@@ -185,8 +185,8 @@ class Venues:
         """What a query needs to know of every plan of a venue.
 
         Returns:
-            rows of `plan_id`, `revision_id`, `level`, `name`, `camera_height_m`, `failure`, and `grid_id`: that of the
-            plan's own grid, None where it is not stored.
+            rows of `plan_id`, `revision_id`, `level`, `name`, `camera_height_m`, `camera_height_std_m`, `failure`, and
+            of the plan's own grid `grid_id` and `poses`, None where it is not stored.
         """
         columns = (
             VENUE_PLANS.c.plan_id,
@@ -194,8 +194,10 @@ class Venues:
             VENUE_PLANS.c.level,
             func.coalesce(VENUE_PLANS.c.name, FLOORPLANS.c.name).label("name"),
             REVISIONS.c.camera_height_m,
+            REVISIONS.c.camera_height_std_m,
             REVISIONS.c.failure,
             LATENT_GRIDS.c.id.label("grid_id"),
+            LATENT_GRIDS.c.poses,
         )
         query = _with_grids(select(*columns), model_sha256, step_m).where(VENUE_PLANS.c.venue_id == venue_id)
         with self._database.reading() as connection:

@@ -25,7 +25,8 @@ class RequestFacts:
         request_id: names the request in answers and log lines.
         trace: this service's span of the caller's trace.
         plan: id of the floor plan.
-        revision: id of the plan's revision.
+        venue: id of the venue.
+        revision: id of the revision of the plan, or of the venue where there is no plan.
         stage: the last stage that produced the position.
         clock: times of the request's stages, also of those that ran before it failed.
         rejection: the kind of problem (its slug) that it was refused with.
@@ -38,6 +39,7 @@ class RequestFacts:
     request_id: str
     trace: TraceContext
     plan: str | None = None
+    venue: str | None = None
     revision: str | None = None
     stage: str | None = None
     clock: StageClock | None = None
@@ -61,6 +63,7 @@ def note(
     request: HTTPConnection,
     *,
     plan: str | None = None,
+    venue: str | None = None,
     revision: str | None = None,
     stage: str | None = None,
     clock: StageClock | None = None,
@@ -74,6 +77,7 @@ def note(
         return
     given = {
         "plan": plan,
+        "venue": venue,
         "revision": revision,
         "stage": stage,
         "clock": clock,

@@ -90,6 +90,7 @@ class Tracing:
             "http.response.status_code": status,
             "lalaloc.request_id": facts.request_id,
             "lalaloc.plan": facts.plan,
+            "lalaloc.venue": facts.venue,
             "lalaloc.revision": facts.revision,
             "lalaloc.stage": facts.stage,
             "lalaloc.rejection": facts.rejection,

@@ -48,7 +48,7 @@ from tests.service.postgres import PostgresServer
 
 ROOT = Path(__file__).parents[2]
 EVERYTHING = tuple(Permission)
-PLAN = "floorplan_id"
+PLAN, VENUE = "floorplan_id", "venue_id"
 _HTTP_METHODS = {"get", "put", "post", "delete", "patch", "options", "head", "trace"}
 
 
@@ -107,9 +107,14 @@ class Guarded:
         """Send a request that is right but for its key."""
         plan_id = plan_id or self.plan_id
         body: dict[str, Any] = {}
+        if f"{{{VENUE}}}" in path:
+            made = self.client.post("/venues", json={}, headers=bearer(self.key)).json()
+            path = path.replace(f"{{{VENUE}}}", made["id"])
         if path == "/localise":
             picture = encode_picture(512, 256, "JPEG")
             body = {"data": {PLAN: plan_id, "refine": "none"}, "files": {"panorama": ("p.jpg", picture, "image/jpeg")}}
+        elif path.startswith("/venues"):
+            body = {"json": {"name": "12 Mill Lane"}}
         elif method in ("POST", "PUT"):
             body = {"json": FLAT}
         path = path.replace(f"{{{PLAN}}}", plan_id)

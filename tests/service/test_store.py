@@ -39,7 +39,16 @@ from service.errors import (
 from service.storage.chunks import CHUNK_BYTES
 from service.storage.idempotency_keys import KEPT_FOR, IdempotencyKeys
 from service.storage.plan_document import PlanDocument
-from service.storage.records import ComputedGrid, Conflict, Cursor, Fresh, GridKey, InProgress, StoredAnswer
+from service.storage.records import (
+    ComputedGrid,
+    Conflict,
+    Cursor,
+    Fresh,
+    GridKey,
+    InProgress,
+    StoredAnswer,
+    VenueMember,
+)
 from service.storage.store import Store
 from service.storage.tables import (
     GRID_CHUNKS,
@@ -747,6 +756,10 @@ CREATE TABLE {grids} (
 """
 
 
+# Columns that came with venues.
+_OF_VENUES = (("latent_grids", "prototypes"), ("revisions", "camera_height_std_m"))
+
+
 def test_grids_of_the_schema_before_are_computed_again_and_the_rest_stays(store: Store, url: str) -> None:
     revision_id = _add(store, "p")
     _put(store, _key(revision_id))
@@ -759,8 +772,11 @@ def test_grids_of_the_schema_before_are_computed_again_and_the_rest_stays(store:
             ("grid_leases", "length_s"),
             ("grid_leases", "attempts"),
             ("idempotency", "lease_s"),
+            *_OF_VENUES,
         ):
             connection.exec_driver_sql(f"ALTER TABLE {table} DROP COLUMN {column}")
+        for table in ("venue_plans", "venues"):
+            connection.exec_driver_sql(f"DROP TABLE {table}")
         connection.exec_driver_sql("UPDATE alembic_version SET version_num = '0001'")
     store.close()
     moved = Store(url)
@@ -770,6 +786,28 @@ def test_grids_of_the_schema_before_are_computed_again_and_the_rest_stays(store:
     assert record is not None
     assert record.plan.to_dict() == PLAN.to_dict()
     assert isinstance(moved.idempotency_keys.begin("t", "r", "k", "body"), InProgress)
+    with moved._database.reading() as connection:
+        context = MigrationContext.configure(connection, opts={"compare_type": True})
+        assert compare_metadata(context, METADATA) == []
+    moved.close()
+
+
+def test_venues_are_added_to_what_there_is(store: Store, url: str) -> None:
+    revision_id = _add(store, "p")
+    _put(store, _key(revision_id))
+    with store._database.writing() as connection:
+        for table, column in _OF_VENUES:
+            connection.exec_driver_sql(f"ALTER TABLE {table} DROP COLUMN {column}")
+        for table in ("venue_plans", "venues"):
+            connection.exec_driver_sql(f"DROP TABLE {table}")
+        connection.exec_driver_sql("UPDATE alembic_version SET version_num = '0002'")
+    store.close()
+    moved = Store(url)
+    assert moved.grids.get(_key(revision_id)) is not None
+    moved.venues.add("default", "v", "venue", None, [VenueMember("p", 1.0)], limit=1)
+    [found] = moved.venues.searched("v", "m1", 0.5)
+    assert (found.plan_id, found.camera_height_std_m) == ("p", None)
+    assert moved.grids.prototypes([found.grid_id]) == {}
     with moved._database.reading() as connection:
         context = MigrationContext.configure(connection, opts={"compare_type": True})
         assert compare_metadata(context, METADATA) == []

@@ -97,6 +97,7 @@ class TelemetryMiddleware:
             "ms": round(duration_s * 1e3, 1),
             "bytes_in": facts.bytes_in,
             "plan": facts.plan,
+            "venue": facts.venue,
             "revision": facts.revision,
             "stage": facts.stage,
             "stages_ms": {name: round(spent_s * 1e3, 1) for name, (_, spent_s) in spans.items()},

@@ -1,6 +1,7 @@
 """Venues, and prototypes of plans beside their latent grids.
 
-Grids that were stored before have no prototypes; they are made of the grid when they are asked for.
+Grids that were stored before have no prototypes; they are made of the grid when they are asked for. Of plans that were,
+venues do not know how sure their camera height is, and take any.
 """
 
 from __future__ import annotations
@@ -41,3 +42,4 @@ def upgrade() -> None:
     op.create_index("venue_plans_by_plan", "venue_plans", ["plan_id"])
     op.create_index("venue_plans_by_level", "venue_plans", ["venue_id", "level", "plan_id"])
     op.add_column("latent_grids", sa.Column("prototypes", sa.LargeBinary))
+    op.add_column("revisions", sa.Column("camera_height_std_m", sa.Double))

@@ -1,0 +1,292 @@
+"""Venues: floor plans that belong together, to be searched at once."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Query, Request, Response, status
+from pydantic import BaseModel
+
+from service.errors import (
+    IdempotencyInProgressError,
+    IdempotencyKeyReusedError,
+    InvalidRequestError,
+    MalformedRequestError,
+    RevisionMismatchError,
+    StoreFullError,
+    StoreUnavailableError,
+    TooManyVenuesError,
+    UnknownVenueError,
+    UnsupportedMediaError,
+    UploadTimeoutError,
+    UploadTooLargeError,
+)
+from service.http import IdempotentRequest
+from service.http.conditional import conditional_answer, expected_revision
+from service.http.cursors import cursor_text, parse_cursor, parse_venue_cursor, venue_cursor_text
+from service.http.json_body import parse_document
+from service.http.problems import problem_responses
+from service.http.uploads import JSON, Parts, UploadLimits, media_type, read_body
+from service.routes.dependencies import (
+    IDEMPOTENCY_KEY,
+    IF_NONE_MATCH,
+    NO_CONTROLS,
+    NOT_MODIFIED,
+    UNLESS_CHANGED,
+    Party,
+    Running,
+    Tenant,
+    is_id,
+)
+from service.routes.venue_answers import plan_entries, venue_representation, venue_summary
+from service.runtime import Runtime
+from service.schemas import (
+    VenueAnchorDocument,
+    VenueAnswer,
+    VenueChangeDocument,
+    VenueDocument,
+    VenueList,
+    VenuePlanDocument,
+    VenuePlanList,
+)
+from service.storage.records import Cursor, VenueAnchor, VenueMember, VenuePlace, VenueRecord
+from service.telemetry import note
+
+router = APIRouter(prefix="/venues", tags=["venues"])
+
+_MAX_LISTED = 500
+_REFUSED_BODIES = (
+    InvalidRequestError,
+    MalformedRequestError,
+    UnsupportedMediaError,
+    UploadTooLargeError,
+    UploadTimeoutError,
+    StoreUnavailableError,
+    StoreFullError,
+)
+
+
+def _body(model: type[BaseModel]) -> dict[str, Any]:
+    return {"required": True, "content": {JSON: {"schema": {"$ref": f"#/components/schemas/{model.__name__}"}}}}
+
+
+@router.post(
+    "",
+    status_code=status.HTTP_201_CREATED,
+    summary="Make a venue",
+    response_model=VenueAnswer,
+    openapi_extra={"requestBody": _body(VenueDocument), "parameters": [IDEMPOTENCY_KEY]},
+    responses=problem_responses(
+        *_REFUSED_BODIES, TooManyVenuesError, IdempotencyKeyReusedError, IdempotencyInProgressError
+    ),
+)
+async def create_venue(request: Request, runtime: Running, tenant: Tenant, party: Party) -> Response:
+    """Group stored floor plans, each with the number of its level, so that a panorama is searched for in all of them.
+
+    A plan may belong to several venues. One that is deleted leaves them.
+    """
+    idempotent = IdempotentRequest(runtime.store.idempotency_keys, request, tenant, "POST /venues")
+    content = await _read(request, runtime)
+
+    def store(token: str) -> Response:
+        document = parse_document(VenueDocument, content)
+        members = _members(document.plans, runtime)
+        limit = runtime.settings.max_venues
+        record = runtime.store.venues.add(tenant, token, document.name, _anchor(document.anchor), members, limit=limit)
+        return _written(request, record, runtime, status.HTTP_201_CREATED)
+
+    return await runtime.uploads.run(party, idempotent.run, Parts({}, {"body": content}), store)
+
+
+@router.get("", summary="List venues", responses=problem_responses(InvalidRequestError, StoreUnavailableError))
+def list_venues(
+    runtime: Running,
+    tenant: Tenant,
+    name: Annotated[
+        str | None,
+        Query(max_length=200, pattern=NO_CONTROLS, description="Only venues with this in their name, in any case."),
+    ] = None,
+    limit: Annotated[int, Query(ge=1, le=_MAX_LISTED, description="How many to return.")] = 100,
+    cursor: Annotated[str | None, Query(description="The `next_cursor` of the page before.")] = None,
+) -> VenueList:
+    """Stored venues, newest first."""
+    after = None if cursor is None else parse_cursor(cursor)
+    found = runtime.store.venues.list(tenant, limit=limit + 1, after=after, name=name)
+    page = found[:limit]
+    more = cursor_text(Cursor(page[-1].created_at, page[-1].id)) if len(found) > limit else None
+    return VenueList(venues=[venue_summary(record) for record in page], next_cursor=more)
+
+
+@router.get(
+    "/{venue_id}",
+    summary="A venue",
+    response_model=VenueAnswer,
+    openapi_extra={"parameters": [IF_NONE_MATCH]},
+    responses=NOT_MODIFIED | problem_responses(UnknownVenueError, InvalidRequestError, StoreUnavailableError),
+)
+def get_venue(venue_id: str, request: Request, runtime: Running, tenant: Tenant) -> Response:
+    """A stored venue, and how many of its plans can be asked about."""
+    record = _stored(tenant, venue_id, runtime)
+    content, etag = venue_representation(record, runtime)
+    return conditional_answer(request, content, JSON, etag)
+
+
+@router.get(
+    "/{venue_id}/plans",
+    summary="The plans of a venue",
+    responses=problem_responses(UnknownVenueError, InvalidRequestError, StoreUnavailableError),
+)
+def list_venue_plans(
+    venue_id: str,
+    runtime: Running,
+    tenant: Tenant,
+    level: Annotated[
+        float | None, Query(ge=-1000, le=1000, allow_inf_nan=False, description="Only plans of this level.")
+    ] = None,
+    limit: Annotated[int, Query(ge=1, le=_MAX_LISTED, description="How many to return.")] = 100,
+    cursor: Annotated[str | None, Query(description="The `next_cursor` of the page before.")] = None,
+) -> VenuePlanList:
+    """The plans of a venue from the lowest level up, and how far the latent grid of each is.
+
+    Going from page to page gives every plan once that belongs to the venue, on the same level, all the while.
+    """
+    record = _stored(tenant, venue_id, runtime)
+    after = None if cursor is None else parse_venue_cursor(cursor)
+    found = runtime.store.venues.plans(record.id, limit=limit + 1, after=after, level=level)
+    page = found[:limit]
+    more = venue_cursor_text(VenuePlace(page[-1].level, page[-1].plan_id)) if len(found) > limit else None
+    return VenuePlanList(plans=plan_entries(page, runtime), next_cursor=more)
+
+
+@router.put(
+    "/{venue_id}",
+    summary="Replace a venue",
+    response_model=VenueAnswer,
+    openapi_extra={"requestBody": _body(VenueDocument), "parameters": UNLESS_CHANGED},
+    responses=problem_responses(*_REFUSED_BODIES, UnknownVenueError, RevisionMismatchError),
+)
+async def replace_venue(venue_id: str, request: Request, runtime: Running, tenant: Tenant, party: Party) -> Response:
+    """Give a venue another name, anchor and plans: what is left out, it has no more."""
+    content = await _read(request, runtime)
+
+    def store() -> Response:
+        current = _stored(tenant, venue_id, runtime)
+        expected = expected_revision(request, current.id, current.revision_id, what="venue")
+        document = parse_document(VenueDocument, content)
+        record = runtime.store.venues.change(
+            tenant,
+            current.id,
+            name=document.name,
+            anchor=_anchor(document.anchor),
+            drop_anchor=document.anchor is None,
+            members=_members(document.plans, runtime),
+            replace_members=True,
+            max_plans=runtime.settings.max_venue_plans,
+            expected=expected,
+        )
+        return _written(request, record, runtime, status.HTTP_200_OK)
+
+    return await runtime.uploads.run(party, store)
+
+
+@router.patch(
+    "/{venue_id}",
+    summary="Change a venue",
+    response_model=VenueAnswer,
+    openapi_extra={"requestBody": _body(VenueChangeDocument), "parameters": UNLESS_CHANGED},
+    responses=problem_responses(*_REFUSED_BODIES, UnknownVenueError, RevisionMismatchError),
+)
+async def change_venue(venue_id: str, request: Request, runtime: Running, tenant: Tenant, party: Party) -> Response:
+    """Change the name or the anchor of a venue, or some of its plans."""
+    content = await _read(request, runtime)
+
+    def store() -> Response:
+        current = _stored(tenant, venue_id, runtime)
+        expected = expected_revision(request, current.id, current.revision_id, what="venue")
+        document = parse_document(VenueChangeDocument, content)
+        given = document.model_fields_set
+        if not given:
+            raise InvalidRequestError([("body", "changes nothing: name, anchor, plans or remove are needed")])
+        record = runtime.store.venues.change(
+            tenant,
+            current.id,
+            name=document.name if "name" in given else None,
+            anchor=_anchor(document.anchor),
+            drop_anchor="anchor" in given and document.anchor is None,
+            members=_members(document.plans, runtime),
+            removed=_removed(document),
+            max_plans=runtime.settings.max_venue_plans,
+            expected=expected,
+        )
+        return _written(request, record, runtime, status.HTTP_200_OK)
+
+    return await runtime.uploads.run(party, store)
+
+
+@router.delete(
+    "/{venue_id}",
+    status_code=status.HTTP_204_NO_CONTENT,
+    summary="Delete a venue",
+    openapi_extra={"parameters": UNLESS_CHANGED},
+    responses=problem_responses(UnknownVenueError, RevisionMismatchError, InvalidRequestError, StoreUnavailableError),
+)
+def delete_venue(venue_id: str, request: Request, runtime: Running, tenant: Tenant) -> None:
+    """Delete a venue; its floor plans stay."""
+    current = _stored(tenant, venue_id, runtime)
+    expected = expected_revision(request, current.id, current.revision_id, what="venue")
+    if not runtime.store.venues.delete(tenant, current.id, expected=expected):
+        raise UnknownVenueError(venue_id)
+
+
+def _stored(tenant: str, venue_id: str, runtime: Runtime) -> VenueRecord:
+    record = runtime.store.venues.get(tenant, venue_id) if is_id(venue_id) else None
+    if record is None:
+        raise UnknownVenueError(venue_id)
+    return record
+
+
+async def _read(request: Request, runtime: Runtime) -> bytes:
+    media_type(request, (JSON,))
+    return await read_body(request, UploadLimits.of(runtime.settings, "max_venue_bytes"))
+
+
+def _anchor(document: VenueAnchorDocument | None) -> VenueAnchor | None:
+    return None if document is None else VenueAnchor(**document.model_dump())
+
+
+def _members(documents: list[VenuePlanDocument], runtime: Runtime) -> list[VenueMember]:
+    """Plans of a venue as they were sent.
+
+    Raises:
+        InvalidRequestError: there are too many, or one of them twice, or ids that are none.
+    """
+    limit = runtime.settings.max_venue_plans
+    if len(documents) > limit:
+        raise InvalidRequestError(
+            [("plans", f"has {len(documents)} floor plans, at most {limit} are allowed (max_venue_plans)")]
+        )
+    counted = Counter(document.floorplan_id for document in documents)
+    twice = [plan_id for plan_id, count in counted.items() if count > 1]
+    if twice:
+        raise InvalidRequestError([("plans", f"has floor plan '{twice[0]}' {counted[twice[0]]} times")])
+    if wrong := [plan_id for plan_id in counted if not is_id(plan_id)]:
+        raise InvalidRequestError([("plans", f"there is no floor plan '{wrong[0]}'")])
+    return [VenueMember(document.floorplan_id, document.level, document.name) for document in documents]
+
+
+def _removed(document: VenueChangeDocument) -> set[str]:
+    removed = set(document.remove)
+    if both := removed & {plan.floorplan_id for plan in document.plans}:
+        raise InvalidRequestError([("remove", f"has floor plan '{min(both)[:64]}', and so has plans")])
+    return removed
+
+
+def _written(request: Request, record: VenueRecord, runtime: Runtime, code: int) -> Response:
+    note(request, venue=record.id, revision=record.revision_id)
+    content, etag = venue_representation(record, runtime)
+    path = str(request.app.url_path_for("get_venue", venue_id=record.id))
+    headers = {"Content-Location": path, "ETag": etag}
+    if code == status.HTTP_201_CREATED:
+        headers["Location"] = path
+    return Response(content, code, headers, JSON)
