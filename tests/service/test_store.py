@@ -140,21 +140,17 @@ def _rows(store: Store, table: object) -> int:
 def test_plans_in_memory_are_not_read_anew_and_none_is_kept_without_a_cache(tmp_path: Path) -> None:
     kept, not_kept = Store(_url(tmp_path)), Store(_url(tmp_path), plan_cache_bytes=0)
     revision_id = _add(kept, "p")
-    first, second = kept.plans.get("default", "p"), not_kept.plans.get("default", "p")
-    assert first is not None
-    assert first == second
-    changed = FloorPlan.from_dict({**FLAT, "name": "changed"})
     for store, same in ((kept, True), (not_kept, False)):
         reads = [store.plans.get("default", "p") for _ in range(2)]
         assert reads[0] is not None
         assert reads[1] is not None
         assert (reads[0].plan is reads[1].plan) == same
+        assert reads[0].plan.to_dict() == reads[1].plan.to_dict()
         assert store.plan_cache.revisions() == ({revision_id} if same else set())
+    changed = FloorPlan.from_dict({**FLAT, "name": "changed"})
     kept.plans.add_revision("default", "p", changed, original=b"{}", keep=5)
-    assert [record and record.plan.name for record in (kept.plans.get("default", "p"), second)] == ["changed", "Flat 3"]
-    older = kept.plans.get_revision("default", "p", revision_id)
-    assert older is not None
-    assert older.plan == first.plan
+    told = [kept.plans.get("default", "p"), kept.plans.get_revision("default", "p", revision_id)]
+    assert [record and record.plan.name for record in told] == ["changed", "Flat 3"]
     assert kept.plans.delete("default", "p")
     assert kept.plan_cache.revisions() == set()
     for store in (kept, not_kept):
