@@ -33,13 +33,13 @@ from examples.launch import running_service
 from service.settings import Settings
 
 # Uploads of 40 MiB are allowed. A worker may hold the pixels of a picture that it is allowed to decode.
-_MOST_MB = 100.0
-_MOST_DECODING_MB = Settings().decode_memory_bytes / 2**20
+_MAX_MB = 100.0
+_MAX_DECODING_MB = Settings().decode_memory_bytes / 2**20
 # What buffers and allocators keep.
 _LEFT_MB = 150.0
 _GIGABYTE = 1 << 30
 # The limit of 40 MiB, and what is on its way when the answer comes.
-_MOST_SENT = 50 << 20
+_MAX_SENT = 50 << 20
 _ANIMATION = "WebP of 9,000 frames"
 _LARGEST = "PNG of 14,140 x 7,070 pixels, which is allowed"
 _ANSWERED = frozenset({_ANIMATION, _LARGEST})
@@ -71,8 +71,8 @@ def main() -> int:
                 sent, outcome = send()
                 seconds, risen = time.perf_counter() - begin, watch.end()
                 expected = outcome.status == 200 if name in _ANSWERED else 400 <= outcome.status < 500
-                most = _MOST_DECODING_MB if name in _ANSWERED else _MOST_MB
-                failed |= not expected or risen > most or sent > _MOST_SENT
+                most = _MAX_DECODING_MB if name in _ANSWERED else _MAX_MB
+                failed |= not expected or risen > most or sent > _MAX_SENT
                 answer = f"{outcome.status} {outcome.detail[:120]}".strip()
                 print(f"| {name} | {sent:,} | {answer} | {seconds:.1f} | +{risen:.0f} MB |", flush=True)
             failed |= httpx.get(f"{service.url}/healthz").status_code != httpx.codes.OK

@@ -29,7 +29,7 @@ from lalaloc_client.retry import RetryPolicy, may_retry, retry_after_s
 
 T = TypeVar("T")
 
-_FIRST_POLL_S, _LONGEST_POLL_S = 0.1, 2.0
+_FIRST_POLL_S, _MAX_POLL_S = 0.1, 2.0
 _SHOWN_CHARACTERS = 500
 # What fails before any of a request has left.
 _UNSENT = (httpx.ConnectError, httpx.ConnectTimeout, httpx.PoolTimeout)
@@ -172,7 +172,7 @@ def ready_plan(floorplan_id: str, timeout_s: float, patience: Patience) -> Steps
             raise NotReadyError(floorplan_id, spent_s, found.progress)
         # The last look is at the very end.
         yield Wait(min(pause_s, timeout_s - spent_s))
-        pause_s = min(1.5 * pause_s, _LONGEST_POLL_S)
+        pause_s = min(1.5 * pause_s, _MAX_POLL_S)
 
 
 def problem_of(response: httpx.Response) -> ProblemError:

@@ -35,7 +35,7 @@ _UPLOAD_THREADS = with_spare(2)
 # Drawings in memory, and revisions that wait to be drawn.
 _DRAWINGS_BYTES, _MAX_DRAWN = 32 * 2**20, 16
 # With keys that are not remembered, streams still look no more often.
-_SOONEST_S = 1.0
+_MIN_HEARTBEAT_S = 1.0
 # Share of the time for stopping that LPO jobs may go on in.
 _LPO_DRAIN = 0.1
 
@@ -160,7 +160,7 @@ def _plan_events(
     store: Store, grids: GridProvider, admission: Admission, looks: BoundedReads, settings: Settings
 ) -> PlanEvents:
     # Their callers' keys are looked at again as often.
-    heartbeat_s = max(min(settings.key_cache_s, HEARTBEAT_S), _SOONEST_S) if settings.api_keys else HEARTBEAT_S
+    heartbeat_s = max(min(settings.key_cache_s, HEARTBEAT_S), _MIN_HEARTBEAT_S) if settings.api_keys else HEARTBEAT_S
     return PlanEvents(store, grids, admission, looks, max_s=settings.stream_deadline_s, heartbeat_s=heartbeat_s)
 
 

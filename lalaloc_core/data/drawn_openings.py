@@ -12,10 +12,10 @@ from jaxtyping import Float
 from lalaloc_core.floorplan import DEFAULT_OPENING_TOLERANCE_M
 
 # What is shorter is a slip of the drawing.
-_SHORTEST_M = 0.02
+_MIN_LENGTH_M = 0.02
 _TOUCHING_M = 0.01
 # Openings are the same wall's when their lines are parallel to 15 degrees.
-_LEAST_COSINE = 0.966
+_MIN_COSINE = 0.966
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -48,8 +48,8 @@ def opening_entries(drawn: Sequence[DrawnOpening], ids: dict[str, str]) -> tuple
     warnings = []
     for opening in drawn:
         length_m = float(np.hypot(*(opening.line_m[1] - opening.line_m[0])))
-        if length_m < _SHORTEST_M:
-            warnings.append(f"a {opening.kind} of {length_m:.2f} m is left out: it is shorter than {_SHORTEST_M:g} m")
+        if length_m < _MIN_LENGTH_M:
+            warnings.append(f"a {opening.kind} of {length_m:.2f} m is left out: it is shorter than {_MIN_LENGTH_M:g} m")
             continue
         shared_m = max((_shared_m(other, opening) for other in kept), default=0.0)
         if shared_m > _TOUCHING_M:
@@ -71,7 +71,7 @@ def _shared_m(first: DrawnOpening, second: DrawnOpening) -> float:
     along = along / length_m
     other = second.line_m - start
     turn = second.line_m[1] - second.line_m[0]
-    if abs(float(along @ turn)) < _LEAST_COSINE * float(np.hypot(*turn)):
+    if abs(float(along @ turn)) < _MIN_COSINE * float(np.hypot(*turn)):
         return 0.0
     if np.abs(other @ np.array([-along[1], along[0]])).min() > DEFAULT_OPENING_TOLERANCE_M:
         return 0.0

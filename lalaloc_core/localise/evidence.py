@@ -38,7 +38,7 @@ from lalaloc_core.localise.poses import Query
 _SHARPEST = 1e-3
 # A predicted ceiling height is never trusted beyond this, as plans round their ceilings.
 _SHARPEST_CEILING = 0.04
-_LOWEST_CLEARANCE_M = 0.05
+_MIN_CLEARANCE_M = 0.05
 # Logarithms are dear: of so many factors, none above the limit, the product is taken before.
 _FACTORS, _MAX_FACTOR = 4, 1e9
 # Poses whose openings are compared at a time, to bound memory.
@@ -254,7 +254,7 @@ class Evidence:
         if predicted is None or not self._config.use_ceiling:
             return np.zeros((len(offset), len(self._plan.rooms)))
         clearance_m = self._plan.ceiling_heights_m[None] - height.height_m * np.exp(offset)[:, None]
-        difference = np.log(np.maximum(clearance_m, _LOWEST_CLEARANCE_M)) - (predicted.log_m + offset[:, None])
+        difference = np.log(np.maximum(clearance_m, _MIN_CLEARANCE_M)) - (predicted.log_m + offset[:, None])
         scale = self._config.tail * np.hypot(np.exp(predicted.log_scale), _SHARPEST_CEILING)
         return np.log1p(np.square(difference / scale))
 

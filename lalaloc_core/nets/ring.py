@@ -19,8 +19,8 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 from lalaloc_core.nets.mixer import MixerBlock
 
 # Distances outside are clamped before they become features: no camera stands nearer, no room is larger.
-_NEAREST_M = 0.05
-_FARTHEST_M = 50.0
+_MIN_DISTANCE_M = 0.05
+_MAX_DISTANCE_M = 50.0
 IMAGE_MEAN = (0.5, 0.5, 0.5)
 IMAGE_STD = (0.25, 0.25, 0.25)
 
@@ -112,7 +112,7 @@ class RingLayoutEncoder(nn.Module):
         ceiling_height_m: Float[Tensor, "b"],
     ) -> Float[Tensor, "b c s"]:
         """Features of the bare layout around the horizon."""
-        distance = profile_m.clamp(_NEAREST_M, _FARTHEST_M)
+        distance = profile_m.clamp(_MIN_DISTANCE_M, _MAX_DISTANCE_M)
         foot = torch.atan(camera_height_m[:, None] / distance)
         top = torch.atan((ceiling_height_m - camera_height_m)[:, None] / distance)
         features = torch.stack([torch.log(distance), 1.0 / distance, foot, top], dim=1)

@@ -24,7 +24,7 @@ from lalaloc_core.nets.trunk import IMAGE_MEAN, IMAGE_STD, TAP_STRIDES, Trunk, T
 
 # How fast the classes' shares are followed once many batches were seen.
 _SHARE_RATE = 1e-3
-_LEAST_LOG_SCALE, _MOST_LOG_SCALE = -6.0, 2.0
+_MIN_LOG_SCALE, _MAX_LOG_SCALE = -6.0, 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,11 +109,11 @@ class TrunkImageEncoder(nn.Module):
         return ImageFeatures(
             ring=self.to_ring(torch.cat([mixed, told], dim=2)).transpose(1, 2),
             log_profile=profile[..., 0] + log_height[:, None],
-            log_scale=profile[..., 1].clamp(_LEAST_LOG_SCALE, _MOST_LOG_SCALE),
+            log_scale=profile[..., 1].clamp(_MIN_LOG_SCALE, _MAX_LOG_SCALE),
             structure=StructureFeatures(
                 opening_logits=openings,
                 log_ceiling=ceiling[:, 0] + log_height,
-                log_ceiling_scale=ceiling[:, 1].clamp(_LEAST_LOG_SCALE, _MOST_LOG_SCALE),
+                log_ceiling_scale=ceiling[:, 1].clamp(_MIN_LOG_SCALE, _MAX_LOG_SCALE),
                 room_type_logits=self.to_room_type(overall),
             ),
         )

@@ -22,7 +22,7 @@ from lalaloc_core.conventions import Array, column_azimuths
 from lalaloc_core.render.profile import inverse_crossings
 
 # Rays that meet nothing, of poses outside any room, are as long as this (m), so that nothing becomes infinite.
-_FARTHEST_M = 1e6
+_MAX_DISTANCE_M = 1e6
 
 
 class Sensitivity(NamedTuple):
@@ -62,7 +62,7 @@ def log_distance_gradient(
     xp = array_namespace(origin_m, azimuth, walls_m)
     crossings = inverse_crossings(origin_m, azimuth, walls_m)
     wall = xp.argmax(crossings.inverse_m, axis=1)
-    inverse_m = xp.clip(xp.max(crossings.inverse_m, axis=1), 1.0 / _FARTHEST_M)
+    inverse_m = xp.clip(xp.max(crossings.inverse_m, axis=1), 1.0 / _MAX_DISTANCE_M)
     edge_x = xp.take_along_axis(crossings.edge_x, wall, axis=1)
     edge_y = xp.take_along_axis(crossings.edge_y, wall, axis=1)
     turned = -(xp.cos(azimuth) * edge_y + xp.sin(azimuth) * edge_x) / inverse_m

@@ -13,7 +13,7 @@ from service.telemetry import LOGGER_NAME
 _OTHERS = 192
 # SQLite has the database, its log and their index open.
 _PER_DATABASE_CONNECTION = 3
-_LEAST_CONNECTIONS = 16
+_MIN_CONNECTIONS = 16
 
 
 def max_connections_of(wanted: int, settings: Settings) -> int:
@@ -24,9 +24,9 @@ def max_connections_of(wanted: int, settings: Settings) -> int:
     """
     others = _OTHERS + _PER_DATABASE_CONNECTION * settings.database_connections
     allowed = _raised_to(wanted + others)
-    if allowed - others < _LEAST_CONNECTIONS:
+    if allowed - others < _MIN_CONNECTIONS:
         raise ConfigError(
-            f"the system allows {allowed} file descriptors, at least {others + _LEAST_CONNECTIONS} are needed; see "
+            f"the system allows {allowed} file descriptors, at least {others + _MIN_CONNECTIONS} are needed; see "
             "`ulimit -n`"
         )
     if allowed - others < wanted:

@@ -15,14 +15,14 @@ from service.storage.tables import IDEMPOTENCY
 
 KEPT_FOR = timedelta(hours=24)
 # After a crash, callers wait for as long at least.
-LEAST_LEASE_S = 15.0
+MIN_LEASE_S = 15.0
 _COLUMNS = IDEMPOTENCY.c
 
 
 class IdempotencyKeys:
     """Answers by (tenant, route, key), for a day."""
 
-    def __init__(self, database: Database, lease_s: float = LEAST_LEASE_S) -> None:
+    def __init__(self, database: Database, lease_s: float = MIN_LEASE_S) -> None:
         """
         Args:
             lease_s: how long a request may take; after that its owner counts as dead, and the next one takes over. An

@@ -10,7 +10,7 @@ from lalaloc_core.errors import ConfigError
 from service.settings import Settings
 from service.storage.api_keys import ApiKeys
 from service.storage.database import Database
-from service.storage.idempotency_keys import LEAST_LEASE_S, IdempotencyKeys
+from service.storage.idempotency_keys import MIN_LEASE_S, IdempotencyKeys
 from service.storage.migration import migrate
 from service.storage.plan_cache import PlanCache
 from service.storage.plans import Plans
@@ -41,7 +41,7 @@ class Store:
         *,
         connections: int = 8,
         wait_s: float = 2.0,
-        claim_s: float = LEAST_LEASE_S,
+        claim_s: float = MIN_LEASE_S,
         plan_cache_bytes: int = 64 * 2**20,
     ) -> None:
         """Connect, and bring the schema up to date.
@@ -94,6 +94,6 @@ def open_store(settings: Settings) -> Store:
         connections=settings.database_connections,
         wait_s=settings.database_wait_s,
         # A query that is computed still must not be computed once more.
-        claim_s=max(LEAST_LEASE_S, settings.request_deadline_s + _CLAIM_MARGIN_S),
+        claim_s=max(MIN_LEASE_S, settings.request_deadline_s + _CLAIM_MARGIN_S),
         plan_cache_bytes=settings.plan_cache_bytes,
     )

@@ -24,7 +24,7 @@ from lalaloc_core.plans.model.report import Notebook
 from lalaloc_core.plans.model.sketch import OpeningKind, Sketch, SketchedOpening, SketchedRoom
 from lalaloc_core.plans.model.words import type_of_room
 
-_SMALLEST_ROOM_M2 = 0.6
+_MIN_ROOM_M2 = 0.6
 # Leaves of doors; a swing of another size is a corner of a bathtub.
 _LEAF_M = (0.45, 1.6)
 # Parts of one symbol (leaf, frame, panes) lie this near to each other.
@@ -38,7 +38,7 @@ _SIZE = re.compile(r"\(?\d+(?:[.,]\d+)?\s*(?:m²|m2|qm|sqm|sq\.? ?ft|sf)(?![a-z]
 _THICK_M = (0.05, 0.6)
 # Lines of walls this near to a room's outline are its own.
 _OFF_WALL_M = 0.03
-_MOST_SEGMENTS = 60_000
+_MAX_SEGMENTS = 60_000
 
 
 def understand(drawing: Drawing, notebook: Notebook, budget: Budget, config: WallConfig = DEFAULT_WALLS) -> Sketch:
@@ -134,9 +134,9 @@ def _pieces(lines: Iterable[BaseGeometry]) -> list[shapely.LineString]:
     for line in lines:
         points = shapely.get_coordinates(line)
         pieces += [shapely.LineString(pair) for pair in pairwise(points) if (pair[0] != pair[1]).any()]
-    if len(pieces) > _MOST_SEGMENTS:
+    if len(pieces) > _MAX_SEGMENTS:
         raise InvalidFloorPlanError(
-            f"{len(pieces)} lines could be walls, at most {_MOST_SEGMENTS} are looked at; name the layers of the walls"
+            f"{len(pieces)} lines could be walls, at most {_MAX_SEGMENTS} are looked at; name the layers of the walls"
         )
     return pieces
 

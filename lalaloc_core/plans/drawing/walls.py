@@ -19,7 +19,7 @@ from shapely.geometry.base import BaseGeometry
 from lalaloc_core.plans.model.geometry import polygons_of
 
 # Sine of the least angle of a corner at the end of a wall; and how far apart two short ends are jambs of one door (m).
-_CORNER, _WIDEST_BETWEEN_NIBS = 0.8, 1.3
+_CORNER, _MAX_BETWEEN_NIBS = 0.8, 1.3
 # Jambs that are not in line by more than this are none (m).
 _OUT_OF_LINE_M = 0.35
 
@@ -190,7 +190,7 @@ def _gap_before(wall: _End, parts: Sequence[shapely.Polygon], tree: shapely.STRt
         return None
     is_between_ends = _faces_an_end(wall.start, wall.end, outward, width, tree)
     is_sure = width - nearest <= 0.25 * config.thickest and (
-        wall.nib >= config.nib or (is_between_ends and width <= _WIDEST_BETWEEN_NIBS)
+        wall.nib >= config.nib or (is_between_ends and width <= _MAX_BETWEEN_NIBS)
     )
     # A little into both walls, so that nothing is left open beside it.
     near, far = -0.02 * outward, (width + 0.02) * outward

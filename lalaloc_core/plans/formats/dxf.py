@@ -39,7 +39,7 @@ _INSUNITS = {1: (0.0254, "in"), 2: (0.3048, "ft"), 4: (1e-3, "mm"), 5: (0.01, "c
 _LINES = {"LINE", "LWPOLYLINE", "POLYLINE", "ARC", "CIRCLE", "ELLIPSE", "SPLINE"}
 _FILLED = {"HATCH", "MPOLYGON", "SOLID", "TRACE"}
 _TEXTS = {"TEXT", "MTEXT", "ATTRIB"}
-_DEEPEST_BLOCK = 16
+_MAX_BLOCK_DEPTH = 16
 # Curves are followed to this share of the drawing's size.
 _SAG = 2e-5
 _USUAL_EXTENT_M = (4.0, 120.0)
@@ -102,8 +102,8 @@ def _check_blocks(document: DxfDocument, budget: Budget) -> None:
     sizes: dict[str, int] = {}
 
     def size(name: str, depth: int) -> int:
-        if depth > _DEEPEST_BLOCK:
-            raise InvalidFloorPlanError(f"blocks lie more than {_DEEPEST_BLOCK} deep in each other, or in themselves")
+        if depth > _MAX_BLOCK_DEPTH:
+            raise InvalidFloorPlanError(f"blocks lie more than {_MAX_BLOCK_DEPTH} deep in each other, or in themselves")
         if name not in sizes:
             block = document.blocks.get(name)
             sizes[name] = 0 if block is None else total(block, depth + 1)
@@ -151,7 +151,7 @@ def _read(document: DxfDocument, options: ImportOptions, notebook: Notebook, bud
 def _walk(entities: object, around: _Place | None, depth: int) -> Iterator[tuple[DXFGraphic, _Place]]:
     """Entities with their places; blocks are opened, but for those that are doors and windows themselves."""
     for entity in entities:  # type: ignore[attr-defined]
-        if not isinstance(entity, DXFGraphic) or depth > _DEEPEST_BLOCK:
+        if not isinstance(entity, DXFGraphic) or depth > _MAX_BLOCK_DEPTH:
             continue
         layer = entity.dxf.get("layer", "0")
         # Layer 0 in a block means the layer that the block was put on.

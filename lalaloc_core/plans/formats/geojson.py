@@ -57,7 +57,7 @@ _NO_PLAN = {
     "amenity",
 }
 _NO_FLOOR = {"opentobelow", "structure", "column", "elevator", "escalator", "movingwalkway"}
-_MOST_METRES = 5000.0
+_MAX_REACH_M = 5000.0
 
 
 @dataclass(frozen=True)
@@ -226,9 +226,9 @@ def _projection(features: Sequence[_Feature], crs: str | None, options: ImportOp
         return shapely.transform(shape, lambda points: frame.to_local(convert(points)))
 
     corners = frame.to_local(convert(everything[[everything[:, 0].argmin(), everything[:, 0].argmax()]]))
-    if np.abs(corners).max() > _MOST_METRES:
+    if np.abs(corners).max() > _MAX_REACH_M:
         raise InvalidFloorPlanError(
-            f"the features lie {2.0 * np.abs(corners).max():.0f} m apart, at most {2 * _MOST_METRES:g} m can be one "
+            f"the features lie {2.0 * np.abs(corners).max():.0f} m apart, at most {2 * _MAX_REACH_M:g} m can be one "
             "plan; where the file is a drawing in a unit of its own, say so: units=m"
         )
     return project, frame.anchor, 1.0, "longitude and latitude (WGS84)" if crs is None else crs

@@ -24,7 +24,7 @@ from lalaloc_core.plans.picture import sketch_picture
 FORMAT = "pdf"
 _METRES_PER_POINT = 0.0254 / 72.0
 # A page with fewer lines than this, or mostly covered by a picture, is a scan.
-_FEWEST_LINES, _MOSTLY = 12, 0.5
+_MIN_LINES, _MOSTLY = 12, 0.5
 _FINEST_M, _COARSEST_PT = 0.01, 4.0
 
 
@@ -59,7 +59,7 @@ def import_pdf(content: bytes, options: ImportOptions, budget: Budget) -> tuple[
 
 def _as_drawing(found: PageContent, factor: float, notebook: Notebook, budget: Budget) -> Sketch | None:
     drawing = found.drawing
-    if len(drawing.strokes) + len(drawing.areas) < _FEWEST_LINES or found.picture_share > _MOSTLY:
+    if len(drawing.strokes) + len(drawing.areas) < _MIN_LINES or found.picture_share > _MOSTLY:
         return None
     notebook.use("lines", "perhaps walls", len(drawing.strokes))
     notebook.use("areas", "perhaps walls", len(drawing.areas))

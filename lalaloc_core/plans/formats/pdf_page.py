@@ -19,10 +19,10 @@ from lalaloc_core.plans.drawing.shapes import Area, Drawing, Lettering, Stroke, 
 from lalaloc_core.plans.model.geometry import polygons_of
 from lalaloc_core.plans.model.limits import Budget
 
-_DEEPEST_FORM = 8
+_MAX_FORM_DEPTH = 8
 _STEPS_OF_CURVE = 12
 _DARK = 110.0
-_MOST_TEXTS, _LONGEST_TEXT = 5000, 200
+_MAX_TEXTS, _MAX_LENGTH = 5000, 200
 Matrix = Float[np.ndarray, "3 3"]
 
 
@@ -95,7 +95,7 @@ def _objects(
         total = matrix @ np.array([[own.a, own.c, own.e], [own.b, own.d, own.f], [0.0, 0.0, 1.0]])
         if pdfium.FPDFPageObj_GetType(item) != pdfium.FPDF_PAGEOBJ_FORM:
             yield item, total
-        elif depth < _DEEPEST_FORM:
+        elif depth < _MAX_FORM_DEPTH:
             yield from _objects(
                 item, pdfium.FPDFFormObj_CountObjects, pdfium.FPDFFormObj_GetObject, total, budget, depth + 1
             )
@@ -186,9 +186,9 @@ def _luminance(item: Any) -> float:
 def _letterings(page: pypdfium2.PdfPage) -> list[Lettering]:
     text = page.get_textpage()
     found = []
-    for index in range(min(text.count_rects(), _MOST_TEXTS)):
+    for index in range(min(text.count_rects(), _MAX_TEXTS)):
         left, bottom, right, top = text.get_rect(index)
-        words = " ".join(text.get_text_bounded(left, bottom, right, top).split())[:_LONGEST_TEXT]
+        words = " ".join(text.get_text_bounded(left, bottom, right, top).split())[:_MAX_LENGTH]
         if words:
             found.append(Lettering(words, (0.5 * (left + right), 0.5 * (bottom + top))))
     text.close()

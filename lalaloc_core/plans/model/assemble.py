@@ -28,7 +28,7 @@ _STRAIGHT_M, _SLIVER_M2 = 0.002, 0.01
 _FAR_M = 10_000.0
 # A tenth of a millimetre is finer than anything that is built.
 _GRID_M, _DECIMALS = 1e-4, 4
-_MOST_NAMED = 5
+_MAX_NAMED = 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +78,7 @@ def assemble(
     openings = [_moved(opening, moved) for opening in sketch.openings]
     settled = settle_openings(openings, [room.shape for room in rooms])
     if settled.astray:
-        places = ", ".join(f"({o.start[0]:.2f}, {o.start[1]:.2f})" for o in settled.astray[:_MOST_NAMED])
+        places = ", ".join(f"({o.start[0]:.2f}, {o.start[1]:.2f})" for o in settled.astray[:_MAX_NAMED])
         notebook.warnings.append(
             f"{len(settled.astray)} openings lie on no wall and were left out, such as at {places}"
         )
@@ -214,5 +214,5 @@ def _xy(point: tuple[float, ...]) -> list[float]:
 
 
 def _what_was_there(notebook: Notebook) -> str:
-    used = [f"{count} {use} on '{layer}'" for (layer, use), count in sorted(notebook.uses.items())][:_MOST_NAMED]
+    used = [f"{count} {use} on '{layer}'" for (layer, use), count in sorted(notebook.uses.items())][:_MAX_NAMED]
     return "it has " + ", ".join(used) if used else "it holds nothing that could be one"

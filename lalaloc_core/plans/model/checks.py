@@ -18,8 +18,8 @@ USUAL_DOOR_M = (0.5, 3.0)
 _USUAL_ROOM_M2 = (0.64, 1600.0)
 # How far apart two rooms lie at most that share a wall, and how far an opening reaches to either side.
 _USUAL_WALL_M, _REACH_M = 0.6, 0.45
-_SMALLEST_OVERLAP_M2 = 0.01
-_MOST_NAMED, _MOST_ROOMS_COMPARED = 5, 2000
+_MIN_OVERLAP_M2 = 0.01
+_MAX_NAMED, _MAX_ROOMS_COMPARED = 5, 2000
 _UNIT_NAMES = {"m": "metres", "cm": "centimetres", "mm": "millimetres", "in": "inches", "ft": "feet"}
 
 
@@ -37,7 +37,7 @@ def check_document(document: Mapping[str, Any]) -> list[str]:
     doubled = [name for name, count in Counter(names).items() if count > 1]
     if doubled:
         warnings.append(f"rooms share a name: {_listed(doubled)}; answers tell them apart by id only")
-    if len(rooms) <= _MOST_ROOMS_COMPARED:
+    if len(rooms) <= _MAX_ROOMS_COMPARED:
         warnings += _gaps(rooms, names)
         warnings += _unreached(rooms, names, document.get("openings", []))
     return warnings
@@ -76,7 +76,7 @@ def _ceilings(document: Mapping[str, Any], names: Sequence[str]) -> list[str]:
         if height is not None:
             seen.setdefault(float(height), name)
     hints = [unit_hint(f"the ceiling of '{name}'", height, USUAL_CEILING_M) for height, name in seen.items()]
-    return [hint for hint in hints if hint is not None][:_MOST_NAMED]
+    return [hint for hint in hints if hint is not None][:_MAX_NAMED]
 
 
 def _unit_of_doors(document: Mapping[str, Any]) -> list[str]:
@@ -137,5 +137,5 @@ def _length(line: Sequence[Sequence[float]]) -> float:
 
 
 def _listed(names: Sequence[str]) -> str:
-    shown = ", ".join(f"'{name}'" for name in names[:_MOST_NAMED])
-    return shown if len(names) <= _MOST_NAMED else f"{shown} and {len(names) - _MOST_NAMED} more"
+    shown = ", ".join(f"'{name}'" for name in names[:_MAX_NAMED])
+    return shown if len(names) <= _MAX_NAMED else f"{shown} and {len(names) - _MAX_NAMED} more"

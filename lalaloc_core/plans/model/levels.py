@@ -10,7 +10,7 @@ from lalaloc_core.plans.model.options import ImportOptions
 from lalaloc_core.plans.model.sketch import Level
 
 T = TypeVar("T")
-_MOST_NAMED = 12
+_MAX_NAMED = 12
 
 
 def chosen_levels(levels: Mapping[str, tuple[Level, T]], options: ImportOptions) -> list[tuple[Level, T]]:
@@ -24,7 +24,7 @@ def chosen_levels(levels: Mapping[str, tuple[Level, T]], options: ImportOptions)
         return ordered
     found = [item for item in ordered if item[0].answers_to(options.level)]
     if not found:
-        known = ", ".join(f"'{level.name}'" for level, _ in ordered[:_MOST_NAMED])
+        known = ", ".join(f"'{level.name}'" for level, _ in ordered[:_MAX_NAMED])
         raise InvalidFloorPlanError(f"the file has no level '{options.level}', it has {known}")
     return found
 

@@ -12,7 +12,7 @@ from lalaloc_core.errors import InvalidFloorPlanError
 
 METRES_PER_UNIT: Mapping[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
 _SCALE = re.compile(r"(?:1\s*[:/]\s*)?(\d+(?:\.\d+)?)")
-_LONGEST_TEXT, _MOST_LAYERS = 200, 100
+_MAX_LENGTH, _MAX_LAYERS = 200, 100
 _CEILING_M = (1.0, 20.0)
 
 
@@ -79,8 +79,8 @@ class ImportOptions:
         _within("ceiling_height_m", self.ceiling_height_m, *_CEILING_M)
         if self.y_axis not in (None, "up", "down"):
             raise InvalidFloorPlanError(f"y_axis is '{self.y_axis}', known are up, down")
-        if len(self.layers) > _MOST_LAYERS:
-            raise InvalidFloorPlanError(f"{len(self.layers)} layers, at most {_MOST_LAYERS} can be named")
+        if len(self.layers) > _MAX_LAYERS:
+            raise InvalidFloorPlanError(f"{len(self.layers)} layers, at most {_MAX_LAYERS} can be named")
         for text in (*self.layers, *filter(None, (self.level, self.name))):
             _check_text(text)
         said = [name for name in ("scale", "metres_per_pixel", "known_distance") if getattr(self, name) is not None]
@@ -148,9 +148,9 @@ def _within(name: str, value: float | int | None, low: float, high: float) -> No
 
 
 def _check_text(text: str) -> None:
-    if len(text) > _LONGEST_TEXT or any(unicodedata.category(character) in {"Cc", "Cs"} for character in text):
+    if len(text) > _MAX_LENGTH or any(unicodedata.category(character) in {"Cc", "Cs"} for character in text):
         raise InvalidFloorPlanError(
-            f"'{text[:50]!a}' is no usable name of a plan, level or layer: at most {_LONGEST_TEXT} printable characters"
+            f"'{text[:50]!a}' is no usable name of a plan, level or layer: at most {_MAX_LENGTH} printable characters"
         )
 
 

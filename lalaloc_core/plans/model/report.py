@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 # Lists of a report end here, so that a file of nothing but mistakes gives no answer of its own size.
-_MOST_LINES = 50
+_MAX_LINES = 50
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class Notebook:
             metres_per_unit,
             scale_source,
             is_draft,
-            tuple(layers[:_MOST_LINES]),
+            tuple(layers[:_MAX_LINES]),
             _bounded(self.notes),
             _bounded(self.warnings),
             _bounded(self.unsure),
@@ -87,6 +87,6 @@ class Notebook:
 
 def _bounded(lines: list[str]) -> tuple[str, ...]:
     distinct = list(dict.fromkeys(lines))
-    if len(distinct) <= _MOST_LINES:
+    if len(distinct) <= _MAX_LINES:
         return tuple(distinct)
-    return (*distinct[:_MOST_LINES], f"and {len(distinct) - _MOST_LINES} more")
+    return (*distinct[:_MAX_LINES], f"and {len(distinct) - _MAX_LINES} more")

@@ -16,9 +16,9 @@ from jaxtyping import Float
 from lalaloc_core.plans.model.sketch import SketchedOpening
 
 # Of what lies beside an opening: walls are thinner, drawn lines are straighter, and a jamb is no opening.
-THICKEST_WALL_M = 0.7
+MAX_WALL_THICKNESS_M = 0.7
 _STRAIGHT = math.sin(math.radians(12.0))
-_SHORTEST_M = 0.25
+_MIN_LENGTH_M = 0.25
 _KIND_RANK = {"door": 0, "window": 1, "passage": 2}
 
 
@@ -72,7 +72,7 @@ def _place(opening: SketchedOpening, edges: Float[np.ndarray, "n 4"], tree: shap
     if length < 1e-6:
         return None
     along = (end - start) / length
-    near = tree.query(opening.line, predicate="dwithin", distance=THICKEST_WALL_M)
+    near = tree.query(opening.line, predicate="dwithin", distance=MAX_WALL_THICKNESS_M)
     beside: list[tuple[float, float]] = []
     for edge in edges[near]:
         first, second = edge[:2], edge[2:]
@@ -85,7 +85,7 @@ def _place(opening: SketchedOpening, edges: Float[np.ndarray, "n 4"], tree: shap
         if shared < min(0.5 * length, 0.5):
             continue
         offset = _cross(along, 0.5 * (first + second) - start)
-        if abs(offset) <= THICKEST_WALL_M:
+        if abs(offset) <= MAX_WALL_THICKNESS_M:
             # The room lies to the left of its edges.
             side = 1.0 if direction @ along > 0.0 else -1.0
             beside.append((offset, side))
@@ -103,7 +103,7 @@ def _offset_of_wall(beside: list[tuple[float, float]]) -> float | None:
     left = [offset for offset, side in beside if side > 0.0]
     right = [offset for offset, side in beside if side < 0.0]
     # The wall lies between a room to its right and one to its left, the nearest pair of them.
-    pairs = [(a, b) for a in left for b in right if -1e-6 <= a - b <= THICKEST_WALL_M]
+    pairs = [(a, b) for a in left for b in right if -1e-6 <= a - b <= MAX_WALL_THICKNESS_M]
     if pairs:
         a, b = min(pairs, key=lambda pair: abs(pair[0] + pair[1]))
         return 0.5 * (a + b)
@@ -119,12 +119,12 @@ def _beside(opening: SketchedOpening, kept: Sequence[SketchedOpening]) -> Sketch
     for other in kept:
         a, b = np.array(other.start) - start, np.array(other.end) - start
         apart = max(abs(_cross(along, a)), abs(_cross(along, b)))
-        if apart > 0.5 * THICKEST_WALL_M:
+        if apart > 0.5 * MAX_WALL_THICKNESS_M:
             continue
         low, high = sorted((float(a @ along), float(b @ along)))
         free = [piece for lo, hi in free for piece in ((lo, min(hi, low)), (max(lo, high), hi)) if piece[1] > piece[0]]
     longest = max(free, key=lambda piece: piece[1] - piece[0], default=(0.0, 0.0))
-    if longest[1] - longest[0] < max(_SHORTEST_M, 0.5 * length):
+    if longest[1] - longest[0] < max(_MIN_LENGTH_M, 0.5 * length):
         return None
     low, high = longest
     return replace(opening, start=_point(start + low * along), end=_point(start + high * along))
@@ -134,9 +134,9 @@ def _stack(opening: SketchedOpening, kept: list[SketchedOpening]) -> None:
     """Windows above each other are one, from the lowest sill to the highest head."""
     if opening.kind != "window" or opening.head_m is None:
         return
-    near = opening.line.buffer(0.5 * THICKEST_WALL_M, cap_style="flat")
+    near = opening.line.buffer(0.5 * MAX_WALL_THICKNESS_M, cap_style="flat")
     for index, other in enumerate(kept):
-        if other.kind != "window" or other.head_m is None or near.intersection(other.line).length < _SHORTEST_M:
+        if other.kind != "window" or other.head_m is None or near.intersection(other.line).length < _MIN_LENGTH_M:
             continue
         sills = [each.sill_m or 0.0 for each in (opening, other)]
         kept[index] = replace(other, sill_m=min(sills), head_m=max(opening.head_m, other.head_m))

@@ -19,9 +19,9 @@ from lalaloc_core.plans.model.report import Notebook
 from lalaloc_core.plans.picture.sketching import sketch_picture
 
 FORMAT = "picture"
-_SMALLEST_PX = 64
+_MIN_SIDE_PX = 64
 # A picture of more metres than that has a wrong scale, and would be drawn over the heads of all limits.
-_LARGEST_M = 1000.0
+_MAX_EXTENT_M = 1000.0
 
 
 def import_picture(content: bytes, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
@@ -33,10 +33,10 @@ def import_picture(content: bytes, options: ImportOptions, budget: Budget) -> tu
     gray, paper_m_per_pixel = _open(content, budget)
     factor, source = drawing_scale(replace(options, units=None), "the picture", paper_m_per_unit=paper_m_per_pixel)
     rows, columns = gray.shape
-    if max(rows, columns) * factor > _LARGEST_M:
+    if max(rows, columns) * factor > _MAX_EXTENT_M:
         raise InvalidFloorPlanError(
             f"the picture is {columns * factor:.0f} m by {rows * factor:.0f} m at {factor:g} m per pixel, at most "
-            f"{_LARGEST_M:g} m are read; is the scale right?"
+            f"{_MAX_EXTENT_M:g} m are read; is the scale right?"
         )
     notebook = Notebook()
     sketch = sketch_picture(gray, factor, notebook, budget)
@@ -63,9 +63,9 @@ def _open(content: bytes, budget: Budget) -> tuple[UInt8[np.ndarray, "h w"], flo
                     raise InvalidFloorPlanError(
                         f"the picture has {width} x {height} pixels, at most {limit} are read (max_pixels)"
                     )
-                if min(width, height) < _SMALLEST_PX:
+                if min(width, height) < _MIN_SIDE_PX:
                     raise InvalidFloorPlanError(
-                        f"the picture has {width} x {height} pixels, at least {_SMALLEST_PX} each way are needed"
+                        f"the picture has {width} x {height} pixels, at least {_MIN_SIDE_PX} each way are needed"
                     )
                 dpi = picture.info.get("dpi")
                 upright = ImageOps.exif_transpose(picture)

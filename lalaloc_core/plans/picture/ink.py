@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, UInt8
 # Lengths of what is looked at, in metres: finer pictures are made coarser, and light is evened out over so much.
 FINEST_M = 0.01
 _LIGHT_M = 1.2
-_MOST_SKEW_DEG = 10.0
+_MAX_SKEW_DEG = 10.0
 _SKEW_PIXELS = 700
 # Lines are thinner than this, and stand out by so much of 255, or so many times the noise.
 _LINE_M, _FAINTEST, _OVER_NOISE = 0.07, 40.0, 8.0
@@ -112,7 +112,7 @@ def find_skew(ink: Bool[np.ndarray, "h w"]) -> float:
         return sum(float(np.sum(np.diff(turned.sum(axis=axis)) ** 2)) for axis in (0, 1))
 
     best = 0.0
-    for step, reach in ((1.0, _MOST_SKEW_DEG), (0.25, 1.0), (0.05, 0.25)):
+    for step, reach in ((1.0, _MAX_SKEW_DEG), (0.25, 1.0), (0.05, 0.25)):
         candidates = best + np.arange(-reach, reach + 0.5 * step, step)
         best = float(max(candidates, key=lambda degrees: energy(float(degrees))))
     # Less than that is not seen, and a straight drawing stays as sharp as it is.

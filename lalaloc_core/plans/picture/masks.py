@@ -13,9 +13,9 @@ from lalaloc_core.plans.model.geometry import polygons_of
 from lalaloc_core.plans.picture.ink import Ink
 
 # Lengths in metres.
-_THINNEST_M = 0.055
+_MIN_THICKNESS_M = 0.055
 # White between the two lines of a wall is no wider; the sector of a door's swing is.
-_WIDEST_CAVITY_M = 0.42
+_MAX_CAVITY_M = 0.42
 _SMALL_M = 1.2
 _STRAIGHT_M, _STRAIGHT_PX = 0.012, 1.3
 # Walls are alike in thickness; a chair, a letter or a basin is not.
@@ -50,16 +50,16 @@ def outlined_walls(ink: Ink) -> WallMask | None:
     depth = cv2.distanceTransform(white, cv2.DIST_L2, 5)
     deepest = np.zeros(count)
     np.maximum.at(deepest, labels.ravel(), depth.ravel())
-    is_cavity = 2.0 * deepest * ink.metres_per_pixel <= _WIDEST_CAVITY_M
+    is_cavity = 2.0 * deepest * ink.metres_per_pixel <= _MAX_CAVITY_M
     is_cavity[0] = False
     return _walls(ink, ink.mask | is_cavity[labels], np.where(is_cavity[labels], labels, 0))
 
 
 def _walls(ink: Ink, filled: Bool[np.ndarray, "h w"], cavities: Int[np.ndarray, "h w"] | None) -> WallMask | None:
-    size = max(3, round(_THINNEST_M / ink.metres_per_pixel))
+    size = max(3, round(_MIN_THICKNESS_M / ink.metres_per_pixel))
     thick = cv2.morphologyEx(filled.astype(np.uint8), cv2.MORPH_OPEN, np.ones((size, size), np.uint8))
     thickness = _usual_thickness(thick) * ink.metres_per_pixel
-    if thickness < _THINNEST_M:
+    if thickness < _MIN_THICKNESS_M:
         return None  # Strokes of a hatch that run together are no walls.
     kept = _without_furniture(thick, thickness / ink.metres_per_pixel, ink.metres_per_pixel)
     return WallMask(kept, thickness, cavities) if kept.any() else None

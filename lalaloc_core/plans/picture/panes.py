@@ -11,7 +11,7 @@ from lalaloc_core.plans.picture.ink import Ink
 from lalaloc_core.plans.picture.masks import WallMask
 
 # A pane is a white strip between two lines of a window: long, filled like a rectangle, and thinner than its wall.
-_SHORTEST_M, _OF_WALL = 0.4, (0.12, 0.72)
+_MIN_LENGTH_M, _OF_WALL = 0.4, (0.12, 0.72)
 _FULL, _LONG = 0.8, 3.0
 _SLANTED_DEG = 8.0
 
@@ -49,14 +49,14 @@ def _panes(walls: WallMask, ink: Ink) -> list[tuple[np.ndarray, float]]:
     found = []
     boxes = _boxes(index, len(names))
     for label, (x0, y0, x1, y1) in enumerate(boxes):
-        if names[label] == 0 or max(x1 - x0, y1 - y0) * ink.metres_per_pixel < _SHORTEST_M:
+        if names[label] == 0 or max(x1 - x0, y1 - y0) * ink.metres_per_pixel < _MIN_LENGTH_M:
             continue
         part = (index[y0:y1, x0:x1] == label).astype(np.uint8)
         points = np.argwhere(part)[:, ::-1].astype(np.float32)
         (cx, cy), (width, height), angle = cv2.minAreaRect(points)
         width, height = width + 1.0, height + 1.0
         long, short = max(width, height), min(width, height)
-        if long * ink.metres_per_pixel < _SHORTEST_M or long < _LONG * short:
+        if long * ink.metres_per_pixel < _MIN_LENGTH_M or long < _LONG * short:
             continue
         if not _OF_WALL[0] * thickness <= short <= _OF_WALL[1] * thickness or part.sum() < _FULL * long * short:
             continue

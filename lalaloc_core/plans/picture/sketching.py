@@ -21,14 +21,14 @@ from lalaloc_core.plans.picture.panes import windows_in_walls
 
 # In pictures windows are gaps in dark walls, and wider than doors; what has no symbol is no opening when it is wide.
 _CONFIG = WallConfig(widest_gap=3.6, narrowest_gap=0.4, thinnest=0.04)
-_WIDEST_BARE_GAP_M, _WIDEST_BARE_GAP_AT_A_FACE_M = 1.9, 1.1
-_SMALLEST_ROOM_M2 = 1.0
-_LARGEST_ISLAND_M2 = 2.0
+_MAX_BARE_GAP_M, _MAX_BARE_GAP_AT_A_FACE_M = 1.9, 1.1
+_MIN_ROOM_M2 = 1.0
+_MAX_ISLAND_M2 = 2.0
 # Dark walls are the surer reading: outlines must enclose so much more to be preferred.
 _MORE = 1.6
 _SURE = 0.85
 _COARSE_M = 0.03
-_THICKEST_WALL_M = 1.2
+_MAX_WALL_THICKNESS_M = 1.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,10 +69,10 @@ def sketch_picture(
         if other.area_m2 > _MORE * best.area_m2:
             best = other
     notebook.use("ink", "walls", len(shapely.get_parts(best.enclosed.walls)))
-    if best.walls.thickness_m > _THICKEST_WALL_M:
+    if best.walls.thickness_m > _MAX_WALL_THICKNESS_M:
         raise InvalidFloorPlanError(
             f"the walls would be {best.walls.thickness_m:.2f} m thick at {metres_per_pixel:g} m per pixel, at most "
-            f"{_THICKEST_WALL_M:g} m are; is the scale right?"
+            f"{_MAX_WALL_THICKNESS_M:g} m are; is the scale right?"
         )
     _tell(best, ink, metres_per_pixel, notebook)
     rooms = [SketchedRoom(straightened(_without_islands(room, notebook))) for room in best.enclosed.rooms]
@@ -89,22 +89,22 @@ def _read(walls: WallMask, ink: Ink, is_dark: bool, budget: Budget) -> _Reading:
 
     def judge(gap: Gap) -> int | None:
         seen[id(gap)] = found = reader.look(gap)
-        widest = _WIDEST_BARE_GAP_M if gap.is_between_ends else _WIDEST_BARE_GAP_AT_A_FACE_M
+        widest = _MAX_BARE_GAP_M if gap.is_between_ends else _MAX_BARE_GAP_AT_A_FACE_M
         if found.kind == "nothing" and not (gap.is_sure and gap.width <= widest):
             return None
         return ("door", "window", "nothing").index(found.kind)
 
     enclosed = enclose(bodies_of(walls, ink), [], (), _CONFIG, budget.check_time, judge)
-    rooms = [room for room in enclosed.rooms if room.area >= _SMALLEST_ROOM_M2]
+    rooms = [room for room in enclosed.rooms if room.area >= _MIN_ROOM_M2]
     return _Reading(walls, Enclosed(rooms, enclosed.gaps, enclosed.walls), seen, is_dark)
 
 
 def _without_islands(room: shapely.Polygon, notebook: Notebook) -> shapely.Polygon:
     """Letters and furniture that were taken for walls stand in rooms; so may columns, which are lost with them."""
-    small = [ring for ring in room.interiors if shapely.Polygon(ring).area <= _LARGEST_ISLAND_M2]
+    small = [ring for ring in room.interiors if shapely.Polygon(ring).area <= _MAX_ISLAND_M2]
     if small:
         notebook.unsure.append(f"{len(small)} dark shapes inside a room were taken for furniture, not for columns")
-    large = [ring for ring in room.interiors if shapely.Polygon(ring).area > _LARGEST_ISLAND_M2]
+    large = [ring for ring in room.interiors if shapely.Polygon(ring).area > _MAX_ISLAND_M2]
     return shapely.Polygon(room.exterior, large)
 
 
