@@ -1,1 +1,4 @@
-"""What maintainers run by hand: setting up, documentation, comparing encoders. Begin with `write_docs.py`."""
+"""What maintainers run by hand: setting up, documentation, comparing encoders.
+
+Begin with `write_docs.py`.
+"""

@@ -68,7 +68,7 @@ def folder_map() -> str:
         for path in sorted((ROOT / package).rglob("__init__.py"), key=lambda path: path.parent):
             docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
             summary = " ".join(docstring.split("\n\n")[0].split()).replace("|", "\\|")
-            begin = re.search(r"Begin with `([^`]+)`", docstring)
+            begin = re.search(r"Begin\s+with\s+`([^`]+)`", docstring)
             rows.append(f"| `{path.parent.relative_to(ROOT)}/` | {summary} | {f'`{begin[1]}`' if begin else ''} |")
     return "\n".join(rows)
 

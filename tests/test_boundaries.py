@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -167,8 +168,10 @@ def test_every_module_imports_only_from_lower_layers_or_its_own_folder(module: s
 
 
 @pytest.mark.parametrize("package", sorted(PACKAGES))
-def test_every_package_says_what_it_is_for(package: str) -> None:
-    assert ast.get_docstring(_tree(package))
+def test_every_package_says_what_it_is_for_and_where_to_begin(package: str) -> None:
+    begin = re.search(r"Begin\s+with\s+`([^`]+)`", ast.get_docstring(_tree(package)) or "")
+    assert begin
+    assert (MODULES[package].parent / begin[1]).exists()
 
 
 def test_the_layer_table_names_no_module_that_is_gone() -> None:

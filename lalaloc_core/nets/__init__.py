@@ -1,56 +1,17 @@
-"""The networks of all architectures, and loading a layout encoder or a decoder from a bundle's weights."""
+"""The networks, in torch: encoders of layouts and of panoramas, and the decoder of latents.
 
-from __future__ import annotations
+Begin with `ring.py`, both encoders of the architecture that ships. `trunk_encoder.py` puts another image encoder on a
+trunk that was pretrained on photographs (`trunk.py`), `resnet.py` has the encoders of the paper; `mixer.py` is the
+attention around the horizon that the first two share, `decoder.py` draws the layout of a latent. `loading.py` rebuilds
+networks from a bundle; `lalaloc_core.localise.encoders` runs the exported ones without torch.
+"""
 
-from typing import Any
-
-import safetensors.torch
-from torch import nn
-
-from lalaloc_core.bundle import DECODER_WEIGHTS, Bundle
-from lalaloc_core.configuration import build_config
-from lalaloc_core.errors import BundleError
 from lalaloc_core.nets.decoder import LayoutDecoder
-from lalaloc_core.nets.resnet import PaperConfig, PaperImageEncoder, PaperLayoutEncoder
-from lalaloc_core.nets.ring import RingConfig, RingImageEncoder, RingLayoutEncoder
+from lalaloc_core.nets.loading import LayoutEncoder, load_decoder, load_layout_encoder
+from lalaloc_core.nets.resnet import PaperImageEncoder
+from lalaloc_core.nets.ring import RingImageEncoder
 from lalaloc_core.nets.trunk_encoder import TrunkImageEncoder
 
-LayoutEncoder = RingLayoutEncoder | PaperLayoutEncoder
 ImageEncoder = RingImageEncoder | TrunkImageEncoder | PaperImageEncoder
 
-
-def load_layout_encoder(architecture: str, config: dict[str, Any], weights: bytes) -> LayoutEncoder:
-    """Rebuild a layout encoder from the configuration and the safetensors of a bundle.
-
-    Raises:
-        ValueError: unknown architecture, or a configuration that is not one (`ConfigError`).
-        RuntimeError: the weights do not fit.
-    """
-    if architecture in ("ring", "trunk"):
-        encoder: LayoutEncoder = RingLayoutEncoder(build_config(RingConfig, config))
-    elif architecture == "paper":
-        encoder = PaperLayoutEncoder(build_config(PaperConfig, config))
-    else:
-        raise ValueError(f"unknown architecture '{architecture}', known are 'ring', 'trunk' and 'paper'")
-    _load_weights(encoder, weights)
-    return encoder
-
-
-def load_decoder(bundle: Bundle) -> LayoutDecoder:
-    """The decoder that a bundle's layout encoder was trained with.
-
-    Raises:
-        BundleError: the bundle has none, or it was altered or does not fit.
-    """
-    decoder = LayoutDecoder(bundle.manifest.latent_size)
-    try:
-        _load_weights(decoder, bundle.read(DECODER_WEIGHTS))
-    except RuntimeError as error:
-        raise BundleError(f"bundle '{bundle.folder}': decoder does not load: {error}") from error
-    return decoder.eval()
-
-
-def _load_weights(module: nn.Module, weights: bytes) -> None:
-    """Half precision is a storage format here; arithmetic is single precision."""
-    state = safetensors.torch.load(weights)
-    module.load_state_dict({k: v.float() if v.is_floating_point() else v for k, v in state.items()}, strict=True)
+__all__ = ["ImageEncoder", "LayoutDecoder", "LayoutEncoder", "load_decoder", "load_layout_encoder"]

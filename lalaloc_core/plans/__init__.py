@@ -2,6 +2,14 @@
 
 `import_plan` and `import_plans` take the bytes of a file and find out by its content what it is. Every importer gives a
 document in the native format (docs/conventions.md) and a report of what it used and what is likely wrong.
+
+formats/   an importer for each format; `native.py` is the shortest
+drawing/   vector drawings, whatever the format: which lines are walls, what they enclose
+picture/   scans and photographs of drawings
+model/     what importers share: options, limits, the sketch that they fill in, and the plan that becomes of it
+exports/   the way back: plans in the formats of other tools
+
+Begin with `importing.py`, which chooses among the formats. What a plan is stands in `lalaloc_core.floorplan`.
 """
 
 from lalaloc_core.plans.exporting import EXPORT_FORMATS, ExportFormat, export_plan

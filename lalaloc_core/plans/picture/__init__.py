@@ -1,4 +1,8 @@
-"""Plans from pictures: scans, photographs of drawings, screenshots. What comes of them is a draft."""
+"""Plans from pictures: scans, photographs of drawings, screenshots. What comes of them is a draft.
+
+Begin with `sketching.py`: `ink.py` makes ink of grey, `masks.py` finds walls in it, `gaps.py` and `panes.py` doors and
+windows, and `plans.drawing.walls` what the walls enclose.
+"""
 
 from lalaloc_core.plans.picture.importing import import_picture
 from lalaloc_core.plans.picture.sketching import sketch_picture
