@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo serve test lint openapi docs clean
+.PHONY: help setup demo serve test lint openapi docs web clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -26,8 +26,8 @@ serve: $(STAMP) ## run the service at http://127.0.0.1:8000 (PORT=8001: there) w
 
 # What computes is shared out to processes with one thread each; what serves needs the machine for itself.
 test: lint ## lint, then the tests
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal --ignore=tests/service --ignore=tests/client
-	$(BIN)/python -m pytest tests/service tests/client
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal --ignore=tests/service --ignore=tests/client --ignore=tests/web
+	$(BIN)/python -m pytest tests/service tests/client tests/web
 
 lint: $(STAMP) ## ruff and pyright
 	$(BIN)/ruff check
@@ -40,6 +40,9 @@ openapi: $(STAMP) ## write openapi.yaml from the application
 docs: $(STAMP) ## write the generated parts of README.md and docs/architecture.md
 	$(BIN)/python -m scripts.write_docs
 
+web: ## build the web pages from web/ into service/web (needs node and npm)
+	cd web && npm ci --no-audit --no-fund && npm run check && npm run build
+
 clean: ## remove the environment and everything that was made; ./data and ./runs stay
-	rm -rf $(VENV) build dist *.egg-info .pytest_cache .ruff_cache .hypothesis demo.png
+	rm -rf $(VENV) web/node_modules build dist *.egg-info .pytest_cache .ruff_cache .hypothesis demo.png
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -13,7 +13,7 @@ pools/      worker processes, kept alive and fed
 workers/    the programs that run in them
 telemetry/  metrics, logs and traces
 preview/    drawings and meshes of plans
-web/        the web pages
+web/        the web pages, built from web/ beside this package
 
 Beside them: `settings.py`, `errors.py` (what errors mean over HTTP), `cores.py` (which part gets how many),
 `sharing.py` (that no tenant takes everything), `threads.py`, `bounded_cache.py`, and the command lines `cli.py`,

@@ -26,6 +26,7 @@ from service.query.decoding import Decoder
 from service.query.heading import KnownHeading, known_heading
 from service.query.hints import hint_warnings, stated_hints
 from service.query.lpo_pool import LpoPool
+from service.query.posterior import posterior_answer
 from service.schemas import CandidateAnswer, LocaliseAnswer, LocaliseForm, ModelAnswer, Position, TimingsAnswer
 from service.settings import Settings
 from service.sharing import with_spare
@@ -118,7 +119,10 @@ class Localiser:
         self._observe(timings_ms, found.stage)
         warnings = [_contradiction(known)] if found.heading_contradicted else []
         warnings += hint_warnings(hints, found, record.plan)
-        return self._compose(record, known, found, warnings, timings_ms)
+        answer = self._compose(record, known, found, warnings, timings_ms)
+        if form.include == "posterior":
+            return answer.model_copy(update={"posterior": posterior_answer(grid, found.posterior)})
+        return answer
 
     def close(self) -> None:
         """Finish what is being computed."""

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from fastapi import Depends, Request
 
-from service.errors import UnknownFloorPlanError
+from service.errors import UnknownFloorPlanError, UnknownRevisionError
 from service.http.idempotent_request import HEADER, MAX_KEY_CHARACTERS
 from service.runtime import Runtime, runtime_of
 from service.security import caller_of
@@ -42,6 +42,21 @@ def stored_plan(tenant: str, floorplan_id: str, plans: Plans) -> PlanRecord:
     if record is None:
         raise UnknownFloorPlanError(floorplan_id)
     return record
+
+
+def plan_at_revision(current: PlanRecord, revision_id: str, plans: Plans) -> PlanRecord:
+    """A stored plan at any of its revisions.
+
+    Raises:
+        UnknownRevisionError: it is not kept, or never was.
+        StoreUnavailableError: the database is away.
+    """
+    if revision_id == current.revision_id:
+        return current
+    found = plans.get_revision(current.tenant, current.id, revision_id) if is_id(revision_id) else None
+    if found is None:
+        raise UnknownRevisionError(current.id, revision_id)
+    return found
 
 
 def plan_summary(tenant: str, floorplan_id: str, plans: Plans) -> PlanSummary:

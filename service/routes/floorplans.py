@@ -40,7 +40,7 @@ from service.routes.dependencies import (
     Party,
     Running,
     Tenant,
-    is_id,
+    plan_at_revision,
     plan_summary,
     stored_plan,
 )
@@ -166,7 +166,7 @@ def get_floorplan(
     record = stored_plan(tenant, floorplan_id, runtime.store.plans)
     superseded = revision is not None and revision != record.revision_id
     if revision is not None and superseded:
-        record = _at_revision(record, revision, runtime)
+        record = plan_at_revision(record, revision, runtime.store.plans)
     note(request, plan=record.id, revision=record.revision_id)
     step_m = runtime.settings.grid_step_m
     content, etag = plan_representation(record, plan_state(record, runtime.grids), step_m, superseded=superseded)
@@ -225,20 +225,6 @@ def delete_floorplan(floorplan_id: str, request: Request, runtime: Running, tena
     if not runtime.store.plans.delete(tenant, current.id, expected=expected):
         raise UnknownFloorPlanError(floorplan_id)
     runtime.grids.forget({current.revision_id})
-
-
-def _at_revision(current: PlanRecord, revision_id: str, runtime: Runtime) -> PlanRecord:
-    """Another revision of a plan.
-
-    Raises:
-        UnknownRevisionError: it is not kept, or never was.
-    """
-    found = None
-    if is_id(revision_id):
-        found = runtime.store.plans.get_revision(current.tenant, current.id, revision_id)
-    if found is None:
-        raise UnknownRevisionError(current.id, revision_id)
-    return found
 
 
 async def _uploaded_plan(request: Request, runtime: Runtime) -> bytes:

@@ -1,59 +1,65 @@
-"""The web pages: a form that tries the service out, and the API's documentation. Nothing is loaded from elsewhere."""
+"""The web pages: one to use the service, one about its API. What they are made of is built from `web/` by `make web`.
+
+Nothing is loaded from elsewhere, nothing is inline, and with API keys on they are the only routes without: they ask for
+a key themselves.
+"""
 
 from __future__ import annotations
 
+import re
 from importlib.resources import files
+from mimetypes import guess_type
 
-from fastapi import APIRouter, Response
+from fastapi import APIRouter, Request, Response
+from starlette.exceptions import HTTPException
+
+from service.http.conditional import conditional_answer, content_etag
 
 router = APIRouter(include_in_schema=False)
 
 _HEADERS = {
+    # Pictures that are chosen on the page are shown from memory: `blob:`.
     "Content-Security-Policy": (
-        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; connect-src 'self'; "
-        "form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
+        "connect-src 'self' blob:; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
     ),
     # A browser asks each time whether its copy is still good: another version may answer next.
     "Cache-Control": "no-cache",
 }
+_NAME = re.compile(r"[A-Za-z0-9_-]+(?:\.[a-z0-9]+)+")
 
 
 @router.get("/")
-def index() -> Response:
-    """The page that tries the service out."""
-    return _page("index.html", "text/html")
+def index(request: Request) -> Response:
+    """The page that shows where photographs were taken."""
+    return _file(request, "index.html")
 
 
 @router.get("/docs")
-def docs() -> Response:
+def docs(request: Request) -> Response:
     """The API's documentation."""
-    return _page("docs.html", "text/html")
+    return _file(request, "docs.html")
 
 
-@router.get("/web/try.js")
-def try_script() -> Response:
-    """Script of the page that tries the service out."""
-    return _page("try.js", "text/javascript")
-
-
-@router.get("/web/docs.js")
-def docs_script() -> Response:
-    """Script of the documentation."""
-    return _page("docs.js", "text/javascript")
-
-
-@router.get("/web/style.css")
-def style() -> Response:
-    """Style of both pages."""
-    return _page("style.css", "text/css")
+@router.get("/web/{name}")
+def part(request: Request, name: str) -> Response:
+    """Scripts, styles and examples of the pages."""
+    return _file(request, name)
 
 
 @router.get("/favicon.ico")
-def icon() -> Response:
+def icon(request: Request) -> Response:
     """What browsers show beside the title, and ask for also where no page names it."""
-    return _page("icon.svg", "image/svg+xml")
+    return _file(request, "icon.svg")
 
 
-def _page(name: str, media_type: str) -> Response:
-    content = (files("service") / "web" / name).read_bytes()
-    return Response(content, media_type=media_type, headers=_HEADERS)
+def _file(request: Request, name: str) -> Response:
+    """Raises:
+    HTTPException: there is no such file.
+    """
+    path = files("service") / "web" / name
+    if not _NAME.fullmatch(name) or not path.is_file():
+        raise HTTPException(404)
+    content = path.read_bytes()
+    media = "text/javascript" if name.endswith(".js") else guess_type(name)[0] or "application/octet-stream"
+    return conditional_answer(request, content, media, content_etag(content), _HEADERS)

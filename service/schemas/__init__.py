@@ -7,6 +7,7 @@ localise_query   what a query says beside the panorama
 hint_fields      what it says of where the camera stood
 localise_answer  where it was taken
 venues           floor plans that belong together
+layout           the walls that a camera may see, for who draws them
 service_state    limits, health, readiness
 problem_details  errors
 
@@ -14,7 +15,15 @@ Begin with `localise_answer.py`.
 """
 
 from service.schemas.fields import Answer
-from service.schemas.localise_answer import CandidateAnswer, LocaliseAnswer, ModelAnswer, Position, TimingsAnswer
+from service.schemas.layout import LayoutAnswer, OpeningFaceAnswer, RoomLayoutAnswer
+from service.schemas.localise_answer import (
+    CandidateAnswer,
+    LocaliseAnswer,
+    ModelAnswer,
+    Position,
+    PosteriorAnswer,
+    TimingsAnswer,
+)
 from service.schemas.localise_query import LocaliseForm
 from service.schemas.native_plan import (
     FloorPlanDocument,
@@ -62,22 +71,26 @@ __all__ = [
     "FloorPlanSummary",
     "GridAnswer",
     "HealthAnswer",
+    "LayoutAnswer",
     "LimitsAnswer",
     "LocaliseAnswer",
     "LocaliseForm",
     "ModelAnswer",
     "OpeningDocument",
+    "OpeningFaceAnswer",
     "OpeningKind",
     "PlanEvent",
     "PlanStatus",
     "Point",
     "PoolAnswer",
     "Position",
+    "PosteriorAnswer",
     "Problem",
     "ReadyAnswer",
     "Ring",
     "RoomAnswer",
     "RoomDocument",
+    "RoomLayoutAnswer",
     "RoomType",
     "Segment",
     "TimingsAnswer",

@@ -25,6 +25,8 @@ Milliseconds = Annotated[float, _rounded(2)]
 # From 0 to 1: how much is done, and probabilities.
 Share = Annotated[float, Field(ge=0, le=1), _rounded(4)]
 Score = Annotated[float, _rounded(4)]
+# Of one place among thousands.
+Mass = Annotated[float, Field(ge=0, le=1), _rounded(6)]
 
 
 class Answer(BaseModel):

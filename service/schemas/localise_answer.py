@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from service.schemas.fields import Answer, Degrees, HeadingDeg, Metres, Milliseconds, Score, Share, Variance
+from service.schemas.fields import Answer, Degrees, HeadingDeg, Mass, Metres, Milliseconds, Score, Share, Variance
 from service.schemas.localise_query import HEADING_MEANING
 
 _LATENT_DISTANCE = Field(ge=0, le=2, description="Distance of the pose's layout to the panorama's latent.")
@@ -41,6 +41,15 @@ class CandidateAnswer(Answer):
     )
     cost: Score = _COST
     latent_distance: Score = _LATENT_DISTANCE
+
+
+class PosteriorAnswer(Answer):
+    """How probable places are, given that the panorama is of this plan: lists of one length, a place each."""
+
+    step_m: float = Field(description="Distance of neighbouring places: each stands for a square of this width.")
+    x_m: list[Metres]
+    y_m: list[Metres]
+    probability: list[Mass] = Field(description="They sum to 1; places of less than 0.0000005 are left out.")
 
 
 class TimingsAnswer(Answer):
@@ -97,5 +106,8 @@ class LocaliseAnswer(Answer):
     latent_distance: Score = _LATENT_DISTANCE
     camera_height_m: Metres = Field(description="The camera height that fits best.")
     candidates: list[CandidateAnswer] = Field(description="Best first; the first one is the answer.")
+    posterior: PosteriorAnswer | None = Field(
+        default=None, description="How probable all places are; null unless asked for with `include`."
+    )
     timings_ms: TimingsAnswer
     model: ModelAnswer

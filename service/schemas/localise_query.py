@@ -57,6 +57,10 @@ class LocaliseForm(HintFields):
         json_schema_extra={"maximum": 100},
     )
 
+    include: Literal["posterior"] | None = Field(
+        None, description="What else to tell: how probable all places of the plan are."
+    )
+
     @field_validator(
         "heading_deg", "heading_tolerance_deg", "camera_height_m", "camera_height_std_m", "top_k", mode="before"
     )

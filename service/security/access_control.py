@@ -18,7 +18,7 @@ from service.errors import (
 from service.security.exposure import check_origin, is_local
 from service.security.key_cache import KeyCache
 from service.security.keys import parse_authorization
-from service.security.permissions import Caller, Permission, anyone, permissions_needed
+from service.security.permissions import Caller, Permission, anyone, is_page, permissions_needed
 from service.security.rate_limits import RateLimits
 from service.settings import Settings
 from service.storage.api_keys import ApiKeys
@@ -70,6 +70,9 @@ class AccessControl:
         """
         if not self._needs_keys:
             self._check_local(request)
+            return anyone(_client_of(request))
+        is_read = request.method in ("GET", "HEAD")
+        if is_read and is_page(routed_path(request.scope)) and "authorization" not in request.headers:
             return anyone(_client_of(request))
         key = await self._key_of(request)
         note(request, key=key.id, tenant=key.tenant)

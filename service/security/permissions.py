@@ -25,16 +25,13 @@ class Permission(StrEnum):
 
 # Answered to everybody: whoever watches the process need not have a key.
 OPEN_PATHS = frozenset({"/healthz", "/readyz"})
+# Answered without a key, from where requests are answered at all: pages, which ask for one themselves. They are the
+# same for everybody.
+PAGES = frozenset({"/", "/docs", "/web/{name}", "/favicon.ico"})
 
 # Every other route. With keys, what does not stand here is not there: a new route is closed until it has a row.
 NEEDED: Mapping[tuple[str, str], Permission] = {
-    ("GET", "/"): Permission.READ,
-    ("GET", "/docs"): Permission.READ,
     ("GET", "/openapi.json"): Permission.READ,
-    ("GET", "/web/try.js"): Permission.READ,
-    ("GET", "/web/docs.js"): Permission.READ,
-    ("GET", "/web/style.css"): Permission.READ,
-    ("GET", "/favicon.ico"): Permission.READ,
     ("GET", "/metrics"): Permission.READ,
     ("GET", "/limits"): Permission.READ,
     ("GET", "/floorplans"): Permission.READ,
@@ -43,6 +40,7 @@ NEEDED: Mapping[tuple[str, str], Permission] = {
     ("PUT", "/floorplans/{floorplan_id}"): Permission.WRITE,
     ("DELETE", "/floorplans/{floorplan_id}"): Permission.WRITE,
     ("GET", "/floorplans/{floorplan_id}/events"): Permission.READ,
+    ("GET", "/floorplans/{floorplan_id}/layout"): Permission.READ,
     ("GET", "/floorplans/{floorplan_id}/original"): Permission.READ,
     ("GET", "/floorplans/{floorplan_id}/preview.svg"): Permission.READ,
     ("GET", "/floorplans/{floorplan_id}/mesh.glb"): Permission.READ,
@@ -56,6 +54,7 @@ NEEDED: Mapping[tuple[str, str], Permission] = {
     ("POST", "/localise"): Permission.LOCALISE,
 }
 _PATTERNS = {path: compile_path(path)[0] for _, path in NEEDED}
+_PAGE_PATTERNS = [compile_path(path)[0] for path in PAGES]
 
 
 @dataclass(frozen=True)
@@ -82,10 +81,17 @@ def anyone(client: str) -> Caller:
 
 def permissions_needed(path: str) -> dict[str, Permission]:
     """Which methods a path has and what each needs; empty for a path that is none of a route."""
+    if is_page(path):
+        return {"GET": Permission.READ}
     # The framework redirects from a path with a slash at its end.
     plain = path.rstrip("/") or "/"
     template = next((template for template, pattern in _PATTERNS.items() if pattern.match(plain)), None)
     return {method: needed for (method, row), needed in NEEDED.items() if row == template}
+
+
+def is_page(path: str) -> bool:
+    """Whether a path is that of a page, or of what one is made of."""
+    return any(pattern.match(path) for pattern in _PAGE_PATTERNS)
 
 
 def put_caller(scope: Scope, caller: Caller) -> None:

@@ -228,23 +228,12 @@ def test_every_operation_but_health_says_that_it_may_be_refused_for_now(client: 
     assert "HTTPValidationError" not in document["components"]["schemas"]
 
 
-@pytest.mark.parametrize("path", ["/", "/docs", "/web/try.js", "/web/docs.js", "/web/style.css", "/favicon.ico"])
+@pytest.mark.parametrize("path", ["/", "/docs", "/web/app.js", "/web/docs.js", "/favicon.ico"])
 def test_pages_load_nothing_from_elsewhere(client: httpx.Client, path: str) -> None:
     response = client.get(path)
     assert response.status_code == 200
     assert "default-src 'none'" in response.headers["content-security-policy"]
     assert not re.search(r"https?://(?!www\.w3\.org/2000/svg\b)|//cdn", response.text)
-
-
-@pytest.mark.skipif(shutil.which("node") is None, reason="node is not installed")
-def test_the_documentation_shows_code_as_code(client: httpx.Client, tmp_path: Path) -> None:
-    (tmp_path / "docs.js").write_text(client.get("/web/docs.js").text)
-    (tmp_path / "openapi.json").write_text(client.get("/openapi.json").text)
-    command = ["node", ROOT / "tests" / "service" / "docs_page.js", tmp_path / "docs.js", tmp_path / "openapi.json"]
-    shown = json.loads(subprocess.run(command, capture_output=True, check=True, timeout=60.0).stdout)
-    assert "Localise a panorama" in " ".join(shown["text"])
-    assert {"status", "If-Match", "application/problem+json"} & set(shown["code"])
-    assert [text for text in shown["text"] + shown["code"] if "`" in text] == []
 
 
 _EVERYWHERE = {
@@ -285,7 +274,9 @@ def test_pages_may_load_what_they_link_to_and_no_one_may_frame_them(client: http
     assert response.headers.items() >= _EVERYWHERE.items()
     policy = dict(part.strip().split(" ", 1) for part in response.headers["content-security-policy"].split(";"))
     assert policy["frame-ancestors"] == policy["default-src"] == "'none'"
-    assert policy["connect-src"] == policy["script-src"] == policy["style-src"] == "'self'"
+    assert policy["script-src"] == policy["style-src"] == "'self'"
+    # `blob:` is a picture that was chosen on the page itself.
+    assert policy["connect-src"] == "'self' blob:"
     # Nothing is inline, so nothing inline has to be allowed.
     assert not re.search(r"<style|<script>|<script (?!src)|\son\w+=|style=", response.text)
     for link in re.findall(r'(?:src|href)="(/[^"]*)"', response.text):

@@ -27,7 +27,7 @@ from service.errors import StoreBusyError, StoreUnavailableError, TooManyRefused
 from service.security.exposure import check_address, is_local
 from service.security.key_cache import KeyCache
 from service.security.keys import PresentedKey, hash_of, key_text, new_secret, parse_authorization
-from service.security.permissions import NEEDED, OPEN_PATHS, Permission
+from service.security.permissions import NEEDED, OPEN_PATHS, PAGES, Permission
 from service.security.rate_limits import RateLimits
 from service.settings import Settings
 from service.storage.store import Store
@@ -65,7 +65,8 @@ def _documented() -> list[tuple[str, str]]:
 
 def _served() -> set[tuple[str, str]]:
     """Method and path of everything that the app answers, documented or not."""
-    routes = [context for context in iter_route_contexts(create_app().routes) if context.path not in OPEN_PATHS]
+    free = OPEN_PATHS | PAGES
+    routes = [context for context in iter_route_contexts(create_app().routes) if context.path not in free]
     assert all(route.methods for route in routes), "websockets and mounted apps have no scopes"
     return {(method, str(route.path)) for route in routes for method in route.methods or ()}
 
@@ -209,6 +210,21 @@ def test_listings_have_the_plans_of_the_tenant_only(guarded: Guarded) -> None:
 @pytest.mark.parametrize("key", [None, "nonsense"])
 def test_health_is_told_to_everybody(guarded: Guarded, path: str, key: str | None) -> None:
     wait_for(lambda: guarded.send("GET", path, key).status_code == 200)
+
+
+@pytest.mark.parametrize("path", ["/", "/docs", "/web/app.js", "/web/style.css", "/favicon.ico"])
+def test_pages_are_shown_without_a_key_and_ask_for_one_themselves(guarded: Guarded, path: str) -> None:
+    assert guarded.send("GET", path, None).status_code == 200
+    assert guarded.client.head(path).status_code == 200
+    assert guarded.send("GET", path, guarded.key).status_code == 200
+    assert guarded.send("GET", path, "lalaloc_wrong").status_code == 401
+    for method in ("POST", "PUT", "DELETE", "PATCH"):
+        assert guarded.send(method, path, None).status_code == 401
+
+
+@pytest.mark.parametrize("path", ["/web/", "/web/../app.py", "/web/%2e%2e/app.py", "/web/none.js", "/web/a/b.js"])
+def test_nothing_but_the_pages_is_shown_without_a_key(guarded: Guarded, path: str) -> None:
+    assert guarded.send("GET", path, None).status_code in (401, 404)
 
 
 def test_an_unknown_path_and_method_are_told_to_those_with_a_key_only(guarded: Guarded) -> None:

@@ -1,0 +1,172 @@
+"""The start page from the first visit to an answer, as people use it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import httpx
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import Browser, Page, expect
+
+from tests.service.conftest import FLAT
+from tests.web.conftest import EXAMPLES, Visit, visit
+
+
+def _marker(page: Page) -> tuple[float, float]:
+    moved = page.locator("#marker").get_attribute("transform") or ""
+    x, y = re.findall(r"-?[\d.]+", moved)
+    return float(x), -float(y)
+
+
+def _assert_accessible(page: Page) -> None:
+    found = Axe().run(page).response["violations"]
+    serious = [fault for fault in found if fault["impact"] in ("serious", "critical")]
+    assert [(fault["id"], [node["html"] for node in fault["nodes"]]) for fault in serious] == []
+
+
+def test_one_click_on_the_first_visit_shows_an_answer_with_its_layout_over_the_photograph(desktop: Visit) -> None:
+    page = desktop.open_example()
+    expect(page.locator("#plan .room")).to_have_count(7)
+    _assert_accessible(page)
+    desktop.find()
+    expect(page.locator("#answer .room")).not_to_be_empty()
+    assert page.locator("#plan .heat rect").count() > 0
+    expect(page.locator("#fit-state")).to_contain_text("Layout as seen from")
+    # The canvas over the photograph has lines in their colour.
+    yellow = page.evaluate(
+        """() => { const canvas = document.querySelector('canvas.overlay');
+        const pixels = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data;
+        let count = 0;
+        for (let i = 0; i < pixels.length; i += 4) if (pixels[i] > 240 && pixels[i + 1] > 210 && pixels[i + 2] < 110) count++;
+        return count; }"""
+    )
+    assert yellow > 200
+    _assert_accessible(page)
+    page.get_by_role("button", name="Whole picture").click()
+    expect(page.locator(".stage")).to_have_attribute("data-shape", "whole")
+
+
+def test_dragging_the_marker_moves_the_layout_and_candidates_lead_back(desktop: Visit) -> None:
+    page = desktop.open_example()
+    desktop.find()
+    # Somewhere inside the living room first, whatever the answer was.
+    begin, told = _marker(page), page.locator("#fit-state").inner_text()
+    grip = page.locator("#marker .dot").bounding_box()
+    assert grip is not None
+    page.mouse.move(grip["x"] + grip["width"] / 2, grip["y"] + grip["height"] / 2)
+    page.mouse.down()
+    page.mouse.move(grip["x"] + 25, grip["y"] + 18, steps=4)
+    page.mouse.up()
+    assert _marker(page) != begin
+    expect(page.locator("#fit-state")).not_to_have_text(told)
+    page.locator("[data-rank='0']").click()
+    assert _marker(page) == pytest.approx(begin)
+    expect(page.locator("#fit-state")).to_have_text(told)
+    second = page.locator("[data-rank='1']")
+    second.click()
+    expect(second).to_have_attribute("aria-pressed", "true")
+    assert _marker(page) != pytest.approx(begin)
+
+
+def test_everything_up_to_an_answer_works_with_the_keyboard_alone(desktop: Visit) -> None:
+    page = desktop.open_example()
+    page.locator("#heading").focus()
+    for _ in range(3):
+        page.keyboard.press("Tab")
+    assert page.evaluate("document.activeElement.id") == "find"
+    page.keyboard.press("Enter")
+    expect(page.locator("#answer")).to_be_visible()
+    page.locator("#marker").focus()
+    x, y = _marker(page)
+    page.keyboard.press("ArrowRight")
+    page.keyboard.press("Shift+ArrowUp")
+    assert _marker(page) == pytest.approx((x + 0.05, y + 0.5))
+    page.locator("#compass").focus()
+    for key in ("Home", "PageUp", "ArrowRight"):
+        page.keyboard.press(key)
+    expect(page.locator("#heading")).to_have_value("11")
+    page.keyboard.press("Delete")
+    expect(page.locator("#heading")).to_have_value("")
+    page.locator("#stage").focus()
+    before = page.locator("#marker .cone").get_attribute("d")
+    page.keyboard.press("ArrowRight")
+    expect(page.locator("#marker .cone")).not_to_have_attribute("d", before or "")
+
+
+def test_an_error_is_told_at_its_field_and_the_previous_answer_goes_away(desktop: Visit) -> None:
+    page = desktop.open_example()
+    desktop.find()
+    page.locator("#heading").fill("400")
+    page.get_by_role("button", name="Find the place").click()
+    expect(page.locator("#photo-error")).to_contain_text("heading_deg")
+    expect(page.locator("#heading")).to_have_attribute("aria-invalid", "true")
+    expect(page.locator("#answer")).to_be_hidden()
+    page.locator("#heading").fill("40")
+    expect(page.locator("#photo-error")).to_be_hidden()
+    desktop.find()
+    assert "heading_deg=40" in _copied(page, "#copy-curl")
+    assert "heading_deg=40" in _copied(page, "#copy-python")
+
+
+def _copied(page: Page, button: str) -> str:
+    page.locator(button).click()
+    return page.locator("#copied").inner_text()
+
+
+def test_a_photograph_that_is_none_is_refused_in_plain_words(desktop: Visit, tmp_path: Path) -> None:
+    page = desktop.open_example()
+    (tmp_path / "notes.txt").write_text("no picture")
+    page.locator("#photo-file").set_input_files(tmp_path / "notes.txt")
+    expect(page.locator("#photo-error")).to_contain_text("twice as wide as high")
+    expect(page.locator("#photo-strip li")).to_have_count(4)
+    (tmp_path / "broken.jpg").write_bytes(b"\xff\xd8\xff no picture")
+    page.locator("#photo-file").set_input_files(tmp_path / "broken.jpg")
+    page.get_by_role("button", name="Find the place").click()
+    expect(page.locator("#photo-error")).to_be_visible()
+    expect(page.locator("#answer")).to_be_hidden()
+
+
+def test_a_phone_shows_all_of_it_without_scrolling_sideways(phone: Visit) -> None:
+    page = phone.open_example()
+    phone.find()
+    assert page.evaluate("document.documentElement.scrollWidth <= document.documentElement.clientWidth")
+    for selector in ("#plan", "#stage", "#find", "#answer"):
+        box = page.locator(selector).bounding_box()
+        assert box is not None
+        assert box["x"] >= 0
+        assert box["x"] + box["width"] <= 390
+    _assert_accessible(page)
+
+
+def test_dark_mode_has_enough_contrast(browser: Browser, service: httpx.Client) -> None:
+    for visited in visit(browser, service, color_scheme="dark"):
+        page = visited.open_example()
+        visited.find()
+        _assert_accessible(page)
+
+
+def test_without_webgl_the_whole_picture_is_shown(desktop: Visit) -> None:
+    desktop.page.add_init_script(
+        "HTMLCanvasElement.prototype.getContext = ((original) => function (kind, ...rest) {"
+        "return kind.startsWith('webgl') ? null : original.call(this, kind, ...rest); })"
+        "(HTMLCanvasElement.prototype.getContext)"
+    )
+    page = desktop.open_example()
+    expect(page.locator(".stage")).to_have_attribute("data-shape", "whole")
+    expect(page.get_by_role("button", name="Look around")).to_be_disabled()
+    desktop.find()
+    # What the viewer says about it is no fault.
+    desktop.faults.clear()
+
+
+def test_the_examples_files_are_not_asked_for_where_there_are_other_plans(desktop: Visit) -> None:
+    desktop.client.post("/floorplans", json=FLAT)
+    for plan in desktop.client.get("/floorplans", params={"name": "Example"}).json()["floorplans"]:
+        desktop.client.delete(f"/floorplans/{plan['id']}")
+    page = desktop.open()
+    expect(page.locator("#plan-name")).to_have_text("Flat 3")
+    expect(page.locator("#find")).to_be_disabled()
+    page.locator("#photo-file").set_input_files(EXAMPLES / "kitchen.jpg")
+    desktop.find()

@@ -1,0 +1,111 @@
+"""Plans on the start page: uploading, searching, deleting, progress, API keys; and the documentation."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Browser, expect
+
+from service.storage.store import Store
+from tests.service.conftest import FLAT, DatabaseOf, StartApp, upload
+from tests.web.conftest import Visit, visit
+from tests.web.test_answer import _assert_accessible
+
+
+def _overlapping() -> dict[str, object]:
+    rooms = [{"name": "hall", "polygon": [[0, 0], [4, 0], [4, 3], [0, 3]]}]
+    rooms.append({"name": "den", "polygon": [[3, 0], [7, 0], [7, 3], [3, 3]]})
+    return {"name": "Overlap", "ceiling_height_m": 2.5, "rooms": rooms}
+
+
+def test_an_uploaded_plan_is_drawn_at_once_with_its_warnings(desktop: Visit, tmp_path: Path) -> None:
+    page = desktop.open_example()
+    (tmp_path / "overlap.json").write_text(json.dumps(_overlapping()))
+    page.locator("#plan-file").set_input_files(tmp_path / "overlap.json")
+    expect(page.locator("#plan-name")).to_have_text("Overlap")
+    expect(page.locator("#plan .room")).to_have_count(2)
+    expect(page.locator("#plan-warnings")).to_contain_text("overlap")
+
+
+def test_a_plan_that_is_refused_is_not_shown_as_if_it_were_there(desktop: Visit, tmp_path: Path) -> None:
+    page = desktop.open_example()
+    crossing = {"rooms": [{"name": "bow", "polygon": [[0, 0], [4, 3], [4, 0], [0, 3]], "ceiling_height_m": 2.5}]}
+    (tmp_path / "bow.json").write_text(json.dumps(crossing))
+    page.locator("#plan-file").set_input_files(tmp_path / "bow.json")
+    expect(page.locator("#plan-error")).to_contain_text("bow")
+    expect(page.locator("#plan .room")).to_have_count(0)
+
+
+def test_plans_are_found_by_name_and_deleted_only_after_a_question(desktop: Visit) -> None:
+    for name in ("Attic of the mill", "Cellar of the mill"):
+        upload(desktop.client, FLAT | {"name": name})
+    page = desktop.open()
+    page.locator("#plan-menu summary").click()
+    page.locator("#plan-search").fill("MILL")
+    expect(page.locator("#plan-list .plan")).to_have_count(2)
+    page.get_by_role("button", name="Delete Attic of the mill").click()
+    page.get_by_role("button", name="Keep it").click()
+    expect(page.locator("#plan-list .plan")).to_have_count(2)
+    page.get_by_role("button", name="Delete Attic of the mill").click()
+    page.get_by_role("button", name="Delete it").click()
+    expect(page.locator("#plan-list .plan")).to_have_count(1)
+    names = [plan["name"] for plan in desktop.client.get("/floorplans").json()["floorplans"]]
+    assert "Attic of the mill" not in names
+
+
+def test_a_plan_that_is_prepared_in_the_background_becomes_ready_on_the_page(
+    browser: Browser, start_app: StartApp, tmp_path: Path
+) -> None:
+    with start_app(tmp_path, inline_grid_poses=0) as client:
+        for visited in visit(browser, client):
+            page = visited.open_example()
+            visited.find()
+            expect(page.locator("#preparing")).to_be_hidden()
+            expect(page.locator("#plan-name")).to_have_text("Example flat")
+
+
+@pytest.mark.one_replica
+def test_with_keys_the_page_asks_for_one_and_goes_on(
+    browser: Browser, start_app: StartApp, database_of: DatabaseOf, tmp_path: Path
+) -> None:
+    with start_app(tmp_path, api_keys=True) as client:
+        store = Store(database_of(tmp_path))
+        scopes = frozenset({"read", "localise", "write"})
+        _, secret = _new_key(store, scopes)
+        store.close()
+        for visited in visit(browser, client):
+            page = visited.open()
+            dialog = page.locator("#key-dialog")
+            expect(dialog).to_be_visible()
+            _assert_accessible(page)
+            page.locator("#key-field").fill("lalaloc_wrong")
+            page.keyboard.press("Enter")
+            expect(page.locator("#key-why")).to_contain_text("refused")
+            page.locator("#key-field").fill(secret)
+            page.keyboard.press("Enter")
+            expect(dialog).to_be_hidden()
+            expect(page.locator("#photo-strip li")).to_have_count(4)
+            visited.find()
+            page.reload()
+            expect(page.locator("#photo-strip li")).to_have_count(4)
+            expect(dialog).to_be_hidden()
+            page.goto(f"{client.base_url}/docs")
+            expect(page.locator("#operations details").first).to_be_visible()
+
+
+def test_the_documentation_has_examples_and_tries_operations(desktop: Visit) -> None:
+    plan_id = upload(desktop.client, FLAT | {"name": "Documented"})
+    page = desktop.open("/docs")
+    _assert_accessible(page)
+    operation = page.locator("details.operation", has_text="A floor plan").first
+    operation.locator("summary").click()
+    expect(operation.locator("pre").first).to_contain_text("curl")
+    operation.get_by_label("floorplan_id *").fill(plan_id)
+    operation.get_by_role("button", name="Send").click()
+    expect(operation.locator("[role=status]")).to_contain_text("Documented")
+    operation.get_by_label("floorplan_id *").fill("none")
+    operation.get_by_role("button", name="Send").click()
+    expect(operation.locator("[role=alert]")).to_contain_text("Unknown floor plan")
+    _assert_accessible(page)

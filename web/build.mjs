@@ -1,0 +1,51 @@
+// Builds the web pages into service/web, with the digest of what they were built from.
+import { createHash } from "node:crypto";
+import { copyFileSync, mkdirSync, readdirSync, readFileSync, rmSync, writeFileSync } from "node:fs";
+import { dirname, join, relative, sep } from "node:path";
+import { fileURLToPath } from "node:url";
+
+import { build } from "esbuild";
+
+const here = dirname(fileURLToPath(import.meta.url));
+const root = dirname(here);
+const out = join(root, "service", "web");
+// What the first visitor sees without having anything at hand.
+const examples = ["flat.json", "living_room.jpg", "kitchen.jpg", "bedroom.jpg", "study.jpg"];
+
+function files(folder) {
+  return readdirSync(folder, { recursive: true, withFileTypes: true })
+    .filter((entry) => entry.isFile())
+    .map((entry) => join(entry.parentPath ?? entry.path, entry.name));
+}
+
+function digest(path) {
+  return createHash("sha256").update(readFileSync(path)).digest("hex");
+}
+
+// By name, so that a file that is renamed counts as changed; the names with slashes on every system.
+const sources = [...files(join(here, "src")), ...["build.mjs", "package.json", "package-lock.json", "tsconfig.json"].map(
+  (name) => join(here, name))].map((path) => relative(root, path).split(sep).join("/")).sort();
+const sum = createHash("sha256");
+for (const name of sources) sum.update(`${name}\n${digest(join(root, name))}\n`);
+
+rmSync(out, { recursive: true, force: true });
+mkdirSync(out, { recursive: true });
+await build({
+  absWorkingDir: here,
+  entryPoints: ["src/app.ts", "src/sphere.ts", "src/docs.ts", "src/style.css"],
+  outdir: out,
+  bundle: true,
+  minify: true,
+  splitting: true,
+  format: "esm",
+  target: "es2022",
+  charset: "utf8",
+  legalComments: "none",
+  chunkNames: "[name]-[hash]",
+  logLevel: "warning",
+});
+for (const name of ["index.html", "docs.html", "icon.svg"]) copyFileSync(join(here, "src", name), join(out, name));
+for (const name of examples) copyFileSync(join(root, "examples", name), join(out, `example-${name}`));
+const built = readdirSync(out).sort();
+const digests = Object.fromEntries(built.map((name) => [name, digest(join(out, name))]));
+writeFileSync(join(out, "built.json"), JSON.stringify({ sources: sum.digest("hex"), files: digests }, null, 1) + "\n");

@@ -1,0 +1,226 @@
+/** The page at /: one plan, some photographs, and where they were taken. */
+
+import { showAnswer, markLooked } from "./answer_panel";
+import { ellipse, heatMap, rivals } from "./answer_overlay";
+import { api } from "./api";
+import { byId, s, show } from "./dom";
+import { exampleFiles, examplePlan } from "./example";
+import { connectKeyDialog } from "./key_dialog";
+import { layoutLines, roomAt } from "./layout";
+import { clearError, showError } from "./notices";
+import { PanoramaView } from "./panorama_view";
+import { type Photo, Photos } from "./photos";
+import { type Box, boxOf, drawNames, drawPlan } from "./plan_drawing";
+import { Plans } from "./plans";
+import { PoseMarker } from "./pose_marker";
+import type { Answer, Layout, Plan, PlanDocument, Pose } from "./types";
+
+// For tests, which compare them with what the service computes.
+export { layoutLines, layoutView } from "./layout";
+
+const DEFAULT_CAMERA_HEIGHT_M = 1.5;
+
+class Page {
+  private readonly svg = byId("plan") as unknown as SVGSVGElement;
+  private readonly base = s("g");
+  private readonly heat = s("g");
+  private readonly names = s("g");
+  private readonly over = s("g");
+  private readonly marker = new PoseMarker(this.svg, (pose) => this.onMoved(pose));
+  private readonly panorama = new PanoramaView(byId("photo-view"), (yaw, fov) => this.marker.look(yaw, fov));
+  private readonly plans = new Plans((plan) => this.onPlan(plan));
+  private readonly photos = new Photos((photo, isAnother) => this.onPhoto(photo, isAnother));
+  private readonly find = byId<HTMLButtonElement>("find");
+  private plan: Plan | null = null;
+  /** What is drawn: a stored plan, or the example before it is stored. */
+  private document: PlanDocument | null = null;
+  private layout: Layout | null = null;
+  private box: Box = boxOf({ rooms: [] });
+  private answer: Answer | null = null;
+  private asking: AbortController | null = null;
+
+  async start(): Promise<void> {
+    connectKeyDialog();
+    this.svg.append(this.base, this.heat, this.names, this.over);
+    this.find.addEventListener("click", () => void this.ask());
+    addEventListener("hashchange", () => void this.open());
+    await this.panorama.setPicture(null);
+    const stored = await this.plans.load();
+    if (await this.open()) return;
+    const example = await examplePlan();
+    const known = stored.find((plan) => plan.name === example.name);
+    if (known !== undefined || stored.length === 0) {
+      if (known === undefined) this.onExample(example);
+      else await this.plans.choose(known.id);
+      this.photos.add(await exampleFiles());
+    } else await this.plans.choose(stored[0]!.id);
+  }
+
+  /** Show the answer that the address names, if it names one. */
+  private async open(): Promise<boolean> {
+    const id = new URLSearchParams(location.hash.slice(1)).get("answer");
+    if (id === null) return false;
+    clearError(byId("plan-error"));
+    try {
+      const answer = await api.answer(id);
+      await this.plans.choose(answer.floorplan_id, answer.floorplan_revision);
+      this.photos.choose(null);
+      this.setAnswer(answer);
+    } catch (error) {
+      showError(byId("plan-error"), error);
+    }
+    return true;
+  }
+
+  private onExample(example: PlanDocument): void {
+    this.document = example;
+    byId("plan-name").textContent = example.name ?? "";
+    byId("plan-facts").textContent = "example, stored with the first question";
+    this.drawBase();
+  }
+
+  private onPlan(plan: Plan | null): void {
+    const isSame = plan !== null && plan.revision === this.plan?.revision;
+    this.plan = plan;
+    this.document = plan?.plan ?? null;
+    byId("plan-name").textContent = plan?.name ?? "No plan is chosen";
+    byId("plan-facts").textContent = plan === null ? "" :
+      `${plan.rooms.length} rooms, ${plan.area_m2.toFixed(1)} m², revision ${plan.revision_number}`;
+    byId("preparing").hidden = plan?.status !== "preparing";
+    byId<HTMLProgressElement>("plan-progress").value = plan?.progress ?? 0;
+    if (plan?.status === "failed") showError(byId("plan-error"), new Error(`This plan cannot be used: ${plan.reason}`));
+    show(byId("plan-warnings"), ...(plan?.warnings ?? []).map((text) => {
+      const item = document.createElement("li");
+      item.textContent = text;
+      return item;
+    }));
+    if (isSame) return;
+    this.layout = null;
+    this.photos.forgetAnswers();
+    this.setAnswer(null);
+    this.drawBase();
+    if (plan !== null) void this.loadLayout(plan);
+  }
+
+  private async loadLayout(plan: Plan): Promise<void> {
+    try {
+      const layout = await api.layout(plan.id, plan.revision);
+      if (this.plan?.revision !== plan.revision) return;
+      this.layout = layout;
+      if (this.answer !== null) this.look(0);
+    } catch (error) {
+      showError(byId("plan-error"), error);
+    }
+  }
+
+  private drawBase(): void {
+    const empty: PlanDocument = { rooms: [] };
+    this.box = boxOf(this.document ?? empty);
+    const { x, y, width, height } = this.box;
+    this.svg.setAttribute("viewBox", `${x} ${y} ${width} ${height}`);
+    drawPlan(this.base, this.document ?? empty);
+    drawNames(this.names, this.document ?? empty, this.box);
+  }
+
+  private onPhoto(photo: Photo | null, isAnother: boolean): void {
+    clearError(byId("photo-error"), this.photos.fields);
+    byId("photo-none").hidden = photo !== null;
+    this.find.disabled = photo === null;
+    if (isAnother) {
+      // A link shows an answer without its photograph; the one that is added to it is taken for that.
+      if (photo !== null && photo.answer === null && this.answer !== null && this.asked === null) photo.answer = this.answer;
+      void this.panorama.setPicture(photo?.file ?? null).then(() => { if (this.answer !== null) this.look(0); });
+    } else if (photo !== null) photo.answer = null;
+    this.setAnswer(photo?.answer ?? null, photo);
+  }
+
+  private asked: Photo | null = null;
+
+  private setAnswer(answer: Answer | null, photo: Photo | null = null): void {
+    this.answer = answer;
+    this.asked = photo;
+    const drawn = this.document;
+    const posterior = answer?.posterior ?? null;
+    byId("heat-legend").hidden = posterior === null;
+    show(this.over);
+    show(this.heat);
+    showAnswer(answer, photo, { look: (index) => this.look(index) });
+    if (answer === null || drawn === null) {
+      this.panorama.setLines([], 0);
+      byId("fit-state").textContent = "";
+      return;
+    }
+    show(this.heat, posterior && heatMap(posterior, drawn));
+    show(this.over, ellipse(answer), rivals(answer, this.box, (index) => this.look(index)), this.marker.element);
+    this.look(0);
+  }
+
+  /** Move the marker to one of the candidates. */
+  private look(index: number): void {
+    const candidate = this.answer?.candidates[index];
+    if (candidate === undefined) return;
+    const { x_m, y_m } = candidate.position;
+    const pose = { x_m, y_m, heading_deg: candidate.heading_deg };
+    this.marker.place(pose, this.box);
+    this.drawLines(pose);
+    markLooked(index);
+  }
+
+  private onMoved(pose: Pose): void {
+    markLooked(null);
+    this.drawLines(pose);
+  }
+
+  private drawLines(pose: Pose): void {
+    const state = byId("fit-state");
+    if (this.layout === null) return;
+    const room = roomAt(this.layout.rooms, pose.x_m, pose.y_m);
+    const height = this.answer?.camera_height_m ?? this.plan?.plan.camera_height_m ?? DEFAULT_CAMERA_HEIGHT_M;
+    this.panorama.setLines(room === null ? [] : layoutLines(pose.x_m, pose.y_m, room, height), pose.heading_deg);
+    const place = `x ${pose.x_m.toFixed(2)} m, y ${pose.y_m.toFixed(2)} m, heading ${pose.heading_deg.toFixed(0)}°`;
+    state.textContent = room === null ? "The marker is in a wall or outside: there is no layout to draw." :
+      this.asked === null ? "Add the photograph to see the layout over it." : `Layout as seen from ${room.name}, ${place}.`;
+  }
+
+  private async ask(): Promise<void> {
+    const photo = this.photos.current;
+    if (photo === null) return;
+    this.asking?.abort();
+    const asking = (this.asking = new AbortController());
+    photo.answer = null;
+    this.setAnswer(null);
+    clearError(byId("photo-error"), this.photos.fields);
+    this.find.setAttribute("aria-busy", "true");
+    try {
+      const plan = this.plan ?? (await this.storeExample());
+      photo.fields = fieldsOf(plan, photo);
+      const answer = await api.localise({ ...photo.fields, include: "posterior" }, photo.file, asking.signal);
+      if (answer.floorplan_revision !== this.plan?.revision) await this.plans.choose(answer.floorplan_id, answer.floorplan_revision);
+      photo.answer = answer;
+      if (this.photos.current === photo) this.setAnswer(answer, photo);
+      this.photos.drawStrip();
+    } catch (error) {
+      if (!asking.signal.aborted) showError(byId("photo-error"), error, this.photos.fields);
+    } finally {
+      if (this.asking === asking) this.find.removeAttribute("aria-busy");
+    }
+  }
+
+  private async storeExample(): Promise<Plan> {
+    if (this.document === null) throw new Error("Choose or upload a floor plan first.");
+    const plan = await api.createPlan(this.document);
+    this.plans.take(plan);
+    await this.plans.load();
+    return plan;
+  }
+}
+
+function fieldsOf(plan: Plan, photo: Photo): Record<string, string> {
+  const fields: Record<string, string> = { floorplan_id: plan.id };
+  if (photo.heading !== null) fields.heading_deg = String(photo.heading);
+  if (photo.tolerance !== 0) fields.heading_tolerance_deg = String(photo.tolerance);
+  if (photo.cameraHeight !== null) fields.camera_height_m = String(photo.cameraHeight);
+  return fields;
+}
+
+void new Page().start();

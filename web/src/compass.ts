@@ -1,0 +1,63 @@
+/** A dial over the photograph that says which azimuth of the plan its centre looks along; unknown until it is turned. */
+
+import { h, s } from "./dom";
+import { degrees } from "./layout";
+
+export class Compass {
+  readonly element: HTMLElement;
+  private readonly needle = s("path", { class: "needle", d: "M0 -34L7 6L0 2L-7 6Z" });
+  private readonly dial: SVGSVGElement;
+  private readonly text = h("span", { class: "dial-text" });
+  private heading: number | null = null;
+
+  constructor(private readonly turned: (headingDeg: number | null) => void) {
+    const marks = ["+y", "+x", "−y", "−x"].map((name, quarter) => {
+      const angle = (quarter * Math.PI) / 2;
+      return s("text", { x: 39 * Math.sin(angle), y: 4 - 39 * Math.cos(angle), "font-size": 11 }, name);
+    });
+    this.dial = s("svg", {
+      viewBox: "-52 -52 104 104", class: "dial", tabindex: 0, role: "slider", id: "compass", "aria-valuemin": 0,
+      "aria-valuemax": 359, "aria-label": "Heading of the photograph: where its centre looks on the plan, degrees",
+    }, s("circle", { class: "rim", r: 50 }), ...marks, this.needle, s("circle", { class: "hub", r: 3 }));
+    this.dial.addEventListener("pointerdown", (event) => this.onPointer(event));
+    this.dial.addEventListener("pointermove", (event) => { if (event.buttons > 0) this.onPointer(event); });
+    this.dial.addEventListener("keydown", (event) => this.onKey(event));
+    this.element = h("div", { class: "compass" }, this.dial, this.text);
+    this.set(null);
+  }
+
+  /** Show a heading; null is unknown. */
+  set(headingDeg: number | null): void {
+    this.heading = headingDeg;
+    this.element.classList.toggle("unknown", headingDeg === null);
+    this.needle.setAttribute("transform", `rotate(${headingDeg ?? 0})`);
+    const told = headingDeg === null ? "unknown" : `${Math.round(headingDeg)}°`;
+    this.dial.setAttribute("aria-valuenow", String(Math.round(headingDeg ?? 0)));
+    this.dial.setAttribute("aria-valuetext", told);
+    this.text.textContent = told;
+  }
+
+  private turn(headingDeg: number | null): void {
+    this.set(headingDeg === null ? null : (headingDeg + 360) % 360);
+    this.turned(this.heading);
+  }
+
+  private onPointer(event: PointerEvent): void {
+    event.preventDefault();
+    this.dial.focus();
+    this.dial.setPointerCapture(event.pointerId);
+    const box = this.dial.getBoundingClientRect();
+    const x = event.clientX - box.x - 0.5 * box.width, y = event.clientY - box.y - 0.5 * box.height;
+    if (Math.hypot(x, y) > 2) this.turn(Math.round(degrees(Math.atan2(x, -y))));
+  }
+
+  private onKey(event: KeyboardEvent): void {
+    const steps: Record<string, number> = { ArrowRight: 1, ArrowUp: 1, ArrowLeft: -1, ArrowDown: -1, PageUp: 10, PageDown: -10 };
+    const step = steps[event.key];
+    if (step !== undefined) this.turn(this.heading === null ? 0 : this.heading + step);
+    else if (event.key === "Home") this.turn(0);
+    else if (event.key === "Delete" || event.key === "Escape") this.turn(null);
+    else return;
+    event.preventDefault();
+  }
+}

@@ -1,0 +1,41 @@
+/** Server-sent events over fetch: the browser's own EventSource cannot send a key. */
+
+import { request } from "./api";
+
+export interface PlanProgress {
+  status: "preparing" | "ready" | "failed" | "deleted";
+  progress?: number;
+  reason?: string;
+}
+
+const ASK_AGAIN_MS = 2000;
+
+/** Tell how far a plan is until it is in a final state or `signal` ends it. */
+export async function followPlan(id: string, tell: (event: PlanProgress) => void, signal: AbortSignal): Promise<void> {
+  while (!signal.aborted) {
+    const response = await request(`/floorplans/${encodeURIComponent(id)}/events`, { signal });
+    for await (const event of eventsOf(response)) {
+      tell(event);
+      if (event.status !== "preparing") return;
+    }
+    // The service ends streams after a while; whoever still wants to know asks anew.
+    await new Promise((done) => setTimeout(done, ASK_AGAIN_MS));
+  }
+}
+
+async function* eventsOf(response: Response): AsyncGenerator<PlanProgress> {
+  if (response.body === null) return;
+  const reader = response.body.pipeThrough(new TextDecoderStream()).getReader();
+  let text = "";
+  for (;;) {
+    const { done, value } = await reader.read();
+    if (done) return;
+    text += value;
+    const blocks = text.split(/\r?\n\r?\n/);
+    text = blocks.pop() ?? "";
+    for (const block of blocks) {
+      const data = block.split(/\r?\n/).filter((line) => line.startsWith("data:")).map((line) => line.slice(5).trim());
+      if (data.length > 0) yield JSON.parse(data.join("\n"));
+    }
+  }
+}

@@ -1,0 +1,181 @@
+/**
+ * The bare layout around a pose, in closed form: what lalaloc_core/render computes, here for lines over a photograph.
+ * Angles are radians, azimuths clockwise from the plan's +y, elevations up from the horizon.
+ */
+
+import type { OpeningKind, Point, Pose, RoomLayout } from "./types";
+
+// As in lalaloc_core/render/profile.py: a ray may miss both of two adjoining walls at their corner by rounding.
+const CORNER_TOLERANCE = 1e-5;
+const PARALLEL = 1e-12;
+const COLUMNS = 720;
+const HALVINGS = 24;
+const STEP = Math.PI / 180;
+
+export const radians = (degrees: number): number => (degrees * Math.PI) / 180;
+export const degrees = (angle: number): number => (angle * 180) / Math.PI;
+
+export interface Hit {
+  distance: number;
+  wall: number;
+  share: number;
+}
+
+/** The nearest of a room's walls along an azimuth; at infinity outside a closed room. */
+export function castRay(x: number, y: number, azimuth: number, walls: RoomLayout["walls_m"]): Hit {
+  const dx = Math.sin(azimuth), dy = Math.cos(azimuth);
+  const nearest: Hit = { distance: Infinity, wall: -1, share: 0 };
+  walls.forEach(([x0, y0, x1, y1], wall) => {
+    const sx = x0 - x, sy = y0 - y, ex = x1 - x0, ey = y1 - y0;
+    const determinant = dx * ey - dy * ex;
+    if (Math.abs(determinant) < PARALLEL) return;
+    const distance = (sx * ey - sy * ex) / determinant;
+    const share = (sx * dy - sy * dx) / determinant;
+    const hit = distance > 0 && share >= -CORNER_TOLERANCE && share <= 1 + CORNER_TOLERANCE;
+    if (hit && distance < nearest.distance) Object.assign(nearest, { distance, wall, share });
+  });
+  return nearest;
+}
+
+/** Azimuth of each column's centre, relative to the heading. */
+export function columnAzimuths(columns: number): number[] {
+  return Array.from({ length: columns }, (_, column) => ((column + 0.5) / columns - 0.5) * 2 * Math.PI);
+}
+
+/** Elevations of the lines where a wall meets the floor and the ceiling. */
+export function wallElevations(distance: number, cameraHeight: number, ceilingHeight: number): Point {
+  return [-Math.atan2(cameraHeight, distance), Math.atan2(ceilingHeight - cameraHeight, distance)];
+}
+
+export interface ColumnView {
+  distance_m: number;
+  kind: "wall" | OpeningKind;
+  floor: number;
+  ceiling: number;
+}
+
+/** What a pose sees in each column of a panorama, at eye height. */
+export function layoutView(pose: Pose, room: RoomLayout, columns: number, cameraHeight: number): ColumnView[] {
+  const heading = radians(pose.heading_deg);
+  return columnAzimuths(columns).map((azimuth) => {
+    const hit = castRay(pose.x_m, pose.y_m, heading + azimuth, room.walls_m);
+    const met = room.openings.find((opening) => opening.wall === hit.wall && opening.start <= hit.share &&
+      hit.share <= opening.end && (opening.sill_m ?? -Infinity) < cameraHeight &&
+      cameraHeight < (opening.head_m ?? Infinity));
+    const [floor, ceiling] = wallElevations(hit.distance, cameraHeight, room.ceiling_height_m);
+    return { distance_m: hit.distance, kind: met?.kind ?? "wall", floor, ceiling };
+  });
+}
+
+/** A line of the layout as directions from the camera: azimuth and elevation of each of its points. */
+export interface LayoutLine {
+  kind: "edge" | OpeningKind;
+  points: Point[];
+}
+
+interface Piece {
+  wall: number;
+  from: number;
+  to: number;
+}
+
+/** All lines of a room that a camera sees: along floor and ceiling, in the corners, around openings. */
+export function layoutLines(x: number, y: number, room: RoomLayout, cameraHeight: number): LayoutLine[] {
+  const pieces = visiblePieces(x, y, room);
+  const distanceAt = (wall: number, azimuth: number): number => toWall(x, y, azimuth, room.walls_m[wall]!);
+  const lines: LayoutLine[] = [];
+  pieces.forEach((piece, index) => {
+    const along = sampled(piece.from, piece.to);
+    const ends = along.map((azimuth) =>
+      wallElevations(distanceAt(piece.wall, azimuth), cameraHeight, room.ceiling_height_m));
+    lines.push({ kind: "edge", points: along.map((azimuth, i) => [azimuth, ends[i]![0]]) });
+    lines.push({ kind: "edge", points: along.map((azimuth, i) => [azimuth, ends[i]![1]]) });
+    const next = pieces[(index + 1) % pieces.length]!;
+    const near = Math.min(distanceAt(piece.wall, piece.to), distanceAt(next.wall, piece.to));
+    const [floor, ceiling] = wallElevations(near, cameraHeight, room.ceiling_height_m);
+    if (pieces.length > 1) lines.push({ kind: "edge", points: [[piece.to, floor], [piece.to, ceiling]] });
+    lines.push(...openingLines(x, y, piece, room, cameraHeight));
+  });
+  return lines;
+}
+
+function openingLines(x: number, y: number, piece: Piece, room: RoomLayout, cameraHeight: number): LayoutLine[] {
+  const wall = room.walls_m[piece.wall]!;
+  return room.openings.filter((opening) => opening.wall === piece.wall).flatMap((opening) => {
+    const sides = [opening.start, opening.end].map((share) => {
+      const azimuth = Math.atan2(wall[0] + share * (wall[2] - wall[0]) - x, wall[1] + share * (wall[3] - wall[1]) - y);
+      return unwrapped(azimuth, 0.5 * (piece.from + piece.to));
+    }).sort((a, b) => a - b) as Point;
+    const from = Math.max(sides[0], piece.from), to = Math.min(sides[1], piece.to);
+    if (from >= to) return [];
+    const sill = opening.sill_m ?? 0, head = Math.min(opening.head_m ?? Infinity, room.ceiling_height_m);
+    const elevations = (azimuth: number): Point => {
+      const distance = toWall(x, y, azimuth, wall);
+      return [Math.atan2(sill - cameraHeight, distance), Math.atan2(head - cameraHeight, distance)];
+    };
+    const along = sampled(from, to);
+    const lower = along.map((azimuth): Point => [azimuth, elevations(azimuth)[0]]);
+    const upper = along.map((azimuth): Point => [azimuth, elevations(azimuth)[1]]);
+    // One line around it; a side that another wall hides is left open.
+    const whole = sides[0] >= piece.from - 1e-9, closed = sides[1] <= piece.to + 1e-9;
+    const points = [...upper.reverse(), ...lower];
+    if (whole && closed) return [{ kind: opening.kind, points: [...points, upper[0]!] }];
+    if (whole) return [{ kind: opening.kind, points }];
+    if (closed) return [{ kind: opening.kind, points: [...lower, ...upper] }];
+    return [{ kind: opening.kind, points: lower }, { kind: opening.kind, points: upper }];
+  });
+}
+
+/** The pieces of walls that are seen, clockwise; together they go around once. */
+function visiblePieces(x: number, y: number, room: RoomLayout): Piece[] {
+  const wallAt = (azimuth: number): number => castRay(x, y, azimuth, room.walls_m).wall;
+  const azimuths = columnAzimuths(COLUMNS);
+  const walls = azimuths.map(wallAt);
+  const borders: { azimuth: number; wall: number }[] = [];
+  walls.forEach((wall, column) => {
+    const previous = walls[(column + COLUMNS - 1) % COLUMNS]!;
+    if (wall === previous || wall < 0 || previous < 0) return;
+    let low = azimuths[column]! - (2 * Math.PI) / COLUMNS, high = azimuths[column]!;
+    for (let halving = 0; halving < HALVINGS; halving++) {
+      const middle = 0.5 * (low + high);
+      if (wallAt(middle) === previous) low = middle;
+      else high = middle;
+    }
+    borders.push({ azimuth: high, wall });
+  });
+  if (borders.length === 0) return walls[0]! < 0 ? [] : [{ wall: walls[0]!, from: -Math.PI, to: Math.PI }];
+  return borders.map(({ azimuth, wall }, index) => {
+    const next = borders[(index + 1) % borders.length]!.azimuth;
+    return { wall, from: azimuth, to: next > azimuth ? next : next + 2 * Math.PI };
+  });
+}
+
+function toWall(x: number, y: number, azimuth: number, [x0, y0, x1, y1]: RoomLayout["walls_m"][number]): number {
+  const ex = x1 - x0, ey = y1 - y0;
+  const determinant = Math.sin(azimuth) * ey - Math.cos(azimuth) * ex;
+  return Math.abs(determinant) < PARALLEL ? Infinity : ((x0 - x) * ey - (y0 - y) * ex) / determinant;
+}
+
+function sampled(from: number, to: number): number[] {
+  const steps = Math.max(1, Math.ceil((to - from) / STEP));
+  return Array.from({ length: steps + 1 }, (_, step) => from + ((to - from) * step) / steps);
+}
+
+function unwrapped(angle: number, near: number): number {
+  return angle + 2 * Math.PI * Math.round((near - angle) / (2 * Math.PI));
+}
+
+/** The room that a point lies in, holes left out; none where it lies in a wall or outside. */
+export function roomAt(rooms: RoomLayout[], x: number, y: number): RoomLayout | null {
+  return rooms.find((room) => inside(room.polygon, x, y) && !room.holes.some((hole) => inside(hole, x, y))) ?? null;
+}
+
+/** Whether a point lies in a polygon, by the parity of crossings. */
+export function inside(polygon: Point[], x: number, y: number): boolean {
+  let odd = false;
+  polygon.forEach(([x0, y0], index) => {
+    const [x1, y1] = polygon[(index + 1) % polygon.length]!;
+    if (y0 > y !== y1 > y && x < x0 + ((y - y0) / (y1 - y0)) * (x1 - x0)) odd = !odd;
+  });
+  return odd;
+}

@@ -1,0 +1,104 @@
+/** A floor plan as SVG; one unit is one metre, y is turned over. */
+
+import { s, show } from "./dom";
+import { inside } from "./layout";
+import type { OpeningDocument, PlanDocument, Point } from "./types";
+
+export interface Box {
+  x: number;
+  y: number;
+  width: number;
+  height: number;
+}
+
+const MARGIN = 0.06;
+
+/** The part of the drawing that a plan takes up, with a margin. */
+export function boxOf(plan: PlanDocument): Box {
+  const points = plan.rooms.flatMap((room) => room.polygon);
+  if (points.length === 0) return { x: -1, y: -9, width: 12, height: 10 };
+  const xs = points.map(([x]) => x), ys = points.map(([, y]) => -y);
+  const x = Math.min(...xs), y = Math.min(...ys);
+  const width = Math.max(...xs) - x, height = Math.max(...ys) - y;
+  const margin = MARGIN * Math.max(width, height, 1);
+  return { x: x - margin, y: y - margin, width: width + 2 * margin, height: height + 2 * margin };
+}
+
+export const path = (polygon: Point[]): string =>
+  polygon.map(([x, y], index) => `${index === 0 ? "M" : "L"}${x} ${-y}`).join("") + "Z";
+
+/** The length that a text or a handle has so that it is equally large on every plan. */
+export const unitOf = (box: Box): number => Math.max(box.width, box.height) / 100;
+
+/** Draw rooms and openings into a group. */
+export function drawPlan(group: SVGGElement, plan: PlanDocument): void {
+  const rooms = plan.rooms.map((room) => {
+    const whole = path(room.polygon) + (room.holes ?? []).map(path).join("");
+    return s("path", { class: `room ${room.type ?? "unknown"}`, d: whole, "fill-rule": "evenodd" });
+  });
+  const walls = plan.rooms.flatMap((room) => (room.walls ?? []).map(([a, b]) =>
+    s("line", { class: "wall", x1: a[0], y1: -a[1], x2: b[0], y2: -b[1] })));
+  show(group, ...rooms, ...walls, ...(plan.openings ?? []).map(openingShape));
+}
+
+/** Write names, north and a scale into a group that lies over everything that is drawn into the rooms. */
+export function drawNames(group: SVGGElement, plan: PlanDocument, box: Box): void {
+  const unit = unitOf(box);
+  show(group, ...plan.rooms.flatMap((room, index) => {
+    const { place: [x, y], clearance } = labelPlace(room.polygon);
+    const name = room.name || `room ${index + 1}`;
+    const size = Math.min(2.2 * unit, (3.4 * clearance) / Math.max(name.length, 4));
+    return size < 0.8 * unit ? [] : [s("text", { class: "name", x, y: -y + 0.35 * size, "font-size": size.toFixed(3) }, name)];
+  }), scaleBar(box), north(plan, box));
+}
+
+function openingShape(opening: OpeningDocument): SVGGElement {
+  const [[ax, ay], [bx, by]] = opening.line;
+  const line = { x1: ax, y1: -ay, x2: bx, y2: -by };
+  // Wide in the colour of the floor first, so that the wall is interrupted.
+  return s("g", { class: `opening ${opening.kind}` }, s("line", { class: "gap", ...line }), s("line", { class: "leaf", ...line }));
+}
+
+const RASTER = 24;
+
+/** The place in a room that is farthest from its walls, of those on a raster, and how far. */
+export function labelPlace(polygon: Point[]): { place: Point; clearance: number } {
+  const xs = polygon.map(([x]) => x), ys = polygon.map(([, y]) => y);
+  const left = Math.min(...xs), low = Math.min(...ys);
+  const width = Math.max(...xs) - left, height = Math.max(...ys) - low;
+  let best: { place: Point; clearance: number } = { place: polygon[0]!, clearance: -1 };
+  for (let row = 1; row < RASTER; row++) {
+    for (let column = 1; column < RASTER; column++) {
+      const place: Point = [left + (width * column) / RASTER, low + (height * row) / RASTER];
+      if (!inside(polygon, ...place)) continue;
+      const clearance = Math.min(...polygon.map((from, index) => distanceTo(place, from, polygon[(index + 1) % polygon.length]!)));
+      // Of places that are as good, the one in the middle.
+      const aside = Math.hypot(column / RASTER - 0.5, row / RASTER - 0.5);
+      if (clearance * (1 - 0.1 * aside) > best.clearance) best = { place, clearance };
+    }
+  }
+  return best;
+}
+
+/** Distance of a point to a segment. */
+export function distanceTo([x, y]: Point, [ax, ay]: Point, [bx, by]: Point): number {
+  const ex = bx - ax, ey = by - ay, square = ex * ex + ey * ey;
+  const share = square === 0 ? 0 : Math.max(0, Math.min(1, ((x - ax) * ex + (y - ay) * ey) / square));
+  return Math.hypot(x - ax - share * ex, y - ay - share * ey);
+}
+
+function scaleBar(box: Box): SVGGElement {
+  const length = [0.1, 0.5, 1, 2, 5, 10, 20, 50, 100].find((metres) => metres > 0.1 * box.width) ?? 100;
+  const unit = unitOf(box), x = box.x + 1.5 * unit, y = box.y + box.height - 1.5 * unit;
+  return s("g", { class: "scale", "aria-hidden": "true" },
+    s("path", { d: `M${x} ${y - 0.6 * unit}v${0.6 * unit}h${length}v${-0.6 * unit}` }),
+    s("text", { x: x + length + unit, y: y + 0.4 * unit, "font-size": 1.7 * unit, class: "start" }, `${length} m`));
+}
+
+function north(plan: PlanDocument, box: Box): SVGGElement | null {
+  if (plan.north_deg === null || plan.north_deg === undefined) return null;
+  const unit = unitOf(box);
+  return s("g", { class: "north", transform: `translate(${box.x + box.width - 4 * unit} ${box.y + box.height - 4 * unit})` },
+    s("path", { d: `M0 ${-3 * unit}L${unit} ${unit}L0 ${0.4 * unit}L${-unit} ${unit}Z`, transform: `rotate(${plan.north_deg})` }),
+    s("text", { y: 3 * unit, "font-size": 1.8 * unit }, "N"));
+}

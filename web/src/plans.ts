@@ -1,0 +1,141 @@
+/** The stored plans: a list to search and choose from, uploads, how far they are prepared, deleting. */
+
+import { api } from "./api";
+import { button, byId, h, show } from "./dom";
+import { followPlan } from "./events";
+import { clearError, say, showError } from "./notices";
+import { acceptDrops } from "./photos";
+import type { Plan, PlanSummary } from "./types";
+
+const SEARCH_AFTER_MS = 250;
+
+export class Plans {
+  private readonly list = byId("plan-list");
+  private readonly search = byId<HTMLInputElement>("plan-search");
+  private readonly error = byId("plan-error");
+  private readonly more = button("More", () => void this.load(this.cursor), { id: "plan-more" });
+  private found: PlanSummary[] = [];
+  private cursor: string | null = null;
+  private current: Plan | null = null;
+  private following: AbortController | null = null;
+
+  /** `chosen` is told the plan that is chosen, also when it is prepared further. */
+  constructor(private readonly chosen: (plan: Plan | null) => void) {
+    let waiting: number | undefined;
+    this.search.addEventListener("input", () => {
+      clearTimeout(waiting);
+      waiting = window.setTimeout(() => void this.load(), SEARCH_AFTER_MS);
+    });
+    const input = byId<HTMLInputElement>("plan-file");
+    input.addEventListener("change", () => {
+      const file = input.files?.[0];
+      input.value = "";
+      if (file !== undefined) void this.upload(file);
+    });
+    acceptDrops(byId("plan-panel"), (files) => { if (files[0] !== undefined) void this.upload(files[0]); });
+  }
+
+  /** Fetch the list; with a cursor, its next page. Returns what is listed. */
+  async load(cursor: string | null = null): Promise<PlanSummary[]> {
+    try {
+      const page = await api.plans(this.search.value.trim(), cursor);
+      this.found = cursor === null ? page.floorplans : [...this.found, ...page.floorplans];
+      this.cursor = page.next_cursor;
+      this.draw();
+    } catch (error) {
+      showError(this.error, error);
+    }
+    return this.found;
+  }
+
+  /** Choose a plan by its id. */
+  async choose(id: string, revision?: string): Promise<Plan | null> {
+    clearError(this.error);
+    try {
+      this.take(await api.plan(id, revision));
+      return this.current;
+    } catch (error) {
+      showError(this.error, error);
+      return null;
+    }
+  }
+
+  /** Show a plan that was just stored or read. */
+  take(plan: Plan | null): void {
+    this.current = plan;
+    this.chosen(plan);
+    this.draw();
+    this.following?.abort();
+    if (plan !== null && plan.status === "preparing") void this.follow(plan);
+  }
+
+  /** Upload a file as a new plan. */
+  async upload(file: File): Promise<void> {
+    clearError(this.error);
+    const state = byId("plan-state");
+    state.textContent = `Reading “${file.name}” …`;
+    try {
+      const plan = await api.uploadPlan(file);
+      this.take(plan);
+      await this.load();
+      say(`“${plan.name}” is stored.`);
+    } catch (error) {
+      // What is shown would be taken for what was refused.
+      this.take(null);
+      showError(this.error, error);
+    } finally {
+      if (state.textContent.startsWith("Reading")) state.textContent = "";
+    }
+  }
+
+  private async follow(plan: Plan): Promise<void> {
+    const own = (this.following = new AbortController());
+    try {
+      await followPlan(plan.id, (event) => {
+        if (this.current?.id !== plan.id) return;
+        if (event.status === "preparing") this.chosen({ ...this.current, progress: event.progress ?? 0 });
+        else if (event.status === "deleted") this.take(null);
+        else void this.choose(plan.id).then(() => this.load());
+      }, own.signal);
+    } catch (error) {
+      if (!own.signal.aborted) showError(this.error, error);
+    }
+  }
+
+  private async remove(plan: PlanSummary): Promise<void> {
+    if (!(await this.sure(plan))) return;
+    clearError(this.error);
+    try {
+      await api.deletePlan(plan.id);
+      say(`“${plan.name}” is deleted.`);
+      if (this.current?.id === plan.id) this.take(null);
+      await this.load();
+    } catch (error) {
+      showError(this.error, error);
+    }
+  }
+
+  private sure(plan: PlanSummary): Promise<boolean> {
+    const dialog = byId<HTMLDialogElement>("delete-dialog");
+    byId("delete-what").textContent = `Delete “${plan.name}” with all its revisions, for good?`;
+    dialog.showModal();
+    return new Promise((resolve) => dialog.addEventListener("close", () => {
+      resolve(dialog.returnValue === "delete");
+      dialog.returnValue = "";
+    }, { once: true }));
+  }
+
+  private draw(): void {
+    const entries = this.found.map((plan) => {
+      const state = plan.status === "preparing" ? `preparing, ${Math.round(100 * plan.progress)} %` : plan.status === "failed" ? "failed" : "";
+      const facts = [`${plan.rooms} ${plan.rooms === 1 ? "room" : "rooms"}`, `${plan.area_m2.toFixed(0)} m²`, state];
+      const choose = h("button", {
+        type: "button", class: "plan", "aria-pressed": String(plan.id === this.current?.id), onclick: () => void this.choose(plan.id),
+      }, h("span", { class: "name" }, plan.name), h("span", { class: "facts" }, facts.filter(Boolean).join(", ")));
+      const remove = h("button", { type: "button", class: "remove", "aria-label": `Delete ${plan.name}`, onclick: () => void this.remove(plan) }, "×");
+      return h("li", {}, choose, remove);
+    });
+    show(this.list, ...entries, this.cursor !== null && h("li", {}, this.more));
+    byId("plan-none").hidden = this.found.length > 0;
+  }
+}

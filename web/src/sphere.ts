@@ -1,0 +1,52 @@
+/** Photo Sphere Viewer, kept in a file of its own that is loaded with the first picture. */
+
+import { Viewer } from "@photo-sphere-viewer/core";
+
+import { radians } from "./layout";
+import type { Gaze } from "./projection";
+
+/** A picture to look around in. */
+export class Sphere {
+  private readonly viewer: Viewer;
+  private shown: string | null = null;
+
+  constructor(container: HTMLElement, rendered: () => void) {
+    this.viewer = new Viewer({
+      container,
+      navbar: false,
+      keyboard: false,
+      defaultZoomLvl: 0,
+      minFov: 35,
+      maxFov: 85,
+      moveInertia: false,
+      loadingTxt: "",
+      // The picture's centre stays at yaw 0: its compass heading is the service's business. It is levelled as there.
+      panoData: (_image, xmp) => ({ ...xmp, poseHeading: 0 }) as never,
+    });
+    this.viewer.addEventListener("render", rendered);
+  }
+
+  async show(url: string): Promise<void> {
+    if (this.shown === url) return;
+    this.shown = url;
+    await this.viewer.setPanorama(url, { transition: false, showLoader: false, position: { yaw: 0, pitch: 0 } });
+  }
+
+  gaze(): Gaze {
+    const { yaw, pitch } = this.viewer.getPosition();
+    return { yaw, pitch, verticalFov: radians(this.viewer.state.vFov) };
+  }
+
+  turnTo(yaw: number, pitch: number): void {
+    this.viewer.rotate({ yaw, pitch });
+  }
+
+  turnBy(yaw: number, pitch: number): void {
+    const now = this.viewer.getPosition();
+    this.turnTo(now.yaw + yaw, Math.max(-1.5, Math.min(1.5, now.pitch + pitch)));
+  }
+
+  zoomBy(steps: number): void {
+    this.viewer.zoom(this.viewer.getZoomLevel() + steps);
+  }
+}
