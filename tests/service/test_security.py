@@ -232,7 +232,12 @@ def test_an_unknown_path_and_method_are_told_to_those_with_a_key_only(guarded: G
     refused = guarded.send("PATCH", "/localise", guarded.key)
     assert_problem(refused, 405, "method-not-allowed")
     assert refused.headers["allow"] == "POST"
-    for method, path in (("GET", "/no/such/route"), ("PATCH", "/localise"), ("GET", "/healthz/"), ("GET", "//healthz")):
+    for method, path in (
+        ("GET", "/no/such/route"),
+        ("PATCH", "/localise"),
+        ("GET", "/healthz/"),
+        ("GET", "/healthz//"),
+    ):
         assert guarded.send(method, path, None).status_code == 401
 
 

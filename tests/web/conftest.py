@@ -55,7 +55,8 @@ class Visit:
         return self.page
 
 
-@pytest.fixture(scope="session")
+# Not for the session: while it is there, no other test can run an event loop.
+@pytest.fixture(scope="package")
 def browser() -> Iterator[Browser]:
     """Chromium, as it is installed here."""
     found = next(filter(None, map(shutil.which, _BROWSERS)), None)

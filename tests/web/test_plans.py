@@ -10,6 +10,7 @@ from playwright.sync_api import Browser, expect
 
 from service.storage.store import Store
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, upload
+from tests.service.test_security import make_key
 from tests.web.conftest import Visit, visit
 from tests.web.test_answer import _assert_accessible
 
@@ -21,7 +22,7 @@ def _overlapping() -> dict[str, object]:
 
 
 def test_an_uploaded_plan_is_drawn_at_once_with_its_warnings(desktop: Visit, tmp_path: Path) -> None:
-    page = desktop.open_example()
+    page = desktop.open()
     (tmp_path / "overlap.json").write_text(json.dumps(_overlapping()))
     page.locator("#plan-file").set_input_files(tmp_path / "overlap.json")
     expect(page.locator("#plan-name")).to_have_text("Overlap")
@@ -30,7 +31,8 @@ def test_an_uploaded_plan_is_drawn_at_once_with_its_warnings(desktop: Visit, tmp
 
 
 def test_a_plan_that_is_refused_is_not_shown_as_if_it_were_there(desktop: Visit, tmp_path: Path) -> None:
-    page = desktop.open_example()
+    page = desktop.open()
+    expect(page.locator("#plan .room").first).to_be_visible()
     crossing = {"rooms": [{"name": "bow", "polygon": [[0, 0], [4, 3], [4, 0], [0, 3]], "ceiling_height_m": 2.5}]}
     (tmp_path / "bow.json").write_text(json.dumps(crossing))
     page.locator("#plan-file").set_input_files(tmp_path / "bow.json")
@@ -72,8 +74,7 @@ def test_with_keys_the_page_asks_for_one_and_goes_on(
 ) -> None:
     with start_app(tmp_path, api_keys=True) as client:
         store = Store(database_of(tmp_path))
-        scopes = frozenset({"read", "localise", "write"})
-        _, secret = _new_key(store, scopes)
+        secret = make_key(store)
         store.close()
         for visited in visit(browser, client):
             page = visited.open()
@@ -99,7 +100,7 @@ def test_the_documentation_has_examples_and_tries_operations(desktop: Visit) -> 
     plan_id = upload(desktop.client, FLAT | {"name": "Documented"})
     page = desktop.open("/docs")
     _assert_accessible(page)
-    operation = page.locator("details.operation", has_text="A floor plan").first
+    operation = page.locator("details.operation", has=page.get_by_text("/floorplans/{floorplan_id}", exact=True)).first
     operation.locator("summary").click()
     expect(operation.locator("pre").first).to_contain_text("curl")
     operation.get_by_label("floorplan_id *").fill(plan_id)

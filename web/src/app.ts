@@ -4,6 +4,7 @@ import { showAnswer, markLooked } from "./answer_panel";
 import { ellipse, heatMap, rivals } from "./answer_overlay";
 import { api } from "./api";
 import { byId, s, show } from "./dom";
+import { Editor } from "./editor/editor";
 import { exampleFiles, examplePlan } from "./example";
 import { connectKeyDialog } from "./key_dialog";
 import { layoutLines, roomAt } from "./layout";
@@ -13,6 +14,7 @@ import { type Photo, Photos } from "./photos";
 import { type Box, boxOf, drawNames, drawPlan } from "./plan_drawing";
 import { Plans } from "./plans";
 import { PoseMarker } from "./pose_marker";
+import { Viewport } from "./viewport";
 import type { Answer, Layout, Plan, PlanDocument, Pose } from "./types";
 
 // For tests, which compare them with what the service computes.
@@ -30,6 +32,13 @@ class Page {
   private readonly panorama = new PanoramaView(byId("photo-view"), (yaw, fov) => this.marker.look(yaw, fov));
   private readonly plans = new Plans((plan) => this.onPlan(plan));
   private readonly photos = new Photos((photo, isAnother) => this.onPhoto(photo, isAnother));
+  private readonly editor = new Editor(this.svg, {
+    draw: (plan) => this.drawRooms(plan),
+    seen: () => this.viewport.current,
+    fit: (box) => this.viewport.fit(box),
+    ended: (stored) => this.onEdited(stored),
+  });
+  private readonly viewport = new Viewport(this.svg, this.svg.parentElement!, () => this.onSeen());
   private readonly find = byId<HTMLButtonElement>("find");
   private plan: Plan | null = null;
   /** What is drawn: a stored plan, or the example before it is stored. */
@@ -41,7 +50,9 @@ class Page {
 
   async start(): Promise<void> {
     connectKeyDialog();
-    this.svg.append(this.base, this.heat, this.names, this.over);
+    this.svg.append(this.editor.under.element, this.base, this.heat, this.names, this.over, ...this.editor.layers);
+    byId("edit-plan").addEventListener("click", () => this.edit(this.plan));
+    byId("draw-plan").addEventListener("click", () => this.edit(null));
     this.find.addEventListener("click", () => void this.ask());
     addEventListener("hashchange", () => void this.open());
     await this.panorama.setPicture(null);
@@ -116,10 +127,39 @@ class Page {
   private drawBase(): void {
     const empty: PlanDocument = { rooms: [] };
     this.box = boxOf(this.document ?? empty);
-    const { x, y, width, height } = this.box;
-    this.svg.setAttribute("viewBox", `${x} ${y} ${width} ${height}`);
-    drawPlan(this.base, this.document ?? empty);
-    drawNames(this.names, this.document ?? empty, this.box);
+    this.viewport.fit(this.box);
+    this.drawRooms(this.document ?? empty);
+    byId<HTMLButtonElement>("edit-plan").disabled = this.plan === null;
+  }
+
+  private drawRooms(plan: PlanDocument): void {
+    drawPlan(this.base, plan);
+    drawNames(this.names, plan, this.viewport.current);
+  }
+
+  /** Handles are equally large however near one looks. */
+  private onSeen(): void {
+    if (this.editor.isOpen) this.editor.redraw();
+    else if (this.document !== null) drawNames(this.names, this.document, this.viewport.current);
+  }
+
+  private edit(plan: Plan | null): void {
+    this.setAnswer(null);
+    document.body.classList.add("editing");
+    byId("plan-name").textContent = plan?.name ?? "New plan";
+    this.editor.open(plan);
+  }
+
+  private onEdited(stored: Plan | null): void {
+    document.body.classList.remove("editing");
+    if (stored === null) {
+      this.drawBase();
+      byId("plan-name").textContent = this.document?.name ?? "No plan is chosen";
+      this.setAnswer(this.photos.current?.answer ?? null, this.photos.current);
+    } else {
+      this.plans.take(stored);
+      void this.plans.load();
+    }
   }
 
   private onPhoto(photo: Photo | null, isAnother: boolean): void {
@@ -129,7 +169,8 @@ class Page {
     if (isAnother) {
       // A link shows an answer without its photograph; the one that is added to it is taken for that.
       if (photo !== null && photo.answer === null && this.answer !== null && this.asked === null) photo.answer = this.answer;
-      void this.panorama.setPicture(photo?.file ?? null).then(() => { if (this.answer !== null) this.look(0); });
+      void this.panorama.setPicture(photo?.file ?? null).then(() => { if (this.answer !== null) this.look(0); })
+        .catch((error: unknown) => { if (this.photos.current === photo) showError(byId("photo-error"), error); });
     } else if (photo !== null) photo.answer = null;
     this.setAnswer(photo?.answer ?? null, photo);
   }

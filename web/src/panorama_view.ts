@@ -53,7 +53,7 @@ export class PanoramaView {
     this.picture.addEventListener("load", () => this.draw());
   }
 
-  /** Show a photograph; null shows none. */
+  /** Show a photograph; null shows none. Refused where the file is no picture. */
   async setPicture(file: Blob | null): Promise<void> {
     if (this.url !== null) URL.revokeObjectURL(this.url);
     this.url = file === null ? null : URL.createObjectURL(file);
@@ -64,6 +64,12 @@ export class PanoramaView {
       return;
     }
     this.picture.src = this.url;
+    try {
+      await this.picture.decode();
+    } catch {
+      this.stage.classList.add("empty");
+      throw new Error("This file cannot be shown as a picture.");
+    }
     await this.refresh();
   }
 

@@ -1,0 +1,168 @@
+"""Drawing and correcting plans on the page."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import pytest
+from PIL import Image, ImageDraw
+from playwright.sync_api import Page, expect
+
+from tests.service.conftest import FLAT, upload
+from tests.web.conftest import Visit
+from tests.web.test_answer import _assert_accessible
+
+
+def _click(page: Page, x_m: float, y_m: float) -> None:
+    """Click a place of the plan."""
+    page.mouse.click(*_on_screen(page, x_m, y_m))
+
+
+def _on_screen(page: Page, x_m: float, y_m: float) -> tuple[float, float]:
+    script = """([x, y]) => { const svg = document.getElementById('plan');
+        const at = new DOMPoint(x, -y).matrixTransform(svg.getScreenCTM()); return [at.x, at.y]; }"""
+    x, y = page.evaluate(script, [x_m, y_m])
+    return x, y
+
+
+def _drag(page: Page, begin: tuple[float, float], end: tuple[float, float]) -> None:
+    page.mouse.move(*_on_screen(page, *begin))
+    page.mouse.down()
+    page.mouse.move(*_on_screen(page, 0.5 * (begin[0] + end[0]), 0.5 * (begin[1] + end[1])))
+    page.mouse.move(*_on_screen(page, *end), steps=3)
+    page.mouse.up()
+
+
+def _stored(visited: Visit, name: str) -> dict[str, Any]:
+    (found,) = visited.client.get("/floorplans", params={"name": name}).json()["floorplans"]
+    return visited.client.get(f"/floorplans/{found['id']}").json()
+
+
+def _editing(visited: Visit, name: str) -> Page:
+    """The editor, open on a plan of this name."""
+    upload(visited.client, FLAT | {"name": name})
+    page = visited.open()
+    expect(page.locator("#plan-name")).to_have_text(name)
+    page.get_by_role("button", name="Edit", exact=True).click()
+    return page
+
+
+def test_a_plan_is_drawn_over_a_picture_to_scale_and_stored(desktop: Visit) -> None:
+    page = desktop.open()
+    page.get_by_role("button", name="Draw", exact=True).click()
+    picture = Image.new("RGB", (600, 400), "white")
+    ImageDraw.Draw(picture).rectangle((100, 100, 400, 300), outline="black", width=4)
+    content = io.BytesIO()
+    picture.save(content, "PNG")
+    page.locator("#underlay-file").set_input_files(
+        {"name": "scan.png", "mimeType": "image/png", "buffer": content.getvalue()}
+    )
+    # 600 pixels are 12 m at first: the rectangle, 300 pixels wide, would be 6 m. It is 4.5 m.
+    _click(page, 2, 2)
+    _click(page, 8, 2)
+    page.locator("#known-distance").fill("4.5")
+    page.get_by_role("button", name="Set the scale").click()
+    width = page.locator("#plan image").get_attribute("width")
+    assert float(width or 0) == pytest.approx(9.0, rel=1e-3)
+    page.locator("#tool-room").click()
+    for corner in ((1.5, 1.5), (6, 1.5), (6, 4.5), (1.5, 4.5), (1.5, 1.5)):
+        _click(page, *corner)
+    expect(page.locator("#plan .room")).to_have_count(1)
+    page.locator("#room-form-name").fill("Workshop")
+    page.locator("#room-form-name").press("Tab")
+    page.locator("#room-form-type").select_option("garage")
+    page.locator("#tool-door").click()
+    _click(page, 3, 1.5)
+    page.locator("#tool-window").click()
+    _click(page, 6, 3)
+    page.locator("#opening-form-sill").fill("1.1")
+    page.locator("#opening-form-sill").press("Tab")
+    _assert_accessible(page)
+    page.mouse.click(*_on_screen(page, 8, 5.2))
+    page.get_by_role("button", name="Store the plan").click()
+    expect(page.locator("#plan-facts")).to_contain_text("1 rooms")
+    plan = _stored(desktop, "New plan")["plan"]
+    (room,) = plan["rooms"]
+    assert (room["name"], room["type"]) == ("Workshop", "garage")
+    assert sorted(map(tuple, room["polygon"])) == [
+        pytest.approx(corner, abs=0.06) for corner in ((1.5, 1.5), (1.5, 4.5), (6, 1.5), (6, 4.5))
+    ]
+    assert sorted(opening["kind"] for opening in plan["openings"]) == ["door", "window"]
+    assert {opening["sill_m"] for opening in plan["openings"] if opening["kind"] == "window"} == {1.1}
+
+
+def test_corners_and_walls_are_dragged_and_every_step_can_be_undone(desktop: Visit) -> None:
+    page = _editing(desktop, "Dragged")
+    _click(page, 2, 1.5)
+    _drag(page, (4, 3), (4.4, 3.4))
+    corner = page.locator("#edit-corner-2")
+    expect(corner).to_have_attribute(
+        "aria-label", r"Corner 3, x 4.40, y 3.40 m. Arrow keys move it, Delete removes it."
+    )
+    _drag(page, (0, 1), (-0.6, 1))
+    expect(page.locator("#edit-corner-0")).to_have_attribute("cx", "-0.6")
+    page.locator("#undo").click()
+    _click(page, 2, 1.5)
+    expect(page.locator("#edit-corner-0")).to_have_attribute("cx", "0")
+    page.keyboard.press("Control+z")
+    _click(page, 2, 1.5)
+    expect(corner).to_have_attribute("cx", "4")
+    expect(page.locator("#undo")).to_be_disabled()
+    page.keyboard.press("Control+Shift+z")
+    page.get_by_role("button", name="Save as a new revision").click()
+    expect(page.locator("#plan-facts")).to_contain_text("revision 2")
+    assert [4.4, 3.4] in [
+        pytest.approx(corner) for corner in _stored(desktop, "Dragged")["plan"]["rooms"][0]["polygon"]
+    ]
+
+
+def test_a_plan_is_changed_with_the_keyboard_alone(desktop: Visit) -> None:
+    page = _editing(desktop, "Typed")
+    page.locator("#edit-room-0").focus()
+    page.keyboard.press("Enter")
+    page.locator("#edit-corner-1").focus()
+    page.keyboard.press("Shift+ArrowRight")
+    page.keyboard.press("ArrowUp")
+    assert page.evaluate("document.activeElement.id") == "edit-corner-1"
+    page.locator("#edit-wall-2").focus()
+    page.keyboard.press("w")
+    page.locator("#save").focus()
+    page.keyboard.press("Enter")
+    expect(page.locator("#plan-facts")).to_contain_text("revision 2")
+    plan = _stored(desktop, "Typed")["plan"]
+    assert [4.5, 0.05] in plan["rooms"][0]["polygon"]
+    assert [opening["kind"] for opening in plan["openings"]] == ["window"]
+
+
+def test_a_plan_that_somebody_else_changed_is_not_overwritten_and_nothing_is_lost(desktop: Visit) -> None:
+    page = _editing(desktop, "Contended")
+    page.locator("#plan-form-name").fill("Contended, mine")
+    page.locator("#plan-form-name").press("Tab")
+    plan_id = _stored(desktop, "Contended")["id"]
+    desktop.client.put(f"/floorplans/{plan_id}", json=FLAT | {"name": "Contended, theirs"}).raise_for_status()
+    page.locator("#save").click()
+    expect(page.locator("#plan-error")).to_contain_text("Somebody changed this plan")
+    assert _stored(desktop, "Contended")["name"] == "Contended, theirs"
+    page.locator("#look-at-theirs").click()
+    expect(page.locator("#plan-form-name")).to_have_value("Contended, theirs")
+    page.locator("#undo").click()
+    expect(page.locator("#plan-form-name")).to_have_value("Contended, mine")
+    page.locator("#save").click()
+    expect(page.locator("#plan-facts")).to_contain_text("revision 3")
+    assert _stored(desktop, "Contended")["name"] == "Contended, mine"
+
+
+def test_leaving_with_changes_asks_first_and_a_refused_plan_stays_open(desktop: Visit) -> None:
+    page = _editing(desktop, "Left")
+    page.locator("#plan-form-ceiling").fill("-1")
+    page.locator("#plan-form-ceiling").press("Tab")
+    page.locator("#save").click()
+    expect(page.locator("#plan-error")).to_contain_text("ceiling_height_m")
+    page.locator("#stop").click()
+    page.get_by_role("button", name="Go on editing").click()
+    expect(page.locator("#save")).to_be_visible()
+    page.locator("#stop").click()
+    page.get_by_role("button", name="Lose my changes").click()
+    expect(page.locator("#save")).to_have_count(0)
+    assert _stored(desktop, "Left")["revision_number"] == 1

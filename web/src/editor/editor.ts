@@ -1,0 +1,268 @@
+/** Editing a plan: a copy is changed, undone and redone, and stored as a new revision, or as a new plan. */
+
+import { api, Refusal } from "../api";
+import { button, byId, h, show } from "../dom";
+import { clearError, say, showError } from "../notices";
+import { type Box, boxOf, unitOf } from "../plan_drawing";
+import type { Plan, PlanDocument, Point } from "../types";
+import * as change from "./changes";
+import { setFormPlan, showForm } from "./forms";
+import { Handles, type Selection } from "./handles";
+import { History } from "./history";
+import { type Tool, Tools } from "./tools";
+import { Underlay } from "./underlay";
+
+export interface EditorHost {
+  /** Draw a plan that is being changed. */
+  draw: (plan: PlanDocument) => void;
+  /** What is seen now, in metres. */
+  seen: () => Box;
+  fit: (box: Box) => void;
+  /** Editing ended, with what was stored or without. */
+  ended: (stored: Plan | null) => void;
+}
+
+const EMPTY: PlanDocument = { name: "New plan", ceiling_height_m: 2.5, rooms: [], openings: [] };
+const NEW_ROOM_M: Point = [4, 3];
+const TOOLS: [Tool, string][] = [["select", "Select"], ["room", "Draw a room"], ["door", "Door"], ["window", "Window"], ["passage", "Passage"], ["scale", "Scale"]];
+
+export class Editor {
+  readonly under = new Underlay();
+  private readonly handles: Handles;
+  private readonly tools: Tools;
+  private readonly bar = byId("plan-tools");
+  private readonly form = byId("plan-form");
+  private readonly error = byId("plan-error");
+  private readonly hint = h("p", { class: "hint", role: "status", id: "edit-hint" });
+  private readonly measure = h("div", { class: "measure", hidden: true });
+  private history: History<PlanDocument> | null = null;
+  private saved: PlanDocument = EMPTY;
+  private base: Plan | null = null;
+  private selection: Selection = { kind: "none" };
+  private measured = 0;
+
+  constructor(svg: SVGSVGElement, private readonly host: EditorHost) {
+    this.handles = new Handles(svg, { edit: (plan, goesOn) => this.edit(plan, goesOn), select: (selection) => this.select(selection) });
+    this.tools = new Tools(svg, {
+      edit: (plan) => {
+        const isRoom = plan.rooms.length > (this.history?.now.rooms.length ?? 0);
+        this.selection = isRoom ? { kind: "room", index: plan.rooms.length - 1 } : { kind: "opening", index: (plan.openings ?? []).length - 1 };
+        this.edit(plan, false);
+      },
+      done: () => this.drawBar(),
+      measured: (distance) => this.onMeasured(distance),
+      tell: (text) => { this.hint.textContent = text; },
+    });
+    addEventListener("keydown", (event) => this.onKey(event));
+    addEventListener("beforeunload", (event) => { if (this.isChanged) event.preventDefault(); });
+  }
+
+  /** What lies over the plan while it is edited. */
+  get layers(): SVGElement[] {
+    return [this.handles.element, this.tools.element];
+  }
+
+  get isOpen(): boolean {
+    return this.history !== null;
+  }
+
+  private get isChanged(): boolean {
+    return this.history !== null && this.history.now !== this.saved;
+  }
+
+  /** Begin to change a stored plan, or a new one. */
+  open(plan: Plan | null): void {
+    this.base = plan;
+    this.saved = plan?.plan ?? EMPTY;
+    this.history = new History(this.saved);
+    this.selection = { kind: "none" };
+    this.under.remove();
+    clearError(this.error);
+    this.tools.choose(plan === null ? "room" : "select");
+    this.host.fit(boxOf(this.saved));
+    this.drawBar();
+    this.redraw();
+  }
+
+  /** Draw again, as after zooming. */
+  redraw(): void {
+    if (this.history === null) return;
+    const plan = this.history.now, unit = unitOf(this.host.seen());
+    setFormPlan(plan);
+    this.host.draw(plan);
+    this.tools.update(plan, unit);
+    this.handles.draw(plan, this.selection, unit);
+    showForm(this.form, plan, this.selection, { edit: (next) => this.edit(next, false), select: (selection) => this.select(selection) });
+  }
+
+  private edit(plan: PlanDocument, goesOn: boolean): void {
+    this.history?.push(plan, goesOn);
+    this.redraw();
+    this.drawUndo();
+  }
+
+  private select(selection: Selection): void {
+    this.selection = selection;
+    this.redraw();
+  }
+
+  private close(stored: Plan | null): void {
+    if (stored !== null) say(`“${stored.name}” is stored, revision ${stored.revision_number}.`);
+    this.history = null;
+    this.under.remove();
+    this.tools.choose("select");
+    show(this.bar);
+    show(this.form);
+    show(this.handles.element);
+    this.measure.hidden = true;
+    this.host.ended(stored);
+  }
+
+  private drawBar(): void {
+    if (this.history === null) return;
+    const tool = ([name, label]: [Tool, string]): HTMLElement => button(label, () => { this.measure.hidden = true; this.tools.choose(name); this.drawBar(); },
+      { "aria-pressed": String(this.tools.current === name), id: `tool-${name}` });
+    const picture = h("input", { type: "file", accept: "image/png,image/jpeg,image/webp", id: "underlay-file" });
+    picture.addEventListener("change", () => { if (picture.files?.[0]) void this.lay(picture.files[0]); });
+    show(this.bar,
+      h("div", { class: "tools", role: "toolbar", "aria-label": "Editing" }, ...TOOLS.map(tool),
+        button("Add 4 × 3 m room", () => this.addRoom(), { id: "add-room" }),
+        h("label", { class: "file" }, picture, h("span", {}, "Picture to draw over")),
+        button("Undo", () => this.step("undo"), { id: "undo" }), button("Redo", () => this.step("redo"), { id: "redo" })),
+      this.measure, this.hint,
+      h("div", { class: "ask" },
+        button(this.base === null ? "Store the plan" : "Save as a new revision", () => void this.save(), { class: "primary", id: "save" }),
+        this.base !== null && button("Save as a new plan", () => void this.saveNew(), { id: "save-new" }),
+        button("Stop editing", () => this.leave(), { id: "stop" })));
+    this.drawUndo();
+  }
+
+  private drawUndo(): void {
+    for (const [id, can] of [["undo", this.history?.canUndo], ["redo", this.history?.canRedo]] as const) {
+      const control = document.getElementById(id) as HTMLButtonElement | null;
+      if (control !== null) control.disabled = !can;
+    }
+  }
+
+  private step(way: "undo" | "redo"): void {
+    this.history?.[way]();
+    // What was selected may be gone.
+    this.selection = { kind: "none" };
+    this.redraw();
+    this.drawUndo();
+  }
+
+  private addRoom(): void {
+    if (this.history === null) return;
+    const plan = this.history.now, right = plan.rooms.length === 0 ? 0 : Math.max(...plan.rooms.flatMap(({ polygon }) => polygon.map(([x]) => x))) + 0.1;
+    const [width, depth] = NEW_ROOM_M;
+    this.tools.choose("select");
+    this.selection = { kind: "room", index: plan.rooms.length };
+    this.edit(change.addRoom(plan, [[right, 0], [right + width, 0], [right + width, depth], [right, depth]]), false);
+    this.host.fit(boxOf(this.history.now));
+  }
+
+  private async lay(file: File): Promise<void> {
+    clearError(this.error);
+    try {
+      await this.under.lay(file);
+      const { width, height } = this.under.box!;
+      this.host.fit({ x: -0.5, y: -height - 0.5, width: width + 1, height: height + 1 });
+      say("Set the scale next: click two points whose distance you know.");
+      this.tools.choose("scale");
+      this.drawBar();
+    } catch (error) {
+      showError(this.error, error);
+    }
+  }
+
+  private onMeasured(distance: number): void {
+    this.measured = distance;
+    const field = h("input", { type: "number", min: 0.01, step: "any", id: "known-distance", value: distance.toFixed(2) });
+    const apply = (): void => this.applyScale(field.valueAsNumber);
+    field.addEventListener("keydown", (event) => { if (event.key === "Enter") apply(); });
+    show(this.measure, h("label", { for: "known-distance" }, "These points are really so many metres apart:"), field, button("Set the scale", apply, { id: "apply-scale" }));
+    this.measure.hidden = false;
+    field.select();
+  }
+
+  private applyScale(distance: number): void {
+    if (this.history === null || !(distance > 0) || !(this.measured > 0)) {
+      showError(this.error, new Error("The distance is a number of metres, more than 0, between two different points."));
+      return;
+    }
+    clearError(this.error);
+    const factor = distance / this.measured, seen = this.host.seen();
+    this.measure.hidden = true;
+    this.under.scale(factor);
+    this.tools.choose("select");
+    this.edit(change.scaled(this.history.now, factor), false);
+    this.host.fit({ x: seen.x * factor, y: seen.y * factor, width: seen.width * factor, height: seen.height * factor });
+    say(`The plan is ${factor.toFixed(3)} times as large.`);
+  }
+
+  private async save(): Promise<void> {
+    if (this.history === null) return;
+    if (this.base === null) return this.saveNew();
+    const document = this.history.now;
+    await this.attempt(async (base) => this.close(await api.replacePlan(base.id, document, base.etag)));
+  }
+
+  private async saveNew(): Promise<void> {
+    const plan = this.history?.now;
+    if (plan !== undefined) await this.attempt(async () => this.close(await api.createPlan(plan)));
+  }
+
+  private async attempt(store: (base: Plan) => Promise<void>): Promise<void> {
+    clearError(this.error);
+    try {
+      await store(this.base!);
+    } catch (error) {
+      showError(this.error, error);
+      if (error instanceof Refusal && error.status === 412) this.offerWays();
+    }
+  }
+
+  /** Somebody else stored a revision meanwhile: say so, and lose nothing of either. */
+  private offerWays(): void {
+    show(this.error, h("strong", {}, "Somebody changed this plan since you began"),
+      h("p", {}, "Nothing of yours or theirs is lost. What shall become of your version?"),
+      h("div", { class: "ask" },
+        button("Look at theirs", () => void this.takeTheirs(true), { id: "look-at-theirs" }),
+        button("Save mine over it", () => void this.takeTheirs(false), { id: "save-over" }),
+        button("Save mine as a new plan", () => void this.saveNew())));
+  }
+
+  private async takeTheirs(look: boolean): Promise<void> {
+    await this.attempt(async (base) => {
+      this.base = await api.plan(base.id);
+      if (!look) {
+        this.close(await api.replacePlan(base.id, this.history!.now, this.base.etag));
+        return;
+      }
+      // As one more step: undoing it leads back to what was drawn here.
+      this.selection = { kind: "none" };
+      this.edit(this.base.plan, false);
+      this.hint.textContent = `This is their revision ${this.base.revision_number}. “Undo” brings yours back; saving it then makes it the newest.`;
+    });
+  }
+
+  private leave(): void {
+    const dialog = byId<HTMLDialogElement>("leave-dialog");
+    if (!this.isChanged) {
+      this.close(null);
+      return;
+    }
+    dialog.showModal();
+    dialog.addEventListener("close", () => { if (dialog.returnValue === "leave") this.close(null); dialog.returnValue = ""; }, { once: true });
+  }
+
+  private onKey(event: KeyboardEvent): void {
+    if (this.history === null || event.target instanceof HTMLInputElement || !(event.ctrlKey || event.metaKey)) return;
+    const key = event.key.toLowerCase();
+    if (key === "z") this.step(event.shiftKey ? "redo" : "undo");
+    else if (key === "y") this.step("redo");
+    else return;
+    event.preventDefault();
+  }
+}

@@ -1,0 +1,94 @@
+/** What is known of a room, an opening or the whole plan besides where it lies. */
+
+import { button, h, show } from "../dom";
+import type { OpeningDocument, OpeningKind, PlanDocument, RoomDocument } from "../types";
+import * as change from "./changes";
+import type { Selection } from "./handles";
+
+const ROOM_TYPES = ["unknown", "bedroom", "living", "kitchen", "dining", "bathroom", "corridor", "entrance", "closet",
+  "storage", "laundry", "garage", "stairs", "balcony", "office", "meeting"];
+const OPENING_KINDS: OpeningKind[] = ["door", "window", "passage"];
+
+export interface FormActions {
+  edit: (plan: PlanDocument) => void;
+  select: (selection: Selection) => void;
+}
+
+/** Show the form of what is selected. */
+export function showForm(place: HTMLElement, plan: PlanDocument, selection: Selection, actions: FormActions): void {
+  if (place.contains(document.activeElement) && document.activeElement instanceof HTMLInputElement) {
+    // Being typed in: what is typed is already there.
+    if (place.dataset.of === JSON.stringify(selection)) return;
+  }
+  place.dataset.of = JSON.stringify(selection);
+  const room = selection.kind === "room" ? plan.rooms[selection.index] : undefined;
+  const opening = selection.kind === "opening" ? plan.openings?.[selection.index] : undefined;
+  if (room !== undefined && selection.kind === "room") show(place, ...roomForm(room, selection.index, actions));
+  else if (opening !== undefined && selection.kind === "opening") show(place, ...openingForm(opening, selection.index, actions));
+  else show(place, ...planForm(plan, actions));
+}
+
+let current: PlanDocument = { rooms: [] };
+
+/** The plan that forms change: as it is when a field is left, not as it was when the form was made. */
+export function setFormPlan(plan: PlanDocument): void {
+  current = plan;
+}
+
+function planForm(plan: PlanDocument, { edit }: FormActions): HTMLElement[] {
+  const set = (values: Partial<PlanDocument>): void => edit({ ...current, ...values });
+  return [
+    h("h3", {}, "The whole plan"),
+    text("plan-form-name", "Name", plan.name ?? "", (name) => set({ name })),
+    number("plan-form-ceiling", "Ceiling, m", plan.ceiling_height_m, (value) => set({ ceiling_height_m: value })),
+    number("plan-form-camera", "Camera height, m", plan.camera_height_m, (value) => set({ camera_height_m: value })),
+    number("plan-form-north", "North, ° clockwise from up", plan.north_deg, (value) => set({ north_deg: value })),
+    h("p", { class: "hint" }, `${plan.rooms.length} rooms, ${(plan.openings ?? []).length} openings. Click one to change it.`),
+  ];
+}
+
+function roomForm(room: RoomDocument, index: number, { edit, select }: FormActions): HTMLElement[] {
+  const set = (values: Partial<RoomDocument>): void => edit(change.changeRoom(current, index, values));
+  return [
+    h("h3", {}, "Room"),
+    text("room-form-name", "Name", room.name ?? "", (name) => set({ name })),
+    choice("room-form-type", "Type", room.type ?? "unknown", ROOM_TYPES, (type) => set({ type })),
+    number("room-form-ceiling", "Ceiling, m", room.ceiling_height_m, (value) => set({ ceiling_height_m: value })),
+    button("Remove this room", () => { select({ kind: "none" }); edit(change.removeRoom(current, index)); }),
+  ];
+}
+
+function openingForm(opening: OpeningDocument, index: number, { edit, select }: FormActions): HTMLElement[] {
+  const set = (values: Partial<OpeningDocument>): void => edit(change.changeOpening(current, index, values));
+  return [
+    h("h3", {}, "Opening"),
+    choice("opening-form-kind", "Kind", opening.kind, OPENING_KINDS, (kind) => set({ kind: kind as OpeningKind })),
+    number("opening-form-width", "Width, m", change.widthOf(opening), (value) => { if (value !== null && value > 0) edit(change.widenOpening(current, index, value)); }),
+    number("opening-form-sill", "From, m over the floor", opening.sill_m, (value) => set({ sill_m: value })),
+    number("opening-form-head", "To, m over the floor", opening.head_m, (value) => set({ head_m: value })),
+    button("Remove this opening", () => { select({ kind: "none" }); edit(change.removeOpening(current, index)); }),
+  ];
+}
+
+function field(id: string, label: string, input: HTMLElement): HTMLElement {
+  input.id = id;
+  return h("div", {}, h("label", { for: id }, label), input);
+}
+
+function text(id: string, label: string, value: string, set: (value: string) => void): HTMLElement {
+  const input = h("input", { type: "text", maxlength: 200, value });
+  input.addEventListener("change", () => set(input.value));
+  return field(id, label, input);
+}
+
+function number(id: string, label: string, value: number | null | undefined, set: (value: number | null) => void): HTMLElement {
+  const input = h("input", { type: "number", step: "any", placeholder: "not said", value: value == null ? null : String(Math.round(value * 1000) / 1000) });
+  input.addEventListener("change", () => set(input.value.trim() === "" ? null : input.valueAsNumber));
+  return field(id, label, input);
+}
+
+function choice(id: string, label: string, value: string, options: string[], set: (value: string) => void): HTMLElement {
+  const input = h("select", {}, ...options.map((option) => h("option", { selected: option === value }, option)));
+  input.addEventListener("change", () => set(input.value));
+  return field(id, label, input);
+}

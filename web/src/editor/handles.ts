@@ -1,0 +1,164 @@
+/** What is taken hold of in a plan that is edited: corners, walls, openings; with pointer and keyboard. */
+
+import { s, show } from "../dom";
+import { path } from "../plan_drawing";
+import { placeOf } from "../pose_marker";
+import type { OpeningKind, PlanDocument, Point } from "../types";
+import * as change from "./changes";
+
+export type Selection = { kind: "none" } | { kind: "room"; index: number } | { kind: "opening"; index: number };
+
+export interface HandleActions {
+  /** Another plan; `goesOn` while something is dragged. */
+  edit: (plan: PlanDocument, goesOn: boolean) => void;
+  select: (selection: Selection) => void;
+}
+
+const STEP_M = 0.05;
+const FAR_STEP_M = 0.5;
+const ARROWS: Record<string, Point> = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
+const KINDS: Record<string, OpeningKind> = { d: "door", w: "window", p: "passage" };
+const SNAP_UNITS = 1;
+
+export class Handles {
+  readonly element = s("g", { class: "handles" });
+  private plan: PlanDocument = { rooms: [] };
+  private unit = 0.1;
+
+  constructor(private readonly svg: SVGSVGElement, private readonly actions: HandleActions) {}
+
+  /** Draw the handles of what is selected; the focus stays where it was. */
+  draw(plan: PlanDocument, selection: Selection, unit: number): void {
+    const focused = this.element.contains(document.activeElement) ? document.activeElement!.id : null;
+    this.plan = plan;
+    this.unit = unit;
+    const room = selection.kind === "room" ? selection.index : -1;
+    const shapes: SVGElement[] = plan.rooms.map((one, index) => this.roomShape(one.polygon, index, index === room));
+    if (room >= 0 && plan.rooms[room] !== undefined) shapes.push(...this.wallShapes(room), ...this.cornerShapes(room));
+    (plan.openings ?? []).forEach((_, index) => shapes.push(...this.openingShapes(index, selection)));
+    show(this.element, ...shapes);
+    if (focused) document.getElementById(focused)?.focus();
+  }
+
+  private roomShape(polygon: Point[], index: number, isSelected: boolean): SVGElement {
+    const name = this.plan.rooms[index]!.name || `room ${index + 1}`;
+    const select = (): void => this.actions.select({ kind: "room", index });
+    return s("path", {
+      d: path(polygon), class: `grab-room${isSelected ? " selected" : ""}`, id: `edit-room-${index}`, tabindex: 0,
+      role: "button", "aria-label": `Room ${name}`, "aria-pressed": String(isSelected), onclick: select,
+      onkeydown: (event) => {
+        const key = (event as KeyboardEvent).key;
+        if (key === "Enter" || key === " ") { event.preventDefault(); select(); }
+        if (key === "Delete") { this.actions.select({ kind: "none" }); this.actions.edit(change.removeRoom(this.plan, index), false); }
+      },
+    });
+  }
+
+  private cornerShapes(room: number): SVGElement[] {
+    return this.plan.rooms[room]!.polygon.map(([x, y], corner) => {
+      const move = (to: Point, goesOn: boolean): void => this.actions.edit(change.moveCorner(this.plan, room, corner, to), goesOn);
+      const handle = s("circle", {
+        cx: x, cy: -y, r: 1.1 * this.unit, class: "corner", id: `edit-corner-${corner}`, tabindex: 0, role: "button",
+        "aria-label": `Corner ${corner + 1}, x ${x.toFixed(2)}, y ${y.toFixed(2)} m. Arrow keys move it, Delete removes it.`,
+        ondblclick: () => this.actions.edit(change.removeCorner(this.plan, room, corner), false),
+        onkeydown: (event) => this.onKey(event as KeyboardEvent, {
+          move: (by) => move([x + by[0], y + by[1]], false),
+          remove: () => this.actions.edit(change.removeCorner(this.plan, room, corner), false),
+        }),
+      });
+      this.drag(handle, (to, goesOn) => {
+        const here = this.plan.rooms[room]!.polygon[corner]!;
+        move(change.snapped(this.plan, to, SNAP_UNITS * this.unit, here), goesOn);
+      });
+      return handle;
+    });
+  }
+
+  private wallShapes(room: number): SVGElement[] {
+    return this.plan.rooms[room]!.polygon.flatMap((_, edge) => {
+      const wall = { room, edge }, [[ax, ay], [bx, by]] = change.wallOf(this.plan, wall);
+      const middle: Point = [0.5 * (ax + bx), 0.5 * (ay + by)];
+      const split = (): void => this.actions.edit(change.splitWall(this.plan, wall, middle), false);
+      const line = s("line", {
+        x1: ax, y1: -ay, x2: bx, y2: -by, class: "grab-wall", id: `edit-wall-${edge}`, tabindex: 0, role: "button",
+        "aria-label": `Wall ${edge + 1}, ${Math.hypot(bx - ax, by - ay).toFixed(2)} m. Arrow keys move it, Enter puts a corner in it, D, W and P a door, a window, a passage.`,
+        ondblclick: split,
+        onkeydown: (event) => {
+          const kind = KINDS[(event as KeyboardEvent).key.toLowerCase()];
+          if (kind !== undefined) this.actions.edit(change.addOpening(this.plan, kind, wall, middle), false);
+          else this.onKey(event as KeyboardEvent, { move: (by) => this.actions.edit(change.moveWall(this.plan, wall, by), false), split });
+        },
+      });
+      let from: Point | null = null;
+      this.drag(line, (to, goesOn) => {
+        if (!goesOn) from = null;
+        const by: Point = from === null ? [0, 0] : [to[0] - from[0], to[1] - from[1]];
+        from = to;
+        if (by[0] !== 0 || by[1] !== 0 || !goesOn) this.actions.edit(change.moveWall(this.plan, wall, by), goesOn);
+      });
+      const plus = s("circle", { cx: middle[0], cy: -middle[1], r: 0.7 * this.unit, class: "split", "aria-hidden": "true", onclick: split });
+      return [line, plus];
+    });
+  }
+
+  private openingShapes(index: number, selection: Selection): SVGElement[] {
+    const opening = this.plan.openings![index]!, [[ax, ay], [bx, by]] = opening.line;
+    const isSelected = selection.kind === "opening" && selection.index === index;
+    const slide = (to: Point, goesOn: boolean): void => this.actions.edit(change.slideOpening(this.plan, index, to), goesOn);
+    const select = (): void => { if (!isSelected) this.actions.select({ kind: "opening", index }); };
+    const line = s("line", {
+      x1: ax, y1: -ay, x2: bx, y2: -by, class: `grab-opening${isSelected ? " selected" : ""}`, id: `edit-opening-${index}`,
+      tabindex: 0, role: "button", "aria-pressed": String(isSelected),
+      "aria-label": `${opening.kind} ${index + 1}, ${change.widthOf(opening).toFixed(2)} m wide. Arrow keys slide it, Delete removes it.`,
+      onclick: select,
+      onkeydown: (event) => this.onKey(event as KeyboardEvent, {
+        move: (by_) => slide([0.5 * (ax + bx) + by_[0], 0.5 * (ay + by) + by_[1]], false),
+        remove: () => { this.actions.select({ kind: "none" }); this.actions.edit(change.removeOpening(this.plan, index), false); },
+        split: select,
+      }),
+    });
+    this.drag(line, (to, goesOn) => { if (!goesOn) select(); slide(to, goesOn); });
+    if (!isSelected) return [line];
+    const ends = opening.line.map(([x, y], end) => {
+      const handle = s("circle", { cx: x, cy: -y, r: 0.9 * this.unit, class: "corner", "aria-hidden": "true" });
+      this.drag(handle, (to, goesOn) => this.actions.edit(change.stretchOpening(this.plan, index, end as 0 | 1, to), goesOn));
+      return handle;
+    });
+    return [line, ...ends];
+  }
+
+  /** Follow a pointer from its first movement on; what was redrawn meanwhile makes no difference. */
+  private drag(handle: SVGElement, to: (place: Point, goesOn: boolean) => void): void {
+    handle.addEventListener("pointerdown", (event) => {
+      if (event.button !== 0) return;
+      event.preventDefault();
+      event.stopPropagation();
+      (handle as SVGElement & { focus(): void }).focus();
+      const begin = placeOf(this.svg, event);
+      let goesOn = false;
+      const move = (moving: PointerEvent): void => {
+        if (!goesOn && Math.hypot(moving.clientX - event.clientX, moving.clientY - event.clientY) < 3) return;
+        if (!goesOn) to(begin, false);
+        goesOn = true;
+        to(placeOf(this.svg, moving), true);
+      };
+      const end = (): void => {
+        removeEventListener("pointermove", move);
+        removeEventListener("pointerup", end);
+        removeEventListener("pointercancel", end);
+      };
+      addEventListener("pointermove", move);
+      addEventListener("pointerup", end);
+      addEventListener("pointercancel", end);
+    });
+  }
+
+  private onKey(event: KeyboardEvent, does: { move: (by: Point) => void; remove?: () => void; split?: () => void }): void {
+    const arrow = ARROWS[event.key], step = event.shiftKey ? FAR_STEP_M : STEP_M;
+    if (arrow !== undefined) does.move([arrow[0] * step, arrow[1] * step]);
+    else if (event.key === "Delete" && does.remove !== undefined) does.remove();
+    else if (event.key === "Enter" && does.split !== undefined) does.split();
+    else return;
+    event.preventDefault();
+  }
+}
