@@ -21,7 +21,7 @@ TWO_PI = 2.0 * math.pi
 # A camera nearer to the floor is one whose height was given in another unit.
 MIN_CAMERA_HEIGHT_M = 0.1
 
-# What a horizontal ray meets at eye height; its place is its code, in plans, renderer, networks and search alike.
+# What a horizontal ray meets at eye height; its place is its code, in plans, layouts, networks and search alike.
 OPENING_CLASSES = ("wall", "door", "window", "passage")
 WALL_CODE, DOOR_CODE, WINDOW_CODE, PASSAGE_CODE = range(len(OPENING_CLASSES))
 

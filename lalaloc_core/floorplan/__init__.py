@@ -1,7 +1,7 @@
 """Floor plans: validated, immutable rooms as closed polygons, with the openings in their walls.
 
 Begin with `plan.py`. `reading.py` makes rooms of a document, `openings.py` puts openings into their walls, `checks.py`
-is what only all rooms together can break, `geometry.py` the arrays that the renderer casts its rays against.
+is what only all rooms together can break, `geometry.py` the arrays that the layout renderer casts its rays against.
 """
 
 from lalaloc_core.floorplan.geometry import PlanGeometry, pad_walls

@@ -1,4 +1,4 @@
-"""A plan's walls and openings as padded arrays, one row per room: what the renderer casts its rays against."""
+"""A plan's walls and openings as padded arrays, one row per room: what the layout renderer casts its rays against."""
 
 from __future__ import annotations
 

@@ -177,7 +177,7 @@ class FloorPlan:
 
     @cached_property
     def geometry(self) -> PlanGeometry:
-        """Walls and openings as the renderer takes them."""
+        """Walls and openings as the layout renderer takes them."""
         return build_geometry(self.rooms, self.openings, self.opening_faces)
 
     @property

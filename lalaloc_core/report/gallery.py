@@ -104,20 +104,20 @@ def build_gallery(run: Run) -> Gallery:
     """
     left_out: list[str] = []
     try:
-        renderer = _CardRenderer(run, left_out)
+        writer = _CardWriter(run, left_out)
     except (LaLaLocError, OSError) as error:
         return Gallery(groups={}, left_out=(f"The gallery is left out, because its data cannot be opened: {error}.",))
     groups: dict[str, list[Card]] = {}
     for group, indices in choose_queries(run.predictions).items():
         for index in indices:
             try:
-                groups.setdefault(group, []).append(renderer.card(index))
+                groups.setdefault(group, []).append(writer.card(index))
             except (LaLaLocError, OSError) as error:
                 left_out.append(f"A query of the gallery is left out: {error}.")
     return Gallery(groups=groups, left_out=tuple(dict.fromkeys(left_out)))
 
 
-class _CardRenderer:
+class _CardWriter:
     """Data set and model of a run, opened to draw its queries; what is gone is told in `left_out`."""
 
     def __init__(self, run: Run, left_out: list[str]) -> None:

@@ -1,4 +1,4 @@
-"""Photographs of procedural homes: the renderer."""
+"""Photographs of procedural homes: the panorama renderer."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from lalaloc_core.training.batches import Batch
 from lalaloc_core.training.config import ImageStageConfig, TrainConfig
 from lalaloc_core.training.objective import anchors_with_neighbours, chamfer_to_anchors, embed
 from lalaloc_core.training.photographs import Photographs
-from lalaloc_core.training.photometric import changed, optics
+from lalaloc_core.training.photometric import jittered, optics
 from lalaloc_core.training.sources import Source
 from lalaloc_core.training.stages import build_image_encoder, panorama_batches
 
@@ -137,7 +137,7 @@ class ImageStage:
         # In full precision, as what a camera does to a picture is: bfloat16 has no 256 grey levels.
         with torch.autocast(image.device.type, enabled=False):
             if self.settings.photometric:
-                image = changed(image, self.settings.photometric, self._randomness(image.device))
+                image = jittered(image, self.settings.photometric, self._randomness(image.device))
             if self.settings.optics:
                 image = optics(image.float(), self.settings.optics, self._randomness(image.device))
         return image

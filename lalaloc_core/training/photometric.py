@@ -16,7 +16,7 @@ _NOISE = 0.01
 _JPEG_SHARE = 0.25
 
 
-def changed(image: UInt8[Tensor, "b h w 3"], strength: float, generator: torch.Generator) -> Float[Tensor, "b h w 3"]:
+def jittered(image: UInt8[Tensor, "b h w 3"], strength: float, generator: torch.Generator) -> Float[Tensor, "b h w 3"]:
     """Panoramas (0 to 255) as another camera or another hour would have shown them.
 
     Args:

@@ -17,7 +17,7 @@ from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.training.batches import Batch, LoadFailure, Stream, non_empty, stacked, worker_share
 from lalaloc_core.training.config import TrainConfig
 from lalaloc_core.training.deferred import DeferredBatch, DeferredBatcher, DeferredRow, DeferredScene, Row
-from lalaloc_core.training.replay import Replay
+from lalaloc_core.training.replay_buffer import ReplayBuffer
 from lalaloc_core.training.sources import Group, Source, View
 from lalaloc_core.training.turning import Turn, draw_heading, draw_turn
 
@@ -89,7 +89,7 @@ class PanoramaBatches(Stream):
 
     def __iter__(self) -> Iterator[Batch | DeferredBatch | LoadFailure]:
         stage, (_, workers) = self.config.image, worker_share()
-        replay: Replay[View] = Replay(stage.uses_per_panorama, stage.replay_panoramas // workers)
+        replay: ReplayBuffer[View] = ReplayBuffer(stage.uses_per_panorama, stage.replay_panoramas // workers)
         batcher = DeferredBatcher(stage.uses_per_panorama)
 
         def rendered(visit: int) -> list[Row] | None:
@@ -114,12 +114,12 @@ class PanoramaBatches(Stream):
             return _batches(deferred, batcher.pack, self.source, stage.batch, self.first)
         return _batches(rendered, stacked, self.source, stage.batch, self.first)
 
-    def _drawn(self, visit: int, replay: Replay[View]) -> list[tuple[View, Turn, Row | None]]:
+    def _drawn(self, visit: int, replay: ReplayBuffer[View]) -> list[tuple[View, Turn, Row | None]]:
         """What a visit shows, how it is turned, and the rest of its rows: None where there are no neighbours."""
         rng = self.source.rng(visit)
         drawn = []
         for new in self.source.views(visit, *self.config.image_size):
-            for view in replay.after(new, rng):
+            for view in replay.add_and_sample(new, rng):
                 turn = draw_turn(self.config.turns, view.heading, self.config.image_size[1], rng)
                 drawn.append((view, turn, self._row(view, turn, rng)))
         return drawn

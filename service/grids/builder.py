@@ -19,7 +19,7 @@ from service.errors import (
 )
 from service.grids.embedding import check_size, embed
 from service.grids.grid_cache import GridCache
-from service.grids.grid_jobs import Job, Jobs
+from service.grids.grid_jobs import GridJob, GridJobs
 from service.grids.lease_heartbeat import LeaseHeartbeat, LeaseLostError
 from service.grids.throttle import BackgroundThrottle
 from service.settings import Settings
@@ -66,11 +66,11 @@ class GridBuilder:
         self._settings = settings
         self._telemetry = telemetry
         self._owner = uuid.uuid4().hex
-        # Of the jobs that are being computed, all by the one thread of `Jobs`.
+        # Of the jobs that are being computed, all by the one thread of `GridJobs`.
         self._heartbeats: list[LeaseHeartbeat] = []
-        self.jobs = Jobs(self._work)
+        self.jobs = GridJobs(self._work)
 
-    def _work(self, job: Job) -> None:
+    def _work(self, job: GridJob) -> None:
         """See a job through; whatever happens ends up in its future, unless another replica is at it."""
         try:
             outcome = self._cache.load(job.key) or self._compute(job)
@@ -82,7 +82,7 @@ class GridBuilder:
             self._note_failure(job, error)
         self.jobs.end(job, outcome)
 
-    def _compute(self, job: Job) -> LatentGrid:
+    def _compute(self, job: GridJob) -> LatentGrid:
         if job.cancelled.is_set():
             raise self._why_cancelled(job)
         record = self._store.plans.by_revision(job.key.revision_id)
@@ -107,7 +107,7 @@ class GridBuilder:
         self._cache.put(job.key, grid)
         return grid
 
-    def _embed(self, job: Job, plan: FloorPlan) -> LatentGrid:
+    def _embed(self, job: GridJob, plan: FloorPlan) -> LatentGrid:
         heartbeat = LeaseHeartbeat(lambda: self._renew(job), self._settings.grid_lease_s / _HEARTBEATS)
 
         def after_chunk(progress: float, worked_s: float) -> None:
@@ -131,7 +131,7 @@ class GridBuilder:
         finally:
             self._heartbeats.pop()
 
-    def _why_cancelled(self, job: Job) -> Exception:
+    def _why_cancelled(self, job: GridJob) -> Exception:
         if self.jobs.closing.is_set():
             return StoppingError()
         if not self._store.plans.is_kept(job.key.revision_id):
@@ -139,14 +139,14 @@ class GridBuilder:
         # The plan has another revision by now, which the next query finds.
         return PlanNotReadyError(job.plan_id, 0.0, 0.0)
 
-    def _renew(self, job: Job) -> bool:
+    def _renew(self, job: GridJob) -> bool:
         try:
             return self._store.leases.renew(job.key, self._owner, self._settings.grid_lease_s, job.progress)
         except StoreUnavailableError:
             # Nobody else can take the lease meanwhile either.
             return True
 
-    def _put(self, job: Job, grid: LatentGrid, *, always_keep_mm: int) -> bool:
+    def _put(self, job: GridJob, grid: LatentGrid, *, always_keep_mm: int) -> bool:
         """Store a grid; it may have taken minutes, so a database that is away for a moment is waited for."""
         give_up_at = monotonic() + _KEEP_TRYING_S
         while True:
@@ -157,7 +157,7 @@ class GridBuilder:
                 if monotonic() > give_up_at or job.cancelled.wait(_TRY_EVERY_S):
                     raise
 
-    def _note_failure(self, job: Job, error: Exception) -> None:
+    def _note_failure(self, job: GridJob, error: Exception) -> None:
         logger = logging.getLogger(LOGGER_NAME)
         if isinstance(error, _ABANDONED):
             logger.info("latent grid abandoned", extra={"fields": {"floorplan": job.plan_id, "reason": str(error)}})

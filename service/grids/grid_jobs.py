@@ -24,7 +24,7 @@ _SMALL_POSES = 2000
 
 
 @dataclass(eq=False)
-class Job:
+class GridJob:
     """One grid that is to be computed.
 
     Attributes:
@@ -45,10 +45,10 @@ class Job:
     remote: bool = False
 
 
-class Jobs:
+class GridJobs:
     """The jobs of this replica and the thread that works on them."""
 
-    def __init__(self, work: Callable[[Job], None]) -> None:
+    def __init__(self, work: Callable[[GridJob], None]) -> None:
         """Start the thread.
 
         Args:
@@ -56,8 +56,8 @@ class Jobs:
         """
         self._work = work
         self._changed = threading.Condition()
-        self._jobs: dict[GridKey, Job] = {}
-        self._queued: list[Job] = []
+        self._jobs: dict[GridKey, GridJob] = {}
+        self._queued: list[GridJob] = []
         self.closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="grids", daemon=True)
         self._thread.start()
@@ -65,11 +65,11 @@ class Jobs:
     def __len__(self) -> int:
         return len(self._jobs)
 
-    def get(self, key: GridKey) -> Job | None:
+    def get(self, key: GridKey) -> GridJob | None:
         """The job for a grid."""
         return self._jobs.get(key)
 
-    def add(self, key: GridKey, *, plan_id: str, poses: int, on_demand: bool) -> Job:
+    def add(self, key: GridKey, *, plan_id: str, poses: int, on_demand: bool) -> GridJob:
         """The job for a grid, a new one if there is none.
 
         Raises:
@@ -86,7 +86,7 @@ class Jobs:
                 raise OverloadedError(MAX_ON_DEMAND)
             if len(self._jobs) >= MAX_JOBS:
                 raise OverloadedError(MAX_JOBS)
-            job = Job(key, plan_id, poses, on_demand)
+            job = GridJob(key, plan_id, poses, on_demand)
             # Others may wait for the same future: nobody can cancel it for them.
             job.future.set_running_or_notify_cancel()
             self._jobs[key] = job
@@ -94,7 +94,7 @@ class Jobs:
             self._changed.notify()
             return job
 
-    def end(self, job: Job, outcome: LatentGrid | Exception) -> None:
+    def end(self, job: GridJob, outcome: LatentGrid | Exception) -> None:
         """Forget a job, then give its outcome to those who wait, so that they find the plan in its final state."""
         with self._changed:
             self._jobs.pop(job.key, None)
@@ -103,12 +103,12 @@ class Jobs:
         else:
             job.future.set_result(outcome)
 
-    def remote(self) -> list[Job]:
+    def remote(self) -> list[GridJob]:
         """The jobs that other replicas have the lease of."""
         with self._changed:
             return [job for job in self._jobs.values() if job.remote]
 
-    def requeue(self, job: Job) -> None:
+    def requeue(self, job: GridJob) -> None:
         """Queue a job that was remote: its lease has run out."""
         with self._changed:
             job.remote = False
@@ -127,7 +127,7 @@ class Jobs:
                 if job.key.revision_id == revision_id:
                     job.cancelled.set()
 
-    def preempt(self, large: Job) -> None:
+    def preempt(self, large: GridJob) -> None:
         """Compute one of the small grids that wait, between two chunks of a large one."""
         if large.poses > _SMALL_POSES and (job := self._next(_SMALL_POSES)) is not None:
             self._work(job)
@@ -153,7 +153,7 @@ class Jobs:
             if (job := self._next()) is not None:
                 self._work(job)
 
-    def _next(self, max_poses: int | None = None) -> Job | None:
+    def _next(self, max_poses: int | None = None) -> GridJob | None:
         """Take the smallest job from the queue."""
         with self._changed:
             job = min(self._queued, key=lambda job: job.poses, default=None)

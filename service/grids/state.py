@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Self
 
-from service.grids.grid_jobs import Job
+from service.grids.grid_jobs import GridJob
 from service.schemas import PlanStatus
 from service.storage.records import ComputedGrid
 
@@ -25,7 +25,7 @@ class GridState:
         return cls("preparing", 0.0, None) if prepared is None else cls("ready", 1.0, len(prepared.grid.poses))
 
     @classmethod
-    def of(cls, failure: str | None, poses: int | None, remote: float | None, job: Job | None) -> Self:
+    def of(cls, failure: str | None, poses: int | None, remote: float | None, job: GridJob | None) -> Self:
         """That of a stored plan.
 
         Args:

@@ -6,10 +6,10 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-_Kept = TypeVar("_Kept")
+T = TypeVar("T")
 
 
-class Replay(Generic[_Kept]):
+class ReplayBuffer(Generic[T]):
     """Gives everything it is given back `uses` times in all, with repeats far apart.
 
     What is new is used at once. Repeats begin when enough has gathered; from then on there are `uses - 1` of them, at
@@ -27,12 +27,12 @@ class Replay(Generic[_Kept]):
         # average, where all begin with `uses - 1`. Beginning with fewer things makes their number end at the limit.
         self._enough = max(int(self._limit * uses / (2 * (uses - 1))), 1) if uses > 1 else 0
         self._begun = False
-        self._waiting: list[tuple[_Kept, int]] = []
+        self._waiting: list[tuple[T, int]] = []
 
     def __len__(self) -> int:
         return len(self._waiting)
 
-    def after(self, new: _Kept, rng: np.random.Generator) -> list[_Kept]:
+    def add_and_sample(self, new: T, rng: np.random.Generator) -> list[T]:
         """What to use now that `new` has come: it, and what is repeated with it."""
         if self._uses == 1:
             return [new]
@@ -43,7 +43,7 @@ class Replay(Generic[_Kept]):
         self._waiting.append((new, self._uses - 1))
         return [new, *repeated]
 
-    def _drawn(self, rng: np.random.Generator) -> _Kept:
+    def _drawn(self, rng: np.random.Generator) -> T:
         index = int(rng.integers(len(self._waiting)))
         value, left = self._waiting[index]
         if left > 1:

@@ -16,8 +16,8 @@ from lalaloc_core.errors import ConfigError
 from lalaloc_core.training.batches import Batch, load_batches
 from lalaloc_core.training.config import PRESETS, TrainConfig
 from lalaloc_core.training.image_stage import ImageStage
-from lalaloc_core.training.photometric import changed
-from lalaloc_core.training.replay import Replay
+from lalaloc_core.training.photometric import jittered
+from lalaloc_core.training.replay_buffer import ReplayBuffer
 from lalaloc_core.training.sources import GeneratedSource
 from lalaloc_core.training.stages import build_layout_encoder
 from lalaloc_core.training.stream import PanoramaBatches
@@ -27,16 +27,16 @@ TINY = PRESETS["tiny"]
 
 
 def used(uses: int, limit: int, count: int) -> list[int]:
-    replay: Replay[int] = Replay(uses, limit)
+    replay: ReplayBuffer[int] = ReplayBuffer(uses, limit)
     rng = np.random.default_rng(0)
     drawn: list[int] = []
     for new in range(count):
-        drawn += replay.after(new, rng)
+        drawn += replay.add_and_sample(new, rng)
         assert len(replay) <= limit
     return drawn
 
 
-class TestReplay:
+class TestReplayBuffer:
     @given(uses=st.integers(1, 6), limit=st.integers(1, 40))
     def test_nothing_is_used_more_often_than_asked_and_all_that_left_exactly_so(self, uses: int, limit: int) -> None:
         counts = Counter(used(uses, limit, 300))
@@ -46,9 +46,9 @@ class TestReplay:
         assert unfinished <= (limit if uses > 1 else 0)
 
     def test_once_begun_there_are_as_many_repeats_as_asked_for_every_new_thing(self) -> None:
-        replay: Replay[int] = Replay(4, 300)
+        replay: ReplayBuffer[int] = ReplayBuffer(4, 300)
         rng = np.random.default_rng(0)
-        together = [len(replay.after(new, rng)) for new in range(3000)]
+        together = [len(replay.add_and_sample(new, rng)) for new in range(3000)]
         assert together[0] == 1
         assert np.mean(together[1000:]) == pytest.approx(4.0, rel=0.02)
         assert 250 < len(replay) <= 300
@@ -123,8 +123,8 @@ class TestPhotometric:
     @given(seed=seeds())
     def test_pictures_keep_their_range_and_their_content(self, seed: int) -> None:
         image = torch.randint(0, 256, (4, 8, 16, 3), dtype=torch.uint8, generator=torch.Generator().manual_seed(seed))
-        shown = changed(image, 1.0, torch.Generator().manual_seed(seed))
-        again = changed(image, 1.0, torch.Generator().manual_seed(seed))
+        shown = jittered(image, 1.0, torch.Generator().manual_seed(seed))
+        again = jittered(image, 1.0, torch.Generator().manual_seed(seed))
         assert torch.equal(shown, again)
         assert shown.min() >= 0.0
         assert shown.max() <= 255.0
@@ -134,8 +134,8 @@ class TestPhotometric:
     def test_without_strength_nothing_changes_and_every_picture_changes_its_own_way(self) -> None:
         image = torch.full((3, 4, 8, 3), 100, dtype=torch.uint8)
         generator = torch.Generator().manual_seed(0)
-        torch.testing.assert_close(changed(image, 0.0, generator), image.float())
-        brightness = changed(image, 1.0, generator).mean(dim=(1, 2, 3))
+        torch.testing.assert_close(jittered(image, 0.0, generator), image.float())
+        brightness = jittered(image, 1.0, generator).mean(dim=(1, 2, 3))
         assert len({round(float(value), 1) for value in brightness}) == 3
 
 
