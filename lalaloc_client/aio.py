@@ -6,7 +6,7 @@ import asyncio
 import os
 from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import aclosing
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, Unpack
 
 import httpx
 from httpx_sse import EventSource
@@ -17,7 +17,7 @@ from lalaloc_client.errors import NotFoundError
 from lalaloc_client.events import Followed, check_stream
 from lalaloc_client.model import FloorPlan, FloorPlanSummary, Localisation, PlanEvent, Readiness
 from lalaloc_client.operations import Patience, Reply, Steps, Wait
-from lalaloc_client.requests import Covariance, Document, Refine, Request
+from lalaloc_client.requests import Covariance, Document, Picture, PictureFormat, QueryOptions, Refine, Request
 from lalaloc_client.retry import RetryPolicy
 
 if TYPE_CHECKING:
@@ -160,6 +160,25 @@ class AsyncClient:
             strict=strict,
         )
         return await self._run(operations.localisation(request, self._patience))
+
+    async def picture(
+        self,
+        floorplan_id: str,
+        panorama: bytes | str | os.PathLike[str] | Image,
+        picture: Picture = "both",
+        *,
+        picture_format: PictureFormat = "png",
+        **asked: Unpack[QueryOptions],
+    ) -> bytes:
+        """See `Client.picture`."""
+        query = await asyncio.to_thread(
+            requests.localise_request,
+            floorplan_id,
+            panorama,
+            **asked,
+        )
+        request = requests.picture_request(query, picture, picture_format)
+        return await self._run(operations.content(request, self._patience))
 
     async def limits(self) -> Mapping[str, Any]:
         """See `Client.limits`."""

@@ -6,7 +6,7 @@ import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, Unpack
 
 import httpx
 from httpx_sse import EventSource
@@ -17,7 +17,7 @@ from lalaloc_client.errors import NotFoundError
 from lalaloc_client.events import Followed, check_stream
 from lalaloc_client.model import FloorPlan, FloorPlanSummary, Localisation, PlanEvent, Readiness
 from lalaloc_client.operations import Patience, Reply, Steps, Wait
-from lalaloc_client.requests import Covariance, Document, Refine, Request
+from lalaloc_client.requests import Covariance, Document, Picture, PictureFormat, QueryOptions, Refine, Request
 from lalaloc_client.retry import RetryPolicy
 
 if TYPE_CHECKING:
@@ -203,6 +203,32 @@ class Client:
             strict=strict,
         )
         return self._run(operations.localisation(request, self._patience))
+
+    def picture(
+        self,
+        floorplan_id: str,
+        panorama: bytes | str | os.PathLike[str] | Image,
+        picture: Picture = "both",
+        *,
+        picture_format: PictureFormat = "png",
+        **asked: Unpack[QueryOptions],
+    ) -> bytes:
+        """Where in a plan a panorama was taken, as a picture 1600 pixels wide.
+
+        Args:
+            picture: `plan`, with the posterior as a heat map, the answer and its rivals; `photograph`, with the found
+                layout drawn in; or `both`.
+            picture_format: `png` or `svg`.
+
+        The others are those of `localise`.
+        """
+        query = requests.localise_request(
+            floorplan_id,
+            panorama,
+            **asked,
+        )
+        request = requests.picture_request(query, picture, picture_format)
+        return self._run(operations.content(request, self._patience))
 
     def limits(self) -> Mapping[str, Any]:
         """What the service allows, by name."""

@@ -10,9 +10,9 @@ import os
 import re
 import uuid
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, TypedDict
 
 import httpx
 
@@ -23,11 +23,29 @@ if TYPE_CHECKING:
 
 Document = Mapping[str, Any] | bytes | str | os.PathLike[str]
 Refine = Literal["none", "vdr", "lpo"]
+Picture = Literal["both", "plan", "photograph"]
+PictureFormat = Literal["png", "svg"]
 Covariance = tuple[tuple[float, float], tuple[float, float]]
 
 _JSON = "application/json"
 _JPEG_QUALITY = 95
+_PICTURE_MEDIA: Mapping[PictureFormat, str] = {"png": "image/png", "svg": "image/svg+xml"}
 _ID = re.compile(r"[A-Za-z0-9_-]{1,128}")
+
+
+class QueryOptions(TypedDict, total=False):
+    """What may be said of a query, as `Client.localise` takes it."""
+
+    heading_deg: float | None
+    heading_tolerance_deg: float | None
+    camera_height_m: float | None
+    camera_height_std_m: float | None
+    near: Mapping[str, float] | None
+    radius_m: float | None
+    rooms: Sequence[str] | None
+    strict: bool | None
+    refine: Refine | None
+    top_k: int | None
 
 
 @dataclass(frozen=True)
@@ -130,16 +148,16 @@ def localise_request(
     floorplan_id: str,
     panorama: bytes | str | os.PathLike[str] | Image,
     *,
-    heading_deg: float | None,
-    heading_tolerance_deg: float | None,
-    camera_height_m: float | None,
-    camera_height_std_m: float | None,
-    refine: Refine | None,
-    top_k: int | None,
-    near: Mapping[str, float] | None,
-    radius_m: float | None,
-    rooms: Sequence[str] | None,
-    strict: bool | None,
+    heading_deg: float | None = None,
+    heading_tolerance_deg: float | None = None,
+    camera_height_m: float | None = None,
+    camera_height_std_m: float | None = None,
+    refine: Refine | None = None,
+    top_k: int | None = None,
+    near: Mapping[str, float] | None = None,
+    radius_m: float | None = None,
+    rooms: Sequence[str] | None = None,
+    strict: bool | None = None,
 ) -> Request:
     """A query; it stores nothing, so asking twice is as good as once."""
     given = {
@@ -170,6 +188,18 @@ def localise_request(
     )
     headers = {"Content-Type": encoded.headers["content-type"]}
     return Request("POST", "/localise", headers=headers, content=encoded.read())
+
+
+def picture_request(query: Request, picture: Picture, picture_format: PictureFormat) -> Request:
+    """A query whose answer is wanted as a picture.
+
+    Raises:
+        ValueError: no such format.
+    """
+    if picture_format not in _PICTURE_MEDIA:
+        raise ValueError(f"picture_format is {picture_format!r}, it must be one of {', '.join(_PICTURE_MEDIA)}")
+    headers = {**query.headers, "Accept": _PICTURE_MEDIA[picture_format]}
+    return replace(query, params={"picture": picture}, headers=headers)
 
 
 def limits_request() -> Request:

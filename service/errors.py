@@ -313,6 +313,13 @@ class ShareExceededError(OverloadedError):
         self.retry_after_s = retry_after_s
 
 
+class DrawingFailedError(ServiceError):
+    """A drawing of this service's own could not be made into pixels."""
+
+    def __init__(self, reason: str) -> None:
+        super().__init__(f"the picture could not be made: {reason}")
+
+
 class DecoderNotReadyError(ServiceError):
     """No process that decodes panoramas is running, nor will be before the request's deadline."""
 
@@ -395,6 +402,7 @@ PROBLEMS: dict[type[Exception], ProblemKind] = {
     DeadlineExceededError: ProblemKind(504, "deadline-exceeded", "Deadline exceeded"),
     StoppingError: ProblemKind(503, "stopping", "Shutting down"),
     DamagedDataError: INTERNAL,
+    DrawingFailedError: INTERNAL,
     ServiceError: INTERNAL,
     LaLaLocError: INTERNAL,
     ConfigError: INTERNAL,

@@ -11,17 +11,13 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from lalaloc_core.bundle import ConfidenceModel
-from lalaloc_core.conventions import heading_from_degrees, heading_to_degrees
+from lalaloc_core.conventions import heading_from_degrees
 from lalaloc_core.draw.canvas import FOUND, INK, MUTED, RULE, TRUE, Number, document, jpeg, shortened, words
-from lalaloc_core.draw.heat import HeatMap, colour_bar, heat_image, posterior_map
+from lalaloc_core.draw.heat import HeatMap, colour_bar, heat_image
 from lalaloc_core.draw.outline import Outline, outline_of
 from lalaloc_core.draw.photograph import photograph_key, photograph_part
 from lalaloc_core.draw.plan import ELLIPSE_STDS, Marker, draw_camera, extent_m, plan_part, shape_of
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.covariance import spread_of
-from lalaloc_core.localise.pipeline import Localisation, panorama_heading
-from lalaloc_core.localise.poses import Candidate, LatentGrid, Query
 
 Picture = Literal["both", "plan", "photograph"]
 PICTURES: tuple[Picture, ...] = get_args(Picture)
@@ -77,54 +73,6 @@ class DrawnAnswer:
         position_m = np.array([self.camera.x_m, self.camera.y_m])
         heading = heading_from_degrees(self.camera.heading_deg or 0.0)
         return outline_of(self.plan, position_m, self.room_index, heading, self.camera_height_m)
-
-
-def drawn_answer(
-    plan: FloorPlan,
-    grid: LatentGrid,
-    found: Localisation,
-    model: ConfidenceModel | None,
-    heading_source: str,
-    truth: Marker | None = None,
-) -> DrawnAnswer:
-    """What is drawn of what the search found.
-
-    Args:
-        model: turns the posterior into probabilities; None leaves them out.
-        heading_source: where the heading came from, in a word or two.
-    """
-    fits = None if model is None else found.fit_probability(model)
-    best, *others = found.candidates
-    spread = None
-    if model is not None and best.information is not None:
-        spread = spread_of(best.information, plan.rooms[best.room_index], model)
-    covariance = None
-    if spread is not None:
-        (xx, xy), (_, yy) = spread.position_m2.tolist()
-        covariance = (xx, xy, yy)
-    rivals = [
-        Rival(
-            one.x_m,
-            one.y_m,
-            _heading_deg(found.query, one),
-            plan.rooms[one.room_index].name,
-            None if fits is None else fits * share,
-        )
-        for one, share in zip(others, found.posterior.candidate[1:], strict=True)
-    ]
-    return DrawnAnswer(
-        plan=plan,
-        camera=Marker(
-            x_m=best.x_m, y_m=best.y_m, heading_deg=_heading_deg(found.query, best), covariance_m2=covariance
-        ),
-        room_index=best.room_index,
-        camera_height_m=found.camera_height_m,
-        heading_source="searched for" if found.heading_contradicted else heading_source,
-        confidence=None if model is None else found.confidence(model),
-        rivals=tuple(rivals),
-        heat=posterior_map(plan, grid.poses, found.posterior.pose, grid.step_m),
-        truth=truth,
-    )
 
 
 def draw_answer(
@@ -269,7 +217,3 @@ def _cross(x: Number, y: Number, reach: Number) -> str:
 
 def _length(metres: float) -> str:
     return f"{100 * metres:.0f} cm" if metres < 0.995 else f"{metres:.1f} m"
-
-
-def _heading_deg(query: Query, candidate: Candidate) -> float:
-    return heading_to_degrees(panorama_heading(query, candidate))

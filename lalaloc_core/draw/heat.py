@@ -24,7 +24,7 @@ _CELLS, _LEAST_CELL_M = 220, 0.04
 # Rounds of growing known values into cells and lattice points that have none.
 _GROWN = 4
 # Bilinear, which is fast, where drawn by resvg; browsers do it anyway.
-_SMOOTH = 'style="image-rendering: smooth"'
+_SMOOTH = 'image-rendering="smooth"'
 # Of probabilities: what is less probable than the best place by this factor has the lightest colour.
 _DECADES = 5
 

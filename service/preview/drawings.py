@@ -8,7 +8,7 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
 
-from lalaloc_core.draw import Marker, draw_rooms, plan_svg
+from lalaloc_core.draw.plan import Marker, draw_rooms, plan_svg
 from service.bounded_cache import BoundedCache
 from service.errors import OverloadedError
 from service.preview.mesh import plan_glb

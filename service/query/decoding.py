@@ -1,4 +1,4 @@
-"""Decoding panoramas in worker processes, bounded in memory and time.
+"""Decoding panoramas, and making pixels of drawings, in worker processes that are bounded in memory and time.
 
 A picture that kills such a process gets a second try, one that takes too long none, and neither harms anything else.
 No party keeps all the processes busy.
@@ -11,11 +11,17 @@ from time import monotonic
 from lalaloc_core.bundle import Manifest
 from lalaloc_core.errors import InvalidPanoramaError
 from lalaloc_core.panorama.images import Panorama
-from service.errors import DeadlineExceededError, DecoderNotReadyError, OverloadedError, StoppingError
+from service.errors import (
+    DeadlineExceededError,
+    DecoderNotReadyError,
+    DrawingFailedError,
+    OverloadedError,
+    StoppingError,
+)
 from service.pools import JobLostError, PoolState, WorkerPool, WorkerSpec
 from service.settings import Settings
 from service.telemetry import Telemetry
-from service.workers.decode import Refusal, run_decoder
+from service.workers.decode import Drawing, Refusal, Upload, run_decoder
 
 
 class Decoder:
@@ -23,7 +29,8 @@ class Decoder:
 
     def __init__(self, manifest: Manifest, settings: Settings, telemetry: Telemetry) -> None:
         self._settings = settings
-        self._pool: WorkerPool[bytes, Panorama | Refusal] = WorkerPool(
+        self._size = manifest.image_height, manifest.image_width
+        self._pool: WorkerPool[Upload | Drawing, Panorama | Refusal | bytes] = WorkerPool(
             WorkerSpec(
                 "decode",
                 run_decoder,
@@ -57,8 +64,13 @@ class Decoder:
         """How many workers are wanted and warm."""
         return self._pool.state
 
-    async def decode(self, content: bytes, deadline: float, party: str = "") -> Panorama:
+    async def decode(
+        self, content: bytes, deadline: float, party: str = "", *, size: tuple[int, int] | None = None
+    ) -> Panorama:
         """The panorama in an uploaded file, by a deadline (`monotonic`).
+
+        Args:
+            size: height and width of its pixels; by default the encoder's.
 
         Raises:
             InvalidPanoramaError: see `open_panorama`; or a worker stalled over it, or two died.
@@ -67,20 +79,36 @@ class Decoder:
             DecoderNotReadyError: no worker is running, nor will be in time.
             StoppingError: the service is shutting down.
         """
-        timeout_s = max(deadline - monotonic(), 0.0)
-        try:
-            answer = await self._pool.answer(content, timeout_s, party)
-        except JobLostError as error:
-            raise self._explained(error) from error
+        height, width = size or self._size
+        answer = await self._answer(Upload(content, height, width), deadline, party)
         if isinstance(answer, Refusal):
             raise InvalidPanoramaError(answer.reason)
+        assert isinstance(answer, Panorama)
         return answer
+
+    async def rasterise(self, svg: str, deadline: float, party: str = "") -> bytes:
+        """A drawing as PNG, by a deadline (`monotonic`).
+
+        Raises:
+            OverloadedError, DeadlineExceededError, DecoderNotReadyError, StoppingError: as `decode`.
+        """
+        answer = await self._answer(Drawing(svg), deadline, party)
+        assert isinstance(answer, bytes)
+        return answer
+
+    async def _answer(self, job: Upload | Drawing, deadline: float, party: str) -> Panorama | Refusal | bytes:
+        try:
+            return await self._pool.answer(job, max(deadline - monotonic(), 0.0), party)
+        except JobLostError as error:
+            raise self._explained(error, job) from error
 
     def close(self) -> None:
         """End all workers and wait for them."""
         self._pool.close()
 
-    def _explained(self, error: JobLostError) -> Exception:
+    def _explained(self, error: JobLostError, job: Upload | Drawing) -> Exception:
+        if isinstance(job, Drawing) and error.reason in ("poisoned", "stalled", "fault"):
+            return DrawingFailedError(error.reason)
         match error.reason:
             case "poisoned":
                 return InvalidPanoramaError(

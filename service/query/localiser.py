@@ -5,12 +5,15 @@ from __future__ import annotations
 import asyncio
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from time import monotonic
 from typing import TypeVar
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import heading_to_degrees
+from lalaloc_core.draw.answer import PHOTOGRAPH_SIZE, Picture, draw_answer
+from lalaloc_core.draw.found import drawn_answer
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.covariance import spread_of
@@ -37,7 +40,33 @@ from service.threads import BoundedReads, Threads
 # Kept free of LPO before the request's deadline, to rank and send the answer.
 _ANSWER_S = 0.25
 
+# Where a heading came from, as pictures say it.
+_SOURCES = {"given": "given", "panorama": "by the compass", "searched": "searched for"}
+
 T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class _Answered:
+    """An answer, and what it was made of."""
+
+    answer: LocaliseAnswer
+    found: Localisation
+    grid: LatentGrid
+
+
+@dataclass(frozen=True, kw_only=True)
+class AskedPicture:
+    """What is to be drawn of an answer.
+
+    Attributes:
+        pixels: whether it is wanted as PNG; else as SVG.
+        rooms: the rooms of the plan as `lalaloc_core.draw.plan.draw_rooms` draws them.
+    """
+
+    picture: Picture
+    pixels: bool
+    rooms: str
 
 
 class Localiser:
@@ -93,11 +122,52 @@ class Localiser:
             OverloadedError: too many queries are computed or wait for it, or grids to be computed on demand.
         """
         with self._queries.hold(party):
-            return await self._answer(record, form, content, begin, clock, party)
+            return (await self._answer(record, form, content, begin, clock, party)).answer
+
+    async def picture(
+        self,
+        record: PlanRecord,
+        form: LocaliseForm,
+        content: bytes,
+        begin: float,
+        clock: StageClock,
+        party: str,
+        asked: AskedPicture,
+    ) -> tuple[LocaliseAnswer, bytes]:
+        """As `answer`, with a picture of it: encoded, PNG or SVG.
+
+        Raises:
+            DrawingFailedError: the picture could not be made.
+            LaLaLocError: see `answer`.
+        """
+        with self._queries.hold(party):
+            answered = await self._answer(record, form, content, begin, clock, party)
+            with clock.stage("draw"):
+                picture = await self._draw(record, answered, content, begin, party, asked)
+            self._telemetry.stage_seconds.labels("draw").observe(clock.timings_ms["draw"] / 1e3)
+            return answered.answer, picture
+
+    async def _draw(
+        self, record: PlanRecord, answered: _Answered, content: bytes, begin: float, party: str, asked: AskedPicture
+    ) -> bytes:
+        deadline = begin + self._settings.request_deadline_s
+        photograph = None
+        if asked.picture != "plan":
+            # Once more, as the encoder takes fewer pixels than one likes to look at.
+            width, height = PHOTOGRAPH_SIZE
+            photograph = (await self._decoder.decode(content, deadline, party, size=(height, width))).pixels
+
+        def draw() -> str:
+            model, source = self._bundle.manifest.confidence, _SOURCES[answered.answer.heading_source]
+            drawn = drawn_answer(record.plan, answered.grid, answered.found, model, source)
+            return draw_answer(drawn, photograph, asked.picture, rooms=asked.rooms)
+
+        svg = await self._compute(party, draw, deadline)
+        return await self._decoder.rasterise(svg, deadline, party) if asked.pixels else svg.encode()
 
     async def _answer(
         self, record: PlanRecord, form: LocaliseForm, content: bytes, begin: float, clock: StageClock, party: str
-    ) -> LocaliseAnswer:
+    ) -> _Answered:
         deadline = begin + self._settings.request_deadline_s
         height, hints = stated_height(form, record), stated_hints(form, record.plan)
         # The picture first: a bad one is refused without waiting for the plan.
@@ -121,8 +191,8 @@ class Localiser:
         warnings += hint_warnings(hints, found, record.plan)
         answer = self._compose(record, known, found, warnings, timings_ms)
         if form.include == "posterior":
-            return answer.model_copy(update={"posterior": posterior_answer(grid, found.posterior)})
-        return answer
+            answer = answer.model_copy(update={"posterior": posterior_answer(grid, found.posterior)})
+        return _Answered(answer, found, grid)
 
     def close(self) -> None:
         """Finish what is being computed."""

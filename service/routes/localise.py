@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from functools import partial
 from time import monotonic
-from typing import Any
+from typing import Annotated, Any
 
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Query, Request, Response
 
+from lalaloc_core.draw.answer import Picture
 from lalaloc_core.errors import InvalidHintError, InvalidPanoramaError, InvalidPoseError
 from lalaloc_core.localise.pipeline import StageClock
 from service.errors import (
@@ -28,13 +29,21 @@ from service.errors import (
     UploadTooLargeError,
 )
 from service.http import IdempotentRequest
+from service.http.accept import preferred
+from service.http.idempotent_request import HEADER as IDEMPOTENCY_HEADER
 from service.http.problems import problem_responses
 from service.http.uploads import JSON, MULTIPART, UploadLimits, faults_of, media_type, read_parts, validate_fields
+from service.query.localiser import AskedPicture
 from service.routes.dependencies import IDEMPOTENCY_KEY, Party, Running, Tenant, plan_for_query
 from service.schemas import LocaliseAnswer, LocaliseForm
 from service.telemetry import note
 
 router = APIRouter(tags=["localisation"])
+
+_PNG, _SVG = "image/png", "image/svg+xml"
+# The photograph in an SVG is a part of it; nothing else may load, and nothing run.
+_POLICY = {"Content-Security-Policy": "default-src 'none'; img-src data:; frame-ancestors 'none'"}
+_VARY = {"Vary": "Accept"}
 
 
 def _body_schema() -> dict[str, Any]:
@@ -55,7 +64,15 @@ def _body_schema() -> dict[str, Any]:
     summary="Localise a panorama",
     response_model=LocaliseAnswer,
     openapi_extra=_body_schema(),
-    responses=problem_responses(
+    responses={
+        200: {
+            "content": {
+                _PNG: {"schema": {"type": "string", "format": "binary"}},
+                _SVG: {"schema": {"type": "string"}},
+            }
+        }
+    }
+    | problem_responses(
         InvalidHintError,
         InvalidPanoramaError,
         InvalidPoseError,
@@ -76,13 +93,30 @@ def _body_schema() -> dict[str, Any]:
         IdempotencyInProgressError,
     ),
 )
-async def localise(request: Request, runtime: Running, tenant: Tenant, party: Party) -> Response:
+async def localise(
+    request: Request,
+    runtime: Running,
+    tenant: Tenant,
+    party: Party,
+    picture: Annotated[
+        Picture | None,
+        Query(
+            description="What a picture shows: the `plan` with the posterior as a heat map, the answer, its covariance "
+            "ellipse and its rivals; the `photograph` with the found layout drawn in; or `both`, as when it is left "
+            "out. Needs `Accept: image/png` or `Accept: image/svg+xml`."
+        ),
+    ] = None,
+) -> Response:
     """Find where in a stored floor plan a panorama was taken.
+
+    With `Accept: image/png` or `Accept: image/svg+xml` the answer is a picture, 1600 pixels wide.
 
     A plan that is still preparing is waited for. When optimisation (`lpo`) cannot answer in time, the answer is
     the one before it, with `"stage": "vdr"`.
     """
     settings = runtime.settings
+    media = preferred(request, (JSON, _PNG, _SVG))
+    _check_asked(request, media, picture)
     idempotent = IdempotentRequest(runtime.store.idempotency_keys, request, tenant, "POST /localise")
     media_type(request, (MULTIPART,))
     limits = UploadLimits.of(settings, "max_panorama_bytes")
@@ -100,8 +134,25 @@ async def localise(request: Request, runtime: Running, tenant: Tenant, party: Pa
     async def answer() -> Response:
         record = await plan_for_query(tenant, form.floorplan_id, runtime)
         note(request, plan=record.id, revision=record.revision_id)
-        found = await runtime.localiser.answer(record, form, parts.files["panorama"], begin, clock, party)
+        content = parts.files["panorama"]
+        if media == JSON:
+            found = await runtime.localiser.answer(record, form, content, begin, clock, party)
+            note(request, stage=found.stage)
+            return Response(found.model_dump_json(), headers=_VARY, media_type=JSON)
+        rooms = await runtime.drawings.rooms(record)
+        asked = AskedPicture(picture=picture or "both", pixels=media == _PNG, rooms=rooms)
+        found, drawn = await runtime.localiser.picture(record, form, content, begin, clock, party, asked)
         note(request, stage=found.stage)
-        return Response(found.model_dump_json(), media_type=JSON)
+        return Response(drawn, headers=_VARY | _POLICY, media_type=media)
 
     return await idempotent.run_async(parts, answer, runtime.reads)
+
+
+def _check_asked(request: Request, media: str, picture: Picture | None) -> None:
+    """Raises:
+    InvalidRequestError: what is said of a picture and none is wanted, or what is for JSON alone.
+    """
+    if media == JSON and picture is not None:
+        raise InvalidRequestError([("picture", f"needs the header Accept: {_PNG} or Accept: {_SVG}")])
+    if media != JSON and IDEMPOTENCY_HEADER in request.headers:
+        raise InvalidRequestError([(IDEMPOTENCY_HEADER, "is for answers in JSON; pictures are not kept")])

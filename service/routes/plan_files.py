@@ -8,7 +8,7 @@ from fastapi import APIRouter, Query, Request, Response
 from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
-from lalaloc_core.draw import Marker
+from lalaloc_core.draw.plan import Marker
 from lalaloc_core.floorplan import FloorPlan
 from service.errors import InvalidRequestError, StoreUnavailableError, UnknownFloorPlanError
 from service.http.conditional import conditional_answer, content_etag

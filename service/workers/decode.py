@@ -1,7 +1,7 @@
 """The body of a decoding worker process: the only place of the service that opens pictures it was sent.
 
-From the bytes of an upload to a `Panorama`, or to the `Refusal` of what is none; the rest is in
-`service.workers.process`.
+From the bytes of an upload to a `Panorama`, or to the `Refusal` of what is none; and, as that keeps the interpreter
+busy for as long, from drawings to pixels. The rest is in `service.workers.process`.
 """
 
 from __future__ import annotations
@@ -13,9 +13,26 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
 
+from lalaloc_core.draw.canvas import rasterise
 from lalaloc_core.errors import InvalidPanoramaError
 from lalaloc_core.panorama.images import Panorama, PanoramaLimits, open_panorama, warm_up
 from service.workers.process import serve_jobs
+
+
+@dataclass(frozen=True)
+class Upload:
+    """An uploaded picture, and the size that its pixels are wanted in."""
+
+    content: bytes
+    height: int
+    width: int
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A drawing that is wanted as PNG."""
+
+    svg: str
 
 
 @dataclass(frozen=True)
@@ -26,25 +43,30 @@ class Refusal:
 
 
 def run_decoder(connection: Connection, height: int, width: int, limits: PanoramaLimits, memory_bytes: int) -> None:
-    """Answer uploads with panoramas of `height` x `width`.
+    """Answer uploads with panoramas, and drawings with their pixels.
 
     Args:
+        height, width: of the usual panorama, to be warm for it.
         memory_bytes: what decoding may need, besides what the process has before its first picture.
     """
     serve_jobs(connection, lambda: _load(height, width, limits, memory_bytes))
 
 
-def _load(height: int, width: int, limits: PanoramaLimits, memory_bytes: int) -> Callable[[bytes], Panorama | Refusal]:
+def _load(
+    height: int, width: int, limits: PanoramaLimits, memory_bytes: int
+) -> Callable[[Upload | Drawing], Panorama | Refusal | bytes]:
     warm_up(height=height, width=width)
     _limit_memory(memory_bytes)
 
-    def decode(content: bytes) -> Panorama | Refusal:
+    def work(job: Upload | Drawing) -> Panorama | Refusal | bytes:
+        if isinstance(job, Drawing):
+            return rasterise(job.svg)
         try:
-            return open_panorama(content, height=height, width=width, limits=limits)
+            return open_panorama(job.content, height=job.height, width=job.width, limits=limits)
         except InvalidPanoramaError as error:
             return Refusal(str(error))
 
-    return decode
+    return work
 
 
 def _limit_memory(memory_bytes: int) -> None:

@@ -12,11 +12,12 @@ import pytest
 from PIL import Image
 
 from lalaloc_core.conventions import TWO_PI, column_azimuths, wrap_angle
-from lalaloc_core.draw import DrawnAnswer, Marker, Picture, Rival, draw_answer, rasterise
-from lalaloc_core.draw.answer import confidence_words, ellipse_m
+from lalaloc_core.draw import rasterise
+from lalaloc_core.draw.answer import DrawnAnswer, Picture, Rival, confidence_words, draw_answer, ellipse_m
 from lalaloc_core.draw.heat import Cells, HeatMap, distance_map, heat_image, posterior_map
 from lalaloc_core.draw.outline import outline_of
 from lalaloc_core.draw.photograph import Stroke, draw_strokes, wall_line
+from lalaloc_core.draw.plan import Marker
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.sampling import pose_grid

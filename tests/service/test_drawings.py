@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from lalaloc_core.draw import Marker, draw_rooms, plan_svg
+from lalaloc_core.draw.plan import Marker, draw_rooms, plan_svg
 from lalaloc_core.floorplan import FloorPlan
 from service.errors import OverloadedError
 from service.preview import drawings as module

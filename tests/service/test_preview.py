@@ -12,7 +12,7 @@ import trimesh
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from lalaloc_core.draw import Marker, plan_svg
+from lalaloc_core.draw.plan import Marker, plan_svg
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
 from service.preview.mesh import plan_glb
