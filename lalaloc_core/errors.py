@@ -3,6 +3,8 @@
 LaLaLocError
 ├── InvalidInputError            the caller's data is wrong (a 4xx over HTTP, exit code 2 on the command line)
 │   ├── InvalidFloorPlanError    a plan cannot be what it says; names the room
+│   │   └── SeveralLevelsError   a file has several storeys, and none was chosen; names them
+│   ├── MissingExtraError        a format that needs a package which is not installed; names the extra
 │   ├── InvalidPanoramaError     a picture that is not a usable 360° panorama
 │   ├── InvalidPoseError         a position, heading or height outside its limits
 │   ├── InvalidHintError         what is said to be known of a place cannot be; names the hint
@@ -16,8 +18,11 @@ LaLaLocError
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+
+# Of the storeys of a tower, so many are named in a sentence.
+_SHOWN_LEVELS = 12
 
 
 class LaLaLocError(Exception):
@@ -40,6 +45,35 @@ class InvalidFloorPlanError(InvalidInputError):
         self.room = room
         self.reason = reason
         super().__init__(f"room '{room}': {reason}" if room is not None else reason)
+
+
+class SeveralLevelsError(InvalidFloorPlanError):
+    """A file has several storeys where one plan is wanted.
+
+    Attributes:
+        levels: their names, lowest first.
+    """
+
+    def __init__(self, levels: Sequence[str]) -> None:
+        self.levels = tuple(levels)
+        shown = ", ".join(f"'{level}'" for level in self.levels[:_SHOWN_LEVELS])
+        more = f" and {len(self.levels) - _SHOWN_LEVELS} more" if len(self.levels) > _SHOWN_LEVELS else ""
+        super().__init__(f"the file has {len(self.levels)} levels: {shown}{more}; choose one with `level`")
+
+
+class MissingExtraError(InvalidInputError):
+    """A format cannot be read or written here: the package that does is not installed.
+
+    Attributes:
+        what: was to be done.
+        extra: of this project, which brings the package.
+    """
+
+    def __init__(self, what: str, extra: str) -> None:
+        self.what, self.extra = what, extra
+        super().__init__(
+            f"{what} needs the extra `{extra}`, which is not installed here: pip install 'lalaloc[{extra}]'"
+        )
 
 
 class InvalidPanoramaError(InvalidInputError):

@@ -32,6 +32,7 @@ LaLaLocError
     ├── OverloadedError             more requests in flight than allowed
     │   └── ShareExceededError      more of one tenant than allowed while others may come
     ├── DecoderNotReadyError        panoramas cannot be decoded at the moment
+    ├── ConverterNotReadyError      files of plans cannot be read or written at the moment
     ├── DeadlineExceededError       the query could not be computed in time
     └── StoppingError               the service is shutting down
 """
@@ -53,7 +54,9 @@ from lalaloc_core.errors import (
     InvalidPanoramaError,
     InvalidPoseError,
     LaLaLocError,
+    MissingExtraError,
     RunError,
+    SeveralLevelsError,
 )
 
 URN = "urn:lalaloc:problem:"
@@ -329,13 +332,22 @@ class DecoderNotReadyError(ServiceError):
         super().__init__("panoramas cannot be decoded at the moment")
 
 
+class ConverterNotReadyError(ServiceError):
+    """No process that reads and writes files of plans is running, nor will be before the deadline."""
+
+    retry_after_s = 2
+
+    def __init__(self) -> None:
+        super().__init__("files of plans, but for the native format, cannot be read or written at the moment")
+
+
 class DeadlineExceededError(ServiceError):
-    """The query could not be computed within its deadline."""
+    """What was asked for could not be done within its deadline."""
 
     retry_after_s = 1
 
-    def __init__(self, limit_s: float) -> None:
-        super().__init__(f"the query was not answered within {limit_s:g} s")
+    def __init__(self, limit_s: float, what: str = "the query was not answered") -> None:
+        super().__init__(f"{what} within {limit_s:g} s")
 
 
 class StoppingError(ServiceError):
@@ -366,6 +378,8 @@ INTERNAL = ProblemKind(500, "internal", "Internal error", public=False)
 
 PROBLEMS: dict[type[Exception], ProblemKind] = {
     InvalidFloorPlanError: ProblemKind(422, "invalid-floorplan", "Invalid floor plan"),
+    SeveralLevelsError: ProblemKind(422, "several-levels", "Several levels, choose one"),
+    MissingExtraError: ProblemKind(501, "missing-extra", "Format not installed"),
     InvalidPanoramaError: ProblemKind(422, "invalid-panorama", "Invalid panorama"),
     InvalidHintError: ProblemKind(422, "invalid-hint", "Hint that the plan contradicts"),
     InvalidPoseError: ProblemKind(422, "invalid-pose", "Invalid position, heading or height"),
@@ -399,6 +413,7 @@ PROBLEMS: dict[type[Exception], ProblemKind] = {
     OverloadedError: ProblemKind(503, "overloaded", "Overloaded"),
     ShareExceededError: ProblemKind(503, "overloaded", "Overloaded"),
     DecoderNotReadyError: ProblemKind(503, "decoder-not-ready", "Decoder not ready"),
+    ConverterNotReadyError: ProblemKind(503, "converter-not-ready", "Converter not ready"),
     DeadlineExceededError: ProblemKind(504, "deadline-exceeded", "Deadline exceeded"),
     StoppingError: ProblemKind(503, "stopping", "Shutting down"),
     DamagedDataError: INTERNAL,

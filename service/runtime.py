@@ -15,6 +15,7 @@ from lalaloc_core import __version__
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
+from service.conversion import Converter
 from service.grids import GridProvider, Sweeper
 from service.http import Admission, AdmissionLimits
 from service.http.events import HEARTBEAT_S, PlanEvents
@@ -53,6 +54,7 @@ class Runtime:
 
     Attributes:
         uploads: threads that check, prepare and store plans.
+        file_uploads: those for plans whose files a converter reads, which is waited for.
         reads: what queries read of the store.
         drawings: drawings and meshes of plans.
     """
@@ -64,11 +66,13 @@ class Runtime:
     plan_lookup: PlanLookup
     pool: LpoPool
     decoder: Decoder
+    converter: Converter
     localiser: Localiser
     admission: Admission
     access_control: AccessControl
     events: PlanEvents
     uploads: Threads
+    file_uploads: Threads
     reads: BoundedReads
     drawings: Drawings
 
@@ -112,6 +116,9 @@ def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack) 
         BoundedReads(threads=_READ_THREADS, max_pending=settings.pending_limit, wait_s=settings.database_wait_s)
     )
     uploads = kept(Threads("lalaloc-uploads", _UPLOAD_THREADS))
+    # As many as may be read at a time, and after the converter in being closed: what waits for it must be let go first.
+    file_uploads = kept(Threads("lalaloc-files", with_spare(settings.import_workers)))
+    converter = kept(Converter(settings, telemetry))
     localiser = kept(
         Localiser(
             settings=settings,
@@ -138,11 +145,13 @@ def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack) 
         plan_lookup=PlanLookup(store, max_age_s=settings.plan_cache_age_s),
         pool=pool,
         decoder=decoder,
+        converter=converter,
         localiser=localiser,
         admission=admission,
         access_control=access_control,
         events=_plan_events(store, grids, admission, looks, settings),
         uploads=uploads,
+        file_uploads=file_uploads,
         reads=reads,
         drawings=kept(Drawings(limit_bytes=_DRAWINGS_BYTES, max_waiting=_MAX_DRAWN)),
     )

@@ -14,6 +14,7 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.floorplan import PlanLimits
 from lalaloc_core.panorama.images import PanoramaLimits
+from lalaloc_core.plans import ImportLimits
 from service.cores import CoreShares, share_cores, usable_cores
 from service.sharing import with_spare
 
@@ -93,6 +94,22 @@ class Settings(BaseSettings):
     )
     decode_memory_bytes: Annotated[int, Field(ge=64 * 2**20)] = Field(
         default=2**30, description="Memory that decoding one panorama may need; enforced on Linux."
+    )
+    import_workers: Annotated[int, Field(ge=1, le=64)] = Field(
+        default=2,
+        description="Processes that read and write files of plans but those in the native format, one at a time each; "
+        "they start with the first such file. One is always left to other tenants than those that have others at work.",
+    )
+    import_queue: Count = Field(default=16, description="Files of plans that may wait to be read; more get a 503.")
+    import_stall_s: Seconds = Field(
+        default=40.0, description="A process busy with one file of a plan for longer is replaced, and the upload fails."
+    )
+    import_deadline_s: Seconds = Field(
+        default=60.0, description="Longest that reading or writing the file of a plan may take, waiting included."
+    )
+    import_memory_bytes: Annotated[int, Field(ge=256 * 2**20)] = Field(
+        default=2 * 2**30,
+        description="Memory that reading the file of a plan may need, with the libraries for it; enforced on Linux.",
     )
     compass_tolerance_deg: float = Field(
         default=20.0,
@@ -216,7 +233,18 @@ class Settings(BaseSettings):
         default=10, description="Revisions kept per floor plan; the oldest makes room."
     )
     max_floorplans: Count = Field(default=10_000, description="Stored floor plans per tenant.")
-    max_plan_bytes: Count = Field(default=2 * 2**20, description="Upload of a floor plan.")
+    max_plan_bytes: Count = Field(default=40 * 2**20, description="Upload of a floor plan, whatever its format.")
+    max_unpacked_bytes: Count = Field(
+        default=200_000_000,
+        description="What an archive, or a compressed part of a floor plan's file, unpacks to.",
+    )
+    max_entities: Count = Field(
+        default=300_000, description="Lines, polygons, texts and the like in the file of a floor plan, with vertices."
+    )
+    max_plan_pixels: Count = Field(default=40_000_000, description="Pixels of a picture of a floor plan.")
+    max_import_s: Seconds = Field(
+        default=30.0, description="Longest that reading the file of a floor plan may take, once it is begun."
+    )
     max_rooms: Count = Field(default=500, description="Rooms per floor plan.")
     max_vertices: Annotated[int, Field(ge=3)] = Field(default=200, description="Vertices per room.")
     max_plan_vertices: Annotated[int, Field(ge=3)] = Field(
@@ -342,6 +370,18 @@ class Settings(BaseSettings):
             max_area_m2=self.max_area_m2,
             max_bounds_area_m2=self.max_bounds_area_m2,
             max_openings=self.max_openings,
+        )
+
+    @property
+    def import_limits(self) -> ImportLimits:
+        """Limits of the files of floor plans in the terms of the core."""
+        return ImportLimits(
+            max_plan_bytes=self.max_plan_bytes,
+            max_unpacked_bytes=self.max_unpacked_bytes,
+            max_entities=self.max_entities,
+            max_plan_pixels=self.max_plan_pixels,
+            max_import_s=self.max_import_s,
+            plan=self.plan_limits,
         )
 
     @property

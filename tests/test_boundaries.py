@@ -63,7 +63,7 @@ SERVICE_LAYERS = (
     # `workers` is what runs in worker processes: it loads nothing of what watches over them.
     "cores settings errors schemas threads bounded_cache telemetry workers",
     "pools storage",
-    "grids preview security",
+    "grids preview security conversion",
     "http",
     "query http.middleware",
     "runtime",

@@ -12,8 +12,16 @@ exports/   the way back: plans in the formats of other tools
 Begin with `importing.py`, which chooses among the formats. What a plan is stands in `lalaloc_core.floorplan`.
 """
 
-from lalaloc_core.plans.exporting import EXPORT_FORMATS, ExportFormat, export_plan
-from lalaloc_core.plans.importing import FORMATS, detect_format, import_plan, import_plans
+from lalaloc_core.plans.exporting import EXPORT_FORMATS, MEDIA_TYPES, ExportFormat, export_plan
+from lalaloc_core.plans.importing import (
+    FORMATS,
+    detect_format,
+    import_if_native,
+    import_plan,
+    import_plans,
+    is_json,
+    media_type_of,
+)
 from lalaloc_core.plans.model.assemble import ImportedPlan
 from lalaloc_core.plans.model.limits import DEFAULT_IMPORT_LIMITS, ImportLimits
 from lalaloc_core.plans.model.options import ImportOptions, KnownDistance
@@ -24,6 +32,7 @@ __all__ = [
     "DEFAULT_IMPORT_LIMITS",
     "EXPORT_FORMATS",
     "FORMATS",
+    "MEDIA_TYPES",
     "Anchor",
     "ExportFormat",
     "ImportLimits",
@@ -35,6 +44,9 @@ __all__ = [
     "Level",
     "detect_format",
     "export_plan",
+    "import_if_native",
     "import_plan",
     "import_plans",
+    "is_json",
+    "media_type_of",
 ]

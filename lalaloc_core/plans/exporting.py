@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.plans.importing import missing_extra
 from lalaloc_core.plans.model.sketch import Anchor
 
 ExportFormat = Literal["native", "geojson", "imdf", "dxf", "svg"]
@@ -30,8 +31,15 @@ def export_plan(plan: FloorPlan, format: str, anchor: Anchor | None = None) -> b
 
     Raises:
         InvalidFloorPlanError: an unknown format, or no anchor where one is needed.
+        MissingExtraError: the package that writes the format is not installed.
     """
-    document = plan.to_dict()
+    try:
+        return _export(plan.to_dict(), format, anchor)
+    except ModuleNotFoundError as error:
+        raise missing_extra(error, f"writing {format}") from error
+
+
+def _export(document: dict[str, Any], format: str, anchor: Anchor | None) -> bytes:
     if format == "native":
         return json.dumps(document, ensure_ascii=False, indent=1).encode()
     if format in ("geojson", "imdf"):

@@ -2,18 +2,42 @@
 
 from __future__ import annotations
 
+import codecs
 import re
 import time
 from collections.abc import Callable
 from dataclasses import fields, replace
+from typing import Any
 
-from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.errors import InvalidFloorPlanError, MissingExtraError, SeveralLevelsError
 from lalaloc_core.floorplan.json_text import read_json
 from lalaloc_core.plans.model.assemble import ImportedPlan
 from lalaloc_core.plans.model.limits import DEFAULT_IMPORT_LIMITS, Budget, ImportLimits
 from lalaloc_core.plans.model.options import DEFAULT_OPTIONS, ImportOptions
 
 FORMATS = ("native", "geojson", "archive", "svg", "dxf", "ifc", "pdf", "picture")
+# How a refusal speaks of them.
+_SPOKEN = {
+    "native": "plan in the native format",
+    "geojson": "GeoJSON file",
+    "archive": "zip archive",
+    "svg": "SVG drawing",
+    "dxf": "DXF drawing",
+    "ifc": "IFC model",
+    "pdf": "PDF document",
+    "picture": "picture",
+}
+_MEDIA_TYPES = {
+    "native": "application/json",
+    "geojson": "application/geo+json",
+    "svg": "image/svg+xml",
+    "dxf": "image/vnd.dxf",
+    "ifc": "application/x-step",
+    "pdf": "application/pdf",
+}
+# Which extra brings a package; the others come with `plans`.
+_EXTRAS = {"ifcopenshell": "ifc"}
+_PNG = b"\x89PNG\r\n\x1a\n"
 _GEOJSON_TYPES = {
     "FeatureCollection", "Feature", "Polygon", "MultiPolygon", "LineString", "MultiLineString", "Point", "MultiPoint",
     "GeometryCollection",
@@ -53,29 +77,46 @@ def import_plans(
 
     Raises:
         InvalidFloorPlanError: what is wrong with the file, and what to do.
+        MissingExtraError: the package that reads its format is not installed.
     """
-    if len(content) > limits.max_bytes:
+    if len(content) > limits.max_plan_bytes:
         raise InvalidFloorPlanError(
-            f"the file has {len(content)} bytes, at most {limits.max_bytes} are read (max_bytes)"
+            f"the file has {len(content)} bytes, at most {limits.max_plan_bytes} are read (max_plan_bytes)"
         )
     budget = Budget(limits, clock)
     try:
-        format = detect_format(content, limits)
-        plans = _import(format, content, options, budget)
+        format, document = _recognise(content, limits)
+        plans = _import(format, content, document, options, budget)
     except RecursionError as error:
         raise InvalidFloorPlanError("the file is nested too deep to be read") from error
     except MemoryError as error:
         raise InvalidFloorPlanError("the file takes more memory than there is for one") from error
-    unheard = [f"'{name}' says nothing about a {format} file and was not used" for name in _unheard(format, options)]
-    return tuple(
-        replace(plan, report=replace(plan.report, warnings=(*unheard, *plan.report.warnings))) for plan in plans
-    )
+    return tuple(_with_unheard(plan, format, options) for plan in plans)
 
 
-def _unheard(format: str, options: ImportOptions) -> list[str]:
-    """Options that were given and that the importer of a format does not look at."""
+def import_if_native(
+    content: bytes, options: ImportOptions = DEFAULT_OPTIONS, limits: ImportLimits = DEFAULT_IMPORT_LIMITS
+) -> ImportedPlan | None:
+    """The plan in a file of JSON; None where that is of another format than the native one.
+
+    For whoever leaves the other formats to another process: nothing is parsed twice, and no library loaded.
+
+    Raises:
+        InvalidFloorPlanError: no JSON, or no plan.
+    """
+    format, document = _recognise(content, limits)
+    if format != "native":
+        return None
+    (plan,) = _import(format, content, document, options, Budget(limits))
+    return _with_unheard(plan, format, options)
+
+
+def _with_unheard(plan: ImportedPlan, format: str, options: ImportOptions) -> ImportedPlan:
+    """Tell of options that were given and that the importer of a format does not look at."""
     given = [field.name for field in fields(options) if getattr(options, field.name) != field.default]
-    return [name for name in given if name not in _ALWAYS_HEARD and name not in _HEARD[format]]
+    unheard = [name for name in given if name not in _ALWAYS_HEARD and name not in _HEARD[format]]
+    told = [f"'{name}' says nothing about a {format} file and was not used" for name in unheard]
+    return replace(plan, report=replace(plan.report, warnings=(*told, *plan.report.warnings)))
 
 
 def import_plan(
@@ -87,12 +128,12 @@ def import_plan(
     """The one plan of a file.
 
     Raises:
-        InvalidFloorPlanError: as `import_plans`, and where a file has several storeys and the options choose none.
+        InvalidFloorPlanError, MissingExtraError: as `import_plans`.
+        SeveralLevelsError: the file has several storeys and the options choose none.
     """
     plans = import_plans(content, options, limits, clock)
     if len(plans) > 1:
-        names = ", ".join(f"'{plan.level.name}'" for plan in plans[:12] if plan.level is not None)
-        raise InvalidFloorPlanError(f"the file has {len(plans)} levels: {names}; choose one with `level`")
+        raise SeveralLevelsError([plan.level.name for plan in plans if plan.level is not None])
     return next(iter(plans))
 
 
@@ -102,11 +143,23 @@ def detect_format(content: bytes, limits: ImportLimits = DEFAULT_IMPORT_LIMITS) 
     Raises:
         InvalidFloorPlanError: none of them; names what it seems to be instead.
     """
+    return _recognise(content, limits)[0]
+
+
+def _recognise(content: bytes, limits: ImportLimits) -> tuple[str, Any]:
+    """The format of a file, and what it says if that is JSON, which is parsed once."""
+    if is_json(content):
+        document = read_json(content, limits.max_depth)
+        return _json_format(document), document
+    return _format_of(content), None
+
+
+def _format_of(content: bytes) -> str:
     head = content[:1024]
-    start = head.removeprefix(b"\xef\xbb\xbf").lstrip()
+    start = head.removeprefix(codecs.BOM_UTF8).lstrip()
     if not start:
         raise InvalidFloorPlanError("the file is empty")
-    if head.startswith((b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff")):
+    if head.startswith((_PNG, b"\xff\xd8\xff")):
         return "picture"
     if b"%PDF-" in head:
         return "pdf"
@@ -116,8 +169,6 @@ def detect_format(content: bytes, limits: ImportLimits = DEFAULT_IMPORT_LIMITS) 
         return "ifc"
     if head.startswith(b"AutoCAD Binary DXF") or re.match(rb"(?:999\r?\n.*\r?\n\s*)*0\r?\n\s*SECTION", start):
         return "dxf"
-    if start[:1] in (b"{", b"[") and not start.startswith(b"{\\rtf"):
-        return _json_format(content, limits)
     if _XML_START.match(start):
         if b"<svg" in content[:65536] or b":svg" in content[:65536]:
             return "svg"
@@ -128,17 +179,51 @@ def detect_format(content: bytes, limits: ImportLimits = DEFAULT_IMPORT_LIMITS) 
     raise InvalidFloorPlanError(f"the file is of no known format; known are {_known()}")
 
 
-def _import(format: str, content: bytes, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
+def is_json(content: bytes) -> bool:
+    """Whether a file can only be JSON, by how it begins."""
+    start = content[:1024].removeprefix(codecs.BOM_UTF8).lstrip()
+    wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE, codecs.BOM_UTF32_BE))
+    return wide or (start[:1] in (b"{", b"[") and not start.startswith(b"{\\rtf"))
+
+
+def media_type_of(content: bytes, format: str) -> str:
+    """The media type of a file that was recognised, as the report of its import tells, as a format."""
+    if content.startswith(b"PK\x03\x04"):
+        return "application/zip"
+    if format == "picture":
+        return "image/png" if content.startswith(_PNG) else "image/jpeg"
+    return _MEDIA_TYPES[format]
+
+
+def missing_extra(error: ModuleNotFoundError, what: str) -> MissingExtraError | ModuleNotFoundError:
+    """What to raise for a package that is not installed; the error itself when the module is one of ours."""
+    package = (error.name or "").partition(".")[0]
+    if package in ("", "lalaloc_core"):
+        return error
+    return MissingExtraError(what, _EXTRAS.get(package, "plans"))
+
+
+def _import(
+    format: str, content: bytes, document: Any, options: ImportOptions, budget: Budget
+) -> tuple[ImportedPlan, ...]:
     """Importers are loaded when they are needed: each brings a library of its own."""
-    limits = budget.limits
+    try:
+        return _import_with(format, content, document, options, budget)
+    except ModuleNotFoundError as error:
+        raise missing_extra(error, f"reading a {_SPOKEN[format]}") from error
+
+
+def _import_with(
+    format: str, content: bytes, document: Any, options: ImportOptions, budget: Budget
+) -> tuple[ImportedPlan, ...]:
     if format == "native":
         from lalaloc_core.plans.formats.native import import_native
 
-        return import_native(read_json(content, limits.max_depth), options, budget)
+        return import_native(document, options, budget)
     if format == "geojson":
         from lalaloc_core.plans.formats.geojson import import_geojson
 
-        return import_geojson(read_json(content, limits.max_depth), options, budget)
+        return import_geojson(document, options, budget)
     if format == "archive":
         return _import_archive(content, options, budget)
     if format == "svg":
@@ -177,13 +262,15 @@ def _import_archive(content: bytes, options: ImportOptions, budget: Budget) -> t
     return import_imdf(files, options, budget)
 
 
-def _json_format(content: bytes, limits: ImportLimits) -> str:
-    document = read_json(content, limits.max_depth)
+def _json_format(document: Any) -> str:
     if isinstance(document, dict) and document.get("type") in _GEOJSON_TYPES and "rooms" not in document:
         return "geojson"
     if isinstance(document, dict):
         return "native"
-    raise InvalidFloorPlanError("the JSON is a list; a plan is an object with 'rooms', GeoJSON one with 'type'")
+    what = "a list" if isinstance(document, list) else "a single value"
+    raise InvalidFloorPlanError(
+        f"the JSON is {what}, it must be an object: a plan with 'rooms', or GeoJSON with 'type'"
+    )
 
 
 def _known() -> str:

@@ -115,8 +115,10 @@ class AdmissionLimits:
             queries=settings.query_limit,
             reads=settings.max_reads,
             streams=settings.max_streams,
-            # An upload, its query, and a slow reader's time to take the answer.
-            deadline_s=settings.upload_deadline_s + 2.0 * settings.request_deadline_s,
+            # An upload, its query or its conversion, and a slow reader's time to take the answer.
+            deadline_s=settings.upload_deadline_s
+            + max(settings.request_deadline_s, settings.import_deadline_s)
+            + settings.request_deadline_s,
         )
 
 

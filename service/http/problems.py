@@ -10,7 +10,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 
-from lalaloc_core.errors import InvalidFloorPlanError, LaLaLocError
+from lalaloc_core.errors import InvalidFloorPlanError, LaLaLocError, SeveralLevelsError
 from service.errors import (
     HTTP_PROBLEMS,
     INTERNAL,
@@ -84,6 +84,7 @@ def problem_answer(request: Request, error: Exception) -> JSONResponse:
         str(error) if kind.public else _HIDDEN,
         headers=headers,
         room=error.room if isinstance(error, InvalidFloorPlanError) else None,
+        levels=list(error.levels) if isinstance(error, SeveralLevelsError) else None,
         faults=error.faults if isinstance(error, InvalidRequestError) else None,
     )
 
@@ -116,6 +117,7 @@ def _answer(
     *,
     headers: dict[str, str] | None = None,
     room: str | None = None,
+    levels: list[str] | None = None,
     faults: list[tuple[str, str]] | None = None,
 ) -> JSONResponse:
     if kind is not INTERNAL:
@@ -127,6 +129,7 @@ def _answer(
         detail=detail,
         request_id=request_id_of(request.scope),
         room=room,
+        levels=levels,
         errors=None if faults is None else [Fault(field=field, message=message) for field, message in faults],
     )
     return _ProblemResponse(problem.model_dump(exclude_none=True), status_code=kind.status, headers=headers)

@@ -2,35 +2,29 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+import json
+from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response, status
 
-from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.file_kinds import kind_of
 from lalaloc_core.floorplan import FloorPlan
+from service.conversion import understand
 from service.errors import (
     IdempotencyInProgressError,
     IdempotencyKeyReusedError,
     InvalidRequestError,
-    MalformedRequestError,
-    PlanTooLargeError,
     RevisionMismatchError,
-    StoreFullError,
     StoreUnavailableError,
     TooManyFloorPlansError,
     UnknownFloorPlanError,
     UnknownRevisionError,
-    UnsupportedMediaError,
-    UploadTimeoutError,
-    UploadTooLargeError,
 )
 from service.grids import GridState
 from service.http import IdempotentRequest
 from service.http.conditional import conditional_answer, expected_revision
 from service.http.cursors import cursor_text, parse_cursor
 from service.http.problems import problem_responses
-from service.http.uploads import JSON, MULTIPART, Parts, UploadLimits, media_type, read_body, read_parts
+from service.http.uploads import JSON
 from service.routes.dependencies import (
     IDEMPOTENCY_KEY,
     IF_NONE_MATCH,
@@ -45,46 +39,15 @@ from service.routes.dependencies import (
     stored_plan,
 )
 from service.routes.plan_answers import list_entries, plan_representation, plan_state
+from service.routes.plan_uploads import REFUSED_UPLOADS, UPLOAD_BODY, Upload, read_upload
 from service.runtime import Runtime
-from service.schemas import FloorPlanAnswer, FloorPlanDocument, FloorPlanList
-from service.storage.records import ComputedGrid, Cursor, PlanRecord
+from service.schemas import FloorPlanAnswer, FloorPlanList
+from service.storage.records import ComputedGrid, Cursor, Original, PlanRecord
 from service.telemetry import note
 
 router = APIRouter(prefix="/floorplans", tags=["floor plans"])
 
-_FILE = "file"
 _MAX_LISTED = 500
-_DOCUMENT: dict[str, Any] = {"$ref": "#/components/schemas/FloorPlanDocument"}
-_BODY = {
-    "required": True,
-    "content": {
-        JSON: {"schema": _DOCUMENT},
-        MULTIPART: {
-            "schema": {
-                "type": "object",
-                "required": [_FILE],
-                "properties": {
-                    _FILE: {
-                        "type": "string",
-                        "format": "binary",
-                        "description": f"The same JSON ({FloorPlanDocument.__name__}) as a file.",
-                    }
-                },
-            },
-        },
-    },
-}
-_REFUSED_UPLOADS = (
-    InvalidFloorPlanError,
-    InvalidRequestError,
-    PlanTooLargeError,
-    MalformedRequestError,
-    UnsupportedMediaError,
-    UploadTooLargeError,
-    UploadTimeoutError,
-    StoreUnavailableError,
-    StoreFullError,
-)
 
 
 @router.post(
@@ -92,24 +55,26 @@ _REFUSED_UPLOADS = (
     status_code=status.HTTP_201_CREATED,
     summary="Upload a floor plan",
     response_model=FloorPlanAnswer,
-    openapi_extra={"requestBody": _BODY, "parameters": [IDEMPOTENCY_KEY]},
+    openapi_extra={"requestBody": UPLOAD_BODY, "parameters": [IDEMPOTENCY_KEY]},
     responses=problem_responses(
-        *_REFUSED_UPLOADS, TooManyFloorPlansError, IdempotencyKeyReusedError, IdempotencyInProgressError
+        *REFUSED_UPLOADS, TooManyFloorPlansError, IdempotencyKeyReusedError, IdempotencyInProgressError
     ),
 )
 async def create_floorplan(request: Request, runtime: Running, tenant: Tenant, party: Party) -> Response:
-    """Store a floor plan.
+    """Store a floor plan, from whatever file there is of it.
 
-    A small one is `ready` with the answer; the latent grid of a larger one is computed in the background (see `status`
-    and `progress`, and `/events`).
+    Its format is found out by its content: JSON in the native format, GeoJSON, an IMDF archive, SVG, DXF, IFC, PDF, or
+    a picture. What was made of it stands in `import_report`; a plan that was read from a picture is a draft, to be
+    looked at before it is used. A small plan is `ready` with the answer; the latent grid of a larger one is computed in
+    the background (see `status` and `progress`, and `/events`).
     """
     idempotent = IdempotentRequest(runtime.store.idempotency_keys, request, tenant, "POST /floorplans")
-    content = await _uploaded_plan(request, runtime)
+    uploaded = await read_upload(request, runtime)
 
     def store(token: str) -> Response:
-        plan, grid = _prepared(content, runtime)
+        plan, original, grid = _prepared(uploaded, runtime, party)
         limit = runtime.settings.max_floorplans
-        record = runtime.store.plans.add(tenant, token, plan, original=content, limit=limit, grid=grid)
+        record = runtime.store.plans.add(tenant, token, plan, original=original, limit=limit, grid=grid)
         if record.plan is plan:
             runtime.grids.on_plan_stored(record, grid)
             # Not asked for: what is stored is answered for, whatever becomes of the database.
@@ -121,7 +86,7 @@ async def create_floorplan(request: Request, runtime: Running, tenant: Tenant, p
         return _written(request, record, state, runtime, status.HTTP_201_CREATED)
 
     # One call from the claim to the answer: a client that hangs up meanwhile does not leave it half-way.
-    return await runtime.uploads.run(party, idempotent.run, Parts({}, {_FILE: content}), store)
+    return await uploaded.threads(runtime).run(party, idempotent.run, uploaded.parts, store)
 
 
 @router.get("", summary="List floor plans", responses=problem_responses(InvalidRequestError, StoreUnavailableError))
@@ -177,32 +142,32 @@ def get_floorplan(
     "/{floorplan_id}",
     summary="Replace a floor plan",
     response_model=FloorPlanAnswer,
-    openapi_extra={"requestBody": _BODY, "parameters": UNLESS_CHANGED},
-    responses=problem_responses(*_REFUSED_UPLOADS, UnknownFloorPlanError, RevisionMismatchError),
+    openapi_extra={"requestBody": UPLOAD_BODY, "parameters": UNLESS_CHANGED},
+    responses=problem_responses(*REFUSED_UPLOADS, UnknownFloorPlanError, RevisionMismatchError),
 )
 async def replace_floorplan(
     floorplan_id: str, request: Request, runtime: Running, tenant: Tenant, party: Party
 ) -> Response:
-    """Store a new revision of a plan that there is.
+    """Store a new revision of a plan that there is, from a file of any format that `POST /floorplans` takes.
 
     Queries in work are answered by the revision that they began with, and say which (`floorplan_revision`).
     """
     current = await runtime.uploads.run(party, plan_summary, tenant, floorplan_id, runtime.store.plans)
     expected = expected_revision(request, current.id, current.revision_id)
-    content = await _uploaded_plan(request, runtime)
+    uploaded = await read_upload(request, runtime)
 
     def store() -> Response:
-        plan, grid = _prepared(content, runtime)
+        plan, original, grid = _prepared(uploaded, runtime, party)
         keep = runtime.settings.max_revisions
         record = runtime.store.plans.add_revision(
-            tenant, current.id, plan, original=content, keep=keep, expected=expected, grid=grid
+            tenant, current.id, plan, original=original, keep=keep, expected=expected, grid=grid
         )
         # First, so that it is not in the way of the new grid; queries in work may still need the one in memory.
         runtime.grids.cancel(current.revision_id)
         runtime.grids.on_plan_stored(record, grid)
         return _written(request, record, GridState.after_upload(grid), runtime, status.HTTP_200_OK)
 
-    return await runtime.uploads.run(party, store)
+    return await uploaded.threads(runtime).run(party, store)
 
 
 @router.delete(
@@ -227,25 +192,12 @@ def delete_floorplan(floorplan_id: str, request: Request, runtime: Running, tena
     runtime.grids.forget({current.revision_id})
 
 
-async def _uploaded_plan(request: Request, runtime: Runtime) -> bytes:
-    limits = UploadLimits.of(runtime.settings, "max_plan_bytes")
-    if media_type(request, (JSON, MULTIPART)) == JSON:
-        content = await read_body(request, limits)
-    else:
-        content = (await read_parts(request, limits, files={_FILE}, fields=set())).files[_FILE]
-    if not content.strip():
-        raise InvalidFloorPlanError("the body is empty, a floor plan in JSON is needed")
-    kind = kind_of(content)
-    if kind is not None:
-        raise InvalidFloorPlanError(f"this is {kind}, a floor plan in the JSON that /docs shows is needed")
-    return content
-
-
-def _prepared(content: bytes, runtime: Runtime) -> tuple[FloorPlan, ComputedGrid | None]:
-    """An uploaded plan, and its grid if that is computed at once."""
-    plan = FloorPlan.from_json(content, runtime.settings.plan_limits)
-    runtime.grids.check_size(plan)
-    return plan, runtime.grids.prepare(plan)
+def _prepared(uploaded: Upload, runtime: Runtime, party: str) -> tuple[FloorPlan, Original, ComputedGrid | None]:
+    """The plan in an uploaded file, the file as it is stored, and the plan's grid if that is computed at once."""
+    file = understand(uploaded.content, uploaded.options, runtime.converter, runtime.settings, party)
+    runtime.grids.check_size(file.plan)
+    original = Original(uploaded.content, file.media_type, json.dumps(file.report))
+    return file.plan, original, runtime.grids.prepare(file.plan)
 
 
 def _written(request: Request, record: PlanRecord, state: GridState, runtime: Runtime, code: int) -> Response:

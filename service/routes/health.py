@@ -43,6 +43,7 @@ async def readyz(runtime: Annotated[Runtime, Depends(runtime_of)], response: Res
         model=runtime.localiser.model,
         lpo_pool=_pool(runtime.pool.state),
         decode_pool=_pool(runtime.decoder.state),
+        import_pool=_pool(runtime.converter.state),
         plans_preparing=runtime.grids.preparing,
     )
 

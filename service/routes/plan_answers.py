@@ -5,7 +5,7 @@ from __future__ import annotations
 from lalaloc_core.sampling import grid_size
 from service.grids import GridProvider, GridState
 from service.http.conditional import plan_etag
-from service.schemas import BoundsAnswer, FloorPlanAnswer, FloorPlanSummary, GridAnswer, RoomAnswer
+from service.schemas import BoundsAnswer, FloorPlanAnswer, FloorPlanSummary, GridAnswer, ImportReport, RoomAnswer
 from service.storage.records import PlanRecord, PlanSummary
 
 
@@ -47,6 +47,7 @@ def list_entries(summaries: list[PlanSummary], grids: GridProvider) -> list[Floo
 
 def _answer(record: PlanRecord, state: GridState, step_m: float, *, superseded: bool) -> FloorPlanAnswer:
     plan = record.plan
+    report = None if record.report is None else ImportReport.model_validate_json(record.report)
     x_min, y_min, x_max, y_max = plan.bounds_m
     return FloorPlanAnswer(
         id=record.id,
@@ -71,7 +72,9 @@ def _answer(record: PlanRecord, state: GridState, step_m: float, *, superseded: 
         bounds=BoundsAnswer(x_min_m=x_min, y_min_m=y_min, x_max_m=x_max, y_max_m=y_max),
         camera_height_m=plan.camera_height_m,
         grid=GridAnswer(step_m=step_m, poses=grid_size(plan, step_m) if state.poses is None else state.poses),
-        warnings=list(plan.warnings),
+        # Those of the import first: what it checks, and what it had to leave out.
+        warnings=list(dict.fromkeys([*(() if report is None else report.warnings), *plan.warnings])),
+        import_report=report,
         plan=plan.to_dict(),
         created_at=record.created_at,
         updated_at=record.updated_at,

@@ -33,19 +33,27 @@ _CONDITIONAL = {"parameters": [IF_NONE_MATCH]}
     response_class=Response,
     openapi_extra=_CONDITIONAL,
     responses={
-        200: {"content": {JSON: {"schema": {"$ref": "#/components/schemas/FloorPlanDocument"}}}},
+        200: {
+            "content": {
+                JSON: {"schema": {"$ref": "#/components/schemas/FloorPlanDocument"}},
+                "*/*": {"schema": {"type": "string", "format": "binary"}},
+            }
+        },
         **NOT_MODIFIED,
         **_PROBLEMS,
     },
 )
 def get_original(floorplan_id: str, request: Request, runtime: Running, tenant: Tenant) -> Response:
-    """The bytes that were uploaded, unchanged; of the current revision."""
+    """The bytes that were uploaded, unchanged, with the media type that their content has; of the current revision."""
     current = plan_summary(tenant, floorplan_id, runtime.store.plans)
     note(request, plan=current.id, revision=current.revision_id)
-    content = runtime.store.plans.original(tenant, current.id)
-    if content is None:
+    original = runtime.store.plans.original(tenant, current.id)
+    if original is None:
         raise UnknownFloorPlanError(floorplan_id)
-    return conditional_answer(request, content, JSON, content_etag(content))
+    # A stranger's drawing may hold scripts: it is a file to keep, and no page of this service.
+    kept = {"Content-Disposition": "attachment"} if original.media_type != JSON else None
+    etag = content_etag(original.content)
+    return conditional_answer(request, original.content, original.media_type, etag, kept)
 
 
 @router.get(

@@ -2,6 +2,7 @@
 
 fields           the base of all answers, and the types of their numbers: how far each is rounded
 native_plan      a floor plan in the native format
+plan_import      what may be said of the file of a plan, and what is told of reading it
 stored_plans     what is told of stored floor plans
 localise_query   what a query says beside the panorama
 hint_fields      what it says of where the camera stood
@@ -35,6 +36,7 @@ from service.schemas.native_plan import (
     RoomType,
     Segment,
 )
+from service.schemas.plan_import import ImportForm, ImportReport, LayerAnswer, LevelAnswer
 from service.schemas.problem_details import Fault, Problem
 from service.schemas.service_state import HealthAnswer, LimitsAnswer, PoolAnswer, ReadyAnswer
 from service.schemas.stored_plans import (
@@ -71,7 +73,11 @@ __all__ = [
     "FloorPlanSummary",
     "GridAnswer",
     "HealthAnswer",
+    "ImportForm",
+    "ImportReport",
+    "LayerAnswer",
     "LayoutAnswer",
+    "LevelAnswer",
     "LimitsAnswer",
     "LocaliseAnswer",
     "LocaliseForm",

@@ -23,4 +23,5 @@ class Problem(BaseModel):
     detail: str = Field(description="What is wrong with this request, with value and limit.")
     request_id: str | None = Field(None, description="Names this request in the service's log.")
     room: str | None = Field(None, description="The room at fault, for an invalid floor plan.")
+    levels: list[str] | None = Field(None, description="The levels of a file with several, to choose one of.")
     errors: list[Fault] | None = Field(None, description="Every field at fault, for an invalid request.")

@@ -13,7 +13,11 @@ from service.schemas.localise_answer import ModelAnswer
 class LimitsAnswer(Answer):
     """What requests may be; each is the setting of the same name, and named by the error about it."""
 
-    max_plan_bytes: int = Field(description="Upload of a floor plan.")
+    max_plan_bytes: int = Field(description="Upload of a floor plan, whatever its format.")
+    max_unpacked_bytes: int = Field(description="What an archive of a floor plan unpacks to.")
+    max_entities: int = Field(description="Lines, polygons, texts and the like in a floor plan's file, with vertices.")
+    max_plan_pixels: int = Field(description="Pixels of a picture of a floor plan.")
+    max_import_s: float = Field(description="Longest that reading the file of a floor plan may take.")
     max_floorplans: int = Field(description="Stored floor plans per tenant.")
     max_rooms: int = Field(description="Rooms per floor plan.")
     max_vertices: int = Field(description="Vertices per room.")
@@ -63,4 +67,5 @@ class ReadyAnswer(Answer):
     model: ModelAnswer
     lpo_pool: PoolAnswer
     decode_pool: PoolAnswer
+    import_pool: PoolAnswer = Field(description="Reads files of plans; its workers start with the first one.")
     plans_preparing: int = Field(description="Plans whose latent grid is being computed, or will be.")

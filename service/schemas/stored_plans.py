@@ -9,6 +9,7 @@ from pydantic import Field, WithJsonSchema
 
 from service.schemas.fields import Answer, Metres, Share, SquareMetres
 from service.schemas.native_plan import RoomType
+from service.schemas.plan_import import ImportReport
 
 PlanStatus = Literal["preparing", "ready", "failed"]
 
@@ -58,7 +59,13 @@ class FloorPlanAnswer(Answer):
     bounds: BoundsAnswer
     camera_height_m: float = Field(description="Camera height assumed for panoramas of this plan.")
     grid: GridAnswer
-    warnings: list[str] = Field(description="What is odd about the plan but usable, such as overlapping rooms.")
+    warnings: list[str] = Field(
+        description="What is likely wrong with the plan but usable: overlapping rooms, rooms that no door reaches, "
+        "improbable ceilings."
+    )
+    import_report: ImportReport | None = Field(
+        description="How its file was read; null for plans that an earlier version of the service stored."
+    )
     plan: Annotated[dict[str, Any], WithJsonSchema({"allOf": [{"$ref": "#/components/schemas/FloorPlanDocument"}]})] = (
         Field(description="The plan itself in the native format.")
     )

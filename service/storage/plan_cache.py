@@ -18,7 +18,7 @@ class PlanCache:
             limit_bytes: about how much memory the plans may take; 0: nothing is kept.
         """
         self._records: BoundedCache[tuple[str, str], tuple[PlanRecord, float]] = BoundedCache(
-            limit_bytes, lambda entry: plan_bytes(entry[0].plan)
+            limit_bytes, lambda entry: plan_bytes(entry[0].plan) + len(entry[0].report or "")
         )
 
     def put(self, record: PlanRecord) -> None:

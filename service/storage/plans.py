@@ -20,7 +20,7 @@ from service.storage.database import Database
 from service.storage.grid_format import PackedGrid, pack
 from service.storage.plan_cache import PlanCache
 from service.storage.plan_document import PlanDocument
-from service.storage.records import ComputedGrid, Cursor, GridKey, PlanRecord, PlanSummary
+from service.storage.records import JSON, ComputedGrid, Cursor, GridKey, Original, PlanRecord, PlanSummary
 from service.storage.stored_grids import insert_grid, select_summaries
 from service.storage.tables import FLOORPLANS, LATENT_GRIDS, ORIGINAL_CHUNKS, REVISIONS
 from service.storage.venues import take_out_of_venues
@@ -35,14 +35,14 @@ class _Content:
     """What is stored of a revision besides its row, made before the transaction that stores it."""
 
     document: PlanDocument
-    original: bytes
+    original: Original
     original_sha256: str
     grid: tuple[GridKey, PackedGrid] | None
 
     @classmethod
-    def of(cls, record: PlanRecord, original: bytes, grid: ComputedGrid | None) -> _Content:
+    def of(cls, record: PlanRecord, original: Original, grid: ComputedGrid | None) -> _Content:
         packed = None if grid is None else (grid.key(record.revision_id), pack(grid.grid))
-        return cls(PlanDocument.of(record.plan), original, hashlib.sha256(original).hexdigest(), packed)
+        return cls(PlanDocument.of(record.plan), original, hashlib.sha256(original.content).hexdigest(), packed)
 
 
 @dataclass(frozen=True)
@@ -70,11 +70,11 @@ class Plans:
         plan_id: str,
         plan: FloorPlan,
         *,
-        original: bytes,
+        original: Original,
         limit: int,
         grid: ComputedGrid | None = None,
     ) -> PlanRecord:
-        """Store a plan, the bytes it was uploaded as, and its grid if that is there already.
+        """Store a plan, the file it was uploaded as, and its grid if that is there already.
 
         A plan that has the id already is the one: an upload that was stored, and whose answer got lost.
 
@@ -86,7 +86,7 @@ class Plans:
             TooManyFloorPlansError: there are `limit` already.
         """
         now = datetime.now(UTC)
-        record = _record(plan, plan_id=plan_id, tenant=tenant, number=1, created_at=now, updated_at=now)
+        record = _record(plan, original, plan_id=plan_id, tenant=tenant, number=1, created_at=now, updated_at=now)
         content = _Content.of(record, original, grid)
         with self._database.writing() as connection:
             if self._database.is_postgresql:
@@ -110,7 +110,7 @@ class Plans:
         plan_id: str,
         plan: FloorPlan,
         *,
-        original: bytes,
+        original: Original,
         keep: int,
         expected: str | None = None,
         grid: ComputedGrid | None = None,
@@ -127,7 +127,7 @@ class Plans:
             RevisionMismatchError: it has another revision than the one expected.
         """
         now = datetime.now(UTC)
-        record = _record(plan, plan_id=plan_id, tenant=tenant, number=0, created_at=now, updated_at=now)
+        record = _record(plan, original, plan_id=plan_id, tenant=tenant, number=0, created_at=now, updated_at=now)
         content = _Content.of(record, original, grid)
         with self._database.writing() as connection:
             query = select(FLOORPLANS).where(FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
@@ -175,14 +175,14 @@ class Plans:
         query = select_summaries().where(FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
         return next(iter(self._summaries(query)), None)
 
-    def original(self, tenant: str, plan_id: str) -> bytes | None:
-        """The bytes that the current revision of a plan was uploaded as.
+    def original(self, tenant: str, plan_id: str) -> Original | None:
+        """The file that the current revision of a plan was uploaded as.
 
         Raises:
             DamagedDataError: what is stored are others.
         """
         query = (
-            select(REVISIONS.c.id, REVISIONS.c.original_sha256)
+            select(REVISIONS.c.id, REVISIONS.c.original_sha256, REVISIONS.c.original_media_type, REVISIONS.c.report)
             .join_from(FLOORPLANS, REVISIONS, FLOORPLANS.c.revision_id == REVISIONS.c.id)
             .where(FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
         )
@@ -193,7 +193,7 @@ class Plans:
             content = b"".join(read_chunks(connection, ORIGINAL_CHUNKS, {"revision_id": row.id}))
         if hashlib.sha256(content).hexdigest() != row.original_sha256:
             raise _damaged("original", plan_id, row.id)
-        return content
+        return Original(content, row.original_media_type or JSON, row.report)
 
     def list(
         self, tenant: str, *, limit: int, after: Cursor | None = None, name: str | None = None
@@ -288,7 +288,14 @@ class Plans:
 
 
 def _record(
-    plan: FloorPlan, *, plan_id: str, tenant: str, number: int, created_at: datetime, updated_at: datetime
+    plan: FloorPlan,
+    original: Original,
+    *,
+    plan_id: str,
+    tenant: str,
+    number: int,
+    created_at: datetime,
+    updated_at: datetime,
 ) -> PlanRecord:
     return PlanRecord(
         id=plan_id,
@@ -299,6 +306,7 @@ def _record(
         updated_at=updated_at,
         plan=plan,
         failure=None,
+        report=original.report,
     )
 
 
@@ -328,13 +336,15 @@ def _insert_revision(connection: Connection, record: PlanRecord, content: _Conte
         "created_at": record.updated_at,
         **content.document.columns(),
         "original_sha256": content.original_sha256,
+        "original_media_type": content.original.media_type,
+        "report": content.original.report,
         "room_count": len(plan.rooms),
         "area_m2": plan.area_m2,
         "camera_height_m": plan.camera_height_m,
         "camera_height_std_m": _height_std_m(plan),
     }
     connection.execute(REVISIONS.insert(), values)
-    write_chunks(connection, ORIGINAL_CHUNKS, {"revision_id": record.revision_id}, memoryview(content.original))
+    write_chunks(connection, ORIGINAL_CHUNKS, {"revision_id": record.revision_id}, memoryview(content.original.content))
     if content.grid is not None:
         insert_grid(connection, *content.grid)
 
@@ -361,4 +371,5 @@ def _select_heads(*, current: bool) -> Any:
         FLOORPLANS.c.created_at,
         REVISIONS.c.created_at.label("updated_at"),
         REVISIONS.c.failure,
+        REVISIONS.c.report,
     ).join_from(FLOORPLANS, REVISIONS, link)

@@ -10,6 +10,8 @@ from lalaloc_core.localise.poses import LatentGrid
 
 # Whose plans are whose without API keys.
 DEFAULT_TENANT = "default"
+# What earlier versions of the service stored was all of this type.
+JSON = "application/json"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +46,20 @@ class ComputedGrid:
         )
 
 
+@dataclass(frozen=True)
+class Original:
+    """The file that a revision of a plan was uploaded as.
+
+    Attributes:
+        media_type: by its content.
+        report: what was told of reading it, as JSON text; None for plans of an earlier version of the service.
+    """
+
+    content: bytes
+    media_type: str = JSON
+    report: str | None = None
+
+
 @dataclass(frozen=True, kw_only=True)
 class PlanRecord:
     """A stored floor plan at one of its revisions.
@@ -54,6 +70,8 @@ class PlanRecord:
         created_at: when the plan was first stored.
         updated_at: when the revision was.
         failure: why its latent grid could not be computed last time, None when that did not happen.
+        report: what was told of reading the file that it was uploaded as, as JSON text; None for plans of an earlier
+            version of the service.
     """
 
     id: str
@@ -64,6 +82,7 @@ class PlanRecord:
     updated_at: datetime
     plan: FloorPlan
     failure: str | None
+    report: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -74,6 +74,9 @@ REVISIONS = Table(
     Column("document_sha256", String(64)),
     Column("warnings", Text),
     Column("original_sha256", String(64), nullable=False),
+    # Nothing where an earlier version of the service stored the plan: JSON in the native format, without a report.
+    Column("original_media_type", String(64)),
+    Column("report", Text),
     Column("room_count", Integer, nullable=False),
     Column("area_m2", Double, nullable=False),
     Column("camera_height_m", Double, nullable=False),

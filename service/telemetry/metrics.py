@@ -54,7 +54,7 @@ class Telemetry:
             "lalaloc_pool_restarts", "Worker processes that had to be replaced, by pool.", ["pool"]
         )
         # Shown as 0 from the start, so that the first restart is a rise.
-        for pool in ("lpo", "decode"):
+        for pool in ("lpo", "decode", "import"):
             self.pool_restarts.labels(pool)
         self.grid_cache_hits = self.counter("lalaloc_grid_cache_hits", "Latent grids found in memory.")
         self.grid_cache_misses = self.counter("lalaloc_grid_cache_misses", "Latent grids not found in memory.")

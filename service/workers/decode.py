@@ -6,17 +6,14 @@ busy for as long, from drawings to pixels. The rest is in `service.workers.proce
 
 from __future__ import annotations
 
-import os
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
-from pathlib import Path
 
 from lalaloc_core.draw.canvas import rasterise
 from lalaloc_core.errors import InvalidPanoramaError
 from lalaloc_core.panorama.images import Panorama, PanoramaLimits, open_panorama, warm_up
-from service.workers.process import serve_jobs
+from service.workers.process import limit_memory, serve_jobs
 
 
 @dataclass(frozen=True)
@@ -56,7 +53,7 @@ def _load(
     height: int, width: int, limits: PanoramaLimits, memory_bytes: int
 ) -> Callable[[Upload | Drawing], Panorama | Refusal | bytes]:
     warm_up(height=height, width=width)
-    _limit_memory(memory_bytes)
+    limit_memory(memory_bytes)
 
     def work(job: Upload | Drawing) -> Panorama | Refusal | bytes:
         if isinstance(job, Drawing):
@@ -67,15 +64,3 @@ def _load(
             return Refusal(str(error))
 
     return work
-
-
-def _limit_memory(memory_bytes: int) -> None:
-    """Let allocations fail, where the system can, beyond what is in use now and `memory_bytes`."""
-    if sys.platform != "linux":
-        return
-    import resource
-
-    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
-    limit = pages * os.sysconf("SC_PAGE_SIZE") + memory_bytes
-    _, most = resource.getrlimit(resource.RLIMIT_AS)
-    resource.setrlimit(resource.RLIMIT_AS, (limit if most == resource.RLIM_INFINITY else min(limit, most), most))

@@ -6,11 +6,13 @@ A `Supervisor` starts such processes and watches over them. Imports little, beca
 from __future__ import annotations
 
 import ctypes
+import os
 import signal
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any
 
 _PR_SET_PDEATHSIG = 1
@@ -35,12 +37,15 @@ class Fault:
     reason: str
 
 
-def serve_jobs(connection: Connection, load: Callable[[], Callable[[Any], Any]]) -> None:
+def serve_jobs(
+    connection: Connection, load: Callable[[], Callable[[Any], Any]], is_fit: Callable[[], bool] = lambda: True
+) -> None:
     """Load what does the work, then answer jobs until the pipe closes.
 
     Args:
         load: takes its time and returns the function from job to answer. What either raises is told to the parent; a
             worker whose function raised goes on with the next job.
+        is_fit: asked after each job; a worker that is not ends, and is replaced.
     """
     # Ctrl-C and a service manager's signal reach the whole process group; the parent decides when its workers end.
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -52,7 +57,7 @@ def serve_jobs(connection: Connection, load: Callable[[], Callable[[Any], Any]])
         _send(connection, Fault(f"{type(error).__name__}: {error}"))
         return
     message: Ready | Answered | Fault = Ready()
-    while _send(connection, message):
+    while _send(connection, message) and is_fit():
         try:
             job = connection.recv()
         except (EOFError, OSError):
@@ -61,6 +66,25 @@ def serve_jobs(connection: Connection, load: Callable[[], Callable[[Any], Any]])
             message = Answered(work(job))
         except Exception as error:
             message = Fault(f"{type(error).__name__}: {error}")
+
+
+def limit_memory(memory_bytes: int) -> None:
+    """Let allocations fail, where the system can, beyond what is in use now and `memory_bytes`."""
+    if sys.platform != "linux":
+        return
+    import resource
+
+    limit = address_space_bytes() + memory_bytes
+    _, most = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (limit if most == resource.RLIM_INFINITY else min(limit, most), most))
+
+
+def address_space_bytes() -> int:
+    """How much this process has asked for; 0 where that cannot be told (it can on Linux)."""
+    if sys.platform != "linux":
+        return 0
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+    return pages * os.sysconf("SC_PAGE_SIZE")
 
 
 def _die_with_parent() -> None:

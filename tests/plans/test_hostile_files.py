@@ -119,7 +119,7 @@ def test_a_picture_that_is_cut_off():
 
 
 def test_more_bytes_than_allowed():
-    _refused(b"{" + b" " * 200, "at most 100 are read", max_bytes=100)
+    _refused(b"{" + b" " * 200, "at most 100 are read", max_plan_bytes=100)
 
 
 def test_an_import_that_takes_too_long():

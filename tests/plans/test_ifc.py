@@ -70,7 +70,7 @@ def _box(x0: float, y0: float, x1: float, y1: float) -> list[tuple[float, float]
     return [(x0, y0), (x1, y0), (x1, y1), (x0, y1)]
 
 
-def _flat() -> _Model:
+def ifc_flat() -> _Model:
     model = _Model()
     model.spaces(
         model.prism("IfcSpace", _box(0, 0, 4000, 3000), 0, 2600, LongName="Küche"),
@@ -89,7 +89,7 @@ def _flat() -> _Model:
 
 
 def test_spaces_doors_windows_columns_and_shafts():
-    plan = import_plan(_flat().content())
+    plan = import_plan(ifc_flat().content())
     assert [(room["name"], room["type"]) for room in plan.document["rooms"]] == [
         ("Küche", "kitchen"),
         ("Wohnen", "living"),
@@ -106,7 +106,7 @@ def test_spaces_doors_windows_columns_and_shafts():
 
 
 def test_a_map_conversion_says_where_and_which_way():
-    model = _flat()
+    model = ifc_flat()
     make = model.file.create_entity
     crs = make("IfcProjectedCRS", "EPSG:25832")
     # Turned by 30° counter-clockwise against the grid.

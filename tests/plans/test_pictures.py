@@ -94,7 +94,7 @@ def test_skew_is_found(degrees: float):
     assert find_skew(turned) == pytest.approx(-degrees, abs=0.15)
 
 
-def _vector_pdf() -> bytes:
+def vector_pdf() -> bytes:
     """Walls as filled outlines, a door and lettering, at 1:100 on a page."""
     centimetre = 72 / 2.54
     content = f"{centimetre:.5f} 0 0 {centimetre:.5f} 28 28 cm 0 g\n"
@@ -128,7 +128,7 @@ def _vector_pdf() -> bytes:
 
 
 def test_a_pdf_that_is_drawn_is_read_as_a_drawing():
-    plan = import_plan(_vector_pdf())
+    plan = import_plan(vector_pdf())
     assert plan.report.scale_source == "1:100, as is written in the drawing"
     assert plan.report.is_draft
     assert {(room["name"], room["type"]) for room in plan.document["rooms"]} == {

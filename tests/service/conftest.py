@@ -93,7 +93,7 @@ def start_app(tiny_bundle: Path, database_of: DatabaseOf) -> StartApp:
         if not (url := database_of(data_dir)).startswith("sqlite"):
             overrides = {"database_url": url} | overrides
         values = {"data_dir": data_dir, "bundle": tiny_bundle, "workers": 0, "onnx_threads": 1, "log_level": "error"}
-        values |= {"decode_workers": 1}
+        values |= {"decode_workers": 1, "import_workers": 1}
         settings = Settings(**(values | overrides))
         with ExitStack() as stack:
             urls = [stack.enter_context(serve(create_app(settings))) for _ in range(_REPLICAS)]

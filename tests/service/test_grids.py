@@ -39,7 +39,7 @@ from service.grids.sweeper import Sweeper
 from service.grids.throttle import BackgroundThrottle
 from service.settings import Settings
 from service.storage.plan_lookup import PlanLookup
-from service.storage.records import PlanRecord
+from service.storage.records import Original, PlanRecord
 from service.storage.store import Store
 from service.telemetry import Telemetry
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, assert_problem, localise, upload, wait_for
@@ -109,7 +109,7 @@ def store(tmp_path: Path) -> Iterator[Store]:
 
 
 def _add(store: Store, plan: FloorPlan = PLAN, plan_id: str = "p") -> PlanRecord:
-    return store.plans.add("default", plan_id, plan, original=b"{}", limit=20)
+    return store.plans.add("default", plan_id, plan, original=Original(b"{}"), limit=20)
 
 
 @pytest.fixture
@@ -412,7 +412,7 @@ def test_gone_plans_and_old_revisions_are_dropped_from_memory_on_every_replica(
         grids.compute(record, 1.5).result(30.0)
         assert store.plans.get("default", name) == record
     elsewhere.plans.delete("default", "deleted")
-    elsewhere.plans.add_revision("default", "changed", PLAN, original=b"", keep=5)
+    elsewhere.plans.add_revision("default", "changed", PLAN, original=Original(b""), keep=5)
     Sweeper(store, grids, sweep_s=5.0).sweep()
     assert grids.revisions() == store.plan_cache.revisions() == {records["kept"].revision_id}
 
@@ -427,7 +427,7 @@ def test_revisions_that_were_replaced_on_another_replica_are_not_computed_any_mo
     futures = [grids.compute(_add(store, HALL), 1.5)]
     wait_for(lambda: encoders.embedded > 0)
     for _ in range(3):
-        record = elsewhere.plans.add_revision("default", "p", HALL, original=b"", keep=5)
+        record = elsewhere.plans.add_revision("default", "p", HALL, original=Original(b""), keep=5)
         futures.append(grids.compute(record, 1.5))
     Sweeper(store, grids, sweep_s=5.0).sweep()
     encoders.go_on.set()
@@ -444,7 +444,7 @@ def test_the_job_of_a_replaced_revision_ends_although_another_replica_is_at_it(
     store.leases.claim(grids.key(record.revision_id, 1.5), "another replica", 60.0)
     future = grids.compute(record, 1.5)
     wait_for(lambda: len(grids._jobs.remote()) == 1)
-    store.plans.add_revision("default", "p", PLAN, original=b"", keep=5)
+    store.plans.add_revision("default", "p", PLAN, original=Original(b""), keep=5)
     grids.cancel(record.revision_id)
     grids.poll_remote()
     assert isinstance(future.exception(30.0), PlanNotReadyError)
@@ -506,7 +506,7 @@ def test_work_on_a_revision_that_was_replaced_ends(
     encoders.go_on.clear()
     future = grids.compute(record, 1.5)
     wait_for(lambda: encoders.embedded > 0)
-    new = store.plans.add_revision("default", "p", PLAN, original=b"", keep=5)
+    new = store.plans.add_revision("default", "p", PLAN, original=Original(b""), keep=5)
     grids.forget({record.revision_id})
     encoders.go_on.set()
     assert isinstance(future.exception(30.0), PlanNotReadyError)

@@ -31,7 +31,7 @@ from service.http.idempotent_request import IdempotentRequest, parts_sha256
 from service.http.uploads import Parts
 from service.pools.job_queue import JobLostError
 from service.storage.idempotency_keys import IdempotencyKeys
-from service.storage.records import Fresh
+from service.storage.records import Fresh, Original
 from service.storage.store import Store
 from service.storage.stored_grids import StoredGrids
 from service.storage.tables import IDEMPOTENCY
@@ -188,7 +188,7 @@ def test_what_a_process_that_died_had_stored_is_found_by_the_next(
             return client.post("/floorplans", content=CONTENT, headers=headers)
 
         assert_problem(send(), 409, "idempotency-in-progress")
-        store.plans.add("default", plan_id, FloorPlan.from_json(CONTENT), original=CONTENT, limit=10)
+        store.plans.add("default", plan_id, FloorPlan.from_json(CONTENT), original=Original(CONTENT), limit=10)
         wait_for(lambda: send().status_code == 201, 10.0)
         again = send()
         assert again.json()["id"] == plan_id
@@ -272,7 +272,7 @@ def test_an_upload_that_failed_after_it_was_stored_is_found_when_it_is_sent_agai
     failures = iter([StoreUnavailableError(), None])
 
     def work(token: str) -> Response:
-        store.plans.add("default", token, FloorPlan.from_json(CONTENT), original=CONTENT, limit=10)
+        store.plans.add("default", token, FloorPlan.from_json(CONTENT), original=Original(CONTENT), limit=10)
         if (failure := next(failures)) is not None:
             raise failure
         return Response(token)

@@ -46,6 +46,7 @@ from service.storage.records import (
     Fresh,
     GridKey,
     InProgress,
+    Original,
     StoredAnswer,
     VenueMember,
 )
@@ -100,7 +101,7 @@ def _url(folder: Path) -> str:
 def _add(store: Store, plan_id: str = "a" * 32, *, tenant: str = "default", name: str = "Flat 3") -> str:
     """Add a plan, return the id of its revision."""
     plan = FloorPlan.from_dict({**FLAT, "name": name})
-    return store.plans.add(tenant, plan_id, plan, original=b"{}", limit=100).revision_id
+    return store.plans.add(tenant, plan_id, plan, original=Original(b"{}"), limit=100).revision_id
 
 
 def _key(revision_id: str, **changes: object) -> GridKey:
@@ -148,7 +149,7 @@ def test_plans_in_memory_are_not_read_anew_and_none_is_kept_without_a_cache(tmp_
         assert reads[0].plan.to_dict() == reads[1].plan.to_dict()
         assert store.plan_cache.revisions() == ({revision_id} if same else set())
     changed = FloorPlan.from_dict({**FLAT, "name": "changed"})
-    kept.plans.add_revision("default", "p", changed, original=b"{}", keep=5)
+    kept.plans.add_revision("default", "p", changed, original=Original(b"{}"), keep=5)
     told = [kept.plans.get("default", "p"), kept.plans.get_revision("default", "p", revision_id)]
     assert [record and record.plan.name for record in told] == ["changed", "Flat 3"]
     assert kept.plans.delete("default", "p")
@@ -161,21 +162,21 @@ def test_plans_in_memory_are_not_read_anew_and_none_is_kept_without_a_cache(tmp_
 def test_a_plan_and_its_original_are_seen_by_another_process_at_once(open_store: OpenStore, size: int) -> None:
     first, second = open_store(), open_store()
     original = np.random.default_rng(1).bytes(size)
-    added = first.plans.add("default", "p1", PLAN, original=original, limit=10)
+    added = first.plans.add("default", "p1", PLAN, original=Original(original), limit=10)
     record = second.plans.get("default", "p1")
     assert record is not None
     assert record.plan.to_dict() == PLAN.to_dict()
     assert (record.revision_id, record.revision) == (added.revision_id, 1)
     assert record.created_at == added.created_at
     assert record.created_at.utcoffset() == timedelta(0)
-    assert second.plans.original("default", "p1") == original
+    assert second.plans.original("default", "p1") == Original(original)
     assert first.plans.delete("default", "p1")
     assert second.plans.get("default", "p1") is None
 
 
 def test_a_plan_may_be_stored_along_with_its_grid(store: Store) -> None:
     computed = ComputedGrid(model_sha256="m1", grid=_grid())
-    record = store.plans.add("default", "p1", PLAN, original=b"{}", limit=10, grid=computed)
+    record = store.plans.add("default", "p1", PLAN, original=Original(b"{}"), limit=10, grid=computed)
     _assert_same(store.grids.get(computed.key(record.revision_id)), computed.grid)
 
 
@@ -184,16 +185,16 @@ def test_a_plan_that_cannot_be_stored_whole_is_not_stored_at_all(store: Store, b
     grid = ComputedGrid(model_sha256=None if broken == "grid" else "m1", grid=_grid())  # pyright: ignore[reportArgumentType]
     original = None if broken == "original" else b"{}"
     with pytest.raises(Exception, match=r"(?i)not.null|buffer"):
-        store.plans.add("default", "p", PLAN, original=original, limit=10, grid=grid)  # pyright: ignore[reportArgumentType]
+        store.plans.add("default", "p", PLAN, original=Original(original), limit=10, grid=grid)  # pyright: ignore[reportArgumentType]
     assert store.plans.get("default", "p") is None
     assert [_rows(store, table) for table in METADATA.sorted_tables] == [0] * len(METADATA.sorted_tables)
 
 
 def test_the_number_of_plans_is_limited_for_each_tenant(store: Store) -> None:
     _add(store, tenant="one")
-    store.plans.add("two", "b", PLAN, original=b"{}", limit=1)
+    store.plans.add("two", "b", PLAN, original=Original(b"{}"), limit=1)
     with pytest.raises(TooManyFloorPlansError, match="1 floor plans"):
-        store.plans.add("two", "c", PLAN, original=b"{}", limit=1)
+        store.plans.add("two", "c", PLAN, original=Original(b"{}"), limit=1)
     assert [summary.id for summary in store.plans.list("two", limit=10)] == ["b"]
 
 
@@ -202,7 +203,7 @@ def test_the_limit_holds_when_many_upload_at_once(open_store: OpenStore) -> None
 
     def add(number: int) -> bool:
         try:
-            stores[number % 2].plans.add("default", f"p{number}", PLAN, original=b"{}", limit=5)
+            stores[number % 2].plans.add("default", f"p{number}", PLAN, original=Original(b"{}"), limit=5)
         except TooManyFloorPlansError:
             return False
         return True
@@ -220,7 +221,7 @@ def test_a_tenants_plan_does_not_exist_for_others(store: Store) -> None:
     assert store.plans.list("two", limit=10) == []
     assert not store.plans.delete("two", "p")
     with pytest.raises(UnknownFloorPlanError):
-        store.plans.add_revision("two", "p", PLAN, original=b"", keep=5)
+        store.plans.add_revision("two", "p", PLAN, original=Original(b""), keep=5)
     assert store.plans.get("one", "p") is not None
 
 
@@ -228,7 +229,7 @@ def test_a_tenants_plan_does_not_exist_for_others(store: Store) -> None:
 def test_what_is_deleted_while_it_is_read_is_read_whole(open_store: OpenStore, half_way: str) -> None:
     first, second = open_store(), open_store()
     original = bytes(CHUNK_BYTES + 1)
-    added = first.plans.add("default", "p", PLAN, original=original, limit=10)
+    added = first.plans.add("default", "p", PLAN, original=Original(original), limit=10)
 
     def delete_elsewhere(*arguments: Any) -> None:
         if arguments[2].startswith(half_way):
@@ -236,7 +237,7 @@ def test_what_is_deleted_while_it_is_read_is_read_whole(open_store: OpenStore, h
 
     event.listen(second._database._engine, "before_cursor_execute", delete_elsewhere)
     if "chunks" in half_way:
-        assert second.plans.original("default", "p") == original
+        assert second.plans.original("default", "p") == Original(original)
     else:
         assert second.plans.get("default", "p") == dataclasses.replace(added, plan=ANY)
     assert second.plans.get("default", "p") is None
@@ -256,13 +257,13 @@ def test_a_plan_is_read_when_the_database_is_done_with_it(
     monkeypatch.setattr(PlanDocument, "plan", watched)
     assert store.plans.get("default", "p") is not None
     repeated = open_store()
-    repeated.plans.add("default", "p", PLAN, original=b"{}", limit=10)
+    repeated.plans.add("default", "p", PLAN, original=Original(b"{}"), limit=10)
     assert in_use == [0, 0]
 
 
 def test_what_was_odd_about_a_plan_is_kept_and_not_looked_for_again(open_store: OpenStore) -> None:
     plan = dataclasses.replace(PLAN, warnings=("as found at the upload",))
-    open_store().plans.add("default", "p", plan, original=b"{}", limit=10)
+    open_store().plans.add("default", "p", plan, original=Original(b"{}"), limit=10)
     found = open_store().plans.get("default", "p")
     assert found is not None
     assert found.plan.warnings == plan.warnings
@@ -272,7 +273,7 @@ def test_a_plan_of_an_earlier_version_is_read_and_looked_at_again(open_store: Op
     rooms = [{"name": name, "polygon": [[0, 0], [4, 0], [4, 3], [0, 3]]} for name in ("one", "other")]
     plan = FloorPlan.from_dict({"ceiling_height_m": 2.5, "rooms": rooms})
     store = open_store()
-    store.plans.add("default", "p", plan, original=b"{}", limit=10)
+    store.plans.add("default", "p", plan, original=Original(b"{}"), limit=10)
     with store._database.writing() as connection:
         connection.execute(update(REVISIONS).values(document_sha256=None, warnings=None))
     found = open_store().plans.get("default", "p")
@@ -295,15 +296,15 @@ def test_a_plan_that_is_not_what_was_validated_is_not_given_out(
         again.plans.get("default", "p")
     summary = again.plans.summary("default", "p")
     assert summary is not None
-    assert again.plans.original("default", "p") == b"{}"
-    again.plans.add_revision("default", "p", PLAN, original=b"{}", keep=5)
+    assert again.plans.original("default", "p") == Original(b"{}")
+    again.plans.add_revision("default", "p", PLAN, original=Original(b"{}"), keep=5)
     assert again.plans.get("default", "p") is not None
     assert again.plans.delete("default", "p")
 
 
 @pytest.mark.parametrize("cut_off", [True, False])
 def test_an_original_that_is_not_what_was_uploaded_is_not_given_out(store: Store, cut_off: bool) -> None:
-    store.plans.add("default", "p", PLAN, original=bytes(CHUNK_BYTES + 1), limit=10)
+    store.plans.add("default", "p", PLAN, original=Original(bytes(CHUNK_BYTES + 1)), limit=10)
     with store._database.writing() as connection:
         last = ORIGINAL_CHUNKS.c.number == 1
         connection.execute(
@@ -315,7 +316,7 @@ def test_an_original_that_is_not_what_was_uploaded_is_not_given_out(store: Store
 
 def test_deleting_a_plan_leaves_nothing_of_it(store: Store) -> None:
     revision_id = _add(store, "p")
-    store.plans.add_revision("default", "p", PLAN, original=b"second", keep=5)
+    store.plans.add_revision("default", "p", PLAN, original=Original(b"second"), keep=5)
     _put(store, _key(revision_id))
     store.leases.claim(_key(revision_id, camera_height_mm=1600), "me", 60.0)
     assert store.plans.delete("default", "p")
@@ -355,8 +356,8 @@ def test_summaries_are_those_of_the_plans_that_there_are(store: Store) -> None:
 
 
 def test_an_upload_that_is_repeated_under_its_id_is_stored_once(store: Store) -> None:
-    first = store.plans.add("default", "p", PLAN, original=b"{}", limit=1)
-    again = store.plans.add("default", "p", PLAN, original=b"{}", limit=1)
+    first = store.plans.add("default", "p", PLAN, original=Original(b"{}"), limit=1)
+    again = store.plans.add("default", "p", PLAN, original=Original(b"{}"), limit=1)
     assert (again.revision_id, again.revision) == (first.revision_id, 1)
     assert len(store.plans.list("default", limit=10)) == 1
 
@@ -367,13 +368,13 @@ def test_an_upload_that_is_repeated_under_its_id_is_stored_once(store: Store) ->
 def test_a_new_revision_replaces_the_plan_and_the_old_one_stays_readable(store: Store) -> None:
     old = _add(store, "p")
     smaller = FloorPlan.from_dict({**FLAT, "name": "smaller", "rooms": FLAT["rooms"][:1]})
-    new = store.plans.add_revision("default", "p", smaller, original=b"new", keep=5, expected=old)
+    new = store.plans.add_revision("default", "p", smaller, original=Original(b"new"), keep=5, expected=old)
     current = store.plans.get("default", "p")
     assert current is not None
     assert (current.revision, current.revision_id) == (2, new.revision_id) != (1, old)
     assert (current.plan.name, len(current.plan.rooms)) == ("smaller", 1)
     assert current.updated_at > current.created_at
-    assert store.plans.original("default", "p") == b"new"
+    assert store.plans.original("default", "p") == Original(b"new")
     assert store.plans.list("default", limit=5)[0].name == "smaller"
     before = store.plans.get_revision("default", "p", old)
     assert before is not None
@@ -383,10 +384,10 @@ def test_a_new_revision_replaces_the_plan_and_the_old_one_stays_readable(store: 
 
 def test_a_revision_that_follows_another_one_than_expected_is_refused(store: Store) -> None:
     old = _add(store, "p")
-    new = store.plans.add_revision("default", "p", PLAN, original=b"2", keep=5, expected=old)
+    new = store.plans.add_revision("default", "p", PLAN, original=Original(b"2"), keep=5, expected=old)
     with pytest.raises(RevisionMismatchError, match=new.revision_id):
-        store.plans.add_revision("default", "p", PLAN, original=b"3", keep=5, expected=old)
-    assert store.plans.original("default", "p") == b"2"
+        store.plans.add_revision("default", "p", PLAN, original=Original(b"3"), keep=5, expected=old)
+    assert store.plans.original("default", "p") == Original(b"2")
 
 
 def test_of_two_revisions_at_the_same_time_that_expect_the_same_one_is_refused(open_store: OpenStore) -> None:
@@ -395,7 +396,7 @@ def test_of_two_revisions_at_the_same_time_that_expect_the_same_one_is_refused(o
 
     def add(store: Store) -> bool:
         try:
-            store.plans.add_revision("default", "p", PLAN, original=b"x", keep=5, expected=old)
+            store.plans.add_revision("default", "p", PLAN, original=Original(b"x"), keep=5, expected=old)
         except RevisionMismatchError:
             return False
         return True
@@ -408,7 +409,9 @@ def test_revisions_and_their_grids_are_bounded(store: Store) -> None:
     ids = [_add(store, "p")]
     for number in range(4):
         _put(store, _key(ids[-1]))
-        ids.append(store.plans.add_revision("default", "p", PLAN, original=b"%d" % number, keep=3).revision_id)
+        ids.append(
+            store.plans.add_revision("default", "p", PLAN, original=Original(b"%d" % number), keep=3).revision_id
+        )
     kept = [store.plans.get_revision("default", "p", revision_id) is not None for revision_id in ids]
     assert kept == [False, False, True, True, True]
     # A query in work may still want the grid of the revision before.
@@ -829,7 +832,7 @@ def test_a_database_of_the_first_version_is_taken_over(tmp_path: Path, grids: st
     assert record is not None
     assert record.created_at == datetime(2026, 1, 1, 10, 0, 0, 123456, tzinfo=UTC)
     assert record.plan.to_dict() == FloorPlan.from_dict({**FLAT, "name": "Flat 1"}).to_dict()
-    assert store.plans.original("default", "1" * 32) == original
+    assert store.plans.original("default", "1" * 32) == Original(original)
     # Grids are computed again.
     assert [summary.name for summary in store.grids.missing("m1", 0.5, 10)] == ["Flat 1", "Flat 2"]
     with store._database.reading() as connection:

@@ -43,7 +43,8 @@ def import_ifc(content: bytes, options: ImportOptions, budget: Budget) -> tuple[
     """One plan for every storey that has spaces, lowest first.
 
     Raises:
-        InvalidFloorPlanError: what is wrong with the model, or that ifcopenshell is not installed.
+        InvalidFloorPlanError: what is wrong with the model.
+        ModuleNotFoundError: ifcopenshell is not installed.
     """
     budget.spend(content.count(b"=IFC") + content.count(b"= IFC"))
     model = _open(content)
@@ -75,10 +76,8 @@ def import_ifc(content: bytes, options: ImportOptions, budget: Budget) -> tuple[
 
 
 def _open(content: bytes) -> Any:
-    try:
-        import ifcopenshell
-    except ImportError as error:
-        raise InvalidFloorPlanError("IFC files are not read here: ifcopenshell (the extra `ifc`) is missing") from error
+    import ifcopenshell
+
     try:
         # Line by line in Latin-1: what lies beyond ASCII is escaped in the format itself.
         model = ifcopenshell.file.from_string(content.decode("utf-8", "replace"))

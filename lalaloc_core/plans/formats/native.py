@@ -7,6 +7,7 @@ from typing import Any
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.floorplan.values import is_number
 from lalaloc_core.plans.model.assemble import ImportedPlan
 from lalaloc_core.plans.model.checks import USUAL_CEILING_M, check_document, likely_unit
 from lalaloc_core.plans.model.limits import Budget
@@ -14,6 +15,8 @@ from lalaloc_core.plans.model.options import METRES_PER_UNIT, ImportOptions
 from lalaloc_core.plans.model.report import Notebook
 
 FORMAT = "native"
+# JSON has numbers of any size.
+_BEYOND = 1e12
 # Lengths of the format. With `units`, a key may stand without its ending and is in that unit.
 _LENGTHS = ("ceiling_height_m", "camera_height_m", "camera_height_std_m", "sill_m", "head_m")
 
@@ -30,10 +33,9 @@ def import_native(document: Any, options: ImportOptions, budget: Budget) -> tupl
     if not isinstance(document, Mapping):
         raise InvalidFloorPlanError("a plan must be an object")
     plan = dict(document)
-    units = _choice(options.units or plan.pop("units", None) or "m")
-    plan.pop("units", None)
-    y_axis = options.y_axis or plan.pop("y_axis", None) or "up"
-    plan.pop("y_axis", None)
+    units_said, y_axis_said = plan.pop("units", None), plan.pop("y_axis", None)
+    units = _choice(options.units or ("m" if units_said is None else units_said))
+    y_axis = options.y_axis or ("up" if y_axis_said is None else y_axis_said)
     if y_axis not in ("up", "down"):
         raise InvalidFloorPlanError(f"y_axis is {str(y_axis)[:50]!r}, known are up, down")
     if options.name is not None:
@@ -47,7 +49,8 @@ def import_native(document: Any, options: ImportOptions, budget: Budget) -> tupl
         plan = _converted(plan, factor, y_factor)
         notebook.notes.append(f"coordinates were converted from {units}" if factor != 1.0 else "y was turned over")
     _refuse_other_units(plan)
-    parsed = FloorPlan.from_dict(plan)
+    limits = budget.limits.plan
+    parsed = FloorPlan.from_dict(plan, limits)
     rooms = plan["rooms"]
     budget.spend(len(rooms))
     notebook.use("rooms", "rooms", len(rooms))
@@ -55,11 +58,11 @@ def import_native(document: Any, options: ImportOptions, budget: Budget) -> tupl
         notebook.use("openings", str(opening["kind"]))
     notebook.warnings.extend(check_document(parsed.to_dict()))
     report = notebook.close(FORMAT, factor, "units" if "units" in document or options.units else "the format: metres")
-    return (ImportedPlan(plan, report),)
+    return (ImportedPlan(plan, report, checked=(limits, parsed)),)
 
 
 def _choice(units: Any) -> str:
-    if units not in METRES_PER_UNIT:
+    if not isinstance(units, str) or units not in METRES_PER_UNIT:
         raise InvalidFloorPlanError(f"units is {str(units)[:50]!r}, known are {', '.join(METRES_PER_UNIT)}")
     return units
 
@@ -78,7 +81,7 @@ def _converted(document: dict[str, Any], factor: float, y_factor: float) -> dict
             else opening
             for opening in openings
         ]
-    if y_factor < 0.0 and isinstance(plan.get("north_deg"), int | float) and not isinstance(plan["north_deg"], bool):
+    if y_factor < 0.0 and is_number(plan.get("north_deg")) and abs(plan["north_deg"]) < _BEYOND:
         # Turned over, what was clockwise from +y on the drawing is clockwise from its new +y after half a turn.
         plan["north_deg"] = (180.0 - plan["north_deg"]) % 360.0
     return plan
@@ -97,7 +100,7 @@ def _lengths(document: Mapping[str, Any], factor: float) -> dict[str, Any]:
         if key in plan:
             raise InvalidFloorPlanError(f"'{short}' and '{key}' say the same, give one of them")
         value = plan.pop(short)
-        plan[key] = value * factor if isinstance(value, int | float) and not isinstance(value, bool) else value
+        plan[key] = _times(value, factor)
     return plan
 
 
@@ -108,9 +111,14 @@ def _scaled_keys(document: Mapping[str, Any], keys: tuple[str, ...], factor: flo
 def _scaled(value: Any, factor: float, y_factor: float) -> Any:
     if not isinstance(value, list | tuple):
         return value
-    if len(value) == 2 and all(isinstance(number, int | float) and not isinstance(number, bool) for number in value):
-        return [value[0] * factor, value[1] * y_factor]
+    if len(value) == 2 and all(is_number(number) for number in value):
+        return [_times(value[0], factor), _times(value[1], y_factor)]
     return [_scaled(item, factor, y_factor) for item in value]
+
+
+def _times(value: Any, factor: float) -> Any:
+    """A length in metres. What is no number, or none that a float can be, is left for the format's checks to refuse."""
+    return value * factor if is_number(value) and abs(value) < _BEYOND else value
 
 
 def _refuse_other_units(plan: Mapping[str, Any]) -> None:
@@ -119,7 +127,7 @@ def _refuse_other_units(plan: Mapping[str, Any]) -> None:
     places = [plan, *(room for room in rooms if isinstance(room, Mapping))] if isinstance(rooms, list) else [plan]
     for place in places:
         height = place.get("ceiling_height_m")
-        if isinstance(height, bool) or not isinstance(height, int | float) or height <= 20.0:
+        if not is_number(height) or not 20.0 < height < _BEYOND:
             continue
         unit = likely_unit(float(height), USUAL_CEILING_M)
         if unit is not None:

@@ -73,7 +73,7 @@ def _as_picture(page: object, found: PageContent, factor: float, notebook: Noteb
     width, height = found.size_pt
     metres_per_pixel = max(_FINEST_M, factor * 0.25)
     scale = min(factor / metres_per_pixel, _COARSEST_PT)
-    if width * height * scale**2 > budget.limits.max_pixels:
+    if width * height * scale**2 > budget.limits.max_plan_pixels:
         raise InvalidFloorPlanError(
             f"the page is {width * factor:.0f} m by {height * factor:.0f} m at this scale, too large to be drawn; "
             "is the scale right?"

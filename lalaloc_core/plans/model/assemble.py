@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import unicodedata
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -40,12 +40,14 @@ class ImportedPlan:
         report: what was used for what, and what is likely wrong.
         level: the storey, where the file says.
         anchor: where on Earth the plan's origin lies, where the file says.
+        checked: the plan, and the limits that it was validated under.
     """
 
     document: dict[str, Any]
     report: ImportReport
     level: Level | None = None
     anchor: Anchor | None = None
+    checked: tuple[PlanLimits, FloorPlan] | None = field(default=None, repr=False)
 
     def plan(self, limits: PlanLimits = DEFAULT_LIMITS) -> FloorPlan:
         """The validated plan.
@@ -53,6 +55,8 @@ class ImportedPlan:
         Raises:
             InvalidFloorPlanError: the document breaks a rule of plans.
         """
+        if self.checked is not None and self.checked[0] == limits:
+            return self.checked[1]
         return FloorPlan.from_dict(self.document, limits)
 
 
@@ -95,9 +99,9 @@ def assemble(
         document["opening_kinds"] = list(sketch.opening_kinds)
     notebook.warnings.extend(check_document(document))
     # Refused here, with what the file says, rather than at whoever uses the plan.
-    FloorPlan.from_dict(document)
+    checked = (DEFAULT_LIMITS, FloorPlan.from_dict(document))
     report = notebook.close(format, metres_per_unit, scale_source, is_draft=is_draft)
-    return ImportedPlan(document, report, sketch.level, sketch.anchor)
+    return ImportedPlan(document, report, sketch.level, sketch.anchor, checked)
 
 
 def clean_name(name: str | None, limit: int = DEFAULT_LIMITS.max_name_length) -> str | None:

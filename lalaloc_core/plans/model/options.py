@@ -134,7 +134,8 @@ def _parse(name: str, text: str) -> object:
 
 def _number(name: str, text: str) -> float:
     try:
-        value = float(text)
+        # Python reads 1_000 as a number, nobody else does.
+        value = math.nan if "_" in text else float(text)
     except ValueError:
         value = math.nan
     if not math.isfinite(value):

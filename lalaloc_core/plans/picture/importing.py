@@ -53,7 +53,7 @@ def import_picture(content: bytes, options: ImportOptions, budget: Budget) -> tu
 
 def _open(content: bytes, budget: Budget) -> tuple[UInt8[np.ndarray, "h w"], float | None]:
     """(grey picture on white paper, length of a pixel on paper where the file says)."""
-    limit = budget.limits.max_pixels
+    limit = budget.limits.max_plan_pixels
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", Image.DecompressionBombWarning)
@@ -61,7 +61,7 @@ def _open(content: bytes, budget: Budget) -> tuple[UInt8[np.ndarray, "h w"], flo
                 width, height = picture.size
                 if width * height > limit:
                     raise InvalidFloorPlanError(
-                        f"the picture has {width} x {height} pixels, at most {limit} are read (max_pixels)"
+                        f"the picture has {width} x {height} pixels, at most {limit} are read (max_plan_pixels)"
                     )
                 if min(width, height) < _MIN_SIDE_PX:
                     raise InvalidFloorPlanError(

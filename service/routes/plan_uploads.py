@@ -1,0 +1,132 @@
+"""The body of a request that uploads a plan: a file of any format, alone or in a form with what to know about it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from fastapi import Request
+
+from lalaloc_core.errors import InvalidFloorPlanError, MissingExtraError, SeveralLevelsError
+from lalaloc_core.plans import ImportOptions
+from service.conversion import seems_native
+from service.errors import (
+    ConverterNotReadyError,
+    InvalidRequestError,
+    MalformedRequestError,
+    PlanTooLargeError,
+    StoreFullError,
+    StoreUnavailableError,
+    UnsupportedMediaError,
+    UploadTimeoutError,
+    UploadTooLargeError,
+)
+from service.http.uploads import JSON, MULTIPART, Parts, UploadLimits, media_type, read_body, read_parts
+from service.runtime import Runtime
+from service.schemas import ImportForm
+from service.threads import Threads
+
+_FILE = "file"
+# What tools say of such files; which of them it is, says the file.
+_FILES = (
+    JSON,
+    "application/geo+json",
+    "application/zip",
+    "application/pdf",
+    "image/svg+xml",
+    "image/png",
+    "image/jpeg",
+    "image/vnd.dxf",
+    "application/dxf",
+    "application/x-step",
+    "application/octet-stream",
+)
+_BYTES = {"schema": {"type": "string", "format": "binary"}}
+REFUSED_UPLOADS = (
+    InvalidFloorPlanError,
+    SeveralLevelsError,
+    MissingExtraError,
+    InvalidRequestError,
+    PlanTooLargeError,
+    MalformedRequestError,
+    UnsupportedMediaError,
+    UploadTooLargeError,
+    UploadTimeoutError,
+    ConverterNotReadyError,
+    StoreUnavailableError,
+    StoreFullError,
+)
+
+
+def _form_schema() -> dict[str, Any]:
+    schema = ImportForm.model_json_schema()
+    schema["properties"][_FILE] = {
+        "type": "string",
+        "format": "binary",
+        "description": "GeoJSON, an IMDF archive, SVG, DXF, IFC (also zipped), PDF, PNG, JPEG, or JSON in the native "
+        "format (FloorPlanDocument); which of them it is, is found out by its content.",
+    }
+    schema["required"] = [_FILE]
+    return schema
+
+
+# How both operations that take a plan describe their body.
+UPLOAD_BODY: dict[str, Any] = {
+    "required": True,
+    "content": {
+        JSON: {"schema": {"$ref": "#/components/schemas/FloorPlanDocument"}},
+        MULTIPART: {"schema": _form_schema()},
+        **dict.fromkeys(_FILES[1:], _BYTES),
+    },
+}
+
+
+@dataclass(frozen=True)
+class Upload:
+    """What was sent: the bytes of a file, and what was said of it."""
+
+    content: bytes
+    options: ImportOptions
+    fields: Mapping[str, str]
+
+    @property
+    def parts(self) -> Parts:
+        """What makes a request the same as another."""
+        return Parts(dict(self.fields), {_FILE: self.content})
+
+    def threads(self, runtime: Runtime) -> Threads:
+        """Where it is read and stored: what waits for a worker is not in the way of what does not."""
+        return runtime.uploads if seems_native(self.content) else runtime.file_uploads
+
+
+async def read_upload(request: Request, runtime: Runtime) -> Upload:
+    """The file in a request, with its options.
+
+    Raises:
+        UnsupportedMediaError: a body that says it is something else.
+        UploadTooLargeError, UploadTimeoutError, MalformedRequestError: see `read_body` and `read_parts`.
+        InvalidRequestError: a part or an option that is missing, unknown, or has a value that it cannot have.
+    """
+    limits = UploadLimits.of(runtime.settings, "max_plan_bytes")
+    if media_type(request, (MULTIPART, *_FILES)) != MULTIPART:
+        return Upload(await read_body(request, limits), ImportOptions(), {})
+    known = set(ImportForm.model_fields)
+    parts = await read_parts(request, limits, files={_FILE}, fields=known, check=_faults)
+    return Upload(parts.files[_FILE], ImportOptions.from_text(parts.fields), parts.fields)
+
+
+def _faults(fields: Mapping[str, str]) -> list[tuple[str, str]]:
+    """What is wrong with options, each by its name; those that contradict each other, by the names of all."""
+    faults = []
+    for name, text in fields.items():
+        try:
+            ImportOptions.from_text({name: text})
+        except InvalidFloorPlanError as error:
+            faults.append((name, error.reason.removeprefix(f"{name} ")))
+    if not faults:
+        try:
+            ImportOptions.from_text(fields)
+        except InvalidFloorPlanError as error:
+            faults.append(("scale", error.reason))
+    return faults

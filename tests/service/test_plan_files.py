@@ -1,0 +1,365 @@
+"""Floor plans as the files people have, over HTTP: read in processes that may die, told with what was understood."""
+
+from __future__ import annotations
+
+import io
+import json
+import multiprocessing
+import os
+import signal
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+import shapely
+from ezdxf.filemanagement import new as new_dxf
+from PIL import Image
+
+from benchmarks.plan_drawing import draw_plan
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.plans import Anchor, export_plan
+from tests.plans.conftest import FLAT as PLAN
+from tests.plans.test_ifc import DUPLEX, ifc_flat
+from tests.plans.test_pictures import vector_pdf
+from tests.service.conftest import StartApp, assert_problem, localise, wait_for
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+ANCHOR = Anchor(latitude=48.1372, longitude=11.5756, north_deg=25.0)
+SVG = '<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink">{}</svg>'
+
+
+def send(client: httpx.Client, content: bytes, **options: Any) -> httpx.Response:
+    fields = {name: str(value) for name, value in options.items()}
+    return client.post("/floorplans", files={"file": ("plan", content)}, data=fields)
+
+
+def stored(client: httpx.Client, content: bytes, **options: Any) -> dict[str, Any]:
+    response = send(client, content, **options)
+    assert response.status_code == 201, response.text
+    return response.json()
+
+
+def written(format: str) -> bytes:
+    """The plan of three rooms as a file."""
+    return export_plan(FloorPlan.from_dict(json.loads(json.dumps(PLAN))), format, ANCHOR if format == "imdf" else None)
+
+
+def importers() -> set[int]:
+    """Process ids of the workers that read files, of all apps that run."""
+    children = [child for child in multiprocessing.active_children() if child.name.startswith("lalaloc-import")]
+    return {child.pid for child in children if child.pid is not None}
+
+
+@pytest.mark.parametrize(
+    ("format", "media", "named"),
+    [
+        ("native", "application/json", "native"),
+        ("geojson", "application/geo+json", "geojson"),
+        ("imdf", "application/zip", "imdf"),
+        ("dxf", "image/vnd.dxf", "dxf"),
+        ("svg", "image/svg+xml", "svg"),
+    ],
+)
+def test_a_file_is_taken_as_it_is_and_says_how_it_was_read(
+    client: httpx.Client, format: str, media: str, named: str
+) -> None:
+    content = written(format)
+    plan = stored(client, content)
+    assert sorted(room["name"] for room in plan["rooms"]) == ["bedroom", "corridor", "living room"]
+    kinds = sorted(opening["kind"] for opening in plan["plan"]["openings"])
+    assert kinds == ["door", "door", "passage", "window"]
+    report = plan["import_report"]
+    assert report["format"] == named
+    assert not report["is_draft"]
+    assert report["layers"]
+    assert client.get(f"/floorplans/{plan['id']}").json()["import_report"] == report
+    original = client.get(f"/floorplans/{plan['id']}/original")
+    assert original.content == content
+    assert original.headers["content-type"] == media
+    assert original.headers["x-content-type-options"] == "nosniff"
+    assert "default-src 'none'" in original.headers["content-security-policy"]
+
+
+def test_an_ifc_model_is_taken(client: httpx.Client) -> None:
+    plan = stored(client, ifc_flat().content())
+    assert [(room["name"], room["type"]) for room in plan["rooms"]] == [("Küche", "kitchen"), ("Wohnen", "living")]
+    assert plan["import_report"]["level"] == {"name": "EG", "number": 0.0, "elevation_m": 0.0}
+
+
+def test_a_pdf_is_a_draft(client: httpx.Client) -> None:
+    plan = stored(client, vector_pdf())
+    assert plan["import_report"]["is_draft"]
+    assert sorted(room["name"] for room in plan["rooms"]) == ["Kitchen", "Wohnzimmer"]
+    assert plan["import_report"]["scale_source"] == "1:100, as is written in the drawing"
+
+
+def test_a_picture_needs_a_scale_and_is_a_draft_that_says_what_it_is_unsure_of(client: httpx.Client) -> None:
+    drawn = draw_plan("thick", 1)
+    asked = assert_problem(send(client, drawn.png()), 422, "invalid-floorplan")
+    assert "metres_per_pixel" in asked["detail"]
+    plan = stored(client, drawn.png(), metres_per_pixel=drawn.metres_per_pixel, name="Drawn")
+    assert plan["name"] == "Drawn"
+    assert len(plan["rooms"]) == len(drawn.rooms)
+    assert plan["import_report"]["is_draft"]
+    assert any("ceiling height" in line for line in plan["import_report"]["unsure"])
+    assert client.get(f"/floorplans/{plan['id']}/original").headers["content-type"] == "image/png"
+
+
+def test_a_plan_in_feet_is_converted(client: httpx.Client) -> None:
+    feet = {"units": "ft", "ceiling_height": 8, "rooms": [{"polygon": [[0, 0], [12, 0], [12, 10], [0, 10]]}]}
+    plan = client.post("/floorplans", json=feet).json()
+    assert plan["area_m2"] == pytest.approx(120 * 0.3048**2, abs=1e-3)
+    assert plan["rooms"][0]["ceiling_height_m"] == pytest.approx(8 * 0.3048)
+    assert plan["warnings"] == []
+
+
+def test_what_is_likely_wrong_is_told(client: httpx.Client) -> None:
+    square = [[0, 0], [4, 0], [4, 3], [0, 3]]
+    plan = {
+        "ceiling_height_m": 8,
+        "rooms": [
+            {"name": "hall", "polygon": square},
+            {"name": "hall", "polygon": [[x + 4.1, y] for x, y in square]},
+            {"name": "over", "polygon": [[x + 6, y] for x, y in square]},
+            {"name": "shed", "polygon": [[x + 30, y] for x, y in square]},
+        ],
+        "openings": [{"kind": "door", "line": [[4.05, 1], [4.05, 1.9]]}],
+    }
+    answer = client.post("/floorplans", json=plan).json()
+    told = "\n".join(answer["warnings"])
+    for words in ("it looks like feet", "share a name: 'hall'", "'shed'", "no door or passage reaches", "overlap"):
+        assert words in told
+    assert client.get(f"/floorplans/{answer['id']}").json()["warnings"] == answer["warnings"]
+
+
+def test_a_y_axis_that_points_down_is_told(client: httpx.Client) -> None:
+    document = new_dxf()
+    document.header["$INSUNITS"] = 6
+    document.header["$UCSYDIR"] = (0, -1, 0)
+    room = document.modelspace().add_lwpolyline([(0, 0), (4, 0), (4, 3), (0, 3)], dxfattribs={"layer": "ROOM"})
+    room.close()
+    text = io.StringIO()
+    document.write(text)
+    assert any("y" in line and "down" in line for line in stored(client, text.getvalue().encode())["warnings"])
+
+
+def test_a_file_is_also_taken_as_the_body_whatever_type_it_is_said_to_have(client: httpx.Client) -> None:
+    for media in ("image/vnd.dxf", "application/octet-stream", "application/json"):
+        response = client.post("/floorplans", content=written("dxf"), headers={"content-type": media})
+        assert response.status_code == 201, response.text
+        assert response.json()["import_report"]["format"] == "dxf"
+
+
+def test_of_several_levels_one_has_to_be_chosen(client: httpx.Client) -> None:
+    collection = json.loads(written("geojson"))
+    upper = json.loads(json.dumps(collection["features"]))
+    for feature in collection["features"]:
+        feature["properties"]["level"] = "0"
+        feature.pop("id", None)
+    for feature in upper:
+        feature["properties"]["level"] = "1"
+        feature.pop("id", None)
+    collection["features"] += upper
+    content = json.dumps(collection).encode()
+    problem = assert_problem(send(client, content), 422, "several-levels")
+    assert problem["levels"] == ["0", "1"]
+    assert "2 levels: '0', '1'; choose one with `level`" in problem["detail"]
+    assert stored(client, content, level="1")["import_report"]["level"]["name"] == "1"
+    nowhere = assert_problem(send(client, content, level="7"), 422, "invalid-floorplan")
+    assert "has no level '7', it has '0', '1'" in nowhere["detail"]
+
+
+@pytest.mark.skipif(DUPLEX is None, reason="the sample model does not lie beside the project")
+def test_the_sample_model_of_two_storeys(client: httpx.Client) -> None:
+    assert DUPLEX is not None
+    content = DUPLEX.read_bytes()
+    levels = assert_problem(send(client, content), 422, "several-levels")["levels"]
+    assert "Level 1" in levels
+    plan = stored(client, content, level="Level 1")
+    assert len(plan["rooms"]) >= 8
+    assert plan["import_report"]["level"]["name"] == "Level 1"
+    assert client.get(f"/floorplans/{plan['id']}/original").content == content
+
+
+@pytest.mark.parametrize(
+    ("options", "field", "words"),
+    [
+        ({"units": "miles"}, "units", "known are m, cm, mm, in, ft"),
+        ({"scale": "large"}, "scale", "must look like 1:100"),
+        ({"metres_per_pixel": "1_0"}, "metres_per_pixel", "must be a number"),
+        ({"metres_per_pixel": "99"}, "metres_per_pixel", "between 1e-06 and 10"),
+        ({"known_distance": "1,2,3"}, "known_distance", "has 3 numbers"),
+        ({"page": "0"}, "page", "between 1 and"),
+        ({"y_axis": "left"}, "y_axis", "known are up, down"),
+        ({"scale": "1:50", "metres_per_pixel": "0.01"}, "scale", "more than once"),
+        ({"color": "red"}, "color", "unknown part"),
+    ],
+)
+def test_an_option_that_cannot_be_is_refused_by_its_name(
+    client: httpx.Client, options: dict[str, str], field: str, words: str
+) -> None:
+    problem = assert_problem(send(client, written("svg"), **options), 422, "invalid-request")
+    assert [fault["field"] for fault in problem["errors"]] == [field]
+    assert words in problem["errors"][0]["message"]
+
+
+def test_an_option_that_says_nothing_about_the_file_is_told(client: httpx.Client) -> None:
+    plan = stored(client, written("native"), level="2")
+    assert any("'level' says nothing about a native file" in line for line in plan["warnings"])
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"hello there", "no known format; known are"),
+        (b"AC1032 dwg", "DWG: save it as DXF"),
+        (b"GIF89a....", "GIF: save it as PNG"),
+        (b"%PDF-1.7 nothing", "cannot be read"),
+        (b'{"type": "FeatureCollection", "features": []}', "no features"),
+        (b"   ", "the body is empty"),
+    ],
+)
+def test_a_file_that_is_no_plan_is_refused_with_what_to_do(client: httpx.Client, content: bytes, words: str) -> None:
+    assert words in assert_problem(send(client, content), 422, "invalid-floorplan")["detail"]
+
+
+def test_a_file_replaces_a_plan(client: httpx.Client) -> None:
+    plan = stored(client, written("native"))
+    content = written("svg")
+    answer = client.put(f"/floorplans/{plan['id']}", files={"file": ("plan.svg", content)}, data={"name": "Anew"})
+    assert answer.status_code == 200, answer.text
+    assert answer.json()["name"] == "Anew"
+    assert answer.json()["import_report"]["format"] == "svg"
+    assert client.get(f"/floorplans/{plan['id']}/original").content == content
+
+
+def test_the_same_file_with_the_same_key_and_other_options_is_another_request(client: httpx.Client) -> None:
+    def ask(**fields: str) -> httpx.Response:
+        file = {"file": ("plan", written("svg"))}
+        return client.post("/floorplans", files=file, data=fields, headers={"Idempotency-Key": "a-file"})
+
+    first = ask(name="one")
+    assert first.status_code == 201
+    again = ask(name="one")
+    assert (again.content, again.headers["idempotency-replayed"]) == (first.content, "true")
+    assert_problem(ask(name="two"), 422, "idempotency-key-reused")
+
+
+@pytest.fixture(scope="module")
+def strict(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+    """An app that takes little."""
+    limits: dict[str, Any] = {
+        "max_unpacked_bytes": 1_000_000,
+        "max_entities": 3000,
+        "max_plan_pixels": 1_000_000,
+        "max_plan_bytes": 3_000_000,
+    }
+    with start_app(tmp_path_factory.mktemp("strict"), **limits) as client:
+        told = client.get("/limits").json()
+        assert {name: told[name] for name in limits} == limits
+        yield client
+
+
+class TestHostile:
+    """What is made to exhaust or to reach out is refused, and the service answers the next one."""
+
+    def refused(self, client: httpx.Client, content: bytes, words: str) -> None:
+        problem = assert_problem(send(client, content, metres_per_pixel=0.01), 422, "invalid-floorplan")
+        assert words in problem["detail"]
+        assert stored(client, written("svg"))["rooms"]
+
+    def test_a_zip_that_unpacks_to_more_than_it_may(self, strict: httpx.Client) -> None:
+        stream = io.BytesIO()
+        with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+            archive.writestr("unit.geojson", b" " * 3_000_000)
+        self.refused(strict, stream.getvalue(), "more than 1000000 bytes (max_unpacked_bytes)")
+
+    def test_entities_that_multiply_and_that_are_elsewhere(self, strict: httpx.Client) -> None:
+        lol = "".join(f'<!ENTITY l{i} "{f"&l{i - 1};" * 10}">' for i in range(1, 10))
+        bomb = f'<!DOCTYPE svg [<!ENTITY l0 "lol">{lol}]>{SVG.format("<text>&l9;</text>")}'
+        self.refused(strict, bomb.encode(), "declares entities")
+        outside = f'<!DOCTYPE svg [<!ENTITY x SYSTEM "file:///etc/passwd">]>{SVG.format("<text>&x;</text>")}'
+        self.refused(strict, outside.encode(), "entities")
+
+    def test_a_drawing_of_too_many_lines(self, strict: httpx.Client) -> None:
+        document = new_dxf()
+        for x in range(4000):
+            document.modelspace().add_line((x, 0), (x, 1))
+        text = io.StringIO()
+        document.write(text)
+        self.refused(strict, text.getvalue().encode(), "more than 3000 entities (max_entities)")
+
+    def test_a_picture_of_too_many_pixels(self, strict: httpx.Client) -> None:
+        header = b"IHDR" + struct.pack(">IIBBBBB", 30_000, 30_000, 8, 0, 0, 0, 0)
+        chunk = struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header))
+        picture = b"\x89PNG\r\n\x1a\n" + chunk + struct.pack(">I", 0) + b"IEND" + struct.pack(">I", zlib.crc32(b"IEND"))
+        self.refused(strict, picture, "pixels")
+
+    def test_json_that_is_deep_and_large(self, strict: httpx.Client) -> None:
+        self.refused(strict, b'{"type": "FeatureCollection", "features": ' + b"[" * 1_000_000, "nested")
+        rooms = {"ceiling_height_m": 2.5, "rooms": [{"polygon": [[0, 0]] * 290_000}]}
+        self.refused(strict, json.dumps(rooms).encode(), "vertices")
+
+    def test_a_file_without_an_end(self, strict: httpx.Client) -> None:
+        def endless() -> Iterator[bytes]:
+            yield b"0\nSECTION\n"
+            for _ in range(200):
+                yield b"0\nLINE\n" * 10_000
+
+        response = strict.post("/floorplans", content=endless(), headers={"content-type": "image/vnd.dxf"})
+        problem = assert_problem(response, 413, "upload-too-large")
+        assert "at most 3000000 bytes are allowed (max_plan_bytes)" in problem["detail"]
+        assert stored(strict, written("svg"))["rooms"]
+
+
+@pytest.mark.one_replica
+def test_a_file_over_which_the_reader_stalls_is_refused_and_the_next_is_read(
+    start_app: StartApp, tmp_path: Path
+) -> None:
+    others = importers()
+    with start_app(tmp_path, import_stall_s=5.0) as client:
+        assert importers() == others, "they start with the first file"
+        stored(client, written("svg"))
+        # Whatever it is that keeps it busy.
+        (pid,) = importers() - others
+        os.kill(pid, signal.SIGSTOP)
+        problem = assert_problem(send(client, written("dxf")), 422, "invalid-floorplan")
+        assert "longer than 5 s (import_stall_s)" in problem["detail"]
+        wait_for(lambda: client.get("/readyz").json()["import_pool"]["ready"] == 1)
+        # One that is killed costs no upload.
+        (pid,) = importers() - others
+        os.kill(pid, signal.SIGKILL)
+        assert stored(client, written("svg"))["rooms"]
+    assert importers() == others, "the pool left a process behind"
+
+
+@pytest.mark.one_replica
+def test_a_file_that_takes_too_much_memory_is_refused(start_app: StartApp, tmp_path: Path) -> None:
+    stream = io.BytesIO()
+    Image.new("L", (9_000, 9_000), 255).save(stream, "PNG")
+    with start_app(tmp_path, import_memory_bytes=256 * 2**20, max_plan_pixels=10**9) as client:
+        response = send(client, stream.getvalue(), metres_per_pixel=0.001)
+        assert "memory" in assert_problem(response, 422, "invalid-floorplan")["detail"]
+        assert stored(client, written("svg"))["rooms"]
+
+
+def test_an_example_is_answered_in_a_plan_that_came_as_a_drawing(start_app: StartApp, tmp_path: Path) -> None:
+    plan = FloorPlan.from_json((EXAMPLES / "flat.json").read_bytes())
+    bundle = Path(__file__).parents[2] / "models" / "default"
+    truth = next(pose for pose in json.loads((EXAMPLES / "poses.json").read_text()) if pose["room"] == "kitchen")
+    picture = (EXAMPLES / truth["file"]).read_bytes()
+    with start_app(tmp_path, bundle=bundle) as client:
+        for format in ("dxf", "svg", "geojson"):
+            made = stored(client, export_plan(plan, format), ceiling_height_m=2.6)
+            assert made["status"] == "ready"
+            response = localise(client, made["id"], picture, heading_deg=truth["heading_deg"], refine="vdr")
+            assert response.status_code == 200, response.text
+            answer = response.json()
+            assert answer["room"] == "kitchen"
+            place = shapely.Point(answer["position"]["x_m"], answer["position"]["y_m"])
+            assert place.distance(shapely.Point(truth["x_m"], truth["y_m"])) < 0.3
