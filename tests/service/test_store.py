@@ -756,6 +756,7 @@ CREATE TABLE {grids} (
 
 
 # Columns that came with venues.
+_OF_FILES = (("revisions", "original_media_type"), ("revisions", "report"))
 _OF_VENUES = (("latent_grids", "prototypes"), ("revisions", "camera_height_std_m"))
 
 
@@ -772,6 +773,7 @@ def test_grids_of_the_schema_before_are_computed_again_and_the_rest_stays(store:
             ("grid_leases", "attempts"),
             ("idempotency", "lease_s"),
             *_OF_VENUES,
+            *_OF_FILES,
         ):
             connection.exec_driver_sql(f"ALTER TABLE {table} DROP COLUMN {column}")
         for table in ("venue_plans", "venues"):
@@ -795,7 +797,7 @@ def test_venues_are_added_to_what_there_is(store: Store, url: str) -> None:
     revision_id = _add(store, "p")
     _put(store, _key(revision_id))
     with store._database.writing() as connection:
-        for table, column in _OF_VENUES:
+        for table, column in (*_OF_VENUES, *_OF_FILES):
             connection.exec_driver_sql(f"ALTER TABLE {table} DROP COLUMN {column}")
         for table in ("venue_plans", "venues"):
             connection.exec_driver_sql(f"DROP TABLE {table}")
