@@ -1,6 +1,6 @@
 """Files of floor plans, read into plans and written from them in worker processes that may die.
 
-`files.py` says what an upload is and takes the native format itself; begin with `converter.py`, which has the workers.
+Begin with `converter.py`, which has the workers. `files.py` says what an upload is, and takes the native format itself.
 """
 
 from service.conversion.converter import Converter
