@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import signal
 import sys
 from collections.abc import Sequence
@@ -13,6 +14,7 @@ from examples.truth import PLAN_PATH
 from lalaloc_client import Client, ClientError, FloorPlan
 
 _PLAN_TIMEOUT_S = 120.0
+_TRIED_OUT = {"LALALOC_KEEP_ANSWERS_S": "86400"}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -22,7 +24,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     port = parser.parse_args(arguments).port
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        with running_service(port, {}) as service:
+        # Whoever tries it out may want to show somebody else what was found; the photograph itself is never kept.
+        kept = {name: value for name, value in _TRIED_OUT.items() if name not in os.environ}
+        with running_service(port, kept) as service:
             with Client(service.url) as client:
                 plan = load_example_plan(client)
             print(f"ready: {service.url} (plan '{plan.name}': {plan.id}); stop with Ctrl-C", flush=True)

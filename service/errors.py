@@ -7,6 +7,7 @@ LaLaLocError
     ├── UnknownFloorPlanError       no floor plan with this id
     ├── UnknownVenueError           no venue with this id
     ├── UnknownRevisionError        no such revision of the floor plan
+    ├── UnknownAnswerError          no answer is kept under this id
     ├── UploadTooLargeError         more bytes than allowed
     ├── UploadTimeoutError          the upload took too long
     ├── UnsupportedMediaError       a body of a type that is not read here
@@ -107,6 +108,16 @@ class UnknownRevisionError(ServiceError):
 
     def __init__(self, plan_id: str, revision_id: str) -> None:
         super().__init__(f"floor plan '{plan_id}' has no revision '{revision_id[:64]}', or has it no more")
+
+
+class UnknownAnswerError(ServiceError):
+    """No answer is kept under this id, or it is no longer."""
+
+    def __init__(self, answer_id: str) -> None:
+        super().__init__(
+            f"no answer is kept under '{answer_id[:64]}': it was forgotten after a while (keep_answers_s) or with its "
+            "floor plan, or never was"
+        )
 
 
 class UploadTooLargeError(ServiceError):
@@ -389,6 +400,7 @@ PROBLEMS: dict[type[Exception], ProblemKind] = {
     UnknownFloorPlanError: ProblemKind(404, "unknown-floorplan", "Unknown floor plan"),
     UnknownVenueError: ProblemKind(404, "unknown-venue", "Unknown venue"),
     UnknownRevisionError: ProblemKind(404, "unknown-revision", "Unknown revision"),
+    UnknownAnswerError: ProblemKind(404, "unknown-answer", "Unknown answer"),
     UploadTooLargeError: ProblemKind(413, "upload-too-large", "Upload too large"),
     UploadTimeoutError: ProblemKind(408, "upload-timeout", "Upload took too long"),
     UnsupportedMediaError: ProblemKind(415, "unsupported-media", "Unsupported media type"),

@@ -132,7 +132,7 @@ def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack) 
             telemetry=telemetry,
         )
     )
-    sweeper = kept(Sweeper(store, grids, sweep_s=settings.sweep_s))
+    sweeper = kept(Sweeper(store, grids, sweep_s=settings.sweep_s, keep_answers_s=settings.keep_answers_s))
     sweeper.start()
     # One look at a time, which takes no thread from queries while the database is silent.
     looks = kept(BoundedReads(threads=1, max_pending=1, wait_s=settings.database_wait_s))

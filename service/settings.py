@@ -229,6 +229,12 @@ class Settings(BaseSettings):
         default=8, description="Stored latent grids (camera heights) per plan; the oldest on-demand one makes room."
     )
 
+    keep_answers_s: Annotated[float, Field(ge=0.0, le=366 * 86400.0)] = Field(
+        default=0.0,
+        description="How long answers, not their panoramas, are kept so that a link opens them again; 0: not at all.",
+    )
+    max_kept_answers: Count = Field(default=10_000, description="Kept answers per tenant; the oldest makes room.")
+
     max_revisions: Annotated[int, Field(ge=2)] = Field(
         default=10, description="Revisions kept per floor plan; the oldest makes room."
     )

@@ -20,10 +20,11 @@ _PURGE_EVERY_S = 3600.0
 class Sweeper:
     """A thread with a few cheap queries every now and then; a database that is away is tried again."""
 
-    def __init__(self, store: Store, grids: GridProvider, *, sweep_s: float) -> None:
+    def __init__(self, store: Store, grids: GridProvider, *, sweep_s: float, keep_answers_s: float) -> None:
         self._store = store
         self._grids = grids
         self._sweep_s = sweep_s
+        self._keep_answers_s = keep_answers_s
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="sweeper", daemon=True)
 
@@ -68,6 +69,7 @@ class Sweeper:
                 if monotonic() >= purge_at:
                     purge_at = monotonic() + _PURGE_EVERY_S
                     self._store.idempotency_keys.purge()
+                    self._store.answers.purge(kept_s=self._keep_answers_s)
             except StoreUnavailableError:
                 continue
             except Exception:

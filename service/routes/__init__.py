@@ -4,12 +4,34 @@ Begin with `localise.py`, the query. `dependencies.py` has what routes about pla
 in the words of the API.
 """
 
-from service.routes import floorplans, health, limits, localise, pages, plan_events, plan_files, plan_layout, venues
+from service.routes import (
+    floorplans,
+    health,
+    kept_answers,
+    limits,
+    localise,
+    pages,
+    plan_events,
+    plan_files,
+    plan_layout,
+    venues,
+)
 
 # In the order in which the API description has them.
 ROUTERS = tuple(
     module.router
-    for module in (floorplans, plan_files, plan_layout, plan_events, venues, localise, health, limits, pages)
+    for module in (
+        floorplans,
+        plan_files,
+        plan_layout,
+        plan_events,
+        venues,
+        localise,
+        kept_answers,
+        health,
+        limits,
+        pages,
+    )
 )
 
 __all__ = ["ROUTERS"]

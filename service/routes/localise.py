@@ -35,6 +35,7 @@ from service.http.problems import problem_responses
 from service.http.uploads import JSON, MULTIPART, UploadLimits, faults_of, media_type, read_parts, validate_fields
 from service.query.localiser import AskedPicture
 from service.routes.dependencies import IDEMPOTENCY_KEY, Party, Running, Tenant, plan_for_query
+from service.runtime import Runtime
 from service.schemas import LocaliseAnswer, LocaliseForm
 from service.telemetry import note
 
@@ -138,7 +139,7 @@ async def localise(
         if media == JSON:
             found = await runtime.localiser.answer(record, form, content, begin, clock, party)
             note(request, stage=found.stage)
-            return Response(found.model_dump_json(), headers=_VARY, media_type=JSON)
+            return Response(await _text(found, tenant, runtime), headers=_VARY, media_type=JSON)
         rooms = await runtime.drawings.rooms(record)
         asked = AskedPicture(picture=picture or "both", pixels=media == _PNG, rooms=rooms)
         found, drawn = await runtime.localiser.picture(record, form, content, begin, clock, party, asked)
@@ -156,3 +157,21 @@ def _check_asked(request: Request, media: str, picture: Picture | None) -> None:
         raise InvalidRequestError([("picture", f"needs the header Accept: {_PNG} or Accept: {_SVG}")])
     if media != JSON and IDEMPOTENCY_HEADER in request.headers:
         raise InvalidRequestError([(IDEMPOTENCY_HEADER, "is for answers in JSON; pictures are not kept")])
+
+
+async def _text(answer: LocaliseAnswer, tenant: str, runtime: Runtime) -> str:
+    """An answer as JSON; under its id it is the same, where answers are kept."""
+    if runtime.settings.keep_answers_s == 0.0:
+        return answer.model_dump_json()
+    told = {"": answer.model_dump_json()}
+
+    def with_id(answer_id: str) -> str:
+        told[answer_id] = answer.model_copy(update={"answer_id": answer_id}).model_dump_json()
+        return told[answer_id]
+
+    keep = partial(runtime.store.answers.add, limit=runtime.settings.max_kept_answers)
+    try:
+        return told[await runtime.reads.run(keep, tenant, answer.floorplan_id, with_id) or ""]
+    except StoreUnavailableError:
+        # It was found all the same.
+        return told[""]

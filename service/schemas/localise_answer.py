@@ -106,6 +106,11 @@ class LocaliseAnswer(Answer):
     latent_distance: Score = _LATENT_DISTANCE
     camera_height_m: Metres = Field(description="The camera height that fits best.")
     candidates: list[CandidateAnswer] = Field(description="Best first; the first one is the answer.")
+    answer_id: str | None = Field(
+        default=None,
+        description="Under which `GET /answers/{answer_id}` tells the same again, for `keep_answers_s`; null where "
+        "answers are not kept.",
+    )
     posterior: PosteriorAnswer | None = Field(
         default=None, description="How probable all places are; null unless asked for with `include`."
     )

@@ -51,6 +51,8 @@ NEEDED: Mapping[tuple[str, str], Permission] = {
     ("PATCH", "/venues/{venue_id}"): Permission.WRITE,
     ("DELETE", "/venues/{venue_id}"): Permission.WRITE,
     ("GET", "/venues/{venue_id}/plans"): Permission.READ,
+    ("GET", "/answers/{answer_id}"): Permission.READ,
+    ("DELETE", "/answers/{answer_id}"): Permission.LOCALISE,
     ("POST", "/localise"): Permission.LOCALISE,
 }
 _PATTERNS = {path: compile_path(path)[0] for _, path in NEEDED}

@@ -11,6 +11,7 @@ from service.settings import Settings
 from service.storage.api_keys import ApiKeys
 from service.storage.database import Database
 from service.storage.idempotency_keys import MIN_LEASE_S, IdempotencyKeys
+from service.storage.kept_answers import KeptAnswers
 from service.storage.migration import migrate
 from service.storage.plan_cache import PlanCache
 from service.storage.plans import Plans
@@ -33,6 +34,7 @@ class Store:
         leases: who computes which grid.
         idempotency_keys: answers to requests that may be sent twice.
         keys: API keys.
+        answers: answers that are kept for a while.
     """
 
     def __init__(
@@ -68,6 +70,7 @@ class Store:
         self.leases = GridLeases(database)
         self.idempotency_keys = IdempotencyKeys(database, claim_s)
         self.keys = ApiKeys(database)
+        self.answers = KeptAnswers(database)
 
     def answered_since(self, moment_s: float) -> bool:
         """Whether the database answered anybody after a moment (`monotonic`); who waits since then finds it busy."""

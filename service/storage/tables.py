@@ -182,6 +182,19 @@ API_KEYS = Table(
     Column("last_used_at", Moment),
 )
 
+KEPT_ANSWERS = Table(
+    "kept_answers",
+    METADATA,
+    Column("id", String(32), primary_key=True),
+    Column("tenant", String(64), nullable=False),
+    Column("plan_id", String(32), ForeignKey("floorplans.id", ondelete="CASCADE"), nullable=False),
+    Column("created_at", Moment, nullable=False),
+    Column("content", Text, nullable=False),
+    Index("kept_answers_by_tenant_and_age", "tenant", "created_at"),
+    Index("kept_answers_by_age", "created_at"),
+    Index("kept_answers_by_plan", "plan_id"),
+)
+
 IDEMPOTENCY = Table(
     "idempotency",
     METADATA,

@@ -11,7 +11,7 @@ from playwright.sync_api import Browser, expect
 from service.storage.store import Store
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, upload
 from tests.service.test_security import make_key
-from tests.web.conftest import Visit, visit
+from tests.web.conftest import EXAMPLES, Visit, visit
 from tests.web.test_answer import _assert_accessible
 
 
@@ -110,3 +110,26 @@ def test_the_documentation_has_examples_and_tries_operations(desktop: Visit) -> 
     operation.get_by_role("button", name="Send").click()
     expect(operation.locator("[role=alert]")).to_contain_text("Unknown floor plan")
     _assert_accessible(page)
+
+
+def test_a_link_opens_an_answer_again_and_takes_its_photograph_back(
+    browser: Browser, start_app: StartApp, tmp_path: Path
+) -> None:
+    with start_app(tmp_path, keep_answers_s=3600.0) as client:
+        for visited in visit(browser, client):
+            page = visited.open_example()
+            visited.find()
+            room = page.locator("#answer .room").inner_text()
+            place = page.locator("#answer .where").inner_text()
+            page.locator("#copy-link").click()
+            link = page.locator("#copied").inner_text()
+            page.goto("about:blank")
+            page.goto(link)
+            expect(page.locator("#answer .room")).to_have_text(room)
+            expect(page.locator("#answer .where")).to_have_text(place)
+            expect(page.locator("#fit-state")).to_contain_text("Add the photograph")
+            page.locator("#photo-file").set_input_files(EXAMPLES / "kitchen.jpg")
+            expect(page.locator("#fit-state")).to_contain_text("Layout as seen from")
+            page.goto("about:blank")
+            page.goto(f"{link[:-32]}{'0' * 32}")
+            expect(page.locator("#plan-error")).to_contain_text("no answer is kept")

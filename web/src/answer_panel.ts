@@ -75,7 +75,7 @@ function facts(answer: Answer): HTMLElement {
 function sharing(answer: Answer, photo: Photo | null): HTMLElement {
   const file = photo?.file.name.replace(/^example-/, "examples/") ?? "photo.jpg";
   const fields = photo?.fields ?? { floorplan_id: answer.floorplan_id };
-  const link = answer.answer_id === null ? null : `${location.origin}${location.pathname}#answer=${answer.answer_id}`;
+  const link = answer.answer_id == null ? null : `${location.origin}${location.pathname}#answer=${answer.answer_id}`;
   return h("div", { class: "sharing" },
     button("Copy as curl", () => void copy(curlSnippet(fields, file), "curl command"), { id: "copy-curl" }),
     button("Copy as Python", () => void copy(pythonSnippet(fields, file), "Python code"), { id: "copy-python" }),

@@ -116,7 +116,7 @@ export interface Posterior {
 export interface Answer {
   floorplan_id: string;
   floorplan_revision: string;
-  answer_id: string | null;
+  answer_id?: string | null;
   position: { x_m: number; y_m: number };
   heading_deg: number;
   room: string;

@@ -1,0 +1,32 @@
+"""Answers that are kept for a while: told again, or forgotten at once."""
+
+from __future__ import annotations
+
+from fastapi import APIRouter, Response, status
+
+from service.errors import InvalidRequestError, StoreUnavailableError, UnknownAnswerError
+from service.http.problems import problem_responses
+from service.http.uploads import JSON
+from service.routes.dependencies import Running, Tenant, is_id
+from service.schemas import LocaliseAnswer
+
+router = APIRouter(prefix="/answers", tags=["localisation"])
+
+_PROBLEMS = problem_responses(UnknownAnswerError, InvalidRequestError, StoreUnavailableError)
+
+
+@router.get("/{answer_id}", summary="An answer again", response_model=LocaliseAnswer, responses=_PROBLEMS)
+def get_answer(answer_id: str, runtime: Running, tenant: Tenant) -> Response:
+    """What a query was answered, to the byte, while it is kept; its panorama never is."""
+    kept_s = runtime.settings.keep_answers_s
+    content = runtime.store.answers.get(tenant, answer_id, kept_s=kept_s) if is_id(answer_id) else None
+    if content is None:
+        raise UnknownAnswerError(answer_id)
+    return Response(content, media_type=JSON)
+
+
+@router.delete("/{answer_id}", status_code=status.HTTP_204_NO_CONTENT, summary="Forget an answer", responses=_PROBLEMS)
+def delete_answer(answer_id: str, runtime: Running, tenant: Tenant) -> None:
+    """Forget an answer before its time."""
+    if not is_id(answer_id) or not runtime.store.answers.delete(tenant, answer_id):
+        raise UnknownAnswerError(answer_id)

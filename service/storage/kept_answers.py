@@ -1,0 +1,65 @@
+"""Answers that are kept for a while, so that a link opens them again; never the panorama that they are about."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+
+from sqlalchemy import delete, select
+
+from service.storage.database import Database
+from service.storage.tables import FLOORPLANS, KEPT_ANSWERS
+
+_COLUMNS = KEPT_ANSWERS.c
+
+
+class KeptAnswers:
+    """Answers by their ids; another tenant's answer is one that does not exist, and one of a deleted plan is gone."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def add(self, tenant: str, plan_id: str, content_of: Callable[[str], str], *, limit: int) -> str | None:
+        """Keep an answer.
+
+        Args:
+            content_of: gives the answer's text, in which its id stands.
+            limit: most answers of the tenant; the oldest make room.
+
+        Returns:
+            its id; None where the plan is gone by now.
+        """
+        answer_id, now = uuid.uuid4().hex, datetime.now(UTC)
+        own = _COLUMNS.tenant == tenant
+        with self._database.writing() as connection:
+            # Held until the answer is stored: a plan that is deleted meanwhile takes it along.
+            plan = select(FLOORPLANS.c.id).where(FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
+            if connection.scalar(plan.with_for_update(read=True)) is None:
+                return None
+            values = {"id": answer_id, "tenant": tenant, "plan_id": plan_id, "created_at": now}
+            connection.execute(KEPT_ANSWERS.insert(), values | {"content": content_of(answer_id)})
+            newest = select(_COLUMNS.id).where(own).order_by(_COLUMNS.created_at.desc(), _COLUMNS.id)
+            surplus = connection.scalars(newest.offset(limit).limit(limit)).all()
+            if surplus:
+                connection.execute(delete(KEPT_ANSWERS).where(_COLUMNS.id.in_(surplus)))
+        return answer_id
+
+    def get(self, tenant: str, answer_id: str, *, kept_s: float) -> str | None:
+        """The text of an answer that is no older than `kept_s`; None where there is none."""
+        oldest = datetime.now(UTC) - timedelta(seconds=kept_s)
+        wanted = (_COLUMNS.tenant == tenant, _COLUMNS.id == answer_id, _COLUMNS.created_at >= oldest)
+        with self._database.reading() as connection:
+            return connection.scalar(select(_COLUMNS.content).where(*wanted))
+
+    def delete(self, tenant: str, answer_id: str) -> bool:
+        """Forget an answer; false where there is none."""
+        statement = delete(KEPT_ANSWERS).where(_COLUMNS.tenant == tenant, _COLUMNS.id == answer_id)
+        with self._database.writing() as connection:
+            return connection.execute(statement).rowcount > 0
+
+    def purge(self, *, kept_s: float) -> int:
+        """Drop what is older than `kept_s`; returns how many."""
+        statement = delete(KEPT_ANSWERS).where(_COLUMNS.created_at < datetime.now(UTC) - timedelta(seconds=kept_s))
+        with self._database.writing() as connection:
+            return connection.execute(statement).rowcount
