@@ -172,3 +172,11 @@ def test_the_examples_files_are_not_asked_for_where_there_are_other_plans(deskto
     expect(page.locator("#find")).to_be_disabled()
     page.locator("#photo-file").set_input_files(EXAMPLES / "kitchen.jpg")
     desktop.find()
+
+
+def test_several_photographs_are_found_with_one_click(desktop: Visit) -> None:
+    page = desktop.open()
+    page.locator("#photo-file").set_input_files([EXAMPLES / "kitchen.jpg", EXAMPLES / "study.jpg"])
+    page.get_by_role("button", name="Find all").click()
+    expect(page.locator(".thumb span", has_text="✓")).to_have_count(page.locator(".thumb").count())
+    expect(page.locator("#answer")).to_be_visible()

@@ -54,6 +54,7 @@ class Page {
     byId("edit-plan").addEventListener("click", () => this.edit(this.plan));
     byId("draw-plan").addEventListener("click", () => this.edit(null));
     this.find.addEventListener("click", () => void this.ask());
+    byId("find-all").addEventListener("click", () => void this.askAll());
     addEventListener("hashchange", () => void this.open());
     await this.panorama.setPicture(null);
     const stored = await this.plans.load();
@@ -107,6 +108,7 @@ class Page {
     }));
     if (isSame) return;
     this.layout = null;
+    this.photos.compass.setNorth(plan?.plan.north_deg ?? null);
     this.photos.forgetAnswers();
     this.setAnswer(null);
     this.drawBase();
@@ -244,6 +246,15 @@ class Page {
       if (!asking.signal.aborted) showError(byId("photo-error"), error, this.photos.fields);
     } finally {
       if (this.asking === asking) this.find.removeAttribute("aria-busy");
+    }
+  }
+
+  /** One after the other; the first that is refused ends it. */
+  private async askAll(): Promise<void> {
+    for (const photo of [...this.photos.list]) {
+      this.photos.choose(photo);
+      await this.ask();
+      if (photo.answer === null) return;
     }
   }
 

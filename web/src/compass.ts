@@ -6,6 +6,7 @@ import { degrees } from "./layout";
 export class Compass {
   readonly element: HTMLElement;
   private readonly needle = s("path", { class: "needle", d: "M0 -34L7 6L0 2L-7 6Z" });
+  private readonly north = s("g", { class: "to-north" }, s("path", { d: "M0 -50L4 -43L-4 -43Z" }), s("text", { y: -24, "font-size": 11 }, "N"));
   private readonly dial: SVGSVGElement;
   private readonly text = h("span", { class: "dial-text" });
   private heading: number | null = null;
@@ -18,12 +19,13 @@ export class Compass {
     this.dial = s("svg", {
       viewBox: "-52 -52 104 104", class: "dial", tabindex: 0, role: "slider", id: "compass", "aria-valuemin": 0,
       "aria-valuemax": 359, "aria-label": "Heading of the photograph: where its centre looks on the plan, degrees",
-    }, s("circle", { class: "rim", r: 50 }), ...marks, this.needle, s("circle", { class: "hub", r: 3 }));
+    }, s("circle", { class: "rim", r: 50 }), ...marks, this.north, this.needle, s("circle", { class: "hub", r: 3 }));
     this.dial.addEventListener("pointerdown", (event) => this.onPointer(event));
     this.dial.addEventListener("pointermove", (event) => { if (event.buttons > 0) this.onPointer(event); });
     this.dial.addEventListener("keydown", (event) => this.onKey(event));
     this.element = h("div", { class: "compass" }, this.dial, this.text);
     this.set(null);
+    this.setNorth(null);
   }
 
   /** Show a heading; null is unknown. */
@@ -35,6 +37,12 @@ export class Compass {
     this.dial.setAttribute("aria-valuenow", String(Math.round(headingDeg ?? 0)));
     this.dial.setAttribute("aria-valuetext", told);
     this.text.textContent = told;
+  }
+
+  /** Show where north is on the plan; null where it does not say. */
+  setNorth(northDeg: number | null): void {
+    this.north.toggleAttribute("hidden", northDeg === null);
+    this.north.setAttribute("transform", `rotate(${northDeg ?? 0})`);
   }
 
   private turn(headingDeg: number | null): void {

@@ -10,7 +10,7 @@ type Shape = "around" | "whole";
 
 // Okabe and Ito's colours, apart for every kind of colour vision, and told apart by their dashes as well.
 const STROKES: Record<"edge" | OpeningKind, { colour: string; dash: number[]; name: string }> = {
-  edge: { colour: "#ffe14d", dash: [], name: "walls, floor and ceiling" },
+  edge: { colour: "#ffe14d", dash: [], name: "walls" },
   door: { colour: "#56b4e9", dash: [10, 4], name: "doors" },
   window: { colour: "#ff9d5c", dash: [3, 3], name: "windows" },
   passage: { colour: "#ffffff", dash: [12, 4, 3, 4], name: "passages" },
@@ -44,7 +44,7 @@ export class PanoramaView {
     const bar = h("div", { class: "bar" },
       h("div", { class: "segmented", role: "group", "aria-label": "How the photograph is shown" },
         this.shapes.around, this.shapes.whole),
-      h("label", { class: "inline" }, lines, "Layout over it"),
+      h("label", { class: "inline" }, lines, "Layout"),
       legend());
     this.stage.append(this.holder, this.picture, this.canvas);
     show(root, this.stage, bar);

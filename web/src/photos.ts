@@ -49,6 +49,10 @@ export class Photos {
     return this.chosen;
   }
 
+  get list(): readonly Photo[] {
+    return this.all;
+  }
+
   get fields(): Record<string, HTMLElement> {
     return { heading_deg: this.heading, heading_tolerance_deg: this.tolerance, camera_height_m: this.height };
   }
@@ -105,6 +109,7 @@ export class Photos {
   }
 
   drawStrip(): void {
+    byId("find-all").hidden = this.all.length < 2;
     show(this.strip, ...this.all.map((photo) => {
       const name = photo.file.name.replace(/^example-/, "");
       const choose = h("button", {

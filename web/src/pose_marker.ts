@@ -62,6 +62,8 @@ export class PoseMarker {
     const tip = (azimuth: number, length: number): string =>
       `${(length * Math.sin(azimuth)).toFixed(4)} ${(-length * Math.cos(azimuth)).toFixed(4)}`;
     const heading = radians(heading_deg), middle = heading + this.view.yaw, half = 0.5 * Math.min(this.view.fov, 6.2);
+    // Whoever sees all around looks nowhere.
+    this.cone.classList.toggle("none", this.view.fov > Math.PI);
     const far = 16 * unit, large = half > Math.PI / 2 ? 1 : 0;
     this.cone.setAttribute("d", `M0 0L${tip(middle - half, far)}A${far} ${far} 0 ${large} 1 ${tip(middle + half, far)}Z`);
     this.arrow.setAttribute("d", `M${tip(heading, 1.1 * unit)}L${tip(heading, 6.4 * unit)}`);
