@@ -77,7 +77,8 @@ def service(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> It
 
 
 def _context(browser: Browser, **options: Any) -> BrowserContext:
-    context = browser.new_context(**({"viewport": DESKTOP} | options))
+    values: dict[str, Any] = {"viewport": DESKTOP} | options
+    context = browser.new_context(**values)
     context.set_default_timeout(_PATIENCE_MS)
     return context
 

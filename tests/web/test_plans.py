@@ -37,6 +37,10 @@ def test_a_plan_that_is_refused_is_not_shown_as_if_it_were_there(desktop: Visit,
     (tmp_path / "bow.json").write_text(json.dumps(crossing))
     page.locator("#plan-file").set_input_files(tmp_path / "bow.json")
     expect(page.locator("#plan-error")).to_contain_text("bow")
+    # What the file may lack can be said, and it is read again without being looked for again.
+    page.get_by_label("Storey").fill("")
+    with page.expect_request(lambda request: request.method == "POST" and request.url.endswith("/floorplans")):
+        page.get_by_role("button", name="Read it again").click()
     expect(page.locator("#plan .room")).to_have_count(0)
 
 

@@ -3,7 +3,7 @@
 import { showAnswer, markLooked } from "./answer_panel";
 import { ellipse, heatMap, rivals } from "./answer_overlay";
 import { api } from "./api";
-import { byId, s, show } from "./dom";
+import { byId, h, s, show } from "./dom";
 import { Editor } from "./editor/editor";
 import { exampleFiles, examplePlan } from "./example";
 import { connectKeyDialog } from "./key_dialog";
@@ -101,11 +101,9 @@ class Page {
     byId("preparing").hidden = plan?.status !== "preparing";
     byId<HTMLProgressElement>("plan-progress").value = plan?.progress ?? 0;
     if (plan?.status === "failed") showError(byId("plan-error"), new Error(`This plan cannot be used: ${plan.reason}`));
-    show(byId("plan-warnings"), ...(plan?.warnings ?? []).map((text) => {
-      const item = document.createElement("li");
-      item.textContent = text;
-      return item;
-    }));
+    const report = plan?.import_report;
+    const draft = report?.is_draft ? ["This plan is a draft, guessed from a picture or lines alone: look at it, and correct it with “Edit”."] : [];
+    show(byId("plan-warnings"), ...[...draft, ...(plan?.warnings ?? []), ...(report?.unsure ?? [])].map((text) => h("li", {}, text)));
     if (isSame) return;
     this.layout = null;
     this.photos.compass.setNorth(plan?.plan.north_deg ?? null);

@@ -3,9 +3,13 @@
 import { api } from "./api";
 import { button, byId, h, show } from "./dom";
 import { followPlan } from "./events";
+import { ImportForm } from "./import_form";
 import { clearError, say, showError } from "./notices";
 import { acceptDrops } from "./photos";
 import type { Plan, PlanSummary } from "./types";
+
+/** Whether nothing of a plan was guessed that one may want to correct. */
+const isSure = (plan: Plan): boolean => !plan.import_report?.is_draft && (plan.import_report?.unsure ?? []).length === 0;
 
 const SEARCH_AFTER_MS = 250;
 
@@ -13,6 +17,7 @@ export class Plans {
   private readonly list = byId("plan-list");
   private readonly search = byId<HTMLInputElement>("plan-search");
   private readonly error = byId("plan-error");
+  private readonly importing = new ImportForm((file, fields) => void this.upload(file, fields));
   private readonly more = button("More", () => void this.load(this.cursor), { id: "plan-more" });
   private found: PlanSummary[] = [];
   private cursor: string | null = null;
@@ -50,7 +55,8 @@ export class Plans {
 
   /** Choose a plan by its id. */
   async choose(id: string, revision?: string): Promise<Plan | null> {
-    clearError(this.error);
+    clearError(this.error, this.importing.fields);
+    this.importing.close();
     try {
       this.take(await api.plan(id, revision));
       return this.current;
@@ -70,19 +76,22 @@ export class Plans {
   }
 
   /** Upload a file as a new plan. */
-  async upload(file: File): Promise<void> {
-    clearError(this.error);
+  async upload(file: File, fields: Record<string, string> = {}): Promise<void> {
+    clearError(this.error, this.importing.fields);
     const state = byId("plan-state");
     state.textContent = `Reading “${file.name}” …`;
     try {
-      const plan = await api.uploadPlan(file);
+      const plan = await api.uploadPlan(file, fields);
       this.take(plan);
+      if (isSure(plan)) this.importing.close();
+      else this.importing.ask(file);
       await this.load();
       say(`“${plan.name}” is stored.`);
     } catch (error) {
       // What is shown would be taken for what was refused.
       this.take(null);
-      showError(this.error, error);
+      this.importing.ask(file);
+      showError(this.error, error, this.importing.fields);
     } finally {
       if (state.textContent.startsWith("Reading")) state.textContent = "";
     }

@@ -48,6 +48,8 @@ export interface Plan {
   rooms: { id: string; name: string; type: string; area_m2: number; ceiling_height_m: number; vertices: number }[];
   area_m2: number;
   warnings: string[];
+  /** How its file was read. */
+  import_report?: { format: string; is_draft: boolean; notes: string[]; unsure: string[] } | null;
   plan: PlanDocument;
   /** Entity tag of this representation, which `If-Match` takes. */
   etag: string;
