@@ -141,7 +141,8 @@ class Candidate:
     """One possible pose; candidates are ranked by `cost`, lower is better.
 
     Attributes:
-        probability: that the camera is within 1 m, and not at a better candidate; None for a model that does not tell.
+        probability: that the camera is within 1 m, turned alike within 25°, and not at a better candidate; None for a
+            model that does not tell.
         room_id: the room's id in the plan, which is unique as its name need not be.
     """
 

@@ -39,7 +39,7 @@ class Signals:
 
 def signals_of(query: Query, answer: Candidate, posterior: Posterior) -> Signals:
     """Signals of an answer, the first candidate of the posterior."""
-    mass = min(max(posterior.candidate[0], 1e-9), 1.0 - 1e-9)
+    mass = min(max(posterior.position, 1e-9), 1.0 - 1e-9)
     log_odds = math.log(mass / (1.0 - mass))
     return Signals(
         log_odds=max(-_MAX_LOG_ODDS, min(_MAX_LOG_ODDS, log_odds)),

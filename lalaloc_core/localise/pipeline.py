@@ -24,7 +24,7 @@ from lalaloc_core.localise.evidence import EvidenceConfig
 from lalaloc_core.localise.hints import NO_HINTS, HintName, Hints
 from lalaloc_core.localise.poses import Candidate, LatentGrid, Query, RefinementJob, RefinementResult
 from lalaloc_core.localise.posterior import Posterior, area_shares, posterior_of
-from lalaloc_core.localise.refinement import refined, refinement_job
+from lalaloc_core.localise.refinement import refined, refinement_job, with_latents
 from lalaloc_core.localise.retrieval import contradicted, grid_costs, missed_hints, retrieve, suppress
 from lalaloc_core.localise.vogel import resample
 
@@ -43,6 +43,8 @@ class LocaliseConfig:
         lpo_candidates: how many are optimised in the latent space; the paper refines the first alone.
         profile_candidates: how many are optimised by their wall profiles, which is cheaper.
         profile_candidates_turned: the same where the heading is searched: rooms look alike from several sides.
+        alike_margin, max_candidates: as many more, up to this number in all, as cost less than this more than the best:
+            places that look alike must all be refined to share what is probable.
         separation_m: candidates nearer than this to a better one are dropped; retrieval keeps those turned otherwise.
         by_probability: rank the answers by how probable they are instead of by cost, as places of several plans are.
         evidence: what poses are compared by.
@@ -54,15 +56,25 @@ class LocaliseConfig:
     lpo_candidates: int = 5
     profile_candidates: int = 10
     profile_candidates_turned: int = 20
+    alike_margin: float = 0.2
+    max_candidates: int = 64
     separation_m: float = 1.0
     by_probability: bool = False
     evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
 
-    def starts(self, query: Query) -> int:
-        """How many candidates of a query are optimised."""
+    def least_starts(self, query: Query) -> int:
+        """How many candidates of a query are optimised at least."""
         if not self.evidence.compares_profiles(query):
             return self.lpo_candidates
         return self.profile_candidates if query.heading_known else self.profile_candidates_turned
+
+    def starts(self, query: Query, modes: list[Candidate]) -> int:
+        """How many of the modes of a query's posterior, the best first, are optimised."""
+        least = self.least_starts(query)
+        if not self.evidence.compares_profiles(query):
+            return least
+        alike = sum(mode.total_cost < modes[0].total_cost + self.alike_margin for mode in modes)
+        return max(least, min(alike, self.max_candidates))
 
 
 @dataclass(frozen=True)
@@ -104,7 +116,7 @@ class Localisation:
     def confidence(self, model: ConfidenceModel) -> float | None:
         """Probability that the answer is right within 1 m; None where the model does not know its stage."""
         fits = self.fit_probability(model)
-        return None if fits is None else fits * min(self.posterior.candidate[0], 1.0)
+        return None if fits is None else fits * self.posterior.position
 
     def heading_confidence(self, model: ConfidenceModel) -> float | None:
         """Probability that the answer's heading is right within 5°."""
@@ -210,11 +222,19 @@ def localise_steps(
     with clock.stage("retrieve"):
         doubted = not hints.strict and contradicted(plan, grid, query, weights, evidence)
         query = query.searched if doubted and query.searched is not None else query
-        starts = config.starts(query)
         costs = grid_costs(plan, grid, query, weights, evidence, hints)
         # Refined candidates may meet and become one; spare ones then take the free places.
-        wanted = max(top_k, starts) + starts
-        modes = retrieve(costs, grid, query, top_k=wanted, separation_m=config.separation_m)
+        least = config.least_starts(query)
+        modes = retrieve(
+            costs,
+            grid,
+            query,
+            top_k=max(top_k, least) + least,
+            separation_m=config.separation_m,
+            margin=config.alike_margin,
+            limit=config.max_candidates + top_k,
+        )
+        starts = config.starts(query, modes)
     candidates, ends = list(modes), list[Candidate]()
 
     def posterior(first: list[Candidate]) -> Posterior:
@@ -248,16 +268,17 @@ def localise_steps(
                 ends = refined(plan, encoders, query, candidates[:starts], result, evidence, hints)
                 candidates = sorted(ends, key=attrgetter("total_cost")) + candidates[starts:]
                 stage = "lpo"
-                best[stage] = candidates[0]
-                signals[stage] = signals_of(query, candidates[0], posterior(candidates[:1]))
     elif stage == "vdr":
         first = config.vdr_candidates
         candidates = sorted(candidates[:first], key=attrgetter("total_cost")) + candidates[first:]
     wanted = max(top_k, starts) if config.by_probability else top_k
-    answers = _distinct(candidates, config.separation_m, wanted)
+    answers = _distinct(candidates, query, config.separation_m, wanted)
     found = posterior(answers)
     if config.by_probability:
         answers, found = _by_probability(answers, found, top_k, posterior)
+    if stage == "lpo" and evidence.compares_profiles(query):
+        answers = with_latents(plan, encoders, query, answers, grid.camera_height_m)
+    if stage == "lpo" or config.by_probability:
         best[stage] = answers[0]
         signals[stage] = signals_of(query, answers[0], found)
     missed = hints.missed(answers[0].position_m, answers[0].room_index)
@@ -278,12 +299,19 @@ def _by_probability(
     shares = found.candidate
     order = sorted(range(len(answers)), key=lambda index: -shares[index])[:top_k]
     ranked = [answers[index] for index in order]
-    # The heading is that of the first one.
-    return ranked, replace(found, candidate=tuple(shares[index] for index in order), heading=posterior(ranked).heading)
+    # Place and heading are those of the first one.
+    first = posterior(ranked[:1])
+    ordered = tuple(shares[index] for index in order)
+    return ranked, replace(found, position=first.position, candidate=ordered, heading=first.heading)
 
 
-def _distinct(candidates: list[Candidate], separation_m: float, top_k: int) -> list[Candidate]:
-    """The first candidates of which no two are at one place."""
-    positions = np.stack([candidate.position_m for candidate in candidates])
-    kept = suppress(positions, np.arange(len(candidates), dtype=float), separation_m=separation_m, limit=top_k)
+def _distinct(candidates: list[Candidate], query: Query, separation_m: float, top_k: int) -> list[Candidate]:
+    """The first candidates of which no two are at one place and turned alike."""
+    kept = suppress(
+        np.stack([candidate.position_m for candidate in candidates]),
+        np.arange(len(candidates), dtype=float),
+        separation_m=separation_m,
+        limit=top_k,
+        heading=np.array([panorama_heading(query, candidate) for candidate in candidates]),
+    )
     return [candidates[index] for index in kept]

@@ -232,7 +232,7 @@ class RefinementResult:
 
     Attributes:
         cost: (k,) what was minimised: of profiles as in `localise.evidence`, else the distance of the embeddings.
-        latent_distance: (k,) distance of the embeddings.
+        latent_distance: (k,) distance of the embeddings; None where it is no part of the cost.
         information: (k, p, p) curvature of the cost by position and heading, the camera height integrated out.
         height_offset: (k,) log of true over stated camera height; None where it was not solved for.
     """
@@ -240,7 +240,7 @@ class RefinementResult:
     position_m: Float[np.ndarray, "k 2"]
     heading: Float[np.ndarray, "k"]
     cost: Float[np.ndarray, "k"]
-    latent_distance: Float[np.ndarray, "k"]
+    latent_distance: Float[np.ndarray, "k"] | None
     information: Float[np.ndarray, "k p p"]
     converged: Bool[np.ndarray, "k"]
     evaluations: Int[np.ndarray, "k"]

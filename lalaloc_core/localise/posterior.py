@@ -2,10 +2,9 @@
 
 Each pair of a pose and a hypothesis has the likelihood `exp(-T cost)`, with the temperature T fitted on validation
 queries, and a prior uniform over floor area and over the headings that are searched, times that of hints, which costs
-contain here. Candidates are the modes of the
-posterior. The optimiser tells how far down the cost of a mode goes, which the grid, whose poses are off, cannot: a
-mode's pairs are shifted by what its candidate gained, all others by what candidates gain usually, and refined modes
-count as equally wide.
+contain here. Candidates are the modes of the posterior. The optimiser tells how far down the cost of a mode goes, which the grid, whose poses are off, cannot: a
+mode's pairs are shifted by what its candidate gained, all others by what candidates gain usually. Candidates that end
+at one place are one mode, and refined modes count as equally wide.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.localise.poses import Candidate, Query
@@ -60,11 +59,14 @@ class Posterior:
 
     Attributes:
         pose: (n,) probability of every grid pose; they sum to one.
-        candidate: probability of being within 1 m of each candidate and of none before it; at most one in sum.
+        position: probability of being within 1 m of the first candidate, however turned.
+        candidate: probability of being within 1 m of each candidate, turned like it, and at none before it; at most one
+            in sum.
         heading: probability that the heading of the first candidate is right within 5°.
     """
 
     pose: Float[np.ndarray, "n"]
+    position: float
     candidate: tuple[float, ...]
     heading: float
 
@@ -109,11 +111,18 @@ def posterior_of(
         position[member] += end.position_m - start.position_m
         heading[member] += end.frame_heading - start.frame_heading
     log_weight = -temperature * (cost - gain) + prior[pose]
-    log_weight += _width_corrections(log_weight, mode, temperature * np.array([end.total_cost for end in ends]))
+    if ends:
+        mode = np.append(_merged(ends, query, separation_m), -1)[mode]
+        log_weight += _width_corrections(log_weight, mode, temperature * np.array([end.total_cost for end in ends]))
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
-    by_pose = np.bincount(pose, weight, minlength=len(grid.poses))
-    return Posterior(by_pose, _shares(position, weight, candidates), _heading_share(heading, weight, query, candidates))
+    near = np.linalg.norm(position - candidates[0].position_m, axis=1) < RIGHT_WITHIN_M
+    return Posterior(
+        pose=np.bincount(pose, weight, minlength=len(grid.poses)),
+        position=min(float(weight[near].sum()), 1.0),
+        candidate=_shares(position, heading, weight, query, candidates),
+        heading=_heading_share(heading, weight, query, candidates),
+    )
 
 
 def _width_corrections(
@@ -140,6 +149,21 @@ def _width_corrections(
     return correction
 
 
+def _merged(ends: Sequence[Candidate], query: Query, separation_m: float) -> Int[np.ndarray, "r"]:
+    """For each refined candidate the best one that ended where it did, and turned alike; itself where it is that."""
+    head = np.arange(len(ends))
+    position = np.stack([end.position_m for end in ends])
+    heading = np.array([query.roll[end.hypothesis] + end.frame_heading for end in ends])
+    left = np.ones(len(ends), bool)
+    for index in np.argsort([end.total_cost for end in ends], kind="stable"):
+        if left[index]:
+            here = left & (np.linalg.norm(position - position[index], axis=1) < separation_m)
+            here &= _turned_alike(heading, query, ends[index])
+            head[here] = index
+            left &= ~here
+    return head
+
+
 def _modes(
     position: Float[np.ndarray, "m 2"],
     heading: Float[np.ndarray, "m"],
@@ -151,17 +175,26 @@ def _modes(
     mode = np.full(len(position), -1)
     for index, start in reversed(list(enumerate(starts))):
         near = np.linalg.norm(position - start.position_m, axis=1) < separation_m
-        turned = wrap_angle(heading - query.roll[start.hypothesis] - start.frame_heading)
-        mode[near & (np.abs(turned) <= TURNED_APART)] = index
+        mode[near & _turned_alike(heading, query, start)] = index
     return mode
 
 
+def _turned_alike(heading: Float[np.ndarray, "m"], query: Query, candidate: Candidate) -> Bool[np.ndarray, "m"]:
+    turned = wrap_angle(heading - query.roll[candidate.hypothesis] - candidate.frame_heading)
+    return np.abs(turned) <= TURNED_APART
+
+
 def _shares(
-    position: Float[np.ndarray, "m 2"], weight: Float[np.ndarray, "m"], candidates: Sequence[Candidate]
+    position: Float[np.ndarray, "m 2"],
+    heading: Float[np.ndarray, "m"],
+    weight: Float[np.ndarray, "m"],
+    query: Query,
+    candidates: Sequence[Candidate],
 ) -> tuple[float, ...]:
     left, shares = weight.copy(), []
     for candidate in candidates:
         near = np.linalg.norm(position - candidate.position_m, axis=1) < RIGHT_WITHIN_M
+        near &= _turned_alike(heading, query, candidate)
         shares.append(float(left[near].sum()))
         left[near] = 0.0
     return tuple(shares)

@@ -84,13 +84,16 @@ def refined(
     against = hints.penalty(plan, result.position_m, rooms) / temperature
     offsets = result.height_offset
     offsets = np.array([start.height_offset for start in starts]) if offsets is None else offsets
+    distance = result.latent_distance
+    if distance is None:
+        distance = np.array([start.latent_distance for start in starts])
     cost, terms = result.cost, [{} for _ in starts]
     if evidence.compares_profiles(query):
         hypotheses = np.array([start.hypothesis for start in starts])
         columns, weights = encoders.manifest.profile_columns, encoders.manifest.evidence
         layouts = layouts_at(plan, PoseSet(result.position_m, rooms), result.heading, columns)
         found = Evidence(plan, query, evidence.fine_reach_m, weights, evidence).terms(layouts, hypotheses, offsets)
-        cost = found.total(weights) + evidence.latent_weight * result.latent_distance
+        cost = found.total(weights) + evidence.latent_weight * distance
         terms = [{name: float(values[k]) for name, values in found._asdict().items()} for k in range(len(starts))]
     return [
         replace(
@@ -99,7 +102,7 @@ def refined(
             y_m=float(result.position_m[k, 1]),
             frame_heading=float(result.heading[k]),
             cost=float(cost[k]),
-            latent_distance=float(result.latent_distance[k]),
+            latent_distance=float(distance[k]),
             height_offset=float(offsets[k]),
             hint_cost=float(against[k]),
             terms=terms[k],
@@ -118,8 +121,9 @@ def _kept_inside(
     began = np.stack([start.position_m for start in starts])
     heading = np.array([start.frame_heading for start in starts])
     cost = np.array([start.cost for start in starts])
-    distance = np.array([start.latent_distance for start in starts])
-    offset = result.height_offset
+    distance, offset = result.latent_distance, result.height_offset
+    if distance is not None:
+        distance = np.where(left, [start.latent_distance for start in starts], distance)
     if offset is not None:
         offset = np.where(left, [start.height_offset for start in starts], offset)
     kept = replace(
@@ -127,7 +131,27 @@ def _kept_inside(
         position_m=np.where(left[:, None], began, result.position_m),
         heading=np.where(left, heading, result.heading),
         cost=np.where(left, cost, result.cost),
-        latent_distance=np.where(left, distance, result.latent_distance),
+        latent_distance=distance,
         height_offset=offset,
     )
     return kept, left
+
+
+def with_latents(
+    plan: FloorPlan, encoders: Encoders, query: Query, candidates: list[Candidate], camera_height_m: float
+) -> list[Candidate]:
+    """Candidates with the latent distances of where they are now, for those that were moved by their walls alone."""
+    moved = [k for k, candidate in enumerate(candidates) if candidate.information is not None]
+    if not moved:
+        return candidates
+    poses = PoseSet(
+        np.stack([candidates[k].position_m for k in moved]), np.array([candidates[k].room_index for k in moved])
+    )
+    heading = np.array([candidates[k].frame_heading for k in moved])
+    latents, _ = encoders.poses(plan, poses, heading, camera_height_m)
+    targets = query.latents[[candidates[k].hypothesis for k in moved]]
+    distance = np.linalg.norm(latents - targets, axis=1)
+    told = list(candidates)
+    for row, k in enumerate(moved):
+        told[k] = replace(candidates[k], latent_distance=float(distance[row]))
+    return told

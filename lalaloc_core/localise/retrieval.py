@@ -105,10 +105,24 @@ def _shortlist(
     return np.union1d(strictly[np.isfinite(against[strictly])], np.argpartition(cost + doubted, kept)[:kept])
 
 
-def retrieve(costs: GridCosts, grid: LatentGrid, query: Query, *, top_k: int, separation_m: float) -> list[Candidate]:
-    """The `top_k` best grid poses, best first, no two closer than `separation_m` and turned alike."""
+def retrieve(
+    costs: GridCosts,
+    grid: LatentGrid,
+    query: Query,
+    *,
+    top_k: int,
+    separation_m: float,
+    margin: float = 0.0,
+    limit: int = 0,
+) -> list[Candidate]:
+    """The `top_k` best grid poses, best first, no two closer than `separation_m` and turned alike.
+
+    Args:
+        margin, limit: up to `limit` of them where they cost less than this more than the best.
+    """
     ranked, ranks = np.argsort(costs.total, axis=None), max(_FIRST_RANKED, top_k)
     ranked = ranked[: np.isfinite(costs.total).sum()]
+    limit, ceiling = max(limit, top_k), float(costs.total.min()) + margin
     while True:
         hypothesis, column = np.unravel_index(ranked[:ranks], costs.total.shape)
         pose = costs.index[column]
@@ -118,8 +132,10 @@ def retrieve(costs: GridCosts, grid: LatentGrid, query: Query, *, top_k: int, se
             separation_m=separation_m,
             limit=top_k,
             heading=query.roll[hypothesis],
+            ceiling=ceiling,
+            limit_below=limit,
         )
-        if len(kept) == top_k or ranks >= len(ranked):
+        if len(kept) >= top_k or ranks >= len(ranked):
             break
         # On a fine grid the best pairs may all be of a few places.
         ranks *= 4
@@ -170,16 +186,21 @@ def suppress(
     separation_m: float,
     limit: int,
     heading: Float[np.ndarray, "n"] | None = None,
+    ceiling: float = -np.inf,
+    limit_below: int = 0,
 ) -> list[int]:
     """Non-maximum suppression: indices by rising cost, skipping what lies within `separation_m` of a kept one.
 
     Args:
         heading: radians; with it, poses at one place are kept if they are turned against each other.
+        ceiling, limit_below: as many as `limit_below` are kept of those that cost less than the ceiling.
     """
     remaining: Int[np.ndarray, "m"] = np.argsort(cost, kind="stable")
     kept: list[int] = []
-    while len(remaining) and len(kept) < limit:
+    while len(remaining) and len(kept) < max(limit, limit_below):
         index = int(remaining[0])
+        if len(kept) >= limit and not cost[index] < ceiling:
+            break
         kept.append(index)
         apart = np.linalg.norm(position_m[remaining] - position_m[index], axis=1) >= separation_m
         if heading is not None:

@@ -107,7 +107,7 @@ class ExplicitLayout:
         )
         aligned = self._aligner.refine(job)
         poses = PoseSet(aligned.position_m, room)
-        return _found(question, poses, 0, float(aligned.latent_distance[0]))
+        return _found(question, poses, 0, float(aligned.cost[0]))
 
 
 @dataclass(frozen=True, eq=False)

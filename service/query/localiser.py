@@ -277,7 +277,7 @@ class Localiser:
             heading_source="searched" if found.heading_contradicted else known.source,
             room=best.room,
             room_id=best.room_id,
-            confidence=best.probability,
+            confidence=None if fits is None else fits * found.posterior.position,
             heading_confidence=None if fits is None else fits * min(found.posterior.heading, 1.0),
             warnings=warnings,
             covariance_m2=None if spread is None else spread.position_m2.tolist(),

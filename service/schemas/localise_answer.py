@@ -29,15 +29,15 @@ class Position(Answer):
 
 
 class CandidateAnswer(Answer):
-    """One possible pose; no two candidates are closer than 1 m."""
+    """One possible pose; no two candidates are closer than 1 m and turned alike."""
 
     position: Position
     heading_deg: HeadingDeg = Field(ge=0, lt=360, description=f"The {HEADING_MEANING}.")
     room: str = Field(description="Name of the room the position lies in.")
     room_id: str = Field(description="Its `id` in the plan, which is unique.")
     probability: Share | None = Field(
-        description="Probability that the position is right within 1 m, and no better candidate's is; null for a model "
-        "without confidence.",
+        description="Probability that the position is right within 1 m and the heading within 25°, and no better "
+        "candidate's are; null for a model without confidence.",
     )
     cost: Score = _COST
     latent_distance: Score = _LATENT_DISTANCE

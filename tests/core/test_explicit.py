@@ -102,7 +102,7 @@ class TestAligner:
         assert shapely.contains(scene.plan.rooms[0].shape, shapely.points(result.position_m)).all()
         profile = wall_profile(starts, np.zeros(3), scene.walls_m, 32)
         depth = layout_depth(profile, np.full(3, CAMERA_M), scene.ceiling_height_m, ROWS).reshape(3, -1)
-        assert (result.latent_distance <= np.abs(depth - job.targets).mean(axis=1) + 1e-5).all()
+        assert (result.cost <= np.abs(depth - job.targets).mean(axis=1) + 1e-5).all()
 
     def test_thinned_images_have_every_so_manieth_column(self) -> None:
         scene = scene_of(plan_of([[0, 0], [4, 0], [4, 3], [0, 3.5]]), 2, 0)
@@ -110,7 +110,7 @@ class TestAligner:
         thinned = job.targets.reshape(2, ROWS, 64)[:, :, ::4].reshape(2, -1)
         aligner = DepthAligner(rows=ROWS, columns=64, thinning=4, config=LpoConfig(adam_steps=1))
         job = RefinementJob(**{**vars(job), "targets": thinned})
-        np.testing.assert_allclose(aligner.refine(job).latent_distance, 0.0, atol=1e-5)
+        np.testing.assert_allclose(aligner.refine(job).cost, 0.0, atol=1e-5)
 
     @given(room_polygons(), seeds(), st.sampled_from(["l1", "l2"]))
     @settings(max_examples=10)

@@ -25,6 +25,7 @@ from lalaloc_core.localise.poses import (
     RefinementJob,
     RefinementResult,
 )
+from lalaloc_core.localise.posterior import TURNED_APART
 from lalaloc_core.localise.retrieval import build_grid
 from lalaloc_core.sampling import PoseSet, random_poses
 from tests.strategies import crooked_flat, plan_of, rectangle, seeds
@@ -108,7 +109,9 @@ class TestAnswer:
         positions = np.stack([candidate.position_m for candidate in found.candidates])
         assert 1 <= len(positions) <= top_k
         gaps = np.linalg.norm(positions[:, None] - positions[None], axis=-1) + 10.0 * np.eye(len(positions))
-        assert gaps.min() >= 1.0
+        turns = np.array([panorama_heading(query, candidate) for candidate in found.candidates])
+        turned = np.abs(wrap_angle(turns[:, None] - turns[None])) > TURNED_APART
+        assert np.all((gaps >= 1.0) | turned)
         refined = [candidate.cost for candidate in found.candidates if candidate.information is not None]
         others = [candidate.cost for candidate in found.candidates if candidate.information is None]
         assert bool(refined) == (refine == "lpo")

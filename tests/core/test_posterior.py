@@ -94,8 +94,18 @@ def test_a_room_that_looks_alike_from_two_sides_has_two_headings() -> None:
     cost[[0, 32]] = 0.0
     starts = [candidate(0.0, 0.0), candidate(0.0, 0.0, hypothesis=32)]
     found = shares(along([0.0], cost), starts, query=query)
-    assert found.candidate[0] == pytest.approx(1.0)
+    assert found.position == pytest.approx(1.0)
+    assert found.candidate == pytest.approx((0.5, 0.5))
     assert found.heading == pytest.approx(0.5)
+
+
+def test_candidates_that_end_at_one_place_are_one_mode() -> None:
+    # Two copies: from two places of the first, and from one of the second, refinement comes to the same.
+    grid = along([0.0, 1.2, 10.0], np.array([0.05, 0.05, 0.05]))
+    starts = [candidate(0.0, 0.05), candidate(1.2, 0.05), candidate(10.0, 0.05)]
+    ends = [candidate(0.6, 0.01), candidate(0.6, 0.01), candidate(10.6, 0.01)]
+    found = posterior_of(grid, np.zeros(3), PLAIN, starts, ends, [ends[0], ends[2]], 16.0, 1.0)
+    assert found.candidate == pytest.approx((0.5, 0.5))
 
 
 def test_every_square_metre_counts_the_same_also_of_rooms_with_a_single_pose() -> None:
@@ -107,7 +117,7 @@ class TestSignals:
     def test_they_are_of_the_answer_and_the_prediction(self) -> None:
         profile = PredictedProfile(np.zeros((2, 4)), np.array([[-3.0, -2.0, -3.0, -2.0]]).repeat(2, axis=0))
         query = dataclasses.replace(PLAIN, profile=profile)
-        posterior = Posterior(np.ones(1), (0.8,), 1.0)
+        posterior = Posterior(np.ones(1), 0.8, (0.7,), 1.0)
         found = signals_of(query, candidate(5.0, 0.4), posterior)
         expected = Signals(log_odds=math.log(4.0), cost=0.4, uncertainty=-2.5, latent_distance=0.3)
         assert dataclasses.astuple(found) == pytest.approx(dataclasses.astuple(expected))
@@ -115,4 +125,4 @@ class TestSignals:
 
     @pytest.mark.parametrize(("mass", "log_odds"), [(0.0, -6.0), (1.0, 6.0), (1.0 + 1e-12, 6.0)])
     def test_no_posterior_is_surer_than_it_can_be(self, mass: float, log_odds: float) -> None:
-        assert signals_of(PLAIN, candidate(0.0, 0.2), Posterior(np.ones(1), (mass,), 1.0)).log_odds == log_odds
+        assert signals_of(PLAIN, candidate(0.0, 0.2), Posterior(np.ones(1), mass, (mass,), 1.0)).log_odds == log_odds

@@ -103,6 +103,8 @@ class LatentPoseOptimiser:
             return self._optimiser(self.encoder, "l2").refine(replace(job, precision=None))
         by_profile = replace(job, targets=job.log_profile)
         result = self._optimiser(None, "cauchy").refine(by_profile)
+        if not job.latent_weight:
+            return replace(result, latent_distance=None)
         distance = self._latent_distance(job, result)
         return replace(result, cost=result.cost + job.latent_weight * distance, latent_distance=distance)
 
