@@ -2,9 +2,9 @@
 
 Each pair of a pose and a hypothesis has the likelihood `exp(-T cost)`, with the temperature T fitted on validation
 queries, and a prior uniform over floor area and over the headings that are searched, times that of hints, which costs
-contain here. Candidates are the modes of the posterior. The optimiser tells how far down the cost of a mode goes, which the grid, whose poses are off, cannot: a
-mode's pairs are shifted by what its candidate gained, all others by what candidates gain usually. Candidates that end
-at one place are one mode, and refined modes count as equally wide.
+contain here. Candidates are the modes of the posterior. The optimiser tells how far down the cost of a mode goes, which
+the grid, whose poses are off, cannot: a mode's pairs are shifted by what its candidate gained, all others by what
+candidates gain usually. Candidates that end at one place are one mode, and refined modes count as equally wide.
 """
 
 from __future__ import annotations

@@ -113,7 +113,7 @@ def test_what_is_overruled_is_said_with_both_values() -> None:
     plan = FloorPlan.from_dict(PLAN)
     query = Query(np.eye(1), np.zeros(1), 0.0, heading_known=True, camera_height=CameraHeight(1.5))
     answer = Candidate(1.0, 4.5, 2, 0.0, 0, 0.1, 0.2)
-    posterior = Posterior(np.ones(1), (1.0,), 1.0)
+    posterior = Posterior(np.ones(1), 1.0, (1.0,), 1.0)
     hints = Hints(near=Near(6.0, 4.5, 3.0), rooms=frozenset({0, 1}))
     found = Localisation(query, [answer], posterior, "lpo", {}, hints_missed=("near", "rooms"))
     assert hint_warnings(hints, found, plan) == [
