@@ -106,7 +106,7 @@ class Workbench:
             kind=ask.kind,
             dataset=dataset.description,
             split=table.split,
-            settings=dict(ask.settings),
+            settings=ask.run_settings,
             data=str(self.data),
             furniture=appearance and appearance.furniture,
             lighting=appearance and appearance.lighting,

@@ -12,11 +12,14 @@ from lalaloc_core.errors import RunError
 from lalaloc_core.evaluation.building import build_method
 from lalaloc_core.evaluation.predictions import RunInfo
 from lalaloc_core.evaluation.score import Scores, StageScores
+from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.reproduce.ablations import ABLATIONS
 from lalaloc_core.reproduce.result import Figure, RowResult, TableResult
 from lalaloc_core.reproduce.result_tables import draw_vogel_samples, markdown
-from lalaloc_core.reproduce.table import COLUMN_TITLES, SHIPPED
+from lalaloc_core.reproduce.table import COLUMN_TITLES, PAPER_SETTING, SHIPPED, RowQuery
 from lalaloc_core.reproduce.tables import TABLES
+from tests.core.questions import question_at
+from tests.strategies import plan_document, rectangle
 
 
 def result(dataset: str = "synthetic scenes (seed 0)", budget: str = "small") -> TableResult:
@@ -92,6 +95,39 @@ class TestTables:
             assert {("lalaloc", kind, "paper"), ("lalaloc", kind, SHIPPED), ("icp", kind, None)} <= asked
             assert {("explicit", kind, SHIPPED), ("decode", kind, SHIPPED)} <= asked
         assert ("oracle", "layout", None) in asked
+
+
+class TestPaperSetting:
+    def test_all_rows_have_it(self) -> None:
+        asked = [row.ask for table in TABLES for row in table.rows if row.ask.method == "lalaloc"]
+        assert len(asked) > 20
+        for ask in asked:
+            assert ask.run_settings.items() >= PAPER_SETTING.items()
+            assert ask.run_settings.items() >= ask.settings.items()
+        assert RowQuery(method="icp").run_settings == {}
+
+    def test_openings_of_the_plan_change_no_answer(self, tiny_bundle: Path) -> None:
+        bare = plan_document(rectangle(4.0, 3.0), rectangle(4.3, 3.6, at=(4.2, 0.0)))
+        door = {"kind": "door", "line": [[4.1, 1.0], [4.1, 2.0]]}
+        window = {"kind": "window", "line": [[1.0, 0.0], [2.5, 0.0]]}
+        plans = [FloorPlan.from_dict(bare), FloorPlan.from_dict({**bare, "openings": [door, window]})]
+        costs = []
+        for settings in (RowQuery().run_settings, {}):
+            info = RunInfo(
+                label="a row",
+                method="lalaloc",
+                kind="layout",
+                dataset="",
+                split="test",
+                settings=settings,
+                bundle=str(tiny_bundle),
+            )
+            method = build_method(info)
+            answers = [method.answer(question_at(plan, (1.3, 1.4))) for plan in plans]
+            costs.append([[one.pose.distance for one in answer.candidates] for answer in answers])
+        in_the_paper, usual = costs
+        assert in_the_paper[0] == in_the_paper[1]
+        assert usual[0] != usual[1]
 
 
 class TestRendering:
