@@ -7,6 +7,7 @@
     localise/    the search: evidence, retrieval, optimiser calibrate.py fits confidence
     synth/       the generator of training data
     unfamiliar/  another generator, for reporting only
+    draw/        pictures of plans and answers
     data/        data sets
     training/    training
     export/      from a training run to a bundle

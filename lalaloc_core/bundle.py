@@ -11,7 +11,9 @@ import hashlib
 import json
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,9 @@ from lalaloc_core.errors import BundleError
 from lalaloc_core.files import atomic_write
 
 MANIFEST_NAME = "manifest.json"
+# Of the model that ships: in a checkout, and where a wheel puts it.
+_CHECKOUT = Path("models/default")
+_INSTALLED = Path("share/lalaloc/models/default")
 FORMAT_VERSION = 2
 
 LAYOUT_ONNX = "layout_encoder.onnx"
@@ -210,6 +215,23 @@ class Bundle:
         if digest != entry.sha256:
             raise BundleError(f"bundle '{self.folder}': '{name}' has SHA-256 {digest}, expected {entry.sha256}")
         return content
+
+
+def default_bundle() -> Path:
+    """The folder of the model that ships: that of the checkout which this file is in, else the installed one.
+
+    Where the working folder is the checkout, the path is relative, so that what runs write down holds elsewhere.
+    """
+    checkout = Path(__file__).resolve().parents[1] / _CHECKOUT
+    if (checkout / MANIFEST_NAME).is_file():
+        return _CHECKOUT if _CHECKOUT.resolve() == checkout else checkout
+    with suppress(PackageNotFoundError):
+        for file in distribution("lalaloc").files or []:
+            path = Path(file.locate()).resolve()
+            if path.name == MANIFEST_NAME and path.parent.match(f"*/{_INSTALLED}"):
+                return path.parent
+    # Nothing is there; whoever opens it is told so.
+    return checkout
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> Bundle:

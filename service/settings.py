@@ -11,6 +11,7 @@ from typing import Annotated, Self
 from pydantic import Field, ValidationError, field_validator, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
+from lalaloc_core.bundle import default_bundle
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.floorplan import PlanLimits
 from lalaloc_core.panorama.images import PanoramaLimits
@@ -19,7 +20,7 @@ from service.cores import CoreShares, share_cores, usable_cores
 from service.sharing import with_spare
 
 PREFIX = "LALALOC_"
-_DEFAULT_BUNDLE = Path(__file__).resolve().parent.parent / "models" / "default"
+_DEFAULT_BUNDLE = default_bundle().resolve()
 
 Count = Annotated[int, Field(ge=1)]
 Seconds = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]

@@ -27,3 +27,19 @@ def processes(text: str) -> int:
     if value < 0:
         raise argparse.ArgumentTypeError(f"{value} must be at least 0")
     return value
+
+
+def heading(text: str) -> float:
+    """A heading in degrees, from -360 to 360."""
+    value = float(text)
+    if not -360.0 <= value <= 360.0:
+        raise argparse.ArgumentTypeError(f"{text} must lie from -360 to 360 degrees")
+    return value
+
+
+def tolerance(text: str) -> float:
+    """How far off a heading may be in degrees, from 0 to 45."""
+    value = float(text)
+    if not 0.0 <= value <= 45.0:
+        raise argparse.ArgumentTypeError(f"{text} must lie from 0 to 45 degrees")
+    return value

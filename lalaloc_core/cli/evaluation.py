@@ -11,14 +11,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from lalaloc_core.bundle import default_bundle
 from lalaloc_core.cli.arguments import count, positive, processes
-from lalaloc_core.cli.printing import print_json
+from lalaloc_core.cli.printing import print_json, print_table
 from lalaloc_core.data.dataset import SPLITS
 from lalaloc_core.errors import InvalidInputError
 
 # So many homes that calibration asks with their own photographs for one that it asks with those of others.
 _PER_MISMATCHED_HOME = 3
-_BUNDLE = Path("models/default")
+# Columns of the printed table.
+_SHARES = ("within_1cm", "within_10cm", "within_1m", "correct_room", "heading_within_2deg")
 
 
 def add_commands(commands: Any) -> None:
@@ -26,7 +28,7 @@ def add_commands(commands: Any) -> None:
     evaluate = commands.add_parser(
         "evaluate", help="answer the queries of a data set, or of generated homes, and score the answers"
     )
-    evaluate.add_argument("--bundle", type=Path, default=_BUNDLE, help="model (default: %(default)s)")
+    evaluate.add_argument("--bundle", type=Path, default=default_bundle(), help="model (default: %(default)s)")
     evaluate.add_argument(
         "--method",
         default="lalaloc",
@@ -47,10 +49,12 @@ def add_commands(commands: Any) -> None:
     evaluate.add_argument("--skip-bad", action="store_true", help="leave out and list what cannot be used")
     evaluate.add_argument("--workers", type=processes, metavar="N", help="processes; default: one per core")
     evaluate.add_argument("--out", type=Path, metavar="RUN", help="folder of the run; one that exists goes on")
+    evaluate.add_argument("--json", action="store_true", help="print every figure as JSON")
     evaluate.set_defaults(run=_evaluate)
 
     score = commands.add_parser("score", help="score the answers of runs again, without model or data")
     score.add_argument("runs", type=Path, nargs="+", metavar="RUN")
+    score.add_argument("--json", action="store_true", help="print every figure as JSON")
     score.set_defaults(run=_score)
 
     report = commands.add_parser("report", help="write one self-contained HTML page about runs")
@@ -66,7 +70,7 @@ def add_commands(commands: Any) -> None:
     worst.set_defaults(run=_worst)
 
     calibrate = commands.add_parser("calibrate", help="fit a bundle's confidence on generated validation homes")
-    calibrate.add_argument("--bundle", type=Path, default=_BUNDLE)
+    calibrate.add_argument("--bundle", type=Path, default=default_bundle())
     _generator_arguments(calibrate)
     calibrate.add_argument("--out", type=Path, metavar="DIR", help="keep the answers there, and go on with those there")
     calibrate.set_defaults(run=_calibrate)
@@ -125,14 +129,47 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     with tempfile.TemporaryDirectory(prefix="lalaloc-run-") as temporary:
         folder = RunFolder(arguments.out or Path(temporary))
         run_evaluation(folder, info, workers=arguments.workers)
-        print_json(score_run(folder))
+        report = score_run(folder)
+    if arguments.json:
+        print_json(report)
+    else:
+        _print_scores(report)
 
 
 def _score(arguments: argparse.Namespace) -> None:
     from lalaloc_core.evaluation.predictions import RunFolder
     from lalaloc_core.evaluation.score import score_run
 
-    print_json({str(path): score_run(RunFolder(path)) for path in arguments.runs})
+    reports = {str(path): score_run(RunFolder(path)) for path in arguments.runs}
+    if arguments.json:
+        print_json(reports)
+        return
+    for path, report in reports.items():
+        print(path)
+        _print_scores(report)
+
+
+def _print_scores(report: dict[str, Any]) -> None:
+    """The figures that everybody asks for first, as a table; the rest is in the run's folder and in its report."""
+    skipped = f", {report['skipped']} left out" if report["skipped"] else ""
+    print(f"{report['label']}, {report['dataset']}: {report['n']} queries, {report['unanswered']} unanswered{skipped}")
+    stages = {**report["stages"], "answer": report["final"]}
+    print_table(
+        ("stage", "median cm", "< 1 cm", "< 10 cm", "< 1 m", "room", "heading < 2°", "median ms"),
+        [
+            (
+                name,
+                "-" if (median := scores["median_cm"]["value"]) is None else f"{median:.1f}",
+                *(f"{100 * scores[share]['value']:.1f} %" for share in _SHARES),
+                f"{report['median_ms'][name]:.0f}" if name in report["median_ms"] else "",
+            )
+            for name, scores in stages.items()
+        ],
+    )
+    interval = report["final"]["within_1m"]
+    print(f"answers within 1 m: 95 % interval {100 * interval['low']:.1f} to {100 * interval['high']:.1f} %")
+    if report["calibration_error"] is not None:
+        print(f"expected calibration error of the confidence: {report['calibration_error']:.3f}")
 
 
 def _report(arguments: argparse.Namespace) -> None:

@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from lalaloc_core.bundle import default_bundle
 from lalaloc_core.cli.printing import print_json
 
 _GROUPS = ("rendering", "service", "accuracy", "evidence", "methods", "datasets")
@@ -15,7 +16,7 @@ _GROUPS = ("rendering", "service", "accuracy", "evidence", "methods", "datasets"
 def add_commands(commands: Any) -> None:
     """Add these commands to the parser."""
     bench = commands.add_parser("bench", help="measure the figures of docs/results.md and print them as JSON")
-    bench.add_argument("--bundle", type=Path, default=Path("models/default"))
+    bench.add_argument("--bundle", type=Path, default=default_bundle())
     bench.add_argument("--homes", type=int, default=250, help="test homes per accuracy figure, 4 queries each")
     bench.add_argument("--textures", type=Path, help="folder of material pictures for the test panoramas")
     bench.add_argument("--out", type=Path, help="also write the JSON to this file; with --only, into it")

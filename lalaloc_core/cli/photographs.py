@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from lalaloc_core.bundle import default_bundle
 from lalaloc_core.cli.arguments import processes
 from lalaloc_core.data.annotated import GALLERIES
 
@@ -18,7 +19,7 @@ def add_commands(commands: Any) -> None:
         "photographs", help="measure a model on annotated photographs of real rooms, and draw what it reads there"
     )
     photographs.add_argument("--data", type=Path, required=True, metavar="DIR", help="folder of annotated photographs")
-    photographs.add_argument("--bundle", type=Path, default=Path("models/default"), help="model (default: %(default)s)")
+    photographs.add_argument("--bundle", type=Path, default=default_bundle(), help="model (default: %(default)s)")
     photographs.add_argument(
         "--galleries",
         type=int,

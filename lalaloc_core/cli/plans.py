@@ -1,4 +1,4 @@
-"""`lalaloc plan`: import, check and export floor plans."""
+"""`lalaloc plan`: import, check, draw and export floor plans."""
 
 from __future__ import annotations
 
@@ -8,27 +8,14 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from lalaloc_core.cli.plan_files import add_plan_options, check_picture_name, read_plan, read_plans, write_picture
 from lalaloc_core.cli.printing import print_json
 from lalaloc_core.errors import InvalidFloorPlanError
 
-# The options of an import, as `plans.ImportOptions.from_text` takes them.
-_OPTIONS = {
-    "units": "unit of the file's coordinates: m, cm, mm, in or ft",
-    "scale": "scale of a drawing on paper, 1:100",
-    "metres-per-pixel": "length of a pixel, or of a unit of an SVG",
-    "known-distance": "two points of the drawing and how far apart they are: x0,y0,x1,y1,metres",
-    "level": "name or number of the storey to take",
-    "layers": "take only these layers, groups or classes; separated by commas",
-    "page": "page of a PDF, from 1",
-    "y-axis": "which way y points in the file: up or down",
-    "ceiling-height-m": "ceiling of rooms whose file gives none",
-    "name": "what to call the plan",
-}
-
 
 def add_commands(commands: Any) -> None:
-    """Add this room's commands to the parser."""
-    plan = commands.add_parser("plan", help="import, check and export floor plans (docs/floorplans.md)")
+    """Add these commands to the parser."""
+    plan = commands.add_parser("plan", help="import, check, draw and export floor plans (docs/floorplans.md)")
     actions = plan.add_subparsers(required=True, metavar="ACTION")
     bring = actions.add_parser(
         "import", help="make a plan of a file, whatever its format, and say what was used for what"
@@ -37,21 +24,25 @@ def add_commands(commands: Any) -> None:
     bring.add_argument("--out", type=Path, help="write the plan in the native format here; else to standard output")
     check = actions.add_parser("check", help="say what is likely wrong with a plan")
     check.add_argument("file", type=Path)
+    check.add_argument("--json", action="store_true", help="print JSON")
+    draw = actions.add_parser("draw", help="draw a plan as PNG or SVG")
+    draw.add_argument("file", type=Path)
+    draw.add_argument("--out", type=Path, required=True, help="the picture, .png or .svg")
     send = actions.add_parser("export", help="write a plan in another format")
     send.add_argument("file", type=Path)
     send.add_argument("--format", required=True, help="native, geojson, imdf, dxf or svg")
     send.add_argument("--out", type=Path, required=True)
     send.add_argument("--anchor", help="latitude,longitude[,north_deg] of the plan's origin, for geojson and imdf")
-    for action in (bring, check, send):
-        for name, meaning in _OPTIONS.items():
-            action.add_argument(f"--{name}", help=meaning)
+    for action in (bring, check, draw, send):
+        add_plan_options(action)
     bring.set_defaults(run=_import)
     check.set_defaults(run=_check)
+    draw.set_defaults(run=_draw)
     send.set_defaults(run=_export)
 
 
 def _import(arguments: argparse.Namespace) -> None:
-    plans = _read(arguments)
+    plans = read_plans(arguments.file, arguments)
     for plan in plans:
         heading = "" if plan.level is None else f"level '{plan.level.name}': "
         print(f"{heading}{json.dumps(plan.report.to_dict(), ensure_ascii=False, indent=1)}", file=sys.stderr)
@@ -65,36 +56,37 @@ def _import(arguments: argparse.Namespace) -> None:
 
 
 def _check(arguments: argparse.Namespace) -> None:
-    said = []
-    for imported in _read(arguments):
+    said, plans = [], []
+    for imported in read_plans(arguments.file, arguments):
         plan = imported.plan()
-        said += [*imported.report.warnings, *imported.report.unsure, *plan.warnings]
-        print(f"'{plan.name}': {len(plan.rooms)} rooms, {plan.area_m2:.1f} m², {len(plan.openings)} openings")
+        warnings = [*imported.report.warnings, *imported.report.unsure, *plan.warnings]
+        said += warnings
+        summary = {"rooms": len(plan.rooms), "area_m2": round(plan.area_m2, 2), "openings": len(plan.openings)}
+        plans.append({"name": plan.name, **summary, "warnings": warnings})
+        if not arguments.json:
+            print(f"'{plan.name}': {len(plan.rooms)} rooms, {plan.area_m2:.1f} m², {len(plan.openings)} openings")
+    if arguments.json:
+        print_json(plans)
+        return
     for line in said:
         print(f"- {line}")
+
+
+def _draw(arguments: argparse.Namespace) -> None:
+    from lalaloc_core.draw.plan import plan_svg
+
+    check_picture_name(arguments.out)
+    write_picture(plan_svg(read_plan(arguments.file, arguments).plan()), arguments.out)
+    print(arguments.out)
 
 
 def _export(arguments: argparse.Namespace) -> None:
     from lalaloc_core.plans import export_plan
 
-    plans = _read(arguments)
-    if len(plans) > 1:
-        raise InvalidFloorPlanError(f"the file has {len(plans)} levels, choose one with --level")
-    anchor = plans[0].anchor if arguments.anchor is None else _anchor(arguments.anchor)
-    arguments.out.write_bytes(export_plan(plans[0].plan(), arguments.format, anchor))
+    plan = read_plan(arguments.file, arguments)
+    anchor = plan.anchor if arguments.anchor is None else _anchor(arguments.anchor)
+    arguments.out.write_bytes(export_plan(plan.plan(), arguments.format, anchor))
     print(arguments.out)
-
-
-def _read(arguments: argparse.Namespace) -> Any:
-    from lalaloc_core.plans import ImportOptions, import_plans
-
-    said = {name.replace("-", "_"): getattr(arguments, name.replace("-", "_")) for name in _OPTIONS}
-    options = ImportOptions.from_text({name: value for name, value in said.items() if value is not None})
-    try:
-        content = arguments.file.read_bytes()
-    except OSError as error:
-        raise InvalidFloorPlanError(f"'{arguments.file}' cannot be read: {error.strerror}") from error
-    return import_plans(content, options)
 
 
 def _anchor(text: str) -> Any:

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from lalaloc_core.bundle import default_bundle
 from lalaloc_core.cli.arguments import count, processes
 from lalaloc_core.errors import InvalidInputError
 
@@ -21,7 +22,7 @@ def add_commands(commands: Any) -> None:
     reproduce.add_argument("--data", type=Path, metavar="DIR", help="the data set")
     reproduce.add_argument("--budget", choices=("small", "full"), default="small", help="training and queries per row")
     reproduce.add_argument("--out", type=Path, default=Path("runs/reproduce"), help="models, runs and tables")
-    reproduce.add_argument("--bundle", type=Path, default=Path("models/default"), help="model of the rows `ring`")
+    reproduce.add_argument("--bundle", type=Path, default=default_bundle(), help="model of the rows `ring`")
     reproduce.add_argument("--limit", type=count, metavar="N", help="queries per row; default: the budget's")
     reproduce.add_argument("--workers", type=processes, metavar="N", help="processes; default: one per core")
     reproduce.add_argument("--skip-bad", action="store_true", help="leave out and count what cannot be used")

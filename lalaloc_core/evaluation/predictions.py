@@ -14,6 +14,7 @@ import json
 import math
 import os
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -166,6 +167,13 @@ class RunFolder:
         """Record what is asked."""
         self.path.mkdir(parents=True, exist_ok=True)
         atomic_write(self.path / RUN_FILE, json.dumps(dataclasses.asdict(info), indent=2) + "\n")
+
+    def remove(self) -> None:
+        """Take the run away, and the folder with it unless something else lies there."""
+        for name in (RUN_FILE, PREDICTIONS_FILE):
+            (self.path / name).unlink(missing_ok=True)
+        with suppress(OSError):
+            self.path.rmdir()
 
     def read_predictions(self) -> list[Prediction]:
         """Every complete answer; a last line that an interruption cut short is left out.

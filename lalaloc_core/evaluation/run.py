@@ -24,7 +24,7 @@ from tqdm import tqdm
 from lalaloc_core.configuration import build_config
 from lalaloc_core.conventions import heading_to_degrees
 from lalaloc_core.data.dataset import Appearance, Camera, Dataset, Scene, facts_of_photograph, load_scenes
-from lalaloc_core.errors import DatasetError, RunError
+from lalaloc_core.errors import DatasetError, InvalidInputError, RunError
 from lalaloc_core.evaluation.building import build_dataset, build_method
 from lalaloc_core.evaluation.predictions import Pose, Prediction, Rival, RunFolder, RunInfo
 from lalaloc_core.methods.method import Answer, Found, Method, Question
@@ -48,10 +48,14 @@ def run_evaluation(folder: RunFolder, info: RunInfo, *, workers: int | None = No
     Raises:
         RunError: `folder` holds a run that asked something else.
         DatasetError: a scene or photograph cannot be used, and `info.skip_bad` is off.
+        InvalidInputError: the split holds nothing to ask; a folder that was made for it is taken away again.
     """
     # What is asked wrongly fails here, before anything is written.
     names = list(build_dataset(info).scenes(info.split))
     build_method(info)
+    if not names:
+        raise InvalidInputError(f"split '{info.split}' of {info.dataset} is empty")
+    is_new = not folder.exists()
     done, skipped = _resume(folder, info)
     limit = math.inf if info.limit is None else info.limit
     if done:
@@ -70,6 +74,10 @@ def run_evaluation(folder: RunFolder, info: RunInfo, *, workers: int | None = No
                 folder.write_info(dataclasses.replace(info, skipped=tuple(skipped)))
             if len(done) >= limit:
                 break
+    if not done and is_new:
+        folder.remove()
+        left_out = f"; {len(skipped)} were left out, the first: {skipped[0]}" if skipped else ""
+        raise InvalidInputError(f"split '{info.split}' of {info.dataset} has no queries{left_out}")
     return done
 
 

@@ -18,6 +18,8 @@ from lalaloc_core.evaluation.run import run_evaluation
 from lalaloc_core.evaluation.score import heading_errors_deg, position_errors_m, score
 from lalaloc_core.synth.facts import facts_of
 
+OWN_DATA = Path(__file__).parents[2] / "examples" / "own_data"
+
 
 @pytest.fixture
 def layout_run(tiny_bundle: Path) -> RunInfo:
@@ -157,15 +159,35 @@ class TestCommandLine:
         self, tiny_bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         asked = ["--bundle", str(tiny_bundle), "--homes", "1", "--kind", "layout", "--workers", "0"]
-        assert main(["evaluate", *asked, "--out", str(tmp_path / "run")]) == 0
+        assert main(["evaluate", *asked, "--out", str(tmp_path / "run"), "--json"]) == 0
         printed = json.loads(capsys.readouterr().out)
         assert printed["n"] == 4
         assert 0.0 <= printed["final"]["within_1m"]["value"] <= 1.0
         info = RunFolder(tmp_path / "run").read_info()
         RunFolder(tmp_path / "run").write_info(dataclasses.replace(info, bundle="gone", data="gone"))
-        assert main(["score", str(tmp_path / "run")]) == 0
+        assert main(["score", str(tmp_path / "run"), "--json"]) == 0
         (again,) = json.loads(capsys.readouterr().out).values()
         assert again == printed
+        assert main(["score", str(tmp_path / "run")]) == 0
+        table = capsys.readouterr().out
+        assert "4 queries" in table
+        assert f"{printed['final']['median_cm']['value']:.1f}" in table.split("answer")[1].split("\n")[0]
+
+    def test_an_empty_split_is_an_error_that_leaves_no_folder(
+        self, tiny_bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        asked = ["--data", str(OWN_DATA), "--split", "train", "--bundle", str(tiny_bundle)]
+        assert main(["evaluate", *asked, "--out", str(tmp_path / "run")]) == 2
+        assert "split 'train'" in capsys.readouterr().err
+        assert not (tmp_path / "run").exists()
+
+    def test_a_split_without_queries_is_an_error_that_leaves_no_folder(
+        self, layout_run: RunInfo, tmp_path: Path
+    ) -> None:
+        folder, silent = RunFolder(tmp_path / "run"), {"homes": 1, "shots_per_home": 0}
+        with pytest.raises(InvalidInputError, match="no queries"):
+            run_evaluation(folder, dataclasses.replace(layout_run, generated=silent), workers=0)
+        assert not folder.path.exists()
 
     def test_the_project_s_own_errors_are_a_message_and_an_exit_code(
         self, tmp_path: Path, capsys: pytest.CaptureFixture[str]

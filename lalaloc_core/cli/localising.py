@@ -1,0 +1,227 @@
+"""`lalaloc localise`: where in a plan photographs were taken, without a service."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from lalaloc_core.bundle import Bundle, default_bundle
+from lalaloc_core.cli.arguments import heading, positive, tolerance
+from lalaloc_core.cli.plan_files import add_plan_options, check_picture_name, read_plan, write_picture
+from lalaloc_core.cli.printing import print_json, print_table
+from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M
+from lalaloc_core.errors import InvalidInputError, InvalidPanoramaError
+
+if TYPE_CHECKING:
+    from lalaloc_core.draw.answer import DrawnAnswer
+    from lalaloc_core.floorplan import FloorPlan
+
+_GRID_STEP_M = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """An answer about one photograph."""
+
+    photograph: Path
+    drawn: DrawnAnswer
+    document: dict[str, Any]
+
+
+def add_commands(commands: Any) -> None:
+    """Add this command to the parser."""
+    localise = commands.add_parser(
+        "localise", help="say where in a plan 360° photographs were taken, without a service"
+    )
+    localise.add_argument("plan", type=Path, metavar="PLAN", help="a floor plan, in any format of docs/floorplans.md")
+    localise.add_argument(
+        "photographs", type=Path, nargs="+", metavar="PHOTO", help="full spheres, twice as wide as high"
+    )
+    localise.add_argument(
+        "--heading",
+        type=heading,
+        metavar="DEG",
+        help="azimuth of the photographs' centre columns, clockwise from the plan's +y; default: by their compass "
+        "where the plan knows north, else it is found",
+    )
+    localise.add_argument(
+        "--heading-tolerance", type=tolerance, metavar="DEG", help="how far off --heading may be (default: 0)"
+    )
+    localise.add_argument(
+        "--camera-height",
+        type=positive,
+        metavar="M",
+        help="metres over the floor; default: the plan's, else it is found",
+    )
+    localise.add_argument(
+        "--out",
+        type=Path,
+        metavar="FILE",
+        help="a picture of the answer, .png or .svg; of several "
+        "photographs each has the number of its photograph in its name",
+    )
+    localise.add_argument(
+        "--picture",
+        choices=("both", "plan", "photograph"),
+        default="both",
+        help="what --out shows: the plan with the posterior, the photograph with the found layout, or both "
+        "(default: %(default)s)",
+    )
+    localise.add_argument("--json", action="store_true", help="print JSON, a list with an answer for each photograph")
+    localise.add_argument("--bundle", type=Path, default=default_bundle(), help="model (default: the one that ships)")
+    add_plan_options(localise)
+    localise.set_defaults(run=_localise)
+
+
+def _localise(arguments: argparse.Namespace) -> None:
+    from lalaloc_core.draw.answer import draw_answer
+
+    if arguments.heading_tolerance is not None and arguments.heading is None:
+        raise InvalidInputError("--heading-tolerance is of --heading, which is missing")
+    if arguments.out is not None:
+        check_picture_name(arguments.out)
+    plan = read_plan(arguments.plan, arguments).plan()
+    _check_height(arguments.camera_height, plan)
+    contents = [_content(path) for path in arguments.photographs]
+    found = []
+    for number, answer in enumerate(_answers(arguments, plan, contents)):
+        found.append(answer)
+        for warning in answer.document["warnings"]:
+            print(f"warning: {answer.photograph}: {warning}", file=sys.stderr)
+        if arguments.out is not None:
+            out = arguments.out if len(contents) == 1 else arguments.out.with_stem(f"{arguments.out.stem}-{number}")
+            shown = None if arguments.picture == "plan" else _pixels(answer.photograph, contents[number])
+            title = answer.photograph.name if len(contents) > 1 else None
+            write_picture(draw_answer(answer.drawn, shown, arguments.picture, title=title), out)
+    if arguments.json:
+        print_json([one.document for one in found])
+    else:
+        print_table(_HEAD, [_row(one) for one in found])
+
+
+def _answers(arguments: argparse.Namespace, plan: FloorPlan, contents: list[bytes]) -> Iterator[_Found]:
+    """The answers in the order of the photographs, with a progress bar on a terminal."""
+    from tqdm import tqdm
+
+    from lalaloc_core.draw.found import drawn_answer
+    from lalaloc_core.localise.encoders import Encoders
+    from lalaloc_core.localise.pipeline import localise
+    from lalaloc_core.localise.retrieval import build_grid
+    from lalaloc_core.localise.stated import known_heading, stated_height
+    from lalaloc_core.methods.lalaloc import local_refiner
+    from lalaloc_core.panorama.images import open_panorama
+
+    bundle = Bundle.open(arguments.bundle)
+    encoders, refiner = Encoders(bundle, threads=1), local_refiner(bundle)
+    height, model = stated_height(plan, arguments.camera_height), bundle.manifest.confidence
+    # Models that compare latents alone have a grid for every height.
+    grid_height_m = plan.camera_height_m if encoders.predicts_profile else height.height_m
+    grid = build_grid(plan, encoders, step_m=_GRID_STEP_M, camera_height_m=grid_height_m)
+    paths = tqdm(arguments.photographs, desc="localise", unit="photograph", disable=None, leave=False)
+    for path, content in zip(paths, contents, strict=True):
+        with _named(path):
+            size = {"height": encoders.manifest.image_height, "width": encoders.manifest.image_width}
+            panorama = open_panorama(content, **size)
+        known = known_heading(plan, arguments.heading, arguments.heading_tolerance or 0.0, panorama.compass_heading)
+        query = encoders.query(panorama.pixels, known.heading, height, heading_tolerance=known.tolerance)
+        found = localise(plan, grid, encoders, query, refiner=refiner)
+        drawn = drawn_answer(plan, grid, found, model, _SOURCES[known.source])
+        source = "searched" if found.heading_contradicted else known.source
+        warnings = ["the photograph contradicts the heading, which was searched for instead"]
+        told = {
+            "stage": found.stage,
+            "heading_source": source,
+            "heading_confidence": None if model is None else found.heading_confidence(model),
+            "warnings": warnings if found.heading_contradicted else [],
+            "model": {"name": bundle.manifest.name, "version": bundle.manifest.version, "sha256": bundle.sha256},
+        }
+        yield _Found(path, drawn, _document(path, drawn) | told)
+
+
+def _document(path: Path, drawn: DrawnAnswer) -> dict[str, Any]:
+    """An answer as JSON, with the names of the API."""
+    room, camera = drawn.plan.rooms[drawn.room_index], drawn.camera
+    covariance = None
+    if camera.covariance_m2 is not None:
+        xx, xy, yy = camera.covariance_m2
+        covariance = [[xx, xy], [xy, yy]]
+    rivals = [
+        {
+            "position": {"x_m": one.x_m, "y_m": one.y_m},
+            "heading_deg": one.heading_deg,
+            "room": one.room,
+            "probability": one.probability,
+        }
+        for one in drawn.rivals
+    ]
+    best = {"position": {"x_m": camera.x_m, "y_m": camera.y_m}, "heading_deg": camera.heading_deg, "room": room.name}
+    return {
+        "photograph": str(path),
+        **best,
+        "room_id": room.id,
+        "confidence": drawn.confidence,
+        "covariance_m2": covariance,
+        "camera_height_m": drawn.camera_height_m,
+        "candidates": [{**best, "probability": drawn.confidence}, *rivals],
+    }
+
+
+_HEAD = ("photograph", "room", "x m", "y m", "heading °", "95 % within", "camera m", "confidence")
+_SOURCES = {"given": "given", "panorama": "by the compass", "searched": "searched for"}
+
+
+def _row(found: _Found) -> tuple[str, ...]:
+    from lalaloc_core.draw.answer import ellipse_m
+
+    drawn, camera = found.drawn, found.drawn.camera
+    within = "-" if camera.covariance_m2 is None else f"{100 * ellipse_m(camera.covariance_m2)[0]:.0f} cm"
+    return (
+        str(found.photograph),
+        drawn.plan.rooms[drawn.room_index].name,
+        f"{camera.x_m:.2f}",
+        f"{camera.y_m:.2f}",
+        f"{camera.heading_deg or 0.0:.1f}",
+        within,
+        f"{drawn.camera_height_m:.2f}",
+        "-" if drawn.confidence is None else f"{100 * drawn.confidence:.1f} %",
+    )
+
+
+def _content(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise InvalidPanoramaError(f"'{path}' cannot be read: {error.strerror}") from error
+
+
+def _pixels(path: Path, content: bytes) -> Any:
+    """The photograph in the size that it is drawn in."""
+    from lalaloc_core.draw.answer import PHOTOGRAPH_SIZE
+    from lalaloc_core.panorama.images import read_panorama
+
+    width, height = PHOTOGRAPH_SIZE
+    with _named(path):
+        return read_panorama(content, height=height, width=width)
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Says of which photograph an error is."""
+    try:
+        yield
+    except InvalidPanoramaError as error:
+        raise InvalidPanoramaError(f"'{path}': {error}") from error
+
+
+def _check_height(height_m: float | None, plan: FloorPlan) -> None:
+    lowest_m = float(plan.ceiling_heights_m.min())
+    if height_m is not None and not MIN_CAMERA_HEIGHT_M <= height_m < lowest_m:
+        raise InvalidInputError(
+            f"--camera-height is {height_m:g}, it must be at least {MIN_CAMERA_HEIGHT_M:g} and below the plan's lowest "
+            f"ceiling ({lowest_m:g} m)"
+        )

@@ -1,0 +1,177 @@
+"""The command line answers without a service, from any folder, in tables or in JSON, and fails in one line."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from lalaloc_core import __version__, bundle
+from lalaloc_core.bundle import Bundle, default_bundle
+from lalaloc_core.cli import main
+
+ROOT = Path(__file__).parents[2]
+EXAMPLES = ROOT / "examples"
+PLAN, KITCHEN, BEDROOM = (str(EXAMPLES / name) for name in ("flat.json", "kitchen.jpg", "bedroom.jpg"))
+LALALOC = [sys.executable, "-c", "import sys; from lalaloc_core.cli import main; sys.exit(main())"]
+
+
+def elsewhere(folder: Path, *arguments: str, **changes: str) -> subprocess.CompletedProcess[str]:
+    """Run the command line in another folder."""
+    environment = os.environ | {"PYTHONPATH": str(ROOT)} | changes
+    return subprocess.run(
+        [*LALALOC, *arguments], cwd=folder, env=environment, capture_output=True, text=True, timeout=300, check=False
+    )
+
+
+def test_photographs_are_found_from_any_folder_and_drawn(tmp_path: Path) -> None:
+    done = elsewhere(tmp_path, "localise", PLAN, KITCHEN, "--heading", "250", "--out", "answer.png", "--json")
+    assert done.returncode == 0, done.stderr
+    (answer,) = json.loads(done.stdout)
+    (truth,) = [one for one in json.loads((EXAMPLES / "poses.json").read_text()) if one["file"] == "kitchen.jpg"]
+    assert answer["room"] == "kitchen"
+    assert answer["position"]["x_m"] == pytest.approx(truth["x_m"], abs=0.1)
+    assert answer["position"]["y_m"] == pytest.approx(truth["y_m"], abs=0.1)
+    assert answer["heading_deg"] == pytest.approx(250.0)
+    assert answer["confidence"] > 0.9
+    assert answer["stage"] == "lpo"
+    with Image.open(tmp_path / "answer.png") as picture:
+        assert (picture.format, picture.width) == ("PNG", 1600)
+
+
+def test_several_photographs_are_rows_of_a_table_and_pictures_with_numbers(
+    tiny_bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "answer.svg"
+    asked = ["localise", PLAN, KITCHEN, BEDROOM, "--bundle", str(tiny_bundle), "--out", str(out), "--picture", "plan"]
+    assert main(asked) == 0
+    head, rule, *rows = capsys.readouterr().out.splitlines()
+    assert head.split()[:2] == ["photograph", "room"]
+    assert set(rule) == {"-", " "}
+    assert [row.split()[0] for row in rows] == [KITCHEN, BEDROOM]
+    drawn = [(tmp_path / f"answer-{number}.svg").read_text() for number in (0, 1)]
+    assert "kitchen.jpg" in drawn[0]
+    assert "bedroom.jpg" in drawn[1]
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["gone.json", KITCHEN], "'gone.json' cannot be read"),
+        ([PLAN, "gone.jpg"], "'gone.jpg' cannot be read"),
+        ([PLAN, PLAN], "flat.json': the panorama is"),
+        ([PLAN, KITCHEN, "--out", "answer.gif"], "'answer.gif', it must end in .png or .svg"),
+        ([PLAN, KITCHEN, "--out", "/gone/answer.svg", "--picture", "plan"], "cannot be written"),
+        ([PLAN, KITCHEN, "--camera-height", "3"], "--camera-height is 3, it must be at least 0.1 and below"),
+        ([PLAN, KITCHEN, "--heading-tolerance", "3"], "--heading, which is missing"),
+    ],
+)
+def test_mistakes_are_told_in_one_line(
+    tiny_bundle: Path, capsys: pytest.CaptureFixture[str], arguments: list[str], complaint: str
+) -> None:
+    assert main(["localise", *arguments, "--bundle", str(tiny_bundle)]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: ")
+    assert complaint in line
+
+
+@pytest.mark.parametrize("option", [["--heading", "400"], ["--camera-height", "-1"], ["--heading-tolerance", "50"]])
+def test_numbers_out_of_range_are_refused_by_the_parser(option: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["localise", PLAN, KITCHEN, *option])
+    assert ended.value.code == 2
+    assert f"argument {option[0]}" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("suffix", [".png", ".svg"])
+def test_a_plan_is_drawn(suffix: str, tmp_path: Path) -> None:
+    out = tmp_path / f"plan{suffix}"
+    assert main(["plan", "draw", PLAN, "--out", str(out)]) == 0
+    if suffix == ".svg":
+        assert "living room" in out.read_text()
+    else:
+        with Image.open(io.BytesIO(out.read_bytes())) as picture:
+            assert max(picture.size) == 1000
+
+
+def test_what_is_likely_wrong_with_a_plan_can_be_had_as_json(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["plan", "check", PLAN, "--json"]) == 0
+    (plan,) = json.loads(capsys.readouterr().out)
+    assert (plan["rooms"], plan["warnings"]) == (7, [])
+
+
+def test_the_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["--version"])
+    assert ended.value.code == 0
+    assert capsys.readouterr().out == f"lalaloc {__version__}\n"
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh"])
+def test_shells_are_told_how_to_complete(shell: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["completion", shell]) == 0
+    script = capsys.readouterr().out
+    assert "--camera-height" in script
+    if (program := shutil.which(shell)) is not None:
+        (tmp_path / "script").write_text(script)
+        subprocess.run([program, "-n", str(tmp_path / "script")], check=True)
+
+
+def test_a_reader_that_has_read_enough_is_no_error(tmp_path: Path) -> None:
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    command = [*LALALOC, "completion", "bash"]
+    with subprocess.Popen(
+        command, cwd=tmp_path, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        # Before a line has come.
+        process.stdout.close()
+        assert process.stderr.read() == b""
+        assert process.wait(60.0) == 0
+
+
+def test_the_shipped_model_is_relative_in_its_checkout_and_absolute_elsewhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(ROOT)
+    assert default_bundle() == Path("models/default")
+    monkeypatch.chdir(tmp_path)
+    assert default_bundle() == Path(bundle.__file__).resolve().parents[1] / "models" / "default"
+    assert Bundle.open(default_bundle()).manifest.name == "default"
+
+
+def test_a_wheel_brings_the_model_and_answers_in_an_empty_folder(tmp_path: Path) -> None:
+    source, wheels, installed, empty = (tmp_path / name for name in ("source", "wheels", "installed", "empty"))
+    for folder in ("lalaloc_core", "service", "lalaloc_client", "models"):
+        shutil.copytree(ROOT / folder, source / folder, ignore=shutil.ignore_patterns("__pycache__"))
+    for file in ("pyproject.toml", "README.md", "LICENSE", "NOTICE"):
+        shutil.copy(ROOT / file, source)
+    empty.mkdir()
+    pip = [sys.executable, "-m", "pip", "--disable-pip-version-check", "-q"]
+    # As the present environment has it, so that nothing is downloaded.
+    subprocess.run([*pip, "wheel", "--no-deps", "--no-build-isolation", "-w", wheels, source], check=True)
+    (wheel,) = wheels.glob("*.whl")
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", installed], check=True)
+    python = installed / "bin" / "python"
+    subprocess.run([*pip, "--python", python, "install", "--no-deps", "--no-index", wheel], check=True)
+    (site,) = installed.glob("lib/python*/site-packages")
+    # The packages that it needs are those of the environment that the tests run in; its own checkout is not.
+    packages = Path(pytest.__file__).parents[1]
+    (site / "needed.pth").write_text(f"{packages}\n")
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    asked = [installed / "bin" / "lalaloc", "localise", PLAN, KITCHEN, "--heading", "250", "--json"]
+    done = subprocess.run(asked, cwd=empty, env=environment, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)[0]["room"] == "kitchen"
+    where = [python, "-c", "from lalaloc_core.bundle import default_bundle; print(default_bundle())"]
+    found = subprocess.run(where, cwd=empty, env=environment, capture_output=True, text=True, check=True).stdout
+    assert Path(found.strip()) == (installed / "share" / "lalaloc" / "models" / "default").resolve()
