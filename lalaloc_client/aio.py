@@ -46,16 +46,23 @@ class AsyncClient:
         """Close the connections."""
         await self._http.aclose()
 
-    async def upload_floorplan(self, document: Document, *, idempotency_key: str | None = None) -> FloorPlan:
+    async def upload_floorplan(
+        self, document: Document, *, options: Mapping[str, object] | None = None, idempotency_key: str | None = None
+    ) -> FloorPlan:
         """See `Client.upload_floorplan`."""
-        request = await asyncio.to_thread(requests.upload_request, document, idempotency_key)
+        request = await asyncio.to_thread(requests.upload_request, document, options, idempotency_key)
         return await self._run(operations.plan(request, self._patience))
 
     async def replace_floorplan(
-        self, floorplan_id: str, document: Document, *, if_match: str | None = None
+        self,
+        floorplan_id: str,
+        document: Document,
+        *,
+        options: Mapping[str, object] | None = None,
+        if_match: str | None = None,
     ) -> FloorPlan:
         """See `Client.replace_floorplan`."""
-        request = await asyncio.to_thread(requests.replace_request, floorplan_id, document, if_match)
+        request = await asyncio.to_thread(requests.replace_request, floorplan_id, document, options, if_match)
         return await self._run(operations.plan(request, self._patience))
 
     async def floorplan(self, floorplan_id: str) -> FloorPlan:
@@ -95,6 +102,10 @@ class AsyncClient:
             floorplan_id, x_m=x_m, y_m=y_m, heading_deg=heading_deg, covariance_m2=covariance_m2
         )
         return (await self._run(operations.content(request, self._patience))).decode()
+
+    async def export(self, floorplan_id: str, file_format: str) -> bytes:
+        """See `Client.export`."""
+        return await self._run(operations.content(requests.export_request(floorplan_id, file_format), self._patience))
 
     async def mesh(self, floorplan_id: str) -> bytes:
         """See `Client.mesh`."""

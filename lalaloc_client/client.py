@@ -56,23 +56,35 @@ class Client:
         """Close the connections."""
         self._http.close()
 
-    def upload_floorplan(self, document: Document, *, idempotency_key: str | None = None) -> FloorPlan:
+    def upload_floorplan(
+        self, document: Document, *, options: Mapping[str, object] | None = None, idempotency_key: str | None = None
+    ) -> FloorPlan:
         """Store a plan; its latent grid may still be computed afterwards, see `wait_until_ready`.
 
         Args:
-            document: the plan in the native format: a mapping, the bytes of the JSON, or the path of a file.
+            document: a mapping in the native format, or the bytes or path of a file of any format that the service
+                reads: native JSON, GeoJSON, IMDF, SVG, DXF, IFC, PDF, PNG or JPEG.
+            options: what the file does not say of itself, such as `{"metres_per_pixel": 0.01}` or `{"level": "1"}`.
             idempotency_key: the same key with the same plan is the same upload, whoever sends it again; by default a
                 new one, which the retries of this call share.
         """
-        return self._run(operations.plan(requests.upload_request(document, idempotency_key), self._patience))
+        return self._run(operations.plan(requests.upload_request(document, options, idempotency_key), self._patience))
 
-    def replace_floorplan(self, floorplan_id: str, document: Document, *, if_match: str | None = None) -> FloorPlan:
+    def replace_floorplan(
+        self,
+        floorplan_id: str,
+        document: Document,
+        *,
+        options: Mapping[str, object] | None = None,
+        if_match: str | None = None,
+    ) -> FloorPlan:
         """Store a new revision of a plan.
 
         Args:
+            document, options: as of `upload_floorplan`.
             if_match: the `etag` of the plan that it replaces; when that is no longer the newest one, ConflictError.
         """
-        request = requests.replace_request(floorplan_id, document, if_match)
+        request = requests.replace_request(floorplan_id, document, options, if_match)
         return self._run(operations.plan(request, self._patience))
 
     def floorplan(self, floorplan_id: str) -> FloorPlan:
@@ -117,6 +129,10 @@ class Client:
             floorplan_id, x_m=x_m, y_m=y_m, heading_deg=heading_deg, covariance_m2=covariance_m2
         )
         return self._run(operations.content(request, self._patience)).decode()
+
+    def export(self, floorplan_id: str, file_format: str) -> bytes:
+        """A plan as a file: `native`, `geojson`, `imdf` (of a plan with an anchor), `dxf` or `svg`."""
+        return self._run(operations.content(requests.export_request(floorplan_id, file_format), self._patience))
 
     def mesh(self, floorplan_id: str) -> bytes:
         """Floor, walls and ceilings of a plan as binary glTF (GLB), in metres and y-up."""

@@ -70,6 +70,7 @@ class FloorPlan:
         created_at: when it was first uploaded; `updated_at`: when this revision was.
         etag: names this revision, for `replace_floorplan(..., if_match=...)`.
         plan: the plan itself in the native format.
+        import_report: how its file was read: what was used for what, what is likely wrong, what was guessed.
     """
 
     id: str
@@ -89,6 +90,7 @@ class FloorPlan:
     updated_at: datetime | None = None
     etag: str | None = None
     plan: Mapping[str, Any] | None = None
+    import_report: Mapping[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -165,6 +167,32 @@ class Model:
 
 
 @dataclass(frozen=True)
+class GeoPosePosition:
+    """A place, WGS84; `h` is metres over the ellipsoid."""
+
+    lat: float
+    lon: float
+    h: float
+
+
+@dataclass(frozen=True)
+class GeoPoseAngles:
+    """Rotations about up, north and east, degrees; a camera that looks north, level, has none."""
+
+    yaw: float
+    pitch: float
+    roll: float
+
+
+@dataclass(frozen=True)
+class GeoPose:
+    """A pose on Earth: OGC GeoPose 1.0, Basic-YPR."""
+
+    position: GeoPosePosition
+    angles: GeoPoseAngles
+
+
+@dataclass(frozen=True)
 class Localisation:
     """Where a panorama was taken.
 
@@ -175,6 +203,7 @@ class Localisation:
         heading_confidence: probability that the heading is right within 5°.
         warnings: what was said and not followed, such as a heading that the panorama contradicts.
         camera_height_m: the camera height that fits best.
+        geopose: the pose on Earth; None for a plan without an anchor.
         room_id: the room's id in the plan.
         stage: the last stage that produced the position: `retrieval`, `vdr` or `lpo`.
         covariance_m2: of the position, given that it is right within 1 m; None unless `stage` is `lpo`.
@@ -203,6 +232,7 @@ class Localisation:
     heading_confidence: float | None = None
     warnings: tuple[str, ...] = ()
     room_id: str | None = None
+    geopose: GeoPose | None = None
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ Picture = Literal["both", "plan", "photograph"]
 PictureFormat = Literal["png", "svg"]
 Covariance = tuple[tuple[float, float], tuple[float, float]]
 
-_JSON = "application/json"
+_JSON, _FILE = "application/json", "application/octet-stream"
 _JPEG_QUALITY = 95
 _PICTURE_MEDIA: Mapping[PictureFormat, str] = {"png": "image/png", "svg": "image/svg+xml"}
 _ID = re.compile(r"[A-Za-z0-9_-]{1,128}")
@@ -69,19 +69,28 @@ class Request:
     streamed: bool = False
 
 
-def upload_request(document: Document, idempotency_key: str | None) -> Request:
+def upload_request(document: Document, options: Mapping[str, object] | None, idempotency_key: str | None) -> Request:
     """Store a plan; the key lets the service see that a second one is the same request."""
-    headers = {"Content-Type": _JSON, "Idempotency-Key": idempotency_key or uuid.uuid4().hex}
-    return Request("POST", "/floorplans", headers=headers, content=_document(document))
+    media, content = _plan_body(document, options)
+    headers = {"Content-Type": media, "Idempotency-Key": idempotency_key or uuid.uuid4().hex}
+    return Request("POST", "/floorplans", headers=headers, content=content)
 
 
-def replace_request(floorplan_id: str, document: Document, if_match: str | None) -> Request:
+def replace_request(
+    floorplan_id: str, document: Document, options: Mapping[str, object] | None, if_match: str | None
+) -> Request:
     """Store a new revision of a plan; with `if_match` a second one would be refused, though the first was done."""
-    headers = {"Content-Type": _JSON}
+    media, content = _plan_body(document, options)
+    headers = {"Content-Type": media}
     if if_match is not None:
         headers["If-Match"] = if_match
     safety = Safety.ANY if if_match is None else Safety.UNSENT
-    return Request("PUT", _plan_path(floorplan_id), headers=headers, content=_document(document), safety=safety)
+    return Request("PUT", _plan_path(floorplan_id), headers=headers, content=content, safety=safety)
+
+
+def export_request(floorplan_id: str, file_format: str) -> Request:
+    """A plan as the file of another tool."""
+    return Request("GET", f"{_plan_path(floorplan_id)}/export", {"format": file_format})
 
 
 def plan_request(floorplan_id: str) -> Request:
@@ -176,18 +185,8 @@ def localise_request(
     }
     _check_finite({**given, **{f"near['{name}']": value for name, value in (near or {}).items()}})
     fields = {name: str(value) for name, value in given.items() if value is not None}
-    picture = _picture(panorama)
-    # Made of the content, so that the same query is the same bytes.
-    boundary = hashlib.sha256(picture).hexdigest()
-    encoded = httpx.Request(
-        "POST",
-        "http://service/localise",
-        headers={"Content-Type": f"multipart/form-data; boundary={boundary}"},
-        data=fields,
-        files={"panorama": ("panorama", picture, "application/octet-stream")},
-    )
-    headers = {"Content-Type": encoded.headers["content-type"]}
-    return Request("POST", "/localise", headers=headers, content=encoded.read())
+    media, content = _form("panorama", _picture(panorama), fields)
+    return Request("POST", "/localise", headers={"Content-Type": media}, content=content)
 
 
 def picture_request(query: Request, picture: Picture, picture_format: PictureFormat) -> Request:
@@ -223,6 +222,29 @@ def _plan_path(floorplan_id: str) -> str:
     if not _ID.fullmatch(floorplan_id):
         raise ValueError(f"floorplan_id is {floorplan_id!r:.100}, it must be 1 to 128 letters, digits, _ or -")
     return f"/floorplans/{floorplan_id}"
+
+
+def _plan_body(document: Document, options: Mapping[str, object] | None) -> tuple[str, bytes]:
+    """Media type and content: the file alone, whose format the service finds out, or a form with what is said of it."""
+    content = _document(document)
+    if not options:
+        return _JSON if isinstance(document, Mapping) else _FILE, content
+    _check_finite(options)
+    return _form("file", content, {name: str(value) for name, value in options.items() if value is not None})
+
+
+def _form(name: str, content: bytes, fields: Mapping[str, str]) -> tuple[str, bytes]:
+    """Media type and content of a form with one file."""
+    # Made of the content, so that the same request is the same bytes.
+    boundary = hashlib.sha256(content).hexdigest()
+    encoded = httpx.Request(
+        "POST",
+        "http://service/",
+        headers={"Content-Type": f"multipart/form-data; boundary={boundary}"},
+        data=dict(fields),
+        files={name: (name, content, _FILE)},
+    )
+    return encoded.headers["content-type"], encoded.read()
 
 
 def _document(document: Document) -> bytes:

@@ -8,6 +8,7 @@ LaLaLocError
     ├── UnknownVenueError           no venue with this id
     ├── UnknownRevisionError        no such revision of the floor plan
     ├── UnknownAnswerError          no answer is kept under this id
+    ├── UnanchoredPlanError         the floor plan does not say where on Earth it lies
     ├── UploadTooLargeError         more bytes than allowed
     ├── UploadTimeoutError          the upload took too long
     ├── UnsupportedMediaError       a body of a type that is not read here
@@ -118,6 +119,13 @@ class UnknownAnswerError(ServiceError):
             f"no answer is kept under '{answer_id[:64]}': it was forgotten after a while (keep_answers_s) or with its "
             "floor plan, or never was"
         )
+
+
+class UnanchoredPlanError(ServiceError):
+    """The floor plan does not say where on Earth it lies, which the answer that is wanted needs."""
+
+    def __init__(self, plan_id: str) -> None:
+        super().__init__(f"floor plan '{plan_id}' has no anchor, so there is no answer in latitude and longitude")
 
 
 class UploadTooLargeError(ServiceError):
@@ -401,6 +409,7 @@ PROBLEMS: dict[type[Exception], ProblemKind] = {
     UnknownVenueError: ProblemKind(404, "unknown-venue", "Unknown venue"),
     UnknownRevisionError: ProblemKind(404, "unknown-revision", "Unknown revision"),
     UnknownAnswerError: ProblemKind(404, "unknown-answer", "Unknown answer"),
+    UnanchoredPlanError: ProblemKind(409, "floorplan-unanchored", "Floor plan has no anchor"),
     UploadTooLargeError: ProblemKind(413, "upload-too-large", "Upload too large"),
     UploadTimeoutError: ProblemKind(408, "upload-timeout", "Upload took too long"),
     UnsupportedMediaError: ProblemKind(415, "unsupported-media", "Unsupported media type"),

@@ -4,6 +4,7 @@ Begin with `plan.py`. `reading.py` makes rooms of a document, `openings.py` puts
 is what only all rooms together can break, `geometry.py` the arrays that the layout renderer casts its rays against.
 """
 
+from lalaloc_core.floorplan.anchors import anchor_document
 from lalaloc_core.floorplan.geometry import PlanGeometry, pad_walls
 from lalaloc_core.floorplan.heights import MAX_CAMERA_HEIGHT_STD_M
 from lalaloc_core.floorplan.limits import DEFAULT_LIMITS, PlanLimits
@@ -24,6 +25,7 @@ __all__ = [
     "PlanGeometry",
     "PlanLimits",
     "Room",
+    "anchor_document",
     "pad_walls",
     "room_type_of",
 ]

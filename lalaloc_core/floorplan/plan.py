@@ -15,8 +15,10 @@ import numpy as np
 import shapely
 from jaxtyping import Float, Int
 
-from lalaloc_core.conventions import heading_to_degrees
+from lalaloc_core.conventions import heading_from_degrees, heading_to_degrees
+from lalaloc_core.earth import Anchor
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan.anchors import anchor_document, read_anchor
 from lalaloc_core.floorplan.arrays import frozen
 from lalaloc_core.floorplan.checks import check_size, overlap_warnings
 from lalaloc_core.floorplan.geometry import PlanGeometry, build_geometry
@@ -43,6 +45,7 @@ _PLAN_KEYS = {
     "camera_height_m",
     "camera_height_std_m",
     "north_deg",
+    "anchor",
     "openings",
     "opening_kinds",
     "opening_tolerance_m",
@@ -65,6 +68,7 @@ class FloorPlan:
         opening_faces: the pieces of walls that openings take up.
         camera_height_std_m: how far off `camera_height_m` may be, one standard deviation; None when it is not said.
         states_camera_height: whether the plan says `camera_height_m`; if not, cameras may stand at any height.
+        anchor: where on Earth the plan lies, None when that is not known.
     """
 
     name: str
@@ -78,6 +82,7 @@ class FloorPlan:
     opening_faces: tuple[OpeningFace, ...] = ()
     camera_height_std_m: float | None = None
     states_camera_height: bool = False
+    anchor: Anchor | None = None
 
     @classmethod
     def from_json(cls, text: str | bytes, limits: PlanLimits = DEFAULT_LIMITS) -> FloorPlan:
@@ -128,6 +133,12 @@ class FloorPlan:
             raise InvalidFloorPlanError(
                 f"no opening lies on a wall: none is within {tolerance_m:g} m of one (opening_tolerance_m)"
             )
+        north = read_north(document.get("north_deg"))
+        # Rounded, so that degrees which went through radians are the same again.
+        north_deg = None if north is None else round(heading_to_degrees(north), 9)
+        anchor = read_anchor(document.get("anchor"), north_deg, rooms)
+        if anchor is not None:
+            north = heading_from_degrees(anchor.north_deg)
         if warnings is None:
             astray = [f"{label(openings[k], k)} lies on no wall" for k in lost]
             warnings = (*overlap_warnings(rooms, limits), *astray)
@@ -136,13 +147,14 @@ class FloorPlan:
             rooms=rooms,
             camera_height_m=read_camera_height(document.get("camera_height_m"), rooms, limits),
             warnings=tuple(warnings),
-            north=read_north(document.get("north_deg")),
+            north=north,
             openings=openings,
             opening_kinds=read_opening_kinds(document.get("opening_kinds"), openings),
             opening_tolerance_m=tolerance_m,
             opening_faces=faces,
             camera_height_std_m=read_camera_height_std(document.get("camera_height_std_m")),
             states_camera_height=document.get("camera_height_m") is not None,
+            anchor=anchor,
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -155,6 +167,8 @@ class FloorPlan:
         if self.north is not None:
             # Rounded, so that degrees which went through radians are the same again.
             document["north_deg"] = round(heading_to_degrees(self.north), 9) % 360.0
+        if self.anchor is not None:
+            document["anchor"] = anchor_document(self.anchor)
         if self.openings or self.opening_kinds:
             document["opening_kinds"] = sorted(self.opening_kinds)
             document["opening_tolerance_m"] = self.opening_tolerance_m

@@ -12,7 +12,8 @@ exports/   the way back: plans in the formats of other tools
 Begin with `importing.py`, which chooses among the formats. What a plan is stands in `lalaloc_core.floorplan`.
 """
 
-from lalaloc_core.plans.exporting import EXPORT_FORMATS, MEDIA_TYPES, ExportFormat, export_plan
+from lalaloc_core.earth import Anchor
+from lalaloc_core.plans.exporting import ENDINGS, EXPORT_FORMATS, MEDIA_TYPES, ExportFormat, export_plan
 from lalaloc_core.plans.importing import (
     FORMATS,
     detect_format,
@@ -26,10 +27,11 @@ from lalaloc_core.plans.model.assemble import ImportedPlan
 from lalaloc_core.plans.model.limits import DEFAULT_IMPORT_LIMITS, ImportLimits
 from lalaloc_core.plans.model.options import ImportOptions, KnownDistance
 from lalaloc_core.plans.model.report import ImportReport, LayerUse
-from lalaloc_core.plans.model.sketch import Anchor, Level
+from lalaloc_core.plans.model.sketch import Level
 
 __all__ = [
     "DEFAULT_IMPORT_LIMITS",
+    "ENDINGS",
     "EXPORT_FORMATS",
     "FORMATS",
     "MEDIA_TYPES",

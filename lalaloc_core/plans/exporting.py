@@ -5,10 +5,10 @@ from __future__ import annotations
 import json
 from typing import Any, Literal, get_args
 
+from lalaloc_core.earth import Anchor
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.plans.importing import missing_extra
-from lalaloc_core.plans.model.sketch import Anchor
 
 ExportFormat = Literal["native", "geojson", "imdf", "dxf", "svg"]
 EXPORT_FORMATS: tuple[ExportFormat, ...] = get_args(ExportFormat)
@@ -19,6 +19,13 @@ MEDIA_TYPES: dict[ExportFormat, str] = {
     "dxf": "image/vnd.dxf",
     "svg": "image/svg+xml",
 }
+ENDINGS: dict[ExportFormat, str] = {
+    "native": "json",
+    "geojson": "geojson",
+    "imdf": "imdf.zip",
+    "dxf": "dxf",
+    "svg": "svg",
+}
 
 
 def export_plan(plan: FloorPlan, format: str, anchor: Anchor | None = None) -> bytes:
@@ -27,14 +34,14 @@ def export_plan(plan: FloorPlan, format: str, anchor: Anchor | None = None) -> b
     Args:
         plan: what was understood.
         format: one of `EXPORT_FORMATS`.
-        anchor: where on Earth the plan's origin lies; IMDF needs it, GeoJSON uses it.
+        anchor: where on Earth the plan's origin lies, by default as the plan says; for IMDF and GeoJSON.
 
     Raises:
         InvalidFloorPlanError: an unknown format, or no anchor where one is needed.
         MissingExtraError: the package that writes the format is not installed.
     """
     try:
-        return _export(plan.to_dict(), format, anchor)
+        return _export(plan.to_dict(), format, anchor or plan.anchor)
     except ModuleNotFoundError as error:
         raise missing_extra(error, f"writing {format}") from error
 

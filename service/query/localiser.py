@@ -26,6 +26,7 @@ from service.grids import GridProvider, grid_height_m
 from service.http.admission_control import Slots
 from service.query.camera_height import stated_height
 from service.query.decoding import Decoder
+from service.query.geopose import geopose_of
 from service.query.heading import KnownHeading, known_heading
 from service.query.hints import hint_warnings, stated_hints
 from service.query.lpo_pool import LpoPool
@@ -287,6 +288,12 @@ class Localiser:
             latent_distance=best.latent_distance,
             camera_height_m=found.camera_height_m,
             candidates=candidates,
+            geopose=geopose_of(
+                record.plan,
+                (found.candidates[0].x_m, found.candidates[0].y_m),
+                best.heading_deg,
+                found.camera_height_m,
+            ),
             timings_ms=TimingsAnswer(**{name: timings_ms.get(name, 0.0) for name in TimingsAnswer.model_fields}),
             model=self.model,
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from functools import partial
 from time import monotonic
 from typing import Annotated, Any
@@ -23,6 +24,7 @@ from service.errors import (
     PlanNotReadyError,
     StoppingError,
     StoreUnavailableError,
+    UnanchoredPlanError,
     UnknownFloorPlanError,
     UnsupportedMediaError,
     UploadTimeoutError,
@@ -33,6 +35,7 @@ from service.http.accept import preferred
 from service.http.idempotent_request import HEADER as IDEMPOTENCY_HEADER
 from service.http.problems import problem_responses
 from service.http.uploads import JSON, MULTIPART, UploadLimits, faults_of, media_type, read_parts, validate_fields
+from service.query.geopose import feature_of
 from service.query.localiser import AskedPicture
 from service.routes.dependencies import IDEMPOTENCY_KEY, Party, Running, Tenant, plan_for_query
 from service.runtime import Runtime
@@ -41,7 +44,7 @@ from service.telemetry import note
 
 router = APIRouter(tags=["localisation"])
 
-_PNG, _SVG = "image/png", "image/svg+xml"
+_PNG, _SVG, _GEOJSON = "image/png", "image/svg+xml", "application/geo+json"
 # The photograph in an SVG is a part of it; nothing else may load, and nothing run.
 _POLICY = {"Content-Security-Policy": "default-src 'none'; img-src data:; frame-ancestors 'none'"}
 _VARY = {"Vary": "Accept"}
@@ -68,6 +71,7 @@ def _body_schema() -> dict[str, Any]:
     responses={
         200: {
             "content": {
+                _GEOJSON: {"schema": {"type": "object", "description": "A Feature of RFC 7946."}},
                 _PNG: {"schema": {"type": "string", "format": "binary"}},
                 _SVG: {"schema": {"type": "string"}},
             }
@@ -80,6 +84,7 @@ def _body_schema() -> dict[str, Any]:
         InvalidRequestError,
         MalformedRequestError,
         UnknownFloorPlanError,
+        UnanchoredPlanError,
         PlanFailedError,
         PlanNotReadyError,
         UnsupportedMediaError,
@@ -110,13 +115,14 @@ async def localise(
 ) -> Response:
     """Find where in a stored floor plan a panorama was taken.
 
-    With `Accept: image/png` or `Accept: image/svg+xml` the answer is a picture, 1600 pixels wide.
+    With `Accept: image/png` or `Accept: image/svg+xml` the answer is a picture, 1600 pixels wide; with `Accept:
+    application/geo+json` a GeoJSON Feature at the place on Earth, for plans with an `anchor`.
 
     A plan that is still preparing is waited for. When optimisation (`lpo`) cannot answer in time, the answer is
     the one before it, with `"stage": "vdr"`.
     """
     settings = runtime.settings
-    media = preferred(request, (JSON, _PNG, _SVG))
+    media = preferred(request, (JSON, _PNG, _SVG, _GEOJSON))
     _check_asked(request, media, picture)
     idempotent = IdempotentRequest(runtime.store.idempotency_keys, request, tenant, "POST /localise")
     media_type(request, (MULTIPART,))
@@ -136,9 +142,13 @@ async def localise(
         record = await plan_for_query(tenant, form.floorplan_id, runtime)
         note(request, plan=record.id, revision=record.revision_id)
         content = parts.files["panorama"]
-        if media == JSON:
+        if media == _GEOJSON and record.plan.anchor is None:
+            raise UnanchoredPlanError(record.id)
+        if media in (JSON, _GEOJSON):
             found = await runtime.localiser.answer(record, form, content, begin, clock, party)
             note(request, stage=found.stage)
+            if media == _GEOJSON:
+                return Response(json.dumps(feature_of(found)), headers=_VARY, media_type=_GEOJSON)
             return Response(await _text(found, tenant, runtime), headers=_VARY, media_type=JSON)
         rooms = await runtime.drawings.rooms(record)
         asked = AskedPicture(picture=picture or "both", pixels=media == _PNG, rooms=rooms)
@@ -153,10 +163,10 @@ def _check_asked(request: Request, media: str, picture: Picture | None) -> None:
     """Raises:
     InvalidRequestError: what is said of a picture and none is wanted, or what is for JSON alone.
     """
-    if media == JSON and picture is not None:
+    if media in (JSON, _GEOJSON) and picture is not None:
         raise InvalidRequestError([("picture", f"needs the header Accept: {_PNG} or Accept: {_SVG}")])
     if media != JSON and IDEMPOTENCY_HEADER in request.headers:
-        raise InvalidRequestError([(IDEMPOTENCY_HEADER, "is for answers in JSON; pictures are not kept")])
+        raise InvalidRequestError([(IDEMPOTENCY_HEADER, "is for answers in application/json, others are not kept")])
 
 
 async def _text(answer: LocaliseAnswer, tenant: str, runtime: Runtime) -> str:

@@ -9,12 +9,20 @@ from pydantic import Field
 from starlette.concurrency import run_in_threadpool
 
 from lalaloc_core.draw.plan import Marker
+from lalaloc_core.errors import MissingExtraError
 from lalaloc_core.floorplan import FloorPlan
-from service.errors import InvalidRequestError, StoreUnavailableError, UnknownFloorPlanError
+from lalaloc_core.plans import ENDINGS, MEDIA_TYPES, ExportFormat
+from service.errors import (
+    ConverterNotReadyError,
+    InvalidRequestError,
+    StoreUnavailableError,
+    UnanchoredPlanError,
+    UnknownFloorPlanError,
+)
 from service.http.conditional import conditional_answer, content_etag
 from service.http.problems import problem_responses
 from service.http.uploads import JSON
-from service.routes.dependencies import IF_NONE_MATCH, NOT_MODIFIED, Running, Tenant, plan_summary, stored_plan
+from service.routes.dependencies import IF_NONE_MATCH, NOT_MODIFIED, Party, Running, Tenant, plan_summary, stored_plan
 from service.storage.records import PlanRecord
 from service.telemetry import note
 
@@ -54,6 +62,41 @@ def get_original(floorplan_id: str, request: Request, runtime: Running, tenant: 
     kept = {"Content-Disposition": "attachment"} if original.media_type != JSON else None
     etag = content_etag(original.content)
     return conditional_answer(request, original.content, original.media_type, etag, kept)
+
+
+@router.get(
+    "/{floorplan_id}/export",
+    summary="The plan as a file of another tool",
+    response_class=Response,
+    openapi_extra=_CONDITIONAL,
+    responses={
+        200: {"content": {media: {"schema": {"type": "string", "format": "binary"}} for media in MEDIA_TYPES.values()}},
+        **NOT_MODIFIED,
+        **problem_responses(
+            UnknownFloorPlanError,
+            UnanchoredPlanError,
+            MissingExtraError,
+            InvalidRequestError,
+            StoreUnavailableError,
+            ConverterNotReadyError,
+        ),
+    },
+)
+async def get_export(
+    floorplan_id: str,
+    request: Request,
+    runtime: Running,
+    tenant: Tenant,
+    party: Party,
+    format: Annotated[ExportFormat, Query(description="IMDF needs a plan with an `anchor`; GeoJSON uses it.")],
+) -> Response:
+    """What was understood of the plan, to be opened elsewhere, or uploaded again."""
+    record = _noted(request, await run_in_threadpool(stored_plan, tenant, floorplan_id, runtime.store.plans))
+    if format == "imdf" and record.plan.anchor is None:
+        raise UnanchoredPlanError(record.id)
+    content = await runtime.converter.write(record.plan, format, party)
+    kept = {"Content-Disposition": f'attachment; filename="plan.{ENDINGS[format]}"'}
+    return conditional_answer(request, content, MEDIA_TYPES[format], content_etag(content), kept)
 
 
 @router.get(

@@ -7,6 +7,7 @@ stored_plans     what is told of stored floor plans
 localise_query   what a query says beside the panorama
 hint_fields      what it says of where the camera stood
 localise_answer  where it was taken
+geopose          the same on Earth
 venues           floor plans that belong together
 layout           the walls that a camera may see, for who draws them
 service_state    limits, health, readiness
@@ -16,6 +17,7 @@ Begin with `localise_answer.py`.
 """
 
 from service.schemas.fields import Answer
+from service.schemas.geopose import GeoPose, GeoPoseAngles, GeoPosePosition
 from service.schemas.layout import LayoutAnswer, OpeningFaceAnswer, RoomLayoutAnswer
 from service.schemas.localise_answer import (
     CandidateAnswer,
@@ -71,6 +73,9 @@ __all__ = [
     "FloorPlanDocument",
     "FloorPlanList",
     "FloorPlanSummary",
+    "GeoPose",
+    "GeoPoseAngles",
+    "GeoPosePosition",
     "GridAnswer",
     "HealthAnswer",
     "ImportForm",

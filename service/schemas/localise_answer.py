@@ -7,6 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from service.schemas.fields import Answer, Degrees, HeadingDeg, Mass, Metres, Milliseconds, Score, Share, Variance
+from service.schemas.geopose import GeoPose
 from service.schemas.localise_query import HEADING_MEANING
 
 _LATENT_DISTANCE = Field(ge=0, le=2, description="Distance of the pose's layout to the panorama's latent.")
@@ -111,6 +112,7 @@ class LocaliseAnswer(Answer):
         description="Under which `GET /answers/{answer_id}` tells the same again, for `keep_answers_s`; null where "
         "answers are not kept.",
     )
+    geopose: GeoPose | None = Field(None, description="The pose on Earth; null for a plan without an `anchor`.")
     posterior: PosteriorAnswer | None = Field(
         default=None, description="How probable all places are; null unless asked for with `include`."
     )

@@ -42,6 +42,27 @@ class OpeningDocument(BaseModel):
     )
 
 
+class ControlPoint(BaseModel):
+    """A place that is known in the plan and on Earth."""
+
+    x: float = Field(description="In the plan, metres.")
+    y: float
+    latitude: float = Field(ge=-90, le=90, description="WGS84, degrees.")
+    longitude: float = Field(ge=-180, le=180)
+
+
+class AnchorDocument(BaseModel):
+    """Where on Earth a plan lies: `latitude` and `longitude` of its origin, or two control points."""
+
+    latitude: float | None = Field(None, ge=-90, le=90, description="Of the plan's origin; WGS84, degrees.")
+    longitude: float | None = Field(None, ge=-180, le=180, description="Of the plan's origin.")
+    altitude_m: float | None = Field(None, ge=-1000, le=10_000, description="Of the floor, over the ellipsoid.")
+    north_deg: float | None = Field(
+        None, ge=-360, le=360, description="Azimuth of true north in the plan, where `north_deg` of the plan says none."
+    )
+    control_points: list[ControlPoint] | None = Field(None, min_length=2, max_length=2)
+
+
 class FloorPlanDocument(BaseModel):
     """A floor plan in the native format; coordinates in metres."""
 
@@ -63,6 +84,9 @@ class FloorPlanDocument(BaseModel):
     )
     north_deg: float | None = Field(
         None, ge=-360, le=360, description="Azimuth of true north: degrees clockwise from the plan's +y."
+    )
+    anchor: AnchorDocument | None = Field(
+        None, description="Where on Earth the plan lies: by its origin, or by two control points."
     )
     camera_height_std_m: float | None = Field(
         None, ge=0, le=2, description="How far off `camera_height_m` may be: one standard deviation."

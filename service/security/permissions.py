@@ -42,6 +42,7 @@ NEEDED: Mapping[tuple[str, str], Permission] = {
     ("GET", "/floorplans/{floorplan_id}/events"): Permission.READ,
     ("GET", "/floorplans/{floorplan_id}/layout"): Permission.READ,
     ("GET", "/floorplans/{floorplan_id}/original"): Permission.READ,
+    ("GET", "/floorplans/{floorplan_id}/export"): Permission.READ,
     ("GET", "/floorplans/{floorplan_id}/preview.svg"): Permission.READ,
     ("GET", "/floorplans/{floorplan_id}/mesh.glb"): Permission.READ,
     ("GET", "/venues"): Permission.READ,

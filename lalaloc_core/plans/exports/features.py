@@ -12,9 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from lalaloc_core.earth import Anchor, LocalFrame
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.plans.formats.earth import LocalFrame
-from lalaloc_core.plans.model.sketch import Anchor
 
 # Nine decimals of a degree are a tenth of a millimetre.
 _DECIMALS = 9

@@ -15,15 +15,15 @@ import shapely
 from jaxtyping import Float
 from pyproj.exceptions import ProjError
 
+from lalaloc_core.earth import Anchor, LocalFrame, to_wgs84
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.plans.formats.earth import LocalFrame, to_wgs84
 from lalaloc_core.plans.model.assemble import ImportedPlan, assemble
 from lalaloc_core.plans.model.geometry import opening_line, polygons_of
 from lalaloc_core.plans.model.levels import chosen_levels
 from lalaloc_core.plans.model.limits import Budget
 from lalaloc_core.plans.model.options import ImportOptions
 from lalaloc_core.plans.model.report import Notebook
-from lalaloc_core.plans.model.sketch import Anchor, Level, OpeningKind, Sketch, SketchedOpening, SketchedRoom
+from lalaloc_core.plans.model.sketch import Level, OpeningKind, Sketch, SketchedOpening, SketchedRoom
 from lalaloc_core.plans.model.words import role_of
 
 FORMAT = "ifc"

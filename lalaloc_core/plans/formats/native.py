@@ -58,7 +58,7 @@ def import_native(document: Any, options: ImportOptions, budget: Budget) -> tupl
         notebook.use("openings", str(opening["kind"]))
     notebook.warnings.extend(check_document(parsed.to_dict()))
     report = notebook.close(FORMAT, factor, "units" if "units" in document or options.units else "the format: metres")
-    return (ImportedPlan(plan, report, checked=(limits, parsed)),)
+    return (ImportedPlan(plan, report, anchor=parsed.anchor, checked=(limits, parsed)),)
 
 
 def _choice(units: Any) -> str:
@@ -84,11 +84,31 @@ def _converted(document: dict[str, Any], factor: float, y_factor: float) -> dict
     if y_factor < 0.0 and is_number(plan.get("north_deg")) and abs(plan["north_deg"]) < _BEYOND:
         # Turned over, what was clockwise from +y on the drawing is clockwise from its new +y after half a turn.
         plan["north_deg"] = (180.0 - plan["north_deg"]) % 360.0
+    anchor = plan.get("anchor")
+    if isinstance(anchor, Mapping):
+        plan["anchor"] = _anchor(anchor, factor, y_factor)
     return plan
 
 
 def _room(room: Mapping[str, Any], factor: float, y_factor: float) -> dict[str, Any]:
     return _lengths(room, factor) | _scaled_keys(room, ("polygon", "holes", "walls"), factor, y_factor)
+
+
+def _anchor(anchor: Mapping[str, Any], factor: float, y_factor: float) -> dict[str, Any]:
+    """Control points are places of the drawing; the altitude is metres in any case."""
+    converted = dict(anchor)
+    north_deg, points = converted.get("north_deg"), converted.get("control_points")
+    if y_factor < 0.0 and is_number(north_deg) and abs(north_deg) < _BEYOND:
+        converted["north_deg"] = (180.0 - north_deg) % 360.0
+    if isinstance(points, list):
+        scales = {"x": factor, "y": y_factor}
+        converted["control_points"] = [
+            {key: _times(value, scales.get(key, 1.0)) for key, value in point.items()}
+            if isinstance(point, Mapping)
+            else point
+            for point in points
+        ]
+    return converted
 
 
 def _lengths(document: Mapping[str, Any], factor: float) -> dict[str, Any]:

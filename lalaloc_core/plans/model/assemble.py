@@ -12,20 +12,23 @@ import shapely
 from shapely import affinity
 from shapely.geometry.base import BaseGeometry
 
+from lalaloc_core.earth import Anchor
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.floorplan import DEFAULT_LIMITS, FloorPlan, PlanLimits
+from lalaloc_core.floorplan import DEFAULT_LIMITS, FloorPlan, PlanLimits, anchor_document
 from lalaloc_core.plans.model.checks import check_document
 from lalaloc_core.plans.model.geometry import polygons_of
 from lalaloc_core.plans.model.options import ImportOptions
 from lalaloc_core.plans.model.report import ImportReport, Notebook
 from lalaloc_core.plans.model.settle import settle_openings
-from lalaloc_core.plans.model.sketch import Anchor, Level, Sketch, SketchedOpening, SketchedRoom
+from lalaloc_core.plans.model.sketch import Level, Sketch, SketchedOpening, SketchedRoom
 from lalaloc_core.plans.model.words import type_of_room
 
 DEFAULT_CEILING_HEIGHT_M = 2.5
 # Rounding of a drawing: vertices this far off a straight wall are not corners, slivers this small are no floor.
 _STRAIGHT_M, _SLIVER_M2 = 0.002, 0.01
 _FAR_M = 10_000.0
+# As far from an anchor directions and lengths are right to a few centimetres.
+_FARTHEST_ANCHOR_M = 20_000.0
 # A tenth of a millimetre is finer than anything that is built.
 _GRID_M, _DECIMALS = 1e-4, 4
 _MAX_NAMED = 5
@@ -91,6 +94,10 @@ def assemble(
     document: dict[str, Any] = {"name": options.name or clean_name(sketch.name) or "floor plan"}
     if sketch.north_deg is not None:
         document["north_deg"] = round(sketch.north_deg % 360.0, 6)
+    anchor = _anchor_moved(sketch.anchor, moved, notebook)
+    if anchor is not None:
+        document["north_deg"] = round(anchor.north_deg % 360.0, 6)
+        document["anchor"] = anchor_document(anchor)
     document["ceiling_height_m"] = _usual_ceiling(rooms, options, notebook)
     document["rooms"] = [_room(room, document["ceiling_height_m"], sketch, moved) for room in rooms]
     if settled.openings:
@@ -101,7 +108,7 @@ def assemble(
     # Refused here, with what the file says, rather than at whoever uses the plan.
     checked = (DEFAULT_LIMITS, FloorPlan.from_dict(document))
     report = notebook.close(format, metres_per_unit, scale_source, is_draft=is_draft)
-    return ImportedPlan(document, report, sketch.level, sketch.anchor, checked)
+    return ImportedPlan(document, report, sketch.level, anchor, checked)
 
 
 def clean_name(name: str | None, limit: int = DEFAULT_LIMITS.max_name_length) -> str | None:
@@ -158,6 +165,17 @@ def _near_origin(rooms: list[SketchedRoom], notebook: Notebook) -> tuple[list[Sk
     notebook.notes.append(f"the plan was moved by ({dx}, {dy}) m, so that it lies near its origin")
     moved = [SketchedRoom(affinity.translate(r.shape, dx, dy), r.name, r.type, r.ceiling_height_m, r.id) for r in rooms]
     return moved, (dx, dy)
+
+
+def _anchor_moved(anchor: Anchor | None, by: tuple[float, float], notebook: Notebook) -> Anchor | None:
+    """The anchor of the moved plan; where it was moved far, its place cannot be told any more."""
+    if anchor is None or by == (0.0, 0.0):
+        return anchor
+    if math.hypot(*by) > _FARTHEST_ANCHOR_M:
+        away_km = math.hypot(*by) / 1000.0
+        notebook.warnings.append(f"the file's origin lies {away_km:.0f} km away: the place on Earth was left out")
+        return None
+    return anchor.moved((-by[0], -by[1]))
 
 
 def _moved(opening: SketchedOpening, by: tuple[float, float]) -> SketchedOpening:

@@ -7,6 +7,8 @@ from typing import Literal
 
 import shapely
 
+from lalaloc_core.earth import Anchor
+
 OpeningKind = Literal["door", "window", "passage"]
 Point = tuple[float, float]
 
@@ -52,16 +54,6 @@ class Level:
         wanted = wanted.strip().casefold()
         number = None if self.number is None else f"{self.number:g}"
         return wanted in (self.name.casefold(), number)
-
-
-@dataclass(frozen=True)
-class Anchor:
-    """Where on Earth a plan's origin lies, WGS84; `north_deg` is the azimuth of true north in the plan frame."""
-
-    latitude: float
-    longitude: float
-    altitude_m: float | None = None
-    north_deg: float = 0.0
 
 
 @dataclass

@@ -1,0 +1,181 @@
+"""Answers on Earth, as OGC GeoPose and GeoJSON have them; and plans written for other tools."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import httpx
+import numpy as np
+import pyproj
+import pytest
+
+from lalaloc_client import Client
+from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.plans import Anchor, ImportOptions, import_plan
+from tests.plans.conftest import FLAT as PLAN
+from tests.plans.conftest import assert_same_plan
+from tests.service.conftest import FLAT, assert_problem, localise, upload
+
+ANCHOR = {"latitude": 48.1372, "longitude": 11.5756, "altitude_m": 519.5}
+# What GeoPose.Basic.YPR.Schema.json of OGC GeoPose 1.0 (21-056r11) asks for.
+YPR = {
+    "position": ("lat", "lon", "h"),
+    "angles": ("yaw", "pitch", "roll"),
+}
+
+
+def check_schema(geopose: dict[str, Any]) -> None:
+    assert geopose.keys() == YPR.keys()
+    for part, names in YPR.items():
+        assert tuple(geopose[part]) == names
+        assert all(type(value) is float for value in geopose[part].values())
+    assert abs(geopose["position"]["lat"]) <= 90.0
+    assert abs(geopose["position"]["lon"]) <= 180.0
+
+
+def anchored(**anchor: Any) -> FloorPlan:
+    return FloorPlan.from_dict(FLAT | {"anchor": anchor})
+
+
+@pytest.mark.parametrize("north_deg", [0.0, 25.0, 200.0])
+def test_places_and_directions_are_those_of_geodesy(north_deg: float) -> None:
+    plan = anchored(**ANCHOR, north_deg=north_deg)
+    assert plan.anchor is not None
+    geod = pyproj.Geod(ellps="WGS84")
+    for x, y in ((5.0, 2.0), (-300.0, 700.0), (2000.0, 0.0)):
+        ((lon, lat),) = plan.anchor.to_earth(np.array([[x, y]]))
+        azimuth, back, distance = geod.inv(plan.anchor.longitude, plan.anchor.latitude, lon, lat)
+        assert distance == pytest.approx(math.hypot(x, y), rel=1e-6)
+        assert (azimuth + north_deg - math.degrees(math.atan2(x, y)) + 180) % 360 - 180 == pytest.approx(0, abs=1e-4)
+        # Looking on, away from the origin: the azimuth at the far end is another one, by the convergence.
+        onwards = plan.anchor.true_azimuth_deg((x, y), math.degrees(math.atan2(x, y)))
+        assert (onwards - (back + 180.0) + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=1e-4)
+        assert plan.anchor.to_plan(np.array([[lon, lat]]))[0] == pytest.approx([x, y], abs=1e-6)
+
+
+def test_two_control_points_are_an_anchor() -> None:
+    known = Anchor(**ANCHOR, north_deg=25.0)
+    places = [(1.0, 2.0), (9.0, 5.5)]
+    points = [
+        {"x": x, "y": y, "latitude": float(lat), "longitude": float(lon)}
+        for (x, y), (lon, lat) in zip(places, known.to_earth(np.array(places)), strict=True)
+    ]
+    found = anchored(control_points=points, altitude_m=519.5).anchor
+    assert found is not None
+    assert (found.latitude, found.longitude) == pytest.approx((known.latitude, known.longitude), abs=1e-9)
+    assert found.north_deg == pytest.approx(25.0, abs=1e-4)
+    in_feet = FLAT | {"units": "ft", "anchor": {"control_points": [p | {"x": p["x"] / 0.3048, "y": p["y"] / 0.3048}
+                                                                   for p in points]}}  # fmt: skip
+    converted = import_plan(json.dumps(in_feet).encode(), ImportOptions()).anchor
+    assert converted is not None
+    assert converted.latitude == pytest.approx(known.latitude, abs=1e-9)
+    stretched = [points[0], points[1] | {"x": 20.0}]
+    with pytest.raises(InvalidFloorPlanError, match="is the scale right"):
+        anchored(control_points=stretched)
+
+
+@pytest.mark.parametrize(
+    ("anchor", "words"),
+    [
+        ({"latitude": 48.0, "longitude": 11.0}, "needs north_deg"),
+        ({"latitude": 91.0, "longitude": 11.0, "north_deg": 0}, "latitude of the anchor is 91"),
+        ({"latitude": "48", "longitude": 11.0, "north_deg": 0}, "must be a number"),
+        ({"longitude": 11.0, "north_deg": 0}, "latitude of the anchor must be a number"),
+        ({"latitude": 48.0, "longitude": 11.0, "north_deg": 0, "altitude_m": 1e9}, "altitude_m of the anchor"),
+        ({"latitude": 48.0, "longitude": 11.0, "north": 0}, "unknown key 'north'"),
+        ({"control_points": [{"x": 0, "y": 0, "latitude": 48.0, "longitude": 11.0}]}, "must be two"),
+        ({"control_points": [{"x": 0, "y": 0, "latitude": 48.0, "longitude": 11.0}] * 2}, "0.00 m apart"),
+        ([48.0, 11.0], "must be an object"),
+    ],
+)
+def test_an_anchor_that_cannot_be_is_refused(client: httpx.Client, anchor: Any, words: str) -> None:
+    response = client.post("/floorplans", json=FLAT | {"anchor": anchor})
+    assert words in assert_problem(response, 422, "invalid-floorplan")["detail"]
+
+
+def test_a_plan_keeps_its_anchor_and_north_is_said_once(client: httpx.Client) -> None:
+    twice = client.post("/floorplans", json=FLAT | {"north_deg": 10, "anchor": ANCHOR | {"north_deg": 25}})
+    assert "give one of them" in assert_problem(twice, 422, "invalid-floorplan")["detail"]
+    plan = client.get(f"/floorplans/{upload(client, FLAT | {'anchor': ANCHOR | {'north_deg': 25}})}").json()["plan"]
+    assert (plan["anchor"], plan["north_deg"]) == (ANCHOR, 25.0)
+    assert FloorPlan.from_dict(plan).to_dict() == plan
+
+
+def test_answers_say_where_on_earth(client: httpx.Client, panorama: bytes) -> None:
+    plan_id = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25})
+    answer = localise(client, plan_id, panorama, heading_deg=115, refine="none").json()
+    geopose = answer["geopose"]
+    check_schema(geopose)
+    ((lon, lat),) = Anchor(**ANCHOR, north_deg=25.0).to_earth(np.array([[*answer["position"].values()]]))
+    assert (geopose["position"]["lon"], geopose["position"]["lat"]) == pytest.approx((lon, lat), abs=1e-8)
+    assert geopose["position"]["h"] == pytest.approx(ANCHOR["altitude_m"] + answer["camera_height_m"], abs=1e-3)
+    # 115° in the plan is 90° from north, to the east: a quarter turn clockwise of a camera that looks north.
+    assert answer["heading_deg"] == 115.0
+    assert geopose["angles"] == pytest.approx({"yaw": -90.0, "pitch": 0.0, "roll": 0.0}, abs=1e-3)
+    fields = {"floorplan_id": plan_id, "heading_deg": "115", "refine": "none"}
+    file = {"panorama": ("p.jpg", panorama, "image/jpeg")}
+    response = client.post("/localise", data=fields, files=file, headers={"Accept": "application/geo+json"})
+    assert response.headers["content-type"] == "application/geo+json"
+    feature = response.json()
+    assert feature["type"] == "Feature"
+    place = geopose["position"]
+    assert feature["geometry"] == {"type": "Point", "coordinates": [place["lon"], place["lat"], place["h"]]}
+    assert feature["properties"]["room"] == answer["room"]
+
+
+def test_a_plan_without_an_anchor_has_no_place_on_earth(client: httpx.Client, panorama: bytes) -> None:
+    plan_id = upload(client)
+    assert localise(client, plan_id, panorama, refine="none").json()["geopose"] is None
+    file = {"panorama": ("p.jpg", panorama, "image/jpeg")}
+    response = client.post(
+        "/localise", data={"floorplan_id": plan_id}, files=file, headers={"Accept": "application/geo+json"}
+    )
+    assert "has no anchor" in assert_problem(response, 409, "floorplan-unanchored")["detail"]
+    assert_problem(client.get(f"/floorplans/{plan_id}/export", params={"format": "imdf"}), 409, "floorplan-unanchored")
+
+
+@pytest.mark.parametrize(
+    ("format", "media"),
+    [
+        ("native", "application/json"),
+        ("geojson", "application/geo+json"),
+        ("dxf", "image/vnd.dxf"),
+        ("svg", "image/svg+xml"),
+    ],
+)
+def test_what_is_exported_can_be_uploaded_again(client: httpx.Client, format: str, media: str) -> None:
+    plan_id = client.post("/floorplans", json=PLAN).json()["id"]
+    response = client.get(f"/floorplans/{plan_id}/export", params={"format": format})
+    assert response.status_code == 200, response.text
+    assert response.headers["content-type"] == media
+    again = client.post("/floorplans", files={"file": ("plan", response.content)}).json()
+    expected = client.get(f"/floorplans/{plan_id}").json()["plan"]
+    assert_same_plan(import_plan(json.dumps(again["plan"]).encode()), expected)
+    unknown = client.get(f"/floorplans/{plan_id}/export", params={"format": "dwg"})
+    assert_problem(unknown, 422, "invalid-request")
+
+
+def test_an_anchored_plan_goes_around_by_imdf_with_its_place(client: httpx.Client) -> None:
+    plan_id = client.post("/floorplans", json=PLAN | {"anchor": ANCHOR, "north_deg": 0}).json()["id"]
+    archive = client.get(f"/floorplans/{plan_id}/export", params={"format": "imdf"}).content
+    again = client.post("/floorplans", files={"file": ("plan", archive)}).json()["plan"]
+    first, second = (Anchor(**{k: d["anchor"][k] for k in ("latitude", "longitude")}) for d in (
+        client.get(f"/floorplans/{plan_id}").json()["plan"], again))  # fmt: skip
+    corners = [np.concatenate([r["polygon"] for r in d["rooms"]]) for d in (PLAN, again)]
+    lowest = [a.to_earth(c.min(axis=0)[None]) for a, c in zip((first, second), corners, strict=True)]
+    assert lowest[0] == pytest.approx(lowest[1], abs=1e-7)
+
+
+def test_the_client_sends_files_with_options_and_fetches_exports(client: httpx.Client) -> None:
+    with Client(str(client.base_url)) as service:
+        plan = service.upload_floorplan(PLAN, options={"name": "named"})
+        assert plan.name == "named"
+        drawing = service.export(plan.id, "svg")
+        again = service.replace_floorplan(plan.id, drawing, options={"ceiling_height_m": 3})
+        assert again.import_report is not None
+        assert again.import_report["format"] == "svg"
+        assert {room.ceiling_height_m for room in again.rooms} == {3.0}
+        assert service.upload_floorplan(drawing).import_report == service.upload_floorplan(drawing).import_report
