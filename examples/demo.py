@@ -1,14 +1,15 @@
 """`make demo`: localise the example panoramas over HTTP and draw what was found to demo.png.
 
 Starts the service on a free port with a temporary data folder, uploads the example flat, asks where each panorama was
-taken (once with its heading given, once without), prints the answers beside the truth, and stops the service. The
-exit status is 0 only when every stage ran.
+taken (once with its heading given, once without), prints the answers beside the truth, draws the service's pictures of
+them, and stops the service. The exit status is 0 only when every stage ran.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
+import io
 import math
 import os
 import sys
@@ -16,6 +17,8 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
+from PIL import Image
 
 from examples.launch import ROOT, ServiceFailedError, running_service
 from examples.picture import Panel, draw_demo
@@ -27,6 +30,7 @@ _PLAN_TIMEOUT_S = 120.0
 _DEFAULTS = {
     "LALALOC_LPO_DEADLINE_S": "30",
     "LALALOC_LPO_STALL_S": "60",
+    "LALALOC_DECODE_STALL_S": "60",
     "LALALOC_REQUEST_DEADLINE_S": "60",
     "LALALOC_LOG_LEVEL": "warning",
 }
@@ -47,7 +51,7 @@ def main() -> int:
     except (StageMissingError, ServiceFailedError, ClientError) as error:
         print(f"demo: {error}", file=sys.stderr)
         return 1
-    print(f"\nthe picture is {out}: true and found position, other candidates, and the distance of every place")
+    print(f"\nthe picture is {out}: the plan in every photograph, and on the plan how probable all places are")
     return 0
 
 
@@ -86,7 +90,11 @@ def _localise_one(client: Client, plan_id: str, truth: TruePose) -> Panel:
     for label, answer in (("known", known), ("unknown", unknown)):
         check_answer(answer)
         print(_line(truth, label, answer), flush=True)
-    return Panel(truth, known, unknown)
+    picture = client.picture(
+        plan_id, truth.picture, heading_deg=truth.heading_deg, camera_height_m=truth.camera_height_m
+    )
+    with Image.open(io.BytesIO(picture)) as opened:
+        return Panel(truth, known, unknown, picture, opened.size)
 
 
 def check_answer(answer: Localisation) -> None:

@@ -12,7 +12,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from lalaloc_core.conventions import heading_from_degrees
-from lalaloc_core.draw.canvas import FOUND, INK, MUTED, RULE, TRUE, Number, document, jpeg, shortened, words
+from lalaloc_core.draw.canvas import FOUND, INK, MUTED, RULE, Number, document, draw_cross, jpeg, shortened, words
 from lalaloc_core.draw.heat import HeatMap, colour_bar, heat_image
 from lalaloc_core.draw.outline import Outline, outline_of
 from lalaloc_core.draw.photograph import photograph_key, photograph_part
@@ -157,7 +157,7 @@ def _marks(answer: DrawnAnswer) -> str:
             f'<text y="{0.36 * size:.4f}" font-size="{size:.4f}" fill="{INK}">{number}</text></g>'
         )
     if answer.truth is not None:
-        parts.append(_cross(answer.truth.x_m, -answer.truth.y_m, 1.3 * size))
+        parts.append(draw_cross(answer.truth.x_m, -answer.truth.y_m, 1.3 * size))
     return "".join([*parts, draw_camera(answer.camera, extent)])
 
 
@@ -176,7 +176,7 @@ def _legend(answer: DrawnAnswer, x: Number, y: Number, height: Number) -> str:
     if answer.truth is not None:
         row += 34
         off_m = math.hypot(answer.truth.x_m - answer.camera.x_m, answer.truth.y_m - answer.camera.y_m)
-        parts.append(_cross(x + 11, row - 6, 12.0) + words(x + 32, row, f"true, {_length(off_m)} away", 18))
+        parts.append(draw_cross(x + 11, row - 6, 12.0) + words(x + 32, row, f"true, {_length(off_m)} away", 18))
     rivals = _shown(answer.rivals)
     row += 48
     parts.append(words(x, row, "Rivals" if rivals else "No other place comes near", 18, more='font-weight="bold"'))
@@ -203,16 +203,6 @@ def _sized(photograph: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3
 
 def _shown(rivals: Sequence[Rival]) -> list[Rival]:
     return [one for one in rivals if one.probability is None or one.probability >= _LEAST_RIVAL]
-
-
-def _cross(x: Number, y: Number, reach: Number) -> str:
-    both = 2.0 * reach
-    d = f"M{x - reach:.3f} {y - reach:.3f}l{both:.3f} {both:.3f}m0 {-both:.3f}l{-both:.3f} {both:.3f}"
-    return "".join(
-        f'<path class="true" d="{d}" fill="none" stroke="{colour}" stroke-width="{width * reach:.4f}" '
-        'stroke-linecap="round"/>'
-        for colour, width in ((INK, 0.62), (TRUE, 0.36))
-    )
 
 
 def _length(metres: float) -> str:

@@ -77,6 +77,17 @@ def words(
     )
 
 
+def draw_cross(x: Number, y: Number, reach: Number) -> str:
+    """A cross at a true place, in the units of the drawing."""
+    both = 2.0 * reach
+    d = f"M{x - reach:.3f} {y - reach:.3f}l{both:.3f} {both:.3f}m0 {-both:.3f}l{-both:.3f} {both:.3f}"
+    return "".join(
+        f'<path class="true" d="{d}" fill="none" stroke="{colour}" stroke-width="{width * reach:.4f}" '
+        'stroke-linecap="round"/>'
+        for colour, width in ((INK, 0.62), (TRUE, 0.36))
+    )
+
+
 def shortened(text: str, characters: int) -> str:
     """Text that is no longer than so many characters."""
     return text if len(text) <= characters else text[: max(characters - 1, 1)] + "…"

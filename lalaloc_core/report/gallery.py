@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lalaloc_core.data.dataset import Camera, Scene
+from lalaloc_core.draw.heat import Cells
 from lalaloc_core.errors import LaLaLocError
 from lalaloc_core.evaluation.building import build_dataset, choose_appearance
 from lalaloc_core.evaluation.failures import Outcome, outcomes
@@ -26,7 +27,6 @@ from lalaloc_core.report.pictures import (
     draw_map,
     draw_panorama,
 )
-from lalaloc_core.report.plan import Cells
 from lalaloc_core.report.reading import Run
 from lalaloc_core.report.reopening import ask_again, find_camera, open_model
 

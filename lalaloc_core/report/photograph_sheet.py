@@ -11,9 +11,10 @@ from PIL import Image
 
 from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.data.annotations import CAMERA_HEIGHT_M
+from lalaloc_core.draw.photograph import Stroke, draw_strokes, wall_line
 from lalaloc_core.evaluation.galleries import GalleryAnswer, describe_answers
 from lalaloc_core.evaluation.photograph_reading import ReadPhotograph
-from lalaloc_core.report.pictures import PREDICTED_COLOUR, TRUE_COLOUR, Stroke, draw_strokes, wall_line
+from lalaloc_core.report.pictures import PREDICTED_COLOUR, TRUE_COLOUR
 from lalaloc_core.report.sheets import Thumbnail, draw_sheet
 
 _HEIGHT, _WIDTH = 256, 512

@@ -4,28 +4,25 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from matplotlib.figure import Figure
-from PIL import Image, ImageDraw
 
 from lalaloc_core.conventions import heading_from_degrees
+from lalaloc_core.draw.canvas import FOUND, TRUE, document, draw_cross, rasterise, words
+from lalaloc_core.draw.heat import Cells, colour_bar, distance_map, heat_image
+from lalaloc_core.draw.photograph import Stroke, draw_strokes, wall_line
+from lalaloc_core.draw.plan import Marker, draw_camera, extent_m, plan_part, shape_of
 from lalaloc_core.evaluation.predictions import Pose
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.render.poses import profiles_at
-from lalaloc_core.report.plan import Cells, draw_camera, draw_distances, draw_plan, halo
 
 PANORAMA_HEIGHT, PANORAMA_WIDTH = 384, 768
-TRUE_COLOUR, FOUND_COLOUR, PREDICTED_COLOUR = "#35e0ff", "#ff3b30", "#ffd60a"
-_EDGE = (20, 24, 30)
-# Lines are drawn this much larger and scaled down, which smooths them.
-_OVERSAMPLING = 3
+TRUE_COLOUR, FOUND_COLOUR, PREDICTED_COLOUR = TRUE, FOUND, "#ffd60a"
 _JPEG_QUALITY = 82
-_MAP_INCHES = (4.6, 3.9)
-_MAP_DPI = 110
+# Pixels of a map: its width, and what stands above and below the plan.
+_MAP_WIDTH, _MAP_HEAD, _MAP_FOOT, _MAP_PAD = 640, 32, 84, 12
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -48,16 +45,6 @@ class Picture:
     def data_uri(self) -> str:
         """The picture as an address of its own."""
         return f"data:image/{self.kind};base64,{base64.b64encode(self.content).decode()}"
-
-
-@dataclass(frozen=True, eq=False)
-class Stroke:
-    """Lines of pixels (x, y) in one colour, `width` pixels broad, on a dark edge of `edge_width`."""
-
-    lines: Sequence[Float[np.ndarray, "n 2"]]
-    colour: str
-    width: float
-    edge_width: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,19 +75,6 @@ def draw_panorama(
     return Picture(name="panorama", content=buffer.getvalue(), kind="jpeg", width=width, height=height, alt=alt)
 
 
-def draw_strokes(image: UInt8[np.ndarray, "h w 3"], strokes: Sequence[Stroke]) -> Image.Image:
-    """A picture with lines over it, the last ones on top."""
-    height, width, _ = image.shape
-    large = Image.fromarray(image).resize((width * _OVERSAMPLING, height * _OVERSAMPLING), Image.Resampling.BICUBIC)
-    draw = ImageDraw.Draw(large)
-    for stroke in strokes:
-        lines = [[tuple(point) for point in line * _OVERSAMPLING] for line in stroke.lines]
-        for line_colour, line_width in ((_EDGE, stroke.edge_width), (stroke.colour, stroke.width)):
-            for line in lines:
-                draw.line(line, fill=line_colour, width=round(line_width * _OVERSAMPLING), joint="curve")
-    return large.resize((width, height), Image.Resampling.LANCZOS)
-
-
 def layout_lines(
     plan: FloorPlan, pose: Pose, camera_height_m: float, height: int, width: int
 ) -> list[Float[np.ndarray, "{width} 2"]]:
@@ -111,29 +85,23 @@ def layout_lines(
     return [wall_line(profile, rise_m, height) for rise_m in (-over_floor, under_ceiling)]
 
 
-def wall_line(profile_m: Float[np.ndarray, "w"], rise_m: float, height: int) -> Float[np.ndarray, "w 2"]:
-    """Where the walls of a profile pass a level `rise_m` above the camera, as pixels (x, y) of a panorama."""
-    x = np.arange(len(profile_m)) + 0.5
-    return np.stack([x, (0.5 - np.arctan2(rise_m, profile_m) / np.pi) * height], axis=1)
-
-
 def draw_map(plan: FloorPlan, drawn: DrawnMap, truth: Pose, found: Pose | None) -> Picture:
     """A plan with a map of distances, the true position (×) and the found pose (dot and heading)."""
-    figure = Figure(figsize=_MAP_INCHES, layout="constrained")
-    axes = figure.subplots()
-    draw_distances(figure, axes, plan, drawn.cells, drawn.distance, drawn.scale)
-    draw_plan(axes, plan)
-    axes.set_title(drawn.title, fontsize=10)
+    extent = extent_m(plan)
+    heat = distance_map(drawn.cells, drawn.distance, drawn.scale)
+    marks = [draw_cross(truth.x_m, -truth.y_m, extent / 45.0)]
     if found is not None:
-        heading = heading_from_degrees(found.heading_deg)
-        draw_camera(axes, (found.x_m, found.y_m), heading, FOUND_COLOUR, "found", 6.0)
-    cross = {"marker": "x", "ls": "", "markersize": 10.0, "mew": 2.5, "color": TRUE_COLOUR}
-    axes.plot(truth.x_m, truth.y_m, **cross, label="true", path_effects=halo(4.5), zorder=4.5)
-    axes.legend(loc="upper left", bbox_to_anchor=(0.0, 0.0), ncols=2, frameon=False, fontsize=9, handletextpad=0.2)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=_MAP_DPI, facecolor="white", pil_kwargs={"optimize": True})
-    width, height = (round(inches * _MAP_DPI) for inches in figure.get_size_inches())
+        marks.append(draw_camera(Marker(x_m=found.x_m, y_m=found.y_m, heading_deg=found.heading_deg), extent))
+    width, height = _MAP_WIDTH, _MAP_HEAD + round(_MAP_WIDTH / shape_of(plan)) + _MAP_FOOT
+    box = (_MAP_PAD, _MAP_HEAD, width - 2 * _MAP_PAD, height - _MAP_HEAD - _MAP_FOOT)
+    middle, foot = 0.5 * width, height - _MAP_FOOT + 16
+    said = "true ×" if found is None else "found ●   true ×"
+    parts = [
+        words(middle, 22, drawn.title, 17, anchor="middle"),
+        plan_part(plan, box, "".join(marks[::-1]), heat=heat_image(heat, plan)),
+        colour_bar(heat, _MAP_PAD, foot, 0.6 * width),
+        words(width - _MAP_PAD, foot + 36, said, 15, anchor="end"),
+    ]
+    content = rasterise(document(width, height, drawn.title, parts))
     alt = f"Floor plan coloured by {drawn.title}"
-    return Picture(
-        name=drawn.title.replace(" ", "-"), content=buffer.getvalue(), kind="png", width=width, height=height, alt=alt
-    )
+    return Picture(name=drawn.title.replace(" ", "-"), content=content, kind="png", width=width, height=height, alt=alt)

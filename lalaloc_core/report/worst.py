@@ -20,6 +20,7 @@ from PIL import Image
 from lalaloc_core.bundle import EvidenceModel
 from lalaloc_core.conventions import TWO_PI, column_azimuths, heading_from_degrees
 from lalaloc_core.data.dataset import Camera, Scene
+from lalaloc_core.draw.photograph import Stroke, draw_strokes, wall_line
 from lalaloc_core.errors import LaLaLocError, RunError
 from lalaloc_core.evaluation.building import build_dataset, choose_appearance
 from lalaloc_core.evaluation.failures import Outcome, is_symmetric, outcomes, symmetric_by_chance
@@ -36,10 +37,7 @@ from lalaloc_core.report.pictures import (
     FOUND_COLOUR,
     PREDICTED_COLOUR,
     TRUE_COLOUR,
-    Stroke,
-    draw_strokes,
     layout_lines,
-    wall_line,
 )
 from lalaloc_core.report.reopening import ask_again, find_camera, open_model
 from lalaloc_core.report.sheets import (

@@ -107,8 +107,11 @@ class Decoder:
         self._pool.close()
 
     def _explained(self, error: JobLostError, job: Upload | Drawing) -> Exception:
-        if isinstance(job, Drawing) and error.reason in ("poisoned", "stalled", "fault"):
+        if isinstance(job, Drawing) and error.reason in ("poisoned", "fault"):
             return DrawingFailedError(error.reason)
+        if isinstance(job, Drawing) and error.reason == "stalled":
+            # Drawings are of bounded size: it is the machine that is slow.
+            return DeadlineExceededError(self._settings.decode_stall_s)
         match error.reason:
             case "poisoned":
                 return InvalidPanoramaError(
