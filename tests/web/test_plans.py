@@ -6,8 +6,11 @@ import json
 from pathlib import Path
 
 import pytest
+from PIL import Image, ImageDraw
 from playwright.sync_api import Browser, expect
 
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.plans.exporting import export_plan
 from service.storage.store import Store
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, upload
 from tests.service.test_security import make_key
@@ -28,6 +31,27 @@ def test_an_uploaded_plan_is_drawn_at_once_with_its_warnings(desktop: Visit, tmp
     expect(page.locator("#plan-name")).to_have_text("Overlap")
     expect(page.locator("#plan .room")).to_have_count(2)
     expect(page.locator("#plan-warnings")).to_contain_text("overlap")
+
+
+def test_files_of_other_tools_are_read_and_a_picture_s_scale_is_asked_for(desktop: Visit, tmp_path: Path) -> None:
+    page = desktop.open()
+    (tmp_path / "flat.dxf").write_bytes(export_plan(FloorPlan.from_dict(FLAT), "dxf"))
+    page.locator("#plan-file").set_input_files(tmp_path / "flat.dxf")
+    expect(page.locator("#plan-facts")).to_contain_text("2 rooms, 36.0 m²")
+    scan = Image.new("RGB", (900, 700), "white")
+    pen = ImageDraw.Draw(scan)
+    pen.rectangle((100, 100, 800, 600), outline="black", width=14)
+    pen.line((400, 100, 400, 600), fill="black", width=14)
+    scan.save(tmp_path / "scan.png")
+    page.locator("#plan-file").set_input_files(tmp_path / "scan.png")
+    page.get_by_label("Metres per pixel").fill("0.01")
+    page.get_by_role("button", name="Read it again").click()
+    expect(page.locator("#plan-warnings")).to_contain_text("draft")
+    expect(page.locator("#plan .room")).to_have_count(2)
+    (tmp_path / "letter.txt").write_text("Dear landlord")
+    page.locator("#plan-file").set_input_files(tmp_path / "letter.txt")
+    expect(page.locator("#plan-error")).to_be_visible()
+    expect(page.locator("#plan .room")).to_have_count(0)
 
 
 def test_a_plan_that_is_refused_is_not_shown_as_if_it_were_there(desktop: Visit, tmp_path: Path) -> None:
