@@ -44,6 +44,7 @@ def test_files_of_other_tools_are_read_and_a_picture_s_scale_is_asked_for(deskto
     pen.line((400, 100, 400, 600), fill="black", width=14)
     scan.save(tmp_path / "scan.png")
     page.locator("#plan-file").set_input_files(tmp_path / "scan.png")
+    expect(page.locator("#plan-error")).to_contain_text("metres_per_pixel")
     page.get_by_label("Metres per pixel").fill("0.01")
     page.get_by_role("button", name="Read it again").click()
     expect(page.locator("#plan-warnings")).to_contain_text("draft")

@@ -78,6 +78,8 @@ export class Plans {
   /** Upload a file as a new plan. */
   async upload(file: File, fields: Record<string, string> = {}): Promise<void> {
     clearError(this.error, this.importing.fields);
+    // What was asked about the last file is not about this one.
+    if (Object.keys(fields).length === 0) this.importing.close();
     const state = byId("plan-state");
     state.textContent = `Reading “${file.name}” …`;
     try {
