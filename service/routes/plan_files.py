@@ -88,7 +88,9 @@ async def get_export(
     runtime: Running,
     tenant: Tenant,
     party: Party,
-    format: Annotated[ExportFormat, Query(description="IMDF needs a plan with an `anchor`; GeoJSON uses it.")],
+    format: Annotated[
+        ExportFormat, Query(description="IMDF needs a plan with an `anchor`; GeoJSON uses it.")
+    ] = "native",
 ) -> Response:
     """What was understood of the plan, to be opened elsewhere, or uploaded again."""
     record = _noted(request, await run_in_threadpool(stored_plan, tenant, floorplan_id, runtime.store.plans))
