@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import tempfile
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -19,33 +20,37 @@ _MAX_HOMES_PER_EVIDENCE = 50
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Benchmark:
-    """What is asked of the model; `unfamiliar`: in homes that another generator than training's drew.
+class Benchmark:
+    """What is asked of the model.
 
-    Of a `minor` benchmark fewer homes are asked.
+    `unfamiliar`: in homes that another generator than training's drew; `copies`: in plans of four copies of a home that
+    differ in their doors.
+
+    Of a `minor` benchmark fewer homes are asked. `settings` are of the method "lalaloc".
     """
 
     kind: QueryKind = "panorama"
     furniture: str = "full"
     heading_known: bool = True
     unfamiliar: bool = False
-    evidence: str = "profile"
+    copies: bool = False
+    settings: Mapping[str, Any] = field(default_factory=dict)
     minor: bool = False
 
 
 _BENCHMARKS = {
-    "layout": _Benchmark(kind="layout"),
-    "panorama_full": _Benchmark(),
-    "panorama_empty": _Benchmark(furniture="empty", minor=True),
-    "panorama_full_unknown_heading": _Benchmark(heading_known=False),
-    "out_of_family_full": _Benchmark(unfamiliar=True, minor=True),
-    "out_of_family_empty": _Benchmark(unfamiliar=True, furniture="empty", minor=True),
+    "layout": Benchmark(kind="layout"),
+    "panorama_full": Benchmark(),
+    "panorama_empty": Benchmark(furniture="empty", minor=True),
+    "panorama_full_unknown_heading": Benchmark(heading_known=False),
+    "out_of_family_full": Benchmark(unfamiliar=True, minor=True),
+    "out_of_family_empty": Benchmark(unfamiliar=True, furniture="empty", minor=True),
 }
 
 
 def bench_accuracy(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
     """Accuracy on generated test homes, 4 queries each, and on at most 100 unfurnished and out-of-family ones."""
-    return {name: _summary(_answers(bundle, benchmark, homes, textures)) for name, benchmark in _BENCHMARKS.items()}
+    return {name: summary_of(answers_to(bundle, asked, homes, textures)) for name, asked in _BENCHMARKS.items()}
 
 
 def bench_evidence(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
@@ -53,9 +58,12 @@ def bench_evidence(bundle: Bundle, homes: int, textures: Path | None) -> dict[st
     homes = min(homes, _MAX_HOMES_PER_EVIDENCE)
     return {
         heading: {
-            evidence: _summary(
-                _answers(
-                    bundle, _Benchmark(evidence=evidence, heading_known=heading == "known_heading"), homes, textures
+            evidence: summary_of(
+                answers_to(
+                    bundle,
+                    Benchmark(settings={"evidence": evidence}, heading_known=heading == "known_heading"),
+                    homes,
+                    textures,
                 )
             )
             for evidence in ("latent", "profile", "both")
@@ -64,20 +72,23 @@ def bench_evidence(bundle: Bundle, homes: int, textures: Path | None) -> dict[st
     }
 
 
-def _answers(bundle: Bundle, benchmark: _Benchmark, homes: int, textures: Path | None) -> list[Prediction]:
+def answers_to(bundle: Bundle, benchmark: Benchmark, homes: int, textures: Path | None) -> list[Prediction]:
+    """The answers to a benchmark, 4 queries in each of some homes."""
     homes = min(homes, _MAX_HOMES_OF_MINOR) if benchmark.minor else homes
     generated: dict[str, Any] = {"homes": homes, "furniture": benchmark.furniture}
     if benchmark.unfamiliar:
         generated["generator"] = "unfamiliar"
     else:
         generated["textures"] = None if textures is None else str(textures)
+    if benchmark.copies:
+        generated["generator"] = "copies"
     info = RunInfo(
         label=f"{benchmark.kind}, {benchmark.furniture}",
         method="lalaloc",
         kind=benchmark.kind,
         dataset="out-of-family homes" if benchmark.unfamiliar else "generated homes",
         split="test",
-        settings={"evidence": benchmark.evidence},
+        settings=dict(benchmark.settings),
         generated=generated,
         bundle=str(bundle.folder),
         furniture=benchmark.furniture if benchmark.kind == "panorama" else None,
@@ -87,8 +98,8 @@ def _answers(bundle: Bundle, benchmark: _Benchmark, homes: int, textures: Path |
         return run_evaluation(RunFolder(Path(folder)), info)
 
 
-def _summary(predictions: list[Prediction]) -> dict[str, Any]:
-    """The figures that tables show."""
+def summary_of(predictions: list[Prediction]) -> dict[str, Any]:
+    """The figures that tables show of some answers."""
     scores = score(predictions)
     shares = ("within_1cm", "within_5cm", "within_10cm", "within_1m")
 

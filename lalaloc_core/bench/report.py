@@ -12,6 +12,7 @@ from lalaloc_core.bench.datasets import bench_datasets
 from lalaloc_core.bench.methods import bench_methods
 from lalaloc_core.bench.rendering import bench_rendering
 from lalaloc_core.bench.service import bench_service
+from lalaloc_core.bench.terms import bench_copies, bench_heights, bench_terms
 from lalaloc_core.bundle import Bundle
 
 
@@ -23,6 +24,9 @@ def run_bench(bundle_folder: Path, groups: Sequence[str], *, homes: int, texture
         "service": lambda: bench_service(bundle, textures),
         "accuracy": lambda: bench_accuracy(bundle, homes, textures),
         "evidence": lambda: bench_evidence(bundle, homes, textures),
+        "terms": lambda: bench_terms(bundle, homes, textures),
+        "heights": lambda: bench_heights(bundle, homes, textures),
+        "copies": lambda: bench_copies(bundle, homes, textures),
         "methods": lambda: bench_methods(bundle),
         "datasets": lambda: bench_datasets(bundle, textures),
     }

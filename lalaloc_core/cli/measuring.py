@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from lalaloc_core.bundle import default_bundle
+from lalaloc_core.cli.arguments import count
 from lalaloc_core.cli.printing import print_json
 
-_GROUPS = ("rendering", "service", "accuracy", "evidence", "methods", "datasets")
+_GROUPS = ("rendering", "service", "accuracy", "evidence", "terms", "heights", "copies", "methods", "datasets")
 
 
 def add_commands(commands: Any) -> None:
@@ -21,10 +22,22 @@ def add_commands(commands: Any) -> None:
     bench.add_argument("--textures", type=Path, help="folder of material pictures for the test panoramas")
     bench.add_argument("--out", type=Path, help="also write the JSON to this file; with --only, into it")
     bench.add_argument("--only", choices=_GROUPS, action="append", help="a group of figures; again for more")
+    bench.add_argument(
+        "--profile", action="store_true", help="print where the time of one query goes, and nothing else"
+    )
+    bench.add_argument(
+        "--queries", type=count, default=10, help="queries that --profile looks at (default: %(default)s)"
+    )
     bench.set_defaults(run=_bench)
 
 
 def _bench(arguments: argparse.Namespace) -> None:
+    if arguments.profile:
+        from lalaloc_core.bench.profile import profile_table
+        from lalaloc_core.bundle import Bundle
+
+        print(profile_table(Bundle.open(arguments.bundle), arguments.queries, arguments.textures))
+        return
     from lalaloc_core.bench.report import run_bench
 
     groups = arguments.only or _GROUPS

@@ -12,6 +12,7 @@ from lalaloc_core.bundle import Bundle
 from lalaloc_core.configuration import build_config
 from lalaloc_core.data.dataset import Appearance, Dataset
 from lalaloc_core.data.opening import open_dataset
+from lalaloc_core.data.synthetic.copied import CopiedScenes
 from lalaloc_core.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.data.synthetic.mismatched import MismatchedScenes
 from lalaloc_core.errors import InvalidInputError
@@ -93,6 +94,8 @@ def build_dataset(info: RunInfo) -> Dataset:
     if arguments.get("textures") is not None:
         arguments["textures"] = Path(arguments["textures"])
     homes = GeneratedScenes(**arguments)
+    if generator == "copies":
+        return CopiedScenes(homes)
     # Runs of earlier versions say "strangers".
     return MismatchedScenes(homes) if generator in ("mismatched", "strangers") else homes
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lalaloc_core.data.synthetic.generated import GeneratedScenes
-from lalaloc_core.data.synthetic.mismatched import MismatchedScenes, OpenAir
+from lalaloc_core.data.synthetic.mismatched import MismatchedScenes, OpenAir, TurnedOver
 
 HOMES = GeneratedScenes(homes=2, shots_per_home=4, furniture=None)
 LOOK = HOMES.appearances[0]
@@ -21,6 +21,10 @@ def test_cameras_are_the_homes_own_and_see_the_next_home() -> None:
         assert (camera.room_index, camera.heading) == (mine.room_index, mine.heading)
         if k == 3:
             assert isinstance(camera.photographs[LOOK], OpenAir)
+        elif k == 2:
+            shown = camera.photographs[LOOK]
+            assert isinstance(shown, TurnedOver)
+            assert np.array_equal(shown.image(16, 32)[::-1, ::-1], mine.photographs[LOOK].image(16, 32))
         else:
             pictures = [one.photographs[LOOK].image(16, 32) for one in (camera, mine, theirs)]
             assert np.array_equal(pictures[0], pictures[2])

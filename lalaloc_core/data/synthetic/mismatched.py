@@ -1,4 +1,4 @@
-"""Questions without an answer: homes that are asked with photographs of other homes, and of no room at all.
+"""Questions without an answer: homes that are asked with photographs of other homes, of no room, and turned over.
 
 Confidence learns from them what it looks like when nothing fits (`lalaloc_core.calibrate`).
 """
@@ -16,13 +16,13 @@ from lalaloc_core.data.dataset import Appearance, Camera, Photograph, Scene, Spl
 from lalaloc_core.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.errors import DatasetError
 
-# One of so many photographs shows no room.
-_ROOMLESS = 4
+# One of so many photographs shows no room, and one is the camera's own upside down.
+_EVERY = 4
 
 
 @dataclass(frozen=True)
 class MismatchedScenes:
-    """Generated homes whose cameras show what the cameras of the next home see, and one in four the open air.
+    """Generated homes whose cameras show what those of the next home see, one in four the open air or upside down.
 
     Poses and heights are those of the home's own cameras: where a camera stands has nothing to do with what it shows.
     """
@@ -51,10 +51,25 @@ class MismatchedScenes:
         return dataclasses.replace(own, cameras=tuple(cameras))
 
     def _shown(self, camera: Camera, other: Camera, k: int) -> dict[Appearance, Photograph]:
-        if k % _ROOMLESS == _ROOMLESS - 1:
+        if k % _EVERY == _EVERY - 2:
+            return {look: TurnedOver(photograph) for look, photograph in camera.photographs.items()}
+        if k % _EVERY == _EVERY - 1:
             seed = int(1e3 * abs(camera.position_m).sum())
             return dict.fromkeys(camera.photographs, OpenAir(seed))
         return dict(zip(camera.photographs, other.photographs.values(), strict=True))
+
+
+@dataclass(frozen=True, eq=False)
+class TurnedOver:
+    """What a camera that hangs upside down takes: the picture turned by half a turn."""
+
+    photograph: Photograph
+
+    def image(self, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
+        return np.ascontiguousarray(self.photograph.image(height, width)[::-1, ::-1])
+
+    def depth_m(self) -> Float[np.ndarray, "h w"]:
+        return np.ascontiguousarray(self.photograph.depth_m()[::-1, ::-1])
 
 
 @dataclass(frozen=True)
