@@ -44,7 +44,8 @@ def draw_demo(panels: Sequence[Panel], path: Path) -> None:
         parts.append(_panel(panel, _GAP + column * (_WIDTH + _GAP), row * row_height))
     whole = document(_COLUMNS * (_WIDTH + _GAP) + _GAP, rows * row_height, "LaLaLoc", parts)
     drawn: Image.Image = pixels(whole)
-    drawn.save(path, **({"quality": _JPEG_QUALITY} if path.suffix.lower() in (".jpg", ".jpeg") else {}))
+    # PNG has no quality and ignores it.
+    drawn.save(path, quality=_JPEG_QUALITY)
 
 
 def _panel(panel: Panel, x: float, y: float) -> str:

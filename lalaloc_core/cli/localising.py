@@ -125,8 +125,8 @@ def _answers(arguments: argparse.Namespace, plan: FloorPlan, contents: list[byte
     paths = tqdm(arguments.photographs, desc="localise", unit="photograph", disable=None, leave=False)
     for path, content in zip(paths, contents, strict=True):
         with _named(path):
-            size = {"height": encoders.manifest.image_height, "width": encoders.manifest.image_width}
-            panorama = open_panorama(content, **size)
+            manifest = encoders.manifest
+            panorama = open_panorama(content, height=manifest.image_height, width=manifest.image_width)
         known = known_heading(plan, arguments.heading, arguments.heading_tolerance or 0.0, panorama.compass_heading)
         query = encoders.query(panorama.pixels, known.heading, height, heading_tolerance=known.tolerance)
         found = localise(plan, grid, encoders, query, refiner=refiner)

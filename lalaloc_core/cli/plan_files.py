@@ -56,10 +56,10 @@ def read_plan(file: Path, arguments: argparse.Namespace) -> ImportedPlan:
     Raises:
         InvalidFloorPlanError: there are several, or none.
     """
-    plans = read_plans(file, arguments)
-    if len(plans) > 1:
-        raise InvalidFloorPlanError(f"the file has {len(plans)} levels, choose one with --level")
-    return plans[0]
+    plan, *others = read_plans(file, arguments)
+    if others:
+        raise InvalidFloorPlanError(f"the file has {1 + len(others)} levels, choose one with --level")
+    return plan
 
 
 def write_picture(svg: str, out: Path) -> None:
