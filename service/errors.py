@@ -18,6 +18,7 @@ LaLaLocError
     ├── PlanNotReadyError           still preparing at the request's deadline
     ├── TooManyFloorPlansError      the tenant has as many as allowed
     ├── TooManyVenuesError          the tenant has as many as allowed
+    ├── VenueUnsearchableError      the venue has no plan, or none that will ever be ready
     ├── VenueNotReadyError          no plan of the venue can be asked about yet
     ├── RevisionMismatchError       the plan or venue has another revision than the one expected
     ├── IdempotencyKeyReusedError   the key was sent with another body before
@@ -203,6 +204,14 @@ class TooManyVenuesError(ServiceError):
 
     def __init__(self, limit: int) -> None:
         super().__init__(f"{limit} venues are stored, no more are allowed (max_venues); delete some")
+
+
+class VenueUnsearchableError(ServiceError):
+    """The venue has no plans, or the latent grids of all of them failed."""
+
+    def __init__(self, venue_id: str, plans: int) -> None:
+        reason = f"all of its {plans} floor plans failed" if plans else "it has no floor plans"
+        super().__init__(f"nothing can be found in venue '{venue_id}': {reason}")
 
 
 class VenueNotReadyError(ServiceError):
@@ -419,6 +428,7 @@ PROBLEMS: dict[type[Exception], ProblemKind] = {
     PlanNotReadyError: ProblemKind(503, "floorplan-not-ready", "Floor plan still preparing"),
     TooManyFloorPlansError: ProblemKind(507, "too-many-floorplans", "Too many floor plans"),
     TooManyVenuesError: ProblemKind(507, "too-many-venues", "Too many venues"),
+    VenueUnsearchableError: ProblemKind(409, "venue-unsearchable", "Nothing to search in the venue"),
     VenueNotReadyError: ProblemKind(503, "venue-not-ready", "Venue still preparing"),
     RevisionMismatchError: ProblemKind(412, "revision-mismatch", "Another revision than expected"),
     IdempotencyKeyReusedError: ProblemKind(422, "idempotency-key-reused", "Idempotency key used for something else"),

@@ -20,7 +20,7 @@ from service.grids import GridProvider, Sweeper
 from service.http import Admission, AdmissionLimits
 from service.http.events import HEARTBEAT_S, PlanEvents
 from service.preview import Drawings
-from service.query import Decoder, Localiser, LpoPool
+from service.query import Decoder, Localiser, LpoPool, VenueLocaliser, VenuePlans
 from service.security import AccessControl
 from service.settings import Settings
 from service.sharing import with_spare
@@ -68,6 +68,7 @@ class Runtime:
     decoder: Decoder
     converter: Converter
     localiser: Localiser
+    venue_localiser: VenueLocaliser
     admission: Admission
     access_control: AccessControl
     events: PlanEvents
@@ -147,6 +148,15 @@ def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack) 
         decoder=decoder,
         converter=converter,
         localiser=localiser,
+        venue_localiser=VenueLocaliser(
+            settings=settings,
+            bundle=bundle,
+            encoders=encoders,
+            plans=_venue_plans(store, grids, reads, settings),
+            localiser=localiser,
+            decoder=decoder,
+            queries=admission.queries,
+        ),
         admission=admission,
         access_control=access_control,
         events=_plan_events(store, grids, admission, looks, settings),
@@ -155,6 +165,11 @@ def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack) 
         reads=reads,
         drawings=kept(Drawings(limit_bytes=_DRAWINGS_BYTES, max_waiting=_MAX_DRAWN)),
     )
+
+
+def _venue_plans(store: Store, grids: GridProvider, reads: BoundedReads, settings: Settings) -> VenuePlans:
+    limit_bytes, max_poses = settings.venue_cache_bytes, settings.max_grid_poses
+    return VenuePlans(store, grids, reads, limit_bytes=limit_bytes, max_poses=max_poses)
 
 
 async def runtime_of(request: Request) -> Runtime:

@@ -127,7 +127,8 @@ def _answers(arguments: argparse.Namespace, plan: FloorPlan, contents: list[byte
         with _named(path):
             manifest = encoders.manifest
             panorama = open_panorama(content, height=manifest.image_height, width=manifest.image_width)
-        known = known_heading(plan, arguments.heading, arguments.heading_tolerance or 0.0, panorama.compass_heading)
+        compass, tolerance_deg = panorama.compass_heading, arguments.heading_tolerance or 0.0
+        known = known_heading(plan.north, arguments.heading, tolerance_deg, compass)
         query = encoders.query(panorama.pixels, known.heading, height, heading_tolerance=known.tolerance)
         found = localise(plan, grid, encoders, query, refiner=refiner)
         drawn = drawn_answer(plan, grid, found, model, _SOURCES[known.source])

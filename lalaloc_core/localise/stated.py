@@ -25,7 +25,7 @@ class KnownHeading:
 
 
 def known_heading(
-    plan: FloorPlan,
+    north: float | None,
     heading_deg: float | None,
     tolerance_deg: float,
     compass_heading: float | None,
@@ -38,8 +38,8 @@ def known_heading(
     """
     if heading_deg is not None:
         return KnownHeading(heading_from_degrees(heading_deg), math.radians(tolerance_deg), "given")
-    if plan.north is not None and compass_heading is not None:
-        heading = (compass_heading + plan.north) % TWO_PI
+    if north is not None and compass_heading is not None:
+        heading = (compass_heading + north) % TWO_PI
         return KnownHeading(heading, math.radians(compass_tolerance_deg), "panorama")
     return KnownHeading(None, 0.0, "searched")
 

@@ -27,6 +27,7 @@ from service.errors import (
     PlanTooLargeError,
     StoreUnavailableError,
     UnknownFloorPlanError,
+    UnknownVenueError,
 )
 from service.http.problems import problem_answer
 from service.http.uploads import Parts
@@ -48,6 +49,7 @@ _FOR_GOOD = (
     InvalidRequestError,
     PlanTooLargeError,
     UnknownFloorPlanError,
+    UnknownVenueError,
 )
 
 

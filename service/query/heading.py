@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise import stated
 from lalaloc_core.localise.stated import KnownHeading
 from lalaloc_core.panorama.images import Panorama
@@ -10,9 +9,13 @@ from service.schemas import LocaliseForm
 
 
 def known_heading(
-    form: LocaliseForm, plan: FloorPlan, panorama: Panorama, compass_tolerance_deg: float
+    form: LocaliseForm, north: float | None, panorama: Panorama, compass_tolerance_deg: float
 ) -> KnownHeading:
-    """What the request says, else what the panorama says where the plan knows north, else nothing."""
+    """What the request says, else what the panorama says where north is known, else nothing.
+
+    Args:
+        north: azimuth of true north (radians) in the plan.
+    """
     return stated.known_heading(
-        plan, form.heading_deg, form.heading_tolerance_deg, panorama.compass_heading, compass_tolerance_deg
+        north, form.heading_deg, form.heading_tolerance_deg, panorama.compass_heading, compass_tolerance_deg
     )

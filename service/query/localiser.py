@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -11,27 +10,24 @@ from time import monotonic
 from typing import TypeVar
 
 from lalaloc_core.bundle import Bundle
-from lalaloc_core.conventions import heading_to_degrees
 from lalaloc_core.draw.answer import PHOTOGRAPH_SIZE, Picture, draw_answer
 from lalaloc_core.draw.found import drawn_answer
-from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.covariance import spread_of
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.pipeline import Localisation, StageClock, Steps, localise_steps, next_step, panorama_heading
-from lalaloc_core.localise.poses import Candidate, LatentGrid, Query
+from lalaloc_core.localise.pipeline import Localisation, StageClock, Steps, localise_steps, next_step
+from lalaloc_core.localise.poses import LatentGrid, Query
 from lalaloc_core.panorama.images import Panorama
 from service.errors import DeadlineExceededError, PlanFailedError, PlanNotReadyError
 from service.grids import GridProvider, grid_height_m
 from service.http.admission_control import Slots
+from service.query.answers import compose, heading_contradiction, model_answer, places_in
 from service.query.camera_height import stated_height
 from service.query.decoding import Decoder
-from service.query.geopose import geopose_of
 from service.query.heading import KnownHeading, known_heading
 from service.query.hints import hint_warnings, stated_hints
 from service.query.lpo_pool import LpoPool
 from service.query.posterior import posterior_answer
-from service.schemas import CandidateAnswer, LocaliseAnswer, LocaliseForm, ModelAnswer, Position, TimingsAnswer
+from service.schemas import LocaliseAnswer, LocaliseForm, ModelAnswer
 from service.settings import Settings
 from service.sharing import with_spare
 from service.storage.records import PlanRecord
@@ -163,7 +159,7 @@ class Localiser:
             drawn = drawn_answer(record.plan, answered.grid, answered.found, model, source)
             return draw_answer(drawn, photograph, asked.picture, rooms=asked.rooms)
 
-        svg = await self._compute(party, draw, deadline)
+        svg = await self.compute(party, draw, deadline)
         return await self._decoder.rasterise(svg, deadline, party) if asked.pixels else svg.encode()
 
     async def _answer(
@@ -174,10 +170,10 @@ class Localiser:
         # The picture first: a bad one is refused without waiting for the plan.
         with clock.stage("decode"):
             panorama = await self._decoder.decode(content, deadline, party)
-        known = known_heading(form, record.plan, panorama, self._settings.compass_tolerance_deg)
+        known = known_heading(form, record.plan.north, panorama, self._settings.compass_tolerance_deg)
         # Looking at many rooms takes a while.
-        await self._compute(party, partial(hints.check, record.plan), deadline)
-        query = await self._compute(party, lambda: self._encode(panorama, known, height, clock), deadline)
+        await self.compute(party, partial(hints.check, record.plan), deadline)
+        query = await self.compute(party, lambda: self.encode(panorama, known, height, clock), deadline)
         latents_alone = not self._encoders.predicts_profile
         with clock.stage("grid"):
             grid_m = grid_height_m(record, height.height_m, latents_alone=latents_alone)
@@ -185,12 +181,12 @@ class Localiser:
         steps = localise_steps(
             record.plan, grid, self._encoders, query, refine=form.refine, top_k=form.top_k, clock=clock, hints=hints
         )
-        found = await self._finished(steps, deadline, party)
+        found = await self.finished(steps, deadline, party)
         timings_ms = clock.timings_ms | {"total": (monotonic() - begin) * 1e3}
-        self._observe(timings_ms, found.stage)
-        warnings = [_contradiction(known)] if found.heading_contradicted else []
+        self.observe(timings_ms, found.stage)
+        warnings = [heading_contradiction(known)] if found.heading_contradicted else []
         warnings += hint_warnings(hints, found, record.plan)
-        answer = self._compose(record, known, found, warnings, timings_ms)
+        answer = compose(found, places_in(record), known, warnings, timings_ms, self._bundle)
         if form.include == "posterior":
             answer = answer.model_copy(update={"posterior": posterior_answer(grid, found.posterior)})
         return _Answered(answer, found, grid)
@@ -199,7 +195,7 @@ class Localiser:
         """Finish what is being computed."""
         self._threads.close()
 
-    async def _compute(self, party: str, work: Callable[[], T], deadline: float) -> T:
+    async def compute(self, party: str, work: Callable[[], T], deadline: float) -> T:
         """Run CPU work on a thread; past the deadline it is not started, or its outcome dropped."""
 
         def run() -> T:
@@ -233,94 +229,22 @@ class Localiser:
         except TimeoutError as error:
             raise PlanNotReadyError(record.id, monotonic() - begin, self._grids.progress(key)) from error
 
-    def _encode(self, panorama: Panorama, known: KnownHeading, height: CameraHeight, clock: StageClock) -> Query:
+    def encode(self, panorama: Panorama, known: KnownHeading, height: CameraHeight, clock: StageClock) -> Query:
+        """Encode a decoded panorama."""
         with clock.stage("encode"):
             return self._encoders.query(panorama.pixels, known.heading, height, heading_tolerance=known.tolerance)
 
-    async def _finished(self, steps: Steps, deadline: float, party: str) -> Localisation:
+    async def finished(self, steps: Steps, deadline: float, party: str) -> Localisation:
         """Run a search on the threads of the localiser, which do something else while LPO is waited for."""
-        step = await self._compute(party, partial(next_step, steps, None), deadline)
+        step = await self.compute(party, partial(next_step, steps, None), deadline)
         while not isinstance(step, Localisation):
             timeout_s = min(self._settings.lpo_deadline_s, deadline - monotonic() - _ANSWER_S)
             result = await self._pool.refine(step, timeout_s, party)
-            step = await self._compute(party, partial(next_step, steps, result), deadline)
+            step = await self.compute(party, partial(next_step, steps, result), deadline)
         return step
 
-    def _observe(self, timings_ms: dict[str, float], stage: str) -> None:
+    def observe(self, timings_ms: dict[str, float], stage: str) -> None:
+        """Count an answer, with what its stages took."""
         for name, duration_ms in timings_ms.items():
             self._telemetry.stage_seconds.labels(name).observe(duration_ms / 1e3)
         self._telemetry.answers.labels(stage).inc()
-
-    def _compose(
-        self,
-        record: PlanRecord,
-        known: KnownHeading,
-        found: Localisation,
-        warnings: list[str],
-        timings_ms: dict[str, float],
-    ) -> LocaliseAnswer:
-        model = self._bundle.manifest.confidence
-        answer = found.best[found.stage]
-        spread = None
-        if model is not None and answer.information is not None:
-            spread = spread_of(answer.information, record.plan.rooms[answer.room_index], model)
-        fits = None if model is None else found.fit_probability(model)
-        candidates = [
-            _candidate(record.plan, found.query, candidate, None if fits is None else fits * share)
-            for candidate, share in zip(found.candidates, found.posterior.candidate, strict=True)
-        ]
-        best = candidates[0]
-        return LocaliseAnswer(
-            floorplan_id=record.id,
-            floorplan_revision=record.revision_id,
-            position=best.position,
-            heading_deg=best.heading_deg,
-            heading_source="searched" if found.heading_contradicted else known.source,
-            room=best.room,
-            room_id=best.room_id,
-            confidence=None if fits is None else fits * found.posterior.position,
-            heading_confidence=None if fits is None else fits * min(found.posterior.heading, 1.0),
-            warnings=warnings,
-            covariance_m2=None if spread is None else spread.position_m2.tolist(),
-            heading_std_deg=None if spread is None or spread.heading_std is None else math.degrees(spread.heading_std),
-            stage=found.stage,
-            cost=best.cost,
-            latent_distance=best.latent_distance,
-            camera_height_m=found.camera_height_m,
-            candidates=candidates,
-            geopose=geopose_of(
-                record.plan,
-                (found.candidates[0].x_m, found.candidates[0].y_m),
-                best.heading_deg,
-                found.camera_height_m,
-            ),
-            timings_ms=TimingsAnswer(**{name: timings_ms.get(name, 0.0) for name in TimingsAnswer.model_fields}),
-            model=self.model,
-        )
-
-
-def model_answer(bundle: Bundle) -> ModelAnswer:
-    """Name, version and digest of a bundle."""
-    return ModelAnswer(name=bundle.manifest.name, version=bundle.manifest.version, sha256=bundle.sha256)
-
-
-def _contradiction(known: KnownHeading) -> str:
-    """Says that a heading was not followed."""
-    assert known.heading is not None
-    origin = "heading_deg" if known.source == "given" else "the panorama's compass heading"
-    degrees = heading_to_degrees(known.heading)
-    return f"{origin} is {degrees:.4g}, which the panorama contradicts: the heading was searched for instead"
-
-
-def _candidate(plan: FloorPlan, query: Query, candidate: Candidate, probability: float | None) -> CandidateAnswer:
-    """A candidate in the words of the API."""
-    room = plan.rooms[candidate.room_index]
-    return CandidateAnswer(
-        position=Position(x_m=candidate.x_m, y_m=candidate.y_m),
-        heading_deg=heading_to_degrees(panorama_heading(query, candidate)),
-        room=room.name,
-        room_id=room.id,
-        probability=None if probability is None else min(probability, 1.0),
-        cost=candidate.cost,
-        latent_distance=min(max(candidate.latent_distance, 0.0), 2.0),
-    )

@@ -7,12 +7,12 @@ from typing import Annotated, Any
 
 from fastapi import Depends, Request
 
-from service.errors import UnknownFloorPlanError, UnknownRevisionError
+from service.errors import UnknownFloorPlanError, UnknownRevisionError, UnknownVenueError
 from service.http.idempotent_request import HEADER, MAX_KEY_CHARACTERS
 from service.runtime import Runtime, runtime_of
 from service.security import caller_of
 from service.storage.plans import Plans
-from service.storage.records import PlanRecord, PlanSummary
+from service.storage.records import PlanRecord, PlanSummary, VenueRecord
 
 _ID = re.compile(r"[0-9a-f]{32}")
 
@@ -82,6 +82,19 @@ async def plan_for_query(tenant: str, floorplan_id: str, runtime: Runtime) -> Pl
     record = await runtime.plan_lookup.find(tenant, floorplan_id, runtime.reads) if is_id(floorplan_id) else None
     if record is None:
         raise UnknownFloorPlanError(floorplan_id)
+    return record
+
+
+async def venue_for_query(tenant: str, venue_id: str, runtime: Runtime) -> VenueRecord:
+    """A venue for a query, as the database has it.
+
+    Raises:
+        UnknownVenueError: there is none.
+        StoreUnavailableError: the database is away, or too many use it.
+    """
+    record = await runtime.reads.run(runtime.store.venues.get, tenant, venue_id) if is_id(venue_id) else None
+    if record is None:
+        raise UnknownVenueError(venue_id)
     return record
 
 

@@ -26,9 +26,12 @@ from service.errors import (
     StoreUnavailableError,
     UnanchoredPlanError,
     UnknownFloorPlanError,
+    UnknownVenueError,
     UnsupportedMediaError,
     UploadTimeoutError,
     UploadTooLargeError,
+    VenueNotReadyError,
+    VenueUnsearchableError,
 )
 from service.http import IdempotentRequest
 from service.http.accept import preferred
@@ -37,7 +40,7 @@ from service.http.problems import problem_responses
 from service.http.uploads import JSON, MULTIPART, UploadLimits, faults_of, media_type, read_parts, validate_fields
 from service.query.geopose import feature_of
 from service.query.localiser import AskedPicture
-from service.routes.dependencies import IDEMPOTENCY_KEY, Party, Running, Tenant, plan_for_query
+from service.routes.dependencies import IDEMPOTENCY_KEY, Party, Running, Tenant, plan_for_query, venue_for_query
 from service.runtime import Runtime
 from service.schemas import LocaliseAnswer, LocaliseForm
 from service.telemetry import note
@@ -58,7 +61,7 @@ def _body_schema() -> dict[str, Any]:
         "description": "Equirectangular panorama as JPEG, PNG or WebP: the full 360°, twice as wide as high, or the "
         "part of it that its photo sphere metadata (GPano in XMP) tell.",
     }
-    schema["required"] = [*schema["required"], "panorama"]
+    schema["required"] = [*schema.get("required", []), "panorama"]
     body = {"required": True, "content": {MULTIPART: {"schema": schema}}}
     return {"requestBody": body, "parameters": [IDEMPOTENCY_KEY]}
 
@@ -85,6 +88,9 @@ def _body_schema() -> dict[str, Any]:
         MalformedRequestError,
         UnknownFloorPlanError,
         UnanchoredPlanError,
+        UnknownVenueError,
+        VenueUnsearchableError,
+        VenueNotReadyError,
         PlanFailedError,
         PlanNotReadyError,
         UnsupportedMediaError,
@@ -113,12 +119,13 @@ async def localise(
         ),
     ] = None,
 ) -> Response:
-    """Find where in a stored floor plan a panorama was taken.
+    """Find where in a stored floor plan, or in which plan of a venue and where in it, a panorama was taken.
 
     With `Accept: image/png` or `Accept: image/svg+xml` the answer is a picture, 1600 pixels wide; with `Accept:
     application/geo+json` a GeoJSON Feature at the place on Earth, for plans with an `anchor`.
 
-    A plan that is still preparing is waited for. When optimisation (`lpo`) cannot answer in time, the answer is
+    A plan that is still preparing is waited for. Of a venue the plans that are ready are searched, and the answer warns
+    of others; while none is, the venue is waited for. When optimisation (`lpo`) cannot answer in time, the answer is
     the one before it, with `"stage": "vdr"`.
     """
     settings = runtime.settings
@@ -138,10 +145,22 @@ async def localise(
     if "top_k" not in form.model_fields_set:
         form = form.model_copy(update={"top_k": min(form.top_k, settings.max_top_k)})
 
+    if form.venue_id is not None and media != JSON:
+        raise InvalidRequestError(
+            [("venue_id", f"is answered in JSON alone, not in {media}: a picture is of one plan")]
+        )
+
     async def answer() -> Response:
+        content = parts.files["panorama"]
+        if form.venue_id is not None:
+            venue = await venue_for_query(tenant, form.venue_id, runtime)
+            note(request, venue=venue.id)
+            found = await runtime.venue_localiser.answer(venue, form, content, begin, clock, party)
+            note(request, plan=found.floorplan_id, revision=found.floorplan_revision, stage=found.stage)
+            return Response(await _text(found, tenant, runtime), headers=_VARY, media_type=JSON)
+        assert form.floorplan_id is not None
         record = await plan_for_query(tenant, form.floorplan_id, runtime)
         note(request, plan=record.id, revision=record.revision_id)
-        content = parts.files["panorama"]
         if media == _GEOJSON and record.plan.anchor is None:
             raise UnanchoredPlanError(record.id)
         if media in (JSON, _GEOJSON):

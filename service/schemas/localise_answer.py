@@ -32,6 +32,8 @@ class Position(Answer):
 class CandidateAnswer(Answer):
     """One possible pose; no two candidates are closer than 1 m and turned alike."""
 
+    floorplan_id: str = Field(description="The plan that it lies in.")
+    level: float | None = Field(description="Level of the plan in the venue, null where none was asked about.")
     position: Position
     heading_deg: HeadingDeg = Field(ge=0, lt=360, description=f"The {HEADING_MEANING}.")
     room: str = Field(description="Name of the room the position lies in.")
@@ -53,11 +55,21 @@ class PosteriorAnswer(Answer):
     probability: list[Mass] = Field(description="They sum to 1; places of less than 0.0000005 are left out.")
 
 
+class PlanProbability(Answer):
+    """How probable it is that a panorama was taken in one plan of a venue."""
+
+    floorplan_id: str
+    level: float = Field(description="Number of its level.")
+    name: str = Field(description="What it is called in the venue, else its own name.")
+    probability: Share | None = Field(description="Null for a model without confidence.")
+
+
 class TimingsAnswer(Answer):
     """Milliseconds per stage, 0 where a stage did not run."""
 
     decode: Milliseconds
     encode: Milliseconds
+    shortlist: Milliseconds = Field(description="Choosing and loading the plans of a venue.")
     retrieve: Milliseconds
     vdr: Milliseconds
     lpo: Milliseconds
@@ -75,15 +87,21 @@ class ModelAnswer(Answer):
 class LocaliseAnswer(Answer):
     """Where the panorama was taken."""
 
-    floorplan_id: str
+    floorplan_id: str = Field(description="The plan that the position lies in.")
     floorplan_revision: str = Field(description="The plan's revision that was searched.")
+    venue_id: str | None = Field(None, description="The venue that was asked about; null where it was a plan.")
+    level: float | None = Field(description="Level of the plan in the venue; null where `venue_id` is.")
+    plans: list[PlanProbability] | None = Field(
+        None, description="The most probable plans of the venue, the most probable first; null where `venue_id` is."
+    )
     position: Position
     heading_deg: HeadingDeg = Field(ge=0, lt=360, description=f"The {HEADING_MEANING}.")
     room: str
     room_id: str = Field(description="`id` of the room in the plan, which is unique.")
     confidence: Share | None = Field(
         description="Probability that the position is right within 1 m: that of the panorama being of this plan, "
-        "times the share that this place has in the posterior over all places. Null for a model without it.",
+        "times the share that this place has in the posterior over all places, of a venue those of all its plans. Null "
+        "for a model without it.",
     )
     heading_confidence: Share | None = Field(
         description="Probability that the heading is right within 5°; null where `confidence` is."
@@ -106,7 +124,9 @@ class LocaliseAnswer(Answer):
     cost: Score = _COST
     latent_distance: Score = _LATENT_DISTANCE
     camera_height_m: Metres = Field(description="The camera height that fits best.")
-    candidates: list[CandidateAnswer] = Field(description="Best first; the first one is the answer.")
+    candidates: list[CandidateAnswer] = Field(
+        description="Best first, of a venue the most probable first; the first one is the answer."
+    )
     answer_id: str | None = Field(
         default=None,
         description="Under which `GET /answers/{answer_id}` tells the same again, for `keep_answers_s`; null where "

@@ -6,6 +6,7 @@ import math
 from typing import Annotated, Literal
 
 from pydantic import Field, ValidationInfo, field_validator
+from pydantic_core import PydanticCustomError
 
 from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M
 from lalaloc_core.floorplan import MAX_CAMERA_HEIGHT_STD_M
@@ -19,7 +20,15 @@ HEADING_MEANING = "azimuth of the panorama's centre column, clockwise from the p
 class LocaliseForm(HintFields):
     """Fields of a query besides the panorama itself; an empty field counts as left out."""
 
-    floorplan_id: str = Field(min_length=1, description="Id of the floor plan the panorama was taken in.")
+    venue_id: str | None = Field(
+        None, min_length=1, description="Id of the venue in one of whose plans the panorama was taken, not known which."
+    )
+    floorplan_id: str | None = Field(
+        None,
+        min_length=1,
+        description="Id of the floor plan the panorama was taken in. Either this or `venue_id` is needed.",
+        validate_default=True,
+    )
     heading_deg: Annotated[float, Finite] | None = Field(
         None,
         ge=-360,
@@ -61,6 +70,13 @@ class LocaliseForm(HintFields):
         None, description="What else to tell: how probable all places of the plan are."
     )
 
+    @field_validator("include")
+    @classmethod
+    def _of_one_plan(cls, value: str | None, given: ValidationInfo) -> str | None:
+        if value is not None and given.data.get("venue_id") is not None:
+            raise ValueError("is about the places of one plan, and not of a venue")
+        return value
+
     @field_validator(
         "heading_deg", "heading_tolerance_deg", "camera_height_m", "camera_height_std_m", "top_k", mode="before"
     )
@@ -68,6 +84,20 @@ class LocaliseForm(HintFields):
     def _plain_number(cls, value: object) -> object:
         if isinstance(value, str) and "_" in value:
             raise ValueError("not a number")
+        return value
+
+    @field_validator("floorplan_id")
+    @classmethod
+    def _plan_or_venue(cls, value: str | None, given: ValidationInfo) -> str | None:
+        venue_id = given.data.get("venue_id")
+        if value is None and venue_id is None and "venue_id" in given.data:
+            raise PydanticCustomError("missing", "missing")
+        if venue_id is None:
+            return value
+        if value is not None:
+            raise ValueError("venue_id is given as well, one of the two is needed")
+        if given.data.get("near") is not None or given.data.get("rooms") is not None:
+            raise ValueError("is missing: near and rooms are about one plan, and not about a venue")
         return value
 
     @field_validator("top_k")

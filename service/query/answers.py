@@ -1,0 +1,124 @@
+"""What was found, in the words of the API."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from lalaloc_core.bundle import Bundle
+from lalaloc_core.conventions import heading_to_degrees
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.covariance import spread_of
+from lalaloc_core.localise.pipeline import Localisation, panorama_heading
+from lalaloc_core.localise.poses import Candidate, Query
+from service.query.geopose import geopose_of
+from service.query.heading import KnownHeading
+from service.schemas import CandidateAnswer, LocaliseAnswer, ModelAnswer, Position, TimingsAnswer
+from service.storage.records import PlanRecord
+
+
+@dataclass(frozen=True)
+class Place:
+    """The plan that a candidate lies in, the candidate in its frame, and the level of the plan in its venue."""
+
+    plan_id: str
+    revision_id: str
+    plan: FloorPlan
+    candidate: Candidate
+    level: float | None = None
+
+
+Places = Callable[[Candidate], Place]
+
+
+def places_in(record: PlanRecord) -> Places:
+    """Where the candidates of a search in a single plan are."""
+    return lambda candidate: Place(record.id, record.revision_id, record.plan, candidate)
+
+
+def compose(
+    found: Localisation,
+    places: Places,
+    known: KnownHeading,
+    warnings: list[str],
+    timings_ms: dict[str, float],
+    bundle: Bundle,
+    *,
+    share: float = 1.0,
+) -> LocaliseAnswer:
+    """An answer.
+
+    Args:
+        places: where each candidate is.
+        share: how probable it is that the place is among those that were searched.
+    """
+    model = bundle.manifest.confidence
+    answer, spread = found.best[found.stage], None
+    if model is not None and answer.information is not None:
+        at = places(answer)
+        spread = spread_of(answer.information, at.plan.rooms[at.candidate.room_index], model)
+    fits = None if model is None else found.fit_probability(model)
+    fits = None if fits is None else fits * share
+    candidates = [
+        _candidate(places(candidate), found.query, None if fits is None else fits * probability)
+        for candidate, probability in zip(found.candidates, found.posterior.candidate, strict=True)
+    ]
+    best, place = candidates[0], places(found.candidates[0])
+    return LocaliseAnswer(
+        floorplan_id=place.plan_id,
+        floorplan_revision=place.revision_id,
+        level=place.level,
+        position=best.position,
+        heading_deg=best.heading_deg,
+        heading_source="searched" if found.heading_contradicted else known.source,
+        room=best.room,
+        room_id=best.room_id,
+        confidence=None if fits is None else fits * found.posterior.position,
+        heading_confidence=None if fits is None else fits * min(found.posterior.heading, 1.0),
+        warnings=warnings,
+        covariance_m2=None if spread is None else spread.position_m2.tolist(),
+        heading_std_deg=None if spread is None or spread.heading_std is None else math.degrees(spread.heading_std),
+        stage=found.stage,
+        cost=best.cost,
+        latent_distance=best.latent_distance,
+        camera_height_m=found.camera_height_m,
+        candidates=candidates,
+        geopose=geopose_of(
+            place.plan,
+            (place.candidate.x_m, place.candidate.y_m),
+            best.heading_deg,
+            found.camera_height_m,
+        ),
+        timings_ms=TimingsAnswer(**{name: timings_ms.get(name, 0.0) for name in TimingsAnswer.model_fields}),
+        model=model_answer(bundle),
+    )
+
+
+def model_answer(bundle: Bundle) -> ModelAnswer:
+    """Name, version and digest of a bundle."""
+    return ModelAnswer(name=bundle.manifest.name, version=bundle.manifest.version, sha256=bundle.sha256)
+
+
+def heading_contradiction(known: KnownHeading) -> str:
+    """Says that a heading was not followed."""
+    assert known.heading is not None
+    origin = "heading_deg" if known.source == "given" else "the panorama's compass heading"
+    degrees = heading_to_degrees(known.heading)
+    return f"{origin} is {degrees:.4g}, which the panorama contradicts: the heading was searched for instead"
+
+
+def _candidate(place: Place, query: Query, probability: float | None) -> CandidateAnswer:
+    candidate = place.candidate
+    room = place.plan.rooms[candidate.room_index]
+    return CandidateAnswer(
+        floorplan_id=place.plan_id,
+        level=place.level,
+        position=Position(x_m=candidate.x_m, y_m=candidate.y_m),
+        heading_deg=heading_to_degrees(panorama_heading(query, candidate)),
+        room=room.name,
+        room_id=room.id,
+        probability=None if probability is None else min(probability, 1.0),
+        cost=candidate.cost,
+        latent_distance=min(max(candidate.latent_distance, 0.0), 2.0),
+    )

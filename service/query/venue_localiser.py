@@ -1,0 +1,245 @@
+"""The query about a venue: in which of its plans was this panorama taken, and where?"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from time import monotonic
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from sqlalchemy import Row
+
+from lalaloc_core.bundle import Bundle
+from lalaloc_core.conventions import heading_from_degrees
+from lalaloc_core.errors import InvalidPoseError
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.hints import Hints
+from lalaloc_core.localise.pipeline import Localisation, LocaliseConfig, StageClock, localise_steps
+from lalaloc_core.localise.poses import Candidate, LatentGrid, Query
+from lalaloc_core.localise.prototypes import share_searched
+from lalaloc_core.localise.side_by_side import PlansSideBySide
+from service.errors import VenueNotReadyError, VenueUnsearchableError
+from service.grids import check_height_m
+from service.http.admission_control import Slots
+from service.query.answers import Place, compose, heading_contradiction
+from service.query.decoding import Decoder
+from service.query.heading import KnownHeading, known_heading
+from service.query.localiser import Localiser
+from service.query.venue_plans import VenuePlans, venue_height
+from service.schemas import LocaliseAnswer, LocaliseForm, PlanProbability
+from service.settings import Settings
+from service.storage.records import PlanRecord, VenueRecord
+
+# The right one of many plans is often not the first by its grid, so more candidates than in a single plan are refined.
+_CONFIG = LocaliseConfig(by_probability=True, profile_candidates=32, profile_candidates_turned=48)
+# How often a venue is looked at none of whose plans is ready.
+_LOOK_EVERY_S = 0.25
+
+
+@dataclass(frozen=True, eq=False)
+class _Searched:
+    """The plans that are searched in full, and how probable those chosen and those left out seemed before.
+
+    Attributes:
+        rows: as `Venues.searched` tells them.
+        log_mass: of all plans that could be asked about; None where all of them are searched.
+        index: which of those the searched ones are.
+        warnings: what was left out.
+    """
+
+    rows: Sequence[Row[Any]]
+    records: Sequence[PlanRecord]
+    side_by_side: PlansSideBySide
+    log_mass: Float[np.ndarray, "p"] | None
+    index: Sequence[int]
+    warnings: list[str]
+
+    def place(self, candidate: Candidate) -> Place:
+        """Where a candidate is."""
+        number, own = self.side_by_side.in_own_plan(candidate)
+        record = self.records[number]
+        return Place(record.id, record.revision_id, record.plan, own, self.rows[number].level)
+
+    def shares(self, found: Localisation) -> tuple[float, Float[np.ndarray, "m"]]:
+        """How probable it is that the plan is among those searched, and each of these, given that it is."""
+        probability = self.side_by_side.by_plan(found.posterior.pose)
+        if self.log_mass is None:
+            return 1.0, probability
+        return share_searched(self.log_mass, np.array(self.index), probability), probability
+
+
+class VenueLocaliser:
+    """Answers queries about venues, on the threads and worker processes of queries about single plans."""
+
+    def __init__(
+        self,
+        *,
+        settings: Settings,
+        bundle: Bundle,
+        encoders: Encoders,
+        plans: VenuePlans,
+        localiser: Localiser,
+        decoder: Decoder,
+        queries: Slots,
+    ) -> None:
+        self._settings = settings
+        self._bundle = bundle
+        self._encoders = encoders
+        self._plans = plans
+        self._localiser = localiser
+        self._decoder = decoder
+        self._queries = queries
+
+    async def answer(
+        self, venue: VenueRecord, form: LocaliseForm, content: bytes, begin: float, clock: StageClock, party: str
+    ) -> LocaliseAnswer:
+        """Localise an encoded panorama in the plans of a venue.
+
+        Args:
+            begin, clock, party: see `Localiser.answer`.
+
+        Raises:
+            VenueUnsearchableError: the venue has no plan that is ready or will be.
+            VenueNotReadyError: none of its plans was ready by the deadline.
+            LaLaLocError: see `Localiser.answer`.
+        """
+        with self._queries.hold(party):
+            return await self._answer(venue, form, content, begin, clock, party)
+
+    async def _answer(
+        self, venue: VenueRecord, form: LocaliseForm, content: bytes, begin: float, clock: StageClock, party: str
+    ) -> LocaliseAnswer:
+        deadline = begin + self._settings.request_deadline_s
+        with clock.stage("decode"):
+            panorama = await self._decoder.decode(content, deadline, party)
+        north = None if venue.anchor is None else heading_from_degrees(venue.anchor.north_deg)
+        known = known_heading(form, north, panorama, self._settings.compass_tolerance_deg)
+        with clock.stage("wait"):
+            ready, warnings = await self._ready(venue, deadline, party)
+        height = venue_height(form, ready)
+        compute = partial(self._localiser.compute, party, deadline=deadline)
+        query = await compute(lambda: self._localiser.encode(panorama, known, height, clock))
+        with clock.stage("shortlist"):
+            searched = await self._searched(venue, ready, query, form, warnings, compute)
+        side_by_side = searched.side_by_side
+        steps = localise_steps(
+            side_by_side.plan,
+            side_by_side.grid,
+            self._encoders,
+            query,
+            refine=form.refine,
+            top_k=form.top_k,
+            config=_CONFIG,
+            clock=clock,
+            hints=Hints(strict=form.strict),
+        )
+        found = await self._localiser.finished(steps, deadline, party)
+        timings_ms = clock.timings_ms | {"total": (monotonic() - begin) * 1e3}
+        self._localiser.observe(timings_ms, found.stage)
+        return self._compose(venue, searched, found, known, form.top_k, timings_ms)
+
+    async def _ready(self, venue: VenueRecord, deadline: float, party: str) -> tuple[Sequence[Row[Any]], list[str]]:
+        """The plans that can be asked about, waited for while there is none, and what is to be said of the others."""
+        begin = monotonic()
+        while True:
+            members = await self._plans.members(venue.id)
+            ready = [row for row in members if row.grid_id is not None]
+            failed = [row for row in members if row.grid_id is None and row.failure is not None]
+            if ready:
+                break
+            if len(failed) == len(members):
+                raise VenueUnsearchableError(venue.id, len(members))
+            if monotonic() + _LOOK_EVERY_S >= deadline:
+                raise VenueNotReadyError(venue.id, len(members), monotonic() - begin)
+            with self._queries.released(party):
+                await asyncio.sleep(_LOOK_EVERY_S)
+        waiting = len(members) - len(ready) - len(failed)
+        warnings = []
+        if waiting:
+            warnings.append(f"{waiting} of the venue's {len(members)} floor plans are preparing and were not searched")
+        if failed:
+            warnings.append(f"{len(failed)} of the venue's {len(members)} floor plans failed and were not searched")
+        return ready, warnings
+
+    async def _searched(
+        self,
+        venue: VenueRecord,
+        ready: Sequence[Row[Any]],
+        query: Query,
+        form: LocaliseForm,
+        warnings: list[str],
+        compute: Callable[..., Any],
+    ) -> _Searched:
+        """The plans that are searched in full: all of few, the most probable ones of many."""
+        rows, log_mass, index = ready, None, list(range(len(ready)))
+        if query.profile is not None and self._plans.needs_choice(ready, query):
+            known = await self._plans.prototypes(ready)
+            weights = self._encoders.manifest.evidence
+            chosen = await compute(partial(self._plans.choose, known, query, weights))
+            rows, log_mass, index = chosen.members, chosen.log_mass, chosen.index.tolist()
+        loaded = await self._plans.load(venue.tenant, rows)
+        kept = [one for one in loaded if _may_stand(one[1], form)]
+        if len(kept) < len(loaded):
+            left_out = len(loaded) - len(kept)
+            warnings = [*warnings, f"{left_out} floor plans have ceilings below camera_height_m and were not searched"]
+        if not kept:
+            if loaded:
+                check_height_m(loaded[0][1], query.camera_height.height_m)
+            raise VenueNotReadyError(venue.id, venue.plans, 0.0)
+        place = {row.plan_id: number for row, number in zip(rows, index, strict=True)}
+        side_by_side = await compute(partial(_laid_out, kept, query))
+        return _Searched(
+            rows=[row for row, _, _ in kept],
+            records=[record for _, record, _ in kept],
+            side_by_side=side_by_side,
+            log_mass=log_mass,
+            index=[place[row.plan_id] for row, _, _ in kept],
+            warnings=warnings,
+        )
+
+    def _compose(
+        self,
+        venue: VenueRecord,
+        searched: _Searched,
+        found: Localisation,
+        known: KnownHeading,
+        top_k: int,
+        timings_ms: dict[str, float],
+    ) -> LocaliseAnswer:
+        share, probability = searched.shares(found)
+        warnings = [heading_contradiction(known)] if found.heading_contradicted else []
+        answer = compose(
+            found, searched.place, known, warnings + searched.warnings, timings_ms, self._bundle, share=share
+        )
+        model = self._bundle.manifest.confidence
+        fits = None if model is None else found.fit_probability(model)
+        plans = [
+            PlanProbability(
+                floorplan_id=searched.rows[number].plan_id,
+                level=searched.rows[number].level,
+                name=searched.rows[number].name,
+                probability=None if fits is None else min(fits * share * float(probability[number]), 1.0),
+            )
+            for number in np.argsort(-probability, kind="stable")[:top_k].tolist()
+        ]
+        return answer.model_copy(update={"venue_id": venue.id, "plans": plans})
+
+
+def _may_stand(record: PlanRecord, form: LocaliseForm) -> bool:
+    """Whether the camera height of a request is possible in a plan."""
+    if form.camera_height_m is None:
+        return True
+    try:
+        check_height_m(record, form.camera_height_m)
+    except InvalidPoseError:
+        return False
+    return True
+
+
+def _laid_out(loaded: Sequence[tuple[Row[Any], PlanRecord, LatentGrid]], query: Query) -> PlansSideBySide:
+    plans, grids = [record.plan for _, record, _ in loaded], [grid for _, _, grid in loaded]
+    return PlansSideBySide.of(plans, grids, query.camera_height.height_m)

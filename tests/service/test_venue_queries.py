@@ -1,0 +1,217 @@
+"""Queries about venues: which of the plans, on which level, and where in it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from service.query import venue_plans
+from tests.service.conftest import FLAT, StartApp, assert_problem, upload, wait_for
+from tests.service.test_localise import HALL
+
+ROOT = Path(__file__).parents[2]
+EXAMPLES = ROOT / "examples"
+HOME: dict[str, Any] = json.loads((EXAMPLES / "flat.json").read_text())
+# Where each example was taken, in the plan above.
+POSES = {pose["file"]: pose for pose in json.loads((EXAMPLES / "poses.json").read_text())}
+STUDIO = {"ceiling_height_m": 2.6, "rooms": [{"name": "studio", "polygon": [[0, 0], [9, 0], [9, 2.2], [0, 2.2]]}]}
+
+
+@pytest.fixture(scope="module")
+def shipped(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+    """The app with the model that ships, and a worker that is warm."""
+    deadlines = {"lpo_deadline_s": 60.0, "lpo_stall_s": 60.0, "request_deadline_s": 90.0}
+    data_dir = tmp_path_factory.mktemp("data")
+    with start_app(data_dir, bundle=ROOT / "models" / "default", workers=1, **deadlines) as client:
+        client.timeout = 100.0
+        wait_for(lambda: client.get("/readyz").status_code == 200, 120.0)
+        yield client
+
+
+def venue_of(client: httpx.Client, *plan_ids: str, **more: Any) -> str:
+    """A venue with plans on levels 0, 1, 2 and so on."""
+    plans = [{"floorplan_id": plan_id, "level": level} for level, plan_id in enumerate(plan_ids)]
+    response = client.post("/venues", json={"plans": plans, **more})
+    assert response.status_code == 201, response.text
+    return response.json()["id"]
+
+
+def ask(client: httpx.Client, venue_id: str, picture: bytes, **fields: Any) -> httpx.Response:
+    data = {"venue_id": venue_id} | {name: str(value) for name, value in fields.items()}
+    return client.post("/localise", data=data, files={"panorama": ("p.jpg", picture, "image/jpeg")})
+
+
+def turned(plan: dict[str, Any]) -> dict[str, Any]:
+    """A plan with x and y exchanged: a mirror image, with the same rooms."""
+
+    def swapped(points: list[list[float]]) -> list[list[float]]:
+        return [[y, x] for x, y in points]
+
+    rooms = [{**room, "polygon": swapped(room["polygon"])} for room in plan["rooms"]]
+    openings = [{**one, "line": swapped(one["line"])} for one in plan.get("openings", [])]
+    return {**plan, "rooms": rooms} | ({"openings": openings} if openings else {})
+
+
+@pytest.fixture(scope="module")
+def home(shipped: httpx.Client) -> str:
+    return upload(shipped, HOME)
+
+
+@pytest.fixture(scope="module")
+def others(shipped: httpx.Client) -> list[str]:
+    return [upload(shipped, plan) for plan in (FLAT, STUDIO, turned(HOME))]
+
+
+@pytest.mark.parametrize("name", sorted(POSES))
+@pytest.mark.parametrize("given", [True, False], ids=["heading given", "heading searched"])
+def test_the_right_plan_and_place_are_found_among_several(
+    shipped: httpx.Client, home: str, others: list[str], name: str, given: bool
+) -> None:
+    pose = POSES[name]
+    fields = {"heading_deg": pose["heading_deg"]} if given else {}
+    venue_id = venue_of(shipped, others[0], others[1], home)
+    response = ask(shipped, venue_id, (EXAMPLES / name).read_bytes(), **fields)
+    assert response.status_code == 200, response.text
+    answer = response.json()
+    assert (answer["venue_id"], answer["floorplan_id"], answer["level"]) == (venue_id, home, 2.0)
+    assert abs(answer["position"]["x_m"] - pose["x_m"]) < 0.5
+    assert abs(answer["position"]["y_m"] - pose["y_m"]) < 0.5
+    assert answer["plans"][0]["floorplan_id"] == home
+    probabilities = [plan["probability"] for plan in answer["plans"]]
+    assert probabilities == sorted(probabilities, reverse=True)
+    assert sum(probabilities) <= 1.0
+    assert probabilities[0] >= answer["confidence"] - 1e-4
+    shares = [candidate["probability"] for candidate in answer["candidates"]]
+    assert shares == sorted(shares, reverse=True)
+    assert shares[0] == answer["confidence"]
+    assert {candidate["floorplan_id"] for candidate in answer["candidates"]} <= {home, others[0], others[1]}
+
+
+def test_a_venue_of_one_plan_is_answered_as_the_plan_itself(shipped: httpx.Client, home: str) -> None:
+    picture = (EXAMPLES / "kitchen.jpg").read_bytes()
+    files = {"panorama": ("p.jpg", picture, "image/jpeg")}
+    alone = shipped.post("/localise", data={"floorplan_id": home, "heading_deg": "250"}, files=files).json()
+    found = ask(shipped, venue_of(shipped, home), picture, heading_deg=250).json()
+    assert found["position"] == alone["position"]
+    assert found["confidence"] == pytest.approx(alone["confidence"], abs=1e-3)
+    assert (alone["venue_id"], alone["level"], alone["plans"]) == (None, None, None)
+
+
+def test_two_equal_flats_share_the_probability(shipped: httpx.Client, home: str, others: list[str]) -> None:
+    twin = upload(shipped, HOME)
+    picture = (EXAMPLES / "kitchen.jpg").read_bytes()
+    answer = ask(shipped, venue_of(shipped, home, others[0], twin), picture, heading_deg=250, top_k=10).json()
+    assert 0.3 < answer["confidence"] <= 0.55
+    [first, second] = [plan for plan in answer["plans"] if plan["floorplan_id"] in (home, twin)]
+    assert first["probability"] == pytest.approx(second["probability"], abs=0.05)
+    assert max(first["probability"], second["probability"]) <= 0.55
+    best = answer["candidates"][:2]
+    assert {candidate["floorplan_id"] for candidate in best} == {home, twin}
+    assert best[0]["position"] == pytest.approx(best[1]["position"], abs=0.3)
+
+
+def test_of_many_plans_the_most_probable_are_searched(
+    shipped: httpx.Client, home: str, others: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    copies = [upload(shipped, HOME) for _ in range(3)]
+    venue_id = venue_of(shipped, *others, home, *copies)
+    picture = (EXAMPLES / "kitchen.jpg").read_bytes()
+    whole = ask(shipped, venue_id, picture, heading_deg=250, top_k=10).json()
+    monkeypatch.setattr(venue_plans, "MAX_SEARCHED", 2)
+    # Once from the store, once from memory.
+    for _ in range(2):
+        chosen = ask(shipped, venue_id, picture, heading_deg=250, top_k=10).json()
+        assert chosen["floorplan_id"] in (home, *copies)
+        assert len(chosen["plans"]) == 2
+        # Copies that were left out keep their shares.
+        assert chosen["confidence"] == pytest.approx(whole["confidence"], abs=0.05)
+        assert chosen["confidence"] <= 0.3
+
+
+def test_prototypes_that_an_earlier_version_did_not_store_are_made(
+    start_app: StartApp, tmp_path: Path, database_of: Any, panorama: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from service.storage import Store
+
+    monkeypatch.setattr(venue_plans, "MAX_SEARCHED", 1)
+    with start_app(tmp_path) as client:
+        venue_id = venue_of(client, upload(client), upload(client, STUDIO))
+        store = Store(database_of(tmp_path))
+        with store._database.writing() as connection:
+            connection.exec_driver_sql("UPDATE latent_grids SET prototypes = NULL")
+        assert ask(client, venue_id, panorama, refine="none").status_code == 200
+        with store._database.reading() as connection:
+            query = "SELECT count(*) FROM latent_grids WHERE prototypes IS NULL"
+            assert connection.exec_driver_sql(query).scalar() == 0
+        store.close()
+
+
+@pytest.fixture(scope="module")
+def plan(client: httpx.Client) -> str:
+    return upload(client)
+
+
+BAD_FIELDS: dict[str, tuple[dict[str, str], str, str]] = {
+    "neither": ({}, "floorplan_id", "is missing"),
+    "both": ({"venue_id": "0" * 32, "floorplan_id": "0" * 32}, "floorplan_id", "venue_id is given as well"),
+    "near": ({"venue_id": "0" * 32, "near": '{"x_m": 1, "y_m": 1}', "radius_m": "1"}, "floorplan_id", "one plan"),
+    "posterior": ({"venue_id": "0" * 32, "include": "posterior"}, "include", "one plan"),
+}
+
+
+@pytest.mark.parametrize(("fields", "field", "message"), BAD_FIELDS.values(), ids=BAD_FIELDS.keys())
+def test_exactly_one_of_plan_and_venue_is_asked_about(
+    client: httpx.Client, panorama: bytes, fields: dict[str, str], field: str, message: str
+) -> None:
+    files = {"panorama": ("p.jpg", panorama, "image/jpeg")}
+    problem = assert_problem(client.post("/localise", data=fields, files=files), 422, "invalid-request")
+    assert [fault["field"] for fault in problem["errors"]] == [field]
+    assert message in problem["detail"]
+
+
+def test_what_cannot_be_found_in_is_told(client: httpx.Client, panorama: bytes) -> None:
+    assert_problem(ask(client, "0" * 32, panorama), 404, "unknown-venue")
+    assert_problem(ask(client, "no id", panorama), 404, "unknown-venue")
+    assert (
+        "no floor plans" in assert_problem(ask(client, venue_of(client), panorama), 409, "venue-unsearchable")["detail"]
+    )
+
+
+def test_plans_with_lower_ceilings_than_the_camera_are_left_out(
+    client: httpx.Client, plan: str, panorama: bytes
+) -> None:
+    low = upload(client, {**STUDIO, "ceiling_height_m": 2.0})
+    answer = ask(client, venue_of(client, plan, low), panorama, camera_height_m=2.1, refine="none").json()
+    assert {entry["floorplan_id"] for entry in answer["plans"]} == {plan}
+    assert "ceilings below camera_height_m" in answer["warnings"][0]
+    assert_problem(ask(client, venue_of(client, low), panorama, camera_height_m=2.1), 422, "invalid-pose")
+
+
+def test_plans_that_are_not_ready_are_told(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
+    # Nothing is computed at upload, and the background is busy with the hall for longer than the query lasts.
+    with start_app(tmp_path, request_deadline_s=2.0) as client:
+        wait_for(lambda: client.get("/readyz").status_code == 200)
+        ready = upload(client)
+        hall = upload(client, HALL, wait=False)
+        answer = ask(client, venue_of(client, ready, hall), panorama, refine="none")
+        assert answer.status_code == 200, answer.text
+        assert answer.json()["floorplan_id"] == ready
+        assert answer.json()["warnings"] == ["1 of the venue's 2 floor plans are preparing and were not searched"]
+        waiting = ask(client, venue_of(client, hall), panorama, refine="none")
+        problem = assert_problem(waiting, 503, "venue-not-ready")
+        assert "none of the 1 floor plans" in problem["detail"]
+        assert int(waiting.headers["retry-after"]) >= 1
+        wait_for(lambda: client.get(f"/floorplans/{hall}").json()["status"] == "ready", 120.0)
+
+
+def test_a_plan_that_is_deleted_is_not_found_any_more(client: httpx.Client, plan: str, panorama: bytes) -> None:
+    leaving = upload(client, STUDIO)
+    venue_id = venue_of(client, plan, leaving)
+    assert len(ask(client, venue_id, panorama, refine="none").json()["plans"]) == 2
+    client.delete(f"/floorplans/{leaving}")
+    assert [one["floorplan_id"] for one in ask(client, venue_id, panorama, refine="none").json()["plans"]] == [plan]
