@@ -33,10 +33,14 @@ from lalaloc_client.model import (
     Localisation,
     Model,
     PlanEvent,
+    PlanProbability,
     Pool,
     Position,
     Readiness,
     Room,
+    Venue,
+    VenueAnchor,
+    VenuePlan,
 )
 from lalaloc_client.retry import RetryPolicy
 
@@ -60,6 +64,7 @@ __all__ = [
     "NotReadyError",
     "OverloadedError",
     "PlanEvent",
+    "PlanProbability",
     "Pool",
     "Position",
     "ProblemError",
@@ -67,4 +72,7 @@ __all__ = [
     "RetryPolicy",
     "Room",
     "UnauthorisedError",
+    "Venue",
+    "VenueAnchor",
+    "VenuePlan",
 ]

@@ -4,21 +4,31 @@ from __future__ import annotations
 
 import asyncio
 import os
-from collections.abc import AsyncIterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
 from contextlib import aclosing
 from typing import TYPE_CHECKING, Any, TypeVar, Unpack
 
 import httpx
 from httpx_sse import EventSource
 
-from lalaloc_client import operations, requests
+from lalaloc_client import operations, requests, venue_requests
 from lalaloc_client.connection import http_options, request_to_send
 from lalaloc_client.errors import NotFoundError
 from lalaloc_client.events import Followed, check_stream
-from lalaloc_client.model import FloorPlan, FloorPlanSummary, Localisation, PlanEvent, Readiness
+from lalaloc_client.model import (
+    FloorPlan,
+    FloorPlanSummary,
+    Localisation,
+    PlanEvent,
+    Readiness,
+    Venue,
+    VenueAnchor,
+    VenuePlan,
+)
 from lalaloc_client.operations import Patience, Reply, Steps, Wait
 from lalaloc_client.requests import Covariance, Document, Picture, PictureFormat, QueryOptions, Refine, Request
 from lalaloc_client.retry import RetryPolicy
+from lalaloc_client.venue_requests import Unchanged
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -82,7 +92,7 @@ class AsyncClient:
 
     async def delete_floorplan(self, floorplan_id: str) -> None:
         """See `Client.delete_floorplan`."""
-        await self._run(operations.delete(floorplan_id, self._patience))
+        await self._run(operations.delete(requests.delete_request(floorplan_id), self._patience))
 
     async def original(self, floorplan_id: str) -> bytes:
         """See `Client.original`."""
@@ -190,6 +200,111 @@ class AsyncClient:
         )
         request = requests.picture_request(query, picture, picture_format)
         return await self._run(operations.content(request, self._patience))
+
+    async def make_venue(
+        self,
+        plans: Iterable[VenuePlan],
+        *,
+        name: str | None = None,
+        anchor: VenueAnchor | None = None,
+        idempotency_key: str | None = None,
+    ) -> Venue:
+        """See `Client.make_venue`."""
+        request = venue_requests.make_request(plans, name, anchor, idempotency_key)
+        return await self._run(operations.venue(request, self._patience))
+
+    async def replace_venue(
+        self,
+        venue_id: str,
+        plans: Iterable[VenuePlan],
+        *,
+        name: str | None = None,
+        anchor: VenueAnchor | None = None,
+        if_match: str | None = None,
+    ) -> Venue:
+        """See `Client.replace_venue`."""
+        request = venue_requests.replace_request(venue_id, plans, name, anchor, if_match)
+        return await self._run(operations.venue(request, self._patience))
+
+    async def change_venue(
+        self,
+        venue_id: str,
+        *,
+        name: str | None = None,
+        anchor: VenueAnchor | Unchanged | None = "unchanged",
+        plans: Iterable[VenuePlan] = (),
+        remove: Sequence[str] = (),
+        if_match: str | None = None,
+    ) -> Venue:
+        """See `Client.change_venue`."""
+        request = venue_requests.change_request(
+            venue_id, name=name, anchor=anchor, plans=plans, remove=remove, if_match=if_match
+        )
+        return await self._run(operations.venue(request, self._patience))
+
+    async def venue(self, venue_id: str) -> Venue:
+        """See `Client.venue`."""
+        return await self._run(operations.venue(venue_requests.venue_request(venue_id), self._patience))
+
+    async def venues(self, name: str | None = None, *, page_size: int = 100) -> AsyncIterator[Venue]:
+        """See `Client.venues`."""
+        cursor = None
+        while True:
+            request = venue_requests.page_request(name, page_size, cursor)
+            page = await self._run(operations.venue_page(request, self._patience))
+            for venue in page.venues:
+                yield venue
+            cursor = page.next_cursor
+            if cursor is None:
+                return
+
+    async def venue_plans(
+        self, venue_id: str, *, level: float | None = None, page_size: int = 100
+    ) -> AsyncIterator[VenuePlan]:
+        """See `Client.venue_plans`."""
+        cursor = None
+        while True:
+            request = venue_requests.plans_request(venue_id, level, page_size, cursor)
+            page = await self._run(operations.venue_plan_page(request, self._patience))
+            for plan in page.plans:
+                yield plan
+            cursor = page.next_cursor
+            if cursor is None:
+                return
+
+    async def delete_venue(self, venue_id: str) -> None:
+        """See `Client.delete_venue`."""
+        await self._run(operations.delete(venue_requests.delete_request(venue_id), self._patience))
+
+    async def localise_in_venue(
+        self,
+        venue_id: str,
+        panorama: bytes | str | os.PathLike[str] | Image,
+        *,
+        heading_deg: float | None = None,
+        heading_tolerance_deg: float | None = None,
+        camera_height_m: float | None = None,
+        camera_height_std_m: float | None = None,
+        strict: bool | None = None,
+        refine: Refine | None = None,
+        top_k: int | None = None,
+    ) -> Localisation:
+        """See `Client.localise_in_venue`."""
+        # As in `localise`.
+        request = await asyncio.to_thread(
+            requests.localise_request,
+            None,
+            panorama,
+            venue_id=venue_id,
+            heading_deg=heading_deg,
+            heading_tolerance_deg=heading_tolerance_deg,
+            camera_height_m=camera_height_m,
+            camera_height_std_m=camera_height_std_m,
+            refine=refine,
+            top_k=top_k,
+            strict=strict,
+        )
+        return await self._run(operations.localisation(request, self._patience))
 
     async def limits(self) -> Mapping[str, Any]:
         """See `Client.limits`."""

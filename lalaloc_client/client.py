@@ -4,21 +4,31 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from typing import TYPE_CHECKING, Any, TypeVar, Unpack
 
 import httpx
 from httpx_sse import EventSource
 
-from lalaloc_client import operations, requests
+from lalaloc_client import operations, requests, venue_requests
 from lalaloc_client.connection import http_options, request_to_send
 from lalaloc_client.errors import NotFoundError
 from lalaloc_client.events import Followed, check_stream
-from lalaloc_client.model import FloorPlan, FloorPlanSummary, Localisation, PlanEvent, Readiness
+from lalaloc_client.model import (
+    FloorPlan,
+    FloorPlanSummary,
+    Localisation,
+    PlanEvent,
+    Readiness,
+    Venue,
+    VenueAnchor,
+    VenuePlan,
+)
 from lalaloc_client.operations import Patience, Reply, Steps, Wait
 from lalaloc_client.requests import Covariance, Document, Picture, PictureFormat, QueryOptions, Refine, Request
 from lalaloc_client.retry import RetryPolicy
+from lalaloc_client.venue_requests import Unchanged
 
 if TYPE_CHECKING:
     from PIL.Image import Image
@@ -103,7 +113,7 @@ class Client:
 
     def delete_floorplan(self, floorplan_id: str) -> None:
         """Delete a plan with everything that was made of it."""
-        self._run(operations.delete(floorplan_id, self._patience))
+        self._run(operations.delete(requests.delete_request(floorplan_id), self._patience))
 
     def original(self, floorplan_id: str) -> bytes:
         """The file that a plan's current revision was uploaded as, to the byte."""
@@ -245,6 +255,117 @@ class Client:
         )
         request = requests.picture_request(query, picture, picture_format)
         return self._run(operations.content(request, self._patience))
+
+    def make_venue(
+        self,
+        plans: Iterable[VenuePlan],
+        *,
+        name: str | None = None,
+        anchor: VenueAnchor | None = None,
+        idempotency_key: str | None = None,
+    ) -> Venue:
+        """Group stored plans, so that a panorama can be searched for in all of them: see `localise_in_venue`.
+
+        Args:
+            idempotency_key: as of `upload_floorplan`.
+        """
+        request = venue_requests.make_request(plans, name, anchor, idempotency_key)
+        return self._run(operations.venue(request, self._patience))
+
+    def replace_venue(
+        self,
+        venue_id: str,
+        plans: Iterable[VenuePlan],
+        *,
+        name: str | None = None,
+        anchor: VenueAnchor | None = None,
+        if_match: str | None = None,
+    ) -> Venue:
+        """Give a venue other plans, name and anchor: what is left out, it has no more."""
+        request = venue_requests.replace_request(venue_id, plans, name, anchor, if_match)
+        return self._run(operations.venue(request, self._patience))
+
+    def change_venue(
+        self,
+        venue_id: str,
+        *,
+        name: str | None = None,
+        anchor: VenueAnchor | Unchanged | None = "unchanged",
+        plans: Iterable[VenuePlan] = (),
+        remove: Sequence[str] = (),
+        if_match: str | None = None,
+    ) -> Venue:
+        """Change some of a venue.
+
+        Args:
+            name: None: as it is.
+            anchor: None takes it away.
+            plans: what comes in, or changes its level or name.
+            remove: ids of plans that leave the venue.
+            if_match: the `etag` of the venue that is changed; when that is no longer the newest one, ConflictError.
+        """
+        request = venue_requests.change_request(
+            venue_id, name=name, anchor=anchor, plans=plans, remove=remove, if_match=if_match
+        )
+        return self._run(operations.venue(request, self._patience))
+
+    def venue(self, venue_id: str) -> Venue:
+        """A stored venue."""
+        return self._run(operations.venue(venue_requests.venue_request(venue_id), self._patience))
+
+    def venues(self, name: str | None = None, *, page_size: int = 100) -> Iterator[Venue]:
+        """All stored venues, newest first, or those that the service finds by a name; asks page by page."""
+        cursor = None
+        while True:
+            request = venue_requests.page_request(name, page_size, cursor)
+            page = self._run(operations.venue_page(request, self._patience))
+            yield from page.venues
+            cursor = page.next_cursor
+            if cursor is None:
+                return
+
+    def venue_plans(self, venue_id: str, *, level: float | None = None, page_size: int = 100) -> Iterator[VenuePlan]:
+        """The plans of a venue from the lowest level up, or those of one level; asks page by page."""
+        cursor = None
+        while True:
+            request = venue_requests.plans_request(venue_id, level, page_size, cursor)
+            page = self._run(operations.venue_plan_page(request, self._patience))
+            yield from page.plans
+            cursor = page.next_cursor
+            if cursor is None:
+                return
+
+    def delete_venue(self, venue_id: str) -> None:
+        """Delete a venue; its plans stay."""
+        self._run(operations.delete(venue_requests.delete_request(venue_id), self._patience))
+
+    def localise_in_venue(
+        self,
+        venue_id: str,
+        panorama: bytes | str | os.PathLike[str] | Image,
+        *,
+        heading_deg: float | None = None,
+        heading_tolerance_deg: float | None = None,
+        camera_height_m: float | None = None,
+        camera_height_std_m: float | None = None,
+        strict: bool | None = None,
+        refine: Refine | None = None,
+        top_k: int | None = None,
+    ) -> Localisation:
+        """In which plan of a venue a panorama was taken, and where; the arguments are those of `localise`."""
+        request = requests.localise_request(
+            None,
+            panorama,
+            venue_id=venue_id,
+            heading_deg=heading_deg,
+            heading_tolerance_deg=heading_tolerance_deg,
+            camera_height_m=camera_height_m,
+            camera_height_std_m=camera_height_std_m,
+            refine=refine,
+            top_k=top_k,
+            strict=strict,
+        )
+        return self._run(operations.localisation(request, self._patience))
 
     def limits(self) -> Mapping[str, Any]:
         """What the service allows, by name."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import types
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from dataclasses import MISSING, asdict, dataclass, field, fields, is_dataclass
 from datetime import datetime
 from functools import cache
 from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -117,6 +117,94 @@ class FloorPlanPage:
 
 
 @dataclass(frozen=True)
+class VenueAnchor:
+    """Where on Earth the origin of a venue's plans lies, WGS84; `north_deg` is the azimuth of true north in them."""
+
+    latitude: float
+    longitude: float
+    altitude_m: float | None = None
+    north_deg: float = 0.0
+
+    def to_dict(self) -> dict[str, Any]:
+        """As it is sent."""
+        return asdict(self)
+
+
+@dataclass(frozen=True)
+class VenuePlan:
+    """A plan of a venue.
+
+    Attributes:
+        level: number of its level, 0 for the ground.
+        name: what it is called in the venue; None, when it is sent: by its own name.
+        status, progress, rooms, area_m2, revision: those of the plan, as the service tells them.
+    """
+
+    floorplan_id: str
+    level: float = 0.0
+    name: str | None = None
+    status: str | None = None
+    progress: float | None = None
+    rooms: int | None = None
+    area_m2: float | None = None
+    revision: str | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """As it is sent."""
+        return {"floorplan_id": self.floorplan_id, "level": self.level, "name": self.name}
+
+
+@dataclass(frozen=True)
+class Venue:
+    """A stored venue.
+
+    Attributes:
+        plans: how many floor plans it has; of these `plans_ready` can be asked about, `plans_failed` never will be.
+            Listings do not tell these two.
+        revision: changes with the name, the anchor and the plans that belong to it.
+        etag: names this revision, for `if_match`.
+    """
+
+    id: str
+    revision: str
+    name: str
+    plans: int
+    created_at: datetime
+    updated_at: datetime
+    anchor: VenueAnchor | None = None
+    revision_number: int | None = None
+    plans_ready: int | None = None
+    plans_failed: int | None = None
+    etag: str | None = None
+
+
+@dataclass(frozen=True)
+class VenuePage:
+    """One page of a listing of venues; `next_cursor` asks for the one after it, None ends the listing."""
+
+    venues: tuple[Venue, ...]
+    next_cursor: str | None = None
+
+
+@dataclass(frozen=True)
+class VenuePlanPage:
+    """One page of the plans of a venue."""
+
+    plans: tuple[VenuePlan, ...]
+    next_cursor: str | None = None
+
+
+@dataclass(frozen=True)
+class PlanProbability:
+    """How probable it is that a panorama was taken in one plan of a venue."""
+
+    floorplan_id: str
+    level: float
+    name: str
+    probability: float | None
+
+
+@dataclass(frozen=True)
 class PlanEvent:
     """How far a plan is at some moment.
 
@@ -146,6 +234,7 @@ class Candidate:
         probability: that the camera is within 1 m, turned alike within 25°, and not at a better candidate; None for a
             model that does not tell.
         room_id: the room's id in the plan, which is unique as its name need not be.
+        floorplan_id, level: the plan that it lies in, and its level in the venue that was asked about.
     """
 
     position: Position
@@ -155,6 +244,8 @@ class Candidate:
     latent_distance: float
     probability: float | None = None
     room_id: str | None = None
+    floorplan_id: str | None = None
+    level: float | None = None
 
 
 @dataclass(frozen=True)
@@ -211,6 +302,8 @@ class Localisation:
         candidates: best first; the first one is the answer.
         timings_ms: per stage of the service.
         floorplan_revision: the revision of the plan that was compared with.
+        venue_id, level: the venue that was asked about, and the level of the plan in it.
+        plans: of a venue, the most probable plans, the most probable first.
     """
 
     floorplan_id: str
@@ -233,6 +326,9 @@ class Localisation:
     warnings: tuple[str, ...] = ()
     room_id: str | None = None
     geopose: GeoPose | None = None
+    venue_id: str | None = None
+    level: float | None = None
+    plans: tuple[PlanProbability, ...] | None = None
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,18 @@ from lalaloc_client.errors import (
     ProblemError,
     problem_class,
 )
-from lalaloc_client.model import FloorPlan, FloorPlanPage, Localisation, PlanEvent, Readiness, parse
-from lalaloc_client.requests import Request, delete_request, limits_request, plan_request, ready_request
+from lalaloc_client.model import (
+    FloorPlan,
+    FloorPlanPage,
+    Localisation,
+    PlanEvent,
+    Readiness,
+    Venue,
+    VenuePage,
+    VenuePlanPage,
+    parse,
+)
+from lalaloc_client.requests import Request, limits_request, plan_request, ready_request
 from lalaloc_client.retry import RetryPolicy, may_retry, retry_after_s
 
 T = TypeVar("T")
@@ -119,6 +129,22 @@ def page(request: Request, patience: Patience) -> Steps[FloorPlanPage]:
     return parse(FloorPlanPage, _json((yield from send(request, patience)).response))
 
 
+def venue(request: Request, patience: Patience) -> Steps[Venue]:
+    """Send a request that is answered with a venue."""
+    response = (yield from send(request, patience)).response
+    return replace(parse(Venue, _json(response)), etag=response.headers.get("etag"))
+
+
+def venue_page(request: Request, patience: Patience) -> Steps[VenuePage]:
+    """Send a request for a page of venues."""
+    return parse(VenuePage, _json((yield from send(request, patience)).response))
+
+
+def venue_plan_page(request: Request, patience: Patience) -> Steps[VenuePlanPage]:
+    """Send a request for a page of the plans of a venue."""
+    return parse(VenuePlanPage, _json((yield from send(request, patience)).response))
+
+
 def localisation(request: Request, patience: Patience) -> Steps[Localisation]:
     """Send a query."""
     return parse(Localisation, _json((yield from send(request, patience)).response))
@@ -134,9 +160,9 @@ def stream(request: Request, patience: Patience) -> Steps[httpx.Response]:
     return (yield from send(request, patience)).response
 
 
-def delete(floorplan_id: str, patience: Patience) -> Steps[None]:
-    """Delete a plan."""
-    yield from send(delete_request(floorplan_id), patience)
+def delete(request: Request, patience: Patience) -> Steps[None]:
+    """Send a request that is answered with nothing."""
+    yield from send(request, patience)
 
 
 def limits(patience: Patience) -> Steps[Mapping[str, Any]]:

@@ -154,7 +154,7 @@ def page_request(name: str | None, limit: int, cursor: str | None) -> Request:
 
 
 def localise_request(
-    floorplan_id: str,
+    floorplan_id: str | None,
     panorama: bytes | str | os.PathLike[str] | Image,
     *,
     heading_deg: float | None = None,
@@ -167,10 +167,12 @@ def localise_request(
     radius_m: float | None = None,
     rooms: Sequence[str] | None = None,
     strict: bool | None = None,
+    venue_id: str | None = None,
 ) -> Request:
-    """A query; it stores nothing, so asking twice is as good as once."""
+    """A query about a plan or a venue; it stores nothing, so asking twice is as good as once."""
     given = {
         "floorplan_id": floorplan_id,
+        "venue_id": venue_id,
         "heading_deg": heading_deg,
         "heading_tolerance_deg": heading_tolerance_deg,
         "camera_height_m": camera_height_m,
@@ -218,10 +220,19 @@ def _check_finite(given: Mapping[str, object]) -> None:
 
 
 def _plan_path(floorplan_id: str) -> str:
+    return resource_path("floorplans", "floorplan_id", floorplan_id)
+
+
+def resource_path(collection: str, name: str, given: str) -> str:
+    """Where something with an id is.
+
+    Raises:
+        ValueError: what was given as `name` is no id.
+    """
     # Anything else could name another route, however it is quoted: servers undo that before they look.
-    if not _ID.fullmatch(floorplan_id):
-        raise ValueError(f"floorplan_id is {floorplan_id!r:.100}, it must be 1 to 128 letters, digits, _ or -")
-    return f"/floorplans/{floorplan_id}"
+    if not _ID.fullmatch(given):
+        raise ValueError(f"{name} is {given!r:.100}, it must be 1 to 128 letters, digits, _ or -")
+    return f"/{collection}/{given}"
 
 
 def _plan_body(document: Document, options: Mapping[str, object] | None) -> tuple[str, bytes]:

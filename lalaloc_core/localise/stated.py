@@ -31,9 +31,10 @@ def known_heading(
     compass_heading: float | None,
     compass_tolerance_deg: float = COMPASS_TOLERANCE_DEG,
 ) -> KnownHeading:
-    """What is said, else what the panorama says where the plan knows north, else nothing.
+    """What is said, else what the panorama says where north is known, else nothing.
 
     Args:
+        north: azimuth of true north (radians) in the plan.
         compass_heading: clockwise from true north (radians), as the panorama's metadata have it.
     """
     if heading_deg is not None:

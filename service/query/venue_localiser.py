@@ -219,12 +219,14 @@ class VenueLocaliser:
         fits = None if model is None else found.fit_probability(model)
         plans = [
             PlanProbability(
-                floorplan_id=searched.rows[number].plan_id,
-                level=searched.rows[number].level,
-                name=searched.rows[number].name,
-                probability=None if fits is None else min(fits * share * float(probability[number]), 1.0),
+                floorplan_id=row.plan_id,
+                level=row.level,
+                name=row.name,
+                probability=None if fits is None else min(fits * share * of_plan, 1.0),
             )
-            for number in np.argsort(-probability, kind="stable")[:top_k].tolist()
+            for of_plan, row in sorted(zip(probability.tolist(), searched.rows, strict=True), key=lambda one: -one[0])[
+                :top_k
+            ]
         ]
         return answer.model_copy(update={"venue_id": venue.id, "plans": plans})
 

@@ -89,10 +89,11 @@ class LocaliseAnswer(Answer):
 
     floorplan_id: str = Field(description="The plan that the position lies in.")
     floorplan_revision: str = Field(description="The plan's revision that was searched.")
-    venue_id: str | None = Field(None, description="The venue that was asked about; null where it was a plan.")
+    venue_id: str | None = Field(default=None, description="The venue that was asked about; null where it was a plan.")
     level: float | None = Field(description="Level of the plan in the venue; null where `venue_id` is.")
     plans: list[PlanProbability] | None = Field(
-        None, description="The most probable plans of the venue, the most probable first; null where `venue_id` is."
+        default=None,
+        description="The most probable plans of the venue, the most probable first; null where `venue_id` is.",
     )
     position: Position
     heading_deg: HeadingDeg = Field(ge=0, lt=360, description=f"The {HEADING_MEANING}.")

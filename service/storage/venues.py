@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterable, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
-from sqlalchemy import Connection, Row, Select, and_, case, delete, distinct, func, or_, select, text, update
+from sqlalchemy import Connection, Row, and_, case, delete, distinct, func, or_, select, text, update
 
 from service.errors import InvalidRequestError, RevisionMismatchError, TooManyVenuesError, UnknownVenueError
 from service.storage.database import Database
@@ -243,7 +243,7 @@ def _head(name: str, anchor: VenueAnchor | None, now: datetime) -> dict[str, Any
     }
 
 
-def _select(*conditions: Any) -> Select[Any]:
+def _select(*conditions: Any) -> Any:
     own = VENUE_PLANS.c.venue_id == VENUES.c.id
     plans = select(func.count()).select_from(VENUE_PLANS).where(own).scalar_subquery().label("plans")
     return select(VENUES, plans).where(*conditions)
@@ -318,14 +318,14 @@ def _count(connection: Connection, venue_id: str) -> int:
     return connection.scalar(select(func.count()).select_from(VENUE_PLANS).where(own)) or 0
 
 
-def _select_plans(venue_id: str) -> Select[Any]:
+def _select_plans(venue_id: str) -> Any:
     """A query for the columns of `VenueMember`."""
     return select(VENUE_PLANS.c.plan_id, VENUE_PLANS.c.level, VENUE_PLANS.c.name).where(
         VENUE_PLANS.c.venue_id == venue_id
     )
 
 
-def _with_grids(query: Select[Any], model_sha256: str, step_m: float) -> Select[Any]:
+def _with_grids(query: Any, model_sha256: str, step_m: float) -> Any:
     """Members joined with their plans at their current revision, and with the plans' own grids where those are."""
     own_grid = and_(
         LATENT_GRIDS.c.revision_id == REVISIONS.c.id,

@@ -101,6 +101,18 @@ class _Blocking:
 
         return self._runner.run(collect())
 
+    def venues(self, *arguments: Any, **options: Any) -> list[Any]:
+        async def collect() -> list[Any]:
+            return [venue async for venue in self._client.venues(*arguments, **options)]
+
+        return self._runner.run(collect())
+
+    def venue_plans(self, *arguments: Any, **options: Any) -> list[Any]:
+        async def collect() -> list[Any]:
+            return [plan async for plan in self._client.venue_plans(*arguments, **options)]
+
+        return self._runner.run(collect())
+
     def events(self, *arguments: Any, **options: Any) -> list[Any]:
         async def collect() -> list[Any]:
             return [event async for event in self._client.events(*arguments, **options)]

@@ -40,6 +40,8 @@ def test_an_answer_has_no_more_digits_than_say_something(client: httpx.Client, p
 def test_rounding_stays_within_the_limits(heading_deg: float, x_m: float) -> None:
     position = Position(x_m=x_m, y_m=-1e-9)
     made = CandidateAnswer(
+        floorplan_id="0" * 32,
+        level=None,
         position=position,
         heading_deg=heading_deg,
         room="x",

@@ -1,0 +1,76 @@
+"""Both clients ask about venues of the production app."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import httpx
+import pytest
+
+from lalaloc_client import ConflictError, InvalidError, NotFoundError, VenueAnchor, VenuePlan
+from tests.client.conftest import MakeClient
+from tests.service.conftest import FLAT, StartApp
+
+ANCHOR = VenueAnchor(51.7546, -1.2545, altitude_m=61.0, north_deg=12.5)
+
+
+@pytest.fixture(scope="module")
+def app(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+    """One app for all tests here."""
+    with start_app(tmp_path_factory.mktemp("data")) as started:
+        yield started
+
+
+@pytest.fixture
+def service(app: httpx.Client, make_client: MakeClient) -> Iterator[Any]:
+    """A client of that app."""
+    with make_client(str(app.base_url)) as client:
+        yield client
+
+
+def test_a_venue_is_made_found_changed_and_deleted(service: Any) -> None:
+    plans = [service.upload_floorplan(FLAT | {"name": f"Flat {number}"}).id for number in range(3)]
+    members = [VenuePlan(plan, level) for level, plan in enumerate(plans[:2])]
+    made = service.make_venue(members, name="12 Mill Lane", anchor=ANCHOR)
+    assert (made.name, made.anchor, made.plans, made.plans_ready) == ("12 Mill Lane", ANCHOR, 2, 2)
+    assert service.venue(made.id) == made
+    assert made.id in [venue.id for venue in service.venues("mill lane", page_size=1)]
+    listed = service.venue_plans(made.id, page_size=1)
+    assert [(plan.floorplan_id, plan.level, plan.name) for plan in listed] == [
+        (plans[0], 0.0, "Flat 0"),
+        (plans[1], 1.0, "Flat 1"),
+    ]
+    assert [plan.floorplan_id for plan in service.venue_plans(made.id, level=1)] == [plans[1]]
+    changed = service.change_venue(
+        made.id, plans=[VenuePlan(plans[2], 5, "attic")], remove=[plans[0]], if_match=made.etag
+    )
+    assert (changed.plans, changed.anchor) == (2, ANCHOR)
+    with pytest.raises(ConflictError):
+        service.change_venue(made.id, name="x", if_match=made.etag)
+    assert service.change_venue(made.id, anchor=None).anchor is None
+    replaced = service.replace_venue(made.id, [VenuePlan(plans[0])], name="new")
+    assert (replaced.name, replaced.plans, replaced.revision_number) == ("new", 1, 4)
+    service.delete_venue(made.id)
+    with pytest.raises(NotFoundError):
+        service.venue(made.id)
+    assert service.floorplan(plans[0]).status == "ready"
+
+
+def test_a_panorama_is_localised_in_a_venue(service: Any, panorama: bytes) -> None:
+    plans = [service.upload_floorplan(FLAT).id for _ in range(2)]
+    venue = service.make_venue([VenuePlan(plan, 3) for plan in plans])
+    answer = service.localise_in_venue(venue.id, panorama, refine="none", top_k=3)
+    assert (answer.venue_id, answer.level) == (venue.id, 3.0)
+    assert answer.floorplan_id in plans
+    assert {plan.floorplan_id for plan in answer.plans} == set(plans)
+    assert {candidate.floorplan_id for candidate in answer.candidates} <= set(plans)
+    alone = service.localise(plans[0], panorama, refine="none")
+    assert (alone.venue_id, alone.level, alone.plans) == (None, None, None)
+
+
+def test_what_is_no_id_never_leaves_the_client(service: Any) -> None:
+    with pytest.raises(ValueError, match=r"venue_id is '\.\./floorplans'"):
+        service.delete_venue("../floorplans")
+    with pytest.raises(InvalidError, match="changes nothing"):
+        service.change_venue(service.make_venue([]).id)

@@ -1,0 +1,189 @@
+"""Several plans as one, and prototypes that tell which of many are worth a full search."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lalaloc_core.bundle import EvidenceModel
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.camera_height import CameraHeight
+from lalaloc_core.localise.evidence import Evidence, EvidenceConfig
+from lalaloc_core.localise.poses import LatentGrid, PredictedProfile, Query
+from lalaloc_core.localise.prototypes import (
+    AZIMUTHS,
+    joined,
+    log_masses,
+    most_probable,
+    prototypes_of,
+    share_searched,
+)
+from lalaloc_core.localise.side_by_side import PlansSideBySide
+from lalaloc_core.render.poses import profiles_at
+from lalaloc_core.sampling import pose_grid
+
+COLUMNS, STEP_M = 64, 0.5
+WEIGHTS, CONFIG = EvidenceModel(temperature=40.0), EvidenceConfig()
+
+
+def plan_of(width_m: float, depth_m: float, *, x_m: float = 0.0, openings: bool = False) -> FloorPlan:
+    """Two rooms side by side, perhaps with a door between them, perhaps far from the origin."""
+    wall_m, near, far = 0.1, x_m, x_m + width_m
+    document = {
+        "ceiling_height_m": 2.5,
+        "rooms": [
+            {"name": "a", "polygon": [[near, 0], [far, 0], [far, depth_m], [near, depth_m]]},
+            {"name": "b", "polygon": [[far + wall_m, 0], [far + 3, 0], [far + 3, 3], [far + wall_m, 3]]},
+        ],
+    }
+    if openings:
+        document["openings"] = [{"kind": "door", "line": [[far + 0.05, 1.0], [far + 0.05, 1.9]]}]
+    return FloorPlan.from_dict(document)
+
+
+def grid_of(plan: FloorPlan) -> LatentGrid:
+    poses = pose_grid(plan, STEP_M)
+    profile_m = profiles_at(plan, poses.position_m, poses.room_index, np.zeros(len(poses)), COLUMNS, np.float32)
+    latents = np.tile(np.eye(1, 8, dtype=np.float32), (len(poses), 1))
+    return LatentGrid(poses, latents, profile_m, STEP_M, 1.5)
+
+
+def query_at(plan: FloorPlan, x_m: float, y_m: float, hypotheses: int = 1) -> Query:
+    """What a perfect encoder would say of a place, with as many hypotheses of the heading; the first one is right."""
+    position = np.array([[x_m, y_m]])
+    profile = profiles_at(plan, position, plan.room_index_at(position), np.zeros(1), COLUMNS)[0]
+    shifts = np.arange(hypotheses) * COLUMNS // hypotheses
+    predicted = PredictedProfile.rolled(np.log(profile), np.full(COLUMNS, np.log(0.05)), shifts)
+    roll = np.arange(hypotheses) * 2.0 * np.pi / hypotheses
+    return Query(np.eye(1, 8)[[0] * hypotheses], roll, 0.0, hypotheses == 1, CameraHeight(1.5), predicted)
+
+
+PLANS = [plan_of(4.0, 3.0, openings=True), plan_of(7.0, 2.0, x_m=1e6), plan_of(5.0, 5.0, openings=True)]
+
+
+@pytest.fixture(scope="module")
+def side_by_side() -> PlansSideBySide:
+    return PlansSideBySide.of(PLANS, [grid_of(plan) for plan in PLANS], 1.5)
+
+
+def test_every_pose_costs_what_it_costs_in_its_own_plan(side_by_side: PlansSideBySide) -> None:
+    query = query_at(PLANS[0], 1.3, 1.1)
+    whole, _ = Evidence(side_by_side.plan, query, 0.3, WEIGHTS, CONFIG).costs(
+        side_by_side.grid.layouts(side_by_side.plan)
+    )
+    parts = []
+    for plan in PLANS:
+        grid = grid_of(plan)
+        # Of the openings only the kinds count that every plan shows; here one shows none.
+        compared = replace(plan, opening_kinds=frozenset())
+        parts.append(Evidence(compared, query, 0.3, WEIGHTS, CONFIG).costs(grid.layouts(plan))[0])
+    np.testing.assert_allclose(whole, np.concatenate(parts, axis=1), atol=1e-5)
+
+
+def test_layouts_side_by_side_are_those_of_the_plans(side_by_side: PlansSideBySide) -> None:
+    own = [grid_of(plan).layouts(plan) for plan in PLANS]
+    merged = side_by_side.grid.layouts(side_by_side.plan)
+    assert merged.kind is not None
+    assert merged.seen is not None
+    assert len(merged) == sum(map(len, own))
+    first = 0
+    for layouts in own:
+        rows = merged.rows(np.arange(first, first + len(layouts)))
+        assert rows.kind is not None
+        np.testing.assert_array_equal(rows.log_profile, layouts.log_profile)
+        np.testing.assert_array_equal(rows.kind, np.zeros_like(rows.kind) if layouts.kind is None else layouts.kind)
+        seen = 0 if layouts.seen is None else len(layouts.seen.row)
+        assert seen == (0 if rows.seen is None else len(rows.seen.row))
+        first += len(layouts)
+
+
+def test_the_renderer_sees_in_all_plans_what_it_sees_in_each(side_by_side: PlansSideBySide) -> None:
+    grid = side_by_side.grid
+    seen = profiles_at(
+        side_by_side.plan, grid.poses.position_m, grid.poses.room_index, np.zeros(len(grid.poses)), COLUMNS, np.float32
+    )
+    np.testing.assert_allclose(seen, grid.profile_m, atol=2e-3)
+
+
+def test_places_are_told_in_the_frames_of_their_plans(side_by_side: PlansSideBySide) -> None:
+    own = [grid_of(plan).poses for plan in PLANS]
+    index, last = side_by_side.grid.poses.room_index, np.cumsum([len(one) for one in own])
+    for number, room in enumerate(index):
+        assert side_by_side.plan_of(int(room)) == int(
+            np.searchsorted(np.cumsum([len(one) for one in own]), number, "right")
+        )
+    ones = side_by_side.by_plan(np.ones(len(index)))
+    np.testing.assert_array_equal(ones, [len(one) for one in own])
+    # No two plans are near each other.
+    parts = np.split(side_by_side.grid.poses.position_m, last[:-1])
+    for k, part in enumerate(parts):
+        for other in parts[k + 1 :]:
+            assert np.linalg.norm(part[:, None] - other[None], axis=-1).min() > 9.0
+    assert np.abs(side_by_side.grid.poses.position_m).max() < 100.0
+
+
+def test_prototypes_stand_for_all_of_the_floor() -> None:
+    grid = grid_of(PLANS[0])
+    prototypes = prototypes_of(grid)
+    assert prototypes.log_profile.shape == (len(prototypes), AZIMUTHS)
+    assert len(grid.poses) / 4 <= len(prototypes) < len(grid.poses) / 2
+    assert np.exp(prototypes.log_area).sum() == pytest.approx(len(grid.poses) * STEP_M**2, rel=1e-5)
+
+
+def slow_masses(grids: list[LatentGrid], query: Query) -> list[float]:
+    """The sums that `log_masses` says it computes, prototype by prototype."""
+    assert query.profile is not None
+    found = []
+    for grid in grids:
+        prototypes, terms = prototypes_of(grid), []
+        for row, log_area in zip(prototypes.log_profile.astype(float), prototypes.log_area, strict=True):
+            for centre, log_scale in zip(query.profile.log_m, query.profile.log_scale, strict=True):
+                centre, scale = centre[::2], np.exp(log_scale[::2])
+                s = np.hypot(scale, 0.6 * 2 * STEP_M * np.exp(-centre))
+                cost = np.mean(np.log1p(np.square((row - centre) / (CONFIG.tail * s))))
+                terms.append(log_area - WEIGHTS.temperature * cost)
+        found.append(np.logaddexp.reduce(terms))
+    return found
+
+
+@pytest.mark.parametrize("hypotheses", [1, 16])
+def test_masses_are_the_sums_that_they_are_said_to_be(hypotheses: int) -> None:
+    grids = [grid_of(plan) for plan in PLANS]
+    parts = [prototypes_of(grid) for grid in grids]
+    first = np.concatenate([[0], np.cumsum([len(part) for part in parts])[:-1]])
+    query = query_at(PLANS[1], 1e6 + 2.2, 0.9, hypotheses)
+    masses = log_masses(joined(parts), first, query, WEIGHTS, CONFIG)
+    np.testing.assert_allclose(masses, slow_masses(grids, query), atol=0.05)
+    assert masses.argmax() == 1
+
+
+def test_an_unknown_camera_height_is_searched() -> None:
+    grids = [grid_of(plan) for plan in PLANS]
+    parts = [prototypes_of(grid) for grid in grids]
+    first = np.concatenate([[0], np.cumsum([len(part) for part in parts])[:-1]])
+    query = query_at(PLANS[1], 1e6 + 2.2, 0.9)
+    assert query.profile is not None
+    # Read at 1.5 m, taken at 1.95 m: everything looks smaller than it is.
+    smaller = replace(query.profile, log_m=query.profile.log_m - np.log(1.3))
+    unknown = replace(query, profile=smaller, camera_height=CameraHeight(1.5, float("inf")))
+    assert log_masses(joined(parts), first, unknown, WEIGHTS, CONFIG).argmax() == 1
+
+
+def test_the_most_probable_plans_are_searched_as_far_as_they_go() -> None:
+    log_mass, poses = np.array([-3.0, -1.0, -2.0, -9.0]), np.array([10, 500, 20, 30])
+    assert most_probable(log_mass, poses, most_plans=3, most_poses=1000).tolist() == [1, 2, 0]
+    assert most_probable(log_mass, poses, most_plans=2, most_poses=1000).tolist() == [1, 2]
+    assert most_probable(log_mass, poses, most_plans=4, most_poses=525).tolist() == [1, 2]
+    assert most_probable(log_mass, poses, most_plans=4, most_poses=5).tolist() == [1]
+
+
+def test_what_was_left_out_keeps_its_share() -> None:
+    copies = np.full(10, -2.0)
+    assert share_searched(copies, np.arange(10), np.full(10, 0.1)) == 1.0
+    # Of ten copies four were searched: each has a quarter among them, a tenth of all.
+    assert share_searched(copies, np.arange(4), np.full(4, 0.25)) == pytest.approx(0.4)
+    # One stands out in the full search; those left out are taken for wrong ones.
+    sharp = np.array([1.0 - 3e-5, 1e-5, 1e-5, 1e-5])
+    assert share_searched(copies, np.arange(4), sharp) > 0.99
