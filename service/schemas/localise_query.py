@@ -37,7 +37,7 @@ class LocaliseForm(HintFields):
         "where the plan has `north_deg`, else unknown and searched over.",
     )
     heading_tolerance_deg: Annotated[float, Finite] = Field(
-        0,
+        0.0,
         ge=0,
         le=45,
         description="How far off `heading_deg` may be: it is then searched for within that, to the next sector of the "
