@@ -16,7 +16,7 @@ from lalaloc_core.cli import main as lalaloc
 from lalaloc_core.data.annotations import read_annotation
 from lalaloc_core.floorplan import FloorPlan
 from scripts.write_docs import documents
-from service.schemas import GeoPose, LocaliseAnswer
+from service.schemas import GeoPose, ImportReport, LocaliseAnswer
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")] + sorted(ROOT.glob("docs/*.md"))
@@ -89,6 +89,8 @@ def test_every_json_example_is_what_the_code_reads_or_writes(tmp_path: Path) -> 
             Image.new("RGB", (1024, 512)).save(tmp_path / document["photograph"])
             (tmp_path / "example.json").write_text(block, encoding="utf-8")
             assert read_annotation(tmp_path / "example.json").counts
+        elif "import_report" in document:
+            ImportReport.model_validate(document["import_report"])
         elif "angles" in document:
             GeoPose.model_validate(document)
         else:
