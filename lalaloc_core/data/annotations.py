@@ -21,7 +21,8 @@ from PIL import Image, UnidentifiedImageError
 
 from lalaloc_core.conventions import OPENING_CLASSES, TWO_PI, wrap_angle
 from lalaloc_core.data.assembly import inside, is_number, read_json
-from lalaloc_core.data.drawn_rooms import DrawnKind, DrawnOpening, DrawnRoom, plan_of_rooms
+from lalaloc_core.data.drawn_openings import DrawnOpening
+from lalaloc_core.data.drawn_rooms import DrawnRoom, plan_of_rooms
 from lalaloc_core.data.photographs import FilePhotograph
 from lalaloc_core.errors import DatasetError, InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan, room_type_of
@@ -33,7 +34,7 @@ _USUAL_CEILING = 1.2
 Quality = Literal["good", "fair", "poor"]
 # A kind of opening, and the columns of its left and right edge as shares of the picture's width; the left one is the
 # larger where the picture's border lies between.
-ClassSpan = tuple[DrawnKind, float, float]
+ClassSpan = tuple[str, float, float]
 
 _REQUIRED = {"photograph", "quality", "polygon", "ceiling_above_camera", "openings"}
 _OPTIONAL = {"alternative_polygon", "room_type", "notes"}
@@ -202,8 +203,8 @@ class _Reader:
             what = f"opening {number}"
             if not isinstance(one, Mapping) or set(one) != _OPENING_KEYS:
                 raise self.error(f"{what} must be an object with the keys {', '.join(sorted(_OPENING_KEYS))}")
-            if one["kind"] not in get_args(DrawnKind):
-                raise self.error(f"{what}: kind is {one['kind']!r}, it must be one of {', '.join(get_args(DrawnKind))}")
+            if one["kind"] not in OPENING_CLASSES[1:]:
+                raise self.error(f"{what}: kind is {one['kind']!r}, it must be one of {', '.join(OPENING_CLASSES[1:])}")
             left, right = self._columns(one["columns"], what, width)
             line = self._points(one["line"], f"{what}: line", 2, 2)
             self._check_sides(line, (left, right), what, width)
@@ -268,7 +269,7 @@ def _pieces(room: DrawnRoom, seen: DrawnRoom, span: ClassSpan) -> list[DrawnOpen
     for number in np.unique(wall[same]):
         met = place[same & (wall == number)]
         if len(met) >= _MIN_SHARE * _RAYS:
-            pieces.append(DrawnOpening(kind, met[[0, -1]]))
+            pieces.append(DrawnOpening(kind=kind, line_m=met[[0, -1]]))
     return pieces
 
 

@@ -60,8 +60,31 @@ def assemble_plan(
     """
     if not outlines:
         raise DatasetError("there is no room", scene=scene, path=path)
+    rooms, warnings = _room_entries(scene, outlines, path=path, units=units)
+    # Every camera of a data set brings its own height; the plan's is only a default that has to fit in.
+    lowest_ceiling_m = min(room["ceiling_height_m"] for room in rooms)
+    camera_height_m = min(DEFAULT_CAMERA_HEIGHT_M, 0.6 * lowest_ceiling_m)
+    document = {"name": scene, "rooms": rooms, "camera_height_m": camera_height_m}
+    try:
+        plan = FloorPlan.from_dict(document)
+    except InvalidFloorPlanError as error:
+        raise DatasetError(f"{error.reason} ({units})", scene=scene, room=error.room, path=path) from error
+    entries, faults = opening_entries(openings, {room["name"]: room["id"] for room in rooms})
+    try:
+        plan = FloorPlan.from_dict(document | {"openings": entries, "opening_kinds": list(opening_kinds)})
+    except InvalidFloorPlanError as error:
+        # The rooms alone are a plan, as they were before data sets' openings were read.
+        faults.append(f"all openings are left out: {error}")
+    return dataclasses.replace(plan, warnings=(*warnings, *faults, *plan.warnings))
+
+
+def _room_entries(
+    scene: str, outlines: Sequence[Outline], *, path: Path, units: str
+) -> tuple[list[dict[str, Any]], list[str]]:
+    """Entries of a plan's `rooms`, and what was odd about the outlines; see `assemble_plan`."""
     warnings = [warning for outline in outlines for warning in outline.warnings]
-    rooms, areas = [], []
+    rooms: list[dict[str, Any]] = []
+    areas = []
     for outline in outlines:
         polygon_m, share = uncrossed(outline.polygon_m)
         if share < _MIN_SHARE_UNCROSSED:
@@ -98,21 +121,7 @@ def assemble_plan(
             room=outlines[int(np.argmax(areas))].name,
             path=path,
         )
-    # Every camera of a data set brings its own height; the plan's is only a default that has to fit in.
-    lowest_ceiling_m = min(room["ceiling_height_m"] for room in rooms)
-    camera_height_m = min(DEFAULT_CAMERA_HEIGHT_M, 0.6 * lowest_ceiling_m)
-    document = {"name": scene, "rooms": rooms, "camera_height_m": camera_height_m}
-    try:
-        plan = FloorPlan.from_dict(document)
-    except InvalidFloorPlanError as error:
-        raise DatasetError(f"{error.reason} ({units})", scene=scene, room=error.room, path=path) from error
-    entries, faults = opening_entries(openings, {room["name"]: room["id"] for room in rooms})
-    try:
-        plan = FloorPlan.from_dict(document | {"openings": entries, "opening_kinds": list(opening_kinds)})
-    except InvalidFloorPlanError as error:
-        # The rooms alone are a plan, as they were before data sets' openings were read.
-        faults.append(f"all openings are left out: {error}")
-    return dataclasses.replace(plan, warnings=(*warnings, *faults, *plan.warnings))
+    return rooms, warnings
 
 
 def pose_fault(

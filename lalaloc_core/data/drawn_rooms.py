@@ -4,26 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
 
 import numpy as np
 import shapely
 from jaxtyping import Float
 
-from lalaloc_core.conventions import ROOM_TYPES
+from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
+from lalaloc_core.data.drawn_openings import DrawnOpening
 from lalaloc_core.floorplan import FloorPlan
 
-DrawnKind = Literal["door", "window", "passage"]
 # Openings are drawn on their walls, but for rounding.
 _ON_THE_WALL_M = 0.01
-
-
-@dataclass(frozen=True, eq=False)
-class DrawnOpening:
-    """A door, window or passage: its ends (x, y) on the outline, in metres."""
-
-    kind: DrawnKind
-    line_m: Float[np.ndarray, "2 2"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -32,6 +23,7 @@ class DrawnRoom:
 
     Attributes:
         polygon_m: counter-clockwise, not closed.
+        openings: on the outline, without heights.
         room_type: one of `conventions.ROOM_TYPES`.
     """
 
@@ -117,7 +109,7 @@ def plan_of_rooms(name: str, rooms: Sequence[DrawnRoom], camera_height_m: float)
                 for key, room in numbered
                 for opening in room.openings
             ],
-            "opening_kinds": list(get_args(DrawnKind)),
+            "opening_kinds": list(OPENING_CLASSES[1:]),
             "opening_tolerance_m": _ON_THE_WALL_M,
         }
     )

@@ -8,13 +8,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import cast
 
 import numpy as np
 from jaxtyping import Float
 
 from lalaloc_core.conventions import wrap_angle
-from lalaloc_core.data.drawn_rooms import DrawnKind, DrawnOpening, DrawnRoom, plan_of_rooms
+from lalaloc_core.data.drawn_openings import DrawnOpening
+from lalaloc_core.data.drawn_rooms import DrawnRoom, plan_of_rooms
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.synth.plans import generate_home
 
@@ -97,7 +97,7 @@ def _drawn(name: str, plan: FloorPlan, index: int) -> DrawnRoom:
         if face.room == index:
             start, end = room.walls_m[face.wall].reshape(2, 2)
             line_m = start + np.array([[face.start], [face.end]]) * (end - start)
-            openings.append(DrawnOpening(cast(DrawnKind, plan.openings[face.opening].kind), line_m))
+            openings.append(DrawnOpening(kind=plan.openings[face.opening].kind, line_m=line_m))
     return DrawnRoom(
         name=name,
         polygon_m=room.polygon_m,

@@ -97,7 +97,7 @@ def draw_openings(plan: UnfamiliarPlan, rng: np.random.Generator) -> list[Openin
     if fronts:
         front = fronts[rng.integers(len(fronts))]
         at = rng.uniform(0.15, front.length_m - 1.15)
-        openings.append(_opening("front door", front, None, at, at + 0.95, 0.0, 2.1, _OUTER_WALL_M, rooms, taken))
+        openings.append(_opening("front door", front, (at, at + 0.95), (0.0, 2.1), _OUTER_WALL_M, rooms, taken))
     for wall in outer:
         openings += _draw_windows(wall, rooms, plan, taken, rng)
     return openings
@@ -174,7 +174,9 @@ def _draw_door(
     ):
         return None
     swing = float(np.radians(rng.uniform(15, 110)))
-    return _opening(kind, first, second, left, left + width, 0.0, top, depth, plan.plan.rooms, taken, swing)
+    return _opening(
+        kind, first, (left, left + width), (0.0, top), depth, plan.plan.rooms, taken, behind=second, swing=swing
+    )
 
 
 def _draw_windows(
@@ -191,7 +193,7 @@ def _draw_windows(
     width = min(rng.uniform(0.6, 2.0), slot - 0.25)
     lefts = [slot * k + (slot - width) / 2 for k in range(count)]
     return [
-        _opening("window", wall, None, left, left + width, sill, top, _OUTER_WALL_M, rooms, taken)
+        _opening("window", wall, (left, left + width), (sill, top), _OUTER_WALL_M, rooms, taken)
         for left in lefts
         if _is_free(taken, wall, left, left + width)
     ]
@@ -200,16 +202,17 @@ def _draw_windows(
 def _opening(
     kind: OpeningKind,
     wall: Wall,
-    behind: Wall | None,
-    left: float,
-    right: float,
-    sill: float,
-    top: float,
-    depth: float,
+    span_m: tuple[float, float],
+    heights_m: tuple[float, float],
+    depth_m: float,
     rooms: tuple[Room, ...],
     taken: _Taken,
+    *,
+    behind: Wall | None = None,
     swing: float = 0.0,
 ) -> Opening:
+    """An opening from left to right along a wall and from its sill up, whose place on the wall is now taken."""
+    (left, right), (sill, top) = span_m, heights_m
     taken.setdefault((wall.room, wall.edge), []).append((left, right))
     if behind is not None:
         taken.setdefault((behind.room, behind.edge), []).append(_seen_from(behind, wall, left, right))
@@ -222,7 +225,7 @@ def _opening(
         right_m=float(right),
         sill_m=float(sill),
         top_m=float(top),
-        depth_m=float(depth),
+        depth_m=float(depth_m),
         swing=swing,
     )
 

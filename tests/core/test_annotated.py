@@ -16,7 +16,8 @@ from lalaloc_core.cli import main
 from lalaloc_core.conventions import OPENING_CLASSES, TWO_PI, column_azimuths
 from lalaloc_core.data.annotated import GALLERIES, AnnotatedPhotographs, GalleryKey
 from lalaloc_core.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph, read_annotation
-from lalaloc_core.data.drawn_rooms import DrawnOpening, DrawnRoom
+from lalaloc_core.data.drawn_openings import DrawnOpening
+from lalaloc_core.data.drawn_rooms import DrawnRoom
 from lalaloc_core.data.opening import open_dataset
 from lalaloc_core.data.room_gallery import GALLERY_ROOMS, build_gallery
 from lalaloc_core.errors import DatasetError, InvalidInputError
@@ -169,7 +170,7 @@ class TestDrawnRooms:
         name="r",
         polygon_m=np.array([[-1.0, -1.0], [3.0, -1.0], [3.0, 2.0], [-1.0, 2.0]]),
         ceiling_height_m=2.5,
-        openings=(DrawnOpening("door", np.array([[0.0, 2.0], [1.0, 2.0]])),),
+        openings=(DrawnOpening(kind="door", line_m=np.array([[0.0, 2.0], [1.0, 2.0]])),),
     )
 
     @pytest.mark.parametrize("angle", [0.3, -0.5, 0.7])
