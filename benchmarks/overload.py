@@ -1,4 +1,4 @@
-"""Ten times more clients than the service takes: those let in are served as before, the rest is refused at once.
+"""Ten times more clients than the service takes: a few wait, those let in are served as before, the rest is refused.
 
     python -m benchmarks.overload --seconds 30
 
@@ -31,7 +31,8 @@ def main() -> int:
         settings = {"LALALOC_DATA_DIR": data, "LALALOC_LOG_LEVEL": "error"}
         with running_service(0, settings) as service:
             plan_id = upload_example_plan(service.url)
-            capacity = httpx.get(f"{service.url}/limits").json()["max_queries"]
+            limits = httpx.get(f"{service.url}/limits").json()
+            capacity, waiting = limits["max_queries"], limits["max_waiting_queries"]
             ask_for(service.url, plan_id, Load(1, 3.0))
             alone = ask_for(service.url, plan_id, Load(1, options.seconds))
             crowd = ask_for(service.url, plan_id, Load(_TIMES * capacity, options.seconds))
@@ -40,6 +41,7 @@ def main() -> int:
     refused = [reply for reply in crowd if reply.status == httpx.codes.SERVICE_UNAVAILABLE]
     report = {
         "capacity": capacity,
+        "waiting": waiting,
         "clients": _TIMES * capacity,
         "alone": {"per_second": round(per_second(alone), 1), "milliseconds": percentiles_ms(alone)},
         "accepted": {
@@ -53,8 +55,10 @@ def main() -> int:
     }
     p99 = percentiles_ms(alone)["p99"]
     report["accepted_p99_over_alone_p99"] = round(percentiles_ms(accepted)["p99"] / p99, 2)
+    queue_ms = 1e3 * waiting / per_second(accepted)
     aims = {
-        "accepted within 3 times": percentiles_ms(accepted)["p99"] <= _ACCEPTED_P99_RATIO * p99,
+        "accepted within 3 times, and the queue": percentiles_ms(accepted)["p99"]
+        <= _ACCEPTED_P99_RATIO * p99 + queue_ms,
         "refused within 50 ms": bool(refused) and percentiles_ms(refused)["p99"] <= _REFUSED_MS,
         "recovered": all(reply.answered for reply in after)
         and percentiles_ms(after)["p50"] <= _RECOVERED_RATIO * percentiles_ms(alone)["p50"],

@@ -175,8 +175,13 @@ class Settings(BaseSettings):
     max_queries: int = Field(
         default=0,
         ge=0,
-        description="Queries, of these, that are computed or wait for it; more get a 503 before they are uploaded. "
+        description="Queries, of these, that are computed at a time; more wait, see `LALALOC_MAX_WAITING_QUERIES`. "
         "0: enough for a tenant alone to have twice as many as LPO workers and compute threads.",
+    )
+    max_waiting_queries: int = Field(
+        default=16,
+        ge=0,
+        description="Queries that wait for one of those to end; more get a 503 before they are uploaded.",
     )
     max_reads: Count = Field(default=64, description="Requests in work that change nothing; more get a 503 at once.")
     max_streams: Count = Field(default=64, description="Clients that follow events; more get a 503 at once.")

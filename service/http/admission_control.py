@@ -1,20 +1,22 @@
 """How many requests may be in work: slots for each kind of them, and refusal at once when all are in use.
 
 Every request but those to health and metrics holds a slot from its first byte to its last, be its body read, its
-query computed, or its answer sent. No slot is waited for, so nothing behind them has more waiting than slots.
+query computed, or its answer sent. A query that is uploaded waits for a slot of its own, in a short queue; nothing else
+is waited for, so nothing behind the slots has more waiting than slots.
 """
 
 from __future__ import annotations
 
+import asyncio
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass
 from time import monotonic
 
 from service.errors import DeadlineExceededError, OverloadedError, ShareExceededError, StoppingError
 from service.settings import Settings
-from service.sharing import FairTurns, Shares
+from service.sharing import FairQueue, FairTurns, Shares
 from service.telemetry import Telemetry
 
 EXEMPT = frozenset({"/healthz", "/readyz", "/metrics"})
@@ -42,14 +44,26 @@ def is_stream(method: str, path: str) -> bool:
 class Slots:
     """How many requests of one kind may be in work, and of these of one party (`Shares`); for one event loop."""
 
-    def __init__(self, limit: int) -> None:
+    def __init__(self, limit: int, max_waiting: int = 0) -> None:
+        """
+        Args:
+            limit: how many may be in work.
+            max_waiting: how many more may wait for that, in `wait_and_hold`; parties share these places as well.
+        """
         self._shares = Shares(limit)
+        self._places = Shares(max_waiting)
+        self._waiting: FairQueue[asyncio.Future[None]] = FairQueue()
         self._held_s = 0.0
 
     @property
     def in_use(self) -> int:
         """How many are in work."""
         return self._shares.in_use
+
+    @property
+    def waiting(self) -> int:
+        """How many wait for a slot."""
+        return self._places.in_use
 
     @contextmanager
     def hold(self, party: str) -> Iterator[None]:
@@ -58,19 +72,30 @@ class Slots:
         Raises:
             OverloadedError: all are in use, or all that the party may have.
         """
-        self.check(party)
+        if not self._shares.may_take(party):
+            raise self._refusal(party)
         self._shares.take(party)
-        begin = monotonic()
-        try:
+        with self._held(party):
             yield
-        finally:
-            self._shares.give_back(party)
-            self._held_s += _NEWEST * (monotonic() - begin - self._held_s)
+
+    @asynccontextmanager
+    async def wait_and_hold(self, party: str, deadline: float) -> AsyncIterator[None]:
+        """Hold a slot as soon as one is free; parties take turns.
+
+        Args:
+            deadline: until when (`monotonic`) it is worth waiting.
+
+        Raises:
+            OverloadedError: as many wait already as may, or as many of the party, or none was free in time.
+        """
+        await self._take_turn(party, deadline)
+        with self._held(party):
+            yield
 
     @contextmanager
     def released(self, party: str) -> Iterator[None]:
         """Lend the slot that one holds to others while the block only waits."""
-        self._shares.give_back(party)
+        self._give_back(party)
         try:
             yield
         finally:
@@ -79,14 +104,59 @@ class Slots:
 
     def check(self, party: str) -> None:
         """Raises:
-        OverloadedError: all are in use, or all that the party may have; by the time it says, those that hold them will
-            be through.
+        OverloadedError: all are in use, or all that the party may have, and there is no place to wait for one either;
+            by the time it says, those that are before it will be through.
         """
-        if not self._shares.may_take(party):
-            retry_after_s = min(max(math.ceil(self._held_s), 1), _MAX_RETRY_AFTER_S)
-            if self.in_use < self._shares.limit:
-                raise ShareExceededError(self._shares.held_by(party), self._shares.limit, retry_after_s)
-            raise OverloadedError(self._shares.limit, retry_after_s)
+        if not self._shares.may_take(party) and not self._places.may_take(party):
+            raise self._refusal(party)
+
+    @contextmanager
+    def _held(self, party: str) -> Iterator[None]:
+        begin = monotonic()
+        try:
+            yield
+        finally:
+            self._held_s += _NEWEST * (monotonic() - begin - self._held_s)
+            self._give_back(party)
+
+    async def _take_turn(self, party: str, deadline: float) -> None:
+        # Whoever waits is of a party that may take none.
+        if self._shares.may_take(party):
+            self._shares.take(party)
+            return
+        if not self._places.may_take(party):
+            raise self._refusal(party)
+        turn = asyncio.get_running_loop().create_future()
+        self._places.take(party)
+        self._waiting.append(party, turn)
+        try:
+            async with asyncio.timeout(max(deadline - monotonic(), 0.0)):
+                await turn
+        except (TimeoutError, asyncio.CancelledError) as error:
+            self._waiting.drop(lambda other: other is turn)
+            if turn.done() and not turn.cancelled():
+                # It came at the very moment when nobody waited any more.
+                self._give_back(party)
+            if isinstance(error, TimeoutError):
+                raise self._refusal(party) from error
+            raise
+        finally:
+            self._places.give_back(party)
+
+    def _give_back(self, party: str) -> None:
+        self._shares.give_back(party)
+        while (found := self._waiting.take(self._shares.may_take)) is not None:
+            next_party, turn = found
+            if not turn.done():
+                self._shares.take(next_party)
+                turn.set_result(None)
+
+    def _refusal(self, party: str) -> OverloadedError:
+        rounds = 1.0 + self.waiting / max(self._shares.limit, 1)
+        retry_after_s = min(max(math.ceil(rounds * self._held_s), 1), _MAX_RETRY_AFTER_S)
+        if self.in_use < self._shares.limit:
+            return ShareExceededError(self._shares.held_by(party), self._shares.limit, retry_after_s)
+        return OverloadedError(self._shares.limit, retry_after_s)
 
 
 @dataclass(frozen=True)
@@ -95,7 +165,8 @@ class AdmissionLimits:
 
     Attributes:
         requests: uploads and queries, from the first byte of the body on.
-        queries: of these, queries that are uploaded and being computed or waiting for it.
+        queries: of these, queries that are uploaded and being computed or waiting for a thread.
+        waiting_queries: more of these, that wait for one of the former to end.
         reads: requests that change nothing.
         streams: answers that go on for as long as their client listens.
         deadline_s: longest that a request may take, of whatever kind but streams; a last resort.
@@ -103,6 +174,7 @@ class AdmissionLimits:
 
     requests: int
     queries: int
+    waiting_queries: int
     reads: int
     streams: int
     deadline_s: float
@@ -113,6 +185,7 @@ class AdmissionLimits:
         return cls(
             requests=settings.pending_limit,
             queries=settings.query_limit,
+            waiting_queries=settings.max_waiting_queries,
             reads=settings.max_reads,
             streams=settings.max_streams,
             # An upload, its query or its conversion, and a slow reader's time to take the answer.
@@ -128,7 +201,7 @@ class Admission:
     def __init__(self, limits: AdmissionLimits, telemetry: Telemetry) -> None:
         self.limits = limits
         self.requests = Slots(limits.requests)
-        self.queries = Slots(limits.queries)
+        self.queries = Slots(limits.queries, limits.waiting_queries)
         self.reads = Slots(limits.reads)
         self.streams = Slots(limits.streams)
         # Reads compute a few at a time: more threads would only take the interpreter from queries.
@@ -143,6 +216,7 @@ class Admission:
             "Queries computed or waiting for it, besides those that wait for a grid.",
             lambda: self.queries.in_use,
         )
+        telemetry.gauge("lalaloc_queries_waiting", "Queries that wait for others to end.", lambda: self.queries.waiting)
         telemetry.gauge("lalaloc_reads_in_flight", "Requests that change nothing.", lambda: self.reads.in_use)
         telemetry.gauge("lalaloc_streams", "Clients that follow events.", lambda: self.streams.in_use)
 

@@ -116,9 +116,9 @@ class Localiser:
             PlanNotReadyError: the grid was not finished by the deadline.
             DeadlineExceededError: the rest was not.
             StoreUnavailableError: the grid is not in memory, and the database is away or silent.
-            OverloadedError: too many queries are computed or wait for it, or grids to be computed on demand.
+            OverloadedError: too many queries are in work and wait for that, or grids to be computed on demand.
         """
-        with self._queries.hold(party):
+        async with self._queries.wait_and_hold(party, begin + self._settings.request_deadline_s):
             return (await self._answer(record, form, content, begin, clock, party)).answer
 
     async def picture(
@@ -137,7 +137,7 @@ class Localiser:
             DrawingFailedError: the picture could not be made.
             LaLaLocError: see `answer`.
         """
-        with self._queries.hold(party):
+        async with self._queries.wait_and_hold(party, begin + self._settings.request_deadline_s):
             answered = await self._answer(record, form, content, begin, clock, party)
             with clock.stage("draw"):
                 picture = await self._draw(record, answered, content, begin, party, asked)

@@ -1,16 +1,20 @@
-"""Admission: a place or a refusal at once, places that come free again, and nobody working for a client that left."""
+"""Admission: a place, a short wait or a refusal at once, and nobody working for a client that left."""
 
 from __future__ import annotations
 
+import asyncio
 import socket
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from time import monotonic
 
 import httpx
 import pytest
 
+from service.errors import OverloadedError, ShareExceededError
+from service.http.admission_control import Slots
 from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upload, wait_for
 from tests.service.test_localise import HALL
 
@@ -23,7 +27,8 @@ PLACES = 3
 @pytest.fixture(scope="module")
 def small(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
     """An app with few places, one thread that computes, and large grids that take their time."""
-    limits = {"max_pending_requests": PLACES + 1, "max_queries": 1, "max_reads": 2, "compute_threads": 1}
+    limits = {"max_pending_requests": PLACES + 1, "max_queries": 1, "max_waiting_queries": 0, "max_reads": 2}
+    limits["compute_threads"] = 1
     with start_app(tmp_path_factory.mktemp("data"), upload_deadline_s=30.0, **limits) as client:
         yield client
 
@@ -84,6 +89,76 @@ def test_a_query_past_the_limit_is_refused_before_it_is_uploaded(small: httpx.Cl
         assert_problem(answer, 503, "overloaded")
     assert localise(small, plan_id, panorama).status_code == 200
     assert 'lalaloc_rejections_total{reason="overloaded"}' in small.get("/metrics").text
+
+
+def test_photographs_that_one_client_sends_at_once_wait_and_are_all_answered(
+    start_app: StartApp, tmp_path: Path, panorama: bytes
+) -> None:
+    with start_app(tmp_path, max_queries=4) as client, ThreadPoolExecutor(14) as threads:
+        plan_id = upload(client)
+        answers = list(threads.map(lambda _: localise(client, plan_id, panorama, refine="none"), range(14)))
+        assert [answer.status_code for answer in answers] == [200] * 14
+        assert _metric(client, "lalaloc_queries_waiting") == _metric(client, "lalaloc_queries_in_work") == 0
+
+
+def test_those_that_wait_for_a_slot_are_few_and_take_turns() -> None:
+    async def scenario() -> None:
+        slots, order, goes_on = Slots(2, 4), list[str](), asyncio.Event()
+
+        async def query(party: str, wait_s: float = 30.0) -> None:
+            async with slots.wait_and_hold(party, monotonic() + wait_s):
+                order.append(party)
+                await goes_on.wait()
+
+        # One in work and three that wait leave one of each to others.
+        own = [asyncio.create_task(query("a")) for _ in range(6)]
+        await asyncio.sleep(0)
+        assert (slots.in_use, slots.waiting) == (1, 3)
+        others = [asyncio.create_task(query("b")) for _ in range(2)]
+        await asyncio.sleep(0)
+        assert (slots.in_use, slots.waiting) == (2, 4)
+        with pytest.raises(OverloadedError):
+            slots.check("c")
+        with pytest.raises(OverloadedError):
+            await query("c")
+        # A place to wait in comes free when whoever has it leaves, or has waited long enough.
+        others[1].cancel()
+        await asyncio.sleep(0)
+        assert slots.waiting == 3
+        with pytest.raises(OverloadedError):
+            await query("c", wait_s=0.01)
+        assert slots.waiting == 3
+        late = asyncio.create_task(query("c"))
+        await asyncio.sleep(0)
+        goes_on.set()
+        outcomes = await asyncio.gather(*own, late, others[0], return_exceptions=True)
+        assert [type(outcome) for outcome in outcomes].count(ShareExceededError) == 2
+        # Whoever came last waits for one of the other party, not for all.
+        assert sorted(order) == ["a", "a", "a", "a", "b", "c"]
+        assert order.index("c") <= 3
+        assert slots.in_use == slots.waiting == 0
+
+    asyncio.run(scenario())
+
+
+def test_a_slot_that_comes_as_its_query_is_given_up_goes_to_the_next() -> None:
+    async def scenario() -> None:
+        slots = Slots(1, 4)
+
+        async def query() -> None:
+            async with slots.wait_and_hold("a", monotonic() + 30.0):
+                pass
+
+        with slots.hold("a"):
+            late = asyncio.create_task(query())
+            await asyncio.sleep(0)
+        late.cancel()
+        await asyncio.gather(late, return_exceptions=True)
+        assert late.cancelled()
+        await asyncio.wait_for(query(), 1.0)
+        assert slots.in_use == slots.waiting == 0
+
+    asyncio.run(scenario())
 
 
 def test_a_query_that_waits_for_its_grid_holds_up_no_other(small: httpx.Client, panorama: bytes) -> None:
