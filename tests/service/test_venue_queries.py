@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,6 +11,8 @@ from typing import Any
 import httpx
 import pytest
 
+from lalaloc_core.localise.poses import LatentGrid
+from service.grids import builder
 from service.query import venue_plans
 from tests.service.conftest import FLAT, StartApp, assert_problem, upload, wait_for
 from tests.service.test_localise import HALL
@@ -193,12 +196,19 @@ def test_plans_with_lower_ceilings_than_the_camera_are_left_out(
     assert_problem(ask(client, venue_of(client, low), panorama, camera_height_m=2.1), 422, "invalid-pose")
 
 
-def test_plans_that_are_not_ready_are_told(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
-    # Nothing is computed at upload, and the background is busy with the hall for longer than the query lasts.
-    with start_app(tmp_path, request_deadline_s=2.0) as client:
+def test_plans_that_are_not_ready_are_told(
+    start_app: StartApp, tmp_path: Path, panorama: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    go_on, embed = threading.Event(), builder.embed
+
+    def held(*arguments: Any, **options: Any) -> LatentGrid:
+        go_on.wait(60.0)
+        return embed(*arguments, **options)
+
+    monkeypatch.setattr(builder, "embed", held)
+    with start_app(tmp_path, request_deadline_s=5.0) as client:
         wait_for(lambda: client.get("/readyz").status_code == 200)
-        ready = upload(client)
-        hall = upload(client, HALL, wait=False)
+        ready, hall = upload(client), upload(client, HALL, wait=False)
         answer = ask(client, venue_of(client, ready, hall), panorama, refine="none")
         assert answer.status_code == 200, answer.text
         assert answer.json()["floorplan_id"] == ready
@@ -207,7 +217,7 @@ def test_plans_that_are_not_ready_are_told(start_app: StartApp, tmp_path: Path, 
         problem = assert_problem(waiting, 503, "venue-not-ready")
         assert "none of the 1 floor plans" in problem["detail"]
         assert int(waiting.headers["retry-after"]) >= 1
-        wait_for(lambda: client.get(f"/floorplans/{hall}").json()["status"] == "ready", 120.0)
+        go_on.set()
 
 
 def test_a_plan_that_is_deleted_is_not_found_any_more(client: httpx.Client, plan: str, panorama: bytes) -> None:
