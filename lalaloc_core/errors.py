@@ -8,6 +8,7 @@ LaLaLocError
 │   ├── InvalidPanoramaError     a picture that is not a usable 360° panorama
 │   ├── InvalidPoseError         a position, heading or height outside its limits
 │   ├── InvalidHintError         what is said to be known of a place cannot be; names the hint
+│   ├── InvalidMotionError       a motion between two pictures that cannot have been measured
 │   └── DatasetError             a data set's file is missing, damaged or impossible; names scene, room and path
 ├── ConfigError                  unknown key or value of a wrong type in a configuration
 ├── BundleError                  a model bundle is missing, incomplete or was altered
@@ -95,6 +96,10 @@ class InvalidHintError(InvalidInputError):
     def __init__(self, hint: str, reason: str) -> None:
         self.hint, self.reason = hint, reason
         super().__init__(f"{hint}: {reason}")
+
+
+class InvalidMotionError(InvalidInputError):
+    """A motion between two pictures lies outside its limits, or misses a part."""
 
 
 class DatasetError(InvalidInputError):

@@ -116,13 +116,7 @@ def posterior_of(
         log_weight += _width_corrections(log_weight, mode, temperature * np.array([end.total_cost for end in ends]))
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
-    near = np.linalg.norm(position - candidates[0].position_m, axis=1) < RIGHT_WITHIN_M
-    return Posterior(
-        pose=np.bincount(pose, weight, minlength=len(grid.poses)),
-        position=min(float(weight[near].sum()), 1.0),
-        candidate=_shares(position, heading, weight, query, candidates),
-        heading=_heading_share(heading, weight, query, candidates),
-    )
+    return told_of(pose, position, heading, weight, len(grid.poses), query, candidates)
 
 
 def _width_corrections(
@@ -182,6 +176,30 @@ def _modes(
 def _turned_alike(heading: Float[np.ndarray, "m"], query: Query, candidate: Candidate) -> Bool[np.ndarray, "m"]:
     turned = wrap_angle(heading - query.roll[candidate.hypothesis] - candidate.frame_heading)
     return np.abs(turned) <= TURNED_APART
+
+
+def told_of(
+    pose: Int[np.ndarray, "m"],
+    position: Float[np.ndarray, "m 2"],
+    heading: Float[np.ndarray, "m"],
+    weight: Float[np.ndarray, "m"],
+    poses: int,
+    query: Query,
+    candidates: Sequence[Candidate],
+) -> Posterior:
+    """What weights of places, which sum to one, say of candidates.
+
+    Args:
+        pose: (m,) the grid pose of each weight, of so many poses.
+        heading: (m,) of the panorama, radians.
+    """
+    near = np.linalg.norm(position - candidates[0].position_m, axis=1) < RIGHT_WITHIN_M
+    return Posterior(
+        pose=np.bincount(pose, weight, minlength=poses),
+        position=min(float(weight[near].sum()), 1.0),
+        candidate=_shares(position, heading, weight, query, candidates),
+        heading=_heading_share(heading, weight, query, candidates),
+    )
 
 
 def _shares(

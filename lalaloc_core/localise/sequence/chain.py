@@ -1,0 +1,233 @@
+"""Chains of pictures: sums over all paths through their states, and the best paths (Rabiner 1989).
+
+All pictures share one camera height. The chain is walked once for every height that is tried, and the heights share the
+probability in proportion to how likely they make all pictures together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+from scipy.sparse import csr_array
+
+from lalaloc_core.localise.sequence.motion import Link
+
+# Pairs of places times headings that are compared at a time, to bound memory.
+_COMPARED = 4_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class Marginals:
+    """What a chain says.
+
+    Attributes:
+        log_evidence: log of the sum over all paths and heights.
+        state: (n, k) of every picture, the probability of its states; they sum to one.
+        height: (j,) probability of every height.
+    """
+
+    log_evidence: float
+    state: list[Float[np.ndarray, "_ _"]]
+    height: Float[np.ndarray, "j"]
+
+
+def forward_backward(
+    log_likelihood: Sequence[Float[np.ndarray, "j _ _"]], links: Sequence[Link], log_prior: Float[np.ndarray, "j"]
+) -> Marginals:
+    """Sum over all paths.
+
+    Args:
+        log_likelihood: of every picture, by height and state.
+        links: between neighbours.
+        log_prior: of the heights.
+    """
+    peak = [float(one.max()) for one in log_likelihood]
+    likelihood = [np.exp(one - top) for one, top in zip(log_likelihood, peak, strict=True)]
+    forward, log_sum = [], log_prior + sum(peak)
+    message = np.ones((len(log_prior), 1, 1))
+    for index, one in enumerate(likelihood):
+        if index:
+            message = _onwards(links[index - 1], forward[-1])
+        joint, log_scale = _scaled(message * one)
+        log_sum = log_sum + log_scale
+        forward.append(joint)
+    log_evidence = float(np.logaddexp.reduce(log_sum))
+    height = np.exp(log_sum - log_evidence)
+    state = [np.empty(0)] * len(forward)
+    behind = np.ones((len(log_prior), 1, 1))
+    for index in reversed(range(len(forward))):
+        if index + 1 < len(forward):
+            behind = _scaled(_back(links[index], behind * likelihood[index + 1]))[0]
+        both = forward[index] * behind
+        total = both.sum(axis=(1, 2), keepdims=True)
+        state[index] = (both * (height[:, None, None] / np.where(total > 0.0, total, 1.0))).sum(axis=0)
+    return Marginals(log_evidence, state, height)
+
+
+def _scaled(values: Float[np.ndarray, "j n k"]) -> tuple[Float[np.ndarray, "j n k"], Float[np.ndarray, "j"]]:
+    """Values with a sum of one for each height, and the logs of what the sums were."""
+    total = values.sum(axis=(1, 2))
+    safe = np.where(total > 0.0, total, 1.0)
+    with np.errstate(divide="ignore"):
+        return values / safe[:, None, None], np.log(total)
+
+
+def _onwards(link: Link, message: Float[np.ndarray, "j n k"]) -> Float[np.ndarray, "j m l"]:
+    """Sum over the states of the first picture of a link."""
+    heights, (_, k, m, after) = len(message), link.sizes
+    total = message.sum(axis=(1, 2), keepdims=True)
+    if link.places is None:
+        placed = np.broadcast_to(message.sum(axis=1, keepdims=True), (heights, m, k))
+    elif link.is_directed:
+        placed = (link.places @ message.reshape(heights, -1).T).T.reshape(heights, m, k)
+    else:
+        columns = message.transpose(1, 0, 2).reshape(message.shape[1], -1)
+        placed = (link.places @ columns).reshape(m, heights, k).transpose(1, 0, 2)
+    if link.turns is None:
+        turned = np.broadcast_to(placed.sum(axis=2, keepdims=True), (heights, m, after))
+    else:
+        turned = placed @ link.turns
+    return turned + link.floor * total
+
+
+def _back(link: Link, message: Float[np.ndarray, "j m l"]) -> Float[np.ndarray, "j n k"]:
+    """Sum over the states of the second picture of a link."""
+    heights, (n, k, m, _) = len(message), link.sizes
+    total = message.sum(axis=(1, 2), keepdims=True)
+    if link.turns is None:
+        turned = np.broadcast_to(message.sum(axis=2, keepdims=True), (heights, m, k))
+    else:
+        turned = message @ link.turns.T
+    if link.places is None:
+        placed = np.broadcast_to(turned.sum(axis=1, keepdims=True), (heights, n, k))
+    elif link.is_directed:
+        placed = (link.places.T @ turned.reshape(heights, -1).T).T.reshape(heights, n, k)
+    else:
+        columns = turned.transpose(1, 0, 2).reshape(m, -1)
+        placed = (link.places.T @ columns).reshape(n, heights, k).transpose(1, 0, 2)
+    return placed + link.floor * total
+
+
+@dataclass(frozen=True, eq=False)
+class BestPaths:
+    """The best path through every state of every picture.
+
+    Attributes:
+        score: (n, k) of every picture, the log likelihood of the best path through each state.
+        before, after: (n, k) of every picture, the state of the one before and after it on that path, counted in
+            row-major order.
+    """
+
+    score: list[Float[np.ndarray, "_ _"]]
+    before: list[Int[np.ndarray, "_ _"]]
+    after: list[Int[np.ndarray, "_ _"]]
+
+    def through(self, picture: int, state: int) -> list[int]:
+        """The best path through a state of a picture."""
+        path = [state]
+        for index in range(picture, 0, -1):
+            path.insert(0, int(self.before[index].ravel()[path[0]]))
+        for index in range(picture, len(self.score) - 1):
+            path.append(int(self.after[index].ravel()[path[-1]]))
+        return path
+
+
+def best_paths(log_likelihood: Sequence[Float[np.ndarray, "_ _"]], links: Sequence[Link]) -> BestPaths:
+    """Viterbi's algorithm in both directions, at one height."""
+    count = len(log_likelihood)
+    reached, left = list(log_likelihood), [np.zeros_like(one) for one in log_likelihood]
+    nothing = [np.full(one.shape, -1) for one in log_likelihood]
+    before, after = list(nothing), list(nothing)
+    for index in range(1, count):
+        best, before[index] = _best_onwards(links[index - 1], reached[index - 1])
+        reached[index] = best + log_likelihood[index]
+    for index in reversed(range(count - 1)):
+        left[index], after[index] = _best_back(links[index], left[index + 1] + log_likelihood[index + 1])
+    return BestPaths([one + other for one, other in zip(reached, left, strict=True)], before, after)
+
+
+_Best = tuple[Float[np.ndarray, "_ _"], Int[np.ndarray, "_ _"]]
+
+
+def _best_onwards(link: Link, score: Float[np.ndarray, "n k"]) -> _Best:
+    """The best first state for every second one of a link."""
+    _, k, m, after = link.sizes
+    placed, place = _best_place(link, score, m)
+    turned, heading = _best_heading(placed, link.turns, after)
+    state = np.take_along_axis(place, heading, axis=1) * k + heading
+    return _or_floor(link, score, turned, state)
+
+
+def _best_back(link: Link, score: Float[np.ndarray, "m l"]) -> _Best:
+    """The best second state for every first one of a link."""
+    n, k, _, after = link.sizes
+    turned, heading = _best_heading(score, None if link.turns is None else link.turns.T, k)
+    placed, place = _best_place(link, turned, n, backwards=True)
+    state = place * after + np.take_along_axis(heading, place, axis=0)
+    return _or_floor(link, score, placed, state)
+
+
+def _or_floor(
+    link: Link, score: Float[np.ndarray, "n k"], found: Float[np.ndarray, "m l"], state: Int[np.ndarray, "m l"]
+) -> _Best:
+    """What was found, or the best state of all where the link has nothing better than its floor."""
+    if not link.floor:
+        return found, state
+    anywhere = float(score.max()) + np.log(link.floor)
+    wrong = found < anywhere
+    return np.where(wrong, anywhere, found), np.where(wrong, int(score.argmax()), state)
+
+
+def _best_heading(score: Float[np.ndarray, "n k"], turns: Float[np.ndarray, "k l"] | None, headings: int) -> _Best:
+    """The best of the headings before for every one after, place by place."""
+    if turns is None:
+        best = score.argmax(axis=1)[:, None]
+        value = np.take_along_axis(score, best, axis=1)
+        return np.repeat(value, headings, axis=1), np.repeat(best, headings, axis=1)
+    with np.errstate(divide="ignore"):
+        log_turns = np.log(turns).T
+    value, best = np.empty((len(score), headings)), np.empty((len(score), headings), int)
+    step = max(_COMPARED // log_turns.size, 1)
+    for first in range(0, len(score), step):
+        pairs = score[first : first + step, None, :] + log_turns[None]
+        best[first : first + step] = pairs.argmax(axis=2)
+        value[first : first + step] = pairs.max(axis=2)
+    return value, best
+
+
+def _best_place(link: Link, score: Float[np.ndarray, "n k"], places: int, *, backwards: bool = False) -> _Best:
+    """The best of the places before for every one after, heading by heading of the first picture."""
+    headings = score.shape[1]
+    if link.places is None:
+        best = score.argmax(axis=0)[None]
+        value = np.take_along_axis(score, best, axis=0)
+        return np.repeat(value, places, axis=0), np.repeat(best, places, axis=0)
+    pairs = link.places.T.tocsr() if backwards else link.places
+    if link.is_directed:
+        value, best = _best_of_rows(pairs, score.reshape(-1, 1))
+        return value.reshape(places, headings), best.reshape(places, headings) // headings
+    return _best_of_rows(pairs, score)
+
+
+def _best_of_rows(pairs: csr_array, score: Float[np.ndarray, "n k"]) -> _Best:
+    """For every row of a sparse matrix the best of `log value + score` over its entries, and which column has it."""
+    rows, columns = pairs.shape[0], score.shape[1]
+    value, best = np.full((rows, columns), -np.inf), np.zeros((rows, columns), int)
+    filled = np.flatnonzero(np.diff(pairs.indptr))
+    if not len(filled):
+        return value, best
+    row_of = np.repeat(np.arange(len(filled)), np.diff(pairs.indptr)[filled])
+    log_value, begins = np.log(pairs.data), pairs.indptr[filled]
+    step = max(_COMPARED // len(log_value), 1)
+    for first in range(0, columns, step):
+        part = slice(first, first + step)
+        total = log_value[:, None] + score[pairs.indices, part]
+        highest = np.maximum.reduceat(total, begins, axis=0)
+        value[filled, part] = highest
+        # Of equals the last: every entry that is no worse than the row's best names its column.
+        entry, column = np.nonzero(total >= highest[row_of])
+        best[filled[row_of[entry]], first + column] = pairs.indices[entry]
+    return value, best

@@ -1,0 +1,242 @@
+"""All poses of a path optimised together: what the pictures say of the walls, and what was measured of the motions.
+
+Levenberg-Marquardt lowers, for every path of a job,
+
+    sum over pictures ½ sum over azimuths log(1 + r²)  +  ½ scale² (sum of the motions' squared residuals)
+    +  ½ (stiffness δ)²
+
+by all positions, the headings that are not known, and one δ, the log of true over stated camera height. The derivatives
+are in closed form (`render.gradient`), so numpy does it: nothing here needs a network. Poses stay inside their rooms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from lalaloc_core.conventions import wrap_angle
+from lalaloc_core.localise.sequence.motion import Motion
+from lalaloc_core.render.gradient import log_distance_gradient, log_profile_gradient
+
+_MARGIN_M, _MAX_STEP_M, _MAX_TURN = 0.03, 0.5, 0.2
+_ITERATIONS, _FIRST_DAMPING = 25, 1e-2
+# A path is done when no pose moves farther, or the cost falls by less than this share.
+_SHORT_M, _LITTLE = 1e-3, 1e-4
+# Keeps systems with an unknown that nothing is known of from being singular.
+_HELD = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class SequenceJob:
+    """Paths to be optimised: `m` of them, through `t` pictures.
+
+    Attributes:
+        roll: (m, t) what is added to the headings (radians), which are of frames as in `poses.Query`.
+        turnable: (t,) which headings are searched.
+        log_profile, precision: as in `poses.RefinementJob`.
+        motions: between neighbours; `trusted` (m, t - 1) says of which paths they hold.
+        motion_scale: factor that turns their residuals into some that count among azimuth columns.
+        height_offset: (m,) where to begin with δ.
+        height_free: whether δ is solved for.
+    """
+
+    position_m: Float[np.ndarray, "m t 2"]
+    heading: Float[np.ndarray, "m t"]
+    roll: Float[np.ndarray, "m t"]
+    turnable: Bool[np.ndarray, "t"]
+    walls_m: Float[np.ndarray, "m t n 4"]
+    log_profile: Float[np.ndarray, "m t w"]
+    precision: Float[np.ndarray, "m t w"]
+    motions: tuple[Motion, ...]
+    trusted: Bool[np.ndarray, "m s"]
+    motion_scale: float
+    height_offset: Float[np.ndarray, "m"]
+    height_free: bool
+    height_stiffness: float
+    height_bounds: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class SequenceResult:
+    """Where paths ended.
+
+    Attributes:
+        information: of every picture, (m, p, p) by position and, where it was searched, heading: what is known of its
+            pose with all the others integrated out.
+    """
+
+    position_m: Float[np.ndarray, "m t 2"]
+    heading: Float[np.ndarray, "m t"]
+    height_offset: Float[np.ndarray, "m"]
+    information: list[Float[np.ndarray, "m p p"]]
+
+
+def refine_sequence(job: SequenceJob) -> SequenceResult:
+    """Optimise every path of a job, each on its own."""
+    count, pictures = job.heading.shape
+    unknowns = np.zeros((count, 3 * pictures + 1))
+    unknowns[:, -1] = job.height_offset
+    here = _evaluate(job, unknowns)
+    damping, active = np.full(count, _FIRST_DAMPING), np.ones(count, bool)
+    for _ in range(_ITERATIONS):
+        if not active.any():
+            break
+        scaling = damping[:, None] * np.diagonal(here.curvature, axis1=1, axis2=2) + _HELD
+        system = here.curvature + scaling[:, :, None] * np.eye(unknowns.shape[1])
+        step = -np.linalg.solve(system, here.slope[:, :, None])[:, :, 0]
+        step = _possible(job, unknowns, step) * active[:, None]
+        there = _evaluate(job, unknowns + step)
+        better = active & (there.cost < here.cost)
+        longest_m = np.abs(step[:, :-1].reshape(count, pictures, 3)[:, :, :2]).max(axis=(1, 2))
+        done = (longest_m < _SHORT_M) | (better & (here.cost - there.cost < _LITTLE * here.cost))
+        unknowns[better] += step[better]
+        here = here.replaced(there, better)
+        damping = np.clip(damping * np.where(better, 0.2, 6.0), 1e-6, 1e8)
+        active &= ~done
+    by_pose = unknowns[:, :-1].reshape(count, pictures, 3)
+    return SequenceResult(
+        position_m=job.position_m + by_pose[:, :, :2],
+        heading=job.heading + by_pose[:, :, 2],
+        height_offset=unknowns[:, -1],
+        information=_information(job, here.curvature),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Evaluation:
+    """Costs of paths, with their derivatives and curvatures (after Gauss and Newton) by all unknowns."""
+
+    cost: Float[np.ndarray, "m"]
+    slope: Float[np.ndarray, "m u"]
+    curvature: Float[np.ndarray, "m u u"]
+
+    def replaced(self, other: _Evaluation, chosen: Bool[np.ndarray, "m"]) -> _Evaluation:
+        """Those that are chosen taken from another one."""
+        return _Evaluation(
+            np.where(chosen, other.cost, self.cost),
+            np.where(chosen[:, None], other.slope, self.slope),
+            np.where(chosen[:, None, None], other.curvature, self.curvature),
+        )
+
+
+def _evaluate(job: SequenceJob, unknowns: Float[np.ndarray, "m u"]) -> _Evaluation:
+    """Unknowns are x, y and heading of every picture, from where it began, and δ."""
+    count, pictures = job.heading.shape
+    by_pose = unknowns[:, :-1].reshape(count, pictures, 3)
+    position_m, heading = job.position_m + by_pose[:, :, :2], job.heading + by_pose[:, :, 2]
+    curvature = np.zeros((count, unknowns.shape[1], unknowns.shape[1]))
+    slope = np.zeros_like(unknowns)
+    columns = job.log_profile.shape[2]
+    seen = log_profile_gradient(
+        position_m.reshape(-1, 2), heading.reshape(-1), job.walls_m.reshape(count * pictures, -1, 4), columns
+    )
+    residual = (seen.log_m.reshape(count, pictures, columns) - job.log_profile - unknowns[:, -1, None, None]) * (
+        job.precision
+    )
+    jacobian = np.empty((count, pictures, 4, columns))
+    jacobian[:, :, :3] = seen.by_pose.reshape(count, pictures, 3, columns)
+    jacobian[:, :, 2] *= job.turnable[None, :, None]
+    jacobian[:, :, 3] = -float(job.height_free)
+    jacobian *= job.precision[:, :, None]
+    cost = 0.5 * np.log1p(np.square(residual)).sum(axis=(1, 2))
+    weighted = jacobian / (1.0 + np.square(residual))[:, :, None]
+    blocks = weighted @ jacobian.swapaxes(2, 3)
+    pulls = (weighted @ residual[..., None])[..., 0]
+    for t in range(pictures):
+        at = [3 * t, 3 * t + 1, 3 * t + 2, unknowns.shape[1] - 1]
+        curvature[:, np.array(at)[:, None], at] += blocks[:, t]
+        slope[:, at] += pulls[:, t]
+    for s, motion in enumerate(job.motions):
+        at = list(range(3 * s, 3 * s + 6))
+        off, by_both = motion_residuals(motion, position_m[:, s : s + 2], (heading + job.roll)[:, s : s + 2])
+        by_both[:, :, 2] *= job.turnable[s]
+        by_both[:, :, 5] *= job.turnable[s + 1]
+        scale = job.motion_scale * job.trusted[:, s, None]
+        off, by_both = off * scale, by_both * scale[:, :, None]
+        cost += 0.5 * np.square(off).sum(axis=1)
+        curvature[:, np.array(at)[:, None], at] += by_both.swapaxes(1, 2) @ by_both
+        slope[:, at] += (by_both.swapaxes(1, 2) @ off[:, :, None])[:, :, 0]
+    held = job.height_stiffness**2
+    cost += 0.5 * held * np.square(unknowns[:, -1])
+    slope[:, -1] += held * unknowns[:, -1]
+    curvature[:, -1, -1] += held
+    return _Evaluation(cost, slope, curvature)
+
+
+def motion_residuals(
+    motion: Motion, position_m: Float[np.ndarray, "m 2 2"], heading: Float[np.ndarray, "m 2"]
+) -> tuple[Float[np.ndarray, "m r"], Float[np.ndarray, "m r 6"]]:
+    """By how many deviations pairs of poses differ from a motion, and the derivatives by both poses' x, y, heading."""
+    off: list[np.ndarray] = []
+    by_both: list[np.ndarray] = []
+    moved = position_m[:, 1] - position_m[:, 0]
+    if motion.distance_m is not None and motion.direction is None:
+        length = np.maximum(np.hypot(moved[:, 0], moved[:, 1]), 1e-6)
+        off.append((length - motion.distance_m) / motion.distance_std_m)
+        along = moved / length[:, None] / motion.distance_std_m
+        by_both.append(_by_displacement(along, np.zeros(len(along))))
+    elif motion.distance_m is not None and motion.direction is not None:
+        azimuth = heading[:, 0] + motion.direction
+        ahead = np.stack([np.sin(azimuth), np.cos(azimuth)], axis=1)
+        aside = np.stack([np.cos(azimuth), -np.sin(azimuth)], axis=1)
+        along, across = (moved * ahead).sum(axis=1), (moved * aside).sum(axis=1)
+        off.append((along - motion.distance_m) / motion.distance_std_m)
+        by_both.append(_by_displacement(ahead / motion.distance_std_m, across / motion.distance_std_m))
+        off.append(across / motion.across_std_m)
+        by_both.append(_by_displacement(aside / motion.across_std_m, -along / motion.across_std_m))
+    if motion.turn is not None:
+        off.append(wrap_angle(heading[:, 1] - heading[:, 0] - motion.turn) / motion.turn_std)
+        turned = np.zeros((len(moved), 6))
+        turned[:, 2], turned[:, 5] = -1.0 / motion.turn_std, 1.0 / motion.turn_std
+        by_both.append(turned)
+    if not off:
+        return np.zeros((len(moved), 0)), np.zeros((len(moved), 0, 6))
+    return np.stack(off, axis=1), np.stack(by_both, axis=1)
+
+
+def _by_displacement(by_moved: Float[np.ndarray, "m 2"], by_heading: Float[np.ndarray, "m"]) -> np.ndarray:
+    """Derivatives by both poses of what depends on the displacement and the first heading."""
+    zero = np.zeros(len(by_moved))
+    return np.stack([-by_moved[:, 0], -by_moved[:, 1], by_heading, by_moved[:, 0], by_moved[:, 1], zero], axis=1)
+
+
+def _possible(
+    job: SequenceJob, unknowns: Float[np.ndarray, "m u"], step: Float[np.ndarray, "m u"]
+) -> Float[np.ndarray, "m u"]:
+    """The step, shortened where a pose would move too far or come too close to a wall."""
+    count, pictures = job.heading.shape
+    poses = step[:, :-1].reshape(count * pictures, 3).copy()
+    begin = (job.position_m + unknowns[:, :-1].reshape(count, pictures, 3)[:, :, :2]).reshape(-1, 2)
+    length = np.hypot(poses[:, 0], poses[:, 1])
+    azimuth = np.arctan2(poses[:, 0], poses[:, 1])[:, None]
+    free_m = np.exp(log_distance_gradient(begin, azimuth, job.walls_m.reshape(len(begin), -1, 4)).log_m[:, 0])
+    allowed = np.clip(free_m - _MARGIN_M, 0.0, _MAX_STEP_M)
+    poses[:, :2] *= np.minimum(1.0, allowed / np.maximum(length, 1e-9))[:, None]
+    poses[:, 2] = np.clip(poses[:, 2], -_MAX_TURN, _MAX_TURN) * np.tile(job.turnable, count)
+    height, (low, high) = unknowns[:, -1], job.height_bounds
+    raised = np.clip(height + step[:, -1], low, high) - height if job.height_free else np.zeros(count)
+    return np.concatenate([poses.reshape(count, -1), raised[:, None]], axis=1)
+
+
+def _information(job: SequenceJob, curvature: Float[np.ndarray, "m u u"]) -> list[Float[np.ndarray, "m p p"]]:
+    """What is known of each pose, in units of the curvature."""
+    spread = np.linalg.inv(curvature + _HELD * np.eye(curvature.shape[1]))
+    found = []
+    for t, turnable in enumerate(job.turnable):
+        at = slice(3 * t, 3 * t + (3 if turnable else 2))
+        found.append(np.linalg.inv(spread[:, at, at]))
+    return found
+
+
+def motion_costs(
+    motions: Sequence[Motion], position_m: Float[np.ndarray, "m t 2"], heading: Float[np.ndarray, "m t"]
+) -> Float[np.ndarray, "m s"]:
+    """Half the sum of the squared residuals of every motion, for every path; headings are of the panoramas."""
+    costs = [
+        0.5 * np.square(motion_residuals(motion, position_m[:, s : s + 2], heading[:, s : s + 2])[0]).sum(axis=1)
+        for s, motion in enumerate(motions)
+    ]
+    return np.stack(costs, axis=1) if costs else np.zeros((len(position_m), 0))

@@ -1,0 +1,187 @@
+"""What was measured of the motion between two pictures, and how likely it makes pairs of poses.
+
+With the displacement v from the first place to the second, the measured distance d, the turn τ (second heading minus
+first, clockwise) and, where it was measured, the direction φ (of the displacement against the first heading):
+
+    r_turn = (heading' - heading - τ) / σ_τ
+    r_dist = (|v| - d) / σ_d                                      without a direction
+    r_along = (v · u - d) / σ_d,  r_across = (v · u') / (d σ_φ)   with one, u along heading + φ and u' at right angles
+
+and the likelihood is `exp(-½ Σ r²) + FLOOR`, as a measurement may be wrong altogether. Deviations are widened by what
+poses of a grid are off.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
+
+from lalaloc_core.conventions import wrap_angle
+from lalaloc_core.errors import InvalidMotionError
+
+# Likelihood of a measurement that is wrong altogether, in units of that of a perfect one.
+FLOOR = 1e-4
+# Pairs that are off by more deviations than these are no more likely than the floor.
+_FARTHEST = math.sqrt(-2.0 * math.log(FLOOR))
+MAX_DISTANCE_M = 1000.0
+# Deviations must be more than nothing: exact measurements would leave no pair of grid poses.
+LEAST_DISTANCE_STD_M, LEAST_ANGLE_STD = 1e-3, math.radians(0.01)
+# How far grid poses are from where the camera is, along any direction, as a share of the grid's step.
+_OFF_GRID = 0.5
+# Sideways errors of short distances do not vanish with them.
+_LEAST_ACROSS_M = 0.05
+
+
+@dataclass(frozen=True, kw_only=True)
+class Motion:
+    """A measured motion; what is None was not measured. Angles in radians.
+
+    Attributes:
+        distance_m: between the two places, as the crow flies.
+        turn: heading of the second picture minus that of the first, clockwise.
+        direction: azimuth of the displacement minus the heading of the first picture; needs the distance.
+    """
+
+    distance_m: float | None = None
+    distance_std_m: float = 0.1
+    turn: float | None = None
+    turn_std: float = math.radians(5.0)
+    direction: float | None = None
+    direction_std: float = math.radians(5.0)
+
+    def __post_init__(self) -> None:
+        _check("distance_m", self.distance_m, 0.0, MAX_DISTANCE_M)
+        _check("distance_std_m", self.distance_std_m, LEAST_DISTANCE_STD_M, MAX_DISTANCE_M)
+        for name in ("turn", "direction"):
+            _check(name, getattr(self, name), -2.0 * math.tau, 2.0 * math.tau)
+            _check(f"{name}_std", getattr(self, f"{name}_std"), LEAST_ANGLE_STD, math.tau)
+        if self.direction is not None and self.distance_m is None:
+            raise InvalidMotionError("a direction needs the distance, distance_m is missing")
+
+    @property
+    def is_unknown(self) -> bool:
+        """Whether nothing was measured."""
+        return self.distance_m is None and self.turn is None
+
+    @property
+    def across_std_m(self) -> float:
+        """Deviation (m) at right angles to the measured direction."""
+        assert self.distance_m is not None
+        return max(self.distance_m * self.direction_std, _LEAST_ACROSS_M)
+
+
+def _check(name: str, value: float | None, least: float, most: float) -> None:
+    if value is not None and not least <= value <= most:
+        raise InvalidMotionError(f"{name} is {value:g}, it must be between {least:g} and {most:g}")
+
+
+@dataclass(frozen=True, eq=False)
+class States:
+    """The states that a picture may have: every pose under every hypothesis of how it is turned.
+
+    Attributes:
+        heading: (k,) headings (radians) of the panorama.
+        sector: angle (radians) that each of them stands for; 0 where the heading is known.
+    """
+
+    position_m: Float[np.ndarray, "n 2"]
+    heading: Float[np.ndarray, "k"]
+    sector: float
+
+
+@dataclass(frozen=True, eq=False)
+class Link:
+    """How likely a motion makes all pairs of states of two pictures.
+
+    Attributes:
+        places: likelihoods of pairs of places but for the floor, (n', n); where the direction was measured of pairs of
+            states with the first heading, (n' k, n k) in row-major order. None: all alike.
+        turns: (k, k') of pairs of headings; None: all alike.
+        sizes: n, k, n' and k'.
+        floor: what is added to every pair.
+    """
+
+    places: csr_array | None
+    turns: Float[np.ndarray, "k l"] | None
+    sizes: tuple[int, int, int, int]
+    floor: float
+
+    @property
+    def is_directed(self) -> bool:
+        """Whether pairs of places depend on the first heading."""
+        return self.places is not None and self.places.shape[1] != self.sizes[0]
+
+    def likelihood(self, first: int, second: int) -> float:
+        """That of a pair of states, counted in row-major order, without the floor."""
+        _, k, _, after = self.sizes
+        (i, a), (j, b) = divmod(first, k), divmod(second, after)
+        turned = 1.0 if self.turns is None else float(self.turns[a, b])
+        if self.places is None:
+            return turned
+        return turned * float(self.places[j * k + a, first] if self.is_directed else self.places[j, i])
+
+    def among(self, first: np.ndarray, second: np.ndarray) -> Link:
+        """The link between some of the poses alone, by their numbers."""
+        _, k, _, after = self.sizes
+        places = self.places
+        if places is not None:
+            rows, columns = second, first
+            if self.is_directed:
+                rows, columns = (_states(index, k) for index in (second, first))
+            places = places[rows][:, columns]
+        return Link(places, self.turns, (len(first), k, len(second), after), self.floor)
+
+
+def _states(poses: np.ndarray, headings: int) -> np.ndarray:
+    return (poses[:, None] * headings + np.arange(headings)).ravel()
+
+
+def link(motion: Motion, first: States, second: States, step_m: float) -> Link:
+    """What a motion says of two pictures whose poses are of a grid.
+
+    Args:
+        step_m: of the grid.
+    """
+    sizes = len(first.position_m), len(first.heading), len(second.position_m), len(second.heading)
+    turns = None
+    if motion.turn is not None:
+        spread = math.sqrt(motion.turn_std**2 + (first.sector**2 + second.sector**2) / 12.0)
+        off = wrap_angle(second.heading[None, :] - first.heading[:, None] - motion.turn)
+        turns = np.exp(-0.5 * np.square(off / spread))
+    places = None if motion.distance_m is None else _places(motion, first, second, _OFF_GRID * step_m)
+    return Link(places, turns, sizes, 0.0 if motion.is_unknown else FLOOR)
+
+
+def _places(motion: Motion, first: States, second: States, off_m: float) -> csr_array:
+    """Likelihoods of pairs of places, in the shapes of `Link`."""
+    assert motion.distance_m is not None
+    along_std = math.hypot(motion.distance_std_m, off_m)
+    reach_m = motion.distance_m + _FARTHEST * along_std
+    near = cKDTree(second.position_m).query_ball_point(first.position_m, reach_m)
+    count = np.array([len(one) for one in near])
+    source = np.repeat(np.arange(len(near)), count)
+    target = np.concatenate([np.asarray(one, dtype=int) for one in near]) if count.any() else np.empty(0, int)
+    moved = second.position_m[target] - first.position_m[source]
+    headings = len(first.heading)
+    if motion.direction is None:
+        squared = np.square((np.hypot(moved[:, 0], moved[:, 1]) - motion.distance_m) / along_std)
+        kept = squared < _FARTHEST**2
+        entries = (np.exp(-0.5 * squared[kept]), (target[kept], source[kept]))
+        return csr_array(entries, shape=(len(second.position_m), len(first.position_m)))
+    across_std = math.sqrt(motion.across_std_m**2 + off_m**2 + (motion.distance_m * first.sector) ** 2 / 12.0)
+    parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    for k, heading in enumerate(first.heading):
+        ahead = np.array([math.sin(heading + motion.direction), math.cos(heading + motion.direction)])
+        along = (moved @ ahead - motion.distance_m) / along_std
+        across = (moved[:, 0] * ahead[1] - moved[:, 1] * ahead[0]) / across_std
+        squared = np.square(along) + np.square(across)
+        kept = squared < _FARTHEST**2
+        parts.append((np.exp(-0.5 * squared[kept]), target[kept] * headings + k, source[kept] * headings + k))
+    value, row, column = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    shape = (len(second.position_m) * headings, len(first.position_m) * headings)
+    return csr_array((value, (row, column)), shape=shape)

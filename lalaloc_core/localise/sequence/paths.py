@@ -1,0 +1,161 @@
+"""How probable paths are, and with them the places of every picture.
+
+As in `localise.posterior`, the optimiser tells how far down the cost of a path goes. The states around a path are its
+*basin*. A path that was refined has as much probability as its depth says, with all basins as wide as that of the
+deepest is on the grid; all other paths gain what these gain usually.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from lalaloc_core.conventions import wrap_angle
+from lalaloc_core.localise.poses import Candidate, Query
+from lalaloc_core.localise.posterior import TURNED_APART, Posterior, told_of
+from lalaloc_core.localise.sequence.chain import Marginals, forward_backward
+from lalaloc_core.localise.sequence.motion import Link, States
+from lalaloc_core.sampling import PoseSet
+
+# States that are less probable than this are nowhere to be seen.
+_NEGLIGIBLE = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Picture:
+    """One picture as the chain has it.
+
+    Attributes:
+        index: (n,) which poses of the grid are its states, under each of k hypotheses.
+        cost: (j, n, k) by height, state and hypothesis.
+        log_likelihood: (j, n, k) the same as a log likelihood, with the prior of the state.
+        doubted: whether its heading was said, and is not what the picture shows.
+    """
+
+    query: Query
+    index: np.ndarray
+    states: States
+    cost: Float[np.ndarray, "j n k"]
+    log_likelihood: Float[np.ndarray, "j n k"]
+    doubted: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """One path: a state of each picture as the grid has it, and where refinement took it.
+
+    Attributes:
+        depth: its negative log likelihood on the grid.
+        refined_depth: the same of where it ended; None where it was not refined.
+    """
+
+    states: tuple[int, ...]
+    starts: tuple[Candidate, ...]
+    depth: float
+    ends: tuple[Candidate, ...]
+    refined_depth: float | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class PathPosterior:
+    """Probabilities of paths, and of the places of every picture with its candidates."""
+
+    path: Float[np.ndarray, "m"]
+    pictures: list[Posterior]
+
+
+@dataclass(frozen=True, eq=False)
+class _Basin:
+    """The states around a path: their numbers by picture, and what the chain says of them alone."""
+
+    kept: list[np.ndarray]
+    marginals: Marginals
+
+
+def path_posterior(
+    poses: PoseSet,
+    pictures: Sequence[Picture],
+    links: Sequence[Link],
+    log_heights: Float[np.ndarray, "j"],
+    whole: Marginals,
+    paths: Sequence[Path],
+    candidates: Sequence[Sequence[Candidate]],
+    separation_m: float,
+) -> PathPosterior:
+    """The posterior over paths.
+
+    Args:
+        whole: what the chain says of all states.
+        candidates: of each picture, what probabilities are wanted of, the answer first.
+    """
+    basins = [_basin(pictures, links, log_heights, path, separation_m) for path in paths]
+    log_mass = np.array([basin.marginals.log_evidence for basin in basins])
+    on_grid = np.exp(log_mass - whole.log_evidence)
+    left = max(1.0 - float(on_grid.sum()), 0.0)
+    with np.errstate(divide="ignore"):
+        log_rest = whole.log_evidence + np.log(left)
+    if paths[0].refined_depth is not None:
+        depth = np.array([path.refined_depth for path in paths], dtype=float)
+        deepest = int(depth.argmin())
+        gains = np.array([path.depth for path in paths]) - depth
+        log_mass = log_mass[deepest] + paths[deepest].depth - depth
+        log_rest += float(np.median(gains))
+    highest = max(float(log_mass.max()), float(log_rest))
+    mass, rest = np.exp(log_mass - highest), float(np.exp(log_rest - highest))
+    total = float(mass.sum()) + rest
+    mass, rest = mass / total, rest / total
+    found = []
+    for t, picture in enumerate(pictures):
+        weight = whole.state[t].copy()
+        for basin, share in zip(basins, on_grid, strict=True):
+            weight[basin.kept[t]] -= share * basin.marginals.state[t]
+        weight = np.maximum(weight, 0.0)
+        weight *= rest / max(float(weight.sum()), _NEGLIGIBLE)
+        parts = [_weighted(picture, weight, None)]
+        for path, basin, share in zip(paths, basins, mass, strict=True):
+            inside = np.zeros_like(weight)
+            inside[basin.kept[t]] = share * basin.marginals.state[t]
+            parts.append(_weighted(picture, inside, (path.starts[t], path.ends[t])))
+        position, heading, value, pose = (np.concatenate(one) for one in zip(*parts, strict=True))
+        found.append(told_of(pose, position, heading, value, len(poses), picture.query, candidates[t]))
+    return PathPosterior(mass, found)
+
+
+def _weighted(
+    picture: Picture, weight: Float[np.ndarray, "n k"], moved: tuple[Candidate, Candidate] | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Places, headings, weights and grid poses of all states that count, moved from the first pose to the second."""
+    row, hypothesis = np.nonzero(weight > _NEGLIGIBLE)
+    position = picture.states.position_m[row].copy()
+    heading = picture.states.heading[hypothesis].copy()
+    if moved is not None:
+        start, end = moved
+        position += end.position_m - start.position_m
+        heading += end.frame_heading - start.frame_heading
+    return position, heading, weight[row, hypothesis], picture.index[row]
+
+
+def _basin(
+    pictures: Sequence[Picture],
+    links: Sequence[Link],
+    log_heights: Float[np.ndarray, "j"],
+    path: Path,
+    separation_m: float,
+) -> _Basin:
+    """All that lies around a path, and is turned alike."""
+    kept, inside = [], []
+    for picture, start in zip(pictures, path.starts, strict=True):
+        near = np.linalg.norm(picture.states.position_m - start.position_m, axis=1) < separation_m
+        rows = np.flatnonzero(near)
+        heading = picture.query.roll[start.hypothesis] + start.frame_heading
+        turned = np.abs(wrap_angle(picture.states.heading - heading)) > TURNED_APART
+        likelihood = picture.log_likelihood[:, rows].copy()
+        likelihood[:, :, turned] = -np.inf
+        kept.append(rows)
+        inside.append(likelihood)
+    among = [one.among(*pair) for one, pair in zip(links, itertools.pairwise(kept), strict=True)]
+    return _Basin(kept, forward_backward(inside, among, log_heights))

@@ -1,0 +1,379 @@
+"""The path of a query of several pictures: compare each with the grid, link them, optimise the best paths, rank."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from lalaloc_core.bundle import EvidenceModel
+from lalaloc_core.conventions import wrap_angle
+from lalaloc_core.errors import InvalidMotionError
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.camera_height import CameraHeight
+from lalaloc_core.localise.confidence import signals_of
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.evidence import Evidence, latent_distances
+from lalaloc_core.localise.pipeline import Localisation, LocaliseConfig, StageClock
+from lalaloc_core.localise.poses import Candidate, LatentGrid, Query, RefinementResult
+from lalaloc_core.localise.posterior import TURNED_APART, area_shares
+from lalaloc_core.localise.refinement import refined, refinement_job
+from lalaloc_core.localise.retrieval import contradicted, suppress
+from lalaloc_core.localise.sequence.chain import best_paths, forward_backward
+from lalaloc_core.localise.sequence.joint import SequenceJob, SequenceResult, motion_costs
+from lalaloc_core.localise.sequence.motion import FLOOR, Link, Motion, States, link
+from lalaloc_core.localise.sequence.paths import Path, Picture, path_posterior
+from lalaloc_core.sampling import PoseSet
+
+SequenceRefine = Literal["none", "lpo"]
+# Runs joint optimisation; None when it could not answer (in time).
+SequenceRefiner = Callable[[SequenceJob], SequenceResult | None]
+# Places that a picture may have; of more, those that are best by every `_STRIDE`th azimuth.
+_MAX_PLACES, _STRIDE = 2048, 4
+# Paths that are optimised, and how many modes of each picture they are looked for through.
+_PATHS, _MODES = 8, 8
+# Paths that end as near as this, and turned as alike (radians), are one.
+_SAME_M, _SAME_TURN = 0.2, math.radians(5.0)
+# A motion is contradicted by what is less likely than four standard deviations off.
+_CONTRADICTED = 0.5 * 4.0**2
+
+
+@dataclass(frozen=True)
+class SequenceLocalisation:
+    """Where the pictures of a sequence were taken.
+
+    Attributes:
+        pictures: of each picture the candidates, best path first, with the posterior that all pictures together give.
+        path_probability: that of the answers of all pictures being right at once, given that they are of the plan.
+        motions_contradicted: numbers of the motions that the answer differs from by more than they allow for.
+    """
+
+    pictures: list[Localisation]
+    path_probability: float
+    stage: Literal["retrieval", "lpo"]
+    motions_contradicted: tuple[int, ...] = ()
+    timings_ms: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def camera_height_m(self) -> float:
+        """The camera height that fits all pictures best."""
+        return self.pictures[0].camera_height_m
+
+
+SequenceSteps = Generator[SequenceJob, SequenceResult | None, SequenceLocalisation]
+
+
+def localise_sequence(
+    plan: FloorPlan,
+    grid: LatentGrid,
+    encoders: Encoders,
+    queries: Sequence[Query],
+    motions: Sequence[Motion],
+    *,
+    refiner: SequenceRefiner | None = None,
+    top_k: int = 5,
+    config: LocaliseConfig | None = None,
+) -> SequenceLocalisation:
+    """Find the places of several encoded panoramas of one visit in a plan.
+
+    Args:
+        queries: in the order in which they were taken, all with the same statement about the camera's height.
+        motions: between neighbours.
+        refiner: optimises paths; None ends at the grid.
+
+    Raises:
+        InvalidMotionError: there is not one motion less than there are pictures.
+    """
+    refine: SequenceRefine = "none" if refiner is None else "lpo"
+    steps = localise_sequence_steps(plan, grid, encoders, queries, motions, refine=refine, top_k=top_k, config=config)
+    result: SequenceResult | None = None
+    while True:
+        step = next_sequence_step(steps, result)
+        if isinstance(step, SequenceLocalisation):
+            return step
+        assert refiner is not None
+        result = refiner(step)
+
+
+def next_sequence_step(steps: SequenceSteps, result: SequenceResult | None) -> SequenceJob | SequenceLocalisation:
+    """As `pipeline.next_step`."""
+    try:
+        return steps.send(result)
+    except StopIteration as done:
+        return done.value
+
+
+def localise_sequence_steps(
+    plan: FloorPlan,
+    grid: LatentGrid,
+    encoders: Encoders,
+    queries: Sequence[Query],
+    motions: Sequence[Motion],
+    *,
+    refine: SequenceRefine = "lpo",
+    top_k: int = 5,
+    config: LocaliseConfig | None = None,
+    clock: StageClock | None = None,
+) -> SequenceSteps:
+    """`localise_sequence` for who waits for the optimiser elsewhere; models without a profile end at the grid."""
+    if len(motions) != len(queries) - 1:
+        raise InvalidMotionError(f"{len(motions)} motions are given, {len(queries)} pictures have {len(queries) - 1}")
+    config, clock = config or LocaliseConfig(), clock or StageClock()
+    weights, height = encoders.manifest.evidence, queries[0].camera_height
+    with clock.stage("retrieve"):
+        pictures = [_picture(plan, grid, query, weights, config) for query in queries]
+        links = [
+            link(motion, first.states, second.states, grid.step_m)
+            for motion, (first, second) in zip(motions, itertools.pairwise(pictures), strict=True)
+        ]
+        log_heights = -height.penalty(_offsets(pictures[0].query, config))
+        log_heights = log_heights - np.logaddexp.reduce(log_heights)
+        whole = forward_backward([one.log_likelihood for one in pictures], links, log_heights)
+        at = int(whole.height.argmax())
+        paths = _paths(grid, pictures, links, at, float(log_heights[at]), config)
+    stage: Literal["retrieval", "lpo"] = "retrieval"
+    if refine == "lpo" and all(config.evidence.compares_profiles(one.query) for one in pictures):
+        with clock.stage("lpo"):
+            job = _job(plan, grid, pictures, paths, links, motions, weights, config)
+            result = yield job
+            if result is not None:
+                paths = _ended(plan, encoders, pictures, motions, paths, result, config)
+                stage = "lpo"
+    candidates = [_distinct([path.ends[t] for path in paths], config.separation_m, top_k) for t in range(len(pictures))]
+    found = path_posterior(grid.poses, pictures, links, log_heights, whole, paths, candidates, config.separation_m)
+    told = []
+    for picture, answers, posterior in zip(pictures, candidates, found.pictures, strict=True):
+        signals = {stage: signals_of(picture.query, answers[0], posterior)}
+        best = {stage: answers[0]}
+        told.append(Localisation(picture.query, answers, posterior, stage, signals, picture.doubted, best=best))
+    costs = _motion_costs(pictures, motions, [paths[0]])[0]
+    missed = tuple(int(index) for index in np.flatnonzero(costs > _CONTRADICTED))
+    if stage == "retrieval":
+        # The places of a grid are off themselves.
+        pairs = zip(links, itertools.pairwise(paths[0].states), strict=True)
+        missed = tuple(s for s, (one, pair) in enumerate(pairs) if one.floor and one.likelihood(*pair) <= FLOOR)
+    return SequenceLocalisation(told, float(found.path[0]), stage, missed, clock.timings_ms)
+
+
+def _offsets(query: Query, config: LocaliseConfig) -> Float[np.ndarray, "j"]:
+    """The height offsets that are tried; latents are of the stated height alone."""
+    return query.camera_height.offsets if config.evidence.compares_profiles(query) else np.zeros(1)
+
+
+def _picture(
+    plan: FloorPlan, grid: LatentGrid, query: Query, weights: EvidenceModel, config: LocaliseConfig
+) -> Picture:
+    """Compare a picture with the grid at every height."""
+    evidence = config.evidence
+    doubted = contradicted(plan, grid, query, weights, evidence)
+    query = query.searched if doubted and query.searched is not None else query
+    index = np.arange(len(grid.poses))
+    if evidence.compares_profiles(query):
+        layouts, reach_m = grid.layouts(plan), evidence.grid_reach * grid.step_m
+        if len(index) > _MAX_PLACES:
+            coarse, _ = Evidence(plan, query, reach_m, weights, evidence, stride=_STRIDE).costs(layouts)
+            index = np.sort(np.argpartition(coarse.min(axis=0), _MAX_PLACES)[:_MAX_PLACES])
+            layouts = layouts.rows(index)
+        costs = []
+        for offset in query.camera_height.offsets:
+            height_m = query.camera_height.height_m * math.exp(offset)
+            exact = replace(query.scaled(float(offset)), camera_height=CameraHeight(height_m, 0.0))
+            costs.append(Evidence(plan, exact, reach_m, weights, evidence).costs(layouts)[0].T)
+        cost = np.stack(costs).astype(np.float64)
+    else:
+        distance = latent_distances(grid.latents, query.latents)
+        index = np.sort(np.argsort(distance.min(axis=0), kind="stable")[:_MAX_PLACES])
+        cost = distance[:, index].T[None].astype(np.float64)
+    prior = area_shares(grid.poses, np.array([room.area_m2 for room in plan.rooms]))
+    prior = prior - np.logaddexp.reduce(prior) - math.log(len(query.roll))
+    states = States(grid.poses.position_m[index], query.roll + query.frame_heading, query.sector)
+    return Picture(query, index, states, cost, -weights.temperature * cost + prior[index][None, :, None], doubted)
+
+
+def _paths(
+    grid: LatentGrid, pictures: list[Picture], links: list[Link], at: int, log_height: float, config: LocaliseConfig
+) -> list[Path]:
+    """The best paths of which no two are alike, at one of the heights."""
+    found = best_paths([one.log_likelihood[at] for one in pictures], links)
+    through: dict[tuple[int, ...], float] = {}
+    for t, picture in enumerate(pictures):
+        score, headings = found.score[t], len(picture.states.heading)
+        ranked = np.argsort(-score, axis=None)[: 64 * _MODES]
+        row, hypothesis = np.unravel_index(ranked, score.shape)
+        modes = suppress(
+            picture.states.position_m[row],
+            -score[row, hypothesis],
+            separation_m=config.separation_m,
+            limit=_MODES,
+            heading=picture.states.heading[hypothesis],
+        )
+        for mode in modes:
+            state = int(row[mode]) * headings + int(hypothesis[mode])
+            through.setdefault(tuple(found.through(t, state)), float(score.ravel()[state]))
+    kept: list[Path] = []
+    for states in sorted(through, key=lambda one: -through[one]):
+        starts = tuple(_start(grid, picture, state, at) for picture, state in zip(pictures, states, strict=True))
+        alike = (_alike(pictures, starts, path.ends, config.separation_m, TURNED_APART) for path in kept)
+        if not any(alike):
+            kept.append(Path(states, starts, -through[states] - log_height, starts))
+        if len(kept) == _PATHS:
+            break
+    return kept
+
+
+def _start(grid: LatentGrid, picture: Picture, state: int, at: int) -> Candidate:
+    """A state of a picture as a candidate."""
+    row, hypothesis = divmod(state, len(picture.states.heading))
+    pose, query = int(picture.index[row]), picture.query
+    offsets = query.camera_height.offsets
+    distance = latent_distances(grid.latents[pose][None], query.latents[hypothesis][None])
+    return Candidate(
+        x_m=float(grid.poses.position_m[pose, 0]),
+        y_m=float(grid.poses.position_m[pose, 1]),
+        room_index=int(grid.poses.room_index[pose]),
+        frame_heading=query.frame_heading,
+        hypothesis=hypothesis,
+        cost=float(picture.cost[at, row, hypothesis]),
+        latent_distance=float(distance[0, 0]),
+        height_offset=float(offsets[at]) if picture.cost.shape[0] == len(offsets) else 0.0,
+    )
+
+
+def _alike(
+    pictures: Sequence[Picture],
+    one: Sequence[Candidate],
+    other: Sequence[Candidate],
+    within_m: float,
+    within_angle: float,
+) -> bool:
+    """Whether two paths are at the same places, turned alike, in every picture."""
+    for picture, first, second in zip(pictures, one, other, strict=True):
+        if np.linalg.norm(first.position_m - second.position_m) >= within_m:
+            return False
+        if abs(wrap_angle(_heading(picture, first) - _heading(picture, second))) > within_angle:
+            return False
+    return True
+
+
+def _heading(picture: Picture, candidate: Candidate) -> float:
+    return float(picture.query.roll[candidate.hypothesis] + candidate.frame_heading)
+
+
+def _job(
+    plan: FloorPlan,
+    grid: LatentGrid,
+    pictures: list[Picture],
+    paths: list[Path],
+    links: list[Link],
+    motions: Sequence[Motion],
+    weights: EvidenceModel,
+    config: LocaliseConfig,
+) -> SequenceJob:
+    """What the optimiser needs: of every picture as if it were alone, and the motions that a path goes by."""
+    parts = [
+        refinement_job(
+            plan, one.query, [path.starts[t] for path in paths], grid.camera_height_m, weights, config.evidence
+        )
+        for t, one in enumerate(pictures)
+    ]
+    rolls = [one.query.roll[[path.starts[t].hypothesis for path in paths]] for t, one in enumerate(pictures)]
+    trusted = [
+        [
+            not one.floor or one.likelihood(*pair) > FLOOR
+            for one, pair in zip(links, itertools.pairwise(path.states), strict=True)
+        ]
+        for path in paths
+    ]
+    log_profile = np.stack([part.log_profile for part in parts if part.log_profile is not None], axis=1)
+    height = pictures[0].query.camera_height
+    return SequenceJob(
+        position_m=np.stack([part.position_m for part in parts], axis=1),
+        heading=np.stack([part.heading for part in parts], axis=1),
+        roll=np.stack(rolls, axis=1),
+        turnable=np.array([part.optimise_heading for part in parts]),
+        walls_m=np.stack([part.walls_m for part in parts], axis=1),
+        log_profile=log_profile.astype(np.float64),
+        precision=np.stack([part.precision for part in parts if part.precision is not None], axis=1),
+        motions=tuple(motions),
+        trusted=np.array(trusted, dtype=bool).reshape(len(paths), len(motions)),
+        motion_scale=math.sqrt(0.5 * log_profile.shape[2] / weights.temperature),
+        height_offset=np.array([path.starts[0].height_offset for path in paths]),
+        height_free=not height.is_exact,
+        height_stiffness=parts[0].height_stiffness,
+        height_bounds=parts[0].height_bounds,
+    )
+
+
+def _ended(
+    plan: FloorPlan,
+    encoders: Encoders,
+    pictures: list[Picture],
+    motions: Sequence[Motion],
+    paths: list[Path],
+    result: SequenceResult,
+    config: LocaliseConfig,
+) -> list[Path]:
+    """The paths where the optimiser took them, best first, of those that met only the best."""
+    temperature = encoders.manifest.evidence.temperature
+    ends: list[list[Candidate]] = []
+    for t, picture in enumerate(pictures):
+        starts = [path.starts[t] for path in paths]
+        poses = PoseSet(result.position_m[:, t], np.array([start.room_index for start in starts]))
+        height_m = picture.query.camera_height.height_m
+        latents, _ = encoders.poses(plan, poses, result.heading[:, t], height_m)
+        targets = picture.query.latents[[start.hypothesis for start in starts]]
+        distance = np.linalg.norm(latents - targets, axis=1)
+        alone = RefinementResult(
+            position_m=result.position_m[:, t],
+            heading=result.heading[:, t],
+            cost=distance,
+            latent_distance=distance,
+            information=result.information[t],
+            converged=np.ones(len(paths), bool),
+            evaluations=np.zeros(len(paths), int),
+            height_offset=result.height_offset,
+        )
+        ends.append(refined(plan, encoders, picture.query, starts, alone, config.evidence))
+    moved = [replace(path, ends=tuple(one[m] for one in ends)) for m, path in enumerate(paths)]
+    log_motions = np.log(np.exp(-_motion_costs(pictures, motions, moved)) + FLOOR)
+    found = []
+    for path, log_motion in zip(moved, log_motions, strict=True):
+        # Every picture counts the prior of the one height that they share.
+        height = path.ends[0].terms["height"]
+        depth = temperature * sum(end.cost for end in path.ends) - (len(path.ends) - 1) * height - log_motion.sum()
+        priors = sum(
+            _log_prior(picture, state, temperature) for picture, state in zip(pictures, path.states, strict=True)
+        )
+        found.append(replace(path, refined_depth=float(depth - priors)))
+    kept: list[Path] = []
+    for path in sorted(found, key=lambda one: one.refined_depth or 0.0):
+        if not any(_alike(pictures, path.ends, other.ends, _SAME_M, _SAME_TURN) for other in kept):
+            kept.append(path)
+    return kept
+
+
+def _log_prior(picture: Picture, state: int, temperature: float) -> float:
+    """That of a state."""
+    row, hypothesis = divmod(state, len(picture.states.heading))
+    return float((picture.log_likelihood + temperature * picture.cost)[0, row, hypothesis])
+
+
+def _motion_costs(
+    pictures: Sequence[Picture], motions: Sequence[Motion], paths: Sequence[Path]
+) -> Float[np.ndarray, "m s"]:
+    """Half the squared residuals of every motion along some paths."""
+    position_m = np.array([[end.position_m for end in path.ends] for path in paths])
+    headings = [[_heading(picture, end) for picture, end in zip(pictures, path.ends, strict=True)] for path in paths]
+    return motion_costs(motions, position_m, np.array(headings))
+
+
+def _distinct(candidates: list[Candidate], separation_m: float, top_k: int) -> list[Candidate]:
+    """The first candidates of which no two are at one place."""
+    positions = np.stack([candidate.position_m for candidate in candidates])
+    kept = suppress(positions, np.arange(len(candidates), dtype=float), separation_m=separation_m, limit=top_k)
+    return [candidates[index] for index in kept]
