@@ -21,12 +21,22 @@ from lalaloc_client.model import (
     Localisation,
     PlanEvent,
     Readiness,
+    SequenceLocalisation,
     Venue,
     VenueAnchor,
     VenuePlan,
 )
 from lalaloc_client.operations import Patience, Reply, Steps, Wait
-from lalaloc_client.requests import Covariance, Document, Picture, PictureFormat, QueryOptions, Refine, Request
+from lalaloc_client.requests import (
+    Covariance,
+    Document,
+    Picture,
+    PictureFormat,
+    QueryOptions,
+    Refine,
+    Request,
+    SequenceRefine,
+)
 from lalaloc_client.retry import RetryPolicy
 from lalaloc_client.venue_requests import Unchanged
 
@@ -305,6 +315,34 @@ class AsyncClient:
             strict=strict,
         )
         return await self._run(operations.localisation(request, self._patience))
+
+    async def localise_sequence(
+        self,
+        floorplan_id: str,
+        panoramas: Sequence[bytes | str | os.PathLike[str] | Image],
+        *,
+        motions: Sequence[Mapping[str, float] | None] | None = None,
+        headings_deg: Sequence[float | None] | None = None,
+        heading_tolerance_deg: float | None = None,
+        camera_height_m: float | None = None,
+        camera_height_std_m: float | None = None,
+        refine: SequenceRefine | None = None,
+        top_k: int | None = None,
+    ) -> SequenceLocalisation:
+        """See `Client.localise_sequence`."""
+        request = await asyncio.to_thread(
+            requests.sequence_request,
+            floorplan_id,
+            panoramas,
+            motions=motions,
+            headings_deg=headings_deg,
+            heading_tolerance_deg=heading_tolerance_deg,
+            camera_height_m=camera_height_m,
+            camera_height_std_m=camera_height_std_m,
+            refine=refine,
+            top_k=top_k,
+        )
+        return await self._run(operations.sequence(request, self._patience))
 
     async def limits(self) -> Mapping[str, Any]:
         """See `Client.limits`."""

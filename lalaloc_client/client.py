@@ -21,12 +21,22 @@ from lalaloc_client.model import (
     Localisation,
     PlanEvent,
     Readiness,
+    SequenceLocalisation,
     Venue,
     VenueAnchor,
     VenuePlan,
 )
 from lalaloc_client.operations import Patience, Reply, Steps, Wait
-from lalaloc_client.requests import Covariance, Document, Picture, PictureFormat, QueryOptions, Refine, Request
+from lalaloc_client.requests import (
+    Covariance,
+    Document,
+    Picture,
+    PictureFormat,
+    QueryOptions,
+    Refine,
+    Request,
+    SequenceRefine,
+)
 from lalaloc_client.retry import RetryPolicy
 from lalaloc_client.venue_requests import Unchanged
 
@@ -366,6 +376,44 @@ class Client:
             strict=strict,
         )
         return self._run(operations.localisation(request, self._patience))
+
+    def localise_sequence(
+        self,
+        floorplan_id: str,
+        panoramas: Sequence[bytes | str | os.PathLike[str] | Image],
+        *,
+        motions: Sequence[Mapping[str, float] | None] | None = None,
+        headings_deg: Sequence[float | None] | None = None,
+        heading_tolerance_deg: float | None = None,
+        camera_height_m: float | None = None,
+        camera_height_std_m: float | None = None,
+        refine: SequenceRefine | None = None,
+        top_k: int | None = None,
+    ) -> SequenceLocalisation:
+        """Where in a plan several panoramas of one visit were taken, answered jointly.
+
+        Args:
+            panoramas: in the order in which they were taken, each as for `localise`.
+            motions: between neighbours, what was measured of {"distance_m": 2.4, "distance_std_m": 0.1, "turn_deg": 35,
+                "turn_std_deg": 2, "direction_deg": 10, "direction_std_deg": 2}: the turn of the heading, clockwise, and
+                the way's direction against the first heading. None where nothing was measured.
+            headings_deg: of each panorama, None where it is unknown.
+            heading_tolerance_deg: how far off those may be; None: not at all.
+            camera_height_m, camera_height_std_m, top_k: as for `localise`; all panoramas share one height.
+            refine: `none` or `lpo`, how far to go; None: as far as possible.
+        """
+        request = requests.sequence_request(
+            floorplan_id,
+            panoramas,
+            motions=motions,
+            headings_deg=headings_deg,
+            heading_tolerance_deg=heading_tolerance_deg,
+            camera_height_m=camera_height_m,
+            camera_height_std_m=camera_height_std_m,
+            refine=refine,
+            top_k=top_k,
+        )
+        return self._run(operations.sequence(request, self._patience))
 
     def limits(self) -> Mapping[str, Any]:
         """What the service allows, by name."""

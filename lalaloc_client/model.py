@@ -332,6 +332,48 @@ class Localisation:
 
 
 @dataclass(frozen=True)
+class SequencePose:
+    """Where one panorama of a sequence was taken, by all of them together; attributes as of `Localisation`."""
+
+    position: Position
+    heading_deg: float
+    heading_source: str
+    room: str
+    room_id: str
+    confidence: float | None
+    heading_confidence: float | None
+    warnings: tuple[str, ...]
+    covariance_m2: tuple[tuple[float, float], tuple[float, float]] | None
+    heading_std_deg: float | None
+    cost: float
+    latent_distance: float
+    candidates: tuple[Candidate, ...]
+
+
+@dataclass(frozen=True)
+class SequenceLocalisation:
+    """Where the panoramas of one visit were taken.
+
+    Attributes:
+        poses: one for each panorama.
+        confidence: probability that all positions are right within 1 m.
+        warnings: motions that were said and not followed.
+        stage: `retrieval` or `lpo`.
+        camera_height_m: the camera height that fits all panoramas best.
+    """
+
+    floorplan_id: str
+    floorplan_revision: str
+    poses: tuple[SequencePose, ...]
+    confidence: float | None
+    warnings: tuple[str, ...]
+    stage: str
+    camera_height_m: float
+    timings_ms: Mapping[str, float]
+    model: Model
+
+
+@dataclass(frozen=True)
 class Pool:
     """The service's LPO workers: wanted, warm now, and whether each has been warm once."""
 

@@ -29,6 +29,7 @@ from lalaloc_client.model import (
     Localisation,
     PlanEvent,
     Readiness,
+    SequenceLocalisation,
     Venue,
     VenuePage,
     VenuePlanPage,
@@ -148,6 +149,11 @@ def venue_plan_page(request: Request, patience: Patience) -> Steps[VenuePlanPage
 def localisation(request: Request, patience: Patience) -> Steps[Localisation]:
     """Send a query."""
     return parse(Localisation, _json((yield from send(request, patience)).response))
+
+
+def sequence(request: Request, patience: Patience) -> Steps[SequenceLocalisation]:
+    """Send a query of several panoramas."""
+    return parse(SequenceLocalisation, _json((yield from send(request, patience)).response))
 
 
 def content(request: Request, patience: Patience) -> Steps[bytes]:

@@ -25,6 +25,7 @@ Document = Mapping[str, Any] | bytes | str | os.PathLike[str]
 Refine = Literal["none", "vdr", "lpo"]
 Picture = Literal["both", "plan", "photograph"]
 PictureFormat = Literal["png", "svg"]
+SequenceRefine = Literal["none", "lpo"]
 Covariance = tuple[tuple[float, float], tuple[float, float]]
 
 _JSON, _FILE = "application/json", "application/octet-stream"
@@ -186,9 +187,47 @@ def localise_request(
         "rooms": None if rooms is None else json.dumps([rooms] if isinstance(rooms, str) else list(rooms)),
     }
     _check_finite({**given, **{f"near['{name}']": value for name, value in (near or {}).items()}})
+    return _query("/localise", given, [panorama])
+
+
+def sequence_request(
+    floorplan_id: str,
+    panoramas: Sequence[bytes | str | os.PathLike[str] | Image],
+    *,
+    motions: Sequence[Mapping[str, float] | None] | None,
+    headings_deg: Sequence[float | None] | None,
+    heading_tolerance_deg: float | None,
+    camera_height_m: float | None,
+    camera_height_std_m: float | None,
+    refine: SequenceRefine | None,
+    top_k: int | None,
+) -> Request:
+    """A query of several panoramas."""
+    given = {
+        "floorplan_id": floorplan_id,
+        "heading_tolerance_deg": heading_tolerance_deg,
+        "camera_height_m": camera_height_m,
+        "camera_height_std_m": camera_height_std_m,
+        "refine": refine,
+        "top_k": top_k,
+    }
+    _check_finite(given)
+    told = {
+        "motions": None if motions is None else [None if one is None else dict(one) for one in motions],
+        "headings_deg": None if headings_deg is None else list(headings_deg),
+    }
+    # What is not finite is a ValueError of `json`.
+    known = {name: None if one is None else json.dumps(one, allow_nan=False) for name, one in told.items()}
+    return _query("/localise/sequence", given | known, panoramas)
+
+
+def _query(
+    path: str, given: Mapping[str, object], panoramas: Sequence[bytes | str | os.PathLike[str] | Image]
+) -> Request:
+    """A form with pictures."""
     fields = {name: str(value) for name, value in given.items() if value is not None}
-    media, content = _form("panorama", _picture(panorama), fields)
-    return Request("POST", "/localise", headers={"Content-Type": media}, content=content)
+    media, content = _form("panorama", [_picture(panorama) for panorama in panoramas], fields)
+    return Request("POST", path, headers={"Content-Type": media}, content=content)
 
 
 def picture_request(query: Request, picture: Picture, picture_format: PictureFormat) -> Request:
@@ -241,19 +280,19 @@ def _plan_body(document: Document, options: Mapping[str, object] | None) -> tupl
     if not options:
         return _JSON if isinstance(document, Mapping) else _FILE, content
     _check_finite(options)
-    return _form("file", content, {name: str(value) for name, value in options.items() if value is not None})
+    return _form("file", [content], {name: str(value) for name, value in options.items() if value is not None})
 
 
-def _form(name: str, content: bytes, fields: Mapping[str, str]) -> tuple[str, bytes]:
-    """Media type and content of a form with one file."""
+def _form(name: str, contents: Sequence[bytes], fields: Mapping[str, str]) -> tuple[str, bytes]:
+    """Media type and content of a form with files, all of one name."""
     # Made of the content, so that the same request is the same bytes.
-    boundary = hashlib.sha256(content).hexdigest()
+    boundary = hashlib.sha256(b"".join(contents)).hexdigest()
     encoded = httpx.Request(
         "POST",
         "http://service/",
         headers={"Content-Type": f"multipart/form-data; boundary={boundary}"},
         data=dict(fields),
-        files={name: (name, content, _FILE)},
+        files=[(name, (name, content, _FILE)) for content in contents],
     )
     return encoded.headers["content-type"], encoded.read()
 

@@ -277,6 +277,12 @@ class Settings(BaseSettings):
     max_venue_plans: Count = Field(default=10_000, description="Floor plans of a venue.")
     max_venue_bytes: Count = Field(default=4 * 2**20, description="Description of a venue: its list of plans, mostly.")
     max_panorama_bytes: Count = Field(default=40 * 2**20, description="Upload of a panorama.")
+    max_sequence_panoramas: Annotated[int, Field(ge=2, le=20)] = Field(
+        default=10, description="Panoramas of one query of several."
+    )
+    max_sequence_bytes: Count = Field(
+        default=100 * 2**20, description="Upload of all panoramas of one query of several."
+    )
     max_pixels: Count = Field(default=100_000_000, description="Pixels of a panorama.")
     max_scans: Count = Field(
         default=20, description="Scans of a panorama that is a progressive JPEG; encoders write 3 to 12."

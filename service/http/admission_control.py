@@ -23,7 +23,7 @@ EXEMPT = frozenset({"/healthz", "/readyz", "/metrics"})
 # What every other request may be refused with, or end with.
 REFUSALS = (OverloadedError, StoppingError, DeadlineExceededError)
 _READING = frozenset({"GET", "HEAD", "OPTIONS"})
-_QUERIES = "/localise"
+_QUERIES = frozenset({"/localise", "/localise/sequence"})
 _STREAMS = "/events"
 _READS_AT_A_TIME = 4
 # How much the last request counts in the mean that Retry-After is told by.
@@ -249,7 +249,7 @@ class Admission:
             slots = self.reads
         else:
             slots = self.requests
-            if path == _QUERIES:
+            if path in _QUERIES:
                 # A body that nobody could do anything with is not worth reading.
                 self.queries.check(party)
         with slots.hold(party):

@@ -9,11 +9,21 @@ from fastapi.openapi.utils import get_openapi
 
 from service.http import admission_control as admission
 from service.http.problems import add_problems
-from service.schemas import FloorPlanDocument, PlanEvent, Problem, VenueChangeDocument, VenueDocument
+from service.schemas import (
+    FloorPlanDocument,
+    PlanEvent,
+    PlanPoint,
+    Problem,
+    StatedMotion,
+    VenueChangeDocument,
+    VenueDocument,
+)
 from service.security import access_control
 from service.security.permissions import NEEDED
 
 _KEY = "api_key"
+# Models that only hand-written parts of the description refer to.
+_BY_HAND = (FloorPlanDocument, PlanEvent, PlanPoint, Problem, StatedMotion, VenueDocument, VenueChangeDocument)
 
 
 def describe_api(app: FastAPI) -> dict[str, Any]:
@@ -21,8 +31,7 @@ def describe_api(app: FastAPI) -> dict[str, Any]:
     if app.openapi_schema is None:
         document = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
         schemas = document["components"]["schemas"]
-        # Those that only hand-written parts of the description refer to.
-        for model in (FloorPlanDocument, PlanEvent, Problem, VenueDocument, VenueChangeDocument):
+        for model in _BY_HAND:
             schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
             schemas |= schema.pop("$defs", {})
             schemas[model.__name__] = schema

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+from collections import Counter
 from collections.abc import AsyncGenerator, Callable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from time import monotonic
+from types import MappingProxyType
 from typing import Literal, Self, TypeVar
 
 from fastapi import Request
@@ -36,6 +38,8 @@ _MAX_PARTS = 20
 _MAX_FIELD_BYTES = 4096
 _UTF_8 = b"utf-8"
 
+# Settings of what an upload may have.
+Settable = Literal["max_plan_bytes", "max_panorama_bytes", "max_sequence_bytes", "max_venue_bytes"]
 Model = TypeVar("Model", bound=BaseModel)
 
 
@@ -58,7 +62,7 @@ class UploadLimits:
     bytes_per_s: float
 
     @classmethod
-    def of(cls, settings: Settings, name: Literal["max_plan_bytes", "max_panorama_bytes", "max_venue_bytes"]) -> Self:
+    def of(cls, settings: Settings, name: Settable) -> Self:
         """As set for one kind of upload."""
         return cls(
             max_bytes=getattr(settings, name),
@@ -71,10 +75,15 @@ class UploadLimits:
 
 @dataclass(frozen=True)
 class Parts:
-    """A multipart body: plain fields, and the bytes of files."""
+    """A multipart body: plain fields, and the bytes of files; those that may be repeated as `name[0]`, `name[1]`..."""
 
     fields: dict[str, str]
     files: dict[str, bytes]
+
+    def repeated(self, name: str) -> list[bytes]:
+        """The files of one name, in order."""
+        count = sum(key.startswith(f"{name}[") for key in self.files)
+        return [self.files[f"{name}[{index}]"] for index in range(count)]
 
 
 Check = Callable[[Mapping[str, str]], list[tuple[str, str]]]
@@ -112,12 +121,19 @@ async def read_body(request: Request, limits: UploadLimits) -> bytes:
 
 
 async def read_parts(
-    request: Request, limits: UploadLimits, *, files: set[str], fields: set[str], check: Check = _no_fields
+    request: Request,
+    limits: UploadLimits,
+    *,
+    files: set[str],
+    fields: set[str],
+    check: Check = _no_fields,
+    repeated: Mapping[str, tuple[int, int]] = MappingProxyType({}),
 ) -> Parts:
     """A multipart body that must have every one of `files`, and no parts other than `files` and `fields`.
 
     Args:
         check: gives what is wrong with the values of fields, which is then told with the rest.
+        repeated: the files that may be given several times, and how often at least and at most.
 
     Raises:
         UploadTooLargeError, UploadTimeoutError: see the limits.
@@ -147,7 +163,7 @@ async def read_parts(
     except FormParserError as error:
         raise MalformedRequestError(f"not valid {MULTIPART}: {error}") from error
     try:
-        return await _sort(form.multi_items(), limits, files, fields, check)
+        return await _sort(form.multi_items(), limits, files, fields, check, repeated)
     finally:
         await form.close()
 
@@ -179,18 +195,28 @@ def faults_of(
 
 
 async def _sort(
-    items: list[tuple[str, UploadFile | str]], limits: UploadLimits, files: set[str], fields: set[str], check: Check
+    items: list[tuple[str, UploadFile | str]],
+    limits: UploadLimits,
+    files: set[str],
+    fields: set[str],
+    check: Check,
+    repeated: Mapping[str, tuple[int, int]],
 ) -> Parts:
     faults: list[tuple[str, str]] = []
     found = Parts({}, {})
-    for name, value in items:
-        shown = name[:50]
-        if name not in files | fields:
+    files, counts = files | repeated.keys(), Counter[str]()
+    for part, value in items:
+        shown, name = part[:50], part
+        if part not in files | fields:
             known = ", ".join(sorted(files | fields))
             faults.append((shown, f"unknown part, known are {known}"))
-        elif name in found.fields or name in found.files:
+            continue
+        if part in repeated:
+            name = f"{part}[{counts[part]}]"
+            counts[part] += 1
+        if name in found.fields or name in found.files:
             faults.append((shown, "given more than once"))
-        elif name in fields:
+        elif part in fields:
             if isinstance(value, UploadFile):
                 faults.append((shown, "must be a plain field, not a file"))
             else:
@@ -204,6 +230,9 @@ async def _sort(
             faults.append((shown, "must be a file (a part with a file name)"))
     given = {name for name, _ in items}
     faults.extend((name, "is missing") for name in sorted(files - given))
+    for name, (low, high) in repeated.items():
+        if name in given and not low <= counts[name] <= high:
+            faults.append((name, f"is given {counts[name]} times, {low} to {high} are needed"))
     faults.extend(check(found.fields))
     if faults:
         raise InvalidRequestError(faults)

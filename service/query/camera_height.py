@@ -5,11 +5,11 @@ from __future__ import annotations
 from lalaloc_core.localise import stated
 from lalaloc_core.localise.camera_height import CameraHeight
 from service.grids import check_height_m
-from service.schemas import LocaliseForm
+from service.schemas.camera_fields import CameraFields
 from service.storage.records import PlanRecord
 
 
-def stated_height(form: LocaliseForm, record: PlanRecord) -> CameraHeight:
+def stated_height(form: CameraFields, record: PlanRecord) -> CameraHeight:
     """What the request says, else what the plan says, else nothing: then any height is possible.
 
     Raises:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from lalaloc_core.localise import stated
 from lalaloc_core.localise.stated import KnownHeading
 from lalaloc_core.panorama.images import Panorama
-from service.schemas import LocaliseForm
+from service.schemas import LocaliseForm, StatedHeading
 
 
 def known_heading(
-    form: LocaliseForm, north: float | None, panorama: Panorama, compass_tolerance_deg: float
+    form: LocaliseForm | StatedHeading, north: float | None, panorama: Panorama, compass_tolerance_deg: float
 ) -> KnownHeading:
     """What the request says, else what the panorama says where north is known, else nothing.
 

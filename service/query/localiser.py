@@ -16,6 +16,7 @@ from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.pipeline import Localisation, StageClock, Steps, localise_steps, next_step
 from lalaloc_core.localise.poses import LatentGrid, Query
+from lalaloc_core.localise.sequence.search import SequenceLocalisation, localise_sequence_steps, next_sequence_step
 from lalaloc_core.panorama.images import Panorama
 from service.errors import DeadlineExceededError, PlanFailedError, PlanNotReadyError
 from service.grids import GridProvider, grid_height_m
@@ -27,7 +28,8 @@ from service.query.heading import KnownHeading, known_heading
 from service.query.hints import hint_warnings, stated_hints
 from service.query.lpo_pool import LpoPool
 from service.query.posterior import posterior_answer
-from service.schemas import LocaliseAnswer, LocaliseForm, ModelAnswer
+from service.query.sequence_answers import sequence_answer
+from service.schemas import LocaliseAnswer, LocaliseForm, ModelAnswer, SequenceAnswer, SequenceForm
 from service.settings import Settings
 from service.sharing import with_spare
 from service.storage.records import PlanRecord
@@ -191,6 +193,59 @@ class Localiser:
             answer = answer.model_copy(update={"posterior": posterior_answer(grid, found.posterior)})
         return _Answered(answer, found, grid)
 
+    async def answer_sequence(
+        self,
+        record: PlanRecord,
+        form: SequenceForm,
+        contents: list[bytes],
+        begin: float,
+        clock: StageClock,
+        party: str,
+    ) -> SequenceAnswer:
+        """Localise several panoramas of one visit jointly; arguments and errors as of `answer`."""
+        with self._queries.hold(party):
+            return await self._answer_sequence(record, form, contents, begin, clock, party)
+
+    async def _answer_sequence(
+        self,
+        record: PlanRecord,
+        form: SequenceForm,
+        contents: list[bytes],
+        begin: float,
+        clock: StageClock,
+        party: str,
+    ) -> SequenceAnswer:
+        deadline = begin + self._settings.request_deadline_s
+        height, plan, compass_deg = stated_height(form, record), record.plan, self._settings.compass_tolerance_deg
+        # One after another: no query keeps more than one decoder busy.
+        with clock.stage("decode"):
+            panoramas = [await self._decoder.decode(content, deadline, party) for content in contents]
+        known = [
+            known_heading(form.heading_of(index), plan.north, panorama, compass_deg)
+            for index, panorama in enumerate(panoramas)
+        ]
+        queries = await self.compute(party, partial(self._encode_all, panoramas, known, height, clock), deadline)
+        latents_alone = not self._encoders.predicts_profile
+        with clock.stage("grid"):
+            grid_m = grid_height_m(record, height.height_m, latents_alone=latents_alone)
+            grid = await self._grid(record, grid_m, deadline, party)
+        motions = form.steps(len(contents))
+        steps = localise_sequence_steps(
+            plan, grid, self._encoders, queries, motions, refine=form.refine, top_k=form.top_k, clock=clock
+        )
+        step = await self.compute(party, partial(next_sequence_step, steps, None), deadline)
+        while not isinstance(step, SequenceLocalisation):
+            timeout_s = min(self._settings.lpo_deadline_s, deadline - monotonic() - _ANSWER_S)
+            result = await self._pool.refine_sequence(step, timeout_s, party)
+            step = await self.compute(party, partial(next_sequence_step, steps, result), deadline)
+        timings_ms = clock.timings_ms | {"total": (monotonic() - begin) * 1e3}
+        self.observe(timings_ms, step.stage)
+        places, alone = places_in(record), []
+        for one, found in zip(known, step.pictures, strict=True):
+            warnings = [heading_contradiction(one)] if found.heading_contradicted else []
+            alone.append(compose(found, places, one, warnings, timings_ms, self._bundle))
+        return sequence_answer(alone, step, motions, self._bundle.manifest.confidence)
+
     def close(self) -> None:
         """Finish what is being computed."""
         self._threads.close()
@@ -233,6 +288,15 @@ class Localiser:
         """Encode a decoded panorama."""
         with clock.stage("encode"):
             return self._encoders.query(panorama.pixels, known.heading, height, heading_tolerance=known.tolerance)
+
+    def _encode_all(
+        self, panoramas: list[Panorama], known: list[KnownHeading], height: CameraHeight, clock: StageClock
+    ) -> list[Query]:
+        with clock.stage("encode"):
+            return [
+                self._encoders.query(panorama.pixels, one.heading, height, heading_tolerance=one.tolerance)
+                for panorama, one in zip(panoramas, known, strict=True)
+            ]
 
     async def finished(self, steps: Steps, deadline: float, party: str) -> Localisation:
         """Run a search on the threads of the localiser, which do something else while LPO is waited for."""

@@ -6,6 +6,7 @@ from typing import get_args
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.localise.poses import RefinementJob, RefinementResult
+from lalaloc_core.localise.sequence import SequenceJob, SequenceResult
 from service.pools import JobLostError, LostReason, PoolState, WorkerPool, WorkerSpec
 from service.settings import Settings
 from service.telemetry import Telemetry
@@ -29,7 +30,7 @@ class LpoPool:
             start_s=_START_S,
             max_start_s=_MAX_START_S,
         )
-        self._workers: WorkerPool[RefinementJob, RefinementResult] = WorkerPool(
+        self._workers: WorkerPool[RefinementJob | SequenceJob, RefinementResult | SequenceResult] = WorkerPool(
             spec,
             workers=cores.workers,
             queue_limit=settings.lpo_queue,
@@ -59,6 +60,19 @@ class LpoPool:
 
         Cancelling it takes a job that was not started out of the queue. Parties take turns.
         """
+        result = await self._answer(job, timeout_s, party)
+        assert not isinstance(result, SequenceResult)
+        return result
+
+    async def refine_sequence(self, job: SequenceJob, timeout_s: float, party: str = "") -> SequenceResult | None:
+        """As `refine`, of paths."""
+        result = await self._answer(job, timeout_s, party)
+        assert not isinstance(result, RefinementResult)
+        return result
+
+    async def _answer(
+        self, job: RefinementJob | SequenceJob, timeout_s: float, party: str
+    ) -> RefinementResult | SequenceResult | None:
         if self.state.workers == 0 or timeout_s <= 0.0:
             return None
         try:

@@ -46,6 +46,26 @@ from service.schemas import LocaliseAnswer, LocaliseForm
 from service.telemetry import note
 
 router = APIRouter(tags=["localisation"])
+# What a query may be refused with.
+QUERY_ERRORS: tuple[type[Exception], ...] = (
+    InvalidPanoramaError,
+    InvalidPoseError,
+    InvalidRequestError,
+    MalformedRequestError,
+    UnknownFloorPlanError,
+    PlanFailedError,
+    PlanNotReadyError,
+    UnsupportedMediaError,
+    UploadTooLargeError,
+    UploadTimeoutError,
+    OverloadedError,
+    StoreUnavailableError,
+    StoppingError,
+    DecoderNotReadyError,
+    DeadlineExceededError,
+    IdempotencyKeyReusedError,
+    IdempotencyInProgressError,
+)
 
 _PNG, _SVG, _GEOJSON = "image/png", "image/svg+xml", "application/geo+json"
 # The photograph in an SVG is a part of it; nothing else may load, and nothing run.
@@ -54,7 +74,9 @@ _VARY = {"Vary": "Accept"}
 
 
 def _body_schema() -> dict[str, Any]:
-    schema = LocaliseForm.model_json_schema()
+    schema = LocaliseForm.model_json_schema(ref_template="#/components/schemas/{model}")
+    # Told with the others, see `http.api_description`.
+    schema.pop("$defs", None)
     schema["properties"]["panorama"] = {
         "type": "string",
         "format": "binary",
@@ -82,27 +104,11 @@ def _body_schema() -> dict[str, Any]:
     }
     | problem_responses(
         InvalidHintError,
-        InvalidPanoramaError,
-        InvalidPoseError,
-        InvalidRequestError,
-        MalformedRequestError,
-        UnknownFloorPlanError,
         UnanchoredPlanError,
         UnknownVenueError,
         VenueUnsearchableError,
         VenueNotReadyError,
-        PlanFailedError,
-        PlanNotReadyError,
-        UnsupportedMediaError,
-        UploadTooLargeError,
-        UploadTimeoutError,
-        OverloadedError,
-        StoreUnavailableError,
-        StoppingError,
-        DecoderNotReadyError,
-        DeadlineExceededError,
-        IdempotencyKeyReusedError,
-        IdempotencyInProgressError,
+        *QUERY_ERRORS,
     ),
 )
 async def localise(

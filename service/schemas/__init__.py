@@ -6,6 +6,9 @@ plan_import      what may be said of the file of a plan, and what is told of rea
 stored_plans     what is told of stored floor plans
 localise_query   what a query says beside the panorama
 hint_fields      what it says of where the camera stood
+camera_fields    what it says of the camera, and of the answer
+sequence_query   what a query of several panoramas says beside them
+sequence_answer  where they were taken
 localise_answer  where it was taken
 geopose          the same on Earth
 venues           floor plans that belong together
@@ -18,6 +21,7 @@ Begin with `localise_answer.py`.
 
 from service.schemas.fields import Answer
 from service.schemas.geopose import GeoPose, GeoPoseAngles, GeoPosePosition
+from service.schemas.hint_fields import PlanPoint
 from service.schemas.layout import LayoutAnswer, OpeningFaceAnswer, RoomLayoutAnswer
 from service.schemas.localise_answer import (
     CandidateAnswer,
@@ -41,6 +45,8 @@ from service.schemas.native_plan import (
 )
 from service.schemas.plan_import import ImportForm, ImportReport, LayerAnswer, LevelAnswer
 from service.schemas.problem_details import Fault, Problem
+from service.schemas.sequence_answer import SequenceAnswer, SequencePoseAnswer
+from service.schemas.sequence_query import SequenceForm, StatedHeading, StatedMotion
 from service.schemas.service_state import HealthAnswer, LimitsAnswer, PoolAnswer, ReadyAnswer
 from service.schemas.stored_plans import (
     BoundsAnswer,
@@ -92,6 +98,7 @@ __all__ = [
     "OpeningFaceAnswer",
     "OpeningKind",
     "PlanEvent",
+    "PlanPoint",
     "PlanProbability",
     "PlanStatus",
     "Point",
@@ -106,6 +113,11 @@ __all__ = [
     "RoomLayoutAnswer",
     "RoomType",
     "Segment",
+    "SequenceAnswer",
+    "SequenceForm",
+    "SequencePoseAnswer",
+    "StatedHeading",
+    "StatedMotion",
     "TimingsAnswer",
     "VenueAnchorAnswer",
     "VenueAnchorDocument",

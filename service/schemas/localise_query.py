@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from typing import Annotated, Literal
 
 from pydantic import Field, ValidationInfo, field_validator
 from pydantic_core import PydanticCustomError
 
-from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M
-from lalaloc_core.floorplan import MAX_CAMERA_HEIGHT_STD_M
-from lalaloc_core.localise.camera_height import DEFAULT_STD_M, UNKNOWN_RANGE_M
+from service.schemas.camera_fields import CameraFields
 from service.schemas.fields import Finite
 from service.schemas.hint_fields import HintFields
 
 HEADING_MEANING = "azimuth of the panorama's centre column, clockwise from the plan's +y seen from above"
 
 
-class LocaliseForm(HintFields):
+class LocaliseForm(CameraFields, HintFields):
     """Fields of a query besides the panorama itself; an empty field counts as left out."""
 
     venue_id: str | None = Field(
@@ -43,27 +40,8 @@ class LocaliseForm(HintFields):
         description="How far off `heading_deg` may be: it is then searched for within that, to the next sector of the "
         "model's ring, and refined. 0: it is exact. Needs `heading_deg`.",
     )
-    camera_height_m: Annotated[float, Finite] | None = Field(
-        None,
-        ge=MIN_CAMERA_HEIGHT_M,
-        description="Height of the camera over the floor; left out: the plan's, and where that has none either, any "
-        f"between {UNKNOWN_RANGE_M[0]:g} and {UNKNOWN_RANGE_M[1]:g}.",
-    )
-    camera_height_std_m: Annotated[float, Finite] | None = Field(
-        None,
-        ge=0,
-        le=MAX_CAMERA_HEIGHT_STD_M,
-        description="Standard deviation of the error of the camera height, which is solved for; 0: it is exact. Left "
-        f"out: the plan's, else {DEFAULT_STD_M:g}.",
-    )
     refine: Literal["none", "vdr", "lpo"] = Field(
         "lpo", description="How far to refine: nearest grid pose, denser poses around it, or optimised pose."
-    )
-    top_k: int = Field(
-        5,
-        ge=1,
-        description="How many distinct candidates to return, at most `max_top_k`.",
-        json_schema_extra={"maximum": 100},
     )
 
     include: Literal["posterior"] | None = Field(
@@ -77,9 +55,7 @@ class LocaliseForm(HintFields):
             raise ValueError("is about the places of one plan, and not of a venue")
         return value
 
-    @field_validator(
-        "heading_deg", "heading_tolerance_deg", "camera_height_m", "camera_height_std_m", "top_k", mode="before"
-    )
+    @field_validator("heading_deg", "heading_tolerance_deg", mode="before")
     @classmethod
     def _plain_number(cls, value: object) -> object:
         if isinstance(value, str) and "_" in value:
@@ -98,14 +74,6 @@ class LocaliseForm(HintFields):
             raise ValueError("venue_id is given as well, one of the two is needed")
         if given.data.get("near") is not None or given.data.get("rooms") is not None:
             raise ValueError("is missing: near and rooms are about one plan, and not about a venue")
-        return value
-
-    @field_validator("top_k")
-    @classmethod
-    def _as_many_as_allowed(cls, value: int, told: ValidationInfo) -> int:
-        most = (told.context or {}).get("max_top_k", math.inf)
-        if value > most:
-            raise ValueError(f"at most {most} are allowed (max_top_k)")
         return value
 
     @field_validator("heading_tolerance_deg")

@@ -31,6 +31,8 @@ class LimitsAnswer(Answer):
     max_venue_plans: int = Field(description="Floor plans of a venue.")
     max_venue_bytes: int = Field(description="Description of a venue.")
     max_panorama_bytes: int = Field(description="Upload of a panorama.")
+    max_sequence_panoramas: int = Field(description="Panoramas of one query.")
+    max_sequence_bytes: int = Field(description="Upload of all panoramas of one query; each may be a panorama's size.")
     max_pixels: int = Field(description="Pixels of a panorama.")
     max_scans: int = Field(description="Scans of a panorama that is a progressive JPEG.")
     max_top_k: int = Field(description="Candidates of an answer.")

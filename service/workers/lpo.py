@@ -1,11 +1,13 @@
 """The body of an LPO worker process: the only place of the service that imports torch.
 
-From `RefinementJob` to `RefinementResult`; `service.workers.process` has the rest.
+From `RefinementJob` to `RefinementResult`, and from `SequenceJob` to `SequenceResult`; `service.workers.process` has
+the rest.
 """
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from itertools import product
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -15,7 +17,8 @@ import numpy as np
 
 from lalaloc_core.bundle import Bundle, Manifest
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.poses import RefinementJob
+from lalaloc_core.localise.poses import RefinementJob, RefinementResult
+from lalaloc_core.localise.sequence.joint import SequenceJob, SequenceResult, refine_sequence
 from service.workers.process import serve_jobs
 
 if TYPE_CHECKING:
@@ -26,7 +29,16 @@ def run_worker(connection: Connection, bundle_folder: str, model_sha256: str, th
     """Load the optimiser, warm it up, then answer jobs until the pipe closes."""
     for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ[variable] = str(threads)
-    serve_jobs(connection, lambda: _load(Path(bundle_folder), model_sha256, threads).refine)
+    serve_jobs(connection, lambda: _refiner(_load(Path(bundle_folder), model_sha256, threads)))
+
+
+def _refiner(
+    optimiser: LatentPoseOptimiser,
+) -> Callable[[RefinementJob | SequenceJob], RefinementResult | SequenceResult]:
+    def refine(job: RefinementJob | SequenceJob) -> RefinementResult | SequenceResult:
+        return refine_sequence(job) if isinstance(job, SequenceJob) else optimiser.refine(job)
+
+    return refine
 
 
 def _load(bundle_folder: Path, model_sha256: str, threads: int) -> LatentPoseOptimiser:

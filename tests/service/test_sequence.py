@@ -1,0 +1,158 @@
+"""Queries of several panoramas: what they may be, and what is told of them."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.sequence import Motion
+from service.schemas import SequenceForm, StatedMotion
+from tests.service.conftest import FLAT, StartApp, assert_problem, encode_picture, localise, upload
+
+MOTION = {"distance_m": 1.5, "distance_std_m": 0.1, "turn_deg": 30, "turn_std_deg": 3}
+
+
+@pytest.fixture(scope="module")
+def client(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+    with start_app(tmp_path_factory.mktemp("data"), max_sequence_panoramas=4, max_sequence_bytes=200_000) as started:
+        yield started
+
+
+@pytest.fixture(scope="module")
+def plan_id(client: httpx.Client) -> str:
+    return upload(client)
+
+
+@pytest.fixture(scope="module")
+def pictures() -> list[bytes]:
+    return [encode_picture(256, 128, kind) for kind in ("JPEG", "PNG", "WEBP")]
+
+
+def ask(client: httpx.Client, plan_id: str, pictures: list[bytes], **fields: Any) -> httpx.Response:
+    data = {"floorplan_id": plan_id} | {
+        name: json.dumps(value) if isinstance(value, list) else str(value) for name, value in fields.items()
+    }
+    files = [("panorama", ("p.jpg", picture, "image/jpeg")) for picture in pictures]
+    return client.post("/localise/sequence", data=data, files=files)
+
+
+def answer_to(client: httpx.Client, plan_id: str, pictures: list[bytes], **fields: Any) -> dict[str, Any]:
+    response = ask(client, plan_id, pictures, **fields)
+    assert response.status_code == 200, response.text
+    return response.json()
+
+
+@pytest.mark.parametrize("refine", ["none", "lpo"])
+def test_every_panorama_has_a_place_of_the_plan(
+    client: httpx.Client, plan_id: str, pictures: list[bytes], refine: str
+) -> None:
+    answer = answer_to(client, plan_id, pictures, motions=[MOTION, None], refine=refine, top_k=3)
+    # This app runs without LPO workers, so the best it can do is the grid.
+    assert answer["stage"] == "retrieval"
+    assert answer["floorplan_id"] == plan_id
+    assert len(answer["poses"]) == 3
+    plan = FloorPlan.from_dict(FLAT)
+    for pose in answer["poses"]:
+        assert pose["position"] == pose["candidates"][0]["position"]
+        assert 1 <= len(pose["candidates"]) <= 3
+        for candidate in pose["candidates"]:
+            at = np.array([[candidate["position"]["x_m"], candidate["position"]["y_m"]]])
+            assert plan.rooms[int(plan.room_index_at(at)[0])].id == candidate["room_id"]
+        assert pose["heading_source"] == "searched"
+
+
+def test_what_is_measured_exactly_is_what_the_answer_moves_by(
+    client: httpx.Client, plan_id: str, pictures: list[bytes]
+) -> None:
+    sharp = {"distance_m": 2.0, "distance_std_m": 0.01, "turn_deg": 90, "turn_std_deg": 1}
+    answer = answer_to(client, plan_id, pictures[:2], motions=[sharp], refine="none")
+    first, second = answer["poses"]
+    away_m = math.dist(*(tuple(pose["position"].values()) for pose in (first, second)))
+    turned_deg = (second["heading_deg"] - first["heading_deg"]) % 360.0
+    if not answer["warnings"]:
+        assert away_m == pytest.approx(2.0, abs=1.1)
+        assert turned_deg == pytest.approx(90.0, abs=25.0)
+    else:
+        assert "motions[0] has distance_m 2, turn_deg 90" in answer["warnings"][0]
+
+
+def test_without_motions_the_answers_are_those_to_each_alone(
+    client: httpx.Client, plan_id: str, pictures: list[bytes]
+) -> None:
+    fields = {"camera_height_m": 1.5, "camera_height_std_m": 0, "refine": "none"}
+    together = answer_to(client, plan_id, pictures, **fields)["poses"]
+    for picture, pose in zip(pictures, together, strict=True):
+        alone = localise(client, plan_id, picture, **fields).json()
+        assert pose["position"] == alone["position"]
+        assert pose["heading_deg"] == alone["heading_deg"]
+        assert pose["cost"] == pytest.approx(alone["cost"], abs=1e-3)
+
+
+def test_headings_that_are_given_hold(client: httpx.Client, plan_id: str, pictures: list[bytes]) -> None:
+    fields = {"headings_deg": [10, None, 200], "heading_tolerance_deg": 5, "refine": "none"}
+    poses = answer_to(client, plan_id, pictures, **fields)["poses"]
+    assert poses[1]["heading_source"] == "searched"
+    for pose, given in ((poses[0], 10.0), (poses[2], 200.0)):
+        if pose["heading_source"] == "given":
+            assert abs((pose["heading_deg"] - given + 180.0) % 360.0 - 180.0) < 25.0  # to the next sector
+        else:
+            assert "which the panorama contradicts" in pose["warnings"][0]
+
+
+@pytest.mark.parametrize(
+    ("count", "fields", "field", "message"),
+    [
+        (1, {}, "panorama", "is given 1 times, 2 to 4 are needed"),
+        (5, {}, "panorama", "is given 5 times, 2 to 4 are needed"),
+        (3, {"motions": [MOTION]}, "motions", "has 1 items, 3 panoramas need 2"),
+        (2, {"headings_deg": [1.0]}, "headings_deg", "has 1 items, 2 panoramas need 2"),
+        (2, {"motions": "{}"}, "motions", "not a JSON array"),
+        (2, {"motions": "[" * 2000}, "motions", "not a JSON array"),
+        (2, {"motions": [MOTION | {"distance_m": -1}]}, "motions.0.distance_m", "must be at least 0"),
+        (2, {"motions": [MOTION | {"distance_std_m": 0}]}, "motions.0.distance_std_m", "must be at least 0.001"),
+        (2, {"motions": [MOTION | {"far": 1}]}, "motions.0.far", "Extra inputs"),
+        (2, {"motions": [{"direction_deg": 3}]}, "motions.0.direction_deg", "distance_m, whose direction this is"),
+        (2, {"headings_deg": [400, None]}, "headings_deg.0", "must be at most 360"),
+        (2, {"heading_tolerance_deg": 5}, "heading_tolerance_deg", "headings_deg, whose tolerance this is"),
+        (2, {"refine": "vdr"}, "refine", "must be 'none' or 'lpo'"),
+        (2, {"top_k": 99}, "top_k", "at most 10 are allowed (max_top_k)"),
+        (2, {"heading_deg": 5}, "heading_deg", "unknown part"),
+    ],
+)
+def test_what_is_wrong_is_told(
+    client: httpx.Client, plan_id: str, panorama: bytes, count: int, fields: dict[str, Any], field: str, message: str
+) -> None:
+    problem = assert_problem(ask(client, plan_id, [panorama] * count, **fields), 422, "invalid-request")
+    assert [(fault["field"], message in fault["message"]) for fault in problem["errors"]] == [(field, True)]
+
+
+def test_a_panorama_that_is_none_is_told(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
+    assert_problem(ask(client, plan_id, [panorama, b"no picture"]), 422, "invalid-panorama")
+    assert_problem(ask(client, "f" * 32, [panorama] * 2), 404, "unknown-floorplan")
+
+
+def test_all_together_are_bounded_and_the_limits_are_told(client: httpx.Client, plan_id: str, panorama: bytes) -> None:
+    problem = assert_problem(ask(client, plan_id, [panorama, bytes(210_000)]), 413, "upload-too-large")
+    assert "max_sequence_bytes" in problem["detail"]
+    limits = client.get("/limits").json()
+    assert (limits["max_sequence_panoramas"], limits["max_sequence_bytes"]) == (4, 200_000)
+
+
+def test_a_motion_is_the_one_that_was_stated() -> None:
+    stated = StatedMotion(**MOTION, direction_deg=-45, direction_std_deg=2)
+    assert stated.motion == Motion(
+        distance_m=1.5,
+        distance_std_m=0.1,
+        turn=math.radians(30),
+        turn_std=math.radians(3),
+        direction=math.radians(-45),
+        direction_std=math.radians(2),
+    )
+    assert SequenceForm(floorplan_id="p").steps(3) == [Motion(), Motion()]
