@@ -211,13 +211,18 @@ def sequence_request(
         "refine": refine,
         "top_k": top_k,
     }
-    _check_finite(given)
+    headings = {f"headings_deg[{index}]": one for index, one in enumerate(headings_deg or ())}
+    measured = {
+        f"motions[{index}]['{name}']": value
+        for index, one in enumerate(motions or ())
+        for name, value in (one or {}).items()
+    }
+    _check_finite(given | headings | measured)
     told = {
         "motions": None if motions is None else [None if one is None else dict(one) for one in motions],
         "headings_deg": None if headings_deg is None else list(headings_deg),
     }
-    # What is not finite is a ValueError of `json`.
-    known = {name: None if one is None else json.dumps(one, allow_nan=False) for name, one in told.items()}
+    known = {name: None if one is None else json.dumps(one) for name, one in told.items()}
     return _query("/localise/sequence", given | known, panoramas)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
+import math
 import uuid
 from collections.abc import Iterator
 from pathlib import Path
@@ -163,3 +164,40 @@ def test_the_service_tells_whether_it_is_ready(service: Any, app: httpx.Client) 
     assert state.ready is True
     assert state.lpo_pool.workers == 0
     assert state.model.sha256 == app.get("/readyz").json()["model"]["sha256"]
+
+
+def test_several_panoramas_of_one_visit_are_one_query(service: Any, app: httpx.Client, panorama: bytes) -> None:
+    plan_id = service.wait_until_ready(service.upload_floorplan(FLAT).id).id
+    motions = [{"distance_m": 1.5, "distance_std_m": 0.2, "turn_deg": 20.0}]
+    answer = service.localise_sequence(
+        plan_id, [panorama, panorama], motions=motions, headings_deg=[90.0, None], refine="none", top_k=2
+    )
+    said = app.post(
+        "/localise/sequence",
+        data={
+            "floorplan_id": plan_id,
+            "motions": json.dumps(motions),
+            "headings_deg": "[90, null]",
+            "refine": "none",
+            "top_k": "2",
+        },
+        files=[("panorama", panorama), ("panorama", panorama)],
+    ).json()
+    assert len(answer.poses) == 2
+    assert json.loads(json.dumps(dataclasses.asdict(answer))) == said | {"timings_ms": dict(answer.timings_ms)}
+    with pytest.raises(InvalidError, match="motions"):
+        service.localise_sequence(plan_id, [panorama, panorama], motions=[])
+    with pytest.raises(ValueError, match=r"headings_deg\[0\] is nan"):
+        service.localise_sequence(plan_id, [panorama, panorama], headings_deg=[float("nan"), None])
+
+
+def test_hints_are_sent(service: Any, panorama: bytes) -> None:
+    plan_id = service.wait_until_ready(service.upload_floorplan(FLAT).id).id
+    assert service.localise(plan_id, panorama, rooms="kitchen", strict=True, refine="none").room == "kitchen"
+    near = {"x_m": 2.0, "y_m": 1.0}
+    answer = service.localise(plan_id, panorama, near=near, radius_m=1.0, strict=True, refine="none")
+    assert math.dist((answer.position.x_m, answer.position.y_m), near.values()) <= 1.0 + 1e-3
+    with pytest.raises(InvalidError, match="no room 'attic'"):
+        service.localise(plan_id, panorama, rooms=["attic"])
+    with pytest.raises(ValueError, match=r"near\['x_m'\] is inf"):
+        service.localise(plan_id, panorama, near={"x_m": float("inf"), "y_m": 0.0}, radius_m=1.0)
