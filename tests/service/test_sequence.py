@@ -155,4 +155,4 @@ def test_a_motion_is_the_one_that_was_stated() -> None:
         direction=math.radians(-45),
         direction_std=math.radians(2),
     )
-    assert SequenceForm(floorplan_id="p").steps(3) == [Motion(), Motion()]
+    assert SequenceForm.model_validate({"floorplan_id": "p"}).steps(3) == [Motion(), Motion()]

@@ -214,7 +214,7 @@ def _best_place(link: Link, score: Float[np.ndarray, "n k"], places: int, *, bac
 
 def _best_of_rows(pairs: csr_array, score: Float[np.ndarray, "n k"]) -> _Best:
     """For every row of a sparse matrix the best of `log value + score` over its entries, and which column has it."""
-    rows, columns = pairs.shape[0], score.shape[1]
+    rows, columns = len(pairs.indptr) - 1, score.shape[1]
     value, best = np.full((rows, columns), -np.inf), np.zeros((rows, columns), int)
     filled = np.flatnonzero(np.diff(pairs.indptr))
     if not len(filled):

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 from scipy.sparse import csr_array
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.errors import InvalidMotionError
@@ -104,17 +104,14 @@ class Link:
         turns: (k, k') of pairs of headings; None: all alike.
         sizes: n, k, n' and k'.
         floor: what is added to every pair.
+        is_directed: whether pairs of places depend on the first heading.
     """
 
     places: csr_array | None
     turns: Float[np.ndarray, "k l"] | None
     sizes: tuple[int, int, int, int]
     floor: float
-
-    @property
-    def is_directed(self) -> bool:
-        """Whether pairs of places depend on the first heading."""
-        return self.places is not None and self.places.shape[1] != self.sizes[0]
+    is_directed: bool = False
 
     def likelihood(self, first: int, second: int) -> float:
         """That of a pair of states, counted in row-major order, without the floor."""
@@ -134,7 +131,7 @@ class Link:
             if self.is_directed:
                 rows, columns = (_states(index, k) for index in (second, first))
             places = places[rows][:, columns]
-        return Link(places, self.turns, (len(first), k, len(second), after), self.floor)
+        return Link(places, self.turns, (len(first), k, len(second), after), self.floor, self.is_directed)
 
 
 def _states(poses: np.ndarray, headings: int) -> np.ndarray:
@@ -154,7 +151,7 @@ def link(motion: Motion, first: States, second: States, step_m: float) -> Link:
         off = wrap_angle(second.heading[None, :] - first.heading[:, None] - motion.turn)
         turns = np.exp(-0.5 * np.square(off / spread))
     places = None if motion.distance_m is None else _places(motion, first, second, _OFF_GRID * step_m)
-    return Link(places, turns, sizes, 0.0 if motion.is_unknown else FLOOR)
+    return Link(places, turns, sizes, 0.0 if motion.is_unknown else FLOOR, motion.direction is not None)
 
 
 def _places(motion: Motion, first: States, second: States, off_m: float) -> csr_array:
@@ -162,7 +159,7 @@ def _places(motion: Motion, first: States, second: States, off_m: float) -> csr_
     assert motion.distance_m is not None
     along_std = math.hypot(motion.distance_std_m, off_m)
     reach_m = motion.distance_m + _FARTHEST * along_std
-    near = cKDTree(second.position_m).query_ball_point(first.position_m, reach_m)
+    near = KDTree(second.position_m).query_ball_point(first.position_m, reach_m)
     count = np.array([len(one) for one in near])
     source = np.repeat(np.arange(len(near)), count)
     target = np.concatenate([np.asarray(one, dtype=int) for one in near]) if count.any() else np.empty(0, int)

@@ -119,7 +119,8 @@ def path_posterior(
         for path, basin, share in zip(paths, basins, mass, strict=True):
             inside = np.zeros_like(weight)
             inside[basin.kept[t]] = share * basin.marginals.state[t]
-            parts.append(_weighted(picture, inside, (path.starts[t], path.ends[t])))
+            moved = None if path.refined_depth is None else (path.starts[t], path.ends[t])
+            parts.append(_weighted(picture, inside, moved))
         position, heading, value, pose = (np.concatenate(one) for one in zip(*parts, strict=True))
         found.append(told_of(pose, position, heading, value, len(poses), picture.query, candidates[t]))
     return PathPosterior(mass, found)
@@ -128,14 +129,15 @@ def path_posterior(
 def _weighted(
     picture: Picture, weight: Float[np.ndarray, "n k"], moved: tuple[Candidate, Candidate] | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Places, headings, weights and grid poses of all states that count, moved from the first pose to the second."""
+    """Places, headings, weights and grid poses of all states that count, moved and turned by refinement."""
     row, hypothesis = np.nonzero(weight > _NEGLIGIBLE)
     position = picture.states.position_m[row].copy()
     heading = picture.states.heading[hypothesis].copy()
     if moved is not None:
         start, end = moved
         position += end.position_m - start.position_m
-        heading += end.frame_heading - start.frame_heading
+        # Neighbours tell how it is turned far better than sectors do.
+        heading[:] = picture.query.roll[end.hypothesis] + end.frame_heading
     return position, heading, weight[row, hypothesis], picture.index[row]
 
 

@@ -16,10 +16,10 @@ from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.errors import InvalidMotionError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.confidence import signals_of
+from lalaloc_core.localise.confidence import Signals, signals_of
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.evidence import Evidence, latent_distances
-from lalaloc_core.localise.pipeline import Localisation, LocaliseConfig, StageClock
+from lalaloc_core.localise.pipeline import Localisation, LocaliseConfig, SearchStage, StageClock
 from lalaloc_core.localise.poses import Candidate, LatentGrid, Query, RefinementResult
 from lalaloc_core.localise.posterior import TURNED_APART, area_shares
 from lalaloc_core.localise.refinement import refined, refinement_job
@@ -148,8 +148,8 @@ def localise_sequence_steps(
     found = path_posterior(grid.poses, pictures, links, log_heights, whole, paths, candidates, config.separation_m)
     told = []
     for picture, answers, posterior in zip(pictures, candidates, found.pictures, strict=True):
-        signals = {stage: signals_of(picture.query, answers[0], posterior)}
-        best = {stage: answers[0]}
+        signals: dict[SearchStage, Signals] = {stage: signals_of(picture.query, answers[0], posterior)}
+        best: dict[SearchStage, Candidate] = {stage: answers[0]}
         told.append(Localisation(picture.query, answers, posterior, stage, signals, picture.doubted, best=best))
     costs = _motion_costs(pictures, motions, [paths[0]])[0]
     missed = tuple(int(index) for index in np.flatnonzero(costs > _CONTRADICTED))
