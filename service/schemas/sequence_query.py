@@ -88,7 +88,7 @@ class SequenceForm(CameraFields):
         "`POST /localise`. Left out: what their metadata say, else unknown.",
     )
     heading_tolerance_deg: Annotated[float, Finite] = Field(
-        0, ge=0, le=45, description="How far off `headings_deg` may be; needs them."
+        0.0, ge=0, le=45, description="How far off `headings_deg` may be; needs them."
     )
     refine: Literal["none", "lpo"] = Field(
         "lpo", description="How far to refine: nearest grid poses, or poses that are optimised together."

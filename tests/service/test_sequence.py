@@ -89,7 +89,9 @@ def test_without_motions_the_answers_are_those_to_each_alone(
     fields = {"camera_height_m": 1.5, "camera_height_std_m": 0, "refine": "none"}
     together = answer_to(client, plan_id, pictures, **fields)["poses"]
     for picture, pose in zip(pictures, together, strict=True):
-        alone = localise(client, plan_id, picture, **fields).json()
+        response = localise(client, plan_id, picture, **fields)
+        assert response.status_code == 200, response.text
+        alone = response.json()
         assert pose["position"] == alone["position"]
         assert pose["heading_deg"] == alone["heading_deg"]
         assert pose["cost"] == pytest.approx(alone["cost"], abs=1e-3)
