@@ -171,7 +171,8 @@ class TestCommandLine:
         assert main(["score", str(tmp_path / "run")]) == 0
         table = capsys.readouterr().out
         assert "4 queries" in table
-        assert f"{printed['final']['median_cm']['value']:.1f}" in table.split("answer")[1].split("\n")[0]
+        (row,) = [line for line in table.splitlines() if line.startswith("answer ")]
+        assert f"{printed['final']['median_cm']['value']:.1f}" in row
 
     def test_an_empty_split_is_an_error_that_leaves_no_folder(
         self, tiny_bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
