@@ -29,7 +29,7 @@ RADIUS_RANGE_M = (0.1, 1000.0)
 # ε, the probability that a hint is wrong altogether.
 _DOUBT = 0.02
 # Regions count as no smaller than this share of a plan, so that the smallest of hints is doubted as well.
-_LEAST_SHARE = 1e-3
+_MIN_SHARE = 1e-3
 # How fast a point's region ends, in units of its radius; an answer as unlikely as `_MISSED` misses it.
 _FALL_OFF, _MISSED = 1.0 / 3.0, 0.5
 # Rooms that an error about an unknown one names.
@@ -96,7 +96,7 @@ class Hints:
             if self.strict:
                 total[inside < 1.0] = np.inf
                 continue
-            odds = (1.0 - _DOUBT) / (_DOUBT * max(self._share(plan, name), _LEAST_SHARE))
+            odds = (1.0 - _DOUBT) / (_DOUBT * max(self._share(plan, name), _MIN_SHARE))
             total += math.log1p(odds) - np.log1p(odds * inside)
         return total
 

@@ -157,7 +157,7 @@ def test_penalties_are_bounded_and_grow_with_the_distance(seed: int, radius_m: f
     away = np.linspace(0.0, 3.0 * radius_m, 50)
     places = np.stack([x_m + away, np.full(50, y_m)], axis=1)
     found = Hints(near=Near(x_m, y_m, radius_m), strict=strict).penalty(plan, places, np.zeros(50, int))
-    assert found[0] == 0.0
+    assert found[0] == pytest.approx(0.0, abs=1e-12)
     assert (np.diff(found[np.isfinite(found)]) >= -1e-12).all()
     if strict:
         assert (np.isinf(found) == (away > radius_m * (1.0 + 1e-6))).mean() > 0.97

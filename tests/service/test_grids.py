@@ -413,7 +413,7 @@ def test_gone_plans_and_old_revisions_are_dropped_from_memory_on_every_replica(
         assert store.plans.get("default", name) == record
     elsewhere.plans.delete("default", "deleted")
     elsewhere.plans.add_revision("default", "changed", PLAN, original=Original(b""), keep=5)
-    Sweeper(store, grids, sweep_s=5.0).sweep()
+    Sweeper(store, grids, sweep_s=5.0, keep_answers_s=0.0).sweep()
     assert grids.revisions() == store.plan_cache.revisions() == {records["kept"].revision_id}
 
 
@@ -429,7 +429,7 @@ def test_revisions_that_were_replaced_on_another_replica_are_not_computed_any_mo
     for _ in range(3):
         record = elsewhere.plans.add_revision("default", "p", HALL, original=Original(b""), keep=5)
         futures.append(grids.compute(record, 1.5))
-    Sweeper(store, grids, sweep_s=5.0).sweep()
+    Sweeper(store, grids, sweep_s=5.0, keep_answers_s=0.0).sweep()
     encoders.go_on.set()
     assert len(futures.pop().result(60.0).poses) == 1521
     assert [type(future.exception(30.0)) for future in futures] == [PlanNotReadyError] * 3
