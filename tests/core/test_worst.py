@@ -8,9 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageColor
 
 from lalaloc_core.cli import main
+from lalaloc_core.draw.canvas import FOUND, TRUE
 from lalaloc_core.errors import RunError
 from lalaloc_core.evaluation.failures import Outcome, is_symmetric, outcomes, symmetric_by_chance
 from lalaloc_core.evaluation.predictions import Pose, Prediction, RunFolder, RunInfo
@@ -134,8 +135,10 @@ class TestPages:
         assert summary["true_pose_fits"] == {"compared": 2, "better_than_found": 2}
         assert summary["pages"] == ["worst-01.png"]
         with Image.open(tmp_path / "worst-01.png") as page:
-            colours = {colour for _, colour in page.convert("RGB").getcolors(page.width * page.height) or []}
-        assert {(0x35, 0xE0, 0xFF), (0xFF, 0x3B, 0x30)} <= colours
+            pixels = np.asarray(page.convert("RGB"), dtype=float).reshape(-1, 3)
+        # Lines are smoothed, so that no pixel need have exactly the colour of the true or of the found layout.
+        for colour in (ImageColor.getrgb(TRUE), ImageColor.getrgb(FOUND)):
+            assert np.abs(pixels - colour).max(axis=1).min() < 48.0
 
     def test_the_command_says_what_they_have_in_common(
         self, layout_run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
