@@ -284,6 +284,16 @@ class GeoPose:
 
 
 @dataclass(frozen=True)
+class Posterior:
+    """How probable places are, lists of one length; each stands for a square `step_m` wide."""
+
+    step_m: float
+    x_m: tuple[float, ...]
+    y_m: tuple[float, ...]
+    probability: tuple[float, ...]
+
+
+@dataclass(frozen=True)
 class Localisation:
     """Where a panorama was taken.
 
@@ -304,6 +314,8 @@ class Localisation:
         floorplan_revision: the revision of the plan that was compared with.
         venue_id, level: the venue that was asked about, and the level of the plan in it.
         plans: of a venue, the most probable plans, the most probable first.
+        answer_id: under which the service keeps the answer; None where it keeps none.
+        posterior: how probable every place is, where that was asked for.
     """
 
     floorplan_id: str
@@ -329,6 +341,8 @@ class Localisation:
     venue_id: str | None = None
     level: float | None = None
     plans: tuple[PlanProbability, ...] | None = None
+    answer_id: str | None = None
+    posterior: Posterior | None = None
 
 
 @dataclass(frozen=True)

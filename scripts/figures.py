@@ -94,7 +94,7 @@ def training_table() -> str:
     manifest = json.loads(MANIFEST.read_text(encoding="utf-8"))
     training = manifest["training"]
     layout, image = training["layout"], training["image"]
-    begun = image["begun_from"]
+    begun = image.get("begun_from") or layout["begun_from"]
     rows = [
         "| | |",
         "|---|---|",
@@ -102,17 +102,28 @@ def training_table() -> str:
         _row("hardware", training["hardware"]),
         _row("command", f"`{training['command']}`"),
         _row("stage 1", f"that of version {begun['version']}: {layout['minutes_in_all']:g} minutes"),
+        _row("stage 2", _second_stage(image)),
         _row(
-            "stage 2",
-            f"begun with version {begun['version']} ({begun['panoramas_in_all']:,} panoramas, "
-            f"{begun['minutes_in_all']:g} minutes), then {image['steps']:,} steps in {image['minutes']:g} minutes on "
-            f"{image['panoramas']:,} new panoramas",
+            "in all",
+            f"{image.get('panoramas_in_all', image['panoramas']):,} panoramas, "
+            f"{image.get('minutes_in_all', image['minutes']):g} minutes",
         ),
-        _row("in all", f"{image['panoramas_in_all']:,} panoramas, {image['minutes_in_all']:g} minutes"),
         _row("weights", image["checkpoint"]),
         _row("export", f"largest difference from torch {training['parity_max_abs_difference']:.1e}"),
     ]
     return "\n".join(rows)
+
+
+def _second_stage(image: dict[str, Any]) -> str:
+    """What the image encoder began with, and for how long it was trained."""
+    trained = f"{image['steps']:,} steps in {image['minutes']:g} minutes on {image['panoramas']:,} new panoramas"
+    begun = image.get("begun_from")
+    if not begun:
+        return f"begun with a trunk pretrained on ImageNet, {trained}"
+    return (
+        f"begun with version {begun['version']} ({begun['panoramas_in_all']:,} panoramas, "
+        f"{begun['minutes_in_all']:g} minutes), then {trained}"
+    )
 
 
 def _row(*cells: str) -> str:

@@ -72,6 +72,12 @@ def add_commands(commands: Any) -> None:
     calibrate = commands.add_parser("calibrate", help="fit a bundle's confidence on generated validation homes")
     calibrate.add_argument("--bundle", type=Path, default=default_bundle())
     _generator_arguments(calibrate)
+    calibrate.add_argument(
+        "--openings-weight",
+        type=positive,
+        metavar="WEIGHT",
+        help="weight of openings in units of the walls', such as photographs ask for; default: what is fitted",
+    )
     calibrate.add_argument("--out", type=Path, metavar="DIR", help="keep the answers there, and go on with those there")
     calibrate.set_defaults(run=_calibrate)
 
@@ -213,6 +219,8 @@ def _calibrate(arguments: argparse.Namespace) -> None:
     mismatched = own | {"generator": "mismatched", "homes": max(arguments.homes // _PER_MISMATCHED_HOME, 1)}
     # Weights first: confidence is fitted on answers that were weighed by them.
     evidence = fit_evidence([one for heading in (True, False) for one in asked(own, heading, "unweighed")])
+    if arguments.openings_weight is not None:
+        evidence = dataclasses.replace(evidence, openings=arguments.openings_weight)
     print_json(dataclasses.asdict(store_evidence(Bundle.open(arguments.bundle), evidence).manifest.evidence))
     known, searched = (
         Answers(own=asked(own, heading, "own"), mismatched=asked(mismatched, heading, "mismatched"))

@@ -135,8 +135,9 @@ class Converter:
         match error.reason:
             case "poisoned":
                 raise InvalidFloorPlanError(
-                    "the file could not be read: twice that ended the process that tried; save it anew, or in another "
-                    "format"
+                    "the file could not be read: twice that ended the process that tried, perhaps for want of memory "
+                    f"({settings.import_memory_bytes} bytes, import_memory_bytes); save it anew, smaller, or in "
+                    "another format"
                 ) from error
             case "stalled":
                 raise InvalidFloorPlanError(

@@ -77,8 +77,12 @@ def test_candidates_are_distinct_best_first_and_the_first_is_the_answer(
     assert costs[0] < costs[-1]
     positions = np.array([[c["position"]["x_m"], c["position"]["y_m"]] for c in candidates])
     gaps = np.linalg.norm(positions[:, None] - positions[None], axis=-1) + 10.0 * np.eye(len(positions))
-    assert gaps.min() >= 1.0 - 1e-3
-    told = {**answer, "probability": answer["confidence"]}
+    headings = np.array([c["heading_deg"] for c in candidates])
+    turned = np.abs((headings[:, None] - headings[None] + 180.0) % 360.0 - 180.0)
+    # At one place there may be two that look in other directions.
+    assert ((gaps >= 1.0 - 1e-3) | (turned >= 25.0 - 0.1)).all()
+    told = {**answer, "probability": candidates[0]["probability"]}
+    assert candidates[0]["probability"] <= answer["confidence"]
     assert {key: told[key] for key in candidates[0]} == candidates[0]
 
 
@@ -301,7 +305,8 @@ def test_confidence_is_that_of_the_stage_s_signals_however_many_are_asked_for(
         [found.heading_confidence(model)] * 3, abs=1e-4
     )
     shares = [candidate["probability"] for candidate in answers[-1]["candidates"]]
-    assert shares[0] == answers[-1]["confidence"]
+    # Confidence is of the place, whichever way the camera looks there.
+    assert 0.0 < shares[0] <= answers[-1]["confidence"]
     assert sum(shares) <= 1.0
     assert unfitted["confidence"] is None
     assert unfitted["candidates"][0]["probability"] is None
@@ -368,7 +373,7 @@ def test_a_database_that_hangs_holds_up_no_query_for_a_known_plan(
     start_app: StartApp, postgres: PostgresServer, tmp_path: Path, panorama: bytes
 ) -> None:
     with start_app(tmp_path, database_url=postgres.new_database(), database_wait_s=1.0) as client:
-        known, unknown = upload(client), upload(client)
+        known, unknown = upload(client), "0" * 32
         assert localise(client, known, panorama, refine="none").status_code == 200
         with postgres.silent():
             begin = monotonic()
@@ -387,7 +392,7 @@ def test_a_database_that_hangs_holds_up_no_query_for_a_known_plan(
                 503,
                 "store-unavailable",
             )
-        wait_for(lambda: localise(client, unknown, panorama, refine="none").status_code == 200)
+        wait_for(lambda: localise(client, unknown, panorama, refine="none").status_code == 404)
 
 
 def test_uploads_hold_up_no_query(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:

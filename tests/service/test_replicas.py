@@ -146,7 +146,7 @@ OF_THE_PROXY = {
     "a long head": (b"GET / HTTP/1.1\r\nHost: x\r\nA: " + b"a" * 40_000 + b"\r\n\r\n", 400, "malformed-request"),
     "a long address": (b"GET /" + b"a" * 40_000 + b" HTTP/1.1\r\nHost: x\r\n\r\n", 414, "malformed-request"),
     "a large body": (
-        b"POST /localise HTTP/1.1\r\nHost: x\r\nContent-Length: 99999999\r\n\r\n",
+        b"POST /localise HTTP/1.1\r\nHost: x\r\nContent-Length: 199999999\r\n\r\n",
         413,
         "upload-too-large",
     ),

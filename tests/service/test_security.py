@@ -111,9 +111,15 @@ class Guarded:
         if f"{{{VENUE}}}" in path:
             made = self.client.post("/venues", json={}, headers=bearer(self.key)).json()
             path = path.replace(f"{{{VENUE}}}", made["id"])
+        picture = ("p.jpg", encode_picture(512, 256, "JPEG"), "image/jpeg")
+        asked = {"data": {PLAN: plan_id, "refine": "none"}, "files": {"panorama": picture}}
+        if "{answer_id}" in path:
+            kept = self.client.post("/localise", headers=bearer(self.key), **asked).json()
+            path = path.replace("{answer_id}", kept["answer_id"])
         if path == "/localise":
-            picture = encode_picture(512, 256, "JPEG")
-            body = {"data": {PLAN: plan_id, "refine": "none"}, "files": {"panorama": ("p.jpg", picture, "image/jpeg")}}
+            body = asked
+        elif path == "/localise/sequence":
+            body = {"data": {PLAN: plan_id}, "files": [("panorama", picture)] * 2}
         elif path.startswith("/venues"):
             body = {"json": {"name": "12 Mill Lane"}}
         elif method in ("POST", "PUT"):
@@ -128,7 +134,7 @@ def guarded(
 ) -> Iterator[Guarded]:
     data_dir = tmp_path_factory.mktemp("data")
     rates = {"rate_per_minute": 0, "rate_burst": 0, "refused_keys_per_minute": 10**6}
-    with start_app(data_dir, api_keys=True, key_cache_s=0.1, **rates) as client:
+    with start_app(data_dir, api_keys=True, key_cache_s=0.1, keep_answers_s=600.0, **rates) as client:
         store = Store(database_of(data_dir))
         key = make_key(store)
         client.headers.update(bearer(key))

@@ -776,7 +776,7 @@ def test_grids_of_the_schema_before_are_computed_again_and_the_rest_stays(store:
             *_OF_FILES,
         ):
             connection.exec_driver_sql(f"ALTER TABLE {table} DROP COLUMN {column}")
-        for table in ("venue_plans", "venues"):
+        for table in ("venue_plans", "venues", "kept_answers"):
             connection.exec_driver_sql(f"DROP TABLE {table}")
         connection.exec_driver_sql("UPDATE alembic_version SET version_num = '0001'")
     store.close()
@@ -799,7 +799,7 @@ def test_venues_are_added_to_what_there_is(store: Store, url: str) -> None:
     with store._database.writing() as connection:
         for table, column in (*_OF_VENUES, *_OF_FILES):
             connection.exec_driver_sql(f"ALTER TABLE {table} DROP COLUMN {column}")
-        for table in ("venue_plans", "venues"):
+        for table in ("venue_plans", "venues", "kept_answers"):
             connection.exec_driver_sql(f"DROP TABLE {table}")
         connection.exec_driver_sql("UPDATE alembic_version SET version_num = '0002'")
     store.close()
