@@ -173,8 +173,9 @@ class Localiser:
         with clock.stage("decode"):
             panorama = await self._decoder.decode(content, deadline, party)
         known = known_heading(form, record.plan.north, panorama, self._settings.compass_tolerance_deg)
-        # Looking at many rooms takes a while.
-        await self.compute(party, partial(hints.check, record.plan), deadline)
+        if not hints.are_none:
+            # Looking at many rooms takes a while.
+            await self.compute(party, partial(hints.check, record.plan), deadline)
         query = await self.compute(party, lambda: self.encode(panorama, known, height, clock), deadline)
         latents_alone = not self._encoders.predicts_profile
         with clock.stage("grid"):
@@ -203,7 +204,7 @@ class Localiser:
         party: str,
     ) -> SequenceAnswer:
         """Localise several panoramas of one visit jointly; arguments and errors as of `answer`."""
-        with self._queries.hold(party):
+        async with self._queries.wait_and_hold(party, begin + self._settings.request_deadline_s):
             return await self._answer_sequence(record, form, contents, begin, clock, party)
 
     async def _answer_sequence(

@@ -107,7 +107,7 @@ class VenueLocaliser:
             VenueNotReadyError: none of its plans was ready by the deadline.
             LaLaLocError: see `Localiser.answer`.
         """
-        with self._queries.hold(party):
+        async with self._queries.wait_and_hold(party, begin + self._settings.request_deadline_s):
             return await self._answer(venue, form, content, begin, clock, party)
 
     async def _answer(

@@ -153,6 +153,22 @@ def test_derivatives_of_motions_are_those_of_differences(name: str) -> None:
         np.testing.assert_allclose(by_both[:, :, unknown], expected, atol=1e-3)
 
 
+def test_a_direction_that_says_next_to_nothing_costs_no_more_than_a_distance() -> None:
+    side = 45
+    position = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2) * 0.5
+    many = States(position, np.linspace(0.0, math.tau, 64, endpoint=False), math.tau / 64)
+    vague = Motion(distance_m=2.0, distance_std_m=1000.0, direction=0.3, direction_std=math.pi)
+    made = link(vague, many, many, 0.5)
+    assert made.places is not None
+    assert not made.is_directed
+    assert made.places.nnz <= len(position) ** 2
+    # A walk with usual odometry keeps its direction.
+    usual = link(Motion(distance_m=2.4, distance_std_m=0.12, direction=0.3, direction_std=0.035), many, many, 0.5)
+    assert usual.is_directed
+    assert usual.places is not None
+    assert usual.places.nnz < 4_000_000
+
+
 def test_a_motion_is_as_it_was_made() -> None:
     # From (1, 1) looking along +x, 2 m to the right hand, then looking along +y.
     position_m, heading = np.array([[[1.0, 1.0], [1.0, -1.0]]]), np.array([[math.pi / 2, 0.0]])

@@ -15,9 +15,10 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.sparse import csr_array
 from scipy.spatial import KDTree
 
@@ -33,6 +34,9 @@ MAX_DISTANCE_M = 1000.0
 LEAST_DISTANCE_STD_M, LEAST_ANGLE_STD = 1e-3, math.radians(0.01)
 # How far grid poses are from where the camera is, along any direction, as a share of the grid's step.
 _OFF_GRID = 0.5
+# Pairs of places times headings that are compared for one motion, and pairs of states that are kept: more of them than
+# this cost seconds and gigabytes, and come of measurements that say next to nothing.
+_MAX_COMPARED, _MAX_KEPT = 64_000_000, 4_000_000
 # Sideways errors of short distances do not vanish with them.
 _LEAST_ACROSS_M = 0.05
 
@@ -99,8 +103,8 @@ class Link:
     """How likely a motion makes all pairs of states of two pictures.
 
     Attributes:
-        places: likelihoods of pairs of places but for the floor, (n', n); where the direction was measured of pairs of
-            states with the first heading, (n' k, n k) in row-major order. None: all alike.
+        places: likelihoods of pairs of places but for the floor, (n', n); where they are directed of pairs of states
+            with the first heading, (n' k, n k) in row-major order. None: all alike.
         turns: (k, k') of pairs of headings; None: all alike.
         sizes: n, k, n' and k'.
         floor: what is added to every pair.
@@ -150,35 +154,67 @@ def link(motion: Motion, first: States, second: States, step_m: float) -> Link:
         spread = math.sqrt(motion.turn_std**2 + (first.sector**2 + second.sector**2) / 12.0)
         off = wrap_angle(second.heading[None, :] - first.heading[:, None] - motion.turn)
         turns = np.exp(-0.5 * np.square(off / spread))
-    places = None if motion.distance_m is None else _places(motion, first, second, _OFF_GRID * step_m)
-    return Link(places, turns, sizes, 0.0 if motion.is_unknown else FLOOR, motion.direction is not None)
+    floor = 0.0 if motion.is_unknown else FLOOR
+    if motion.distance_m is None:
+        return Link(None, turns, sizes, floor)
+    off_m = _OFF_GRID * step_m
+    pairs = _pairs_at_distance(motion.distance_m, math.hypot(motion.distance_std_m, off_m), first, second)
+    if motion.direction is not None:
+        directed = _directed(motion, pairs, first, second, off_m)
+        if directed is not None:
+            return Link(directed, turns, sizes, floor, is_directed=True)
+    places = csr_array((np.exp(-0.5 * np.square(pairs.off)), (pairs.target, pairs.source)), shape=(sizes[2], sizes[0]))
+    return Link(places, turns, sizes, floor)
 
 
-def _places(motion: Motion, first: States, second: States, off_m: float) -> csr_array:
-    """Likelihoods of pairs of places, in the shapes of `Link`."""
-    assert motion.distance_m is not None
-    along_std = math.hypot(motion.distance_std_m, off_m)
-    reach_m = motion.distance_m + _FARTHEST * along_std
-    near = KDTree(second.position_m).query_ball_point(first.position_m, reach_m)
+class _Pairs(NamedTuple):
+    """Numbers of places, the displacement (m) from one to the other, and its length's deviation in units of its own."""
+
+    source: Int[np.ndarray, "p"]
+    target: Int[np.ndarray, "p"]
+    moved_m: Float[np.ndarray, "p 2"]
+    off: Float[np.ndarray, "p"]
+
+
+def _pairs_at_distance(distance_m: float, std_m: float, first: States, second: States) -> _Pairs:
+    """The pairs of places that are about so far apart."""
+    near = KDTree(second.position_m).query_ball_point(first.position_m, distance_m + _FARTHEST * std_m)
     count = np.array([len(one) for one in near])
     source = np.repeat(np.arange(len(near)), count)
     target = np.concatenate([np.asarray(one, dtype=int) for one in near]) if count.any() else np.empty(0, int)
-    moved = second.position_m[target] - first.position_m[source]
+    moved_m = second.position_m[target] - first.position_m[source]
+    off = (np.hypot(moved_m[:, 0], moved_m[:, 1]) - distance_m) / std_m
+    kept = np.abs(off) < _FARTHEST
+    return _Pairs(source[kept], target[kept], moved_m[kept], off[kept])
+
+
+def _directed(motion: Motion, pairs: _Pairs, first: States, second: States, off_m: float) -> csr_array | None:
+    """Likelihoods of pairs of states with the first heading; None where a direction leaves too many to be compared.
+
+    The chain then goes by the distance alone; the optimiser, to which paths are few, goes by the direction still.
+    """
     headings = len(first.heading)
-    if motion.direction is None:
-        squared = np.square((np.hypot(moved[:, 0], moved[:, 1]) - motion.distance_m) / along_std)
-        kept = squared < _FARTHEST**2
-        entries = (np.exp(-0.5 * squared[kept]), (target[kept], source[kept]))
-        return csr_array(entries, shape=(len(second.position_m), len(first.position_m)))
+    if len(pairs.source) * headings > _MAX_COMPARED:
+        return None
+    assert motion.distance_m is not None
+    assert motion.direction is not None
+    along_std = math.hypot(motion.distance_std_m, off_m)
     across_std = math.sqrt(motion.across_std_m**2 + off_m**2 + (motion.distance_m * first.sector) ** 2 / 12.0)
     parts: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    found = 0
     for k, heading in enumerate(first.heading):
         ahead = np.array([math.sin(heading + motion.direction), math.cos(heading + motion.direction)])
-        along = (moved @ ahead - motion.distance_m) / along_std
-        across = (moved[:, 0] * ahead[1] - moved[:, 1] * ahead[0]) / across_std
+        along = (pairs.moved_m @ ahead - motion.distance_m) / along_std
+        across = (pairs.moved_m[:, 0] * ahead[1] - pairs.moved_m[:, 1] * ahead[0]) / across_std
         squared = np.square(along) + np.square(across)
         kept = squared < _FARTHEST**2
-        parts.append((np.exp(-0.5 * squared[kept]), target[kept] * headings + k, source[kept] * headings + k))
+        found += int(kept.sum())
+        if found > _MAX_KEPT:
+            return None
+        parts.append(
+            (np.exp(-0.5 * squared[kept]), pairs.target[kept] * headings + k, pairs.source[kept] * headings + k)
+        )
     value, row, column = (np.concatenate(columns) for columns in zip(*parts, strict=True))
-    shape = (len(second.position_m) * headings, len(first.position_m) * headings)
-    return csr_array((value, (row, column)), shape=shape)
+    return csr_array(
+        (value, (row, column)), shape=(len(second.position_m) * headings, len(first.position_m) * headings)
+    )
