@@ -39,8 +39,8 @@ def test_the_tutorial_ends_in_the_answer_that_it_shows(
         assert picture.width == 1600
     kitchen, bedroom = json.loads(next(out for line, out in printed.items() if "--json" in line))
     # The plan's lower left corner lies half a metre from the picture's, and a metre above it.
-    assert kitchen["position"]["x_m"] == pytest.approx(7.1 + 0.5, abs=0.1)
-    assert kitchen["position"]["y_m"] == pytest.approx(2.2 + 1.0, abs=0.1)
+    assert kitchen["position"]["x_m"] == pytest.approx(7.1 + 0.5, abs=0.2)
+    assert kitchen["position"]["y_m"] == pytest.approx(2.2 + 1.0, abs=0.2)
     assert bedroom["room"] != kitchen["room"]
 
 

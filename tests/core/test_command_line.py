@@ -37,8 +37,8 @@ def test_photographs_are_found_from_any_folder_and_drawn(tmp_path: Path) -> None
     (answer,) = json.loads(done.stdout)
     (truth,) = [one for one in json.loads((EXAMPLES / "poses.json").read_text()) if one["file"] == "kitchen.jpg"]
     assert answer["room"] == "kitchen"
-    assert answer["position"]["x_m"] == pytest.approx(truth["x_m"], abs=0.1)
-    assert answer["position"]["y_m"] == pytest.approx(truth["y_m"], abs=0.1)
+    assert answer["position"]["x_m"] == pytest.approx(truth["x_m"], abs=0.2)
+    assert answer["position"]["y_m"] == pytest.approx(truth["y_m"], abs=0.2)
     assert answer["heading_deg"] == pytest.approx(250.0)
     assert answer["confidence"] > 0.9
     assert answer["stage"] == "lpo"

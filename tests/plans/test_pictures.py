@@ -43,6 +43,13 @@ def test_a_picture_is_a_draft_that_says_what_it_is_unsure_of(drawn: dict[Style, 
     assert any("lettering is not read" in line for line in plan.report.notes)
 
 
+def test_what_a_draft_shows_is_not_held_against_photographs_until_it_is_claimed(drawn: dict[Style, DrawnPlan]):
+    draft = import_plan(drawn["thick"].png(), ImportOptions(metres_per_pixel=drawn["thick"].metres_per_pixel))
+    assert draft.plan().openings
+    assert draft.plan().opening_kinds == frozenset()
+    assert any("opening_kinds" in guess for guess in draft.report.unsure)
+
+
 def test_a_scale_is_never_assumed(drawn: dict[Style, DrawnPlan]):
     with pytest.raises(InvalidFloorPlanError, match="does not say how long anything is"):
         import_plan(drawn["thick"].png())

@@ -46,7 +46,8 @@ class _Reading:
 def sketch_picture(
     gray: UInt8[np.ndarray, "h w"], metres_per_pixel: float, notebook: Notebook, budget: Budget
 ) -> Sketch:
-    """Rooms are what walls enclose; gaps in walls are doors, windows and passages by what is drawn in them.
+    """Rooms are what walls enclose; gaps in walls are doors, windows and passages by what is drawn in them. No kind of
+    opening is claimed to be shown completely: that is for who has looked at the draft to say.
 
     Walls are read twice, as what is dark and thick, and as what lies between two lines; the reading that encloses
     more is taken.
@@ -76,7 +77,13 @@ def sketch_picture(
         )
     _tell(best, ink, metres_per_pixel, notebook)
     rooms = [SketchedRoom(straightened(_without_islands(room, notebook))) for room in best.enclosed.rooms]
-    return Sketch(rooms=rooms, openings=_openings(best, ink, notebook))
+    openings = _openings(best, ink, notebook)
+    if openings:
+        notebook.unsure.append(
+            "openings are drawn, but count for nothing until opening_kinds names the kinds that are shown completely"
+        )
+    # A door that was taken for a window, or one that was missed, would speak against the right place.
+    return Sketch(rooms=rooms, openings=openings, opening_kinds=())
 
 
 def _hypotheses(ink: Ink) -> Sequence[tuple[WallMask | None, bool]]:
