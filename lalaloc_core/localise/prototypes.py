@@ -32,6 +32,8 @@ _CHUNK = 4096
 _FACTORS, _MAX_FACTOR = 8, 1e4
 # A plan that weighs nothing in the posterior counts as this improbable, in logs: posteriors leave out what is less.
 _NEGLIGIBLE = -12.0
+# Plans whose log masses are nearer than this are alike in all their prototypes.
+_ALIKE = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,7 +127,8 @@ def share_searched(
     """How much of the posterior over all plans those have that were searched.
 
     A full search changes what a plan weighs. Those left out are taken to change as most of those searched did: by the
-    median of their ratios, which is that of wrong plans, or of copies where there are many.
+    median of their ratios, which is that of wrong plans. But what is left out of equal plans changes as those of them do
+    that were searched.
 
     Args:
         probability: of each plan that was searched, given that it is one of them.
@@ -134,8 +137,12 @@ def share_searched(
     if not len(left_out):
         return 1.0
     log_probability = np.log(np.maximum(probability, np.exp(_NEGLIGIBLE)))
-    usual = float(np.median(log_probability - log_mass[searched]))
-    return float(1.0 / (1.0 + np.exp(np.logaddexp.reduce(left_out) + usual)))
+    change = log_probability - log_mass[searched]
+    # The most probable plans are searched, so only the least of them can have equals that are not.
+    least = log_mass[searched].min() + _ALIKE
+    equals = change[log_mass[searched] <= least]
+    expected = left_out + np.where(left_out >= least - 2 * _ALIKE, np.median(equals), np.median(change))
+    return float(1.0 / (1.0 + np.exp(np.logaddexp.reduce(expected))))
 
 
 def _azimuths(columns: int) -> Int[np.ndarray, "a"]:

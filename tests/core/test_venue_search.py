@@ -187,3 +187,6 @@ def test_what_was_left_out_keeps_its_share() -> None:
     # One stands out in the full search; those left out are taken for wrong ones.
     sharp = np.array([1.0 - 3e-5, 1e-5, 1e-5, 1e-5])
     assert share_searched(copies, np.arange(4), sharp) > 0.99
+    # A wrong plan and one of four copies of the right one were searched.
+    mixed = np.array([-1.0, -2.0, -2.0, -2.0, -2.0, -7.0])
+    assert share_searched(mixed, np.arange(2), np.array([0.0, 1.0])) == pytest.approx(0.25, abs=0.01)
