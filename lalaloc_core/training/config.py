@@ -116,7 +116,10 @@ class ImageStageConfig:
         ceiling_weight: weight of the Laplace likelihood of the ceiling's height.
         room_type_weight: weight of the cross entropy of the room's type.
         photograph_weight: weight of following a teacher's maps on photographs without labels, where there are any.
+        photograph_profile_weight: weight of following its lines of floor and ceiling on them.
         photographs_per_batch: how many of them are added to each batch.
+        style_mixing: where there are photographs, share of a batch's pictures whose early features take on another's
+            style, every other time that of a photograph.
         ema_decay: decay per step of the averaged weights that are validated and shipped; 0 turns it off.
     """
 
@@ -142,7 +145,9 @@ class ImageStageConfig:
     ceiling_weight: float = 0.0
     room_type_weight: float = 0.0
     photograph_weight: float = 0.0
+    photograph_profile_weight: float = 0.0
     photographs_per_batch: int = 4
+    style_mixing: float = 0.0
     ema_decay: float = 0.0
     optimiser: OptimiserConfig = field(default_factory=OptimiserConfig)
 
@@ -377,8 +382,11 @@ PRESETS: dict[str, TrainConfig] = {
             ceiling_weight=0.2,
             room_type_weight=0.1,
             photograph_weight=0.3,
+            photograph_profile_weight=0.3,
+            photographs_per_batch=8,
+            style_mixing=0.5,
             ema_decay=0.998,
-            optimiser=OptimiserConfig(learning_rate=1.5e-3, schedule="trapezoid", warmup=0.03, trunk_factor=0.15),
+            optimiser=OptimiserConfig(learning_rate=1.5e-3, schedule="trapezoid", warmup=0.03, trunk_factor=0.05),
         ),
     ),
     "tiny": _TINY,
@@ -393,7 +401,9 @@ PRESETS: dict[str, TrainConfig] = {
             ceiling_weight=0.2,
             room_type_weight=0.1,
             photograph_weight=0.3,
+            photograph_profile_weight=0.3,
             photographs_per_batch=2,
+            style_mixing=0.5,
             optimiser=OptimiserConfig(trunk_factor=0.3),
         ),
     ),

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from lalaloc_core.nets import LayoutEncoder
 from lalaloc_core.nets.ring import ImageFeatures, RingLayoutEncoder, StructureFeatures, first_of
+from lalaloc_core.nets.trunk import StyleMixing
 from lalaloc_core.nets.trunk_encoder import TrunkImageEncoder
 from lalaloc_core.training import losses
 from lalaloc_core.training.batches import Batch
@@ -103,16 +104,34 @@ class ImageStage:
     def _encoded(self, batch: Batch) -> tuple[ImageFeatures, dict[str, Tensor]]:
         """What the encoder says of a batch's panoramas, and the loss on photographs, which it sees along with them."""
         stage, image, height = self.settings, batch["image"], batch["camera_height_m"]
-        if self.photographs is None or not stage.photograph_weight:
+        if self.photographs is None or not (stage.photograph_weight or stage.photograph_profile_weight):
             return self.encoder(self._seen(image), height), {}
         count, columns = stage.photographs_per_batch, self.config.profile_columns
-        others, taught = self.photographs.draw(count, columns, self._randomness(torch.device("cpu")))
-        together = torch.cat([image, others.to(image.device)])
-        # How high real cameras stood is not known, and openings do not depend on it.
-        seen = self.encoder(self._seen(together), torch.cat([height, height.new_ones(count)]))
+        others = self.photographs.draw(count, columns, self._randomness(torch.device("cpu")))
+        together = self._seen(torch.cat([image, others.images.to(image.device)]))
+        # How high real cameras stood is not known: what is told of photographs is in camera heights.
+        heights = torch.cat([height, height.new_ones(count)])
+        seen = self.encoder(together, heights, self._styles(len(image), count, image.device))
         assert seen.structure is not None
-        loss = losses.followed_maps(seen.structure.opening_logits[len(image) :], taught.to(image.device))
-        return first_of(seen, len(image)), {"photographs": stage.photograph_weight * loss}
+        openings, log_distance = (told.to(image.device) for told in (others.openings, others.log_distance))
+        real = slice(len(image), None)
+        maps = losses.followed_maps(seen.structure.opening_logits[real], openings)
+        walls = losses.followed_walls(seen.log_profile[real], seen.log_scale[real], log_distance)
+        followed = stage.photograph_weight * maps + stage.photograph_profile_weight * walls
+        return first_of(seen, len(image)), {"photographs": followed}
+
+    def _styles(self, rendered: int, photographs: int, device: torch.device) -> StyleMixing | None:
+        """Who takes on whose style: every other partner is a photograph, since that is how pictures are to look."""
+        if not self.settings.style_mixing:
+            return None
+        generator = self._randomness(torch.device("cpu"))
+        count = rendered + photographs
+        partner = torch.randint(count, (count,), generator=generator)
+        real = rendered + torch.randint(photographs, (count,), generator=generator)
+        partner = torch.where(torch.rand(count, generator=generator) < 0.5, real, partner)
+        share = torch.rand(count, generator=generator)
+        share[torch.rand(count, generator=generator) >= self.settings.style_mixing] = 0.0
+        return StyleMixing(partner.to(device), share.to(device))
 
     def _structural(self, seen: StructureFeatures, batch: Batch) -> dict[str, Tensor]:
         """Losses on what is met at each azimuth, the ceiling and the type of the room."""

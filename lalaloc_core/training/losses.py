@@ -69,6 +69,16 @@ def laplace(
     return (error * torch.exp(-log_scale) + log_scale).mean()
 
 
+def followed_walls(
+    log_profile: Float[Tensor, "b w"], log_scale: Float[Tensor, "b w"], log_distance: Float[Tensor, "b w"]
+) -> Tensor:
+    """`laplace` of a teacher's walls, whose log distances are nan where it sees none."""
+    known = torch.isfinite(log_distance)
+    error = (log_profile - log_distance.nan_to_num()).abs()
+    each = error * torch.exp(-log_scale) + log_scale
+    return (each * known).sum() / known.sum().clamp_min(1)
+
+
 def opening(
     logits: Float[Tensor, "b w c"], kind: Int[Tensor, "b w"], share: Float[Tensor, "c"], balance: float
 ) -> Tensor:

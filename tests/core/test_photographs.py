@@ -13,11 +13,13 @@ from PIL import Image
 from lalaloc_core.errors import ConfigError, DatasetError
 from lalaloc_core.training.config import PRESETS
 from lalaloc_core.training.data import TrainingData
-from lalaloc_core.training.photographs import Photographs, _class_map, _seen, load_photographs
+from lalaloc_core.training.photographs import Photographs, load_photographs
 from lalaloc_core.training.photometric import _blurred, _lenses, optics
+from lalaloc_core.training.stretching import stretched
+from lalaloc_core.training.teacher import _class_map, look
 
 ROWS, COLUMNS, WIDTH = 512, 1024, 128
-WALL, DOOR, WINDOW = 1, 15, 9
+WALL, DOOR, WINDOW, FLOOR, CEILING, SOFA = 1, 15, 9, 4, 6, 24
 has_runtime = importlib.util.find_spec("ai_edge_litert") is not None
 
 
@@ -46,7 +48,7 @@ class TestMaps:
         assert (kind == panorama[row, :, 0]).mean() > 0.99
 
     def test_shares_of_columns_serve_as_probabilities(self) -> None:
-        seen = _seen(painted(), by_colour, WIDTH)
+        seen = look(painted(), by_colour, WIDTH).openings
         at = lambda column: seen[column * WIDTH // COLUMNS]  # noqa: E731
         assert at(260).tolist() == [1.0, 0.0]
         assert at(640).tolist() == [0.0, 1.0]
@@ -57,18 +59,91 @@ class TestMaps:
         assert (seen.sum(axis=1) <= 1.0 + 1e-6).all()
 
 
+def room(half_m: tuple[float, float], camera_m: float = 1.5, ceiling_m: float = 2.5) -> np.ndarray:
+    """A panorama of an empty rectangular room from its middle, in the teacher's classes."""
+    azimuth = ((np.arange(COLUMNS) + 0.5) / COLUMNS - 0.5) * 2.0 * np.pi
+    elevation = (0.5 - (np.arange(ROWS) + 0.5) / ROWS)[:, None] * np.pi
+    distance = distances(azimuth, half_m)
+    kind = np.where(np.tan(elevation) < -camera_m / distance, FLOOR, WALL)
+    kind = np.where(np.tan(elevation) > (ceiling_m - camera_m) / distance, CEILING, kind)
+    return np.repeat(kind[..., None], 3, axis=2).astype(np.uint8)
+
+
+def distances(azimuth: np.ndarray, half_m: tuple[float, float]) -> np.ndarray:
+    across, along = np.abs(np.sin(azimuth)), np.abs(np.cos(azimuth))
+    return np.minimum(half_m[0] / np.maximum(across, 1e-9), half_m[1] / np.maximum(along, 1e-9))
+
+
+class TestWalls:
+    azimuth = ((np.arange(WIDTH) + 0.5) / WIDTH - 0.5) * 2.0 * np.pi
+
+    def test_where_floor_ends_at_a_wall_the_wall_stands(self) -> None:
+        seen = look(room((2.0, 3.0)), by_colour, WIDTH).log_distance
+        expected = np.log(distances(self.azimuth, (2.0, 3.0)) / 1.5)
+        assert np.isfinite(seen).all()
+        np.testing.assert_allclose(seen, expected, atol=0.05)
+
+    def test_behind_furniture_a_flat_ceiling_tells_the_distance(self) -> None:
+        panorama = room((2.0, 3.0))
+        panorama[ROWS // 2 + 20 :, 100:200] = SOFA
+        seen = look(panorama, by_colour, WIDTH).log_distance
+        expected = np.log(distances(self.azimuth, (2.0, 3.0)) / 1.5)
+        np.testing.assert_allclose(seen, expected, atol=0.08)
+
+    def test_where_neither_is_seen_nothing_is_told(self) -> None:
+        panorama = room((2.0, 3.0))
+        panorama[:, 100:200] = SOFA
+        # A ceiling that is not flat tells no distances.
+        sloped = room((2.0, 3.0))
+        for number, ceiling_m in enumerate((2.9, 3.4), start=1):
+            there = np.arange(COLUMNS) // 16 % 3 == number
+            sloped[: ROWS // 2, there] = room((2.0, 3.0), ceiling_m=ceiling_m)[: ROWS // 2, there]
+        sloped[ROWS // 2 + 20 :, 100:200] = SOFA
+        for one in (panorama, sloped):
+            unseen = np.isnan(look(one, by_colour, WIDTH).log_distance)
+            assert unseen[14:24].all()
+            assert not unseen[30:].any()
+
+
+class TestStretching:
+    def test_a_stretched_room_is_seen_as_a_room_of_that_size(self) -> None:
+        factors, half_m = torch.tensor([[1.5, 0.75]]), (2.0, 3.0)
+        azimuth = ((np.arange(COLUMNS) + 0.5) / COLUMNS - 0.5) * 2.0 * np.pi
+        marks = (np.abs(azimuth) < 0.3).astype(np.float32)
+        images, openings, log_distance = stretched(
+            torch.from_numpy(room(half_m))[None],
+            torch.from_numpy(marks)[None, :, None],
+            torch.from_numpy(np.log(distances(azimuth, half_m))).float()[None],
+            factors,
+        )
+        larger = (1.5 * half_m[0], 0.75 * half_m[1])
+        np.testing.assert_allclose(log_distance[0].exp(), distances(azimuth, larger), rtol=0.02)
+        assert (images[0].numpy() == room(larger)).mean() > 0.98
+        edge = np.arctan(np.tan(0.3) * 1.5 / 0.75)
+        np.testing.assert_array_equal(openings[0, :, 0], np.abs(azimuth) < edge)
+
+    def test_factors_of_one_change_nothing(self) -> None:
+        panorama = torch.randint(0, 256, (1, 16, 32, 3), dtype=torch.uint8)
+        images, _, _ = stretched(panorama, torch.zeros(1, 32, 2), torch.zeros(1, 32), torch.ones(1, 2))
+        assert int((images.int() - panorama.int()).abs().max()) <= 1
+
+
 class TestDrawing:
     def test_what_is_taught_is_turned_and_mirrored_with_the_picture(self) -> None:
-        width, columns = 16, 8
-        mark = torch.arange(width, dtype=torch.uint8)
-        images = mark[None, None, :, None].expand(1, 4, width, 3).contiguous()
-        photographs = Photographs(images, (mark.float() / width)[None, :, None].expand(1, width, 2).contiguous())
-        shown, taught = photographs.draw(32, columns, torch.Generator().manual_seed(0))
-        expected = (shown[:, 0, :, 0].float() / width).unflatten(1, (columns, 2)).mean(dim=2)
-        torch.testing.assert_close(taught, expected[..., None].expand(-1, -1, 2))
-        starts = {tuple(row.tolist()) for row in shown[:, 0, :, 0]}
-        assert len(starts) > 16
-        assert any(row[1] == (row[0] - 1) % width for row in starts)
+        width, columns = 64, 32
+        # As bright as what is taught; a wave, since pictures are sampled between pixels.
+        mark = (127.0 + 100.0 * torch.sin(2.0 * torch.pi * torch.arange(width) / width)).to(torch.uint8)
+        images = mark[None, None, :, None].expand(1, 8, width, 3).contiguous()
+        taught = (mark.float() / 256.0)[None]
+        photographs = Photographs(images, taught[..., None].expand(1, width, 2).contiguous(), torch.zeros(1, width))
+        drawn = photographs.draw(32, columns, torch.Generator().manual_seed(0))
+        expected = (drawn.images[:, 4, :, 0].float() / 256.0).unflatten(1, (columns, 2)).mean(dim=2)
+        torch.testing.assert_close(drawn.openings, expected[..., None].expand(-1, -1, 2), atol=0.03, rtol=0.0)
+        brightest = drawn.images[:, 4, :, 0].argmax(dim=1)
+        assert len(set(brightest.tolist())) > 10
+        assert drawn.log_distance.shape == (32, columns)
+        assert float(drawn.log_distance.amin()) < -0.2
+        assert float(drawn.log_distance.amax()) > 0.2
 
 
 class TestLoading:

@@ -23,6 +23,7 @@ from lalaloc_core.localise.poses import rolled
 from lalaloc_core.nets.trunk import (
     PRETRAINED_PACKAGE,
     TAP_STRIDES,
+    StyleMixing,
     Trunk,
     TrunkConfig,
     _PadAround,
@@ -130,6 +131,18 @@ class TestTrunk:
     def test_the_padding_has_the_right_derivative(self, before: int, after: int) -> None:
         x = torch.randn(2, 3, 4, 8, dtype=torch.double, requires_grad=True)
         assert torch.autograd.gradcheck(lambda t: _PadAround.apply(t, before, after), x)
+
+    def test_a_style_is_the_mean_and_spread_of_each_channel(self) -> None:
+        x = torch.randn(3, 4, 5, 6, generator=torch.Generator().manual_seed(1)) * 3.0 + 2.0
+        partner, share = torch.tensor([1, 2, 0]), torch.tensor([1.0, 0.0, 0.5])
+        mixed = StyleMixing(partner, share)(x)
+        torch.testing.assert_close(mixed[0].mean((1, 2)), x[1].mean((1, 2)), rtol=1e-3, atol=1e-3)
+        torch.testing.assert_close(mixed[0].std((1, 2)), x[1].std((1, 2)), rtol=1e-3, atol=1e-3)
+        torch.testing.assert_close(mixed[1], x[1], rtol=1e-3, atol=1e-3)
+        torch.testing.assert_close(mixed[2].mean((1, 2)), (x[2] + x[0]).mean((1, 2)) / 2.0, rtol=1e-3, atol=1e-3)
+        # What is where stays: only one factor and one offset by channel.
+        ranks = lambda one: one.flatten(1).argsort(dim=1)  # noqa: E731
+        assert torch.equal(ranks(mixed[0]), ranks(x[0]))
 
     @pytest.mark.parametrize("change", [{"widths": (8, 8)}, {"repeats": (1,) * 8}, {"frozen_stages": 8}])
     def test_what_is_no_such_trunk_is_refused(self, change: dict) -> None:

@@ -44,7 +44,10 @@ WALL, DOOR, WINDOW, PASSAGE = range(len(OPENING_CLASSES))
 def some_photographs() -> Photographs:
     generator = torch.Generator().manual_seed(5)
     images = torch.randint(0, 256, (3, *TINY.image_size, 3), dtype=torch.uint8, generator=generator)
-    return Photographs(images, 0.5 * torch.rand(3, TINY.image_size[1], 2, generator=generator))
+    width = TINY.image_size[1]
+    log_distance = torch.rand(3, width, generator=generator)
+    log_distance[:, : width // 2] = torch.nan
+    return Photographs(images, 0.5 * torch.rand(3, width, 2, generator=generator), log_distance)
 
 
 def stage_of(config: TrainConfig = TINY, photographs: Photographs | None = None) -> ImageStage:
@@ -111,14 +114,25 @@ class TestLosses:
         assert heads | {"trunk", "squeezes", "join", "mixer", "norm"} == grown
         assert all(p.grad is None for p in stage.teacher.parameters())
 
-    def test_photographs_change_what_is_said_of_openings_alone(self, batch: dict[str, torch.Tensor]) -> None:
-        """Their poses are not known, so nothing else can be learnt from them."""
-        plain = dataclasses.replace(TINY, image=dataclasses.replace(TINY.image, optics=0.0))
+    def test_photographs_have_a_loss_of_their_own(self, batch: dict[str, torch.Tensor]) -> None:
+        plain = dataclasses.replace(TINY, image=dataclasses.replace(TINY.image, optics=0.0, style_mixing=0.0))
         with_them = stage_of(plain, some_photographs()).losses(batch)
         without = stage_of(plain).losses(batch)
         assert with_them.keys() - without.keys() == {"photographs"}
         for name, term in without.items():
             torch.testing.assert_close(with_them[name], term, rtol=1e-4, atol=1e-5)
+
+    def test_walls_and_openings_of_photographs_are_learnt(self, batch: dict[str, torch.Tensor]) -> None:
+        for weight, head in (("photograph_weight", "to_openings"), ("photograph_profile_weight", "to_profile")):
+            alone = {"photograph_weight": 0.0, "photograph_profile_weight": 0.0} | {weight: 1.0}
+            stage = stage_of(
+                dataclasses.replace(TINY, image=dataclasses.replace(TINY.image, **alone)), some_photographs()
+            )
+            stage.losses(batch)["photographs"].backward()
+            grown = {
+                n.split(".")[0] for n, p in stage.encoder.named_parameters() if p.grad is not None and p.grad.any()
+            }
+            assert {name for name in grown if name.startswith("to_")} == {head}
 
     def test_a_stage_learns_a_batch(self, batch: dict[str, torch.Tensor]) -> None:
         stage = stage_of(dataclasses.replace(TINY, image=dataclasses.replace(TINY.image, optics=0.0)))

@@ -1,0 +1,53 @@
+"""Panoramas of rooms drawn out along two horizontal axes, as HorizonNet's "pano stretch" (Sun et al., CVPR 2019)."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+from torch.nn import functional
+
+from lalaloc_core.conventions import TWO_PI
+
+
+def stretched(
+    images: UInt8[Tensor, "n h w 3"],
+    openings: Float[Tensor, "n w k"],
+    log_distance: Float[Tensor, "n w"],
+    factors: Float[Tensor, "n 2"],
+) -> tuple[UInt8[Tensor, "n h w 3"], Float[Tensor, "n w k"], Float[Tensor, "n w"]]:
+    """Panoramas, and what is known by column, as if what they show were wider and deeper about the camera.
+
+    A point (x, y, z) comes to lie at (a x, b y, z), so what is seen in direction (u, v, t) was seen in
+    (u / a, v / b, t).
+
+    Args:
+        factors: (a, b), across and along the direction of the central column.
+    """
+    height, width = images.shape[1:3]
+    azimuth = ((torch.arange(width) + 0.5) / width - 0.5) * TWO_PI
+    across, along = torch.sin(azimuth) / factors[:, :1], torch.cos(azimuth) / factors[:, 1:]
+    reach = torch.hypot(across, along)
+    column = (torch.atan2(across, along) / TWO_PI + 0.5) * width - 0.5
+    tangent = torch.tan((0.5 - (torch.arange(height) + 0.5) / height) * math.pi)
+    elevation = torch.atan(tangent[:, None] / reach[:, None, :])
+    row = (0.5 - elevation / math.pi) * height - 0.5
+    nearest = column.round().long() % width
+    moved = openings.gather(1, nearest[..., None].expand_as(openings))
+    return _sampled(images, row, column), moved, log_distance.gather(1, nearest) - torch.log(reach)
+
+
+def _sampled(
+    images: UInt8[Tensor, "n h w 3"], row: Float[Tensor, "n h w"], column: Float[Tensor, "n w"]
+) -> UInt8[Tensor, "n h w 3"]:
+    """Pixels between pixels, linearly, around the horizon."""
+    height, width = images.shape[1:3]
+    around = torch.cat([images[:, :, -1:], images, images[:, :, :1]], dim=2).permute(0, 3, 1, 2).float()
+    # The first column of `around` is the last of the picture, and -1 to 1 reach from the edges of its edge pixels.
+    x = (2.0 * (column % width) + 3.0) / (width + 2) - 1.0
+    y = (2.0 * row + 1.0) / height - 1.0
+    grid = torch.stack([x[:, None, :].expand_as(y), y], dim=3)
+    seen = functional.grid_sample(around, grid, padding_mode="border", align_corners=False)
+    return seen.permute(0, 2, 3, 1).round().to(torch.uint8)
