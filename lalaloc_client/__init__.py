@@ -6,7 +6,8 @@ with Client("http://127.0.0.1:8000") as service:
     plan = service.wait_until_ready(service.upload_floorplan("flat.json").id)
     answer = service.localise(plan.id, "kitchen.jpg", heading_deg=250)
 
-Begin with `client.py`; `operations.py` is what both clients do, without doing it.
+Begin with `client.py`, whose methods stand in `plan_methods.py`, `query_methods.py` and `venue_methods.py`;
+`operations.py` is what both clients do, without doing it.
 """
 
 from lalaloc_client.aio import AsyncClient

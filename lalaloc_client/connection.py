@@ -32,6 +32,17 @@ def http_options(base_url: str, api_key: str | None, timeout_s: float) -> dict[s
     return {"base_url": address, "headers": headers, "timeout": timeout_s}
 
 
+def checked_max_queries(given: int | None) -> int | None:
+    """How many queries may be under way, None if the service is to say.
+
+    Raises:
+        ValueError: fewer than 1.
+    """
+    if given is not None and given < 1:
+        raise ValueError(f"max_queries is {given}, at least 1 is needed")
+    return given
+
+
 def request_to_send(http: httpx.Client | httpx.AsyncClient, request: Request) -> httpx.Request:
     """A request as httpx sends it."""
     made = http.build_request(

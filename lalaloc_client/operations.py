@@ -42,6 +42,8 @@ T = TypeVar("T")
 
 _FIRST_POLL_S, _MAX_POLL_S = 0.1, 2.0
 _SHOWN_CHARACTERS = 500
+# Where the service does not say how many it takes: less than on any machine.
+_UNTOLD_QUERIES = 3
 # What fails before any of a request has left.
 _UNSENT = (httpx.ConnectError, httpx.ConnectTimeout, httpx.PoolTimeout)
 
@@ -177,6 +179,17 @@ def limits(patience: Patience) -> Steps[Mapping[str, Any]]:
     if not isinstance(answer, dict):
         raise MalformedAnswerError(f"answer is {answer!r:.100}, not an object")
     return answer
+
+
+def queries_at_a_time(patience: Patience) -> Steps[int]:
+    """How many queries the service takes of one client at a time, by its limits."""
+    try:
+        told = yield from limits(patience)
+    except ProblemError:
+        # A key that may ask, but not read.
+        return _UNTOLD_QUERIES
+    own = told.get("max_queries_per_tenant")
+    return own if isinstance(own, int) and own > 0 else _UNTOLD_QUERIES
 
 
 def readiness(patience: Patience) -> Steps[Readiness]:

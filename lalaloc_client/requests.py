@@ -12,7 +12,7 @@ import uuid
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypedDict
+from typing import TYPE_CHECKING, Any, Literal, TypedDict, Unpack
 
 import httpx
 
@@ -235,7 +235,13 @@ def _query(
     return Request("POST", path, headers={"Content-Type": media}, content=content)
 
 
-def picture_request(query: Request, picture: Picture, picture_format: PictureFormat) -> Request:
+def drawn_request(
+    floorplan_id: str,
+    panorama: bytes | str | os.PathLike[str] | Image,
+    picture: Picture,
+    picture_format: PictureFormat,
+    **asked: Unpack[QueryOptions],
+) -> Request:
     """A query whose answer is wanted as a picture.
 
     Raises:
@@ -243,6 +249,7 @@ def picture_request(query: Request, picture: Picture, picture_format: PictureFor
     """
     if picture_format not in _PICTURE_MEDIA:
         raise ValueError(f"picture_format is {picture_format!r}, it must be one of {', '.join(_PICTURE_MEDIA)}")
+    query = localise_request(floorplan_id, panorama, **asked)
     headers = {**query.headers, "Accept": _PICTURE_MEDIA[picture_format]}
     return replace(query, params={"picture": picture}, headers=headers)
 

@@ -27,6 +27,11 @@ def with_spare(count: int) -> int:
     return count + -(-count // _TIMES_WHAT_IS_LEFT)
 
 
+def most_of_one(limit: int) -> int:
+    """How many of so many a party may hold while it is alone, of one at least."""
+    return max(limit * _TIMES_WHAT_IS_LEFT // (_TIMES_WHAT_IS_LEFT + 1), 1)
+
+
 class Shares:
     """How much of something each party holds. Not locked: for one event loop, or under the lock of its owner."""
 

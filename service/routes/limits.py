@@ -8,6 +8,7 @@ from fastapi import APIRouter, Depends
 
 from service.runtime import Runtime, runtime_of
 from service.schemas import LimitsAnswer
+from service.sharing import most_of_one
 
 router = APIRouter(tags=["operations"])
 
@@ -16,7 +17,11 @@ router = APIRouter(tags=["operations"])
 async def limits(runtime: Annotated[Runtime, Depends(runtime_of)]) -> LimitsAnswer:
     """The limits this service was started with; the error about one names it."""
     settings = runtime.settings
-    told = {name: getattr(settings, name) for name in LimitsAnswer.model_fields}
     # As they are in effect: the settings may leave these numbers to the service.
-    resolved = {"max_queries": settings.query_limit, "max_pending_requests": settings.pending_limit}
-    return LimitsAnswer(**told | resolved)
+    resolved = {
+        "max_queries": settings.query_limit,
+        "max_queries_per_tenant": most_of_one(settings.query_limit),
+        "max_pending_requests": settings.pending_limit,
+    }
+    told = {name: getattr(settings, name) for name in LimitsAnswer.model_fields.keys() - resolved.keys()}
+    return LimitsAnswer(**told, **resolved)

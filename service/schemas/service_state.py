@@ -11,7 +11,7 @@ from service.schemas.localise_answer import ModelAnswer
 
 
 class LimitsAnswer(Answer):
-    """What requests may be; each is the setting of the same name, and named by the error about it."""
+    """What requests may be; most are the setting of the same name, and named by the error about it."""
 
     max_plan_bytes: int = Field(description="Upload of a floor plan, whatever its format.")
     max_unpacked_bytes: int = Field(description="What an archive of a floor plan unpacks to.")
@@ -38,6 +38,10 @@ class LimitsAnswer(Answer):
     max_top_k: int = Field(description="Candidates of an answer.")
     max_pending_requests: int = Field(description="Uploads and queries in flight.")
     max_queries: int = Field(description="Queries in work; more wait.")
+    max_queries_per_tenant: int = Field(
+        description="Of these, in work for one tenant, or one client where there are no API keys: who sends no more at "
+        "a time is refused none while it is alone."
+    )
     max_waiting_queries: int = Field(description="Queries that wait for those in work; more get a 503 at once.")
     max_reads: int = Field(description="Requests in work that change nothing; more get a 503 at once.")
     max_streams: int = Field(description="Clients that follow events; more get a 503 at once.")

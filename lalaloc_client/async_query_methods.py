@@ -1,0 +1,124 @@
+"""What the client for asyncio asks about panoramas."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Unpack
+
+from lalaloc_client import operations, requests
+from lalaloc_client.async_sender import AsyncSender
+from lalaloc_client.model import Localisation, SequenceLocalisation
+from lalaloc_client.requests import Picture, PictureFormat, QueryOptions, Refine, SequenceRefine
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+
+
+class AsyncQueryMethods(AsyncSender):
+    """Methods of `AsyncClient` about panoramas, see `QueryMethods`."""
+
+    async def localise(
+        self,
+        floorplan_id: str,
+        panorama: bytes | str | os.PathLike[str] | Image,
+        *,
+        heading_deg: float | None = None,
+        heading_tolerance_deg: float | None = None,
+        camera_height_m: float | None = None,
+        camera_height_std_m: float | None = None,
+        near: Mapping[str, float] | None = None,
+        radius_m: float | None = None,
+        rooms: Sequence[str] | None = None,
+        strict: bool | None = None,
+        refine: Refine | None = None,
+        top_k: int | None = None,
+    ) -> Localisation:
+        """See `Client.localise`."""
+        return await self._query(
+            operations.localisation,
+            requests.localise_request,
+            floorplan_id,
+            panorama,
+            heading_deg=heading_deg,
+            heading_tolerance_deg=heading_tolerance_deg,
+            camera_height_m=camera_height_m,
+            camera_height_std_m=camera_height_std_m,
+            refine=refine,
+            top_k=top_k,
+            near=near,
+            radius_m=radius_m,
+            rooms=rooms,
+            strict=strict,
+        )
+
+    async def picture(
+        self,
+        floorplan_id: str,
+        panorama: bytes | str | os.PathLike[str] | Image,
+        picture: Picture = "both",
+        *,
+        picture_format: PictureFormat = "png",
+        **asked: Unpack[QueryOptions],
+    ) -> bytes:
+        """See `Client.picture`."""
+        return await self._query(
+            operations.content, requests.drawn_request, floorplan_id, panorama, picture, picture_format, **asked
+        )
+
+    async def localise_in_venue(
+        self,
+        venue_id: str,
+        panorama: bytes | str | os.PathLike[str] | Image,
+        *,
+        heading_deg: float | None = None,
+        heading_tolerance_deg: float | None = None,
+        camera_height_m: float | None = None,
+        camera_height_std_m: float | None = None,
+        strict: bool | None = None,
+        refine: Refine | None = None,
+        top_k: int | None = None,
+    ) -> Localisation:
+        """See `Client.localise_in_venue`."""
+        return await self._query(
+            operations.localisation,
+            requests.localise_request,
+            None,
+            panorama,
+            venue_id=venue_id,
+            heading_deg=heading_deg,
+            heading_tolerance_deg=heading_tolerance_deg,
+            camera_height_m=camera_height_m,
+            camera_height_std_m=camera_height_std_m,
+            refine=refine,
+            top_k=top_k,
+            strict=strict,
+        )
+
+    async def localise_sequence(
+        self,
+        floorplan_id: str,
+        panoramas: Sequence[bytes | str | os.PathLike[str] | Image],
+        *,
+        motions: Sequence[Mapping[str, float] | None] | None = None,
+        headings_deg: Sequence[float | None] | None = None,
+        heading_tolerance_deg: float | None = None,
+        camera_height_m: float | None = None,
+        camera_height_std_m: float | None = None,
+        refine: SequenceRefine | None = None,
+        top_k: int | None = None,
+    ) -> SequenceLocalisation:
+        """See `Client.localise_sequence`."""
+        return await self._query(
+            operations.sequence,
+            requests.sequence_request,
+            floorplan_id,
+            panoramas,
+            motions=motions,
+            headings_deg=headings_deg,
+            heading_tolerance_deg=heading_tolerance_deg,
+            camera_height_m=camera_height_m,
+            camera_height_std_m=camera_height_std_m,
+            refine=refine,
+            top_k=top_k,
+        )
