@@ -15,7 +15,6 @@ from starlette.routing import BaseRoute, Route
 from starlette.types import ASGIApp
 
 from lalaloc_core import __version__
-from service.errors import HTTP_PROBLEMS, PROBLEMS
 from service.http.api_description import describe_api
 from service.http.middleware import (
     AdmissionMiddleware,
@@ -28,6 +27,7 @@ from service.http.middleware import (
 )
 from service.http.parameters import check_parameters
 from service.http.problems import install_problem_handlers
+from service.problem_kinds import HTTP_PROBLEMS, PROBLEMS
 from service.routes import ROUTERS
 from service.runtime import start_runtime
 from service.settings import Settings

@@ -1,4 +1,4 @@
-"""Errors of the service, and the one table that says what every error means over HTTP.
+"""Errors of the service; `problem_kinds` says what each means over HTTP.
 
 LaLaLocError
 └── ServiceError
@@ -43,27 +43,8 @@ LaLaLocError
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 
-from lalaloc_core.errors import (
-    BundleError,
-    CheckpointError,
-    ConfigError,
-    DatasetError,
-    ExportError,
-    InvalidFloorPlanError,
-    InvalidHintError,
-    InvalidInputError,
-    InvalidMotionError,
-    InvalidPanoramaError,
-    InvalidPoseError,
-    LaLaLocError,
-    MissingExtraError,
-    RunError,
-    SeveralLevelsError,
-)
-
-URN = "urn:lalaloc:problem:"
+from lalaloc_core.errors import LaLaLocError
 
 
 class ServiceError(LaLaLocError):
@@ -126,8 +107,9 @@ class UnknownAnswerError(ServiceError):
 class UnanchoredPlanError(ServiceError):
     """The floor plan does not say where on Earth it lies, which the answer that is wanted needs."""
 
-    def __init__(self, plan_id: str) -> None:
-        super().__init__(f"floor plan '{plan_id}' has no anchor, so there is no answer in latitude and longitude")
+    def __init__(self, plan_id: str, venue_id: str | None = None) -> None:
+        nor = "" if venue_id is None else f", nor has venue '{venue_id}'"
+        super().__init__(f"floor plan '{plan_id}' has no anchor{nor}, so there is no answer in latitude and longitude")
 
 
 class UploadTooLargeError(ServiceError):
@@ -386,92 +368,3 @@ class StoppingError(ServiceError):
 
     def __init__(self) -> None:
         super().__init__("the service is shutting down")
-
-
-@dataclass(frozen=True)
-class ProblemKind:
-    """What an error means over HTTP: status, stable type, title, and whether its text may leave the service."""
-
-    status: int
-    slug: str
-    title: str
-    public: bool = True
-
-    @property
-    def type(self) -> str:
-        """The stable URN of RFC 9457's `type`."""
-        return URN + self.slug
-
-
-INTERNAL = ProblemKind(500, "internal", "Internal error", public=False)
-
-PROBLEMS: dict[type[Exception], ProblemKind] = {
-    InvalidFloorPlanError: ProblemKind(422, "invalid-floorplan", "Invalid floor plan"),
-    SeveralLevelsError: ProblemKind(422, "several-levels", "Several levels, choose one"),
-    MissingExtraError: ProblemKind(501, "missing-extra", "Format not installed"),
-    InvalidPanoramaError: ProblemKind(422, "invalid-panorama", "Invalid panorama"),
-    InvalidMotionError: ProblemKind(422, "invalid-motion", "Impossible motion between two panoramas"),
-    InvalidHintError: ProblemKind(422, "invalid-hint", "Hint that the plan contradicts"),
-    InvalidPoseError: ProblemKind(422, "invalid-pose", "Invalid position, heading or height"),
-    InvalidInputError: ProblemKind(422, "invalid-request", "Invalid request"),
-    MalformedRequestError: ProblemKind(400, "malformed-request", "Malformed request"),
-    InvalidRequestError: ProblemKind(422, "invalid-request", "Invalid request"),
-    UnknownFloorPlanError: ProblemKind(404, "unknown-floorplan", "Unknown floor plan"),
-    UnknownVenueError: ProblemKind(404, "unknown-venue", "Unknown venue"),
-    UnknownRevisionError: ProblemKind(404, "unknown-revision", "Unknown revision"),
-    UnknownAnswerError: ProblemKind(404, "unknown-answer", "Unknown answer"),
-    UnanchoredPlanError: ProblemKind(409, "floorplan-unanchored", "Floor plan has no anchor"),
-    UploadTooLargeError: ProblemKind(413, "upload-too-large", "Upload too large"),
-    UploadTimeoutError: ProblemKind(408, "upload-timeout", "Upload took too long"),
-    UnsupportedMediaError: ProblemKind(415, "unsupported-media", "Unsupported media type"),
-    UnsupportedEncodingError: ProblemKind(415, "unsupported-media", "Unsupported media type"),
-    PlanTooLargeError: ProblemKind(422, "floorplan-too-large", "Floor plan too large"),
-    PlanFailedError: ProblemKind(409, "floorplan-failed", "Floor plan could not be prepared"),
-    PlanNotReadyError: ProblemKind(503, "floorplan-not-ready", "Floor plan still preparing"),
-    TooManyFloorPlansError: ProblemKind(507, "too-many-floorplans", "Too many floor plans"),
-    TooManyVenuesError: ProblemKind(507, "too-many-venues", "Too many venues"),
-    VenueUnsearchableError: ProblemKind(409, "venue-unsearchable", "Nothing to search in the venue"),
-    VenueNotReadyError: ProblemKind(503, "venue-not-ready", "Venue still preparing"),
-    RevisionMismatchError: ProblemKind(412, "revision-mismatch", "Another revision than expected"),
-    IdempotencyKeyReusedError: ProblemKind(422, "idempotency-key-reused", "Idempotency key used for something else"),
-    IdempotencyInProgressError: ProblemKind(409, "idempotency-in-progress", "Request already in work"),
-    StoreUnavailableError: ProblemKind(503, "store-unavailable", "Storage unavailable"),
-    StoreBusyError: ProblemKind(503, "store-unavailable", "Storage unavailable"),
-    StoreFullError: ProblemKind(507, "store-full", "Storage full"),
-    UnauthenticatedError: ProblemKind(401, "unauthenticated", "API key needed"),
-    InsufficientScopeError: ProblemKind(403, "insufficient-scope", "API key not good for this"),
-    ExposedWithoutKeysError: ProblemKind(403, "exposed-without-keys", "Only answered on its own machine"),
-    RateLimitedError: ProblemKind(429, "rate-limited", "Too many requests"),
-    TooManyRefusedKeysError: ProblemKind(429, "too-many-refused-keys", "Too many invalid API keys"),
-    OverloadedError: ProblemKind(503, "overloaded", "Overloaded"),
-    ShareExceededError: ProblemKind(503, "overloaded", "Overloaded"),
-    DecoderNotReadyError: ProblemKind(503, "decoder-not-ready", "Decoder not ready"),
-    ConverterNotReadyError: ProblemKind(503, "converter-not-ready", "Converter not ready"),
-    DeadlineExceededError: ProblemKind(504, "deadline-exceeded", "Deadline exceeded"),
-    StoppingError: ProblemKind(503, "stopping", "Shutting down"),
-    DamagedDataError: INTERNAL,
-    DrawingFailedError: INTERNAL,
-    ServiceError: INTERNAL,
-    LaLaLocError: INTERNAL,
-    ConfigError: INTERNAL,
-    BundleError: INTERNAL,
-    CheckpointError: INTERNAL,
-    ExportError: INTERNAL,
-    DatasetError: INTERNAL,
-    RunError: INTERNAL,
-}
-
-# What the framework itself answers: no such route, method not allowed, and so on.
-HTTP_PROBLEMS: dict[int, ProblemKind] = {
-    400: ProblemKind(400, "malformed-request", "Malformed request"),
-    404: ProblemKind(404, "not-found", "Not found"),
-    405: ProblemKind(405, "method-not-allowed", "Method not allowed"),
-}
-
-
-def problem_kind(error: Exception) -> ProblemKind:
-    """The table's entry for an error: that of its class, else of its nearest base class."""
-    for cls in type(error).__mro__:
-        if cls in PROBLEMS:
-            return PROBLEMS[cls]
-    return INTERNAL

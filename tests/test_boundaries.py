@@ -63,7 +63,7 @@ LAYERS = {
 SERVICE_LAYERS = (
     "sharing",
     # `workers` is what runs in worker processes: it loads nothing of what watches over them.
-    "cores settings errors schemas threads bounded_cache telemetry workers",
+    "cores settings errors problem_kinds schemas threads bounded_cache telemetry workers",
     "pools storage",
     "grids preview security conversion",
     "http",

@@ -12,18 +12,14 @@ from starlette.exceptions import HTTPException
 
 from lalaloc_core.errors import InvalidFloorPlanError, LaLaLocError, SeveralLevelsError
 from service.errors import (
-    HTTP_PROBLEMS,
-    INTERNAL,
-    PROBLEMS,
     InvalidRequestError,
-    ProblemKind,
     ServiceError,
     UnauthenticatedError,
     UnsupportedEncodingError,
     UnsupportedMediaError,
-    problem_kind,
 )
 from service.http.faults import describe_fault
+from service.problem_kinds import HTTP_PROBLEMS, INTERNAL, PROBLEMS, ProblemKind, problem_kind
 from service.schemas import Fault, Problem
 from service.security.access_control import routed_path
 from service.security.permissions import permissions_needed

@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 
 from lalaloc_core.errors import LaLaLocError
-from service.errors import PROBLEMS, ServiceError, problem_kind
+from service.errors import ServiceError
+from service.problem_kinds import PROBLEMS, problem_kind
 
 
 def _all_subclasses(cls: type[Exception]) -> set[type[Exception]]:
