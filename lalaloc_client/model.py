@@ -235,6 +235,7 @@ class Candidate:
             model that does not tell.
         room_id: the room's id in the plan, which is unique as its name need not be.
         floorplan_id, level: the plan that it lies in, and its level in the venue that was asked about.
+        geopose: the pose on Earth; None where neither plan nor venue have an anchor.
     """
 
     position: Position
@@ -246,6 +247,7 @@ class Candidate:
     room_id: str | None = None
     floorplan_id: str | None = None
     level: float | None = None
+    geopose: GeoPose | None = None
 
 
 @dataclass(frozen=True)
@@ -304,7 +306,7 @@ class Localisation:
         heading_confidence: probability that the heading is right within 5°.
         warnings: what was said and not followed, such as a heading that the panorama contradicts.
         camera_height_m: the camera height that fits best.
-        geopose: the pose on Earth; None for a plan without an anchor.
+        geopose: the pose on Earth; None where neither plan nor venue have an anchor.
         room_id: the room's id in the plan.
         stage: the last stage that produced the position: `retrieval`, `vdr` or `lpo`.
         covariance_m2: of the position, given that it is right within 1 m; None unless `stage` is `lpo`.
@@ -362,6 +364,7 @@ class SequencePose:
     cost: float
     latent_distance: float
     candidates: tuple[Candidate, ...]
+    geopose: GeoPose | None = None
 
 
 @dataclass(frozen=True)

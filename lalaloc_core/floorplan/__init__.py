@@ -4,7 +4,7 @@ Begin with `plan.py`. `reading.py` makes rooms of a document, `openings.py` puts
 is what only all rooms together can break, `geometry.py` the arrays that the layout renderer casts its rays against.
 """
 
-from lalaloc_core.floorplan.anchors import anchor_document
+from lalaloc_core.floorplan.anchors import MAX_FROM_ORIGIN_M, anchor_document
 from lalaloc_core.floorplan.geometry import PlanGeometry, pad_walls
 from lalaloc_core.floorplan.heights import MAX_CAMERA_HEIGHT_STD_M
 from lalaloc_core.floorplan.limits import DEFAULT_LIMITS, PlanLimits
@@ -18,6 +18,7 @@ __all__ = [
     "DEFAULT_LIMITS",
     "DEFAULT_OPENING_TOLERANCE_M",
     "MAX_CAMERA_HEIGHT_STD_M",
+    "MAX_FROM_ORIGIN_M",
     "USUAL_HEIGHTS_M",
     "FloorPlan",
     "Opening",

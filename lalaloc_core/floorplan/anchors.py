@@ -18,7 +18,7 @@ _CONTROL_KEYS = {"control_points", "altitude_m"}
 _POINT_KEYS = {"x", "y", "latitude", "longitude"}
 _ALTITUDE_M = (-1000.0, 10_000.0)
 # Farther from its origin a plan would be drawn out by more than a centimetre.
-_MAX_FROM_ORIGIN_M = 10_000.0
+MAX_FROM_ORIGIN_M = 10_000.0
 # Two control points as near as this say nothing of directions, and lengths on both sides agree to this share.
 _MIN_APART_M, _MAX_STRETCH = 1.0, 0.02
 # What is said of north twice may differ by this much.
@@ -39,9 +39,9 @@ def read_anchor(raw: Any, north_deg: float | None, rooms: Sequence[Room]) -> Anc
     if not isinstance(raw, Mapping):
         raise InvalidFloorPlanError(f"anchor must be an object, not {json_kind(raw)}")
     reach_m = max(float(np.abs(room.polygon_m).max()) for room in rooms)
-    if reach_m > _MAX_FROM_ORIGIN_M:
+    if reach_m > MAX_FROM_ORIGIN_M:
         raise InvalidFloorPlanError(
-            f"the plan reaches {reach_m:.0f} m from its origin, at most {_MAX_FROM_ORIGIN_M:.0f} m can be anchored; "
+            f"the plan reaches {reach_m:.0f} m from its origin, at most {MAX_FROM_ORIGIN_M:.0f} m can be anchored; "
             "move it near its origin"
         )
     altitude_m = raw.get("altitude_m")
@@ -84,7 +84,7 @@ def _from_control_points(raw: Any, altitude_m: float | None) -> Anchor:
         if not all(is_number(point.get(key)) for key in ("x", "y")):
             raise InvalidFloorPlanError(f"control point {index} needs numbers x and y, metres of the plan")
         places.append(_place(point, f"control point {index}"))
-    reach_m = _MAX_FROM_ORIGIN_M
+    reach_m = MAX_FROM_ORIGIN_M
     drawn = np.array([[read_number_between(each[key], key, -reach_m, reach_m, " m") for key in "xy"] for each in raw])
     lon_lat = np.array([[longitude, latitude] for latitude, longitude in places])
     frame = LocalFrame(float(lon_lat[:, 0].mean()), float(lon_lat[:, 1].mean()))

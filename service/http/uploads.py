@@ -31,6 +31,7 @@ from service.http.faults import describe_fault
 from service.settings import Settings
 
 JSON = "application/json"
+GEOJSON = "application/geo+json"
 MULTIPART = "multipart/form-data"
 # Boundaries and part headers come on top of the file that the limit is meant for.
 _ENVELOPE_BYTES = 16 * 1024

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import heading_to_degrees
+from lalaloc_core.earth import Anchor
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.covariance import spread_of
 from lalaloc_core.localise.pipeline import Localisation, panorama_heading
@@ -20,12 +21,18 @@ from service.storage.records import PlanRecord
 
 @dataclass(frozen=True)
 class Place:
-    """The plan that a candidate lies in, the candidate in its frame, and the level of the plan in its venue."""
+    """The plan that a candidate lies in, and the candidate in its frame.
+
+    Attributes:
+        anchor: where on Earth the plan lies; None where that is not known.
+        level: of the plan in its venue.
+    """
 
     plan_id: str
     revision_id: str
     plan: FloorPlan
     candidate: Candidate
+    anchor: Anchor | None
     level: float | None = None
 
 
@@ -34,7 +41,7 @@ Places = Callable[[Candidate], Place]
 
 def places_in(record: PlanRecord) -> Places:
     """Where the candidates of a search in a single plan are."""
-    return lambda candidate: Place(record.id, record.revision_id, record.plan, candidate)
+    return lambda candidate: Place(record.id, record.revision_id, record.plan, candidate, record.plan.anchor)
 
 
 def compose(
@@ -84,12 +91,7 @@ def compose(
         latent_distance=best.latent_distance,
         camera_height_m=found.camera_height_m,
         candidates=candidates,
-        geopose=geopose_of(
-            place.plan,
-            (place.candidate.x_m, place.candidate.y_m),
-            best.heading_deg,
-            found.camera_height_m,
-        ),
+        geopose=best.geopose,
         timings_ms=TimingsAnswer(**{name: timings_ms.get(name, 0.0) for name in TimingsAnswer.model_fields}),
         model=model_answer(bundle),
     )
@@ -111,14 +113,17 @@ def heading_contradiction(known: KnownHeading) -> str:
 def _candidate(place: Place, query: Query, probability: float | None) -> CandidateAnswer:
     candidate = place.candidate
     room = place.plan.rooms[candidate.room_index]
+    heading_deg = heading_to_degrees(panorama_heading(query, candidate))
+    camera_height_m = query.camera_height.height_m * math.exp(candidate.height_offset)
     return CandidateAnswer(
         floorplan_id=place.plan_id,
         level=place.level,
         position=Position(x_m=candidate.x_m, y_m=candidate.y_m),
-        heading_deg=heading_to_degrees(panorama_heading(query, candidate)),
+        heading_deg=heading_deg,
         room=room.name,
         room_id=room.id,
         probability=None if probability is None else min(probability, 1.0),
         cost=candidate.cost,
         latent_distance=min(max(candidate.latent_distance, 0.0), 2.0),
+        geopose=geopose_of(place.anchor, (candidate.x_m, candidate.y_m), heading_deg, camera_height_m),
     )

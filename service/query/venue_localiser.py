@@ -15,6 +15,7 @@ from sqlalchemy import Row
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import heading_from_degrees
+from lalaloc_core.earth import Anchor
 from lalaloc_core.errors import InvalidPoseError
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.hints import Hints
@@ -27,6 +28,7 @@ from service.grids import check_height_m
 from service.http.admission_control import Slots
 from service.query.answers import Place, compose, heading_contradiction
 from service.query.decoding import Decoder
+from service.query.geopose import anchor_of
 from service.query.heading import KnownHeading, known_heading
 from service.query.localiser import Localiser
 from service.query.venue_plans import VenuePlans, venue_height
@@ -49,6 +51,7 @@ class _Searched:
         log_mass: of all plans that could be asked about; None where all of them are searched.
         index: which of those the searched ones are.
         warnings: what was left out.
+        anchor: of the venue.
     """
 
     rows: Sequence[Row[Any]]
@@ -57,12 +60,14 @@ class _Searched:
     log_mass: Float[np.ndarray, "p"] | None
     index: Sequence[int]
     warnings: list[str]
+    anchor: Anchor | None
 
     def place(self, candidate: Candidate) -> Place:
         """Where a candidate is."""
         number, own = self.side_by_side.in_own_plan(candidate)
         record = self.records[number]
-        return Place(record.id, record.revision_id, record.plan, own, self.rows[number].level)
+        anchor, level = anchor_of(record.plan, self.anchor), self.rows[number].level
+        return Place(record.id, record.revision_id, record.plan, own, anchor, level)
 
     def shares(self, found: Localisation) -> tuple[float, Float[np.ndarray, "m"]]:
         """How probable it is that the plan is among those searched, and each of these, given that it is."""
@@ -199,6 +204,7 @@ class VenueLocaliser:
             log_mass=log_mass,
             index=[place[row.plan_id] for row, _, _ in kept],
             warnings=warnings,
+            anchor=venue.anchor,
         )
 
     def _compose(

@@ -37,7 +37,16 @@ from service.http import IdempotentRequest
 from service.http.accept import preferred
 from service.http.idempotent_request import HEADER as IDEMPOTENCY_HEADER
 from service.http.problems import problem_responses
-from service.http.uploads import JSON, MULTIPART, UploadLimits, faults_of, media_type, read_parts, validate_fields
+from service.http.uploads import (
+    GEOJSON,
+    JSON,
+    MULTIPART,
+    UploadLimits,
+    faults_of,
+    media_type,
+    read_parts,
+    validate_fields,
+)
 from service.query.geopose import feature_of
 from service.query.localiser import AskedPicture
 from service.routes.dependencies import IDEMPOTENCY_KEY, Party, Running, Tenant, plan_for_query, venue_for_query
@@ -67,7 +76,7 @@ QUERY_ERRORS: tuple[type[Exception], ...] = (
     IdempotencyInProgressError,
 )
 
-_PNG, _SVG, _GEOJSON = "image/png", "image/svg+xml", "application/geo+json"
+_PNG, _SVG = "image/png", "image/svg+xml"
 # The photograph in an SVG is a part of it; nothing else may load, and nothing run.
 _POLICY = {"Content-Security-Policy": "default-src 'none'; img-src data:; frame-ancestors 'none'"}
 _VARY = {"Vary": "Accept"}
@@ -96,7 +105,7 @@ def _body_schema() -> dict[str, Any]:
     responses={
         200: {
             "content": {
-                _GEOJSON: {"schema": {"type": "object", "description": "A Feature of RFC 7946."}},
+                GEOJSON: {"schema": {"type": "object", "description": "A Feature of RFC 7946."}},
                 _PNG: {"schema": {"type": "string", "format": "binary"}},
                 _SVG: {"schema": {"type": "string"}},
             }
@@ -128,14 +137,14 @@ async def localise(
     """Find where in a stored floor plan, or in which plan of a venue and where in it, a panorama was taken.
 
     With `Accept: image/png` or `Accept: image/svg+xml` the answer is a picture, 1600 pixels wide; with `Accept:
-    application/geo+json` a GeoJSON Feature at the place on Earth, for plans with an `anchor`.
+    application/geo+json` a GeoJSON Feature at the place on Earth, for plans and venues with an `anchor`.
 
     A plan that is still preparing is waited for. Of a venue the plans that are ready are searched, and the answer warns
     of others; while none is, the venue is waited for. When optimisation (`lpo`) cannot answer in time, the answer is
     the one before it, with `"stage": "vdr"`.
     """
     settings = runtime.settings
-    media = preferred(request, (JSON, _PNG, _SVG, _GEOJSON))
+    media = preferred(request, (JSON, _PNG, _SVG, GEOJSON))
     _check_asked(request, media, picture)
     idempotent = IdempotentRequest(runtime.store.idempotency_keys, request, tenant, "POST /localise")
     media_type(request, (MULTIPART,))
@@ -151,10 +160,8 @@ async def localise(
     if "top_k" not in form.model_fields_set:
         form = form.model_copy(update={"top_k": min(form.top_k, settings.max_top_k)})
 
-    if form.venue_id is not None and media != JSON:
-        raise InvalidRequestError(
-            [("venue_id", f"is answered in JSON alone, not in {media}: a picture is of one plan")]
-        )
+    if form.venue_id is not None and media in (_PNG, _SVG):
+        raise InvalidRequestError([("venue_id", f"is not answered in {media}: a picture is of one plan")])
 
     async def answer() -> Response:
         content = parts.files["panorama"]
@@ -163,18 +170,16 @@ async def localise(
             note(request, venue=venue.id)
             found = await runtime.venue_localiser.answer(venue, form, content, begin, clock, party)
             note(request, plan=found.floorplan_id, revision=found.floorplan_revision, stage=found.stage)
-            return Response(await _text(found, tenant, runtime), headers=_VARY, media_type=JSON)
+            return await _told(found, media, tenant, runtime)
         assert form.floorplan_id is not None
         record = await plan_for_query(tenant, form.floorplan_id, runtime)
         note(request, plan=record.id, revision=record.revision_id)
-        if media == _GEOJSON and record.plan.anchor is None:
+        if media == GEOJSON and record.plan.anchor is None:
             raise UnanchoredPlanError(record.id)
-        if media in (JSON, _GEOJSON):
+        if media in (JSON, GEOJSON):
             found = await runtime.localiser.answer(record, form, content, begin, clock, party)
             note(request, stage=found.stage)
-            if media == _GEOJSON:
-                return Response(json.dumps(feature_of(found)), headers=_VARY, media_type=_GEOJSON)
-            return Response(await _text(found, tenant, runtime), headers=_VARY, media_type=JSON)
+            return await _told(found, media, tenant, runtime)
         rooms = await runtime.drawings.rooms(record)
         asked = AskedPicture(picture=picture or "both", pixels=media == _PNG, rooms=rooms)
         found, drawn = await runtime.localiser.picture(record, form, content, begin, clock, party, asked)
@@ -188,10 +193,24 @@ def _check_asked(request: Request, media: str, picture: Picture | None) -> None:
     """Raises:
     InvalidRequestError: what is said of a picture and none is wanted, or what is for JSON alone.
     """
-    if media in (JSON, _GEOJSON) and picture is not None:
+    if media in (JSON, GEOJSON) and picture is not None:
         raise InvalidRequestError([("picture", f"needs the header Accept: {_PNG} or Accept: {_SVG}")])
     if media != JSON and IDEMPOTENCY_HEADER in request.headers:
         raise InvalidRequestError([(IDEMPOTENCY_HEADER, "is for answers in application/json, others are not kept")])
+
+
+async def _told(answer: LocaliseAnswer, media: str, tenant: str, runtime: Runtime) -> Response:
+    """An answer as JSON or as GeoJSON.
+
+    Raises:
+        UnanchoredPlanError: GeoJSON is wanted of an answer that is nowhere on Earth.
+    """
+    if media != GEOJSON:
+        return Response(await _text(answer, tenant, runtime), headers=_VARY, media_type=JSON)
+    feature = feature_of(answer)
+    if feature is None:
+        raise UnanchoredPlanError(answer.floorplan_id, answer.venue_id)
+    return Response(json.dumps(feature), headers=_VARY, media_type=GEOJSON)
 
 
 async def _text(answer: LocaliseAnswer, tenant: str, runtime: Runtime) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from functools import partial
 from time import monotonic
 from typing import Any
@@ -10,10 +11,13 @@ from fastapi import APIRouter, Request, Response
 
 from lalaloc_core.errors import InvalidMotionError
 from lalaloc_core.localise.pipeline import StageClock
-from service.errors import InvalidRequestError, UploadTooLargeError
+from service.errors import InvalidRequestError, UnanchoredPlanError, UploadTooLargeError
 from service.http import IdempotentRequest
+from service.http.accept import preferred
+from service.http.idempotent_request import HEADER as IDEMPOTENCY_HEADER
 from service.http.problems import problem_responses
 from service.http.uploads import (
+    GEOJSON,
     JSON,
     MULTIPART,
     Parts,
@@ -23,6 +27,7 @@ from service.http.uploads import (
     read_parts,
     validate_fields,
 )
+from service.query.geopose import features_of
 from service.routes.dependencies import IDEMPOTENCY_KEY, Party, Running, Tenant, plan_for_query
 from service.routes.localise import QUERY_ERRORS
 from service.schemas import SequenceAnswer, SequenceForm
@@ -54,16 +59,23 @@ def _body_schema() -> dict[str, Any]:
     summary="Localise several panoramas of one visit",
     response_model=SequenceAnswer,
     openapi_extra=_body_schema(),
-    responses=problem_responses(InvalidMotionError, *QUERY_ERRORS),
+    responses={
+        200: {"content": {GEOJSON: {"schema": {"type": "object", "description": "A FeatureCollection of RFC 7946."}}}}
+    }
+    | problem_responses(InvalidMotionError, UnanchoredPlanError, *QUERY_ERRORS),
 )
 async def localise_sequence(request: Request, runtime: Running, tenant: Tenant, party: Party) -> Response:
     """Find where in a stored floor plan several panoramas of one visit were taken, all of them together.
 
-    What was measured of the motions between them tells places apart that look alike. A plan that is still preparing is
-    waited for. When optimisation (`lpo`) cannot answer in time, the answer is the one before it, with
-    `"stage": "retrieval"`.
+    What was measured of the motions between them tells places apart that look alike. With `Accept:
+    application/geo+json` the answer is a GeoJSON FeatureCollection, a Feature for each panorama, for plans with an
+    `anchor`. A plan that is still preparing is waited for. When optimisation (`lpo`) cannot answer in time, the answer
+    is the one before it, with `"stage": "retrieval"`.
     """
     settings = runtime.settings
+    media = preferred(request, (JSON, GEOJSON))
+    if media != JSON and IDEMPOTENCY_HEADER in request.headers:
+        raise InvalidRequestError([(IDEMPOTENCY_HEADER, "is for answers in application/json, others are not kept")])
     idempotent = IdempotentRequest(runtime.store.idempotency_keys, request, tenant, "POST /localise/sequence")
     media_type(request, (MULTIPART,))
     clock = StageClock()
@@ -87,9 +99,12 @@ async def localise_sequence(request: Request, runtime: Running, tenant: Tenant, 
     async def answer() -> Response:
         record = await plan_for_query(tenant, form.floorplan_id, runtime)
         note(request, plan=record.id, revision=record.revision_id)
+        if media == GEOJSON and record.plan.anchor is None:
+            raise UnanchoredPlanError(record.id)
         found = await runtime.localiser.answer_sequence(record, form, contents, begin, clock, party)
         note(request, stage=found.stage)
-        return Response(found.model_dump_json(), media_type=JSON)
+        content = found.model_dump_json() if media == JSON else json.dumps(features_of(found))
+        return Response(content, headers={"Vary": "Accept"}, media_type=media)
 
     return await idempotent.run_async(parts, answer, runtime.reads)
 

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Request, Response, status
 from pydantic import BaseModel
 
+from lalaloc_core.earth import Anchor
 from service.errors import (
     IdempotencyInProgressError,
     IdempotencyKeyReusedError,
@@ -50,7 +51,7 @@ from service.schemas import (
     VenuePlanDocument,
     VenuePlanList,
 )
-from service.storage.records import Cursor, VenueAnchor, VenueMember, VenuePlace, VenueRecord
+from service.storage.records import Cursor, VenueMember, VenuePlace, VenueRecord
 from service.telemetry import note
 
 router = APIRouter(prefix="/venues", tags=["venues"])
@@ -251,8 +252,8 @@ async def _read(request: Request, runtime: Runtime) -> bytes:
     return await read_body(request, UploadLimits.of(runtime.settings, "max_venue_bytes"))
 
 
-def _anchor(document: VenueAnchorDocument | None) -> VenueAnchor | None:
-    return None if document is None else VenueAnchor(**document.model_dump())
+def _anchor(document: VenueAnchorDocument | None) -> Anchor | None:
+    return None if document is None else Anchor(**document.model_dump())
 
 
 def _members(documents: list[VenuePlanDocument], runtime: Runtime) -> list[VenueMember]:

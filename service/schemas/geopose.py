@@ -13,7 +13,8 @@ class GeoPosePosition(Answer):
     lat: float = Field(ge=-90, le=90, description="Latitude, degrees.")
     lon: float = Field(ge=-180, le=180, description="Longitude, degrees.")
     h: float = Field(
-        description="Height over the ellipsoid in metres; over the plan's floor where its anchor has no `altitude_m`."
+        description="Height over the ellipsoid in metres; over the plan's floor where its anchor has no `altitude_m`. "
+        "By the anchor of a venue: its altitude and the camera's height over the floor, whatever the level."
     )
 
 

@@ -18,6 +18,10 @@ _COST = Field(
     "that were, and their costs, which allow for the distance of neighbouring poses, do not compare.",
 )
 
+_GEOPOSE = (
+    "The pose on Earth: by the `anchor` of the plan, else by that of the venue that was asked about; null without one."
+)
+
 Pair = Annotated[list[Variance], Field(min_length=2, max_length=2)]
 Covariance = Annotated[list[Pair], Field(min_length=2, max_length=2)]
 
@@ -44,6 +48,7 @@ class CandidateAnswer(Answer):
     )
     cost: Score = _COST
     latent_distance: Score = _LATENT_DISTANCE
+    geopose: GeoPose | None = Field(None, description=_GEOPOSE)
 
 
 class PosteriorAnswer(Answer):
@@ -133,7 +138,7 @@ class LocaliseAnswer(Answer):
         description="Under which `GET /answers/{answer_id}` tells the same again, for `keep_answers_s`; null where "
         "answers are not kept.",
     )
-    geopose: GeoPose | None = Field(None, description="The pose on Earth; null for a plan without an `anchor`.")
+    geopose: GeoPose | None = Field(None, description=_GEOPOSE)
     posterior: PosteriorAnswer | None = Field(
         default=None, description="How probable all places are; null unless asked for with `include`."
     )

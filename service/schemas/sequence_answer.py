@@ -7,6 +7,7 @@ from typing import Literal
 from pydantic import Field
 
 from service.schemas.fields import Answer, Degrees, HeadingDeg, Metres, Score, Share
+from service.schemas.geopose import GeoPose
 from service.schemas.localise_answer import CandidateAnswer, Covariance, ModelAnswer, Position, TimingsAnswer
 
 
@@ -25,6 +26,7 @@ class SequencePoseAnswer(Answer):
     heading_std_deg: Degrees | None
     cost: Score
     latent_distance: Score
+    geopose: GeoPose | None = None
     candidates: list[CandidateAnswer] = Field(
         description="Places on the best paths, that of the best path first; the first one is the answer."
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from datetime import datetime
 
+from lalaloc_core.earth import Anchor
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.poses import LatentGrid
 
@@ -102,16 +103,6 @@ class PlanSummary:
 
 
 @dataclass(frozen=True)
-class VenueAnchor:
-    """Where on Earth the origin of a venue's plans lies, WGS84; `north_deg` is the azimuth of true north in them."""
-
-    latitude: float
-    longitude: float
-    altitude_m: float | None = None
-    north_deg: float = 0.0
-
-
-@dataclass(frozen=True)
 class VenueMember:
     """A plan of a venue: its level, and what it is called there, None for the plan's own name."""
 
@@ -126,6 +117,7 @@ class VenueRecord:
 
     Attributes:
         revision_id: changes with its name, its anchor and its plans.
+        anchor: of its plans that have none, which are then drawn in one frame.
         revision: number of the revision, from 1.
         plans: how many it has.
         created_at: when the venue was first stored.
@@ -137,7 +129,7 @@ class VenueRecord:
     revision_id: str
     revision: int
     name: str
-    anchor: VenueAnchor | None
+    anchor: Anchor | None
     plans: int
     created_at: datetime
     updated_at: datetime

@@ -13,11 +13,11 @@ from typing import Any
 
 from sqlalchemy import Connection, Row, and_, case, delete, distinct, func, or_, select, text, update
 
+from lalaloc_core.earth import Anchor
 from service.errors import InvalidRequestError, RevisionMismatchError, TooManyVenuesError, UnknownVenueError
 from service.storage.database import Database
 from service.storage.records import (
     Cursor,
-    VenueAnchor,
     VenueCounts,
     VenueMember,
     VenuePlace,
@@ -45,7 +45,7 @@ class Venues:
         tenant: str,
         venue_id: str,
         name: str,
-        anchor: VenueAnchor | None,
+        anchor: Anchor | None,
         members: Sequence[VenueMember],
         *,
         limit: int,
@@ -81,7 +81,7 @@ class Venues:
         venue_id: str,
         *,
         name: str | None = None,
-        anchor: VenueAnchor | None = None,
+        anchor: Anchor | None = None,
         drop_anchor: bool = False,
         members: Sequence[VenueMember] = (),
         removed: Collection[str] = (),
@@ -229,7 +229,7 @@ def take_out_of_venues(connection: Connection, plan_id: str) -> None:
         connection.execute(update(VENUES).where(VENUES.c.id == venue_id).values(**values))
 
 
-def _head(name: str, anchor: VenueAnchor | None, now: datetime) -> dict[str, Any]:
+def _head(name: str, anchor: Anchor | None, now: datetime) -> dict[str, Any]:
     """What changes of a venue with a revision."""
     return {
         "name": name,
@@ -256,7 +256,7 @@ def _find(connection: Connection, tenant: str, venue_id: str) -> Row[Any] | None
 def _record(row: Row[Any]) -> VenueRecord:
     anchor = None
     if row.latitude is not None:
-        anchor = VenueAnchor(row.latitude, row.longitude, row.altitude_m, row.north_deg)
+        anchor = Anchor(row.latitude, row.longitude, row.altitude_m, row.north_deg)
     return VenueRecord(
         id=row.id,
         tenant=row.tenant,

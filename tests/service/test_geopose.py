@@ -36,6 +36,18 @@ def check_schema(geopose: dict[str, Any]) -> None:
     assert abs(geopose["position"]["lon"]) <= 180.0
 
 
+def assert_at(geopose: dict[str, Any], pose: dict[str, Any], anchor: Anchor) -> None:
+    """A pose on Earth is the one that a geodesic from the anchor leads to."""
+    geod, place = pyproj.Geod(ellps="WGS84"), geopose["position"]
+    azimuth, _, distance = geod.inv(anchor.longitude, anchor.latitude, place["lon"], place["lat"])
+    at = pose["position"]
+    assert distance == pytest.approx(math.hypot(at["x_m"], at["y_m"]), abs=2e-3)
+    bearing = azimuth + anchor.north_deg - math.degrees(math.atan2(at["x_m"], at["y_m"]))
+    assert (bearing + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=0.1)
+    turned = geopose["angles"]["yaw"] + pose["heading_deg"] - anchor.north_deg
+    assert (turned + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=0.01)
+
+
 def anchored(**anchor: Any) -> FloorPlan:
     return FloorPlan.from_dict(FLAT | {"anchor": anchor})
 
@@ -124,6 +136,75 @@ def test_answers_say_where_on_earth(client: httpx.Client, panorama: bytes) -> No
     place = geopose["position"]
     assert feature["geometry"] == {"type": "Point", "coordinates": [place["lon"], place["lat"], place["h"]]}
     assert feature["properties"]["room"] == answer["room"]
+
+
+def test_every_candidate_is_somewhere_on_earth(client: httpx.Client, panorama: bytes) -> None:
+    plan_id = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25})
+    answer = localise(client, plan_id, panorama, refine="none", top_k=5).json()
+    assert len(answer["candidates"]) > 1
+    assert answer["candidates"][0]["geopose"] == answer["geopose"]
+    for candidate in answer["candidates"]:
+        check_schema(candidate["geopose"])
+        assert_at(candidate["geopose"], candidate, Anchor(**ANCHOR, north_deg=25.0))
+
+
+def test_a_plan_of_a_venue_lies_by_its_own_anchor_else_by_that_of_the_venue(
+    client: httpx.Client, panorama: bytes
+) -> None:
+    of_venue = {"latitude": -33.86, "longitude": 151.21, "altitude_m": 3.0, "north_deg": 90.0}
+    ids = [upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25}), upload(client)]
+    far = FLAT | {"rooms": [{"name": "far", "polygon": [[x + 2e4, y] for x, y in FLAT["rooms"][0]["polygon"]]}]}
+    ids.append(upload(client, far))
+    anchors = {ids[0]: Anchor(**ANCHOR, north_deg=25.0), ids[1]: Anchor(**of_venue)}
+    plans = [{"floorplan_id": plan_id} for plan_id in ids]
+    venue_id = client.post("/venues", json={"plans": plans, "anchor": of_venue}).json()["id"]
+    fields, file = {"venue_id": venue_id, "refine": "none", "top_k": "10"}, {"panorama": panorama}
+    response = client.post("/localise", data=fields, files=file)
+    assert response.status_code == 200, response.text
+    found = response.json()["candidates"]
+    assert {candidate["floorplan_id"] for candidate in found} == set(ids)
+    for candidate in found:
+        if candidate["floorplan_id"] == ids[2]:
+            # Too far from the venue's origin for a map that is true to scale.
+            assert candidate["geopose"] is None
+        else:
+            assert_at(candidate["geopose"], candidate, anchors[candidate["floorplan_id"]])
+    client.delete(f"/floorplans/{ids[2]}")
+    feature = client.post("/localise", data=fields, files=file, headers={"Accept": "application/geo+json"}).json()
+    place = feature["properties"]["geopose"]["position"]
+    assert feature["geometry"]["coordinates"] == [place["lon"], place["lat"], place["h"]]
+
+
+def test_a_venue_without_an_anchor_has_no_place_on_earth(client: httpx.Client, panorama: bytes) -> None:
+    venue_id = client.post("/venues", json={"plans": [{"floorplan_id": upload(client)}]}).json()["id"]
+    headers, fields = {"Accept": "application/geo+json"}, {"venue_id": venue_id, "refine": "none"}
+    response = client.post("/localise", data=fields, files={"panorama": panorama}, headers=headers)
+    assert "nor has venue" in assert_problem(response, 409, "floorplan-unanchored")["detail"]
+    picture = client.post("/localise", data=fields, files={"panorama": panorama}, headers={"Accept": "image/png"})
+    assert "a picture is of one plan" in assert_problem(picture, 422, "invalid-request")["detail"]
+
+
+def test_a_sequence_is_a_collection_of_features(client: httpx.Client, panorama: bytes) -> None:
+    plan_id = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25})
+    fields, files = {"floorplan_id": plan_id, "refine": "none"}, [("panorama", panorama)] * 2
+    answer = client.post("/localise/sequence", data=fields, files=files).json()
+    headers = {"Accept": "application/geo+json"}
+    response = client.post("/localise/sequence", data=fields, files=files, headers=headers)
+    assert response.headers["content-type"] == "application/geo+json"
+    collection = response.json()
+    assert collection["type"] == "FeatureCollection"
+    assert (collection["floorplan_id"], collection["confidence"]) == (plan_id, answer["confidence"])
+    assert not collection.keys() & {"poses", "geometry", "properties", "coordinates"}
+    for pose, feature in zip(answer["poses"], collection["features"], strict=True):
+        assert_at(pose["geopose"], pose, Anchor(**ANCHOR, north_deg=25.0))
+        place = pose["geopose"]["position"]
+        assert feature["geometry"] == {"type": "Point", "coordinates": [place["lon"], place["lat"], place["h"]]}
+        assert feature["properties"] == pose
+    elsewhere = fields | {"floorplan_id": upload(client)}
+    nowhere = client.post("/localise/sequence", data=elsewhere, files=files, headers=headers)
+    assert_problem(nowhere, 409, "floorplan-unanchored")
+    keyed = client.post("/localise/sequence", data=fields, files=files, headers=headers | {"Idempotency-Key": "k"})
+    assert_problem(keyed, 422, "invalid-request")
 
 
 def test_a_plan_without_an_anchor_has_no_place_on_earth(client: httpx.Client, panorama: bytes) -> None:
