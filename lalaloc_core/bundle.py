@@ -33,6 +33,8 @@ HEAD_ONNX = "head.onnx"
 LAYOUT_WEIGHTS = "layout_encoder.safetensors"
 IMAGE_WEIGHTS = "image_encoder.safetensors"
 DECODER_WEIGHTS = "decoder.safetensors"
+# Made by calibration, not by export.
+COHORT = "cohort.npz"
 BUNDLE_FILES = (LAYOUT_ONNX, IMAGE_ONNX, HEAD_ONNX, LAYOUT_WEIGHTS, IMAGE_WEIGHTS, DECODER_WEIGHTS)
 
 
@@ -40,7 +42,8 @@ BUNDLE_FILES = (LAYOUT_ONNX, IMAGE_ONNX, HEAD_ONNX, LAYOUT_WEIGHTS, IMAGE_WEIGHT
 class LogisticModel:
     """Probability that a picture fits its plan by the signals of `localise.confidence`.
 
-    Before there was a posterior, `log_odds` stood for it in this model; models that are fitted now leave it at 0.
+    Before there was a posterior, `log_odds` stood for it in this model; models that are fitted now leave it at 0. Those
+    fitted before there was a cohort leave `cost_to_chance` at 0.
     """
 
     bias: float
@@ -48,11 +51,21 @@ class LogisticModel:
     cost: float
     uncertainty: float
     latent_distance: float
+    cost_to_chance: float = 0.0
 
-    def probability(self, *, log_odds: float, cost: float, uncertainty: float, latent_distance: float) -> float:
+    def probability(
+        self,
+        *,
+        log_odds: float,
+        cost: float,
+        uncertainty: float,
+        latent_distance: float,
+        cost_to_chance: float = 0.0,
+    ) -> float:
         """Confidence of an answer with these signals."""
         logit = self.bias + self.log_odds * log_odds + self.cost * cost
         logit += self.uncertainty * uncertainty + self.latent_distance * latent_distance
+        logit += self.cost_to_chance * cost_to_chance
         return 1.0 / (1.0 + math.exp(-max(-30.0, min(30.0, logit))))
 
 

@@ -2,6 +2,7 @@
 
 * How much each term of the evidence may count, and how sharp the posterior is: what makes the right ones of the
   candidates the most probable (`fit_evidence`).
+* What fits a picture by chance (`localise.cohort`), from training homes.
 * The probability that a picture fits its plan, with which the posterior makes the probability of "within 1 m", and the
   covariance (`fit_confidence`). Queries are photographs of the plan's home, and some of other homes and of none: what
   fits nothing must not be trusted.
@@ -16,10 +17,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import optimize
 
-from lalaloc_core.bundle import Bundle, ConfidenceModel, EvidenceModel, LogisticModel, write_manifest
+from lalaloc_core.bundle import COHORT, Bundle, ConfidenceModel, EvidenceModel, LogisticModel, write_manifest
 from lalaloc_core.conventions import heading_from_degrees, wrap_angle
 from lalaloc_core.evaluation.predictions import Pose, Prediction
 from lalaloc_core.evaluation.score import position_errors_m
+from lalaloc_core.files import atomic_write
+from lalaloc_core.localise.cohort import Cohort
 from lalaloc_core.localise.covariance import marginal_information
 from lalaloc_core.localise.posterior import RIGHT_WITHIN_M, TURNED_APART
 from lalaloc_core.metrics import Accuracy
@@ -34,7 +37,7 @@ _WEIGHT_RIDGE = 0.5
 # Medians of the chi-squared distribution with one and with two degrees of freedom.
 _MEDIAN_CHI2 = {1: 0.4549, 2: 1.3863}
 # Signals of a picture that fits, or not; which place it is, is the posterior's to say.
-_SIGNALS = ("cost", "uncertainty", "latent_distance")
+_SIGNALS = ("cost", "uncertainty", "latent_distance", "cost_to_chance")
 _TERMS = ("walls", "openings", "ceiling", "room_type")
 
 
@@ -113,6 +116,12 @@ def _is_right(pose: Pose, prediction: Prediction) -> bool:
     turned = wrap_angle(heading_from_degrees(pose.heading_deg - truth.heading_deg))
     near = np.hypot(pose.x_m - truth.x_m, pose.y_m - truth.y_m) < RIGHT_WITHIN_M
     return bool(near and abs(turned) <= TURNED_APART)
+
+
+def store_cohort(bundle: Bundle, cohort: Cohort) -> Bundle:
+    """Store what fits by chance in the bundle."""
+    atomic_write(bundle.folder / COHORT, cohort.to_bytes())
+    return write_manifest(bundle.folder, bundle.manifest)
 
 
 def store_evidence(bundle: Bundle, evidence: EvidenceModel) -> Bundle:

@@ -18,7 +18,9 @@ from lalaloc_core.data.dataset import SPLITS
 from lalaloc_core.errors import InvalidInputError
 
 # So many homes that calibration asks with their own photographs for one that it asks with those of others.
-_PER_MISMATCHED_HOME = 3
+_PER_MISMATCHED_HOME = 1
+# Homes that the cohort is drawn from.
+_COHORT_HOMES = 60
 # Columns of the printed table.
 _SHARES = ("within_1cm", "within_10cm", "within_1m", "correct_room", "heading_within_2deg")
 
@@ -192,10 +194,12 @@ def _worst(arguments: argparse.Namespace) -> None:
 
 def _calibrate(arguments: argparse.Namespace) -> None:
     from lalaloc_core.bundle import Bundle
-    from lalaloc_core.calibrate import Answers, calibrate, fit_evidence, store_evidence
+    from lalaloc_core.calibrate import Answers, calibrate, fit_evidence, store_cohort, store_evidence
+    from lalaloc_core.data.synthetic import training_plans
     from lalaloc_core.evaluation.building import describe_model
     from lalaloc_core.evaluation.predictions import Prediction, RunFolder, RunInfo
     from lalaloc_core.evaluation.run import run_evaluation
+    from lalaloc_core.localise.cohort import cohort_of
 
     def asked(generated: dict[str, Any], known: bool, whose: str) -> list[Prediction]:
         heading = "known" if known else "searched"
@@ -215,6 +219,9 @@ def _calibrate(arguments: argparse.Namespace) -> None:
         with tempfile.TemporaryDirectory(prefix="lalaloc-run-") as folder:
             return run_evaluation(RunFolder(Path(folder)), info)
 
+    bundle = Bundle.open(arguments.bundle)
+    strangers = training_plans(_COHORT_HOMES, arguments.seed)
+    store_cohort(bundle, cohort_of(strangers, bundle.manifest.profile_columns, arguments.seed))
     own = _generated(arguments, None)
     mismatched = own | {"generator": "mismatched", "homes": max(arguments.homes // _PER_MISMATCHED_HOME, 1)}
     # Weights first: confidence is fitted on answers that were weighed by them.

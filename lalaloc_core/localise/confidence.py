@@ -1,8 +1,9 @@
 """How sure an answer is: the posterior within 1 m of it, times the probability that the picture fits the plan at all.
 
-Whether it fits is judged by signals that do not compare places: how badly the best one fits, how sure the image encoder
-is, and how far the latents are apart. How these become a probability is fitted on validation queries and on photographs
-of something else (`lalaloc_core.calibrate`), and travels with the model (`bundle.ConfidenceModel`).
+Whether it fits is judged by signals that do not compare places: how badly the best one fits, also in units of how
+badly places of other homes do (`localise.cohort`), how sure the image encoder is, and how far the latents are apart.
+How these become a probability is fitted on validation queries and on photographs of something else
+(`lalaloc_core.calibrate`), and travels with the model (`bundle.ConfidenceModel`).
 """
 
 from __future__ import annotations
@@ -29,15 +30,17 @@ class Signals:
         uncertainty: mean log of the scales that the image encoder predicts; 0 where it predicts none.
         latent_distance: of the answer. Pictures of no room at all fit anywhere, as nothing is predicted of them with
             any certainty, but their latents are like no layout's.
+        cost_to_chance: log of the cost of the plan's best grid pose in units of what fits by chance.
     """
 
     log_odds: float
     cost: float
     uncertainty: float
     latent_distance: float
+    cost_to_chance: float
 
 
-def signals_of(query: Query, answer: Candidate, posterior: Posterior) -> Signals:
+def signals_of(query: Query, answer: Candidate, posterior: Posterior, cost_to_chance: float) -> Signals:
     """Signals of an answer, the first candidate of the posterior."""
     mass = min(max(posterior.position, 1e-9), 1.0 - 1e-9)
     log_odds = math.log(mass / (1.0 - mass))
@@ -46,4 +49,5 @@ def signals_of(query: Query, answer: Candidate, posterior: Posterior) -> Signals
         cost=answer.cost,
         uncertainty=0.0 if query.profile is None else float(query.profile.log_scale.mean()),
         latent_distance=answer.latent_distance,
+        cost_to_chance=cost_to_chance,
     )

@@ -15,6 +15,7 @@ from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, TWO_PI, wrap_a
 from lalaloc_core.errors import BundleError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import CameraHeight
+from lalaloc_core.localise.cohort import Cohort
 from lalaloc_core.localise.poses import (
     PredictedCeiling,
     PredictedOpenings,
@@ -49,6 +50,7 @@ class Encoders:
             BundleError: a file is missing or altered, or the model knows other classes of openings or types of rooms.
         """
         self.manifest = bundle.manifest
+        self.cohort = Cohort.of_bundle(bundle)
         self._layout = _session(bundle.read(LAYOUT_ONNX), threads)
         # A bundle of the layout branch alone answers layout queries only.
         image = bundle.read(IMAGE_ONNX) if IMAGE_ONNX in self.manifest.files else None

@@ -18,6 +18,7 @@ import numpy as np
 from lalaloc_core.bundle import ConfidenceModel
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.cohort import log_cost_to_chance
 from lalaloc_core.localise.confidence import Signals, signals_of
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.evidence import EvidenceConfig
@@ -235,6 +236,10 @@ def localise_steps(
             limit=config.max_candidates + top_k,
         )
         starts = config.starts(query, modes)
+        reach_m = evidence.grid_reach * grid.step_m
+        cost_to_chance = log_cost_to_chance(
+            encoders.cohort, plan, query, float(costs.cost.min()), reach_m, weights, evidence
+        )
     candidates, ends = list(modes), list[Candidate]()
 
     def posterior(first: list[Candidate]) -> Posterior:
@@ -242,7 +247,9 @@ def localise_steps(
         return posterior_of(costs, prior, query, begun, ends, first, weights.temperature, config.separation_m)
 
     best: dict[SearchStage, Candidate] = {"retrieval": candidates[0]}
-    signals: dict[SearchStage, Signals] = {"retrieval": signals_of(query, candidates[0], posterior(candidates[:1]))}
+    signals: dict[SearchStage, Signals] = {
+        "retrieval": signals_of(query, candidates[0], posterior(candidates[:1]), cost_to_chance)
+    }
     if refine in ("vdr", "lpo") and config.vdr_candidates:
         with clock.stage("vdr"):
             for index in range(min(config.vdr_candidates, len(candidates))):
@@ -259,7 +266,7 @@ def localise_steps(
                 )
         stage = "vdr"
         best[stage] = min(candidates[: config.vdr_candidates], key=attrgetter("total_cost"))
-        signals[stage] = signals_of(query, best[stage], posterior([best[stage]]))
+        signals[stage] = signals_of(query, best[stage], posterior([best[stage]]), cost_to_chance)
     if refine == "lpo":
         with clock.stage("lpo"):
             job = refinement_job(plan, query, candidates[:starts], grid.camera_height_m, weights, evidence)
@@ -280,7 +287,7 @@ def localise_steps(
         answers = with_latents(plan, encoders, query, answers, grid.camera_height_m)
     if stage == "lpo" or config.by_probability:
         best[stage] = answers[0]
-        signals[stage] = signals_of(query, answers[0], found)
+        signals[stage] = signals_of(query, answers[0], found, cost_to_chance)
     missed = hints.missed(answers[0].position_m, answers[0].room_index)
     if hints.strict:
         missed = missed_hints(plan, costs, weights, hints)

@@ -22,10 +22,17 @@ TRUTH = Pose(x_m=0.0, y_m=0.0, room_index=0, heading_deg=0.0)
 MAKER = LogisticModel(bias=1.0, log_odds=0.0, cost=-6.0, uncertainty=-0.7, latent_distance=-3.0)
 
 
-def result(error_m: float, log_odds: float = 0.0, cost: float = 0.1, uncertainty: float = -3.0) -> Prediction:
+def result(
+    error_m: float,
+    log_odds: float = 0.0,
+    cost: float = 0.1,
+    uncertainty: float = -3.0,
+    cost_to_chance: float = 0.0,
+) -> Prediction:
     """A query that was answered that far off; NaN stands for no answer."""
     answered = not math.isnan(error_m)
     signals = {"log_odds": log_odds, "cost": cost, "uncertainty": uncertainty, "latent_distance": 0.5 * cost}
+    signals["cost_to_chance"] = cost_to_chance
     return Prediction(
         scene="a",
         camera="0",
@@ -90,6 +97,15 @@ class TestConfidence:
         # Answers about the home itself are told as right as they are.
         share = np.mean(position_errors_m(own) < 1.0)
         assert np.mean([confidence(taught, one) for one in own]) == pytest.approx(share, abs=0.03)
+
+    def test_what_fits_no_better_than_by_chance_is_not_believed_whatever_it_costs(self) -> None:
+        rng = np.random.default_rng(7)
+        own = [result(0.2, 6.0, cost, cost_to_chance=rng.normal(-1.0, 0.3)) for cost in rng.uniform(0.1, 0.8, 200)]
+        others = [result(3.0, 6.0, cost, cost_to_chance=rng.normal(0.5, 0.3)) for cost in rng.uniform(0.1, 0.8, 200)]
+        model = fit_confidence(Answers(own=own, mismatched=others), Answers(own=own)).known_heading["lpo"]
+        assert model.cost_to_chance < 0.0
+        assert np.mean([confidence(model, one) for one in own]) > 0.95
+        assert np.mean([confidence(model, one) for one in others]) < 0.1
 
     @pytest.mark.parametrize("wrong_log_odds", [None, 0.0, 3.0], ids=["none", "like the others", "surer"])
     def test_mismatched_photographs_gain_nothing_where_hardly_an_answer_is_wrong(

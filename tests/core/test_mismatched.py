@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lalaloc_core.data.synthetic.generated import GeneratedScenes
-from lalaloc_core.data.synthetic.mismatched import MismatchedScenes, OpenAir, TurnedOver
+from lalaloc_core.data.synthetic.mismatched import CutOut, MismatchedScenes, OpenAir, TurnedOver
 
 HOMES = GeneratedScenes(homes=2, shots_per_home=4, furniture=None)
 LOOK = HOMES.appearances[0]
@@ -25,10 +25,25 @@ def test_cameras_are_the_homes_own_and_see_the_next_home() -> None:
             shown = camera.photographs[LOOK]
             assert isinstance(shown, TurnedOver)
             assert np.array_equal(shown.image(16, 32)[::-1, ::-1], mine.photographs[LOOK].image(16, 32))
+        elif k == 1:
+            assert isinstance(camera.photographs[LOOK], CutOut)
         else:
             pictures = [one.photographs[LOOK].image(16, 32) for one in (camera, mine, theirs)]
             assert np.array_equal(pictures[0], pictures[2])
             assert not np.array_equal(pictures[0], pictures[1])
+
+
+def test_every_other_home_is_shown_nothing_that_is_cut_out() -> None:
+    shown = [camera.photographs[LOOK] for camera in MismatchedScenes(HOMES).load("validation-00000").cameras]
+    assert not any(isinstance(one, CutOut) for one in shown)
+
+
+def test_what_is_cut_out_is_a_part_drawn_out_to_the_whole() -> None:
+    whole = HOMES.load("validation-00000").cameras[0].photographs[LOOK]
+    picture, part = whole.image(40, 80), CutOut(whole).image(40, 80)
+    assert part.shape == picture.shape
+    assert np.array_equal(part[0, 0], picture[12, 20])
+    assert np.array_equal(part[-1, -1], picture[27, 39])
 
 
 def test_the_open_air_has_no_walls() -> None:

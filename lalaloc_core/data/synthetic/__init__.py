@@ -5,8 +5,8 @@ photographs of others, for calibration; `unfamiliar.py` draws the out-of-family 
 `writing.py` is `lalaloc synth`.
 """
 
-from lalaloc_core.data.synthetic.generated import GeneratedScenes
+from lalaloc_core.data.synthetic.generated import GeneratedScenes, training_plans
 from lalaloc_core.data.synthetic.mismatched import MismatchedScenes
 from lalaloc_core.data.synthetic.writing import Synthesis, synthesise
 
-__all__ = ["GeneratedScenes", "MismatchedScenes", "Synthesis", "synthesise"]
+__all__ = ["GeneratedScenes", "MismatchedScenes", "Synthesis", "synthesise", "training_plans"]

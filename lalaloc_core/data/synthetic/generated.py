@@ -13,6 +13,7 @@ from jaxtyping import Float, UInt8
 
 from lalaloc_core.data.dataset import Appearance, Camera, Scene, Split
 from lalaloc_core.errors import DatasetError
+from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.synth.facts import facts_of
 from lalaloc_core.synth.furniture import FurnitureLevel
 from lalaloc_core.synth.materials import MaterialLibrary
@@ -75,6 +76,11 @@ class GeneratedScenes:
 
     def _studio(self, split: int) -> Studio:
         return studio_of(split, self.seed, self.textures)
+
+
+def training_plans(homes: int, seed: int) -> list[FloorPlan]:
+    """The plans of the first training homes."""
+    return [home_of(TRAIN, seed, index)[0].plan for index in range(homes)]
 
 
 class Studio:

@@ -1,4 +1,4 @@
-"""Questions without an answer: homes that are asked with photographs of other homes, of no room, and turned over.
+"""Questions without an answer: homes that are asked with photographs of others, of no room, turned over, or cut out.
 
 Confidence learns from them what it looks like when nothing fits (`lalaloc_core.calibrate`).
 """
@@ -16,13 +16,15 @@ from lalaloc_core.data.dataset import Appearance, Camera, Photograph, Scene, Spl
 from lalaloc_core.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.errors import DatasetError
 
-# One of so many photographs shows no room, and one is the camera's own upside down.
+# One of so many photographs shows no room, and one is the camera's own upside down; of every other home one is cut out.
 _EVERY = 4
+# Of a picture's rows and columns, what an ordinary camera shows of them.
+_CUT_OUT = slice(0.3, 0.7), slice(0.25, 0.5)
 
 
 @dataclass(frozen=True)
 class MismatchedScenes:
-    """Generated homes whose cameras show what those of the next home see, one in four the open air or upside down.
+    """Generated homes whose cameras show what those of the next home see, or nothing that can be localised.
 
     Poses and heights are those of the home's own cameras: where a camera stands has nothing to do with what it shows.
     """
@@ -45,18 +47,24 @@ class MismatchedScenes:
         prefix, _, number = name.rpartition("-")
         other = self.homes.load(f"{prefix}-{int(number) + 1:0{len(number)}d}", problems)
         cameras = [
-            dataclasses.replace(camera, photographs=self._shown(camera, other.cameras[k % len(other.cameras)], k))
+            dataclasses.replace(
+                camera, photographs=_shown(camera, other.cameras[k % len(other.cameras)], k, int(number))
+            )
             for k, camera in enumerate(own.cameras)
         ]
         return dataclasses.replace(own, cameras=tuple(cameras))
 
-    def _shown(self, camera: Camera, other: Camera, k: int) -> dict[Appearance, Photograph]:
-        if k % _EVERY == _EVERY - 2:
-            return {look: TurnedOver(photograph) for look, photograph in camera.photographs.items()}
-        if k % _EVERY == _EVERY - 1:
-            seed = int(1e3 * abs(camera.position_m).sum())
-            return dict.fromkeys(camera.photographs, OpenAir(seed))
-        return dict(zip(camera.photographs, other.photographs.values(), strict=True))
+
+def _shown(camera: Camera, other: Camera, k: int, home: int) -> dict[Appearance, Photograph]:
+    """What the k-th camera of a home shows."""
+    if k % _EVERY == _EVERY - 3 and home % 2:
+        return {look: CutOut(photograph) for look, photograph in camera.photographs.items()}
+    if k % _EVERY == _EVERY - 2:
+        return {look: TurnedOver(photograph) for look, photograph in camera.photographs.items()}
+    if k % _EVERY == _EVERY - 1:
+        seed = int(1e3 * abs(camera.position_m).sum())
+        return dict.fromkeys(camera.photographs, OpenAir(seed))
+    return dict(zip(camera.photographs, other.photographs.values(), strict=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +78,24 @@ class TurnedOver:
 
     def depth_m(self) -> Float[np.ndarray, "h w"]:
         return np.ascontiguousarray(self.photograph.depth_m()[::-1, ::-1])
+
+
+@dataclass(frozen=True, eq=False)
+class CutOut:
+    """What an ordinary camera shows of the room, drawn out to the size of a panorama."""
+
+    photograph: Photograph
+
+    def image(self, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
+        whole = self.photograph.image(height, width)
+        rows, columns = (
+            np.linspace(part.start * size, part.stop * size, size, endpoint=False).astype(int)
+            for part, size in zip(_CUT_OUT, (height, width), strict=True)
+        )
+        return np.ascontiguousarray(whole[rows][:, columns])
+
+    def depth_m(self) -> Float[np.ndarray, "h w"]:
+        raise DatasetError("a picture that is cut out has no depth all around")
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.errors import InvalidMotionError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import CameraHeight
+from lalaloc_core.localise.cohort import log_cost_to_chance
 from lalaloc_core.localise.confidence import Signals, signals_of
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.evidence import Evidence, latent_distances
@@ -148,7 +149,8 @@ def localise_sequence_steps(
     found = path_posterior(grid.poses, pictures, links, log_heights, whole, paths, candidates, config.separation_m)
     told = []
     for picture, answers, posterior in zip(pictures, candidates, found.pictures, strict=True):
-        signals: dict[SearchStage, Signals] = {stage: signals_of(picture.query, answers[0], posterior)}
+        to_chance = _cost_to_chance(plan, grid, encoders, picture, config)
+        signals: dict[SearchStage, Signals] = {stage: signals_of(picture.query, answers[0], posterior, to_chance)}
         best: dict[SearchStage, Candidate] = {stage: answers[0]}
         told.append(Localisation(picture.query, answers, posterior, stage, signals, picture.doubted, best=best))
     costs = _motion_costs(pictures, motions, [paths[0]])[0]
@@ -158,6 +160,17 @@ def localise_sequence_steps(
         pairs = zip(links, itertools.pairwise(paths[0].states), strict=True)
         missed = tuple(s for s, (one, pair) in enumerate(pairs) if one.floor and one.likelihood(*pair) <= FLOOR)
     return SequenceLocalisation(told, float(found.path[0]), stage, missed, clock.timings_ms)
+
+
+def _cost_to_chance(
+    plan: FloorPlan, grid: LatentGrid, encoders: Encoders, picture: Picture, config: LocaliseConfig
+) -> float:
+    """See `Signals`; heights that nobody expects cost what they do of a single picture."""
+    query, weights = picture.query, encoders.manifest.evidence
+    penalty = query.camera_height.penalty(_offsets(query, config)) / weights.temperature
+    cost = float((picture.cost.min(axis=(1, 2)) + penalty).min())
+    reach_m = config.evidence.grid_reach * grid.step_m
+    return log_cost_to_chance(encoders.cohort, plan, query, cost, reach_m, weights, config.evidence)
 
 
 def _offsets(query: Query, config: LocaliseConfig) -> Float[np.ndarray, "j"]:

@@ -1,0 +1,115 @@
+"""What fits a picture by chance: how well it fits places of homes that it cannot be of.
+
+A photograph of a dim or cluttered room fits its own place badly, and one of another building fits some place quite
+well, so how badly the best place fits does not tell the two apart. How badly it fits *in units of what a cohort of
+strangers gives* does; speaker verification normalises its scores so (Auckenthaler, Carey and Lloyd-Thomas, 2000). The
+cohort are poses of training homes. It is made when a model is calibrated, and travels in its bundle.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from lalaloc_core.bundle import COHORT, Bundle, EvidenceModel
+from lalaloc_core.errors import BundleError
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.evidence import Evidence, EvidenceConfig
+from lalaloc_core.localise.layouts import Layouts, layouts_at
+from lalaloc_core.localise.poses import Query
+from lalaloc_core.sampling import pose_grid
+
+SIZE = 2048
+# Of the grids that poses are drawn from.
+_STEP_M = 0.5
+# They are compared at every so many azimuths, and under so many hypotheses of the heading.
+_STRIDE = 4
+_HYPOTHESES = 4
+# Costs are compared above this: it is what the best of pictures costs.
+_LEAST_COST = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Cohort:
+    """Poses of strangers.
+
+    Attributes:
+        log_profile: (n, w) log wall profiles (m), in half precision.
+        kind: (n, w) codes of what is met, as in `conventions.OPENING_CLASSES`.
+    """
+
+    log_profile: Float[np.ndarray, "n w"]
+    kind: UInt8[np.ndarray, "n w"]
+
+    def to_bytes(self) -> bytes:
+        """A file of it."""
+        buffer = io.BytesIO()
+        np.savez_compressed(buffer, log_profile=self.log_profile, kind=self.kind)
+        return buffer.getvalue()
+
+    @classmethod
+    def of_bundle(cls, bundle: Bundle) -> Cohort | None:
+        """The cohort of a model; None where it has none.
+
+        Raises:
+            BundleError: the file was altered, or does not hold one.
+        """
+        if COHORT not in bundle.manifest.files:
+            return None
+        try:
+            with np.load(io.BytesIO(bundle.read(COHORT)), allow_pickle=False) as arrays:
+                found = cls(arrays["log_profile"], arrays["kind"])
+        except (ValueError, KeyError, OSError) as error:
+            raise BundleError(f"bundle '{bundle.folder}': '{COHORT}' holds no cohort: {error}") from error
+        columns = bundle.manifest.profile_columns
+        if found.log_profile.shape[1:] != (columns,) or found.kind.shape != found.log_profile.shape:
+            raise BundleError(f"'{COHORT}' is of {found.log_profile.shape[1:]} columns, the model has {columns}")
+        return found
+
+
+def cohort_of(plans: Iterable[FloorPlan], columns: int, seed: int) -> Cohort:
+    """`SIZE` poses of some plans, fewer if they have not so many, drawn at random."""
+    profiles, kinds = [], []
+    for plan in plans:
+        poses = pose_grid(plan, _STEP_M)
+        layouts = layouts_at(plan, poses, np.zeros(len(poses)), columns)
+        profiles.append(layouts.log_profile.astype(np.float16))
+        walls = np.zeros(layouts.log_profile.shape, np.uint8)
+        kinds.append(walls if layouts.kind is None else layouts.kind)
+    log_profile, kind = np.concatenate(profiles), np.concatenate(kinds)
+    chosen = np.sort(np.random.default_rng(seed).permutation(len(log_profile))[:SIZE])
+    return Cohort(log_profile[chosen], kind[chosen])
+
+
+def log_cost_to_chance(
+    cohort: Cohort | None,
+    plan: FloorPlan,
+    query: Query,
+    cost: float,
+    reach_m: float,
+    weights: EvidenceModel,
+    config: EvidenceConfig,
+) -> float:
+    """Log of how badly a plan fits a picture, in units of how badly the cohort does: below 0 it fits better.
+
+    Args:
+        plan: says which openings count.
+        cost: of the best pose of the plan's grid, and `reach_m` how far those may lie from the camera.
+
+    Returns:
+        0 without a cohort, or where poses are compared by their latents.
+    """
+    if cohort is None or not config.compares_profiles(query):
+        return 0.0
+    # What is particular to a room is no matter of chance.
+    alone = replace(config, use_ceiling=False, use_room_type=False, use_see_through=False)
+    nowhere = np.zeros(len(cohort.kind), dtype=np.int64)
+    layouts = Layouts(cohort.log_profile.astype(np.float32), nowhere, cohort.kind)
+    hypotheses = np.unique(np.arange(_HYPOTHESES) * len(query.roll) // _HYPOTHESES)
+    by_chance, _ = Evidence(plan, query, reach_m, weights, alone, stride=_STRIDE).costs(layouts, hypotheses)
+    return math.log((cost + _LEAST_COST) / (float(by_chance.min()) + _LEAST_COST))
