@@ -13,6 +13,7 @@ from lalaloc_client import operations, requests
 from lalaloc_client.async_sender import AsyncSender
 from lalaloc_client.errors import NotFoundError
 from lalaloc_client.events import Followed, check_stream
+from lalaloc_client.layout import Layout
 from lalaloc_client.model import FloorPlan, FloorPlanSummary, PlanEvent
 from lalaloc_client.requests import Covariance, Document
 
@@ -80,6 +81,11 @@ class AsyncPlanMethods(AsyncSender):
     async def export(self, floorplan_id: str, file_format: str) -> bytes:
         """See `Client.export`."""
         return await self._run(operations.content(requests.export_request(floorplan_id, file_format), self._patience))
+
+    async def layout(self, floorplan_id: str, *, revision: str | None = None) -> Layout:
+        """See `Client.layout`."""
+        request = requests.layout_request(floorplan_id, revision)
+        return await self._run(operations.layout(request, self._patience))
 
     async def mesh(self, floorplan_id: str) -> bytes:
         """See `Client.mesh`."""

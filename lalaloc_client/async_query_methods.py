@@ -33,6 +33,7 @@ class AsyncQueryMethods(AsyncSender):
         strict: bool | None = None,
         refine: Refine | None = None,
         top_k: int | None = None,
+        posterior: bool = False,
     ) -> Localisation:
         """See `Client.localise`."""
         return await self._query(
@@ -50,7 +51,16 @@ class AsyncQueryMethods(AsyncSender):
             radius_m=radius_m,
             rooms=rooms,
             strict=strict,
+            posterior=posterior,
         )
+
+    async def answer(self, answer_id: str) -> Localisation:
+        """See `Client.answer`."""
+        return await self._run(operations.localisation(requests.answer_request(answer_id), self._patience))
+
+    async def forget_answer(self, answer_id: str) -> None:
+        """See `Client.forget_answer`."""
+        await self._run(operations.delete(requests.answer_request(answer_id, "DELETE"), self._patience))
 
     async def picture(
         self,

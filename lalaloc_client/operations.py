@@ -23,6 +23,7 @@ from lalaloc_client.errors import (
     ProblemError,
     problem_class,
 )
+from lalaloc_client.layout import Layout
 from lalaloc_client.model import (
     FloorPlan,
     FloorPlanPage,
@@ -146,6 +147,11 @@ def venue_page(request: Request, patience: Patience) -> Steps[VenuePage]:
 def venue_plan_page(request: Request, patience: Patience) -> Steps[VenuePlanPage]:
     """Send a request for a page of the plans of a venue."""
     return parse(VenuePlanPage, _json((yield from send(request, patience)).response))
+
+
+def layout(request: Request, patience: Patience) -> Steps[Layout]:
+    """Send a request for the walls of a plan."""
+    return parse(Layout, _json((yield from send(request, patience)).response))
 
 
 def localisation(request: Request, patience: Patience) -> Steps[Localisation]:

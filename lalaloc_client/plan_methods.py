@@ -11,6 +11,7 @@ from httpx_sse import EventSource
 from lalaloc_client import operations, requests
 from lalaloc_client.errors import NotFoundError
 from lalaloc_client.events import Followed, check_stream
+from lalaloc_client.layout import Layout
 from lalaloc_client.model import FloorPlan, FloorPlanSummary, PlanEvent
 from lalaloc_client.requests import Covariance, Document
 from lalaloc_client.sender import Sender
@@ -96,6 +97,15 @@ class PlanMethods(Sender):
     def export(self, floorplan_id: str, file_format: str) -> bytes:
         """A plan as a file: `native`, `geojson`, `imdf` (of a plan with an anchor), `dxf` or `svg`."""
         return self._run(operations.content(requests.export_request(floorplan_id, file_format), self._patience))
+
+    def layout(self, floorplan_id: str, *, revision: str | None = None) -> Layout:
+        """The walls of a plan with the openings in them, room by room: what it takes to draw what a camera sees.
+
+        Args:
+            revision: an older one, while the service keeps it; None: the current one.
+        """
+        request = requests.layout_request(floorplan_id, revision)
+        return self._run(operations.layout(request, self._patience))
 
     def mesh(self, floorplan_id: str) -> bytes:
         """Floor, walls and ceilings of a plan as binary glTF (GLB), in metres and y-up."""

@@ -36,6 +36,7 @@ class QueryMethods(Sender):
         strict: bool | None = None,
         refine: Refine | None = None,
         top_k: int | None = None,
+        posterior: bool = False,
     ) -> Localisation:
         """Where in a plan a panorama was taken.
 
@@ -52,6 +53,7 @@ class QueryMethods(Sender):
             strict: whether nothing else is looked at than what hints and heading say; None: they may be wrong.
             refine: `none`, `vdr` or `lpo`, how far to go; None: as far as possible.
             top_k: how many candidates; None: as many as the service likes.
+            posterior: whether to tell how probable every place of the plan is.
         """
         return self._query(
             operations.localisation,
@@ -68,7 +70,16 @@ class QueryMethods(Sender):
             radius_m=radius_m,
             rooms=rooms,
             strict=strict,
+            posterior=posterior,
         )
+
+    def answer(self, answer_id: str) -> Localisation:
+        """An answer again by its `answer_id`, while the service keeps it."""
+        return self._run(operations.localisation(requests.answer_request(answer_id), self._patience))
+
+    def forget_answer(self, answer_id: str) -> None:
+        """Have the service forget an answer that it keeps."""
+        self._run(operations.delete(requests.answer_request(answer_id, "DELETE"), self._patience))
 
     def picture(
         self,

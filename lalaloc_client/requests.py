@@ -132,6 +132,17 @@ def preview_request(
     return Request("GET", f"{_plan_path(floorplan_id)}/preview.svg", params=params, headers=headers)
 
 
+def layout_request(floorplan_id: str, revision: str | None) -> Request:
+    """The walls of a plan, room by room."""
+    params = {} if revision is None else {"revision": revision}
+    return Request("GET", f"{_plan_path(floorplan_id)}/layout", params)
+
+
+def answer_request(answer_id: str, method: Literal["GET", "DELETE"] = "GET") -> Request:
+    """An answer that the service keeps, to be told again or forgotten."""
+    return Request(method, resource_path("answers", "answer_id", answer_id))
+
+
 def mesh_request(floorplan_id: str) -> Request:
     """A mesh of a plan."""
     return Request("GET", f"{_plan_path(floorplan_id)}/mesh.glb", headers={"Accept": "model/gltf-binary"})
@@ -168,6 +179,7 @@ def localise_request(
     radius_m: float | None = None,
     rooms: Sequence[str] | None = None,
     strict: bool | None = None,
+    posterior: bool = False,
     venue_id: str | None = None,
 ) -> Request:
     """A query about a plan or a venue; it stores nothing, so asking twice is as good as once."""
@@ -182,6 +194,7 @@ def localise_request(
         "top_k": top_k,
         "radius_m": radius_m,
         "strict": strict,
+        "include": "posterior" if posterior else None,
         "near": None if near is None else json.dumps(dict(near)),
         # Text alone would be taken for a room by each of its letters.
         "rooms": None if rooms is None else json.dumps([rooms] if isinstance(rooms, str) else list(rooms)),

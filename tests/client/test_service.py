@@ -128,6 +128,39 @@ def test_an_answer_has_all_that_the_service_says(service: Any, app: httpx.Client
     assert answer.candidates[0].position == answer.position
 
 
+def test_how_probable_every_place_is_comes_where_it_is_asked_for(service: Any, panorama: bytes) -> None:
+    plan_id = service.wait_until_ready(service.upload_floorplan(FLAT).id).id
+    posterior = service.localise(plan_id, panorama, refine="none", posterior=True).posterior
+    assert len(posterior.x_m) == len(posterior.y_m) == len(posterior.probability) > 10
+    assert sum(posterior.probability) == pytest.approx(1.0, abs=1e-4)
+    assert service.localise(plan_id, panorama, refine="none").posterior is None
+
+
+def test_the_layout_of_a_revision_is_told_room_by_room(service: Any, app: httpx.Client) -> None:
+    plan = service.upload_floorplan(FLAT)
+    service.replace_floorplan(plan.id, FLAT | {"rooms": FLAT["rooms"][:1], "openings": []})
+    assert len(service.layout(plan.id).rooms) == 1
+    layout = service.layout(plan.id, revision=plan.revision)
+    said = app.get(f"/floorplans/{plan.id}/layout", params={"revision": plan.revision}).json()
+    assert json.loads(json.dumps(dataclasses.asdict(layout))) == said
+    with pytest.raises(NotFoundError, match="unknown-revision"):
+        service.layout(plan.id, revision="0" * 32)
+
+
+def test_kept_answers_are_told_again_and_forgotten(
+    start_app: StartApp, make_client: MakeClient, panorama: bytes, tmp_path: Path
+) -> None:
+    with start_app(tmp_path, keep_answers_s=3600.0) as app, make_client(str(app.base_url)) as service:
+        plan_id = service.wait_until_ready(service.upload_floorplan(FLAT).id).id
+        answer = service.localise(plan_id, panorama, refine="none", posterior=True)
+        assert service.answer(answer.answer_id) == answer
+        service.forget_answer(answer.answer_id)
+        with pytest.raises(NotFoundError, match="unknown-answer"):
+            service.answer(answer.answer_id)
+        with pytest.raises(ValueError, match="answer_id is"):
+            service.answer("../floorplans")
+
+
 def test_a_panorama_may_be_bytes_a_file_or_a_picture(service: Any, panorama: bytes, tmp_path: Path) -> None:
     plan_id = service.wait_until_ready(service.upload_floorplan(json.dumps(FLAT).encode()).id).id
     (tmp_path / "p.jpg").write_bytes(panorama)
