@@ -176,12 +176,13 @@ def _view_box(plan: FloorPlan, seen_m: Sequence[tuple[float, float]]) -> tuple[f
 
 def _outline(room: Room, fill: str, extent_m: float) -> str:
     """The floor, with holes left white, and free-standing walls."""
-    width = f'stroke-width="{extent_m / 250:.4f}"'
+    # Half of an outline lies on the floor, which would look smaller by so much.
+    width = f'stroke-width="{extent_m / 500:.4f}"'
     rings = [(room.polygon_m, fill), *((hole, "#fff") for hole in room.holes_m)]
     lines = [f'<polygon points="{_points(ring)}" fill="{colour}" {width}/>' for ring, colour in rings]
     if len(room.inner_walls_m):
         path = "".join(f"M{x0:.3f} {-y0:.3f}L{x1:.3f} {-y1:.3f}" for x0, y0, x1, y1 in room.inner_walls_m)
-        lines.append(f'<path class="walls" d="{path}" {width}/>')
+        lines.append(f'<path class="walls" d="{path}" stroke-width="{extent_m / 250:.4f}"/>')
     return "\n".join(lines)
 
 
@@ -190,15 +191,22 @@ def _opening(plan: FloorPlan, face: OpeningFace, extent_m: float) -> str:
     own = _piece_m(plan.rooms[face.room], face.wall, face.start, face.end)
     kind = plan.openings[face.opening].kind
     parts = []
+    sides = [own]
     if face.behind < 0 or face.behind > face.room:
         # Walls that face each other run in opposite directions.
-        quad = np.concatenate([own, _beyond_m(plan, face, own)])
-        parts.append(f'<polygon points="{_points(quad)}" fill="{_GAP_COLOURS[kind]}"/>')
-    (x0, y0), (x1, y1) = own.tolist()
-    parts.append(
-        f'<path class="{kind}" d="M{x0:.3f} {-y0:.3f}L{x1:.3f} {-y1:.3f}" stroke="{_OPENING_COLOURS[kind]}" '
-        f'stroke-width="{extent_m / 220:.4f}"/>'
-    )
+        beyond = _beyond_m(plan, face, own)
+        parts.append(f'<polygon points="{_points(np.concatenate([own, beyond]))}" fill="{_GAP_COLOURS[kind]}"/>')
+        # The room behind draws its own side.
+        sides += [beyond] if face.behind < 0 else []
+    ends = (side.ravel().tolist() for side in sides)
+    path = "".join(f"M{x0:.3f} {-y0:.3f}L{x1:.3f} {-y1:.3f}" for x0, y0, x1, y1 in ends)
+    stroke = f'd="{path}" stroke-width="{extent_m / 220:.4f}"'
+    dashes = ""
+    if kind == "passage":
+        # Nothing stands there: between the dashes there is no wall either.
+        parts.append(f'<path {stroke} stroke="{_GAP_COLOURS[kind]}"/>')
+        dashes = f' stroke-dasharray="{extent_m / 75:.4f}"'
+    parts.append(f'<path class="{kind}" {stroke} stroke="{_OPENING_COLOURS[kind]}"{dashes}/>')
     return "".join(parts)
 
 

@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import io
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+import shapely
+from PIL import Image, ImageDraw
 
 from benchmarks.plan_drawing import STYLES, DrawnPlan, Style, draw_plan
-from benchmarks.plan_pictures import Score, f1, score_plan, table
+from benchmarks.plan_pictures import Score, _iou, f1, score_plan, table
+from lalaloc_core.draw.canvas import rasterise
+from lalaloc_core.draw.plan import plan_svg
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.plans import ImportOptions, KnownDistance, import_plan
 from lalaloc_core.plans.picture.ink import find_skew
 from tests.plans.conftest import lines, shapes
 
+FLAT = Path(__file__).parents[2] / "examples" / "flat.json"
 # Homes that are read well in every style; the benchmark has those that are not.
 SEED = {"thin": 0, "thick": 1, "hatched": 0, "coloured": 3, "scanned": 3}
 
@@ -33,6 +40,57 @@ def test_rooms_doors_and_windows_are_found(drawn: dict[Style, DrawnPlan], style:
     assert f1(score.door) >= 0.8
     assert f1(score.window) >= 0.8
     assert f"| {style} | {score.rooms} | 100.0% |" in table({style: score})
+
+
+@pytest.mark.parametrize("coloured", [True, False])
+def test_the_project_s_own_drawings_are_read_back(coloured: bool):
+    flat = FloorPlan.from_json(FLAT.read_bytes())
+    svg = plan_svg(flat)
+    left, top, width, height = (float(number) for number in re.findall(r'viewBox="([^"]+)"', svg)[0].split())
+    picture = Image.open(io.BytesIO(rasterise(svg)))
+    stream = io.BytesIO()
+    (picture if coloured else picture.convert("LA")).save(stream, "PNG")
+    plan = import_plan(stream.getvalue(), ImportOptions(metres_per_pixel=width / picture.width)).document
+    # A picture's origin is its lower left corner.
+    origin = np.array([left, -top - height])
+
+    def placed(points: np.ndarray) -> np.ndarray:
+        return points + origin
+
+    found = [shapely.transform(room, placed) for room in shapes(plan)]
+    shares = [max(_iou(room.shape, other) for other in found) for room in flat.rooms]
+    assert min(shares) > 0.95
+    for kind in ("door", "window", "passage"):
+        told = [shapely.transform(line, placed) for line in lines(plan, kind)]
+        true = [shapely.LineString(opening.line_m) for opening in flat.openings if opening.kind == kind]
+        if not coloured:
+            # The entrance has panes in an outer wall.
+            entrance = [line for line in true if line.coords[0][0] == 9.4 and kind == "door"]
+            true = [line for line in true if line not in entrance]
+            told = [line for line in told if line.centroid.x < 9.3 or line.centroid.y < 5.0]
+        assert len(told) == len(true)
+        assert all(min(shapely.hausdorff_distance(line, other) for other in told) < 0.2 for line in true)
+
+
+def test_a_single_line_in_an_outer_wall_is_a_window_and_in_an_inner_one_a_passage():
+    page = Image.new("L", (900, 500), 255)
+    pen = ImageDraw.Draw(page)
+    pen.rectangle((100, 100, 800, 400), outline=0, width=20)
+    pen.line((450, 100, 450, 400), fill=0, width=12)
+    for box, line in [
+        ((200, 95, 320, 125), ((200, 110), (320, 110))),
+        ((440, 200, 460, 290), ((450, 200), (450, 290))),
+    ]:
+        pen.rectangle(box, fill=255)
+        pen.line(line, fill=0, width=2)
+    stream = io.BytesIO()
+    page.save(stream, "PNG")
+    plan = import_plan(stream.getvalue(), ImportOptions(metres_per_pixel=0.01))
+    assert len(plan.document["rooms"]) == 2
+    (window,) = lines(plan.document, "window")
+    assert window.length == pytest.approx(1.2, abs=0.03)
+    assert len(lines(plan.document, "passage")) == 1
+    assert sum("a single line" in guess for guess in plan.report.unsure) == 2
 
 
 def test_a_picture_is_a_draft_that_says_what_it_is_unsure_of(drawn: dict[Style, DrawnPlan]):

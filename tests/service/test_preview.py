@@ -149,7 +149,8 @@ def test_openings_holes_and_free_standing_walls_are_drawn() -> None:
     paths = [(path.get("class"), path.get("d")) for path in root.iter(f"{SVG}path")]
     assert ("walls", "M3.000 -3.000L3.000 -2.000") in paths
     assert [kind for kind, _ in paths if kind in ("door", "window")] == ["door", "door", "window"]
-    assert ("window", "M1.000 -0.000L2.000 -0.000") in paths
+    # At both faces of the outer wall.
+    assert ("window", "M1.000 -0.000L2.000 -0.000M2.000 0.120L1.000 0.120") in paths
     polygons = [polygon.attrib for polygon in root.iter(f"{SVG}polygon")]
     assert any(polygon["points"].count(" ") == 2 and polygon["fill"] == "#fff" for polygon in polygons)
     # The doorway through the wall's thickness.

@@ -11,10 +11,10 @@ import numpy as np
 from jaxtyping import Float
 
 from lalaloc_core.plans.drawing.walls import Gap
-from lalaloc_core.plans.picture.ink import Ink
+from lalaloc_core.plans.picture.ink import COLOURLESS, Ink
 
 # Shares of an arc, of a leaf, of a pane's line that must be inked; ink this near counts (pixels).
-_ARC, _ARC_WITH_LEAF, _LEAF, _LINE = 0.8, 0.55, 0.8, 0.7
+_ARC, _ARC_WITH_LEAF, _LEAF, _LINE, _ONE_LINE = 0.8, 0.55, 0.8, 0.7, 0.9
 _NEAR_PX = 2
 _DOOR_M = (0.5, 2.4)
 _ARC_POINTS = 28
@@ -24,10 +24,15 @@ _FAINT, _DIP, _RISE = 22.0, 30.0, 12.0
 
 @dataclass(frozen=True)
 class Seen:
-    """What was seen in a gap, and how sure that is (0 to 1)."""
+    """What was seen in a gap, and how sure that is (0 to 1).
 
-    kind: Literal["door", "window", "nothing"]
+    `swing`: the arc of a door; `pane`: two or more lines along the wall; `line`: a single one. `warmth` is that of
+    these lines, of 255: above 0 they are red or brown, below blue.
+    """
+
+    kind: Literal["swing", "pane", "line", "nothing"]
     sureness: float
+    warmth: float = 0.0
 
 
 class GapReader:
@@ -42,10 +47,12 @@ class GapReader:
         """The most likely content of a gap."""
         arc = self._arc(gap) if _DOOR_M[0] <= gap.width <= _DOOR_M[1] else 0.0
         if arc >= _ARC:
-            return Seen("door", arc)
-        lines, share = self._lines(gap)
+            return Seen("swing", arc)
+        lines, share, warmth = self._lines(gap)
         if lines >= 2:
-            return Seen("window", share)
+            return Seen("pane", share, warmth)
+        if lines == 1 and share >= _ONE_LINE:
+            return Seen("line", share, warmth)
         return Seen("nothing", 1.0 - max(arc, share if lines else 0.0))
 
     def _arc(self, gap: Gap) -> float:
@@ -85,8 +92,8 @@ class GapReader:
                 best = max(best, share)
         return best
 
-    def _lines(self, gap: Gap) -> tuple[int, float]:
-        """(lines that run from jamb to jamb within the wall, how much of the second best is inked).
+    def _lines(self, gap: Gap) -> tuple[int, float, float]:
+        """(lines that run from jamb to jamb within the wall, how much of the second best is inked, their warmth).
 
         Along a pane's line the mean of many pixels stands out of the paper, be it as thin and faint as it may.
         """
@@ -99,15 +106,17 @@ class GapReader:
         reach = np.linspace(0.08, 0.92, max(8, math.ceil(gap.width / pixel)))
         points = start + (reach * gap.width)[None, :, None] * along + offsets[:, None, None] * across
         columns, rows = (self._ink.to_pixels(points.reshape(-1, 2)) - 0.5).astype(np.float32).T
-        shape = (len(offsets), len(reach))
-        values = cv2.remap(
-            self._ink.gray, columns.reshape(shape), rows.reshape(shape), cv2.INTER_LINEAR, borderValue=255
-        )
+        place = columns.reshape(len(offsets), len(reach)), rows.reshape(len(offsets), len(reach))
+        values = cv2.remap(self._ink.gray, *place, cv2.INTER_LINEAR, borderValue=255)
         profile = values.mean(axis=1)
         shares = (values < 255.0 - _FAINT).mean(axis=1)
-        found = [float(shares[index]) for index in _dips(profile) if shares[index] >= _LINE]
-        best = sorted(found, reverse=True)
-        return len(best), best[1] if len(best) > 1 else (best[0] if best else 0.0)
+        found = [index for index in _dips(profile) if shares[index] >= _LINE]
+        best = sorted((float(shares[index]) for index in found), reverse=True)
+        warmth = 0.0
+        if found and self._ink.warmth is not None:
+            colours = cv2.remap(self._ink.warmth, *place, cv2.INTER_LINEAR, borderValue=COLOURLESS)
+            warmth = float(colours[found].mean()) - COLOURLESS
+        return len(best), best[1] if len(best) > 1 else (best[0] if best else 0.0), warmth
 
     def _inked(self, points_m: Float[np.ndarray, "n 2"]) -> float:
         return float(self._values(points_m, self._near).mean())

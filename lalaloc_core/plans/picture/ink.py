@@ -11,6 +11,8 @@ from jaxtyping import Bool, Float, UInt8
 
 # Lengths of what is looked at, in metres: finer pictures are made coarser, and light is evened out over so much.
 FINEST_M = 0.01
+# Warmth of what has no colour.
+COLOURLESS = 128.0
 _LIGHT_M = 1.2
 _MAX_SKEW_DEG = 10.0
 _SKEW_PIXELS = 700
@@ -27,6 +29,7 @@ class Ink:
     Attributes:
         mask: what is dark; rows from the top.
         gray: what it was made of, lines straight and paper white.
+        warmth: 128 where there is no colour, more towards red, less towards blue; None of a picture in grey.
         lines: what is dark, and every line that is darker than what is around it, however faint.
         metres_per_pixel: of this mask, not of the picture it came from.
         skew_deg: by how much the picture was turned (clockwise as seen) to make its lines straight.
@@ -34,6 +37,7 @@ class Ink:
     """
 
     gray: UInt8[np.ndarray, "h w"]
+    warmth: UInt8[np.ndarray, "h w"] | None
     mask: Bool[np.ndarray, "h w"]
     lines: Bool[np.ndarray, "h w"]
     metres_per_pixel: float
@@ -55,17 +59,22 @@ class Ink:
         return np.column_stack([x, self.size[0] - y]) + shift
 
 
-def read_ink(gray: UInt8[np.ndarray, "h w"], metres_per_pixel: float) -> Ink:
+def read_ink(
+    gray: UInt8[np.ndarray, "h w"], metres_per_pixel: float, warmth: UInt8[np.ndarray, "h w"] | None = None
+) -> Ink:
     """Even out light, turn lines straight, and threshold.
 
     Args:
         gray: rows from the top, 255 is white.
         metres_per_pixel: of this picture.
+        warmth: as of `Ink`.
     """
     if metres_per_pixel < FINEST_M:
         factor = metres_per_pixel / FINEST_M
         rows, columns = (max(1, round(size * factor)) for size in gray.shape)
         gray = cv2.resize(gray, (columns, rows), interpolation=cv2.INTER_AREA).astype(np.uint8)
+        if warmth is not None:
+            warmth = cv2.resize(warmth, (columns, rows), interpolation=cv2.INTER_AREA).astype(np.uint8)
         metres_per_pixel = FINEST_M
     even = _even_light(gray, metres_per_pixel)
     threshold, _ = cv2.threshold(even, 0, 255, cv2.THRESH_BINARY + cv2.THRESH_OTSU)
@@ -73,9 +82,10 @@ def read_ink(gray: UInt8[np.ndarray, "h w"], metres_per_pixel: float) -> Ink:
     skew_deg = find_skew(even < threshold)
     if skew_deg:
         even = _turned(even, skew_deg)
+        warmth = None if warmth is None else _turned(warmth, skew_deg, fill=COLOURLESS)
     mask = even < threshold
     size = (int(gray.shape[0]), int(gray.shape[1]))
-    return Ink(even, mask, mask | _faint_lines(even, metres_per_pixel), metres_per_pixel, skew_deg, size)
+    return Ink(even, warmth, mask, mask | _faint_lines(even, metres_per_pixel), metres_per_pixel, skew_deg, size)
 
 
 def _faint_lines(even: UInt8[np.ndarray, "h w"], metres_per_pixel: float) -> Bool[np.ndarray, "h w"]:

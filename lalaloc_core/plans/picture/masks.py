@@ -20,6 +20,8 @@ _SMALL_M = 1.2
 _STRAIGHT_M, _STRAIGHT_PX = 0.012, 1.3
 # Walls are alike in thickness; a chair, a letter or a basin is not.
 _ALIKE = (0.6, 1.6)
+# The stroke of a pane is as thick as a thin wall, but so much paler (of 255), thinner than its wall, and so long.
+_PALER, _THINNER, _STROKE_M = 45.0, 0.55, 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +40,30 @@ class WallMask:
 
 
 def dark_walls(ink: Ink) -> WallMask | None:
-    """Walls that are filled: what stays of the ink when thin lines are taken away."""
-    return _walls(ink, ink.mask, None)
+    """Walls that are filled: what stays of the ink when thin lines, and broad ones of another tone, are taken away."""
+    walls = _walls(ink, ink.mask, None)
+    if walls is None:
+        return None
+    strokes = _pale_strokes(ink, walls)
+    return _walls(ink, ink.mask & ~strokes, None) if strokes.any() else walls
+
+
+def _pale_strokes(ink: Ink, walls: WallMask) -> Bool[np.ndarray, "h w"]:
+    """Strokes of doors and windows that are as broad as thin walls: much paler, and thinner than most walls."""
+    tone = float(np.median(ink.gray[cv2.erode(walls.mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0]))
+    pale = (ink.mask & (ink.gray > tone + _PALER)).astype(np.uint8)
+    # The rims of dark walls are pale as well, but only a pixel or two.
+    _, found, stats, _ = cv2.connectedComponentsWithStats(
+        cv2.morphologyEx(pale, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)), connectivity=8
+    )
+    long = stats[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1)
+    # As thick as a strip of that length that has this area.
+    thick = stats[:, cv2.CC_STAT_AREA] / np.maximum(long, 1)
+    pixel = ink.metres_per_pixel
+    is_stroke = (long * pixel >= _STROKE_M) & (thick * pixel <= _THINNER * walls.thickness_m)
+    is_stroke[0] = False
+    strokes = is_stroke[np.asarray(found, dtype=np.int32)].astype(np.uint8)
+    return (cv2.dilate(strokes, np.ones((5, 5), np.uint8)) & pale) > 0
 
 
 def outlined_walls(ink: Ink) -> WallMask | None:

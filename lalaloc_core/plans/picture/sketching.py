@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,7 +14,7 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.plans.drawing.walls import Enclosed, Gap, WallConfig, enclose
 from lalaloc_core.plans.model.limits import Budget
 from lalaloc_core.plans.model.report import Notebook
-from lalaloc_core.plans.model.sketch import Sketch, SketchedOpening, SketchedRoom
+from lalaloc_core.plans.model.sketch import OpeningKind, Sketch, SketchedOpening, SketchedRoom
 from lalaloc_core.plans.picture.gaps import GapReader, Seen
 from lalaloc_core.plans.picture.ink import Ink, read_ink
 from lalaloc_core.plans.picture.masks import WallMask, bodies_of, dark_walls, outlined_walls, straightened
@@ -29,6 +30,10 @@ _MORE = 1.6
 _SURE = 0.85
 _COARSE_M = 0.03
 _MAX_WALL_THICKNESS_M = 1.2
+# Beyond, what stands in an inner wall is glass; and how far beside a wall one looks what lies there.
+_WIDEST_DOOR_M, _BESIDE_M = 1.3, 0.25
+# Where drawings have colours, glass is blue and wood is brown, by so much of 255.
+_COLOURED = 25.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +49,11 @@ class _Reading:
 
 
 def sketch_picture(
-    gray: UInt8[np.ndarray, "h w"], metres_per_pixel: float, notebook: Notebook, budget: Budget
+    gray: UInt8[np.ndarray, "h w"],
+    metres_per_pixel: float,
+    notebook: Notebook,
+    budget: Budget,
+    warmth: UInt8[np.ndarray, "h w"] | None = None,
 ) -> Sketch:
     """Rooms are what walls enclose; gaps in walls are doors, windows and passages by what is drawn in them. No kind of
     opening is claimed to be shown completely: that is for who has looked at the draft to say.
@@ -55,11 +64,12 @@ def sketch_picture(
     Args:
         gray: rows from the top, 255 is white.
         metres_per_pixel: of the picture.
+        warmth: 128 where there is no colour, more towards red, less towards blue; None of a picture in grey.
 
     Raises:
         InvalidFloorPlanError: walls of a thickness that no house has: the scale is wrong.
     """
-    ink = read_ink(gray, metres_per_pixel)
+    ink = read_ink(gray, metres_per_pixel, warmth)
     budget.check_time()
     readings = [_read(walls, ink, is_dark, budget) for walls, is_dark in _hypotheses(ink) if walls is not None]
     if not readings:
@@ -97,9 +107,10 @@ def _read(walls: WallMask, ink: Ink, is_dark: bool, budget: Budget) -> _Reading:
     def judge(gap: Gap) -> int | None:
         seen[id(gap)] = found = reader.look(gap)
         widest = _MAX_BARE_GAP_M if gap.is_between_ends else _MAX_BARE_GAP_AT_A_FACE_M
-        if found.kind == "nothing" and not (gap.is_sure and gap.width <= widest):
+        is_bare = found.kind == "nothing" or (found.kind == "line" and not gap.is_between_ends)
+        if is_bare and not (gap.is_sure and gap.width <= widest):
             return None
-        return ("door", "window", "nothing").index(found.kind)
+        return ("swing", "pane", "line", "nothing").index(found.kind)
 
     enclosed = enclose(bodies_of(walls, ink), [], (), _CONFIG, budget.check_time, judge)
     rooms = [room for room in enclosed.rooms if room.area >= _MIN_ROOM_M2]
@@ -116,28 +127,60 @@ def _without_islands(room: shapely.Polygon, notebook: Notebook) -> shapely.Polyg
 
 
 def _openings(reading: _Reading, ink: Ink, notebook: Notebook) -> list[SketchedOpening]:
-    """Gaps by what was seen in them, and windows that are drawn into walls."""
-    found = []
-    outside = shapely.unary_union([room.buffer(0.05) for room in reading.enclosed.rooms])
-    for gap in reading.enclosed.gaps:
-        seen = reading.seen[id(gap)]
-        # What leads from nowhere to nowhere is a gap between strokes of something else.
-        if not outside.intersects(gap.shape):
-            continue
-        kind = "passage" if seen.kind == "nothing" else seen.kind
-        found.append(SketchedOpening(kind, gap.start, gap.end))
-        if seen.kind == "nothing" or seen.sureness < _SURE:
-            where = f"({gap.start[0]:.2f}, {gap.start[1]:.2f})"
-            notebook.unsure.append(f"a gap of {gap.width:.2f} m at {where} was taken for a {kind}: {_why(seen)}")
+    """Gaps by what was seen in them and what lies at their sides, and panes that are drawn into walls."""
+    rooms = reading.enclosed.rooms
+    outside = shapely.unary_union([room.buffer(0.05) for room in rooms])
+    # What leads from nowhere to nowhere is a gap between strokes of something else.
+    gaps = [(gap, reading.seen[id(gap)]) for gap in reading.enclosed.gaps if outside.intersects(gap.shape)]
+    seen = [(gap.start, gap.end, what) for gap, what in gaps]
     if not reading.is_dark:
-        found += windows_in_walls(reading.walls, ink)
+        panes = windows_in_walls(reading.walls, ink)
+        seen += [(pane.start, pane.end, Seen("pane", 1.0)) for pane in panes]
+    found = []
+    for start, end, what in seen:
+        width = math.dist(start, end)
+        is_inner = _is_between_rooms(start, end, reading.walls.thickness_m, rooms)
+        kind = _kind(what, width, is_inner=is_inner)
+        found.append(SketchedOpening(kind, start, end))
+        if (why := _doubt(what, kind)) is not None:
+            where = f"({start[0]:.2f}, {start[1]:.2f})"
+            notebook.unsure.append(f"a gap of {width:.2f} m at {where} was taken for a {kind}: {why}")
     return found
 
 
-def _why(seen: Seen) -> str:
+def _kind(seen: Seen, width: float, *, is_inner: bool) -> OpeningKind:
+    """Doors are drawn without their swing, too: lines in an inner wall are a leaf, those in an outer one panes."""
+    if seen.kind == "swing":
+        return "door"
+    if seen.kind == "nothing":
+        return "passage"
+    if abs(seen.warmth) >= _COLOURED:
+        return "door" if seen.warmth > 0.0 else "window"
+    if seen.kind == "line" and is_inner:
+        return "passage"
+    return "door" if is_inner and width <= _WIDEST_DOOR_M else "window"
+
+
+def _is_between_rooms(
+    start: tuple[float, float], end: tuple[float, float], thickness_m: float, rooms: Sequence[shapely.Polygon]
+) -> bool:
+    """Whether there is a room at both sides of a gap, be it the same one."""
+    a, b = np.array(start), np.array(end)
+    along = (b - a) / max(math.dist(start, end), 1e-9)
+    across = (0.5 * thickness_m + _BESIDE_M) * np.array([-along[1], along[0]])
+    sides = [shapely.Point(0.5 * (a + b) + side * across) for side in (1.0, -1.0)]
+    return all(any(room.covers(side) for room in rooms) for side in sides)
+
+
+def _doubt(seen: Seen, kind: OpeningKind) -> str | None:
+    """Why an opening may be of another kind; None where nothing speaks for that."""
     if seen.kind == "nothing":
         return "nothing is drawn in it"
-    return f"{seen.sureness:.0%} of its symbol is drawn"
+    if seen.kind == "line":
+        return "a single line is drawn in it"
+    if seen.kind == "pane" and kind == "door":
+        return "it is drawn like a window, but " + ("brown" if seen.warmth >= _COLOURED else "in an inner wall")
+    return f"{seen.sureness:.0%} of its symbol is drawn" if seen.sureness < _SURE else None
 
 
 def _tell(reading: _Reading, ink: Ink, metres_per_pixel: float, notebook: Notebook) -> None:
