@@ -63,7 +63,7 @@ def _pale_strokes(ink: Ink, walls: WallMask) -> Bool[np.ndarray, "h w"]:
     is_stroke = (long * pixel >= _STROKE_M) & (thick * pixel <= _THINNER * walls.thickness_m)
     is_stroke[0] = False
     strokes = is_stroke[np.asarray(found, dtype=np.int32)].astype(np.uint8)
-    return (cv2.dilate(strokes, np.ones((5, 5), np.uint8)) & pale) > 0
+    return (cv2.dilate(strokes, np.ones((5, 5), np.uint8)) > 0) & (pale > 0)
 
 
 def outlined_walls(ink: Ink) -> WallMask | None:
