@@ -17,6 +17,7 @@ from lalaloc_core.training.photographs import Photographs, load_photographs
 from lalaloc_core.training.photometric import _blurred, _lenses, optics
 from lalaloc_core.training.stretching import stretched
 from lalaloc_core.training.teacher import _class_map, look
+from tests.painted import painted_surfaces, wall_distance_m
 
 ROWS, COLUMNS, WIDTH = 512, 1024, 128
 WALL, DOOR, WINDOW, FLOOR, CEILING, SOFA = 1, 15, 9, 4, 6, 24
@@ -59,19 +60,14 @@ class TestMaps:
         assert (seen.sum(axis=1) <= 1.0 + 1e-6).all()
 
 
-def room(half_m: tuple[float, float], camera_m: float = 1.5, ceiling_m: float = 2.5) -> np.ndarray:
+def room(half_m: tuple[float, float], ceiling_m: float = 2.5) -> np.ndarray:
     """A panorama of an empty rectangular room from its middle, in the teacher's classes."""
-    azimuth = ((np.arange(COLUMNS) + 0.5) / COLUMNS - 0.5) * 2.0 * np.pi
-    elevation = (0.5 - (np.arange(ROWS) + 0.5) / ROWS)[:, None] * np.pi
-    distance = distances(azimuth, half_m)
-    kind = np.where(np.tan(elevation) < -camera_m / distance, FLOOR, WALL)
-    kind = np.where(np.tan(elevation) > (ceiling_m - camera_m) / distance, CEILING, kind)
-    return np.repeat(kind[..., None], 3, axis=2).astype(np.uint8)
+    surfaces = painted_surfaces((2.0 * half_m[0], 2.0 * half_m[1]), half_m, ceiling_m=ceiling_m, rows=ROWS)
+    return np.repeat(np.array([FLOOR, WALL, CEILING])[surfaces][..., None], 3, axis=2).astype(np.uint8)
 
 
 def distances(azimuth: np.ndarray, half_m: tuple[float, float]) -> np.ndarray:
-    across, along = np.abs(np.sin(azimuth)), np.abs(np.cos(azimuth))
-    return np.minimum(half_m[0] / np.maximum(across, 1e-9), half_m[1] / np.maximum(along, 1e-9))
+    return wall_distance_m(azimuth, (2.0 * half_m[0], 2.0 * half_m[1]), half_m)
 
 
 class TestWalls:

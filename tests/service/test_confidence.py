@@ -18,6 +18,7 @@ from PIL import Image
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.data.synthetic.generated import GeneratedScenes
+from tests.painted import painted_room
 from tests.service.conftest import StartApp, localise, upload, wait_for
 
 BUNDLE = Path(__file__).parents[2] / "models" / "default"
@@ -227,3 +228,37 @@ def test_a_heading_that_is_right_is_not_doubted(right: list[dict[str, Any]], giv
     assert sum(bool(answer["warnings"]) for answer in right) <= 1
     if given:
         assert np.median([answer["heading_confidence"] for answer in right]) > 0.7
+
+
+def plain_room(size_m: tuple[float, float]) -> dict[str, Any]:
+    """A plan of one room without openings."""
+    polygon = [[0.0, 0.0], [size_m[0], 0.0], list(size_m), [0.0, size_m[1]]]
+    return {"rooms": [{"name": "room", "polygon": polygon, "ceiling_height_m": 2.5}], "camera_height_m": 1.5}
+
+
+@pytest.mark.parametrize(("size_m", "ways"), [((3.2, 4.6), 2), ((3.2, 3.2), 4)], ids=["rectangle", "square"])
+def test_a_plain_room_is_split_between_its_headings(
+    shipped: httpx.Client, size_m: tuple[float, float], ways: int
+) -> None:
+    room, picture = upload(shipped, plain_room(size_m)), painted_room(size_m, (0.8, 1.0))
+    answer = ask(shipped, room, picture, None, top_k=5)
+    shares = [candidate["probability"] for candidate in answer["candidates"]]
+    assert shares[:ways] == pytest.approx([1.0 / ways] * ways, abs=0.08)
+    assert answer["confidence"] <= 1.0 / ways + 0.05
+    assert answer["heading_confidence"] <= 1.0 / ways + 0.05
+    turns = {round(candidate["heading_deg"] / (360.0 / ways)) % ways for candidate in answer["candidates"][:ways]}
+    assert turns == set(range(ways))
+    # With the heading nothing is left to doubt.
+    assert ask(shipped, room, picture, 0.0)["confidence"] > 0.8
+
+
+def test_a_plain_corridor_is_known_across_and_not_along(shipped: httpx.Client, given: bool) -> None:
+    size_m = (40.0, 1.8)
+    answer = ask(
+        shipped, upload(shipped, plain_room(size_m)), painted_room(size_m, (15.0, 0.8)), 0.0 if given else None
+    )
+    assert answer["confidence"] < 0.25
+    across, along = np.linalg.eigvalsh(np.array(answer["covariance_m2"]))
+    assert along > 25.0 * across
+    assert answer["covariance_m2"][0][0] == pytest.approx(along, rel=0.05)
+    assert min(abs(answer["position"]["y_m"] - y_m) for y_m in (0.8, 1.0)) < 0.15
