@@ -1,0 +1,152 @@
+"""The manifests are valid for the versions of Kubernetes in use, and fit the service, the image, and one another.
+
+The schemas come with the package kubernetes-validate; nothing is asked of a cluster or a network.
+"""
+
+from __future__ import annotations
+
+import re
+from copy import deepcopy
+from pathlib import Path
+from typing import Any
+
+import kubernetes_validate
+import pytest
+import yaml
+from fastapi.routing import APIRoute
+
+from service.cores import share_cores
+from service.http.admission_control import Admission, AdmissionLimits
+from service.routes import ROUTERS
+from service.settings import PREFIX, Settings
+from service.telemetry import Telemetry
+
+FOLDER = Path(__file__).parents[1] / "docker" / "kubernetes"
+DOCKERFILE = (FOLDER.parent / "Dockerfile").read_text(encoding="utf-8")
+KUSTOMIZATION: dict[str, Any] = yaml.safe_load((FOLDER / "kustomization.yaml").read_text(encoding="utf-8"))
+RESOURCES: dict[str, dict[str, Any]] = {
+    name: yaml.safe_load((FOLDER / name).read_text(encoding="utf-8")) for name in KUSTOMIZATION["resources"]
+}
+BY_KIND = {one["kind"]: one for one in RESOURCES.values()}
+# The oldest that is looked after at the time of writing, and the newest.
+VERSIONS = ("1.34", "1.37")
+POD: dict[str, Any] = BY_KIND["Deployment"]["spec"]["template"]["spec"]
+CONTAINER: dict[str, Any] = POD["containers"][0]
+LABELS: dict[str, str] = BY_KIND["Deployment"]["spec"]["template"]["metadata"]["labels"]
+CONFIGURED: dict[str, str] = BY_KIND["ConfigMap"]["data"]
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+@pytest.mark.parametrize("name", RESOURCES)
+def test_each_manifest_is_valid(name: str, version: str) -> None:
+    assert kubernetes_validate.validate(RESOURCES[name], version, strict=True) == version
+
+
+@pytest.mark.parametrize(
+    ("name", "path", "value"),
+    [
+        ("deployment.yaml", ("spec", "replica"), 2),
+        ("deployment.yaml", ("spec", "template", "spec", "containers", 0, "readinessProbe", "periodSeconds"), "2s"),
+        ("horizontalpodautoscaler.yaml", ("spec", "metrics", 0, "pods", "target", "averageValue"), [3]),
+        ("poddisruptionbudget.yaml", ("spec", "maxUnavailible"), 1),
+    ],
+)
+def test_a_slip_would_be_noticed(name: str, path: tuple[str | int, ...], value: object) -> None:
+    manifest: Any = deepcopy(RESOURCES[name])
+    inner = manifest
+    for step in path[:-1]:
+        inner = inner[step]
+    inner[path[-1]] = value
+    with pytest.raises(kubernetes_validate.ValidationError):
+        kubernetes_validate.validate(manifest, VERSIONS[-1], strict=True)
+
+
+def test_every_manifest_is_applied() -> None:
+    others = {"kustomization.yaml", "prometheus-adapter.yaml"}
+    assert {path.name for path in FOLDER.iterdir()} - others == set(RESOURCES)
+    name, _, tag = CONTAINER["image"].partition(":")
+    assert KUSTOMIZATION["images"] == [{"name": name, "newTag": tag}]
+
+
+def test_all_are_about_the_same_pods() -> None:
+    spec = {kind: one.get("spec", {}) for kind, one in BY_KIND.items()}
+    assert spec["Deployment"]["selector"]["matchLabels"] == LABELS
+    assert spec["Service"]["selector"] == LABELS
+    assert spec["PodDisruptionBudget"]["selector"]["matchLabels"] == LABELS
+    assert spec["NetworkPolicy"]["podSelector"]["matchLabels"] == LABELS
+    assert [one["labelSelector"]["matchLabels"] for one in POD["topologySpreadConstraints"]] == [LABELS]
+    scaled = spec["HorizontalPodAutoscaler"]["scaleTargetRef"]
+    assert (scaled["kind"], scaled["name"]) == ("Deployment", BY_KIND["Deployment"]["metadata"]["name"])
+    # Else each deployment of a new version would undo what the autoscaler chose.
+    assert "replicas" not in spec["Deployment"]
+    assert POD["serviceAccountName"] == BY_KIND["ServiceAccount"]["metadata"]["name"]
+    assert [one["configMapRef"]["name"] for one in CONTAINER["envFrom"]] == [BY_KIND["ConfigMap"]["metadata"]["name"]]
+
+
+def test_settings_are_those_of_the_service() -> None:
+    given = {name: value for name, value in CONFIGURED.items() if name.startswith(PREFIX)}
+    settings = Settings(**{name.removeprefix(PREFIX).lower(): value for name, value in given.items()})
+    assert settings.api_keys
+    named = {one["name"] for one in CONTAINER["env"]}
+    assert {name.removeprefix(PREFIX).lower() for name in named} <= Settings.model_fields.keys()
+    assert CONFIGURED.keys() - given.keys() == {"FORWARDED_ALLOW_IPS"}
+    # What is secret comes from a secret.
+    assert all("value" not in one and "secretKeyRef" in one["valueFrom"] for one in CONTAINER["env"])
+    assert "database_url" not in {name.removeprefix(PREFIX).lower() for name in given}
+
+
+def test_a_pod_has_time_to_stop_and_is_not_asked_meanwhile() -> None:
+    notice_s, deadline_s = float(CONFIGURED["LALALOC_STOP_NOTICE_S"]), Settings().stop_deadline_s
+    assert POD["terminationGracePeriodSeconds"] > notice_s + deadline_s
+    probe = CONTAINER["readinessProbe"]
+    assert notice_s > probe["periodSeconds"] * probe["failureThreshold"]
+
+
+def test_the_pod_may_do_no_more_than_it_needs() -> None:
+    security = CONTAINER["securityContext"]
+    assert security["readOnlyRootFilesystem"]
+    assert security["allowPrivilegeEscalation"] is False
+    assert security["capabilities"] == {"drop": ["ALL"]}
+    assert POD["securityContext"]["runAsNonRoot"]
+    assert POD["securityContext"]["seccompProfile"] == {"type": "RuntimeDefault"}
+    assert POD["automountServiceAccountToken"] is False
+    assert f"--uid {POD['securityContext']['runAsUser']} " in DOCKERFILE
+    # Where it may write: what the image has for its data, and temporary files.
+    written = {one["mountPath"] for one in CONTAINER["volumeMounts"]}
+    assert written == {"/tmp", *re.findall(r"LALALOC_DATA_DIR=(\S+)", DOCKERFILE)}
+    assert {one["name"] for one in CONTAINER["volumeMounts"]} == {one["name"] for one in POD["volumes"]}
+    assert all("sizeLimit" in one["emptyDir"] for one in POD["volumes"])
+
+
+def test_ports_and_probes_are_those_of_the_service() -> None:
+    [port] = CONTAINER["ports"]
+    assert f"EXPOSE {port['containerPort']}" in DOCKERFILE
+    assert BY_KIND["Service"]["spec"]["ports"][0]["targetPort"] == port["name"]
+    asked = [CONTAINER[f"{kind}Probe"]["httpGet"] for kind in ("startup", "liveness", "readiness")]
+    assert {one["port"] for one in asked} == {port["name"]}
+    paths = {route.path for router in ROUTERS for route in router.routes if isinstance(route, APIRoute)}
+    assert {one["path"] for one in asked} <= paths
+    # A service that is stopping is to finish what it has, not to be killed.
+    assert CONTAINER["livenessProbe"]["httpGet"]["path"] == "/healthz"
+    assert CONTAINER["readinessProbe"]["httpGet"]["path"] == "/readyz"
+
+
+def test_the_autoscaler_goes_by_a_metric_that_there_is() -> None:
+    [by_requests] = [one for one in BY_KIND["HorizontalPodAutoscaler"]["spec"]["metrics"] if one["type"] == "Pods"]
+    metric = by_requests["pods"]["metric"]["name"]
+    adapter = yaml.safe_load((FOLDER / "prometheus-adapter.yaml").read_text(encoding="utf-8"))
+    assert [one["seriesQuery"].partition("{")[0] for one in adapter["rules"]["custom"]] == [metric]
+    telemetry = Telemetry()
+    Admission(AdmissionLimits.of(Settings()), telemetry)
+    assert f"\n{metric} " in telemetry.render().decode()
+    # More are added before the pods there are begin to refuse.
+    cores = int(CONTAINER["resources"]["limits"]["cpu"])
+    shares = share_cores(cores, workers=None, worker_threads=0, compute_threads=0, onnx_threads=0)
+    assert shares.total == cores
+    assert int(by_requests["pods"]["target"]["averageValue"]) < 2 * (shares.workers + shares.compute_threads)
+
+
+def test_a_node_can_be_emptied_without_an_outage() -> None:
+    scaling = BY_KIND["HorizontalPodAutoscaler"]["spec"]
+    assert scaling["minReplicas"] > BY_KIND["PodDisruptionBudget"]["spec"]["maxUnavailable"]
+    assert BY_KIND["Deployment"]["spec"]["strategy"]["rollingUpdate"]["maxUnavailable"] == 0
