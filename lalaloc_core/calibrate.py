@@ -29,15 +29,17 @@ from lalaloc_core.metrics import Accuracy
 
 # Of all that is fitted on, photographs of something else than the plan's home weigh so much: enough to tell them, too
 # little to make answers about the home itself look less sure than they are.
-_MISMATCHED_SHARE = 0.15
+_MISMATCHED_SHARE = 0.2
 # A weak pull to zero keeps the fit finite when the queries are perfectly separable.
-_RIDGE = 1e-2
+_RIDGE = 1e-3
 # A weak pull of the evidence's weights to what they are by default, in units of a query.
 _WEIGHT_RIDGE = 0.5
 # Medians of the chi-squared distribution with one and with two degrees of freedom.
 _MEDIAN_CHI2 = {1: 0.4549, 2: 1.3863}
-# Signals of a picture that fits, or not; which place it is, is the posterior's to say.
-_SIGNALS = ("cost", "uncertainty", "latent_distance", "cost_to_chance")
+# Signals of a picture that fits, or not; which place it is, is the posterior's to say. What a picture costs in units of
+# chance is fair to photographs that are hard to read, as the others are not, so where it is known it is used alone.
+_SIGNALS = ("cost", "uncertainty", "latent_distance")
+_NORMALISED = ("cost_to_chance",)
 _TERMS = ("walls", "openings", "ceiling", "room_type")
 
 
@@ -147,8 +149,10 @@ def _fit_stage(stage: str, answers: Answers) -> LogisticModel:
     """Maximum-likelihood model of a picture fitting its plan, so that times the posterior the answer is right."""
     own = [one for one in answers.own if stage in one.signals]
     mismatched = [one for one in answers.mismatched if stage in one.signals]
-    features = np.array([[1.0, *(one.signals[stage][name] for name in _SIGNALS)] for one in own + mismatched])
-    log_odds = np.array([one.signals[stage]["log_odds"] for one in own + mismatched])
+    signals = [one.signals[stage] for one in own + mismatched]
+    used = _NORMALISED if any(one["cost_to_chance"] for one in signals) else _SIGNALS
+    features = np.array([[1.0, *(one[name] for name in used)] for one in signals])
+    log_odds = np.array([one["log_odds"] for one in signals])
     posterior = 1.0 / (1.0 + np.exp(-log_odds))
     distance = [np.hypot(one.stages[stage].x_m - one.truth.x_m, one.stages[stage].y_m - one.truth.y_m) for one in own]
     right = np.append(np.array(distance) < RIGHT_WITHIN_M, np.zeros(len(mismatched), bool))
@@ -165,9 +169,10 @@ def _fit_stage(stage: str, answers: Answers) -> LogisticModel:
         return float(_RIDGE * np.square(weights).sum() - (weight * likelihood).sum())
 
     # Begins with trust in all: without mismatched photographs there is nothing that teaches otherwise.
-    start = np.append(3.0, np.zeros(len(_SIGNALS)))
+    start = np.append(3.0, np.zeros(len(used)))
     bias, *weights = (optimize.minimize(loss, start, method="L-BFGS-B").x / scale).tolist()
-    return LogisticModel(bias=bias, log_odds=0.0, **dict(zip(_SIGNALS, weights, strict=True)))
+    fitted = dict.fromkeys((*_SIGNALS, "log_odds"), 0.0) | dict(zip(used, weights, strict=True))
+    return LogisticModel(bias=bias, **fitted)
 
 
 def _covariance_factors(predictions: Sequence[Prediction]) -> tuple[float | None, float | None]:

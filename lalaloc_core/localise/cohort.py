@@ -30,6 +30,8 @@ _STEP_M = 0.5
 # They are compared at every so many azimuths, and under so many hypotheses of the heading.
 _STRIDE = 4
 _HYPOTHESES = 4
+# What fits by chance costs what the mean of so many of the best does: the very best is a matter of luck.
+_BEST = 8
 # Costs are compared above this: it is what the best of pictures costs.
 _LEAST_COST = 0.01
 
@@ -112,4 +114,5 @@ def log_cost_to_chance(
     layouts = Layouts(cohort.log_profile.astype(np.float32), nowhere, cohort.kind)
     hypotheses = np.unique(np.arange(_HYPOTHESES) * len(query.roll) // _HYPOTHESES)
     by_chance, _ = Evidence(plan, query, reach_m, weights, alone, stride=_STRIDE).costs(layouts, hypotheses)
-    return math.log((cost + _LEAST_COST) / (float(by_chance.min()) + _LEAST_COST))
+    best = np.sort(by_chance.min(axis=0))[:_BEST]
+    return math.log((cost + _LEAST_COST) / (float(best.mean()) + _LEAST_COST))
