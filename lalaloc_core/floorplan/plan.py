@@ -35,6 +35,7 @@ from lalaloc_core.floorplan.openings import DEFAULT_OPENING_TOLERANCE_M, Opening
 from lalaloc_core.floorplan.reading import read_ceiling, read_rooms
 from lalaloc_core.floorplan.rooms import Room
 from lalaloc_core.floorplan.values import check_keys, json_kind, read_name
+from lalaloc_core.floorplan.wall_table import WallTable
 
 __all__ = ["DEFAULT_CAMERA_HEIGHT_M", "FloorPlan"]
 
@@ -193,6 +194,11 @@ class FloorPlan:
     def geometry(self) -> PlanGeometry:
         """Walls and openings as the layout renderer takes them."""
         return build_geometry(self.rooms, self.openings, self.opening_faces)
+
+    @cached_property
+    def wall_table(self) -> WallTable:
+        """The same without padding, for what goes through many poses at once."""
+        return WallTable.of(self.geometry, np.array([len(room.inner_walls_m) for room in self.rooms]))
 
     @property
     def walls_m(self) -> Float[np.ndarray, "rooms n 4"]:

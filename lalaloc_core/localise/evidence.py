@@ -26,7 +26,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 
 from lalaloc_core.bundle import EvidenceModel
 from lalaloc_core.conventions import OPENING_CLASSES, PASSAGE_CODE, ROOM_TYPES, TWO_PI, WALL_CODE
@@ -41,8 +41,8 @@ _SHARPEST_CEILING = 0.04
 _MIN_CLEARANCE_M = 0.05
 # Logarithms are dear: of so many factors, none above the limit, the product is taken before.
 _FACTORS, _MAX_FACTOR = 4, 1e9
-# Poses whose openings are compared at a time, to bound memory.
-_CHUNK = 4096
+# Poses whose openings are compared at a time, to bound memory; pairs, few enough to stay in the processor's cache.
+_CHUNK, _PAIRS = 4096, 512
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -130,37 +130,70 @@ class Evidence:
         self, layouts: Layouts, hypotheses: Int[np.ndarray, "k"] | None = None
     ) -> tuple[Float[np.ndarray, "k n"], Float[np.ndarray, "k n"]]:
         """Cost of every pose under some hypotheses of how the panorama is turned (all), and the δ that gives it."""
-        hypotheses = np.arange(len(self._centre)) if hypotheses is None else hypotheses
+        hypotheses = np.arange(self.hypotheses) if hypotheses is None else hypotheses
         layouts = layouts.thinned(self._stride) if self._stride > 1 else layouts
-        height = self._query.camera_height
-        # What depends on δ, but on the room only.
-        shared = height.penalty(height.offsets)[:, None] / self._weights.temperature
-        shared = shared + self._weights.ceiling * self._ceilings(height.offsets)
+        shared = self.by_room()
         best = np.full((len(hypotheses), len(layouts)), np.inf, np.float32)
         chosen = np.zeros(best.shape, np.intp)
         for row, hypothesis in enumerate(hypotheses):
-            for j, offset in enumerate(height.offsets):
+            for j, offset in enumerate(self.offsets):
                 cost = self._walls(layouts, int(hypothesis), float(offset)) + shared[j, layouts.room_index]
                 chosen[row, cost < best[row]] = j
                 np.minimum(best[row], cost, out=best[row])
         best += self._weights.openings * self._openings(layouts, hypotheses)
-        best += self._weights.room_type * self._room_types[layouts.room_index]
-        return best, height.offsets[chosen]
+        return best, self.offsets[chosen]
+
+    def pairs(
+        self, layouts: Layouts, pose: Int[np.ndarray, "m"], hypothesis: Int[np.ndarray, "m"]
+    ) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m"]]:
+        """As `costs`, of some pairs of a pose and a hypothesis alone: the cost, and the δ that gives it."""
+        shared, cost, chosen = self.by_room(), np.empty(len(pose), np.float32), np.empty(len(pose), np.intp)
+        for first in range(0, len(pose), _PAIRS):
+            part = slice(first, first + _PAIRS)
+            walls = self._walls_of(layouts, pose[part], hypothesis[part], self.offsets)
+            walls += shared[:, layouts.room_index[pose[part]]]
+            chosen[part] = walls.argmin(axis=0)
+            cost[part] = walls.min(axis=0)
+            cost[part] += self._weights.openings * self._openings_of(layouts, pose[part], hypothesis[part])
+        return cost, self.offsets[chosen]
 
     def terms(self, layouts: Layouts, hypothesis: Int[np.ndarray, "n"], offset: Float[np.ndarray, "n"]) -> Terms:
         """What each term says of poses that each have their own hypothesis and δ."""
-        walls, openings = np.zeros(len(layouts)), np.zeros(len(layouts))
-        for index in range(len(layouts)):
-            row = layouts.rows(np.array([index]))
-            walls[index] = self._walls(row, int(hypothesis[index]), float(offset[index]))[0]
-            openings[index] = self._openings(row, hypothesis[[index]])[0, 0]
+        every = np.arange(len(layouts))
         return Terms(
-            walls=walls,
-            openings=openings,
-            ceiling=self._ceilings(offset)[np.arange(len(layouts)), layouts.room_index],
+            walls=self._walls_of(layouts, every, hypothesis, offset[None])[0].astype(np.float64),
+            openings=self._openings_of(layouts, every, hypothesis).astype(np.float64),
+            ceiling=self._ceilings(offset)[every, layouts.room_index],
             room_type=self._room_types[layouts.room_index],
             height=self._query.camera_height.penalty(offset),
         )
+
+    @property
+    def hypotheses(self) -> int:
+        """How many there are."""
+        return len(self._centre)
+
+    @property
+    def offsets(self) -> Float[np.ndarray, "j"]:
+        """The δ that are tried."""
+        return self._query.camera_height.offsets
+
+    def by_room(self) -> Float[np.ndarray, "j r"]:
+        """What δ and the room alone cost: the height's penalty, the ceiling and the room's type."""
+        penalty = self._query.camera_height.penalty(self.offsets)[:, None] / self._weights.temperature
+        types = self._weights.room_type * self._room_types
+        return (penalty + self._weights.ceiling * self._ceilings(self.offsets) + types).astype(np.float32)
+
+    def predicted(
+        self, columns: Int[np.ndarray, "a"]
+    ) -> tuple[Float[np.ndarray, "k a"], Float[np.ndarray, "k a"], Float[np.ndarray, "k a c"] | None]:
+        """What is compared at some azimuths: centres, precisions, and the weighted cost of every class of opening.
+
+        The latter is None where openings are not compared; kinds that the plan does not claim cost what walls do.
+        """
+        loss = self._claimed_loss
+        loss = None if loss is None else self._weights.openings * loss[:, columns]
+        return self._centre[:, columns], self._precision[:, columns], loss
 
     def shut_share(self, layouts: Layouts, index: int, hypothesis: int, offset: float) -> Float[np.ndarray, "w"]:
         """Probability by azimuth that a pose's walls are met, and not what lies behind an opening in them."""
@@ -171,7 +204,7 @@ class Evidence:
         at = row.seen.column
         centre, precision = self._centre[hypothesis, at] + offset, self._precision[hypothesis, at]
         shut = 1.0 / (1.0 + np.square((row.log_profile[0, at] - centre) * precision))
-        opened = self._open_odds(row) / (1.0 + np.square((row.seen.log_behind - centre) * precision))
+        opened = self._open_odds(row.seen.kind) / (1.0 + np.square((row.seen.log_behind - centre) * precision))
         share[at] = shut / (shut + opened)
         return share
 
@@ -186,13 +219,55 @@ class Evidence:
             behind = np.square((seen.log_behind - centre[seen.column]) * precision[seen.column]) + 1.0
             shut = factor[seen.row, seen.column]
             # Where the wall fits, its being shut in a door costs nothing: networks learn to see the wall there.
-            factor[seen.row, seen.column] = np.maximum(1.0 / (1.0 / shut + self._open_odds(layouts) / behind), 1.0)
+            factor[seen.row, seen.column] = np.maximum(1.0 / (1.0 / shut + self._open_odds(seen.kind) / behind), 1.0)
         return _mean_log(factor)
 
-    def _open_odds(self, layouts: Layouts) -> Float[np.ndarray, "m"]:
-        """Odds that one looks through each of the openings that are seen."""
-        assert layouts.seen is not None
-        is_passage = layouts.seen.kind == PASSAGE_CODE
+    def _walls_of(
+        self,
+        layouts: Layouts,
+        pose: Int[np.ndarray, "m"],
+        hypothesis: Int[np.ndarray, "m"],
+        offset: Float[np.ndarray, "j n"] | Float[np.ndarray, "j"],
+    ) -> Float[np.ndarray, "j m"]:
+        """Cost of the walls of pairs at each δ, which is one for all pairs, or each pair's own."""
+        centre, precision = self._centre[hypothesis], self._precision[hypothesis]
+        apart = layouts.log_profile[pose] - centre
+        apart *= precision
+        offset = offset.astype(np.float32)
+        offset = offset[:, None, None] if offset.ndim == 1 else offset[:, :, None]
+        seen = layouts.seen if self._config.use_see_through else None
+        if seen is not None:
+            pair, entry = seen.of(pose)
+            row, column = pair, seen.column[entry]
+            sharp, odds = precision[row, column], self._open_odds(seen.kind[entry])
+            behind = (seen.log_behind[entry] - centre[row, column]) * sharp
+        cost = np.empty((len(offset), len(pose)), np.float32)
+        for j, one in enumerate(offset):
+            factor = apart - one * precision
+            np.square(factor, out=factor)
+            factor += 1.0
+            if seen is not None:
+                shift = one if one.shape[0] == 1 else one[row]
+                beyond = np.square(behind - shift[:, 0] * sharp) + 1.0
+                shut = factor[row, column]
+                factor[row, column] = np.maximum(1.0 / (1.0 / shut + odds / beyond), 1.0)
+            cost[j] = _mean_log(factor)
+        return cost
+
+    def _openings_of(
+        self, layouts: Layouts, pose: Int[np.ndarray, "m"], hypothesis: Int[np.ndarray, "m"]
+    ) -> Float[np.ndarray, "m"]:
+        """Cost of the openings of pairs."""
+        loss = self._claimed_loss
+        if loss is None or layouts.kind is None:
+            return np.zeros(len(pose), np.float32)
+        columns, classes = loss.shape[1:]
+        at = (hypothesis[:, None] * columns + np.arange(columns)) * classes + layouts.kind[pose]
+        return loss.ravel()[at].mean(axis=1)
+
+    def _open_odds(self, kind: UInt8[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
+        """Odds that one looks through openings of some kinds."""
+        is_passage = kind == PASSAGE_CODE
         open_share = np.where(is_passage, self._config.open_passage, self._config.open_door).astype(np.float32)
         return open_share / (1.0 - open_share)
 
@@ -215,6 +290,15 @@ class Evidence:
     def _claimed(self) -> list[int]:
         """Codes of the kinds of openings that the plan shows completely."""
         return [OPENING_CLASSES.index(kind) for kind in sorted(self._plan.opening_kinds)]
+
+    @cached_property
+    def _claimed_loss(self) -> Float[np.ndarray, "k w c"] | None:
+        """As `_opening_loss` of all hypotheses, where kinds that the plan does not claim cost what walls do."""
+        loss = self._opening_loss(np.arange(self.hypotheses))
+        if loss is not None:
+            unclaimed = [code for code in range(len(OPENING_CLASSES)) if code not in self._claimed]
+            loss[..., unclaimed] = loss[..., [WALL_CODE]]
+        return loss
 
     def _opening_loss(self, hypotheses: Int[np.ndarray, "k"]) -> Float[np.ndarray, "k w c"] | None:
         """Cost of each class by azimuth; None where openings are not compared."""

@@ -8,22 +8,31 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.render.layout import layout_view
 from lalaloc_core.render.poses import profiles_at
+from lalaloc_core.render.sweep import swept_views
 from lalaloc_core.sampling import PoseSet
-
-# Poses whose openings are looked through at a time, to bound memory.
-_CHUNK = 1024
 
 
 @dataclass(frozen=True, eq=False)
 class SeenThrough:
-    """The azimuths at which one may look through an opening: pose, column, kind, and log distance (m) behind it."""
+    """Where one may look through an opening: pose (rising), azimuth column, kind, and log distance (m) behind it."""
 
     row: Int[np.ndarray, "m"]
     column: Int[np.ndarray, "m"]
     kind: UInt8[np.ndarray, "m"]
     log_behind: Float[np.ndarray, "m"]
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that the arrays take."""
+        return self.row.nbytes + self.column.nbytes + self.kind.nbytes + self.log_behind.nbytes
+
+    def of(self, pose: Int[np.ndarray, "k"]) -> tuple[Int[np.ndarray, "e"], Int[np.ndarray, "e"]]:
+        """What some poses see through: for each entry which of them it is of, and its place here."""
+        begin = np.searchsorted(self.row, pose)
+        count = np.searchsorted(self.row, pose, side="right") - begin
+        of = np.repeat(np.arange(len(pose)), count)
+        return of, np.arange(len(of)) - np.repeat(np.cumsum(count) - count - begin, count)
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +54,12 @@ class Layouts:
     def __len__(self) -> int:
         return len(self.room_index)
 
+    @property
+    def nbytes(self) -> int:
+        """Memory that the arrays take."""
+        kind = 0 if self.kind is None else self.kind.nbytes
+        return self.log_profile.nbytes + self.room_index.nbytes + kind + (0 if self.seen is None else self.seen.nbytes)
+
     def rows(self, index: Int[np.ndarray, "m"]) -> Layouts:
         """The layouts of some poses, in rising order, alone."""
         seen = self.seen
@@ -65,35 +80,12 @@ class Layouts:
         return Layouts(np.ascontiguousarray(self.log_profile[:, ::stride]), self.room_index, kind, seen)
 
 
-def layouts_at(
-    plan: FloorPlan,
-    poses: PoseSet,
-    heading: Float[np.ndarray, "n"],
-    columns: int,
-    *,
-    profile_m: Float[np.ndarray, "n w"] | None = None,
-) -> Layouts:
-    """Render the layouts of some poses; openings count as the plan's own camera height sees them.
-
-    Args:
-        profile_m: their wall profiles (m), where they are known already.
-    """
-    position_m, turned = poses.position_m.astype(np.float32), heading.astype(np.float32)
+def layouts_at(plan: FloorPlan, poses: PoseSet, heading: Float[np.ndarray, "n"], columns: int) -> Layouts:
+    """Render the layouts of some poses; openings count as the plan's own camera height sees them."""
     if not plan.opening_faces:
-        if profile_m is None:
-            profile_m = profiles_at(plan, poses.position_m, poses.room_index, heading, columns, np.float32)
-        return Layouts(np.log(np.asarray(profile_m, np.float32)), poses.room_index)
-    shape = (len(poses), columns)
-    log_profile, kind = np.empty(shape, np.float32), np.empty(shape, np.uint8)
-    parts: list[SeenThrough] = []
-    for first in range(0, len(poses), _CHUNK):
-        part = slice(first, first + _CHUNK)
-        view = layout_view(
-            position_m[part], turned[part], poses.room_index[part], plan.geometry, columns, plan.camera_height_m
-        )
-        log_profile[part], kind[part] = np.log(view.distance_m), view.kind
-        row, column = np.nonzero(view.behind_m > view.distance_m)
-        behind = np.log(view.behind_m[row, column], dtype=np.float32)
-        parts.append(SeenThrough(row + first, column, kind[part][row, column], behind))
-    seen = SeenThrough(*(np.concatenate([getattr(one, name) for one in parts]) for name in SeenThrough.__annotations__))
-    return Layouts(log_profile, poses.room_index, kind, seen if len(seen.row) else None)
+        profile_m = profiles_at(plan, poses.position_m, poses.room_index, heading, columns, np.float32)
+        return Layouts(np.log(profile_m), poses.room_index)
+    view = swept_views(poses.position_m, heading, poses.room_index, plan.wall_table, columns, plan.camera_height_m)
+    behind = view.row, view.column, view.kind[view.row, view.column], np.log(view.behind_m)
+    seen = SeenThrough(*behind) if len(view.row) else None
+    return Layouts(np.log(view.distance_m), poses.room_index, view.kind, seen)

@@ -241,6 +241,7 @@ def localise_steps(
             encoders.cohort, plan, query, float(costs.cost.min()), reach_m, weights, evidence
         )
     candidates, ends = list(modes), list[Candidate]()
+    candidates[:1] = with_latents(plan, encoders, query, candidates[:1], grid.camera_height_m)
 
     def posterior(first: list[Candidate]) -> Posterior:
         begun = modes[: len(ends)]
@@ -283,7 +284,7 @@ def localise_steps(
     found = posterior(answers)
     if config.by_probability:
         answers, found = _by_probability(answers, found, top_k, posterior)
-    if stage == "lpo" and evidence.compares_profiles(query):
+    if evidence.compares_profiles(query):
         answers = with_latents(plan, encoders, query, answers, grid.camera_height_m)
     if stage == "lpo" or config.by_probability:
         best[stage] = answers[0]

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.layouts import Layouts, layouts_at
+from lalaloc_core.localise.sketch import Sketch
 from lalaloc_core.sampling import PoseSet
 
 
@@ -17,21 +20,23 @@ from lalaloc_core.sampling import PoseSet
 class LatentGrid:
     """Poses, latents and wall profiles of one plan for one model, one camera height and one grid step; heading 0.
 
-    Only latents depend on the camera height: wall profiles serve queries of any.
+    Only latents depend on the camera height: wall profiles serve queries of any. Where poses are compared by their wall
+    profiles, nobody asks for latents of a whole grid, and `latents` is None.
     """
 
     poses: PoseSet
-    latents: Float[np.ndarray, "n d"]
+    latents: Float[np.ndarray, "n d"] | None
     profile_m: Float[np.ndarray, "n w"]
     step_m: float
     camera_height_m: float
     _layouts: list[Layouts] = field(default_factory=list, init=False, repr=False)
+    _sketch: list[Sketch] = field(default_factory=list, init=False, repr=False)
 
     @classmethod
     def with_layouts(
         cls,
         poses: PoseSet,
-        latents: Float[np.ndarray, "n d"],
+        latents: Float[np.ndarray, "n d"] | None,
         profile_m: Float[np.ndarray, "n w"],
         step_m: float,
         camera_height_m: float,
@@ -45,10 +50,42 @@ class LatentGrid:
     def layouts(self, plan: FloorPlan) -> Layouts:
         """What the plan shows at the poses; rendered at first use, since grids are stored without openings."""
         if not self._layouts:
-            heading, columns = np.zeros(len(self.poses)), self.profile_m.shape[1]
             # Two threads that meet here do the same work twice, and no harm.
-            self._layouts.append(layouts_at(plan, self.poses, heading, columns, profile_m=self.profile_m))
+            self._layouts.append(self._rendered(plan))
         return self._layouts[0]
+
+    def sketch(self, plan: FloorPlan) -> Sketch:
+        """The poses as the first look of a search sees them; made at first use."""
+        if not self._sketch:
+            self._sketch.append(Sketch.of(self.layouts(plan)))
+        return self._sketch[0]
+
+    @property
+    def known_latents(self) -> Float[np.ndarray, "n d"]:
+        """The latents.
+
+        Raises:
+            InvalidInputError: the grid was made without.
+        """
+        if self.latents is None:
+            raise InvalidInputError("the grid was made without latents, which poses are to be compared by")
+        return self.latents
+
+    def latent_distance(self, pose: int, target: Float[np.ndarray, "d"]) -> float:
+        """Distance of a pose's latent to another; NaN where there are none."""
+        return math.nan if self.latents is None else float(np.linalg.norm(self.latents[pose] - target))
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that it takes, with what was made of it at first use."""
+        arrays = [self.poses.position_m, self.poses.room_index, self.profile_m]
+        arrays += [] if self.latents is None else [self.latents]
+        return sum(part.nbytes for part in (*arrays, *self._layouts, *self._sketch))
+
+    def _rendered(self, plan: FloorPlan) -> Layouts:
+        if not plan.opening_faces:
+            return Layouts(np.log(self.profile_m.astype(np.float32)), self.poses.room_index)
+        return layouts_at(plan, self.poses, np.zeros(len(self.poses)), self.profile_m.shape[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +203,8 @@ class Candidate:
             the panorama's heading is `query.roll[hypothesis] + frame_heading`.
         cost: how badly the layout fits, see `localise.evidence`; the latent distance where the model predicts no wall
             profile.
-        latent_distance: from the latent of its layout to the query's.
+        latent_distance: from the latent of its layout to the query's; NaN where nobody has looked, which of answers is
+            done in the end.
         height_offset: log of true over stated camera height that fits best.
         hint_cost: what hints have against the place, in units of the cost; see `localise.hints`.
         terms: what each term of the evidence says of it, by name; empty where poses are compared by latents.

@@ -26,30 +26,48 @@ HEADING_WITHIN = np.radians(5.0)
 # Two poses at one place are of different modes if they are turned against each other by this much (radians).
 TURNED_APART = np.radians(25.0)
 # Pairs that are less likely than the best by this factor's logarithm weigh nothing.
-_NEGLIGIBLE = 12.0
+NEGLIGIBLE = 12.0
 
 
 @dataclass(frozen=True, eq=False)
 class GridCosts:
-    """What retrieval found for every hypothesis and every pose that it compared.
+    """What retrieval found for pairs of a grid's pose and a hypothesis.
 
     Attributes:
         poses: all poses of the grid.
-        index: (n,) which of them were compared; of large grids those that may be the best.
-        cost: (k, n) under every hypothesis.
-        offset: (k, n) the height offset δ that gives it.
-        hint_cost: (n,) what hints have against the pose, in units of the cost; None where there are no hints.
+        pose: (m,) which of them each pair is of. Pairs that are missing are improbable.
+        hypothesis: (m,) how it is turned.
+        cost: (m,) what it costs.
+        offset: (m,) the height offset δ that gives it.
+        hint_cost: (m,) what hints have against the pose, in units of the cost; None where there are no hints.
+        compared: the first so many were compared in full, and are what candidates may be; of the others, which share
+            the probability with them, the cost is estimated.
     """
 
     poses: PoseSet
-    index: Int[np.ndarray, "n"]
-    cost: Float[np.ndarray, "k n"]
-    offset: Float[np.ndarray, "k n"]
-    hint_cost: Float[np.ndarray, "n"] | None = None
+    pose: Int[np.ndarray, "m"]
+    hypothesis: Int[np.ndarray, "m"]
+    cost: Float[np.ndarray, "m"]
+    offset: Float[np.ndarray, "m"]
+    hint_cost: Float[np.ndarray, "m"] | None
+    compared: int
+
+    @classmethod
+    def of_all(
+        cls,
+        poses: PoseSet,
+        cost: Float[np.ndarray, "k n"],
+        offset: Float[np.ndarray, "k n"],
+        hint_cost: Float[np.ndarray, "n"] | None = None,
+    ) -> GridCosts:
+        """Of every pose under every hypothesis."""
+        hypothesis, pose = np.indices(cost.shape).reshape(2, -1)
+        against = None if hint_cost is None else hint_cost[pose]
+        return cls(poses, pose, hypothesis, cost.ravel(), offset.ravel(), against, cost.size)
 
     @cached_property
-    def total(self) -> Float[np.ndarray, "k n"]:
-        """What poses are ranked by: the cost with that of hints."""
+    def total(self) -> Float[np.ndarray, "m"]:
+        """What pairs are ranked by: the cost with that of hints."""
         return self.cost if self.hint_cost is None else self.cost + self.hint_cost
 
 
@@ -99,9 +117,9 @@ def posterior_of(
     gains = [start.total_cost - end.total_cost for start, end in zip(starts, ends, strict=True)]
     usual = float(np.median(gains)) if gains else 0.0
     best = min([lowest - usual, *(end.total_cost for end in ends)])
-    hypothesis, column = np.nonzero(temperature * (grid.total - max(gains, default=0.0) - best) < _NEGLIGIBLE)
-    cost, pose = grid.total[hypothesis, column].astype(np.float64), grid.index[column]
-    position = grid.poses.position_m[pose].copy()
+    pair = np.flatnonzero(temperature * (grid.total - max(gains, default=0.0) - best) < NEGLIGIBLE)
+    cost, pose, hypothesis = grid.total[pair].astype(np.float64), grid.pose[pair], grid.hypothesis[pair]
+    position = grid.poses.position_m[pose]
     heading = query.roll[hypothesis] + query.frame_heading
     mode = _modes(position, heading, starts, query, separation_m)
     gain = np.full(len(cost), usual)

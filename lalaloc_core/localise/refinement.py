@@ -93,7 +93,9 @@ def refined(
         columns, weights = encoders.manifest.profile_columns, encoders.manifest.evidence
         layouts = layouts_at(plan, PoseSet(result.position_m, rooms), result.heading, columns)
         found = Evidence(plan, query, evidence.fine_reach_m, weights, evidence).terms(layouts, hypotheses, offsets)
-        cost = found.total(weights) + evidence.latent_weight * distance
+        cost = found.total(weights)
+        if evidence.latent_weight:
+            cost = cost + evidence.latent_weight * distance
         terms = [{name: float(values[k]) for name, values in found._asdict().items()} for k in range(len(starts))]
     return [
         replace(
@@ -140,8 +142,11 @@ def _kept_inside(
 def with_latents(
     plan: FloorPlan, encoders: Encoders, query: Query, candidates: list[Candidate], camera_height_m: float
 ) -> list[Candidate]:
-    """Candidates with the latent distances of where they are now, for those that were moved by their walls alone."""
-    moved = [k for k, candidate in enumerate(candidates) if candidate.information is not None]
+    """Candidates with the latent distances of where they are now, for those that nobody knows them of.
+
+    These are those that were moved by their walls alone, and those of a grid without latents.
+    """
+    moved = [k for k, one in enumerate(candidates) if one.information is not None or math.isnan(one.latent_distance)]
     if not moved:
         return candidates
     poses = PoseSet(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -14,24 +15,34 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.evidence import Evidence, EvidenceConfig, latent_distances
+from lalaloc_core.localise.first_look import Fewest, first_costs
 from lalaloc_core.localise.hints import NO_HINTS, HintName, Hints
 from lalaloc_core.localise.poses import Candidate, LatentGrid, Query
-from lalaloc_core.localise.posterior import TURNED_APART, GridCosts
+from lalaloc_core.localise.posterior import NEGLIGIBLE, TURNED_APART, GridCosts
 from lalaloc_core.sampling import PoseSet, pose_grid
 
-# Poses times hypotheses times height offsets that are compared in full; of more, the poses that are best by every
-# `_STRIDE`th azimuth.
-_MAX_COMPARISONS = 1_000_000
-_STRIDE = 4
+# Pairs of a pose and a hypothesis that are compared in full: so many, and up to so many of those that may be probable.
+_LEAST_COMPARED, _MOST_COMPARED = 1024, 8192
+# Of so many the cost is estimated by the first look, as they share what is probable.
+_ESTIMATED = 65_536
+# What refinement gains and the first look errs at most: pairs that cost so much more than what is negligible weigh
+# nothing.
+_MARGIN = 0.35
+# The last so many of those compared in full tell how the first look errs about those that were not.
+_TELLING = 256
 # The best pairs, which are looked at for distinct candidates; more if they hold too few.
-_FIRST_RANKED = 4096
+_FIRST_RANKED = 1024
 
 
-def build_grid(plan: FloorPlan, encoders: Encoders, *, step_m: float, camera_height_m: float) -> LatentGrid:
-    """Sample the plan's pose grid, render every layout and embed it."""
+def build_grid(
+    plan: FloorPlan, encoders: Encoders, *, step_m: float, camera_height_m: float, latents: bool = True
+) -> LatentGrid:
+    """Sample the plan's pose grid, render every layout and, with `latents`, embed it: dear, and often not needed."""
     poses = pose_grid(plan, step_m)
-    latents, profile_m = encoders.poses(plan, poses, np.zeros(len(poses)), camera_height_m)
-    return LatentGrid(poses, latents, profile_m, step_m, camera_height_m)
+    if not latents:
+        return LatentGrid(poses, None, encoders.profiles(plan, poses, np.zeros(len(poses))), step_m, camera_height_m)
+    embedded, profile_m = encoders.poses(plan, poses, np.zeros(len(poses)), camera_height_m)
+    return LatentGrid(poses, embedded, profile_m, step_m, camera_height_m)
 
 
 def grid_costs(
@@ -42,33 +53,98 @@ def grid_costs(
     config: EvidenceConfig,
     hints: Hints = NO_HINTS,
 ) -> GridCosts:
-    """Cost of every pose of the grid under every hypothesis; of large grids, of the poses that may be the best.
+    """Costs of the pairs of a pose of the grid and a hypothesis that may be the best, or are probable.
+
+    All pairs get a first look (`first_look.py`), and those that are the best by that are compared in full.
 
     Raises:
         InvalidHintError: no pose of the grid is left.
+        InvalidInputError: latents are compared, and the grid was made without.
     """
     against = _hint_costs(plan, grid, weights, hints)
     if not config.compares_profiles(query):
-        distance = latent_distances(grid.latents, query.latents)
-        return GridCosts(grid.poses, np.arange(len(grid.poses)), distance, np.zeros_like(distance), against)
-    layouts, index = grid.layouts(plan), np.arange(len(grid.poses))
-    reach_m = config.grid_reach * grid.step_m
-    comparisons = len(query.roll) * len(query.camera_height.offsets)
-    kept = max(_MAX_COMPARISONS // comparisons, _FIRST_RANKED)
-    if kept < len(index):
-        coarse, _ = Evidence(plan, query, reach_m, weights, config, stride=_STRIDE).costs(layouts)
-        index = _shortlist(coarse.min(axis=0), kept, against, _hint_costs(plan, grid, weights, hints.doubted))
-        layouts = layouts.rows(index)
-    cost, offset = Evidence(plan, query, reach_m, weights, config).costs(layouts)
+        distance = latent_distances(grid.known_latents, query.latents)
+        return GridCosts.of_all(grid.poses, distance, np.zeros_like(distance), against)
+    evidence = Evidence(plan, query, config.grid_reach * grid.step_m, weights, config)
+    doubted = _hint_costs(plan, grid, weights, hints.doubted) if hints.strict else None
+    chosen = _chosen(plan, grid, evidence, weights.temperature, against, doubted)
+    pose, hypothesis = np.divmod(chosen.pair, len(query.roll))
+    cost, offset = evidence.pairs(grid.layouts(plan), pose[: chosen.compared], hypothesis[: chosen.compared])
     if config.latent_weight:
-        cost += config.latent_weight * latent_distances(grid.latents[index], query.latents)
-    return GridCosts(grid.poses, index, cost, offset, None if against is None else against[index])
+        latents, targets = grid.known_latents[pose[: len(cost)]], query.latents[hypothesis[: len(cost)]]
+        cost += config.latent_weight * np.linalg.norm(latents - targets, axis=1)
+    estimated = np.maximum(chosen.estimate + chosen.error(cost, weights.temperature), cost.min())
+    cost, offset = np.append(cost, estimated), np.append(offset, np.zeros(len(estimated)))
+    return GridCosts(
+        grid.poses, pose, hypothesis, cost, offset, None if against is None else against[pose], chosen.compared
+    )
+
+
+class _Chosen(NamedTuple):
+    """What the first look leaves.
+
+    Attributes:
+        pair: pose times the number of hypotheses, plus hypothesis: those to be compared in full, then the others.
+        compared: how many are to be compared in full.
+        seen: what the first ones cost at first look.
+        estimate: what the others cost at first look.
+    """
+
+    pair: Int[np.ndarray, "m"]
+    compared: int
+    seen: Float[np.ndarray, "c"]
+    estimate: Float[np.ndarray, "e"]
+
+    def error(self, cost: Float[np.ndarray, "c"], temperature: float) -> float:
+        """What the first look is to be corrected by, so that what pairs weigh together is right.
+
+        Those that were only just compared in full are most like those that were not.
+        """
+        if not len(self.estimate):
+            return 0.0
+        last = slice(max(len(self.seen) - _TELLING, 0), len(self.seen))
+        weight = -temperature * (cost[: len(self.seen)][last] - self.seen[last]).astype(np.float64)
+        return float(np.log(len(weight)) - np.logaddexp.reduce(weight)) / temperature
+
+
+def _chosen(
+    plan: FloorPlan,
+    grid: LatentGrid,
+    evidence: Evidence,
+    temperature: float,
+    against: Float[np.ndarray, "n"] | None,
+    doubted: Float[np.ndarray, "n"] | None,
+) -> _Chosen:
+    """The pairs that are worth more than a first look.
+
+    Args:
+        against: what hints have against every pose.
+        doubted: the same if they were no fences, where they are: what would be the best then is compared as well.
+    """
+    pairs, nothing = len(grid.poses) * evidence.hypotheses, np.empty(0, np.float32)
+    if pairs <= _LEAST_COMPARED:
+        return _Chosen(np.arange(pairs), pairs, nothing, nothing)
+    best, beyond = Fewest(_ESTIMATED), Fewest(_LEAST_COMPARED)
+    for first, cost in first_costs(grid.sketch(plan), evidence, grid.poses.room_index):
+        part = slice(first, first + len(cost))
+        best.offer(first, cost if against is None else cost + against[part, None])
+        if doubted is not None:
+            beyond.offer(first, cost + doubted[part, None])
+    total, pair = best.told()
+    probable = int(np.searchsorted(total, total[0] + _MARGIN + NEGLIGIBLE / temperature))
+    compared = min(max(probable, _LEAST_COMPARED), _MOST_COMPARED, len(pair))
+    cost = total if against is None else total - against[pair // evidence.hypotheses]
+    seen, estimate = cost[:compared], cost[compared:probable]
+    first, others = pair[:compared], pair[compared:probable]
+    if doubted is not None:
+        first = np.append(first, np.setdiff1d(beyond.told()[1], pair[:probable]))
+    return _Chosen(np.append(first, others), len(first), seen, estimate)
 
 
 def missed_hints(plan: FloorPlan, costs: GridCosts, weights: EvidenceModel, hints: Hints) -> tuple[HintName, ...]:
     """The hints that would not hold where the picture fits best, if they were no fences."""
-    doubted = _penalties(plan, costs.poses, weights, hints.doubted)[costs.index]
-    pose = costs.index[int((costs.cost + doubted).min(axis=0).argmin())]
+    doubted = _penalties(plan, costs.poses, weights, hints.doubted)[costs.pose]
+    pose = costs.pose[int((costs.cost + doubted)[: costs.compared].argmin())]
     return hints.missed(costs.poses.position_m[pose], int(costs.poses.room_index[pose]))
 
 
@@ -92,19 +168,6 @@ def _hint_costs(
     )
 
 
-def _shortlist(
-    cost: Float[np.ndarray, "n"],
-    kept: int,
-    against: Float[np.ndarray, "n"] | None,
-    doubted: Float[np.ndarray, "n"] | None,
-) -> Int[np.ndarray, "m"]:
-    """The poses that may be the best, in rising order: by the hints, and if those were no fences."""
-    if against is None or doubted is None:
-        return np.sort(np.argpartition(cost, kept)[:kept])
-    strictly = np.argpartition(cost + against, kept)[:kept]
-    return np.union1d(strictly[np.isfinite(against[strictly])], np.argpartition(cost + doubted, kept)[:kept])
-
-
 def retrieve(
     costs: GridCosts,
     grid: LatentGrid,
@@ -120,18 +183,18 @@ def retrieve(
     Args:
         margin, limit: up to `limit` of them where they cost less than this more than the best.
     """
-    ranked, ranks = np.argsort(costs.total, axis=None), max(_FIRST_RANKED, top_k)
-    ranked = ranked[: np.isfinite(costs.total).sum()]
-    limit, ceiling = max(limit, top_k), float(costs.total.min()) + margin
+    total = costs.total[: costs.compared]
+    ranked, ranks = np.argsort(total, kind="stable"), max(_FIRST_RANKED, top_k)
+    ranked = ranked[: np.isfinite(total).sum()]
+    limit, ceiling = max(limit, top_k), float(total.min()) + margin
     while True:
-        hypothesis, column = np.unravel_index(ranked[:ranks], costs.total.shape)
-        pose = costs.index[column]
+        pair = ranked[:ranks]
         kept = suppress(
-            grid.poses.position_m[pose],
-            costs.total[hypothesis, column],
+            grid.poses.position_m[costs.pose[pair]],
+            total[pair],
             separation_m=separation_m,
             limit=top_k,
-            heading=query.roll[hypothesis],
+            heading=query.roll[costs.hypothesis[pair]],
             ceiling=ceiling,
             limit_below=limit,
         )
@@ -139,22 +202,21 @@ def retrieve(
             break
         # On a fine grid the best pairs may all be of a few places.
         ranks *= 4
-    return [_candidate(costs, query, grid, int(hypothesis[index]), int(column[index])) for index in kept]
+    return [_candidate(costs, query, grid, int(pair[index])) for index in kept]
 
 
-def _candidate(costs: GridCosts, query: Query, grid: LatentGrid, hypothesis: int, column: int) -> Candidate:
-    pose = int(costs.index[column])
-    distance = latent_distances(grid.latents[pose][None], query.latents[hypothesis][None])
+def _candidate(costs: GridCosts, query: Query, grid: LatentGrid, pair: int) -> Candidate:
+    pose, hypothesis = int(costs.pose[pair]), int(costs.hypothesis[pair])
     return Candidate(
         x_m=float(grid.poses.position_m[pose, 0]),
         y_m=float(grid.poses.position_m[pose, 1]),
         room_index=int(grid.poses.room_index[pose]),
         frame_heading=query.frame_heading,
         hypothesis=hypothesis,
-        cost=float(costs.cost[hypothesis, column]),
-        latent_distance=float(distance[0, 0]),
-        height_offset=float(costs.offset[hypothesis, column]),
-        hint_cost=0.0 if costs.hint_cost is None else float(costs.hint_cost[column]),
+        cost=float(costs.cost[pair]),
+        latent_distance=grid.latent_distance(pose, query.latents[hypothesis]),
+        height_offset=float(costs.offset[pair]),
+        hint_cost=0.0 if costs.hint_cost is None else float(costs.hint_cost[pair]),
     )
 
 
@@ -168,15 +230,18 @@ def contradicted(
     searched = query.searched
     if searched is None or not config.compares_profiles(query) or not config.heading_doubt:
         return False
-    layouts, reach_m = grid.layouts(plan), config.grid_reach * grid.step_m
-    said, offset = Evidence(plan, query, reach_m, weights, config, stride=_STRIDE).costs(layouts)
+    doubt = np.log((1.0 - config.heading_doubt) / config.heading_doubt * len(searched.roll)) / weights.temperature
+    said = grid_costs(plan, grid, query, weights, config)
+    best = int(said.cost[: said.compared].argmin())
+    if said.cost[best] <= doubt:
+        # Nothing costs less than nothing.
+        return False
     # The height that is best at the heading that was said is good enough for a doubt.
-    best = np.unravel_index(said.argmin(), said.shape)
-    height_m = query.camera_height.height_m * float(np.exp(offset[best]))
-    exact = replace(searched.scaled(float(offset[best])), camera_height=CameraHeight(height_m, 0.0))
-    any_heading, _ = Evidence(plan, exact, reach_m, weights, config, stride=_STRIDE).costs(layouts)
-    doubt = np.log((1.0 - config.heading_doubt) / config.heading_doubt * len(searched.roll))
-    return bool(weights.temperature * (said.min() - any_heading.min()) > doubt)
+    offset = float(said.offset[best])
+    height_m = query.camera_height.height_m * float(np.exp(offset))
+    exact = replace(searched.scaled(offset), camera_height=CameraHeight(height_m, 0.0))
+    any_heading = grid_costs(plan, grid, exact, weights, config)
+    return bool(said.cost[best] - any_heading.cost[: any_heading.compared].min() > doubt)
 
 
 def suppress(

@@ -134,7 +134,7 @@ def _grid(
     )
     return LatentGrid.with_layouts(
         poses,
-        np.concatenate([grid.latents for grid in grids]),
+        None if any(grid.latents is None for grid in grids) else np.concatenate([grid.known_latents for grid in grids]),
         np.concatenate([grid.profile_m for grid in grids]),
         grids[0].step_m,
         camera_height_m,

@@ -6,9 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.render.profile import wall_profile
-
-_FAR_OUT_M = 1000.0
+from lalaloc_core.render.sweep import swept_profiles
 
 
 def profiles_at(
@@ -23,19 +21,6 @@ def profiles_at(
 
     Args:
         heading: azimuth of the centre column, radians.
-        dtype: single precision is enough for networks, and twice as fast.
+        dtype: of the result.
     """
-    origin_m = _origin_m(plan)
-    walls_m = plan.walls_m[room_index] - np.tile(origin_m, 2)
-    return wall_profile((position_m - origin_m).astype(dtype), heading.astype(dtype), walls_m.astype(dtype), columns)
-
-
-def _origin_m(plan: FloorPlan) -> Float[np.ndarray, "2"]:
-    """What to count coordinates from: a place in a plan that lies far out, as surveyed ones do, in whole metres.
-
-    A hundred kilometres from the origin single precision tells centimetres apart, at ten thousand only metres.
-    """
-    x_min, y_min, x_max, y_max = plan.bounds_m
-    if max(abs(x_min), abs(y_min), abs(x_max), abs(y_max)) < _FAR_OUT_M:
-        return np.zeros(2)
-    return np.rint([x_min, y_min])
+    return swept_profiles(position_m, heading, room_index, plan.wall_table, columns, dtype)

@@ -199,7 +199,7 @@ def _picture(
             costs.append(Evidence(plan, exact, reach_m, weights, evidence).costs(layouts)[0].T)
         cost = np.stack(costs).astype(np.float64)
     else:
-        distance = latent_distances(grid.latents, query.latents)
+        distance = latent_distances(grid.known_latents, query.latents)
         index = np.sort(np.argsort(distance.min(axis=0), kind="stable")[:_MAX_PLACES])
         cost = distance[:, index].T[None].astype(np.float64)
     prior = area_shares(grid.poses, np.array([room.area_m2 for room in plan.rooms]))
@@ -244,7 +244,6 @@ def _start(grid: LatentGrid, picture: Picture, state: int, at: int) -> Candidate
     row, hypothesis = divmod(state, len(picture.states.heading))
     pose, query = int(picture.index[row]), picture.query
     offsets = query.camera_height.offsets
-    distance = latent_distances(grid.latents[pose][None], query.latents[hypothesis][None])
     return Candidate(
         x_m=float(grid.poses.position_m[pose, 0]),
         y_m=float(grid.poses.position_m[pose, 1]),
@@ -252,7 +251,7 @@ def _start(grid: LatentGrid, picture: Picture, state: int, at: int) -> Candidate
         frame_heading=query.frame_heading,
         hypothesis=hypothesis,
         cost=float(picture.cost[at, row, hypothesis]),
-        latent_distance=float(distance[0, 0]),
+        latent_distance=grid.latent_distance(pose, query.latents[hypothesis]),
         height_offset=float(offsets[at]) if picture.cost.shape[0] == len(offsets) else 0.0,
     )
 
