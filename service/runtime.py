@@ -34,6 +34,8 @@ _READ_THREADS = 4
 # Small grids are computed on them: more of one tenant would take the cores from queries.
 _UPLOAD_THREADS = with_spare(2)
 # Drawings in memory, and revisions that wait to be drawn.
+# Poses of the plans of a venue that are searched together, besides a single larger plan: they are copied for a query.
+_VENUE_POSES = 40_000
 _DRAWINGS_BYTES, _MAX_DRAWN = 32 * 2**20, 16
 # With keys that are not remembered, streams still look no more often.
 _MIN_HEARTBEAT_S = 1.0
@@ -168,7 +170,7 @@ def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack) 
 
 
 def _venue_plans(store: Store, grids: GridProvider, reads: BoundedReads, settings: Settings) -> VenuePlans:
-    limit_bytes, max_poses = settings.venue_cache_bytes, settings.max_grid_poses
+    limit_bytes, max_poses = settings.venue_cache_bytes, min(settings.max_grid_poses, _VENUE_POSES)
     return VenuePlans(store, grids, reads, limit_bytes=limit_bytes, max_poses=max_poses)
 
 

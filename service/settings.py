@@ -201,7 +201,7 @@ class Settings(BaseSettings):
     )
 
     grid_step_m: float = Field(default=0.5, ge=0.1, le=5.0, description="Distance of the poses of a latent grid.")
-    max_grid_poses: Count = Field(default=40_000, description="Poses that a plan's latent grid may have.")
+    max_grid_poses: Count = Field(default=900_000, description="Poses that a plan's latent grid may have.")
     inline_grid_poses: int = Field(
         default=1000,
         ge=0,
@@ -225,7 +225,7 @@ class Settings(BaseSettings):
     plan_cache_age_s: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] = Field(
         default=600.0, description="How long a plan in memory is trusted while the database is away."
     )
-    grid_cache_bytes: int = Field(default=256 * 2**20, ge=0, description="Latent grids kept in memory.")
+    grid_cache_bytes: int = Field(default=2**30, ge=0, description="Latent grids kept in memory.")
     venue_cache_bytes: int = Field(
         default=128 * 2**20,
         ge=0,
@@ -257,21 +257,21 @@ class Settings(BaseSettings):
     max_import_s: Seconds = Field(
         default=30.0, description="Longest that reading the file of a floor plan may take, once it is begun."
     )
-    max_rooms: Count = Field(default=500, description="Rooms per floor plan.")
+    max_rooms: Count = Field(default=10_000, description="Rooms per floor plan.")
     max_vertices: Annotated[int, Field(ge=3)] = Field(default=200, description="Vertices per room.")
     max_plan_vertices: Annotated[int, Field(ge=3)] = Field(
-        default=10_000, description="Vertices of all rooms of a floor plan."
+        default=100_000, description="Vertices of all rooms of a floor plan."
     )
-    max_extent_m: Metres = Field(default=500.0, description="Width or height of a floor plan.")
+    max_extent_m: Metres = Field(default=1000.0, description="Width or height of a floor plan.")
     max_area_m2: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] = Field(
-        default=20_000.0, description="Floor area of all rooms of a floor plan."
+        default=200_000.0, description="Floor area of all rooms of a floor plan."
     )
     max_bounds_area_m2: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] = Field(
-        default=200_000.0,
+        default=500_000.0,
         description="Area of the boxes around all rooms of a floor plan, which its latent grid is looked for in.",
     )
     max_openings: Annotated[int, Field(ge=0)] = Field(
-        default=2000, description="Doors, windows and passages of a floor plan."
+        default=20_000, description="Doors, windows and passages of a floor plan."
     )
     max_venues: Count = Field(default=1000, description="Stored venues per tenant.")
     max_venue_plans: Count = Field(default=10_000, description="Floor plans of a venue.")

@@ -37,7 +37,8 @@ def profile_table(bundle: Bundle, queries: int, textures: Path | None) -> str:
     height, width = encoders.manifest.image_height, encoders.manifest.image_width
     images = studio.renderer(height, width).render(shots).cpu().numpy()
     camera_m = home.plan.camera_height_m
-    grid = build_grid(home.plan, encoders, step_m=_GRID_STEP_M, camera_height_m=camera_m)
+    latents = not encoders.predicts_profile
+    grid = build_grid(home.plan, encoders, step_m=_GRID_STEP_M, camera_height_m=camera_m, latents=latents)
 
     def ask(index: int, *, known: bool) -> dict[str, float]:
         clock, shot = StageClock(), shots[index]

@@ -121,7 +121,9 @@ def _answers(arguments: argparse.Namespace, plan: FloorPlan, contents: list[byte
     height, model = stated_height(plan, arguments.camera_height), bundle.manifest.confidence
     # Models that compare latents alone have a grid for every height.
     grid_height_m = plan.camera_height_m if encoders.predicts_profile else height.height_m
-    grid = build_grid(plan, encoders, step_m=_GRID_STEP_M, camera_height_m=grid_height_m)
+    grid = build_grid(
+        plan, encoders, step_m=_GRID_STEP_M, camera_height_m=grid_height_m, latents=not encoders.predicts_profile
+    )
     paths = tqdm(arguments.photographs, desc="localise", unit="photograph", disable=None, leave=False)
     for path, content in zip(paths, contents, strict=True):
         with _named(path):

@@ -64,7 +64,7 @@ def outline_of(
         heading: azimuth (radians) of the panorama's centre column.
         camera_height_m: over the floor; what lies higher than the ceiling is drawn as if it lay just below it.
     """
-    walls_m = plan.walls_m[room_index][: plan.geometry.wall_count[room_index]]
+    walls_m = plan.rooms[room_index].walls_m
     ends = np.concatenate([walls_m[:, :2], walls_m[:, 2:]]) - position_m
     corner = wrap_angle(np.arctan2(ends[:, 0], ends[:, 1]) - heading)
     edges = np.array([-math.pi, math.pi])

@@ -16,10 +16,10 @@ class PlanLimits:
     `max_plan_vertices` are those of all rooms. `max_depth` is of objects and lists within each other.
     """
 
-    max_rooms: int = 500
+    max_rooms: int = 10_000
     max_vertices_per_room: int = 500
     max_plan_vertices: int = 100_000
-    max_openings: int = 2000
+    max_openings: int = 20_000
     # Pieces of openings on the walls of one room, and walls that one opening may lie on.
     max_openings_per_room: int = 100
     max_walls_per_opening: int = 32

@@ -140,10 +140,13 @@ def place_openings(
     if not openings:
         return (), ()
     walls = _Walls(rooms)
+    by_id: dict[str, list[int]] = {}
+    for number, room in enumerate(rooms):
+        by_id.setdefault(room.id, []).append(number)
     faces: list[OpeningFace] = []
     lost = []
     for index, opening in enumerate(openings):
-        contacts = _contacts(index, opening, rooms, walls, tolerance_m, limits)
+        contacts = _contacts(index, opening, by_id, walls, tolerance_m, limits)
         found = [face for contact in contacts for face in _faces(index, opening, contact, contacts, walls)]
         faces += found
         if not found:
@@ -165,7 +168,7 @@ def label(opening: Opening, index: int) -> str:
 
 
 def _contacts(
-    index: int, opening: Opening, rooms: Sequence[Room], walls: _Walls, tolerance_m: float, limits: PlanLimits
+    index: int, opening: Opening, by_id: dict[str, list[int]], walls: _Walls, tolerance_m: float, limits: PlanLimits
 ) -> list[_Contact]:
     """Walls that an opening lies on; in each room the nearest one at every place of the opening."""
     start = opening.line_m[0]
@@ -174,7 +177,7 @@ def _contacts(
     direction = along / length_m
     near = walls.near(opening.line_m, tolerance_m)
     if opening.rooms is not None:
-        near = near[np.isin(walls.room[near], [k for k, room in enumerate(rooms) if room.id in opening.rooms])]
+        near = near[np.isin(walls.room[near], [room for name in opening.rooms for room in by_id.get(name, [])])]
     near = near[np.abs(walls.edge[near] @ direction) >= _MIN_COSINE * walls.length_m[near]]
     first = walls.start[near] - start
     ends = np.stack([first, first + walls.edge[near]], axis=1)

@@ -21,7 +21,7 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.anchors import anchor_document, read_anchor
 from lalaloc_core.floorplan.arrays import frozen
 from lalaloc_core.floorplan.checks import check_size, overlap_warnings
-from lalaloc_core.floorplan.geometry import PlanGeometry, build_geometry
+from lalaloc_core.floorplan.geometry import PlanGeometry, build_geometry, pad_walls
 from lalaloc_core.floorplan.heights import (
     DEFAULT_CAMERA_HEIGHT_M,
     read_camera_height,
@@ -39,6 +39,8 @@ from lalaloc_core.floorplan.wall_table import WallTable
 
 __all__ = ["DEFAULT_CAMERA_HEIGHT_M", "FloorPlan"]
 
+# Of more, those are found that have a place in their boxes before the rooms themselves are asked.
+_FEW_ROOMS = 32
 _PLAN_KEYS = {
     "name",
     "rooms",
@@ -181,7 +183,7 @@ class FloorPlan:
     @property
     def area_m2(self) -> float:
         """Sum of the rooms' floor areas."""
-        return sum(room.area_m2 for room in self.rooms)
+        return float(self.areas_m2.sum())
 
     @property
     def bounds_m(self) -> tuple[float, float, float, float]:
@@ -198,7 +200,7 @@ class FloorPlan:
     @cached_property
     def wall_table(self) -> WallTable:
         """The same without padding, for what goes through many poses at once."""
-        return WallTable.of(self.geometry, np.array([len(room.inner_walls_m) for room in self.rooms]))
+        return WallTable.of(self.rooms, self.openings, self.opening_faces)
 
     @property
     def walls_m(self) -> Float[np.ndarray, "rooms n 4"]:
@@ -208,14 +210,33 @@ class FloorPlan:
         """
         return self.geometry.walls_m
 
+    def walls_of(self, room_index: Int[np.ndarray, "k"]) -> Float[np.ndarray, "k n 4"]:
+        """As `walls_m[room_index]`, padded to the longest of these rooms alone."""
+        longest = max(len(self.rooms[index].walls_m) for index in room_index)
+        return np.stack([pad_walls(self.rooms[index].walls_m, longest) for index in room_index])
+
+    @cached_property
+    def areas_m2(self) -> Float[np.ndarray, "rooms"]:
+        """Floor area of every room."""
+        return frozen(np.array([room.area_m2 for room in self.rooms]))
+
     @cached_property
     def ceiling_heights_m(self) -> Float[np.ndarray, "rooms"]:
         """Ceiling height of every room."""
         return frozen(np.array([room.ceiling_height_m for room in self.rooms]))
 
+    @cached_property
+    def _room_tree(self) -> shapely.STRtree:
+        return shapely.STRtree([room.shape for room in self.rooms])
+
     def room_index_at(self, position_m: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, "n"]:
         """Index of the room each position lies in, -1 outside and in holes; of rooms that overlap, the first."""
         x, y = position_m[:, 0], position_m[:, 1]
+        if len(self.rooms) > _FEW_ROOMS:
+            point, room = self._room_tree.query(shapely.points(x, y), predicate="within")
+            first = np.full(len(position_m), len(self.rooms))
+            np.minimum.at(first, point, room)
+            return np.where(first < len(self.rooms), first, -1)
         index = np.full(len(position_m), -1)
         for room_index in reversed(range(len(self.rooms))):
             index[shapely.contains_xy(self.rooms[room_index].shape, x, y)] = room_index

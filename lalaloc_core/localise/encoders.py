@@ -16,6 +16,7 @@ from lalaloc_core.errors import BundleError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.cohort import Cohort
+from lalaloc_core.localise.layouts import Layouts, layouts_at
 from lalaloc_core.localise.poses import (
     PredictedCeiling,
     PredictedOpenings,
@@ -89,6 +90,10 @@ class Encoders:
         profile_m = self.profiles(plan, poses, heading)
         heights = np.full(len(poses), camera_height_m)
         return self.layouts(profile_m, heights, plan.ceiling_heights_m[poses.room_index]), profile_m
+
+    def rendered(self, plan: FloorPlan, poses: PoseSet) -> Layouts:
+        """The layouts of poses of a grid, at heading 0, as wide as the networks take them."""
+        return layouts_at(plan, poses, np.zeros(len(poses)), self.manifest.profile_columns)
 
     def profiles(self, plan: FloorPlan, poses: PoseSet, heading: Float[np.ndarray, "b"]) -> Float[np.ndarray, "b c"]:
         """Wall profiles (m) of poses of a plan, as wide as the layout encoder takes them."""

@@ -21,7 +21,7 @@ A weighted latent distance may be added. Models that predict no wall profile are
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -132,6 +132,7 @@ class Evidence:
         """Cost of every pose under some hypotheses of how the panorama is turned (all), and the δ that gives it."""
         hypotheses = np.arange(self.hypotheses) if hypotheses is None else hypotheses
         layouts = layouts.thinned(self._stride) if self._stride > 1 else layouts
+        layouts = replace(layouts, log_profile=layouts.log_profile.astype(np.float32, copy=False))
         shared = self.by_room()
         best = np.full((len(hypotheses), len(layouts)), np.inf, np.float32)
         chosen = np.zeros(best.shape, np.intp)
@@ -231,7 +232,7 @@ class Evidence:
     ) -> Float[np.ndarray, "j m"]:
         """Cost of the walls of pairs at each δ, which is one for all pairs, or each pair's own."""
         centre, precision = self._centre[hypothesis], self._precision[hypothesis]
-        apart = layouts.log_profile[pose] - centre
+        apart = layouts.log_profile[pose].astype(np.float32) - centre
         apart *= precision
         offset = offset.astype(np.float32)
         offset = offset[:, None, None] if offset.ndim == 1 else offset[:, :, None]

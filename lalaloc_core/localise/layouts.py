@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from lalaloc_core.conventions import WALL_CODE
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.render.sweep import swept_views
@@ -37,7 +39,7 @@ class SeenThrough:
 
 @dataclass(frozen=True, eq=False)
 class Layouts:
-    """Layouts of n poses, in single precision.
+    """Layouts of n poses, in single precision; those of grids that have no latents in half.
 
     Attributes:
         log_profile: (n, w) log wall profiles (m).
@@ -89,3 +91,24 @@ def layouts_at(plan: FloorPlan, poses: PoseSet, heading: Float[np.ndarray, "n"],
     behind = view.row, view.column, view.kind[view.row, view.column], np.log(view.behind_m)
     seen = SeenThrough(*behind) if len(view.row) else None
     return Layouts(np.log(view.distance_m), poses.room_index, view.kind, seen)
+
+
+def joined_layouts(parts: Sequence[Layouts], room_index: Int[np.ndarray, "n"]) -> Layouts:
+    """Layouts that were rendered in parts, one after the other; rooms get other numbers."""
+    log_profile = np.concatenate([part.log_profile for part in parts])
+    if all(part.kind is None for part in parts):
+        return Layouts(log_profile, room_index)
+    kind = np.full(log_profile.shape, WALL_CODE, np.uint8)
+    first, seen = 0, []
+    for part in parts:
+        if part.kind is not None:
+            kind[first : first + len(part)] = part.kind
+        if part.seen is not None:
+            seen.append(replace(part.seen, row=part.seen.row + first))
+        first += len(part)
+    if not seen:
+        return Layouts(log_profile, room_index, kind)
+    through = SeenThrough(
+        *(np.concatenate([getattr(one, name) for one in seen]) for name in ("row", "column", "kind", "log_behind"))
+    )
+    return Layouts(log_profile, room_index, kind, through)

@@ -217,7 +217,7 @@ def localise_steps(
     config = config or LocaliseConfig()
     clock = clock or StageClock()
     weights, evidence = encoders.manifest.evidence, config.evidence
-    prior = area_shares(grid.poses, np.array([room.area_m2 for room in plan.rooms]))
+    prior = area_shares(grid.poses, plan.areas_m2)
     stage: SearchStage = "retrieval"
     hints.check(plan)
     with clock.stage("retrieve"):

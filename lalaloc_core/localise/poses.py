@@ -47,6 +47,13 @@ class LatentGrid:
         grid._layouts.append(layouts)
         return grid
 
+    @classmethod
+    def without_latents(cls, poses: PoseSet, layouts: Layouts, step_m: float, camera_height_m: float) -> LatentGrid:
+        """A grid of rendered layouts whose poses are compared by these alone; distances in half precision."""
+        profile_m = np.exp(layouts.log_profile).astype(np.float16)
+        kept = replace(layouts, log_profile=layouts.log_profile.astype(np.float16))
+        return cls.with_layouts(poses, None, profile_m, step_m, camera_height_m, kept)
+
     def layouts(self, plan: FloorPlan) -> Layouts:
         """What the plan shows at the poses; rendered at first use, since grids are stored without openings."""
         if not self._layouts:
@@ -83,9 +90,12 @@ class LatentGrid:
         return sum(part.nbytes for part in (*arrays, *self._layouts, *self._sketch))
 
     def _rendered(self, plan: FloorPlan) -> Layouts:
+        precision = self.profile_m.dtype if self.latents is None else np.float32
         if not plan.opening_faces:
-            return Layouts(np.log(self.profile_m.astype(np.float32)), self.poses.room_index)
-        return layouts_at(plan, self.poses, np.zeros(len(self.poses)), self.profile_m.shape[1])
+            log_profile = np.log(self.profile_m.astype(np.float32)).astype(precision)
+            return Layouts(log_profile, self.poses.room_index)
+        layouts = layouts_at(plan, self.poses, np.zeros(len(self.poses)), self.profile_m.shape[1])
+        return replace(layouts, log_profile=layouts.log_profile.astype(precision))
 
 
 @dataclass(frozen=True, eq=False)

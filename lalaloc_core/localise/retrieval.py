@@ -22,7 +22,7 @@ from lalaloc_core.localise.posterior import NEGLIGIBLE, TURNED_APART, GridCosts
 from lalaloc_core.sampling import PoseSet, pose_grid
 
 # Pairs of a pose and a hypothesis that are compared in full: so many, and up to so many of those that may be probable.
-_LEAST_COMPARED, _MOST_COMPARED = 1024, 8192
+_LEAST_COMPARED, _MOST_COMPARED = 1024, 4096
 # Of so many the cost is estimated by the first look, as they share what is probable.
 _ESTIMATED = 65_536
 # What refinement gains and the first look errs at most: pairs that cost so much more than what is negligible weigh
@@ -40,7 +40,7 @@ def build_grid(
     """Sample the plan's pose grid, render every layout and, with `latents`, embed it: dear, and often not needed."""
     poses = pose_grid(plan, step_m)
     if not latents:
-        return LatentGrid(poses, None, encoders.profiles(plan, poses, np.zeros(len(poses))), step_m, camera_height_m)
+        return LatentGrid.without_latents(poses, encoders.rendered(plan, poses), step_m, camera_height_m)
     embedded, profile_m = encoders.poses(plan, poses, np.zeros(len(poses)), camera_height_m)
     return LatentGrid(poses, embedded, profile_m, step_m, camera_height_m)
 

@@ -13,9 +13,8 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 
-from lalaloc_core.conventions import WALL_CODE
 from lalaloc_core.floorplan import FloorPlan, OpeningFace, Room
-from lalaloc_core.localise.layouts import Layouts, SeenThrough
+from lalaloc_core.localise.layouts import joined_layouts
 from lalaloc_core.localise.poses import Candidate, LatentGrid
 from lalaloc_core.sampling import PoseSet
 
@@ -138,26 +137,5 @@ def _grid(
         np.concatenate([grid.profile_m for grid in grids]),
         grids[0].step_m,
         camera_height_m,
-        _layouts([grid.layouts(plan) for grid, plan in zip(grids, plans, strict=True)], poses.room_index),
+        joined_layouts([grid.layouts(plan) for grid, plan in zip(grids, plans, strict=True)], poses.room_index),
     )
-
-
-def _layouts(parts: Sequence[Layouts], room_index: Int[np.ndarray, "n"]) -> Layouts:
-    """What was rendered of each plan before, as of one."""
-    log_profile = np.concatenate([part.log_profile for part in parts])
-    if all(part.kind is None for part in parts):
-        return Layouts(log_profile, room_index)
-    kind = np.full(log_profile.shape, WALL_CODE, np.uint8)
-    first, seen = 0, []
-    for part in parts:
-        if part.kind is not None:
-            kind[first : first + len(part)] = part.kind
-        if part.seen is not None:
-            seen.append(replace(part.seen, row=part.seen.row + first))
-        first += len(part)
-    if not seen:
-        return Layouts(log_profile, room_index, kind)
-    through = SeenThrough(
-        *(np.concatenate([getattr(one, name) for one in seen]) for name in ("row", "column", "kind", "log_behind"))
-    )
-    return Layouts(log_profile, room_index, kind, through)

@@ -1,4 +1,4 @@
-"""The poses of a grid as the first look of a search (`first_look.py`) sees them: log distances in bins, and openings."""
+"""The poses of a grid as the first look of a search (`first_look.py`) sees them: distances in bins, and openings."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Sketch:
         width = layouts.log_profile.shape[1]
         count = min(_AZIMUTHS, width)
         columns = np.arange(count) * width // count
-        log_m = np.clip(layouts.log_profile[:, columns], math.log(_NEAREST_M), math.log(_FARTHEST_M))
+        log_m = np.clip(layouts.log_profile[:, columns].astype(np.float32), math.log(_NEAREST_M), math.log(_FARTHEST_M))
         number = np.floor(log_m / _BIN).astype(np.int32)
         low, bins = int(number.min()), int(np.ptp(number)) + 1
         at = number - low + np.arange(count, dtype=np.int32) * bins

@@ -10,14 +10,17 @@ import numpy as np
 from lalaloc_core.errors import InvalidPoseError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.layouts import joined_layouts
 from lalaloc_core.localise.poses import LatentGrid
 from lalaloc_core.sampling import PoseSet, grid_size, pose_grid
 from service.errors import PlanTooLargeError
 from service.settings import Settings
 
-# Rays times walls that are cast at once: bounds the memory of a plan with rooms of many corners.
-_CAST_AT_ONCE = 2_000_000
-_MAX_CHUNK, _MIN_CHUNK = 256, 8
+# Poses between two of which queries go first; networks embed fewer at a time than are rendered.
+_RENDERED, _EMBEDDED = 512, 128
+# What queries make of a pose at first use: for every azimuth its log distance, in half precision where there are no
+# latents, and a code; what is seen through openings; and what the first look sees.
+_BYTES_PER_COLUMN, _BYTES_PER_POSE = 3, 400
 
 
 def embed(
@@ -28,7 +31,7 @@ def embed(
     camera_height_m: float,
     after_chunk: Callable[[float, float], None],
 ) -> LatentGrid:
-    """Sample, render and embed the grid of a plan.
+    """Sample and render the grid of a plan, and embed it where the model compares poses by their latents.
 
     Args:
         after_chunk: called with the share that is done (0 to 1) and the seconds that the last chunk took, and with 0
@@ -38,19 +41,27 @@ def embed(
         InvalidPoseError: the networks have no latents for this plan at this camera height.
     """
     poses = pose_grid(plan, step_m, after_room=lambda: after_chunk(0.0, 0.0))
-    rays = encoders.manifest.profile_columns * plan.walls_m.shape[1]
-    chunk = min(max(_CAST_AT_ONCE // rays, _MIN_CHUNK), _MAX_CHUNK)
-    latents, profiles_m = [], []
+    chunk = _RENDERED if encoders.predicts_profile else _EMBEDDED
+    layouts, latents = [], []
     for first in range(0, len(poses), chunk):
         begin = perf_counter()
         part = PoseSet(poses.position_m[first : first + chunk], poses.room_index[first : first + chunk])
-        latent, profile_m = encoders.poses(plan, part, np.zeros(len(part)), camera_height_m)
-        if not (np.isfinite(latent).all() and np.isfinite(profile_m).all()):
+        seen = encoders.rendered(plan, part)
+        layouts.append(seen)
+        is_finite = bool(np.isfinite(seen.log_profile).all())
+        if not encoders.predicts_profile:
+            heights = np.full(len(part), camera_height_m)
+            latent = encoders.layouts(np.exp(seen.log_profile), heights, plan.ceiling_heights_m[part.room_index])
+            latents.append(latent.astype(np.float32, copy=False))
+            is_finite &= bool(np.isfinite(latent).all())
+        if not is_finite:
             raise InvalidPoseError(f"the model has no latents at camera_height_m {camera_height_m:g}")
-        latents.append(latent.astype(np.float32, copy=False))
-        profiles_m.append(profile_m.astype(np.float32, copy=False))
         after_chunk(min(first + chunk, len(poses)) / len(poses), perf_counter() - begin)
-    return LatentGrid(poses, np.concatenate(latents), np.concatenate(profiles_m), step_m, camera_height_m)
+    whole = joined_layouts(layouts, poses.room_index)
+    if not latents:
+        return LatentGrid.without_latents(poses, whole, step_m, camera_height_m)
+    profile_m = np.exp(whole.log_profile)
+    return LatentGrid.with_layouts(poses, np.concatenate(latents), profile_m, step_m, camera_height_m, whole)
 
 
 def check_size(plan: FloorPlan, settings: Settings) -> None:
@@ -65,6 +76,7 @@ def check_size(plan: FloorPlan, settings: Settings) -> None:
 
 
 def grid_bytes(grid: LatentGrid) -> int:
-    """The memory that a grid takes."""
+    """The memory that a grid takes, with what queries make of it."""
     arrays = (grid.latents, grid.profile_m, grid.poses.position_m, grid.poses.room_index)
-    return sum(array.nbytes for array in arrays)
+    stored = sum(array.nbytes for array in arrays if array is not None)
+    return stored + len(grid.poses) * (_BYTES_PER_COLUMN * grid.profile_m.shape[1] + _BYTES_PER_POSE)

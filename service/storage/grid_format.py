@@ -1,7 +1,8 @@
 """A latent grid as one blob: a header, then its arrays as they lie in memory, so that reading copies nothing.
 
 4 bytes "LLG1", then the numbers of poses, latent values and profile columns as little-endian uint32;
-positions (float64, n·2), latents (float32, n·d), profiles (float32, n·w), room indices (int32, n).
+positions (float64, n·2), latents (float32, n·d), profiles (float32, n·w), room indices (int32, n). "LLG2" is the same
+without latents, d = 0, and with profiles in half precision (float16).
 
 The prototypes of a plan likewise: "LLP1", their number and that of azimuths, log profiles (float16, n·a), log areas
 (float32, n).
@@ -20,10 +21,10 @@ from lalaloc_core.localise.prototypes import Prototypes, prototypes_of
 from lalaloc_core.sampling import PoseSet
 
 _HEADER = struct.Struct("<4s3I")
-_MAGIC = b"LLG1"
+_MAGIC, _MAGIC_WITHOUT_LATENTS = b"LLG1", b"LLG2"
 _PROTOTYPES_HEADER = struct.Struct("<4s2I")
 _PROTOTYPES_MAGIC = b"LLP1"
-_POSE_BYTES, _VALUE_BYTES, _ROOM_BYTES = 16, 4, 4
+_POSE_BYTES, _LATENT_BYTES, _ROOM_BYTES = 16, 4, 4
 
 
 @dataclass(frozen=True)
@@ -38,12 +39,14 @@ class PackedGrid:
 
 def pack(grid: LatentGrid) -> PackedGrid:
     """The blob of a grid."""
-    count, latent_size = grid.latents.shape
-    header = _HEADER.pack(_MAGIC, count, latent_size, grid.profile_m.shape[1])
+    count, columns = grid.profile_m.shape
+    latents = np.empty((count, 0)) if grid.latents is None else grid.latents
+    magic, profiles = (_MAGIC_WITHOUT_LATENTS, "<f2") if grid.latents is None else (_MAGIC, "<f4")
+    header = _HEADER.pack(magic, count, latents.shape[1], columns)
     arrays = (
         grid.poses.position_m.astype("<f8", copy=False),
-        grid.latents.astype("<f4", copy=False),
-        grid.profile_m.astype("<f4", copy=False),
+        latents.astype("<f4", copy=False),
+        grid.profile_m.astype(profiles, copy=False),
         grid.poses.room_index.astype("<i4", copy=False),
     )
     content = b"".join((header, *(np.ascontiguousarray(array).data.cast("B") for array in arrays)))
@@ -82,18 +85,22 @@ def unpack(content: bytes | bytearray, *, step_m: float, camera_height_m: float)
     if len(content) < _HEADER.size:
         return None
     magic, count, latent_size, columns = _HEADER.unpack_from(content)
-    pose_bytes = _POSE_BYTES + _VALUE_BYTES * (latent_size + columns) + _ROOM_BYTES
-    if magic != _MAGIC or count == 0 or len(content) != _HEADER.size + count * pose_bytes:
+    if magic not in (_MAGIC, _MAGIC_WITHOUT_LATENTS) or count == 0 or (magic == _MAGIC) != (latent_size > 0):
+        return None
+    profiles = np.dtype("<f4" if magic == _MAGIC else "<f2")
+    pose_bytes = _POSE_BYTES + _LATENT_BYTES * latent_size + profiles.itemsize * columns + _ROOM_BYTES
+    if len(content) != _HEADER.size + count * pose_bytes:
         return None
     view, offset = memoryview(content).toreadonly(), _HEADER.size
 
-    def take(dtype: str, width: int) -> np.ndarray:
+    def take(dtype: str | np.dtype, width: int) -> np.ndarray:
         nonlocal offset
         array = np.frombuffer(view, dtype, count * width, offset)
         offset += array.nbytes
         return array.reshape(count, width)
 
-    position_m, latents, profile_m = take("<f8", 2), take("<f4", latent_size), take("<f4", columns)
+    position_m, latents, profile_m = take("<f8", 2), take("<f4", latent_size), take(profiles, columns)
     if not all(np.isfinite(array).all() for array in (position_m, latents, profile_m)):
         return None
-    return LatentGrid(PoseSet(position_m, take("<i4", 1)[:, 0]), latents, profile_m, step_m, camera_height_m)
+    poses = PoseSet(position_m, take("<i4", 1)[:, 0])
+    return LatentGrid(poses, latents if latent_size else None, profile_m, step_m, camera_height_m)

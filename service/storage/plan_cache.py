@@ -49,5 +49,5 @@ class PlanCache:
 
 
 def plan_bytes(plan: FloorPlan) -> int:
-    """About how much memory a plan takes: its geometry as padded arrays, and its corners three times over."""
-    return plan.geometry.nbytes + 3 * sum(room.polygon_m.nbytes for room in plan.rooms) + 2000 * len(plan.rooms)
+    """About how much memory a plan takes: its walls as arrays, and its corners three times over."""
+    return plan.wall_table.nbytes + 3 * sum(room.polygon_m.nbytes for room in plan.rooms) + 2000 * len(plan.rooms)

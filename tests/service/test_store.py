@@ -37,6 +37,7 @@ from service.errors import (
     UnknownFloorPlanError,
 )
 from service.storage.chunks import CHUNK_BYTES
+from service.storage.grid_format import pack
 from service.storage.idempotency_keys import KEPT_FOR, IdempotencyKeys
 from service.storage.plan_document import PlanDocument
 from service.storage.records import (
@@ -430,8 +431,22 @@ def test_a_grid_comes_back_exactly_without_being_copied(store: Store) -> None:
     found = store.grids.get(key)
     _assert_same(found, grid)
     assert found is not None
+    assert found.latents is not None
     assert not found.latents.flags.owndata
     assert not found.latents.flags.writeable
+
+
+def test_a_grid_without_latents_comes_back_in_half_precision(store: Store) -> None:
+    whole, key = _grid(count=50), _key(_add(store))
+    grid = dataclasses.replace(whole, latents=None, profile_m=whole.profile_m.astype(np.float16))
+    assert _put(store, key, grid)
+    found = store.grids.get(key)
+    assert found is not None
+    assert found.latents is None
+    assert found.profile_m.dtype == np.float16
+    np.testing.assert_array_equal(found.profile_m, grid.profile_m)
+    np.testing.assert_array_equal(found.poses.room_index, grid.poses.room_index)
+    assert len(pack(grid).content) < 0.3 * len(pack(whole).content)
 
 
 @pytest.mark.parametrize("changed", [{"model_sha256": "m2"}, {"step_m": 0.25}, {"camera_height_mm": 1520}])

@@ -15,6 +15,7 @@ from lalaloc_core.bundle import EvidenceModel
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.errors import InvalidMotionError
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.floorplan.geometry import pad_walls
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.cohort import log_cost_to_chance
 from lalaloc_core.localise.confidence import Signals, signals_of
@@ -23,7 +24,7 @@ from lalaloc_core.localise.evidence import Evidence, latent_distances
 from lalaloc_core.localise.pipeline import Localisation, LocaliseConfig, SearchStage, StageClock
 from lalaloc_core.localise.poses import Candidate, LatentGrid, Query, RefinementResult
 from lalaloc_core.localise.posterior import TURNED_APART, area_shares
-from lalaloc_core.localise.refinement import refined, refinement_job
+from lalaloc_core.localise.refinement import refined, refinement_job, with_latents
 from lalaloc_core.localise.retrieval import contradicted, suppress
 from lalaloc_core.localise.sequence.chain import best_paths, forward_backward
 from lalaloc_core.localise.sequence.joint import SequenceJob, SequenceResult, motion_costs
@@ -147,6 +148,11 @@ def localise_sequence_steps(
                 stage = "lpo"
     candidates = [_distinct([path.ends[t] for path in paths], config.separation_m, top_k) for t in range(len(pictures))]
     found = path_posterior(grid.poses, pictures, links, log_heights, whole, paths, candidates, config.separation_m)
+    if stage == "retrieval" and config.evidence.compares_profiles(pictures[0].query):
+        candidates = [
+            with_latents(plan, encoders, picture.query, answers, grid.camera_height_m)
+            for picture, answers in zip(pictures, candidates, strict=True)
+        ]
     told = []
     for picture, answers, posterior in zip(pictures, candidates, found.pictures, strict=True):
         to_chance = _cost_to_chance(plan, grid, encoders, picture, config)
@@ -202,7 +208,7 @@ def _picture(
         distance = latent_distances(grid.known_latents, query.latents)
         index = np.sort(np.argsort(distance.min(axis=0), kind="stable")[:_MAX_PLACES])
         cost = distance[:, index].T[None].astype(np.float64)
-    prior = area_shares(grid.poses, np.array([room.area_m2 for room in plan.rooms]))
+    prior = area_shares(grid.poses, plan.areas_m2)
     prior = prior - np.logaddexp.reduce(prior) - math.log(len(query.roll))
     states = States(grid.poses.position_m[index], query.roll + query.frame_heading, query.sector)
     return Picture(query, index, states, cost, -weights.temperature * cost + prior[index][None, :, None], doubted)
@@ -301,6 +307,8 @@ def _job(
         ]
         for path in paths
     ]
+    longest = max(part.walls_m.shape[1] for part in parts)
+    walls_m = [np.stack([pad_walls(room_m, longest) for room_m in part.walls_m]) for part in parts]
     log_profile = np.stack([part.log_profile for part in parts if part.log_profile is not None], axis=1)
     height = pictures[0].query.camera_height
     return SequenceJob(
@@ -308,7 +316,7 @@ def _job(
         heading=np.stack([part.heading for part in parts], axis=1),
         roll=np.stack(rolls, axis=1),
         turnable=np.array([part.optimise_heading for part in parts]),
-        walls_m=np.stack([part.walls_m for part in parts], axis=1),
+        walls_m=np.stack(walls_m, axis=1),
         log_profile=log_profile.astype(np.float64),
         precision=np.stack([part.precision for part in parts if part.precision is not None], axis=1),
         motions=tuple(motions),

@@ -1,0 +1,141 @@
+"""How preparing and searching plans grows with their area: `python -m benchmarks.large_plans`.
+
+Buildings are generated homes side by side, with corridors between them and halls full of columns (`synth.buildings`),
+and photographs those of their homes. Times are of one thread's processor, so that a busy machine may be measured on;
+memory is that of the latent grid with all that queries make of it. With `--oracle` every query is also compared with
+all poses, headings and heights at all azimuths, which takes minutes for the larger buildings.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from jaxtyping import UInt8
+
+from lalaloc_core.bundle import Bundle, default_bundle
+from lalaloc_core.data.synthetic.generated import Studio
+from lalaloc_core.floorplan import FloorPlan, PlanLimits
+from lalaloc_core.localise.camera_height import CameraHeight
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.evidence import Evidence, EvidenceConfig
+from lalaloc_core.localise.pipeline import localise
+from lalaloc_core.localise.poses import LatentGrid, Query
+from lalaloc_core.localise.retrieval import grid_costs
+from lalaloc_core.methods.lalaloc import local_refiner
+from lalaloc_core.synth.buildings import Building, building_of
+from lalaloc_core.synth.materials import MaterialLibrary
+from lalaloc_core.synth.shots import Shot, sample_shots
+from lalaloc_core.synth.splits import VALIDATION
+from service.grids.embedding import embed, grid_bytes
+
+_AREAS_M2 = (100.0, 1000.0, 5000.0, 10_000.0, 50_000.0, 100_000.0, 200_000.0)
+_STEP_M = 0.5
+_T = TypeVar("_T")
+
+
+@dataclass(frozen=True)
+class _Row:
+    """What was measured of one building; seconds and milliseconds of processor time."""
+
+    plan: FloorPlan
+    poses: int
+    read_s: float
+    ready_s: float
+    megabytes: float
+    known_ms: float
+    unknown_ms: float
+    retrieve_ms: float
+    same: list[bool] = field(default_factory=list)
+
+    def __str__(self) -> str:
+        agree = f"{sum(self.same)} of {len(self.same)}" if self.same else "-"
+        return (
+            f"| {self.plan.area_m2:,.0f} | {len(self.plan.rooms):,} | {self.poses:,} | {self.read_s:.2f} s "
+            f"| {self.ready_s:.2f} s | {self.megabytes:.1f} MB, {1e3 * self.megabytes / self.poses:.2f} kB "
+            f"| {self.known_ms:.0f} ms | {self.unknown_ms:.0f} ms | {self.retrieve_ms:.0f} ms | {agree} |"
+        )
+
+
+def main() -> None:
+    """Parse arguments, measure, print a table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--areas", type=float, nargs="+", default=list(_AREAS_M2), help="m²")
+    parser.add_argument("--queries", type=int, default=8, help="photographs of each building")
+    parser.add_argument("--bundle", type=Path, default=default_bundle())
+    parser.add_argument("--textures", type=Path, help="folder of material pictures")
+    parser.add_argument("--oracle", type=float, default=0.0, help="compare with everything up to this area (m²)")
+    arguments = parser.parse_args()
+    bundle = Bundle.open(arguments.bundle)
+    studio = Studio(MaterialLibrary.create(np.random.default_rng(1), arguments.textures))
+    print(
+        "| area m² | rooms | poses | read | ready | grid, a pose | known | unknown | retrieval | as brute force |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|---|")
+    for area_m2 in arguments.areas:
+        building = building_of(VALIDATION, 0, area_m2, hall_share=0.2 if area_m2 > 1000.0 else 0.0)
+        print(_measure(building, bundle, studio, arguments.queries, oracle=area_m2 <= arguments.oracle), flush=True)
+
+
+def _measure(building: Building, bundle: Bundle, studio: Studio, count: int, *, oracle: bool) -> _Row:
+    encoders = Encoders(bundle, threads=1)
+    document, limits = building.plan.to_dict(), PlanLimits()
+    read_s, plan = _timed(lambda: FloorPlan.from_dict(document, limits))
+    grids: list[LatentGrid] = []
+
+    def prepare() -> None:
+        grid = embed(
+            plan, encoders, step_m=_STEP_M, camera_height_m=plan.camera_height_m, after_chunk=lambda _share, _s: None
+        )
+        grid.sketch(plan)
+        grids.append(grid)
+
+    ready_s, _ = _timed(prepare)
+    grid, rng = grids[0], np.random.default_rng(5)
+    homes = rng.integers(len(building.homes), size=count)
+    shots = [sample_shots(building.homes[home], 1, rng)[0] for home in homes]
+    refiner, config, weights = local_refiner(bundle), EvidenceConfig(), encoders.manifest.evidence
+    height, width = encoders.manifest.image_height, encoders.manifest.image_width
+    images = [studio.renderer(height, width).render([shot]).cpu().numpy()[0] for shot in shots]
+    spent: dict[bool, list[float]] = {True: [], False: []}
+    retrieved, same = [], []
+
+    def answer(image: UInt8[np.ndarray, "h w 3"], shot: Shot, *, known: bool) -> None:
+        query = _encoded(encoders, image, shot, known=known)
+        localise(plan, grid, encoders, query, refiner=refiner)
+
+    for number, (image, shot) in enumerate(zip(images, shots, strict=True)):
+        for known in (True, False):
+            if not number:
+                answer(image, shot, known=known)
+            spent[known].append(_timed(lambda image=image, shot=shot, known=known: answer(image, shot, known=known))[0])
+        query = _encoded(encoders, image, shot, known=False)
+        seconds, found = _timed(lambda query=query: grid_costs(plan, grid, query, weights, config))
+        retrieved.append(seconds)
+        if oracle:
+            every, _ = Evidence(plan, query, config.grid_reach * _STEP_M, weights, config).costs(grid.layouts(plan))
+            best = int(found.cost[: found.compared].argmin())
+            hypothesis, pose = np.unravel_index(int(every.argmin()), every.shape)
+            same.append((int(found.hypothesis[best]), int(found.pose[best])) == (int(hypothesis), int(pose)))
+    medians = [1e3 * statistics.median(times) for times in (spent[True], spent[False], retrieved)]
+    return _Row(plan, len(grid.poses), read_s, ready_s, grid_bytes(grid) / 1e6, *medians, same)
+
+
+def _encoded(encoders: Encoders, image: UInt8[np.ndarray, "h w 3"], shot: Shot, *, known: bool) -> Query:
+    return encoders.query(image, shot.heading if known else None, CameraHeight(shot.camera_height_m))
+
+
+def _timed(work: Callable[[], _T]) -> tuple[float, _T]:
+    begin = time.process_time()
+    done = work()
+    return time.process_time() - begin, done
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,83 @@
+"""What many poses see, wall by wall, against the renderer that casts every ray at every wall."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.render.layout import layout_view
+from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.render.sweep import SweptViews, swept_profiles, swept_views
+from lalaloc_core.sampling import PoseSet, pose_grid, random_poses
+from lalaloc_core.synth.buildings import building_of
+from lalaloc_core.synth.splits import VALIDATION
+from tests.strategies import plan_document, plan_of, rectangle, rows_of_rooms, seeds, spiral
+
+COLUMNS, EYE_M = 64, 1.5
+
+
+def behind_of(view: SweptViews) -> np.ndarray:
+    """As the other renderer tells it: the wall's distance where one does not see through."""
+    behind_m = view.distance_m.copy()
+    behind_m[view.row, view.column] = view.behind_m
+    return behind_m
+
+
+def assert_the_same(plan: FloorPlan, poses: PoseSet, heading: np.ndarray, misses: float = 0.0) -> None:
+    """Both renderers agree on all rays but the share that graze a corner, for which the last bit decides."""
+    swept = swept_views(poses.position_m, heading, poses.room_index, plan.wall_table, COLUMNS, EYE_M)
+    cast = layout_view(poses.position_m, heading, poses.room_index, plan.geometry, COLUMNS, EYE_M)
+    differs = ~np.isclose(swept.distance_m, cast.distance_m, rtol=1e-4) | (swept.kind != cast.kind)
+    differs |= ~np.isclose(behind_of(swept), cast.behind_m, rtol=1e-3)
+    assert differs.mean() <= misses
+    assert (np.diff(swept.row) >= 0).all()
+
+
+@settings(max_examples=25, deadline=None)
+@given(rows_of_rooms(), seeds())
+def test_rows_of_rooms_with_openings(plan: FloorPlan, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    poses = random_poses(plan, 6, rng, 0.1)
+    assert_the_same(plan, poses, rng.uniform(-math.pi, math.pi, 6), misses=2 / (6 * COLUMNS))
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_building_of_homes_halls_and_corridors(turned: bool) -> None:
+    plan = building_of(VALIDATION, 0, 2300.0, hall_share=0.8).plan
+    assert max(len(room.walls_m) for room in plan.rooms) > 100
+    every = pose_grid(plan, 1.0)
+    rng = np.random.default_rng(0)
+    some = np.sort(rng.permutation(len(every))[:300])
+    heading = rng.uniform(-4.0, 4.0, len(some)) if turned else np.full(len(some), 0.3)
+    poses = PoseSet(every.position_m[some], every.room_index[some])
+    assert_the_same(plan, poses, heading, misses=1e-3)
+
+
+def test_free_standing_walls_are_seen_from_both_sides() -> None:
+    document = plan_document(rectangle(8.0, 6.0))
+    document["rooms"][0]["walls"] = [[[3.0, 1.0], [3.0, 5.0]], [[5.0, 2.0], [6.0, 4.0]]]
+    document["openings"] = [{"kind": "passage", "line": [[3.0, 2.0], [3.0, 3.0]]}]
+    plan = FloorPlan.from_dict(document)
+    poses = pose_grid(plan, 0.7)
+    assert_the_same(plan, poses, np.zeros(len(poses)), misses=1e-3)
+    assert len(swept_views(poses.position_m, np.zeros(len(poses)), poses.room_index, plan.wall_table, 64, 1.5).row)
+
+
+@pytest.mark.parametrize("at", [(0.0, 0.0), (4e5, -5e6)])
+def test_profiles_alone_also_far_from_the_origin_and_in_a_wound_up_room(at: tuple[float, float]) -> None:
+    plan = plan_of((np.array(spiral(80)) + at).tolist())
+    poses = pose_grid(plan, 0.5)
+    heading = np.linspace(-1.0, 1.0, len(poses))
+    swept = swept_profiles(poses.position_m, heading, poses.room_index, plan.wall_table, COLUMNS)
+    cast = wall_profile(poses.position_m, heading, plan.walls_m[poses.room_index], COLUMNS)
+    assert (~np.isclose(swept, cast, rtol=1e-6)).mean() < 1e-3
+
+
+def test_nothing_is_seen_outside_a_room() -> None:
+    plan = plan_of(rectangle(2.0, 2.0))
+    outside = swept_profiles(np.array([[9.0, 1.0]]), np.zeros(1), np.zeros(1, int), plan.wall_table, 8)
+    assert np.isinf(outside).all()
