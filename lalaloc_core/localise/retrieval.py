@@ -23,6 +23,8 @@ from lalaloc_core.sampling import PoseSet, pose_grid
 
 # Pairs of a pose and a hypothesis that are compared in full: so many, and up to so many of those that may be probable.
 _LEAST_COMPARED, _MOST_COMPARED = 1024, 4096
+# Where there are no more than that, all of them, as in a single room.
+_ALL_COMPARED = 2560
 # Of so many the cost is estimated by the first look, as they share what is probable.
 _ESTIMATED = 65_536
 # What refinement gains and the first look errs at most: pairs that cost so much more than what is negligible weigh
@@ -122,7 +124,7 @@ def _chosen(
         doubted: the same if they were no fences, where they are: what would be the best then is compared as well.
     """
     pairs, nothing = len(grid.poses) * evidence.hypotheses, np.empty(0, np.float32)
-    if pairs <= _LEAST_COMPARED:
+    if pairs <= _ALL_COMPARED:
         return _Chosen(np.arange(pairs), pairs, nothing, nothing)
     best, beyond = Fewest(_ESTIMATED), Fewest(_LEAST_COMPARED)
     for first, cost in first_costs(grid.sketch(plan), evidence, grid.poses.room_index):

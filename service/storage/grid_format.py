@@ -45,7 +45,7 @@ def pack(grid: LatentGrid) -> PackedGrid:
     header = _HEADER.pack(magic, count, latents.shape[1], columns)
     arrays = (
         grid.poses.position_m.astype("<f8", copy=False),
-        latents.astype("<f4", copy=False),
+        *([] if grid.latents is None else [latents.astype("<f4", copy=False)]),
         grid.profile_m.astype(profiles, copy=False),
         grid.poses.room_index.astype("<i4", copy=False),
     )

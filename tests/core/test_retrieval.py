@@ -181,6 +181,7 @@ class TestRetrieval:
             any_heading(unit(rng, 2, 8)), profile=PredictedProfile(seen, np.full((2, 16), -3.0))
         )
         everything = best_places(grid, query, top_k=3)
+        monkeypatch.setattr("lalaloc_core.localise.retrieval._ALL_COMPARED", 0)
         monkeypatch.setattr("lalaloc_core.localise.retrieval._LEAST_COMPARED", 50)
         monkeypatch.setattr("lalaloc_core.localise.retrieval._MOST_COMPARED", 50)
         costs = grid_costs(PLAN, grid, query, EvidenceModel(), EvidenceConfig())
