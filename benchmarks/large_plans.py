@@ -74,9 +74,7 @@ def main() -> None:
     arguments = parser.parse_args()
     bundle = Bundle.open(arguments.bundle)
     studio = Studio(MaterialLibrary.create(np.random.default_rng(1), arguments.textures))
-    print(
-        "| area m² | rooms | poses | read | ready | grid, a pose | known | unknown | retrieval | as brute force |"
-    )
+    print("| area m² | rooms | poses | read | ready | grid, a pose | known | unknown | retrieval | as brute force |")
     print("|---|---|---|---|---|---|---|---|---|---|")
     for area_m2 in arguments.areas:
         building = building_of(VALIDATION, 0, area_m2, hall_share=0.2 if area_m2 > 1000.0 else 0.0)

@@ -17,7 +17,7 @@ from service.errors import PlanTooLargeError
 from service.settings import Settings
 
 # Poses between two of which queries go first; networks embed fewer at a time than are rendered.
-_RENDERED, _EMBEDDED = 512, 128
+_RENDERED, _EMBEDDED = 256, 128
 # What queries make of a pose at first use: for every azimuth its log distance, in half precision where there are no
 # latents, and a code; what is seen through openings; and what the first look sees.
 _BYTES_PER_COLUMN, _BYTES_PER_POSE = 3, 400

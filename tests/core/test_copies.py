@@ -88,7 +88,7 @@ class TestHeadings:
         assert turns == list(range(ways)), [math.degrees(heading) for heading in headings]
         assert found.posterior.candidate[:ways] == pytest.approx([1.0 / ways] * ways, abs=0.05)
         assert found.posterior.heading <= 1.0 / ways + 0.05
-        # Standing in the middle, all of them are at one place. Else the last bit decides which of the equals is the first,
+        # Standing in the middle, all of them are at one place. Else the last bit decides which of the equals is first,
         # and where the grid's lattice happens to lie how much of the others is within a metre of it.
         assert found.posterior.position == pytest.approx(1.0 if middle else 1.0 / ways, abs=0.1)
 
