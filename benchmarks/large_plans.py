@@ -121,8 +121,11 @@ def _measure(building: Building, bundle: Bundle, studio: Studio, count: int, *, 
             best = int(found.cost[: found.compared].argmin())
             hypothesis, pose = np.unravel_index(int(every.argmin()), every.shape)
             same.append((int(found.hypothesis[best]), int(found.pose[best])) == (int(hypothesis), int(pose)))
-    medians = [1e3 * statistics.median(times) for times in (spent[True], spent[False], retrieved)]
-    return _Row(plan, len(grid.poses), read_s, ready_s, grid_bytes(grid) / 1e6, *medians, same)
+    known_ms, unknown_ms, retrieve_ms = (
+        1e3 * statistics.median(times) for times in (spent[True], spent[False], retrieved)
+    )
+    megabytes = grid_bytes(grid) / 1e6
+    return _Row(plan, len(grid.poses), read_s, ready_s, megabytes, known_ms, unknown_ms, retrieve_ms, same)
 
 
 def _encoded(encoders: Encoders, image: UInt8[np.ndarray, "h w 3"], shot: Shot, *, known: bool) -> Query:

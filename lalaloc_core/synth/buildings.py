@@ -120,7 +120,7 @@ class _Builder:
         for column_x in np.arange(_COLUMNS_EVERY_M, width - 1.0, _COLUMNS_EVERY_M):
             for column_y in np.arange(_COLUMNS_EVERY_M, depth - 1.0, _COLUMNS_EVERY_M):
                 at = np.array([x_m + column_x, y_m + column_y]) + rng.uniform(-0.6, 0.6, 2)
-                columns.append(_rectangle(*at.tolist(), _COLUMN_M, _COLUMN_M)[::-1])
+                columns.append(_rectangle(float(at[0]), float(at[1]), _COLUMN_M, _COLUMN_M)[::-1])
         self._rooms.append(_room(f"hall-{len(self._rooms)}", _rectangle(x_m, y_m, width, depth), columns))
         self._floor_m2 += width * depth
         self._halls_m2 += width * depth
