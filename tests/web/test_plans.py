@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from PIL import Image, ImageDraw
-from playwright.sync_api import Browser, expect
+from playwright.sync_api import Browser, Page, expect
 
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.plans.exporting import export_plan
@@ -33,22 +33,64 @@ def test_an_uploaded_plan_is_drawn_at_once_with_its_warnings(desktop: Visit, tmp
     expect(page.locator("#plan-warnings")).to_contain_text("overlap")
 
 
-def test_files_of_other_tools_are_read_and_a_picture_s_scale_is_asked_for(desktop: Visit, tmp_path: Path) -> None:
-    page = desktop.open()
-    (tmp_path / "flat.dxf").write_bytes(export_plan(FloorPlan.from_dict(FLAT), "dxf"))
-    page.locator("#plan-file").set_input_files(tmp_path / "flat.dxf")
-    expect(page.locator("#plan-facts")).to_contain_text("2 rooms, 36.0 m²")
+def _scan() -> Image.Image:
+    """Two rooms with a door that is drawn without its swing between them, 7 by 5 m at a centimetre a pixel."""
     scan = Image.new("RGB", (900, 700), "white")
     pen = ImageDraw.Draw(scan)
     pen.rectangle((100, 100, 800, 600), outline="black", width=14)
     pen.line((400, 100, 400, 600), fill="black", width=14)
-    scan.save(tmp_path / "scan.png")
+    pen.rectangle((394, 300, 407, 390), fill="white", outline="black", width=2)
+    return scan
+
+
+def _drag_end(page: Page, index: int, x: float, y: float) -> None:
+    """Move an end of the line that measures a picture, to pixels of it."""
+    end = page.locator(".measured circle").nth(index).bounding_box()
+    assert end is not None
+    script = """([x, y]) => { const at = new DOMPoint(x, y).matrixTransform(
+        document.querySelector('svg.picture').getScreenCTM()); return [at.x, at.y]; }"""
+    to_x, to_y = page.evaluate(script, [x, y])
+    page.mouse.move(end["x"] + end["width"] / 2, end["y"] + end["height"] / 2)
+    page.mouse.down()
+    page.mouse.move(to_x, to_y, steps=3)
+    page.mouse.up()
+
+
+def test_a_picture_s_scale_is_set_on_it_and_what_was_read_is_corrected_over_it(desktop: Visit, tmp_path: Path) -> None:
+    page = desktop.open()
+    _scan().save(tmp_path / "scan.png")
     page.locator("#plan-file").set_input_files(tmp_path / "scan.png")
-    expect(page.locator("#plan-error")).to_contain_text("metres_per_pixel")
-    page.get_by_label("Metres per pixel").fill("0.01")
-    page.get_by_role("button", name="Read it again").click()
+    page.get_by_role("button", name="Read the picture").click()
+    expect(page.locator("#plan-error")).to_contain_text("how many metres apart")
+    # Across both rooms, from the middle of a wall to the middle of the other: 6.87 m.
+    _drag_end(page, 0, 107, 350)
+    _drag_end(page, 1, 793, 350)
+    _assert_accessible(page)
+    page.get_by_label("metres apart").fill("6.86")
+    page.get_by_role("button", name="Read the picture").click()
     expect(page.locator("#plan-warnings")).to_contain_text("draft")
-    expect(page.locator("#plan .room")).to_have_count(2)
+    expect(page.locator("#plan-facts")).to_contain_text("2 rooms, 31.")
+    page.get_by_role("button", name="Edit", exact=True).click()
+    # The picture lies under what was read of it: as wide as it is.
+    picture = page.locator("#plan image")
+    expect(picture).to_have_count(1)
+    assert float(picture.get_attribute("width") or 0) == pytest.approx(9.0, rel=0.01)
+    doors = page.locator("#plan-form-all-door")
+    expect(doors).not_to_be_checked()
+    doors.check()
+    page.get_by_role("button", name="Save as a new revision").click()
+    expect(page.locator("#plan-facts")).to_contain_text("revision 2")
+    (listed,) = desktop.client.get("/floorplans", params={"name": "scan"}).json()["floorplans"]
+    plan = desktop.client.get(f"/floorplans/{listed['id']}").json()["plan"]
+    assert plan["opening_kinds"] == ["door"]
+    assert [opening["kind"] for opening in plan["openings"]] == ["door"]
+
+
+def test_files_of_other_tools_are_read(desktop: Visit, tmp_path: Path) -> None:
+    page = desktop.open()
+    (tmp_path / "flat.dxf").write_bytes(export_plan(FloorPlan.from_dict(FLAT), "dxf"))
+    page.locator("#plan-file").set_input_files(tmp_path / "flat.dxf")
+    expect(page.locator("#plan-facts")).to_contain_text("2 rooms, 36.0 m²")
     (tmp_path / "letter.txt").write_text("Dear landlord")
     page.locator("#plan-file").set_input_files(tmp_path / "letter.txt")
     expect(page.locator("#plan-error")).to_be_visible()

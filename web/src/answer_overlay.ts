@@ -45,10 +45,11 @@ export function ellipse(answer: Answer): SVGElement | null {
   return s("ellipse", { class: "covariance", rx: radii[0]!, ry: radii[1]!, transform: `translate(${x_m} ${-y_m}) rotate(${turn})` });
 }
 
-/** Places that were considered besides the answer, by their rank; `look` is called with the one that was chosen. */
-export function rivals(answer: Answer, box: Box, look: (index: number) => void): SVGGElement {
+/** Places of a plan that were considered besides the answer, by their rank; `look` is called with the one that was chosen. */
+export function rivals(answer: Answer, planId: string, box: Box, look: (index: number) => void): SVGGElement {
   const unit = unitOf(box);
   return s("g", { class: "rivals" }, ...answer.candidates.slice(1).map((candidate, index) => {
+    if (candidate.floorplan_id !== planId) return s("g");
     const { x_m, y_m } = candidate.position;
     return s("g", { class: "rival", transform: `translate(${x_m} ${-y_m})`, onclick: () => look(index + 1) },
       s("circle", { r: 1.5 * unit }), s("text", { "font-size": 1.9 * unit, y: 0.68 * unit }, index + 2));

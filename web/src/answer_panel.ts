@@ -5,11 +5,16 @@ import { say } from "./notices";
 import type { Photo } from "./photos";
 import { curlSnippet, pythonSnippet } from "./snippets";
 import type { Answer, Candidate } from "./types";
+import { planLabel } from "./venues";
 import { accuracyWords, confidenceWords, HEADING_SOURCES, milliseconds, percent, STAGES } from "./words";
+
+const MOST_PLANS = 3;
 
 export interface AnswerActions {
   /** Move the marker to a candidate. */
   look: (index: number) => void;
+  /** Draw the answer to a photograph as a picture to keep. */
+  save: (photo: Photo) => Promise<void>;
 }
 
 /** Show an answer; null takes the previous one away. */
@@ -20,7 +25,7 @@ export function showAnswer(answer: Answer | null, photo: Photo | null, actions: 
     show(byId("answer-body"));
     return;
   }
-  show(byId("answer-body"), verdict(answer), ...warnings(answer), places(answer, actions), facts(answer), sharing(answer, photo));
+  show(byId("answer-body"), verdict(answer), ...warnings(answer), places(answer, actions), facts(answer), sharing(answer, photo, actions));
 }
 
 /** Mark the candidate that is looked at. */
@@ -37,10 +42,17 @@ function verdict(answer: Answer): HTMLElement {
   return h("div", { class: "verdict" },
     h("p", { class: "words" }, confidenceWords(answer.confidence)),
     h("p", { class: "room" }, answer.room),
+    answer.venue_id != null && h("p", { class: "plan-of" }, planOf(answer, answer)),
     h("p", { class: "where" }, `x ${x_m.toFixed(2)} m, y ${y_m.toFixed(2)} m`, accuracy && h("span", { title: "One standard deviation, along the longer axis" }, ` ${accuracy}`)),
     answer.confidence !== null && h("div", { class: "sure" },
       h("meter", { min: 0, max: 1, value: share, "aria-label": "Confidence" }),
       h("span", {}, `${percent(share)} sure that it is right within 1 m`)));
+}
+
+/** What a plan of a venue is called, and its level; of the less probable ones the level alone is known. */
+function planOf(answer: Answer, place: { floorplan_id: string; level: number | null }): string {
+  const plan = answer.plans?.find((one) => one.floorplan_id === place.floorplan_id);
+  return plan === undefined ? `level ${place.level}` : planLabel(plan);
 }
 
 function warnings(answer: Answer): HTMLElement[] {
@@ -52,7 +64,7 @@ function places(answer: Answer, { look }: AnswerActions): HTMLElement {
     const share = candidate.probability;
     return h("li", {}, h("button", { type: "button", "data-rank": index, "aria-pressed": String(index === 0), onclick: () => look(index) },
       h("span", { class: "rank" }, index + 1),
-      h("span", { class: "name" }, candidate.room),
+      h("span", { class: "name" }, candidate.room, answer.venue_id != null && h("small", {}, planOf(answer, candidate))),
       h("meter", { min: 0, max: 1, value: share ?? 0, "aria-hidden": "true" }),
       h("span", { class: "share" }, share === null ? "" : percent(share))));
   };
@@ -63,7 +75,12 @@ function facts(answer: Answer): HTMLElement {
   const spread = answer.heading_std_deg === null ? "" : ` ± ${answer.heading_std_deg.toFixed(1)}°`;
   const stages = Object.entries(answer.timings_ms).filter(([name, spent]) => name !== "total" && spent > 0)
     .map(([name, spent]) => `${name} ${milliseconds(spent)}`);
+  const likely = (answer.plans ?? []).filter(({ probability }) => probability !== null).slice(0, MOST_PLANS)
+    .map((plan) => `${planLabel(plan)}: ${percent(plan.probability!)}`);
+  const earth = answer.geopose?.position;
   const pairs: [string, string][] = [
+    ...(likely.length > 0 ? [["Plans", likely.join("; ")] as [string, string]] : []),
+    ...(earth ? [["On Earth", `${earth.lat.toFixed(6)}, ${earth.lon.toFixed(6)}`] as [string, string]] : []),
     ["Heading", `${answer.heading_deg.toFixed(1)}°${spread}, ${HEADING_SOURCES[answer.heading_source]}`],
     ["Camera height", `${answer.camera_height_m.toFixed(2)} m fits best`],
     ["Time", `${milliseconds(answer.timings_ms.total ?? 0)} (${stages.join(", ")})`],
@@ -72,13 +89,15 @@ function facts(answer: Answer): HTMLElement {
   return h("dl", { class: "facts" }, ...pairs.flatMap(([name, value]) => [h("dt", {}, name), h("dd", {}, value)]));
 }
 
-function sharing(answer: Answer, photo: Photo | null): HTMLElement {
+function sharing(answer: Answer, photo: Photo | null, { save }: AnswerActions): HTMLElement {
   const file = photo?.file.name.replace(/^example-/, "examples/") ?? "photo.jpg";
-  const fields = photo?.fields ?? { floorplan_id: answer.floorplan_id };
+  const fields = photo?.fields ?? (answer.venue_id != null ? { venue_id: answer.venue_id } : { floorplan_id: answer.floorplan_id });
   const link = answer.answer_id == null ? null : `${location.origin}${location.pathname}#answer=${answer.answer_id}`;
   return h("div", { class: "sharing" },
     button("Copy as curl", () => void copy(curlSnippet(fields, file), "curl command"), { id: "copy-curl" }),
     button("Copy as Python", () => void copy(pythonSnippet(fields, file), "Python code"), { id: "copy-python" }),
+    // The service draws answers about single plans, and does not keep photographs.
+    photo !== null && answer.venue_id == null && button("Save picture", () => void save(photo), { id: "save-picture", title: "The photograph with the layout, and the plan with the place, as PNG" }),
     link !== null && button("Copy link", () => void copy(link, "link"), { id: "copy-link", title: "Opens this answer again while the service keeps it" }),
     h("pre", { class: "copied", id: "copied", tabindex: 0, hidden: true, "aria-label": "What was copied" }));
 }

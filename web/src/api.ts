@@ -1,6 +1,6 @@
 /** The service's API: every request of the pages goes through here, with the key where there is one. */
 
-import type { Answer, Fault, Layout, Plan, PlanDocument, PlanSummary } from "./types";
+import type { Answer, Fault, Layout, Plan, PlanDocument, PlanSummary, Venue, VenuePlan } from "./types";
 
 const KEY = "lalaloc-key";
 
@@ -75,6 +75,13 @@ async function planOf(response: Response): Promise<Plan> {
 const path = (id: string): string => `/floorplans/${encodeURIComponent(id)}`;
 const at = (revision?: string): string => (revision ? `?revision=${encodeURIComponent(revision)}` : "");
 
+function form(fields: Record<string, string>, name: string, file: File): FormData {
+  const body = new FormData();
+  for (const [field, value] of Object.entries(fields)) body.set(field, value);
+  body.set(name, file);
+  return body;
+}
+
 export const api = {
   async plans(name = "", cursor: string | null = null): Promise<{ floorplans: PlanSummary[]; next_cursor: string | null }> {
     const query = new URLSearchParams({ limit: "50" });
@@ -93,10 +100,12 @@ export const api = {
 
   /** Upload a plan as a file; `fields` are options of the import. */
   async uploadPlan(file: File, fields: Record<string, string> = {}): Promise<Plan> {
-    const body = new FormData();
-    body.set("file", file);
-    for (const [name, value] of Object.entries(fields)) body.set(name, value);
-    return planOf(await request("/floorplans", { method: "POST", body }));
+    return planOf(await request("/floorplans", { method: "POST", body: form(fields, "file", file) }));
+  },
+
+  /** The file that a plan's revision was uploaded as. */
+  async original(id: string): Promise<Blob> {
+    return (await request(`${path(id)}/original`)).blob();
   },
 
   async createPlan(document: PlanDocument): Promise<Plan> {
@@ -115,10 +124,31 @@ export const api = {
   },
 
   async localise(fields: Record<string, string>, panorama: File, signal?: AbortSignal): Promise<Answer> {
-    const body = new FormData();
-    for (const [name, value] of Object.entries(fields)) body.set(name, value);
-    body.set("panorama", panorama);
-    return json("/localise", { method: "POST", body, signal });
+    return json("/localise", { method: "POST", body: form(fields, "panorama", panorama), signal });
+  },
+
+  /** The answer to a question as the service draws it: the photograph with the layout, and the plan with the place. */
+  async picture(fields: Record<string, string>, panorama: File): Promise<Blob> {
+    const { include: _, ...asked } = fields;
+    const response = await request("/localise", {
+      method: "POST", headers: { Accept: "image/png" }, body: form(asked, "panorama", panorama),
+    });
+    return response.blob();
+  },
+
+  async venues(name = ""): Promise<{ venues: Venue[]; next_cursor: string | null }> {
+    const query = new URLSearchParams({ limit: "50" });
+    if (name) query.set("name", name);
+    return json(`/venues?${query}`);
+  },
+
+  async venue(id: string): Promise<Venue> {
+    return json(`/venues/${encodeURIComponent(id)}`);
+  },
+
+  /** The plans of a venue from the lowest level up, as many as fit on a page. */
+  async venuePlans(id: string): Promise<{ plans: VenuePlan[]; next_cursor: string | null }> {
+    return json(`/venues/${encodeURIComponent(id)}/plans?limit=500`);
   },
 
   async answer(id: string): Promise<Answer> {

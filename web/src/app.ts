@@ -3,9 +3,10 @@
 import { showAnswer, markLooked } from "./answer_panel";
 import { ellipse, heatMap, rivals } from "./answer_overlay";
 import { api } from "./api";
-import { byId, h, s, show } from "./dom";
+import { byId, download, h, s, show } from "./dom";
 import { Editor } from "./editor/editor";
 import { exampleFiles, examplePlan } from "./example";
+import { HintForm, hintFields } from "./hints";
 import { connectKeyDialog } from "./key_dialog";
 import { layoutLines, roomAt } from "./layout";
 import { clearError, showError } from "./notices";
@@ -14,8 +15,9 @@ import { type Photo, Photos } from "./photos";
 import { type Box, boxOf, drawNames, drawPlan } from "./plan_drawing";
 import { Plans } from "./plans";
 import { PoseMarker } from "./pose_marker";
+import type { Answer, Layout, Plan, PlanDocument, Pose, Venue } from "./types";
+import { Venues } from "./venues";
 import { Viewport } from "./viewport";
-import type { Answer, Layout, Plan, PlanDocument, Pose } from "./types";
 
 // For tests, which compare them with what the service computes.
 export { layoutLines, layoutView } from "./layout";
@@ -30,8 +32,12 @@ class Page {
   private readonly over = s("g");
   private readonly marker = new PoseMarker(this.svg, (pose) => this.onMoved(pose));
   private readonly panorama = new PanoramaView(byId("photo-view"), (yaw, fov) => this.marker.look(yaw, fov));
-  private readonly plans = new Plans((plan) => this.onPlan(plan));
+  private readonly venues = new Venues({ chosen: (venue) => this.onVenue(venue), look: (planId) => void this.plans.choose(planId) });
+  private readonly plans = new Plans({
+    chosen: (plan) => this.onPlan(plan), picked: () => this.venues.leave(), searched: (name) => void this.venues.load(name),
+  });
   private readonly photos = new Photos((photo, isAnother) => this.onPhoto(photo, isAnother));
+  private readonly hints = new HintForm(this.svg, (hints) => this.photos.setHints(hints));
   private readonly editor = new Editor(this.svg, {
     draw: (plan) => this.drawRooms(plan),
     seen: () => this.viewport.current,
@@ -46,18 +52,20 @@ class Page {
   private layout: Layout | null = null;
   private box: Box = boxOf({ rooms: [] });
   private answer: Answer | null = null;
+  /** Which of its candidates is looked at. */
+  private looked = 0;
   private asking: AbortController | null = null;
 
   async start(): Promise<void> {
     connectKeyDialog();
-    this.svg.append(this.editor.under.element, this.base, this.heat, this.names, this.over, ...this.editor.layers);
+    this.svg.append(this.editor.under.element, this.base, this.heat, this.names, this.hints.element, this.over, ...this.editor.layers);
     byId("edit-plan").addEventListener("click", () => this.edit(this.plan));
     byId("draw-plan").addEventListener("click", () => this.edit(null));
     this.find.addEventListener("click", () => void this.ask());
     byId("find-all").addEventListener("click", () => void this.askAll());
     addEventListener("hashchange", () => void this.open());
     await this.panorama.setPicture(null);
-    const stored = await this.plans.load();
+    const [stored] = await Promise.all([this.plans.load(), this.venues.load("")]);
     if (await this.open()) return;
     const example = await examplePlan();
     const known = stored.find((plan) => plan.name === example.name);
@@ -75,6 +83,8 @@ class Page {
     clearError(byId("plan-error"));
     try {
       const answer = await api.answer(id);
+      if (answer.venue_id != null) await this.venues.choose(answer.venue_id, null);
+      else this.venues.leave();
       await this.plans.choose(answer.floorplan_id, answer.floorplan_revision);
       this.photos.choose(null);
       this.setAnswer(answer);
@@ -86,13 +96,24 @@ class Page {
 
   private onExample(example: PlanDocument): void {
     this.document = example;
+    this.hints.setRooms(example.rooms.map(({ name }, index) => ({ id: name ?? "", name: name ?? `room ${index + 1}` })));
     byId("plan-name").textContent = example.name ?? "";
     byId("plan-facts").textContent = "example, stored with the first question";
     this.drawBase();
   }
 
+  private onVenue(venue: Venue | null): void {
+    byId("hints").hidden = venue !== null;
+    this.photos.forgetHints();
+    this.photos.forgetAnswers();
+    this.hints.show(this.photos.current?.hints ?? null);
+    this.setAnswer(null);
+    if (venue !== null && venue.plans === 0) showError(byId("plan-error"), new Error("This venue has no plans."));
+  }
+
   private onPlan(plan: Plan | null): void {
     const isSame = plan !== null && plan.revision === this.plan?.revision;
+    const wasOther = plan === null || (this.plan !== null && this.plan.id !== plan.id);
     this.plan = plan;
     this.document = plan?.plan ?? null;
     byId("plan-name").textContent = plan?.name ?? "No plan is chosen";
@@ -102,14 +123,21 @@ class Page {
     byId<HTMLProgressElement>("plan-progress").value = plan?.progress ?? 0;
     if (plan?.status === "failed") showError(byId("plan-error"), new Error(`This plan cannot be used: ${plan.reason}`));
     const report = plan?.import_report;
-    const draft = report?.is_draft ? ["This plan is a draft, guessed from a picture or lines alone: look at it, and correct it with “Edit”."] : [];
-    show(byId("plan-warnings"), ...[...draft, ...(plan?.warnings ?? []), ...(report?.unsure ?? [])].map((text) => h("li", {}, text)));
+    const draft = report?.is_draft ? [DRAFT] : [];
+    showWarnings([...draft, ...(plan?.warnings ?? []), ...(report?.unsure ?? [])]);
     if (isSame) return;
     this.layout = null;
     this.photos.compass.setNorth(plan?.plan.north_deg ?? null);
-    this.photos.forgetAnswers();
-    this.setAnswer(null);
+    if (plan !== null && this.venues.current !== null) this.venues.mark(plan.id);
+    else {
+      this.photos.forgetAnswers();
+      if (wasOther) this.photos.forgetHints();
+      this.setAnswer(null);
+    }
+    this.hints.setRooms(plan?.rooms ?? []);
+    this.hints.show(this.photos.current?.hints ?? null);
     this.drawBase();
+    this.drawAnswer();
     if (plan !== null) void this.loadLayout(plan);
   }
 
@@ -118,7 +146,7 @@ class Page {
       const layout = await api.layout(plan.id, plan.revision);
       if (this.plan?.revision !== plan.revision) return;
       this.layout = layout;
-      if (this.answer !== null) this.look(0);
+      this.drawAnswer();
     } catch (error) {
       showError(byId("plan-error"), error);
     }
@@ -139,6 +167,7 @@ class Page {
 
   /** Handles are equally large however near one looks. */
   private onSeen(): void {
+    this.hints.draw(this.viewport.current);
     if (this.editor.isOpen) this.editor.redraw();
     else if (this.document !== null) drawNames(this.names, this.document, this.viewport.current);
   }
@@ -157,19 +186,22 @@ class Page {
       byId("plan-name").textContent = this.document?.name ?? "No plan is chosen";
       this.setAnswer(this.photos.current?.answer ?? null, this.photos.current);
     } else {
+      this.photos.forgetAnswers();
+      this.setAnswer(null);
       this.plans.take(stored);
       void this.plans.load();
     }
   }
 
   private onPhoto(photo: Photo | null, isAnother: boolean): void {
-    clearError(byId("photo-error"), this.photos.fields);
+    clearError(byId("photo-error"), this.fields);
     byId("photo-none").hidden = photo !== null;
     this.find.disabled = photo === null;
+    if (isAnother) this.hints.show(photo?.hints ?? null);
     if (isAnother) {
       // A link shows an answer without its photograph; the one that is added to it is taken for that.
       if (photo !== null && photo.answer === null && this.answer !== null && this.asked === null) photo.answer = this.answer;
-      void this.panorama.setPicture(photo?.file ?? null).then(() => { if (this.answer !== null) this.look(0); })
+      void this.panorama.setPicture(photo?.file ?? null).then(() => this.drawAnswer())
         .catch((error: unknown) => { if (this.photos.current === photo) showError(byId("photo-error"), error); });
     } else if (photo !== null) photo.answer = null;
     this.setAnswer(photo?.answer ?? null, photo);
@@ -177,34 +209,52 @@ class Page {
 
   private asked: Photo | null = null;
 
+  private get fields(): Record<string, HTMLElement> {
+    return { ...this.photos.fields, ...this.hints.fields };
+  }
+
   private setAnswer(answer: Answer | null, photo: Photo | null = null): void {
     this.answer = answer;
     this.asked = photo;
-    const drawn = this.document;
-    const posterior = answer?.posterior ?? null;
+    this.looked = 0;
+    showAnswer(answer, photo, { look: (index) => this.look(index), save: (one) => this.savePicture(one) });
+    this.drawAnswer();
+    // The answer to a question about a venue may lie in another of its plans.
+    if (answer !== null) this.look(0);
+  }
+
+  /** Draw what there is of the answer in the plan that is shown. */
+  private drawAnswer(): void {
+    const { answer, document: drawn, plan } = this;
+    const isHere = answer !== null && answer.floorplan_id === plan?.id;
+    const posterior = isHere ? answer.posterior : null;
     byId("heat-legend").hidden = posterior === null;
+    show(this.heat, posterior && drawn && heatMap(posterior, drawn));
     show(this.over);
-    show(this.heat);
-    showAnswer(answer, photo, { look: (index) => this.look(index) });
-    if (answer === null || drawn === null) {
+    const looked = answer?.candidates[this.looked];
+    if (answer === null || drawn === null || looked === undefined || looked.floorplan_id !== plan?.id) {
       this.panorama.setLines([], 0);
-      byId("fit-state").textContent = "";
+      byId("fit-state").textContent = answer === null ? "" : "The place that is looked at lies in another plan of the venue.";
       return;
     }
-    show(this.heat, posterior && heatMap(posterior, drawn));
-    show(this.over, ellipse(answer), rivals(answer, this.box, (index) => this.look(index)), this.marker.element);
-    this.look(0);
+    show(this.over, isHere && ellipse(answer), rivals(answer, plan.id, this.box, (index) => this.look(index)), this.marker.element);
+    this.look(this.looked);
   }
 
   /** Move the marker to one of the candidates. */
   private look(index: number): void {
     const candidate = this.answer?.candidates[index];
     if (candidate === undefined) return;
+    this.looked = index;
+    markLooked(index);
+    if (candidate.floorplan_id !== this.plan?.id) {
+      void this.plans.choose(candidate.floorplan_id);
+      return;
+    }
     const { x_m, y_m } = candidate.position;
     const pose = { x_m, y_m, heading_deg: candidate.heading_deg };
     this.marker.place(pose, this.box);
     this.drawLines(pose);
-    markLooked(index);
   }
 
   private onMoved(pose: Pose): void {
@@ -230,20 +280,30 @@ class Page {
     const asking = (this.asking = new AbortController());
     photo.answer = null;
     this.setAnswer(null);
-    clearError(byId("photo-error"), this.photos.fields);
+    clearError(byId("photo-error"), this.fields);
     this.find.setAttribute("aria-busy", "true");
     try {
-      const plan = this.plan ?? (await this.storeExample());
-      photo.fields = fieldsOf(plan, photo);
-      const answer = await api.localise({ ...photo.fields, include: "posterior" }, photo.file, asking.signal);
+      const venue = this.venues.current;
+      photo.fields = fieldsOf(venue, venue === null ? this.plan ?? (await this.storeExample()) : null, photo);
+      const asked = venue === null ? { ...photo.fields, include: "posterior" } : photo.fields;
+      const answer = await api.localise(asked, photo.file, asking.signal);
       if (answer.floorplan_revision !== this.plan?.revision) await this.plans.choose(answer.floorplan_id, answer.floorplan_revision);
       photo.answer = answer;
       if (this.photos.current === photo) this.setAnswer(answer, photo);
       this.photos.drawStrip();
     } catch (error) {
-      if (!asking.signal.aborted) showError(byId("photo-error"), error, this.photos.fields);
+      if (!asking.signal.aborted) showError(byId("photo-error"), error, this.fields);
     } finally {
       if (this.asking === asking) this.find.removeAttribute("aria-busy");
+    }
+  }
+
+  private async savePicture(photo: Photo): Promise<void> {
+    clearError(byId("photo-error"), this.fields);
+    try {
+      download(await api.picture(photo.fields, photo.file), `lalaloc-${photo.file.name.replace(/\.[^.]*$/, "")}.png`);
+    } catch (error) {
+      showError(byId("photo-error"), error, this.fields);
     }
   }
 
@@ -265,8 +325,20 @@ class Page {
   }
 }
 
-function fieldsOf(plan: Plan, photo: Photo): Record<string, string> {
-  const fields: Record<string, string> = { floorplan_id: plan.id };
+const DRAFT = "This plan is a draft, guessed from a picture or lines alone: look at it, and correct it with “Edit”. When all doors or "
+  + "all windows are right, tick them there: then they count.";
+const MOST_WARNINGS = 4;
+
+/** Warnings about the plan; where there are many, the others are a click away. */
+function showWarnings(texts: string[]): void {
+  const items = texts.map((text) => h("li", {}, text));
+  const rest = items.splice(MOST_WARNINGS);
+  show(byId("plan-warnings"), ...items,
+    rest.length > 0 && h("li", {}, h("details", {}, h("summary", {}, `${rest.length} more`), h("ul", {}, ...rest))));
+}
+
+function fieldsOf(venue: Venue | null, plan: Plan | null, photo: Photo): Record<string, string> {
+  const fields: Record<string, string> = venue !== null ? { venue_id: venue.id } : { floorplan_id: plan?.id ?? "", ...hintFields(photo.hints) };
   if (photo.heading !== null) fields.heading_deg = String(photo.heading);
   if (photo.tolerance !== 0) fields.heading_tolerance_deg = String(photo.tolerance);
   if (photo.cameraHeight !== null) fields.camera_height_m = String(photo.cameraHeight);

@@ -15,6 +15,7 @@ export function showError(place: HTMLElement, error: unknown, fields: Record<str
     faults.length > 0 && h("ul", {}, ...faults.map((fault) => h("li", {}, h("code", {}, fault.field), ` ${fault.message}`))),
     refusal?.retryAfterS ? h("p", {}, `Try again in ${refusal.retryAfterS} s.`) : null);
   place.hidden = false;
+  place.scrollIntoView({ block: "nearest" });
   for (const fault of faults) {
     const field = fields[fault.field];
     if (field === undefined) continue;

@@ -2,8 +2,9 @@
 
 import { Compass } from "./compass";
 import { byId, h, show } from "./dom";
+import { NO_HINTS } from "./hints";
 import { clearError, showError } from "./notices";
-import type { Answer } from "./types";
+import type { Answer, Hints } from "./types";
 
 export interface Photo {
   file: File;
@@ -11,6 +12,7 @@ export interface Photo {
   heading: number | null;
   tolerance: number;
   cameraHeight: number | null;
+  hints: Hints;
   answer: Answer | null;
   /** What was asked, for the snippets. */
   fields: Record<string, string>;
@@ -66,7 +68,8 @@ export class Photos {
       showError(this.error, new Error(`${names}: a photograph is a JPEG, PNG or WebP, the full 360° and twice as wide as high.`));
     }
     const added = files.filter((file) => PICTURES.test(file.type)).map((file, index): Photo => ({
-      file, url: URL.createObjectURL(file), heading: headings[index] ?? null, tolerance: 0, cameraHeight: null, answer: null, fields: {},
+      file, url: URL.createObjectURL(file), heading: headings[index] ?? null, tolerance: 0, cameraHeight: null, hints: NO_HINTS,
+      answer: null, fields: {},
     }));
     this.all.push(...added);
     if (added[0] !== undefined) this.choose(added[0]);
@@ -88,6 +91,18 @@ export class Photos {
   forgetAnswers(): void {
     for (const photo of this.all) photo.answer = null;
     this.drawStrip();
+  }
+
+  /** So are hints of the place. */
+  forgetHints(): void {
+    for (const photo of this.all) photo.hints = NO_HINTS;
+  }
+
+  /** Take over what is known of the place of the chosen photograph. */
+  setHints(hints: Hints): void {
+    if (this.chosen === null) return;
+    this.chosen.hints = hints;
+    this.changed(this.chosen, false);
   }
 
   private remove(photo: Photo): void {

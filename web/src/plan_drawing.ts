@@ -12,6 +12,8 @@ export interface Box {
 }
 
 const MARGIN = 0.06;
+// Half as thick as a wall between two rooms is drawn.
+const WALL_M = 0.12;
 
 /** The part of the drawing that a plan takes up, with a margin. */
 export function boxOf(plan: PlanDocument): Box {
@@ -38,7 +40,9 @@ export function drawPlan(group: SVGGElement, plan: PlanDocument): void {
   });
   const walls = plan.rooms.flatMap((room) => (room.walls ?? []).map(([a, b]) =>
     s("line", { class: "wall", x1: a[0], y1: -a[1], x2: b[0], y2: -b[1] })));
-  show(group, ...rooms, ...walls, ...(plan.openings ?? []).map(openingShape));
+  // Walls stand around the floors that they enclose, those between rooms meet.
+  const solid = s("path", { class: "solid", d: plan.rooms.map((room) => path(room.polygon)).join(""), "stroke-width": 2 * WALL_M });
+  show(group, solid, ...rooms, ...walls, ...(plan.openings ?? []).map(openingShape));
 }
 
 /** Write names, north and a scale into a group that lies over everything that is drawn into the rooms. */
@@ -55,8 +59,8 @@ export function drawNames(group: SVGGElement, plan: PlanDocument, box: Box): voi
 function openingShape(opening: OpeningDocument): SVGGElement {
   const [[ax, ay], [bx, by]] = opening.line;
   const line = { x1: ax, y1: -ay, x2: bx, y2: -by };
-  // Wide in the colour of the floor first, so that the wall is interrupted.
-  return s("g", { class: `opening ${opening.kind}` }, s("line", { class: "gap", ...line }), s("line", { class: "leaf", ...line }));
+  // As wide as the wall in the colour of the floor first, so that the wall is interrupted.
+  return s("g", { class: `opening ${opening.kind}` }, s("line", { class: "gap", "stroke-width": 2.1 * WALL_M, ...line }), s("line", { class: "leaf", ...line }));
 }
 
 const RASTER = 24;

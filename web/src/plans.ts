@@ -12,6 +12,16 @@ import type { Plan, PlanSummary } from "./types";
 const isSure = (plan: Plan): boolean => !plan.import_report?.is_draft && (plan.import_report?.unsure ?? []).length === 0;
 
 const SEARCH_AFTER_MS = 250;
+const PICTURES = /^image\/(png|jpeg)$/;
+
+export interface PlanActions {
+  /** A plan is to be shown; told again when it is prepared further. */
+  chosen: (plan: Plan | null) => void;
+  /** Somebody picked a plan of the list, or uploaded one. */
+  picked: () => void;
+  /** Somebody looks for what has this in its name. */
+  searched: (name: string) => void;
+}
 
 export class Plans {
   private readonly list = byId("plan-list");
@@ -24,20 +34,22 @@ export class Plans {
   private current: Plan | null = null;
   private following: AbortController | null = null;
 
-  /** `chosen` is told the plan that is chosen, also when it is prepared further. */
-  constructor(private readonly chosen: (plan: Plan | null) => void) {
+  constructor(private readonly actions: PlanActions) {
     let waiting: number | undefined;
     this.search.addEventListener("input", () => {
       clearTimeout(waiting);
-      waiting = window.setTimeout(() => void this.load(), SEARCH_AFTER_MS);
+      waiting = window.setTimeout(() => {
+        void this.load();
+        actions.searched(this.search.value.trim());
+      }, SEARCH_AFTER_MS);
     });
     const input = byId<HTMLInputElement>("plan-file");
     input.addEventListener("change", () => {
       const file = input.files?.[0];
       input.value = "";
-      if (file !== undefined) void this.upload(file);
+      if (file !== undefined) this.begin(file);
     });
-    acceptDrops(byId("plan-panel"), (files) => { if (files[0] !== undefined) void this.upload(files[0]); });
+    acceptDrops(byId("plan-panel"), (files) => { if (files[0] !== undefined) this.begin(files[0]); });
   }
 
   /** Fetch the list; with a cursor, its next page. Returns what is listed. */
@@ -69,10 +81,17 @@ export class Plans {
   /** Show a plan that was just stored or read. */
   take(plan: Plan | null): void {
     this.current = plan;
-    this.chosen(plan);
+    this.actions.chosen(plan);
     this.draw();
     this.following?.abort();
     if (plan !== null && plan.status === "preparing") void this.follow(plan);
+  }
+
+  /** A picture never says how large it is: that is asked first. */
+  private begin(file: File): void {
+    clearError(this.error, this.importing.fields);
+    if (PICTURES.test(file.type)) this.importing.ask(file, true);
+    else void this.upload(file);
   }
 
   /** Upload a file as a new plan. */
@@ -84,15 +103,16 @@ export class Plans {
     state.textContent = `Reading “${file.name}” …`;
     try {
       const plan = await api.uploadPlan(file, fields);
+      this.actions.picked();
       this.take(plan);
       if (isSure(plan)) this.importing.close();
-      else this.importing.ask(file);
+      else this.importing.ask(file, false);
       await this.load();
       say(`“${plan.name}” is stored.`);
     } catch (error) {
       // What is shown would be taken for what was refused.
       this.take(null);
-      this.importing.ask(file);
+      this.importing.ask(file, true);
       showError(this.error, error, this.importing.fields);
     } finally {
       if (state.textContent.startsWith("Reading")) state.textContent = "";
@@ -104,13 +124,18 @@ export class Plans {
     try {
       await followPlan(plan.id, (event) => {
         if (this.current?.id !== plan.id) return;
-        if (event.status === "preparing") this.chosen({ ...this.current, progress: event.progress ?? 0 });
+        if (event.status === "preparing") this.actions.chosen({ ...this.current, progress: event.progress ?? 0 });
         else if (event.status === "deleted") this.take(null);
         else void this.choose(plan.id).then(() => this.load());
       }, own.signal);
     } catch (error) {
       if (!own.signal.aborted) showError(this.error, error);
     }
+  }
+
+  private pick(id: string): void {
+    this.actions.picked();
+    void this.choose(id);
   }
 
   private async remove(plan: PlanSummary): Promise<void> {
@@ -141,7 +166,7 @@ export class Plans {
       const state = plan.status === "preparing" ? `preparing, ${Math.round(100 * plan.progress)} %` : plan.status === "failed" ? "failed" : "";
       const facts = [`${plan.rooms} ${plan.rooms === 1 ? "room" : "rooms"}`, `${plan.area_m2.toFixed(0)} m²`, state];
       const choose = h("button", {
-        type: "button", class: "plan", "aria-pressed": String(plan.id === this.current?.id), onclick: () => void this.choose(plan.id),
+        type: "button", class: "plan", "aria-pressed": String(plan.id === this.current?.id), onclick: () => this.pick(plan.id),
       }, h("span", { class: "name" }, plan.name), h("span", { class: "facts" }, facts.filter(Boolean).join(", ")));
       const remove = h("button", { type: "button", class: "remove", "aria-label": `Delete ${plan.name}`, onclick: () => void this.remove(plan) }, "×");
       return h("li", {}, choose, remove);

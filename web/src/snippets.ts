@@ -5,6 +5,12 @@ import { key } from "./api";
 const shell = (text: string): string => (/^[\w@./:=-]+$/.test(text) ? text : `'${text.replaceAll("'", "'\\''")}'`);
 const python = (text: string): string => JSON.stringify(text);
 
+/** A field's value in Python; objects and lists are written alike in JSON. */
+function literal(name: string, value: string): string {
+  if (value === "true") return "True";
+  return name === "near" || name === "rooms" || /^-?[\d.]+$/.test(value) ? value : python(value);
+}
+
 /** The query with curl. */
 export function curlSnippet(fields: Record<string, string>, file: string): string {
   const parts = [`curl ${shell(`${location.origin}/localise`)}`];
@@ -16,17 +22,18 @@ export function curlSnippet(fields: Record<string, string>, file: string): strin
 
 /** The query with the Python client. */
 export function pythonSnippet(fields: Record<string, string>, file: string): string {
-  const { floorplan_id: plan = "", ...rest } = fields;
+  const { floorplan_id: plan, venue_id: venue, ...rest } = fields;
   const options = Object.entries(rest)
     .filter(([name]) => name !== "include")
-    .map(([name, value]) => `, ${name}=${/^-?[\d.]+$/.test(value) ? value : python(value)}`);
+    .map(([name, value]) => `, ${name}=${literal(name, value)}`);
+  const ask = venue === undefined ? `localise(${python(plan ?? "")}` : `localise_in_venue(${python(venue)}`;
   const secret = key.get() === null ? "" : `, api_key=os.environ["LALALOC_KEY"]`;
   return [
     ...(secret ? ["import os", ""] : []),
     "from lalaloc_client import Client",
     "",
     `with Client(${python(location.origin)}${secret}) as service:`,
-    `    answer = service.localise(${python(plan)}, ${python(file)}${options.join("")})`,
+    `    answer = service.${ask}, ${python(file)}${options.join("")})`,
     "print(answer.room, answer.position, answer.confidence)",
   ].join("\n");
 }

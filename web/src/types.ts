@@ -49,7 +49,7 @@ export interface Plan {
   area_m2: number;
   warnings: string[];
   /** How its file was read. */
-  import_report?: { format: string; is_draft: boolean; notes: string[]; unsure: string[] } | null;
+  import_report?: { format: string; metres_per_unit: number | null; is_draft: boolean; notes: string[]; unsure: string[] } | null;
   plan: PlanDocument;
   /** Entity tag of this representation, which `If-Match` takes. */
   etag: string;
@@ -65,6 +65,20 @@ export interface PlanSummary {
   area_m2: number;
   created_at: string;
   updated_at: string;
+}
+
+export interface Venue {
+  id: string;
+  name: string;
+  plans: number;
+}
+
+/** A plan of a venue. */
+export interface VenuePlan {
+  floorplan_id: string;
+  level: number;
+  name: string;
+  status: PlanStatus;
 }
 
 export interface OpeningPiece {
@@ -99,7 +113,17 @@ export interface Pose {
   heading_deg: number;
 }
 
+/** What is known of where a camera stood: a place on the plan with how far off it may be, rooms. */
+export interface Hints {
+  near: Point | null;
+  radius: number;
+  rooms: string[];
+  strict: boolean;
+}
+
 export interface Candidate {
+  floorplan_id: string;
+  level: number | null;
   position: { x_m: number; y_m: number };
   heading_deg: number;
   room: string;
@@ -118,6 +142,10 @@ export interface Posterior {
 export interface Answer {
   floorplan_id: string;
   floorplan_revision: string;
+  venue_id?: string | null;
+  level: number | null;
+  /** Of a venue: its most probable plans. */
+  plans?: { floorplan_id: string; level: number; name: string; probability: number | null }[] | null;
   answer_id?: string | null;
   position: { x_m: number; y_m: number };
   heading_deg: number;
@@ -133,6 +161,7 @@ export interface Answer {
   camera_height_m: number;
   candidates: Candidate[];
   posterior: Posterior | null;
+  geopose?: { position: { lat: number; lon: number; h: number } } | null;
   timings_ms: Record<string, number>;
   model: { name: string; version: string; sha256: string };
 }

@@ -134,11 +134,21 @@ export function addOpening(plan: PlanDocument, kind: OpeningKind, wall: WallRef,
   const middle = clamp(along.along(place), 0.5 * width, along.length - 0.5 * width);
   const line: [Point, Point] = [rounded(along.point(middle - 0.5 * width, 0)), rounded(along.point(middle + 0.5 * width, 0))];
   const opening: OpeningDocument = { kind, line, ...USUAL_HEIGHTS[kind] };
-  const kinds = plan.opening_kinds;
-  return {
-    ...plan, openings: [...(plan.openings ?? []), opening],
-    ...(kinds && !kinds.includes(kind) ? { opening_kinds: [...kinds, kind] } : {}),
-  };
+  const next = { ...plan, openings: [...(plan.openings ?? []), opening] };
+  // A plan that has shown none of a kind shows all of them with its first; one that has some says itself whether it does.
+  const isFirst = !(plan.openings ?? []).some((one) => one.kind === kind);
+  return plan.opening_kinds && plan.opening_kinds.length > 0 && isFirst ? claimKind(next, kind, true) : next;
+}
+
+/** The kinds of openings that a plan shows completely, so that they count as evidence; those in it where it does not say. */
+export function claimedKinds(plan: PlanDocument): OpeningKind[] {
+  return plan.opening_kinds ?? [...new Set((plan.openings ?? []).map(({ kind }) => kind))];
+}
+
+/** Say that a plan shows all openings of a kind, or that it does not. */
+export function claimKind(plan: PlanDocument, kind: OpeningKind, isComplete: boolean): PlanDocument {
+  const others = claimedKinds(plan).filter((one) => one !== kind);
+  return { ...plan, opening_kinds: isComplete ? [...others, kind] : others };
 }
 
 export function changeOpening(plan: PlanDocument, index: number, change: Partial<OpeningDocument>): PlanDocument {

@@ -23,6 +23,8 @@ export interface EditorHost {
 }
 
 const EMPTY: PlanDocument = { name: "New plan", ceiling_height_m: 2.5, rooms: [], openings: [] };
+// How the importer tells that its coordinates are not those of the picture.
+const TURNED = /picture was turned/;
 const NEW_ROOM_M: Point = [4, 3];
 const TOOLS: [Tool, string][] = [["select", "Select"], ["room", "Draw a room"], ["door", "Door"], ["window", "Window"], ["passage", "Passage"], ["scale", "Scale"]];
 
@@ -82,6 +84,19 @@ export class Editor {
     this.host.fit(boxOf(this.saved));
     this.drawBar();
     this.redraw();
+    if (plan !== null) void this.layOriginal(plan);
+  }
+
+  /** The picture that a plan was read from lies under it, where that was not turned to be straight. */
+  private async layOriginal(plan: Plan): Promise<void> {
+    const report = plan.import_report;
+    if (report?.format !== "picture" || report.metres_per_unit == null || report.notes.some((note) => TURNED.test(note))) return;
+    try {
+      const original = await api.original(plan.id);
+      if (this.base?.revision === plan.revision) await this.under.lay(original, plan.name, report.metres_per_unit);
+    } catch {
+      // It is a help, and no more.
+    }
   }
 
   /** Draw again, as after zooming. */
@@ -165,7 +180,7 @@ export class Editor {
   private async lay(file: File): Promise<void> {
     clearError(this.error);
     try {
-      await this.under.lay(file);
+      await this.under.lay(file, file.name);
       const { width, height } = this.under.box!;
       this.host.fit({ x: -0.5, y: -height - 0.5, width: width + 1, height: height + 1 });
       say("Set the scale next: click two points whose distance you know.");

@@ -43,8 +43,21 @@ function planForm(plan: PlanDocument, { edit }: FormActions): HTMLElement[] {
     number("plan-form-ceiling", "Ceiling, m", plan.ceiling_height_m, (value) => set({ ceiling_height_m: value })),
     number("plan-form-camera", "Camera height, m", plan.camera_height_m, (value) => set({ camera_height_m: value })),
     number("plan-form-north", "North, ° clockwise from up", plan.north_deg, (value) => set({ north_deg: value })),
+    claims(plan, edit),
     h("p", { class: "hint" }, `${plan.rooms.length} rooms, ${(plan.openings ?? []).length} openings. Click one to change it.`),
   ];
+}
+
+/** Which kinds are shown completely: of these a photograph may also speak against the plan. */
+function claims(plan: PlanDocument, edit: FormActions["edit"]): HTMLElement {
+  const claimed = change.claimedKinds(plan);
+  return h("fieldset", { class: "claims" }, h("legend", {}, "All of these are drawn, and count when photographs are compared"),
+    ...OPENING_KINDS.map((kind) => {
+      const box = h("input", { type: "checkbox", id: `plan-form-all-${kind}`, checked: claimed.includes(kind) });
+      box.addEventListener("change", () => edit(change.claimKind(current, kind, box.checked)));
+      const count = (plan.openings ?? []).filter((one) => one.kind === kind).length;
+      return h("label", { class: "inline" }, box, `${count} ${kind}${count === 1 ? "" : "s"}`);
+    }));
 }
 
 function roomForm(room: RoomDocument, index: number, { edit, select }: FormActions): HTMLElement[] {

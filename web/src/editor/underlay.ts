@@ -14,8 +14,8 @@ export class Underlay {
     return this.url === null ? null : { width: this.size.width * this.metresPerPixel, height: this.size.height * this.metresPerPixel };
   }
 
-  /** Lay a picture under the plan, 12 m wide until its scale is set. Refused where the file is no picture. */
-  async lay(file: File): Promise<void> {
+  /** Lay a picture under the plan, 12 m wide until its scale is set, if it is not known. Refused where it is no picture. */
+  async lay(file: Blob, name: string, metresPerPixel: number | null = null): Promise<void> {
     const url = URL.createObjectURL(file);
     const picture = new Image();
     picture.src = url;
@@ -23,12 +23,12 @@ export class Underlay {
       await picture.decode();
     } catch {
       URL.revokeObjectURL(url);
-      throw new Error(`“${file.name}” cannot be shown as a picture. PNG and JPEG can.`);
+      throw new Error(`“${name}” cannot be shown as a picture. PNG and JPEG can.`);
     }
     this.remove();
     this.url = url;
     this.size = { width: picture.naturalWidth, height: picture.naturalHeight };
-    this.metresPerPixel = FIRST_WIDTH_M / picture.naturalWidth;
+    this.metresPerPixel = metresPerPixel ?? FIRST_WIDTH_M / picture.naturalWidth;
     this.draw();
   }
 

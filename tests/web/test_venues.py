@@ -1,0 +1,53 @@
+"""Venues on the start page: several plans that are asked about at once."""
+
+from __future__ import annotations
+
+from playwright.sync_api import Browser, expect
+
+from tests.service.conftest import FLAT, StartApp, upload
+from tests.web.conftest import EXAMPLES, visit
+from tests.web.test_answer import _assert_accessible
+
+
+def test_a_venue_is_chosen_and_its_answer_says_which_plan(browser: Browser, start_app: StartApp, tmp_path) -> None:
+    with start_app(tmp_path, keep_answers_s=3600.0) as client:
+        ids = [upload(client, FLAT | {"name": name}) for name in ("Flat below", "Flat above")]
+        plans = [{"floorplan_id": plan_id, "level": level} for level, plan_id in enumerate(ids)]
+        client.post("/venues", json={"name": "Mill", "plans": plans}).raise_for_status()
+        for visited in visit(browser, client):
+            page = visited.open()
+            page.locator("#plan-menu summary").click()
+            page.get_by_role("button", name="Mill").click()
+            expect(page.locator("#venue-bar")).to_contain_text("Mill 2 plans")
+            expect(page.locator("#plan-name")).to_have_text("Flat below")
+            expect(page.locator("#hints")).to_be_hidden()
+            page.locator("#plan-menu summary").click()
+            page.locator("#photo-file").set_input_files(EXAMPLES / "kitchen.jpg")
+            visited.find()
+            _assert_accessible(page)
+            plan_of = page.locator("#answer .plan-of")
+            expect(plan_of).to_have_text(
+                "Flat below, level 0" if "below" in plan_of.inner_text() else "Flat above, level 1"
+            )
+            found = plan_of.inner_text().split(",")[0]
+            # The plan of the answer is drawn, also after looking at another.
+            expect(page.locator("#plan-name")).to_have_text(found)
+            expect(page.locator("#plan #marker")).to_have_count(1)
+            other = next(name for name in ("Flat below", "Flat above") if name != found)
+            page.get_by_label("Shown is").select_option(label=f"{other}, level {int(other == 'Flat above')}")
+            expect(page.locator("#plan-name")).to_have_text(other)
+            expect(page.locator("#fit-state")).to_contain_text("another plan of the venue")
+            page.locator("[data-rank='0']").click()
+            expect(page.locator("#plan-name")).to_have_text(found)
+            expect(page.locator("#fit-state")).to_contain_text("Layout as seen from")
+            page.locator("#copy-python").click()
+            expect(page.locator("#copied")).to_contain_text("service.localise_in_venue(")
+            page.locator("#copy-link").click()
+            link = page.locator("#copied").inner_text()
+            page.get_by_role("button", name="Ask about this plan alone").click()
+            expect(page.locator("#venue-bar")).to_be_hidden()
+            expect(page.locator("#answer")).to_be_hidden()
+            page.goto("about:blank")
+            page.goto(link)
+            expect(plan_of).to_contain_text(found)
+            expect(page.locator("#venue-bar")).to_contain_text("Mill")

@@ -1,0 +1,85 @@
+/** Venues: several plans that are asked about at once, when it is not known which of them a photograph is of. */
+
+import { api } from "./api";
+import { byId, h, show } from "./dom";
+import { clearError, showError } from "./notices";
+import type { Venue } from "./types";
+
+export interface VenueActions {
+  /** A venue was chosen, or none is any more. */
+  chosen: (venue: Venue | null) => void;
+  /** One of its plans is to be shown. */
+  look: (planId: string) => void;
+}
+
+/** What a plan is called among those of a venue. */
+export const planLabel = ({ name, level }: { name: string; level: number }): string => `${name}, level ${level}`;
+
+export class Venues {
+  private readonly list = byId("venue-list");
+  private readonly bar = byId("venue-bar");
+  private readonly which = byId<HTMLSelectElement>("venue-plan");
+  private readonly error = byId("plan-error");
+  private found: Venue[] = [];
+  private venue: Venue | null = null;
+
+  constructor(private readonly actions: VenueActions) {
+    this.which.addEventListener("change", () => actions.look(this.which.value));
+    byId("venue-leave").addEventListener("click", () => this.leave());
+  }
+
+  get current(): Venue | null {
+    return this.venue;
+  }
+
+  /** Fetch the list of those with this in their name. */
+  async load(name: string): Promise<void> {
+    try {
+      this.found = (await api.venues(name)).venues;
+      this.draw();
+    } catch (error) {
+      showError(this.error, error);
+    }
+  }
+
+  /** Choose a venue by its id, and show one of its plans: the first unless one is named; null shows none. */
+  async choose(id: string, planId?: string | null): Promise<void> {
+    clearError(this.error);
+    try {
+      const [venue, { plans, next_cursor: more }] = await Promise.all([api.venue(id), api.venuePlans(id)]);
+      this.venue = venue;
+      byId("venue-name").textContent = venue.name;
+      byId("venue-facts").textContent = `${venue.plans} ${venue.plans === 1 ? "plan" : "plans"}`
+        + (more === null ? "" : `, the first ${plans.length} are listed`);
+      show(this.which, ...plans.map((plan) => h("option", { value: plan.floorplan_id }, planLabel(plan))));
+      this.bar.hidden = false;
+      this.draw();
+      this.actions.chosen(venue);
+      const first = planId === undefined ? plans[0]?.floorplan_id : planId;
+      if (first) this.actions.look(first);
+    } catch (error) {
+      showError(this.error, error);
+    }
+  }
+
+  /** Ask about a single plan again. */
+  leave(): void {
+    if (this.venue === null) return;
+    this.venue = null;
+    this.bar.hidden = true;
+    this.draw();
+    this.actions.chosen(null);
+  }
+
+  /** Which of its plans is shown. */
+  mark(planId: string): void {
+    this.which.value = planId;
+  }
+
+  private draw(): void {
+    show(this.list, ...this.found.map((venue) => h("li", {}, h("button", {
+      type: "button", class: "plan", "aria-pressed": String(venue.id === this.venue?.id), onclick: () => void this.choose(venue.id),
+    }, h("span", { class: "name" }, venue.name), h("span", { class: "facts" }, `venue, ${venue.plans} plans`)))));
+    byId("venues").hidden = this.found.length === 0;
+  }
+}
