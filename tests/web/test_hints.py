@@ -51,8 +51,8 @@ def test_hints_are_set_on_the_plan_and_sent(desktop: Visit) -> None:
 
 
 def test_the_service_s_picture_of_an_answer_is_saved(browser: Browser, start_app: StartApp, tmp_path: Path) -> None:
-    # Drawing takes a second of a core, which a busy machine may not have within the usual deadline.
-    with start_app(tmp_path / "data", request_deadline_s=100.0) as client:
+    # Drawing takes a second of a core, which a busy machine may not have within the usual limits.
+    with start_app(tmp_path / "data", request_deadline_s=100.0, decode_stall_s=90.0) as client:
         for visited in visit(browser, client):
             page = visited.open_example()
             visited.find()
