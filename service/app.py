@@ -29,7 +29,7 @@ from service.http.parameters import check_parameters
 from service.http.problems import install_problem_handlers
 from service.problem_kinds import HTTP_PROBLEMS, PROBLEMS
 from service.routes import ROUTERS
-from service.runtime import start_runtime
+from service.runtime import HERE, Elsewhere, start_runtime
 from service.settings import Settings
 from service.telemetry import Telemetry, configure_logging
 
@@ -41,11 +41,12 @@ _DESCRIPTION = (
 )
 
 
-def create_app(settings: Settings | None = None) -> FastAPI:
+def create_app(settings: Settings | None = None, elsewhere: Elsewhere = HERE) -> FastAPI:
     """Make an application.
 
     Args:
         settings: by default read from the environment when the application starts.
+        elsewhere: what is not in this process.
     """
     telemetry = Telemetry()
     # Shown as 0 from the start, so that the first one is a rise.
@@ -56,7 +57,7 @@ def create_app(settings: Settings | None = None) -> FastAPI:
         version=__version__,
         description=_DESCRIPTION,
         dependencies=[Depends(check_parameters)],
-        lifespan=partial(_lifespan, settings, telemetry),
+        lifespan=partial(_lifespan, settings, telemetry, elsewhere),
         # The stock documentation pages load their scripts from elsewhere; `routes.pages` has one that does not.
         docs_url=None,
         redoc_url=None,
@@ -82,11 +83,13 @@ def _layers(app: FastAPI, telemetry: Telemetry, routes: list[BaseRoute]) -> ASGI
 
 
 @asynccontextmanager
-async def _lifespan(settings: Settings | None, telemetry: Telemetry, app: FastAPI) -> AsyncIterator[None]:
+async def _lifespan(
+    settings: Settings | None, telemetry: Telemetry, elsewhere: Elsewhere, app: FastAPI
+) -> AsyncIterator[None]:
     settings = settings or Settings.load()
     logger = configure_logging(settings.log_level)
     with ExitStack() as cleanup:
-        runtime = app.state.runtime = await asyncio.to_thread(start_runtime, settings, telemetry, cleanup)
+        runtime = app.state.runtime = await asyncio.to_thread(start_runtime, settings, telemetry, cleanup, elsewhere)
         app.state.cors_origins = settings.cors_origin_set
         app.state.admission = runtime.admission
         app.state.access_control = runtime.access_control

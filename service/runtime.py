@@ -20,7 +20,17 @@ from service.grids import GridProvider, Sweeper
 from service.http import Admission, AdmissionLimits
 from service.http.events import HEARTBEAT_S, PlanEvents
 from service.preview import Drawings
-from service.query import Decoder, Localiser, LpoPool, VenueLocaliser, VenuePlans
+from service.query import (
+    Answering,
+    Decoder,
+    Localiser,
+    LpoPool,
+    Refining,
+    VenueAnswering,
+    VenueLocaliser,
+    VenuePlans,
+)
+from service.schemas import ModelAnswer
 from service.security import AccessControl
 from service.settings import Settings
 from service.sharing import with_spare
@@ -66,11 +76,11 @@ class Runtime:
     store: Store
     grids: GridProvider
     plan_lookup: PlanLookup
-    pool: LpoPool
+    pool: Refining
     decoder: Decoder
     converter: Converter
-    localiser: Localiser
-    venue_localiser: VenueLocaliser
+    localiser: Answering
+    venue_localiser: VenueAnswering
     admission: Admission
     access_control: AccessControl
     events: PlanEvents
@@ -85,13 +95,42 @@ class Runtime:
         return not self.admission.draining and self.pool.state.warmed_up and self.decoder.state.warmed_up
 
 
-def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack) -> Runtime:
+@dataclass(frozen=True, kw_only=True)
+class Elsewhere:
+    """What makes those parts that may be in other processes than the service's own and its workers; by default none is.
+
+    Attributes:
+        pool: who optimises poses.
+        encoders: the networks, warm.
+        queries: who answers queries; None: this process.
+    """
+
+    pool: Callable[[Bundle, Settings, Telemetry], Refining]
+    encoders: Callable[[Bundle, Settings], Encoders]
+    queries: Callable[[ModelAnswer, Settings, Telemetry], tuple[Answering, VenueAnswering]] | None = None
+
+
+def warm_encoders(bundle: Bundle, settings: Settings) -> Encoders:
+    """The networks, each of which has run once; the first run allocates."""
+    encoders = Encoders(bundle, threads=settings.cores.onnx_threads)
+    manifest = encoders.manifest
+    image = np.zeros((manifest.image_height, manifest.image_width, 3), np.uint8)
+    encoders.query(image, None, CameraHeight(1.5))
+    encoders.layouts(np.full((1, manifest.profile_columns), 2.0), np.array([1.5]), np.array([2.5]))
+    return encoders
+
+
+HERE = Elsewhere(pool=LpoPool, encoders=warm_encoders)
+
+
+def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack, elsewhere: Elsewhere = HERE) -> Runtime:
     """Open the store, load and warm the model, start the LPO pool, and queue unfinished grids.
 
     Blocks for as long as the model loads; the pool warms up in the background.
 
     Args:
         cleanup: takes what has to be closed, also when starting fails half-way.
+        elsewhere: what is not in this process.
 
     Raises:
         ConfigError: the data folder or the database cannot be used.
@@ -108,11 +147,11 @@ def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack) 
     store = kept(open_store(settings))
     access_control = kept(AccessControl(store.keys, settings))
     # The pool first: loading torch in the workers overlaps with loading the model here.
-    pool = kept(LpoPool(bundle, settings, telemetry), _LPO_DRAIN * settings.stop_deadline_s)
+    pool = kept(elsewhere.pool(bundle, settings, telemetry), _LPO_DRAIN * settings.stop_deadline_s)
     pool.start()
     decoder = kept(Decoder(bundle.manifest, settings, telemetry))
     decoder.start()
-    encoders = _warm_encoders(bundle, settings)
+    encoders = elsewhere.encoders(bundle, settings)
     grids = kept(GridProvider(store, encoders, bundle.sha256, settings, telemetry))
     admission = Admission(AdmissionLimits.of(settings), telemetry)
     reads = kept(
@@ -139,6 +178,18 @@ def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack) 
     sweeper.start()
     # One look at a time, which takes no thread from queries while the database is silent.
     looks = kept(BoundedReads(threads=1, max_pending=1, wait_s=settings.database_wait_s))
+    answering: Answering = localiser
+    venue_answering: VenueAnswering = VenueLocaliser(
+        settings=settings,
+        bundle=bundle,
+        encoders=encoders,
+        plans=_venue_plans(store, grids, reads, settings),
+        localiser=localiser,
+        decoder=decoder,
+        queries=admission.queries,
+    )
+    if elsewhere.queries is not None:
+        answering, venue_answering = elsewhere.queries(localiser.model, settings, telemetry)
     _tell_start(bundle, grids, telemetry)
     return Runtime(
         settings=settings,
@@ -149,16 +200,8 @@ def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack) 
         pool=pool,
         decoder=decoder,
         converter=converter,
-        localiser=localiser,
-        venue_localiser=VenueLocaliser(
-            settings=settings,
-            bundle=bundle,
-            encoders=encoders,
-            plans=_venue_plans(store, grids, reads, settings),
-            localiser=localiser,
-            decoder=decoder,
-            queries=admission.queries,
-        ),
+        localiser=answering,
+        venue_localiser=venue_answering,
         admission=admission,
         access_control=access_control,
         events=_plan_events(store, grids, admission, looks, settings),
@@ -195,13 +238,3 @@ def _tell_start(bundle: Bundle, grids: GridProvider, telemetry: Telemetry) -> No
     telemetry.describe_build(__version__, manifest.name, manifest.version, bundle.sha256)
     fields = {"model": manifest.name, "sha256": bundle.sha256, "grids_to_compute": grids.preparing}
     logging.getLogger(LOGGER_NAME).info("service started", extra={"fields": fields})
-
-
-def _warm_encoders(bundle: Bundle, settings: Settings) -> Encoders:
-    """The networks, each of which has run once; the first run allocates."""
-    encoders = Encoders(bundle, threads=settings.cores.onnx_threads)
-    manifest = encoders.manifest
-    image = np.zeros((manifest.image_height, manifest.image_width, 3), np.uint8)
-    encoders.query(image, None, CameraHeight(1.5))
-    encoders.layouts(np.full((1, manifest.profile_columns), 2.0), np.array([1.5]), np.array([2.5]))
-    return encoders

@@ -85,8 +85,8 @@ def test_all_are_about_the_same_pods() -> None:
 
 def test_settings_are_those_of_the_service() -> None:
     given = {name: value for name, value in CONFIGURED.items() if name.startswith(PREFIX)}
-    settings = Settings(**{name.removeprefix(PREFIX).lower(): value for name, value in given.items()})
-    assert settings.api_keys
+    values: dict[str, Any] = {name.removeprefix(PREFIX).lower(): value for name, value in given.items()}
+    assert Settings(**values).api_keys
     named = {one["name"] for one in CONTAINER["env"]}
     assert {name.removeprefix(PREFIX).lower() for name in named} <= Settings.model_fields.keys()
     assert CONFIGURED.keys() - given.keys() == {"FORWARDED_ALLOW_IPS"}

@@ -87,7 +87,7 @@ def build_dataset(info: RunInfo) -> Dataset:
     arguments: dict[str, Any] = dict(info.generated or {})
     generator = arguments.pop("generator", "synth")
     if generator == "unfamiliar":
-        # Traced by embree, which only the extra `ray` brings.
+        # Traced by embree, which only the extra `oracle` brings.
         from lalaloc_core.data.synthetic.unfamiliar import UnfamiliarScenes
 
         return UnfamiliarScenes(**arguments)

@@ -2,7 +2,7 @@
 
 Begin with `profile.py`, which casts rays at walls; `depth.py` adds floor and ceiling, `layout.py` openings and what
 lies behind them, `poses.py` does it for poses of a plan, `gradient.py` tells how walls change as a pose moves. The same
-lines run on numpy and on torch. `oracle.py` is the slow check of them, which needs the extra `ray` and is not
+lines run on numpy and on torch. `oracle.py` is the slow check of them, which needs the extra `oracle` and is not
 re-exported. Photographs are rendered by `synth`.
 """
 

@@ -1,7 +1,7 @@
 """Slow oracles of the closed forms, which share no formula with them.
 
-Trimesh casts every pixel's ray against the extruded mesh of the room (needs the extra `ray`, embree); what a ray meets
-and what lies behind it is asked of shapely, one ray at a time, by the plan's own lines.
+Trimesh casts every pixel's ray against the extruded mesh of the room (needs the extra `oracle`, embree); what a ray
+meets and what lies behind it is asked of shapely, one ray at a time, by the plan's own lines.
 """
 
 from __future__ import annotations

@@ -42,6 +42,8 @@ def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
     return uvicorn.Config(
         app,
         http=bounded_protocol(settings.head_deadline_s, max_connections),
+        # Not another one where it happens to be installed, as with the extra `ray`.
+        loop="asyncio",
         ws="none",
         log_level="warning",
         # Connections make room for others before; this is for when all of them have a request in work.

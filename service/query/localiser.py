@@ -26,8 +26,8 @@ from service.query.camera_height import stated_height
 from service.query.decoding import Decoder
 from service.query.heading import KnownHeading, known_heading
 from service.query.hints import hint_warnings, stated_hints
-from service.query.lpo_pool import LpoPool
 from service.query.posterior import posterior_answer
+from service.query.refining import Refining
 from service.query.sequence_answers import sequence_answer
 from service.schemas import LocaliseAnswer, LocaliseForm, ModelAnswer, SequenceAnswer, SequenceForm
 from service.settings import Settings
@@ -78,7 +78,7 @@ class Localiser:
         bundle: Bundle,
         encoders: Encoders,
         grids: GridProvider,
-        pool: LpoPool,
+        pool: Refining,
         decoder: Decoder,
         queries: Slots,
         reads: BoundedReads,

@@ -11,7 +11,6 @@ from collections.abc import Callable
 from itertools import product
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,27 +20,22 @@ from lalaloc_core.localise.poses import RefinementJob, RefinementResult
 from lalaloc_core.localise.sequence.joint import SequenceJob, SequenceResult, refine_sequence
 from service.workers.process import serve_jobs
 
-if TYPE_CHECKING:
-    from lalaloc_core.localise.optimise import LatentPoseOptimiser
-
 
 def run_worker(connection: Connection, bundle_folder: str, model_sha256: str, threads: int) -> None:
     """Load the optimiser, warm it up, then answer jobs until the pipe closes."""
     for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ[variable] = str(threads)
-    serve_jobs(connection, lambda: _refiner(_load(Path(bundle_folder), model_sha256, threads)))
+    serve_jobs(connection, lambda: load_refiner(Path(bundle_folder), model_sha256, threads))
 
 
-def _refiner(
-    optimiser: LatentPoseOptimiser,
+def load_refiner(
+    bundle_folder: Path, model_sha256: str, threads: int
 ) -> Callable[[RefinementJob | SequenceJob], RefinementResult | SequenceResult]:
-    def refine(job: RefinementJob | SequenceJob) -> RefinementResult | SequenceResult:
-        return refine_sequence(job) if isinstance(job, SequenceJob) else optimiser.refine(job)
+    """Load the optimiser and warm it up: what answers jobs.
 
-    return refine
-
-
-def _load(bundle_folder: Path, model_sha256: str, threads: int) -> LatentPoseOptimiser:
+    Raises:
+        RuntimeError: the bundle is not the one with that digest.
+    """
     import torch
 
     from lalaloc_core.localise.optimise import LatentPoseOptimiser
@@ -53,7 +47,11 @@ def _load(bundle_folder: Path, model_sha256: str, threads: int) -> LatentPoseOpt
     optimiser = LatentPoseOptimiser.from_bundle(bundle)
     for optimise_heading, by_profile in product((False, True), repeat=2):
         optimiser.refine(warm_up_job(bundle.manifest, optimise_heading=optimise_heading, by_profile=by_profile))
-    return optimiser
+
+    def refine(job: RefinementJob | SequenceJob) -> RefinementResult | SequenceResult:
+        return refine_sequence(job) if isinstance(job, SequenceJob) else optimiser.refine(job)
+
+    return refine
 
 
 def warm_up_job(manifest: Manifest, *, optimise_heading: bool, by_profile: bool) -> RefinementJob:

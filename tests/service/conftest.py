@@ -24,6 +24,7 @@ from PIL import Image
 from service.app import create_app
 from service.settings import Settings
 from tests.service.postgres import PostgresServer, postgres_programs, postgres_server
+from tests.service.ray_cluster import ray_cluster, serving
 
 FLAT: dict[str, Any] = {
     "name": "Flat 3",
@@ -52,7 +53,7 @@ def _no_settings_from_outside(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(autouse=True)
 def _only_what_replicas_share(request: pytest.FixtureRequest) -> None:
-    if _REPLICAS > 1 and request.node.get_closest_marker("one_replica") is not None:
+    if (_REPLICAS > 1 or _DATABASE == "ray") and request.node.get_closest_marker("one_replica") is not None:
         pytest.skip("about what each replica has for itself")
 
 
@@ -76,7 +77,8 @@ def postgres() -> Iterator[PostgresServer]:
 def database_of(request: pytest.FixtureRequest) -> DatabaseOf:
     """The database that an app started on a data folder uses: SQLite, or PostgreSQL with TEST_DATABASE=postgresql.
 
-    With TEST_DATABASE=replicas, two apps use the same PostgreSQL database, and take turns in answering.
+    With TEST_DATABASE=replicas, two apps use the same PostgreSQL database, and take turns in answering. With
+    TEST_DATABASE=ray, the app runs on Ray, on PostgreSQL as well.
     """
     if _DATABASE == "sqlite":
         return lambda data_dir: f"sqlite:///{data_dir / 'lalaloc.sqlite3'}"
@@ -85,7 +87,14 @@ def database_of(request: pytest.FixtureRequest) -> DatabaseOf:
 
 
 @pytest.fixture(scope="session")
-def start_app(tiny_bundle: Path, database_of: DatabaseOf) -> StartApp:
+def ray_address() -> Iterator[str]:
+    """Where the app answers that runs on Ray, see `serving`."""
+    with ray_cluster() as address:
+        yield address
+
+
+@pytest.fixture(scope="session")
+def start_app(request: pytest.FixtureRequest, tiny_bundle: Path, database_of: DatabaseOf) -> StartApp:
     """Starts the production app in this process; without LPO workers unless asked for."""
 
     @contextmanager
@@ -96,6 +105,11 @@ def start_app(tiny_bundle: Path, database_of: DatabaseOf) -> StartApp:
         values |= {"decode_workers": 1, "import_workers": 1}
         settings = Settings(**(values | overrides))
         with ExitStack() as stack:
+            if _DATABASE == "ray":
+                address = request.getfixturevalue("ray_address")
+                stack.enter_context(serving(settings))
+                yield stack.enter_context(httpx.Client(base_url=address, timeout=60.0))
+                return
             urls = [stack.enter_context(serve(create_app(settings))) for _ in range(_REPLICAS)]
             turns = InTurn(urls) if _REPLICAS > 1 else None
             yield stack.enter_context(httpx.Client(base_url=urls[0], timeout=30.0, transport=turns))
@@ -134,7 +148,7 @@ def serve(app: FastAPI) -> Iterator[str]:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         # Connections inherit it; without, answers wait 40 ms for their heads to be acknowledged.
         listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        server = uvicorn.Server(uvicorn.Config(app, log_level="critical"))
+        server = uvicorn.Server(uvicorn.Config(app, http="h11", loop="asyncio", ws="none", log_level="critical"))
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
         thread.start()
         try:

@@ -1,7 +1,7 @@
 """Data sets that are drawn, not read, and writing them to disk.
 
 Begin with `generated.py`, homes of the generator rendered when they are looked at. `mismatched.py` asks them with
-photographs of others, for calibration; `unfamiliar.py` draws the out-of-family homes, which need the extra `ray`;
+photographs of others, for calibration; `unfamiliar.py` draws the out-of-family homes, which need the extra `oracle`;
 `writing.py` is `lalaloc synth`.
 """
 

@@ -1,0 +1,238 @@
+"""What asks the replicas of another deployment, with the face of what does the same in one process."""
+
+from __future__ import annotations
+
+import asyncio
+from time import monotonic
+from typing import Any, TypeVar
+
+import numpy as np
+from jaxtyping import UInt8
+from ray.exceptions import RayError
+from ray.serve.exceptions import BackPressureError
+from ray.serve.handle import DeploymentHandle
+
+from lalaloc_core.bundle import Bundle
+from lalaloc_core.localise.camera_height import CameraHeight
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.pipeline import StageClock
+from lalaloc_core.localise.poses import Query, RefinementJob, RefinementResult
+from lalaloc_core.localise.sequence import SequenceJob, SequenceResult
+from service.errors import DeadlineExceededError, OverloadedError
+from service.on_ray.outcome import Answered, Refused
+from service.pools import LostReason, PoolState
+from service.query.localiser import AskedPicture
+from service.schemas import LocaliseAnswer, LocaliseForm, ModelAnswer, SequenceAnswer, SequenceForm
+from service.settings import Settings
+from service.storage.records import PlanRecord, VenueRecord
+from service.telemetry import Telemetry
+
+# A replica that dies takes its requests with it; what it was asked stores nothing, so another one is asked.
+_ATTEMPTS = 2
+# How much later than the query's own deadline its answer may come: that says more than a deadline does.
+_ON_THE_WAY_S = 1.0
+
+T = TypeVar("T")
+
+
+class RemoteEncoders(Encoders):
+    """The networks, of which that of images runs elsewhere."""
+
+    def __init__(self, bundle: Bundle, settings: Settings, encoder: DeploymentHandle) -> None:
+        super().__init__(bundle, threads=settings.cores.onnx_threads)
+        self._deadline_s = settings.request_deadline_s
+        self._encoder = encoder
+
+    def query(
+        self,
+        image: UInt8[np.ndarray, "h w 3"],
+        heading: float | None,
+        camera_height: CameraHeight,
+        *,
+        heading_tolerance: float = 0.0,
+    ) -> Query:
+        """See `Encoders.query`; for threads, which wait for the answer.
+
+        Raises:
+            DeadlineExceededError: no replica answered, or two died.
+        """
+        for _ in range(_ATTEMPTS):
+            response = self._encoder.query.remote(image, heading, camera_height, heading_tolerance)
+            try:
+                return response.result(timeout_s=self._deadline_s)
+            except TimeoutError:
+                response.cancel()
+                break
+            except RayError:
+                continue
+        raise DeadlineExceededError(self._deadline_s, "the panorama was not encoded")
+
+
+class RemoteRefining:
+    """LPO elsewhere, whose jobs may fail for any reason: the caller then does without, as with `LpoPool`."""
+
+    def __init__(self, lpo: DeploymentHandle | None, telemetry: Telemetry) -> None:
+        """
+        Args:
+            lpo: None: LPO is turned off.
+        """
+        self._lpo = lpo
+        self._telemetry = telemetry
+
+    def start(self) -> None:
+        """Nothing to do: an application runs once all its deployments do."""
+
+    @property
+    def state(self) -> PoolState:
+        """As one worker that is always warm: Ray starts and replaces the replicas."""
+        workers = 0 if self._lpo is None else 1
+        return PoolState(workers=workers, ready=workers, warmed_up=True, fault=None)
+
+    async def refine(self, job: RefinementJob, timeout_s: float, party: str = "") -> RefinementResult | None:
+        """See `LpoPool.refine`; parties do not take turns."""
+        result = await self._answer(job, timeout_s)
+        assert not isinstance(result, SequenceResult)
+        return result
+
+    async def refine_sequence(self, job: SequenceJob, timeout_s: float, party: str = "") -> SequenceResult | None:
+        """As `refine`, of paths."""
+        result = await self._answer(job, timeout_s)
+        assert not isinstance(result, RefinementResult)
+        return result
+
+    def close(self, drain_s: float = 0.0) -> None:
+        """Nothing to do, as for `start`."""
+
+    async def _answer(
+        self, job: RefinementJob | SequenceJob, timeout_s: float
+    ) -> RefinementResult | SequenceResult | None:
+        if self._lpo is None or timeout_s <= 0.0:
+            return None
+        deadline = monotonic() + timeout_s
+        for _ in range(_ATTEMPTS):
+            response = self._lpo.refine.remote(job)
+            try:
+                async with asyncio.timeout(max(deadline - monotonic(), 0.0)):
+                    return await response
+            except TimeoutError:
+                response.cancel()
+                return self._missed("deadline")
+            except BackPressureError:
+                return self._missed("queue-full")
+            except RayError:
+                continue
+        return self._missed("died")
+
+    def _missed(self, reason: LostReason) -> None:
+        self._telemetry.lpo_missed.labels(reason).inc()
+
+
+class _Asking:
+    """Asks the replicas that search, the same one about the same plan or venue while there is no change in them."""
+
+    def __init__(self, search: DeploymentHandle, settings: Settings, telemetry: Telemetry) -> None:
+        self._search = search
+        self._settings = settings
+        self._telemetry = telemetry
+
+    async def _ask(self, method: str, of_id: str, begin: float, clock: StageClock, *arguments: Any) -> Any:
+        """
+        Args:
+            of_id: the plan or venue.
+            begin: when (`monotonic`) the query was there as a whole.
+
+        Raises:
+            LaLaLocError: what the replica raised.
+            OverloadedError: as many wait already as may.
+            DeadlineExceededError: no answer came in time, or two replicas died over it.
+        """
+        deadline_s = self._settings.request_deadline_s
+        with clock.stage("search"):
+            for _ in range(_ATTEMPTS):
+                spent_s = monotonic() - begin
+                call = getattr(self._search.options(session_id=of_id), method)
+                response = call.remote(*arguments, spent_s)
+                try:
+                    async with asyncio.timeout(max(deadline_s + _ON_THE_WAY_S - spent_s, 0.0)):
+                        outcome: Answered[Any] | Refused = await response
+                except TimeoutError:
+                    response.cancel()
+                    break
+                except BackPressureError as error:
+                    raise OverloadedError(self._settings.query_limit) from error
+                except RayError:
+                    continue
+                if isinstance(outcome, Refused):
+                    raise outcome.error
+                return outcome.value
+        raise DeadlineExceededError(deadline_s)
+
+    def _observe(self, answer: LocaliseAnswer | SequenceAnswer) -> None:
+        """Count an answer here as well, where metrics are asked for."""
+        for name, spent_ms in answer.timings_ms.model_dump(exclude_none=True).items():
+            self._telemetry.stage_seconds.labels(name).observe(spent_ms / 1e3)
+        self._telemetry.answers.labels(answer.stage).inc()
+
+
+class RemoteAnswering(_Asking):
+    """Answers queries about plans, as `Localiser` does."""
+
+    def __init__(self, model: ModelAnswer, search: DeploymentHandle, settings: Settings, telemetry: Telemetry) -> None:
+        super().__init__(search, settings, telemetry)
+        self._model = model
+
+    @property
+    def model(self) -> ModelAnswer:
+        """See `Localiser.model`."""
+        return self._model
+
+    async def answer(
+        self, record: PlanRecord, form: LocaliseForm, content: bytes, begin: float, clock: StageClock, party: str
+    ) -> LocaliseAnswer:
+        """See `Localiser.answer`, for the errors as well."""
+        found = await self._ask("answer", record.id, begin, clock, record.tenant, record.id, form, content, party)
+        self._observe(found)
+        return found
+
+    async def picture(
+        self,
+        record: PlanRecord,
+        form: LocaliseForm,
+        content: bytes,
+        begin: float,
+        clock: StageClock,
+        party: str,
+        asked: AskedPicture,
+    ) -> tuple[LocaliseAnswer, bytes]:
+        """See `Localiser.picture`."""
+        arguments = record.tenant, record.id, form, content, party, asked
+        found, drawn = await self._ask("picture", record.id, begin, clock, *arguments)
+        self._observe(found)
+        return found, drawn
+
+    async def answer_sequence(
+        self,
+        record: PlanRecord,
+        form: SequenceForm,
+        contents: list[bytes],
+        begin: float,
+        clock: StageClock,
+        party: str,
+    ) -> SequenceAnswer:
+        """See `Localiser.answer_sequence`."""
+        arguments = record.tenant, record.id, form, contents, party
+        found = await self._ask("answer_sequence", record.id, begin, clock, *arguments)
+        self._observe(found)
+        return found
+
+
+class RemoteVenueAnswering(_Asking):
+    """Answers queries about venues, as `VenueLocaliser` does."""
+
+    async def answer(
+        self, venue: VenueRecord, form: LocaliseForm, content: bytes, begin: float, clock: StageClock, party: str
+    ) -> LocaliseAnswer:
+        """See `VenueLocaliser.answer`."""
+        found = await self._ask("answer_in_venue", venue.id, begin, clock, venue.tenant, venue.id, form, content, party)
+        self._observe(found)
+        return found

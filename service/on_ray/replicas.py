@@ -1,0 +1,198 @@
+"""What runs in the replicas of each deployment."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from contextlib import ExitStack
+from copy import deepcopy
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+import numpy as np
+from fastapi import FastAPI
+from jaxtyping import UInt8
+from ray import serve
+from ray.serve.handle import DeploymentHandle
+
+from lalaloc_core.bundle import Bundle
+from lalaloc_core.errors import LaLaLocError
+from lalaloc_core.localise.camera_height import CameraHeight
+from lalaloc_core.localise.pipeline import StageClock
+from lalaloc_core.localise.poses import Query, RefinementJob, RefinementResult
+from lalaloc_core.localise.sequence import SequenceJob, SequenceResult
+from service.app import create_app
+from service.errors import UnknownFloorPlanError, UnknownVenueError
+from service.on_ray.outcome import Answered, Refused
+from service.on_ray.remote import RemoteAnswering, RemoteEncoders, RemoteRefining, RemoteVenueAnswering
+from service.query.localiser import AskedPicture
+from service.runtime import Elsewhere, start_runtime, warm_encoders
+from service.schemas import LocaliseForm, ModelAnswer, SequenceForm
+from service.settings import Settings
+from service.storage.records import PlanRecord, VenueRecord
+from service.telemetry import Telemetry, configure_logging
+from service.workers.lpo import load_refiner
+
+
+class EncoderReplica:
+    """Encodes panoramas."""
+
+    def __init__(self, settings: Settings, model_sha256: str) -> None:
+        """Raises:
+        RuntimeError: this machine has another bundle than the others.
+        """
+        self._encoders = warm_encoders(_same_bundle(settings, model_sha256), settings)
+
+    def query(
+        self,
+        image: UInt8[np.ndarray, "h w 3"],
+        heading: float | None,
+        camera_height: CameraHeight,
+        heading_tolerance: float,
+    ) -> Query:
+        """See `Encoders.query`."""
+        return self._encoders.query(image, heading, camera_height, heading_tolerance=heading_tolerance)
+
+
+class LpoReplica:
+    """Optimises poses, on torch; the body of an LPO worker in a process that Ray watches over."""
+
+    def __init__(self, settings: Settings, model_sha256: str) -> None:
+        """See `EncoderReplica`."""
+        self._refine = load_refiner(Path(settings.bundle), model_sha256, settings.cores.worker_threads)
+
+    def refine(self, job: RefinementJob | SequenceJob) -> RefinementResult | SequenceResult:
+        """A job's result."""
+        # What comes out of the shared memory may only be read, of which torch warns.
+        return self._refine(deepcopy(job))
+
+
+class SearchReplica:
+    """Answers queries: the service without its HTTP, whose encoder and optimiser are elsewhere."""
+
+    def __init__(self, settings: Settings, model_sha256: str, encoder: DeploymentHandle, lpo: DeploymentHandle) -> None:
+        """See `EncoderReplica`."""
+        _same_bundle(settings, model_sha256)
+        configure_logging(settings.log_level)
+        elsewhere = Elsewhere(
+            pool=lambda _bundle, _settings, telemetry: RemoteRefining(lpo, telemetry),
+            encoders=lambda bundle, settings: RemoteEncoders(bundle, settings, encoder),
+        )
+        self._cleanup = ExitStack()
+        self._runtime = start_runtime(settings, Telemetry(), self._cleanup, elsewhere)
+
+    async def answer(
+        self, tenant: str, plan_id: str, form: LocaliseForm, content: bytes, party: str, spent_s: float
+    ) -> Answered[Any] | Refused:
+        """See `Localiser.answer`.
+
+        Args:
+            spent_s: how long the query has been there as a whole; clocks of machines differ.
+        """
+
+        async def ask(begin: float, clock: StageClock) -> Any:
+            record = await self._plan(tenant, plan_id)
+            return await self._runtime.localiser.answer(record, form, content, begin, clock, party)
+
+        return await _outcome(ask, spent_s)
+
+    async def picture(
+        self,
+        tenant: str,
+        plan_id: str,
+        form: LocaliseForm,
+        content: bytes,
+        party: str,
+        asked: AskedPicture,
+        spent_s: float,
+    ) -> Answered[Any] | Refused:
+        """See `Localiser.picture`."""
+
+        async def ask(begin: float, clock: StageClock) -> Any:
+            record = await self._plan(tenant, plan_id)
+            return await self._runtime.localiser.picture(record, form, content, begin, clock, party, asked)
+
+        return await _outcome(ask, spent_s)
+
+    async def answer_sequence(
+        self, tenant: str, plan_id: str, form: SequenceForm, contents: list[bytes], party: str, spent_s: float
+    ) -> Answered[Any] | Refused:
+        """See `Localiser.answer_sequence`."""
+
+        async def ask(begin: float, clock: StageClock) -> Any:
+            record = await self._plan(tenant, plan_id)
+            return await self._runtime.localiser.answer_sequence(record, form, contents, begin, clock, party)
+
+        return await _outcome(ask, spent_s)
+
+    async def answer_in_venue(
+        self, tenant: str, venue_id: str, form: LocaliseForm, content: bytes, party: str, spent_s: float
+    ) -> Answered[Any] | Refused:
+        """See `VenueLocaliser.answer`."""
+
+        async def ask(begin: float, clock: StageClock) -> Any:
+            venue = await self._venue(tenant, venue_id)
+            return await self._runtime.venue_localiser.answer(venue, form, content, begin, clock, party)
+
+        return await _outcome(ask, spent_s)
+
+    async def revisions(self) -> frozenset[str]:
+        """The revisions of plans whose latent grids are in memory here."""
+        return frozenset(self._runtime.grids.revisions())
+
+    async def _plan(self, tenant: str, plan_id: str) -> PlanRecord:
+        """A plan as it is kept here: with all that has been derived from it."""
+        record = await self._runtime.plan_lookup.find(tenant, plan_id, self._runtime.reads)
+        if record is None:
+            # Deleted since the ingress looked.
+            raise UnknownFloorPlanError(plan_id)
+        return record
+
+    async def _venue(self, tenant: str, venue_id: str) -> VenueRecord:
+        record = await self._runtime.reads.run(self._runtime.store.venues.get, tenant, venue_id)
+        if record is None:
+            raise UnknownVenueError(venue_id)
+        return record
+
+    def __del__(self) -> None:
+        # What Ray calls when it takes a replica down; it is not there where starting failed early.
+        if (cleanup := self.__dict__.get("_cleanup")) is not None:
+            cleanup.close()
+
+
+@serve.ingress()
+class IngressReplica:
+    """The HTTP API: the service's own application, whose queries the replicas that search answer."""
+
+    def __init__(self, settings: Settings, lpo: DeploymentHandle | None, search: DeploymentHandle) -> None:
+        self._settings = settings
+        self._lpo = lpo
+        self._search = search
+
+    def __serve_build_asgi_app__(self) -> FastAPI:
+        def queries(
+            model: ModelAnswer, settings: Settings, telemetry: Telemetry
+        ) -> tuple[RemoteAnswering, RemoteVenueAnswering]:
+            plans = RemoteAnswering(model, self._search, settings, telemetry)
+            return plans, RemoteVenueAnswering(self._search, settings, telemetry)
+
+        elsewhere = Elsewhere(
+            pool=lambda _bundle, _settings, telemetry: RemoteRefining(self._lpo, telemetry),
+            encoders=warm_encoders,
+            queries=queries,
+        )
+        return create_app(self._settings, elsewhere)
+
+
+async def _outcome(ask: Callable[[float, StageClock], Awaitable[Any]], spent_s: float) -> Answered[Any] | Refused:
+    try:
+        return Answered(await ask(monotonic() - spent_s, StageClock()))
+    except LaLaLocError as error:
+        return Refused.of(error)
+
+
+def _same_bundle(settings: Settings, model_sha256: str) -> Bundle:
+    bundle = Bundle.open(settings.bundle)
+    if bundle.sha256 != model_sha256:
+        raise RuntimeError(f"the bundle in {settings.bundle} is {bundle.sha256}, elsewhere it is {model_sha256}")
+    return bundle

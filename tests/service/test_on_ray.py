@@ -1,0 +1,147 @@
+"""The service on Ray: one application answers as one process does, and keeps each plan with one of its replicas.
+
+`.venv/bin/pytest -m slow tests/service/test_on_ray.py` starts a cluster of its own, and `TEST_DATABASE=ray
+.venv/bin/pytest tests/service` runs the other tests on one as well.
+"""
+
+from __future__ import annotations
+
+import json
+import pickle
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import pytest
+
+from lalaloc_core.errors import ConfigError
+from service.errors import DeadlineExceededError, InvalidRequestError, PlanNotReadyError
+from service.problem_kinds import PROBLEMS, problem_kind
+from service.settings import Settings
+from tests.service.conftest import FLAT, StartApp, assert_problem, localise, serving, upload, wait_for
+
+ray = pytest.importorskip("ray", reason="Ray is not installed: pip install -c constraints.txt -e '.[ray]'")
+
+from ray import serve  # noqa: E402
+
+from service.on_ray import app  # noqa: E402
+from service.on_ray.outcome import Refused  # noqa: E402
+from tests.service.ray_cluster import NAME  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def data_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where plans are kept."""
+    return tmp_path_factory.mktemp("data")
+
+
+@pytest.fixture(scope="module")
+def on_ray(ray_address: str, tiny_bundle: Path, data_dir: Path) -> Iterator[httpx.Client]:
+    """The service on Ray, with two replicas that search."""
+    # Deadlines as they would be on a machine that has nothing else to do are not what is tested.
+    patient: dict[str, Any] = {"request_deadline_s": 50.0, "decode_stall_s": 50.0, "lpo_deadline_s": 30.0}
+    processes: dict[str, Any] = {"decode_workers": 1, "import_workers": 1}
+    settings = Settings(data_dir=data_dir, bundle=tiny_bundle, log_level="error", **patient, **processes)
+    with serving(settings), httpx.Client(base_url=ray_address, timeout=60.0) as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def plan_id(on_ray: httpx.Client) -> str:
+    """A plan, stored through Ray."""
+    return upload(on_ray, FLAT)
+
+
+@pytest.mark.slow
+def test_it_answers_as_one_process_does(
+    on_ray: httpx.Client, plan_id: str, start_app: StartApp, data_dir: Path, panorama: bytes
+) -> None:
+    assert on_ray.get("/readyz").status_code == 200
+    told = localise(on_ray, plan_id, panorama, refine="vdr", heading_deg=30).json()
+    with start_app(data_dir) as alone:
+        expected = localise(alone, plan_id, panorama, refine="vdr", heading_deg=30).json()
+    for name in ("position", "heading_deg", "room", "cost", "stage", "model", "floorplan_revision"):
+        assert told[name] == pytest.approx(expected[name]), name
+    optimised = localise(on_ray, plan_id, panorama, heading_deg=30).json()
+    assert optimised["stage"] == "lpo"
+    assert optimised["cost"] <= told["cost"]
+
+
+@pytest.mark.slow
+def test_sequences_venues_and_pictures_are_answered(on_ray: httpx.Client, plan_id: str, panorama: bytes) -> None:
+    files = [("panorama", ("p.jpg", panorama, "image/jpeg"))] * 2
+    sequence = on_ray.post("/localise/sequence", data={"floorplan_id": plan_id}, files=files)
+    assert sequence.status_code == 200, sequence.text
+    venue = on_ray.post("/venues", json={"plans": [{"floorplan_id": plan_id, "level": 1}]}).json()["id"]
+    found = on_ray.post("/localise", data={"venue_id": venue}, files=files[:1])
+    assert found.json()["floorplan_id"] == plan_id, found.text
+    accepted = {"Accept": "image/png"}
+    drawn = on_ray.post("/localise", data={"floorplan_id": plan_id}, files=files[:1], headers=accepted)
+    assert drawn.content.startswith(b"\x89PNG"), drawn.text
+
+
+@pytest.mark.slow
+def test_what_a_replica_refuses_is_told_as_ever(on_ray: httpx.Client, plan_id: str, panorama: bytes) -> None:
+    assert_problem(localise(on_ray, plan_id, b"no picture"), 422, "invalid-panorama")
+    assert_problem(localise(on_ray, plan_id, panorama, rooms=json.dumps(["nowhere"])), 422, "invalid-hint")
+    assert_problem(localise(on_ray, "0" * 32, panorama), 404, "unknown-floorplan")
+    assert_problem(localise(on_ray, plan_id, panorama, camera_height_m=2.6), 422, "invalid-pose")
+
+
+@pytest.mark.slow
+def test_each_plan_stays_in_the_memory_of_one_replica(on_ray: httpx.Client, panorama: bytes) -> None:
+    plans = [upload(on_ray, FLAT | {"name": f"flat {number}"}) for number in range(8)]
+    revisions = {localise(on_ray, plan, panorama, refine="none").json()["floorplan_revision"] for plan in plans * 2}
+    search = serve.get_deployment_handle("search", NAME)
+    # Enough to come across both.
+    kept = {search.options(session_id=str(number)).revisions.remote().result(timeout_s=30) for number in range(16)}
+    shares = [of_one & revisions for of_one in kept]
+    assert len(shares) == 2
+    assert all(shares)
+    assert sum(len(share) for share in shares) == len(revisions) == len(plans)
+
+
+@pytest.mark.slow
+def test_an_optimiser_that_dies_is_done_without_and_replaced(
+    on_ray: httpx.Client, plan_id: str, panorama: bytes
+) -> None:
+    named = ray.util.list_named_actors(all_namespaces=True)
+    [lpo] = [one for one in named if one["name"].startswith(f"SERVE_REPLICA::{NAME}#lpo#")]
+    ray.kill(ray.get_actor(**lpo), no_restart=True)
+    assert localise(on_ray, plan_id, panorama).status_code == 200
+    wait_for(lambda: localise(on_ray, plan_id, panorama).json()["stage"] == "lpo", timeout_s=120.0)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        ({"search_max": "0"}, "search_max is '0': .*greater than or equal to 1"),
+        ({"searchers": "2"}, "searchers is '2': .*known are ingress_min, ingress_max"),
+        ({"lpo_min": "3", "lpo_max": "2"}, "lpo_max is 2, less than lpo_min, which is 3"),
+    ],
+)
+def test_numbers_of_replicas_that_cannot_be_are_refused_by_name(
+    arguments: dict[str, str], told: str, tiny_bundle: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("LALALOC_BUNDLE", str(tiny_bundle))
+    assert isinstance(app({"search_max": "2"}), serve.Application)
+    with pytest.raises(ConfigError, match=told):
+        app(arguments)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        PlanNotReadyError("p", 1.5, 0.25),
+        DeadlineExceededError(10.0),
+        InvalidRequestError([("top_k", "is 0, at least 1 is needed")]),
+    ],
+)
+def test_errors_arrive_with_all_that_they_say(error: Any) -> None:
+    arrived = pickle.loads(pickle.dumps(Refused.of(error))).error
+    assert type(arrived) is type(error)
+    assert str(arrived) == str(error)
+    assert vars(arrived) == vars(error)
+    assert problem_kind(arrived) is problem_kind(error)
+    assert type(error) in PROBLEMS
