@@ -10,10 +10,10 @@ from time import monotonic
 from typing import Any
 
 import numpy as np
-from fastapi import FastAPI
 from jaxtyping import UInt8
 from ray import serve
 from ray.serve.handle import DeploymentHandle
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.errors import LaLaLocError
@@ -169,7 +169,7 @@ class IngressReplica:
         self._lpo = lpo
         self._search = search
 
-    def __serve_build_asgi_app__(self) -> FastAPI:
+    def __serve_build_asgi_app__(self) -> ASGIApp:
         def queries(
             model: ModelAnswer, settings: Settings, telemetry: Telemetry
         ) -> tuple[RemoteAnswering, RemoteVenueAnswering]:
@@ -181,7 +181,22 @@ class IngressReplica:
             encoders=warm_encoders,
             queries=queries,
         )
-        return create_app(self._settings, elsewhere)
+        return named_once(create_app(self._settings, elsewhere))
+
+
+def named_once(app: ASGIApp) -> ASGIApp:
+    """An application that leaves it to Ray's proxy to tell the id of a request, which it adds to every answer."""
+
+    async def without_id(scope: Scope, receive: Receive, send: Send) -> None:
+        async def told(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                kept = [(name, value) for name, value in message["headers"] if name.lower() != b"x-request-id"]
+                message = {**message, "headers": kept}
+            await send(message)
+
+        await app(scope, receive, told)
+
+    return without_id
 
 
 async def _outcome(ask: Callable[[float, StageClock], Awaitable[Any]], spent_s: float) -> Answered[Any] | Refused:
