@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Unpack
 
 from lalaloc_client import operations, requests
 from lalaloc_client.async_sender import AsyncSender
-from lalaloc_client.model import Localisation, SequenceLocalisation
+from lalaloc_client.model import GeoPoseAnswer, Localisation, SequenceLocalisation
 from lalaloc_client.requests import Picture, PictureFormat, QueryOptions, Refine, SequenceRefine
 
 if TYPE_CHECKING:
@@ -81,13 +81,8 @@ class AsyncQueryMethods(AsyncSender):
         venue_id: str,
         panorama: bytes | str | os.PathLike[str] | Image,
         *,
-        heading_deg: float | None = None,
-        heading_tolerance_deg: float | None = None,
-        camera_height_m: float | None = None,
-        camera_height_std_m: float | None = None,
-        strict: bool | None = None,
-        refine: Refine | None = None,
-        top_k: int | None = None,
+        level: float | None = None,
+        **asked: Unpack[QueryOptions],
     ) -> Localisation:
         """See `Client.localise_in_venue`."""
         return await self._query(
@@ -96,13 +91,30 @@ class AsyncQueryMethods(AsyncSender):
             None,
             panorama,
             venue_id=venue_id,
-            heading_deg=heading_deg,
-            heading_tolerance_deg=heading_tolerance_deg,
-            camera_height_m=camera_height_m,
-            camera_height_std_m=camera_height_std_m,
-            refine=refine,
-            top_k=top_k,
-            strict=strict,
+            level=level,
+            **asked,
+        )
+
+    async def geopose(
+        self,
+        panorama: bytes | str | os.PathLike[str] | Image,
+        *,
+        floorplan_id: str | None = None,
+        venue_id: str | None = None,
+        latitude: float | None = None,
+        longitude: float | None = None,
+        accuracy_m: float | None = None,
+    ) -> GeoPoseAnswer:
+        """See `Client.geopose`."""
+        return await self._query(
+            operations.geopose,
+            requests.geopose_request,
+            panorama,
+            floorplan_id=floorplan_id,
+            venue_id=venue_id,
+            latitude=latitude,
+            longitude=longitude,
+            accuracy_m=accuracy_m,
         )
 
     async def localise_sequence(

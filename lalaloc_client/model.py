@@ -348,6 +348,63 @@ class Localisation:
 
 
 @dataclass(frozen=True)
+class GeoPoseQuaternion:
+    """A rotation from the camera (x right, y where the panorama's centre looks, z up) to east, north, up."""
+
+    x: float
+    y: float
+    z: float
+    w: float
+
+
+@dataclass(frozen=True)
+class QuaternionGeoPose:
+    """A pose on Earth: OGC GeoPose 1.0, Basic-Quaternion."""
+
+    position: GeoPosePosition
+    quaternion: GeoPoseQuaternion
+
+
+@dataclass(frozen=True)
+class GeoPoseAccuracy:
+    """How far off a pose may be: metres, and degrees about the vertical."""
+
+    position: float
+    orientation: float
+
+
+@dataclass(frozen=True)
+class PlaceInPlan:
+    """Where a device is, by its floor plan; attributes as of `Localisation`."""
+
+    floorplan_id: str
+    level: float | None
+    position: Position
+    heading_deg: float
+    room: str
+    room_id: str
+    confidence: float | None
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class GeoPoseAnswer:
+    """An answer of the OSCP GeoPose protocol.
+
+    Attributes:
+        id, timestamp: of the request.
+        lalaloc: what the protocol has no place for.
+    """
+
+    id: str
+    timestamp: float
+    type: str
+    accuracy: GeoPoseAccuracy
+    geopose: QuaternionGeoPose
+    lalaloc: PlaceInPlan
+
+
+@dataclass(frozen=True)
 class SequencePose:
     """Where one panorama of a sequence was taken, by all of them together; attributes as of `Localisation`."""
 

@@ -27,6 +27,7 @@ from lalaloc_client.layout import Layout
 from lalaloc_client.model import (
     FloorPlan,
     FloorPlanPage,
+    GeoPoseAnswer,
     Localisation,
     PlanEvent,
     Readiness,
@@ -162,6 +163,11 @@ def localisation(request: Request, patience: Patience) -> Steps[Localisation]:
 def sequence(request: Request, patience: Patience) -> Steps[SequenceLocalisation]:
     """Send a query of several panoramas."""
     return parse(SequenceLocalisation, _json((yield from send(request, patience)).response))
+
+
+def geopose(request: Request, patience: Patience) -> Steps[GeoPoseAnswer]:
+    """Send a request of the OSCP GeoPose protocol."""
+    return parse(GeoPoseAnswer, _json((yield from send(request, patience)).response))
 
 
 def content(request: Request, patience: Patience) -> Steps[bytes]:

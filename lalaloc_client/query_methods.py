@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Unpack
 
 from lalaloc_client import operations, requests
-from lalaloc_client.model import Localisation, SequenceLocalisation
+from lalaloc_client.model import GeoPoseAnswer, Localisation, SequenceLocalisation
 from lalaloc_client.requests import Picture, PictureFormat, QueryOptions, Refine, SequenceRefine
 from lalaloc_client.sender import Sender
 
@@ -47,7 +47,8 @@ class QueryMethods(Sender):
             heading_tolerance_deg: how far off that may be, up to 45; None: not at all.
             camera_height_m: over the floor; None: the plan's, and if it has none, any.
             camera_height_std_m: standard deviation of that, which is solved for; None: the plan's, or 0.1; 0: exact.
-            near: where the camera stood, about: {"x_m": 3.5, "y_m": 2.0}, in the plan.
+            near: where the camera stood, about: {"x_m": 3.5, "y_m": 2.0} in the plan, or with an anchor {"latitude":
+                48.1372, "longitude": 11.5757}.
             radius_m: how far from there it may have stood; needed with `near`.
             rooms: ids or names of rooms in one of which it stood.
             strict: whether nothing else is looked at than what hints and heading say; None: they may be wrong.
@@ -108,28 +109,54 @@ class QueryMethods(Sender):
         venue_id: str,
         panorama: bytes | str | os.PathLike[str] | Image,
         *,
-        heading_deg: float | None = None,
-        heading_tolerance_deg: float | None = None,
-        camera_height_m: float | None = None,
-        camera_height_std_m: float | None = None,
-        strict: bool | None = None,
-        refine: Refine | None = None,
-        top_k: int | None = None,
+        level: float | None = None,
+        **asked: Unpack[QueryOptions],
     ) -> Localisation:
-        """In which plan of a venue a panorama was taken, and where; the arguments are those of `localise`."""
+        """In which plan of a venue a panorama was taken, and where.
+
+        Args:
+            level: on which level the camera stood, as of hints: it may be wrong unless `strict`.
+
+        The others are those of `localise`; `near` is a latitude and longitude, or in a venue with an anchor a point of
+        the frame that all plans are drawn in.
+        """
         return self._query(
             operations.localisation,
             requests.localise_request,
             None,
             panorama,
             venue_id=venue_id,
-            heading_deg=heading_deg,
-            heading_tolerance_deg=heading_tolerance_deg,
-            camera_height_m=camera_height_m,
-            camera_height_std_m=camera_height_std_m,
-            refine=refine,
-            top_k=top_k,
-            strict=strict,
+            level=level,
+            **asked,
+        )
+
+    def geopose(
+        self,
+        panorama: bytes | str | os.PathLike[str] | Image,
+        *,
+        floorplan_id: str | None = None,
+        venue_id: str | None = None,
+        latitude: float | None = None,
+        longitude: float | None = None,
+        accuracy_m: float | None = None,
+    ) -> GeoPoseAnswer:
+        """Where on Earth a panorama was taken, by the OSCP GeoPose protocol.
+
+        Args:
+            panorama: as of `localise`.
+            floorplan_id, venue_id: what it was taken in; None of both: in a plan near the place, which is then needed.
+            latitude, longitude: about where, degrees.
+            accuracy_m: how far off that may be; None: not known.
+        """
+        return self._query(
+            operations.geopose,
+            requests.geopose_request,
+            panorama,
+            floorplan_id=floorplan_id,
+            venue_id=venue_id,
+            latitude=latitude,
+            longitude=longitude,
+            accuracy_m=accuracy_m,
         )
 
     def localise_sequence(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import base64
 import hashlib
 import io
 import json
 import math
 import os
 import re
+import time
 import uuid
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -181,6 +183,7 @@ def localise_request(
     strict: bool | None = None,
     posterior: bool = False,
     venue_id: str | None = None,
+    level: float | None = None,
 ) -> Request:
     """A query about a plan or a venue; it stores nothing, so asking twice is as good as once."""
     given = {
@@ -195,12 +198,52 @@ def localise_request(
         "radius_m": radius_m,
         "strict": strict,
         "include": "posterior" if posterior else None,
+        "level": level,
         "near": None if near is None else json.dumps(dict(near)),
         # Text alone would be taken for a room by each of its letters.
         "rooms": None if rooms is None else json.dumps([rooms] if isinstance(rooms, str) else list(rooms)),
     }
     _check_finite({**given, **{f"near['{name}']": value for name, value in (near or {}).items()}})
     return _query("/localise", given, [panorama])
+
+
+def geopose_request(
+    panorama: bytes | str | os.PathLike[str] | Image,
+    *,
+    floorplan_id: str | None,
+    venue_id: str | None,
+    latitude: float | None,
+    longitude: float | None,
+    accuracy_m: float | None,
+) -> Request:
+    """A request of the OSCP GeoPose protocol.
+
+    Raises:
+        ValueError: half a place, or an accuracy without one; or a number that is not finite.
+    """
+    if (latitude is None) != (longitude is None):
+        raise ValueError(f"latitude is {latitude} and longitude is {longitude}, they belong together")
+    if latitude is None and accuracy_m is not None:
+        raise ValueError("accuracy_m needs a place, latitude and longitude")
+    _check_finite({"latitude": latitude, "longitude": longitude, "accuracy_m": accuracy_m})
+    now_ms = time.time_ns() // 1_000_000
+    privacy = {
+        f"data{what}": [] for what in ("Retention", "AcceptableUse", "SanitizationApplied", "SanitizationRequested")
+    }
+    common = {"timestamp": now_ms, "privacy": privacy}
+    picture = base64.b64encode(_picture(panorama)).decode("ascii")
+    # The size of a file is in the file.
+    camera = {"sensorId": "camera", "sequenceNumber": 0, "imageFormat": "JPG", "size": [], "imageBytes": picture}
+    sensors, readings = [{"id": "camera", "type": "camera"}], {"cameraReadings": [common | camera]}
+    if latitude is not None:
+        place = {"sensorId": "place", "latitude": latitude, "longitude": longitude, "accuracy": accuracy_m or 0.0}
+        sensors.append({"id": "place", "type": "geolocation"})
+        readings["geolocationReadings"] = [common | place]
+    asked = {"id": uuid.uuid4().hex, "timestamp": now_ms, "type": "geopose", "sensors": sensors}
+    given = {"floorplan_id": floorplan_id, "venue_id": venue_id}
+    params = {name: value for name, value in given.items() if value is not None}
+    content = json.dumps(asked | {"sensorReadings": readings}).encode()
+    return Request("POST", "/geopose", params, {"Content-Type": _JSON}, content)
 
 
 def sequence_request(

@@ -9,6 +9,7 @@ LaLaLocError
     ├── UnknownRevisionError        no such revision of the floor plan
     ├── UnknownAnswerError          no answer is kept under this id
     ├── UnanchoredPlanError         the floor plan does not say where on Earth it lies
+    ├── NoPlanNearbyError           no floor plan lies near a place on Earth
     ├── UploadTooLargeError         more bytes than allowed
     ├── UploadTimeoutError          the upload took too long
     ├── UnsupportedMediaError       a body of a type that is not read here
@@ -110,6 +111,15 @@ class UnanchoredPlanError(ServiceError):
     def __init__(self, plan_id: str, venue_id: str | None = None) -> None:
         nor = "" if venue_id is None else f", nor has venue '{venue_id}'"
         super().__init__(f"floor plan '{plan_id}' has no anchor{nor}, so there is no answer in latitude and longitude")
+
+
+class NoPlanNearbyError(ServiceError):
+    """No floor plan with an anchor lies near a place on Earth."""
+
+    def __init__(self, place: str, within_m: float) -> None:
+        super().__init__(
+            f"no floor plan with an anchor lies within {within_m:g} m of {place}: say which by floorplan_id or venue_id"
+        )
 
 
 class UploadTooLargeError(ServiceError):

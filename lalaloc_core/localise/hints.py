@@ -14,7 +14,8 @@ fences: nothing outside is looked at.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -24,7 +25,7 @@ from jaxtyping import Float, Int
 from lalaloc_core.errors import InvalidHintError
 from lalaloc_core.floorplan import FloorPlan
 
-HintName = Literal["near", "rooms"]
+HintName = Literal["near", "rooms", "level"]
 RADIUS_RANGE_M = (0.1, 1000.0)
 # ε, the probability that a hint is wrong altogether.
 _DOUBT = 0.02
@@ -38,15 +39,49 @@ _ROOMS_TOLD = 20
 
 @dataclass(frozen=True)
 class Near:
-    """A point of the plan (m), and how far from it the camera is said to be at most."""
+    """A point of the plan (m), and how far from it the camera is said to be at most.
+
+    Attributes:
+        said: the point as it was given, where that was in other words.
+    """
 
     x_m: float
     y_m: float
     radius_m: float
+    said: str = ""
 
-    def distance_m(self, position_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
-        """How far places are from the point."""
+    def __str__(self) -> str:
+        return self.said or f"({self.x_m:g}, {self.y_m:g})"
+
+    def distance_m(
+        self, position_m: Float[np.ndarray, "n 2"], room_index: Int[np.ndarray, "n"]
+    ) -> Float[np.ndarray, "n"]:
+        """How far places are from the point, whatever their rooms."""
         return np.hypot(position_m[:, 0] - self.x_m, position_m[:, 1] - self.y_m)
+
+
+@dataclass(frozen=True, eq=False)
+class NearInEach:
+    """One place in each of several plans that are searched as one, such as what GPS says in all storeys of a house.
+
+    Attributes:
+        point_m: (r, 2) where it is in the frame of each room's plan; NaN where it is not known where that plan lies,
+            of whose places the hint says nothing.
+        said: the place as it was given.
+    """
+
+    point_m: Float[np.ndarray, "r 2"]
+    radius_m: float
+    said: str
+
+    def __str__(self) -> str:
+        return self.said
+
+    def distance_m(
+        self, position_m: Float[np.ndarray, "n 2"], room_index: Int[np.ndarray, "n"]
+    ) -> Float[np.ndarray, "n"]:
+        """How far places in these rooms are from it; NaN where that is not known."""
+        return np.linalg.norm(position_m - self.point_m[room_index], axis=1)
 
 
 @dataclass(frozen=True)
@@ -55,12 +90,17 @@ class Hints:
 
     Attributes:
         rooms: numbers of the rooms of which the camera stands in one.
+        level: numbers of the rooms on the level that the camera is on, of plans that are searched as one.
         strict: whether nothing else is possible.
+        shares: how much of the area a hint leaves, where that is not of this plan alone, as where a plan is of the
+            most probable ones of many.
     """
 
-    near: Near | None = None
+    near: Near | NearInEach | None = None
     rooms: frozenset[int] | None = None
+    level: frozenset[int] | None = None
     strict: bool = False
+    shares: Mapping[HintName, float] = field(default_factory=dict)
 
     def check(self, plan: FloorPlan) -> None:
         """See that the hints can be meant for a plan.
@@ -71,19 +111,19 @@ class Hints:
         """
         if self.rooms is not None and not self.rooms:
             raise InvalidHintError("rooms", "none is named: leave the hint out where nothing is known")
-        if self.near is None:
+        if not isinstance(self.near, Near):
             return
         low, high = RADIUS_RANGE_M
         if not low <= self.near.radius_m <= high:
             raise InvalidHintError("radius_m", f"{self.near.radius_m:g} m, it must be between {low:g} and {high:g} m")
         if not (math.isfinite(self.near.x_m) and math.isfinite(self.near.y_m)):
-            raise InvalidHintError("near", f"({self.near.x_m:g}, {self.near.y_m:g}) is no point of the plan")
+            raise InvalidHintError("near", f"{self.near} is no point of the plan")
         point = shapely.Point(self.near.x_m, self.near.y_m)
         away_m = min(shapely.distance(shapely.Polygon(room.polygon_m), point) for room in plan.rooms)
         if away_m > self.near.radius_m:
             raise InvalidHintError(
                 "near",
-                f"({self.near.x_m:g}, {self.near.y_m:g}) is {away_m:.3g} m from the nearest room of the plan, farther "
+                f"{self.near} is {away_m:.3g} m from the nearest room of the plan, farther "
                 f"than radius_m, {self.near.radius_m:g} m",
             )
 
@@ -94,10 +134,12 @@ class Hints:
         total = np.zeros(len(position_m))
         for name, inside in self._inside(position_m, room_index).items():
             if self.strict:
-                total[inside < 1.0] = np.inf
+                total[~(inside >= 1.0)] = np.inf
                 continue
-            odds = (1.0 - _DOUBT) / (_DOUBT * max(self._share(plan, name), _MIN_SHARE))
-            total += math.log1p(odds) - np.log1p(odds * inside)
+            share = max(self._share(plan, name), _MIN_SHARE)
+            odds = (1.0 - _DOUBT) / (_DOUBT * share)
+            # Where nothing is said, f is 1, which it is also where g is the share.
+            total += math.log1p(odds) - np.log1p(odds * np.where(np.isnan(inside), share, inside))
         return total
 
     def missed(self, position_m: Float[np.ndarray, "2"], room_index: int) -> tuple[HintName, ...]:
@@ -108,7 +150,7 @@ class Hints:
     @property
     def are_none(self) -> bool:
         """Whether nothing is known."""
-        return self.near is None and self.rooms is None
+        return self.near is None and self.rooms is None and self.level is None
 
     @property
     def doubted(self) -> Hints:
@@ -118,25 +160,43 @@ class Hints:
     def _inside(
         self, position_m: Float[np.ndarray, "n 2"], room_index: Int[np.ndarray, "n"]
     ) -> dict[HintName, Float[np.ndarray, "n"]]:
-        """g of every hint."""
+        """g of every hint; NaN where it says nothing."""
         found: dict[HintName, Float[np.ndarray, "n"]] = {}
         if self.near is not None:
-            beyond = np.maximum(self.near.distance_m(position_m) / self.near.radius_m - 1.0, 0.0)
+            beyond = np.maximum(self.near.distance_m(position_m, room_index) / self.near.radius_m - 1.0, 0.0)
             found["near"] = np.exp(-0.5 * np.square(beyond / _FALL_OFF))
-        if self.rooms is not None:
-            found["rooms"] = np.isin(room_index, list(self.rooms)).astype(float)
+        for name, rooms in self._of_rooms().items():
+            found[name] = np.isin(room_index, list(rooms)).astype(float)
         return found
+
+    def _of_rooms(self) -> dict[HintName, frozenset[int]]:
+        """The hints that are of some rooms."""
+        given: dict[HintName, frozenset[int] | None] = {"rooms": self.rooms, "level": self.level}
+        return {name: rooms for name, rooms in given.items() if rooms is not None}
 
     def _share(self, plan: FloorPlan, name: HintName) -> float:
         """How much of the plan's area a hint leaves."""
+        if name in self.shares:
+            return self.shares[name]
         if name == "near":
             assert self.near is not None
             return min(math.pi * self.near.radius_m**2 / plan.area_m2, 1.0)
-        assert self.rooms is not None
-        return sum(plan.rooms[index].area_m2 for index in self.rooms) / plan.area_m2
+        return sum(plan.rooms[index].area_m2 for index in self._of_rooms()[name]) / plan.area_m2
 
 
 NO_HINTS = Hints()
+
+
+def log_factor(inside: Float[np.ndarray, "n"], share: float, *, strict: bool) -> Float[np.ndarray, "n"]:
+    """Log of f, the factor of the prior, of regions that are inside to some share; that of no hint is 0.
+
+    Args:
+        share: of all that is possible, how much is inside.
+    """
+    share = max(share, _MIN_SHARE)
+    doubt = 0.0 if strict else _DOUBT
+    with np.errstate(divide="ignore"):
+        return np.log((1.0 - doubt) * inside / share + doubt)
 
 
 def rooms_named(plan: FloorPlan, names: list[str]) -> frozenset[int]:

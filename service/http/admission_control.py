@@ -23,7 +23,7 @@ EXEMPT = frozenset({"/healthz", "/readyz", "/metrics"})
 # What every other request may be refused with, or end with.
 REFUSALS = (OverloadedError, StoppingError, DeadlineExceededError)
 _READING = frozenset({"GET", "HEAD", "OPTIONS"})
-_QUERIES = frozenset({"/localise", "/localise/sequence"})
+_QUERIES = frozenset({"/localise", "/localise/sequence", "/geopose"})
 _STREAMS = "/events"
 _READS_AT_A_TIME = 4
 # How much the last request counts in the mean that Retry-After is told by.

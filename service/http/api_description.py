@@ -10,6 +10,7 @@ from fastapi.openapi.utils import get_openapi
 from service.http import admission_control as admission
 from service.http.problems import add_problems
 from service.schemas import (
+    EarthPoint,
     FloorPlanDocument,
     PlanEvent,
     PlanPoint,
@@ -18,12 +19,23 @@ from service.schemas import (
     VenueChangeDocument,
     VenueDocument,
 )
+from service.schemas.oscp import OscpRequest
 from service.security import access_control
 from service.security.permissions import NEEDED
 
 _KEY = "api_key"
 # Models that only hand-written parts of the description refer to.
-_BY_HAND = (FloorPlanDocument, PlanEvent, PlanPoint, Problem, StatedMotion, VenueDocument, VenueChangeDocument)
+_BY_HAND = (
+    EarthPoint,
+    FloorPlanDocument,
+    OscpRequest,
+    PlanEvent,
+    PlanPoint,
+    Problem,
+    StatedMotion,
+    VenueDocument,
+    VenueChangeDocument,
+)
 
 
 def describe_api(app: FastAPI) -> dict[str, Any]:

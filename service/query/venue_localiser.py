@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from functools import partial
 from time import monotonic
 from typing import Any
@@ -23,7 +24,7 @@ from lalaloc_core.localise.pipeline import Localisation, LocaliseConfig, StageCl
 from lalaloc_core.localise.poses import Candidate, LatentGrid, Query
 from lalaloc_core.localise.prototypes import share_searched
 from lalaloc_core.localise.side_by_side import PlansSideBySide
-from service.errors import VenueNotReadyError, VenueUnsearchableError
+from service.errors import NoPlanNearbyError, VenueNotReadyError, VenueUnsearchableError
 from service.grids import check_height_m
 from service.http.admission_control import Slots
 from service.query.answers import Place, compose, heading_contradiction
@@ -31,8 +32,9 @@ from service.query.decoding import Decoder
 from service.query.geopose import anchor_of
 from service.query.heading import KnownHeading, known_heading
 from service.query.localiser import Localiser
+from service.query.venue_hints import VenueHints
 from service.query.venue_plans import VenuePlans, venue_height
-from service.schemas import LocaliseAnswer, LocaliseForm, PlanProbability
+from service.schemas import EarthPoint, LocaliseAnswer, LocaliseForm, PlanProbability
 from service.settings import Settings
 from service.storage.records import PlanRecord, VenueRecord
 
@@ -40,6 +42,8 @@ from service.storage.records import PlanRecord, VenueRecord
 _CONFIG = LocaliseConfig(by_probability=True, profile_candidates=32, profile_candidates_turned=48)
 # How often a venue is looked at none of whose plans is ready.
 _LOOK_EVERY_S = 0.25
+# Tells the plans that are asked about, as they are at the moment.
+Members = Callable[[], Awaitable[Sequence[Row[Any]]]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +56,7 @@ class _Searched:
         index: which of those the searched ones are.
         warnings: what was left out.
         anchor: of the venue.
+        hints: about the plans as they lie side by side.
     """
 
     rows: Sequence[Row[Any]]
@@ -61,6 +66,7 @@ class _Searched:
     index: Sequence[int]
     warnings: list[str]
     anchor: Anchor | None
+    hints: Hints
 
     def place(self, candidate: Candidate) -> Place:
         """Where a candidate is."""
@@ -115,21 +121,74 @@ class VenueLocaliser:
         async with self._queries.wait_and_hold(party, begin + self._settings.request_deadline_s):
             return await self._answer(venue, form, content, begin, clock, party)
 
+    async def check_hints(self, venue: VenueRecord, form: LocaliseForm) -> None:
+        """Raises:
+        InvalidHintError: what the form says of the place cannot be of the venue.
+        """
+        VenueHints.of(form, venue.anchor).check(await self._plans.members(venue.id))
+
+    async def answer_near(
+        self,
+        tenant: str,
+        place: EarthPoint,
+        within_m: float,
+        form: LocaliseForm,
+        content: bytes,
+        begin: float,
+        clock: StageClock,
+        party: str,
+    ) -> LocaliseAnswer:
+        """As `answer`, in all plans of a tenant with an anchor that lie so near a place on Earth.
+
+        Raises:
+            NoPlanNearbyError: there are none.
+            LaLaLocError: see `answer`.
+        """
+        members = await self._plans.near(tenant, place, within_m)
+        if not members:
+            raise NoPlanNearbyError(str(place), within_m)
+        now = datetime.now(UTC)
+        of_place = VenueRecord(
+            id=f"near {place}",
+            tenant=tenant,
+            revision_id="",
+            revision=1,
+            name="",
+            anchor=None,
+            plans=len(members),
+            created_at=now,
+            updated_at=now,
+        )
+        async with self._queries.wait_and_hold(party, begin + self._settings.request_deadline_s):
+            return await self._answer(
+                of_place, form, content, begin, clock, party, partial(self._plans.near, tenant, place, within_m)
+            )
+
     async def _answer(
-        self, venue: VenueRecord, form: LocaliseForm, content: bytes, begin: float, clock: StageClock, party: str
+        self,
+        venue: VenueRecord,
+        form: LocaliseForm,
+        content: bytes,
+        begin: float,
+        clock: StageClock,
+        party: str,
+        members: Members | None = None,
     ) -> LocaliseAnswer:
         deadline = begin + self._settings.request_deadline_s
+        hints = VenueHints.of(form, venue.anchor)
         with clock.stage("decode"):
             panorama = await self._decoder.decode(content, deadline, party)
         north = None if venue.anchor is None else heading_from_degrees(venue.anchor.north_deg)
         known = known_heading(form, north, panorama, self._settings.compass_tolerance_deg)
         with clock.stage("wait"):
-            ready, warnings = await self._ready(venue, deadline, party)
+            ready, warnings = await self._ready(
+                venue, members or partial(self._plans.members, venue.id), hints, deadline, party
+            )
         height = venue_height(form, ready)
         compute = partial(self._localiser.compute, party, deadline=deadline)
         query = await compute(lambda: self._localiser.encode(panorama, known, height, clock))
         with clock.stage("shortlist"):
-            searched = await self._searched(venue, ready, query, form, warnings, compute)
+            searched = await self._searched(venue, ready, query, form, hints, warnings, compute)
         side_by_side = searched.side_by_side
         steps = localise_steps(
             side_by_side.plan,
@@ -140,18 +199,23 @@ class VenueLocaliser:
             top_k=form.top_k,
             config=_CONFIG,
             clock=clock,
-            hints=Hints(strict=form.strict),
+            hints=searched.hints,
         )
         found = await self._localiser.finished(steps, deadline, party)
         timings_ms = clock.timings_ms | {"total": (monotonic() - begin) * 1e3}
         self._localiser.observe(timings_ms, found.stage)
-        return self._compose(venue, searched, found, known, form.top_k, timings_ms)
+        contradicted = hints.warnings(searched.hints, found, searched.rows, side_by_side)
+        return self._compose(venue, searched, found, known, form.top_k, contradicted, timings_ms)
 
-    async def _ready(self, venue: VenueRecord, deadline: float, party: str) -> tuple[Sequence[Row[Any]], list[str]]:
+    async def _ready(
+        self, venue: VenueRecord, tell: Members, hints: VenueHints, deadline: float, party: str
+    ) -> tuple[Sequence[Row[Any]], list[str]]:
         """The plans that can be asked about, waited for while there is none, and what is to be said of the others."""
         begin = monotonic()
         while True:
-            members = await self._plans.members(venue.id)
+            members = await tell()
+            if members:
+                hints.check(members)
             ready = [row for row in members if row.grid_id is not None]
             failed = [row for row in members if row.grid_id is None and row.failure is not None]
             if ready:
@@ -176,16 +240,23 @@ class VenueLocaliser:
         ready: Sequence[Row[Any]],
         query: Query,
         form: LocaliseForm,
+        hints: VenueHints,
         warnings: list[str],
         compute: Callable[..., Any],
     ) -> _Searched:
         """The plans that are searched in full: all of few, the most probable ones of many."""
         rows, log_mass, index = ready, None, list(range(len(ready)))
+        shares, warnings = hints.shares(ready), [*warnings, *hints.unplaced(ready)]
         if query.profile is not None and self._plans.needs_choice(ready, query):
             known = await self._plans.prototypes(ready)
             weights = self._encoders.manifest.evidence
-            chosen = await compute(partial(self._plans.choose, known, query, weights))
+            chosen = await compute(
+                partial(self._plans.choose, known, query, weights, partial(hints.log_prior, shares=shares))
+            )
             rows, log_mass, index = chosen.members, chosen.log_mass, chosen.index.tolist()
+            if hints.rooms:
+                told = f"rooms was looked for in the {len(rows)} most probable ones of {len(ready)} floor plans"
+                warnings.append(told)
         loaded = await self._plans.load(venue.tenant, rows)
         kept = [one for one in loaded if _may_stand(one[1], form)]
         if len(kept) < len(loaded):
@@ -197,14 +268,18 @@ class VenueLocaliser:
             raise VenueNotReadyError(venue.id, venue.plans, 0.0)
         place = {row.plan_id: number for row, number in zip(rows, index, strict=True)}
         side_by_side = await compute(partial(_laid_out, kept, query))
+        searched_rows, plans = [row for row, _, _ in kept], [record.plan for _, record, _ in kept]
         return _Searched(
-            rows=[row for row, _, _ in kept],
+            rows=searched_rows,
             records=[record for _, record, _ in kept],
             side_by_side=side_by_side,
             log_mass=log_mass,
             index=[place[row.plan_id] for row, _, _ in kept],
             warnings=warnings,
             anchor=venue.anchor,
+            hints=await compute(
+                partial(hints.among, searched_rows, plans, side_by_side, shares, partly=log_mass is not None)
+            ),
         )
 
     def _compose(
@@ -214,10 +289,12 @@ class VenueLocaliser:
         found: Localisation,
         known: KnownHeading,
         top_k: int,
+        contradicted: list[str],
         timings_ms: dict[str, float],
     ) -> LocaliseAnswer:
         share, probability = searched.shares(found)
         warnings = [heading_contradiction(known)] if found.heading_contradicted else []
+        warnings += contradicted
         answer = compose(
             found, searched.place, known, warnings + searched.warnings, timings_ms, self._bundle, share=share
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,14 +13,16 @@ from jaxtyping import Float, Int
 from sqlalchemy import Row
 
 from lalaloc_core.bundle import EvidenceModel
+from lalaloc_core.errors import InvalidHintError
 from lalaloc_core.localise.camera_height import DEFAULT_STD_M, CameraHeight
 from lalaloc_core.localise.evidence import EvidenceConfig
 from lalaloc_core.localise.poses import LatentGrid, Query
 from lalaloc_core.localise.prototypes import Prototypes, joined, log_masses, most_probable
 from service.bounded_cache import BoundedCache
 from service.grids import GridProvider
-from service.schemas import LocaliseForm
+from service.schemas import EarthPoint, LocaliseForm
 from service.storage import Store
+from service.storage.plan_places import distances_m
 from service.storage.records import PlanRecord
 from service.threads import BoundedReads
 
@@ -28,6 +30,9 @@ from service.threads import BoundedReads
 # of these times hypotheses of the heading times camera heights.
 MAX_SEARCHED = 128
 _MAX_COMPARISONS = 8_000_000
+# The largest circle around a plan, whose centre may be as far from a place that it covers; and plans near one place.
+_LARGEST_REACH_M = 1000.0
+_MAX_NEAR = 2000
 # Prototypes that are read at a time, so that one read is short.
 _AT_ONCE = 1000
 
@@ -70,6 +75,17 @@ class VenuePlans:
         rows = await self._reads.run(self._store.venues.searched, venue_id, *self._grids.model)
         return list({row.plan_id: row for row in rows}.values())
 
+    async def near(self, tenant: str, place: EarthPoint, within_m: float) -> Sequence[Row[Any]]:
+        """Plans of a tenant with an anchor that lie so near a place, the nearest first."""
+        latitude, longitude = place.latitude, place.longitude
+        reach_m = within_m + _LARGEST_REACH_M
+        near = self._store.venues.searched_near
+        rows = await self._reads.run(near, tenant, latitude, longitude, reach_m, *self._grids.model)
+        away_m = distances_m(rows, None, latitude, longitude)
+        order = np.argsort(away_m, kind="stable")
+        unique = {rows[k].plan_id: rows[k] for k in order.tolist() if away_m[k] <= within_m}
+        return list(unique.values())[:_MAX_NEAR]
+
     def needs_choice(self, ready: Sequence[Row[Any]], query: Query) -> bool:
         """Whether not all of some plans can be searched in full."""
         return len(ready) > MAX_SEARCHED or sum(row.poses for row in ready) > self._most_poses(query)
@@ -97,14 +113,31 @@ class VenuePlans:
                     self._prototypes.put(row.grid_id, prototypes)
         return known
 
-    def choose(self, known: Sequence[tuple[Row[Any], Prototypes]], query: Query, weights: EvidenceModel) -> ChosenPlans:
-        """The most probable plans; takes a while with many."""
+    def choose(
+        self,
+        known: Sequence[tuple[Row[Any], Prototypes]],
+        query: Query,
+        weights: EvidenceModel,
+        log_prior: Callable[[Sequence[Row[Any]]], Float[np.ndarray, "p"]],
+    ) -> ChosenPlans:
+        """The most probable plans; takes a while with many.
+
+        Args:
+            log_prior: what is known of plans beforehand; -inf for those that are excluded.
+
+        Raises:
+            InvalidHintError: all are.
+        """
         counts = [len(prototypes) for _, prototypes in known]
         first = np.concatenate([[0], np.cumsum(counts)[:-1]])
         all_of_them = joined([prototypes for _, prototypes in known])
         log_mass = log_masses(all_of_them, first, query, weights, EvidenceConfig())
+        log_mass = log_mass + log_prior([row for row, _ in known])
+        if not np.isfinite(log_mass).any():
+            raise InvalidHintError("strict", f"all hints hold in none of the {len(known)} floor plans that are ready")
         poses = np.array([row.poses for row, _ in known])
         index = most_probable(log_mass, poses, most_plans=MAX_SEARCHED, most_poses=self._most_poses(query))
+        index = index[np.isfinite(log_mass[index])]
         return ChosenPlans([known[k][0] for k in index], log_mass, index)
 
     async def load(self, tenant: str, members: Sequence[Row[Any]]) -> list[tuple[Row[Any], PlanRecord, LatentGrid]]:

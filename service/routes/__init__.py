@@ -6,6 +6,7 @@ in the words of the API.
 
 from service.routes import (
     floorplans,
+    geopose,
     health,
     kept_answers,
     limits,
@@ -29,6 +30,7 @@ ROUTERS = tuple(
         venues,
         localise,
         localise_sequence,
+        geopose,
         kept_answers,
         health,
         limits,

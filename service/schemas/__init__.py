@@ -11,6 +11,7 @@ sequence_query   what a query of several panoramas says beside them
 sequence_answer  where they were taken
 localise_answer  where it was taken
 geopose          the same on Earth
+oscp             the same as AR clients ask for it
 venues           floor plans that belong together
 layout           the walls that a camera may see, for who draws them
 service_state    limits, health, readiness
@@ -21,7 +22,7 @@ Begin with `localise_answer.py`.
 
 from service.schemas.fields import Answer
 from service.schemas.geopose import GeoPose, GeoPoseAngles, GeoPosePosition
-from service.schemas.hint_fields import PlanPoint
+from service.schemas.hint_fields import EarthPoint, PlanPoint
 from service.schemas.layout import LayoutAnswer, OpeningFaceAnswer, RoomLayoutAnswer
 from service.schemas.localise_answer import (
     CandidateAnswer,
@@ -75,6 +76,7 @@ __all__ = [
     "Answer",
     "BoundsAnswer",
     "CandidateAnswer",
+    "EarthPoint",
     "Fault",
     "FloorPlanAnswer",
     "FloorPlanDocument",

@@ -13,6 +13,7 @@ from service.schemas.fields import Finite
 # Longer lists are no hints.
 _MAX_ROOMS = 100
 _A_POINT = '{"x_m": 3.5, "y_m": 2.0}'
+_ON_EARTH = '{"latitude": 48.13722, "longitude": 11.57569}'
 
 
 class PlanPoint(BaseModel):
@@ -24,15 +25,30 @@ class PlanPoint(BaseModel):
     y_m: Annotated[float, Finite] = Field(description="Up on the drawing.")
 
 
+class EarthPoint(BaseModel):
+    """A place on Earth, WGS84."""
+
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", json_schema_extra={"example": {"latitude": 48.13722, "longitude": 11.57569}}
+    )
+
+    latitude: Annotated[float, Finite] = Field(ge=-90, le=90, description="Degrees north.")
+    longitude: Annotated[float, Finite] = Field(ge=-180, le=180, description="Degrees east.")
+
+    def __str__(self) -> str:
+        return f"latitude {self.latitude:.7g}, longitude {self.longitude:.7g}"
+
+
 class HintFields(BaseModel):
     """Fields of a form that hint at the place: priors, and fences only if they are strict."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    near: PlanPoint | None = Field(
+    near: PlanPoint | EarthPoint | None = Field(
         None,
-        description=f"Where the camera stood, about, as a JSON object such as `{_A_POINT}`; at most `radius_m` from a "
-        "room.",
+        description=f"Where the camera stood, about, as a JSON object such as `{_A_POINT}`, or for plans and venues "
+        f"with an `anchor` `{_ON_EARTH}`; at most `radius_m` from a room. In a venue, `x_m` and `y_m` are in the frame "
+        "that its `anchor` says all plans share.",
     )
     radius_m: Annotated[float, Finite] | None = Field(
         None,
@@ -45,8 +61,11 @@ class HintFields(BaseModel):
         Field(
             None,
             description="In which of the plan's rooms the camera stood, as a JSON array of ids or names; a single one "
-            "may be given plainly.",
+            "may be given plainly. In a venue, those of all plans that have one.",
         )
+    )
+    level: Annotated[float, Finite] | None = Field(
+        None, ge=-1000, le=1000, description="On which level of the venue the camera stood. Needs `venue_id`."
     )
     strict: bool = Field(
         False,
@@ -65,7 +84,8 @@ class HintFields(BaseModel):
             raise ValueError(f"not a JSON object such as {_A_POINT}") from error
         if not isinstance(found, dict):
             raise ValueError(f"not a JSON object such as {_A_POINT}")
-        return found
+        # By its keys, so that what is said to be wrong is wrong with the kind of point that is meant.
+        return (EarthPoint if found.keys() & EarthPoint.model_fields.keys() else PlanPoint).model_validate(found)
 
     @field_validator("rooms", mode="before")
     @classmethod
@@ -79,7 +99,7 @@ class HintFields(BaseModel):
         except (ValueError, RecursionError) as error:
             raise ValueError('not a JSON array such as ["kitchen", "hall"]') from error
 
-    @field_validator("radius_m", mode="before")
+    @field_validator("radius_m", "level", mode="before")
     @classmethod
     def _without_underscores(cls, value: object) -> object:
         if isinstance(value, str) and "_" in value:

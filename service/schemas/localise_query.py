@@ -68,12 +68,10 @@ class LocaliseForm(CameraFields, HintFields):
         venue_id = given.data.get("venue_id")
         if value is None and venue_id is None and "venue_id" in given.data:
             raise PydanticCustomError("missing", "missing")
-        if venue_id is None:
-            return value
-        if value is not None:
+        if venue_id is not None and value is not None:
             raise ValueError("venue_id is given as well, one of the two is needed")
-        if given.data.get("near") is not None or given.data.get("rooms") is not None:
-            raise ValueError("is missing: near and rooms are about one plan, and not about a venue")
+        if value is not None and given.data.get("level") is not None:
+            raise ValueError("level is given as well, which is of the plans of a venue: one plan is on one level")
         return value
 
     @field_validator("heading_tolerance_deg")

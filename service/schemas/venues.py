@@ -43,7 +43,7 @@ class VenueAnchorDocument(Document):
     longitude: float = Field(ge=-180, le=180, description="Degrees east.")
     altitude_m: float | None = Field(None, ge=-12_000, le=100_000, description="Height over the ellipsoid.")
     north_deg: float = Field(
-        0, ge=-360, le=360, description="Azimuth of true north: degrees clockwise from the plans' +y."
+        0.0, ge=-360, le=360, description="Azimuth of true north: degrees clockwise from the plans' +y."
     )
 
 

@@ -56,6 +56,7 @@ NEEDED: Mapping[tuple[str, str], Permission] = {
     ("DELETE", "/answers/{answer_id}"): Permission.LOCALISE,
     ("POST", "/localise"): Permission.LOCALISE,
     ("POST", "/localise/sequence"): Permission.LOCALISE,
+    ("POST", "/geopose"): Permission.LOCALISE,
 }
 _PATTERNS = {path: compile_path(path)[0] for _, path in NEEDED}
 _PAGE_PATTERNS = [compile_path(path)[0] for path in PAGES]

@@ -20,6 +20,7 @@ from service.storage.database import Database
 from service.storage.grid_format import PackedGrid, pack
 from service.storage.plan_cache import PlanCache
 from service.storage.plan_document import PlanDocument
+from service.storage.plan_places import place_columns
 from service.storage.records import JSON, ComputedGrid, Cursor, GridKey, Original, PlanRecord, PlanSummary
 from service.storage.stored_grids import insert_grid, select_summaries
 from service.storage.tables import FLOORPLANS, LATENT_GRIDS, ORIGINAL_CHUNKS, REVISIONS
@@ -318,6 +319,7 @@ def _head(record: PlanRecord) -> dict[str, Any]:
         "folded_name": name.casefold(),
         "revision_id": record.revision_id,
         "updated_at": record.updated_at,
+        **place_columns(record.plan),
     }
 
 

@@ -58,7 +58,15 @@ FLOORPLANS = Table(
     Column("revision_id", String(32), nullable=False),
     Column("created_at", Moment, nullable=False),
     Column("updated_at", Moment, nullable=False),
+    # The circle around the plan, in its own frame; nothing where an earlier version stored what cannot be read now.
+    Column("centre_x_m", Double),
+    Column("centre_y_m", Double),
+    Column("reach_m", Double),
+    # Its centre on Earth; nothing for a plan without an anchor.
+    Column("latitude", Double),
+    Column("longitude", Double),
     Index("floorplans_by_tenant_and_age", "tenant", "created_at", "id"),
+    Index("floorplans_by_place", "tenant", "latitude"),
     Index("floorplans_by_revision", "revision_id"),
 )
 

@@ -11,11 +11,26 @@ from collections.abc import Collection, Iterable, Sequence
 from datetime import UTC, datetime
 from typing import Any
 
-from sqlalchemy import Connection, Row, and_, case, delete, distinct, func, or_, select, text, update
+from sqlalchemy import (
+    Connection,
+    FromClause,
+    Row,
+    and_,
+    case,
+    delete,
+    distinct,
+    func,
+    literal,
+    or_,
+    select,
+    text,
+    update,
+)
 
 from lalaloc_core.earth import Anchor
 from service.errors import InvalidRequestError, RevisionMismatchError, TooManyVenuesError, UnknownVenueError
 from service.storage.database import Database
+from service.storage.plan_places import may_lie_near
 from service.storage.records import (
     Cursor,
     VenueCounts,
@@ -32,6 +47,22 @@ _COUNT_LOCK = 5_210_003
 _AT_ONCE = 1000
 # Ids in one refusal.
 _NAMED = 5
+# What a query needs to know of a plan, but for its level and its name.
+_SEARCHED = (
+    FLOORPLANS.c.id.label("plan_id"),
+    FLOORPLANS.c.revision_id,
+    FLOORPLANS.c.centre_x_m,
+    FLOORPLANS.c.centre_y_m,
+    FLOORPLANS.c.reach_m,
+    FLOORPLANS.c.latitude,
+    FLOORPLANS.c.longitude,
+    REVISIONS.c.area_m2,
+    REVISIONS.c.camera_height_m,
+    REVISIONS.c.camera_height_std_m,
+    REVISIONS.c.failure,
+    LATENT_GRIDS.c.id.label("grid_id"),
+    LATENT_GRIDS.c.poses,
+)
 
 
 class Venues:
@@ -177,7 +208,8 @@ class Venues:
         ready = case((grid.is_not(None), plan))
         failed = case((and_(grid.is_(None), failure.is_not(None)), plan))
         counts = select(*(func.count(distinct(counted)) for counted in (plan, ready, failed)))
-        query = _with_grids(counts, model_sha256, step_m).where(VENUE_PLANS.c.venue_id == venue_id)
+        joined = VENUE_PLANS.join(FLOORPLANS, FLOORPLANS.c.id == VENUE_PLANS.c.plan_id)
+        query = _with_grids(counts, joined, model_sha256, step_m).where(VENUE_PLANS.c.venue_id == venue_id)
         with self._database.reading() as connection:
             return VenueCounts(*connection.execute(query).one())
 
@@ -185,23 +217,26 @@ class Venues:
         """What a query needs to know of every plan of a venue.
 
         Returns:
-            rows of `plan_id`, `revision_id`, `level`, `name`, `camera_height_m`, `camera_height_std_m`, `failure`, and
-            of the plan's own grid `grid_id` and `poses`, None where it is not stored.
+            rows of `plan_id`, `revision_id`, `level`, `name`, `camera_height_m`, `camera_height_std_m`, `failure`,
+            `area_m2`, of where the plan lies (`plan_places`), and of the plan's own grid `grid_id` and `poses`, None
+            where it is not stored.
         """
-        columns = (
-            VENUE_PLANS.c.plan_id,
-            FLOORPLANS.c.revision_id,
-            VENUE_PLANS.c.level,
-            func.coalesce(VENUE_PLANS.c.name, FLOORPLANS.c.name).label("name"),
-            REVISIONS.c.camera_height_m,
-            REVISIONS.c.camera_height_std_m,
-            REVISIONS.c.failure,
-            LATENT_GRIDS.c.id.label("grid_id"),
-            LATENT_GRIDS.c.poses,
-        )
-        query = _with_grids(select(*columns), model_sha256, step_m).where(VENUE_PLANS.c.venue_id == venue_id)
+        name = func.coalesce(VENUE_PLANS.c.name, FLOORPLANS.c.name).label("name")
+        columns = (VENUE_PLANS.c.level, name, *_SEARCHED)
+        joined = VENUE_PLANS.join(FLOORPLANS, FLOORPLANS.c.id == VENUE_PLANS.c.plan_id)
+        query = _with_grids(select(*columns), joined, model_sha256, step_m).where(VENUE_PLANS.c.venue_id == venue_id)
         with self._database.reading() as connection:
             return connection.execute(query.order_by(VENUE_PLANS.c.level, VENUE_PLANS.c.plan_id)).all()
+
+    def searched_near(
+        self, tenant: str, latitude: float, longitude: float, within_m: float, model_sha256: str, step_m: float
+    ) -> Sequence[Row[Any]]:
+        """As `searched`, of the plans of a tenant that may lie so near a place; all are on level 0."""
+        columns = (literal(0.0).label("level"), FLOORPLANS.c.name, *_SEARCHED)
+        near = may_lie_near(latitude, longitude, within_m)
+        query = _with_grids(select(*columns), FLOORPLANS, model_sha256, step_m)
+        with self._database.reading() as connection:
+            return connection.execute(query.where(FLOORPLANS.c.tenant == tenant, near).order_by(FLOORPLANS.c.id)).all()
 
     def delete(self, tenant: str, venue_id: str, *, expected: str | None = None) -> bool:
         """Delete a venue, and none of its plans; False when there was none.
@@ -325,8 +360,8 @@ def _select_plans(venue_id: str) -> Any:
     )
 
 
-def _with_grids(query: Any, model_sha256: str, step_m: float) -> Any:
-    """Members joined with their plans at their current revision, and with the plans' own grids where those are."""
+def _with_grids(query: Any, plans: FromClause, model_sha256: str, step_m: float) -> Any:
+    """Plans joined with their current revision, and with their own grids where those are."""
     own_grid = and_(
         LATENT_GRIDS.c.revision_id == REVISIONS.c.id,
         LATENT_GRIDS.c.model_sha256 == model_sha256,
@@ -334,11 +369,7 @@ def _with_grids(query: Any, model_sha256: str, step_m: float) -> Any:
         has_digest(),
         is_own_height(LATENT_GRIDS),
     )
-    joined = (
-        VENUE_PLANS.join(FLOORPLANS, FLOORPLANS.c.id == VENUE_PLANS.c.plan_id)
-        .join(REVISIONS, REVISIONS.c.id == FLOORPLANS.c.revision_id)
-        .outerjoin(LATENT_GRIDS, own_grid)
-    )
+    joined = plans.join(REVISIONS, REVISIONS.c.id == FLOORPLANS.c.revision_id).outerjoin(LATENT_GRIDS, own_grid)
     return query.select_from(joined)
 
 

@@ -69,6 +69,30 @@ def test_a_panorama_is_localised_in_a_venue(service: Any, panorama: bytes) -> No
     assert (alone.venue_id, alone.level, alone.plans) == (None, None, None)
 
 
+def test_a_venue_takes_hints(service: Any, panorama: bytes) -> None:
+    plans = [service.upload_floorplan(FLAT).id for _ in range(2)]
+    venue = service.make_venue([VenuePlan(plan, level) for level, plan in enumerate(plans)])
+    answer = service.localise_in_venue(venue.id, panorama, level=1, rooms=["kitchen"], strict=True, refine="none")
+    assert (answer.floorplan_id, answer.level, answer.room) == (plans[1], 1.0, "kitchen")
+    with pytest.raises(InvalidError, match="no floor plan of the venue is on level 5"):
+        service.localise_in_venue(venue.id, panorama, level=5)
+
+
+def test_ar_clients_are_told_where_on_earth(service: Any, panorama: bytes) -> None:
+    anchor = {"latitude": 51.7546, "longitude": -1.2545}
+    plan = service.upload_floorplan(FLAT | {"anchor": anchor, "north_deg": 0}).id
+    answer = service.geopose(panorama, floorplan_id=plan)
+    assert answer.lalaloc.floorplan_id == plan
+    assert abs(answer.geopose.position.lat - anchor["latitude"]) < 1e-3
+    near = service.geopose(panorama, **anchor, accuracy_m=20.0)
+    assert near.lalaloc.floorplan_id == plan
+    service.delete_floorplan(plan)
+    with pytest.raises(NotFoundError, match="no floor plan with an anchor lies within 100 m"):
+        service.geopose(panorama, latitude=-51.0, longitude=0.0)
+    with pytest.raises(ValueError, match="they belong together"):
+        service.geopose(panorama, latitude=1.0)
+
+
 def test_what_is_no_id_never_leaves_the_client(service: Any) -> None:
     with pytest.raises(ValueError, match=r"venue_id is '\.\./floorplans'"):
         service.delete_venue("../floorplans")

@@ -117,7 +117,7 @@ class TestAnswers:
         near = Near(11.0, 1.0, 0.8)
         found = ask(query, Hints(near=near, strict=True), refine)
         places = np.stack([candidate.position_m for candidate in found.candidates])
-        assert (near.distance_m(places) <= near.radius_m + 1e-9).all()
+        assert (near.distance_m(places, np.zeros(len(places), int)) <= near.radius_m + 1e-9).all()
         assert found.hints_missed == ("near",)
         assert ask(query, Hints(rooms=frozenset({0}), strict=True), refine).candidates[0].room_index == 0
 

@@ -108,6 +108,40 @@ def test_an_anchor_that_cannot_be_is_refused(client: httpx.Client, anchor: Any, 
     assert words in assert_problem(response, 422, "invalid-floorplan")["detail"]
 
 
+def test_a_hint_on_earth_is_the_same_hint_in_the_plan(client: httpx.Client, panorama: bytes) -> None:
+    plan_id = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25})
+    ((lon, lat),) = Anchor(**ANCHOR, north_deg=25.0).to_earth(np.array([[2.0, 1.0]]))
+    on_earth = json.dumps({"latitude": lat, "longitude": lon})
+    fields = {"radius_m": 1.0, "strict": "true", "refine": "none"}
+    found = localise(client, plan_id, panorama, near=on_earth, **fields).json()
+    in_plan = localise(client, plan_id, panorama, near='{"x_m": 2, "y_m": 1}', **fields).json()
+    assert [one["position"] for one in found["candidates"]] == [one["position"] for one in in_plan["candidates"]]
+    assert all(math.dist(one["position"].values(), (2.0, 1.0)) <= 1.0 + 1e-3 for one in found["candidates"])
+
+
+@pytest.mark.parametrize(
+    ("near", "slug", "words"),
+    [
+        ({"latitude": 48.1372, "longitude": 11.6}, "invalid-hint", "near: latitude 48.1372, longitude 11.6 is 1.81e"),
+        ({"latitude": -48.1372, "longitude": -168.4}, "invalid-hint", "near: latitude -48.1372, longitude -168.4 is"),
+        ({"latitude": 48.1}, "invalid-request", "near.longitude: is missing"),
+        ({"latitude": 98.1, "longitude": 11}, "invalid-request", "near.latitude: is '98.1': must be at most 90"),
+        ({"latitude": 48.1, "longitude": 11, "x_m": 1}, "invalid-request", "near.x_m: is '1'"),
+    ],
+)
+def test_a_hint_on_earth_that_cannot_be_is_told(
+    client: httpx.Client, panorama: bytes, near: dict[str, float], slug: str, words: str
+) -> None:
+    plan_id = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 25})
+    problem = assert_problem(localise(client, plan_id, panorama, near=json.dumps(near), radius_m=5), 422, slug)
+    assert words in problem["detail"]
+
+
+def test_without_an_anchor_a_hint_on_earth_is_refused(client: httpx.Client, panorama: bytes) -> None:
+    response = localise(client, upload(client), panorama, near='{"latitude": 48, "longitude": 11}', radius_m=5)
+    assert "the plan has no anchor" in assert_problem(response, 422, "invalid-hint")["detail"]
+
+
 def test_a_plan_keeps_its_anchor_and_north_is_said_once(client: httpx.Client) -> None:
     twice = client.post("/floorplans", json=FLAT | {"north_deg": 10, "anchor": ANCHOR | {"north_deg": 25}})
     assert "give one of them" in assert_problem(twice, 422, "invalid-floorplan")["detail"]

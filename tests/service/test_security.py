@@ -45,6 +45,7 @@ from tests.service.conftest import (
     wait_for,
 )
 from tests.service.postgres import PostgresServer
+from tests.service.test_oscp import oscp_request
 
 ROOT = Path(__file__).parents[2]
 EVERYTHING = tuple(Permission)
@@ -118,6 +119,10 @@ class Guarded:
             path = path.replace("{answer_id}", kept["answer_id"])
         if path == "/localise":
             body = asked
+        elif path == "/geopose":
+            told = {"plans": [{"floorplan_id": plan_id}], "anchor": {"latitude": 48.0, "longitude": 11.0}}
+            made = self.client.post("/venues", json=told, headers=bearer(self.key)).json()
+            body = {"json": oscp_request(picture[1]), "params": {"venue_id": made["id"]}}
         elif path == "/localise/sequence":
             body = {"data": {PLAN: plan_id}, "files": [("panorama", picture)] * 2}
         elif path.startswith("/venues"):

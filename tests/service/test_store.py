@@ -53,6 +53,7 @@ from service.storage.records import (
 )
 from service.storage.store import Store
 from service.storage.tables import (
+    FLOORPLANS,
     GRID_CHUNKS,
     GRID_LEASES,
     IDEMPOTENCY,
@@ -773,6 +774,30 @@ CREATE TABLE {grids} (
 # Columns that came with venues.
 _OF_FILES = (("revisions", "original_media_type"), ("revisions", "report"))
 _OF_VENUES = (("latent_grids", "prototypes"), ("revisions", "camera_height_std_m"))
+_OF_PLACES = tuple(("floorplans", name) for name in ("centre_x_m", "centre_y_m", "reach_m", "latitude", "longitude"))
+
+
+def test_places_of_plans_that_were_stored_before_are_filled_in(store: Store, url: str) -> None:
+    anchored = FloorPlan.from_dict({**FLAT, "anchor": {"latitude": 48.0, "longitude": 11.0}, "north_deg": 0})
+    for plan_id, plan in (("p", PLAN), ("q", anchored), ("r", PLAN)):
+        store.plans.add("default", plan_id, plan, original=Original(b"{}"), limit=100)
+    columns = select(*(getattr(FLOORPLANS.c, name) for _, name in _OF_PLACES)).order_by(FLOORPLANS.c.id)
+    with store._database.writing() as connection:
+        written = connection.execute(columns).all()
+        connection.exec_driver_sql("DROP INDEX floorplans_by_place")
+        for table, column in _OF_PLACES:
+            connection.exec_driver_sql(f"ALTER TABLE {table} DROP COLUMN {column}")
+        connection.exec_driver_sql("UPDATE revisions SET document = 'damaged' WHERE plan_id = 'r'")
+        connection.exec_driver_sql("UPDATE alembic_version SET version_num = '0005'")
+    store.close()
+    moved = Store(url)
+    with moved._database.reading() as connection:
+        filled = connection.execute(columns).all()
+    assert tuple(filled[0])[:3] == pytest.approx((4.5, 3.0, 0.5 * math.hypot(9.0, 6.0)))
+    assert tuple(filled[0])[3:] == (None, None)
+    assert tuple(filled[1]) == pytest.approx(tuple(written[1]), abs=1e-12)
+    assert tuple(filled[2]) == (None,) * 5
+    moved.close()
 
 
 def test_grids_of_the_schema_before_are_computed_again_and_the_rest_stays(store: Store, url: str) -> None:
@@ -780,6 +805,7 @@ def test_grids_of_the_schema_before_are_computed_again_and_the_rest_stays(store:
     _put(store, _key(revision_id))
     store.idempotency_keys.begin("t", "r", "k", "body")
     with store._database.writing() as connection:
+        connection.exec_driver_sql("DROP INDEX floorplans_by_place")
         for table, column in (
             ("latent_grids", "sha256"),
             ("revisions", "document_sha256"),
@@ -789,6 +815,7 @@ def test_grids_of_the_schema_before_are_computed_again_and_the_rest_stays(store:
             ("idempotency", "lease_s"),
             *_OF_VENUES,
             *_OF_FILES,
+            *_OF_PLACES,
         ):
             connection.exec_driver_sql(f"ALTER TABLE {table} DROP COLUMN {column}")
         for table in ("venue_plans", "venues", "kept_answers"):
@@ -812,7 +839,8 @@ def test_venues_are_added_to_what_there_is(store: Store, url: str) -> None:
     revision_id = _add(store, "p")
     _put(store, _key(revision_id))
     with store._database.writing() as connection:
-        for table, column in (*_OF_VENUES, *_OF_FILES):
+        connection.exec_driver_sql("DROP INDEX floorplans_by_place")
+        for table, column in (*_OF_VENUES, *_OF_FILES, *_OF_PLACES):
             connection.exec_driver_sql(f"ALTER TABLE {table} DROP COLUMN {column}")
         for table in ("venue_plans", "venues", "kept_answers"):
             connection.exec_driver_sql(f"DROP TABLE {table}")

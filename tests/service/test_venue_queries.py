@@ -163,7 +163,8 @@ def plan(client: httpx.Client) -> str:
 BAD_FIELDS: dict[str, tuple[dict[str, str], str, str]] = {
     "neither": ({}, "floorplan_id", "is missing"),
     "both": ({"venue_id": "0" * 32, "floorplan_id": "0" * 32}, "floorplan_id", "venue_id is given as well"),
-    "near": ({"venue_id": "0" * 32, "near": '{"x_m": 1, "y_m": 1}', "radius_m": "1"}, "floorplan_id", "one plan"),
+    "level": ({"floorplan_id": "0" * 32, "level": "1"}, "floorplan_id", "one plan is on one level"),
+    "level of none": ({"venue_id": "0" * 32, "level": "1001"}, "level", "at most 1000"),
     "posterior": ({"venue_id": "0" * 32, "include": "posterior"}, "include", "one plan"),
 }
 

@@ -1,0 +1,131 @@
+"""Requests of the OSCP GeoPose protocol as queries of this service, and its answers as the protocol has them."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import math
+
+import numpy as np
+import shapely
+
+from lalaloc_core.earth import LocalFrame
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.hints import RADIUS_RANGE_M
+from lalaloc_core.localise.posterior import HEADING_WITHIN, RIGHT_WITHIN_M
+from service.errors import InvalidRequestError, UnanchoredPlanError
+from service.schemas import EarthPoint, GeoPose, LocaliseAnswer
+from service.schemas.oscp import (
+    OscpAccuracy,
+    OscpAnswer,
+    OscpFound,
+    OscpGeolocationReading,
+    OscpGeoPose,
+    OscpQuaternion,
+    OscpRequest,
+)
+
+# How far off a reading may be that does not say it.
+UNKNOWN_ACCURACY_M = 100.0
+_PANORAMAS = {"", "UNKNOWN", "UNKNOWN_CAMERA", "EQUIRECTANGULAR", "SPHERICAL"}
+_READING = "sensorReadings.cameraReadings.0"
+
+
+def picture_of(request: OscpRequest) -> bytes:
+    """The file of the panorama.
+
+    Raises:
+        InvalidRequestError: the reading is not of a camera of the request, or not of a panorama, or not in Base64.
+    """
+    reading, faults = request.camera_reading, list[tuple[str, str]]()
+    if not any(one.id == reading.sensor_id and one.type == "camera" for one in request.sensors):
+        faults.append((f"{_READING}.sensorId", f"is '{reading.sensor_id[:50]}', sensors has no camera with this id"))
+    if reading.image_format.upper() == "DEPTH":
+        faults.append((f"{_READING}.imageFormat", "is 'DEPTH', a panorama in colours is needed"))
+    model = "" if reading.params is None else (reading.params.model or "").upper()
+    if model not in _PANORAMAS:
+        what = "the picture must be a full 360° panorama (EQUIRECTANGULAR)"
+        faults.append((f"{_READING}.params.model", f"is '{model[:50]}': {what}"))
+    orientation = reading.image_orientation
+    if orientation is not None and (orientation.mirrored or orientation.rotation % 360.0):
+        faults.append((f"{_READING}.imageOrientation", "must be neither mirrored nor rotated: send panoramas upright"))
+    try:
+        content = base64.b64decode(reading.image_bytes, validate=True)
+    except (binascii.Error, ValueError):
+        content = b""
+        faults.append((f"{_READING}.imageBytes", "is not Base64"))
+    if faults:
+        raise InvalidRequestError(faults)
+    return content
+
+
+def place_of(reading: OscpGeolocationReading) -> tuple[EarthPoint, float]:
+    """Where a reading says that the device is, and how far off that may be (m)."""
+    known = reading.accuracy is not None and reading.accuracy > 0.0
+    radius_m = min(max(reading.accuracy or 0.0, RADIUS_RANGE_M[0]), RADIUS_RANGE_M[1]) if known else UNKNOWN_ACCURACY_M
+    return EarthPoint(latitude=reading.latitude, longitude=reading.longitude), radius_m
+
+
+def away_m(place: EarthPoint, plan: FloorPlan) -> float:
+    """How far a place on Earth is from the nearest room of a plan with an anchor."""
+    assert plan.anchor is not None
+    ((x_m, y_m),) = plan.anchor.to_plan(np.array([[place.longitude, place.latitude]]))
+    if not (math.isfinite(x_m) and math.isfinite(y_m)):
+        return math.inf
+    return min(float(shapely.distance(shapely.Polygon(room.polygon_m), shapely.Point(x_m, y_m))) for room in plan.rooms)
+
+
+def unused_warnings(request: OscpRequest) -> list[str]:
+    """Says what was sent and has no say."""
+    found = [f"{name} are not used" for name in request.sensor_readings.unused]
+    return [*found, "priorPoses are not used"] if request.prior_poses else found
+
+
+def answer_of(request: OscpRequest, found: LocaliseAnswer, warnings: list[str]) -> OscpAnswer:
+    """An answer as the protocol has it.
+
+    Raises:
+        UnanchoredPlanError: it is nowhere on Earth.
+    """
+    if found.geopose is None:
+        raise UnanchoredPlanError(found.floorplan_id, found.venue_id)
+    half = 0.5 * math.radians(found.geopose.angles.yaw)
+    quaternion = OscpQuaternion(x=0.0, y=0.0, z=round(math.sin(half), 9) + 0.0, w=round(math.cos(half), 9) + 0.0)
+    return OscpAnswer(
+        id=request.id,
+        timestamp=request.timestamp,
+        accuracy=_accuracy(found, found.geopose),
+        geopose=OscpGeoPose(position=found.geopose.position, quaternion=quaternion),
+        lalaloc=OscpFound(
+            floorplan_id=found.floorplan_id,
+            level=found.level,
+            position=found.position,
+            heading_deg=found.heading_deg,
+            room=found.room,
+            room_id=found.room_id,
+            confidence=found.confidence,
+            warnings=[*warnings, *found.warnings],
+        ),
+    )
+
+
+def _accuracy(found: LocaliseAnswer, at: GeoPose) -> OscpAccuracy:
+    """By the covariance where there is one, else by what counts as right; and by the rivals, which are elsewhere."""
+    variance_m2 = RIGHT_WITHIN_M**2
+    if found.covariance_m2 is not None:
+        variance_m2 = found.covariance_m2[0][0] + found.covariance_m2[1][1]
+    std_deg = math.degrees(HEADING_WITHIN) if found.heading_std_deg is None else found.heading_std_deg
+    rivals = [(one.geopose, one.probability) for one in found.candidates if one.geopose and one.probability]
+    weight = sum(probability for _, probability in rivals)
+    squared_m2 = squared_deg2 = 0.0
+    if weight > 0.0:
+        lon_lat = np.array([[pose.position.lon, pose.position.lat] for pose, _ in rivals])
+        apart_m = np.linalg.norm(LocalFrame(at.position.lon, at.position.lat).to_local(lon_lat), axis=1)
+        turned = np.array([pose.angles.yaw - at.angles.yaw for pose, _ in rivals])
+        share = np.array([probability for _, probability in rivals]) / weight
+        squared_m2 = float(share @ np.square(apart_m))
+        squared_deg2 = float(share @ np.square((turned + 180.0) % 360.0 - 180.0))
+    return OscpAccuracy(
+        position=round(math.sqrt(variance_m2 + squared_m2), 3),
+        orientation=round(math.sqrt(std_deg**2 + squared_deg2), 2),
+    )

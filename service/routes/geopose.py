@@ -1,0 +1,172 @@
+"""The query of AR clients: the GeoPose protocol of the Open Spatial Computing Platform, version 2."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from time import monotonic
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Request, Response
+
+from lalaloc_core.errors import InvalidHintError
+from lalaloc_core.localise.pipeline import StageClock
+from service.errors import (
+    InvalidRequestError,
+    NoPlanNearbyError,
+    UnanchoredPlanError,
+    UnknownVenueError,
+    UploadTooLargeError,
+    VenueNotReadyError,
+    VenueUnsearchableError,
+)
+from service.http import IdempotentRequest
+from service.http.json_body import parse_document
+from service.http.problems import problem_responses
+from service.http.uploads import JSON, Parts, UploadLimits, media_type, read_body
+from service.query.oscp import answer_of, away_m, picture_of, place_of, unused_warnings
+from service.routes.dependencies import IDEMPOTENCY_KEY, Party, Running, Tenant, plan_for_query, venue_for_query
+from service.routes.localise import QUERY_ERRORS
+from service.runtime import Runtime
+from service.schemas import LocaliseAnswer, LocaliseForm
+from service.schemas.oscp import OscpAnswer, OscpRequest
+from service.telemetry import note
+
+router = APIRouter(tags=["localisation"])
+# What a request has beside its picture.
+_ENVELOPE_BYTES = 64 * 1024
+
+
+@router.post(
+    "/geopose",
+    summary="Localise a panorama by the OSCP GeoPose protocol",
+    response_model=OscpAnswer,
+    openapi_extra={
+        "requestBody": {
+            "required": True,
+            "content": {JSON: {"schema": {"$ref": f"#/components/schemas/{OscpRequest.__name__}"}}},
+        },
+        "parameters": [IDEMPOTENCY_KEY],
+    },
+    responses=problem_responses(
+        InvalidHintError,
+        NoPlanNearbyError,
+        UnanchoredPlanError,
+        UnknownVenueError,
+        VenueUnsearchableError,
+        VenueNotReadyError,
+        *QUERY_ERRORS,
+    ),
+)
+async def geopose(
+    request: Request,
+    runtime: Running,
+    tenant: Tenant,
+    party: Party,
+    floorplan_id: Annotated[str | None, Query(description="The floor plan that the device is in.")] = None,
+    venue_id: Annotated[str | None, Query(description="The venue that it is in.")] = None,
+) -> Response:
+    """Where on Earth is this device? For AR clients of the GeoPose protocol, version 2 (`GeoPoseReq`, `GeoPoseResp`).
+
+    The one camera reading is a panorama. Without `floorplan_id` and `venue_id` in the address, all floor plans with an
+    `anchor` are searched that are as near the geolocation reading as its accuracy says, or within 100 m where it says
+    none. With them the reading is a hint. Plans have to have an `anchor`, or be of a venue that has one.
+    """
+    settings = runtime.settings
+    if floorplan_id is not None and venue_id is not None:
+        raise InvalidRequestError([("venue_id", "floorplan_id is given as well, at most one of the two may be")])
+    idempotent = IdempotentRequest(runtime.store.idempotency_keys, request, tenant, "POST /geopose")
+    media_type(request, (JSON,))
+    clock, most = StageClock(), settings.max_panorama_bytes
+    note(request, clock=clock)
+    with clock.stage("upload"):
+        limits = UploadLimits.of(settings, "max_panorama_bytes")
+        body = await read_body(request, replace(limits, max_bytes=4 * -(-most // 3) + _ENVELOPE_BYTES))
+    begin = monotonic()
+
+    def read() -> tuple[OscpRequest, bytes]:
+        parsed = parse_document(OscpRequest, body)
+        content = picture_of(parsed)
+        if len(content) > most:
+            raise UploadTooLargeError(limits.name, most, len(content))
+        return parsed, content
+
+    async def answer() -> Response:
+        asked, content = await runtime.localiser.compute(party, read, begin + settings.request_deadline_s)
+        query = _Query(runtime, tenant, party, asked, content, begin, clock)
+        found, warnings = await query.answer(floorplan_id, venue_id)
+        note(request, plan=found.floorplan_id, revision=found.floorplan_revision, stage=found.stage)
+        told = answer_of(asked, found, [*unused_warnings(asked), *warnings])
+        return Response(told.model_dump_json(), media_type=JSON)
+
+    named = {name: value for name, value in (("floorplan_id", floorplan_id), ("venue_id", venue_id)) if value}
+    return await idempotent.run_async(Parts(named, {"body": body}), answer, runtime.reads)
+
+
+class _Query:
+    """One request, once it is read."""
+
+    def __init__(
+        self,
+        runtime: Runtime,
+        tenant: str,
+        party: str,
+        asked: OscpRequest,
+        content: bytes,
+        begin: float,
+        clock: StageClock,
+    ) -> None:
+        self._runtime = runtime
+        self._tenant = tenant
+        self._asked = asked
+        self._rest = (content, begin, clock, party)
+        reading = asked.geolocation
+        self._place = None if reading is None else place_of(reading)
+
+    async def answer(self, floorplan_id: str | None, venue_id: str | None) -> tuple[LocaliseAnswer, list[str]]:
+        """The answer, and what is to be said of the geolocation reading."""
+        if floorplan_id is not None:
+            return await self._in_plan(floorplan_id)
+        if venue_id is not None:
+            return await self._in_venue(venue_id)
+        if self._place is None:
+            fault = "is missing: it tells which floor plan, where the address has neither floorplan_id nor venue_id"
+            raise InvalidRequestError([("sensorReadings.geolocationReadings", fault)])
+        place, radius_m = self._place
+        # Plans near a place are asked about as a venue is.
+        form = self._form(venue_id="near").model_copy(update={"near": place, "radius_m": radius_m})
+        found = await self._runtime.venue_localiser.answer_near(self._tenant, place, radius_m, form, *self._rest)
+        return found, []
+
+    async def _in_plan(self, floorplan_id: str) -> tuple[LocaliseAnswer, list[str]]:
+        record = await plan_for_query(self._tenant, floorplan_id, self._runtime)
+        if record.plan.anchor is None:
+            raise UnanchoredPlanError(record.id)
+        form, warnings = self._form(floorplan_id=record.id), list[str]()
+        if self._place is not None:
+            place, radius_m = self._place
+            if (off_m := away_m(place, record.plan)) <= radius_m:
+                form = form.model_copy(update={"near": place, "radius_m": radius_m})
+            else:
+                warnings = [_contradicted(f"is {off_m:.3g} m from the floor plan, its accuracy is {radius_m:g} m")]
+        return await self._runtime.localiser.answer(record, form, *self._rest), warnings
+
+    async def _in_venue(self, venue_id: str) -> tuple[LocaliseAnswer, list[str]]:
+        venue, localiser = await venue_for_query(self._tenant, venue_id, self._runtime), self._runtime.venue_localiser
+        form, warnings = self._form(venue_id=venue.id), list[str]()
+        if self._place is not None:
+            place, radius_m = self._place
+            near = form.model_copy(update={"near": place, "radius_m": radius_m})
+            try:
+                await localiser.check_hints(venue, near)
+                form = near
+            except InvalidHintError as error:
+                warnings = [_contradicted(f"has no say: {error.reason}")]
+        return await localiser.answer(venue, form, *self._rest), warnings
+
+    def _form(self, **about: str) -> LocaliseForm:
+        form = LocaliseForm.model_validate(about)
+        return form.model_copy(update={"top_k": min(form.top_k, self._runtime.settings.max_top_k)})
+
+
+def _contradicted(reason: str) -> str:
+    return f"the geolocation reading {reason}: it was not used"

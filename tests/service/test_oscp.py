@@ -1,0 +1,186 @@
+"""The GeoPose protocol of the Open Spatial Computing Platform, version 2, with the model that ships."""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from lalaloc_core.earth import Anchor, LocalFrame
+from tests.service.conftest import FLAT, StartApp, assert_problem, upload
+
+ROOT = Path(__file__).parents[2]
+EXAMPLES = ROOT / "examples"
+POSES = {pose["file"]: pose for pose in json.loads((EXAMPLES / "poses.json").read_text())}
+HOME: dict[str, Any] = json.loads((EXAMPLES / "flat.json").read_text())
+ANCHOR = {"latitude": 48.1372, "longitude": 11.5756, "altitude_m": 519.5}
+NORTH_DEG = 25.0
+PRIVACY = {name: [] for name in ("dataRetention", "dataAcceptableUse", "dataSanitizationApplied",
+                                 "dataSanitizationRequested")}  # fmt: skip
+
+
+def oscp_request(picture: bytes, place: dict[str, Any] | None = None) -> dict[str, Any]:
+    """A GeoPoseReq as clients of the protocol send it, every member that is not optional included."""
+    camera = {
+        "timestamp": 1732266000000,
+        "sensorId": "camera",
+        "privacy": PRIVACY,
+        "sequenceNumber": 0,
+        "imageFormat": "JPG",
+        "size": [512, 256],
+        "imageBytes": base64.b64encode(picture).decode(),
+        "imageOrientation": {"mirrored": False, "rotation": 0},
+    }
+    sensors, readings = [{"type": "camera", "id": "camera"}], {"cameraReadings": [camera]}
+    if place is not None:
+        rest = {"altitude": None, "altitudeAccuracy": None, "heading": None, "speed": 0}
+        sensors.append({"type": "geolocation", "id": "gps"})
+        reading = {"timestamp": 1732266000000, "sensorId": "gps", "privacy": PRIVACY, **rest, **place}
+        readings["geolocationReadings"] = [reading]
+    return {"id": "r1", "timestamp": 1732266000123, "type": "geopose", "sensors": sensors, "sensorReadings": readings}
+
+
+def gps(east_m: float, north_m: float, accuracy_m: float) -> dict[str, float]:
+    """A reading so far from the anchor."""
+    frame = LocalFrame(ANCHOR["longitude"], ANCHOR["latitude"])
+    ((longitude, latitude),) = frame.to_earth(np.array([[east_m, north_m]]))
+    return {"latitude": float(latitude), "longitude": float(longitude), "accuracy": accuracy_m}
+
+
+@pytest.fixture(scope="module")
+def shipped(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+    data_dir = tmp_path_factory.mktemp("data")
+    with start_app(data_dir, bundle=ROOT / "models" / "default", request_deadline_s=90.0, max_top_k=3) as client:
+        client.timeout = 100.0
+        yield client
+
+
+@pytest.fixture(scope="module")
+def home(shipped: httpx.Client) -> str:
+    """The example flat on Earth, besides a flat 400 m to the north and one that is nowhere."""
+    upload(shipped, FLAT)
+    north = {name: value for name, value in gps(0.0, 400.0, 0.0).items() if name != "accuracy"}
+    upload(shipped, FLAT | {"anchor": north, "north_deg": 0})
+    return upload(shipped, HOME | {"anchor": ANCHOR, "north_deg": NORTH_DEG})
+
+
+def check_answer(answer: dict[str, Any], home: str, name: str) -> None:
+    """An answer is a GeoPoseResp, and where the photograph was taken."""
+    assert answer.keys() == {"id", "timestamp", "type", "accuracy", "geopose", "lalaloc"}
+    assert (answer["id"], answer["timestamp"], answer["type"]) == ("r1", 1732266000123, "geopose")
+    assert answer["accuracy"].keys() == {"position", "orientation"}
+    pose, position = POSES[name], answer["geopose"]["position"]
+    anchor = Anchor(**ANCHOR, north_deg=NORTH_DEG)
+    ((x_m, y_m),) = anchor.to_plan(np.array([[position["lon"], position["lat"]]]))
+    error_m = math.dist((x_m, y_m), (pose["x_m"], pose["y_m"]))
+    assert error_m < 0.5
+    assert error_m < 5.0 * answer["accuracy"]["position"] + 0.2
+    quaternion = answer["geopose"]["quaternion"]
+    assert (quaternion["x"], quaternion["y"]) == (0.0, 0.0)
+    assert math.hypot(quaternion["z"], quaternion["w"]) == pytest.approx(1.0)
+    # Where the camera's y axis points: the image of (0, 1, 0), east and north.
+    z, w = quaternion["z"], quaternion["w"]
+    true_deg = math.degrees(math.atan2(-2.0 * z * w, w * w - z * z))
+    assert (true_deg - (pose["heading_deg"] - NORTH_DEG) + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=5.0)
+    assert answer["lalaloc"]["floorplan_id"] == home
+    assert position["h"] == pytest.approx(519.5 + pose.get("camera_height_m", 1.5), abs=0.3)
+
+
+def test_a_plan_by_its_id(shipped: httpx.Client, home: str) -> None:
+    asked = oscp_request((EXAMPLES / "kitchen.jpg").read_bytes())
+    response = shipped.post("/geopose", params={"floorplan_id": home}, json=asked)
+    assert response.status_code == 200, response.text
+    check_answer(response.json(), home, "kitchen.jpg")
+    assert response.json()["lalaloc"]["warnings"] == []
+
+
+def test_a_plan_by_where_the_device_is_about(shipped: httpx.Client, home: str) -> None:
+    # Storeys of one house have one place.
+    upper = upload(shipped, FLAT | {"anchor": ANCHOR, "north_deg": NORTH_DEG})
+    asked = oscp_request((EXAMPLES / "kitchen.jpg").read_bytes(), gps(12.0, 8.0, 30.0))
+    asked["sensorReadings"]["wiFiReadings"] = [{"SSID": "x"}]
+    response = shipped.post("/geopose", json=asked)
+    assert response.status_code == 200, response.text
+    check_answer(response.json(), home, "kitchen.jpg")
+    assert "wiFiReadings are not used" in response.json()["lalaloc"]["warnings"]
+    shipped.delete(f"/floorplans/{upper}")
+    nowhere = shipped.post("/geopose", json=oscp_request(b"x", gps(0.0, -3000.0, 50.0)))
+    assert "within 50 m of latitude" in assert_problem(nowhere, 404, "no-floorplan-nearby")["detail"]
+
+
+def test_a_venue_whose_anchor_holds_and_a_reading_that_does_not(shipped: httpx.Client, home: str) -> None:
+    plain = upload(shipped, HOME)
+    anchor = ANCHOR | {"north_deg": NORTH_DEG}
+    venue = shipped.post("/venues", json={"plans": [{"floorplan_id": plain, "level": 2}], "anchor": anchor}).json()
+    asked = oscp_request((EXAMPLES / "kitchen.jpg").read_bytes(), gps(900.0, 0.0, 20.0))
+    response = shipped.post("/geopose", params={"venue_id": venue["id"]}, json=asked)
+    assert response.status_code == 200, response.text
+    check_answer(response.json(), plain, "kitchen.jpg")
+    assert response.json()["lalaloc"]["level"] == 2.0
+    [warning] = response.json()["lalaloc"]["warnings"]
+    assert "geolocation reading" in warning
+    in_plan = shipped.post("/geopose", params={"floorplan_id": home}, json=asked).json()
+    assert "its accuracy is 20 m: it was not used" in in_plan["lalaloc"]["warnings"][0]
+    bare = shipped.post("/geopose", params={"floorplan_id": plain}, json=asked)
+    assert_problem(bare, 409, "floorplan-unanchored")
+
+
+def _camera(**changes: Any) -> Callable[[dict[str, Any]], None]:
+    return lambda asked: asked["sensorReadings"]["cameraReadings"][0].update(changes)
+
+
+def _asked(**changes: Any) -> Callable[[dict[str, Any]], None]:
+    return lambda asked: asked.update(changes)
+
+
+WRONG: dict[str, tuple[Callable[[dict[str, Any]], None], str, str]] = {
+    "no id": (lambda asked: asked.pop("id"), "id", "is missing"),
+    "another type": (_asked(type="vps"), "type", "must be 'geopose'"),
+    "no readings": (lambda asked: asked.pop("sensorReadings"), "sensorReadings", "is missing"),
+    "no camera reading": (_asked(sensorReadings={}), "sensorReadings.cameraReadings", "is missing"),
+    "no picture": (_asked(sensorReadings={"cameraReadings": []}), "sensorReadings.cameraReadings", "1 are needed"),
+    "no base64": (_camera(imageBytes="***"), "sensorReadings.cameraReadings.0.imageBytes", "is not Base64"),
+    "depth": (_camera(imageFormat="DEPTH"), "sensorReadings.cameraReadings.0.imageFormat", "colours"),
+    "a pinhole": (_camera(params={"model": "PINHOLE"}), "sensorReadings.cameraReadings.0.params.model", "full 360°"),
+    "mirrored": (
+        _camera(imageOrientation={"mirrored": True, "rotation": 0}),
+        "sensorReadings.cameraReadings.0.imageOrientation",
+        "upright",
+    ),
+    "no sensor": (_asked(sensors=[]), "sensorReadings.cameraReadings.0.sensorId", "no camera with this id"),
+    "no place": (lambda _: None, "sensorReadings.geolocationReadings", "neither floorplan_id nor venue_id"),
+}
+
+
+@pytest.mark.parametrize(("change", "field", "words"), WRONG.values(), ids=WRONG.keys())
+def test_what_is_missing_or_wrong_is_told(
+    client: httpx.Client, panorama: bytes, change: Callable[[dict[str, Any]], None], field: str, words: str
+) -> None:
+    asked = oscp_request(panorama)
+    change(asked)
+    problem = assert_problem(client.post("/geopose", json=asked), 422, "invalid-request")
+    assert [fault["field"] for fault in problem["errors"]] == [field]
+    assert words in problem["detail"]
+
+
+def test_what_is_no_panorama_or_too_large_is_told(start_app: StartApp, tmp_path: Path) -> None:
+    with start_app(tmp_path, max_panorama_bytes=2000) as client:
+        plan_id = upload(client, FLAT | {"anchor": ANCHOR, "north_deg": 0})
+        params = {"floorplan_id": plan_id}
+        picture = client.post("/geopose", params=params, json=oscp_request(b"no picture"))
+        assert_problem(picture, 422, "invalid-panorama")
+        large = client.post("/geopose", params=params, json=oscp_request(bytes(2001)))
+        assert "max_panorama_bytes" in assert_problem(large, 413, "upload-too-large")["detail"]
+        larger = client.post("/geopose", params=params, json=oscp_request(bytes(90_000)))
+        assert_problem(larger, 413, "upload-too-large")
+        both = client.post("/geopose", params={**params, "venue_id": "v"}, json=oscp_request(b"x"))
+        assert "at most one of the two" in assert_problem(both, 422, "invalid-request")["detail"]
+        form = client.post("/geopose", params=params, data={"id": "r"})
+        assert_problem(form, 415, "unsupported-media")
