@@ -17,6 +17,7 @@ from lalaloc_core.data.annotations import read_annotation
 from lalaloc_core.floorplan import FloorPlan
 from scripts.write_docs import documents
 from service.schemas import GeoPose, ImportReport, LocaliseAnswer
+from service.schemas.oscp import OscpAnswer
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")] + sorted(ROOT.glob("docs/*.md"))
@@ -93,6 +94,8 @@ def test_every_json_example_is_what_the_code_reads_or_writes(tmp_path: Path) -> 
             ImportReport.model_validate(document["import_report"])
         elif "angles" in document:
             GeoPose.model_validate(document)
+        elif "lalaloc" in document:
+            OscpAnswer.model_validate(document)
         else:
             LocaliseAnswer.model_validate(document)
         kinds.add(page)
