@@ -183,7 +183,7 @@ def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack, 
         settings=settings,
         bundle=bundle,
         encoders=encoders,
-        plans=_venue_plans(store, grids, reads, settings),
+        plans=kept(_venue_plans(store, grids, reads, settings)),
         localiser=localiser,
         decoder=decoder,
         queries=admission.queries,
@@ -213,8 +213,15 @@ def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack, 
 
 
 def _venue_plans(store: Store, grids: GridProvider, reads: BoundedReads, settings: Settings) -> VenuePlans:
-    limit_bytes, max_poses = settings.venue_cache_bytes, min(settings.max_grid_poses, _VENUE_POSES)
-    return VenuePlans(store, grids, reads, limit_bytes=limit_bytes, max_poses=max_poses)
+    return VenuePlans(
+        store,
+        grids,
+        reads,
+        path=settings.data_dir / "prototypes.bin",
+        file_bytes=settings.venue_file_bytes,
+        limit_bytes=settings.venue_cache_bytes,
+        max_poses=min(settings.max_grid_poses, _VENUE_POSES),
+    )
 
 
 async def runtime_of(request: Request) -> Runtime:

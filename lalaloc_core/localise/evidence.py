@@ -32,7 +32,7 @@ from lalaloc_core.bundle import EvidenceModel
 from lalaloc_core.conventions import OPENING_CLASSES, PASSAGE_CODE, ROOM_TYPES, TWO_PI, WALL_CODE
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.layouts import Layouts
-from lalaloc_core.localise.poses import Query
+from lalaloc_core.localise.poses import PredictedCeiling, PredictedRoomType, Query
 
 # A prediction is never trusted beyond this: the scale of log distance of a centimetre at ten metres.
 _SHARPEST = 1e-3
@@ -311,7 +311,7 @@ class Evidence:
             if code != WALL_CODE and code not in self._claimed:
                 probability[..., WALL_CODE] += probability[..., code]
                 prior[WALL_CODE] += prior[code]
-        probability = _smoothed(probability, self._spread)
+        probability = smoothed(probability, self._spread)
         possible = [WALL_CODE, *self._claimed]
         loss = -np.log(self._config.floor + (1.0 - self._config.floor) * probability / prior)
         loss -= loss[..., possible].min(axis=-1, keepdims=True)
@@ -328,10 +328,8 @@ class Evidence:
         predicted = self._query.room_type
         if predicted is None or not self._config.use_room_type:
             return np.zeros(len(self._plan.rooms))
-        floor = self._config.floor
-        ratio = floor + (1.0 - floor) * np.exp(predicted.log_probability) / np.maximum(predicted.prior, 1e-4)
-        loss = np.log(ratio[1:].max()) - np.log(np.concatenate([[1.0], ratio[1:]]))
-        return np.maximum(loss, 0.0)[[ROOM_TYPES.index(room.type) for room in self._plan.rooms]]
+        losses = room_type_losses(predicted, self._config)
+        return losses[[ROOM_TYPES.index(room.type) for room in self._plan.rooms]]
 
     def _ceilings(self, offset: Float[np.ndarray, "j"]) -> Float[np.ndarray, "j r"]:
         """Cost of every room's ceiling at each δ."""
@@ -339,9 +337,7 @@ class Evidence:
         if predicted is None or not self._config.use_ceiling:
             return np.zeros((len(offset), len(self._plan.rooms)))
         clearance_m = self._plan.ceiling_heights_m[None] - height.height_m * np.exp(offset)[:, None]
-        difference = np.log(np.maximum(clearance_m, _MIN_CLEARANCE_M)) - (predicted.log_m + offset[:, None])
-        scale = self._config.tail * np.hypot(np.exp(predicted.log_scale), _SHARPEST_CEILING)
-        return np.log1p(np.square(difference / scale))
+        return ceiling_costs(predicted, clearance_m, offset[:, None], self._config)
 
 
 def precisions(query: Query, reach_m: float, config: EvidenceConfig) -> Float[np.ndarray, "k w"]:
@@ -349,6 +345,25 @@ def precisions(query: Query, reach_m: float, config: EvidenceConfig) -> Float[np
     assert query.profile is not None
     scale = np.maximum(np.exp(query.profile.log_scale), _SHARPEST)
     return 1.0 / (config.tail * np.hypot(scale, reach_m * np.exp(-query.profile.log_m)))
+
+
+def ceiling_costs(
+    predicted: PredictedCeiling,
+    clearance_m: Float[np.ndarray, "*n"],
+    offset: Float[np.ndarray, "*n"],
+    config: EvidenceConfig,
+) -> Float[np.ndarray, "*n"]:
+    """Cost of ceilings that are so far (m) above the camera, each at a δ."""
+    difference = np.log(np.maximum(clearance_m, _MIN_CLEARANCE_M)) - (predicted.log_m + offset)
+    scale = config.tail * np.hypot(np.exp(predicted.log_scale), _SHARPEST_CEILING)
+    return np.log1p(np.square(difference / scale))
+
+
+def room_type_losses(predicted: PredictedRoomType, config: EvidenceConfig) -> Float[np.ndarray, "t"]:
+    """Cost of every type of room; the unknown type costs what says nothing."""
+    ratio = config.floor + (1.0 - config.floor) * np.exp(predicted.log_probability) / np.maximum(predicted.prior, 1e-4)
+    loss = np.log(ratio[1:].max()) - np.log(np.concatenate([[1.0], ratio[1:]]))
+    return np.maximum(loss, 0.0)
 
 
 def latent_distances(latents: Float[np.ndarray, "n d"], targets: Float[np.ndarray, "k d"]) -> Float[np.ndarray, "k n"]:
@@ -369,7 +384,7 @@ def _mean_log(factor: Float[np.ndarray, "n w"]) -> Float[np.ndarray, "n"]:
     return np.log(product).sum(axis=1) / columns
 
 
-def _smoothed(probability: Float[np.ndarray, "k w c"], spread: float) -> Float[np.ndarray, "k w c"]:
+def smoothed(probability: Float[np.ndarray, "k w c"], spread: float) -> Float[np.ndarray, "k w c"]:
     """Probabilities by azimuth, blurred around the horizon by a Gaussian with a deviation of `spread` radians."""
     columns = probability.shape[1]
     deviation = spread / TWO_PI * columns

@@ -1,12 +1,14 @@
-"""Which of many plans a panorama was taken in: a first look at a few poses of each.
+"""Prototypes of floor plans: a few poses of each, by which those of a large venue are chosen that are searched in full.
 
 The *prototypes* of a plan are one pose of its latent grid for every square of two grid steps and every room, with the
-wall profile at 32 azimuths and the floor that it stands for. They are compared with the panorama as all poses are, by
-walls alone, and give every plan a probability; the plans that have most of it are then searched in full.
+floor that it stands for, the wall profile and the openings at 32 azimuths, and the room's ceiling and type. They are
+compared with the panorama much as all poses are (`prototype_costs`), and give every plan a probability; the plans that
+have most of it are then searched in full.
 
-    mass(plan) = sum over its prototypes and the hypotheses of  floor · exp(-T walls)
+    mass(plan) = sum over its prototypes and the hypotheses of  floor · exp(-T cost)
 
-What the plans left out would have weighed is estimated (`share_searched`).
+`plan_index` finds the prototypes that are worth comparing. What the plans left out would have weighed is estimated
+(`share_searched`).
 """
 
 from __future__ import annotations
@@ -15,21 +17,30 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 
-from lalaloc_core.bundle import EvidenceModel
-from lalaloc_core.localise.evidence import EvidenceConfig, precisions
-from lalaloc_core.localise.poses import LatentGrid, Query
+from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, WALL_CODE
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.poses import LatentGrid
 
 AZIMUTHS = 32
 # Prototypes are so many grid steps apart.
-_STEPS = 2
-# Camera heights whose logs are nearer than this are not told apart by prototypes, whose distances are farther off.
-_OFFSETS_APART = 0.2
-# Poses that are compared at a time, few enough to stay in the processor's cache.
-_CHUNK = 4096
-# Of so many factors, none above the limit, the product is taken before the logarithm.
-_FACTORS, _MAX_FACTOR = 8, 1e4
+STEPS = 2
+# Opening classes at so many azimuths share a byte, two bits each, the first one lowest.
+PER_BYTE = 4
+# What is kept of a prototype; as it lies in files and in the database. `claims` has a bit for each opening class that
+# the plan shows completely; `cell` is its cell of `prototype_cells`.
+ROW = np.dtype(
+    [
+        ("log_profile", "<f2", (AZIMUTHS,)),
+        ("openings", "u1", (AZIMUTHS // PER_BYTE,)),
+        ("log_area", "<f4"),
+        ("ceiling_m", "<f2"),
+        ("cell", "<u2"),
+        ("room_type", "u1"),
+        ("claims", "u1"),
+    ]
+)
 # A plan that weighs nothing in the posterior counts as this improbable, in logs: posteriors leave out what is less.
 _NEGLIGIBLE = -12.0
 # Plans whose log masses are nearer than this are alike in all their prototypes.
@@ -41,82 +52,70 @@ class Prototypes:
     """Prototypes of one plan, or of several, one after the other.
 
     Attributes:
-        log_profile: (n, a) log wall profiles (m) in half precision, at 32 azimuths unless there are fewer.
-        log_area: (n,) log of the floor (m²) that each stands for.
+        rows: (n,) of `ROW`.
         step_m: of the grid that they were taken from.
     """
 
-    log_profile: Float[np.ndarray, "n a"]
-    log_area: Float[np.ndarray, "n"]
+    rows: np.ndarray
     step_m: float
 
     def __len__(self) -> int:
-        return len(self.log_area)
-
-    @property
-    def nbytes(self) -> int:
-        """Memory that the arrays take."""
-        return self.log_profile.nbytes + self.log_area.nbytes
+        return len(self.rows)
 
 
-def prototypes_of(grid: LatentGrid) -> Prototypes:
-    """The prototypes of a plan."""
-    cell = np.floor(grid.poses.position_m / (_STEPS * grid.step_m)).astype(np.int64)
+def prototypes_of(grid: LatentGrid, plan: FloorPlan) -> Prototypes:
+    """The prototypes of a plan, in cell 0."""
+    cell = np.floor(grid.poses.position_m / (STEPS * grid.step_m)).astype(np.int64)
     key = np.column_stack([grid.poses.room_index, cell])
     _, first, count = np.unique(key, axis=0, return_index=True, return_counts=True)
-    log_profile = np.log(grid.profile_m[first][:, _azimuths(grid.profile_m.shape[1])])
-    log_area = np.log(count * grid.step_m**2)
-    return Prototypes(log_profile.astype(np.float16), log_area.astype(np.float32), grid.step_m)
+    rows = np.zeros(len(first), ROW)
+    compared, room = azimuths(grid.profile_m.shape[1]), grid.poses.room_index[first]
+    layouts = grid.layouts(plan)
+    rows["log_profile"] = np.log(grid.profile_m[first][:, compared])
+    kind = np.full(rows["log_profile"].shape, WALL_CODE, np.uint8)
+    if layouts.kind is not None:
+        kind = layouts.kind[first][:, compared]
+    rows["openings"] = packed_openings(kind)
+    rows["log_area"] = np.log(count * grid.step_m**2)
+    rows["ceiling_m"] = plan.ceiling_heights_m[room]
+    rows["room_type"] = np.array([ROOM_TYPES.index(one.type) for one in plan.rooms], np.uint8)[room]
+    rows["claims"] = sum(1 << OPENING_CLASSES.index(claimed) for claimed in plan.opening_kinds)
+    return Prototypes(rows, grid.step_m)
 
 
 def joined(parts: Sequence[Prototypes]) -> Prototypes:
     """Prototypes of several plans, one after the other."""
-    return Prototypes(
-        np.concatenate([part.log_profile for part in parts]),
-        np.concatenate([part.log_area for part in parts]),
-        parts[0].step_m,
-    )
+    return Prototypes(np.concatenate([part.rows for part in parts]), parts[0].step_m)
 
 
-def log_masses(
-    prototypes: Prototypes, first: Int[np.ndarray, "p"], query: Query, weights: EvidenceModel, config: EvidenceConfig
-) -> Float[np.ndarray, "p"]:
-    """Log of each plan's mass.
+def packed_openings(kind: UInt8[np.ndarray, "n a"]) -> UInt8[np.ndarray, "n b"]:
+    """Codes of opening classes by azimuth, four to a byte."""
+    place = 2 * np.arange(PER_BYTE, dtype=np.uint8)
+    return (kind.reshape(len(kind), -1, PER_BYTE) << place).sum(axis=2, dtype=np.uint8)
 
-    Args:
-        first: where the prototypes of each plan begin.
-    """
-    assert query.profile is not None
-    compared = _azimuths(query.profile.log_m.shape[1])
-    # Hypotheses between two azimuths of the prototypes tell nothing new.
-    every = max(1, len(query.roll) // len(compared))
-    centre = query.profile.log_m[::every, compared].astype(np.float32)
-    reach_m = config.grid_reach * _STEPS * prototypes.step_m
-    precision = precisions(query, reach_m, config)[::every, compared].astype(np.float32)
-    offsets = _offsets(query)
-    penalty = query.camera_height.penalty(offsets)
-    mass = np.empty(len(prototypes), np.float32)
-    for begin in range(0, len(prototypes), _CHUNK):
-        log_profile = prototypes.log_profile[begin : begin + _CHUNK].astype(np.float32)
-        total = np.full(len(log_profile), -np.inf, np.float32)
-        for hypothesis in range(len(centre)):
-            for offset, dear in zip(offsets, penalty, strict=True):
-                walls = _walls(log_profile, centre[hypothesis] + np.float32(offset), precision[hypothesis])
-                np.logaddexp(total, -weights.temperature * walls - dear, out=total)
-        mass[begin : begin + _CHUNK] = total
-    return np.logaddexp.reduceat(mass + prototypes.log_area, first)
+
+def unpacked_openings(packed: UInt8[np.ndarray, "n b"]) -> UInt8[np.ndarray, "n a"]:
+    """What `packed_openings` packed."""
+    place = 2 * np.arange(PER_BYTE, dtype=np.uint8)
+    return ((packed[:, :, None] >> place) & 3).reshape(len(packed), -1)
+
+
+def azimuths(columns: int) -> Int[np.ndarray, "a"]:
+    """The columns of a wall profile that prototypes have; of a profile with fewer, some twice."""
+    return np.arange(AZIMUTHS) * columns // AZIMUTHS
 
 
 def most_probable(
     log_mass: Float[np.ndarray, "p"], poses: Int[np.ndarray, "p"], *, most_plans: int, most_poses: int
 ) -> Int[np.ndarray, "m"]:
-    """The plans that are to be searched in full, the most probable first: at least one.
+    """The plans that are to be searched in full, the most probable first: at least one, and none that weighs nothing.
 
     Args:
         poses: of the grid of each plan.
         most_poses: how many the grids of all of them may have.
     """
     order = np.argsort(-log_mass, kind="stable")[:most_plans]
+    order = order[np.isfinite(log_mass[order])]
     within = np.cumsum(poses[order]) <= most_poses
     return order[: max(int(within.sum()), 1)]
 
@@ -143,36 +142,3 @@ def share_searched(
     equals = change[log_mass[searched] <= least]
     expected = left_out + np.where(left_out >= least - 2 * _ALIKE, np.median(equals), np.median(change))
     return float(1.0 / (1.0 + np.exp(np.logaddexp.reduce(expected))))
-
-
-def _azimuths(columns: int) -> Int[np.ndarray, "a"]:
-    """The columns of a wall profile that prototypes have."""
-    count = min(AZIMUTHS, columns)
-    return np.arange(count) * columns // count
-
-
-def _offsets(query: Query) -> Float[np.ndarray, "j"]:
-    """The logs of true over stated camera height that are tried."""
-    tried = query.camera_height.offsets
-    reach = float(tried[-1] - tried[0])
-    if reach <= _OFFSETS_APART:
-        return np.array([0.5 * (tried[0] + tried[-1])])
-    return np.linspace(tried[0], tried[-1], int(np.ceil(reach / _OFFSETS_APART)) + 1)
-
-
-def _walls(
-    log_profile: Float[np.ndarray, "n a"], centre: Float[np.ndarray, "a"], precision: Float[np.ndarray, "a"]
-) -> Float[np.ndarray, "n"]:
-    """Mean log of 1 + r² by azimuth, as in `evidence`."""
-    factor = log_profile - centre
-    factor *= precision
-    np.square(factor, out=factor)
-    factor += 1.0
-    np.minimum(factor, _MAX_FACTOR, out=factor)
-    azimuths = factor.shape[1]
-    width = -(-azimuths // _FACTORS)
-    product = factor[:, :width].copy()
-    for begin in range(width, azimuths, width):
-        part = factor[:, begin : begin + width]
-        product[:, : part.shape[1]] *= part
-    return np.log(product).sum(axis=1) / azimuths

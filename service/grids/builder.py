@@ -10,6 +10,8 @@ from lalaloc_core.errors import LaLaLocError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.poses import LatentGrid
+from lalaloc_core.localise.prototype_cells import shipped_cells
+from lalaloc_core.localise.prototypes import prototypes_of
 from service.errors import (
     PlanFailedError,
     PlanNotReadyError,
@@ -24,6 +26,7 @@ from service.grids.lease_heartbeat import LeaseHeartbeat, LeaseLostError
 from service.grids.throttle import BackgroundThrottle
 from service.settings import Settings
 from service.storage import Store
+from service.storage.grid_format import SortedPrototypes
 from service.storage.records import millimetres
 from service.telemetry import LOGGER_NAME, Telemetry
 
@@ -102,7 +105,8 @@ class GridBuilder:
             raise PlanFailedError(job.plan_id, reason)
         with self._telemetry.timed(self._telemetry.grid_seconds):
             grid = self._embed(job, record.plan)
-        if not self._put(job, grid, always_keep_mm=millimetres(record.plan.camera_height_m)):
+        prototypes = SortedPrototypes.of(prototypes_of(grid, record.plan), shipped_cells())
+        if not self._put(job, grid, prototypes, always_keep_mm=millimetres(record.plan.camera_height_m)):
             raise UnknownFloorPlanError(job.plan_id)
         self._cache.put(job.key, grid)
         return grid
@@ -146,13 +150,15 @@ class GridBuilder:
             # Nobody else can take the lease meanwhile either.
             return True
 
-    def _put(self, job: GridJob, grid: LatentGrid, *, always_keep_mm: int) -> bool:
+    def _put(self, job: GridJob, grid: LatentGrid, prototypes: SortedPrototypes, *, always_keep_mm: int) -> bool:
         """Store a grid; it may have taken minutes, so a database that is away for a moment is waited for."""
         give_up_at = monotonic() + _KEEP_TRYING_S
         while True:
             try:
                 keep = self._settings.max_grids_per_plan
-                return self._store.grids.put(job.key, grid, keep=keep, always_keep_mm=always_keep_mm)
+                return self._store.grids.put(
+                    job.key, grid, keep=keep, always_keep_mm=always_keep_mm, prototypes=prototypes
+                )
             except StoreUnavailableError:
                 if monotonic() > give_up_at or job.cancelled.wait(_TRY_EVERY_S):
                     raise

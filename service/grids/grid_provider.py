@@ -10,7 +10,8 @@ from contextlib import suppress
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.poses import LatentGrid
-from lalaloc_core.localise.prototypes import Prototypes, prototypes_of
+from lalaloc_core.localise.prototype_cells import shipped_cells
+from lalaloc_core.localise.prototypes import prototypes_of
 from lalaloc_core.sampling import grid_size
 from service.errors import OverloadedError, StoppingError
 from service.grids.builder import GridBuilder
@@ -20,6 +21,7 @@ from service.grids.state import GridState
 from service.grids.throttle import BackgroundThrottle
 from service.settings import Settings
 from service.storage import Store
+from service.storage.grid_format import SortedPrototypes
 from service.storage.records import ComputedGrid, GridKey, PlanRecord, PlanSummary, millimetres
 from service.telemetry import LOGGER_NAME, Telemetry
 
@@ -120,7 +122,8 @@ class GridProvider:
                     camera_height_m=millimetres(plan.camera_height_m) / 1000.0,
                     after_chunk=lambda _progress, worked_s: self.throttle.pause(worked_s),
                 )
-            return ComputedGrid(model_sha256=self._model_sha256, grid=grid)
+            prototypes = SortedPrototypes.of(prototypes_of(grid, plan), shipped_cells())
+            return ComputedGrid(model_sha256=self._model_sha256, grid=grid, prototypes=prototypes)
         except Exception:
             # The background fails at it as well, and records it with the plan.
             logging.getLogger(LOGGER_NAME).exception("latent grid failed")
@@ -145,12 +148,12 @@ class GridProvider:
         """
         return self._cache.find(key)
 
-    def make_prototypes(self, key: GridKey, grid_id: int) -> Prototypes | None:
+    def make_prototypes(self, key: GridKey, grid_id: int) -> SortedPrototypes | None:
         """Make and store the prototypes of a grid that was stored without; None when it is gone."""
-        grid = self.find(key)
-        if grid is None:
+        grid, record = self.find(key), self._store.plans.by_revision(key.revision_id)
+        if grid is None or record is None:
             return None
-        prototypes = prototypes_of(grid)
+        prototypes = SortedPrototypes.of(prototypes_of(grid, record.plan), shipped_cells())
         self._store.grids.put_prototypes(grid_id, prototypes)
         return prototypes
 

@@ -33,7 +33,7 @@ from service.query.geopose import anchor_of
 from service.query.heading import KnownHeading, known_heading
 from service.query.localiser import Localiser
 from service.query.venue_hints import VenueHints
-from service.query.venue_plans import VenuePlans, venue_height
+from service.query.venue_plans import VenuePlans, not_excluded, venue_height
 from service.schemas import EarthPoint, LocaliseAnswer, LocaliseForm, PlanProbability
 from service.settings import Settings
 from service.storage.records import PlanRecord, VenueRecord
@@ -248,11 +248,10 @@ class VenueLocaliser:
         rows, log_mass, index = ready, None, list(range(len(ready)))
         shares, warnings = hints.shares(ready), [*warnings, *hints.unplaced(ready)]
         if query.profile is not None and self._plans.needs_choice(ready, query):
-            known = await self._plans.prototypes(ready)
-            weights = self._encoders.manifest.evidence
-            chosen = await compute(
-                partial(self._plans.choose, known, query, weights, partial(hints.log_prior, shares=shares))
-            )
+            possible = not_excluded(ready, hints.log_prior(ready, shares))
+            known, plan_index = await self._plans.index(possible, compute)
+            weights, log_prior = self._encoders.manifest.evidence, hints.log_prior(known, shares)
+            chosen = await compute(partial(self._plans.choose, known, plan_index, query, weights, log_prior))
             rows, log_mass, index = chosen.members, chosen.log_mass, chosen.index.tolist()
             if hints.rooms:
                 told = f"rooms was looked for in the {len(rows)} most probable ones of {len(ready)} floor plans"

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
+import logging
 import math
+import threading
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,14 +21,20 @@ from lalaloc_core.bundle import EvidenceModel
 from lalaloc_core.errors import InvalidHintError
 from lalaloc_core.localise.camera_height import DEFAULT_STD_M, CameraHeight
 from lalaloc_core.localise.evidence import EvidenceConfig
+from lalaloc_core.localise.plan_index import PlanIndex
 from lalaloc_core.localise.poses import LatentGrid, Query
-from lalaloc_core.localise.prototypes import Prototypes, joined, log_masses, most_probable
+from lalaloc_core.localise.prototype_cells import shipped_cells
+from lalaloc_core.localise.prototypes import most_probable
 from service.bounded_cache import BoundedCache
+from service.errors import StoreUnavailableError
 from service.grids import GridProvider
+from service.query.prototype_file import BlockKey, PrototypeFile
 from service.schemas import EarthPoint, LocaliseForm
 from service.storage import Store
+from service.storage.grid_format import SortedPrototypes
 from service.storage.plan_places import distances_m
-from service.storage.records import PlanRecord
+from service.storage.records import PlanRecord, VenueState
+from service.telemetry import LOGGER_NAME
 from service.threads import BoundedReads
 
 # Plans that are searched in full, and what that may come to: poses of all of them, as many as one plan may have, and
@@ -35,6 +46,28 @@ _LARGEST_REACH_M = 1000.0
 _MAX_NEAR = 2000
 # Prototypes that are read at a time, so that one read is short.
 _AT_ONCE = 1000
+# About what a plan takes in memory besides its prototypes: its row.
+_ROW_BYTES = 600
+
+
+# Runs a call on the threads that compute for queries.
+Compute = Callable[[Callable[[], Any]], Awaitable[Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class _Venue:
+    """The plans of a venue, which hold as long as its state stays."""
+
+    state: VenueState
+    rows: Sequence[Row[Any]]
+
+
+@dataclass(frozen=True, eq=False)
+class _Indexed:
+    """The index of some plans: of which of those that were asked for, in their order."""
+
+    place: Int[np.ndarray, "p"]
+    index: PlanIndex
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +76,7 @@ class ChosenPlans:
 
     Attributes:
         members: the plans as `Venues.searched` tells them.
-        log_mass: (p,) of all plans that are ready, chosen or not; see `localise.prototypes`.
+        log_mass: (p,) of all plans that are ready, chosen or not; see `localise.plan_index`.
         index: (m,) which of those were chosen.
     """
 
@@ -53,27 +86,47 @@ class ChosenPlans:
 
 
 class VenuePlans:
-    """Finds the plans of a venue, and chooses among them by their prototypes, which are kept in memory."""
+    """Finds the plans of a venue, and chooses among them by an index of their prototypes.
+
+    Prototypes lie in a file of this replica, which is filled from the database with what is asked for. Which plans a
+    venue has, and where their prototypes are, is kept in memory for as long as the database says that nothing of it has
+    changed.
+    """
 
     def __init__(
-        self, store: Store, grids: GridProvider, reads: BoundedReads, *, limit_bytes: int, max_poses: int
+        self,
+        store: Store,
+        grids: GridProvider,
+        reads: BoundedReads,
+        *,
+        path: Path | None,
+        file_bytes: int,
+        limit_bytes: int,
+        max_poses: int,
     ) -> None:
         """
         Args:
-            limit_bytes: memory for prototypes.
+            path: of the file of prototypes; None for one that is gone with the process.
+            file_bytes: how large that may become.
+            limit_bytes: memory for what is kept of venues.
             max_poses: that the grids of chosen plans may have in sum.
         """
         self._store = store
         self._grids = grids
         self._reads = reads
+        self._path, self._file_bytes = path, file_bytes
         self._max_poses = max_poses
-        # By the ids of their grids, which never stand for anything else.
-        self._prototypes: BoundedCache[int, Prototypes] = BoundedCache(limit_bytes, lambda one: one.nbytes)
+        self._venues: BoundedCache[str, _Venue] = BoundedCache(limit_bytes, lambda one: _ROW_BYTES * len(one.rows))
+        # By the ids of the plans' grids.
+        self._indices: BoundedCache[bytes, _Indexed] = BoundedCache(
+            limit_bytes, lambda one: one.place.nbytes + one.index.nbytes
+        )
+        self._file: PrototypeFile | None = None
+        self._building = threading.Lock()
 
     async def members(self, venue_id: str) -> Sequence[Row[Any]]:
-        """All plans of a venue, each once."""
-        rows = await self._reads.run(self._store.venues.searched, venue_id, *self._grids.model)
-        return list({row.plan_id: row for row in rows}.values())
+        """All plans of a venue as they are now, each once."""
+        return await self._reads.run(self._members, venue_id)
 
     async def near(self, tenant: str, place: EarthPoint, within_m: float) -> Sequence[Row[Any]]:
         """Plans of a tenant with an anchor that lie so near a place, the nearest first."""
@@ -90,55 +143,50 @@ class VenuePlans:
         """Whether not all of some plans can be searched in full."""
         return len(ready) > MAX_SEARCHED or sum(row.poses for row in ready) > self._most_poses(query)
 
-    async def prototypes(self, ready: Sequence[Row[Any]]) -> list[tuple[Row[Any], Prototypes]]:
-        """Plans that are ready with their prototypes, from memory or from the store.
+    async def index(self, ready: Sequence[Row[Any]], compute: Compute) -> tuple[Sequence[Row[Any]], PlanIndex]:
+        """The index of plans that are ready, with the plans in its order: without those whose grid is gone by now.
 
-        Those of grids that an earlier version of the service stored are made of the grid, and stored; plans whose grid
-        is not there any more are left out.
+        Prototypes of grids that were stored without, or by an earlier version of the service, are made and stored.
+
+        Args:
+            compute: what takes the processor is done with it.
         """
-        found = {row.grid_id: self._prototypes.get(row.grid_id) for row in ready}
-        missing = [grid_id for grid_id, prototypes in found.items() if prototypes is None]
-        for first in range(0, len(missing), _AT_ONCE):
-            part = missing[first : first + _AT_ONCE]
-            found |= await self._reads.run(self._store.grids.prototypes, part)
-        known, fresh = [], set(missing)
-        for row in ready:
-            prototypes = found[row.grid_id]
-            if prototypes is None:
-                key = self._grids.key(row.revision_id, row.camera_height_m)
-                prototypes = await self._reads.run(self._grids.make_prototypes, key, row.grid_id)
-            if prototypes is not None:
-                known.append((row, prototypes))
-                if row.grid_id in fresh:
-                    self._prototypes.put(row.grid_id, prototypes)
-        return known
+        asked = hashlib.sha256(np.array([row.grid_id for row in ready], np.int64).tobytes()).digest()
+        indexed = self._indices.get(asked)
+        if indexed is None:
+            found = await compute(partial(self._in_file, ready))
+            fresh = await self._fetched([row for row in ready if _key(row) not in found])
+            place = np.array([k for k, row in enumerate(ready) if _key(row) in found or _key(row) in fresh], np.intp)
+            if not len(place):
+                # Gone since a moment: whoever asks again finds what took their place.
+                raise StoreUnavailableError
+            there = [ready[k] for k in place.tolist()]
+            index = await compute(partial(self._indexed, there, fresh))
+            if index is None:
+                # The file has no room for all of them: this index has them in memory.
+                fresh |= await self._fetched([row for row in there if _key(row) not in fresh])
+                index = await compute(partial(self._in_memory, there, fresh))
+            indexed = _Indexed(place, index)
+            self._indices.put(asked, indexed)
+        return [ready[k] for k in indexed.place.tolist()], indexed.index
 
     def choose(
         self,
-        known: Sequence[tuple[Row[Any], Prototypes]],
+        known: Sequence[Row[Any]],
+        index: PlanIndex,
         query: Query,
         weights: EvidenceModel,
-        log_prior: Callable[[Sequence[Row[Any]]], Float[np.ndarray, "p"]],
+        log_prior: Float[np.ndarray, "p"],
     ) -> ChosenPlans:
-        """The most probable plans; takes a while with many.
+        """The most probable plans of an index.
 
         Args:
-            log_prior: what is known of plans beforehand; -inf for those that are excluded.
-
-        Raises:
-            InvalidHintError: all are.
+            log_prior: what is known of plans beforehand.
         """
-        counts = [len(prototypes) for _, prototypes in known]
-        first = np.concatenate([[0], np.cumsum(counts)[:-1]])
-        all_of_them = joined([prototypes for _, prototypes in known])
-        log_mass = log_masses(all_of_them, first, query, weights, EvidenceConfig())
-        log_mass = log_mass + log_prior([row for row, _ in known])
-        if not np.isfinite(log_mass).any():
-            raise InvalidHintError("strict", f"all hints hold in none of the {len(known)} floor plans that are ready")
-        poses = np.array([row.poses for row, _ in known])
-        index = most_probable(log_mass, poses, most_plans=MAX_SEARCHED, most_poses=self._most_poses(query))
-        index = index[np.isfinite(log_mass[index])]
-        return ChosenPlans([known[k][0] for k in index], log_mass, index)
+        log_mass = index.log_masses(query, weights, EvidenceConfig()) + log_prior
+        poses = np.array([row.poses for row in known])
+        chosen = most_probable(log_mass, poses, most_plans=MAX_SEARCHED, most_poses=self._most_poses(query))
+        return ChosenPlans([known[k] for k in chosen.tolist()], log_mass, chosen)
 
     async def load(self, tenant: str, members: Sequence[Row[Any]]) -> list[tuple[Row[Any], PlanRecord, LatentGrid]]:
         """Chosen plans with their grids; those that were deleted or replaced a moment ago are left out."""
@@ -151,9 +199,89 @@ class VenuePlans:
                 loaded.append((row, record, grid))
         return loaded
 
+    def close(self) -> None:
+        """Let another process have the file."""
+        if self._file is not None:
+            self._file.close()
+
     def _most_poses(self, query: Query) -> int:
         compared = len(query.roll) * len(query.camera_height.offsets)
         return min(self._max_poses, _MAX_COMPARISONS // compared)
+
+    def _members(self, venue_id: str) -> Sequence[Row[Any]]:
+        # The state first: what changes in between is found out by the next query.
+        state = self._store.venues.state(venue_id, *self._grids.model)
+        venue = self._venues.get(venue_id)
+        if venue is None or venue.state != state:
+            rows = self._store.venues.searched(venue_id, *self._grids.model)
+            venue = _Venue(state, list({row.plan_id: row for row in rows}.values()))
+            self._venues.put(venue_id, venue)
+        return venue.rows
+
+    def _in_file(self, ready: Sequence[Row[Any]]) -> dict[BlockKey, tuple[int, int]]:
+        with self._building:
+            return self._opened().find(_key(row) for row in ready)
+
+    async def _fetched(self, rows: Sequence[Row[Any]]) -> dict[BlockKey, SortedPrototypes]:
+        """Prototypes of some plans from the database; those that it has not are made, of grids that are still there."""
+        fetched: dict[BlockKey, SortedPrototypes] = {}
+        for first in range(0, len(rows), _AT_ONCE):
+            part = rows[first : first + _AT_ONCE]
+            stored = await self._reads.run(self._store.grids.prototypes, [row.grid_id for row in part])
+            for row in part:
+                prototypes = stored.get(row.grid_id)
+                if prototypes is None:
+                    key = self._grids.key(row.revision_id, row.camera_height_m)
+                    prototypes = await self._reads.run(self._grids.make_prototypes, key, row.grid_id)
+                if prototypes is not None:
+                    fetched[_key(row)] = prototypes
+        return fetched
+
+    def _indexed(self, known: Sequence[Row[Any]], fresh: Mapping[BlockKey, SortedPrototypes]) -> PlanIndex | None:
+        """The index of some plans, of which some are not in the file yet; None where that has no room for them."""
+        keys = [_key(row) for row in known]
+        with self._building:
+            file = self._opened()
+            there = file.find(fresh)
+            try:
+                file.add({key: one.in_shipped_cells() for key, one in fresh.items() if key not in there})
+            except OSError as error:
+                logging.getLogger(LOGGER_NAME).warning("cannot write the file of prototypes: %s", error)
+            rows, found = file.rows(), file.find(keys)
+        if not all(key in found for key in keys):
+            return None
+        begin, count = np.array([found[key] for key in keys], np.int64).T
+        return PlanIndex.of(rows, begin, count, step_m=self._grids.model[1], cells=shipped_cells())
+
+    def _in_memory(self, known: Sequence[Row[Any]], fresh: Mapping[BlockKey, SortedPrototypes]) -> PlanIndex:
+        blocks = [fresh[_key(row)].in_shipped_cells() for row in known]
+        count = np.array([len(block) for block in blocks])
+        rows, begin = np.concatenate(blocks), np.cumsum(count) - count
+        return PlanIndex.of(rows, begin, count, step_m=self._grids.model[1], cells=shipped_cells())
+
+    def _opened(self) -> PrototypeFile:
+        if self._file is None:
+            version, limit_bytes = shipped_cells().version, self._file_bytes
+            try:
+                self._file = PrototypeFile(self._path, cells_version=version, limit_bytes=limit_bytes)
+            except OSError as error:
+                logging.getLogger(LOGGER_NAME).warning("cannot open the file of prototypes: %s", error)
+                self._file = PrototypeFile(None, cells_version=version, limit_bytes=limit_bytes)
+        return self._file
+
+
+def not_excluded(ready: Sequence[Row[Any]], log_prior: Float[np.ndarray, "p"]) -> Sequence[Row[Any]]:
+    """The plans that are possible at all.
+
+    Raises:
+        InvalidHintError: none is.
+    """
+    possible = np.isfinite(log_prior)
+    if possible.all():
+        return ready
+    if not possible.any():
+        raise InvalidHintError("strict", f"all hints hold in none of the {len(ready)} floor plans that are ready")
+    return [ready[k] for k in np.flatnonzero(possible).tolist()]
 
 
 def venue_height(form: LocaliseForm, ready: Sequence[Row[Any]]) -> CameraHeight:
@@ -169,3 +297,7 @@ def venue_height(form: LocaliseForm, ready: Sequence[Row[Any]]) -> CameraHeight:
     if len(said) > 1 or std_m is None:
         std_m = math.inf
     return CameraHeight(height_m, std_m if form.camera_height_std_m is None else form.camera_height_std_m)
+
+
+def _key(row: Row[Any]) -> BlockKey:
+    return BlockKey(row.grid_id, row.grid_sha256)

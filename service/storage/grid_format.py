@@ -4,8 +4,8 @@
 positions (float64, n·2), latents (float32, n·d), profiles (float32, n·w), room indices (int32, n). "LLG2" is the same
 without latents, d = 0, and with profiles in half precision (float16).
 
-The prototypes of a plan likewise: "LLP1", their number and that of azimuths, log profiles (float16, n·a), log areas
-(float32, n).
+The prototypes of a plan likewise: "LLP2", the version of the cells that they are sorted into, their number, and rows of
+`prototypes.ROW`. What an earlier version of the service stored ("LLP1") is not read: it has no openings.
 """
 
 from __future__ import annotations
@@ -17,27 +17,48 @@ from dataclasses import dataclass
 import numpy as np
 
 from lalaloc_core.localise.poses import LatentGrid
-from lalaloc_core.localise.prototypes import Prototypes, prototypes_of
+from lalaloc_core.localise.prototype_cells import Cells, shipped_cells
+from lalaloc_core.localise.prototypes import ROW, Prototypes
 from lalaloc_core.sampling import PoseSet
 
 _HEADER = struct.Struct("<4s3I")
 _MAGIC, _MAGIC_WITHOUT_LATENTS = b"LLG1", b"LLG2"
 _PROTOTYPES_HEADER = struct.Struct("<4s2I")
-_PROTOTYPES_MAGIC = b"LLP1"
+_PROTOTYPES_MAGIC = b"LLP2"
 _POSE_BYTES, _LATENT_BYTES, _ROOM_BYTES = 16, 4, 4
+
+
+@dataclass(frozen=True, eq=False)
+class SortedPrototypes:
+    """Prototypes of a plan, rows of `prototypes.ROW`, sorted into cells of a version."""
+
+    rows: np.ndarray
+    version: int
+
+    @classmethod
+    def of(cls, prototypes: Prototypes, cells: Cells) -> SortedPrototypes:
+        """Sort prototypes."""
+        rows = prototypes.rows.copy()
+        rows["cell"] = cells.sort(rows)
+        return cls(rows, cells.version)
+
+    def in_shipped_cells(self) -> np.ndarray:
+        """The rows, sorted anew where that was into other cells."""
+        cells = shipped_cells()
+        return self.rows if self.version == cells.version else self.of(Prototypes(self.rows, 0.0), cells).rows
 
 
 @dataclass(frozen=True)
 class PackedGrid:
-    """A grid as a blob, with the number of its poses, the digest of the blob, and its prototypes as another one."""
+    """A grid as a blob, with the number of its poses, the digest of the blob, and perhaps its prototypes as another."""
 
     poses: int
     content: bytes
     sha256: str
-    prototypes: bytes
+    prototypes: bytes | None
 
 
-def pack(grid: LatentGrid) -> PackedGrid:
+def pack(grid: LatentGrid, prototypes: SortedPrototypes | None = None) -> PackedGrid:
     """The blob of a grid."""
     count, columns = grid.profile_m.shape
     latents = np.empty((count, 0)) if grid.latents is None else grid.latents
@@ -50,29 +71,26 @@ def pack(grid: LatentGrid) -> PackedGrid:
         grid.poses.room_index.astype("<i4", copy=False),
     )
     content = b"".join((header, *(np.ascontiguousarray(array).data.cast("B") for array in arrays)))
-    return PackedGrid(count, content, digest_of(content), pack_prototypes(prototypes_of(grid)))
+    return PackedGrid(count, content, digest_of(content), None if prototypes is None else pack_prototypes(prototypes))
 
 
-def pack_prototypes(prototypes: Prototypes) -> bytes:
+def pack_prototypes(prototypes: SortedPrototypes) -> bytes:
     """The blob of a plan's prototypes."""
-    count, azimuths = prototypes.log_profile.shape
-    header = _PROTOTYPES_HEADER.pack(_PROTOTYPES_MAGIC, count, azimuths)
-    profile, area = prototypes.log_profile.astype("<f2"), prototypes.log_area.astype("<f4")
-    return b"".join((header, profile.tobytes(), area.tobytes()))
+    rows = prototypes.rows
+    return _PROTOTYPES_HEADER.pack(_PROTOTYPES_MAGIC, prototypes.version, len(rows)) + rows.tobytes()
 
 
-def unpack_prototypes(content: bytes, *, step_m: float) -> Prototypes | None:
+def unpack_prototypes(content: bytes) -> SortedPrototypes | None:
     """The prototypes in a blob, as read-only views of it; None when it is none, or has numbers that are none."""
     if len(content) < _PROTOTYPES_HEADER.size:
         return None
-    magic, count, azimuths = _PROTOTYPES_HEADER.unpack_from(content)
-    if magic != _PROTOTYPES_MAGIC or len(content) != _PROTOTYPES_HEADER.size + count * (2 * azimuths + 4):
+    magic, version, count = _PROTOTYPES_HEADER.unpack_from(content)
+    if magic != _PROTOTYPES_MAGIC or len(content) != _PROTOTYPES_HEADER.size + count * ROW.itemsize or not count:
         return None
-    log_profile = np.frombuffer(content, "<f2", count * azimuths, _PROTOTYPES_HEADER.size).reshape(count, azimuths)
-    log_area = np.frombuffer(content, "<f4", count, len(content) - 4 * count)
-    if not (count and np.isfinite(log_profile).all() and np.isfinite(log_area).all()):
+    rows = np.frombuffer(content, ROW, count, _PROTOTYPES_HEADER.size)
+    if not all(np.isfinite(rows[name]).all() for name in ("log_profile", "log_area", "ceiling_m")):
         return None
-    return Prototypes(log_profile, log_area, step_m)
+    return SortedPrototypes(rows, version)
 
 
 def digest_of(content: bytes | bytearray) -> str:

@@ -42,7 +42,7 @@ class _Content:
 
     @classmethod
     def of(cls, record: PlanRecord, original: Original, grid: ComputedGrid | None) -> _Content:
-        packed = None if grid is None else (grid.key(record.revision_id), pack(grid.grid))
+        packed = None if grid is None else (grid.key(record.revision_id), pack(grid.grid, grid.prototypes))
         return cls(PlanDocument.of(record.plan), original, hashlib.sha256(original.content).hexdigest(), packed)
 
 

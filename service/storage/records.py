@@ -8,6 +8,7 @@ from datetime import datetime
 from lalaloc_core.earth import Anchor
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.poses import LatentGrid
+from service.storage.grid_format import SortedPrototypes
 
 # Whose plans are whose without API keys.
 DEFAULT_TENANT = "default"
@@ -36,6 +37,7 @@ class ComputedGrid:
 
     model_sha256: str
     grid: LatentGrid
+    prototypes: SortedPrototypes | None = None
 
     def key(self, revision_id: str) -> GridKey:
         """Its key, once the revision is known."""
@@ -142,6 +144,28 @@ class VenueCounts:
     plans: int
     ready: int
     failed: int
+
+
+@dataclass(frozen=True)
+class VenueState:
+    """What changes whenever a query about a venue would be told something else of its plans.
+
+    Plans come and go with the venue's revision, and a plan that is replaced makes the sum of the revisions' numbers
+    greater; where nothing of that happened, grids can only have come or gone.
+
+    Attributes:
+        revision_id: of the venue; None where there is no venue.
+        plans, ready, failed: how many there are.
+        revisions: the sum of the numbers of the plans' revisions.
+        grids: the sum of the ids of the grids of those that are ready.
+    """
+
+    revision_id: str | None
+    plans: int
+    ready: int
+    failed: int
+    revisions: int
+    grids: int
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,17 @@ from sqlalchemy import ColumnElement, Connection, Table, and_, delete, exists, f
 from sqlalchemy.exc import IntegrityError
 
 from lalaloc_core.localise.poses import LatentGrid
-from lalaloc_core.localise.prototypes import Prototypes
 from service.storage.chunks import read_exactly, write_chunks
 from service.storage.database import Database
-from service.storage.grid_format import PackedGrid, digest_of, pack, pack_prototypes, unpack, unpack_prototypes
+from service.storage.grid_format import (
+    PackedGrid,
+    SortedPrototypes,
+    digest_of,
+    pack,
+    pack_prototypes,
+    unpack,
+    unpack_prototypes,
+)
 from service.storage.records import GridKey, PlanSummary
 from service.storage.tables import FLOORPLANS, GRID_CHUNKS, GRID_LEASES, LATENT_GRIDS, REVISIONS
 from service.telemetry import LOGGER_NAME
@@ -47,22 +54,22 @@ class StoredGrids:
             logging.getLogger(LOGGER_NAME).error("a stored latent grid is damaged", extra={"fields": fields})
         return grid
 
-    def prototypes(self, grid_ids: Sequence[int]) -> dict[int, Prototypes]:
+    def prototypes(self, grid_ids: Sequence[int]) -> dict[int, SortedPrototypes]:
         """Prototypes of stored grids by the grids' ids, those that there are."""
-        found: dict[int, Prototypes] = {}
+        found: dict[int, SortedPrototypes] = {}
         columns = LATENT_GRIDS.c
         for first in range(0, len(grid_ids), _AT_ONCE):
-            query = select(columns.id, columns.step_m, columns.prototypes).where(
+            query = select(columns.id, columns.prototypes).where(
                 columns.id.in_(grid_ids[first : first + _AT_ONCE]), columns.prototypes.is_not(None)
             )
             with self._database.reading() as connection:
                 rows = connection.execute(query).all()
             for row in rows:
-                if (prototypes := unpack_prototypes(row.prototypes, step_m=row.step_m)) is not None:
+                if (prototypes := unpack_prototypes(row.prototypes)) is not None:
                     found[row.id] = prototypes
         return found
 
-    def put_prototypes(self, grid_id: int, prototypes: Prototypes) -> None:
+    def put_prototypes(self, grid_id: int, prototypes: SortedPrototypes) -> None:
         """Store the prototypes of a grid that an earlier version of the service stored without."""
         statement = update(LATENT_GRIDS).where(LATENT_GRIDS.c.id == grid_id)
         with self._database.writing() as connection:
@@ -81,7 +88,15 @@ class StoredGrids:
         with self._database.reading() as connection:
             return {(row.revision_id, row.camera_height_mm): row.poses for row in connection.execute(query)}
 
-    def put(self, key: GridKey, grid: LatentGrid, *, keep: int, always_keep_mm: int) -> bool:
+    def put(
+        self,
+        key: GridKey,
+        grid: LatentGrid,
+        *,
+        keep: int,
+        always_keep_mm: int,
+        prototypes: SortedPrototypes | None = None,
+    ) -> bool:
         """Store a grid, drop the oldest of its revision beyond `keep`, and end the lease on it.
 
         Grids for one other model or grid step stay, the latest: while a model is replaced, replicas with the old one
@@ -89,11 +104,12 @@ class StoredGrids:
 
         Args:
             always_keep_mm: the camera height (mm) that is never dropped to make room.
+            prototypes: those of the plan; None leaves them to whoever asks for them first.
 
         Returns:
             False when the revision is gone, then nothing is stored.
         """
-        packed = pack(grid)
+        packed = pack(grid, prototypes)
         with self._database.writing() as connection:
             # Whoever stores grids of one revision takes turns.
             lock = select(REVISIONS.c.id).where(REVISIONS.c.id == key.revision_id).with_for_update(key_share=True)

@@ -37,6 +37,7 @@ from service.storage.records import (
     VenueMember,
     VenuePlace,
     VenueRecord,
+    VenueState,
 )
 from service.storage.stored_grids import has_digest, is_own_height
 from service.storage.tables import FLOORPLANS, LATENT_GRIDS, REVISIONS, VENUE_PLANS, VENUES
@@ -61,6 +62,7 @@ _SEARCHED = (
     REVISIONS.c.camera_height_std_m,
     REVISIONS.c.failure,
     LATENT_GRIDS.c.id.label("grid_id"),
+    LATENT_GRIDS.c.sha256.label("grid_sha256"),
     LATENT_GRIDS.c.poses,
 )
 
@@ -213,13 +215,27 @@ class Venues:
         with self._database.reading() as connection:
             return VenueCounts(*connection.execute(query).one())
 
+    def state(self, venue_id: str, model_sha256: str, step_m: float) -> VenueState:
+        """What tells whether `searched` would answer as it did: a look at indices, without the rows themselves."""
+        grid, own_revision = LATENT_GRIDS.c.id, VENUES.c.revision_id
+        failed = case((and_(grid.is_(None), REVISIONS.c.failure.is_not(None)), 1))
+        sums = (func.coalesce(func.sum(summed), 0) for summed in (REVISIONS.c.number, grid))
+        counts = select(func.count(), func.count(grid), func.count(failed), *sums)
+        joined = VENUE_PLANS.join(FLOORPLANS, FLOORPLANS.c.id == VENUE_PLANS.c.plan_id)
+        query = _with_grids(counts, joined, model_sha256, step_m).where(VENUE_PLANS.c.venue_id == venue_id)
+        with self._database.reading() as connection:
+            revision_id = connection.scalar(select(own_revision).where(VENUES.c.id == venue_id))
+            counted = connection.execute(query).one()
+        # PostgreSQL sums up to decimals.
+        return VenueState(revision_id, *map(int, counted))
+
     def searched(self, venue_id: str, model_sha256: str, step_m: float) -> Sequence[Row[Any]]:
         """What a query needs to know of every plan of a venue.
 
         Returns:
             rows of `plan_id`, `revision_id`, `level`, `name`, `camera_height_m`, `camera_height_std_m`, `failure`,
-            `area_m2`, of where the plan lies (`plan_places`), and of the plan's own grid `grid_id` and `poses`, None
-            where it is not stored.
+            `area_m2`, of where the plan lies (`plan_places`), and of the plan's own grid `grid_id`,
+            `grid_sha256` and `poses`, None where it is not stored.
         """
         name = func.coalesce(VENUE_PLANS.c.name, FLOORPLANS.c.name).label("name")
         columns = (VENUE_PLANS.c.level, name, *_SEARCHED)

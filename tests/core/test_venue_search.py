@@ -1,4 +1,4 @@
-"""Several plans as one, and prototypes that tell which of many are worth a full search."""
+"""Several plans as one, and how probable it is that the plan is among those that were searched."""
 
 from __future__ import annotations
 
@@ -12,14 +12,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.evidence import Evidence, EvidenceConfig
 from lalaloc_core.localise.poses import LatentGrid, PredictedProfile, Query
-from lalaloc_core.localise.prototypes import (
-    AZIMUTHS,
-    joined,
-    log_masses,
-    most_probable,
-    prototypes_of,
-    share_searched,
-)
+from lalaloc_core.localise.prototypes import most_probable, share_searched
 from lalaloc_core.localise.side_by_side import PlansSideBySide
 from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.sampling import pose_grid
@@ -124,59 +117,15 @@ def test_places_are_told_in_the_frames_of_their_plans(side_by_side: PlansSideByS
     assert np.abs(side_by_side.grid.poses.position_m).max() < 100.0
 
 
-def test_prototypes_stand_for_all_of_the_floor() -> None:
-    grid = grid_of(PLANS[0])
-    prototypes = prototypes_of(grid)
-    assert prototypes.log_profile.shape == (len(prototypes), AZIMUTHS)
-    assert len(grid.poses) / 4 <= len(prototypes) < len(grid.poses) / 2
-    assert np.exp(prototypes.log_area).sum() == pytest.approx(len(grid.poses) * STEP_M**2, rel=1e-5)
-
-
-def slow_masses(grids: list[LatentGrid], query: Query) -> list[float]:
-    """The sums that `log_masses` says it computes, prototype by prototype."""
-    assert query.profile is not None
-    found = []
-    for grid in grids:
-        prototypes, terms = prototypes_of(grid), []
-        for row, log_area in zip(prototypes.log_profile.astype(float), prototypes.log_area, strict=True):
-            for centre, log_scale in zip(query.profile.log_m, query.profile.log_scale, strict=True):
-                centre, scale = centre[::2], np.exp(log_scale[::2])
-                s = np.hypot(scale, 0.6 * 2 * STEP_M * np.exp(-centre))
-                cost = np.mean(np.log1p(np.square((row - centre) / (CONFIG.tail * s))))
-                terms.append(log_area - WEIGHTS.temperature * cost)
-        found.append(np.logaddexp.reduce(terms))
-    return found
-
-
-@pytest.mark.parametrize("hypotheses", [1, 16])
-def test_masses_are_the_sums_that_they_are_said_to_be(hypotheses: int) -> None:
-    grids = [grid_of(plan) for plan in PLANS]
-    parts = [prototypes_of(grid) for grid in grids]
-    first = np.concatenate([[0], np.cumsum([len(part) for part in parts])[:-1]])
-    query = query_at(PLANS[1], 1e6 + 2.2, 0.9, hypotheses)
-    masses = log_masses(joined(parts), first, query, WEIGHTS, CONFIG)
-    np.testing.assert_allclose(masses, slow_masses(grids, query), atol=0.05)
-    assert masses.argmax() == 1
-
-
-def test_an_unknown_camera_height_is_searched() -> None:
-    grids = [grid_of(plan) for plan in PLANS]
-    parts = [prototypes_of(grid) for grid in grids]
-    first = np.concatenate([[0], np.cumsum([len(part) for part in parts])[:-1]])
-    query = query_at(PLANS[1], 1e6 + 2.2, 0.9)
-    assert query.profile is not None
-    # Read at 1.5 m, taken at 1.95 m: everything looks smaller than it is.
-    smaller = replace(query.profile, log_m=query.profile.log_m - np.log(1.3))
-    unknown = replace(query, profile=smaller, camera_height=CameraHeight(1.5, float("inf")))
-    assert log_masses(joined(parts), first, unknown, WEIGHTS, CONFIG).argmax() == 1
-
-
 def test_the_most_probable_plans_are_searched_as_far_as_they_go() -> None:
     log_mass, poses = np.array([-3.0, -1.0, -2.0, -9.0]), np.array([10, 500, 20, 30])
     assert most_probable(log_mass, poses, most_plans=3, most_poses=1000).tolist() == [1, 2, 0]
     assert most_probable(log_mass, poses, most_plans=2, most_poses=1000).tolist() == [1, 2]
     assert most_probable(log_mass, poses, most_plans=4, most_poses=525).tolist() == [1, 2]
     assert most_probable(log_mass, poses, most_plans=4, most_poses=5).tolist() == [1]
+    # Nor those that weigh nothing.
+    nothing = np.array([-np.inf, -1.0, -np.inf, -9.0])
+    assert most_probable(nothing, poses, most_plans=4, most_poses=1000).tolist() == [1, 3]
 
 
 def test_what_was_left_out_keeps_its_share() -> None:
@@ -190,3 +139,6 @@ def test_what_was_left_out_keeps_its_share() -> None:
     # A wrong plan and one of four copies of the right one were searched.
     mixed = np.array([-1.0, -2.0, -2.0, -2.0, -2.0, -7.0])
     assert share_searched(mixed, np.arange(2), np.array([0.0, 1.0])) == pytest.approx(0.25, abs=0.01)
+    # What weighs nothing changes nothing.
+    more = np.append(mixed, [-np.inf, -np.inf])
+    assert share_searched(more, np.arange(2), np.array([0.0, 1.0])) == pytest.approx(0.25, abs=0.01)

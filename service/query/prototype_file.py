@@ -1,0 +1,169 @@
+"""Prototypes of many plans in one file, mapped into memory: what a replica need not read of the database again.
+
+The file is an array of rows of `prototypes.ROW`. A block is a row that holds a header instead, and behind it the
+prototypes of one latent grid:
+
+    magic (8 bytes), id of the grid (int64), its digest (32 bytes), version of the cells (uint32),
+    number of rows (uint32), CRC-32 of the rows (uint32), CRC-32 of all that (uint32), zeros
+
+Blocks are appended and never changed. What the database says decides which are asked for: those of plans that were
+deleted or replaced are never found again, whoever asks. A file that ends in the middle of a block, or was damaged, is
+cut off there when it is opened; one that would grow beyond its limit begins anew.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import logging
+import os
+import struct
+import tempfile
+import threading
+import zlib
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+
+from lalaloc_core.localise.prototypes import ROW
+from service.telemetry import LOGGER_NAME
+
+_HEADER = struct.Struct("<8sq32sIII")
+_CRC = struct.Struct("<I")
+_MAGIC = b"LLROWS1\0"
+
+
+@dataclass(frozen=True)
+class BlockKey:
+    """Whose prototypes a block has: the id of the latent grid, and its digest (hexadecimal)."""
+
+    grid_id: int
+    sha256: str
+
+
+class PrototypeFile:
+    """One file of one process; safe to share between threads."""
+
+    def __init__(self, path: Path | None, *, cells_version: int, limit_bytes: int) -> None:
+        """Open a file, or make one, and look through it: about a second for each GB.
+
+        Args:
+            path: None, or one that another process has open, is a file that goes when it is closed.
+            cells_version: blocks that were sorted into other cells are not found.
+            limit_bytes: how large it may become.
+
+        Raises:
+            OSError: it cannot be read or written.
+        """
+        self._cells_version = cells_version
+        self._limit = limit_bytes // ROW.itemsize
+        self._lock = threading.Lock()
+        self._path, self._file = path, _opened(path)
+        self._places: dict[BlockKey, tuple[int, int]] = {}
+        self._end = 0
+        self._read()
+
+    @property
+    def bytes(self) -> int:
+        """How large it is."""
+        return self._end * ROW.itemsize
+
+    def find(self, keys: Iterable[BlockKey]) -> dict[BlockKey, tuple[int, int]]:
+        """Where the blocks of some grids begin in `rows`, and how many rows they have; those that there are."""
+        with self._lock:
+            return {key: self._places[key] for key in keys if key in self._places}
+
+    def add(self, blocks: Mapping[BlockKey, np.ndarray]) -> None:
+        """Append prototypes, sorted into cells; where there is no room for them, in place of all that it had.
+
+        Those that are more than may be in it at all are not added.
+
+        Raises:
+            OSError: they cannot be written; the file is as before.
+        """
+        with self._lock:
+            needed = sum(len(rows) + 1 for rows in blocks.values())
+            if needed > self._limit:
+                return
+            if self._end + needed > self._limit:
+                self._begin_anew()
+            parts, places, end = [], {}, self._end
+            for key, rows in blocks.items():
+                content = np.ascontiguousarray(rows, ROW).tobytes()
+                parts += [self._header(key, len(rows), zlib.crc32(content)), content]
+                places[key] = (end + 1, len(rows))
+                end += 1 + len(rows)
+            self._file.seek(self._end * ROW.itemsize)
+            self._file.write(b"".join(parts))
+            self._file.flush()
+            self._places |= places
+            self._end = end
+
+    def rows(self) -> np.ndarray:
+        """The whole file as it is now; stays as it is when the file begins anew."""
+        with self._lock:
+            if not self._end:
+                return np.empty(0, ROW)
+            return np.memmap(self._file, ROW, "r", shape=(self._end,))
+
+    def close(self) -> None:
+        """Let another process have it."""
+        self._file.close()
+
+    def _header(self, key: BlockKey, count: int, crc: int) -> bytes:
+        fields = (_MAGIC, key.grid_id, bytes.fromhex(key.sha256), self._cells_version, count, crc)
+        header = _HEADER.pack(*fields)
+        return (header + _CRC.pack(zlib.crc32(header))).ljust(ROW.itemsize, b"\0")
+
+    def _read(self) -> None:
+        size = os.fstat(self._file.fileno()).st_size // ROW.itemsize
+        if size:
+            content = np.memmap(self._file, np.uint8, "r", shape=(size * ROW.itemsize,)).data
+            while (block := _block(content, self._end)) is not None:
+                key, version, count = block
+                if version == self._cells_version:
+                    self._places[key] = (self._end + 1, count)
+                self._end += 1 + count
+        with contextlib.suppress(OSError):
+            self._file.truncate(self._end * ROW.itemsize)
+
+    def _begin_anew(self) -> None:
+        """Queries in work keep the file that they have mapped; it goes with the last of them."""
+        logging.getLogger(LOGGER_NAME).info("the file of prototypes is full and begins anew")
+        if self._path is not None:
+            with contextlib.suppress(FileNotFoundError):
+                self._path.unlink()
+        fresh = _opened(self._path)
+        self._file.close()
+        self._file, self._places, self._end = fresh, {}, 0
+
+
+def _opened(path: Path | None) -> IO[bytes]:
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = open(path, "a+b", buffering=0)  # noqa: SIM115
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.close()
+        else:
+            return file
+    return tempfile.TemporaryFile(prefix="lalaloc-prototypes-", buffering=0)
+
+
+def _block(content: memoryview, begin: int) -> tuple[BlockKey, int, int] | None:
+    """The block that begins at a row: whose it is, which cells it was sorted into, how many rows; None without one."""
+    at = begin * ROW.itemsize
+    header = content[at : at + ROW.itemsize]
+    if len(header) < ROW.itemsize:
+        return None
+    (crc,) = _CRC.unpack_from(header, _HEADER.size)
+    magic, grid_id, digest, version, count, rows_crc = _HEADER.unpack_from(header)
+    rows = content[at + ROW.itemsize : at + (1 + count) * ROW.itemsize]
+    whole = magic == _MAGIC and crc == zlib.crc32(header[: _HEADER.size]) and len(rows) == count * ROW.itemsize
+    if not whole or zlib.crc32(rows) != rows_crc:
+        return None
+    return BlockKey(grid_id, digest.hex()), version, count

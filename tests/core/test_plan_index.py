@@ -1,0 +1,258 @@
+"""Prototypes of plans, what they cost, and the index that finds those that are worth comparing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lalaloc_core.bundle import EvidenceModel
+from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.camera_height import CameraHeight
+from lalaloc_core.localise.evidence import EvidenceConfig
+from lalaloc_core.localise.plan_index import PlanIndex
+from lalaloc_core.localise.poses import (
+    LatentGrid,
+    PredictedCeiling,
+    PredictedOpenings,
+    PredictedProfile,
+    PredictedRoomType,
+    Query,
+    rolled,
+)
+from lalaloc_core.localise.prototype_cells import FAMILIES, Cells, family_of, shipped_cells
+from lalaloc_core.localise.prototype_costs import PrototypeCosts
+from lalaloc_core.localise.prototypes import (
+    AZIMUTHS,
+    Prototypes,
+    joined,
+    packed_openings,
+    prototypes_of,
+    unpacked_openings,
+)
+from lalaloc_core.render.poses import profiles_at
+from lalaloc_core.sampling import pose_grid
+
+COLUMNS, STEP_M = 64, 0.5
+WEIGHTS, CONFIG = EvidenceModel(temperature=40.0, openings=0.4, ceiling=0.1, room_type=0.05), EvidenceConfig()
+CLASSES = len(OPENING_CLASSES)
+
+
+def plan_of(rng: np.random.Generator, *, kinds: tuple[str, ...] | None = None) -> FloorPlan:
+    """Two rooms side by side, with a door between them and a window."""
+    width_m, depth_m, other_m = rng.uniform(2.5, 7.0, 3).tolist()
+    wall_m = 0.1
+    end_m = width_m + wall_m + other_m
+    document = {
+        "ceiling_height_m": float(rng.uniform(2.3, 3.0)),
+        "rooms": [
+            {"name": "a", "type": "kitchen", "polygon": [[0, 0], [width_m, 0], [width_m, depth_m], [0, depth_m]]},
+            {"name": "b", "polygon": [[width_m + wall_m, 0], [end_m, 0], [end_m, 3], [width_m + wall_m, 3]]},
+        ],
+        "openings": [
+            {"kind": "door", "line": [[width_m + 0.05, 1.0], [width_m + 0.05, 1.9]]},
+            {"kind": "window", "line": [[0.5, 0], [1.7, 0]], "sill_m": 0.9, "head_m": 2.0},
+        ],
+    }
+    if kinds is not None:
+        document["opening_kinds"] = list(kinds)
+        document["openings"] = [one for one in document["openings"] if one["kind"] in kinds]
+    return FloorPlan.from_dict(document)
+
+
+def grid_of(plan: FloorPlan) -> LatentGrid:
+    poses = pose_grid(plan, STEP_M)
+    profile_m = profiles_at(plan, poses.position_m, poses.room_index, np.zeros(len(poses)), COLUMNS, np.float32)
+    return LatentGrid(poses, np.zeros((len(poses), 1), np.float32), profile_m, STEP_M, 1.5)
+
+
+def query_of(prototypes: Prototypes, number: int, rng: np.random.Generator, *, hypotheses: int = 1) -> Query:
+    """What an encoder would say that sees a prototype, with errors; the first hypothesis of the heading is right."""
+    row = prototypes.rows[number]
+    log_m = np.repeat(row["log_profile"].astype(float), COLUMNS // AZIMUTHS) + rng.normal(0.0, 0.03, COLUMNS)
+    kind = np.repeat(unpacked_openings(row["openings"][None])[0], COLUMNS // AZIMUTHS)
+    log_probability = np.log(np.where(kind[:, None] == np.arange(CLASSES), 0.85, 0.05))
+    shifts = np.arange(hypotheses) * COLUMNS // hypotheses
+    types = np.full(len(ROOM_TYPES), 1.0 / len(ROOM_TYPES))
+    return Query(
+        np.zeros((hypotheses, 1)),
+        shifts * 2.0 * np.pi / COLUMNS,
+        0.0,
+        hypotheses == 1,
+        CameraHeight(1.5),
+        PredictedProfile.rolled(log_m, np.full(COLUMNS, np.log(0.05)), shifts),
+        PredictedOpenings(rolled(log_probability, shifts), np.array([0.5, 0.2, 0.2, 0.1])),
+        PredictedCeiling(float(np.log(row["ceiling_m"] - 1.5)), np.log(0.05)),
+        PredictedRoomType(np.log(rng.dirichlet(np.ones(len(ROOM_TYPES)))), types),
+    )
+
+
+@pytest.fixture(scope="module")
+def parts() -> list[Prototypes]:
+    rng = np.random.default_rng(0)
+    plans = [plan_of(rng) for _ in range(20)]
+    return [prototypes_of(grid_of(plan), plan) for plan in plans]
+
+
+def test_prototypes_stand_for_all_of_the_floor() -> None:
+    plan = plan_of(np.random.default_rng(1), kinds=("door",))
+    grid = grid_of(plan)
+    prototypes = prototypes_of(grid, plan)
+    assert len(grid.poses) / 4 <= len(prototypes) < len(grid.poses) / 2
+    assert np.exp(prototypes.rows["log_area"]).sum() == pytest.approx(len(grid.poses) * STEP_M**2, rel=1e-5)
+    assert set(prototypes.rows["claims"].tolist()) == {1 << OPENING_CLASSES.index("door")}
+    kinds = unpacked_openings(prototypes.rows["openings"])
+    assert set(kinds.ravel().tolist()) == {0, OPENING_CLASSES.index("door")}
+    assert set(prototypes.rows["room_type"].tolist()) == {ROOM_TYPES.index("kitchen"), ROOM_TYPES.index("unknown")}
+    np.testing.assert_allclose(prototypes.rows["ceiling_m"], plan.ceiling_heights_m[0], rtol=1e-3)
+
+
+def test_openings_are_packed_without_loss() -> None:
+    kind = np.random.default_rng(0).integers(0, CLASSES, (50, AZIMUTHS)).astype(np.uint8)
+    np.testing.assert_array_equal(unpacked_openings(packed_openings(kind)), kind)
+
+
+def slow_cost(row: Any, query: Query, hypothesis: int, delta: float) -> float:
+    """What `PrototypeCosts` says that it computes, azimuth by azimuth."""
+    assert query.profile is not None and query.openings is not None  # noqa: PT018
+    assert query.ceiling is not None and query.room_type is not None  # noqa: PT018
+    reach_m = CONFIG.grid_reach * 2 * STEP_M
+    every, floor = COLUMNS // AZIMUTHS, CONFIG.floor
+    centre = query.profile.log_m[hypothesis, ::every]
+    scale = np.exp(query.profile.log_scale[hypothesis, ::every])
+    walls = 0.0
+    for azimuth in range(AZIMUTHS):
+        s = np.hypot(scale[azimuth], reach_m * np.exp(-centre[azimuth]))
+        r = (float(row["log_profile"][azimuth]) - centre[azimuth] - delta) / (CONFIG.tail * s)
+        walls += np.log1p(r * r) / AZIMUTHS
+    # Blurred by the reach at a usual distance.
+    spread = reach_m / np.exp(np.median(query.profile.log_m[0, ::every]))
+    deviation = spread / (2.0 * np.pi) * COLUMNS
+    apart = (np.arange(COLUMNS) + COLUMNS // 2) % COLUMNS - COLUMNS // 2
+    kernel = np.exp(-0.5 * np.square(apart / deviation))
+    probability = np.exp(query.openings.log_probability[hypothesis])
+    blurred = np.stack([np.roll(kernel, w) @ probability for w in range(COLUMNS)]) / kernel.sum()
+    openings, kinds = 0.0, unpacked_openings(row["openings"][None])[0]
+    for azimuth in range(AZIMUTHS):
+        p, prior = blurred[azimuth * every], query.openings.prior
+        best = max(floor + (1.0 - floor) * p[c] / prior[c] for c in range(CLASSES))
+        if kinds[azimuth] == 0:
+            meant = [c for c in range(CLASSES) if c == 0 or not int(row["claims"]) >> c & 1]
+        else:
+            meant = [int(kinds[azimuth])]
+        said = floor + (1.0 - floor) * p[meant].sum() / prior[meant].sum()
+        openings += np.log(best / said) / AZIMUTHS
+    height_m = query.camera_height.height_m * np.exp(delta)
+    difference = np.log(float(row["ceiling_m"]) - height_m) - query.ceiling.log_m - delta
+    ceiling = np.log1p((difference / (CONFIG.tail * np.hypot(np.exp(query.ceiling.log_scale), 0.04))) ** 2)
+    ratio = floor + (1.0 - floor) * np.exp(query.room_type.log_probability) / query.room_type.prior
+    room_type = np.log(ratio[1:].max()) - (np.log(ratio[row["room_type"]]) if row["room_type"] else 0.0)
+    cost = walls + 0.6 * WEIGHTS.openings * openings + WEIGHTS.ceiling * ceiling
+    cost += WEIGHTS.room_type * max(room_type, 0.0)
+    return cost + float(query.camera_height.penalty(np.array([delta]))[0]) / WEIGHTS.temperature
+
+
+@pytest.mark.parametrize("kinds", [None, ("door",), ()], ids=["all claimed", "doors claimed", "none claimed"])
+def test_prototypes_cost_what_they_are_said_to(kinds: tuple[str, ...] | None) -> None:
+    rng = np.random.default_rng(3)
+    plan = plan_of(rng, kinds=kinds)
+    prototypes = prototypes_of(grid_of(plan), plan)
+    query = replace(query_of(prototypes, 2, rng, hypotheses=8), camera_height=CameraHeight(1.5, 0.3))
+    costs = PrototypeCosts(query, STEP_M, WEIGHTS, CONFIG)
+    n, (k, j) = len(prototypes), costs.shape
+    assert (k, j) == (8, len(costs.offsets))
+    number, hypothesis, offset = rng.integers(n, size=60), rng.integers(k, size=60), rng.integers(j, size=60)
+    found = costs.of(prototypes.rows[number], hypothesis, offset)
+    slow = [
+        slow_cost(prototypes.rows[a], query, int(b), float(costs.offsets[c]))
+        for a, b, c in zip(number, hypothesis, offset, strict=True)
+    ]
+    np.testing.assert_allclose(found, slow, rtol=2e-3, atol=2e-3)
+
+
+def test_masses_are_sums_over_prototypes_and_hypotheses(parts: list[Prototypes]) -> None:
+    few, rng = parts[:4], np.random.default_rng(4)
+    query = query_of(few[1], 3, rng, hypotheses=4)
+    costs = PrototypeCosts(query, STEP_M, WEIGHTS, CONFIG)
+    index = PlanIndex.of_parts(few, shipped_cells())
+    expected = []
+    for part in few:
+        cost = np.stack([costs.of(part.rows, np.full(len(part), k), np.zeros(len(part), int)) for k in range(4)])
+        weighed = part.rows["log_area"] - WEIGHTS.temperature * cost.astype(float)
+        expected.append(np.logaddexp.reduce(weighed, axis=None))
+    found = index.log_masses(query, WEIGHTS, CONFIG)
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-4)
+    assert found.argmax() == 1
+
+
+def test_few_comparisons_find_what_all_of_them_do(parts: list[Prototypes]) -> None:
+    index, rng = PlanIndex.of_parts(parts, shipped_cells()), np.random.default_rng(5)
+    pairs = sum(map(len, parts)) * 16
+    for number in range(len(parts)):
+        query = query_of(parts[number], 5, rng, hypotheses=16)
+        whole = index.log_masses(query, WEIGHTS, CONFIG, compared=pairs)
+        few = index.log_masses(query, WEIGHTS, CONFIG, compared=pairs // 20)
+        assert few[whole.argmax()] > few.max() - 0.1
+        # What is compared is compared alike; what is not weighs nothing.
+        assert (few <= whole + 1e-6).all()
+        assert few.max() == pytest.approx(whole.max(), abs=0.7)
+
+
+def test_an_unknown_camera_height_is_searched(parts: list[Prototypes]) -> None:
+    rng = np.random.default_rng(6)
+    query = query_of(parts[7], 4, rng)
+    assert query.profile is not None
+    # Read at 1.5 m, taken at 1.95 m: everything looks smaller than it is.
+    smaller = replace(query.profile, log_m=query.profile.log_m - np.log(1.3))
+    unknown = replace(query, profile=smaller, ceiling=None, camera_height=CameraHeight(1.5, float("inf")))
+    index = PlanIndex.of_parts(parts, shipped_cells())
+    assert index.log_masses(unknown, WEIGHTS, CONFIG).argmax() == 7
+    assert index.log_masses(unknown, WEIGHTS, CONFIG, compared=2000).argmax() == 7
+
+
+def test_copies_have_equal_masses_however_few_are_compared(parts: list[Prototypes]) -> None:
+    several = [*parts, parts[3], parts[3]]
+    index, rng = PlanIndex.of_parts(several, shipped_cells()), np.random.default_rng(7)
+    for compared in (1, 50, 10**9):
+        masses = index.log_masses(query_of(parts[3], 1, rng, hypotheses=8), WEIGHTS, CONFIG, compared=compared)
+        assert np.isfinite(masses[3])
+        np.testing.assert_allclose(masses[[20, 21]], masses[3], rtol=0, atol=1e-9)
+
+
+def test_plans_with_and_without_openings_are_sorted_and_found_alike() -> None:
+    rng, cells = np.random.default_rng(8), shipped_cells()
+    whole, parts = list[Prototypes](), list[Prototypes]()
+    for number in range(12):
+        complete, bare = (plan_of(np.random.default_rng(number), kinds=kinds) for kinds in (None, ()))
+        whole.append(prototypes_of(grid_of(complete), complete))
+        parts.append(prototypes_of(grid_of(bare), bare) if number % 2 else whole[-1])
+    rows = joined(parts).rows.copy()
+    rows["cell"] = cells.sort(rows)
+    # None, or doors and windows.
+    assert np.unique(rows["cell"] // (len(cells) // FAMILIES)).tolist() == [0, 3]
+    assert np.unique(family_of(rows["claims"])).tolist() == [0, 3]
+    index = PlanIndex.of_parts(parts, cells)
+    for number in range(12):
+        query = query_of(whole[number], 2, rng, hypotheses=8)
+        masses = index.log_masses(query, WEIGHTS, CONFIG, compared=3000)
+        assert (masses > masses[number]).sum() <= (2 if number % 2 else 0)
+
+
+def test_cells_cost_about_what_prototypes_in_their_middle_do(parts: list[Prototypes]) -> None:
+    # Cells that have a prototype each, with nothing to average.
+    rows = joined(parts).rows[:50].copy()
+    share = (unpacked_openings(rows["openings"])[:, :, None] == np.arange(CLASSES)).astype(np.float32)
+    cells = Cells(rows["log_profile"].astype(np.float32), share, version=1)
+    rows["claims"] = sum(1 << code for code in range(1, CLASSES))
+    family = FAMILIES - 1
+    assert cells.sort(rows).tolist() == list(range(family * 50, family * 50 + 50))
+    query = query_of(parts[0], 1, np.random.default_rng(9), hypotheses=4)
+    query = replace(query, ceiling=None, room_type=None)
+    costs = PrototypeCosts(query, STEP_M, WEIGHTS, CONFIG)
+    by_cell = cells.costs(costs, [family])[family]
+    for hypothesis in range(4):
+        exact = costs.of(rows, np.full(50, hypothesis), np.zeros(50, int))
+        np.testing.assert_allclose(by_cell[:, hypothesis, 0], exact, atol=0.07)
