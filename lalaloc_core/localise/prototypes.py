@@ -21,7 +21,9 @@ from jaxtyping import Float, Int, UInt8
 
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, WALL_CODE
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.layouts import layouts_at
 from lalaloc_core.localise.poses import LatentGrid
+from lalaloc_core.sampling import PoseSet
 
 AZIMUTHS = 32
 # Prototypes are so many grid steps apart.
@@ -70,12 +72,12 @@ def prototypes_of(grid: LatentGrid, plan: FloorPlan) -> Prototypes:
     _, first, count = np.unique(key, axis=0, return_index=True, return_counts=True)
     rows = np.zeros(len(first), ROW)
     compared, room = azimuths(grid.profile_m.shape[1]), grid.poses.room_index[first]
-    layouts = grid.layouts(plan)
     rows["log_profile"] = np.log(grid.profile_m[first][:, compared])
-    kind = np.full(rows["log_profile"].shape, WALL_CODE, np.uint8)
-    if layouts.kind is not None:
-        kind = layouts.kind[first][:, compared]
-    rows["openings"] = packed_openings(kind)
+    # Of these poses alone: the others are looked at when they are searched.
+    poses, columns = PoseSet(grid.poses.position_m[first], room), grid.profile_m.shape[1]
+    layouts = layouts_at(plan, poses, np.zeros(len(first)), columns, profile_m=grid.profile_m[first])
+    kind = np.full((len(first), columns), WALL_CODE, np.uint8) if layouts.kind is None else layouts.kind
+    rows["openings"] = packed_openings(kind[:, compared])
     rows["log_area"] = np.log(count * grid.step_m**2)
     rows["ceiling_m"] = plan.ceiling_heights_m[room]
     rows["room_type"] = np.array([ROOM_TYPES.index(one.type) for one in plan.rooms], np.uint8)[room]

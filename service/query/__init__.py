@@ -2,7 +2,8 @@
 
 Begin with `localiser.py`. `decoding.py` and `lpo_pool.py` are the pools of worker processes that it asks, and
 `heading.py` decides which heading holds. `venue_localiser.py` asks about all plans of a venue, among which
-`venue_plans.py` chooses. `answering.py` and `refining.py` say what others may put in their place.
+`venue_plans.py` chooses, by what `prototype_file.py` keeps. `answering.py` and `refining.py` say what others may put in
+their place.
 """
 
 from service.query.answering import Answering, VenueAnswering

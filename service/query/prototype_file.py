@@ -111,7 +111,10 @@ class PrototypeFile:
 
     def close(self) -> None:
         """Let another process have it."""
-        self._file.close()
+        if not self._file.closed:
+            # Maps that are still there keep the file open, and would keep the lock.
+            fcntl.flock(self._file, fcntl.LOCK_UN)
+            self._file.close()
 
     def _header(self, key: BlockKey, count: int, crc: int) -> bytes:
         fields = (_MAGIC, key.grid_id, bytes.fromhex(key.sha256), self._cells_version, count, crc)

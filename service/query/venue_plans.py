@@ -117,7 +117,7 @@ class VenuePlans:
         self._path, self._file_bytes = path, file_bytes
         self._max_poses = max_poses
         self._venues: BoundedCache[str, _Venue] = BoundedCache(limit_bytes, lambda one: _ROW_BYTES * len(one.rows))
-        # By the ids of the plans' grids.
+        # By a digest of the plans' grids, in their order.
         self._indices: BoundedCache[bytes, _Indexed] = BoundedCache(
             limit_bytes, lambda one: one.place.nbytes + one.index.nbytes
         )
@@ -151,7 +151,7 @@ class VenuePlans:
         Args:
             compute: what takes the processor is done with it.
         """
-        asked = hashlib.sha256(np.array([row.grid_id for row in ready], np.int64).tobytes()).digest()
+        asked = hashlib.sha256("".join(f"{row.grid_id} {row.grid_sha256} " for row in ready).encode()).digest()
         indexed = self._indices.get(asked)
         if indexed is None:
             found = await compute(partial(self._in_file, ready))

@@ -14,6 +14,7 @@ import pytest
 from lalaloc_core.localise.poses import LatentGrid
 from service.grids import builder
 from service.query import venue_plans
+from service.storage.stored_grids import StoredGrids
 from tests.service.conftest import FLAT, StartApp, assert_problem, upload, wait_for
 from tests.service.test_localise import HALL
 
@@ -137,8 +138,14 @@ def test_of_many_plans_the_most_probable_are_searched(
         assert chosen["confidence"] <= 0.3
 
 
+@pytest.mark.parametrize("stored", ["NULL", "x'4c4c5031'"], ids=["nothing", "without openings"])
 def test_prototypes_that_an_earlier_version_did_not_store_are_made(
-    start_app: StartApp, tmp_path: Path, database_of: Any, panorama: bytes, monkeypatch: pytest.MonkeyPatch
+    start_app: StartApp,
+    tmp_path: Path,
+    database_of: Any,
+    panorama: bytes,
+    monkeypatch: pytest.MonkeyPatch,
+    stored: str,
 ) -> None:
     from service.storage import Store
 
@@ -147,12 +154,50 @@ def test_prototypes_that_an_earlier_version_did_not_store_are_made(
         venue_id = venue_of(client, upload(client), upload(client, STUDIO))
         store = Store(database_of(tmp_path))
         with store._database.writing() as connection:
-            connection.exec_driver_sql("UPDATE latent_grids SET prototypes = NULL")
+            value = "'\\x4c4c5031'" if stored != "NULL" and store._database.is_postgresql else stored
+            connection.exec_driver_sql(f"UPDATE latent_grids SET prototypes = {value}")
+            grid_ids = connection.exec_driver_sql("SELECT id FROM latent_grids").scalars().all()
+        assert store.grids.prototypes(grid_ids) == {}
         assert ask(client, venue_id, panorama, refine="none").status_code == 200
-        with store._database.reading() as connection:
-            query = "SELECT count(*) FROM latent_grids WHERE prototypes IS NULL"
-            assert connection.exec_driver_sql(query).scalar() == 0
+        assert store.grids.prototypes(grid_ids).keys() == set(grid_ids)
         store.close()
+
+
+def test_a_plan_that_is_replaced_is_chosen_as_what_it_is_now(
+    start_app: StartApp, tmp_path: Path, panorama: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(venue_plans, "MAX_SEARCHED", 1)
+    indexed = list[int]()
+    choose = venue_plans.VenuePlans.choose
+
+    def noted(self: venue_plans.VenuePlans, known: Any, index: Any, *arguments: Any) -> Any:
+        indexed.append(len(index.member))
+        return choose(self, known, index, *arguments)
+
+    monkeypatch.setattr(venue_plans.VenuePlans, "choose", noted)
+    with start_app(tmp_path) as client:
+        plan_ids = [upload(client), upload(client, STUDIO)]
+        venue_id = venue_of(client, *plan_ids)
+
+        def answer() -> dict[str, Any]:
+            response = ask(client, venue_id, panorama, refine="none")
+            assert response.status_code == 200, response.text
+            return response.json()
+
+        first, again = answer(), answer()
+        assert indexed[0] == indexed[1]
+        assert first["plans"] == again["plans"]
+        for plan_id in plan_ids:
+            assert client.put(f"/floorplans/{plan_id}", json=HALL).status_code == 200
+            wait_for(lambda plan_id=plan_id: client.get(f"/floorplans/{plan_id}").json()["status"] == "ready")
+        replaced = answer()
+        assert replaced["floorplan_revision"] != first["floorplan_revision"]
+        assert indexed[2] > indexed[1]
+        assert answer()["floorplan_id"] == replaced["floorplan_id"]
+    monkeypatch.setattr(StoredGrids, "prototypes", lambda *_: pytest.fail("read of the database"))
+    # Once more, by what the file has.
+    with start_app(tmp_path) as client:
+        assert ask(client, venue_id, panorama, refine="none").json()["floorplan_id"] == replaced["floorplan_id"]
 
 
 @pytest.fixture(scope="module")

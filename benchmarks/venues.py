@@ -1,0 +1,143 @@
+"""Which of very many plans: how fast the index of prototypes answers, and how often it finds what brute force finds.
+
+Generated homes stand in for real ones. Their prototypes come from the renderer, without latents; queries are
+photographs of some of the homes, encoded by the model. Brute force compares all prototypes under all hypotheses; it is
+asked where `--exact` allows for it, as it takes minutes with many plans. Times are of the processor, in one thread.
+
+    .venv/bin/python -m benchmarks.venues --plans 2000 --queries 20 --exact 10000000000
+    .venv/bin/python -m benchmarks.venues --plans 10000 --repeat 10 --queries 20 --exact 0
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from lalaloc_core.bundle import Bundle
+from lalaloc_core.data.synthetic.generated import SPLIT_NUMBERS, RenderedPhotograph, studio_of
+from lalaloc_core.localise.camera_height import CameraHeight
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.evidence import EvidenceConfig
+from lalaloc_core.localise.plan_index import COMPARED, PlanIndex
+from lalaloc_core.localise.poses import Query
+from lalaloc_core.localise.prototype_cells import shipped_cells
+from lalaloc_core.localise.prototypes import prototypes_of
+from lalaloc_core.synth.shots import sample_shots
+from lalaloc_core.synth.splits import home_of
+from scripts.make_prototype_cells import grid_without_latents
+from service.query.prototype_file import BlockKey, PrototypeFile
+
+_TEST = SPLIT_NUMBERS["test"]
+_FIRST = 20
+_STEP_M = 0.5
+
+
+def prototypes(plans: int, seed: int) -> list[np.ndarray]:
+    """Prototypes of so many homes, sorted into cells."""
+    blocks = []
+    for number in range(plans):
+        home, _ = home_of(_TEST, seed, number)
+        rows = prototypes_of(grid_without_latents(home), home.plan).rows
+        rows["cell"] = shipped_cells().sort(rows)
+        blocks.append(rows)
+        if number % 1000 == 999:
+            print(f"  {number + 1} homes", flush=True)
+    return blocks
+
+
+def repeated(blocks: list[np.ndarray], times: int, rng: np.random.Generator) -> list[np.ndarray]:
+    """Each of some plans several times: as it is, and a little larger or smaller, in the cells that it was in."""
+    found = list(blocks)
+    for _ in range(times - 1):
+        for block in blocks:
+            rows = block.copy()
+            rows["log_profile"] += rng.normal(0.0, 0.05)
+            rows["ceiling_m"] += rng.normal(0.0, 0.1)
+            found.append(rows)
+    return found
+
+
+def queries(bundle: Bundle, homes: list[int], seed: int) -> Iterator[tuple[int, str, Query]]:
+    """A photograph of each home, asked about with what is known of the camera."""
+    encoders, studio = Encoders(bundle, threads=1), studio_of(_TEST, seed, None)
+    size = bundle.manifest.image_height, bundle.manifest.image_width
+    for number in homes:
+        home, rng = home_of(_TEST, seed, number)
+        shot = sample_shots(home, 1, rng, "full")[0]
+        image = RenderedPhotograph(shot, studio).image(*size)
+        known, unknown = CameraHeight(shot.camera_height_m), CameraHeight(1.5, float("inf"))
+        yield number, "heading known", encoders.query(image, shot.heading, known)
+        yield number, "heading unknown", encoders.query(image, None, known)
+        yield number, "heading and height unknown", encoders.query(image, None, unknown)
+
+
+def main() -> None:
+    """Print times and recall."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--bundle", type=Path, default=Path("models/default"))
+    parser.add_argument("--plans", type=int, default=2000)
+    parser.add_argument(
+        "--repeat", type=int, default=1, help="so many variants of each plan, whose homes are generated once"
+    )
+    parser.add_argument("--queries", type=int, default=20)
+    parser.add_argument("--compared", type=int, default=COMPARED, help="pairs that the index compares")
+    parser.add_argument("--exact", type=float, default=1e9, help="most pairs that brute force compares for a query")
+    parser.add_argument("--seed", type=int, default=0)
+    asked = parser.parse_args()
+    bundle, rng = Bundle.open(asked.bundle), np.random.default_rng(asked.seed)
+    blocks = repeated(prototypes(asked.plans, asked.seed), asked.repeat, rng)
+    count = np.array([len(block) for block in blocks])
+    print(f"{len(blocks)} plans, {count.sum()} prototypes of {blocks[0].itemsize} bytes")
+    weights, config, told = bundle.manifest.evidence, EvidenceConfig(), defaultdict(lambda: defaultdict(list))
+    with tempfile.TemporaryDirectory() as folder:
+        path, cells = Path(folder) / "prototypes.bin", shipped_cells()
+        keys = [BlockKey(number, "0" * 64) for number in range(len(blocks))]
+        begin = time.process_time()
+        file = PrototypeFile(path, cells_version=cells.version, limit_bytes=2**40)
+        file.add(dict(zip(keys, blocks, strict=True)))
+        written = time.process_time()
+        file.close()
+        file = PrototypeFile(path, cells_version=cells.version, limit_bytes=2**40)
+        opened = time.process_time()
+        found = file.find(keys)
+        first = np.array([found[key][0] for key in keys])
+        index = PlanIndex.of(file.rows(), first, count, step_m=_STEP_M, cells=cells)
+        built = time.process_time()
+        print(
+            f"written in {written - begin:.2f} s, opened in {opened - written:.2f} s, index in {built - opened:.2f} s"
+        )
+        homes = np.linspace(0, asked.plans - 1, asked.queries).astype(int).tolist()
+        for number, name, query in queries(bundle, homes, asked.seed):
+            begin, began = time.process_time(), time.perf_counter()
+            mass = index.log_masses(query, weights, config, compared=asked.compared)
+            tally = told[name]
+            tally["ms"].append(1e3 * (time.process_time() - begin))
+            tally["ms by the clock"].append(1e3 * (time.perf_counter() - began))
+            best = np.argsort(-mass, kind="stable")
+            tally["right plan in the first 20"].append(number in best[:_FIRST])
+            tally["right plan in the first 128"].append(number in best[:128])
+            pairs = int(count.sum()) * min(len(query.roll), 32) * len(query.camera_height.offsets)
+            if pairs <= asked.exact:
+                exact = index.log_masses(query, weights, config, compared=10**15)
+                brute = np.argsort(-exact, kind="stable")
+                tally["recall of 20"].append(len(np.intersect1d(best[:_FIRST], brute[:_FIRST])) / _FIRST)
+                tally["first in the first 20"].append(brute[0] in best[:_FIRST])
+                tally["brute force: right plan in the first 20"].append(number in brute[:_FIRST])
+        file.close()
+    for name, tally in told.items():
+        print(f"{name}, n = {asked.queries}")
+        for what, values in tally.items():
+            if what.startswith("ms"):
+                print(f"  {what}: p50 {np.median(values):.0f}, p95 {np.percentile(values, 95):.0f}")
+            else:
+                print(f"  {what}: {np.mean(values):.1%} of {len(values)}")
+
+
+if __name__ == "__main__":
+    main()
