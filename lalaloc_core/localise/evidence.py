@@ -349,8 +349,8 @@ def precisions(query: Query, reach_m: float, config: EvidenceConfig) -> Float[np
 
 def ceiling_costs(
     predicted: PredictedCeiling,
-    clearance_m: Float[np.ndarray, "*n"],
-    offset: Float[np.ndarray, "*n"],
+    clearance_m: Float[np.ndarray, "*#n"],
+    offset: Float[np.ndarray, "*#n"],
     config: EvidenceConfig,
 ) -> Float[np.ndarray, "*n"]:
     """Cost of ceilings that are so far (m) above the camera, each at a δ."""

@@ -175,7 +175,7 @@ def test_a_plan_that_is_replaced_is_chosen_as_what_it_is_now(
         return choose(self, known, index, *arguments)
 
     monkeypatch.setattr(venue_plans.VenuePlans, "choose", noted)
-    with start_app(tmp_path) as client:
+    with start_app(tmp_path, request_deadline_s=60.0) as client:
         plan_ids = [upload(client), upload(client, STUDIO)]
         venue_id = venue_of(client, *plan_ids)
 
@@ -196,7 +196,7 @@ def test_a_plan_that_is_replaced_is_chosen_as_what_it_is_now(
         assert answer()["floorplan_id"] == replaced["floorplan_id"]
     monkeypatch.setattr(StoredGrids, "prototypes", lambda *_: pytest.fail("read of the database"))
     # Once more, by what the file has.
-    with start_app(tmp_path) as client:
+    with start_app(tmp_path, request_deadline_s=60.0) as client:
         assert ask(client, venue_id, panorama, refine="none").json()["floorplan_id"] == replaced["floorplan_id"]
 
 
