@@ -75,8 +75,8 @@ def prototypes_of(grid: LatentGrid, plan: FloorPlan) -> Prototypes:
     rows["log_profile"] = np.log(grid.profile_m[first][:, compared])
     # Of these poses alone: the others are looked at when they are searched.
     poses, columns = PoseSet(grid.poses.position_m[first], room), grid.profile_m.shape[1]
-    layouts = layouts_at(plan, poses, np.zeros(len(first)), columns, profile_m=grid.profile_m[first])
-    kind = np.full((len(first), columns), WALL_CODE, np.uint8) if layouts.kind is None else layouts.kind
+    kind = layouts_at(plan, poses, np.zeros(len(first)), columns).kind if plan.opening_faces else None
+    kind = np.full((len(first), columns), WALL_CODE, np.uint8) if kind is None else kind
     rows["openings"] = packed_openings(kind[:, compared])
     rows["log_area"] = np.log(count * grid.step_m**2)
     rows["ceiling_m"] = plan.ceiling_heights_m[room]
