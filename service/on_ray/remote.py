@@ -22,7 +22,7 @@ from service.errors import DeadlineExceededError, OverloadedError
 from service.on_ray.outcome import Answered, Refused
 from service.pools import LostReason, PoolState
 from service.query.localiser import AskedPicture
-from service.schemas import LocaliseAnswer, LocaliseForm, ModelAnswer, SequenceAnswer, SequenceForm
+from service.schemas import EarthPoint, LocaliseAnswer, LocaliseForm, ModelAnswer, SequenceAnswer, SequenceForm
 from service.settings import Settings
 from service.storage.records import PlanRecord, VenueRecord
 from service.telemetry import Telemetry
@@ -236,3 +236,24 @@ class RemoteVenueAnswering(_Asking):
         found = await self._ask("answer_in_venue", venue.id, begin, clock, venue.tenant, venue.id, form, content, party)
         self._observe(found)
         return found
+
+    async def answer_near(
+        self,
+        tenant: str,
+        place: EarthPoint,
+        within_m: float,
+        form: LocaliseForm,
+        content: bytes,
+        begin: float,
+        clock: StageClock,
+        party: str,
+    ) -> LocaliseAnswer:
+        """See `VenueLocaliser.answer_near`."""
+        arguments = tenant, place, within_m, form, content, party
+        found = await self._ask("answer_near", str(place), begin, clock, *arguments)
+        self._observe(found)
+        return found
+
+    async def check_hints(self, venue: VenueRecord, form: LocaliseForm) -> None:
+        """See `VenueLocaliser.check_hints`."""
+        await self._ask("check_hints", venue.id, monotonic(), StageClock(), venue.tenant, venue.id, form)

@@ -27,7 +27,7 @@ from service.on_ray.outcome import Answered, Refused
 from service.on_ray.remote import RemoteAnswering, RemoteEncoders, RemoteRefining, RemoteVenueAnswering
 from service.query.localiser import AskedPicture
 from service.runtime import Elsewhere, start_runtime, warm_encoders
-from service.schemas import LocaliseForm, ModelAnswer, SequenceForm
+from service.schemas import EarthPoint, LocaliseForm, ModelAnswer, SequenceForm
 from service.settings import Settings
 from service.storage.records import PlanRecord, VenueRecord
 from service.telemetry import Telemetry, configure_logging
@@ -133,6 +133,34 @@ class SearchReplica:
         async def ask(begin: float, clock: StageClock) -> Any:
             venue = await self._venue(tenant, venue_id)
             return await self._runtime.venue_localiser.answer(venue, form, content, begin, clock, party)
+
+        return await _outcome(ask, spent_s)
+
+    async def answer_near(
+        self,
+        tenant: str,
+        place: EarthPoint,
+        within_m: float,
+        form: LocaliseForm,
+        content: bytes,
+        party: str,
+        spent_s: float,
+    ) -> Answered[Any] | Refused:
+        """See `VenueLocaliser.answer_near`."""
+
+        async def ask(begin: float, clock: StageClock) -> Any:
+            near = self._runtime.venue_localiser.answer_near
+            return await near(tenant, place, within_m, form, content, begin, clock, party)
+
+        return await _outcome(ask, spent_s)
+
+    async def check_hints(
+        self, tenant: str, venue_id: str, form: LocaliseForm, spent_s: float
+    ) -> Answered[Any] | Refused:
+        """See `VenueLocaliser.check_hints`."""
+
+        async def ask(_begin: float, _clock: StageClock) -> Any:
+            await self._runtime.venue_localiser.check_hints(await self._venue(tenant, venue_id), form)
 
         return await _outcome(ask, spent_s)
 

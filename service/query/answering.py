@@ -6,7 +6,7 @@ from typing import Protocol
 
 from lalaloc_core.localise.pipeline import StageClock
 from service.query.localiser import AskedPicture
-from service.schemas import LocaliseAnswer, LocaliseForm, ModelAnswer, SequenceAnswer, SequenceForm
+from service.schemas import EarthPoint, LocaliseAnswer, LocaliseForm, ModelAnswer, SequenceAnswer, SequenceForm
 from service.storage.records import PlanRecord, VenueRecord
 
 
@@ -48,3 +48,17 @@ class VenueAnswering(Protocol):
     async def answer(
         self, venue: VenueRecord, form: LocaliseForm, content: bytes, begin: float, clock: StageClock, party: str
     ) -> LocaliseAnswer: ...
+
+    async def answer_near(
+        self,
+        tenant: str,
+        place: EarthPoint,
+        within_m: float,
+        form: LocaliseForm,
+        content: bytes,
+        begin: float,
+        clock: StageClock,
+        party: str,
+    ) -> LocaliseAnswer: ...
+
+    async def check_hints(self, venue: VenueRecord, form: LocaliseForm) -> None: ...

@@ -91,7 +91,7 @@ async def geopose(
         return parsed, content
 
     async def answer() -> Response:
-        asked, content = await runtime.localiser.compute(party, read, begin + settings.request_deadline_s)
+        asked, content = await runtime.uploads.run(party, read)
         query = _Query(runtime, tenant, party, asked, content, begin, clock)
         found, warnings = await query.answer(floorplan_id, venue_id)
         note(request, plan=found.floorplan_id, revision=found.floorplan_revision, stage=found.stage)
