@@ -22,6 +22,8 @@ from lalaloc_core.errors import BundleError
 from lalaloc_core.files import atomic_write
 
 MANIFEST_NAME = "manifest.json"
+# The model card, which is no part of the model: it may be corrected without making it another one.
+CARD_NAME = "README.md"
 # Of the model that ships: in a checkout, and where a wheel puts it.
 _CHECKOUT = Path("models/default")
 _INSTALLED = Path("share/lalaloc/models/default")
@@ -248,10 +250,10 @@ def default_bundle() -> Path:
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> Bundle:
-    """Write the manifest over the files that lie in `folder`, recording their sizes and digests."""
+    """Write the manifest over the files that lie in `folder`, but for its card, recording sizes and digests."""
     files = {}
     for path in sorted(folder.iterdir()):
-        if path.name != MANIFEST_NAME:
+        if path.name not in (MANIFEST_NAME, CARD_NAME):
             content = path.read_bytes()
             files[path.name] = FileEntry(bytes=len(content), sha256=hashlib.sha256(content).hexdigest())
     complete = dataclasses.replace(manifest, files=files)

@@ -80,6 +80,9 @@ def add_commands(commands: Any) -> None:
         metavar="WEIGHT",
         help="weight of openings in units of the walls', such as photographs ask for; default: what is fitted",
     )
+    calibrate.add_argument(
+        "--keep-evidence", action="store_true", help="keep the bundle's weights of the evidence; fit confidence alone"
+    )
     calibrate.add_argument("--out", type=Path, metavar="DIR", help="keep the answers there, and go on with those there")
     calibrate.set_defaults(run=_calibrate)
 
@@ -225,7 +228,9 @@ def _calibrate(arguments: argparse.Namespace) -> None:
     own = _generated(arguments, None)
     mismatched = own | {"generator": "mismatched", "homes": max(arguments.homes // _PER_MISMATCHED_HOME, 1)}
     # Weights first: confidence is fitted on answers that were weighed by them.
-    evidence = fit_evidence([one for heading in (True, False) for one in asked(own, heading, "unweighed")])
+    evidence = bundle.manifest.evidence
+    if not arguments.keep_evidence:
+        evidence = fit_evidence([one for heading in (True, False) for one in asked(own, heading, "unweighed")])
     if arguments.openings_weight is not None:
         evidence = dataclasses.replace(evidence, openings=arguments.openings_weight)
     print_json(dataclasses.asdict(store_evidence(Bundle.open(arguments.bundle), evidence).manifest.evidence))

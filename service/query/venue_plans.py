@@ -136,7 +136,7 @@ class VenuePlans:
         rows = await self._reads.run(near, tenant, latitude, longitude, reach_m, *self._grids.model)
         away_m = distances_m(rows, None, latitude, longitude)
         order = np.argsort(away_m, kind="stable")
-        unique = {rows[k].plan_id: rows[k] for k in order.tolist() if away_m[k] <= within_m}
+        unique = {rows[int(k)].plan_id: rows[int(k)] for k in order if away_m[k] <= within_m}
         return list(unique.values())[:_MAX_NEAR]
 
     def needs_choice(self, ready: Sequence[Row[Any]], query: Query) -> bool:
@@ -160,7 +160,7 @@ class VenuePlans:
             if not len(place):
                 # Gone since a moment: whoever asks again finds what took their place.
                 raise StoreUnavailableError
-            there = [ready[k] for k in place.tolist()]
+            there = [ready[int(k)] for k in place]
             index = await compute(partial(self._indexed, there, fresh))
             if index is None:
                 # The file has no room for all of them: this index has them in memory.
@@ -168,7 +168,7 @@ class VenuePlans:
                 index = await compute(partial(self._in_memory, there, fresh))
             indexed = _Indexed(place, index)
             self._indices.put(asked, indexed)
-        return [ready[k] for k in indexed.place.tolist()], indexed.index
+        return [ready[int(k)] for k in indexed.place], indexed.index
 
     def choose(
         self,
@@ -186,7 +186,7 @@ class VenuePlans:
         log_mass = index.log_masses(query, weights, EvidenceConfig()) + log_prior
         poses = np.array([row.poses for row in known])
         chosen = most_probable(log_mass, poses, most_plans=MAX_SEARCHED, most_poses=self._most_poses(query))
-        return ChosenPlans([known[k] for k in chosen.tolist()], log_mass, chosen)
+        return ChosenPlans([known[int(k)] for k in chosen], log_mass, chosen)
 
     async def load(self, tenant: str, members: Sequence[Row[Any]]) -> list[tuple[Row[Any], PlanRecord, LatentGrid]]:
         """Chosen plans with their grids; those that were deleted or replaced a moment ago are left out."""

@@ -253,6 +253,7 @@ class TestGrid:
     def test_the_grid_holds_the_latents_of_its_own_poses_at_heading_zero(
         self, flat: FloorPlan, grid: LatentGrid, encoders: Encoders
     ) -> None:
+        assert grid.latents is not None
         assert len(grid.latents) == len(grid.poses)
         index = np.array([0, 5, len(grid.poses) - 1])
         some = PoseSet(grid.poses.position_m[index], grid.poses.room_index[index])
@@ -263,6 +264,7 @@ class TestGrid:
     def test_another_camera_height_is_another_grid(self, flat: FloorPlan, grid: LatentGrid, encoders: Encoders) -> None:
         higher = build_grid(flat, encoders, step_m=0.5, camera_height_m=1.8)
         assert dataclasses.replace(higher, latents=grid.latents).camera_height_m == 1.8
+        assert higher.latents is not None
         assert np.abs(higher.latents - grid.latents).max() > 1e-3
 
 

@@ -115,6 +115,7 @@ class TestRetrieval:
     def test_the_first_is_the_best_of_all_places_and_hypotheses(self, seed: int, hypotheses: int) -> None:
         grid = random_grid(seed)
         query = any_heading(unit(np.random.default_rng(seed + 1), hypotheses, 8))
+        assert grid.latents is not None
         distances = latent_distances(grid.latents, query.latents)
         found = best_places(grid, query, top_k=5)
         assert found[0].latent_distance == pytest.approx(distances.min())
@@ -139,6 +140,7 @@ class TestRetrieval:
     def test_a_grid_pose_s_own_latent_retrieves_it(self) -> None:
         grid = random_grid(0)
         for index in (0, 17, 59):
+            assert grid.latents is not None
             query = any_heading(grid.latents[index : index + 1])
             best = best_places(grid, query, top_k=1)[0]
             np.testing.assert_array_equal(best.position_m, grid.poses.position_m[index])
@@ -164,6 +166,7 @@ class TestRetrieval:
         )
         evidence = EvidenceConfig(latent_weight=0.7)
         assert query.profile is not None
+        assert grid.latents is not None
         residual = np.log(grid.profile_m)[None] - query.profile.log_m[:, None]
         costs = np.log1p(np.square(residual * precisions(query, 0.3, evidence)[:, None])).mean(axis=2)
         costs += 0.7 * latent_distances(grid.latents, query.latents)

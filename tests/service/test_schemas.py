@@ -49,6 +49,7 @@ def test_rounding_stays_within_the_limits(heading_deg: float, x_m: float) -> Non
         probability=None,
         cost=0.0,
         latent_distance=2.0,
+        geopose=None,
     )
     assert 0.0 <= made.heading_deg < 360.0
     assert abs((made.heading_deg - heading_deg + 180.0) % 360.0 - 180.0) <= 0.005 + 1e-9

@@ -124,6 +124,7 @@ def _put(store: Store, key: GridKey, grid: LatentGrid | None = None, keep: int =
 
 def _assert_same(found: LatentGrid | None, grid: LatentGrid) -> None:
     assert found is not None
+    assert found.latents is not None
     np.testing.assert_array_equal(found.latents, grid.latents)
     np.testing.assert_array_equal(found.profile_m, grid.profile_m)
     np.testing.assert_array_equal(found.poses.position_m, grid.poses.position_m)
