@@ -12,6 +12,7 @@ import io
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -20,18 +21,18 @@ from lalaloc_core.bundle import COHORT, Bundle, EvidenceModel
 from lalaloc_core.errors import BundleError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.evidence import Evidence, EvidenceConfig
+from lalaloc_core.localise.first_look import first_costs
 from lalaloc_core.localise.layouts import Layouts, layouts_at
 from lalaloc_core.localise.poses import Query
+from lalaloc_core.localise.sketch import Sketch
 from lalaloc_core.sampling import pose_grid
 
 SIZE = 2048
 # Of the grids that poses are drawn from.
 _STEP_M = 0.5
-# They are compared at every so many azimuths, and under so many hypotheses of the heading.
-_STRIDE = 4
-_HYPOTHESES = 4
-# What fits by chance costs what the mean of so many of the best does: the very best is a matter of luck.
-_BEST = 8
+# So many that are the best at first look are compared in full. What fits by chance costs what the mean of so many of
+# these does, as the very best is a matter of luck.
+_COMPARED, _BEST = 64, 8
 # Costs are compared above this: it is what the best of pictures costs.
 _LEAST_COST = 0.01
 
@@ -47,6 +48,16 @@ class Cohort:
 
     log_profile: Float[np.ndarray, "n w"]
     kind: UInt8[np.ndarray, "n w"]
+
+    @cached_property
+    def layouts(self) -> Layouts:
+        """The poses as evidence is weighed of them, all as of one room."""
+        return Layouts(self.log_profile, np.zeros(len(self.kind), dtype=np.int64), self.kind)
+
+    @cached_property
+    def sketch(self) -> Sketch:
+        """What the first look sees of them."""
+        return Sketch.of(self.layouts)
 
     def to_bytes(self) -> bytes:
         """A file of it."""
@@ -110,9 +121,10 @@ def log_cost_to_chance(
         return 0.0
     # What is particular to a room is no matter of chance.
     alone = replace(config, use_ceiling=False, use_room_type=False, use_see_through=False)
-    nowhere = np.zeros(len(cohort.kind), dtype=np.int64)
-    layouts = Layouts(cohort.log_profile.astype(np.float32), nowhere, cohort.kind)
-    hypotheses = np.unique(np.arange(_HYPOTHESES) * len(query.roll) // _HYPOTHESES)
-    by_chance, _ = Evidence(plan, query, reach_m, weights, alone, stride=_STRIDE).costs(layouts, hypotheses)
-    best = np.sort(by_chance.min(axis=0))[:_BEST]
+    evidence = Evidence(plan, query, reach_m, weights, alone)
+    rough = np.concatenate([part for _, part in first_costs(cohort.sketch, evidence, cohort.layouts.room_index)])
+    hypothesis = rough.argmin(axis=1)
+    pose = np.argsort(rough[np.arange(len(rough)), hypothesis], kind="stable")[:_COMPARED]
+    by_chance, _ = evidence.pairs(cohort.layouts, pose, hypothesis[pose])
+    best = np.sort(by_chance)[:_BEST]
     return math.log((cost + _LEAST_COST) / (float(best.mean()) + _LEAST_COST))
