@@ -51,7 +51,8 @@ class LatentGrid:
     def without_latents(cls, poses: PoseSet, layouts: Layouts, step_m: float, camera_height_m: float) -> LatentGrid:
         """A grid of rendered layouts whose poses are compared by these alone; distances in half precision."""
         profile_m = np.exp(layouts.log_profile).astype(np.float16)
-        kept = replace(layouts, log_profile=layouts.log_profile.astype(np.float16))
+        # The logs of what is kept of the profile, so that a grid which is read again answers the same.
+        kept = replace(layouts, log_profile=np.log(profile_m.astype(np.float32)).astype(np.float16))
         return cls.with_layouts(poses, None, profile_m, step_m, camera_height_m, kept)
 
     def layouts(self, plan: FloorPlan) -> Layouts:
@@ -91,11 +92,11 @@ class LatentGrid:
 
     def _rendered(self, plan: FloorPlan) -> Layouts:
         precision = self.profile_m.dtype if self.latents is None else np.float32
+        log_profile = np.log(self.profile_m.astype(np.float32)).astype(precision)
         if not plan.opening_faces:
-            log_profile = np.log(self.profile_m.astype(np.float32)).astype(precision)
             return Layouts(log_profile, self.poses.room_index)
         layouts = layouts_at(plan, self.poses, np.zeros(len(self.poses)), self.profile_m.shape[1])
-        return replace(layouts, log_profile=layouts.log_profile.astype(precision))
+        return replace(layouts, log_profile=log_profile)
 
 
 @dataclass(frozen=True, eq=False)

@@ -58,6 +58,7 @@ def test_a_plan_is_drawn_over_a_picture_to_scale_and_stored(desktop: Visit) -> N
     page.locator("#underlay-file").set_input_files(
         {"name": "scan.png", "mimeType": "image/png", "buffer": content.getvalue()}
     )
+    expect(page.get_by_text("Set the scale next")).to_be_attached()
     # 600 pixels are 12 m at first: the rectangle, 300 pixels wide, would be 6 m. It is 4.5 m.
     _click(page, 2, 2)
     _click(page, 8, 2)
