@@ -36,10 +36,8 @@ _RIDGE = 1e-3
 _WEIGHT_RIDGE = 0.5
 # Medians of the chi-squared distribution with one and with two degrees of freedom.
 _MEDIAN_CHI2 = {1: 0.4549, 2: 1.3863}
-# Signals of a picture that fits, or not; which place it is, is the posterior's to say. What a picture costs in units of
-# chance is fair to photographs that are hard to read, as the others are not, so where it is known it is used alone.
-_SIGNALS = ("cost", "uncertainty", "latent_distance")
-_NORMALISED = ("cost_to_chance",)
+# Signals of a picture that fits, or not; which place it is, is the posterior's to say.
+_SIGNALS = ("cost", "uncertainty", "latent_distance", "cost_to_chance")
 _TERMS = ("walls", "openings", "ceiling", "room_type")
 
 
@@ -150,8 +148,7 @@ def _fit_stage(stage: str, answers: Answers) -> LogisticModel:
     own = [one for one in answers.own if stage in one.signals]
     mismatched = [one for one in answers.mismatched if stage in one.signals]
     signals = [one.signals[stage] for one in own + mismatched]
-    used = _NORMALISED if any(one["cost_to_chance"] for one in signals) else _SIGNALS
-    features = np.array([[1.0, *(one[name] for name in used)] for one in signals])
+    features = np.array([[1.0, *(one[name] for name in _SIGNALS)] for one in signals])
     log_odds = np.array([one["log_odds"] for one in signals])
     posterior = 1.0 / (1.0 + np.exp(-log_odds))
     distance = [np.hypot(one.stages[stage].x_m - one.truth.x_m, one.stages[stage].y_m - one.truth.y_m) for one in own]
@@ -169,10 +166,9 @@ def _fit_stage(stage: str, answers: Answers) -> LogisticModel:
         return float(_RIDGE * np.square(weights).sum() - (weight * likelihood).sum())
 
     # Begins with trust in all: without mismatched photographs there is nothing that teaches otherwise.
-    start = np.append(3.0, np.zeros(len(used)))
+    start = np.append(3.0, np.zeros(len(_SIGNALS)))
     bias, *weights = (optimize.minimize(loss, start, method="L-BFGS-B").x / scale).tolist()
-    fitted = dict.fromkeys((*_SIGNALS, "log_odds"), 0.0) | dict(zip(used, weights, strict=True))
-    return LogisticModel(bias=bias, **fitted)
+    return LogisticModel(bias=bias, log_odds=0.0, **dict(zip(_SIGNALS, weights, strict=True)))
 
 
 def _covariance_factors(predictions: Sequence[Prediction]) -> tuple[float | None, float | None]:
