@@ -92,9 +92,11 @@ def test_without_motions_the_answers_are_those_to_each_alone(
         response = localise(client, plan_id, picture, **fields)
         assert response.status_code == 200, response.text
         alone = response.json()
-        assert pose["position"] == alone["position"]
-        assert pose["heading_deg"] == alone["heading_deg"]
         assert pose["cost"] == pytest.approx(alone["cost"], abs=1e-3)
+        # A room that looks the same turned by half has two that are equally good.
+        best = [one for one in alone["candidates"] if one["cost"] == pytest.approx(alone["cost"], abs=1e-4)]
+        assert len(best) <= 2
+        assert (pose["position"], pose["heading_deg"]) in [(one["position"], one["heading_deg"]) for one in best]
 
 
 def test_headings_that_are_given_hold(client: httpx.Client, plan_id: str, pictures: list[bytes]) -> None:

@@ -26,6 +26,8 @@ def _overlapping() -> dict[str, object]:
 
 def test_an_uploaded_plan_is_drawn_at_once_with_its_warnings(desktop: Visit, tmp_path: Path) -> None:
     page = desktop.open()
+    # The example is shown when all is loaded, and would take the place of what comes before.
+    expect(page.locator("#plan-name")).not_to_be_empty()
     (tmp_path / "overlap.json").write_text(json.dumps(_overlapping()))
     page.locator("#plan-file").set_input_files(tmp_path / "overlap.json")
     expect(page.locator("#plan-name")).to_have_text("Overlap")
