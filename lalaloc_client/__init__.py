@@ -11,6 +11,18 @@ Begin with `client.py`, whose methods stand in `plan_methods.py`, `query_methods
 """
 
 from lalaloc_client.aio import AsyncClient
+from lalaloc_client.answers import (
+    Candidate,
+    GeoPoseAnswer,
+    Localisation,
+    Model,
+    PlanProbability,
+    Pool,
+    Posterior,
+    Readiness,
+    SequenceLocalisation,
+    SequencePose,
+)
 from lalaloc_client.client import Client
 from lalaloc_client.errors import (
     ClientError,
@@ -28,22 +40,12 @@ from lalaloc_client.errors import (
 from lalaloc_client.layout import Layout, OpeningPiece, RoomLayout
 from lalaloc_client.model import (
     Bounds,
-    Candidate,
     FloorPlan,
     FloorPlanSummary,
-    GeoPoseAnswer,
     Grid,
-    Localisation,
-    Model,
     PlanEvent,
-    PlanProbability,
-    Pool,
     Position,
-    Posterior,
-    Readiness,
     Room,
-    SequenceLocalisation,
-    SequencePose,
     Venue,
     VenueAnchor,
     VenuePlan,

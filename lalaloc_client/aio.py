@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from lalaloc_client import operations
+from lalaloc_client.answers import Readiness
 from lalaloc_client.async_plan_methods import AsyncPlanMethods
 from lalaloc_client.async_query_methods import AsyncQueryMethods
 from lalaloc_client.async_venue_methods import AsyncVenueMethods
-from lalaloc_client.model import Readiness
 
 
 class AsyncClient(AsyncPlanMethods, AsyncQueryMethods, AsyncVenueMethods):

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Unpack
 
 from lalaloc_client import operations, requests
+from lalaloc_client.answers import GeoPoseAnswer, Localisation, SequenceLocalisation
 from lalaloc_client.async_sender import AsyncSender
-from lalaloc_client.model import GeoPoseAnswer, Localisation, SequenceLocalisation
 from lalaloc_client.requests import Picture, PictureFormat, QueryOptions, Refine, SequenceRefine
 
 if TYPE_CHECKING:

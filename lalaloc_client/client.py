@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from lalaloc_client import operations
-from lalaloc_client.model import Readiness
+from lalaloc_client.answers import Readiness
 from lalaloc_client.plan_methods import PlanMethods
 from lalaloc_client.query_methods import QueryMethods
 from lalaloc_client.venue_methods import VenueMethods

@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 
 import httpx
 
+from lalaloc_client.answers import GeoPoseAnswer, Localisation, Readiness, SequenceLocalisation
 from lalaloc_client.errors import (
     ConnectionFailedError,
     FloorPlanFailedError,
@@ -24,19 +25,8 @@ from lalaloc_client.errors import (
     problem_class,
 )
 from lalaloc_client.layout import Layout
-from lalaloc_client.model import (
-    FloorPlan,
-    FloorPlanPage,
-    GeoPoseAnswer,
-    Localisation,
-    PlanEvent,
-    Readiness,
-    SequenceLocalisation,
-    Venue,
-    VenuePage,
-    VenuePlanPage,
-    parse,
-)
+from lalaloc_client.model import FloorPlan, FloorPlanPage, PlanEvent, Venue, VenuePage, VenuePlanPage
+from lalaloc_client.parsing import parse
 from lalaloc_client.requests import Request, limits_request, plan_request, ready_request
 from lalaloc_client.retry import RetryPolicy, may_retry, retry_after_s
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Unpack
 
 from lalaloc_client import operations, requests
-from lalaloc_client.model import GeoPoseAnswer, Localisation, SequenceLocalisation
+from lalaloc_client.answers import GeoPoseAnswer, Localisation, SequenceLocalisation
 from lalaloc_client.requests import Picture, PictureFormat, QueryOptions, Refine, SequenceRefine
 from lalaloc_client.sender import Sender
 
