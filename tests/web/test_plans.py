@@ -60,6 +60,7 @@ def _drag_end(page: Page, index: int, x: float, y: float) -> None:
 
 def test_a_picture_s_scale_is_set_on_it_and_what_was_read_is_corrected_over_it(desktop: Visit, tmp_path: Path) -> None:
     page = desktop.open()
+    expect(page.locator("#plan-name")).not_to_be_empty()
     _scan().save(tmp_path / "scan.png")
     page.locator("#plan-file").set_input_files(tmp_path / "scan.png")
     page.get_by_role("button", name="Read the picture").click()
@@ -90,6 +91,7 @@ def test_a_picture_s_scale_is_set_on_it_and_what_was_read_is_corrected_over_it(d
 
 def test_files_of_other_tools_are_read(desktop: Visit, tmp_path: Path) -> None:
     page = desktop.open()
+    expect(page.locator("#plan-name")).not_to_be_empty()
     (tmp_path / "flat.dxf").write_bytes(export_plan(FloorPlan.from_dict(FLAT), "dxf"))
     page.locator("#plan-file").set_input_files(tmp_path / "flat.dxf")
     expect(page.locator("#plan-facts")).to_contain_text("2 rooms, 36.0 m²")
