@@ -280,7 +280,7 @@ def localise_steps(
         first = config.vdr_candidates
         candidates = sorted(candidates[:first], key=attrgetter("total_cost")) + candidates[first:]
     wanted = max(top_k, starts) if config.by_probability else top_k
-    answers = _distinct(candidates, query, config.separation_m, wanted)
+    answers = distinct(candidates, query, config.separation_m, wanted)
     found = posterior(answers)
     if config.by_probability:
         answers, found = _by_probability(answers, found, top_k, posterior)
@@ -313,7 +313,7 @@ def _by_probability(
     return ranked, replace(found, position=first.position, candidate=ordered, heading=first.heading)
 
 
-def _distinct(candidates: list[Candidate], query: Query, separation_m: float, top_k: int) -> list[Candidate]:
+def distinct(candidates: list[Candidate], query: Query, separation_m: float, top_k: int) -> list[Candidate]:
     """The first candidates of which no two are at one place and turned alike."""
     kept = suppress(
         np.stack([candidate.position_m for candidate in candidates]),

@@ -21,7 +21,14 @@ from lalaloc_core.localise.cohort import log_cost_to_chance
 from lalaloc_core.localise.confidence import Signals, signals_of
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.evidence import Evidence, latent_distances
-from lalaloc_core.localise.pipeline import Localisation, LocaliseConfig, SearchStage, StageClock
+from lalaloc_core.localise.pipeline import (
+    Localisation,
+    LocaliseConfig,
+    SearchStage,
+    StageClock,
+    distinct,
+    panorama_heading,
+)
 from lalaloc_core.localise.poses import Candidate, LatentGrid, Query, RefinementResult
 from lalaloc_core.localise.posterior import TURNED_APART, area_shares
 from lalaloc_core.localise.refinement import refined, refinement_job, with_latents
@@ -146,7 +153,10 @@ def localise_sequence_steps(
             if result is not None:
                 paths = _ended(plan, encoders, pictures, motions, paths, result, config)
                 stage = "lpo"
-    candidates = [_distinct([path.ends[t] for path in paths], config.separation_m, top_k) for t in range(len(pictures))]
+    candidates = [
+        distinct([path.ends[t] for path in paths], picture.query, config.separation_m, top_k)
+        for t, picture in enumerate(pictures)
+    ]
     found = path_posterior(grid.poses, pictures, links, log_heights, whole, paths, candidates, config.separation_m)
     if stage == "retrieval" and config.evidence.compares_profiles(pictures[0].query):
         candidates = [
@@ -271,15 +281,11 @@ def _alike(
 ) -> bool:
     """Whether two paths are at the same places, turned alike, in every picture."""
     for picture, first, second in zip(pictures, one, other, strict=True):
-        if np.linalg.norm(first.position_m - second.position_m) >= within_m:
-            return False
-        if abs(wrap_angle(_heading(picture, first) - _heading(picture, second))) > within_angle:
+        apart_m = np.linalg.norm(first.position_m - second.position_m)
+        turned = wrap_angle(panorama_heading(picture.query, first) - panorama_heading(picture.query, second))
+        if apart_m >= within_m or abs(turned) > within_angle:
             return False
     return True
-
-
-def _heading(picture: Picture, candidate: Candidate) -> float:
-    return float(picture.query.roll[candidate.hypothesis] + candidate.frame_heading)
 
 
 def _job(
@@ -388,12 +394,6 @@ def _motion_costs(
 ) -> Float[np.ndarray, "m s"]:
     """Half the squared residuals of every motion along some paths."""
     position_m = np.array([[end.position_m for end in path.ends] for path in paths])
-    headings = [[_heading(picture, end) for picture, end in zip(pictures, path.ends, strict=True)] for path in paths]
+    queries = [picture.query for picture in pictures]
+    headings = [[panorama_heading(*pair) for pair in zip(queries, path.ends, strict=True)] for path in paths]
     return motion_costs(motions, position_m, np.array(headings))
-
-
-def _distinct(candidates: list[Candidate], separation_m: float, top_k: int) -> list[Candidate]:
-    """The first candidates of which no two are at one place."""
-    positions = np.stack([candidate.position_m for candidate in candidates])
-    kept = suppress(positions, np.arange(len(candidates), dtype=float), separation_m=separation_m, limit=top_k)
-    return [candidates[index] for index in kept]
