@@ -79,7 +79,7 @@ class GeoPose:
 
 @dataclass(frozen=True)
 class Posterior:
-    """How probable places are, lists of one length; each stands for a square `step_m` wide."""
+    """How probable places are, lists of one length; each stands for a part of its room that is `step_m` wide."""
 
     step_m: float
     x_m: tuple[float, ...]

@@ -11,18 +11,20 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
+from scipy.ndimage import find_objects, gaussian_filter
 
 from lalaloc_core.draw.canvas import MUTED, RULE, Number, image, png, words, xml_text
 from lalaloc_core.draw.plan import floor_path
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.places import Places
 from lalaloc_core.sampling import PoseSet
 
 # ColorBrewer's YlGnBu, which is safe for the colour-blind and still a scale when it is printed in grey.
 _COLOURS = ["#ffffe5", "#f7fcb9", "#d9f0a3", "#a6dba0", "#5cc2b0", "#2fa4c0", "#2a7ab9", "#27509b", "#132a6b"]
 # So many cells along the longer side of a plan, and none smaller than this.
 _CELLS, _LEAST_CELL_M = 220, 0.04
-# Rounds of growing known values into cells and lattice points that have none.
-_GROWN = 4
+# Places are spread by a normal distribution: its deviation in steps of the grid, and how many of them it reaches.
+_SPREAD, _REACH = 0.4, 5.0
 # Bilinear, which is fast, where drawn by resvg; browsers do it anyway.
 _SMOOTH = 'image-rendering="smooth"'
 # Of probabilities: what is less probable than the best place by this factor has the lightest colour.
@@ -90,27 +92,35 @@ def distance_map(cells: Cells, distance: Float[np.ndarray, "n"], title: str) -> 
     return HeatMap(cells, shade, title, ticks)
 
 
-def posterior_map(plan: FloorPlan, poses: PoseSet, probability: Float[np.ndarray, "n"], step_m: float) -> HeatMap:
+def posterior_map(plan: FloorPlan, places: Places, step_m: float) -> HeatMap:
     """A map of how probable every place is beside the most probable one.
 
     Args:
-        poses: those of a grid, on the multiples of `step_m` but for rooms that hold none.
-        probability: of each.
+        step_m: of the grid that was searched: each place stands for a part of its room that is so wide.
     """
     cells = Cells.of(plan)
-    best = max(float(probability.max()), np.finfo(float).tiny)
+    left, _, bottom, _ = cells.extent_m
+    size_m = (cells.extent_m[1] - left) / cells.room.shape[1]
+    # In cells, from the middle of the first one.
+    x, y = ((places.position_m - [left, bottom]) / size_m - 0.5).T
+    density = np.zeros(cells.room.shape)
+    boxes = find_objects(cells.room + 1)
+    for room in np.unique(places.room_index):
+        box, own = boxes[room] if room < len(boxes) else None, places.room_index == room
+        # A room may be smaller than a cell.
+        if box is None:
+            continue
+        inside = cells.room[box] == room
+        spread = _splatted(x[own] - box[1].start, y[own] - box[0].start, places.probability[own], inside.shape)
+        # Walls part rooms: what is spread beyond them is of no place.
+        smooth = gaussian_filter(spread, _SPREAD * step_m / size_m, mode="constant", truncate=_REACH)
+        density[box][inside] = smooth[inside]
+    known = density[cells.room >= 0]
     with np.errstate(divide="ignore"):
-        shade = np.maximum(1.0 + np.log10(probability / best) / _DECADES, 0.0)
-    between = np.zeros(len(cells.poses))
-    for room in np.unique(poses.room_index):
-        inside, known = cells.poses.room_index == room, poses.room_index == room
-        if inside.any():
-            between[inside] = _interpolated(
-                poses.position_m[known] / step_m, shade[known], cells.poses.position_m[inside] / step_m
-            )
+        shade = np.maximum(1.0 + np.log10(known / max(float(known.max()), np.finfo(float).tiny)) / _DECADES, 0.0)
     exponents = "⁰¹²³⁴⁵"
     ticks = [(1.0, "1"), *((1.0 - k / _DECADES, f"10⁻{exponents[k]}") for k in range(1, _DECADES + 1))]
-    return HeatMap(cells, between, "probability beside the best place", tuple(ticks))
+    return HeatMap(cells, shade, "probability beside the best place", tuple(ticks))
 
 
 def heat_image(heat: HeatMap, plan: FloorPlan) -> str:
@@ -157,23 +167,21 @@ def _colours_of(shade: Float[np.ndarray, "n"]) -> UInt8[np.ndarray, "n 3"]:
     return np.stack([np.interp(shade, place, anchors[:, k]) for k in range(3)], axis=1).round().astype(np.uint8)
 
 
-def _interpolated(
-    lattice: Float[np.ndarray, "n 2"], value: Float[np.ndarray, "n"], wanted: Float[np.ndarray, "m 2"]
-) -> Float[np.ndarray, "m"]:
-    """Values between points of a lattice with spacing 1; 0 where none is near."""
-    node = np.rint(lattice).astype(int)
-    low = np.minimum(node.min(axis=0), np.floor(wanted.min(axis=0)).astype(int)) - 1
-    high = np.maximum(node.max(axis=0), np.floor(wanted.max(axis=0)).astype(int)) + 2
-    table = np.full(high - low + 1, np.nan)
-    table[tuple((node - low).T)] = value
-    for _ in range(_GROWN):
-        table = _grown(table)
-    table = np.nan_to_num(table)
-    corner = np.floor(wanted).astype(int)
-    share, (i, j) = wanted - corner, (corner - low).T
-    lower = table[i, j] * (1.0 - share[:, 0]) + table[i + 1, j] * share[:, 0]
-    upper = table[i, j + 1] * (1.0 - share[:, 0]) + table[i + 1, j + 1] * share[:, 0]
-    return lower * (1.0 - share[:, 1]) + upper * share[:, 1]
+def _splatted(
+    x: Float[np.ndarray, "n"], y: Float[np.ndarray, "n"], value: Float[np.ndarray, "n"], shape: tuple[int, int]
+) -> Float[np.ndarray, "rows columns"]:
+    """Values at places between the middles of cells, shared among the four around each."""
+    spread = np.zeros(shape)
+    column, row = np.floor(x).astype(int), np.floor(y).astype(int)
+    to_right, up = x - column, y - row
+    for rows, columns, share in (
+        (row, column, (1.0 - up) * (1.0 - to_right)),
+        (row, column + 1, (1.0 - up) * to_right),
+        (row + 1, column, up * (1.0 - to_right)),
+        (row + 1, column + 1, up * to_right),
+    ):
+        np.add.at(spread, (np.clip(rows, 0, shape[0] - 1), np.clip(columns, 0, shape[1] - 1)), share * value)
+    return spread
 
 
 def _grown(table: Float[np.ndarray, "r c"]) -> Float[np.ndarray, "r c"]:

@@ -72,6 +72,21 @@ class GridCosts:
 
 
 @dataclass(frozen=True, eq=False)
+class Support:
+    """Where the probability lies once candidates are refined, which moves what stands around them along with them.
+
+    Attributes:
+        pose: (m,) the grid pose that each place comes from.
+        position_m: (m, 2) where it lies now, which may be outside of its room.
+        weight: (m,) its probability; they sum to one.
+    """
+
+    pose: Int[np.ndarray, "m"]
+    position_m: Float[np.ndarray, "m 2"]
+    weight: Float[np.ndarray, "m"]
+
+
+@dataclass(frozen=True, eq=False)
 class Posterior:
     """Probabilities, given that the picture was taken in the plan at all.
 
@@ -81,12 +96,14 @@ class Posterior:
         candidate: probability of being within 1 m of each candidate, turned like it, and at none before it; at most one
             in sum.
         heading: probability that the heading of the first candidate is right within 5°.
+        support: the same probability, at the places that refinement found; `places.places_of` makes a map of it.
     """
 
     pose: Float[np.ndarray, "n"]
     position: float
     candidate: tuple[float, ...]
     heading: float
+    support: Support
 
 
 def area_shares(poses: PoseSet, areas_m2: Float[np.ndarray, "r"]) -> Float[np.ndarray, "n"]:
@@ -217,6 +234,7 @@ def told_of(
         position=min(float(weight[near].sum()), 1.0),
         candidate=_shares(position, heading, weight, query, candidates),
         heading=_heading_share(heading, weight, query, candidates),
+        support=Support(pose, position, weight),
     )
 
 

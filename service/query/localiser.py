@@ -191,7 +191,7 @@ class Localiser:
         warnings += hint_warnings(hints, found, record.plan)
         answer = compose(found, places_in(record), known, warnings, timings_ms, self._bundle)
         if form.include == "posterior":
-            answer = answer.model_copy(update={"posterior": posterior_answer(grid, found.posterior)})
+            answer = answer.model_copy(update={"posterior": posterior_answer(record.plan, grid, found.posterior)})
         return _Answered(answer, found, grid)
 
     async def answer_sequence(

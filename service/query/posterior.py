@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import numpy as np
-
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.places import places_of
 from lalaloc_core.localise.poses import LatentGrid
 from lalaloc_core.localise.posterior import Posterior
 from service.schemas import PosteriorAnswer
@@ -12,13 +12,14 @@ from service.schemas import PosteriorAnswer
 _LEAST = 5e-7
 
 
-def posterior_answer(grid: LatentGrid, posterior: Posterior) -> PosteriorAnswer:
-    """Places of the grid with their probabilities, without those that have next to none."""
-    index = np.flatnonzero(posterior.pose >= _LEAST)
-    position = grid.poses.position_m[index]
+def posterior_answer(plan: FloorPlan, grid: LatentGrid, posterior: Posterior) -> PosteriorAnswer:
+    """Places with their probabilities, without those that have next to none."""
+    places = places_of(plan, grid.poses, posterior)
+    told = places.probability >= _LEAST
+    position_m = places.position_m[told]
     return PosteriorAnswer(
         step_m=grid.step_m,
-        x_m=position[:, 0].tolist(),
-        y_m=position[:, 1].tolist(),
-        probability=posterior.pose[index].tolist(),
+        x_m=position_m[:, 0].tolist(),
+        y_m=position_m[:, 1].tolist(),
+        probability=places.probability[told].tolist(),
     )

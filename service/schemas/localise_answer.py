@@ -54,7 +54,9 @@ class CandidateAnswer(Answer):
 class PosteriorAnswer(Answer):
     """How probable places are, given that the panorama is of this plan: lists of one length, a place each."""
 
-    step_m: float = Field(description="Distance of neighbouring places: each stands for a square of this width.")
+    step_m: float = Field(
+        description="How wide a part of its room each place stands for: the distance of neighbours on the plan's grid."
+    )
     x_m: list[Metres]
     y_m: list[Metres]
     probability: list[Mass] = Field(description="They sum to 1; places of less than 0.0000005 are left out.")

@@ -19,8 +19,9 @@ from lalaloc_core.draw.outline import outline_of
 from lalaloc_core.draw.photograph import Stroke, draw_strokes, wall_line
 from lalaloc_core.draw.plan import Marker
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.places import Places
 from lalaloc_core.render.poses import profiles_at
-from lalaloc_core.sampling import pose_grid
+from lalaloc_core.sampling import PoseSet, pose_grid
 
 SVG = "{http://www.w3.org/2000/svg}"
 PLAN = FloorPlan.from_dict(
@@ -116,27 +117,41 @@ def test_a_round_room_has_no_corners() -> None:
     np.testing.assert_allclose(outline.floor[:, 1], 0.5 + math.atan(0.5) / math.pi, atol=1e-5)
 
 
+def all_places(probability: np.ndarray, poses: PoseSet) -> Places:
+    return Places(poses.position_m, poses.room_index, probability / probability.sum())
+
+
 def test_the_most_probable_place_is_the_darkest_and_what_is_hopeless_is_the_lightest() -> None:
-    poses = pose_grid(PLAN, 0.5)
-    probability = np.full(len(poses), 1e-9)
-    best = int(np.linalg.norm(poses.position_m - [1.0, 4.0], axis=1).argmin())
-    probability[best] = 0.9
-    heat = posterior_map(PLAN, poses, probability, 0.5)
-    distance_m = np.linalg.norm(heat.cells.poses.position_m - poses.position_m[best], axis=1)
-    assert heat.shade[distance_m.argmin()] == pytest.approx(1.0, abs=0.15)
-    assert heat.shade[distance_m < 0.2].min() > heat.shade[distance_m > 0.8].max()
-    assert heat.shade[distance_m > 0.8].max() == 0.0
+    # Between grid poses, as an answer is.
+    place_m = np.array([1.18, 4.07])
+    heat = posterior_map(PLAN, Places(place_m[None], np.zeros(1, int), np.ones(1)), 0.5)
+    distance_m = np.linalg.norm(heat.cells.poses.position_m - place_m, axis=1)
+    assert heat.shade[distance_m.argmin()] == pytest.approx(1.0, abs=0.01)
+    assert np.argsort(distance_m)[:4].tolist().count(int(heat.shade.argmax())) == 1
+    assert heat.shade[distance_m < 0.2].min() > heat.shade[distance_m > 0.5].max()
+    assert heat.shade[distance_m > 1.1].max() == 0.0
     assert heat.shade[heat.cells.poses.room_index == 1].max() == 0.0, "walls part the colours of rooms"
 
 
-def test_between_two_poses_the_shade_is_between_theirs() -> None:
+def test_a_map_s_shades_follow_the_logarithm_of_the_probability() -> None:
     poses = pose_grid(PLAN, 0.5)
     # A tenth for every metre to the right.
-    heat = posterior_map(PLAN, poses, 10.0 ** (poses.position_m[:, 0] - 4.0) + 0.0, 0.5)
+    probability = np.where(poses.room_index == 0, 10.0 ** poses.position_m[:, 0], 0.0)
+    heat = posterior_map(PLAN, all_places(probability, poses), 0.5)
     inside = heat.cells.poses.room_index == 0
-    x_m, best_m = heat.cells.poses.position_m[inside, 0], poses.position_m[:, 0].max()
-    between = (x_m > 0.5) & (x_m < 3.5)
-    np.testing.assert_allclose(heat.shade[inside][between], np.maximum(1 + (x_m - best_m)[between] / 5, 0), atol=0.02)
+    (x_m, y_m), shade = heat.cells.poses.position_m[inside].T, heat.shade[inside]
+    between = (x_m > 0.8) & (x_m < 3.2) & (np.abs(y_m - y_m.mean()) < 0.6)
+    slope, start = np.polyfit(x_m[between], shade[between], 1)
+    assert slope == pytest.approx(0.2, abs=0.01)
+    np.testing.assert_allclose(shade[between], start + slope * x_m[between], atol=0.02)
+
+
+def test_places_that_are_as_probable_are_as_dark() -> None:
+    poses = pose_grid(PLAN, 0.5)
+    heat = posterior_map(PLAN, all_places(np.ones(len(poses)), poses), 0.5)
+    off_m = np.abs(heat.cells.poses.position_m[:, None] - poses.position_m).max(axis=2).min(axis=1)
+    assert heat.shade[off_m <= 0.25].min() > 0.85
+    assert np.median(heat.shade) > 0.9
 
 
 def test_a_map_of_distances_is_darkest_where_they_are_least() -> None:
@@ -179,7 +194,7 @@ def test_strokes_lie_over_the_picture_and_leave_the_rest_of_it() -> None:
 
 @pytest.mark.parametrize("picture", ["both", "plan", "photograph"])
 def test_an_answer_is_drawn_with_all_that_belongs_to_it(picture: Picture) -> None:
-    heat = posterior_map(PLAN, poses := pose_grid(PLAN, 0.5), np.full(len(poses), 1.0 / len(poses)), 0.5)
+    heat = posterior_map(PLAN, all_places(np.ones(len(poses := pose_grid(PLAN, 0.5))), poses), 0.5)
     photograph = np.full((128, 256, 3), 90, np.uint8)
     drawn = draw_answer(answer(heat=heat, truth=Marker(x_m=2.2, y_m=3.0)), photograph, picture)
     root = ElementTree.fromstring(drawn)

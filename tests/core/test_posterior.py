@@ -10,13 +10,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.confidence import Signals, signals_of
+from lalaloc_core.localise.places import places_of
 from lalaloc_core.localise.poses import Candidate, PredictedProfile, Query
-from lalaloc_core.localise.posterior import GridCosts, Posterior, area_shares, posterior_of
+from lalaloc_core.localise.posterior import GridCosts, Posterior, Support, area_shares, posterior_of
 from lalaloc_core.sampling import PoseSet
 from tests.strategies import seeds
 
+NOWHERE = Support(np.zeros(1, int), np.zeros((1, 2)), np.ones(1))
 PLAIN = Query(np.eye(1), np.zeros(1), 0.0, heading_known=True, camera_height=CameraHeight(1.5))
 
 
@@ -36,6 +39,30 @@ def shares(
     ends = starts if ends is None else ends
     answers = sorted(ends, key=lambda one: one.cost)
     return posterior_of(grid, np.zeros(len(grid.poses)), query, starts, ends, answers, 16.0, 1.0)
+
+
+def test_the_map_is_of_the_places_where_candidates_ended_and_not_of_where_they_began() -> None:
+    plan = FloorPlan.from_dict({"ceiling_height_m": 2.5, "rooms": [{"polygon": [[-5, -2], [6, -2], [6, 2], [-5, 2]]}]})
+    # Both begin beside the answer and end at it, as twice as many grid poses look as good where nothing is.
+    places, cost = [-0.6, 0.0, 0.6, 3.0], np.array([0.2, 0.5, 0.2, 0.4])
+    grid = along(places, cost)
+    starts = [candidate(-0.6, 0.2), candidate(0.6, 0.2)]
+    ends = [dataclasses.replace(start, x_m=0.1, cost=0.02) for start in starts]
+    told = places_of(plan, grid.poses, shares(grid, starts, ends))
+    best = told.probability.argmax()
+    assert told.position_m[best] == pytest.approx([0.1, 0.0])
+    at_answer = np.linalg.norm(told.position_m - [0.1, 0.0], axis=1) < 1e-9
+    assert told.probability[at_answer].sum() > 0.9
+    assert told.probability.sum() == pytest.approx(1.0)
+    assert (told.room_index == 0).all()
+
+
+def test_what_refinement_moves_into_a_wall_is_on_no_map() -> None:
+    plan = FloorPlan.from_dict({"ceiling_height_m": 2.5, "rooms": [{"polygon": [[-1, -1], [1, -1], [1, 1], [-1, 1]]}]})
+    grid = along([0.2, 0.8], np.array([0.1, 0.12]))
+    told = places_of(plan, grid.poses, shares(grid, [candidate(0.2, 0.1)], [candidate(0.5, 0.05)]))
+    np.testing.assert_allclose(told.position_m, [[0.5, 0.0]])
+    assert told.probability == pytest.approx([1.0])
 
 
 @pytest.mark.parametrize("copies", [2, 4, 8, 50])
@@ -117,7 +144,7 @@ class TestSignals:
     def test_they_are_of_the_answer_and_the_prediction(self) -> None:
         profile = PredictedProfile(np.zeros((2, 4)), np.array([[-3.0, -2.0, -3.0, -2.0]]).repeat(2, axis=0))
         query = dataclasses.replace(PLAIN, profile=profile)
-        posterior = Posterior(np.ones(1), 0.8, (0.7,), 1.0)
+        posterior = Posterior(np.ones(1), 0.8, (0.7,), 1.0, NOWHERE)
         found = signals_of(query, candidate(5.0, 0.4), posterior, -0.6)
         expected = Signals(log_odds=math.log(4.0), cost=0.4, uncertainty=-2.5, latent_distance=0.3, cost_to_chance=-0.6)
         assert dataclasses.astuple(found) == pytest.approx(dataclasses.astuple(expected))
@@ -125,5 +152,5 @@ class TestSignals:
 
     @pytest.mark.parametrize(("mass", "log_odds"), [(0.0, -6.0), (1.0, 6.0), (1.0 + 1e-12, 6.0)])
     def test_no_posterior_is_surer_than_it_can_be(self, mass: float, log_odds: float) -> None:
-        posterior = Posterior(np.ones(1), mass, (mass,), 1.0)
+        posterior = Posterior(np.ones(1), mass, (mass,), 1.0, NOWHERE)
         assert signals_of(PLAIN, candidate(0.0, 0.2), posterior, 0.0).log_odds == log_odds

@@ -15,7 +15,7 @@ from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.hints import Hints, Near
 from lalaloc_core.localise.pipeline import Localisation
 from lalaloc_core.localise.poses import Candidate, Query
-from lalaloc_core.localise.posterior import Posterior
+from lalaloc_core.localise.posterior import Posterior, Support
 from service.query.hints import hint_warnings
 from tests.service.conftest import FLAT, assert_problem, localise, upload
 from tests.strategies import rectangle
@@ -113,7 +113,7 @@ def test_what_is_overruled_is_said_with_both_values() -> None:
     plan = FloorPlan.from_dict(PLAN)
     query = Query(np.eye(1), np.zeros(1), 0.0, heading_known=True, camera_height=CameraHeight(1.5))
     answer = Candidate(1.0, 4.5, 2, 0.0, 0, 0.1, 0.2)
-    posterior = Posterior(np.ones(1), 1.0, (1.0,), 1.0)
+    posterior = Posterior(np.ones(1), 1.0, (1.0,), 1.0, Support(np.zeros(1, int), np.zeros((1, 2)), np.ones(1)))
     hints = Hints(near=Near(6.0, 4.5, 3.0), rooms=frozenset({0, 1}))
     found = Localisation(query, [answer], posterior, "lpo", {}, hints_missed=("near", "rooms"))
     assert hint_warnings(hints, found, plan) == [

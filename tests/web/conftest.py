@@ -93,10 +93,8 @@ def visit(browser: Browser, client: httpx.Client, **options: Any) -> Iterator[Vi
         visited = Visit(context.new_page(), client)
 
         def heard(message: ConsoleMessage) -> None:
-            # Refused requests are told as errors as well; what they mean is shown on the page. The viewer of spheres
-            # complains of a picture that is gone before it was loaded, as another was chosen.
-            told = "Failed to load resource" in message.text or "Failed to fetch" in message.text
-            if message.type in ("error", "warning") and not told:
+            # Refused requests are told as errors as well; what they mean is shown on the page.
+            if message.type in ("error", "warning") and "Failed to load resource" not in message.text:
                 visited.faults.append(message.text)
 
         visited.page.on("console", heard)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from PIL import Image, ImageDraw
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Page, Route, expect
 
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.plans.exporting import export_plan
@@ -26,13 +26,27 @@ def _overlapping() -> dict[str, object]:
 
 def test_an_uploaded_plan_is_drawn_at_once_with_its_warnings(desktop: Visit, tmp_path: Path) -> None:
     page = desktop.open()
-    # The example is shown when all is loaded, and would take the place of what comes before.
-    expect(page.locator("#plan-name")).not_to_be_empty()
     (tmp_path / "overlap.json").write_text(json.dumps(_overlapping()))
     page.locator("#plan-file").set_input_files(tmp_path / "overlap.json")
     expect(page.locator("#plan-name")).to_have_text("Overlap")
     expect(page.locator("#plan .room")).to_have_count(2)
     expect(page.locator("#plan-warnings")).to_contain_text("overlap")
+
+
+def test_what_is_begun_while_the_page_is_loaded_is_not_replaced_by_the_example(desktop: Visit, tmp_path: Path) -> None:
+    (tmp_path / "overlap.json").write_text(json.dumps(_overlapping() | {"name": "Early"}))
+    page, held = desktop.page, list[Route]()
+    page.route("**/web/example-flat.json", lambda route: held.append(route))
+    with page.expect_request("**/web/example-flat.json"):
+        desktop.open()
+    page.locator("#plan-file").set_input_files(tmp_path / "overlap.json")
+    expect(page.locator("#plan-name")).to_have_text("Early")
+    (route,) = held
+    with page.expect_response("**/web/example-flat.json"):
+        route.continue_()
+    page.wait_for_load_state("networkidle")
+    expect(page.locator("#plan-name")).to_have_text("Early")
+    expect(page.locator("#photo-strip li")).to_have_count(0)
 
 
 def _scan() -> Image.Image:
@@ -60,7 +74,6 @@ def _drag_end(page: Page, index: int, x: float, y: float) -> None:
 
 def test_a_picture_s_scale_is_set_on_it_and_what_was_read_is_corrected_over_it(desktop: Visit, tmp_path: Path) -> None:
     page = desktop.open()
-    expect(page.locator("#plan-name")).not_to_be_empty()
     _scan().save(tmp_path / "scan.png")
     page.locator("#plan-file").set_input_files(tmp_path / "scan.png")
     page.get_by_role("button", name="Read the picture").click()
@@ -91,7 +104,6 @@ def test_a_picture_s_scale_is_set_on_it_and_what_was_read_is_corrected_over_it(d
 
 def test_files_of_other_tools_are_read(desktop: Visit, tmp_path: Path) -> None:
     page = desktop.open()
-    expect(page.locator("#plan-name")).not_to_be_empty()
     (tmp_path / "flat.dxf").write_bytes(export_plan(FloorPlan.from_dict(FLAT), "dxf"))
     page.locator("#plan-file").set_input_files(tmp_path / "flat.dxf")
     expect(page.locator("#plan-facts")).to_contain_text("2 rooms, 36.0 m²")
@@ -119,7 +131,7 @@ def test_plans_are_found_by_name_and_deleted_only_after_a_question(desktop: Visi
     for name in ("Attic of the mill", "Cellar of the mill"):
         upload(desktop.client, FLAT | {"name": name})
     page = desktop.open()
-    page.locator("#plan-menu summary").click()
+    page.get_by_text("Plans", exact=True).click()
     page.locator("#plan-search").fill("MILL")
     expect(page.locator("#plan-list .plan")).to_have_count(2)
     page.get_by_role("button", name="Delete Attic of the mill").click()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from playwright.sync_api import Browser, expect
 
 from tests.service.conftest import FLAT, StartApp, upload
-from tests.web.conftest import EXAMPLES, visit
+from tests.web.conftest import EXAMPLES, PHONE, visit
 from tests.web.test_answer import _assert_accessible
 
 
@@ -16,12 +16,12 @@ def test_a_venue_is_chosen_and_its_answer_says_which_plan(browser: Browser, star
         client.post("/venues", json={"name": "Mill", "plans": plans}).raise_for_status()
         for visited in visit(browser, client):
             page = visited.open()
-            page.locator("#plan-menu summary").click()
+            page.get_by_text("Plans", exact=True).click()
             page.get_by_role("button", name="Mill").click()
             expect(page.locator("#venue-bar")).to_contain_text("Mill 2 plans")
             expect(page.locator("#plan-name")).to_have_text("Flat below")
             expect(page.locator("#hints")).to_be_hidden()
-            page.locator("#plan-menu summary").click()
+            page.get_by_text("Plans", exact=True).click()
             page.locator("#photo-file").set_input_files(EXAMPLES / "kitchen.jpg")
             visited.find()
             _assert_accessible(page)
@@ -51,3 +51,38 @@ def test_a_venue_is_chosen_and_its_answer_says_which_plan(browser: Browser, star
             page.goto(link)
             expect(plan_of).to_contain_text(found)
             expect(page.locator("#venue-bar")).to_contain_text("Mill")
+
+
+def test_a_venue_is_made_of_stored_plans_and_asked_about(browser: Browser, start_app: StartApp, tmp_path) -> None:
+    with start_app(tmp_path) as client:
+        for name in ("Cellar", "Shop"):
+            upload(client, FLAT | {"name": name})
+        for visited in visit(browser, client, viewport=PHONE):
+            page = visited.open()
+            page.get_by_text("Plans", exact=True).click()
+            page.get_by_text("Make a venue").click()
+            make = page.get_by_role("button", name="Make the venue")
+            make.click()
+            expect(page.locator("#venue-error")).to_contain_text("what the venue is called")
+            page.get_by_label("Name of the venue").fill("Mill Lane 12")
+            add = page.get_by_role("button", name="Add", exact=True)
+            for name in ("Cellar", "Shop"):
+                page.get_by_label("Plan to add").select_option(label=name)
+                add.click()
+            expect(add).to_be_disabled()
+            page.get_by_label("Level of Cellar").fill("")
+            make.click()
+            expect(page.locator("#venue-error")).to_contain_text("Which level is Cellar on?")
+            page.get_by_label("Level of Cellar").fill("-1")
+            page.get_by_label("Level of Shop").fill("2000000")
+            make.click()
+            expect(page.get_by_label("Level of Shop")).to_have_attribute("aria-invalid", "true")
+            page.get_by_label("Level of Shop").fill("0")
+            _assert_accessible(page)
+            make.click()
+            expect(page.locator("#venue-bar")).to_contain_text("Mill Lane 12 2 plans")
+            expect(page.locator("#plan-name")).to_have_text("Cellar")
+            page.get_by_text("Plans", exact=True).click()
+            page.locator("#photo-file").set_input_files(EXAMPLES / "kitchen.jpg")
+            visited.find()
+            expect(page.locator("#answer .plan-of")).to_contain_text("level")

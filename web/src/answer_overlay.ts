@@ -1,37 +1,12 @@
-/** What an answer adds to a plan: the posterior as a heat map, the found place with its ellipse, and its rivals. */
+/** What an answer adds to a plan besides the heat map: the ellipse of the found place, and its rivals. */
 
 import { s } from "./dom";
 import { degrees } from "./layout";
-import { type Box, path, unitOf } from "./plan_drawing";
-import type { Answer, PlanDocument, Posterior } from "./types";
+import { type Box, unitOf } from "./plan_drawing";
+import type { Answer } from "./types";
 
-const LEAST = 1e-5;
 // 95 % of a two-dimensional normal distribution lie within so many standard deviations.
 const WITHIN_95 = Math.sqrt(5.991);
-
-/** From 0 for what is next to impossible to 1 for what is certain, on the scale of the logarithm. */
-export function heat(probability: number): number {
-  return Math.max(0, Math.min(1, 1 - Math.log(Math.max(probability, LEAST)) / Math.log(LEAST)));
-}
-
-/** Cells around the poses of the grid, cut off at the walls: one colour, denser where it is likelier. */
-export function heatMap(posterior: Posterior, plan: PlanDocument): SVGGElement {
-  const step = posterior.step_m;
-  const clip = s("clipPath", { id: "floor" }, ...plan.rooms.map((room) =>
-    s("path", { d: path(room.polygon) + (room.holes ?? []).map(path).join(""), "clip-rule": "evenodd" })));
-  const cells = posterior.x_m.map((x, index) => {
-    const value = heat(posterior.probability[index]!);
-    const y = posterior.y_m[index]!;
-    return s("rect", {
-      x: (x - 0.5 * step).toFixed(3), y: (-y - 0.5 * step).toFixed(3), width: step, height: step,
-      "fill-opacity": (0.08 + 0.84 * value).toFixed(2),
-    });
-  });
-  const blur = s("filter", { id: "soft", x: "-20%", y: "-20%", width: "140%", height: "140%" },
-    s("feGaussianBlur", { stdDeviation: 0.35 * step }));
-  return s("g", { class: "heat", "aria-hidden": "true" }, s("defs", {}, clip, blur),
-    s("g", { "clip-path": "url(#floor)" }, s("g", { filter: "url(#soft)" }, ...cells)));
-}
 
 /** The ellipse that holds 95 % of where the camera may have stood. */
 export function ellipse(answer: Answer): SVGElement | null {

@@ -142,6 +142,11 @@ export const api = {
     return json(`/venues?${query}`);
   },
 
+  async createVenue(name: string, plans: { floorplan_id: string; level: number }[]): Promise<Venue> {
+    const headers = { "Content-Type": "application/json" };
+    return json("/venues", { method: "POST", headers, body: JSON.stringify({ name, plans }) });
+  },
+
   async venue(id: string): Promise<Venue> {
     return json(`/venues/${encodeURIComponent(id)}`);
   },

@@ -1,11 +1,12 @@
 /** The page at /: one plan, some photographs, and where they were taken. */
 
 import { showAnswer, markLooked } from "./answer_panel";
-import { ellipse, heatMap, rivals } from "./answer_overlay";
+import { ellipse, rivals } from "./answer_overlay";
 import { api } from "./api";
 import { byId, download, h, s, show } from "./dom";
 import { Editor } from "./editor/editor";
 import { exampleFiles, examplePlan } from "./example";
+import { heatMap } from "./heat";
 import { HintForm, hintFields } from "./hints";
 import { connectKeyDialog } from "./key_dialog";
 import { layoutLines, roomAt } from "./layout";
@@ -34,7 +35,8 @@ class Page {
   private readonly panorama = new PanoramaView(byId("photo-view"), (yaw, fov) => this.marker.look(yaw, fov));
   private readonly venues = new Venues({ chosen: (venue) => this.onVenue(venue), look: (planId) => void this.plans.choose(planId) });
   private readonly plans = new Plans({
-    chosen: (plan) => this.onPlan(plan), picked: () => this.venues.leave(), searched: (name) => void this.venues.load(name),
+    chosen: (plan) => this.onPlan(plan), begun: () => { this.isBegun = true; }, picked: () => this.venues.leave(),
+    listed: (plans) => this.venues.offer(plans), searched: (name) => void this.venues.load(name),
   });
   private readonly photos = new Photos((photo, isAnother) => this.onPhoto(photo, isAnother));
   private readonly hints = new HintForm(this.svg, (hints) => this.photos.setHints(hints));
@@ -55,6 +57,8 @@ class Page {
   /** Which of its candidates is looked at. */
   private looked = 0;
   private asking: AbortController | null = null;
+  /** Whether somebody has begun with a plan of their own, which the example must not take the place of. */
+  private isBegun = false;
 
   async start(): Promise<void> {
     connectKeyDialog();
@@ -64,15 +68,19 @@ class Page {
     this.find.addEventListener("click", () => void this.ask());
     byId("find-all").addEventListener("click", () => void this.askAll());
     addEventListener("hashchange", () => void this.open());
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.drawAnswer());
     await this.panorama.setPicture(null);
     const [stored] = await Promise.all([this.plans.load(), this.venues.load("")]);
     if (await this.open()) return;
     const example = await examplePlan();
+    // What was begun while all this was loaded stays: nobody waits for an example.
+    if (this.isBegun) return;
     const known = stored.find((plan) => plan.name === example.name);
     if (known !== undefined || stored.length === 0) {
       if (known === undefined) this.onExample(example);
       else await this.plans.choose(known.id);
-      this.photos.add(await exampleFiles());
+      const files = await exampleFiles();
+      if (!this.isBegun && this.photos.list.length === 0) this.photos.add(files);
     } else await this.plans.choose(stored[0]!.id);
   }
 
@@ -103,6 +111,7 @@ class Page {
   }
 
   private onVenue(venue: Venue | null): void {
+    if (venue !== null) this.isBegun = true;
     byId("hints").hidden = venue !== null;
     this.photos.forgetHints();
     this.photos.forgetAnswers();
@@ -173,6 +182,8 @@ class Page {
   }
 
   private edit(plan: Plan | null): void {
+    this.isBegun = true;
+    this.plans.stay();
     this.setAnswer(null);
     document.body.classList.add("editing");
     byId("plan-name").textContent = plan?.name ?? "New plan";

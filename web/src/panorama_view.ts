@@ -29,6 +29,8 @@ export class PanoramaView {
   private sphere: Sphere | null = null;
   private shape: Shape = "around";
   private url: string | null = null;
+  /** Ends when the viewer has read the picture that it was given last, or has given up on it. */
+  private loading: Promise<void> = Promise.resolve();
   private lines: LayoutLine[] = [];
   private heading = 0;
   private shown = true;
@@ -55,7 +57,7 @@ export class PanoramaView {
 
   /** Show a photograph; null shows none. Refused where the file is no picture. */
   async setPicture(file: Blob | null): Promise<void> {
-    if (this.url !== null) URL.revokeObjectURL(this.url);
+    this.release(this.url);
     this.url = file === null ? null : URL.createObjectURL(file);
     this.stage.classList.toggle("empty", file === null);
     if (this.url === null) {
@@ -90,14 +92,23 @@ export class PanoramaView {
     void this.refresh();
   }
 
+  /** Give a picture's memory back once nothing loads it any more. */
+  private release(url: string | null): void {
+    if (url === null) return;
+    void this.loading.catch(() => undefined).then(() => URL.revokeObjectURL(url));
+  }
+
   private async refresh(): Promise<void> {
     if (this.shape === "around" && this.url !== null) {
       const url = this.url;
       try {
         // The viewer is large, and only needed once there is a picture.
         const { Sphere } = await import("./sphere");
+        // Another picture was chosen meanwhile, and is shown by its own call.
+        if (this.url !== url) return;
         this.sphere ??= new Sphere(this.holder, () => this.draw());
-        await this.sphere.show(url);
+        this.loading = this.sphere.show(url);
+        await this.loading;
       } catch (error) {
         // Without WebGL there is no looking around, but everything else.
         if (this.url !== url) return;

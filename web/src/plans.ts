@@ -17,6 +17,10 @@ const PICTURES = /^image\/(png|jpeg)$/;
 export interface PlanActions {
   /** A plan is to be shown; told again when it is prepared further. */
   chosen: (plan: Plan | null) => void;
+  /** These plans are listed now. */
+  listed: (plans: PlanSummary[]) => void;
+  /** Somebody begins with a plan of their own. */
+  begun: () => void;
   /** Somebody picked a plan of the list, or uploaded one. */
   picked: () => void;
   /** Somebody looks for what has this in its name. */
@@ -33,6 +37,8 @@ export class Plans {
   private cursor: string | null = null;
   private current: Plan | null = null;
   private following: AbortController | null = null;
+  /** Counts what was asked to be shown: only the last of it is. */
+  private turn = 0;
 
   constructor(private readonly actions: PlanActions) {
     let waiting: number | undefined;
@@ -59,6 +65,7 @@ export class Plans {
       this.found = cursor === null ? page.floorplans : [...this.found, ...page.floorplans];
       this.cursor = page.next_cursor;
       this.draw();
+      this.actions.listed(this.found);
     } catch (error) {
       showError(this.error, error);
     }
@@ -69,13 +76,20 @@ export class Plans {
   async choose(id: string, revision?: string): Promise<Plan | null> {
     clearError(this.error, this.importing.fields);
     this.importing.close();
+    const turn = this.stay();
     try {
-      this.take(await api.plan(id, revision));
+      const plan = await api.plan(id, revision);
+      if (turn === this.turn) this.take(plan);
       return this.current;
     } catch (error) {
-      showError(this.error, error);
+      if (turn === this.turn) showError(this.error, error);
       return null;
     }
+  }
+
+  /** Show nothing of what was asked for before. */
+  stay(): number {
+    return ++this.turn;
   }
 
   /** Show a plan that was just stored or read. */
@@ -89,6 +103,8 @@ export class Plans {
 
   /** A picture never says how large it is: that is asked first. */
   private begin(file: File): void {
+    this.actions.begun();
+    this.stay();
     clearError(this.error, this.importing.fields);
     if (PICTURES.test(file.type)) this.importing.ask(file, true);
     else void this.upload(file);
@@ -99,19 +115,22 @@ export class Plans {
     clearError(this.error, this.importing.fields);
     // What was asked about the last file is not about this one.
     if (Object.keys(fields).length === 0) this.importing.close();
+    const turn = this.stay();
     const state = byId("plan-state");
     state.textContent = `Reading “${file.name}” …`;
     try {
       const plan = await api.uploadPlan(file, fields);
-      this.actions.picked();
-      this.take(plan);
-      if (isSure(plan)) this.importing.close();
-      else this.importing.ask(file, false);
+      if (turn === this.turn) {
+        this.actions.picked();
+        this.take(plan);
+        if (isSure(plan)) this.importing.close();
+        else this.importing.ask(file, false);
+      }
       await this.load();
       say(`“${plan.name}” is stored.`);
     } catch (error) {
       // What is shown would be taken for what was refused.
-      this.take(null);
+      if (turn === this.turn) this.take(null);
       this.importing.ask(file, true);
       showError(this.error, error, this.importing.fields);
     } finally {
@@ -126,14 +145,27 @@ export class Plans {
         if (this.current?.id !== plan.id) return;
         if (event.status === "preparing") this.actions.chosen({ ...this.current, progress: event.progress ?? 0 });
         else if (event.status === "deleted") this.take(null);
-        else void this.choose(plan.id).then(() => this.load());
+        else void this.renew(plan.id);
       }, own.signal);
     } catch (error) {
       if (!own.signal.aborted) showError(this.error, error);
     }
   }
 
+  /** Show how a plan is by now, unless another was asked for meanwhile. */
+  private async renew(id: string): Promise<void> {
+    const turn = this.turn;
+    try {
+      const plan = await api.plan(id);
+      if (turn === this.turn && this.current?.id === id) this.take(plan);
+    } catch (error) {
+      if (turn === this.turn) showError(this.error, error);
+    }
+    await this.load();
+  }
+
   private pick(id: string): void {
+    this.actions.begun();
     this.actions.picked();
     void this.choose(id);
   }

@@ -3,7 +3,8 @@
 import { api } from "./api";
 import { byId, h, show } from "./dom";
 import { clearError, showError } from "./notices";
-import type { Venue } from "./types";
+import type { PlanSummary, Venue } from "./types";
+import { VenueForm } from "./venue_form";
 
 export interface VenueActions {
   /** A venue was chosen, or none is any more. */
@@ -20,6 +21,7 @@ export class Venues {
   private readonly bar = byId("venue-bar");
   private readonly which = byId<HTMLSelectElement>("venue-plan");
   private readonly error = byId("plan-error");
+  private readonly form = new VenueForm((venue) => void this.onMade(venue));
   private found: Venue[] = [];
   private venue: Venue | null = null;
 
@@ -30,6 +32,17 @@ export class Venues {
 
   get current(): Venue | null {
     return this.venue;
+  }
+
+  /** Plans that are listed: what a venue can be made of. */
+  offer(plans: PlanSummary[]): void {
+    byId("venue-make").hidden = plans.length === 0;
+    this.form.offer(plans);
+  }
+
+  private async onMade(venue: Venue): Promise<void> {
+    byId<HTMLDetailsElement>("venue-make").open = false;
+    await Promise.all([this.load(""), this.choose(venue.id)]);
   }
 
   /** Fetch the list of those with this in their name. */

@@ -1,0 +1,81 @@
+/** Making a venue: a name, and plans with the levels they are on. */
+
+import { api } from "./api";
+import { button, byId, h, show } from "./dom";
+import { clearError, say, showError } from "./notices";
+import type { PlanSummary, Venue } from "./types";
+
+interface Row {
+  plan: PlanSummary;
+  level: HTMLInputElement;
+}
+
+const LONGEST_NAME = 200;
+
+export class VenueForm {
+  private readonly error = h("div", { class: "error", id: "venue-error", role: "alert", hidden: true });
+  private readonly name = h("input", { id: "venue-form-name", type: "text", maxlength: LONGEST_NAME, autocomplete: "off" });
+  private readonly which = h("select", { id: "venue-form-plan" });
+  private readonly rows = h("ul", { "aria-label": "Plans of the new venue" });
+  private readonly add = button("Add", () => this.take(), { id: "venue-form-add" });
+  private listed: PlanSummary[] = [];
+  private chosen: Row[] = [];
+
+  /** `made` is told of a venue that was just stored. */
+  constructor(private readonly made: (venue: Venue) => void) {
+    show(byId("venue-form"), this.error,
+      h("div", {}, h("label", { for: this.name.id }, "Name of the venue"), this.name),
+      h("div", { class: "row" }, h("label", { class: "sr", for: this.which.id }, "Plan to add"), this.which, this.add),
+      this.rows, button("Make the venue", () => void this.send(), { class: "primary", id: "venue-form-make" }));
+  }
+
+  /** Plans that may be added: those that are listed. */
+  offer(plans: PlanSummary[]): void {
+    this.listed = plans;
+    this.draw();
+  }
+
+  /** Add a plan, one level above the last. */
+  private take(): void {
+    const plan = this.listed.find(({ id }) => id === this.which.value);
+    if (plan === undefined) return;
+    const last = this.chosen.at(-1)?.level.valueAsNumber ?? -1;
+    const level = h("input", { type: "number", step: "any", value: Number.isNaN(last) ? 0 : last + 1, "aria-label": `Level of ${plan.name}` });
+    this.chosen.push({ plan, level });
+    this.draw();
+  }
+
+  private async send(): Promise<void> {
+    const fields = Object.fromEntries([["name", this.name] as const, ...this.chosen.map(({ level }, index) => [`plans.${index}.level`, level] as const)]);
+    clearError(this.error, fields);
+    try {
+      const missing = this.chosen.find(({ level }) => Number.isNaN(level.valueAsNumber));
+      if (this.name.value.trim() === "") throw new Error("Say what the venue is called.");
+      if (this.chosen.length === 0) throw new Error("Add the plans that are part of it.");
+      if (missing !== undefined) throw new Error(`Which level is ${missing.plan.name} on? A number: 0 is the ground floor.`);
+      const plans = this.chosen.map(({ plan, level }) => ({ floorplan_id: plan.id, level: level.valueAsNumber }));
+      const venue = await api.createVenue(this.name.value.trim(), plans);
+      this.name.value = "";
+      this.chosen = [];
+      this.draw();
+      say(`“${venue.name}” is stored.`);
+      this.made(venue);
+    } catch (error) {
+      showError(this.error, error, fields);
+    }
+  }
+
+  private draw(): void {
+    const left = this.listed.filter(({ id }) => !this.chosen.some(({ plan }) => plan.id === id));
+    show(this.which, ...left.map((plan) => h("option", { value: plan.id }, plan.name)));
+    this.which.disabled = this.add.disabled = left.length === 0;
+    show(this.rows, ...this.chosen.map(({ plan, level }, index) => h("li", {},
+      h("span", { class: "name" }, plan.name), h("span", { "aria-hidden": "true" }, "level"), level,
+      h("button", { type: "button", class: "remove", "aria-label": `Leave ${plan.name} out`, onclick: () => this.leaveOut(index) }, "×"))));
+  }
+
+  private leaveOut(index: number): void {
+    this.chosen.splice(index, 1);
+    this.draw();
+  }
+}
