@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from lalaloc_core.bundle import Bundle
 from lalaloc_core.cli.printing import print_json
 from lalaloc_core.errors import InvalidInputError
 
@@ -86,6 +87,10 @@ def add_commands(commands: Any) -> None:
     export.add_argument("--note", action="append", default=[], metavar="KEY=VALUE", help="recorded in the manifest")
     export.add_argument("--last", action="store_true", help="the last weights, instead of the best by validation")
     export.set_defaults(run=_export)
+
+    again = commands.add_parser("export-again", help="write the networks of a model bundle anew, of its own weights")
+    again.add_argument("bundle", type=Path, help="folder of the bundle")
+    again.set_defaults(run=_export_again)
 
 
 def _train(arguments: argparse.Namespace) -> None:
@@ -171,3 +176,11 @@ def _export(arguments: argparse.Namespace) -> None:
         arguments.folder, arguments.out, name=name, version=arguments.model_version, notes=notes, last=arguments.last
     )
     print_json({name: entry.bytes for name, entry in bundle.manifest.files.items()})
+
+
+def _export_again(arguments: argparse.Namespace) -> None:
+    from lalaloc_core.export.run import export_bundle_again
+
+    before = Bundle.open(arguments.bundle)
+    after = export_bundle_again(arguments.bundle)
+    print_json({"before": before.sha256, "after": after.sha256})

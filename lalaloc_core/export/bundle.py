@@ -89,6 +89,25 @@ def export_bundle(
     return _write_manifest(folder, manifest)
 
 
+def export_again(
+    bundle: Bundle, config: TrainConfig, layout_encoder: LayoutEncoder, image_encoder: ImageEncoder | None
+) -> Bundle:
+    """Write the ONNX networks of a bundle anew, of its own weights; nothing else of it changes but its digest.
+
+    Raises:
+        ExportError: as of `export_bundle`; the bundle is untouched.
+    """
+    with tempfile.TemporaryDirectory(prefix="lalaloc-export-") as scratch:
+        work = Path(scratch)
+        for module in filter(None, (layout_encoder, image_encoder)):
+            module.cpu().eval().requires_grad_(False)
+        parity = _export_networks(work, config, layout_encoder, image_encoder)
+        for path in work.iterdir():
+            (bundle.folder / path.name).write_bytes(path.read_bytes())
+    training = {**bundle.manifest.training, "parity_max_abs_difference": parity}
+    return _write_manifest(bundle.folder, dataclasses.replace(bundle.manifest, training=training))
+
+
 def _export_networks(
     work: Path, config: TrainConfig, layout_encoder: LayoutEncoder, image_encoder: ImageEncoder | None
 ) -> float:
@@ -153,6 +172,7 @@ def _export(path: Path, module: nn.Module, inputs: dict[str, Tensor], outputs: l
     assert program is not None
     model = program.model_proto
     _drop_traces(model)
+    _settle_types(model)
     _store_in_half(model)
     content = model.SerializeToString()
     path.write_bytes(content)
@@ -194,6 +214,18 @@ def _drop_traces(model: onnx.ModelProto) -> None:
         del part.metadata_props[:]
     del model.graph.metadata_props[:]
     del model.metadata_props[:]
+
+
+def _settle_types(model: onnx.ModelProto) -> None:
+    """Say of limits that are cast to the type of a map what that type is: single precision, as everywhere here.
+
+    Otherwise they depend on the map, and onnxruntime cannot clip it while it convolves, but does so afterwards.
+    """
+    for node in model.graph.node:
+        if node.op_type == "CastLike":
+            node.op_type = "Cast"
+            del node.input[1:]
+            node.attribute.append(onnx.helper.make_attribute("to", onnx.TensorProto.FLOAT))
 
 
 def _store_in_half(model: onnx.ModelProto) -> None:

@@ -5,13 +5,21 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from lalaloc_core.bundle import Bundle
-from lalaloc_core.export.bundle import export_bundle
+from lalaloc_core.bundle import IMAGE_WEIGHTS, LAYOUT_WEIGHTS, Bundle
+from lalaloc_core.export.bundle import export_again, export_bundle
+from lalaloc_core.nets import load_layout_encoder
 from lalaloc_core.training.best import best_path
 from lalaloc_core.training.checkpoint import Checkpoint
 from lalaloc_core.training.stages import build_image_encoder
 from lalaloc_core.training.trained import load_decoder_of, load_layout_encoder_of
-from lalaloc_core.training.warm_start import JOINT, check_same_networks, checkpoint_with, panoramas, totals
+from lalaloc_core.training.warm_start import (
+    JOINT,
+    check_same_networks,
+    checkpoint_with,
+    panoramas,
+    totals,
+    weights_of_bundle,
+)
 
 
 def export_run(
@@ -59,6 +67,25 @@ def export_run(
         version=version,
         training={**training, **(notes or {})},
     )
+
+
+def export_bundle_again(folder: Path) -> Bundle:
+    """Write the ONNX networks of the bundle in `folder` anew, where the exporter has learnt something since.
+
+    Raises:
+        BundleError: there is none, or it is damaged.
+        ExportError: the exported networks differ from torch; the bundle is untouched.
+    """
+    bundle = Bundle.open(folder)
+    bundle.check()
+    manifest, image_encoder = bundle.manifest, None
+    stage = "image" if IMAGE_WEIGHTS in manifest.files else "layout"
+    found = weights_of_bundle(bundle, stage)
+    if stage == "image":
+        image_encoder = build_image_encoder(found.checkpoint.config)
+        found.load_into({"image_encoder": image_encoder})
+    layout_encoder = load_layout_encoder(manifest.architecture, manifest.layout_config, bundle.read(LAYOUT_WEIGHTS))
+    return export_again(bundle, found.checkpoint.config, layout_encoder, image_encoder)
 
 
 def _summary(checkpoint: Checkpoint, folder: Path, *, last: bool) -> dict[str, Any]:

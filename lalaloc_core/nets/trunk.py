@@ -109,13 +109,24 @@ class _PadAround(torch.autograd.Function):
         return inner, None, None
 
 
-def _convolve(x: Tensor, conv: nn.Conv2d, norm: _FrozenNorm) -> Tensor:
-    """Convolution and normalisation, of "same" size as TensorFlow pads it, but around the horizon in azimuth."""
-    weight, bias = norm.folded(conv.weight)
+def _around(conv: nn.Conv2d) -> tuple[int, int]:
+    """How much a convolution needs on both ends to keep its map's size, uneven as TensorFlow pads it."""
     total = conv.kernel_size[0] - conv.stride[0]
-    before, after = total // 2, total - total // 2
-    if total:
-        x = _PadAround.apply(x, before, after) if x.requires_grad else _padded_around(x, before, after)
+    return total // 2, total - total // 2
+
+
+def _pad_around(x: Tensor, conv: nn.Conv2d) -> Tensor:
+    """Give a convolution the azimuths that it needs on both ends."""
+    before, after = _around(conv)
+    if not before + after:
+        return x
+    return _PadAround.apply(x, before, after) if x.requires_grad else _padded_around(x, before, after)
+
+
+def _convolve(x: Tensor, conv: nn.Conv2d, norm: _FrozenNorm) -> Tensor:
+    """Convolution and normalisation of a map that was padded around the horizon; over height zeros are padded."""
+    weight, bias = norm.folded(conv.weight)
+    before, after = _around(conv)
     if before != after:
         x = functional.pad(x, (0, 0, before, after))
     padding = (before if before == after else 0, 0)
@@ -143,9 +154,10 @@ class _Block(nn.Module):
         self.skips = stride == 1 and inputs == outputs
 
     def forward(self, x: Float[Tensor, "b i h w"]) -> Float[Tensor, "b o g v"]:
-        inner = x
+        # Before it is expanded: that goes pixel by pixel, and the map is a sixth as deep.
+        inner = _pad_around(x, self._depthwise_conv)
         if self.expands:
-            inner = functional.relu6(_convolve(x, self._expand_conv, self._bn0))
+            inner = functional.relu6(_convolve(inner, self._expand_conv, self._bn0))
         inner = functional.relu6(_convolve(inner, self._depthwise_conv, self._bn1))
         inner = _convolve(inner, self._project_conv, self._bn2)
         return x + inner if self.skips else inner
@@ -205,7 +217,7 @@ class Trunk(nn.Module):
 
     def forward(self, image: Float[Tensor, "b 3 h w"], styles: StyleMixing | None = None) -> list[Tensor]:
         """Maps (b, c, h / stride, w / stride) by the strides of `TAP_STRIDES`."""
-        x = functional.relu6(_convolve(image, self._conv_stem, self._bn0))
+        x = functional.relu6(_convolve(_pad_around(image, self._conv_stem), self._conv_stem, self._bn0))
         taps, tapped = [], {self._ends[stage] for stage in _TAPPED}
         styled = {self._ends[stage] for stage in _STYLED} if styles is not None else set()
         for number, block in enumerate(self._blocks, start=1):

@@ -55,12 +55,12 @@ def load_warm_start(folder: Path, stage: str, config: TrainConfig) -> WarmStart:
         BundleError: the bundle is damaged.
     """
     is_bundle = (folder / MANIFEST_NAME).exists()
-    found = _of_bundle(Bundle.open(folder), stage) if is_bundle else _of_run(folder, stage)
+    found = weights_of_bundle(Bundle.open(folder), stage) if is_bundle else _of_run(folder, stage)
     check_same_networks(stage, config, found.checkpoint.config, str(folder))
     return found
 
 
-def _of_bundle(bundle: Bundle, stage: str) -> WarmStart:
+def weights_of_bundle(bundle: Bundle, stage: str) -> WarmStart:
     """Of what a bundle was trained with only its networks and totals are taken: older manifests know fewer settings."""
     manifest = bundle.manifest
     weights = {module: _state(bundle.read(file)) for module, file in _MODULES[stage].items() if file in manifest.files}

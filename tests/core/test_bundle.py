@@ -32,6 +32,7 @@ from lalaloc_core.bundle import (
 from lalaloc_core.errors import BundleError, ExportError
 from lalaloc_core.export import bundle as export
 from lalaloc_core.export.bundle import PARITY_TOLERANCE, export_bundle
+from lalaloc_core.export.run import export_bundle_again
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.optimise import LatentPoseOptimiser
@@ -254,6 +255,36 @@ class TestIdentity:
         assert replaced.sha256 != opened_bundle.sha256
         assert Bundle.open(copied).sha256 == replaced.sha256
         Encoders(replaced)
+
+    @pytest.mark.parametrize("architecture", ["ring", "trunk"])
+    def test_networks_are_written_anew_of_the_weights_that_a_bundle_has(
+        self, tmp_path: Path, architecture: str
+    ) -> None:
+        before = exported(tmp_path, PRESETS["tiny" if architecture == "ring" else "tiny-trunk"])
+        manifest, image = (
+            Bundle.open(tmp_path).manifest,
+            np.random.default_rng(0).integers(0, 256, (32, 64, 3), dtype=np.uint8),
+        )
+        told = Encoders(before, threads=1).query(image, None, CameraHeight(1.5))
+        for name in (IMAGE_ONNX, LAYOUT_ONNX, HEAD_ONNX):
+            # As an exporter of before would have written it.
+            model = onnx.load_from_string(before.read(name))
+            model.producer_name = "older"
+            (tmp_path / name).write_bytes(model.SerializeToString())
+        older = write_manifest(tmp_path, manifest)
+        after = export_bundle_again(tmp_path)
+        assert after.sha256 == Bundle.open(tmp_path).sha256 != older.sha256
+        again = Encoders(after, threads=1).query(image, None, CameraHeight(1.5))
+        np.testing.assert_allclose(again.latents, told.latents, atol=1e-6)
+        assert after.manifest.image_config == manifest.image_config
+        assert after.manifest.opening_prior == manifest.opening_prior
+        for name in set(manifest.files) - {IMAGE_ONNX, LAYOUT_ONNX, HEAD_ONNX}:
+            assert after.manifest.files[name] == manifest.files[name]
+
+    def test_networks_are_not_written_anew_of_damaged_weights(self, copied: Path) -> None:
+        (copied / LAYOUT_WEIGHTS).write_bytes(b"damaged")
+        with pytest.raises(BundleError, match=LAYOUT_WEIGHTS):
+            export_bundle_again(copied)
 
 
 class TestConfidence:

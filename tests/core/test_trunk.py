@@ -9,11 +9,12 @@ import math
 from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
 import torch
 from torch.nn import functional
 
-from lalaloc_core.bundle import MANIFEST_NAME, Bundle
+from lalaloc_core.bundle import IMAGE_ONNX, MANIFEST_NAME, Bundle
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.errors import BundleError, ConfigError
 from lalaloc_core.export.bundle import export_bundle
@@ -26,6 +27,8 @@ from lalaloc_core.nets.trunk import (
     StyleMixing,
     Trunk,
     TrunkConfig,
+    _Block,
+    _FrozenNorm,
     _PadAround,
     load_pretrained,
 )
@@ -55,6 +58,14 @@ def lively(module: torch.nn.Module) -> torch.nn.Module:
         if value.is_floating_point() and value.ndim == 1:
             value.uniform_(0.5, 1.5, generator=generator) if "bias" not in name else value.normal_(generator=generator)
     return module.eval()
+
+
+def _plainly(x: torch.Tensor, conv: torch.nn.Conv2d, norm: _FrozenNorm) -> torch.Tensor:
+    """A convolution that pads right where it needs it: circular in azimuth, zeros in height; then batch norm."""
+    total = conv.kernel_size[0] - conv.stride[0]
+    before, after = total // 2, total - total // 2
+    x = functional.pad(functional.pad(x, (before, after, 0, 0), mode="circular"), (0, 0, before, after))
+    return norm(functional.conv2d(x, conv.weight, stride=conv.stride, groups=conv.groups))
 
 
 def pictures(count: int, config: TrunkEncoderConfig = WIDE) -> torch.Tensor:
@@ -131,6 +142,22 @@ class TestTrunk:
     def test_the_padding_has_the_right_derivative(self, before: int, after: int) -> None:
         x = torch.randn(2, 3, 4, 8, dtype=torch.double, requires_grad=True)
         assert torch.autograd.gradcheck(lambda t: _PadAround.apply(t, before, after), x)
+
+    def test_padding_before_a_map_is_expanded_is_padding_it_afterwards(self) -> None:
+        trunk = lively(Trunk(WIDE.trunk))
+        x = torch.rand(2, 3, 16, 32)
+        with torch.no_grad():
+            maps, x = trunk(x), functional.relu6(_plainly(x, trunk._conv_stem, trunk._bn0))
+            found = []
+            for block in trunk._blocks:
+                assert isinstance(block, _Block)
+                inner = functional.relu6(_plainly(x, block._expand_conv, block._bn0)) if block.expands else x
+                inner = functional.relu6(_plainly(inner, block._depthwise_conv, block._bn1))
+                inner = _plainly(inner, block._project_conv, block._bn2)
+                x = x + inner if block.skips else inner
+                found.append(x)
+        for expected in maps:
+            assert any(one.shape == expected.shape and torch.allclose(one, expected, atol=1e-4) for one in found)
 
     def test_a_style_is_the_mean_and_spread_of_each_channel(self) -> None:
         x = torch.randn(3, 4, 5, 6, generator=torch.Generator().manual_seed(1)) * 3.0 + 2.0
@@ -264,6 +291,17 @@ def panorama() -> np.ndarray:
 
 
 class TestBundle:
+    def test_maps_are_clipped_while_they_are_convolved(self, bundle: Bundle) -> None:
+        # onnxruntime does that where the limits are constants.
+        model = onnx.load_from_string(bundle.read(IMAGE_ONNX))
+        made_by = {name: node for node in model.graph.node for name in node.output}
+        clips = [node for node in model.graph.node if node.op_type == "Clip"]
+        assert clips
+        for clip in clips:
+            for limit in clip.input[1:]:
+                node = made_by[limit]
+                assert node.op_type == "Constant" or made_by[node.input[0]].op_type == "Constant"
+
     def test_the_manifest_says_what_is_told_apart_and_which_shares_it_presumes(self, bundle: Bundle) -> None:
         manifest = bundle.manifest
         assert (manifest.architecture, manifest.ring_sectors) == ("trunk", TINY.ring.sectors)
