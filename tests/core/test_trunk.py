@@ -28,7 +28,6 @@ from lalaloc_core.nets.trunk import (
     Trunk,
     TrunkConfig,
     _Block,
-    _FrozenNorm,
     _PadAround,
     load_pretrained,
 )
@@ -60,12 +59,14 @@ def lively(module: torch.nn.Module) -> torch.nn.Module:
     return module.eval()
 
 
-def _plainly(x: torch.Tensor, conv: torch.nn.Conv2d, norm: _FrozenNorm) -> torch.Tensor:
+def _plainly(x: torch.Tensor, part: torch.nn.Module, convolution: str, norm: str) -> torch.Tensor:
     """A convolution that pads right where it needs it: circular in azimuth, zeros in height; then batch norm."""
+    conv = part.get_submodule(convolution)
+    assert isinstance(conv, torch.nn.Conv2d)
     total = conv.kernel_size[0] - conv.stride[0]
     before, after = total // 2, total - total // 2
     x = functional.pad(functional.pad(x, (before, after, 0, 0), mode="circular"), (0, 0, before, after))
-    return norm(functional.conv2d(x, conv.weight, stride=conv.stride, groups=conv.groups))
+    return part.get_submodule(norm)(functional.conv2d(x, conv.weight, stride=conv.stride, groups=conv.groups))
 
 
 def pictures(count: int, config: TrunkEncoderConfig = WIDE) -> torch.Tensor:
@@ -145,15 +146,15 @@ class TestTrunk:
 
     def test_padding_before_a_map_is_expanded_is_padding_it_afterwards(self) -> None:
         trunk = lively(Trunk(WIDE.trunk))
-        x = torch.rand(2, 3, 16, 32)
+        x = torch.rand(2, 3, 32, 128)
         with torch.no_grad():
-            maps, x = trunk(x), functional.relu6(_plainly(x, trunk._conv_stem, trunk._bn0))
+            maps, x = trunk(x), functional.relu6(_plainly(x, trunk, "_conv_stem", "_bn0"))
             found = []
-            for block in trunk._blocks:
+            for block in trunk.get_submodule("_blocks").children():
                 assert isinstance(block, _Block)
-                inner = functional.relu6(_plainly(x, block._expand_conv, block._bn0)) if block.expands else x
-                inner = functional.relu6(_plainly(inner, block._depthwise_conv, block._bn1))
-                inner = _plainly(inner, block._project_conv, block._bn2)
+                inner = functional.relu6(_plainly(x, block, "_expand_conv", "_bn0")) if block.expands else x
+                inner = functional.relu6(_plainly(inner, block, "_depthwise_conv", "_bn1"))
+                inner = _plainly(inner, block, "_project_conv", "_bn2")
                 x = x + inner if block.skips else inner
                 found.append(x)
         for expected in maps:
