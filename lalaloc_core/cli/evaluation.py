@@ -14,7 +14,7 @@ from typing import Any
 from lalaloc_core.bundle import default_bundle
 from lalaloc_core.cli.arguments import count, positive, processes
 from lalaloc_core.cli.printing import print_json, print_table
-from lalaloc_core.data.dataset import SPLITS
+from lalaloc_core.data.dataset import DATASET_FORMATS, SPLITS
 from lalaloc_core.errors import InvalidInputError
 
 # So many homes that calibration asks with their own photographs for one that it asks with those of others.
@@ -90,6 +90,9 @@ def add_commands(commands: Any) -> None:
 def _data_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--data", type=Path, metavar="DIR", help="a data set; default: generated homes")
     parser.add_argument(
+        "--dataset", choices=tuple(DATASET_FORMATS), help="format of the data set; default: found out by its files"
+    )
+    parser.add_argument(
         "--generator",
         choices=("synth", "unfamiliar"),
         default="synth",
@@ -112,6 +115,8 @@ def _evaluate(arguments: argparse.Namespace) -> None:
 
     method, panorama = arguments.method, arguments.kind == "panorama"
     bundle = None if method in ("oracle", "icp") else arguments.bundle
+    if arguments.data is None and arguments.dataset is not None:
+        raise InvalidInputError(f"--dataset {arguments.dataset} is the format of --data, which is missing")
     if arguments.data is not None and arguments.generator != "synth":
         raise InvalidInputError(f"--generator {arguments.generator} is for generated homes, not for --data")
     if arguments.refine is not None and method != "lalaloc":
@@ -124,6 +129,7 @@ def _evaluate(arguments: argparse.Namespace) -> None:
         split=arguments.split,
         settings={} if arguments.refine is None else {"refine": arguments.refine},
         data=None if arguments.data is None else str(arguments.data),
+        data_format=arguments.dataset,
         generated=_asked_homes(arguments) if arguments.data is None else None,
         heading_known=arguments.heading == "known",
         grid_step_m=arguments.grid_step,

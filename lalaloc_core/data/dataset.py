@@ -18,6 +18,13 @@ from lalaloc_core.floorplan import FloorPlan
 
 Split = Literal["train", "validation", "test"]
 SPLITS: tuple[Split, ...] = get_args(Split)
+# What each format is called on the command line and in words.
+DATASET_FORMATS = {
+    "structured3d": "Structured3D",
+    "zind": "ZInD",
+    "own": "own data",
+    "annotated": "annotated photographs",
+}
 
 
 @dataclass(frozen=True, order=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from lalaloc_core.data.annotated import AnnotatedPhotographs, annotation_files
-from lalaloc_core.data.dataset import Dataset
+from lalaloc_core.data.dataset import DATASET_FORMATS, Dataset
 from lalaloc_core.data.folder import PLAN_FILE, OwnData
 from lalaloc_core.data.structured3d import Structured3D
 from lalaloc_core.data.zind import DATA_FILE, PARTITION_FILE, Zind
@@ -14,11 +14,15 @@ from lalaloc_core.errors import DatasetError
 _STRUCTURED3D_SCENES = "scene_" + 5 * "[0-9]"
 
 
-def open_dataset(root: Path) -> Dataset:
+def open_dataset(root: Path, dataset_format: str | None = None) -> Dataset:
     """The data set that a folder holds.
 
+    Args:
+        dataset_format: which of `dataset.DATASET_FORMATS` to read; None finds it out.
+
     Raises:
-        DatasetError: there is no such folder, it holds none of the known formats, or more than one.
+        DatasetError: there is no such folder, it holds none of the known formats or not the one that is asked for, or
+            it holds more than one and none is asked for.
     """
     if not root.exists():
         raise DatasetError("there is no such folder", path=root)
@@ -33,6 +37,11 @@ def open_dataset(root: Path) -> Dataset:
         found["own data"] = OwnData(root)
     if annotation_files(root):
         found["annotated photographs"] = AnnotatedPhotographs(root)
+    if dataset_format is not None:
+        wanted = DATASET_FORMATS[dataset_format]
+        if wanted not in found:
+            raise DatasetError(f"no {wanted} here; found: {', '.join(found) or 'nothing known'}", path=root)
+        return found[wanted]
     if len(found) > 1:
         raise DatasetError(f"the folder holds several data sets: {', '.join(found)}", path=root)
     if not found:

@@ -83,7 +83,7 @@ def build_dataset(info: RunInfo) -> Dataset:
         DatasetError: its folder is gone or holds no data set.
     """
     if info.data is not None:
-        return open_dataset(Path(info.data))
+        return open_dataset(Path(info.data), info.data_format)
     arguments: dict[str, Any] = dict(info.generated or {})
     generator = arguments.pop("generator", "synth")
     if generator == "unfamiliar":

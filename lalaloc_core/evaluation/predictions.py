@@ -109,6 +109,7 @@ class RunInfo:
         settings: the method's own settings, plain data.
         dataset: what results are to be called, such as "Structured3D".
         data: folder of the data set as it was given; None for generated homes.
+        data_format: which of `DATASET_FORMATS` that is; None where it is found out.
         generated: arguments of the generator where `data` is None.
         furniture, lighting: the appearance of the photographs; None where the data set has none.
         limit: at most so many queries; None for all.
@@ -126,6 +127,7 @@ class RunInfo:
     split: Split
     settings: dict[str, Any] = field(default_factory=dict)
     data: str | None = None
+    data_format: str | None = None
     generated: dict[str, Any] | None = None
     furniture: str | None = None
     lighting: str | None = None

@@ -207,6 +207,16 @@ class TestOpening:
         assert isinstance(open_dataset(tmp_path / "sets" / "partition"), Zind)
         assert isinstance(open_dataset(root), OwnData)
 
+    def test_of_several_the_one_that_is_named_is_read(self, tmp_path: Path) -> None:
+        write_scene(tmp_path, "home")
+        (tmp_path / "zind_partition.json").write_text("{}")
+        with pytest.raises(DatasetError, match="several data sets: ZInD, own data"):
+            open_dataset(tmp_path)
+        assert isinstance(open_dataset(tmp_path, "zind"), Zind)
+        assert isinstance(open_dataset(tmp_path, "own"), OwnData)
+        with pytest.raises(DatasetError, match="no Structured3D here; found: ZInD, own data"):
+            open_dataset(tmp_path, "structured3d")
+
     def test_own_scenes_may_have_any_name(self, tmp_path: Path) -> None:
         write_scene(tmp_path, "scene_00000")
         assert isinstance(open_dataset(tmp_path), OwnData)

@@ -5,6 +5,8 @@ import { degrees } from "./layout";
 import { type Box, unitOf } from "./plan_drawing";
 import type { Answer } from "./types";
 
+// Rivals that are less probable are drawn faintly.
+const LEAST_RIVAL = 0.001;
 // 95 % of a two-dimensional normal distribution lie within so many standard deviations.
 const WITHIN_95 = Math.sqrt(5.991);
 
@@ -26,7 +28,8 @@ export function rivals(answer: Answer, planId: string, box: Box, look: (index: n
   return s("g", { class: "rivals" }, ...answer.candidates.slice(1).map((candidate, index) => {
     if (candidate.floorplan_id !== planId) return s("g");
     const { x_m, y_m } = candidate.position;
-    return s("g", { class: "rival", transform: `translate(${x_m} ${-y_m})`, onclick: () => look(index + 1) },
+    const faint = candidate.probability !== null && candidate.probability < LEAST_RIVAL ? " faint" : "";
+    return s("g", { class: `rival${faint}`, transform: `translate(${x_m} ${-y_m})`, onclick: () => look(index + 1) },
       s("circle", { r: 1.5 * unit }), s("text", { "font-size": 1.9 * unit, y: 0.68 * unit }, index + 2));
   }));
 }
