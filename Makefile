@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo serve test lint openapi docs web clean
+.PHONY: help setup demo serve test ray lint openapi docs web clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -28,6 +28,12 @@ serve: $(STAMP) ## run the service at http://127.0.0.1:8000 (PORT=8001: there) w
 test: lint ## lint, then the tests
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal --ignore=tests/service --ignore=tests/client --ignore=tests/web
 	$(BIN)/python -m pytest tests/service tests/client tests/web
+
+# A cluster for each file: what one of them leaves behind is not the next one's.
+ON_RAY := floorplans localise resources idempotency events venues venue_queries sequence
+ray: $(STAMP) ## the tests of Ray, and those of the API on it (some 20 minutes)
+	$(BIN)/python -m pytest -m "slow or not slow" tests/service/test_on_ray.py
+	for file in $(ON_RAY); do TEST_DATABASE=ray $(BIN)/python -m pytest tests/service/test_$$file.py || exit 1; done
 
 lint: $(STAMP) ## ruff and pyright
 	$(BIN)/ruff check

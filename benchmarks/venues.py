@@ -1,11 +1,16 @@
 """Which of very many plans: how fast the index of prototypes answers, and how often it finds what brute force finds.
 
-Generated homes stand in for real ones. Their prototypes come from the renderer, without latents; queries are
-photographs of some of the homes, encoded by the model. Brute force compares all prototypes under all hypotheses; it is
-asked where `--exact` allows for it, as it takes minutes with many plans. Times are of the processor, in one thread.
+Generated homes stand in for real ones, with variants of each where more plans are asked for: drawn out along each axis
+by up to a tenth, with other ceilings, turned by quarters and mirrored by chance. Their prototypes come from the
+renderer, without latents; those of variants are made of these, which is exact but for what lies between two azimuths.
+Queries are photographs of some of the homes, encoded by the model.
 
-    .venv/bin/python -m benchmarks.venues --plans 2000 --queries 20 --exact 10000000000
-    .venv/bin/python -m benchmarks.venues --plans 10000 --repeat 10 --queries 20 --exact 0
+Brute force compares all prototypes under all hypotheses, where `--exact` allows for so many pairs: it takes half a
+minute for every 100 million. Where it does not, all of them are compared by codes, and the best million as they are.
+Times are of the processor, in one thread.
+
+    .venv/bin/python -m benchmarks.venues --plans 2000 --queries 20 --exact 1e9
+    .venv/bin/python -m benchmarks.venues --plans 2500 --repeat 40 --queries 12 --exact 0
 """
 
 from __future__ import annotations
@@ -24,10 +29,10 @@ from lalaloc_core.data.synthetic.generated import SPLIT_NUMBERS, RenderedPhotogr
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.evidence import EvidenceConfig
-from lalaloc_core.localise.plan_index import COMPARED, PlanIndex
+from lalaloc_core.localise.plan_index import COMPARED, SCANNED, PlanIndex
 from lalaloc_core.localise.poses import Query
 from lalaloc_core.localise.prototype_cells import shipped_cells
-from lalaloc_core.localise.prototypes import prototypes_of
+from lalaloc_core.localise.prototypes import AZIMUTHS, packed_openings, prototypes_of, unpacked_openings
 from lalaloc_core.synth.shots import sample_shots
 from lalaloc_core.synth.splits import home_of
 from scripts.make_prototype_cells import grid_without_latents
@@ -35,6 +40,10 @@ from service.query.prototype_file import BlockKey, PrototypeFile
 
 _TEST = SPLIT_NUMBERS["test"]
 _FIRST = 20
+# Variants of plans are longer and wider by at most so much.
+_DRAWN_OUT = 0.1
+# Pairs that are compared as they are where brute force compares all by codes.
+_MOST_COMPARED = 1_000_000
 _STEP_M = 0.5
 
 
@@ -52,15 +61,40 @@ def prototypes(plans: int, seed: int) -> list[np.ndarray]:
 
 
 def repeated(blocks: list[np.ndarray], times: int, rng: np.random.Generator) -> list[np.ndarray]:
-    """Each of some plans several times: as it is, and a little larger or smaller, in the cells that it was in."""
+    """Each of some plans several times: as it is, and variants of it."""
     found = list(blocks)
-    for _ in range(times - 1):
-        for block in blocks:
-            rows = block.copy()
-            rows["log_profile"] += rng.normal(0.0, 0.05)
-            rows["ceiling_m"] += rng.normal(0.0, 0.1)
-            found.append(rows)
+    for number in range(1, times):
+        variants = [_variant(block, rng) for block in blocks]
+        # Together, which is faster.
+        cell = shipped_cells().sort(np.concatenate(variants))
+        ends = np.cumsum([len(block) for block in variants])
+        for block, own in zip(variants, np.split(cell, ends[:-1]), strict=True):
+            block["cell"] = own
+        found += variants
+        if number % 5 == 4:
+            print(f"  {len(found)} plans", flush=True)
     return found
+
+
+def _variant(block: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Prototypes of a plan that was drawn out along both axes, turned by quarters and mirrored by chance."""
+    rows, (x, y) = block.copy(), 1.0 + rng.uniform(-_DRAWN_OUT, _DRAWN_OUT, 2)
+    azimuth = 2.0 * np.pi / AZIMUTHS * np.arange(AZIMUTHS)
+    # What is seen at an azimuth was seen at another one before, at another distance.
+    before = np.arctan2(np.sin(azimuth) / y, np.cos(azimuth) / x)
+    farther = -0.5 * np.log(np.square(np.cos(azimuth) / x) + np.square(np.sin(azimuth) / y))
+    place = before / (2.0 * np.pi) * AZIMUTHS % AZIMUTHS
+    lower, share = place.astype(int), place % 1.0
+    log_profile = block["log_profile"].astype(np.float32)
+    between = (1.0 - share) * log_profile[:, lower % AZIMUTHS] + share * log_profile[:, (lower + 1) % AZIMUTHS]
+    order = np.roll(np.arange(AZIMUTHS), rng.integers(4) * AZIMUTHS // 4)
+    order = -order % AZIMUTHS if rng.random() < 0.5 else order
+    rows["log_profile"] = (between + farther)[:, order]
+    kind = unpacked_openings(block["openings"])[:, np.rint(place).astype(int) % AZIMUTHS]
+    rows["openings"] = packed_openings(kind[:, order])
+    rows["log_area"] += np.log(x * y)
+    rows["ceiling_m"] += rng.normal(0.0, 0.1)
+    return rows
 
 
 def queries(bundle: Bundle, homes: list[int], seed: int) -> Iterator[tuple[int, str, Query]]:
@@ -77,6 +111,10 @@ def queries(bundle: Bundle, homes: list[int], seed: int) -> Iterator[tuple[int, 
         yield number, "heading and height unknown", encoders.query(image, None, unknown)
 
 
+def _best(mass: np.ndarray) -> np.ndarray:
+    return np.argsort(-mass, kind="stable")
+
+
 def main() -> None:
     """Print times and recall."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -86,7 +124,10 @@ def main() -> None:
         "--repeat", type=int, default=1, help="so many variants of each plan, whose homes are generated once"
     )
     parser.add_argument("--queries", type=int, default=20)
-    parser.add_argument("--compared", type=int, default=COMPARED, help="pairs that the index compares")
+    parser.add_argument("--compared", type=int, default=COMPARED, help="pairs that the index compares as they are")
+    parser.add_argument(
+        "--scanned", type=float, nargs="+", default=[SCANNED], help="pairs that the index compares by codes"
+    )
     parser.add_argument("--exact", type=float, default=1e9, help="most pairs that brute force compares for a query")
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
@@ -109,26 +150,30 @@ def main() -> None:
         first = np.array([found[key][0] for key in keys])
         index = PlanIndex.of(file.rows(), first, count, step_m=_STEP_M, cells=cells)
         built = time.process_time()
+        index.prepare()
         print(
-            f"written in {written - begin:.2f} s, opened in {opened - written:.2f} s, index in {built - opened:.2f} s"
+            f"written in {written - begin:.2f} s, opened in {opened - written:.2f} s, index in {built - opened:.2f} s, "
+            f"its codes in {time.process_time() - built:.2f} s, {index.nbytes / 1e6:.0f} MB",
+            flush=True,
         )
         homes = np.linspace(0, asked.plans - 1, asked.queries).astype(int).tolist()
         for number, name, query in queries(bundle, homes, asked.seed):
-            begin, began = time.process_time(), time.perf_counter()
-            mass = index.log_masses(query, weights, config, compared=asked.compared)
-            tally = told[name]
-            tally["ms"].append(1e3 * (time.process_time() - begin))
-            tally["ms by the clock"].append(1e3 * (time.perf_counter() - began))
-            best = np.argsort(-mass, kind="stable")
-            tally["right plan in the first 20"].append(number in best[:_FIRST])
-            tally["right plan in the first 128"].append(number in best[:128])
-            pairs = int(count.sum()) * min(len(query.roll), 32) * len(query.camera_height.offsets)
-            if pairs <= asked.exact:
-                exact = index.log_masses(query, weights, config, compared=10**15)
-                brute = np.argsort(-exact, kind="stable")
-                tally["recall of 20"].append(len(np.intersect1d(best[:_FIRST], brute[:_FIRST])) / _FIRST)
-                tally["first in the first 20"].append(brute[0] in best[:_FIRST])
-                tally["brute force: right plan in the first 20"].append(number in brute[:_FIRST])
+            pairs = int(count.sum()) * min(len(query.roll), AZIMUTHS) * len(query.camera_height.offsets)
+            how = "brute force" if pairs <= asked.exact else "all codes"
+            compared = 10**15 if pairs <= asked.exact else _MOST_COMPARED
+            brute = _best(index.log_masses(query, weights, config, compared=compared, scanned=10**15))
+            for scanned in asked.scanned:
+                begin, began = time.process_time(), time.perf_counter()
+                mass = index.log_masses(query, weights, config, compared=asked.compared, scanned=int(scanned))
+                tally = told[f"{name}, {scanned:,.0f} pairs by codes"]
+                tally["ms"].append(1e3 * (time.process_time() - begin))
+                tally["ms by the clock"].append(1e3 * (time.perf_counter() - began))
+                best = _best(mass)
+                tally["right plan in the first 20"].append(number in best[:_FIRST])
+                tally["right plan in the first 128"].append(number in best[:128])
+                tally[f"{how}: recall of 20"].append(len(np.intersect1d(best[:_FIRST], brute[:_FIRST])) / _FIRST)
+                tally[f"{how}: its first in the first 20"].append(brute[0] in best[:_FIRST])
+                tally[f"{how}: right plan in the first 20"].append(number in brute[:_FIRST])
         file.close()
     for name, tally in told.items():
         print(f"{name}, n = {asked.queries}")

@@ -229,13 +229,13 @@ class Settings(BaseSettings):
     venue_cache_bytes: int = Field(
         default=128 * 2**20,
         ge=0,
-        description="Memory for indices of large venues: 8 bytes per prototype, some 1.5 kB per plan of a home.",
+        description="Memory for indices of large venues: 45 bytes per prototype, some 7.5 kB per plan of a home.",
     )
     venue_file_bytes: int = Field(
         default=2 * 2**30,
         ge=0,
         description="Prototypes of floor plans in a file in `LALALOC_DATA_DIR`, which large venues are searched by: 82 "
-        "bytes each, some 9 kB per floor plan of a home. It can be deleted while the service is stopped.",
+        "bytes each, some 14 kB per floor plan of a home. It can be deleted while the service is stopped.",
     )
     max_grids_per_plan: Annotated[int, Field(ge=2)] = Field(
         default=8, description="Stored latent grids (camera heights) per plan; the oldest on-demand one makes room."

@@ -1,34 +1,42 @@
-"""Which of very many plans a panorama may have been taken in: an inverted file of their prototypes.
+"""Which of very many plans a panorama may have been taken in: an index of their prototypes.
 
-Prototypes are sorted into cells (`prototype_cells`). A query compares the *cells* under all hypotheses of the heading
-and the camera's height, and then, from the best triple of a cell and two hypotheses on, the prototypes that lie in it,
-each under these hypotheses alone, until it has compared so many pairs. What is not compared weighs nothing. Prototypes
-that are equal lie in one cell, and a cell is compared whole or not at all: copies of a plan have equal masses.
+A query goes through three stages, each of which leaves fewer pairs of a prototype and hypotheses of the heading and the
+camera's height to the next one:
 
-Where there are no more pairs than that, all of them are compared, and the masses are exact.
+1. The prototypes lie in *cells* (`prototype_cells`), an inverted file. Where there are very many, those cells are
+   looked into, each under those hypotheses, that cost least in their middle.
+2. What lies in them is compared by codes of 25 bytes (`prototype_codes`).
+3. Those that cost least by their codes are compared as they are (`prototype_costs`). What is not weighs nothing.
+
+Prototypes that are equal are compared once, for all plans that have them: copies of a plan have equal masses. Where
+there are so few pairs that all of them can be compared in the last stage, they are, and the masses are exact.
 """
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int, UInt64
 
 from lalaloc_core.bundle import EvidenceModel
 from lalaloc_core.localise.evidence import EvidenceConfig
 from lalaloc_core.localise.poses import Query
-from lalaloc_core.localise.prototype_cells import FAMILIES, Cells
+from lalaloc_core.localise.prototype_cells import FAMILIES, Cells, claims_of
+from lalaloc_core.localise.prototype_codes import BYTES_OF_ONE, CodeScan, codes_of, tables_of
 from lalaloc_core.localise.prototype_costs import PrototypeCosts
 from lalaloc_core.localise.prototypes import ROW, Prototypes, joined
 
-# Pairs of a prototype and hypotheses that a query compares.
-COMPARED = 150_000
-# Pairs that are compared at a time, to bound memory; those of one cell are not divided between two queries.
+# Pairs of a prototype and hypotheses that a query compares by codes, and of these as they are.
+SCANNED, COMPARED = 40_000_000, 20_000
+# Candidates for the last stage, of each hypothesis: so many times its share, as one may have more of the best.
+_MORE = 6
+# Pairs that are compared at a time, and rows that are read at a time, to bound memory.
 _AT_ONCE = 65_536
+# A cell is told by the upper bits of a key by which prototypes are sorted, what they say by the lower ones.
+_CELL_SHIFT = np.uint64(48)
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +48,9 @@ class PlanIndex:
         step_m: of the grids that they were taken from.
         cells: that they were sorted into.
         plans: how many plans there are.
-        member: (n,) where in `rows` the prototypes are, by their cells.
-        plan: (n,) which plan each of these is of.
+        member: (u,) where in `rows` the prototypes are, by their cells; of those that are equal, the first one.
+        plan: (n,) the plans that have each of these.
+        owners: (u + 1,) where in `plan` those of each begin.
         first: (v + 1,) where the members of each cell begin.
     """
 
@@ -49,9 +58,10 @@ class PlanIndex:
     step_m: float
     cells: Cells
     plans: int
-    member: Int[np.ndarray, "n"]
+    member: Int[np.ndarray, "u"]
     plan: Int[np.ndarray, "n"]
-    first: Int[np.ndarray, "w"]
+    owners: Int[np.ndarray, "w"]
+    first: Int[np.ndarray, "v"]
 
     @classmethod
     def of(
@@ -64,16 +74,28 @@ class PlanIndex:
         cells: Cells,
     ) -> PlanIndex:
         """An index of the plans whose prototypes are `count` rows from `begin` on."""
-        total = int(count.sum())
         plan = np.repeat(np.arange(len(count), dtype=np.int32), count)
         ends = np.cumsum(count)
-        member = np.arange(total) + np.repeat(begin - (ends - count), count)
-        cell = np.asarray(rows["cell"])[member]
+        member = np.arange(len(plan)) + np.repeat(begin - (ends - count), count)
+        key = _keys(rows, member)
         # Stable, so that the plans' order, and nothing else, tells which of equals comes first.
-        order = np.argsort(cell, kind="stable")
+        order = np.argsort(key, kind="stable")
+        key = key[order]
+        owners = np.flatnonzero(np.concatenate([[True], key[1:] != key[:-1]]))
+        cell = (key[owners] >> _CELL_SHIFT).astype(np.intp)
         first = np.concatenate([[0], np.cumsum(np.bincount(cell, minlength=len(cells)))])
         small = np.int32 if len(rows) < 2**31 else np.int64
-        return cls(rows, step_m, cells, len(count), member[order].astype(small), plan[order], first)
+        owners = np.append(owners, len(plan))
+        return cls(
+            rows,
+            step_m,
+            cells,
+            len(count),
+            member[order[owners[:-1]]].astype(small),
+            plan[order],
+            owners.astype(small),
+            first,
+        )
 
     @classmethod
     def of_parts(cls, parts: Sequence[Prototypes], cells: Cells) -> PlanIndex:
@@ -85,80 +107,157 @@ class PlanIndex:
 
     @property
     def nbytes(self) -> int:
-        """Memory that the index takes; of rows in a file, none."""
+        """Memory that it takes, with the codes, which large ones make for the first query; of rows in a file, none."""
         rows = 0 if isinstance(self.rows, np.memmap) else self.rows.nbytes
-        return rows + self.member.nbytes + self.plan.nbytes + self.first.nbytes
+        places = self.member.nbytes + self.plan.nbytes + self.owners.nbytes + self.first.nbytes
+        return rows + places + BYTES_OF_ONE * len(self.member)
+
+    def prepare(self) -> None:
+        """Make the codes now, which the first query would else."""
+        _ = self._scans
 
     def log_masses(
-        self, query: Query, weights: EvidenceModel, config: EvidenceConfig, *, compared: int = COMPARED
+        self,
+        query: Query,
+        weights: EvidenceModel,
+        config: EvidenceConfig,
+        *,
+        compared: int = COMPARED,
+        scanned: int = SCANNED,
     ) -> Float[np.ndarray, "p"]:
-        """Log of each plan's mass; -inf for plans none of whose prototypes was compared.
+        """Log of each plan's mass; -inf for plans none of whose prototypes was compared as it is.
 
         Args:
-            compared: pairs that are compared; a few more, so that the last cell is compared whole.
+            compared: pairs that are compared as they are.
+            scanned: pairs that are compared by codes; a few more, so that the last cell is compared whole.
         """
         costs = PrototypeCosts(query, self.step_m, weights, config)
-        cell, hypothesis, offset = self._triples(costs, compared)
-        size, mass, best = self._size[cell], np.zeros(self.plans), np.inf
-        for part in _batches(size):
-            repeats = size[part]
-            inside = np.arange(int(repeats.sum())) - np.repeat(np.cumsum(repeats) - repeats, repeats)
-            where = np.repeat(self.first[cell[part]], repeats) + inside
-            rows = self._raw[self.member[where]].view(ROW)
-            cost = costs.of(rows, np.repeat(hypothesis[part], repeats), np.repeat(offset[part], repeats))
+        k, j = costs.shape
+        few = len(self.member) * k * j <= compared
+        mass, best = np.zeros(self.plans), np.inf
+        for member, hypothesis, offset in self._all(k, j) if few else self._chosen(costs, compared, scanned):
+            rows = self._raw[self.member[member]].view(ROW)
+            cost = costs.of(rows, hypothesis, offset)
             # In units of the least cost so far, so that nothing underflows that weighs something.
             lowest = min(best, float(cost.min()))
             mass *= np.exp(-weights.temperature * (best - lowest)) if np.isfinite(best) else 1.0
             best = lowest
             weight = np.exp(rows["log_area"] - weights.temperature * (cost.astype(np.float64) - best))
-            mass += np.bincount(self.plan[where], weight, minlength=self.plans)
+            begin, count = self.owners[member], self.owners[member + 1] - self.owners[member]
+            inside = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
+            owner = self.plan[np.repeat(begin, count) + inside]
+            mass += np.bincount(owner, np.repeat(weight, count), minlength=self.plans)
         with np.errstate(divide="ignore"):
             return np.log(mass) - weights.temperature * best
 
-    def _triples(
-        self, costs: PrototypeCosts, compared: int
-    ) -> tuple[Int[np.ndarray, "t"], Int[np.ndarray, "t"], Int[np.ndarray, "t"]]:
-        """The cells whose members are compared, with the hypotheses that they are compared under."""
-        k, j = costs.shape
-        if len(self.member) * k * j <= compared:
-            shape = len(self._filled), k, j
-            cell, hypothesis, offset = np.unravel_index(np.arange(len(self._filled) * k * j), shape)
-            return self._filled[cell], hypothesis, offset
-        return self._best_triples(costs, compared)
+    def _all(self, k: int, j: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """All pairs: members, and the hypotheses of heading and height."""
+        shape = len(self.member), k, j
+        for begin in range(0, len(self.member) * k * j, _AT_ONCE):
+            pair = np.arange(begin, min(begin + _AT_ONCE, len(self.member) * k * j))
+            member, hypothesis, offset = np.unravel_index(pair, shape)
+            yield member, hypothesis, offset
 
-    def _best_triples(self, costs: PrototypeCosts, compared: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        family, within = np.divmod(self._filled, len(self.cells) // FAMILIES)
-        by_family = self.cells.costs(costs, np.unique(family).tolist())
-        by_cell = np.concatenate([cost[within[family == number]] for number, cost in by_family.items()])
-        size = np.repeat(self._size[self._filled], costs.shape[0] * costs.shape[1])
-        flat = by_cell.ravel()
-        # No more triples than pairs are needed, and usually far fewer: a cell of many plans has many members.
-        kept = min(len(flat), max(64, 8 * compared // max(1, int(size.mean()))))
-        order = np.argpartition(flat, kept - 1)[:kept]
-        order = order[np.argsort(flat[order], kind="stable")]
-        within = np.cumsum(size[order]) <= compared
-        order = order[: max(1, int(within.sum()) + 1)]
-        cell, hypothesis, offset = np.unravel_index(order, by_cell.shape)
-        return self._filled[cell], hypothesis, offset
+    def _chosen(
+        self, costs: PrototypeCosts, compared: int, scanned: int
+    ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """As `_all`, those pairs that cost least by their codes."""
+        k, j = costs.shape
+        looked_into = self._looked_into(costs, scanned)
+        count = min(compared, -(-_MORE * compared // (k * j)))
+        parts = []
+        for family, (begin, scan) in self._scans.items():
+            tables = tables_of(costs, claims_of(family)).reshape(k * j, -1)
+            found, cost = scan.best(tables, looked_into[family].reshape(-1, k * j).T, count)
+            turned = np.broadcast_to(np.arange(k * j)[:, None], found.shape)
+            there = found >= 0
+            parts.append((found[there] + begin, turned[there], cost[there]))
+        member, turned, cost = (np.concatenate(of_all) for of_all in zip(*parts, strict=True))
+        if len(cost) > compared:
+            kept = np.argpartition(cost, compared - 1)[:compared]
+            member, turned = member[kept], turned[kept]
+        # In the order of memory.
+        order = np.argsort(member, kind="stable")
+        member, turned = member[order], turned[order]
+        hypothesis, offset = np.divmod(turned, j)
+        for begin in range(0, len(member), _AT_ONCE):
+            part = slice(begin, begin + _AT_ONCE)
+            yield member[part], hypothesis[part], offset[part]
+
+    def _looked_into(self, costs: PrototypeCosts, scanned: int) -> dict[int, Bool[np.ndarray, "l k j"]]:
+        """Which of the filled cells of each family are looked into, under which hypotheses."""
+        k, j = costs.shape
+        filled = self._filled
+        if len(self.member) * k * j <= scanned:
+            return {family: np.ones((len(cell), k, j), bool) for family, cell in filled.items()}
+        by_family = self.cells.costs(costs, filled)
+        cost = np.concatenate([by_family[family][cell % self._of_family].ravel() for family, cell in filled.items()])
+        size = np.concatenate([np.repeat(self._size[cell], k * j) for cell in filled.values()])
+        # Rounded to 16 bits, which numpy sorts twenty times as fast.
+        least = float(cost.min())
+        rounded = ((cost - least) * (65535.0 / max(float(cost.max()) - least, 1e-9))).astype(np.uint16)
+        order = np.argsort(rounded, kind="stable")
+        within = np.cumsum(size[order]) <= scanned
+        looked_into = np.zeros(len(cost), bool)
+        looked_into[order[: int(within.sum()) + 1]] = True
+        ends = np.cumsum([len(cell) * k * j for cell in filled.values()])
+        parts = np.split(looked_into, ends[:-1])
+        return {family: part.reshape(-1, k, j) for family, part in zip(filled, parts, strict=True)}
+
+    @cached_property
+    def _scans(self) -> dict[int, tuple[int, CodeScan]]:
+        """The codes of each family, a list for each filled cell, and the number of the first one's first member."""
+        scans = {}
+        for family, cell in self._filled.items():
+            begin, end = int(self.first[cell[0]]), int(self.first[cell[-1] + 1])
+            parts = range(begin, end, _AT_ONCE)
+            code = np.concatenate(
+                [codes_of(self._raw[self.member[at : min(at + _AT_ONCE, end)]].view(ROW)) for at in parts]
+            )
+            scans[family] = begin, CodeScan(code, np.append(self.first[cell], end) - begin)
+        return scans
 
     @cached_property
     def _raw(self) -> np.ndarray:
         """The rows as bytes: numpy copies those an order of magnitude faster than it copies fields."""
-        return self.rows.view(np.dtype((np.void, ROW.itemsize)))
+        return _bytes_of(self.rows)
+
+    @property
+    def _of_family(self) -> int:
+        return len(self.cells) // FAMILIES
 
     @cached_property
     def _size(self) -> Int[np.ndarray, "v"]:
         return np.diff(self.first)
 
     @cached_property
-    def _filled(self) -> Int[np.ndarray, "u"]:
-        """The cells that have members."""
-        return np.flatnonzero(self._size)
+    def _filled(self) -> dict[int, Int[np.ndarray, "l"]]:
+        """The cells of each family that have members; families that have none are left out."""
+        filled = np.flatnonzero(self._size)
+        family = filled // self._of_family
+        return {int(one): filled[family == one] for one in np.unique(family)}
 
 
-def _batches(size: Int[np.ndarray, "t"]) -> Iterator[slice]:
-    """Triples that are taken together, up to so many pairs but for the last triple."""
-    batch = (np.cumsum(size) - size) // _AT_ONCE
-    edges = np.flatnonzero(np.diff(batch, prepend=-1, append=batch[-1] + 1))
-    for begin, end in itertools.pairwise(edges.tolist()):
-        yield slice(begin, end)
+def _bytes_of(rows: np.ndarray) -> np.ndarray:
+    return rows.view(np.dtype((np.void, ROW.itemsize)))
+
+
+def _keys(rows: np.ndarray, member: Int[np.ndarray, "n"]) -> UInt64[np.ndarray, "n"]:
+    """Sorts prototypes by their cells, and then by a hash of all that they say (multilinear, modulo 2^64).
+
+    Two of one cell that differ have one key by a chance of 2^-48, and would then be compared as if they were equal.
+    """
+    key, raw = np.empty(len(member), np.uint64), _bytes_of(rows)
+    words = -(-ROW.itemsize // 8)
+    # Odd numbers, as random as need be.
+    factor = np.random.default_rng(0).integers(2**62, size=words, dtype=np.uint64) * np.uint64(2) + np.uint64(1)
+    for begin in range(0, len(member), _AT_ONCE):
+        part = raw[member[begin : begin + _AT_ONCE]]
+        content = np.zeros((len(part), 8 * words), np.uint8)
+        content[:, : ROW.itemsize] = part.view(np.uint8).reshape(len(part), -1)
+        hashed = (content.view(np.uint64) * factor).sum(axis=1, dtype=np.uint64)
+        # The upper bits of a product are the random ones; those of a sum depend on all that is below them.
+        hashed = (hashed ^ hashed >> np.uint64(29)) * factor[0]
+        cell = part.view(ROW)["cell"].astype(np.uint64)
+        key[begin : begin + len(part)] = cell << _CELL_SHIFT | hashed >> np.uint64(64 - 48)
+    return key

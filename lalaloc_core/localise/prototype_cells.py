@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -72,10 +72,10 @@ class Cells:
         if compared.opening_loss is None:
             return dict.fromkeys(families, walls)
         share = self.share.reshape(v, -1)
-        told = {family: compared.opening_loss[_claims_of(family)].reshape(k, -1) for family in families}
+        told = {family: compared.opening_loss[claims_of(family)].reshape(k, -1) for family in families}
         return {family: walls + (share @ loss.T)[:, :, None] for family, loss in told.items()}
 
-    @property
+    @cached_property
     def _bins(self) -> Float[np.ndarray, "v b"]:
         return _soft_bins(self.log_profile)
 
@@ -94,14 +94,15 @@ def family_of(claims: UInt8[np.ndarray, "n"]) -> UInt8[np.ndarray, "n"]:
     return claims >> (WALL_CODE + 1) & (FAMILIES - 1)
 
 
-def _claims_of(family: int) -> int:
+def claims_of(family: int) -> int:
+    """What plans claim whose prototypes are sorted into a family of cells."""
     return family << (WALL_CODE + 1)
 
 
 def _claimed_features(family: int) -> Int[np.ndarray, "f"]:
     """The columns of `features` that count for a family."""
     kinds = np.arange(1, len(OPENING_CLASSES))
-    claimed = np.tile(_claims_of(family) >> kinds & 1, AZIMUTHS).astype(bool)
+    claimed = np.tile(claims_of(family) >> kinds & 1, AZIMUTHS).astype(bool)
     return np.concatenate([np.arange(AZIMUTHS), AZIMUTHS + np.flatnonzero(claimed)])
 
 

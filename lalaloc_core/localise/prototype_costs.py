@@ -1,9 +1,10 @@
 """How badly prototypes fit a panorama: walls, openings, ceiling and type of the room, as in `evidence`, but coarser.
 
-There are 32 azimuths and as many hypotheses of the heading at most, and the reach is that of two grid steps. What is
-seen through openings is left out. A prototype may stand a step away from the camera, where openings appear displaced,
-so these count for less. Kinds of openings that a plan does not claim are neither for nor against it: in their place
-stands what an unknown class would cost, so that plans with and without openings can be compared.
+There are 32 azimuths and as many hypotheses of the heading at most, and the reach is that of a grid as fine as the
+prototypes. What is seen through openings is left out. A prototype may stand half a metre away from the camera, where
+openings appear displaced, so these count for less. Kinds of openings that a plan does not claim are neither for nor
+against it: in their place stands what an unknown class would cost, so that plans with and without openings can be
+compared.
 """
 
 from __future__ import annotations
@@ -14,9 +15,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lalaloc_core.bundle import EvidenceModel
-from lalaloc_core.conventions import OPENING_CLASSES, WALL_CODE
+from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, WALL_CODE
 from lalaloc_core.localise.evidence import EvidenceConfig, ceiling_costs, precisions, room_type_losses, smoothed
-from lalaloc_core.localise.poses import Query
+from lalaloc_core.localise.poses import PredictedCeiling, Query
 from lalaloc_core.localise.prototypes import AZIMUTHS, PER_BYTE, STEPS, azimuths, unpacked_openings
 
 # Camera heights whose logs are nearer than this are not told apart by prototypes, whose distances are farther off.
@@ -78,18 +79,28 @@ class PrototypeCosts:
     def _shifted(self) -> Float[np.ndarray, "k j a"]:
         return self.centre[:, None] + self.offsets[None, :, None].astype(np.float32)
 
+    def of_ceilings(self, ceiling_m: Float[np.ndarray, "n"]) -> Float[np.ndarray, "j n"]:
+        """What ceilings cost under every hypothesis of the camera's height."""
+        if self._query.ceiling is None or not self._config.use_ceiling:
+            return np.zeros((len(self.offsets), len(ceiling_m)))
+        return self._ceilings(self._query.ceiling, ceiling_m, self.offsets[:, None])
+
+    @cached_property
+    def of_room_types(self) -> Float[np.ndarray, "t"]:
+        """What types of rooms cost."""
+        if self._query.room_type is None or not self._config.use_room_type:
+            return np.zeros(len(ROOM_TYPES))
+        return self._weights.room_type * room_type_losses(self._query.room_type, self._config)
+
     def _by_room(self, rows: np.ndarray, offset: np.ndarray) -> Float[np.ndarray, "n"]:
-        cost = self.penalty[offset]
-        query, weights = self._query, self._weights
-        if query.ceiling is not None and self._config.use_ceiling:
-            height_m = query.camera_height.height_m * np.exp(self.offsets[offset])
-            clearance_m = rows["ceiling_m"].astype(np.float64) - height_m
-            cost = cost + weights.ceiling * ceiling_costs(
-                query.ceiling, clearance_m, self.offsets[offset], self._config
-            )
-        if query.room_type is not None and self._config.use_room_type:
-            cost = cost + weights.room_type * room_type_losses(query.room_type, self._config)[rows["room_type"]]
+        cost = self.penalty[offset] + self.of_room_types[rows["room_type"]]
+        if self._query.ceiling is not None and self._config.use_ceiling:
+            cost += self._ceilings(self._query.ceiling, rows["ceiling_m"].astype(np.float64), self.offsets[offset])
         return cost
+
+    def _ceilings(self, predicted: PredictedCeiling, ceiling_m: np.ndarray, offset: np.ndarray) -> np.ndarray:
+        clearance_m = ceiling_m - self._query.camera_height.height_m * np.exp(offset)
+        return self._weights.ceiling * ceiling_costs(predicted, clearance_m, offset, self._config)
 
     def _openings(self, rows: np.ndarray, hypothesis: np.ndarray) -> Float[np.ndarray, "n"]:
         table, packed = self._byte_losses, rows["openings"]

@@ -1,7 +1,7 @@
 """Prototypes of floor plans: a few poses of each, by which those of a large venue are chosen that are searched in full.
 
-The *prototypes* of a plan are one pose of its latent grid for every square of two grid steps and every room, with the
-floor that it stands for, the wall profile and the openings at 32 azimuths, and the room's ceiling and type. They are
+The *prototypes* of a plan are every other pose of its latent grid, as the black squares of a chessboard, with the floor
+that each stands for, the wall profile and the openings at 32 azimuths, and the room's ceiling and type. They are
 compared with the panorama much as all poses are (`prototype_costs`), and give every plan a probability; the plans that
 have most of it are then searched in full.
 
@@ -13,6 +13,7 @@ have most of it are then searched in full.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -26,8 +27,8 @@ from lalaloc_core.localise.poses import LatentGrid
 from lalaloc_core.sampling import PoseSet
 
 AZIMUTHS = 32
-# Prototypes are so many grid steps apart.
-STEPS = 2
+# Neighbouring prototypes are so many grid steps apart.
+STEPS = math.sqrt(2.0)
 # Opening classes at so many azimuths share a byte, two bits each, the first one lowest.
 PER_BYTE = 4
 # What is kept of a prototype; as it lies in files and in the database. `claims` has a bit for each opening class that
@@ -67,10 +68,12 @@ class Prototypes:
 
 def prototypes_of(grid: LatentGrid, plan: FloorPlan) -> Prototypes:
     """The prototypes of a plan, in cell 0."""
-    cell = np.floor(grid.poses.position_m / (STEPS * grid.step_m)).astype(np.int64)
-    key = np.column_stack([grid.poses.room_index, cell])
-    _, first, count = np.unique(key, axis=0, return_index=True, return_counts=True)
-    rows = np.zeros(len(first), ROW)
+    place = np.rint(grid.poses.position_m / grid.step_m).astype(np.int64)
+    chosen, of_room = place.sum(axis=1) % 2 == 0, grid.poses.room_index
+    # Rooms that have none so, which are narrow ones, keep all of theirs.
+    chosen |= ~np.isin(of_room, of_room[chosen])
+    first = np.flatnonzero(chosen)
+    rows, floor_m2 = np.zeros(len(first), ROW), grid.step_m**2 * np.bincount(of_room)
     compared, room = azimuths(grid.profile_m.shape[1]), grid.poses.room_index[first]
     rows["log_profile"] = np.log(grid.profile_m[first][:, compared])
     # Of these poses alone: the others are looked at when they are searched.
@@ -78,7 +81,7 @@ def prototypes_of(grid: LatentGrid, plan: FloorPlan) -> Prototypes:
     kind = layouts_at(plan, poses, np.zeros(len(first)), columns).kind if plan.opening_faces else None
     kind = np.full((len(first), columns), WALL_CODE, np.uint8) if kind is None else kind
     rows["openings"] = packed_openings(kind[:, compared])
-    rows["log_area"] = np.log(count * grid.step_m**2)
+    rows["log_area"] = np.log(floor_m2[room] / np.bincount(room)[room])
     rows["ceiling_m"] = plan.ceiling_heights_m[room]
     rows["room_type"] = np.array([ROOM_TYPES.index(one.type) for one in plan.rooms], np.uint8)[room]
     rows["claims"] = sum(1 << OPENING_CLASSES.index(claimed) for claimed in plan.opening_kinds)

@@ -33,7 +33,7 @@ from service.telemetry import LOGGER_NAME
 
 _HEADER = struct.Struct("<8sq32sIII")
 _CRC = struct.Struct("<I")
-_MAGIC = b"LLROWS1\0"
+_MAGIC = b"LLROWS2\0"
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ from service.settings import Settings
 from service.storage.records import PlanRecord, VenueRecord
 
 # The right one of many plans is often not the first by its grid, so more candidates than in a single plan are refined.
-_CONFIG = LocaliseConfig(by_probability=True, profile_candidates=32, profile_candidates_turned=48)
+VENUE_CONFIG = LocaliseConfig(by_probability=True, profile_candidates=32, profile_candidates_turned=48)
 # How often a venue is looked at none of whose plans is ready.
 _LOOK_EVERY_S = 0.25
 # Tells the plans that are asked about, as they are at the moment.
@@ -197,7 +197,7 @@ class VenueLocaliser:
             query,
             refine=form.refine,
             top_k=form.top_k,
-            config=_CONFIG,
+            config=VENUE_CONFIG,
             clock=clock,
             hints=searched.hints,
         )

@@ -141,7 +141,7 @@ class VenuePlans:
 
     def needs_choice(self, ready: Sequence[Row[Any]], query: Query) -> bool:
         """Whether not all of some plans can be searched in full."""
-        return len(ready) > MAX_SEARCHED or sum(row.poses for row in ready) > self._most_poses(query)
+        return len(ready) > MAX_SEARCHED or sum(row.poses for row in ready) > most_poses(query, self._max_poses)
 
     async def index(self, ready: Sequence[Row[Any]], compute: Compute) -> tuple[Sequence[Row[Any]], PlanIndex]:
         """The index of plans that are ready, with the plans in its order: without those whose grid is gone by now.
@@ -185,7 +185,7 @@ class VenuePlans:
         """
         log_mass = index.log_masses(query, weights, EvidenceConfig()) + log_prior
         poses = np.array([row.poses for row in known])
-        chosen = most_probable(log_mass, poses, most_plans=MAX_SEARCHED, most_poses=self._most_poses(query))
+        chosen = most_probable(log_mass, poses, most_plans=MAX_SEARCHED, most_poses=most_poses(query, self._max_poses))
         return ChosenPlans([known[int(k)] for k in chosen], log_mass, chosen)
 
     async def load(self, tenant: str, members: Sequence[Row[Any]]) -> list[tuple[Row[Any], PlanRecord, LatentGrid]]:
@@ -203,10 +203,6 @@ class VenuePlans:
         """Let another process have the file."""
         if self._file is not None:
             self._file.close()
-
-    def _most_poses(self, query: Query) -> int:
-        compared = len(query.roll) * len(query.camera_height.offsets)
-        return min(self._max_poses, _MAX_COMPARISONS // compared)
 
     def _members(self, venue_id: str) -> Sequence[Row[Any]]:
         # The state first: what changes in between is found out by the next query.
@@ -268,6 +264,11 @@ class VenuePlans:
                 logging.getLogger(LOGGER_NAME).warning("cannot open the file of prototypes: %s", error)
                 self._file = PrototypeFile(None, cells_version=version, limit_bytes=limit_bytes)
         return self._file
+
+
+def most_poses(query: Query, max_poses: int) -> int:
+    """How many poses all plans may have that are searched in full: so many comparisons, and at most `max_poses`."""
+    return min(max_poses, _MAX_COMPARISONS // (len(query.roll) * len(query.camera_height.offsets)))
 
 
 def not_excluded(ready: Sequence[Row[Any]], log_prior: Float[np.ndarray, "p"]) -> Sequence[Row[Any]]:

@@ -4,8 +4,8 @@
 positions (float64, n·2), latents (float32, n·d), profiles (float32, n·w), room indices (int32, n). "LLG2" is the same
 without latents, d = 0, and with profiles in half precision (float16).
 
-The prototypes of a plan likewise: "LLP2", the version of the cells that they are sorted into, their number, and rows of
-`prototypes.ROW`. What an earlier version of the service stored ("LLP1") is not read: it has no openings.
+The prototypes of a plan likewise: "LLP3", the version of the cells that they are sorted into, their number, and rows of
+`prototypes.ROW`. What earlier versions of the service stored is not read: "LLP1" has no openings, "LLP2" fewer poses.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from lalaloc_core.sampling import PoseSet
 _HEADER = struct.Struct("<4s3I")
 _MAGIC, _MAGIC_WITHOUT_LATENTS = b"LLG1", b"LLG2"
 _PROTOTYPES_HEADER = struct.Struct("<4s2I")
-_PROTOTYPES_MAGIC = b"LLP2"
+_PROTOTYPES_MAGIC = b"LLP3"
 _POSE_BYTES, _LATENT_BYTES, _ROOM_BYTES = 16, 4, 4
 
 
