@@ -393,4 +393,6 @@ def smoothed(probability: Float[np.ndarray, "k w c"], spread: float) -> Float[np
     offset = (np.arange(columns) + columns // 2) % columns - columns // 2
     kernel = np.exp(-0.5 * np.square(offset / deviation))
     kernel = (kernel / kernel.sum())[(np.arange(columns)[:, None] - np.arange(columns)[None]) % columns]
-    return np.einsum("vw,kwc->kvc", kernel, probability, optimize=True)
+    # One product of matrices, not one for each hypothesis.
+    blurred = kernel @ probability.transpose(1, 0, 2).reshape(columns, -1)
+    return blurred.reshape(columns, len(probability), -1).transpose(1, 0, 2)

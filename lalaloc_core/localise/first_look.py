@@ -8,11 +8,16 @@ an azimuth says of a pose is one row of
 and what a pose costs under all of them at once is the sum of its rows: the product of a sparse matrix, which belongs to
 the plan, with the table, which belongs to the query. That is a tenth of the work for each azimuth, and there are fewer
 of them. Openings are rows as well; what lies behind them is left to the second look.
+
+Of a large plan most poses do not even get that. A bound comes first: what a pose costs at least, whatever δ and
+whichever of some neighbouring hypotheses, by a table of the least of all these in short integers, which stays in the
+cache. Poses are then looked at by rising bounds, until no other can be among those that are wanted.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -23,6 +28,12 @@ from lalaloc_core.localise.sketch import OPENING_ROWS, Sketch
 
 # Poses that are looked at together, so that what is summed up stays in the processor's cache.
 _CHUNK = 512
+# ... when they are looked at by rising bounds: few at first, as these tell how far to go; and for their bounds.
+_FIRST_CHUNK, _LAST_CHUNK, _BOUNDED_CHUNK = 128, 1024, 4096
+# So many neighbouring hypotheses share a bound.
+_NEIGHBOURS = 2
+# Sums of bounds stay below this, which is almost what a short integer holds.
+_MOST = 30_000
 
 
 class Fewest:
@@ -35,11 +46,17 @@ class Fewest:
         self._place: list[Int[np.ndarray, "_"]] = []
         self._kept = 0
 
-    def offer(self, first: int, cost: Float[np.ndarray, "n k"]) -> None:
-        """Costs of all pairs of the poses from number `first` on; infinite ones are no pairs."""
+    @property
+    def bound(self) -> float:
+        """What costs as much as this is none of them; infinite as long as there are fewer."""
+        return self._bound
+
+    def offer(self, pose: Int[np.ndarray, "n"], cost: Float[np.ndarray, "n k"]) -> None:
+        """Costs of all pairs of some poses, by their numbers; infinite ones are no pairs."""
         place = np.flatnonzero(cost < self._bound)
+        row, hypothesis = np.divmod(place, cost.shape[1])
         self._cost.append(cost.ravel()[place])
-        self._place.append(place + first * cost.shape[1])
+        self._place.append(pose[row] * cost.shape[1] + hypothesis)
         self._kept += len(place)
         if self._kept > 2 * self._limit:
             self._drop()
@@ -48,7 +65,7 @@ class Fewest:
         """Their costs, rising, and their places: pose times the number of hypotheses, plus hypothesis."""
         self._drop()
         cost, place = self._cost[0], self._place[0]
-        order = np.argsort(cost, kind="stable")
+        order = np.lexsort((place, cost))
         return cost[order], place[order]
 
     def _drop(self) -> None:
@@ -60,6 +77,88 @@ class Fewest:
         self._cost, self._place, self._kept = [cost], [place], len(cost)
 
 
+@dataclass(frozen=True, kw_only=True)
+class Wanted:
+    """Which pairs of a pose and a hypothesis are looked for.
+
+    Attributes:
+        limit: at most so many.
+        least: so many at least, if there are as many.
+        window: the others only if they cost at most this more than the best.
+    """
+
+    limit: int
+    least: int
+    window: float = 0.0
+
+
+def likeliest(
+    sketch: Sketch,
+    evidence: Evidence,
+    room_index: Int[np.ndarray, "n"],
+    wanted: Wanted,
+    against: Float[np.ndarray, "n"] | None = None,
+) -> tuple[Float[np.ndarray, "m"], Int[np.ndarray, "m"]]:
+    """Rough costs, rising, and places (pose times the number of hypotheses, plus hypothesis) of the likeliest pairs.
+
+    They are those of all `first_costs`; some that are beyond `wanted` may follow.
+
+    Args:
+        against: what is added to the costs of every pose; infinite: it is not possible.
+    """
+    table, by_room = _table(sketch, evidence), evidence.by_room()
+    shape = (-1, len(evidence.offsets), evidence.hypotheses)
+    bound = _bounds(sketch, table.reshape(len(table), *shape[1:])) + by_room.min(axis=0)[room_index]
+    bound = bound if against is None else bound + against
+    possible = np.flatnonzero(np.isfinite(bound))
+    # Short integers are sorted in no time.
+    order = possible[np.argsort(_shortened(bound[possible]), kind="stable")]
+    least_after = np.minimum.accumulate(bound[order][::-1])[::-1]
+    best, least = Fewest(wanted.limit), Fewest(wanted.least)
+    lowest, first, count = np.inf, 0, _FIRST_CHUNK
+    while first < len(order) and least_after[first] <= min(best.bound, max(lowest + wanted.window, least.bound)):
+        pose = order[first : first + count]
+        cost = _least(sketch.rows[pose] @ table, by_room[:, room_index[pose]], shape)
+        cost = cost if against is None else cost + against[pose, None]
+        best.offer(pose, cost)
+        least.offer(pose, cost)
+        lowest = min(lowest, float(cost.min()))
+        first, count = first + count, min(2 * count, _LAST_CHUNK)
+    return best.told()
+
+
+def _shortened(bound: Float[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
+    """Numbers in about the same order."""
+    low, span = float(bound.min(initial=np.inf)), float(np.ptp(bound)) if len(bound) else 0.0
+    return ((bound - low) * (_MOST / max(span, 1e-9))).astype(np.int16)
+
+
+def _bounds(sketch: Sketch, table: Float[np.ndarray, "r j k"]) -> Float[np.ndarray, "n"]:
+    """Of every pose what its walls and openings cost at least, whatever the δ and the hypothesis."""
+    azimuths = len(sketch.columns)
+    least = np.minimum.reduceat(table.min(axis=1), np.arange(0, table.shape[2], _NEIGHBOURS), axis=1)
+    walls, openings = np.split(least, [azimuths * len(sketch.bins)])
+    # Every azimuth has one row of walls, and at most one of openings.
+    most = azimuths * float(np.abs(walls).max() + np.abs(openings).max(initial=0.0))
+    scale = _MOST / max(most, 1e-6)
+    short = np.floor(least * scale).astype(np.int16)
+    bound = np.empty(len(sketch), np.float32)
+    for first in range(0, len(sketch), _BOUNDED_CHUNK):
+        part = slice(first, first + _BOUNDED_CHUNK)
+        bound[part] = (sketch.rows[part] @ short).min(axis=1)
+    # Rounding of single precision aside.
+    return bound / scale - 1e-5
+
+
+def _least(
+    costs: Float[np.ndarray, "n c"], by_room: Float[np.ndarray, "j n"], shape: tuple[int, int, int]
+) -> Float[np.ndarray, "n k"]:
+    """What poses cost under every hypothesis, each at its best δ."""
+    costs = costs.reshape(shape)
+    costs += by_room.T[:, :, None]
+    return costs.min(axis=1)
+
+
 def first_costs(
     sketch: Sketch, evidence: Evidence, room_index: Int[np.ndarray, "n"]
 ) -> Iterator[tuple[int, Float[np.ndarray, "n k"]]]:
@@ -68,9 +167,7 @@ def first_costs(
     shape = (-1, len(evidence.offsets), evidence.hypotheses)
     for first in range(0, len(sketch), _CHUNK):
         part = slice(first, first + _CHUNK)
-        cost = (sketch.rows[part] @ table).reshape(shape)
-        cost += by_room[:, room_index[part]].T[:, :, None]
-        yield first, cost.min(axis=1)
+        yield first, _least(sketch.rows[part] @ table, by_room[:, room_index[part]], shape)
 
 
 def _table(sketch: Sketch, evidence: Evidence) -> Float[np.ndarray, "r c"]:

@@ -15,7 +15,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.evidence import Evidence, EvidenceConfig, latent_distances
-from lalaloc_core.localise.first_look import Fewest, first_costs
+from lalaloc_core.localise.first_look import Wanted, likeliest
 from lalaloc_core.localise.hints import NO_HINTS, HintName, Hints
 from lalaloc_core.localise.poses import Candidate, LatentGrid, Query
 from lalaloc_core.localise.posterior import NEGLIGIBLE, TURNED_APART, GridCosts
@@ -126,20 +126,19 @@ def _chosen(
     pairs, nothing = len(grid.poses) * evidence.hypotheses, np.empty(0, np.float32)
     if pairs <= _ALL_COMPARED:
         return _Chosen(np.arange(pairs), pairs, nothing, nothing)
-    best, beyond = Fewest(_ESTIMATED), Fewest(_LEAST_COMPARED)
-    for first, cost in first_costs(grid.sketch(plan), evidence, grid.poses.room_index):
-        part = slice(first, first + len(cost))
-        best.offer(first, cost if against is None else cost + against[part, None])
-        if doubted is not None:
-            beyond.offer(first, cost + doubted[part, None])
-    total, pair = best.told()
-    probable = int(np.searchsorted(total, total[0] + _MARGIN + NEGLIGIBLE / temperature))
+    window = _MARGIN + NEGLIGIBLE / temperature
+    sketch, room_index = grid.sketch(plan), grid.poses.room_index
+    wanted = Wanted(limit=_ESTIMATED, least=_LEAST_COMPARED, window=window)
+    total, pair = likeliest(sketch, evidence, room_index, wanted, against)
+    probable = int(np.searchsorted(total, total[0] + window))
     compared = min(max(probable, _LEAST_COMPARED), _MOST_COMPARED, len(pair))
     cost = total if against is None else total - against[pair // evidence.hypotheses]
     seen, estimate = cost[:compared], cost[compared:probable]
     first, others = pair[:compared], pair[compared:probable]
     if doubted is not None:
-        first = np.append(first, np.setdiff1d(beyond.told()[1], pair[:probable]))
+        wanted = Wanted(limit=_LEAST_COMPARED, least=_LEAST_COMPARED)
+        beyond = likeliest(sketch, evidence, room_index, wanted, doubted)[1]
+        first = np.append(first, np.setdiff1d(beyond, pair[:probable]))
     return _Chosen(np.append(first, others), len(first), seen, estimate)
 
 

@@ -52,7 +52,8 @@ class Sketch:
             opening = count * bins + np.arange(count, dtype=np.int32) * OPENING_ROWS + kind - 1
             at, present = np.concatenate([at, opening], axis=1), np.concatenate([present, kind != WALL_CODE], axis=1)
         begin = np.concatenate([[0], np.cumsum(present.sum(axis=1))]).astype(np.int32)
-        ones = np.ones(int(begin[-1]), np.float32)
+        # Of the narrowest type, so that products are of the type of what they are taken with.
+        ones = np.ones(int(begin[-1]), np.int8)
         rows = scipy.sparse.csr_array((ones, at[present], begin), shape=(len(layouts), count * (bins + OPENING_ROWS)))
         return cls(rows, columns, (_BIN * (low + 0.5 + np.arange(bins))).astype(np.float32))
 

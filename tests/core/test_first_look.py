@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from lalaloc_core.bundle import EvidenceModel
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.evidence import Evidence, EvidenceConfig
-from lalaloc_core.localise.first_look import Fewest
+from lalaloc_core.localise.first_look import Fewest, Wanted, _bounds, _table, first_costs, likeliest
 from lalaloc_core.localise.layouts import layouts_at
 from lalaloc_core.localise.poses import LatentGrid, PredictedOpenings, PredictedProfile, Query, rolled
 from lalaloc_core.localise.retrieval import grid_costs, retrieve
@@ -125,6 +125,43 @@ def test_openings_and_what_lies_behind_them_count_for_pairs_as_for_all(
     assert (found == offset[hypothesis, pose]).mean() > 0.99
 
 
+@pytest.mark.parametrize("wanted", [Wanted(limit=6000, least=200, window=0.5), Wanted(limit=300, least=300)])
+@pytest.mark.parametrize("hinted", [False, True])
+def test_the_likeliest_pairs_are_those_of_a_first_look_at_all(
+    building: Building, grid: LatentGrid, queries: list[Query], wanted: Wanted, hinted: bool
+) -> None:
+    looked_at, rng = 0, np.random.default_rng(2)
+    for query in queries[:8]:
+        against = np.where(rng.random(len(grid.poses)) < 0.5, np.inf, 0.1) if hinted else None
+        evidence = Evidence(building.plan, query, CONFIG.grid_reach * STEP_M, WEIGHTS, CONFIG)
+        sketch, room_index = grid.sketch(building.plan), grid.poses.room_index
+        every = np.concatenate([cost for _, cost in first_costs(sketch, evidence, room_index)])
+        every = every if against is None else every + against[:, None]
+        found, place = likeliest(sketch, evidence, room_index, wanted, against)
+        count = int((every <= every.min() + wanted.window).sum())
+        count = min(max(count, wanted.least), wanted.limit)
+        np.testing.assert_allclose(found[:count], np.sort(every.ravel())[:count], atol=1e-6)
+        np.testing.assert_allclose(every.ravel()[place], found, atol=1e-6)
+        assert len(np.unique(place)) == len(place) <= wanted.limit
+        looked_at += len(np.unique(place // HYPOTHESES))
+    assert looked_at < 8 * len(grid.poses)
+
+
+def test_no_pose_costs_less_than_its_bound(building: Building, grid: LatentGrid, queries: list[Query]) -> None:
+    ranks = []
+    for query in queries[:8]:
+        evidence = Evidence(building.plan, query, CONFIG.grid_reach * STEP_M, WEIGHTS, CONFIG)
+        sketch, room_index = grid.sketch(building.plan), grid.poses.room_index
+        every = np.concatenate([cost for _, cost in first_costs(sketch, evidence, room_index)])
+        table = _table(sketch, evidence).reshape(-1, len(evidence.offsets), evidence.hypotheses)
+        bound = _bounds(sketch, table) + evidence.by_room().min(axis=0)[room_index]
+        least = every.min(axis=1)
+        assert (bound <= least).all()
+        ranks.append((bound < bound[least.argmin()]).mean())
+    # ... and bounds tell poses apart.
+    assert np.median(ranks) < 0.1
+
+
 @given(seeds(), st.integers(1, 60))
 def test_the_fewest_of_slices_are_those_of_the_whole(seed: int, limit: int) -> None:
     rng = np.random.default_rng(seed)
@@ -132,7 +169,7 @@ def test_the_fewest_of_slices_are_those_of_the_whole(seed: int, limit: int) -> N
     cost[rng.random(cost.shape) < 0.2] = np.inf
     fewest = Fewest(limit)
     for first in range(0, 90, 16):
-        fewest.offer(first, cost[first : first + 16])
+        fewest.offer(np.arange(first, min(first + 16, 90)), cost[first : first + 16])
     found, place = fewest.told()
     finite = np.sort(cost[np.isfinite(cost)])
     np.testing.assert_array_equal(found, finite[:limit])
