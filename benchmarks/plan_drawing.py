@@ -21,6 +21,8 @@ STYLES: tuple[Style, ...] = get_args(Style)
 # What nobody can tell from a drawing: rooms that are joined by more than this without a symbol are one.
 WIDEST_BARE_OPENING_M = 1.9
 _MARGIN_M = 1.5
+# Walls between slanted rooms are wedges; an opening leads through one that is no deeper than this.
+_DEEPEST_WALL_M = 0.8
 _PIXELS_PER_M = {"thin": 80.0, "thick": 80.0, "hatched": 80.0, "coloured": 80.0, "scanned": 60.0}
 _HOME = HomeConfig(rotated_share=0.0, sheared_share=0.0, rooms=(3, 9), area_m2=(30.0, 140.0))
 _PALE = ((250, 240, 220), (226, 240, 250), (232, 246, 228), (250, 232, 238), (246, 246, 236))
@@ -29,12 +31,13 @@ _SHIFT = 4
 
 @dataclass(frozen=True)
 class DrawnOpening:
-    """An opening that a drawing shows: its quadrilateral in the wall, and its middle line."""
+    """An opening that a drawing shows: its quadrilateral in the wall, its middle line, and what is cut out of walls."""
 
     kind: Literal["door", "window", "passage"]
     shape: shapely.Polygon
     start: tuple[float, float]
     end: tuple[float, float]
+    cut: BaseGeometry
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,7 +105,7 @@ def _model(home: Home, thickness: float) -> _Model:
     openings = _openings(home, origin, thickness, inside)
     walls = shapely.unary_union([room.buffer(thickness, join_style="mitre") for room in rooms]).difference(inside)
     walls = walls.difference(
-        shapely.unary_union([opening.shape.buffer(1e-4, join_style="mitre") for opening in openings])
+        shapely.unary_union([opening.cut.buffer(1e-4, join_style="mitre") for opening in openings])
     )
     return _Model(rooms, [room.name for room in home.plan.rooms], openings, walls, (float(size[0]), float(size[1])))
 
@@ -123,8 +126,28 @@ def _openings(home: Home, origin: np.ndarray, thickness: float, inside: BaseGeom
             continue
         middle = 0.5 * thickness * outward
         a, b = start + middle, end + middle
-        found.append(DrawnOpening(kind, shape, (float(a[0]), float(a[1])), (float(b[0]), float(b[1]))))  # type: ignore[arg-type]
+        cut = _cut_through(start, end, outward, shape, inside)
+        found.append(DrawnOpening(kind, shape, (float(a[0]), float(a[1])), (float(b[0]), float(b[1])), cut))  # type: ignore[arg-type]
     return found
+
+
+def _cut_through(
+    start: Float[np.ndarray, "2"],
+    end: Float[np.ndarray, "2"],
+    outward: Float[np.ndarray, "2"],
+    shape: shapely.Polygon,
+    inside: BaseGeometry,
+) -> BaseGeometry:
+    """What an opening takes out of walls: all of the wall up to a room behind it, which may be slanted against it."""
+    deep = []
+    for corner in (start, 0.5 * (start + end), end):
+        ray = shapely.LineString([corner + 0.01 * outward, corner + _DEEPEST_WALL_M * outward])
+        behind = shapely.intersection(ray, inside)
+        if behind.is_empty:
+            return shape
+        deep.append(shapely.distance(shapely.Point(corner), behind))
+    far = max(deep) * outward
+    return shapely.union(shape, shapely.difference(shapely.Polygon([start, end, end + far, start + far]), inside))
 
 
 def _as_seen(model: _Model) -> tuple[list[shapely.Polygon], list[DrawnOpening]]:

@@ -198,7 +198,9 @@ def test_a_plan_that_is_replaced_is_chosen_as_what_it_is_now(
     monkeypatch.setattr(StoredGrids, "prototypes", lambda *_: pytest.fail("read of the database"))
     # Once more, by what the file has.
     with start_app(tmp_path, request_deadline_s=60.0) as client:
-        assert ask(client, venue_id, panorama, refine="none").json()["floorplan_id"] == replaced["floorplan_id"]
+        response = ask(client, venue_id, panorama, refine="none")
+        assert response.status_code == 200, response.text
+        assert response.json()["floorplan_id"] == replaced["floorplan_id"]
 
 
 @pytest.fixture(scope="module")

@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from lalaloc_core.plans.drawing.walls import Gap
 from lalaloc_core.plans.picture.ink import COLOURLESS, Ink
+from lalaloc_core.plans.picture.masks import WallMask
 
 # Shares of an arc, of a leaf, of a pane's line that must be inked; ink this near counts (pixels).
 _ARC, _ARC_WITH_LEAF, _LEAF, _LINE, _ONE_LINE = 0.8, 0.55, 0.8, 0.7, 0.9
@@ -38,10 +39,12 @@ class Seen:
 class GapReader:
     """Looks into gaps of one picture."""
 
-    def __init__(self, ink: Ink) -> None:
+    def __init__(self, ink: Ink, walls: WallMask) -> None:
         self._ink = ink
         reach = 2 * _NEAR_PX - 1
-        self._near = cv2.dilate(ink.lines.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
+        # Lines of a hatch would make an arc of any.
+        lines = ink.lines & ~walls.mask
+        self._near = cv2.dilate(lines.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
 
     def look(self, gap: Gap) -> Seen:
         """The most likely content of a gap."""

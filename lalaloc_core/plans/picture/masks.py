@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import shapely
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
 from lalaloc_core.plans.model.geometry import polygons_of
 from lalaloc_core.plans.picture.ink import Ink
@@ -18,8 +18,12 @@ _MIN_THICKNESS_M = 0.055
 _MAX_CAVITY_M = 0.42
 _SMALL_M = 1.2
 _STRAIGHT_M, _STRAIGHT_PX = 0.012, 1.3
-# Walls are alike in thickness; a chair, a letter or a basin is not.
-_ALIKE = (0.6, 1.6)
+# Walls are alike in thickness; a chair, a letter or a basin is not. Thicker pieces that are filled have pillars.
+_ALIKE, _FILLED = (0.6, 2.5), (0.6, 3.0)
+# Where walls meet, the white between their lines is wider than in a wall; of walls it is so on a small part only.
+_WIDE_PART = 0.15
+# A corner that is cut off by less than this is one (m), where the walls turn by about a right angle in all (its sine).
+_CUT_CORNER_M, _SQUARE = 0.07, 0.8
 # The stroke of a pane is as thick as a thin wall, but so much paler (of 255), thinner than its wall, and so long.
 _PALER, _THINNER, _STROKE_M = 45.0, 0.55, 0.3
 
@@ -75,8 +79,21 @@ def outlined_walls(ink: Ink) -> WallMask | None:
     deepest = np.zeros(count)
     np.maximum.at(deepest, labels.ravel(), depth.ravel())
     is_cavity = 2.0 * deepest * ink.metres_per_pixel <= _MAX_CAVITY_M
+    is_cavity |= _is_narrow(labels, depth * ink.metres_per_pixel, count)
     is_cavity[0] = False
     return _walls(ink, ink.mask | is_cavity[labels], np.where(is_cavity[labels], labels, 0))
+
+
+def _is_narrow(labels: Int[np.ndarray, "h w"], depth_m: Float[np.ndarray, "h w"], count: int) -> Bool[np.ndarray, "n"]:
+    """Which white areas are as narrow as a wall nearly everywhere, and but a little wider elsewhere."""
+    area = np.bincount(labels.ravel(), minlength=count)
+    reach = 0.5 * _MAX_CAVITY_M
+    middle = labels[depth_m > reach]
+    deepest = np.zeros(count)
+    np.maximum.at(deepest, labels.ravel(), depth_m.ravel())
+    # What a disc as wide as the widest cavity covers is not only its centres.
+    wide = 3.0 * np.bincount(middle, minlength=count)
+    return (wide <= _WIDE_PART * area) & (deepest <= 1.5 * reach)
 
 
 def _walls(ink: Ink, filled: Bool[np.ndarray, "h w"], cavities: Int[np.ndarray, "h w"] | None) -> WallMask | None:
@@ -85,7 +102,8 @@ def _walls(ink: Ink, filled: Bool[np.ndarray, "h w"], cavities: Int[np.ndarray, 
     thickness = _usual_thickness(thick) * ink.metres_per_pixel
     if thickness < _MIN_THICKNESS_M:
         return None  # Strokes of a hatch that run together are no walls.
-    kept = _without_furniture(thick, thickness / ink.metres_per_pixel, ink.metres_per_pixel)
+    alike = _FILLED if cavities is None else _ALIKE
+    kept = _without_furniture(thick, thickness / ink.metres_per_pixel, ink.metres_per_pixel, alike)
     return WallMask(kept, thickness, cavities) if kept.any() else None
 
 
@@ -97,8 +115,14 @@ def _usual_thickness(mask: np.ndarray) -> float:
     return 2.0 * float(np.median(values)) - 1.0 if len(values) and not mask.all() else 0.0
 
 
-def _without_furniture(mask: np.ndarray, thickness: float, metres_per_pixel: float) -> Bool[np.ndarray, "h w"]:
-    """Small pieces stay only where they are as thick as a wall, corners between two windows included."""
+def _without_furniture(
+    mask: np.ndarray, thickness: float, metres_per_pixel: float, alike: tuple[float, float]
+) -> Bool[np.ndarray, "h w"]:
+    """Small pieces stay only where they are as thick as a wall, corners between two windows included.
+
+    Args:
+        alike: how thick pieces are at least and at most, in units of the thickness of walls.
+    """
     count, found, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
     labels = np.asarray(found, dtype=np.int32)
     depth = cv2.distanceTransform(mask, cv2.DIST_L2, 5)
@@ -107,7 +131,7 @@ def _without_furniture(mask: np.ndarray, thickness: float, metres_per_pixel: flo
     is_large = stats[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1) * metres_per_pixel >= _SMALL_M
     # A corner is deeper than its two walls are thick, by the half of a diagonal.
     thick = 2.0 * deepest - 1.0
-    keep = is_large | ((thick >= _ALIKE[0] * thickness) & (thick <= _ALIKE[1] * thickness))
+    keep = is_large | ((thick >= alike[0] * thickness) & (thick <= alike[1] * thickness))
     keep[0] = False
     return keep[labels]
 
@@ -141,13 +165,34 @@ def _ring(contour: np.ndarray, ink: Ink) -> np.ndarray:
 def straightened(shape: shapely.Polygon, tolerance_deg: float = 6.0, reach_m: float = 0.06) -> shapely.Polygon:
     """A polygon whose edges that nearly run along the axes do so exactly; the same where that would spoil it."""
     rings = [
-        _straight_ring(np.asarray(ring.coords)[:-1], tolerance_deg, reach_m)
+        _straight_ring(_sharp_ring(np.asarray(ring.coords)[:-1]), tolerance_deg, reach_m)
         for ring in (shape.exterior, *shape.interiors)
     ]
     straight = shapely.Polygon(rings[0], rings[1:])
     if not straight.is_valid or abs(straight.area - shape.area) > 0.05 * shape.area:
         return shape
     return straight
+
+
+def _sharp_ring(points: np.ndarray) -> np.ndarray:
+    """The ring with the corners that pixels round made sharp: edges so short that turn by two obtuse angles."""
+    kept = list(points)
+    index = 0
+    while len(kept) > 4 and index < len(kept):
+        before, a, b, after = (kept[(index + k) % len(kept)] for k in (-1, 0, 1, 2))
+        first, edge, last = a - before, b - a, after - b
+        lengths = [float(np.linalg.norm(step)) for step in (first, edge, last)]
+        turns = _cross(first, edge), _cross(edge, last), _cross(first, last)
+        is_cut = 0.0 < lengths[1] < _CUT_CORNER_M and min(lengths[0], lengths[2]) > lengths[1]
+        if is_cut and turns[0] * turns[1] > 0.0 and abs(turns[2]) > _SQUARE * lengths[0] * lengths[2]:
+            kept[index] = a + first * (_cross(edge, last) / turns[2])
+            del kept[(index + 1) % len(kept)]
+        index += 1
+    return np.array(kept)
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> float:
+    return float(a[0] * b[1] - a[1] * b[0])
 
 
 def _straight_ring(points: np.ndarray, tolerance_deg: float, reach_m: float) -> np.ndarray:

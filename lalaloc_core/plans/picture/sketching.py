@@ -21,9 +21,10 @@ from lalaloc_core.plans.picture.masks import WallMask, bodies_of, dark_walls, ou
 from lalaloc_core.plans.picture.panes import windows_in_walls
 
 # In pictures windows are gaps in dark walls, and wider than doors; what has no symbol is no opening when it is wide.
-_CONFIG = WallConfig(widest_gap=3.6, narrowest_gap=0.4, thinnest=0.04)
+_CONFIG = WallConfig(widest_gap=6.0, narrowest_gap=0.4, thinnest=0.04)
+_WIDEST_WITH_ONE_LINE_M = 3.6
 _MAX_BARE_GAP_M, _MAX_BARE_GAP_AT_A_FACE_M = 1.9, 1.1
-_MIN_ROOM_M2 = 1.0
+_MIN_ROOM_M2 = 0.8
 _MAX_ISLAND_M2 = 2.0
 # Dark walls are the surer reading: outlines must enclose so much more to be preferred.
 _MORE = 1.6
@@ -101,7 +102,7 @@ def _hypotheses(ink: Ink) -> Sequence[tuple[WallMask | None, bool]]:
 
 
 def _read(walls: WallMask, ink: Ink, is_dark: bool, budget: Budget) -> _Reading:
-    reader = GapReader(ink)
+    reader = GapReader(ink, walls)
     seen: dict[int, Seen] = {}
 
     def judge(gap: Gap) -> int | None:
@@ -109,6 +110,8 @@ def _read(walls: WallMask, ink: Ink, is_dark: bool, budget: Budget) -> _Reading:
         widest = _MAX_BARE_GAP_M if gap.is_between_ends else _MAX_BARE_GAP_AT_A_FACE_M
         is_bare = found.kind == "nothing" or (found.kind == "line" and not gap.is_between_ends)
         if is_bare and not (gap.is_sure and gap.width <= widest):
+            return None
+        if found.kind != "pane" and gap.width > _WIDEST_WITH_ONE_LINE_M:
             return None
         return ("swing", "pane", "line", "nothing").index(found.kind)
 
