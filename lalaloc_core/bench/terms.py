@@ -41,7 +41,7 @@ def bench_heights(bundle: Bundle, homes: int, textures: Path | None) -> dict[str
 
 
 def bench_copies(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
-    """Which of four copies of a home that differ in their doors only, with and without openings."""
+    """Which of four copies of a home that differ in where their doors are, with and without openings."""
     rows = {name: TERMS[name] for name in ("all", "without_openings")}
     return {"test": _rows(bundle, rows, homes, textures, unfamiliar=False, copies=True)}
 
