@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from lalaloc_core.bench.accuracy import bench_accuracy, bench_evidence
+from lalaloc_core.bench.azimuths import bench_azimuths
 from lalaloc_core.bench.datasets import bench_datasets
 from lalaloc_core.bench.methods import bench_methods
 from lalaloc_core.bench.rendering import bench_rendering
@@ -24,6 +25,7 @@ def run_bench(bundle_folder: Path, groups: Sequence[str], *, homes: int, texture
         "service": lambda: bench_service(bundle, textures),
         "accuracy": lambda: bench_accuracy(bundle, homes, textures),
         "evidence": lambda: bench_evidence(bundle, homes, textures),
+        "azimuths": lambda: bench_azimuths(bundle, homes, textures),
         "terms": lambda: bench_terms(bundle, homes, textures),
         "heights": lambda: bench_heights(bundle, homes, textures),
         "copies": lambda: bench_copies(bundle, homes, textures),

@@ -11,7 +11,18 @@ from lalaloc_core.bundle import default_bundle
 from lalaloc_core.cli.arguments import count
 from lalaloc_core.cli.printing import print_json
 
-_GROUPS = ("rendering", "service", "accuracy", "evidence", "terms", "heights", "copies", "methods", "datasets")
+_GROUPS = (
+    "rendering",
+    "service",
+    "accuracy",
+    "evidence",
+    "azimuths",
+    "terms",
+    "heights",
+    "copies",
+    "methods",
+    "datasets",
+)
 
 
 def add_commands(commands: Any) -> None:

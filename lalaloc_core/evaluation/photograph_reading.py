@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from lalaloc_core.azimuths import AzimuthMeasures, measure_azimuths
 from lalaloc_core.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph
@@ -41,13 +41,7 @@ def read_photographs(encoders: Encoders, photographs: Sequence[AnnotatedPhotogra
     read = []
     for one in photographs:
         image = one.photograph.image(manifest.image_height, manifest.image_width)
-        query = encoders.query(image, 0.0, CameraHeight(CAMERA_HEIGHT_M, 0.0))
-        if query.profile is None:
-            raise BundleError(f"model '{manifest.name}' predicts no wall profile, which is what is measured")
-        log_m, log_scale = query.profile.log_m[0], query.profile.log_scale[0]
-        # Relative to the shares of the classes, as poses are compared: every class counts alike in what is reported.
-        openings = query.openings
-        scores = None if openings is None else openings.log_probability[0] - np.log(openings.prior)
+        log_m, log_scale, scores = read_azimuths(encoders, image, CAMERA_HEIGHT_M)
         measures = measure_azimuths(
             [one.profile_m(outline, len(log_m)) for outline in range(len(one.outlines))],
             log_m,
@@ -57,3 +51,23 @@ def read_photographs(encoders: Encoders, photographs: Sequence[AnnotatedPhotogra
         )
         read.append(ReadPhotograph(photograph=one, profile_m=np.exp(log_m), class_scores=scores, measures=measures))
     return read
+
+
+def read_azimuths(
+    encoders: Encoders, image: UInt8[np.ndarray, "height width 3"], camera_height_m: float
+) -> tuple[Float[np.ndarray, "w"], Float[np.ndarray, "w"], Float[np.ndarray, "w c"] | None]:
+    """What a model says of a panorama in its own frame.
+
+    Returns:
+        the log of the predicted wall profile (m), the log of its scale, and `ReadPhotograph.class_scores`.
+
+    Raises:
+        BundleError: the model predicts no wall profile.
+    """
+    query = encoders.query(image, 0.0, CameraHeight(camera_height_m, 0.0))
+    if query.profile is None:
+        raise BundleError(f"model '{encoders.manifest.name}' predicts no wall profile, which is what is measured")
+    # Relative to the shares of the classes, as poses are compared: every class counts alike in what is reported.
+    openings = query.openings
+    scores = None if openings is None else openings.log_probability[0] - np.log(openings.prior)
+    return query.profile.log_m[0], query.profile.log_scale[0], scores
