@@ -47,6 +47,8 @@ class LocaliseConfig:
         alike_margin, max_candidates: as many more, up to this number in all, as cost less than this more than the best:
             places that look alike must all be refined to share what is probable.
         separation_m: candidates nearer than this to a better one are dropped; retrieval keeps those turned otherwise.
+        every_stage: tell what every stage found, even where a later one is reached. Where walls are compared the
+            optimiser begins with the grid's candidates; VDR is then worth its time only where LPO has no result.
         by_probability: rank the answers by how probable they are instead of by cost, as places of several plans are.
         evidence: what poses are compared by.
     """
@@ -60,6 +62,7 @@ class LocaliseConfig:
     alike_margin: float = 0.2
     max_candidates: int = 64
     separation_m: float = 1.0
+    every_stage: bool = False
     by_probability: bool = False
     evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
 
@@ -214,85 +217,152 @@ def localise_steps(
     hints: Hints = NO_HINTS,
 ) -> Steps:
     """`localise` for who waits for the optimiser elsewhere: stops where poses are to be optimised; see `next_step`."""
-    config = config or LocaliseConfig()
-    clock = clock or StageClock()
-    weights, evidence = encoders.manifest.evidence, config.evidence
-    prior = area_shares(grid.poses, plan.areas_m2)
-    stage: SearchStage = "retrieval"
+    config, clock = config or LocaliseConfig(), clock or StageClock()
     hints.check(plan)
-    with clock.stage("retrieve"):
-        doubted = not hints.strict and contradicted(plan, grid, query, weights, evidence)
-        query = query.searched if doubted and query.searched is not None else query
-        costs = grid_costs(plan, grid, query, weights, evidence, hints)
-        # Refined candidates may meet and become one; spare ones then take the free places.
-        least = config.least_starts(query)
-        modes = retrieve(
-            costs,
-            grid,
-            query,
-            top_k=max(top_k, least) + least,
-            separation_m=config.separation_m,
-            margin=config.alike_margin,
-            limit=config.max_candidates + top_k,
-        )
-        starts = config.starts(query, modes)
-        reach_m = evidence.grid_reach * grid.step_m
-        cost_to_chance = log_cost_to_chance(
-            encoders.cohort, plan, query, float(costs.cost.min()), reach_m, weights, evidence
-        )
-    candidates, ends = list(modes), list[Candidate]()
-    candidates[:1] = with_latents(plan, encoders, query, candidates[:1], grid.camera_height_m)
+    search = _Search(plan, grid, encoders, query, config, clock, hints, top_k)
+    resampling = refine != "none" and config.vdr_candidates > 0
+    if refine != "lpo":
+        return search.answer(search.without_lpo(resampling=resampling))
+    # Where walls are compared the optimiser begins with the grid's candidates, and what comes before is told at need.
+    early = None
+    if config.every_stage or not search.by_walls:
+        early = search.without_lpo(resampling=resampling)
+    begun = search.modes if search.by_walls or early is None else early
+    with clock.stage("lpo"):
+        result = yield search.job(begun)
+        refined = None if result is None else search.refined(begun, result)
+    if refined is not None:
+        return search.answer(refined)
+    return search.answer(search.without_lpo(resampling=resampling) if early is None else early)
 
-    def posterior(first: list[Candidate]) -> Posterior:
-        begun = modes[: len(ends)]
-        return posterior_of(costs, prior, query, begun, ends, first, weights.temperature, config.separation_m)
 
-    best: dict[SearchStage, Candidate] = {"retrieval": candidates[0]}
-    signals: dict[SearchStage, Signals] = {
-        "retrieval": signals_of(query, candidates[0], posterior(candidates[:1]), cost_to_chance)
-    }
-    if refine in ("vdr", "lpo") and config.vdr_candidates:
-        with clock.stage("vdr"):
-            for index in range(min(config.vdr_candidates, len(candidates))):
-                candidates[index] = resample(
-                    plan,
-                    encoders,
-                    query,
-                    candidates[index],
-                    camera_height_m=grid.camera_height_m,
+class _Search:
+    """One query in one plan: its candidates, and what its stages tell of them.
+
+    Attributes:
+        query: it, or it with an unknown heading where the picture contradicts what is said of the heading.
+        by_walls: whether poses are compared by their wall profiles.
+        modes: of the grid's posterior, the best first.
+    """
+
+    def __init__(
+        self,
+        plan: FloorPlan,
+        grid: LatentGrid,
+        encoders: Encoders,
+        query: Query,
+        config: LocaliseConfig,
+        clock: StageClock,
+        hints: Hints,
+        top_k: int,
+    ) -> None:
+        """Retrieve candidates."""
+        self._plan, self._grid, self._encoders, self._config = plan, grid, encoders, config
+        self._clock, self._hints, self._top_k = clock, hints, top_k
+        weights, evidence = encoders.manifest.evidence, config.evidence
+        with clock.stage("retrieve"):
+            self._doubted = not hints.strict and contradicted(plan, grid, query, weights, evidence)
+            self.query = query = query.searched if self._doubted and query.searched is not None else query
+            self._costs = costs = grid_costs(plan, grid, query, weights, evidence, hints)
+            # Refined candidates may meet and become one; spare ones then take the free places.
+            least = config.least_starts(query)
+            self.modes = retrieve(
+                costs,
+                grid,
+                query,
+                top_k=max(top_k, least) + least,
+                separation_m=config.separation_m,
+                margin=config.alike_margin,
+                limit=config.max_candidates + top_k,
+            )
+            self._starts = config.starts(query, self.modes)
+            reach_m = evidence.grid_reach * grid.step_m
+            self._cost_to_chance = log_cost_to_chance(
+                encoders.cohort, plan, query, float(costs.cost.min()), reach_m, weights, evidence
+            )
+        self.by_walls = evidence.compares_profiles(query)
+        self._prior = area_shares(grid.poses, plan.areas_m2)
+        self._ends = list[Candidate]()
+        self._best = dict[SearchStage, Candidate]()
+        self._signals = dict[SearchStage, Signals]()
+        self._stage: SearchStage = "retrieval"
+
+    def without_lpo(self, *, resampling: bool) -> list[Candidate]:
+        """The candidates after retrieval and, with `resampling`, after VDR; tells what these stages found."""
+        config, camera_height_m = self._config, self._grid.camera_height_m
+        first = with_latents(self._plan, self._encoders, self.query, self.modes[:1], camera_height_m)
+        candidates = first + self.modes[1:]
+        self._tell("retrieval", first[0], self._posterior(first))
+        if not resampling:
+            return candidates
+        with self._clock.stage("vdr"):
+            resampled = [
+                resample(
+                    self._plan,
+                    self._encoders,
+                    self.query,
+                    candidate,
+                    camera_height_m=camera_height_m,
                     samples=config.vdr_samples,
-                    radius_m=config.vdr_radius_steps * grid.step_m,
-                    evidence=evidence,
-                    hints=hints,
+                    radius_m=config.vdr_radius_steps * self._grid.step_m,
+                    evidence=config.evidence,
+                    hints=self._hints,
                 )
-        stage = "vdr"
-        best[stage] = min(candidates[: config.vdr_candidates], key=attrgetter("total_cost"))
-        signals[stage] = signals_of(query, best[stage], posterior([best[stage]]), cost_to_chance)
-    if refine == "lpo":
-        with clock.stage("lpo"):
-            job = refinement_job(plan, query, candidates[:starts], grid.camera_height_m, weights, evidence)
-            result = yield job
-            if result is not None:
-                ends = refined(plan, encoders, query, candidates[:starts], result, evidence, hints)
-                candidates = sorted(ends, key=attrgetter("total_cost")) + candidates[starts:]
-                stage = "lpo"
-    elif stage == "vdr":
-        first = config.vdr_candidates
-        candidates = sorted(candidates[:first], key=attrgetter("total_cost")) + candidates[first:]
-    wanted = max(top_k, starts) if config.by_probability else top_k
-    answers = distinct(candidates, query, config.separation_m, wanted)
-    found = posterior(answers)
-    if config.by_probability:
-        answers, found = _by_probability(answers, found, top_k, posterior)
-    if evidence.compares_profiles(query):
-        answers = with_latents(plan, encoders, query, answers, grid.camera_height_m)
-    if stage == "lpo" or config.by_probability:
-        best[stage] = answers[0]
-        signals[stage] = signals_of(query, answers[0], found, cost_to_chance)
-    missed = hints.missed(answers[0].position_m, answers[0].room_index)
-    if hints.strict:
-        missed = missed_hints(plan, costs, weights, hints)
-    return Localisation(query, answers, found, stage, signals, doubted, missed, best, clock.timings_ms)
+                for candidate in candidates[: config.vdr_candidates]
+            ]
+        resampled.sort(key=attrgetter("total_cost"))
+        self._tell("vdr", resampled[0], self._posterior(resampled[:1]))
+        return resampled + candidates[config.vdr_candidates :]
+
+    def job(self, begun: list[Candidate]) -> RefinementJob:
+        """What is to be optimised of candidates."""
+        weights, evidence = self._encoders.manifest.evidence, self._config.evidence
+        first = begun[: self._starts]
+        return refinement_job(self._plan, self.query, first, self._grid.camera_height_m, weights, evidence)
+
+    def refined(self, begun: list[Candidate], result: RefinementResult) -> list[Candidate]:
+        """The candidates after LPO, the best first."""
+        evidence, first, rest = self._config.evidence, begun[: self._starts], begun[self._starts :]
+        self._ends = refined(self._plan, self._encoders, self.query, first, result, evidence, self._hints)
+        self._stage = "lpo"
+        return sorted(self._ends, key=attrgetter("total_cost")) + rest
+
+    def answer(self, candidates: list[Candidate]) -> Localisation:
+        """The distinct ones of the candidates of the last stage, and how they came about."""
+        config, hints, camera_height_m = self._config, self._hints, self._grid.camera_height_m
+        wanted = max(self._top_k, self._starts) if config.by_probability else self._top_k
+        answers = distinct(candidates, self.query, config.separation_m, wanted)
+        found = self._posterior(answers)
+        if config.by_probability:
+            answers, found = _by_probability(answers, found, self._top_k, self._posterior)
+        if self.by_walls:
+            answers = with_latents(self._plan, self._encoders, self.query, answers, camera_height_m)
+        if self._stage == "lpo" or config.by_probability:
+            self._tell(self._stage, answers[0], found)
+        missed = hints.missed(answers[0].position_m, answers[0].room_index)
+        if hints.strict:
+            missed = missed_hints(self._plan, self._costs, self._encoders.manifest.evidence, hints)
+        return Localisation(
+            self.query,
+            answers,
+            found,
+            self._stage,
+            self._signals,
+            self._doubted,
+            missed,
+            self._best,
+            self._clock.timings_ms,
+        )
+
+    def _posterior(self, first: list[Candidate]) -> Posterior:
+        """The posterior by what is known by now, with the probabilities of some candidates."""
+        ends, temperature = self._ends, self._encoders.manifest.evidence.temperature
+        begun, apart_m = self.modes[: len(ends)], self._config.separation_m
+        return posterior_of(self._costs, self._prior, self.query, begun, ends, first, temperature, apart_m)
+
+    def _tell(self, stage: SearchStage, candidate: Candidate, found: Posterior) -> None:
+        self._stage, self._best[stage] = stage, candidate
+        self._signals[stage] = signals_of(self.query, candidate, found, self._cost_to_chance)
 
 
 def panorama_heading(query: Query, candidate: Candidate) -> float:

@@ -81,7 +81,8 @@ class LaLaLoc:
         self._stated = stated
         self._refine: Refine = refine
         self._refiner = refiner
-        self._config = config or LocaliseConfig()
+        # What every stage found is what evaluations report.
+        self._config = dataclasses.replace(config or LocaliseConfig(), every_stage=True)
         self._grids: LRUCache[Any, LatentGrid] = LRUCache(GRIDS_CACHED)
 
     def answer(self, question: Question) -> Answer:

@@ -23,6 +23,8 @@ _CORRIDOR_M, _LONGEST_CORRIDOR_M, _DOOR_M, _DOORS_EVERY_M = 2.5, 60.0, 0.9, 6.0
 # Halls: their area (m²), how far their columns are apart, and how thick they are.
 _HALL_M2, _COLUMNS_EVERY_M, _COLUMN_M = 900.0, 5.0, 0.5
 _CEILING_M = 3.0
+# Floor by length of the wings (m); gaps and courtyards make buildings more than twice as deep.
+_DEEPEST_M = 350.0
 # Buildings are larger than what one may upload.
 _LIMITS = PlanLimits(max_rooms=10**6, max_plan_vertices=10**7, max_openings=10**6)
 
@@ -59,7 +61,8 @@ class _Builder:
     def __init__(self, split: int, seed: int, area_m2: float, hall_share: float) -> None:
         self._split, self._seed = split, seed
         self._area_m2, self._hall_share = area_m2, hall_share
-        self._length_m = 1.1 * math.sqrt(area_m2)
+        # Nearly square; large ones are wider, as a wing is as deep as its deepest home and they would be too long.
+        self._length_m = max(1.1 * math.sqrt(area_m2), area_m2 / _DEEPEST_M)
         self._rooms: list[dict[str, Any]] = []
         self._openings: list[dict[str, Any]] = []
         self._homes: list[Home] = []
@@ -119,7 +122,9 @@ class _Builder:
         columns: list[list[list[float]]] = []
         for column_x in np.arange(_COLUMNS_EVERY_M, width - 1.0, _COLUMNS_EVERY_M):
             for column_y in np.arange(_COLUMNS_EVERY_M, depth - 1.0, _COLUMNS_EVERY_M):
-                at = np.array([x_m + column_x, y_m + column_y]) + rng.uniform(-0.6, 0.6, 2)
+                at = np.array([column_x, column_y]) + rng.uniform(-0.6, 0.6, 2)
+                # Within the hall, however it falls.
+                at = np.array([x_m, y_m]) + np.minimum(at, np.array([width, depth]) - _COLUMN_M - 0.1)
                 columns.append(_rectangle(float(at[0]), float(at[1]), _COLUMN_M, _COLUMN_M)[::-1])
         self._rooms.append(_room(f"hall-{len(self._rooms)}", _rectangle(x_m, y_m, width, depth), columns))
         self._floor_m2 += width * depth

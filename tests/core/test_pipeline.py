@@ -192,6 +192,23 @@ class TestStages:
         assert few.signals == many.signals
         assert few.signals["lpo"].cost == few.candidates[0].cost
 
+    def test_vdr_of_what_is_compared_by_walls_runs_where_it_is_asked_for_or_lpo_has_nothing(
+        self, flat: FloorPlan, grid: LatentGrid, encoders: Encoders, optimiser: LatentPoseOptimiser
+    ) -> None:
+        query = layout_query(encoders, flat, some_pose(flat, 3), by_profile=True)
+        every = LocaliseConfig(every_stage=True)
+        alone = localise(flat, grid, encoders, query, refiner=optimiser.refine)
+        told = localise(flat, grid, encoders, query, refiner=optimiser.refine, config=every)
+        lost = localise(flat, grid, encoders, query, refiner=lambda job: None)
+        assert list(alone.best) == ["lpo"]
+        assert list(told.best) == ["retrieval", "vdr", "lpo"]
+        assert list(lost.best) == ["retrieval", "vdr"]
+        assert lost.stage == "vdr"
+        assert "vdr" not in alone.timings_ms
+        assert told.timings_ms["vdr"] > 0.0
+        assert alone.candidates == told.candidates
+        assert alone.signals["lpo"] == told.signals["lpo"]
+
     def test_the_refiner_is_given_each_candidate_with_its_own_room_and_target(
         self, flat: FloorPlan, grid: LatentGrid, encoders: Encoders
     ) -> None:
@@ -201,7 +218,7 @@ class TestStages:
             query = encoders.query(image, heading, CameraHeight(CAMERA_M))
             assert query.profile is not None
             localise(flat, grid, encoders, query, refiner=lambda job: jobs.append(job))
-            expected = localise(flat, grid, encoders, query, refine="vdr").candidates
+            expected = localise(flat, grid, encoders, query, refine="none").candidates
             job = jobs[-1]
             assert job.optimise_heading == (heading is None)
             assert job.log_profile is not None
