@@ -36,6 +36,8 @@ from lalaloc_core.synth.splits import VALIDATION
 from service.grids.embedding import embed, grid_bytes
 
 _AREAS_M2 = (100.0, 1000.0, 5000.0, 10_000.0, 50_000.0, 100_000.0, 200_000.0)
+# Homes side by side have more doors and windows than plans of this size may have otherwise.
+_MAX_OPENINGS = 30_000
 _STEP_M = 0.5
 _T = TypeVar("_T")
 
@@ -83,7 +85,7 @@ def main() -> None:
 
 def _measure(building: Building, bundle: Bundle, studio: Studio, count: int, *, oracle: bool) -> _Row:
     encoders = Encoders(bundle, threads=1)
-    document, limits = building.plan.to_dict(), PlanLimits()
+    document, limits = building.plan.to_dict(), PlanLimits(max_openings=_MAX_OPENINGS)
     read_s, plan = _timed(lambda: FloorPlan.from_dict(document, limits))
     grids: list[LatentGrid] = []
 
