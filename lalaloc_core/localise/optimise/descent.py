@@ -30,7 +30,8 @@ def levenberg_marquardt(problem: Problem, config: LpoConfig) -> Outcome:
     converged = torch.zeros(len(pose), dtype=torch.bool, device=pose.device)
     part, rows = problem, torch.arange(len(pose), device=pose.device)
     evaluations = 1
-    while evaluations < config.max_iterations:
+    limit = config.profile_iterations if problem.norm == "cauchy" else config.max_iterations
+    while evaluations < limit:
         going_on = ~converged[rows]
         if evaluations >= config.prune_after:
             going_on &= here.distance[rows] <= _worth_going_on(problem, here, config)
