@@ -8,8 +8,8 @@ from pathlib import Path
 
 _CGROUPS = Path("/sys/fs/cgroup")
 _OWN_CGROUP = Path("/proc/self/cgroup")
-# A query keeps an LPO worker busy for about twice as long as it keeps the service's own threads.
-_SHARE_OF_WORKERS = 0.6
+# What LPO has of a query's processor time: a sixth where the heading is known, else a quarter.
+_SHARE_OF_WORKERS = 0.25
 _MAX_WORKERS = 64
 
 
@@ -33,7 +33,9 @@ class CoreShares:
 def share_cores(
     cores: int, *, workers: int | None, worker_threads: int, compute_threads: int, onnx_threads: int
 ) -> CoreShares:
-    """Fill in what is left open, so that no more threads compute than there are cores, but one of each kind.
+    """Fill in what is left open: by the shares that queries and LPO have of the work, and one thread of each kind at least.
+
+    On fewer than four cores one thread more computes than there are cores, as a single LPO worker is mostly idle.
 
     Args:
         cores: to be shared out.
@@ -45,7 +47,8 @@ def share_cores(
     if workers is None:
         workers = min(max(int(_SHARE_OF_WORKERS * cores) // worker_threads, 1), _MAX_WORKERS)
     if not compute_threads:
-        compute_threads = max((cores - workers * worker_threads) // onnx_threads, 1)
+        busy = min(workers * worker_threads, int(_SHARE_OF_WORKERS * cores))
+        compute_threads = max((cores - busy) // onnx_threads, 1)
     return CoreShares(workers, worker_threads, compute_threads, onnx_threads)
 
 

@@ -68,8 +68,8 @@ class Settings(BaseSettings):
         default=None,
         ge=0,
         le=64,
-        description="LPO worker processes; by default six of ten cores that the process may use (affinity and control "
-        "group's quota), at least one. 0 turns LPO off, answers end at VDR.",
+        description="LPO worker processes; by default a quarter of the cores that the process may use (affinity and "
+        "control group's quota), at least one. 0 turns LPO off, answers end at VDR.",
     )
     worker_threads: int = Field(default=0, ge=0, le=256, description="Torch threads of each LPO worker; 0: one.")
     onnx_threads: int = Field(default=0, ge=0, le=256, description="onnxruntime threads per network; 0: one.")
@@ -78,7 +78,7 @@ class Settings(BaseSettings):
         ge=0,
         le=256,
         description="Queries that the service's own process computes at the same time, besides those in LPO; 0: as "
-        "many as the LPO workers leave cores for, at least one.",
+        "many as the LPO workers leave cores for; a worker that has more than a quarter of them shares it.",
     )
     lpo_queue: Count = Field(default=16, description="LPO jobs that may wait for a worker; more are answered by VDR.")
     lpo_deadline_s: Seconds = Field(default=2.0, description="Longest wait for LPO before the VDR pose is the answer.")
