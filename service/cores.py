@@ -33,7 +33,7 @@ class CoreShares:
 def share_cores(
     cores: int, *, workers: int | None, worker_threads: int, compute_threads: int, onnx_threads: int
 ) -> CoreShares:
-    """Fill in what is left open: by the shares that queries and LPO have of the work, and one thread of each kind at least.
+    """Fill in what is left open: by the shares of queries and LPO, and one thread of each kind at least.
 
     On fewer than four cores one thread more computes than there are cores, as a single LPO worker is mostly idle.
 

@@ -13,8 +13,8 @@ class LpoConfig:
     Attributes:
         margin_m: poses keep this distance to walls, so that none ends on the other side of one.
         max_iterations: evaluations of Levenberg-Marquardt at most, the first at the start.
-        profile_iterations: the same where wall profiles are compared: what is predicted errs by more than the last steps
-            gain, and following it to the end finds places that are worse.
+        profile_iterations: the same where wall profiles are compared: what is predicted errs by more than the last
+            steps gain, and following it to the end finds places that are worse.
         tolerance_m: a Levenberg-Marquardt step shorter than this ends the search.
         tolerance_cost: and so does one that lowers the cost by less than this share, or would by the linear model.
         max_step_m, max_turn: longest step (m) and turn (radians) per iteration.
