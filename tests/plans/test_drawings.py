@@ -109,6 +109,11 @@ def test_german_wall_lines_become_rooms():
     assert {("WAND", "lines: wall"), ("MÖBEL", "ignored"), ("TÜREN", "swings of doors")} <= used
 
 
+def test_layers_that_a_dxf_does_not_have_are_refused_with_those_that_it_has():
+    with pytest.raises(InvalidFloorPlanError, match=r"nothing lies on the layers walls; .*'Fenster', .*'WAND'"):
+        import_plan(_dxf(_german_walls()), ImportOptions(layers=("walls",)))
+
+
 def test_a_dxf_without_a_unit_is_refused_with_the_likely_one():
     with pytest.raises(InvalidFloorPlanError, match=r"\$INSUNITS is 0.*looks like mm: units=mm"):
         import_plan(_dxf(_german_walls(insunits=0)))

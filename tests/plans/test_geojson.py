@@ -126,3 +126,13 @@ def test_more_vertices_than_allowed_are_refused():
     content = json.dumps({"type": "Polygon", "coordinates": [[*ring, ring[0]]]}).encode()
     with pytest.raises(InvalidFloorPlanError, match="more than 1000 entities"):
         import_plan(content, limits=ImportLimits(max_entities=1000))
+
+
+def test_an_archive_without_units_says_what_it_has():
+    cases = (("readme.txt", "", "no GeoJSON at all"), ("venue/level.geojson", _collection(), "venue/level.geojson"))
+    for name, content, has in cases:
+        stream = io.BytesIO()
+        with zipfile.ZipFile(stream, "w") as archive:
+            archive.writestr(name, content)
+        with pytest.raises(InvalidFloorPlanError, match=f"no unit.geojson, it has {has}"):
+            import_plan(stream.getvalue())

@@ -127,6 +127,12 @@ def test_a_model_without_spaces_says_what_to_do():
         import_plan(_Model().content())
 
 
+def test_a_model_that_is_cut_off_is_refused():
+    content = _Model().content()
+    with pytest.raises(InvalidFloorPlanError, match="cut off: it does not end with END-ISO-10303-21"):
+        import_plan(content[: len(content) - 30])
+
+
 @pytest.fixture(scope="module")
 def duplex() -> tuple[ImportedPlan, ...]:
     if DUPLEX is None:

@@ -39,6 +39,7 @@ _INSUNITS = {1: (0.0254, "in"), 2: (0.3048, "ft"), 4: (1e-3, "mm"), 5: (0.01, "c
 _LINES = {"LINE", "LWPOLYLINE", "POLYLINE", "ARC", "CIRCLE", "ELLIPSE", "SPLINE"}
 _FILLED = {"HATCH", "MPOLYGON", "SOLID", "TRACE"}
 _TEXTS = {"TEXT", "MTEXT", "ATTRIB"}
+_MAX_NAMED_LAYERS = 20
 _MAX_BLOCK_DEPTH = 16
 # Curves are followed to this share of the drawing's size.
 _SAG = 2e-5
@@ -145,6 +146,12 @@ def _read(document: DxfDocument, options: ImportOptions, notebook: Notebook, bud
             notebook.use(place.layer, "ignored")
         else:
             _add(entity, place, drawing, notebook, sag)
+    if options.layers and not drawing.areas and not drawing.strokes:
+        there = sorted({layer for layer, _ in notebook.uses})[:_MAX_NAMED_LAYERS]
+        raise InvalidFloorPlanError(
+            f"nothing lies on the layers {', '.join(options.layers)[:200]}; "
+            f"the drawing has {', '.join(repr(layer) for layer in there) or 'nothing on any layer'}"
+        )
     return drawing
 
 

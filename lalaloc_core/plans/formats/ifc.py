@@ -36,6 +36,8 @@ _SEAM_M = 1e-4
 _TOUCHING_M, _THICK_M, _TOUCHING_PASSAGE_M = 2e-3, 0.6, 0.3
 # Where nearly all neighbours touch, spaces are drawn to the middle of their walls.
 _MOSTLY = 0.9
+# How a whole file ends, and in how many last bytes that must stand: some tools append spaces or comments.
+_END, _TAIL_BYTES = b"END-ISO-10303-21", 4096
 _KINDS = {"IfcDoor": "door", "IfcWindow": "window"}
 
 
@@ -78,6 +80,9 @@ def import_ifc(content: bytes, options: ImportOptions, budget: Budget) -> tuple[
 def _open(content: bytes) -> Any:
     import ifcopenshell
 
+    # What is cut off would be read as far as it goes, without the storeys or doors that are missing.
+    if _END not in content[-_TAIL_BYTES:]:
+        raise InvalidFloorPlanError(f"the IFC file is cut off: it does not end with {_END.decode()}")
     try:
         # Line by line in Latin-1: what lies beyond ASCII is escaped in the format itself.
         model = ifcopenshell.file.from_string(content.decode("utf-8", "replace"))

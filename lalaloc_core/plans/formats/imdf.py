@@ -29,7 +29,8 @@ def import_imdf(files: Mapping[str, bytes], options: ImportOptions, budget: Budg
     """
     by_type = {name.rpartition("/")[2].partition(".")[0].casefold(): name for name in files}
     if "unit" not in by_type:
-        raise InvalidFloorPlanError(f"the archive has no unit.geojson, it has {', '.join(sorted(files)[:10])}")
+        found = ", ".join(sorted(files)[:10]) or "no GeoJSON at all"
+        raise InvalidFloorPlanError(f"the archive has no unit.geojson, it has {found}")
     features = []
     for kind in _TAKEN:
         if kind in by_type:
