@@ -19,7 +19,7 @@ from lalaloc_core.localise.cohort import SIZE, Cohort, cohort_of, log_cost_to_ch
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.evidence import EvidenceConfig
 from lalaloc_core.localise.optimise import LatentPoseOptimiser
-from lalaloc_core.localise.pipeline import localise
+from lalaloc_core.localise.pipeline import LocaliseConfig, localise
 from lalaloc_core.localise.poses import PredictedProfile, Query
 from lalaloc_core.localise.retrieval import build_grid, grid_costs
 from lalaloc_core.sampling import PoseSet
@@ -92,7 +92,8 @@ class TestBundles:
         encoders, home = Encoders(with_cohort, threads=1), crooked_flat()
         query = picture_of(encoders, home, (5.1, 1.3), -3.5)
         grid = build_grid(home, encoders, step_m=0.5, camera_height_m=CAMERA_M)
-        signals = localise(home, grid, encoders, query, refiner=optimiser.refine).signals
+        config = LocaliseConfig(every_stage=True)
+        signals = localise(home, grid, encoders, query, refiner=optimiser.refine, config=config).signals
         expected = in_units_of_chance(encoders, cohort, home, query)
         assert len(signals) == 3
         for signal in signals.values():

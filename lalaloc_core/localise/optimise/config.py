@@ -13,8 +13,8 @@ class LpoConfig:
     Attributes:
         margin_m: poses keep this distance to walls, so that none ends on the other side of one.
         max_iterations: evaluations of Levenberg-Marquardt at most, the first at the start.
-        profile_iterations: the same where wall profiles are compared: what is predicted errs by more than the last
-            steps gain, and following it to the end finds places that are worse.
+        profile_iterations, exact_cost: so many where wall profiles are compared, and more for poses of less than this
+            cost alone: what is predicted errs by more than the last steps gain, unless it fits so well.
         tolerance_m: a Levenberg-Marquardt step shorter than this ends the search.
         tolerance_cost: and so does one that lowers the cost by less than this share, or would by the linear model.
         max_step_m, max_turn: longest step (m) and turn (radians) per iteration.
@@ -28,6 +28,7 @@ class LpoConfig:
     margin_m: float = 0.03
     max_iterations: int = 15
     profile_iterations: int = 4
+    exact_cost: float = 0.01
     tolerance_m: float = 1e-3
     tolerance_cost: float = 1e-2
     initial_damping: float = 1e-2

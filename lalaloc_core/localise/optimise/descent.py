@@ -30,11 +30,12 @@ def levenberg_marquardt(problem: Problem, config: LpoConfig) -> Outcome:
     converged = torch.zeros(len(pose), dtype=torch.bool, device=pose.device)
     part, rows = problem, torch.arange(len(pose), device=pose.device)
     evaluations = 1
-    limit = config.profile_iterations if problem.norm == "cauchy" else config.max_iterations
-    while evaluations < limit:
+    while evaluations < config.max_iterations:
         going_on = ~converged[rows]
         if evaluations >= config.prune_after:
             going_on &= here.distance[rows] <= _worth_going_on(problem, here, config)
+        if problem.norm == "cauchy" and evaluations >= config.profile_iterations:
+            going_on &= here.distance[rows] < config.exact_cost
         left = rows[going_on]
         if len(left) == 0:
             break
