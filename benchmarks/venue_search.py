@@ -22,11 +22,11 @@ from lalaloc_core.data.synthetic.generated import SPLIT_NUMBERS
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.evidence import EvidenceConfig
 from lalaloc_core.localise.pipeline import localise
-from lalaloc_core.localise.plan_index import PlanIndex
 from lalaloc_core.localise.poses import Query
-from lalaloc_core.localise.prototype_cells import shipped_cells
-from lalaloc_core.localise.prototypes import most_probable, prototypes_of
-from lalaloc_core.localise.side_by_side import PlansSideBySide
+from lalaloc_core.localise.venue.merged_plans import MergedPlans
+from lalaloc_core.localise.venue.plan_index import PlanIndex
+from lalaloc_core.localise.venue.prototype_cells import shipped_cells
+from lalaloc_core.localise.venue.prototypes import most_probable, prototypes_of
 from lalaloc_core.methods.lalaloc import local_refiner
 from lalaloc_core.synth.splits import home_of
 from scripts.make_prototype_cells import grid_without_latents
@@ -53,7 +53,7 @@ def main() -> None:
     poses = np.array([len(grid.poses) for grid in grids])
 
     def found(query: Query, among: list[int]) -> int:
-        laid = PlansSideBySide.of([plans[k] for k in among], [grids[k] for k in among], query.camera_height.height_m)
+        laid = MergedPlans.of([plans[k] for k in among], [grids[k] for k in among], query.camera_height.height_m)
         answer = localise(laid.plan, laid.grid, encoders, query, refiner=refiner, config=VENUE_CONFIG)
         return among[laid.in_own_plan(answer.candidates[0])[0]]
 

@@ -29,10 +29,10 @@ from lalaloc_core.data.synthetic.generated import SPLIT_NUMBERS, RenderedPhotogr
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.evidence import EvidenceConfig
-from lalaloc_core.localise.plan_index import COMPARED, SCANNED, PlanIndex
 from lalaloc_core.localise.poses import Query
-from lalaloc_core.localise.prototype_cells import shipped_cells
-from lalaloc_core.localise.prototypes import AZIMUTHS, packed_openings, prototypes_of, unpacked_openings
+from lalaloc_core.localise.venue.plan_index import COMPARED, SCANNED, PlanIndex
+from lalaloc_core.localise.venue.prototype_cells import shipped_cells
+from lalaloc_core.localise.venue.prototypes import AZIMUTHS, packed_openings, prototypes_of, unpacked_openings
 from lalaloc_core.synth.shots import sample_shots
 from lalaloc_core.synth.splits import home_of
 from scripts.make_prototype_cells import grid_without_latents

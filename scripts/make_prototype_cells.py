@@ -1,7 +1,7 @@
-"""Write the cells of `lalaloc_core.localise.prototype_cells`: k-means over prototypes of generated homes for training.
+"""Write the cells of `lalaloc_core.localise.venue.prototype_cells`: k-means over prototypes of generated homes.
 
-Some of the homes are scaled up, so that offices and halls find cells as well. Plans that were sorted into other cells
-are sorted anew where they are read.
+The homes are those for training. Some of them are scaled up, so that offices and halls find cells as well. Plans that
+were sorted into other cells are sorted anew where they are read.
 
     .venv/bin/python -m scripts.make_prototype_cells
 """
@@ -17,8 +17,8 @@ from jaxtyping import Float
 
 from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.localise.poses import LatentGrid
-from lalaloc_core.localise.prototype_cells import CELLS_FILE, features, nearest
-from lalaloc_core.localise.prototypes import AZIMUTHS, Prototypes, joined, prototypes_of, unpacked_openings
+from lalaloc_core.localise.venue.prototype_cells import CELLS_FILE, features, nearest
+from lalaloc_core.localise.venue.prototypes import AZIMUTHS, Prototypes, joined, prototypes_of, unpacked_openings
 from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.sampling import pose_grid
 from lalaloc_core.synth.plans import Home

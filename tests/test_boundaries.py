@@ -45,6 +45,7 @@ LAYERS = {
     "lalaloc_core.localise": 4,
     "lalaloc_core.localise.optimise": 5,
     "lalaloc_core.localise.sequence": 5,
+    "lalaloc_core.localise.venue": 5,
     "lalaloc_core.data": 5,
     "lalaloc_core.draw": 5,
     "lalaloc_core.data.synthetic": 6,

@@ -3,7 +3,8 @@
 Begin with `pipeline.py`, the path of a query: `retrieval.py` compares it with the plan's grid, `vogel.py` samples more
 poses around the best, `optimise/` moves them (LPO, all here that imports torch), `confidence.py` and
 `covariance.py` say how sure the answer is. `evidence.py` is what poses are compared by, `encoders.py` runs the networks
-on onnxruntime. Worker processes load parts of this, so only plain values are re-exported.
+on onnxruntime. `venue/` searches several plans as one, `sequence/` answers several photographs jointly. Worker
+processes load parts of this, so only plain values are re-exported.
 """
 
 from lalaloc_core.localise.evidence import EvidenceConfig

@@ -10,8 +10,8 @@ from lalaloc_core.errors import LaLaLocError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.poses import LatentGrid
-from lalaloc_core.localise.prototype_cells import shipped_cells
-from lalaloc_core.localise.prototypes import prototypes_of
+from lalaloc_core.localise.venue.prototype_cells import shipped_cells
+from lalaloc_core.localise.venue.prototypes import prototypes_of
 from service.errors import (
     PlanFailedError,
     PlanNotReadyError,

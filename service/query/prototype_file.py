@@ -28,7 +28,7 @@ from typing import IO
 
 import numpy as np
 
-from lalaloc_core.localise.prototypes import ROW
+from lalaloc_core.localise.venue.prototypes import ROW
 from service.telemetry import LOGGER_NAME
 
 _HEADER = struct.Struct("<8sq32sIII")

@@ -16,7 +16,7 @@ from lalaloc_core.errors import InvalidHintError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.hints import HintName, Hints, NearInEach, log_factor, rooms_named
 from lalaloc_core.localise.pipeline import Localisation
-from lalaloc_core.localise.side_by_side import PlansSideBySide
+from lalaloc_core.localise.venue.merged_plans import MergedPlans
 from service.query.geopose import anchor_of
 from service.query.hints import contradiction, near_missed
 from service.schemas.hint_fields import EarthPoint, HintFields
@@ -119,7 +119,7 @@ class VenueHints:
         self,
         rows: _Rows,
         plans: Sequence[FloorPlan],
-        laid: PlansSideBySide,
+        laid: MergedPlans,
         shares: Mapping[HintName, float],
         *,
         partly: bool,
@@ -159,7 +159,7 @@ class VenueHints:
         what = "were not searched, near being strict" if self.strict else "near says nothing of them"
         return [f"{count} of the venue's {len(rows)} floor plans have no anchor: {what}"]
 
-    def warnings(self, hints: Hints, found: Localisation, rows: _Rows, laid: PlansSideBySide) -> list[str]:
+    def warnings(self, hints: Hints, found: Localisation, rows: _Rows, laid: MergedPlans) -> list[str]:
         """Says which hints were not followed, or were although the panorama contradicts them."""
         answer = found.candidates[0]
         row = rows[laid.plan_of(answer.room_index)]

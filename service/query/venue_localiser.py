@@ -22,8 +22,8 @@ from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.hints import Hints
 from lalaloc_core.localise.pipeline import Localisation, LocaliseConfig, StageClock, localise_steps
 from lalaloc_core.localise.poses import Candidate, LatentGrid, Query
-from lalaloc_core.localise.prototypes import share_searched
-from lalaloc_core.localise.side_by_side import PlansSideBySide
+from lalaloc_core.localise.venue.merged_plans import MergedPlans
+from lalaloc_core.localise.venue.prototypes import share_searched
 from service.errors import NoPlanNearbyError, VenueNotReadyError, VenueUnsearchableError
 from service.grids import check_height_m
 from service.http.admission_control import Slots
@@ -61,7 +61,7 @@ class _Searched:
 
     rows: Sequence[Row[Any]]
     records: Sequence[PlanRecord]
-    side_by_side: PlansSideBySide
+    merged: MergedPlans
     log_mass: Float[np.ndarray, "p"] | None
     index: Sequence[int]
     warnings: list[str]
@@ -70,14 +70,14 @@ class _Searched:
 
     def place(self, candidate: Candidate) -> Place:
         """Where a candidate is."""
-        number, own = self.side_by_side.in_own_plan(candidate)
+        number, own = self.merged.in_own_plan(candidate)
         record = self.records[number]
         anchor, level = anchor_of(record.plan, self.anchor), self.rows[number].level
         return Place(record.id, record.revision_id, record.plan, own, anchor, level)
 
     def shares(self, found: Localisation) -> tuple[float, Float[np.ndarray, "m"]]:
         """How probable it is that the plan is among those searched, and each of these, given that it is."""
-        probability = self.side_by_side.by_plan(found.posterior.pose)
+        probability = self.merged.by_plan(found.posterior.pose)
         if self.log_mass is None:
             return 1.0, probability
         return share_searched(self.log_mass, np.array(self.index), probability), probability
@@ -189,10 +189,10 @@ class VenueLocaliser:
         query = await compute(lambda: self._localiser.encode(panorama, known, height, clock))
         with clock.stage("shortlist"):
             searched = await self._searched(venue, ready, query, form, hints, warnings, compute)
-        side_by_side = searched.side_by_side
+        merged = searched.merged
         steps = localise_steps(
-            side_by_side.plan,
-            side_by_side.grid,
+            merged.plan,
+            merged.grid,
             self._encoders,
             query,
             refine=form.refine,
@@ -204,7 +204,7 @@ class VenueLocaliser:
         found = await self._localiser.finished(steps, deadline, party)
         timings_ms = clock.timings_ms | {"total": (monotonic() - begin) * 1e3}
         self._localiser.observe(timings_ms, found.stage)
-        contradicted = hints.warnings(searched.hints, found, searched.rows, side_by_side)
+        contradicted = hints.warnings(searched.hints, found, searched.rows, merged)
         return self._compose(venue, searched, found, known, form.top_k, contradicted, timings_ms)
 
     async def _ready(
@@ -266,18 +266,18 @@ class VenueLocaliser:
                 check_height_m(loaded[0][1], query.camera_height.height_m)
             raise VenueNotReadyError(venue.id, venue.plans, 0.0)
         place = {row.plan_id: number for row, number in zip(rows, index, strict=True)}
-        side_by_side = await compute(partial(_laid_out, kept, query))
+        merged = await compute(partial(_laid_out, kept, query))
         searched_rows, plans = [row for row, _, _ in kept], [record.plan for _, record, _ in kept]
         return _Searched(
             rows=searched_rows,
             records=[record for _, record, _ in kept],
-            side_by_side=side_by_side,
+            merged=merged,
             log_mass=log_mass,
             index=[place[row.plan_id] for row, _, _ in kept],
             warnings=warnings,
             anchor=venue.anchor,
             hints=await compute(
-                partial(hints.among, searched_rows, plans, side_by_side, shares, partly=log_mass is not None)
+                partial(hints.among, searched_rows, plans, merged, shares, partly=log_mass is not None)
             ),
         )
 
@@ -324,6 +324,6 @@ def _may_stand(record: PlanRecord, form: LocaliseForm) -> bool:
     return True
 
 
-def _laid_out(loaded: Sequence[tuple[Row[Any], PlanRecord, LatentGrid]], query: Query) -> PlansSideBySide:
+def _laid_out(loaded: Sequence[tuple[Row[Any], PlanRecord, LatentGrid]], query: Query) -> MergedPlans:
     plans, grids = [record.plan for _, record, _ in loaded], [grid for _, _, grid in loaded]
-    return PlansSideBySide.of(plans, grids, query.camera_height.height_m)
+    return MergedPlans.of(plans, grids, query.camera_height.height_m)

@@ -21,10 +21,10 @@ from lalaloc_core.bundle import EvidenceModel
 from lalaloc_core.errors import InvalidHintError
 from lalaloc_core.localise.camera_height import DEFAULT_STD_M, CameraHeight
 from lalaloc_core.localise.evidence import EvidenceConfig
-from lalaloc_core.localise.plan_index import PlanIndex
 from lalaloc_core.localise.poses import LatentGrid, Query
-from lalaloc_core.localise.prototype_cells import shipped_cells
-from lalaloc_core.localise.prototypes import most_probable
+from lalaloc_core.localise.venue.plan_index import PlanIndex
+from lalaloc_core.localise.venue.prototype_cells import shipped_cells
+from lalaloc_core.localise.venue.prototypes import most_probable
 from service.bounded_cache import BoundedCache
 from service.errors import StoreUnavailableError
 from service.grids import GridProvider

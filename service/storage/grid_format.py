@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from lalaloc_core.localise.poses import LatentGrid
-from lalaloc_core.localise.prototype_cells import Cells, shipped_cells
-from lalaloc_core.localise.prototypes import ROW, Prototypes
+from lalaloc_core.localise.venue.prototype_cells import Cells, shipped_cells
+from lalaloc_core.localise.venue.prototypes import ROW, Prototypes
 from lalaloc_core.sampling import PoseSet
 
 _HEADER = struct.Struct("<4s3I")

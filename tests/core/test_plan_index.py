@@ -13,7 +13,6 @@ from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.evidence import EvidenceConfig
-from lalaloc_core.localise.plan_index import PlanIndex
 from lalaloc_core.localise.poses import (
     LatentGrid,
     PredictedCeiling,
@@ -23,10 +22,11 @@ from lalaloc_core.localise.poses import (
     Query,
     rolled,
 )
-from lalaloc_core.localise.prototype_cells import FAMILIES, Cells, claims_of, family_of, shipped_cells
-from lalaloc_core.localise.prototype_codes import CodeScan, codes_of, tables_of
-from lalaloc_core.localise.prototype_costs import PrototypeCosts
-from lalaloc_core.localise.prototypes import (
+from lalaloc_core.localise.venue.plan_index import PlanIndex
+from lalaloc_core.localise.venue.prototype_cells import FAMILIES, Cells, claims_of, family_of, shipped_cells
+from lalaloc_core.localise.venue.prototype_codes import CodeScan, codes_of, tables_of
+from lalaloc_core.localise.venue.prototype_costs import PrototypeCosts
+from lalaloc_core.localise.venue.prototypes import (
     AZIMUTHS,
     Prototypes,
     joined,

@@ -12,8 +12,8 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.evidence import Evidence, EvidenceConfig
 from lalaloc_core.localise.poses import LatentGrid, PredictedProfile, Query
-from lalaloc_core.localise.prototypes import most_probable, share_searched
-from lalaloc_core.localise.side_by_side import PlansSideBySide
+from lalaloc_core.localise.venue.merged_plans import MergedPlans
+from lalaloc_core.localise.venue.prototypes import most_probable, share_searched
 from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.sampling import pose_grid
 
@@ -57,14 +57,14 @@ PLANS = [plan_of(4.0, 3.0, openings=True), plan_of(7.0, 2.0, x_m=1e6), plan_of(5
 
 
 @pytest.fixture(scope="module")
-def side_by_side() -> PlansSideBySide:
-    return PlansSideBySide.of(PLANS, [grid_of(plan) for plan in PLANS], 1.5)
+def merged_plans() -> MergedPlans:
+    return MergedPlans.of(PLANS, [grid_of(plan) for plan in PLANS], 1.5)
 
 
-def test_every_pose_costs_what_it_costs_in_its_own_plan(side_by_side: PlansSideBySide) -> None:
+def test_every_pose_costs_what_it_costs_in_its_own_plan(merged_plans: MergedPlans) -> None:
     query = query_at(PLANS[0], 1.3, 1.1)
-    whole, _ = Evidence(side_by_side.plan, query, 0.3, WEIGHTS, CONFIG).costs(
-        side_by_side.grid.layouts(side_by_side.plan)
+    whole, _ = Evidence(merged_plans.plan, query, 0.3, WEIGHTS, CONFIG).costs(
+        merged_plans.grid.layouts(merged_plans.plan)
     )
     parts = []
     for plan in PLANS:
@@ -75,9 +75,9 @@ def test_every_pose_costs_what_it_costs_in_its_own_plan(side_by_side: PlansSideB
     np.testing.assert_allclose(whole, np.concatenate(parts, axis=1), atol=1e-5)
 
 
-def test_layouts_side_by_side_are_those_of_the_plans(side_by_side: PlansSideBySide) -> None:
+def test_layouts_side_by_side_are_those_of_the_plans(merged_plans: MergedPlans) -> None:
     own = [grid_of(plan).layouts(plan) for plan in PLANS]
-    merged = side_by_side.grid.layouts(side_by_side.plan)
+    merged = merged_plans.grid.layouts(merged_plans.plan)
     assert merged.kind is not None
     assert merged.seen is not None
     assert len(merged) == sum(map(len, own))
@@ -92,29 +92,29 @@ def test_layouts_side_by_side_are_those_of_the_plans(side_by_side: PlansSideBySi
         first += len(layouts)
 
 
-def test_the_renderer_sees_in_all_plans_what_it_sees_in_each(side_by_side: PlansSideBySide) -> None:
-    grid = side_by_side.grid
+def test_the_renderer_sees_in_all_plans_what_it_sees_in_each(merged_plans: MergedPlans) -> None:
+    grid = merged_plans.grid
     seen = profiles_at(
-        side_by_side.plan, grid.poses.position_m, grid.poses.room_index, np.zeros(len(grid.poses)), COLUMNS, np.float32
+        merged_plans.plan, grid.poses.position_m, grid.poses.room_index, np.zeros(len(grid.poses)), COLUMNS, np.float32
     )
     np.testing.assert_allclose(seen, grid.profile_m, atol=2e-3)
 
 
-def test_places_are_told_in_the_frames_of_their_plans(side_by_side: PlansSideBySide) -> None:
+def test_places_are_told_in_the_frames_of_their_plans(merged_plans: MergedPlans) -> None:
     own = [grid_of(plan).poses for plan in PLANS]
-    index, last = side_by_side.grid.poses.room_index, np.cumsum([len(one) for one in own])
+    index, last = merged_plans.grid.poses.room_index, np.cumsum([len(one) for one in own])
     for number, room in enumerate(index):
-        assert side_by_side.plan_of(int(room)) == int(
+        assert merged_plans.plan_of(int(room)) == int(
             np.searchsorted(np.cumsum([len(one) for one in own]), number, "right")
         )
-    ones = side_by_side.by_plan(np.ones(len(index)))
+    ones = merged_plans.by_plan(np.ones(len(index)))
     np.testing.assert_array_equal(ones, [len(one) for one in own])
     # No two plans are near each other.
-    parts = np.split(side_by_side.grid.poses.position_m, last[:-1])
+    parts = np.split(merged_plans.grid.poses.position_m, last[:-1])
     for k, part in enumerate(parts):
         for other in parts[k + 1 :]:
             assert np.linalg.norm(part[:, None] - other[None], axis=-1).min() > 9.0
-    assert np.abs(side_by_side.grid.poses.position_m).max() < 100.0
+    assert np.abs(merged_plans.grid.poses.position_m).max() < 100.0
 
 
 def test_the_most_probable_plans_are_searched_as_far_as_they_go() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lalaloc_core.localise.prototypes import ROW
+from lalaloc_core.localise.venue.prototypes import ROW
 from service.query.prototype_file import BlockKey, PrototypeFile
 
 LIMIT = 1000 * ROW.itemsize

@@ -18,7 +18,7 @@ from lalaloc_core.bundle import EvidenceModel
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, WALL_CODE
 from lalaloc_core.localise.evidence import EvidenceConfig, ceiling_costs, precisions, room_type_losses, smoothed
 from lalaloc_core.localise.poses import PredictedCeiling, Query
-from lalaloc_core.localise.prototypes import AZIMUTHS, PER_BYTE, STEPS, azimuths, unpacked_openings
+from lalaloc_core.localise.venue.prototypes import AZIMUTHS, PER_BYTE, STEPS, azimuths, unpacked_openings
 
 # Camera heights whose logs are nearer than this are not told apart by prototypes, whose distances are farther off.
 _OFFSETS_APART = 0.2

@@ -19,8 +19,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
 from lalaloc_core.conventions import OPENING_CLASSES
-from lalaloc_core.localise.prototype_costs import PrototypeCosts
-from lalaloc_core.localise.prototypes import AZIMUTHS
+from lalaloc_core.localise.venue.prototype_costs import PrototypeCosts
+from lalaloc_core.localise.venue.prototypes import AZIMUTHS
 
 _VALUES = 16
 # Where one value of a distance (m) ends and the next one begins: finest where rooms of homes end.

@@ -23,7 +23,7 @@ _GAP_M = 10.0
 
 
 @dataclass(frozen=True, eq=False)
-class PlansSideBySide:
+class MergedPlans:
     """Some plans and their grids as one plan and one grid.
 
     Attributes:
@@ -41,7 +41,7 @@ class PlansSideBySide:
     _poses: Int[np.ndarray, "p"] = field(repr=False)
 
     @classmethod
-    def of(cls, plans: Sequence[FloorPlan], grids: Sequence[LatentGrid], camera_height_m: float) -> PlansSideBySide:
+    def of(cls, plans: Sequence[FloorPlan], grids: Sequence[LatentGrid], camera_height_m: float) -> MergedPlans:
         """Lay plans out, in rows and columns: a single row of many would be so long that single precision feels it.
 
         Args:

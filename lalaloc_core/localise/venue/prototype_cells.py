@@ -20,8 +20,8 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8, UInt16
 
 from lalaloc_core.conventions import OPENING_CLASSES, WALL_CODE
-from lalaloc_core.localise.prototype_costs import PrototypeCosts
-from lalaloc_core.localise.prototypes import AZIMUTHS, unpacked_openings
+from lalaloc_core.localise.venue.prototype_costs import PrototypeCosts
+from lalaloc_core.localise.venue.prototypes import AZIMUTHS, unpacked_openings
 
 CELLS_FILE = Path(__file__).with_name("prototype_cells.npz")
 # What log distances and classes count where prototypes are sorted: about as much as they cost at a usual precision.

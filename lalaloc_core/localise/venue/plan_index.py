@@ -24,10 +24,10 @@ from jaxtyping import Bool, Float, Int, UInt64
 from lalaloc_core.bundle import EvidenceModel
 from lalaloc_core.localise.evidence import EvidenceConfig
 from lalaloc_core.localise.poses import Query
-from lalaloc_core.localise.prototype_cells import FAMILIES, Cells, claims_of
-from lalaloc_core.localise.prototype_codes import BYTES_OF_ONE, CodeScan, codes_of, tables_of
-from lalaloc_core.localise.prototype_costs import PrototypeCosts
-from lalaloc_core.localise.prototypes import ROW, Prototypes, joined
+from lalaloc_core.localise.venue.prototype_cells import FAMILIES, Cells, claims_of
+from lalaloc_core.localise.venue.prototype_codes import BYTES_OF_ONE, CodeScan, codes_of, tables_of
+from lalaloc_core.localise.venue.prototype_costs import PrototypeCosts
+from lalaloc_core.localise.venue.prototypes import ROW, Prototypes, joined
 
 # Pairs of a prototype and hypotheses that a query compares by codes, and of these as they are.
 SCANNED, COMPARED = 40_000_000, 20_000
