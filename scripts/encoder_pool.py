@@ -18,7 +18,7 @@ from torch import Tensor
 from lalaloc_core.bundle import LAYOUT_WEIGHTS, Bundle
 from lalaloc_core.data.synthetic.generated import GeneratedScenes, RenderedPhotograph
 from lalaloc_core.nets import load_layout_encoder
-from lalaloc_core.nets.ring import RingLayoutEncoder
+from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
 from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.sampling import pose_grid, random_poses
 from lalaloc_core.training.config import PRESETS

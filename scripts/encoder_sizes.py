@@ -27,7 +27,7 @@ import torch
 from torch import Tensor, nn
 
 from lalaloc_core.bundle import Bundle
-from lalaloc_core.nets.ring import RingConfig, RingLayoutEncoder
+from lalaloc_core.nets.layout_encoder import RingConfig, RingLayoutEncoder
 from lalaloc_core.training.averaging import moving_average
 from lalaloc_core.training.config import PRESETS, OptimiserConfig
 from lalaloc_core.training.loop import learning_rate

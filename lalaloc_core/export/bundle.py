@@ -35,9 +35,10 @@ from lalaloc_core.bundle import (
 from lalaloc_core.bundle import write_manifest as _write_manifest
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.errors import ExportError
-from lalaloc_core.nets import ImageEncoder, LayoutEncoder, resnet, ring, trunk
+from lalaloc_core.nets import ImageEncoder, LayoutEncoder, paper_encoders, trunk
+from lalaloc_core.nets import layout_encoder as ring
 from lalaloc_core.nets.decoder import LayoutDecoder
-from lalaloc_core.nets.trunk_encoder import TrunkImageEncoder
+from lalaloc_core.nets.image_encoder import TrunkImageEncoder
 from lalaloc_core.training import losses
 from lalaloc_core.training.config import TrainConfig
 
@@ -251,7 +252,7 @@ def _manifest(
     config: TrainConfig, image_encoder: ImageEncoder | None, name: str, version: str, training: dict[str, Any]
 ) -> Manifest:
     sizes = config.layout_sizes
-    statistics = {"ring": ring, "trunk": trunk, "paper": resnet}[config.architecture]
+    statistics = {"ring": ring, "trunk": trunk, "paper": paper_encoders}[config.architecture]
     structure: dict[str, Any] = {}
     if isinstance(image_encoder, TrunkImageEncoder):
         prior = losses.opening_prior(image_encoder.opening_share, config.image.opening_balance)

@@ -18,7 +18,7 @@ from lalaloc_core.bundle import MANIFEST_NAME, Bundle
 from lalaloc_core.data.dataset import Dataset
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.export.run import export_run
-from lalaloc_core.nets.resnet import PaperConfig
+from lalaloc_core.nets.paper_encoders import PaperConfig
 from lalaloc_core.sampling import TripletSampling
 from lalaloc_core.training.checkpoint import Checkpoint
 from lalaloc_core.training.config import (

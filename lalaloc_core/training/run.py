@@ -9,8 +9,8 @@ from typing import Any
 import torch
 
 from lalaloc_core.data.dataset import Scene
+from lalaloc_core.nets.image_encoder import TrunkImageEncoder
 from lalaloc_core.nets.trunk import load_pretrained
-from lalaloc_core.nets.trunk_encoder import TrunkImageEncoder
 from lalaloc_core.training.best import Validate
 from lalaloc_core.training.checkpoint import Checkpoint
 from lalaloc_core.training.config import TrainConfig

@@ -23,9 +23,9 @@ from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.data.dataset import Appearance, Camera, Scene
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.metrics import Accuracy
-from lalaloc_core.nets.resnet import PaperImageEncoder
-from lalaloc_core.nets.ring import ImageFeatures
-from lalaloc_core.nets.trunk_encoder import TrunkImageEncoder
+from lalaloc_core.nets.image_encoder import TrunkImageEncoder
+from lalaloc_core.nets.layout_encoder import ImageFeatures
+from lalaloc_core.nets.paper_encoders import PaperImageEncoder
 from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.sampling import PoseSet, pose_grid
 from lalaloc_core.training import losses

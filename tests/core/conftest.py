@@ -11,7 +11,7 @@ from hypothesis import HealthCheck, settings
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.optimise import LatentPoseOptimiser
-from lalaloc_core.nets.ring import RingConfig, RingLayoutEncoder
+from lalaloc_core.nets.layout_encoder import RingConfig, RingLayoutEncoder
 
 # Derandomised: the same commit always gives the same verdict.
 settings.register_profile(

@@ -15,7 +15,7 @@ from lalaloc_core.bundle import LAYOUT_WEIGHTS, Bundle
 from lalaloc_core.errors import BundleError
 from lalaloc_core.localise.optimise import LatentPoseOptimiser, LpoConfig
 from lalaloc_core.localise.poses import RefinementJob, RefinementResult
-from lalaloc_core.nets.ring import RingLayoutEncoder
+from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.sampling import PoseSet
 from tests.strategies import Scene, convex_polygons, l_shape, plan_of, room_polygons, scene_of, seeds

@@ -21,6 +21,7 @@ from lalaloc_core.export.bundle import export_bundle
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.poses import rolled
+from lalaloc_core.nets.image_encoder import TrunkEncoderConfig, TrunkImageEncoder, _interpolation
 from lalaloc_core.nets.trunk import (
     PRETRAINED_PACKAGE,
     TAP_STRIDES,
@@ -31,7 +32,6 @@ from lalaloc_core.nets.trunk import (
     _PadAround,
     load_pretrained,
 )
-from lalaloc_core.nets.trunk_encoder import TrunkEncoderConfig, TrunkImageEncoder, _interpolation
 from lalaloc_core.training.config import PRESETS
 from lalaloc_core.training.stages import build_image_encoder, build_layout_encoder
 

@@ -18,8 +18,8 @@ from lalaloc_core.export.run import export_run
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.nets.image_encoder import TrunkImageEncoder
 from lalaloc_core.nets.trunk import Trunk
-from lalaloc_core.nets.trunk_encoder import TrunkImageEncoder
 from lalaloc_core.training import losses, run
 from lalaloc_core.training.checkpoint import Checkpoint
 from lalaloc_core.training.config import PRESETS, OptimiserConfig, TrainConfig

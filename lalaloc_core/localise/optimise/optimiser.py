@@ -16,7 +16,7 @@ from lalaloc_core.localise.optimise.descent import adam, levenberg_marquardt
 from lalaloc_core.localise.optimise.problem import Embedding, Norm, Problem
 from lalaloc_core.localise.poses import RefinementJob, RefinementResult
 from lalaloc_core.nets import LayoutEncoder, load_layout_encoder
-from lalaloc_core.nets.ring import RingLayoutEncoder
+from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
 from lalaloc_core.render.profile import wall_profile
 
 

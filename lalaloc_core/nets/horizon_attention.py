@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 
-class MixerBlock(nn.Module):
+class HorizonAttention(nn.Module):
     """Attention over the sectors, with a learnt bias by their circular offset, and a feed-forward layer.
 
     What furniture hides is inferred from the rest of the room. Offsets, not positions, keep it true that rolling

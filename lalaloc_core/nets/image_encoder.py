@@ -18,8 +18,8 @@ from torch import Tensor, nn
 
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.errors import ConfigError
-from lalaloc_core.nets.mixer import MixerBlock
-from lalaloc_core.nets.ring import ImageFeatures, RingConfig, StructureFeatures
+from lalaloc_core.nets.horizon_attention import HorizonAttention
+from lalaloc_core.nets.layout_encoder import ImageFeatures, RingConfig, StructureFeatures
 from lalaloc_core.nets.trunk import IMAGE_MEAN, IMAGE_STD, TAP_STRIDES, StyleMixing, Trunk, TrunkConfig
 
 # How fast the classes' shares are followed once many batches were seen.
@@ -77,7 +77,7 @@ class TrunkImageEncoder(nn.Module):
             self.register_buffer(f"interpolation{number}", weights, persistent=False)
         self.join = nn.Linear(sum(config.squeezed), width)
         self.mixer = nn.Sequential(
-            *(MixerBlock(width, config.mixer_heads, ring.sectors) for _ in range(config.mixer_blocks))
+            *(HorizonAttention(width, config.mixer_heads, ring.sectors) for _ in range(config.mixer_blocks))
         )
         self.norm = nn.LayerNorm(width)
         self.to_profile = nn.Linear(width, 2 * self.per_sector)

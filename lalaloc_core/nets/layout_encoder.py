@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-from lalaloc_core.nets.mixer import MixerBlock
+from lalaloc_core.nets.horizon_attention import HorizonAttention
 
 # Distances outside are clamped before they become features: no camera stands nearer, no room is larger.
 _MIN_DISTANCE_M = 0.05
@@ -223,7 +223,7 @@ class RingImageEncoder(nn.Module):
         self.stages = nn.Sequential(*stages)
         self.squeeze = nn.Linear(inputs * height + 1, config.mixer_width)
         mixers = (
-            MixerBlock(config.mixer_width, config.mixer_heads, config.sectors) for _ in range(config.mixer_blocks)
+            HorizonAttention(config.mixer_width, config.mixer_heads, config.sectors) for _ in range(config.mixer_blocks)
         )
         self.mixer = nn.Sequential(*mixers)
         self.norm = nn.LayerNorm(config.mixer_width)
