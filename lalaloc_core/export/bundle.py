@@ -35,10 +35,11 @@ from lalaloc_core.bundle import (
 from lalaloc_core.bundle import write_manifest as _write_manifest
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.errors import ExportError
-from lalaloc_core.nets import ImageEncoder, LayoutEncoder, paper_encoders, trunk
-from lalaloc_core.nets import layout_encoder as ring
+from lalaloc_core.nets import ImageEncoder, LayoutEncoder, paper_encoders, ring_image_encoder, trunk
 from lalaloc_core.nets.decoder import LayoutDecoder
 from lalaloc_core.nets.image_encoder import TrunkImageEncoder
+from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
+from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
 from lalaloc_core.training import losses
 from lalaloc_core.training.config import TrainConfig
 
@@ -123,10 +124,10 @@ def _export_networks(
     height, width = config.image_size
     image = torch.randint(0, 256, (_PARITY_BATCH, height, width, 3), dtype=torch.uint8, generator=generator)
     differences = [_export(work / LAYOUT_ONNX, layout_encoder, layout, ["latent"])]
-    if isinstance(layout_encoder, ring.RingLayoutEncoder):
+    if isinstance(layout_encoder, RingLayoutEncoder):
         features = layout_encoder.ring(*layout.values())
         differences.append(_export(work / HEAD_ONNX, layout_encoder.head, {"ring": features}, ["latent"]))
-    if isinstance(image_encoder, ring.RingImageEncoder | TrunkImageEncoder):
+    if isinstance(image_encoder, RingImageEncoder | TrunkImageEncoder):
         inputs = {"image": image, "camera_height_m": heights(1.0, 1.9)}
         outputs = ["ring", "log_profile", "log_scale"]
         if isinstance(image_encoder, TrunkImageEncoder):
@@ -140,7 +141,7 @@ def _export_networks(
 class _RingOutputs(nn.Module):
     """The image encoder's features as a plain tuple, which is what ONNX knows."""
 
-    def __init__(self, encoder: ring.RingImageEncoder | TrunkImageEncoder) -> None:
+    def __init__(self, encoder: RingImageEncoder | TrunkImageEncoder) -> None:
         super().__init__()
         self.encoder = encoder
 
@@ -252,7 +253,7 @@ def _manifest(
     config: TrainConfig, image_encoder: ImageEncoder | None, name: str, version: str, training: dict[str, Any]
 ) -> Manifest:
     sizes = config.layout_sizes
-    statistics = {"ring": ring, "trunk": trunk, "paper": paper_encoders}[config.architecture]
+    statistics = {"ring": ring_image_encoder, "trunk": trunk, "paper": paper_encoders}[config.architecture]
     structure: dict[str, Any] = {}
     if isinstance(image_encoder, TrunkImageEncoder):
         prior = losses.opening_prior(image_encoder.opening_share, config.image.opening_balance)

@@ -9,9 +9,9 @@ rebuilds networks from a bundle; `lalaloc_core.localise.encoders` runs the expor
 
 from lalaloc_core.nets.decoder import LayoutDecoder
 from lalaloc_core.nets.image_encoder import TrunkImageEncoder
-from lalaloc_core.nets.layout_encoder import RingImageEncoder
 from lalaloc_core.nets.loading import LayoutEncoder, load_decoder, load_layout_encoder
 from lalaloc_core.nets.paper_encoders import PaperImageEncoder
+from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
 
 ImageEncoder = RingImageEncoder | TrunkImageEncoder | PaperImageEncoder
 

@@ -11,7 +11,8 @@ from torch import Tensor, nn
 
 from lalaloc_core.nets import LayoutEncoder
 from lalaloc_core.nets.image_encoder import TrunkImageEncoder
-from lalaloc_core.nets.layout_encoder import ImageFeatures, RingLayoutEncoder, StructureFeatures, first_of
+from lalaloc_core.nets.image_features import ImageFeatures, StructureFeatures, first_of
+from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
 from lalaloc_core.nets.trunk import StyleMixing
 from lalaloc_core.training import losses
 from lalaloc_core.training.batches import Batch

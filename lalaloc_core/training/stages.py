@@ -11,8 +11,9 @@ from torch import Tensor, nn
 from lalaloc_core.nets import ImageEncoder, LayoutEncoder
 from lalaloc_core.nets.decoder import LayoutDecoder
 from lalaloc_core.nets.image_encoder import TrunkImageEncoder
-from lalaloc_core.nets.layout_encoder import RingImageEncoder, RingLayoutEncoder
+from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
 from lalaloc_core.nets.paper_encoders import PaperImageEncoder, PaperLayoutEncoder
+from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
 from lalaloc_core.nets.trunk import Trunk
 from lalaloc_core.training.batches import Batch, load_batches
 from lalaloc_core.training.config import ImageStageConfig, LayoutStageConfig, OptimiserConfig, TrainConfig

@@ -24,7 +24,7 @@ from lalaloc_core.data.dataset import Appearance, Camera, Scene
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.metrics import Accuracy
 from lalaloc_core.nets.image_encoder import TrunkImageEncoder
-from lalaloc_core.nets.layout_encoder import ImageFeatures
+from lalaloc_core.nets.image_features import ImageFeatures
 from lalaloc_core.nets.paper_encoders import PaperImageEncoder
 from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.sampling import PoseSet, pose_grid

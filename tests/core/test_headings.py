@@ -24,7 +24,8 @@ from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.optimise import LatentPoseOptimiser
 from lalaloc_core.localise.pipeline import localise, panorama_heading
 from lalaloc_core.localise.retrieval import build_grid
-from lalaloc_core.nets.layout_encoder import RingImageEncoder, RingLayoutEncoder
+from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
+from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.sampling import PoseSet
 from lalaloc_core.training.config import PRESETS

@@ -12,8 +12,9 @@ import torch
 
 from lalaloc_core.nets import load_layout_encoder
 from lalaloc_core.nets.decoder import LayoutDecoder
-from lalaloc_core.nets.layout_encoder import RingConfig, RingImageEncoder, RingLayoutEncoder, pad_around
+from lalaloc_core.nets.layout_encoder import RingConfig, RingLayoutEncoder, pad_around
 from lalaloc_core.nets.paper_encoders import PaperConfig, PaperImageEncoder, PaperLayoutEncoder, ResNet
+from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
 from lalaloc_core.training.config import PRESETS
 
 TINY = PRESETS["tiny"].ring

@@ -24,7 +24,8 @@ from lalaloc_core.errors import CheckpointError, ConfigError
 from lalaloc_core.export.run import export_run
 from lalaloc_core.metrics import chamfer_distance
 from lalaloc_core.nets import LayoutEncoder
-from lalaloc_core.nets.layout_encoder import ImageFeatures, RingLayoutEncoder
+from lalaloc_core.nets.image_features import ImageFeatures
+from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
 from lalaloc_core.render.depth import back_project, layout_depth
 from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.sampling import TripletSampling, random_poses
