@@ -3,7 +3,7 @@
     floorplan/   plans: validated rooms and openings        sampling.py  camera poses in a plan
     panorama/    pictures as files                          bundle.py    a model on disk
     render/      the layout renderer                        conventions.py  axes, units, pixels
-    nets/        the networks in torch                      metrics.py, azimuths.py  distances and scores
+    nets/        the networks in torch                      metrics.py, azimuth_metrics.py  scores
     localise/    the search: evidence, retrieval, optimiser calibrate.py fits confidence
     synth/       the generator of training data
     unfamiliar/  another generator, for reporting only

@@ -48,7 +48,7 @@ def render_shard(task: tuple[int, Path, Path]) -> None:
     source = GeneratedSource(PRESETS["ring"], textures)
     images, rows = [], []
     for visit in range(shard * HOMES_PER_SHARD, (shard + 1) * HOMES_PER_SHARD):
-        for view in source.views(visit, FULL_HEIGHT, FULL_WIDTH):
+        for view in source.samples(visit, FULL_HEIGHT, FULL_WIDTH):
             others = random_poses(view.plan, OTHER_POSES, source.rng(visit))
             room = np.append(view.room_index, others.room_index)
             position = np.concatenate([np.asarray(view.position_m)[None], others.position_m])

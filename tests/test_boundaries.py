@@ -27,7 +27,7 @@ LAYERS = {
     "lalaloc_core.floorplan": 1,
     "lalaloc_core.sampling": 2,
     "lalaloc_core.metrics": 1,
-    "lalaloc_core.azimuths": 1,
+    "lalaloc_core.azimuth_metrics": 1,
     "lalaloc_core.bundle": 1,
     "lalaloc_core.panorama": 2,
     "lalaloc_core.render": 2,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from lalaloc_core.azimuths import AzimuthMeasures, measure_azimuths, summarise_azimuths
+from lalaloc_core.azimuth_metrics import AzimuthMeasures, measure_azimuths, summarise_azimuths
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.data.dataset import Camera, Dataset

@@ -11,8 +11,8 @@ from lalaloc_core.bundle import Bundle
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.retrieval import build_grid
 from lalaloc_core.render.depth import layout_depth
-from lalaloc_core.render.oracle import oracle_depth
 from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.render.reference import reference_depth
 from lalaloc_core.sampling import random_poses
 
 _GRID_STEP_M = 0.5
@@ -35,7 +35,7 @@ def bench_rendering(bundle: Bundle, poses: int = 200) -> dict[str, float]:
     def oracle() -> None:
         for index in sample:
             room = plan.rooms[drawn.room_index[index]]
-            oracle_depth(room, drawn.position_m[index], 0.0, 1.5, 128, 256)
+            reference_depth(room, drawn.position_m[index], 0.0, 1.5, 128, 256)
 
     encoders = Encoders(bundle)
     closed_form_ms = median_ms(closed_form) / poses

@@ -108,7 +108,7 @@ def _generator_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _evaluate(arguments: argparse.Namespace) -> None:
-    from lalaloc_core.evaluation.building import build_dataset, choose_appearance, describe_model
+    from lalaloc_core.evaluation.factories import build_dataset, choose_appearance, describe_model
     from lalaloc_core.evaluation.predictions import RunFolder, RunInfo
     from lalaloc_core.evaluation.run import run_evaluation
     from lalaloc_core.evaluation.score import score_run
@@ -205,7 +205,7 @@ def _calibrate(arguments: argparse.Namespace) -> None:
     from lalaloc_core.bundle import Bundle
     from lalaloc_core.calibrate import Answers, calibrate, fit_evidence, store_cohort, store_evidence
     from lalaloc_core.data.synthetic import training_plans
-    from lalaloc_core.evaluation.building import describe_model
+    from lalaloc_core.evaluation.factories import describe_model
     from lalaloc_core.evaluation.predictions import Prediction, RunFolder, RunInfo
     from lalaloc_core.evaluation.run import run_evaluation
     from lalaloc_core.localise.cohort import cohort_of

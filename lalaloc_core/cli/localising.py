@@ -112,7 +112,7 @@ def _answers(arguments: argparse.Namespace, plan: FloorPlan, contents: list[byte
     from lalaloc_core.localise.encoders import Encoders
     from lalaloc_core.localise.pipeline import localise
     from lalaloc_core.localise.retrieval import build_grid
-    from lalaloc_core.localise.stated import known_heading, stated_height
+    from lalaloc_core.localise.stated_camera import known_heading, stated_height
     from lalaloc_core.methods.lalaloc import local_refiner
     from lalaloc_core.panorama.images import open_panorama
 

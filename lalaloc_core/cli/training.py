@@ -142,7 +142,7 @@ def _train(arguments: argparse.Namespace) -> None:
         validation_scenes=arguments.validation_homes,
         unfamiliar=None if arguments.data is not None else UnfamiliarScenes(homes=unfamiliar_homes),
         photographs=arguments.photographs,
-        teacher=arguments.teacher,
+        segmenter=arguments.teacher,
     )
     train: Callable[..., Any] = {"layout": train_layout, "image": train_image, "end-to-end": train_end_to_end}[
         arguments.stage

@@ -10,8 +10,8 @@ from lalaloc_core.draw.plan import Marker
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.covariance import spread_of
 from lalaloc_core.localise.pipeline import Localisation, panorama_heading
-from lalaloc_core.localise.places import places_of
 from lalaloc_core.localise.poses import Candidate, LatentGrid, Query
+from lalaloc_core.localise.probability_map import probability_map
 
 
 def drawn_answer(
@@ -57,7 +57,7 @@ def drawn_answer(
         heading_source="searched for" if found.heading_contradicted else heading_source,
         confidence=None if model is None else found.confidence(model),
         rivals=tuple(rivals),
-        heat=posterior_map(plan, places_of(plan, grid.poses, found.posterior), grid.step_m),
+        heat=posterior_map(plan, probability_map(plan, grid.poses, found.posterior), grid.step_m),
         truth=truth,
     )
 

@@ -16,7 +16,7 @@ from scipy.ndimage import find_objects, gaussian_filter
 from lalaloc_core.draw.canvas import MUTED, RULE, Number, image, png, words, xml_text
 from lalaloc_core.draw.plan import floor_path
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.places import Places
+from lalaloc_core.localise.probability_map import ProbabilityMap
 from lalaloc_core.sampling import PoseSet
 
 # ColorBrewer's YlGnBu, which is safe for the colour-blind and still a scale when it is printed in grey.
@@ -92,7 +92,7 @@ def distance_map(cells: Cells, distance: Float[np.ndarray, "n"], title: str) -> 
     return HeatMap(cells, shade, title, ticks)
 
 
-def posterior_map(plan: FloorPlan, places: Places, step_m: float) -> HeatMap:
+def posterior_map(plan: FloorPlan, places: ProbabilityMap, step_m: float) -> HeatMap:
     """A map of how probable every place is beside the most probable one.
 
     Args:

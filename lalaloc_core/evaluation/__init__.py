@@ -1,6 +1,6 @@
 """Asking a method about a data set, writing its answers down, and scoring them.
 
-Begin with `run.py`, which asks; `building.py` finds data set and method, `predictions.py` is the folder that a run
+Begin with `run.py`, which asks; `factories.py` finds data set and method, `predictions.py` is the folder that a run
 leaves, `score.py` scores it without model or data, `failures.py` sorts what went wrong.
 Only what loads no network is re-exported.
 """

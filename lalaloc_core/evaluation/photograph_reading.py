@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from lalaloc_core.azimuths import AzimuthMeasures, measure_azimuths
+from lalaloc_core.azimuth_metrics import AzimuthMeasures, measure_azimuths
 from lalaloc_core.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph
 from lalaloc_core.errors import BundleError
 from lalaloc_core.localise.camera_height import CameraHeight

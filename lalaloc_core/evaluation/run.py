@@ -25,7 +25,7 @@ from lalaloc_core.configuration import build_config
 from lalaloc_core.conventions import heading_to_degrees
 from lalaloc_core.data.dataset import Appearance, Camera, Dataset, Scene, facts_of_photograph, load_scenes
 from lalaloc_core.errors import DatasetError, InvalidInputError, RunError
-from lalaloc_core.evaluation.building import build_dataset, build_method
+from lalaloc_core.evaluation.factories import build_dataset, build_method
 from lalaloc_core.evaluation.predictions import Pose, Prediction, Rival, RunFolder, RunInfo
 from lalaloc_core.methods.method import Answer, Found, Method, Question
 from lalaloc_core.methods.similarity import ChamferGrid, true_layout

@@ -11,7 +11,7 @@ from lalaloc_core.nets import load_layout_encoder
 from lalaloc_core.training.best import best_path
 from lalaloc_core.training.checkpoint import Checkpoint
 from lalaloc_core.training.stages import build_image_encoder
-from lalaloc_core.training.trained import load_decoder_of, load_layout_encoder_of
+from lalaloc_core.training.trained_networks import load_decoder_of, load_layout_encoder_of
 from lalaloc_core.training.warm_start import (
     JOINT,
     check_same_networks,

@@ -20,11 +20,11 @@ from jaxtyping import Float, UInt8
 from lalaloc_core.bundle import COHORT, Bundle, EvidenceModel
 from lalaloc_core.errors import BundleError
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.binned_layouts import BinnedLayouts
 from lalaloc_core.localise.evidence import Evidence, EvidenceConfig
 from lalaloc_core.localise.first_look import first_costs
 from lalaloc_core.localise.layouts import Layouts, layouts_at
 from lalaloc_core.localise.poses import Query
-from lalaloc_core.localise.sketch import Sketch
 from lalaloc_core.sampling import pose_grid
 
 SIZE = 2048
@@ -55,9 +55,9 @@ class Cohort:
         return Layouts(self.log_profile, np.zeros(len(self.kind), dtype=np.int64), self.kind)
 
     @cached_property
-    def sketch(self) -> Sketch:
+    def binned(self) -> BinnedLayouts:
         """What the first look sees of them."""
-        return Sketch.of(self.layouts)
+        return BinnedLayouts.of(self.layouts)
 
     def to_bytes(self) -> bytes:
         """A file of it."""
@@ -122,7 +122,7 @@ def log_cost_to_chance(
     # What is particular to a room is no matter of chance.
     alone = replace(config, use_ceiling=False, use_room_type=False, use_see_through=False)
     evidence = Evidence(plan, query, reach_m, weights, alone)
-    rough = np.concatenate([part for _, part in first_costs(cohort.sketch, evidence, cohort.layouts.room_index)])
+    rough = np.concatenate([part for _, part in first_costs(cohort.binned, evidence, cohort.layouts.room_index)])
     hypothesis = rough.argmin(axis=1)
     pose = np.argsort(rough[np.arange(len(rough)), hypothesis], kind="stable")[:_COMPARED]
     by_chance, _ = evidence.pairs(cohort.layouts, pose, hypothesis[pose])

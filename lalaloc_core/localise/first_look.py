@@ -1,7 +1,7 @@
 """A first look at all poses of a grid under all hypotheses and heights, which tells the few that are worth a second.
 
-Of every pose a few azimuths are compared, and these by a table: log distances are put into bins (`sketch.py`), so what
-an azimuth says of a pose is one row of
+Of every pose a few azimuths are compared, and these by a table: log distances are put into bins (`binned_layouts.py`),
+so what an azimuth says of a pose is one row of
 
     table[azimuth, bin] = log(1 + r²) for every δ and hypothesis, over the number of azimuths
 
@@ -23,8 +23,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from lalaloc_core.conventions import WALL_CODE
+from lalaloc_core.localise.binned_layouts import OPENING_ROWS, BinnedLayouts
 from lalaloc_core.localise.evidence import Evidence
-from lalaloc_core.localise.sketch import OPENING_ROWS, Sketch
 
 # Poses that are looked at together, so that what is summed up stays in the processor's cache.
 _CHUNK = 512
@@ -93,7 +93,7 @@ class Wanted:
 
 
 def likeliest(
-    sketch: Sketch,
+    binned: BinnedLayouts,
     evidence: Evidence,
     room_index: Int[np.ndarray, "n"],
     wanted: Wanted,
@@ -106,9 +106,9 @@ def likeliest(
     Args:
         against: what is added to the costs of every pose; infinite: it is not possible.
     """
-    table, by_room = _table(sketch, evidence), evidence.by_room()
+    table, by_room = _table(binned, evidence), evidence.by_room()
     shape = (-1, len(evidence.offsets), evidence.hypotheses)
-    bound = _bounds(sketch, table.reshape(len(table), *shape[1:])) + by_room.min(axis=0)[room_index]
+    bound = _bounds(binned, table.reshape(len(table), *shape[1:])) + by_room.min(axis=0)[room_index]
     bound = bound if against is None else bound + against
     possible = np.flatnonzero(np.isfinite(bound))
     # Short integers are sorted in no time.
@@ -118,7 +118,7 @@ def likeliest(
     lowest, first, count = np.inf, 0, _FIRST_CHUNK
     while first < len(order) and least_after[first] <= min(best.bound, max(lowest + wanted.window, least.bound)):
         pose = order[first : first + count]
-        cost = _least(sketch.rows[pose] @ table, by_room[:, room_index[pose]], shape)
+        cost = _least(binned.rows[pose] @ table, by_room[:, room_index[pose]], shape)
         cost = cost if against is None else cost + against[pose, None]
         best.offer(pose, cost)
         least.offer(pose, cost)
@@ -133,19 +133,19 @@ def _shortened(bound: Float[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
     return ((bound - low) * (_MOST / max(span, 1e-9))).astype(np.int16)
 
 
-def _bounds(sketch: Sketch, table: Float[np.ndarray, "r j k"]) -> Float[np.ndarray, "n"]:
+def _bounds(binned: BinnedLayouts, table: Float[np.ndarray, "r j k"]) -> Float[np.ndarray, "n"]:
     """Of every pose what its walls and openings cost at least, whatever the δ and the hypothesis."""
-    azimuths = len(sketch.columns)
+    azimuths = len(binned.columns)
     least = np.minimum.reduceat(table.min(axis=1), np.arange(0, table.shape[2], _NEIGHBOURS), axis=1)
-    walls, openings = np.split(least, [azimuths * len(sketch.bins)])
+    walls, openings = np.split(least, [azimuths * len(binned.bins)])
     # Every azimuth has one row of walls, and at most one of openings.
     most = azimuths * float(np.abs(walls).max() + np.abs(openings).max(initial=0.0))
     scale = _MOST / max(most, 1e-6)
     short = np.floor(least * scale).astype(np.int16)
-    bound = np.empty(len(sketch), np.float32)
-    for first in range(0, len(sketch), _BOUNDED_CHUNK):
+    bound = np.empty(len(binned), np.float32)
+    for first in range(0, len(binned), _BOUNDED_CHUNK):
         part = slice(first, first + _BOUNDED_CHUNK)
-        bound[part] = (sketch.rows[part] @ short).min(axis=1)
+        bound[part] = (binned.rows[part] @ short).min(axis=1)
     # Rounding of single precision aside.
     return bound / scale - 1e-5
 
@@ -160,24 +160,24 @@ def _least(
 
 
 def first_costs(
-    sketch: Sketch, evidence: Evidence, room_index: Int[np.ndarray, "n"]
+    binned: BinnedLayouts, evidence: Evidence, room_index: Int[np.ndarray, "n"]
 ) -> Iterator[tuple[int, Float[np.ndarray, "n k"]]]:
     """Rough costs of all poses under all hypotheses, each at its best δ: the first pose of a slice, and its costs."""
-    table, by_room = _table(sketch, evidence), evidence.by_room()
+    table, by_room = _table(binned, evidence), evidence.by_room()
     shape = (-1, len(evidence.offsets), evidence.hypotheses)
-    for first in range(0, len(sketch), _CHUNK):
+    for first in range(0, len(binned), _CHUNK):
         part = slice(first, first + _CHUNK)
-        yield first, _least(sketch.rows[part] @ table, by_room[:, room_index[part]], shape)
+        yield first, _least(binned.rows[part] @ table, by_room[:, room_index[part]], shape)
 
 
-def _table(sketch: Sketch, evidence: Evidence) -> Float[np.ndarray, "r c"]:
+def _table(binned: BinnedLayouts, evidence: Evidence) -> Float[np.ndarray, "r c"]:
     """What each row says under every δ and hypothesis, δ by δ."""
-    centre, precision, loss = evidence.predicted(sketch.columns)
-    azimuths, bins = len(sketch.columns), len(sketch.bins)
+    centre, precision, loss = evidence.predicted(binned.columns)
+    azimuths, bins = len(binned.columns), len(binned.bins)
     shape = (len(evidence.offsets), evidence.hypotheses)
     # Hypotheses are one prediction that is turned, so few pairs of a centre and a precision are different.
     pairs, which = np.unique((centre + 1j * precision).ravel(), return_inverse=True)
-    apart = sketch.bins[:, None, None] - evidence.offsets.astype(np.float32)[:, None] - pairs.real.astype(np.float32)
+    apart = binned.bins[:, None, None] - evidence.offsets.astype(np.float32)[:, None] - pairs.real.astype(np.float32)
     walls = np.log1p(np.square(apart * pairs.imag.astype(np.float32))) / azimuths
     table = np.zeros((azimuths * (bins + OPENING_ROWS), *shape), np.float32)
     of_walls = table[: azimuths * bins].reshape(azimuths, bins, *shape)

@@ -10,9 +10,9 @@ from jaxtyping import Bool, Float, Int
 
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.binned_layouts import BinnedLayouts
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.layouts import Layouts, layouts_at
-from lalaloc_core.localise.sketch import Sketch
 from lalaloc_core.sampling import PoseSet
 
 
@@ -30,7 +30,7 @@ class LatentGrid:
     step_m: float
     camera_height_m: float
     _layouts: list[Layouts] = field(default_factory=list, init=False, repr=False)
-    _sketch: list[Sketch] = field(default_factory=list, init=False, repr=False)
+    _binned: list[BinnedLayouts] = field(default_factory=list, init=False, repr=False)
 
     @classmethod
     def with_layouts(
@@ -62,11 +62,11 @@ class LatentGrid:
             self._layouts.append(self._rendered(plan))
         return self._layouts[0]
 
-    def sketch(self, plan: FloorPlan) -> Sketch:
+    def binned(self, plan: FloorPlan) -> BinnedLayouts:
         """The poses as the first look of a search sees them; made at first use."""
-        if not self._sketch:
-            self._sketch.append(Sketch.of(self.layouts(plan)))
-        return self._sketch[0]
+        if not self._binned:
+            self._binned.append(BinnedLayouts.of(self.layouts(plan)))
+        return self._binned[0]
 
     @property
     def known_latents(self) -> Float[np.ndarray, "n d"]:
@@ -88,7 +88,7 @@ class LatentGrid:
         """Memory that it takes, with what was made of it at first use."""
         arrays = [self.poses.position_m, self.poses.room_index, self.profile_m]
         arrays += [] if self.latents is None else [self.latents]
-        return sum(part.nbytes for part in (*arrays, *self._layouts, *self._sketch))
+        return sum(part.nbytes for part in (*arrays, *self._layouts, *self._binned))
 
     def _rendered(self, plan: FloorPlan) -> Layouts:
         precision = self.profile_m.dtype if self.latents is None else np.float32

@@ -96,7 +96,7 @@ class Posterior:
         candidate: probability of being within 1 m of each candidate, turned like it, and at none before it; at most one
             in sum.
         heading: probability that the heading of the first candidate is right within 5°.
-        support: the same probability, at the places that refinement found; `places.places_of` makes a map of it.
+        support: the same probability, at the places that refinement found; `probability_map.py` makes a map of it.
     """
 
     pose: Float[np.ndarray, "n"]

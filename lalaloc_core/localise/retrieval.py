@@ -127,9 +127,9 @@ def _chosen(
     if pairs <= _ALL_COMPARED:
         return _Chosen(np.arange(pairs), pairs, nothing, nothing)
     window = _MARGIN + NEGLIGIBLE / temperature
-    sketch, room_index = grid.sketch(plan), grid.poses.room_index
+    binned, room_index = grid.binned(plan), grid.poses.room_index
     wanted = Wanted(limit=_ESTIMATED, least=_LEAST_COMPARED, window=window)
-    total, pair = likeliest(sketch, evidence, room_index, wanted, against)
+    total, pair = likeliest(binned, evidence, room_index, wanted, against)
     probable = int(np.searchsorted(total, total[0] + window))
     compared = min(max(probable, _LEAST_COMPARED), _MOST_COMPARED, len(pair))
     cost = total if against is None else total - against[pair // evidence.hypotheses]
@@ -137,7 +137,7 @@ def _chosen(
     first, others = pair[:compared], pair[compared:probable]
     if doubted is not None:
         wanted = Wanted(limit=_LEAST_COMPARED, least=_LEAST_COMPARED)
-        beyond = likeliest(sketch, evidence, room_index, wanted, doubted)[1]
+        beyond = likeliest(binned, evidence, room_index, wanted, doubted)[1]
         first = np.append(first, np.setdiff1d(beyond, pair[:probable]))
     return _Chosen(np.append(first, others), len(first), seen, estimate)
 

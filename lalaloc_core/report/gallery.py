@@ -10,7 +10,7 @@ import numpy as np
 from lalaloc_core.data.dataset import Camera, Scene
 from lalaloc_core.draw.heat import Cells
 from lalaloc_core.errors import LaLaLocError
-from lalaloc_core.evaluation.building import build_dataset, choose_appearance
+from lalaloc_core.evaluation.factories import build_dataset, choose_appearance
 from lalaloc_core.evaluation.failures import Outcome, outcomes
 from lalaloc_core.evaluation.predictions import Prediction, RunInfo
 from lalaloc_core.evaluation.score import heading_errors_deg, position_errors_m

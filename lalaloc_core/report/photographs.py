@@ -13,12 +13,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lalaloc_core.azimuths import ClassScores, summarise_azimuths
+from lalaloc_core.azimuth_metrics import ClassScores, summarise_azimuths
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.data.annotated import AnnotatedPhotographs
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.evaluation.building import describe_model
+from lalaloc_core.evaluation.factories import describe_model
 from lalaloc_core.evaluation.galleries import (
     GalleryAnswer,
     answers_in_galleries,

@@ -6,7 +6,7 @@ import numpy as np
 
 from lalaloc_core.data.dataset import Appearance, Camera, Dataset, Scene
 from lalaloc_core.errors import BundleError, DatasetError
-from lalaloc_core.evaluation.building import require_bundle
+from lalaloc_core.evaluation.factories import require_bundle
 from lalaloc_core.evaluation.predictions import Prediction, RunInfo
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.methods.method import Question

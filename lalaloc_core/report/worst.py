@@ -22,7 +22,7 @@ from lalaloc_core.conventions import TWO_PI, column_azimuths, heading_from_degre
 from lalaloc_core.data.dataset import Camera, Scene
 from lalaloc_core.draw.photograph import Stroke, draw_strokes, wall_line
 from lalaloc_core.errors import LaLaLocError, RunError
-from lalaloc_core.evaluation.building import build_dataset, choose_appearance
+from lalaloc_core.evaluation.factories import build_dataset, choose_appearance
 from lalaloc_core.evaluation.failures import Outcome, is_symmetric, outcomes, symmetric_by_chance
 from lalaloc_core.evaluation.predictions import Pose, Prediction, RunFolder, RunInfo
 from lalaloc_core.evaluation.score import position_errors_m

@@ -37,7 +37,7 @@ class TrainingData:
         unfamiliar: scenes that are nothing like those trained on; image validation reports those of their validation
             split as well, and nothing is chosen by them.
         photographs: folder of panoramas without labels that the image stage learns from as well.
-        teacher: what tells doors and windows in them, see `training.photographs`.
+        segmenter: what tells doors and windows in them, see `training.photographs`.
     """
 
     dataset: Dataset | None = None
@@ -47,7 +47,7 @@ class TrainingData:
     validation_scenes: int = 50
     unfamiliar: Dataset | None = None
     photographs: Path | None = None
-    teacher: Path | None = None
+    segmenter: Path | None = None
 
     def source(self, config: TrainConfig) -> Source:
         """What training looks at."""
@@ -56,22 +56,22 @@ class TrainingData:
         return SceneSource(config, self.dataset, self.skip_bad)
 
     def load_photographs(self, config: TrainConfig) -> Photographs | None:
-        """The photographs with what the teacher sees in them; None where none are to be learnt from.
+        """The photographs with what the segmenter sees in them; None where none are to be learnt from.
 
         Raises:
-            ConfigError: photographs without a teacher or the reverse, an architecture that tells no openings, or a
-                teacher that cannot be run.
+            ConfigError: photographs without a segmenter or the reverse, an architecture that tells no openings, or a
+                segmenter that cannot be run.
             DatasetError: a photograph cannot be read.
         """
-        if self.photographs is None and self.teacher is None:
+        if self.photographs is None and self.segmenter is None:
             return None
-        if self.photographs is None or self.teacher is None:
+        if self.photographs is None or self.segmenter is None:
             raise ConfigError("photographs and their teacher are given together or not at all")
         if config.architecture != "trunk":
             raise ConfigError(
                 f"architecture '{config.architecture}' tells no openings, it cannot learn from photographs"
             )
-        return load_photographs(self.photographs, self.teacher, *config.image_size)
+        return load_photographs(self.photographs, self.segmenter, *config.image_size)
 
     def validation(self, config: TrainConfig) -> list[Scene]:
         """Validation scenes, none where the data set has none.

@@ -18,7 +18,7 @@ from torch import Tensor
 from lalaloc_core.synth.panorama import PanoramaRenderer
 from lalaloc_core.synth.render_scene import RenderScene
 from lalaloc_core.training.batches import Batch, stacked
-from lalaloc_core.training.turning import Turn
+from lalaloc_core.training.rotation import Rotation
 
 Row = dict[str, np.ndarray]
 
@@ -36,7 +36,7 @@ class DeferredRow:
     """A row of a batch: the panorama to render, how it is turned, and everything else."""
 
     deferred: DeferredScene
-    turn: Turn
+    turn: Rotation
     rest: Row
 
 
@@ -127,7 +127,7 @@ class DeferredRenderer:
 def turned(
     images: UInt8[Tensor, "b h w 3"], shift: Int[Tensor, "b"], mirrored: Bool[Tensor, "b"]
 ) -> UInt8[Tensor, "b h w 3"]:
-    """Panoramas, each rolled by `shift` columns to the right and then mirrored or not, as `Turn.picture` does."""
+    """Panoramas, each rolled by `shift` columns to the right and then mirrored or not, as `Rotation.picture` does."""
     width = images.shape[2]
     column = torch.arange(width, device=images.device)
     source = torch.where(mirrored.to(images.device)[:, None], width - 1 - column, column)

@@ -7,12 +7,12 @@ from typing import Any
 
 from torch import Tensor, nn
 
+from lalaloc_core.training.batch_streams import LayoutBatches
 from lalaloc_core.training.batches import Batch, load_batches
 from lalaloc_core.training.config import LayoutStageConfig, TrainConfig
 from lalaloc_core.training.objective import LayoutObjective
 from lalaloc_core.training.sources import Source
 from lalaloc_core.training.stages import build_decoder, build_layout_encoder
-from lalaloc_core.training.stream import LayoutBatches
 
 
 class LayoutStage:

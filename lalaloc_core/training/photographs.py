@@ -1,4 +1,4 @@
-"""Real photographs without labels, with what a teacher sees in them."""
+"""Real photographs without labels, with what a segmenter sees in them."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from torch import Tensor
 
 from lalaloc_core.errors import DatasetError, InvalidPanoramaError
 from lalaloc_core.panorama.images import read_panorama
+from lalaloc_core.training.segmenter import PANORAMA_ROWS, load_segmenter, read_walls_and_openings
 from lalaloc_core.training.stretching import stretched
-from lalaloc_core.training.teacher import SEEN_ROWS, look, segmenter
 
 # Rooms are drawn out or pushed together along two axes by factors between these, evenly in logs: half of the
 # photographs without labels that there are were taken in halls, which so become rooms.
@@ -22,7 +22,7 @@ _LEAST_STRETCH, _MOST_STRETCH = 0.5, 1.6
 
 @dataclass(frozen=True, eq=False)
 class Photographs:
-    """Photographs with a teacher's opinion.
+    """Photographs with a segmenter's opinion.
 
     Attributes:
         images: (n, h, w, 3) RGB bytes.
@@ -58,25 +58,27 @@ class Photographs:
         )
 
 
-def load_photographs(folder: Path, teacher: Path, height: int, width: int) -> Photographs:
-    """Read the panoramas (`*.jpg`, `*.png`) of a folder and let the teacher look at each.
+def load_photographs(folder: Path, segmenter: Path, height: int, width: int) -> Photographs:
+    """Read the panoramas (`*.jpg`, `*.png`) of a folder and let the segmenter look at each.
 
     Raises:
-        ConfigError: the teacher cannot be run.
+        ConfigError: the segmenter cannot be run.
         DatasetError: there are none, or one cannot be read.
     """
     paths = sorted(path for pattern in ("*.jpg", "*.jpeg", "*.png") for path in folder.glob(pattern))
     if not paths:
         raise DatasetError("no photographs (*.jpg, *.jpeg, *.png)", path=folder)
-    segment = segmenter(teacher)
-    images, seen = [], []
+    segment = load_segmenter(segmenter)
+    images, readings = [], []
     for path in paths:
         try:
             content = path.read_bytes()
-            large = read_panorama(content, height=SEEN_ROWS, width=2 * SEEN_ROWS)
+            large = read_panorama(content, height=PANORAMA_ROWS, width=2 * PANORAMA_ROWS)
             images.append(read_panorama(content, height=height, width=width))
         except (OSError, InvalidPanoramaError) as error:
             raise DatasetError(f"cannot be read: {error}", path=path) from error
-        seen.append(look(large, segment, width))
-    openings, log_distance = (np.stack([getattr(one, name) for one in seen]) for name in ("openings", "log_distance"))
+        readings.append(read_walls_and_openings(large, segment, width))
+    openings, log_distance = (
+        np.stack([getattr(one, name) for one in readings]) for name in ("openings", "log_distance")
+    )
     return Photographs(torch.from_numpy(np.stack(images)), torch.from_numpy(openings), torch.from_numpy(log_distance))

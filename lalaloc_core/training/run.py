@@ -19,7 +19,7 @@ from lalaloc_core.training.end_to_end import EndToEndStage
 from lalaloc_core.training.image_stage import ImageStage
 from lalaloc_core.training.layout_stage import LayoutStage
 from lalaloc_core.training.loop import run_stage
-from lalaloc_core.training.trained import load_layout_encoder_of
+from lalaloc_core.training.trained_networks import load_layout_encoder_of
 from lalaloc_core.training.validate import LayoutValidation
 from lalaloc_core.training.warm_start import check_same_networks, checkpoint_with, load_warm_start
 

@@ -57,7 +57,7 @@ class Group:
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class View:
+class PanoramaSample:
     """A panorama and the pose it was taken from; `image` is (h, w, 3) RGB bytes, or a scene yet to be rendered."""
 
     plan: FloorPlan
@@ -111,7 +111,7 @@ class Source(Protocol):
         """
         ...
 
-    def views(self, visit: int, height: int, width: int) -> list[View]:
+    def samples(self, visit: int, height: int, width: int) -> list[PanoramaSample]:
         """Panoramas of stage 2, `height` x `width`; none where the scene is of no use.
 
         Raises:
@@ -170,7 +170,7 @@ class GeneratedSource:
             )
         return groups
 
-    def views(self, visit: int, height: int, width: int) -> list[View]:
+    def samples(self, visit: int, height: int, width: int) -> list[PanoramaSample]:
         stage = self.config.image
         home, rng = home_of(TRAIN, self.config.seed, visit)
         shots = sample_shots(
@@ -192,7 +192,7 @@ class GeneratedSource:
         else:
             images = list(self._studio.renderer(height, width, stage.supersample).render_scenes(scenes).numpy())
         return [
-            View(
+            PanoramaSample(
                 plan=home.plan,
                 position_m=shot.position_m,
                 room_index=shot.room_index,
@@ -204,7 +204,7 @@ class GeneratedSource:
         ]
 
     def renderer(self, device: torch.device) -> PanoramaRenderer:
-        """Renders deferred panoramas as `views` would have."""
+        """Renders deferred panoramas as `samples` would have."""
         return self._studio_on(device).renderer(*self.config.image_size, self.config.image.supersample)
 
     def _studio_on(self, device: torch.device | str) -> Studio:
@@ -266,18 +266,18 @@ class SceneSource:
                     break
         return groups
 
-    def views(self, visit: int, height: int, width: int) -> list[View]:
+    def samples(self, visit: int, height: int, width: int) -> list[PanoramaSample]:
         rng = np.random.default_rng([7, self.config.seed, visit])
         scene = self._scene(visit)
         if scene is None:
             return []
-        views = []
+        samples = []
         for index in rng.permutation(len(scene.cameras))[: self.config.image.shots_per_home]:
             camera = scene.cameras[index]
             image = self._picture(scene, camera, rng, height, width)
             if image is not None:
-                views.append(
-                    View(
+                samples.append(
+                    PanoramaSample(
                         plan=scene.plan,
                         position_m=camera.position_m,
                         room_index=camera.room_index,
@@ -286,7 +286,7 @@ class SceneSource:
                         image=image,
                     )
                 )
-        return views
+        return samples
 
     def _scene(self, visit: int) -> Scene | None:
         epoch, place = divmod(visit, len(self._names))
@@ -328,7 +328,7 @@ class SceneSource:
 
 
 def _group_around(
-    anchor: Camera | View, plan: FloorPlan, sampling: TripletSampling, rng: np.random.Generator
+    anchor: Camera | PanoramaSample, plan: FloorPlan, sampling: TripletSampling, rng: np.random.Generator
 ) -> Group | None:
     pose = PoseSet(np.asarray(anchor.position_m)[None], np.array([anchor.room_index]))
     near = sample_neighbours(plan, pose, sampling, rng, anchor.camera_height_m + _HEADROOM_M)

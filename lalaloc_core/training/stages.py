@@ -15,11 +15,11 @@ from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
 from lalaloc_core.nets.paper_encoders import PaperImageEncoder, PaperLayoutEncoder
 from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
 from lalaloc_core.nets.trunk import Trunk
+from lalaloc_core.training.batch_streams import PanoramaBatches
 from lalaloc_core.training.batches import Batch, load_batches
 from lalaloc_core.training.config import ImageStageConfig, LayoutStageConfig, OptimiserConfig, TrainConfig
 from lalaloc_core.training.deferred import DeferredRenderer
 from lalaloc_core.training.sources import GeneratedSource, Source
-from lalaloc_core.training.stream import PanoramaBatches
 
 
 @runtime_checkable

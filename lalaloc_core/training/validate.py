@@ -18,7 +18,7 @@ from cachetools import LRUCache, cachedmethod
 from jaxtyping import Int
 from torch import Tensor, nn
 
-from lalaloc_core.azimuths import score_classes
+from lalaloc_core.azimuth_metrics import score_classes
 from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.data.dataset import Appearance, Camera, Scene
 from lalaloc_core.errors import DatasetError
@@ -29,10 +29,10 @@ from lalaloc_core.nets.paper_encoders import PaperImageEncoder
 from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.sampling import PoseSet, pose_grid
 from lalaloc_core.training import losses
+from lalaloc_core.training.batch_streams import UNKNOWN, opening_kinds
 from lalaloc_core.training.config import TrainConfig
 from lalaloc_core.training.picture_cache import cached_pictures
-from lalaloc_core.training.stream import UNKNOWN, opening_kinds
-from lalaloc_core.training.turning import Turn, draw_turn
+from lalaloc_core.training.rotation import Rotation, sample_rotation
 
 _GRID_STEP_M = 0.5
 _MAX_LOG_ERROR = 0.7
@@ -47,7 +47,7 @@ class _Query:
     scene: Scene
     grid: PoseSet
     camera: Camera
-    turn: Turn
+    turn: Rotation
 
     @property
     def pose(self) -> PoseSet:
@@ -319,7 +319,7 @@ def _queries(config: TrainConfig, scenes: Sequence[Scene]) -> list[_Query]:
     queries = []
     for scene in scenes:
         grid = pose_grid(scene.plan, _GRID_STEP_M)
-        turns = [draw_turn("none", camera.heading, config.image_size[1], rng) for camera in scene.cameras]
+        turns = [sample_rotation("none", camera.heading, config.image_size[1], rng) for camera in scene.cameras]
         queries += [_Query(scene, grid, camera, turn) for camera, turn in zip(scene.cameras, turns, strict=True)]
     return queries
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lalaloc_core.localise import stated
+from lalaloc_core.localise import stated_camera
 from lalaloc_core.localise.camera_height import CameraHeight
 from service.grids import check_height_m
 from service.schemas.camera_fields import CameraFields
@@ -17,4 +17,4 @@ def stated_height(form: CameraFields, record: PlanRecord) -> CameraHeight:
     """
     if form.camera_height_m is not None:
         check_height_m(record, form.camera_height_m)
-    return stated.stated_height(record.plan, form.camera_height_m, form.camera_height_std_m)
+    return stated_camera.stated_height(record.plan, form.camera_height_m, form.camera_height_std_m)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from lalaloc_core.localise import stated
-from lalaloc_core.localise.stated import KnownHeading
+from lalaloc_core.localise import stated_camera
+from lalaloc_core.localise.stated_camera import KnownHeading
 from lalaloc_core.panorama.images import Panorama
 from service.schemas import LocaliseForm, StatedHeading
 
@@ -16,6 +16,6 @@ def known_heading(
     Args:
         north: azimuth of true north (radians) in the plan.
     """
-    return stated.known_heading(
+    return stated_camera.known_heading(
         north, form.heading_deg, form.heading_tolerance_deg, panorama.compass_heading, compass_tolerance_deg
     )

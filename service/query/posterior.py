@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.places import places_of
 from lalaloc_core.localise.poses import LatentGrid
 from lalaloc_core.localise.posterior import Posterior
+from lalaloc_core.localise.probability_map import probability_map
 from service.schemas import PosteriorAnswer
 
 # What is less probable would be told as 0.
@@ -14,7 +14,7 @@ _LEAST = 5e-7
 
 def posterior_answer(plan: FloorPlan, grid: LatentGrid, posterior: Posterior) -> PosteriorAnswer:
     """Places with their probabilities, without those that have next to none."""
-    places = places_of(plan, grid.poses, posterior)
+    places = probability_map(plan, grid.poses, posterior)
     told = places.probability >= _LEAST
     position_m = places.position_m[told]
     return PosteriorAnswer(

@@ -11,7 +11,7 @@ import pytest
 import shapely
 from PIL import Image, ImageColor
 
-from lalaloc_core.azimuths import QUANTILES, measure_azimuths, score_classes, summarise_azimuths
+from lalaloc_core.azimuth_metrics import QUANTILES, measure_azimuths, score_classes, summarise_azimuths
 from lalaloc_core.cli import main
 from lalaloc_core.conventions import OPENING_CLASSES, TWO_PI, column_azimuths
 from lalaloc_core.data.annotated import GALLERIES, AnnotatedPhotographs, GalleryKey

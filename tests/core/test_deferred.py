@@ -12,14 +12,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lalaloc_core.cli import main
+from lalaloc_core.training.batch_streams import PanoramaBatches
 from lalaloc_core.training.batches import Batch, load_batches
 from lalaloc_core.training.checkpoint import Checkpoint
 from lalaloc_core.training.config import PRESETS, TrainConfig
 from lalaloc_core.training.deferred import DeferredRenderer, turned
+from lalaloc_core.training.rotation import Rotation
 from lalaloc_core.training.sources import GeneratedSource
 from lalaloc_core.training.stages import panorama_batches
-from lalaloc_core.training.stream import PanoramaBatches
-from lalaloc_core.training.turning import Turn
 
 CPU = torch.device("cpu")
 
@@ -73,8 +73,8 @@ def test_whole_batches_turn_as_single_pictures_do(shift: int, mirrored: bool) ->
     images = np.random.default_rng(0).integers(0, 256, (2, 3, 16, 3), dtype=np.uint8)
     found = turned(torch.from_numpy(images), torch.tensor([shift, 1]), torch.tensor([mirrored, True]))
     expected = [
-        Turn(shift=shift, heading=0.0, mirrored=mirrored).picture(images[0]),
-        Turn(shift=1, heading=0.0, mirrored=True).picture(images[1]),
+        Rotation(shift=shift, heading=0.0, mirrored=mirrored).picture(images[0]),
+        Rotation(shift=1, heading=0.0, mirrored=True).picture(images[1]),
     ]
     assert np.array_equal(found.numpy(), np.stack(expected))
 

@@ -19,7 +19,7 @@ from lalaloc_core.draw.outline import outline_of
 from lalaloc_core.draw.photograph import Stroke, draw_strokes, wall_line
 from lalaloc_core.draw.plan import Marker
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.places import Places
+from lalaloc_core.localise.probability_map import ProbabilityMap
 from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.sampling import PoseSet, pose_grid
 
@@ -117,14 +117,14 @@ def test_a_round_room_has_no_corners() -> None:
     np.testing.assert_allclose(outline.floor[:, 1], 0.5 + math.atan(0.5) / math.pi, atol=1e-5)
 
 
-def all_places(probability: np.ndarray, poses: PoseSet) -> Places:
-    return Places(poses.position_m, poses.room_index, probability / probability.sum())
+def all_places(probability: np.ndarray, poses: PoseSet) -> ProbabilityMap:
+    return ProbabilityMap(poses.position_m, poses.room_index, probability / probability.sum())
 
 
 def test_the_most_probable_place_is_the_darkest_and_what_is_hopeless_is_the_lightest() -> None:
     # Between grid poses, as an answer is.
     place_m = np.array([1.18, 4.07])
-    heat = posterior_map(PLAN, Places(place_m[None], np.zeros(1, int), np.ones(1)), 0.5)
+    heat = posterior_map(PLAN, ProbabilityMap(place_m[None], np.zeros(1, int), np.ones(1)), 0.5)
     distance_m = np.linalg.norm(heat.cells.poses.position_m - place_m, axis=1)
     assert heat.shade[distance_m.argmin()] == pytest.approx(1.0, abs=0.01)
     assert np.argsort(distance_m)[:4].tolist().count(int(heat.shade.argmax())) == 1

@@ -12,7 +12,7 @@ import pytest
 from lalaloc_core.cli import main
 from lalaloc_core.data.synthetic.generated import GeneratedScenes, RenderedPhotograph
 from lalaloc_core.errors import InvalidInputError, RunError
-from lalaloc_core.evaluation.building import build_dataset, choose_appearance
+from lalaloc_core.evaluation.factories import build_dataset, choose_appearance
 from lalaloc_core.evaluation.predictions import PREDICTIONS_FILE, Prediction, RunFolder, RunInfo
 from lalaloc_core.evaluation.run import run_evaluation
 from lalaloc_core.evaluation.score import heading_errors_deg, position_errors_m, score

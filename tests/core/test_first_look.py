@@ -134,10 +134,10 @@ def test_the_likeliest_pairs_are_those_of_a_first_look_at_all(
     for query in queries[:8]:
         against = np.where(rng.random(len(grid.poses)) < 0.5, np.inf, 0.1) if hinted else None
         evidence = Evidence(building.plan, query, CONFIG.grid_reach * STEP_M, WEIGHTS, CONFIG)
-        sketch, room_index = grid.sketch(building.plan), grid.poses.room_index
-        every = np.concatenate([cost for _, cost in first_costs(sketch, evidence, room_index)])
+        binned, room_index = grid.binned(building.plan), grid.poses.room_index
+        every = np.concatenate([cost for _, cost in first_costs(binned, evidence, room_index)])
         every = every if against is None else every + against[:, None]
-        found, place = likeliest(sketch, evidence, room_index, wanted, against)
+        found, place = likeliest(binned, evidence, room_index, wanted, against)
         count = int((every <= every.min() + wanted.window).sum())
         count = min(max(count, wanted.least), wanted.limit)
         np.testing.assert_allclose(found[:count], np.sort(every.ravel())[:count], atol=1e-6)
@@ -151,10 +151,10 @@ def test_no_pose_costs_less_than_its_bound(building: Building, grid: LatentGrid,
     ranks = []
     for query in queries[:8]:
         evidence = Evidence(building.plan, query, CONFIG.grid_reach * STEP_M, WEIGHTS, CONFIG)
-        sketch, room_index = grid.sketch(building.plan), grid.poses.room_index
-        every = np.concatenate([cost for _, cost in first_costs(sketch, evidence, room_index)])
-        table = _table(sketch, evidence).reshape(-1, len(evidence.offsets), evidence.hypotheses)
-        bound = _bounds(sketch, table) + evidence.by_room().min(axis=0)[room_index]
+        binned, room_index = grid.binned(building.plan), grid.poses.room_index
+        every = np.concatenate([cost for _, cost in first_costs(binned, evidence, room_index)])
+        table = _table(binned, evidence).reshape(-1, len(evidence.offsets), evidence.hypotheses)
+        bound = _bounds(binned, table) + evidence.by_room().min(axis=0)[room_index]
         least = every.min(axis=1)
         assert (bound <= least).all()
         ranks.append((bound < bound[least.argmin()]).mean())

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from lalaloc_core.conventions import DOOR_CODE, OPENING_CLASSES, PASSAGE_CODE, WALL_CODE, WINDOW_CODE, column_azimuths
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.render.layout import LayoutView, layout_view
-from lalaloc_core.render.oracle import oracle_view
 from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.render.reference import reference_view
 from lalaloc_core.sampling import random_poses
 from lalaloc_core.synth.plans import generate_home
 from tests.strategies import plan_document, plan_of, rectangle, rows_of_rooms, seeds
@@ -55,7 +55,7 @@ def test_the_view_is_what_asking_shapely_ray_by_ray_gives(plan: FloorPlan, seed:
     assert steady.mean() > 0.8
     for pose, column in np.argwhere(steady):
         azimuth = float(heading[pose] + column_azimuths(COLUMNS)[column])
-        expected = oracle_view(plan, int(poses.room_index[pose]), poses.position_m[pose], azimuth, EYE_M)
+        expected = reference_view(plan, int(poses.room_index[pose]), poses.position_m[pose], azimuth, EYE_M)
         found = (view.distance_m[pose, column], view.kind[pose, column], view.behind_m[pose, column])
         assert found == pytest.approx(expected, abs=2e-3)
 

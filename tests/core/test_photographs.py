@@ -15,8 +15,8 @@ from lalaloc_core.training.config import PRESETS
 from lalaloc_core.training.data import TrainingData
 from lalaloc_core.training.photographs import Photographs, load_photographs
 from lalaloc_core.training.photometric import _blurred, _lenses, optics
+from lalaloc_core.training.segmenter import _class_map, read_walls_and_openings
 from lalaloc_core.training.stretching import stretched
-from lalaloc_core.training.teacher import _class_map, look
 from tests.painted import painted_surfaces, wall_distance_m
 
 ROWS, COLUMNS, WIDTH = 512, 1024, 128
@@ -49,7 +49,7 @@ class TestMaps:
         assert (kind == panorama[row, :, 0]).mean() > 0.99
 
     def test_shares_of_columns_serve_as_probabilities(self) -> None:
-        seen = look(painted(), by_colour, WIDTH).openings
+        seen = read_walls_and_openings(painted(), by_colour, WIDTH).openings
         at = lambda column: seen[column * WIDTH // COLUMNS]  # noqa: E731
         assert at(260).tolist() == [1.0, 0.0]
         assert at(640).tolist() == [0.0, 1.0]
@@ -74,7 +74,7 @@ class TestWalls:
     azimuth = ((np.arange(WIDTH) + 0.5) / WIDTH - 0.5) * 2.0 * np.pi
 
     def test_where_floor_ends_at_a_wall_the_wall_stands(self) -> None:
-        seen = look(room((2.0, 3.0)), by_colour, WIDTH).log_distance
+        seen = read_walls_and_openings(room((2.0, 3.0)), by_colour, WIDTH).log_distance
         expected = np.log(distances(self.azimuth, (2.0, 3.0)) / 1.5)
         assert np.isfinite(seen).all()
         np.testing.assert_allclose(seen, expected, atol=0.05)
@@ -82,7 +82,7 @@ class TestWalls:
     def test_behind_furniture_a_flat_ceiling_tells_the_distance(self) -> None:
         panorama = room((2.0, 3.0))
         panorama[ROWS // 2 + 20 :, 100:200] = SOFA
-        seen = look(panorama, by_colour, WIDTH).log_distance
+        seen = read_walls_and_openings(panorama, by_colour, WIDTH).log_distance
         expected = np.log(distances(self.azimuth, (2.0, 3.0)) / 1.5)
         np.testing.assert_allclose(seen, expected, atol=0.08)
 
@@ -96,7 +96,7 @@ class TestWalls:
             sloped[: ROWS // 2, there] = room((2.0, 3.0), ceiling_m=ceiling_m)[: ROWS // 2, there]
         sloped[ROWS // 2 + 20 :, 100:200] = SOFA
         for one in (panorama, sloped):
-            unseen = np.isnan(look(one, by_colour, WIDTH).log_distance)
+            unseen = np.isnan(read_walls_and_openings(one, by_colour, WIDTH).log_distance)
             assert unseen[14:24].all()
             assert not unseen[30:].any()
 
@@ -149,7 +149,7 @@ class TestLoading:
 
     def test_an_architecture_without_openings_learns_nothing_from_them(self, tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match="'ring' tells no openings"):
-            TrainingData(photographs=tmp_path, teacher=tmp_path / "t").load_photographs(PRESETS["tiny"])
+            TrainingData(photographs=tmp_path, segmenter=tmp_path / "t").load_photographs(PRESETS["tiny"])
 
     def test_a_folder_without_photographs_is_named(self, tmp_path: Path) -> None:
         with pytest.raises(DatasetError, match="no photographs"):

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.confidence import Signals, signals_of
-from lalaloc_core.localise.places import places_of
 from lalaloc_core.localise.poses import Candidate, PredictedProfile, Query
 from lalaloc_core.localise.posterior import GridCosts, Posterior, Support, area_shares, posterior_of
+from lalaloc_core.localise.probability_map import probability_map
 from lalaloc_core.sampling import PoseSet
 from tests.strategies import seeds
 
@@ -48,7 +48,7 @@ def test_the_map_is_of_the_places_where_candidates_ended_and_not_of_where_they_b
     grid = along(places, cost)
     starts = [candidate(-0.6, 0.2), candidate(0.6, 0.2)]
     ends = [dataclasses.replace(start, x_m=0.1, cost=0.02) for start in starts]
-    told = places_of(plan, grid.poses, shares(grid, starts, ends))
+    told = probability_map(plan, grid.poses, shares(grid, starts, ends))
     best = told.probability.argmax()
     assert told.position_m[best] == pytest.approx([0.1, 0.0])
     at_answer = np.linalg.norm(told.position_m - [0.1, 0.0], axis=1) < 1e-9
@@ -60,7 +60,7 @@ def test_the_map_is_of_the_places_where_candidates_ended_and_not_of_where_they_b
 def test_what_refinement_moves_into_a_wall_is_on_no_map() -> None:
     plan = FloorPlan.from_dict({"ceiling_height_m": 2.5, "rooms": [{"polygon": [[-1, -1], [1, -1], [1, 1], [-1, 1]]}]})
     grid = along([0.2, 0.8], np.array([0.1, 0.12]))
-    told = places_of(plan, grid.poses, shares(grid, [candidate(0.2, 0.1)], [candidate(0.5, 0.05)]))
+    told = probability_map(plan, grid.poses, shares(grid, [candidate(0.2, 0.1)], [candidate(0.5, 0.05)]))
     np.testing.assert_allclose(told.position_m, [[0.5, 0.0]])
     assert told.probability == pytest.approx([1.0])
 

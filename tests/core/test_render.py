@@ -21,8 +21,8 @@ from lalaloc_core.conventions import (
 )
 from lalaloc_core.floorplan import FloorPlan, pad_walls
 from lalaloc_core.render.depth import back_project, layout_depth
-from lalaloc_core.render.oracle import oracle_depth, room_mesh
 from lalaloc_core.render.profile import cast_rays, wall_profile
+from lalaloc_core.render.reference import reference_depth, room_mesh
 from tests.strategies import Scene, plan_of, plans, rectangle, scenes
 
 COLUMNS = 64
@@ -46,7 +46,7 @@ class TestOracle:
         profile = profile_of(scene)
         depth = layout_depth(profile, np.full(1, CAMERA_M), scene.ceiling_height_m, rows)[0]
         position, heading = scene.poses.position_m[0], float(scene.heading[0])
-        oracle = oracle_depth(scene.plan.rooms[0], position, heading, CAMERA_M, rows, COLUMNS)
+        oracle = reference_depth(scene.plan.rooms[0], position, heading, CAMERA_M, rows, COLUMNS)
         # Beside a corner that hides something, a ray's wall is decided by the last bit; such columns prove nothing.
         before, after = (
             wall_profile(scene.poses.position_m, scene.heading + shift, scene.walls_m, COLUMNS)[0]

@@ -9,7 +9,7 @@ import pytest
 
 from lalaloc_core.cli import main
 from lalaloc_core.errors import RunError
-from lalaloc_core.evaluation.building import build_method
+from lalaloc_core.evaluation.factories import build_method
 from lalaloc_core.evaluation.predictions import RunInfo
 from lalaloc_core.evaluation.score import Scores, StageScores
 from lalaloc_core.floorplan import FloorPlan

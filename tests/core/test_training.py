@@ -31,6 +31,7 @@ from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.sampling import TripletSampling, random_poses
 from lalaloc_core.synth.splits import TEST, TRAIN, VALIDATION, home_of
 from lalaloc_core.training import batches, objective, sources
+from lalaloc_core.training.batch_streams import LayoutBatches, PanoramaBatches
 from lalaloc_core.training.batches import Batch, load_batches
 from lalaloc_core.training.checkpoint import Checkpoint
 from lalaloc_core.training.config import PRESETS, ImageStageConfig, OptimiserConfig, TrainConfig, Turns
@@ -38,11 +39,10 @@ from lalaloc_core.training.end_to_end import EndToEndStage
 from lalaloc_core.training.image_stage import ImageStage
 from lalaloc_core.training.layout_stage import LayoutStage
 from lalaloc_core.training.loop import run_stage
+from lalaloc_core.training.rotation import sample_rotation
 from lalaloc_core.training.run import train_image
 from lalaloc_core.training.sources import GeneratedSource
 from lalaloc_core.training.stages import TrainingStage, build_layout_encoder
-from lalaloc_core.training.stream import LayoutBatches, PanoramaBatches
-from lalaloc_core.training.turning import draw_turn
 from tests.strategies import crooked_flat, seeds
 
 CPU = torch.device("cpu")
@@ -334,7 +334,7 @@ class TestStreams:
 
         # A picture that shows the distance to the wall, so that its layout can be read off it.
         image = np.repeat(seen(heading, width)[None, :, None], 3, axis=2)
-        turn = draw_turn(turns, heading, width, rng)
+        turn = sample_rotation(turns, heading, width, rng)
         shown = turn.picture(image)[0, :, 0]
         np.testing.assert_allclose(shown, turn.profile(seen(turn.heading, width)), rtol=1e-4)
         # Profiles need not have as many columns as the picture: mirroring keeps every resolution together.
@@ -351,7 +351,7 @@ class TestStreams:
     @pytest.mark.parametrize(("turns", "count"), [("any", 16), ("quarters", 8), ("none", 1)])
     def test_all_turns_and_both_hands_occur(self, turns: Turns, count: int) -> None:
         rng = np.random.default_rng(0)
-        drawn = [draw_turn(turns, 0.0, 8, rng) for _ in range(300)]
+        drawn = [sample_rotation(turns, 0.0, 8, rng) for _ in range(300)]
         assert len({(round(turn.heading % TWO_PI, 6), turn.mirrored) for turn in drawn}) == count
 
     def test_neighbours_are_turned_and_mirrored_as_their_panorama_is(self) -> None:

@@ -22,13 +22,13 @@ from lalaloc_core.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.errors import CheckpointError, DatasetError
 from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.sampling import random_poses
+from lalaloc_core.training.batch_streams import LayoutBatches, PanoramaBatches
 from lalaloc_core.training.batches import Batch, load_batches
 from lalaloc_core.training.checkpoint import Checkpoint
 from lalaloc_core.training.config import PRESETS, TrainConfig
 from lalaloc_core.training.data import TrainingData
 from lalaloc_core.training.run import train_layout
 from lalaloc_core.training.sources import SceneSource
-from lalaloc_core.training.stream import LayoutBatches, PanoramaBatches
 from lalaloc_core.training.validate import ImageValidation, LayoutValidation
 from tests.strategies import crooked_flat
 
@@ -115,7 +115,7 @@ class TestDrawing:
         alone = SceneSource(CONFIG, data)
         shared = [SceneSource(CONFIG, data) for _ in range(2)]
         for visit in range(12):
-            mine, theirs = alone.views(visit, 32, 64), shared[visit % 2].views(visit, 32, 64)
+            mine, theirs = alone.samples(visit, 32, 64), shared[visit % 2].samples(visit, 32, 64)
             assert [np.asarray(view.image).tobytes() for view in mine] == [
                 np.asarray(view.image).tobytes() for view in theirs
             ]
@@ -143,7 +143,7 @@ class TestDrawing:
     def test_looks_are_drawn_anew_for_each_visit(self) -> None:
         # Generated scenes serve as a data set as well; here each camera has one look per furniture level.
         levels = GeneratedScenes(homes=1, shots_per_home=1, furniture=None)
-        views = SceneSource(CONFIG, levels).views(0, 32, 64)
+        views = SceneSource(CONFIG, levels).samples(0, 32, 64)
         assert [np.shape(np.asarray(view.image)) for view in views] == [(32, 64, 3)]
 
 

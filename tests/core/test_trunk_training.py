@@ -21,6 +21,7 @@ from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.nets.image_encoder import TrunkImageEncoder
 from lalaloc_core.nets.trunk import Trunk
 from lalaloc_core.training import losses, run
+from lalaloc_core.training.batch_streams import UNKNOWN, PanoramaBatches, opening_kinds
 from lalaloc_core.training.checkpoint import Checkpoint
 from lalaloc_core.training.config import PRESETS, OptimiserConfig, TrainConfig
 from lalaloc_core.training.data import TrainingData
@@ -28,10 +29,9 @@ from lalaloc_core.training.end_to_end import EndToEndStage
 from lalaloc_core.training.image_stage import ImageStage
 from lalaloc_core.training.loop import run_stage
 from lalaloc_core.training.photographs import Photographs
+from lalaloc_core.training.rotation import Rotation
 from lalaloc_core.training.sources import GeneratedSource
 from lalaloc_core.training.stages import build_image_encoder, build_layout_encoder, build_optimiser
-from lalaloc_core.training.stream import UNKNOWN, PanoramaBatches, opening_kinds
-from lalaloc_core.training.turning import Turn
 from lalaloc_core.training.warm_start import load_warm_start
 
 TINY = PRESETS["tiny-trunk"]
@@ -98,7 +98,7 @@ class TestLabels:
 
     def test_a_mirrored_panorama_has_mirrored_openings(self) -> None:
         kind = np.arange(8)
-        assert Turn(shift=0, heading=0.0, mirrored=True).profile(kind).tolist() == list(range(8))[::-1]
+        assert Rotation(shift=0, heading=0.0, mirrored=True).profile(kind).tolist() == list(range(8))[::-1]
 
 
 class TestLosses:

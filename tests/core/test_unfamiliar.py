@@ -16,7 +16,7 @@ from lalaloc_core.conventions import column_azimuths
 from lalaloc_core.data.dataset import Appearance, Dataset
 from lalaloc_core.data.synthetic.unfamiliar import UnfamiliarPhotograph, UnfamiliarScenes
 from lalaloc_core.errors import DatasetError, InvalidInputError
-from lalaloc_core.evaluation.building import build_dataset
+from lalaloc_core.evaluation.factories import build_dataset
 from lalaloc_core.evaluation.predictions import RunInfo
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.render.depth import layout_depth

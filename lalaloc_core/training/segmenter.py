@@ -18,8 +18,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.errors import ConfigError
 
-# Height (pixels) of the panoramas that are shown to it, and of its views.
-SEEN_ROWS = 512
+# Height (pixels) of the panoramas that are shown to it, and height and width of its views.
+PANORAMA_ROWS = 512
 _VIEWS = 8
 _FIELD_OF_VIEW_DEG = 95.0
 # Its classes.
@@ -42,7 +42,7 @@ Segment = Callable[[UInt8[np.ndarray, "h w 3"]], Int[np.ndarray, "h w"]]
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
+class SegmenterReading:
     """What is seen in a panorama, by column.
 
     Attributes:
@@ -54,11 +54,11 @@ class Seen:
     log_distance: Float[np.ndarray, "w"]
 
 
-def look(panorama: UInt8[np.ndarray, "h w 3"], segment: Segment, width: int) -> Seen:
+def read_walls_and_openings(panorama: UInt8[np.ndarray, "h w 3"], segment: Segment, width: int) -> SegmenterReading:
     """What a segmenter sees in a panorama, in so many columns."""
     elevation_deg = np.arange(-_REACH_DEG, _REACH_DEG, _STEP_DEG) + 0.5 * _STEP_DEG
     kind = _class_map(panorama, segment, np.radians(elevation_deg), width)
-    return Seen(_openings(kind, elevation_deg), _walls(kind, elevation_deg))
+    return SegmenterReading(_openings(kind, elevation_deg), _walls(kind, elevation_deg))
 
 
 def _openings(kind: Int[np.ndarray, "r w"], elevation_deg: Float[np.ndarray, "r"]) -> Float[np.ndarray, "w 2"]:
@@ -114,7 +114,7 @@ def _class_map(
     kind = np.zeros((len(elevation), width), dtype=np.int64)
     for view in np.unique(nearest):
         centre, chosen = view * TWO_PI / _VIEWS, nearest == view
-        size, focal = SEEN_ROWS, 0.5 * SEEN_ROWS / math.tan(math.radians(_FIELD_OF_VIEW_DEG / 2.0))
+        size, focal = PANORAMA_ROWS, 0.5 * PANORAMA_ROWS / math.tan(math.radians(_FIELD_OF_VIEW_DEG / 2.0))
         pixel = np.arange(size) + 0.5 - 0.5 * size
         seen_azimuth = centre + np.arctan2(pixel, focal)[None, :]
         seen_elevation = np.arctan2(-pixel[:, None], np.hypot(pixel, focal)[None, :])
@@ -128,7 +128,7 @@ def _class_map(
     return kind
 
 
-def segmenter(path: Path) -> Segment:
+def load_segmenter(path: Path) -> Segment:
     """The segmenter in a file, as a function of pictures of 512 x 512 pixels.
 
     Raises:
@@ -145,12 +145,12 @@ def segmenter(path: Path) -> Segment:
     except (ValueError, RuntimeError) as error:
         raise ConfigError(f"teacher '{path}' cannot be run: {error}") from error
     (given,), (answered,) = interpreter.get_input_details(), interpreter.get_output_details()
-    if tuple(given["shape"]) != (1, SEEN_ROWS, SEEN_ROWS, 3) or given["dtype"] != np.uint8:
+    if tuple(given["shape"]) != (1, PANORAMA_ROWS, PANORAMA_ROWS, 3) or given["dtype"] != np.uint8:
         raise ConfigError(f"teacher '{path}' takes {given['shape']} {given['dtype']}, not (1, 512, 512, 3) bytes")
 
     def segment(picture: np.ndarray) -> np.ndarray:
         interpreter.set_tensor(given["index"], np.ascontiguousarray(picture[None]))
         interpreter.invoke()
-        return interpreter.get_tensor(answered["index"]).reshape(SEEN_ROWS, SEEN_ROWS)
+        return interpreter.get_tensor(answered["index"]).reshape(PANORAMA_ROWS, PANORAMA_ROWS)
 
     return segment

@@ -20,7 +20,7 @@ _APART_M = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class Places:
+class ProbabilityMap:
     """Places of rooms with their probabilities, which sum to one.
 
     Attributes:
@@ -33,7 +33,7 @@ class Places:
     probability: Float[np.ndarray, "k"]
 
 
-def places_of(plan: FloorPlan, poses: PoseSet, posterior: Posterior) -> Places:
+def probability_map(plan: FloorPlan, poses: PoseSet, posterior: Posterior) -> ProbabilityMap:
     """The places that a posterior over the grid `poses` of a plan weighs.
 
     What was moved out of its room is left out: no camera stands in a wall.
@@ -47,4 +47,4 @@ def places_of(plan: FloorPlan, poses: PoseSet, posterior: Posterior) -> Places:
     if not weight[inside].sum() > 0.0:
         position_m, inside = poses.position_m[support.pose[first]], np.ones(len(first), bool)
     left = weight[inside]
-    return Places(position_m[inside], room[inside], left / left.sum())
+    return ProbabilityMap(position_m[inside], room[inside], left / left.sum())

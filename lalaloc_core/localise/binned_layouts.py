@@ -23,7 +23,7 @@ OPENING_ROWS = len(OPENING_CLASSES) - 1
 
 
 @dataclass(frozen=True, eq=False)
-class Sketch:
+class BinnedLayouts:
     """What the first look sees of the poses of a grid.
 
     Attributes:
@@ -37,8 +37,8 @@ class Sketch:
     bins: Float[np.ndarray, "b"]
 
     @classmethod
-    def of(cls, layouts: Layouts) -> Sketch:
-        """The sketch of some poses."""
+    def of(cls, layouts: Layouts) -> BinnedLayouts:
+        """The layouts of some poses, binned."""
         width = layouts.log_profile.shape[1]
         count = min(_AZIMUTHS, width)
         columns = np.arange(count) * width // count

@@ -14,7 +14,7 @@ _QUARTER = TWO_PI / 4.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class Turn:
+class Rotation:
     """How a panorama is turned.
 
     Attributes:
@@ -37,15 +37,15 @@ class Turn:
         return profile_m[..., ::-1] if self.mirrored else profile_m
 
 
-def draw_turn(turns: Turns, heading: float, width: int, rng: np.random.Generator) -> Turn:
+def sample_rotation(turns: Turns, heading: float, width: int, rng: np.random.Generator) -> Rotation:
     """Draw how to turn a panorama of `width` columns whose centre column looks along `heading` (radians)."""
     pixel = TWO_PI / width
     shift = int(rng.integers(width)) if turns == "any" else round((heading - _target(turns, rng)) / pixel)
     mirrored = turns != "none" and bool(rng.random() < 0.5)
-    return Turn(shift=shift, heading=float(wrap_angle(heading - shift * pixel)), mirrored=mirrored)
+    return Rotation(shift=shift, heading=float(wrap_angle(heading - shift * pixel)), mirrored=mirrored)
 
 
-def draw_heading(turns: Turns, rng: np.random.Generator) -> float:
+def sample_heading(turns: Turns, rng: np.random.Generator) -> float:
     """Draw the heading (radians) of a layout that has none of its own."""
     return float(rng.uniform(0.0, TWO_PI)) if turns == "any" else _target(turns, rng)
 

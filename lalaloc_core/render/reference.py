@@ -24,7 +24,7 @@ def room_mesh(room: Room) -> trimesh.Trimesh:
     return trimesh.creation.extrude_polygon(room.shape, room.ceiling_height_m)
 
 
-def oracle_depth(
+def reference_depth(
     room: Room,
     position_m: Float[np.ndarray, "2"],
     heading: float,
@@ -47,7 +47,7 @@ def oracle_depth(
     return depth.reshape(rows, columns)
 
 
-def oracle_view(
+def reference_view(
     plan: FloorPlan, room_index: int, position_m: Float[np.ndarray, "2"], azimuth: float, camera_height_m: float
 ) -> tuple[float, int, float]:
     """Distance to the wall (m), code of what is in it, and distance to what lies behind (m), along one ray."""

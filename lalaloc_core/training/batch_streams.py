@@ -18,8 +18,8 @@ from lalaloc_core.training.batches import Batch, LoadFailure, Stream, non_empty,
 from lalaloc_core.training.config import TrainConfig
 from lalaloc_core.training.deferred import DeferredBatch, DeferredBatcher, DeferredRow, DeferredScene, Row
 from lalaloc_core.training.replay_buffer import ReplayBuffer
-from lalaloc_core.training.sources import Group, Source, View
-from lalaloc_core.training.turning import Turn, draw_heading, draw_turn
+from lalaloc_core.training.rotation import Rotation, sample_heading, sample_rotation
+from lalaloc_core.training.sources import Group, PanoramaSample, Source
 
 # Code of a class that is not known; losses pass over it.
 UNKNOWN = -1
@@ -52,11 +52,11 @@ class LayoutBatches(Stream):
         stage, turns = self.config.layout, self.config.turns
         size = len(group.position_m)
         # One heading for all turns the whole plan; some negatives stand where positives do, at another heading.
-        chosen, heading = np.arange(size), np.full(size, draw_heading(turns, rng))
+        chosen, heading = np.arange(size), np.full(size, sample_heading(turns, rng))
         turned = int(stage.turned_share * stage.triplets.negatives)
         if turned:
             chosen[size - turned :] = rng.integers(0, 1 + stage.triplets.positives, turned)
-            heading[size - turned :] = [draw_heading(turns, rng) for _ in range(turned)]
+            heading[size - turned :] = [sample_heading(turns, rng) for _ in range(turned)]
         room = group.room_index[chosen]
         profile = profiles_at(
             group.plan, group.position_m[chosen], room, heading, self.config.profile_columns, np.float32
@@ -89,70 +89,73 @@ class PanoramaBatches(Stream):
 
     def __iter__(self) -> Iterator[Batch | DeferredBatch | LoadFailure]:
         stage, (_, workers) = self.config.image, worker_share()
-        replay: ReplayBuffer[View] = ReplayBuffer(stage.uses_per_panorama, stage.replay_panoramas // workers)
+        replay: ReplayBuffer[PanoramaSample] = ReplayBuffer(stage.uses_per_panorama, stage.replay_panoramas // workers)
         batcher = DeferredBatcher(stage.uses_per_panorama)
 
         def rendered(visit: int) -> list[Row] | None:
             drawn = self._drawn(visit, replay)
             return [
-                row | {"image": turn.picture(view.image)}
-                for view, turn, row in drawn
-                if row is not None and isinstance(view.image, np.ndarray)
+                row | {"image": turn.picture(sample.image)}
+                for sample, turn, row in drawn
+                if row is not None and isinstance(sample.image, np.ndarray)
             ] or None
 
         def deferred(visit: int) -> list[DeferredRow] | None:
             rows = []
-            for view, turn, row in self._drawn(visit, replay):
-                assert isinstance(view.image, DeferredScene)
+            for sample, turn, row in self._drawn(visit, replay):
+                assert isinstance(sample.image, DeferredScene)
                 if row is None:
-                    batcher.drop(view.image)
+                    batcher.drop(sample.image)
                 else:
-                    rows.append(DeferredRow(view.image, turn, row))
+                    rows.append(DeferredRow(sample.image, turn, row))
             return rows or None
 
         if self.source.deferred:
             return _batches(deferred, batcher.pack, self.source, stage.batch, self.first)
         return _batches(rendered, stacked, self.source, stage.batch, self.first)
 
-    def _drawn(self, visit: int, replay: ReplayBuffer[View]) -> list[tuple[View, Turn, Row | None]]:
+    def _drawn(
+        self, visit: int, replay: ReplayBuffer[PanoramaSample]
+    ) -> list[tuple[PanoramaSample, Rotation, Row | None]]:
         """What a visit shows, how it is turned, and the rest of its rows: None where there are no neighbours."""
         rng = self.source.rng(visit)
         drawn = []
-        for new in self.source.views(visit, *self.config.image_size):
-            for view in replay.add_and_sample(new, rng):
-                turn = draw_turn(self.config.turns, view.heading, self.config.image_size[1], rng)
-                drawn.append((view, turn, self._row(view, turn, rng)))
+        for new in self.source.samples(visit, *self.config.image_size):
+            for sample in replay.add_and_sample(new, rng):
+                turn = sample_rotation(self.config.turns, sample.heading, self.config.image_size[1], rng)
+                drawn.append((sample, turn, self._row(sample, turn, rng)))
         return drawn
 
-    def _row(self, view: View, turn: Turn, rng: np.random.Generator) -> Row | None:
-        position, room = view.position_m[None], np.array([view.room_index])
+    def _row(self, sample: PanoramaSample, turn: Rotation, rng: np.random.Generator) -> Row | None:
+        position, room = sample.position_m[None], np.array([sample.room_index])
         if self.neighbours:
-            group = view.group(self.config.layout.triplets, rng)
+            group = sample.group(self.config.layout.triplets, rng)
             if group is None:
                 return None
             position, room = group.position_m, group.room_index
         heading = np.full(len(position), turn.heading)
-        profile = turn.profile(profiles_at(view.plan, position, room, heading, self.config.profile_columns, np.float32))
-        ceiling = view.plan.ceiling_heights_m[room].astype(np.float32)
+        columns = self.config.profile_columns
+        profile = turn.profile(profiles_at(sample.plan, position, room, heading, columns, np.float32))
+        ceiling = sample.plan.ceiling_heights_m[room].astype(np.float32)
         row = {
             "profile_m": profile[0],
-            "camera_height_m": np.float32(view.camera_height_m + self._height_error_m(rng)),
+            "camera_height_m": np.float32(sample.camera_height_m + self._height_error_m(rng)),
             "ceiling_height_m": ceiling[0],
         }
         if self.config.architecture == "trunk":
-            row |= self._structure(view, turn)
+            row |= self._structure(sample, turn)
         if self.neighbours:
             row |= {"neighbour_profile_m": profile[1:], "neighbour_ceiling_height_m": ceiling[1:]}
         return row
 
-    def _structure(self, view: View, turn: Turn) -> Row:
-        room = view.plan.rooms[view.room_index]
+    def _structure(self, sample: PanoramaSample, turn: Rotation) -> Row:
+        room = sample.plan.rooms[sample.room_index]
         kind = opening_kinds(
-            view.plan,
-            view.position_m,
-            view.room_index,
+            sample.plan,
+            sample.position_m,
+            sample.room_index,
             turn.heading,
-            view.camera_height_m,
+            sample.camera_height_m,
             self.config.profile_columns,
         )
         type_code = ROOM_TYPES.index(room.type)
