@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from lalaloc_core.synth.pieces import Finish, Part, Piece
+from lalaloc_core.synth.pieces import Finish, Piece, box
 from lalaloc_core.synth.pieces_living import wardrobe_run
 from lalaloc_core.synth.pieces_service import COUNTER_DEPTH_M, bathtub, counter_run, shower, toilet, washbasin
 
@@ -133,11 +133,11 @@ def _around_the_corner(
 
 def _tall_unit(body: Finish, height: float) -> Piece:
     half, front = 0.5 * _TALL_UNIT_M, 0.31
-    oven = Part(0, front - 0.01, half - 0.03, 0.012, 0.9, 1.45, "dark")
+    oven = box(at=(0, front - 0.01), half=(half - 0.03, 0.012), z=(0.9, 1.45), finish="dark")
     parts = (
-        Part(0, -0.01, half, front - 0.01, 0.0, height, body),
+        box(at=(0, -0.01), half=(half, front - 0.01), z=(0.0, height), finish=body),
         oven,
-        Part(0, front - 0.005, half - 0.01, 0.008, 1.5, height - 0.02, body),
+        box(at=(0, front - 0.005), half=(half - 0.01, 0.008), z=(1.5, height - 0.02), finish=body),
     )
     return Piece(_TALL_UNIT_M, 0.62, parts, label="counter")
 
@@ -146,11 +146,11 @@ def _block(width: float, depth: float, height: float, body: Finish) -> Piece:
     """Base units under a worktop that can be walked around."""
     hx, hy = 0.5 * width, 0.5 * depth
     parts = [
-        Part(0, 0, hx - 0.05, hy - 0.05, 0.0, 0.1, "dark"),
-        Part(0, 0, hx - 0.02, hy - 0.03, 0.1, height - 0.04, body),
-        Part(0, 0, hx, hy, height - 0.04, height, "stone"),
+        box(at=(0, 0), half=(hx - 0.05, hy - 0.05), z=(0.0, 0.1), finish="dark"),
+        box(at=(0, 0), half=(hx - 0.02, hy - 0.03), z=(0.1, height - 0.04), finish=body),
+        box(at=(0, 0), half=(hx, hy), z=(height - 0.04, height), finish="stone"),
     ]
     for k in range(max(1, math.floor(width / 0.6))):
         x = -hx + width * (k + 0.5) / max(1, math.floor(width / 0.6))
-        parts.append(Part(x, hy - 0.025, 0.12, 0.008, height - 0.14, height - 0.12, "metal"))
+        parts.append(box(at=(x, hy - 0.025), half=(0.12, 0.008), z=(height - 0.14, height - 0.12), finish="metal"))
     return Piece(width, depth, tuple(parts), label="counter")

@@ -13,7 +13,7 @@ from lalaloc_core.floorplan import Room
 from lalaloc_core.synth.catalogue import ROOM_PIECES
 from lalaloc_core.synth.fitted import Placed, Stretch, kitchen, sanitary, wardrobes
 from lalaloc_core.synth.openings import Opening
-from lalaloc_core.synth.pieces import Finish, Label, Maker, Part, Piece
+from lalaloc_core.synth.pieces import Finish, Label, Maker, Piece, box, cylinder
 from lalaloc_core.synth.pieces_service import counter, island
 
 FurnitureLevel = Literal["empty", "simple", "full"]
@@ -44,7 +44,7 @@ class Prism(NamedTuple):
         z0, z1: lower and upper end over the floor, metres.
         finish: what it is made of.
         piece: number of the piece of furniture that it is part of.
-        round: whether it is a cylinder.
+        is_round: whether it is a cylinder.
         label: of the piece, see `pieces`.
     """
 
@@ -58,7 +58,7 @@ class Prism(NamedTuple):
     z1: float
     finish: Finish
     piece: int
-    round: bool
+    is_round: bool
     label: Label = ""
 
 
@@ -236,7 +236,7 @@ def place(piece: Piece, centre_m: Float[np.ndarray, "2"], axis: Float[np.ndarray
             z1=part.z1,
             finish=part.finish,
             piece=number,
-            round=part.round,
+            is_round=part.is_round,
             label=piece.label,
         )
         for part in piece.parts
@@ -280,7 +280,8 @@ def _rugs(floor: _Floor, rng: np.random.Generator, first_number: int) -> list[Pr
         half_a, half_b = rng.uniform(0.25, 1.5), rng.uniform(0.25, 1.0)
         pose = floor.lay(half_a, half_b, rng)
         if pose is not None:
-            part = Part(0, 0, half_a, half_b, 0.0, 0.012, "fabric", bool(rng.random() < 0.2))
+            shape = cylinder if rng.random() < 0.2 else box
+            part = shape(at=(0, 0), half=(half_a, half_b), z=(0.0, 0.012), finish="fabric")
             rug = Piece(2 * half_a, 2 * half_b, (part,), against_wall=False)
             prisms += place(rug, *pose, first_number + number)
     return prisms

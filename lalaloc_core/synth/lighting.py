@@ -189,7 +189,7 @@ def _hanging(
         z1=z_m[1],
         finish=finish,
         piece=_NO_PIECE,
-        round=is_round,
+        is_round=is_round,
     )
 
 
@@ -226,7 +226,7 @@ def _wall_lamp(
         z1=z + 0.1,
         finish="glow",
         piece=_NO_PIECE,
-        round=False,
+        is_round=False,
     )
     return light, lamp
 

@@ -1,7 +1,7 @@
 """What a piece of furniture is: textured boxes and cylinders in a frame of their own.
 
 Frame of a piece: x along its width, y from its back (negative, the wall's side) to its front, z up; the origin lies
-on the floor in the middle of its footprint. A part is given by centre, half extents and z-range.
+on the floor in the middle of its footprint. A part is a `box` or a `cylinder`: centre, half extents and z-range.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Label = Literal["", "counter"]
 
 
 class Part(NamedTuple):
-    """A vertical box, or an elliptic cylinder when `round`; metres."""
+    """A vertical box, or an elliptic cylinder when `is_round`; metres. Made by `box` and `cylinder`."""
 
     x: float
     y: float
@@ -27,7 +27,17 @@ class Part(NamedTuple):
     z0: float
     z1: float
     finish: Finish
-    round: bool = False
+    is_round: bool
+
+
+def box(*, at: tuple[float, float], half: tuple[float, float], z: tuple[float, float], finish: Finish) -> Part:
+    """A box with its centre `at` (x, y), half extents along x and y, and lower and upper end `z`; metres."""
+    return Part(*at, *half, *z, finish, is_round=False)
+
+
+def cylinder(*, at: tuple[float, float], half: tuple[float, float], z: tuple[float, float], finish: Finish) -> Part:
+    """An elliptic cylinder, given as a `box` is, whose footprint it fills."""
+    return Part(*at, *half, *z, finish, is_round=True)
 
 
 @dataclass(frozen=True)
@@ -53,5 +63,7 @@ def square_legs(hx: float, hy: float, thickness: float, height: float, finish: F
     """Four square legs under a rectangle of half extents (hx, hy)."""
     half = 0.5 * thickness
     return [
-        Part(sx * (hx - half), sy * (hy - half), half, half, 0.0, height, finish) for sx in (-1, 1) for sy in (-1, 1)
+        box(at=(sx * (hx - half), sy * (hy - half)), half=(half, half), z=(0.0, height), finish=finish)
+        for sx in (-1, 1)
+        for sy in (-1, 1)
     ]

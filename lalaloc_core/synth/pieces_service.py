@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lalaloc_core.synth.pieces import Finish, Part, Piece
+from lalaloc_core.synth.pieces import Finish, Piece, box, cylinder
 
 COUNTER_DEPTH_M = 0.62
 _UNIT_M = 0.6
@@ -23,25 +23,33 @@ def counter_run(rng: np.random.Generator, width: float, height: float, body: Fin
     unit, depth = width / units, COUNTER_DEPTH_M
     hx, hy = 0.5 * width, 0.5 * depth
     parts = [
-        Part(0, -0.03, hx, hy - 0.06, 0.0, 0.1, "dark"),
-        Part(0, -0.01, hx, hy - 0.03, 0.1, height - 0.04, body),
-        Part(0, 0, hx, hy, height - 0.04, height, "stone"),
-        Part(0, -hy + 0.01, hx, 0.01, height, height + rng.uniform(0.1, 0.35), "ceramic"),
+        box(at=(0, -0.03), half=(hx, hy - 0.06), z=(0.0, 0.1), finish="dark"),
+        box(at=(0, -0.01), half=(hx, hy - 0.03), z=(0.1, height - 0.04), finish=body),
+        box(at=(0, 0), half=(hx, hy), z=(height - 0.04, height), finish="stone"),
+        box(at=(0, -hy + 0.01), half=(hx, 0.01), z=(height, height + rng.uniform(0.1, 0.35)), finish="ceramic"),
     ]
     if width > 3 * _UNIT_M:
-        parts.append(Part(rng.uniform(-0.3, 0.0) * width, 0, 0.25, 0.22, height, height + 0.01, "dark"))
-        parts.append(Part(rng.uniform(0.1, 0.3) * width, -0.1, 0.02, 0.02, height, height + 0.3, "metal", True))
+        parts.append(
+            box(at=(rng.uniform(-0.3, 0.0) * width, 0), half=(0.25, 0.22), z=(height, height + 0.01), finish="dark")
+        )
+        parts.append(
+            cylinder(
+                at=(rng.uniform(0.1, 0.3) * width, -0.1), half=(0.02, 0.02), z=(height, height + 0.3), finish="metal"
+            )
+        )
     for k in range(units):
         x = -hx + unit * (k + 0.5)
         oven = rng.random() < 0.15
-        parts.append(Part(x, hy - 0.03, 0.49 * unit, 0.01, 0.11, height - 0.06, "dark" if oven else body))
-        parts.append(Part(x, hy - 0.01, 0.25 * unit, 0.01, height - 0.14, height - 0.12, "metal"))
+        parts.append(
+            box(at=(x, hy - 0.03), half=(0.49 * unit, 0.01), z=(0.11, height - 0.06), finish="dark" if oven else body)
+        )
+        parts.append(box(at=(x, hy - 0.01), half=(0.25 * unit, 0.01), z=(height - 0.14, height - 0.12), finish="metal"))
     if wall_units:
         bottom, top = rng.uniform(1.35, 1.5), rng.uniform(1.95, 2.15)
         for k in range(units):
             if rng.random() < 0.85:
                 x = -hx + unit * (k + 0.5)
-                parts.append(Part(x, -hy + 0.17, 0.495 * unit, 0.17, bottom, top, body))
+                parts.append(box(at=(x, -hy + 0.17), half=(0.495 * unit, 0.17), z=(bottom, top), finish=body))
     return Piece(width, depth, tuple(parts), label="counter")
 
 
@@ -51,13 +59,13 @@ def island(rng: np.random.Generator) -> Piece:
     body: Finish = ("white", "wood", "paint")[int(rng.integers(3))]
     hx, hy = 0.5 * width, 0.5 * depth
     parts = [
-        Part(0, 0, hx - 0.03, hy - 0.05, 0.0, height - 0.04, body),
-        Part(0, 0, hx, hy, height - 0.04, height, "stone"),
+        box(at=(0, 0), half=(hx - 0.03, hy - 0.05), z=(0.0, height - 0.04), finish=body),
+        box(at=(0, 0), half=(hx, hy), z=(height - 0.04, height), finish="stone"),
     ]
     for x in np.arange(-hx + 0.3, hx - 0.2, 0.6):
         if rng.random() < 0.5:
-            parts.append(Part(float(x), hy + 0.25, 0.17, 0.17, 0.62, 0.67, "wood", True))
-            parts.append(Part(float(x), hy + 0.25, 0.03, 0.03, 0.0, 0.62, "metal", True))
+            parts.append(cylinder(at=(float(x), hy + 0.25), half=(0.17, 0.17), z=(0.62, 0.67), finish="wood"))
+            parts.append(cylinder(at=(float(x), hy + 0.25), half=(0.03, 0.03), z=(0.0, 0.62), finish="metal"))
     return Piece(width, depth + 0.9, tuple(parts), against_wall=False, label="counter")
 
 
@@ -66,10 +74,10 @@ def fridge(rng: np.random.Generator) -> Piece:
     width, height, split = rng.uniform(0.55, 0.9), rng.uniform(1.5, 2.05), rng.uniform(0.5, 1.3)
     finish: Finish = "white" if rng.random() < 0.5 else "metal"
     parts = (
-        Part(0, -0.02, 0.5 * width, 0.31, 0.02, height, finish),
-        Part(0, 0.3, 0.5 * width - 0.005, 0.02, 0.05, split, finish),
-        Part(0, 0.3, 0.5 * width - 0.005, 0.02, split + 0.015, height, finish),
-        Part(0.5 * width - 0.05, 0.33, 0.012, 0.012, split + 0.05, split + 0.4, "dark"),
+        box(at=(0, -0.02), half=(0.5 * width, 0.31), z=(0.02, height), finish=finish),
+        box(at=(0, 0.3), half=(0.5 * width - 0.005, 0.02), z=(0.05, split), finish=finish),
+        box(at=(0, 0.3), half=(0.5 * width - 0.005, 0.02), z=(split + 0.015, height), finish=finish),
+        box(at=(0.5 * width - 0.05, 0.33), half=(0.012, 0.012), z=(split + 0.05, split + 0.4), finish="dark"),
     )
     return Piece(width, 0.7, parts)
 
@@ -79,23 +87,23 @@ def bathtub(rng: np.random.Generator) -> Piece:
     width, depth, height = rng.uniform(1.4, 1.8), rng.uniform(0.7, 0.8), rng.uniform(0.5, 0.62)
     hx, hy, rim = 0.5 * width, 0.5 * depth, 0.06
     parts = [
-        Part(0, 0, hx - rim, hy - rim, 0.0, 0.2, "ceramic"),
-        Part(0, -hy + 0.5 * rim, hx, 0.5 * rim, 0.0, height, "ceramic"),
-        Part(0, hy - 0.5 * rim, hx, 0.5 * rim, 0.0, height, "ceramic"),
-        Part(-hx + 0.5 * rim, 0, 0.5 * rim, hy, 0.0, height, "ceramic"),
-        Part(hx - 0.5 * rim, 0, 0.5 * rim, hy, 0.0, height, "ceramic"),
+        box(at=(0, 0), half=(hx - rim, hy - rim), z=(0.0, 0.2), finish="ceramic"),
+        box(at=(0, -hy + 0.5 * rim), half=(hx, 0.5 * rim), z=(0.0, height), finish="ceramic"),
+        box(at=(0, hy - 0.5 * rim), half=(hx, 0.5 * rim), z=(0.0, height), finish="ceramic"),
+        box(at=(-hx + 0.5 * rim, 0), half=(0.5 * rim, hy), z=(0.0, height), finish="ceramic"),
+        box(at=(hx - 0.5 * rim, 0), half=(0.5 * rim, hy), z=(0.0, height), finish="ceramic"),
     ]
     if rng.random() < 0.4:
-        parts.append(Part(0.2 * width, hy - 0.02, 0.3 * width, 0.02, 0.3, 1.95, "fabric"))
+        parts.append(box(at=(0.2 * width, hy - 0.02), half=(0.3 * width, 0.02), z=(0.3, 1.95), finish="fabric"))
     return Piece(width, depth, tuple(parts))
 
 
 def toilet(rng: np.random.Generator) -> Piece:
     """Bowl, seat and cistern."""
     parts = (
-        Part(0, 0.1, 0.13, 0.2, 0.0, 0.36, "ceramic", True),
-        Part(0, 0.08, 0.19, 0.25, 0.36, 0.41, "white", True),
-        Part(0, -0.24, 0.19, 0.09, 0.36 * rng.integers(0, 2), rng.uniform(0.7, 0.85), "ceramic"),
+        cylinder(at=(0, 0.1), half=(0.13, 0.2), z=(0.0, 0.36), finish="ceramic"),
+        cylinder(at=(0, 0.08), half=(0.19, 0.25), z=(0.36, 0.41), finish="white"),
+        box(at=(0, -0.24), half=(0.19, 0.09), z=(0.36 * rng.integers(0, 2), rng.uniform(0.7, 0.85)), finish="ceramic"),
     )
     return Piece(0.4, 0.66, parts)
 
@@ -105,15 +113,15 @@ def washbasin(rng: np.random.Generator) -> Piece:
     width = rng.uniform(0.45, 1.3)
     hx = 0.5 * width
     below = (
-        Part(0, 0, hx, 0.22, 0.25 * rng.random(), 0.78, "wood")
+        box(at=(0, 0), half=(hx, 0.22), z=(0.25 * rng.random(), 0.78), finish="wood")
         if rng.random() < 0.6
-        else Part(0, 0, 0.09, 0.09, 0, 0.78, "ceramic", True)
+        else cylinder(at=(0, 0), half=(0.09, 0.09), z=(0, 0.78), finish="ceramic")
     )
     parts = (
         below,
-        Part(0, 0, hx, 0.24, 0.78, 0.86, "ceramic"),
-        Part(0, -0.23, 0.9 * hx, 0.01, 1.15, rng.uniform(1.7, 2.0), "metal"),
-        Part(0, -0.15, 0.02, 0.02, 0.86, 1.0, "metal", True),
+        box(at=(0, 0), half=(hx, 0.24), z=(0.78, 0.86), finish="ceramic"),
+        box(at=(0, -0.23), half=(0.9 * hx, 0.01), z=(1.15, rng.uniform(1.7, 2.0)), finish="metal"),
+        cylinder(at=(0, -0.15), half=(0.02, 0.02), z=(0.86, 1.0), finish="metal"),
     )
     return Piece(width, 0.48, parts)
 
@@ -123,8 +131,8 @@ def shower(rng: np.random.Generator) -> Piece:
     side = rng.uniform(0.75, 1.1)
     half = 0.5 * side
     parts = [
-        Part(0, 0, half, half, 0.0, rng.uniform(0.02, 0.15), "ceramic"),
-        Part(half - 0.01, 0, 0.01, half, 0.1, 2.0, "metal"),
-        Part(-0.2, -half + 0.03, 0.015, 0.015, 0.9, 2.05, "metal", True),
+        box(at=(0, 0), half=(half, half), z=(0.0, rng.uniform(0.02, 0.15)), finish="ceramic"),
+        box(at=(half - 0.01, 0), half=(0.01, half), z=(0.1, 2.0), finish="metal"),
+        cylinder(at=(-0.2, -half + 0.03), half=(0.015, 0.015), z=(0.9, 2.05), finish="metal"),
     ]
     return Piece(side, side, tuple(parts))

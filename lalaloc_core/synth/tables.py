@@ -95,7 +95,7 @@ class SceneTables:
             half_b_m=prism.half_b,
             z0_m=prism.z0,
             z1_m=prism.z1,
-            is_round=prism.round,
+            is_round=prism.is_round,
             surface=surface,
             is_opaque=opaque,
         )
