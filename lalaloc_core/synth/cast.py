@@ -147,7 +147,16 @@ def _trace_shell(batch: SceneBatch, direction: Float[Tensor, "b c 2"], slope: Fl
     vertical = torch.where(is_wall, 0.0, torch.where(up, -1.0, 1.0))
     surface, hole = _paint(batch, _decals_at(batch, own.wall, own.along_m), z, is_wall, surface)
     slot, is_beyond = torch.zeros_like(surface), torch.zeros_like(surface)
-    shell = _ShellHits(distance, surface, slot, vertical, is_beyond, own, own.normal.clone(), own.distance_m.clone())
+    shell = _ShellHits(
+        distance_m=distance,
+        surface=surface,
+        slot=slot,
+        vertical=vertical,
+        is_beyond=is_beyond,
+        own=own,
+        beyond_normal=own.normal.clone(),
+        end_m=own.distance_m.clone(),
+    )
     item, column = (hole >= 0).any(dim=2).nonzero(as_tuple=True)
     columns = (item, column)
     if len(item):

@@ -46,19 +46,19 @@ def add_door(
     is_framed = opening.kind != "opening" or (head < room.ceiling_height_m - 0.15 and rng.random() < 0.3)
     if is_framed:
         border = rng.uniform(0.04, 0.1)
-        tables.add_decal(wall, s0 - border, s1 + border, 0.0, head + border, style.trim)
+        tables.add_decal(wall, s_m=(s0 - border, s1 + border), z_m=(0.0, head + border), surface=style.trim)
     if slot_behind is not None:
         neighbour = home.plan.rooms[opening.neighbour]
         depth = _hole_depth(room, neighbour, opening)
         cheeks = style.trim if is_framed else tables.wall_surfaces[wall]
-        tables.add_decal(wall, s0, s1, _BELOW_M, head, cheeks, slot=slot_behind, depth_m=depth)
+        tables.add_decal(wall, s_m=(s0, s1), z_m=(_BELOW_M, head), surface=cheeks, slot=slot_behind, depth_m=depth)
         _add_threshold(tables, style, room, opening, depth, rng)
         if opening.kind == "door_open":
             _add_leaves(tables, style, room, neighbour, opening, depth, rng)
     elif opening.kind == "door_shut" or (opening.kind == "door_open" and rng.random() < 0.5):
         _add_shut_door(tables, style, wall, opening, rng)
     else:
-        tables.add_decal(wall, s0, s1, _BELOW_M, head, style.gloom)
+        tables.add_decal(wall, s_m=(s0, s1), z_m=(_BELOW_M, head), surface=style.gloom)
 
 
 def _hole_depth(room: Room, neighbour: Room, opening: Opening) -> float:
@@ -83,17 +83,17 @@ def _add_shut_door(
     """One leaf or two, with up to three panels or panes and a handle."""
     s0, s1, head = opening.start_m, opening.end_m, opening.head_m
     middle, is_double = 0.5 * (s0 + s1), s1 - s0 > DOUBLE_FROM_M
-    tables.add_decal(wall, s0, s1, _BELOW_M, head, style.door)
+    tables.add_decal(wall, s_m=(s0, s1), z_m=(_BELOW_M, head), surface=style.door)
     panels = int(rng.integers(0, 4))
     panel = style.gloom if style.doors_are_glazed else style.door_panel
     for start, end in [(s0, middle), (middle, s1)] if is_double else [(s0, s1)]:
         for k in range(panels):
             low, high = 0.15 + k * (head - 0.25) / panels, 0.05 + (k + 1) * (head - 0.25) / panels
-            tables.add_decal(wall, start + 0.12, end - 0.12, low, high, panel)
+            tables.add_decal(wall, s_m=(start + 0.12, end - 0.12), z_m=(low, high), surface=panel)
     s = middle - 0.08 if is_double else (s1 - 0.08 if rng.random() < 0.5 else s0 + 0.08)
-    tables.add_decal(wall, s - 0.05, s + 0.05, _HANDLE_M, _HANDLE_M + 0.04, style.handle)
+    tables.add_decal(wall, s_m=(s - 0.05, s + 0.05), z_m=(_HANDLE_M, _HANDLE_M + 0.04), surface=style.handle)
     if is_double:
-        tables.add_decal(wall, middle - 0.006, middle + 0.006, 0.0, head, style.gloom)
+        tables.add_decal(wall, s_m=(middle - 0.006, middle + 0.006), z_m=(0.0, head), surface=style.gloom)
 
 
 def _add_leaves(
@@ -109,9 +109,11 @@ def _add_leaves(
     for leaf in hang_leaves(opening, room, neighbour, depth_m, tables.camera_m, rng):
         for board in boards(leaf.half_width_m, opening.head_m, glazed=style.doors_are_glazed):
             centre = leaf.centre_m + leaf.axis * board.along_m
-            tables.add_box(centre, leaf.axis, board.half_a, board.half_b, board.z0, board.z1, style.door)
+            tables.add_box(
+                centre, leaf.axis, half_m=(board.half_a, board.half_b), z_m=(board.z0, board.z1), surface=style.door
+            )
         knob = leaf.centre_m + leaf.axis * 0.8 * leaf.half_width_m
-        tables.add_box(knob, leaf.axis, 0.06, 0.06, _HANDLE_M, _HANDLE_M + 0.03, style.handle)
+        tables.add_box(knob, leaf.axis, half_m=(0.06, 0.06), z_m=(_HANDLE_M, _HANDLE_M + 0.03), surface=style.handle)
 
 
 def _add_threshold(
@@ -124,4 +126,4 @@ def _add_threshold(
     surface = style.trim if rng.random() < 0.5 else style.handle
     half = 0.5 * (opening.end_m - opening.start_m)
     centre = middle - inwards * 0.5 * depth_m
-    tables.add_box(centre, along, half, 0.5 * depth_m, 0.0, rng.uniform(0.006, 0.025), surface)
+    tables.add_box(centre, along, half_m=(half, 0.5 * depth_m), z_m=(0.0, rng.uniform(0.006, 0.025)), surface=surface)

@@ -87,13 +87,18 @@ def add_mirror(
     for decal in [decal for decal in tables.decals if decal.wall < count]:
         length = tables.wall_length_m(decal.wall)
         seen = style.gloom if decal.slot >= 0 else decal.surface
-        tables.add_decal(first + decal.wall, length - decal.s1_m, length - decal.s0_m, decal.z0_m, decal.z1_m, seen)
+        tables.add_decal(
+            first + decal.wall,
+            s_m=(length - decal.s1_m, length - decal.s0_m),
+            z_m=(decal.z0_m, decal.z1_m),
+            surface=seen,
+        )
     tables.prisms += [relative.prism(Prisms(prism)).rows for prism in prisms]
     if rng.random() < 0.6:
         border = rng.uniform(0.02, 0.08)
         frame = tables.surfaces.add_finish("wood")
-        tables.add_decal(wall, s0 - border, s1 + border, z0 - border, z1 + border, frame)
-    tables.add_decal(wall, s0, s1, z0, z1, style.handle, slot=slot, depth_m=_DEPTH_M)
+        tables.add_decal(wall, s_m=(s0 - border, s1 + border), z_m=(z0 - border, z1 + border), surface=frame)
+    tables.add_decal(wall, s_m=(s0, s1), z_m=(z0, z1), surface=style.handle, slot=slot, depth_m=_DEPTH_M)
 
 
 def _reflected_slot(own: Float[np.ndarray, "12"], lights: Lights, relative: Reflection) -> Float[np.ndarray, "12"]:

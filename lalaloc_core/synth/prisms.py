@@ -61,7 +61,9 @@ def cross_prisms(prisms: Prisms, direction: Float[Tensor, "b c 2"], limit_m: Flo
     length = torch.sqrt(nu**2 + nv**2) + _TINY
     nu, nv = nu / length, nv / length
     normal = torch.stack([nu * ax - nv * ay, nu * ay + nv * ax], dim=-1)
-    return PrismHits(enter, leave, pick(each.z0_m), pick(each.z1_m), index, normal)
+    return PrismHits(
+        enter_m=enter, leave_m=leave, z0_m=pick(each.z0_m), z1_m=pick(each.z1_m), index=index, normal=normal
+    )
 
 
 def _cross_square(u: Tensor, v: Tensor, du: Tensor, dv: Tensor) -> tuple[Tensor, Tensor, Tensor]:

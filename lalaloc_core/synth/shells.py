@@ -89,16 +89,18 @@ def _dress_wall(
     length = tables.wall_length_m(wall)
     start, end = -_BEYOND_M, length + _BEYOND_M
     if style.baseboard_m > 0.0:
-        tables.add_decal(wall, start, end, -_BEYOND_M, style.baseboard_m, style.trim)
+        tables.add_decal(wall, s_m=(start, end), z_m=(-_BEYOND_M, style.baseboard_m), surface=style.trim)
     if style.crown_m > 0.0:
-        tables.add_decal(wall, start, end, ceiling_m - style.crown_m, ceiling_m + _BEYOND_M, style.trim)
+        tables.add_decal(
+            wall, s_m=(start, end), z_m=(ceiling_m - style.crown_m, ceiling_m + _BEYOND_M), surface=style.trim
+        )
     if is_bare and rng.random() < 0.8:
         return
     if length > 1.0 and rng.random() < 0.45:
         _hang_picture(tables, wall, length, rng)
     if length > 0.5 and rng.random() < 0.5:
         s, z = rng.uniform(0.1, length - 0.1), float(rng.choice([0.25, 1.1]))
-        tables.add_decal(wall, s - 0.04, s + 0.04, z - 0.04, z + 0.04, style.trim)
+        tables.add_decal(wall, s_m=(s - 0.04, s + 0.04), z_m=(z - 0.04, z + 0.04), surface=style.trim)
 
 
 def _hang_picture(tables: SceneTables, wall: int, length_m: float, rng: np.random.Generator) -> None:
@@ -112,6 +114,6 @@ def _hang_picture(tables: SceneTables, wall: int, length_m: float, rng: np.rando
     frame = tables.surfaces.add_finish("dark")
     is_screen = rng.random() < 0.15
     picture = frame if is_screen else tables.surfaces.add("furniture", vivid(rng), scale=0.7)
-    tables.add_decal(wall, s0, s1, z0, z1, frame)
+    tables.add_decal(wall, s_m=(s0, s1), z_m=(z0, z1), surface=frame)
     inset = rng.uniform(0.015, 0.05)
-    tables.add_decal(wall, s0 + inset, s1 - inset, z0 + inset, z1 - inset, picture)
+    tables.add_decal(wall, s_m=(s0 + inset, s1 - inset), z_m=(z0 + inset, z1 - inset), surface=picture)

@@ -71,17 +71,21 @@ class SceneTables:
     def add_decal(
         self,
         wall: int,
-        s0: float,
-        s1: float,
-        z0: float,
-        z1: float,
-        surface: int,
         *,
+        s_m: tuple[float, float],
+        z_m: tuple[float, float],
+        surface: int,
         slot: int = -1,
         depth_m: float = 0.0,
     ) -> None:
-        """A rectangle on a wall, with a `slot` a hole of some depth through which one sees that room."""
-        self.decals.append(Decal(wall, s0, s1, z0, z1, surface, slot, depth_m))
+        """A rectangle on a wall: from where to where along it, and up it.
+
+        With a `slot` it is a hole of some depth through which one sees that room.
+        """
+        decal = Decal(
+            wall=wall, s0_m=s_m[0], s1_m=s_m[1], z0_m=z_m[0], z1_m=z_m[1], surface=surface, slot=slot, depth_m=depth_m
+        )
+        self.decals.append(decal)
 
     def add_prism(self, prism: Prism, surface: int, *, opaque: bool = True) -> None:
         """A box or cylinder with a surface of its finish; an `opaque` one casts shadows."""
@@ -105,20 +109,19 @@ class SceneTables:
         self,
         centre_m: Float[np.ndarray, "2"],
         axis: Float[np.ndarray, "2"],
-        half_a: float,
-        half_b: float,
-        z0: float,
-        z1: float,
+        *,
+        half_m: tuple[float, float],
+        z_m: tuple[float, float],
         surface: int,
     ) -> None:
-        """A box that casts shadows; centre in the plan frame, the first half extent along `axis`."""
+        """A box that casts shadows; centre in the plan frame, half extents along `axis` and across it."""
         row = Prisms.row(
             centre_m=centre_m - self.camera_m,
             axis=axis,
-            half_a_m=half_a,
-            half_b_m=half_b,
-            z0_m=z0,
-            z1_m=z1,
+            half_a_m=half_m[0],
+            half_b_m=half_m[1],
+            z0_m=z_m[0],
+            z1_m=z_m[1],
             surface=surface,
             is_opaque=True,
         )
