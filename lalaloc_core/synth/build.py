@@ -32,7 +32,7 @@ class _Builder:
         self._shot, self._home = shot, shot.home
         self._room = shot.home.plan.rooms[shot.room_index]
         self._openings = self._openings_of(shot.room_index)
-        seen = [opening.neighbour for opening in self._openings if opening.is_passage]
+        seen = [opening.neighbour for opening in self._openings if opening.is_see_through]
         self._slot_rooms = [shot.room_index, *dict.fromkeys(seen)]
         self._streams = Streams(shot.seed, is_staged=shot.lighting is not None)
         self._rng = self._streams.shapes
@@ -96,7 +96,7 @@ class _Builder:
         number = self._home.openings.index(opening)
         self._streams.begin(ScenePart.OPENING, number)
         if opening.kind != "window":
-            slot_behind = self._slot_rooms.index(opening.neighbour) if is_own and opening.is_passage else None
+            slot_behind = self._slot_rooms.index(opening.neighbour) if is_own and opening.is_see_through else None
             add_door(tables, style, self._home, wall, opening, slot_behind, rng)
             return
         add_window(tables, style, wall, opening, rng)

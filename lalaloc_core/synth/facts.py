@@ -42,18 +42,21 @@ def facts_of(shot: Shot) -> frozenset[Fact]:
 
 def _facts_of_place(shot: Shot) -> set[Fact]:
     room, here = shot.home.plan.rooms[shot.room_index], shapely.Point(shot.position_m)
-    passages = [opening for opening in shot.home.openings if opening.room == shot.room_index and opening.is_passage]
-    wide = [opening for opening in passages if opening.kind == "opening" and opening.end_m - opening.start_m >= _WIDE_M]
+    own = [opening for opening in shot.home.openings if opening.room == shot.room_index]
+    see_through = [opening for opening in own if opening.is_see_through]
+    wide = [
+        opening for opening in see_through if opening.kind == "opening" and opening.end_m - opening.start_m >= _WIDE_M
+    ]
     inscribed_m = 2.0 * shapely.maximum_inscribed_circle(room.shape, 0.02).length
     holds: dict[Fact, bool] = {
-        "open_door": any(opening.kind == "door_open" for opening in passages),
+        "open_door": any(opening.kind == "door_open" for opening in see_through),
         "wide_opening": bool(wide),
         "wall_stub": any(_has_stub(shot, opening) for opening in wide),
         "corridor": inscribed_m <= _CORRIDOR_WIDTH_M and 0.5 * room.shape.length - inscribed_m >= _CORRIDOR_LENGTH_M,
         "closet": room.area_m2 < _CLOSET_M2,
         "large_room": room.area_m2 > _LARGE_M2,
         "near_wall": room.shape.exterior.distance(here) < _NEAR_M,
-        "threshold": any(_segment(shot, opening).distance(here) < _THRESHOLD_M for opening in passages),
+        "threshold": any(_segment(shot, opening).distance(here) < _THRESHOLD_M for opening in see_through),
     }
     return {fact for fact, true in holds.items() if true}
 

@@ -47,7 +47,7 @@ class Opening:
     neighbour: int
 
     @property
-    def is_passage(self) -> bool:
+    def is_see_through(self) -> bool:
         """Whether one looks through it into another room of the plan."""
         return self.kind in ("door_open", "opening") and self.neighbour >= 0
 

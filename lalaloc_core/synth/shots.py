@@ -140,9 +140,9 @@ def _hard_place(home: Home, rng: np.random.Generator) -> tuple[Float[np.ndarray,
     """A position and its room: on a threshold, beside a wall, in a corridor or another narrow room."""
     rooms = home.plan.rooms
     kind = rng.random()
-    passages = [opening for opening in home.openings if opening.kind in ("door_open", "opening")]
-    if kind < 0.3 and passages:
-        opening = passages[int(rng.integers(len(passages)))]
+    see_through = [opening for opening in home.openings if opening.is_see_through]
+    if kind < 0.3 and see_through:
+        opening = see_through[int(rng.integers(len(see_through)))]
         room = rooms[opening.room]
         start, along, inwards = wall_frame(room, opening.wall)
         inner = room.shape.buffer(-POSE_MARGIN_M)
