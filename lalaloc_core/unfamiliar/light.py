@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -60,27 +61,28 @@ class Lights:
         power = rng.uniform(2.0, 6.0) * np.sqrt(area / 12) * rng.uniform(0.6, 1.4, len(area)) * on
         lamp = power[:, None] * tint
         lamp_m = np.array([[*lamp_place(room.shape), room.ceiling_height_m - _LAMP_DROP_M] for room in plan.rooms])
-        panes = np.array([_pane(o) for o in windows]).reshape(-1, 4, 3)
+        panes = [_pane(o) for o in windows]
         flux = 4 * np.pi * lamp
-        for o, (_, u, v, inward) in zip(windows, panes, strict=True):
-            size = 4 * np.linalg.norm(u) * np.linalg.norm(v)
-            flux[o.wall.room] += size * (np.pi * sky.mean() + 0.3 * sky.sunlight * max(0.0, float(-inward @ sky.sun)))
+        for o, pane in zip(windows, panes, strict=True):
+            size = 4 * np.linalg.norm(pane.u) * np.linalg.norm(pane.v)
+            facing = max(0.0, float(-pane.inward @ sky.sun))
+            flux[o.wall.room] += size * (np.pi * sky.mean() + 0.3 * sky.sunlight * facing)
         heights = plan.ceiling_heights_m
         around = np.array(
             [2 * room.area_m2 + room.shape.length * h for room, h in zip(plan.rooms, heights, strict=True)]
         )
         ambient = flux / around[:, None] * _MEAN_REFLECTANCE / (1 - _MEAN_REFLECTANCE)
         return cls(
-            lamp_m,
-            lamp,
-            panes[:, 0],
-            panes[:, 1],
-            panes[:, 2],
-            panes[:, 3],
-            np.cumsum(count) - count,
-            count,
-            ambient + 0.01,
-            sky,
+            lamp_m=lamp_m,
+            lamp=lamp,
+            window_m=_rows([pane.centre_m for pane in panes]),
+            window_u=_rows([pane.u for pane in panes]),
+            window_v=_rows([pane.v for pane in panes]),
+            inward=_rows([pane.inward for pane in panes]),
+            first=np.cumsum(count) - count,
+            count=count,
+            ambient=ambient + 0.01,
+            sky=sky,
         )
 
     def soft(
@@ -176,14 +178,27 @@ class Lights:
         return np.minimum(light, _BRIGHTEST * self.ambient[room]).astype(np.float32)
 
 
-def _pane(opening: Opening) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Centre, half extents and inward normal of a window, in the face of its wall."""
+class _Pane(NamedTuple):
+    """Centre, half extents (vectors) and inward normal of a window."""
+
+    centre_m: Float[np.ndarray, "3"]
+    u: Float[np.ndarray, "3"]
+    v: Float[np.ndarray, "3"]
+    inward: Float[np.ndarray, "3"]
+
+
+def _pane(opening: Opening) -> _Pane:
+    """A window in the face of its wall."""
     wall = opening.wall
     middle = wall.point_m((opening.left_m + opening.right_m) / 2)
     centre = np.array([*middle, (opening.sill_m + opening.top_m) / 2])
     u = np.array([*wall.along, 0.0]) * (opening.right_m - opening.left_m) / 2
     v = np.array([0.0, 0.0, (opening.top_m - opening.sill_m) / 2])
-    return centre, u, v, np.array([*-wall.outward, 0.0])
+    return _Pane(centre_m=centre, u=u, v=v, inward=np.array([*-wall.outward, 0.0]))
+
+
+def _rows(vectors: Sequence[Float[np.ndarray, "3"]]) -> Float[np.ndarray, "w 3"]:
+    return np.array(vectors).reshape(-1, 3)
 
 
 def _toward(start: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

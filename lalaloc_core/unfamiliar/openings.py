@@ -97,7 +97,17 @@ def draw_openings(plan: UnfamiliarPlan, rng: np.random.Generator) -> list[Openin
     if fronts:
         front = fronts[rng.integers(len(fronts))]
         at = rng.uniform(0.15, front.length_m - 1.15)
-        openings.append(_opening("front door", front, (at, at + 0.95), (0.0, 2.1), _OUTER_WALL_M, rooms, taken))
+        openings.append(
+            _opening(
+                "front door",
+                front,
+                span_m=(at, at + 0.95),
+                heights_m=(0.0, 2.1),
+                depth_m=_OUTER_WALL_M,
+                rooms=rooms,
+                taken=taken,
+            )
+        )
     for wall in outer:
         openings += _draw_windows(wall, rooms, plan, taken, rng)
     return openings
@@ -175,7 +185,15 @@ def _draw_door(
         return None
     swing = float(np.radians(rng.uniform(15, 110)))
     return _opening(
-        kind, first, (left, left + width), (0.0, top), depth, plan.plan.rooms, taken, behind=second, swing=swing
+        kind,
+        first,
+        span_m=(left, left + width),
+        heights_m=(0.0, top),
+        depth_m=depth,
+        rooms=plan.plan.rooms,
+        taken=taken,
+        behind=second,
+        swing=swing,
     )
 
 
@@ -193,7 +211,15 @@ def _draw_windows(
     width = min(rng.uniform(0.6, 2.0), slot - 0.25)
     lefts = [slot * k + (slot - width) / 2 for k in range(count)]
     return [
-        _opening("window", wall, (left, left + width), (sill, top), _OUTER_WALL_M, rooms, taken)
+        _opening(
+            "window",
+            wall,
+            span_m=(left, left + width),
+            heights_m=(sill, top),
+            depth_m=_OUTER_WALL_M,
+            rooms=rooms,
+            taken=taken,
+        )
         for left in lefts
         if _is_free(taken, wall, left, left + width)
     ]
@@ -202,12 +228,12 @@ def _draw_windows(
 def _opening(
     kind: OpeningKind,
     wall: Wall,
+    *,
     span_m: tuple[float, float],
     heights_m: tuple[float, float],
     depth_m: float,
     rooms: tuple[Room, ...],
     taken: _Taken,
-    *,
     behind: Wall | None = None,
     swing: float = 0.0,
 ) -> Opening:

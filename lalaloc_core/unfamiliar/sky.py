@@ -44,13 +44,13 @@ class Sky:
         waves = np.stack([rng.integers(1, 12, 5), rng.uniform(0, 6.28, 5), rng.uniform(0.005, 0.05, 5)], axis=1)
         ground = np.array(horizon) * rng.uniform(0.1, 0.4) * rng.choice([[0.4, 0.6, 0.25], [0.55, 0.5, 0.45]])
         return cls(
-            np.array(zenith) * bright,
-            np.array(horizon) * bright,
-            ground * bright,
-            sun,
-            np.asarray(sunlight),
-            waves,
-            rng.random(48),
+            zenith=np.array(zenith) * bright,
+            horizon=np.array(horizon) * bright,
+            ground=ground * bright,
+            sun=sun,
+            sunlight=np.asarray(sunlight),
+            waves=waves,
+            blocks=rng.random(48),
         )
 
     def colour(self, direction: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
