@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from lalaloc_core.synth.columns import Column, Table
+from lalaloc_core.synth.records import Column, Records
 
 DISC, BLURRED, LOGO, MIRROR_BALL, TRIPOD, PERSON = range(6)
 _NADIR_SHARES = (0.4, 0.15, 0.15, 0.08, 0.12, 0.1)
@@ -15,7 +15,7 @@ _NADIR_RADIUS_DEG = (6.0, 30.0)
 _MAX_TILT_DEG = 2.0
 
 
-class Exposure(Table):
+class Exposure(Records):
     """How a camera turns light into a picture.
 
     Attributes:
@@ -37,10 +37,30 @@ class Exposure(Table):
         zenith, zenith_tone: radius (radians, 0 for none) and tone of what covers the zenith.
     """
 
-    WIDTH = 24
-    target, red_gain, blue_gain, contrast, saturation, noise, blur, nadir, nadir_tone = map(Column, range(9))
-    noise_seed, shoulder, tint, flatness, vignette, seam, seam_step, seam_shift = map(Column, range(9, 17))
-    roll, pitch, jpeg, nadir_kind, nadir_turn, zenith, zenith_tone = map(Column, range(17, 24))
+    target = Column()
+    red_gain = Column()
+    blue_gain = Column()
+    contrast = Column()
+    saturation = Column()
+    noise = Column()
+    blur = Column()
+    nadir = Column()
+    nadir_tone = Column()
+    noise_seed = Column()
+    shoulder = Column()
+    tint = Column()
+    flatness = Column()
+    vignette = Column()
+    seam = Column()
+    seam_step = Column()
+    seam_shift = Column()
+    roll = Column()
+    pitch = Column()
+    jpeg = Column()
+    nadir_kind = Column()
+    nadir_turn = Column()
+    zenith = Column()
+    zenith_tone = Column()
 
 
 def draw_exposure(rng: np.random.Generator, *, bright: bool = False) -> Exposure:

@@ -15,6 +15,7 @@ from lalaloc_core.floorplan import Room
 from lalaloc_core.synth.furniture import Prism, wall_frame
 from lalaloc_core.synth.openings import Opening
 from lalaloc_core.synth.pieces import Finish
+from lalaloc_core.synth.records import Row
 from lalaloc_core.synth.render_scene import Backdrop, Lights, RenderScene, Sun
 
 Mood = Literal["cold", "raw", "warm"]
@@ -27,7 +28,6 @@ _FRAME_M = 0.06
 # Lamps are no piece of furniture.
 _NO_PIECE = -2
 
-LightRow = Float[np.ndarray, "8"]
 # What a mood multiplies the neutral light of lamps and of the sky with.
 _LAMP_TINTS: dict[Mood, tuple[float, float, float]] = {
     "cold": (0.62, 0.85, 1.15),
@@ -126,7 +126,7 @@ def relit(scene: RenderScene, mood: Mood) -> RenderScene:
     return dataclasses.replace(scene, lights=lights, slots=slots, surfaces=surfaces, sun=sun, backdrop=backdrop)
 
 
-def _window_light(room: Room, window: Opening, origin_m: np.ndarray, lighting: Lighting) -> LightRow:
+def _window_light(room: Room, window: Opening, origin_m: np.ndarray, lighting: Lighting) -> Row:
     start, along, inwards = wall_frame(room, window.wall)
     centre = start + along * 0.5 * (window.start_m + window.end_m) + inwards * 0.05 - origin_m
     area = (window.end_m - window.start_m) * (window.head_m - window.sill_m)
@@ -137,7 +137,7 @@ def _window_light(room: Room, window: Opening, origin_m: np.ndarray, lighting: L
 
 def _lamps(
     room: Room, origin_m: np.ndarray, lighting: Lighting, lit: bool, rng: np.random.Generator
-) -> tuple[list[LightRow], list[Prism]]:
+) -> tuple[list[Row], list[Prism]]:
     """One lamp in the middle of the room, a second one in a large room or on a wall; or a ceiling of downlights."""
     spots = [np.array(room.shape.representative_point().coords[0])]
     if room.area_m2 > 18.0:
@@ -204,9 +204,7 @@ def _downlights(room: Room, finish: Finish, rng: np.random.Generator) -> list[Pr
     return [_hanging(spot, radius, (z1 - 0.008, z1), finish) for spot in spots]
 
 
-def _wall_lamp(
-    room: Room, origin_m: np.ndarray, lighting: Lighting, rng: np.random.Generator
-) -> tuple[LightRow, Prism]:
+def _wall_lamp(room: Room, origin_m: np.ndarray, lighting: Lighting, rng: np.random.Generator) -> tuple[Row, Prism]:
     """A lamp on the longest wall, which it washes with light."""
     lengths = np.hypot(*(room.walls_m[:, 2:] - room.walls_m[:, :2]).T)
     wall = int(lengths.argmax())

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from lalaloc_core.floorplan import Room
 from lalaloc_core.synth.openings import Opening
+from lalaloc_core.synth.records import Row
 from lalaloc_core.synth.render_scene import Lights, Prisms, Slots
 from lalaloc_core.synth.style import HouseStyle
 from lalaloc_core.synth.tables import SceneTables
@@ -63,7 +64,7 @@ def add_mirror(
     style: HouseStyle,
     mirror: Mirror,
     room: Room,
-    prisms: Iterable[Float[np.ndarray, "11"]],
+    prisms: Iterable[Row],
     lights: Lights,
     rng: np.random.Generator,
 ) -> None:
@@ -101,7 +102,7 @@ def add_mirror(
     tables.add_decal(wall, s_m=(s0, s1), z_m=(z0, z1), surface=style.handle, slot=slot, depth_m=_DEPTH_M)
 
 
-def _reflected_slot(own: Float[np.ndarray, "12"], lights: Lights, relative: Reflection) -> Float[np.ndarray, "12"]:
+def _reflected_slot(own: Row, lights: Lights, relative: Reflection) -> Row:
     """The room's slot with its brightest light where the mirror shows it."""
     slot = Slots(own.copy())
     if len(lights.rows):

@@ -15,11 +15,11 @@ from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.synth.build import build_scene
 from lalaloc_core.synth.camera import develop
 from lalaloc_core.synth.cast import Hits, SceneBatch, trace
-from lalaloc_core.synth.columns import Table
 from lalaloc_core.synth.exposure import Exposure
 from lalaloc_core.synth.lighting import Mood, relit
 from lalaloc_core.synth.materials import MaterialLibrary
 from lalaloc_core.synth.outdoors import Outdoors
+from lalaloc_core.synth.records import Records
 from lalaloc_core.synth.render_scene import Backdrop, Decals, Lights, Prisms, RenderScene, Slots, Sun
 from lalaloc_core.synth.shading import Atlas, shade
 from lalaloc_core.synth.shots import Shot, sample_shots
@@ -150,7 +150,7 @@ def stack_scenes(scenes: Sequence[RenderScene], device: torch.device) -> SceneBa
 
     def stack(name: str, dtype: torch.dtype = torch.float32, padding: np.ndarray | int = 0) -> Tensor:
         values = [getattr(scene, name) for scene in scenes]
-        rows = [value.rows if isinstance(value, Table) else value for value in values]
+        rows = [value.rows if isinstance(value, Records) else value for value in values]
         padded = np.zeros((len(rows), max(1, *(len(row) for row in rows)), *rows[0].shape[1:]))
         padded[:] = padding
         for target, row in zip(padded, rows, strict=True):

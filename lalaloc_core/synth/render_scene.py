@@ -12,8 +12,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from lalaloc_core.synth.columns import Column, Table
 from lalaloc_core.synth.exposure import Exposure
+from lalaloc_core.synth.records import Column, Joined, Records
 from lalaloc_core.synth.surfaces import Surfaces
 
 Fact = Literal[
@@ -33,7 +33,7 @@ Fact = Literal[
 ]
 
 
-class Decals(Table):
+class Decals(Records):
     """Rectangles on walls; later ones cover earlier ones.
 
     Attributes:
@@ -45,11 +45,17 @@ class Decals(Table):
         depth_m: of a hole.
     """
 
-    WIDTH = 8
-    wall, s0_m, s1_m, z0_m, z1_m, surface, slot, depth_m = map(Column, range(8))
+    wall = Column()
+    s0_m = Column()
+    s1_m = Column()
+    z0_m = Column()
+    z1_m = Column()
+    surface = Column()
+    slot = Column()
+    depth_m = Column()
 
 
-class Prisms(Table):
+class Prisms(Records):
     """Vertical boxes and elliptic cylinders.
 
     Attributes:
@@ -62,12 +68,22 @@ class Prisms(Table):
         is_opaque: 1 for what casts shadows.
     """
 
-    WIDTH = 11
-    x_m, y_m, axis_x, axis_y, half_a_m, half_b_m, z0_m, z1_m, is_round, surface, is_opaque = map(Column, range(11))
-    centre_m, axis = Column(0, 2), Column(2, 2)
+    x_m = Column()
+    y_m = Column()
+    axis_x = Column()
+    axis_y = Column()
+    half_a_m = Column()
+    half_b_m = Column()
+    z0_m = Column()
+    z1_m = Column()
+    is_round = Column()
+    surface = Column()
+    is_opaque = Column()
+    centre_m = Joined(x_m, y_m)
+    axis = Joined(axis_x, axis_y)
 
 
-class Slots(Table):
+class Slots(Records):
     """Rooms: that of the camera, then those seen through its doors.
 
     Attributes:
@@ -77,12 +93,15 @@ class Slots(Table):
         ambient: light from everywhere.
     """
 
-    WIDTH = 12
-    ceiling_m, floor_surface, ceiling_surface = map(Column, range(3))
-    light_m, light_colour, ambient = Column(3, 3), Column(6, 3), Column(9, 3)
+    ceiling_m = Column()
+    floor_surface = Column()
+    ceiling_surface = Column()
+    light_m = Column(3)
+    light_colour = Column(3)
+    ambient = Column(3)
 
 
-class Lights(Table):
+class Lights(Records):
     """Lamps and windows of the own room.
 
     Attributes:
@@ -91,12 +110,14 @@ class Lights(Table):
         normal: horizontal unit normal of a window; (0, 0) for a lamp, which shines everywhere.
     """
 
-    WIDTH = 8
-    position_m, xy_m, z_m = Column(0, 3), Column(0, 2), Column(2)
-    colour, normal = Column(3, 3), Column(6, 2)
+    xy_m = Column(2)
+    z_m = Column()
+    position_m = Joined(xy_m, z_m)
+    colour = Column(3)
+    normal = Column(2)
 
 
-class Sun(Table):
+class Sun(Records):
     """Sunlight through one window; all 0 for none.
 
     Attributes:
@@ -107,13 +128,17 @@ class Sun(Table):
         colour: times the power.
     """
 
-    WIDTH = 14
-    direction, wall_start_m, wall_along = Column(0, 3), Column(3, 2), Column(5, 2)
-    s0_m, s1_m, z0_m, z1_m = map(Column, range(7, 11))
-    colour = Column(11, 3)
+    direction = Column(3)
+    wall_start_m = Column(2)
+    wall_along = Column(2)
+    s0_m = Column()
+    s1_m = Column()
+    z0_m = Column()
+    z1_m = Column()
+    colour = Column(3)
 
 
-class Backdrop(Table):
+class Backdrop(Records):
     """The outdoors.
 
     Attributes:
@@ -123,9 +148,12 @@ class Backdrop(Table):
         turn, lift: shares of a full turn by which outline and mottle are shifted.
     """
 
-    WIDTH = 10
-    sky, ground = Column(0, 3), Column(3, 3)
-    horizon, ruggedness, turn, lift = map(Column, range(6, 10))
+    sky = Column(3)
+    ground = Column(3)
+    horizon = Column()
+    ruggedness = Column()
+    turn = Column()
+    lift = Column()
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +166,7 @@ class RenderScene:
         walls_m: segments (x0, y0, x1, y1), room interior to their left.
         wall_owner: slot of the room that a wall belongs to; -1 - d for the jambs of the hole that is decal d.
         wall_surface: row of `surfaces`.
-        sun, backdrop, exposure: tables of a single row.
+        sun, backdrop, exposure: records of a single row.
         facts: what was drawn of what is worth knowing about a picture; `facts` knows more.
     """
 

@@ -7,9 +7,9 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from lalaloc_core.synth.columns import Column, Table
 from lalaloc_core.synth.materials import MaterialCategory, MaterialLibrary
 from lalaloc_core.synth.pieces import Finish
+from lalaloc_core.synth.records import Column, Records, Row
 
 Colour = Float[np.ndarray, "3"]
 
@@ -17,7 +17,7 @@ _WOODY: tuple[Finish, ...] = ("wood", "stone")
 _PLAIN_FINISHES: tuple[Finish, ...] = ("white", "metal", "dark", "ceramic", "glow", "paint")
 
 
-class Surfaces(Table):
+class Surfaces(Records):
     """What the surfaces of a scene look like.
 
     Attributes:
@@ -31,10 +31,16 @@ class Surfaces(Table):
         shift_u, shift_v: by which the picture is moved, as shares of it.
     """
 
-    WIDTH = 12
-    picture, scale, cosine, sine = map(Column, range(4))
-    tint = Column(4, 3)
-    gloss, glow, is_outdoors, shift_u, shift_v = map(Column, range(7, 12))
+    picture = Column()
+    scale = Column()
+    cosine = Column()
+    sine = Column()
+    tint = Column(3)
+    gloss = Column()
+    glow = Column()
+    is_outdoors = Column()
+    shift_u = Column()
+    shift_v = Column()
 
 
 class SurfaceTable:
@@ -44,7 +50,7 @@ class SurfaceTable:
         self._materials = materials
         self._means = mean_colours
         self._rng = rng
-        self.rows: list[Float[np.ndarray, "12"]] = []
+        self.rows: list[Row] = []
 
     def add(
         self,

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from lalaloc_core.synth.exposure import Exposure
 from lalaloc_core.synth.furniture import Prism
+from lalaloc_core.synth.records import Row
 from lalaloc_core.synth.render_scene import Backdrop, Decals, Fact, Lights, Prisms, RenderScene, Slots, Sun
 from lalaloc_core.synth.shots import Shot
 from lalaloc_core.synth.surfaces import Surfaces, SurfaceTable
@@ -53,8 +54,8 @@ class SceneTables:
         self.wall_surfaces: list[int] = []
         self._wall_owners: list[int] = []
         self.decals: list[Decal] = []
-        self.prisms: list[Float[np.ndarray, "11"]] = []
-        self.slots: list[Float[np.ndarray, "12"]] = []
+        self.prisms: list[Row] = []
+        self.slots: list[Row] = []
 
     def add_wall(self, ends_m: Float[np.ndarray, "4"], owner: int, surface: int) -> int:
         """A wall, with its row of `RenderScene.wall_owner`; returns its index."""

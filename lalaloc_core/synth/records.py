@@ -1,0 +1,96 @@
+"""Records whose columns have names: rows of numbers that stack, travel and lie on a device as one array."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, ClassVar, overload
+
+import numpy as np
+from jaxtyping import Float
+
+Row = Float[np.ndarray, "width"]
+
+
+class Column:
+    """One column of records, or `width` neighbouring ones, which keep an axis; a view, which may be assigned to.
+
+    Attributes:
+        index: of the columns among all; given by the order in which a class of `Records` names them.
+    """
+
+    index: int | slice
+
+    def __init__(self, width: int | None = None) -> None:
+        self.width = width
+
+    @overload
+    def __get__(self, records: None, owner: type[Records]) -> Column: ...
+
+    @overload
+    def __get__(self, records: Records, owner: type[Records]) -> Any: ...
+
+    def __get__(self, records: Records | None, owner: type[Records]) -> Any:
+        return self if records is None else records.rows[..., self.index]
+
+    def __set__(self, records: Records, value: Any) -> None:
+        records.rows[..., self.index] = value
+
+
+class Joined(Column):
+    """Columns that follow each other, by one more name: that of all of them together."""
+
+    def __init__(self, *columns: Column) -> None:
+        super().__init__(sum(column.width or 1 for column in columns))
+        self.columns = columns
+
+
+@dataclass(eq=False)
+class Records:
+    """Rows of numbers, numpy or torch, of any leading shape; subclasses name their columns, in order."""
+
+    WIDTH: ClassVar[int]
+    rows: Any
+
+    def __init_subclass__(cls) -> None:
+        columns = [value for value in vars(cls).values() if isinstance(value, Column)]
+        cls.WIDTH = 0
+        for column in columns:
+            if not isinstance(column, Joined):
+                start, cls.WIDTH = cls.WIDTH, cls.WIDTH + (column.width or 1)
+                column.index = start if column.width is None else slice(start, cls.WIDTH)
+        for joined in columns:
+            if isinstance(joined, Joined):
+                joined.index = _together([column.index for column in joined.columns])
+
+    def __post_init__(self) -> None:
+        if self.rows.shape[-1] != self.WIDTH:
+            raise ValueError(f"rows of {type(self).__name__} have {self.WIDTH} columns, not {self.rows.shape[-1]}")
+
+    def __getitem__(self, index: Any) -> Any:
+        """The records at an index into the leading axes."""
+        return type(self)(self.rows[index])
+
+    def copy(self) -> Any:
+        """Records with rows of their own (numpy)."""
+        return type(self)(self.rows.copy())
+
+    @classmethod
+    def row(cls, **columns: Any) -> Row:
+        """One row with columns by name, 0 where they are not given; an unknown name is a `KeyError`."""
+        row, known = np.zeros(cls.WIDTH), vars(cls)
+        for name, value in columns.items():
+            row[known[name].index] = value
+        return row
+
+    @classmethod
+    def stacked(cls, rows: list[Row]) -> Any:
+        """Records (n, width) of single rows."""
+        return cls(np.array(rows, dtype=float).reshape(-1, cls.WIDTH))
+
+
+def _together(parts: list[int | slice]) -> slice:
+    """The columns of several indices that follow each other."""
+    spans = [slice(part, part + 1) if isinstance(part, int) else part for part in parts]
+    assert all(one.stop == following.start for one, following in pairwise(spans)), "columns that are not neighbours"
+    return slice(spans[0].start, spans[-1].stop)
