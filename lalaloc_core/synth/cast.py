@@ -13,32 +13,22 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from lalaloc_core.render.profile import cross_walls
-from lalaloc_core.synth.exposure import Exposure
 from lalaloc_core.synth.prisms import PrismHits, cross_prisms, gap_behind, resolve_prisms
-from lalaloc_core.synth.render_scene import Backdrop, Decals, Lights, Prisms, Slots, Sun
-from lalaloc_core.synth.surfaces import Surfaces
+from lalaloc_core.synth.render_scene import Decals, SceneRecords
 
 _TINY = 1e-9
 _MAX_DECALS_PER_COLUMN = 10
 
 
-@dataclass(frozen=True, eq=False)
-class SceneBatch:
-    """Scenes padded to one size and stacked; see `RenderScene` for the fields, tables of rows (b, n)."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SceneBatch(SceneRecords):
+    """Scenes padded to one size and stacked; see `RenderScene` for the fields, records of rows (b, n)."""
 
     camera_height_m: Float[Tensor, "b"]
     heading: Float[Tensor, "b"]
     walls_m: Float[Tensor, "b n 4"]
     wall_owner: Int[Tensor, "b n"]
     wall_surface: Int[Tensor, "b n"]
-    decals: Decals
-    prisms: Prisms
-    surfaces: Surfaces
-    slots: Slots
-    lights: Lights
-    sun: Sun
-    backdrop: Backdrop
-    exposure: Exposure
 
     def __getitem__(self, index: Tensor) -> SceneBatch:
         """A batch of some of the scenes."""
@@ -134,7 +124,7 @@ def cast_own_walls(
 
 
 def _trace_shell(batch: SceneBatch, direction: Float[Tensor, "b c 2"], slope: Float[Tensor, "h"]) -> _ShellHits:
-    eye, room = batch.camera_height_m, batch.slots[:, 0]
+    eye, room = batch.camera_height_m, batch.rooms[:, 0]
     crossings = _cross_walls(batch.walls_m, direction)
     own = _nearest(batch, crossings, direction, (batch.wall_owner == 0)[:, None])
     up = slope > 0.0
@@ -301,7 +291,7 @@ def _look_through(
     decal = hole.max(dim=1).values
     opening = batch.decals[item, decal]
     slot = opening.slot.long()
-    room = batch.slots[item, slot]
+    room = batch.rooms[item, slot]
     eye = batch.camera_height_m[item]
     near = own.distance_m[columns]
     incidence = (own.normal[columns] * direction[columns]).sum(dim=-1).abs().clamp(min=1e-3)

@@ -111,19 +111,19 @@ def light_room(
 def relit(scene: RenderScene, mood: Mood) -> RenderScene:
     """The same scene, shape and materials, in another light; `raw` is the neutral light that it was built with."""
     lamp, sky = np.array(_LAMP_TINTS[mood]), np.array(_SKY_TINTS[mood])
-    lights, slots, surfaces = scene.lights.copy(), scene.slots.copy(), scene.surfaces.copy()
+    lights, rooms, surfaces = scene.lights.copy(), scene.rooms.copy(), scene.surfaces.copy()
     sun, backdrop = scene.sun.copy(), scene.backdrop.copy()
     is_lamp = ~lights.normal.any(axis=1, keepdims=True)
     lights.colour *= np.where(is_lamp, lamp, sky)
-    slots.light_colour *= lamp
+    rooms.light_colour *= lamp
     # What light is left after many bounces comes from both.
-    slots.ambient *= np.sqrt(lamp * sky)
+    rooms.ambient *= np.sqrt(lamp * sky)
     glowing = (surfaces.glow > 0.0) & (surfaces.is_outdoors == 0.0)
     surfaces.tint[glowing] *= lamp
     sun.colour *= sky
     backdrop.sky *= sky
     backdrop.ground *= sky
-    return dataclasses.replace(scene, lights=lights, slots=slots, surfaces=surfaces, sun=sun, backdrop=backdrop)
+    return dataclasses.replace(scene, lights=lights, rooms=rooms, surfaces=surfaces, sun=sun, backdrop=backdrop)
 
 
 def _window_light(room: Room, window: Opening, origin_m: np.ndarray, lighting: Lighting) -> Row:

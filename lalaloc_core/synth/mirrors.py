@@ -11,7 +11,7 @@ from jaxtyping import Float
 from lalaloc_core.floorplan import Room
 from lalaloc_core.synth.openings import Opening
 from lalaloc_core.synth.records import Row
-from lalaloc_core.synth.render_scene import Lights, Prisms, Slots
+from lalaloc_core.synth.render_scene import Lights, Prisms, VisibleRooms
 from lalaloc_core.synth.style import HouseStyle
 from lalaloc_core.synth.tables import SceneTables
 
@@ -80,9 +80,9 @@ def add_mirror(
         rng: source of randomness.
     """
     wall, s0, s1, z0, z1 = mirror
-    ends, count, first, slot = tables.walls_m[wall], len(room.walls_m), len(tables.walls_m), len(tables.slots)
+    ends, count, first, slot = tables.walls_m[wall], len(room.walls_m), len(tables.walls_m), len(tables.rooms)
     reflection, relative = Reflection(ends), Reflection(ends - np.tile(tables.camera_m, 2))
-    tables.slots.append(_reflected_slot(tables.slots[0], lights, relative))
+    tables.rooms.append(_reflected_room(tables.rooms[0], lights, relative))
     for edge in range(count):
         tables.add_wall(reflection.wall(tables.walls_m[edge]), slot, tables.wall_surfaces[edge])
     for decal in [decal for decal in tables.decals if decal.wall < count]:
@@ -102,14 +102,14 @@ def add_mirror(
     tables.add_decal(wall, s_m=(s0, s1), z_m=(z0, z1), surface=style.handle, slot=slot, depth_m=_DEPTH_M)
 
 
-def _reflected_slot(own: Row, lights: Lights, relative: Reflection) -> Row:
-    """The room's slot with its brightest light where the mirror shows it."""
-    slot = Slots(own.copy())
+def _reflected_room(own: Row, lights: Lights, relative: Reflection) -> Row:
+    """The room with its brightest light where the mirror shows it."""
+    room = VisibleRooms(own.copy())
     if len(lights.rows):
         brightest = lights[lights.colour.sum(axis=1).argmax()]
-        slot.light_m = np.append(relative.point(brightest.xy_m), brightest.z_m)
-        slot.light_colour = brightest.colour
-    return slot.rows
+        room.light_m = np.append(relative.point(brightest.xy_m), brightest.z_m)
+        room.light_colour = brightest.colour
+    return room.rows
 
 
 class Reflection:

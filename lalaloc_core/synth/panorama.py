@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -15,15 +16,13 @@ from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.synth.build import build_scene
 from lalaloc_core.synth.camera import develop
 from lalaloc_core.synth.cast import Hits, SceneBatch, trace
-from lalaloc_core.synth.exposure import Exposure
 from lalaloc_core.synth.lighting import Mood, relit
 from lalaloc_core.synth.materials import MaterialLibrary
 from lalaloc_core.synth.outdoors import Outdoors
-from lalaloc_core.synth.records import Records
-from lalaloc_core.synth.render_scene import Backdrop, Decals, Lights, Prisms, RenderScene, Slots, Sun
+from lalaloc_core.synth.records import Row
+from lalaloc_core.synth.render_scene import Decals, Prisms, RenderScene, SceneRecords
 from lalaloc_core.synth.shading import Atlas, shade
 from lalaloc_core.synth.shots import Shot, sample_shots
-from lalaloc_core.synth.surfaces import Surfaces
 
 __all__ = ["PanoramaRenderer", "Shot", "sample_shots"]
 
@@ -32,8 +31,10 @@ _PIXELS_AT_ONCE = {"cpu": 1 << 17}
 _PIXELS_AT_ONCE_ELSEWHERE = 1 << 21
 # What tables are padded with: walls of no room, decals on no wall, and a small box far away.
 _NO_ROOM = -(10**6)
-_ON_NO_WALL = Decals.row(wall=-1.0)
-_FAR_AWAY = Prisms.row(x_m=1e6, axis_x=1.0, half_a_m=1.0, half_b_m=1.0)
+_PADDING = {
+    "decals": Decals.row(wall=-1.0),
+    "prisms": Prisms.row(x_m=1e6, axis_x=1.0, half_a_m=1.0, half_b_m=1.0),
+}
 
 
 class PanoramaRenderer:
@@ -148,30 +149,22 @@ def _shrink(radiance: Float[Tensor, "b h w 3"], factor: tuple[int, int]) -> Floa
 def stack_scenes(scenes: Sequence[RenderScene], device: torch.device) -> SceneBatch:
     """Pad the tables of scenes to one length and stack them."""
 
-    def stack(name: str, dtype: torch.dtype = torch.float32, padding: np.ndarray | int = 0) -> Tensor:
-        values = [getattr(scene, name) for scene in scenes]
-        rows = [value.rows if isinstance(value, Records) else value for value in values]
+    def stack(rows: Sequence[np.ndarray], dtype: torch.dtype = torch.float32, padding: Row | int = 0) -> Tensor:
         padded = np.zeros((len(rows), max(1, *(len(row) for row in rows)), *rows[0].shape[1:]))
         padded[:] = padding
         for target, row in zip(padded, rows, strict=True):
             target[: len(row)] = row
         return torch.from_numpy(padded).to(device=device, dtype=dtype)
 
-    def scalars(name: str) -> Tensor:
-        return torch.tensor([getattr(scene, name) for scene in scenes], dtype=torch.float32, device=device)
+    def stack_records(name: str) -> Any:
+        records = [getattr(scene, name) for scene in scenes]
+        return type(records[0])(stack([one.rows for one in records], padding=_PADDING.get(name, 0)))
 
     return SceneBatch(
-        camera_height_m=scalars("camera_height_m"),
-        heading=scalars("heading"),
-        walls_m=stack("walls_m"),
-        wall_owner=stack("wall_owner", torch.long, _NO_ROOM),
-        wall_surface=stack("wall_surface", torch.long),
-        decals=Decals(stack("decals", padding=_ON_NO_WALL)),
-        prisms=Prisms(stack("prisms", padding=_FAR_AWAY)),
-        surfaces=Surfaces(stack("surfaces")),
-        slots=Slots(stack("slots")),
-        lights=Lights(stack("lights")),
-        sun=Sun(stack("sun")),
-        backdrop=Backdrop(stack("backdrop")),
-        exposure=Exposure(stack("exposure")),
+        camera_height_m=torch.tensor([scene.camera_height_m for scene in scenes], dtype=torch.float32, device=device),
+        heading=torch.tensor([scene.heading for scene in scenes], dtype=torch.float32, device=device),
+        walls_m=stack([scene.walls_m for scene in scenes]),
+        wall_owner=stack([scene.wall_owner for scene in scenes], torch.long, _NO_ROOM),
+        wall_surface=stack([scene.wall_surface for scene in scenes], torch.long),
+        **{one.name: stack_records(one.name) for one in dataclasses.fields(SceneRecords)},
     )

@@ -83,7 +83,7 @@ class Prisms(Records):
     axis = Joined(axis_x, axis_y)
 
 
-class Slots(Records):
+class VisibleRooms(Records):
     """Rooms: that of the camera, then those seen through its doors.
 
     Attributes:
@@ -156,8 +156,27 @@ class Backdrop(Records):
     lift = Column()
 
 
-@dataclass(frozen=True, eq=False)
-class RenderScene:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SceneRecords:
+    """What a scene has as records, and a batch of scenes as records with one axis more.
+
+    Attributes:
+        rooms: that of the camera, then those seen through its doors: the row of a room is its slot.
+        sun, backdrop, exposure: a single row.
+    """
+
+    decals: Decals
+    prisms: Prisms
+    surfaces: Surfaces
+    rooms: VisibleRooms
+    lights: Lights
+    sun: Sun
+    backdrop: Backdrop
+    exposure: Exposure
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RenderScene(SceneRecords):
     """Everything that one picture is made of.
 
     Attributes:
@@ -166,7 +185,6 @@ class RenderScene:
         walls_m: segments (x0, y0, x1, y1), room interior to their left.
         wall_owner: slot of the room that a wall belongs to; -1 - d for the jambs of the hole that is decal d.
         wall_surface: row of `surfaces`.
-        sun, backdrop, exposure: records of a single row.
         facts: what was drawn of what is worth knowing about a picture; `facts` knows more.
     """
 
@@ -175,12 +193,4 @@ class RenderScene:
     walls_m: Float[np.ndarray, "n 4"]
     wall_owner: Int[np.ndarray, "n"]
     wall_surface: Int[np.ndarray, "n"]
-    decals: Decals
-    prisms: Prisms
-    surfaces: Surfaces
-    slots: Slots
-    lights: Lights
-    sun: Sun
-    backdrop: Backdrop
-    exposure: Exposure
     facts: frozenset[Fact] = frozenset()

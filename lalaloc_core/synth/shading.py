@@ -134,7 +134,7 @@ def _light_beyond(
 ) -> Float[Tensor, "b c h 3"]:
     """Replace the light of rooms seen through doors by that of their own single lamp, without shadows."""
     beyond = hits.slot.nonzero(as_tuple=True)
-    room = batch.slots[beyond[0], hits.slot[beyond]]
+    room = batch.rooms[beyond[0], hits.slot[beyond]]
     to = room.light_m - torch.stack([axis[beyond] for axis in point], dim=-1)
     square = (to**2).sum(dim=-1)
     lambert = ((to * hits.normal[beyond]).sum(dim=-1) / torch.sqrt(square + 1e-6)).clamp(min=0.0)
@@ -212,9 +212,9 @@ def _add_sunlight(
 def _ambient(batch: SceneBatch, hits: Hits, point: tuple[Tensor, Tensor, Tensor]) -> Float[Tensor, "b c h 3"]:
     """Light from everywhere, less of it in corners and beside furniture."""
     beyond = hits.slot.nonzero(as_tuple=True)
-    room = batch.slots[beyond[0], hits.slot[beyond]]
+    room = batch.rooms[beyond[0], hits.slot[beyond]]
     z, nz = point[2], hits.normal[..., 2]
-    own = batch.slots[:, 0, None, None]
+    own = batch.rooms[:, 0, None, None]
     ceiling = own.ceiling_m.expand_as(z).clone()
     ceiling[beyond] = room.ceiling_m
     ambient = own.ambient.expand_as(hits.normal).clone()

@@ -9,7 +9,7 @@ import numpy as np
 from lalaloc_core.floorplan import Room
 from lalaloc_core.synth.furniture import wall_frame
 from lalaloc_core.synth.lighting import Lighting
-from lalaloc_core.synth.render_scene import Slots
+from lalaloc_core.synth.render_scene import VisibleRooms
 from lalaloc_core.synth.streams import ScenePart, Streams
 from lalaloc_core.synth.style import HouseStyle
 from lalaloc_core.synth.surfaces import Colour, bright, paint, pale, vivid
@@ -51,7 +51,7 @@ class Shells:
         floor = self._floor_of(room_index, room, colour)
         streams.begin(ScenePart.ACCENT, room_index)
         lamp = lighting.of_room_beyond(room, tables.camera_m)
-        slot_row = Slots.row(
+        room_row = VisibleRooms.row(
             ceiling_m=room.ceiling_height_m,
             floor_surface=floor,
             ceiling_surface=ceiling,
@@ -59,7 +59,7 @@ class Shells:
             light_colour=lamp.colour,
             ambient=lamp.ambient,
         )
-        tables.slots.append(slot_row)
+        tables.rooms.append(room_row)
         accented = int(rng.integers(len(room.walls_m)))
         streams.begin(ScenePart.TRIM, room_index)
         first = len(tables.walls_m)

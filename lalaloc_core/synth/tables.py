@@ -11,7 +11,7 @@ from jaxtyping import Float
 from lalaloc_core.synth.exposure import Exposure
 from lalaloc_core.synth.furniture import Prism
 from lalaloc_core.synth.records import Row
-from lalaloc_core.synth.render_scene import Backdrop, Decals, Fact, Lights, Prisms, RenderScene, Slots, Sun
+from lalaloc_core.synth.render_scene import Backdrop, Decals, Fact, Lights, Prisms, RenderScene, Sun, VisibleRooms
 from lalaloc_core.synth.shots import Shot
 from lalaloc_core.synth.surfaces import Surfaces, SurfaceTable
 
@@ -44,7 +44,7 @@ class SceneTables:
         wall_surfaces: their surfaces.
         decals: later ones cover earlier ones.
         prisms: rows of `render_scene.Prisms`, relative to the camera.
-        slots: rows of `render_scene.Slots`.
+        rooms: rows of `render_scene.VisibleRooms`.
     """
 
     def __init__(self, camera_m: Float[np.ndarray, "2"], surfaces: SurfaceTable) -> None:
@@ -55,7 +55,7 @@ class SceneTables:
         self._wall_owners: list[int] = []
         self.decals: list[Decal] = []
         self.prisms: list[Row] = []
-        self.slots: list[Row] = []
+        self.rooms: list[Row] = []
 
     def add_wall(self, ends_m: Float[np.ndarray, "4"], owner: int, surface: int) -> int:
         """A wall, with its row of `RenderScene.wall_owner`; returns its index."""
@@ -171,7 +171,7 @@ class SceneTables:
             decals=Decals.stacked([Decals.row(**decal._asdict()) for decal in self.decals]),
             prisms=Prisms.stacked(self.prisms),
             surfaces=Surfaces.stacked(self.surfaces.rows),
-            slots=Slots.stacked(self.slots),
+            rooms=VisibleRooms.stacked(self.rooms),
             lights=lights,
             sun=sun,
             backdrop=backdrop,

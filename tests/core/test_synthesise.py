@@ -377,7 +377,7 @@ def test_pictures_in_several_lights_are_the_same_as_one_by_one() -> None:
 
 def floors_and_ceilings(scene: RenderScene) -> np.ndarray:
     """Surfaces (2, rooms, columns) of every room's floor and ceiling."""
-    used = np.stack([scene.slots.floor_surface, scene.slots.ceiling_surface]).astype(int)
+    used = np.stack([scene.rooms.floor_surface, scene.rooms.ceiling_surface]).astype(int)
     return scene.surfaces.rows[used]
 
 
