@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from lalaloc_core.bundle import Bundle, default_bundle
-from lalaloc_core.data.synthetic.generated import Studio
+from lalaloc_core.data.synthetic.generated import RendererCache
 from lalaloc_core.floorplan import FloorPlan, PlanLimits
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
@@ -75,15 +75,15 @@ def main() -> None:
     parser.add_argument("--oracle", type=float, default=0.0, help="compare with everything up to this area (m²)")
     arguments = parser.parse_args()
     bundle = Bundle.open(arguments.bundle)
-    studio = Studio(MaterialLibrary.create(np.random.default_rng(1), arguments.textures))
+    renderers = RendererCache(MaterialLibrary.create(np.random.default_rng(1), arguments.textures))
     print("| area m² | rooms | poses | read | ready | grid, a pose | known | unknown | retrieval | as brute force |")
     print("|---|---|---|---|---|---|---|---|---|---|")
     for area_m2 in arguments.areas:
         building = building_of(VALIDATION, 0, area_m2, hall_share=0.2 if area_m2 > 1000.0 else 0.0)
-        print(_measure(building, bundle, studio, arguments.queries, oracle=area_m2 <= arguments.oracle), flush=True)
+        print(_measure(building, bundle, renderers, arguments.queries, oracle=area_m2 <= arguments.oracle), flush=True)
 
 
-def _measure(building: Building, bundle: Bundle, studio: Studio, count: int, *, oracle: bool) -> _Row:
+def _measure(building: Building, bundle: Bundle, renderers: RendererCache, count: int, *, oracle: bool) -> _Row:
     encoders = Encoders(bundle, threads=1)
     document, limits = building.plan.to_dict(), PlanLimits(max_openings=_MAX_OPENINGS)
     read_s, plan = _timed(lambda: FloorPlan.from_dict(document, limits))
@@ -102,7 +102,7 @@ def _measure(building: Building, bundle: Bundle, studio: Studio, count: int, *, 
     shots = [sample_shots(building.homes[home], 1, rng)[0] for home in homes]
     refiner, config, weights = local_refiner(bundle), EvidenceConfig(), encoders.manifest.evidence
     height, width = encoders.manifest.image_height, encoders.manifest.image_width
-    images = [studio.renderer(height, width).render([shot]).cpu().numpy()[0] for shot in shots]
+    images = [renderers.renderer(height, width).render([shot]).cpu().numpy()[0] for shot in shots]
     spent: dict[bool, list[float]] = {True: [], False: []}
     retrieved, same = [], []
 

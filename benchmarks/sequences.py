@@ -20,7 +20,7 @@ import numpy as np
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import wrap_angle
-from lalaloc_core.data.synthetic.generated import SPLIT_NUMBERS, RenderedPhotograph, studio_of
+from lalaloc_core.data.synthetic.generated import SPLIT_NUMBERS, RenderedPhotograph, renderer_cache_of
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.pipeline import Localisation, localise, panorama_heading
@@ -120,7 +120,7 @@ def main() -> None:
     asked = parser.parse_args()
     bundle = Bundle.open(asked.bundle)
     encoders, refiner = Encoders(bundle, threads=1), local_refiner(bundle)
-    model, studio = bundle.manifest.confidence, studio_of(SPLIT_NUMBERS["test"], asked.seed, None)
+    model, renderers = bundle.manifest.confidence, renderer_cache_of(SPLIT_NUMBERS["test"], asked.seed, None)
     ways = {"alone": None, "distance and turn": False, "distance, turn and direction": True}
     tallies = {name: Tally([], [], [], []) for name in ways}
     index = done = 0
@@ -134,7 +134,7 @@ def main() -> None:
         height = CameraHeight(shots[0].camera_height_m)
         grid = build_grid(home.plan, encoders, step_m=_GRID_STEP_M, camera_height_m=height.height_m)
         size = bundle.manifest.image_height, bundle.manifest.image_width
-        queries = [encoders.query(RenderedPhotograph(shot, studio).image(*size), None, height) for shot in shots]
+        queries = [encoders.query(RenderedPhotograph(shot, renderers).image(*size), None, height) for shot in shots]
         for name, directed in ways.items():
             begin = time.perf_counter()
             if directed is None:

@@ -25,7 +25,7 @@ from pathlib import Path
 import numpy as np
 
 from lalaloc_core.bundle import Bundle
-from lalaloc_core.data.synthetic.generated import SPLIT_NUMBERS, RenderedPhotograph, studio_of
+from lalaloc_core.data.synthetic.generated import SPLIT_NUMBERS, RenderedPhotograph, renderer_cache_of
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.evidence import EvidenceConfig
@@ -99,12 +99,12 @@ def _variant(block: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 def queries(bundle: Bundle, homes: list[int], seed: int) -> Iterator[tuple[int, str, Query]]:
     """A photograph of each home, asked about with what is known of the camera."""
-    encoders, studio = Encoders(bundle, threads=1), studio_of(_TEST, seed, None)
+    encoders, renderers = Encoders(bundle, threads=1), renderer_cache_of(_TEST, seed, None)
     size = bundle.manifest.image_height, bundle.manifest.image_width
     for number in homes:
         home, rng = home_of(_TEST, seed, number)
         shot = sample_shots(home, 1, rng, "full")[0]
-        image = RenderedPhotograph(shot, studio).image(*size)
+        image = RenderedPhotograph(shot, renderers).image(*size)
         known, unknown = CameraHeight(shot.camera_height_m), CameraHeight(1.5, float("inf"))
         yield number, "heading known", encoders.query(image, shot.heading, known)
         yield number, "heading unknown", encoders.query(image, None, known)

@@ -11,7 +11,7 @@ import numpy as np
 from lalaloc_core.bench.homes import home_of_area
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.data.dataset import Camera
-from lalaloc_core.data.synthetic.generated import RenderedPhotograph, Studio
+from lalaloc_core.data.synthetic.generated import RenderedPhotograph, RendererCache
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.methods.icp import Icp
 from lalaloc_core.methods.lalaloc import LaLaLoc, local_refiner
@@ -31,7 +31,7 @@ def bench_methods(bundle: Bundle) -> dict[str, Any]:
     """
     home = home_of_area(100.0)
     shots = sample_shots(home, _QUERIES + 1, np.random.default_rng(2), "full")
-    studio = Studio(MaterialLibrary.create(np.random.default_rng(2)))
+    renderers = RendererCache(MaterialLibrary.create(np.random.default_rng(2)))
     grid = pose_grid(home.plan, _GRID_STEP_M)
     questions = [
         Question(
@@ -48,7 +48,7 @@ def bench_methods(bundle: Bundle) -> dict[str, Any]:
                 photographs={},
             ),
             kind="panorama",
-            photograph=RenderedPhotograph(replace(shot, camera_height_m=shots[0].camera_height_m), studio),
+            photograph=RenderedPhotograph(replace(shot, camera_height_m=shots[0].camera_height_m), renderers),
         )
         for index, shot in enumerate(shots)
     ]

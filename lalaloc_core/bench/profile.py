@@ -11,7 +11,7 @@ import numpy as np
 
 from lalaloc_core.bench.homes import home_of_area
 from lalaloc_core.bundle import Bundle
-from lalaloc_core.data.synthetic.generated import Studio
+from lalaloc_core.data.synthetic.generated import RendererCache
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.pipeline import StageClock, localise
@@ -32,10 +32,10 @@ def profile_table(bundle: Bundle, queries: int, textures: Path | None) -> str:
     """
     home = home_of_area(100.0)
     shots = sample_shots(home, queries, np.random.default_rng(1), "full")
-    studio = Studio(MaterialLibrary.create(np.random.default_rng(1), textures))
+    renderers = RendererCache(MaterialLibrary.create(np.random.default_rng(1), textures))
     encoders, refiner = Encoders(bundle, threads=1), local_refiner(bundle)
     height, width = encoders.manifest.image_height, encoders.manifest.image_width
-    images = studio.renderer(height, width).render(shots).cpu().numpy()
+    images = renderers.renderer(height, width).render(shots).cpu().numpy()
     camera_m = home.plan.camera_height_m
     latents = not encoders.predicts_profile
     grid = build_grid(home.plan, encoders, step_m=_GRID_STEP_M, camera_height_m=camera_m, latents=latents)

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from lalaloc_core.synth.doors import add_door
-from lalaloc_core.synth.exposure import draw_exposure, draw_staged_exposure
+from lalaloc_core.synth.exposure import sample_exposure, sample_staged_exposure
 from lalaloc_core.synth.furniture import FurnitureLevel, furnish
-from lalaloc_core.synth.lighting import Lighting, draw_backdrop, light_room, relit
+from lalaloc_core.synth.lighting import Lighting, light_room, relit, sample_backdrop
 from lalaloc_core.synth.materials import MaterialLibrary
-from lalaloc_core.synth.mirrors import add_mirror, draw_mirror
+from lalaloc_core.synth.mirrors import add_mirror, sample_mirror
 from lalaloc_core.synth.openings import Opening
 from lalaloc_core.synth.render_scene import Fact, RenderScene
 from lalaloc_core.synth.shells import Shells
 from lalaloc_core.synth.shots import Shot
 from lalaloc_core.synth.streams import ScenePart, Streams
-from lalaloc_core.synth.style import draw_style
+from lalaloc_core.synth.style import sample_style
 from lalaloc_core.synth.surfaces import SurfaceTable
 from lalaloc_core.synth.tables import SceneTables
 from lalaloc_core.synth.windows import add_curtains, add_radiator, add_window
@@ -41,7 +41,7 @@ class _Builder:
         self._is_bright = self._is_bare and not self._streams.is_staged and self._rng.random() < 0.6
         surfaces = SurfaceTable(materials, materials.mean_colours, self._streams.materials)
         self._tables = SceneTables(shot.position_m, surfaces)
-        self._style = draw_style(surfaces, self._rng)
+        self._style = sample_style(surfaces, self._rng)
         if shot.is_night:
             surfaces.darken_outdoors(self._style.outdoors)
         self._shells = Shells(
@@ -65,7 +65,7 @@ class _Builder:
         for lamp in lamps:
             tables.add_prism(lamp, tables.surfaces.add_finish(lamp.finish), opaque=False)
         if not streams.is_staged:
-            mirror = draw_mirror(self._room, self._openings, rng, is_bare=self._is_bare)
+            mirror = sample_mirror(self._room, self._openings, rng, is_bare=self._is_bare)
             if mirror is not None:
                 self._facts.add("mirror")
                 in_room += tables.prisms[before_lamps:]
@@ -74,8 +74,8 @@ class _Builder:
         if self._is_bright and any(opening.kind == "window" for opening in self._openings):
             self._facts.add("bare_bright")
         streams.begin(ScenePart.CAMERA, self._shot.room_index)
-        backdrop = draw_backdrop(rng)
-        exposure = draw_staged_exposure(rng) if streams.is_staged else draw_exposure(rng, bright=self._is_bright)
+        backdrop = sample_backdrop(rng)
+        exposure = sample_staged_exposure(rng) if streams.is_staged else sample_exposure(rng, bright=self._is_bright)
         return tables.to_scene(
             self._shot, lights=lights, sun=sun, backdrop=backdrop, exposure=exposure, facts=self._facts
         )
@@ -111,9 +111,9 @@ class _Builder:
         level: FurnitureLevel = self._shot.furniture if is_own or self._is_bare else "simple"
         camera = self._tables.camera_m if is_own else None
         # The empty rooms of a staged home are bare; others keep what is built in.
-        fitted = not (self._streams.is_staged and level == "empty")
+        built_in = not (self._streams.is_staged and level == "empty")
         room, openings = self._home.plan.rooms[room_index], self._openings_of(room_index)
-        pieces = furnish(room, openings, level, self._rng, camera, fitted=fitted)
+        pieces = furnish(room, openings, level, self._rng, camera, built_in=built_in)
         if is_own:
             self._facts |= {prism.label for prism in pieces if prism.label}
         self._tables.add_pieces(pieces)

@@ -24,7 +24,7 @@ def develop(
 
     Args:
         radiance: linear light.
-        exposure: camera settings per picture, drawn by `draw_exposure`.
+        exposure: camera settings per picture, drawn by `sample_exposure`.
         noise: unit noise, at least as large as a picture; every picture takes its own rolled part of it.
     """
     luma = radiance @ radiance.new_tensor(_LUMA)

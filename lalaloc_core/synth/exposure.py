@@ -63,7 +63,7 @@ class Exposure(Records):
     zenith_tone = Column()
 
 
-def draw_exposure(rng: np.random.Generator, *, bright: bool = False) -> Exposure:
+def sample_exposure(rng: np.random.Generator, *, bright: bool = False) -> Exposure:
     """How the camera turns light into a picture; see `Exposure`.
 
     Args:
@@ -84,14 +84,14 @@ def draw_exposure(rng: np.random.Generator, *, bright: bool = False) -> Exposure
     exposure.shoulder = rng.uniform(0.2, 1.0)
     if rng.random() < (0.6 if bright else 0.3):
         exposure.flatness = rng.uniform(0.1, 0.5)
-    _draw_lenses(exposure, rng)
-    _draw_stand(exposure, rng)
+    _sample_lenses(exposure, rng)
+    _sample_stand(exposure, rng)
     return exposure
 
 
-def draw_staged_exposure(rng: np.random.Generator) -> Exposure:
-    """As `draw_exposure`, for the rendered pictures of one data set: alike, level, without seams and tripods."""
-    exposure = draw_exposure(rng)
+def sample_staged_exposure(rng: np.random.Generator) -> Exposure:
+    """As `sample_exposure`, for the rendered pictures of one data set: alike, level, without seams and tripods."""
+    exposure = sample_exposure(rng)
     exposure.target = math.sqrt(0.5 * exposure.target)
     exposure.saturation = 0.5 + 0.5 * exposure.saturation
     exposure.nadir = exposure.zenith = exposure.roll = exposure.pitch = exposure.jpeg = 0.0
@@ -99,7 +99,7 @@ def draw_staged_exposure(rng: np.random.Generator) -> Exposure:
     return exposure
 
 
-def _draw_lenses(exposure: Exposure, rng: np.random.Generator) -> None:
+def _sample_lenses(exposure: Exposure, rng: np.random.Generator) -> None:
     exposure.seam = rng.uniform(-math.pi, math.pi)
     if rng.random() < 0.5:
         exposure.vignette = rng.uniform(0.03, 0.4)
@@ -113,7 +113,7 @@ def _draw_lenses(exposure: Exposure, rng: np.random.Generator) -> None:
         exposure.jpeg = rng.uniform(50.0, 95.0)
 
 
-def _draw_stand(exposure: Exposure, rng: np.random.Generator) -> None:
+def _sample_stand(exposure: Exposure, rng: np.random.Generator) -> None:
     if rng.random() < 0.38:
         kind = int(rng.choice(len(_NADIR_SHARES), p=_NADIR_SHARES))
         exposure.nadir_kind = kind

@@ -10,8 +10,8 @@ import shapely
 from jaxtyping import Float
 
 from lalaloc_core.floorplan import Room
+from lalaloc_core.synth.built_in import Placed, Stretch, kitchen, sanitary, wardrobes
 from lalaloc_core.synth.catalogue import ROOM_PIECES
-from lalaloc_core.synth.fitted import Placed, Stretch, kitchen, sanitary, wardrobes
 from lalaloc_core.synth.openings import Opening
 from lalaloc_core.synth.pieces import Finish, Label, Maker, Piece, box, cylinder
 from lalaloc_core.synth.pieces_service import counter, island
@@ -158,7 +158,7 @@ def furnish(
     rng: np.random.Generator,
     camera_m: Float[np.ndarray, "2"] | None = None,
     *,
-    fitted: bool = False,
+    built_in: bool = False,
 ) -> list[Prism]:
     """Furnish one room.
 
@@ -168,16 +168,16 @@ def furnish(
         level: how much.
         rng: source of randomness.
         camera_m: nothing comes closer to this position than `CAMERA_CLEARANCE_M`.
-        fitted: whether kitchens, bathrooms and wardrobes are built in where they belong, in empty rooms too.
+        built_in: whether kitchens, bathrooms and wardrobes are built in where they belong, in empty rooms too.
     """
     most = _MAX_PIECES[level]
-    if most == 0 and not fitted:
+    if most == 0 and not built_in:
         return []
     keep_clear = [_door_zone(room, opening) for opening in openings if opening.kind != "window"]
     if camera_m is not None:
         keep_clear.append(shapely.Point(camera_m).buffer(CAMERA_CLEARANCE_M + 0.01))
     floor = _Floor(room, openings, keep_clear)
-    prisms = _build_in(floor, room, rng) if fitted else []
+    prisms = _build_in(floor, room, rng) if built_in else []
     first = 1 + max((prism.piece for prism in prisms), default=-1)
     has_kitchen = any(prism.label == "counter" for prism in prisms)
     placed = refused = 0

@@ -249,7 +249,7 @@ def _sun(room: Room, window: Opening, origin_m: np.ndarray, rng: np.random.Gener
     return Sun(row)
 
 
-def draw_backdrop(rng: np.random.Generator) -> Backdrop:
+def sample_backdrop(rng: np.random.Generator) -> Backdrop:
     """The outdoors: sky, ground or foliage, the height of what stands before the sky, and its outline."""
     sky = rng.uniform(0.7, 1.0) * np.array([rng.uniform(0.7, 1.0), rng.uniform(0.85, 1.0), 1.0])
     ground = rng.uniform(0.05, 0.5) * np.array([rng.uniform(0.6, 1.1), 1.0, rng.uniform(0.4, 1.0)])

@@ -70,7 +70,7 @@ class MaterialLibrary:
         """Mean linear colour of every picture."""
         return self.pictures.mean(dim=(1, 2)).numpy().astype(np.float64)
 
-    def draw(self, category: MaterialCategory, rng: np.random.Generator) -> int:
+    def sample(self, category: MaterialCategory, rng: np.random.Generator) -> int:
         """Index of a random picture: a generated one or, where there are any, a photograph with even chances."""
         photographs = self.photographs[category]
         source = self.procedural[category]
@@ -79,7 +79,7 @@ class MaterialLibrary:
             source = photographs[int(rng.integers(len(photographs)))]
         return int(source[rng.integers(len(source))])
 
-    def draw_plain(self, rng: np.random.Generator) -> int:
+    def sample_plain(self, rng: np.random.Generator) -> int:
         """Index of a random picture with hardly any structure."""
         return int(self.plain[rng.integers(len(self.plain))])
 

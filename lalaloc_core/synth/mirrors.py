@@ -34,7 +34,7 @@ class Mirror(NamedTuple):
     z1_m: float
 
 
-def draw_mirror(room: Room, openings: Sequence[Opening], rng: np.random.Generator, *, is_bare: bool) -> Mirror | None:
+def sample_mirror(room: Room, openings: Sequence[Opening], rng: np.random.Generator, *, is_bare: bool) -> Mirror | None:
     """Where a mirror hangs between the openings; None for no mirror."""
     chance = _CHANCE.get(room.name.split()[0], _OTHERS) * (_BARE_SHARE if is_bare else 1.0)
     if rng.random() > chance:
@@ -73,7 +73,7 @@ def add_mirror(
     Args:
         tables: of the scene, whose first walls are those of the room.
         style: the house's.
-        mirror: where it hangs, see `draw_mirror`.
+        mirror: where it hangs, see `sample_mirror`.
         room: the own room.
         prisms: what stands and hangs in it, rows of `tables.prisms`.
         lights: its lamps and windows, of which the brightest shines in the reflected room.

@@ -16,8 +16,9 @@ from lalaloc_core.synth.lighting import Mood
 from lalaloc_core.synth.plans import Home
 
 POSE_MARGIN_M = 0.2
+# Cameras stand at least this far below the ceiling.
+CEILING_CLEARANCE_M = 0.3
 _LEVEL_SHARES = (0.3, 0.2, 0.5)
-_CEILING_CLEARANCE_M = 0.3
 _STAGED_HEIGHTS_M = (1.2, 1.7)
 _THRESHOLD_M = 0.55
 _TRIES = 8
@@ -94,7 +95,7 @@ def sample_shots(
                 position_m=position,
                 room_index=int(room),
                 heading=float(rng.uniform(0.0, TWO_PI)),
-                camera_height_m=float(min(height, ceiling - _CEILING_CLEARANCE_M)),
+                camera_height_m=float(min(height, ceiling - CEILING_CLEARANCE_M)),
                 furniture=level or FURNITURE_LEVELS[int(rng.choice(3, p=_LEVEL_SHARES))],
                 seed=int(rng.integers(1 << 62)),
                 is_night=bool(night_share) and rng.random() < night_share,
@@ -110,7 +111,7 @@ def stage_rooms(home: Home, rng: np.random.Generator) -> list[Shot]:
     """
     low, high = _STAGED_HEIGHTS_M
     lowest_ceiling = min(room.ceiling_height_m for room in home.plan.rooms)
-    height = rng.uniform(low, min(high, lowest_ceiling - _CEILING_CLEARANCE_M))
+    height = rng.uniform(low, min(high, lowest_ceiling - CEILING_CLEARANCE_M))
     seed = int(rng.integers(1 << 62))
     return [
         Shot(

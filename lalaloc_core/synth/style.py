@@ -37,7 +37,7 @@ class HouseStyle:
     crown_m: float
 
 
-def draw_style(surfaces: SurfaceTable, rng: np.random.Generator) -> HouseStyle:
+def sample_style(surfaces: SurfaceTable, rng: np.random.Generator) -> HouseStyle:
     """Draw a style, whose surfaces are added to the table."""
     trim = surfaces.add_plain(bright(rng) if rng.random() < 0.7 else wood_tone(rng))
     door_colour = _door_colour(rng)

@@ -72,7 +72,7 @@ class SurfaceTable:
             gloss: share of light reflected like a mirror.
             glow: when positive the surface emits its colour times this instead of reflecting light.
         """
-        picture = self._materials.draw(category, self._rng)
+        picture = self._materials.sample(category, self._rng)
         if colour is None:
             tint = np.exp(self._rng.normal(0.0, 0.2)) * np.exp(self._rng.normal(0.0, 0.04, 3))
         else:
@@ -81,7 +81,7 @@ class SurfaceTable:
 
     def add_plain(self, colour: Colour, *, gloss: float = 0.0, glow: float = 0.0) -> int:
         """A surface of one colour; see `add`."""
-        picture = self._materials.draw_plain(self._rng)
+        picture = self._materials.sample_plain(self._rng)
         return self._append(picture, colour / self._means[picture], scale=0.5, angle=0.0, gloss=gloss, glow=glow)
 
     def _append(self, picture: int, tint: Colour, *, scale: float, angle: float, gloss: float, glow: float) -> int:

@@ -18,14 +18,14 @@ from cachetools import LRUCache, cachedmethod
 from jaxtyping import Float, Int
 
 from lalaloc_core.data.dataset import Appearance, Camera, Dataset, Scene
-from lalaloc_core.data.synthetic.generated import Studio
+from lalaloc_core.data.synthetic.generated import RendererCache
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.sampling import PoseSet, TripletSampling, sample_neighbours, sample_triplets
 from lalaloc_core.synth.build import build_scene
 from lalaloc_core.synth.materials import MaterialLibrary
 from lalaloc_core.synth.panorama import PanoramaRenderer
-from lalaloc_core.synth.shots import sample_shots
+from lalaloc_core.synth.shots import CEILING_CLEARANCE_M, sample_shots
 from lalaloc_core.synth.splits import TRAIN, home_of
 from lalaloc_core.training.config import TrainConfig
 from lalaloc_core.training.deferred import DeferredScene
@@ -33,7 +33,6 @@ from lalaloc_core.training.deferred import DeferredScene
 # Cameras stand at least this far below the ceiling of a neighbour's room.
 _HEADROOM_M = 0.1
 _MIN_CAMERA_M, _MAX_CAMERA_M = 1.0, 1.9
-_CEILING_CLEARANCE_M = 0.3
 # Of panoramas; lower and higher than photographers usually hold a camera, but they do.
 _CAMERA_HEIGHTS_M = (0.5, 2.2)
 # Share of generated panoramas from thresholds, beside walls, in corridors and closets.
@@ -132,7 +131,7 @@ class GeneratedSource:
     config: TrainConfig
     textures: Path | None = None
     deferred: bool = False
-    _studio: Studio | None = field(default=None, init=False)
+    _renderers: RendererCache | None = field(default=None, init=False)
     patience = _GENERATOR_PATIENCE
     skip_bad = False
 
@@ -163,9 +162,7 @@ class GeneratedSource:
                     plan=home.plan,
                     position_m=poses.position_m[row],
                     room_index=poses.room_index[row],
-                    camera_height_m=float(
-                        rng.uniform(_MIN_CAMERA_M, min(_MAX_CAMERA_M, lowest - _CEILING_CLEARANCE_M))
-                    ),
+                    camera_height_m=float(rng.uniform(_MIN_CAMERA_M, min(_MAX_CAMERA_M, lowest - CEILING_CLEARANCE_M))),
                 )
             )
         return groups
@@ -183,14 +180,14 @@ class GeneratedSource:
             night_share=_NIGHT_SHARE,
         )
         # Made where it is needed: it does not travel to worker processes.
-        self._studio = self._studio or self._studio_on("cpu")
-        scenes = [build_scene(shot, self._studio.materials) for shot in shots]
+        self._renderers = self._renderers or self._renderers_on("cpu")
+        scenes = [build_scene(shot, self._renderers.materials) for shot in shots]
         images: Sequence[np.ndarray | DeferredScene]
         if self.deferred:
             first = visit * stage.shots_per_home
             images = [DeferredScene(number=first + k, scene=scene) for k, scene in enumerate(scenes)]
         else:
-            images = list(self._studio.renderer(height, width, stage.supersample).render_scenes(scenes).numpy())
+            images = list(self._renderers.renderer(height, width, stage.supersample).render_scenes(scenes).numpy())
         return [
             PanoramaSample(
                 plan=home.plan,
@@ -205,10 +202,10 @@ class GeneratedSource:
 
     def renderer(self, device: torch.device) -> PanoramaRenderer:
         """Renders deferred panoramas as `samples` would have."""
-        return self._studio_on(device).renderer(*self.config.image_size, self.config.image.supersample)
+        return self._renderers_on(device).renderer(*self.config.image_size, self.config.image.supersample)
 
-    def _studio_on(self, device: torch.device | str) -> Studio:
-        return Studio(MaterialLibrary.create(np.random.default_rng(self.config.seed), self.textures), device)
+    def _renderers_on(self, device: torch.device | str) -> RendererCache:
+        return RendererCache(MaterialLibrary.create(np.random.default_rng(self.config.seed), self.textures), device)
 
 
 def _picture_key(

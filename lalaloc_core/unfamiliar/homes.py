@@ -12,9 +12,9 @@ from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.unfamiliar.furnish import Furnishing, Level
 from lalaloc_core.unfamiliar.geometry import Part
-from lalaloc_core.unfamiliar.openings import Opening, draw_openings, with_openings
+from lalaloc_core.unfamiliar.openings import Opening, sample_openings, with_openings
 from lalaloc_core.unfamiliar.palette import room_surfaces, thing_surfaces
-from lalaloc_core.unfamiliar.plans import UnfamiliarPlan, draw_plan
+from lalaloc_core.unfamiliar.plans import UnfamiliarPlan, sample_plan
 from lalaloc_core.unfamiliar.shell import shell_parts
 from lalaloc_core.unfamiliar.surfaces import Materials, Noise
 from lalaloc_core.unfamiliar.tracing import Tracer
@@ -76,8 +76,8 @@ class Stand:
 def home_of(key: HomeKey) -> UnfamiliarHome:
     """The home of a key."""
     rng = key.rng(0)
-    plan = draw_plan(rng, f"unfamiliar {key.index}")
-    openings = draw_openings(plan, rng)
+    plan = sample_plan(rng, f"unfamiliar {key.index}")
+    openings = sample_openings(plan, rng)
     return UnfamiliarHome(with_openings(plan, openings), tuple(openings), tuple(shell_parts(plan.plan, openings, rng)))
 
 

@@ -49,7 +49,7 @@ class Lights:
     sky: Sky
 
     @classmethod
-    def draw(cls, plan: FloorPlan, openings: Sequence[Opening], sky: Sky, rng: np.random.Generator) -> Lights:
+    def sample(cls, plan: FloorPlan, openings: Sequence[Opening], sky: Sky, rng: np.random.Generator) -> Lights:
         """Light the rooms: by day lamps are often off, in rooms without windows never."""
         windows = sorted((o for o in openings if o.kind == "window"), key=lambda o: o.wall.room)
         count = np.bincount([o.wall.room for o in windows], minlength=len(plan.rooms))

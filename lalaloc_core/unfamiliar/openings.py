@@ -86,12 +86,12 @@ def walls_of(room: Room, index: int) -> list[Wall]:
     ]
 
 
-def draw_openings(plan: UnfamiliarPlan, rng: np.random.Generator) -> list[Opening]:
+def sample_openings(plan: UnfamiliarPlan, rng: np.random.Generator) -> list[Opening]:
     """Doors that join all rooms, a front door, and windows where nothing stands in front of them."""
     rooms = plan.plan.rooms
     walls = [wall for index, room in enumerate(rooms) for wall in walls_of(room, index)]
     taken: _Taken = {}
-    openings = _draw_doors(plan, walls, taken, rng)
+    openings = _sample_doors(plan, walls, taken, rng)
     outer = [wall for wall in walls if wall.length_m > 0.9 and _has_outlook(wall, rooms)]
     fronts = [wall for wall in outer if wall.length_m > 1.3 and plan.kinds[wall.room] in ("living", "corridor")]
     if fronts:
@@ -109,7 +109,7 @@ def draw_openings(plan: UnfamiliarPlan, rng: np.random.Generator) -> list[Openin
             )
         )
     for wall in outer:
-        openings += _draw_windows(wall, rooms, plan, taken, rng)
+        openings += _sample_windows(wall, rooms, plan, taken, rng)
     return openings
 
 
@@ -134,7 +134,7 @@ def with_openings(plan: UnfamiliarPlan, openings: Sequence[Opening]) -> Unfamili
     return replace(plan, plan=FloorPlan.from_dict(document))
 
 
-def _draw_doors(plan: UnfamiliarPlan, walls: list[Wall], taken: _Taken, rng: np.random.Generator) -> list[Opening]:
+def _sample_doors(plan: UnfamiliarPlan, walls: list[Wall], taken: _Taken, rng: np.random.Generator) -> list[Opening]:
     contacts = [
         contact
         for first in walls
@@ -153,7 +153,7 @@ def _draw_doors(plan: UnfamiliarPlan, walls: list[Wall], taken: _Taken, rng: np.
         new = (first.room in joined) != (second.room in joined)
         if (first.room, second.room) in pairs or not (new or rng.random() < 0.35):
             continue
-        door = _draw_door(plan, first, second, (low, high), depth, taken, rng)
+        door = _sample_door(plan, first, second, (low, high), depth, taken, rng)
         if door is not None:
             doors.append(door)
             pairs.add((first.room, second.room))
@@ -161,7 +161,7 @@ def _draw_doors(plan: UnfamiliarPlan, walls: list[Wall], taken: _Taken, rng: np.
     return doors
 
 
-def _draw_door(
+def _sample_door(
     plan: UnfamiliarPlan,
     first: Wall,
     second: Wall,
@@ -197,7 +197,7 @@ def _draw_door(
     )
 
 
-def _draw_windows(
+def _sample_windows(
     wall: Wall, rooms: tuple[Room, ...], plan: UnfamiliarPlan, taken: _Taken, rng: np.random.Generator
 ) -> list[Opening]:
     if plan.kinds[wall.room] == "closet" or rng.random() < (0.55 if plan.kinds[wall.room] == "corridor" else 0.25):

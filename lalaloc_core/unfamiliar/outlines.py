@@ -136,7 +136,7 @@ _MAKERS: Mapping[RoomKind, tuple[_Maker, ...]] = {
 }
 
 
-def draw_outline(kind: RoomKind, rng: np.random.Generator) -> shapely.Polygon:
+def sample_outline(kind: RoomKind, rng: np.random.Generator) -> shapely.Polygon:
     """The outline of one room (metres, anywhere, counter-clockwise), without walls too short or corners too tight."""
     while True:
         maker = _MAKERS[kind][rng.integers(len(_MAKERS[kind]))]

@@ -34,8 +34,8 @@ def render(shot: UnfamiliarShot, height: int, width: int) -> UInt8[np.ndarray, "
     rng = shot.key.rng(4, shot.number)
     traced = traced_home(shot.key, shot.furniture)
     plan = traced.home.plan.plan
-    lights = Lights.draw(plan, traced.home.openings, Sky.draw(rng), rng)
-    film = _Film.draw(rng)
+    lights = Lights.sample(plan, traced.home.openings, Sky.sample(rng), rng)
+    film = _Film.sample(rng)
     light = _radiance(traced, lights, shot.stand, height, width, rng)
     return film.develop(light, rng)
 
@@ -167,7 +167,7 @@ class _Film:
     nadir: float
 
     @classmethod
-    def draw(cls, rng: np.random.Generator) -> _Film:
+    def sample(cls, rng: np.random.Generator) -> _Film:
         return cls(
             stops=float(rng.normal(0.0, 0.45)),
             balance=float(rng.uniform(0.4, 0.95)),

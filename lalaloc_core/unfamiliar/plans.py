@@ -11,7 +11,7 @@ from jaxtyping import Float
 from shapely import affinity
 
 from lalaloc_core.floorplan import FloorPlan, room_type_of
-from lalaloc_core.unfamiliar.outlines import RoomKind, draw_outline
+from lalaloc_core.unfamiliar.outlines import RoomKind, sample_outline
 
 MIN_ROOMS, MAX_ROOMS = 3, 9
 MIN_AREA_M2, MAX_AREA_M2 = 40.0, 160.0
@@ -37,7 +37,7 @@ class UnfamiliarPlan:
     wall_m: float
 
 
-def draw_plan(rng: np.random.Generator, name: str) -> UnfamiliarPlan:
+def sample_plan(rng: np.random.Generator, name: str) -> UnfamiliarPlan:
     """Draw a plan of 3 to 9 rooms and 40 to 160 m²."""
     while True:
         kinds: list[RoomKind] = ["living", "kitchen", "bathroom"]
@@ -66,12 +66,12 @@ def draw_plan(rng: np.random.Generator, name: str) -> UnfamiliarPlan:
 
 def _grow(kinds: list[RoomKind], wall_m: float, rng: np.random.Generator) -> list[shapely.Polygon] | None:
     """Rooms in the order of `kinds`; None where one found no place."""
-    shapes = [draw_outline(kinds[0], rng)]
+    shapes = [sample_outline(kinds[0], rng)]
     for kind in kinds[1:]:
         standing = shapely.union_all(shapes)
         best, best_size = None, math.inf
         for _ in range(_PLACEMENTS):
-            placed = _against(shapes[rng.integers(len(shapes))], draw_outline(kind, rng), wall_m, rng)
+            placed = _against(shapes[rng.integers(len(shapes))], sample_outline(kind, rng), wall_m, rng)
             if placed is None or placed.distance(standing) < wall_m - 1e-6:
                 continue
             # The most compact of several places: what a builder would choose.

@@ -29,7 +29,7 @@ class Sky:
     blocks: Float[np.ndarray, "m"]
 
     @classmethod
-    def draw(cls, rng: np.random.Generator) -> Sky:
+    def sample(cls, rng: np.random.Generator) -> Sky:
         """Mostly day, clear or covered; sometimes dusk, sometimes night."""
         weather = rng.choice(["clear", "covered", "dusk", "night"], p=[0.45, 0.35, 0.1, 0.1])
         height, around = np.radians(rng.uniform(8, 60)), rng.uniform(0, 2 * np.pi)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lalaloc_core.data.synthetic.generated import GeneratedScenes
-from lalaloc_core.data.synthetic.mismatched import CutOut, MismatchedScenes, OpenAir, TurnedOver
+from lalaloc_core.data.synthetic.mismatched import CutOut, MismatchedScenes, OutdoorPhotograph, TurnedOver
 
 HOMES = GeneratedScenes(homes=2, shots_per_home=4, furniture=None)
 LOOK = HOMES.appearances[0]
@@ -20,7 +20,7 @@ def test_cameras_are_the_homes_own_and_see_the_next_home() -> None:
         assert np.array_equal(camera.position_m, mine.position_m)
         assert (camera.room_index, camera.heading) == (mine.room_index, mine.heading)
         if k == 3:
-            assert isinstance(camera.photographs[LOOK], OpenAir)
+            assert isinstance(camera.photographs[LOOK], OutdoorPhotograph)
         elif k == 2:
             shown = camera.photographs[LOOK]
             assert isinstance(shown, TurnedOver)
@@ -48,8 +48,8 @@ def test_what_is_cut_out_is_a_part_drawn_out_to_the_whole() -> None:
 
 def test_the_open_air_has_no_walls() -> None:
     for seed in range(20):
-        picture = OpenAir(seed).image(64, 128).astype(float)
+        picture = OutdoorPhotograph(seed).image(64, 128).astype(float)
         # Nothing but grain tells one azimuth from another.
         columns = picture.mean(axis=0)
         assert np.ptp(columns, axis=0).max() < 12.0
-        assert np.array_equal(picture, OpenAir(seed).image(64, 128))
+        assert np.array_equal(picture, OutdoorPhotograph(seed).image(64, 128))

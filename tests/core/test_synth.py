@@ -20,9 +20,9 @@ from lalaloc_core.render.depth import layout_depth
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.synth.build import build_scene
 from lalaloc_core.synth.catalogue import ROOM_PIECES
+from lalaloc_core.synth.contact_sheet import contact_sheet
 from lalaloc_core.synth.facts import facts_of
 from lalaloc_core.synth.furniture import CAMERA_CLEARANCE_M, FURNITURE_LEVELS, furnish, rectangle
-from lalaloc_core.synth.gallery import contact_sheet
 from lalaloc_core.synth.materials import MaterialLibrary
 from lalaloc_core.synth.panorama import PanoramaRenderer, sample_shots
 from lalaloc_core.synth.plans import Home, generate_home
@@ -307,7 +307,7 @@ def test_materials_work_without_and_with_a_folder_of_pictures(tmp_path: Path, ma
     folder.mkdir(parents=True)
     Image.new("RGB", (100, 128), (255, 0, 0)).save(folder / "red.jpg")
     library = MaterialLibrary.create(np.random.default_rng(0), tmp_path)
-    drawn = {library.draw("floor", rng) for rng in [np.random.default_rng(8)] for _ in range(50)}
+    drawn = {library.sample("floor", rng) for rng in [np.random.default_rng(8)] for _ in range(50)}
     photographs = set(np.concatenate(library.photographs["floor"]).tolist())
     assert drawn & photographs
     assert drawn - photographs

@@ -119,7 +119,7 @@ def test_what_is_built_in_keeps_to_its_room_and_clear_of_doors(seed: int) -> Non
     home = generate_home(rng)
     for index, room in enumerate(home.plan.rooms):
         openings = [opening for opening in home.openings if opening.room == index]
-        for prism in furnish(room, openings, "empty", rng, fitted=True):
+        for prism in furnish(room, openings, "empty", rng, built_in=True):
             footprint = rectangle(
                 np.array([prism.x, prism.y]), np.array([prism.axis_x, prism.axis_y]), prism.half_a, prism.half_b
             )

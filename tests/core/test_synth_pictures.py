@@ -14,7 +14,7 @@ from PIL import Image
 
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.synth.camera import develop
-from lalaloc_core.synth.exposure import Exposure, draw_exposure, draw_staged_exposure
+from lalaloc_core.synth.exposure import Exposure, sample_exposure, sample_staged_exposure
 from lalaloc_core.synth.jpeg import compress
 from lalaloc_core.synth.lens import lens_gain, tilt
 from lalaloc_core.synth.materials import MaterialLibrary
@@ -114,11 +114,11 @@ def test_compression_loses_about_what_a_jpeg_file_loses(quality: int, rows: int)
 @given(seed=seeds)
 @settings(max_examples=30, deadline=None)
 def test_cameras_stay_within_their_limits_and_staged_ones_have_no_flaws(seed: int) -> None:
-    drawn = draw_exposure(np.random.default_rng(seed), bright=seed % 2 == 0)
+    drawn = sample_exposure(np.random.default_rng(seed), bright=seed % 2 == 0)
     assert max(abs(drawn.roll), abs(drawn.pitch)) <= math.radians(2.0) + 1e-9
     assert drawn.jpeg == 0.0 or 50.0 <= drawn.jpeg <= 95.0
     assert 0.0 <= drawn.nadir <= math.radians(65.0)
-    staged = draw_staged_exposure(np.random.default_rng(seed))
+    staged = sample_staged_exposure(np.random.default_rng(seed))
     flaws = (staged.roll, staged.pitch, staged.nadir, staged.zenith, staged.seam_step, staged.seam_shift, staged.jpeg)
     assert not any(flaws)
 
@@ -127,7 +127,7 @@ def test_cameras_stay_within_their_limits_and_staged_ones_have_no_flaws(seed: in
 @settings(max_examples=10, deadline=None)
 def test_a_picture_is_developed_alike_in_any_batch(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    cameras = Exposure(torch.from_numpy(np.stack([draw_exposure(rng).rows for _ in range(4)])).float())
+    cameras = Exposure(torch.from_numpy(np.stack([sample_exposure(rng).rows for _ in range(4)])).float())
     radiance = torch.rand(4, ROWS, COLUMNS, 3, generator=torch.Generator().manual_seed(seed % 1000))
     noise = torch.zeros(ROWS, COLUMNS, 3)
     together = develop(radiance.clone(), cameras, noise)

@@ -23,9 +23,9 @@ from lalaloc_core.render.depth import layout_depth
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.unfamiliar.furnish import LEVELS, Furnishing
 from lalaloc_core.unfamiliar.homes import WALL_MARGIN_M, HomeKey, UnfamiliarHome, home_of, traced_home
-from lalaloc_core.unfamiliar.openings import draw_openings
-from lalaloc_core.unfamiliar.outlines import AREAS_M2, draw_outline
-from lalaloc_core.unfamiliar.plans import MAX_AREA_M2, MAX_ROOMS, MIN_AREA_M2, MIN_ROOMS, draw_plan
+from lalaloc_core.unfamiliar.openings import sample_openings
+from lalaloc_core.unfamiliar.outlines import AREAS_M2, sample_outline
+from lalaloc_core.unfamiliar.plans import MAX_AREA_M2, MAX_ROOMS, MIN_AREA_M2, MIN_ROOMS, sample_plan
 from lalaloc_core.unfamiliar.shell import shell_parts
 from lalaloc_core.unfamiliar.tracing import Tracer
 
@@ -66,7 +66,7 @@ class TestPlans:
     def test_outlines_are_simple_rings_of_the_wanted_size(self, kind: str) -> None:
         rng = np.random.default_rng(0)
         for _ in range(20):
-            shape = draw_outline(kind, rng)  # pyright: ignore[reportArgumentType]
+            shape = sample_outline(kind, rng)  # pyright: ignore[reportArgumentType]
             assert shape.is_valid
             assert shape.exterior.is_ccw
             assert AREAS_M2[kind][0] - 1e-6 <= shape.area <= AREAS_M2[kind][1] + 1e-6  # pyright: ignore[reportArgumentType]
@@ -109,7 +109,7 @@ class TestTruth:
     def closed(seed: int) -> tuple[FloorPlan, Tracer]:
         """A home without any opening or furniture."""
         rng = np.random.default_rng(seed)
-        plan = draw_plan(rng, "closed").plan
+        plan = sample_plan(rng, "closed").plan
         return plan, Tracer(shell_parts(plan, [], rng))
 
     @pytest.mark.parametrize("seed", range(3))
@@ -260,5 +260,7 @@ class TestAsking:
 
 
 def test_the_same_seed_draws_the_same_openings() -> None:
-    first, second = (draw_openings(draw_plan(rng, "x"), rng) for rng in (np.random.default_rng(3) for _ in range(2)))
+    first, second = (
+        sample_openings(sample_plan(rng, "x"), rng) for rng in (np.random.default_rng(3) for _ in range(2))
+    )
     assert [(o.kind, o.left_m, o.right_m) for o in first] == [(o.kind, o.left_m, o.right_m) for o in second]

@@ -60,6 +60,7 @@ class GeneratedScenes:
         if number is None or not index.isdecimal():
             raise DatasetError("no such generated scene; names are like 'test-00042'", scene=name)
         home, rng = home_of(number, self.seed, int(index))
+        renderers = renderer_cache_of(number, self.seed, self.textures)
         shots = sample_shots(home, self.shots_per_home, rng, self.furniture)
         cameras = tuple(
             Camera(
@@ -68,14 +69,11 @@ class GeneratedScenes:
                 room_index=shot.room_index,
                 heading=shot.heading,
                 camera_height_m=shot.camera_height_m,
-                photographs={self.appearances[0]: RenderedPhotograph(shot, self._studio(number))},
+                photographs={self.appearances[0]: RenderedPhotograph(shot, renderers)},
             )
             for k, shot in enumerate(shots)
         )
         return Scene(name=name, plan=home.plan, cameras=cameras)
-
-    def _studio(self, split: int) -> Studio:
-        return studio_of(split, self.seed, self.textures)
 
 
 def training_plans(homes: int, seed: int) -> list[FloorPlan]:
@@ -83,7 +81,7 @@ def training_plans(homes: int, seed: int) -> list[FloorPlan]:
     return [home_of(TRAIN, seed, index)[0].plan for index in range(homes)]
 
 
-class Studio:
+class RendererCache:
     """The materials of a split, and its renderers by picture: both take a second to build and are kept."""
 
     def __init__(self, materials: MaterialLibrary, device: torch.device | str = "cpu") -> None:
@@ -102,9 +100,9 @@ class Studio:
 
 
 @lru_cache(maxsize=4)
-def studio_of(split: int, seed: int, textures: Path | None) -> Studio:
-    """The studio of a split: materials are drawn anew for each."""
-    return Studio(MaterialLibrary.create(np.random.default_rng([split, seed]), textures))
+def renderer_cache_of(split: int, seed: int, textures: Path | None) -> RendererCache:
+    """The renderers of a split: materials are sampled anew for each."""
+    return RendererCache(MaterialLibrary.create(np.random.default_rng([split, seed]), textures))
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +110,7 @@ class RenderedPhotograph:
     """A photograph that is rendered whenever it is asked for; like a real one it averages over each pixel's area."""
 
     shot: Shot
-    studio: Studio
+    renderers: RendererCache
 
     @cached_property
     def facts(self) -> frozenset[str]:
@@ -120,7 +118,7 @@ class RenderedPhotograph:
         return frozenset(facts_of(self.shot))
 
     def image(self, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
-        return self.studio.renderer(height, width, _PHOTOGRAPH_RAYS).render([self.shot])[0].cpu().numpy()
+        return self.renderers.renderer(height, width, _PHOTOGRAPH_RAYS).render([self.shot])[0].cpu().numpy()
 
     def depth_m(self) -> Float[np.ndarray, "h w"]:
-        return self.studio.renderer(_DEPTH_HEIGHT, 2 * _DEPTH_HEIGHT).depth_m([self.shot])[0].cpu().numpy()
+        return self.renderers.renderer(_DEPTH_HEIGHT, 2 * _DEPTH_HEIGHT).depth_m([self.shot])[0].cpu().numpy()

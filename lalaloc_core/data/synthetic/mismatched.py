@@ -63,7 +63,7 @@ def _shown(camera: Camera, other: Camera, k: int, home: int) -> dict[Appearance,
         return {look: TurnedOver(photograph) for look, photograph in camera.photographs.items()}
     if k % _EVERY == _EVERY - 1:
         seed = int(1e3 * abs(camera.position_m).sum())
-        return dict.fromkeys(camera.photographs, OpenAir(seed))
+        return dict.fromkeys(camera.photographs, OutdoorPhotograph(seed))
     return dict(zip(camera.photographs, other.photographs.values(), strict=True))
 
 
@@ -99,7 +99,7 @@ class CutOut:
 
 
 @dataclass(frozen=True)
-class OpenAir:
+class OutdoorPhotograph:
     """Ground under a sky, both of any colour, at times the same one, as of a lens against a wall."""
 
     seed: int

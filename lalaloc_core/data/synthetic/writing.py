@@ -32,7 +32,7 @@ from lalaloc_core.data.dataset import SPLITS, Split
 from lalaloc_core.data.structured3d import RENDERING_FOLDER, SYNTHETIC_FILE, Structured3D, Synthetic, scene_name
 from lalaloc_core.data.structured3d_splits import scene_numbers
 from lalaloc_core.data.structured3d_writer import room_id, write_annotation, write_camera, write_depth, write_picture
-from lalaloc_core.data.synthetic.generated import SPLIT_NUMBERS, studio_of
+from lalaloc_core.data.synthetic.generated import SPLIT_NUMBERS, renderer_cache_of
 from lalaloc_core.errors import DatasetError, InvalidInputError
 from lalaloc_core.files import PART_SUFFIX, atomic_write
 from lalaloc_core.synth.furniture import FURNITURE_LEVELS
@@ -173,7 +173,7 @@ def _write_scene(job: _Job, stop: Event | None = None) -> int:
     """
     settings, split = job.settings, SPLIT_NUMBERS[job.split]
     home, rng = home_of(split, settings.seed, job.number)
-    renderer = studio_of(split, settings.seed, settings.textures).renderer(settings.height, 2 * settings.height)
+    renderer = renderer_cache_of(split, settings.seed, settings.textures).renderer(settings.height, 2 * settings.height)
     shots = stage_rooms(home, rng)
     try:
         with _named_errors(job.part):
