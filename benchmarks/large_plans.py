@@ -1,9 +1,10 @@
 """How preparing and searching plans grows with their area: `python -m benchmarks.large_plans`.
 
-Buildings are generated homes side by side, with corridors between them and halls full of columns (`synth.buildings`),
-and photographs those of their homes. Times are of one thread's processor, so that a busy machine may be measured on;
-memory is that of the latent grid with all that queries make of it. With `--oracle` every query is also compared with
-all poses, headings and heights at all azimuths, which takes minutes for the larger buildings.
+Buildings are generated homes side by side, with corridors between them and halls full of columns
+(`synth.homes.buildings`), and photographs those of their homes. Times are of one thread's processor, so that a busy
+machine may be measured on; memory is that of the latent grid with all that queries make of it. With `--oracle` every
+query is also compared with all poses, headings and heights at all azimuths, which takes minutes for the larger
+buildings.
 """
 
 from __future__ import annotations
@@ -29,10 +30,10 @@ from lalaloc_core.localise.pipeline import localise
 from lalaloc_core.localise.poses import LatentGrid, Query
 from lalaloc_core.localise.retrieval import grid_costs
 from lalaloc_core.methods.lalaloc import local_refiner
-from lalaloc_core.synth.buildings import Building, building_of
-from lalaloc_core.synth.materials import MaterialLibrary
-from lalaloc_core.synth.shots import Shot, sample_shots
-from lalaloc_core.synth.splits import VALIDATION
+from lalaloc_core.synth.homes.buildings import Building, building_of
+from lalaloc_core.synth.homes.splits import VALIDATION
+from lalaloc_core.synth.scene.materials import MaterialLibrary
+from lalaloc_core.synth.scene.shots import Shot, sample_shots
 from service.grids.embedding import embed, grid_bytes
 
 _AREAS_M2 = (100.0, 1000.0, 5000.0, 10_000.0, 50_000.0, 100_000.0, 200_000.0)

@@ -29,9 +29,9 @@ from lalaloc_core.localise.sequence import Motion
 from lalaloc_core.localise.sequence.joint import refine_sequence
 from lalaloc_core.localise.sequence.search import localise_sequence
 from lalaloc_core.methods.lalaloc import local_refiner
-from lalaloc_core.synth.plans import Home
-from lalaloc_core.synth.shots import Shot, sample_shots
-from lalaloc_core.synth.splits import home_of
+from lalaloc_core.synth.homes.plans import Home
+from lalaloc_core.synth.homes.splits import home_of
+from lalaloc_core.synth.scene.shots import Shot, sample_shots
 
 # Places that a walk may go through, and how far apart neighbours on it are.
 _PLACES, _STRIDE_M = 80, (0.8, 3.5)

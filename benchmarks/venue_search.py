@@ -28,7 +28,7 @@ from lalaloc_core.localise.venue.plan_index import PlanIndex
 from lalaloc_core.localise.venue.prototype_cells import shipped_cells
 from lalaloc_core.localise.venue.prototypes import most_probable, prototypes_of
 from lalaloc_core.methods.lalaloc import local_refiner
-from lalaloc_core.synth.splits import home_of
+from lalaloc_core.synth.homes.splits import home_of
 from scripts.make_prototype_cells import grid_without_latents
 from service.query.venue_localiser import VENUE_CONFIG
 from service.query.venue_plans import MAX_SEARCHED, most_poses

@@ -33,8 +33,8 @@ from lalaloc_core.localise.poses import Query
 from lalaloc_core.localise.venue.plan_index import COMPARED, SCANNED, PlanIndex
 from lalaloc_core.localise.venue.prototype_cells import shipped_cells
 from lalaloc_core.localise.venue.prototypes import AZIMUTHS, packed_openings, prototypes_of, unpacked_openings
-from lalaloc_core.synth.shots import sample_shots
-from lalaloc_core.synth.splits import home_of
+from lalaloc_core.synth.homes.splits import home_of
+from lalaloc_core.synth.scene.shots import sample_shots
 from scripts.make_prototype_cells import grid_without_latents
 from service.query.prototype_file import BlockKey, PrototypeFile
 

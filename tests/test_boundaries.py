@@ -39,7 +39,13 @@ LAYERS = {
     # Chooses among the formats.
     "lalaloc_core.plans": 7,
     "lalaloc_core.nets": 3,
+    "lalaloc_core.synth.records": 2,
+    "lalaloc_core.synth.homes": 2,
     "lalaloc_core.synth": 3,
+    "lalaloc_core.synth.camera": 3,
+    "lalaloc_core.synth.furniture": 3,
+    "lalaloc_core.synth.scene": 4,
+    "lalaloc_core.synth.rendering": 5,
     # Beside synth and apart from it: neither may import the other.
     "lalaloc_core.unfamiliar": 3,
     "lalaloc_core.localise": 4,

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from lalaloc_core.synth.plans import Home
-from lalaloc_core.synth.splits import TEST, home_of
+from lalaloc_core.synth.homes.plans import Home
+from lalaloc_core.synth.homes.splits import TEST, home_of
 
 
 def home_of_area(area_m2: float) -> Home:

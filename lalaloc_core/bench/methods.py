@@ -17,8 +17,8 @@ from lalaloc_core.methods.icp import Icp
 from lalaloc_core.methods.lalaloc import LaLaLoc, local_refiner
 from lalaloc_core.methods.method import Method, Question
 from lalaloc_core.sampling import pose_grid
-from lalaloc_core.synth.materials import MaterialLibrary
-from lalaloc_core.synth.shots import sample_shots
+from lalaloc_core.synth.scene.materials import MaterialLibrary
+from lalaloc_core.synth.scene.shots import sample_shots
 
 _QUERIES = 5
 _GRID_STEP_M = 0.5

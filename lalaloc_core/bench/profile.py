@@ -17,8 +17,8 @@ from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.pipeline import StageClock, localise
 from lalaloc_core.localise.retrieval import build_grid
 from lalaloc_core.methods.lalaloc import local_refiner
-from lalaloc_core.synth.materials import MaterialLibrary
-from lalaloc_core.synth.shots import sample_shots
+from lalaloc_core.synth.scene.materials import MaterialLibrary
+from lalaloc_core.synth.scene.shots import sample_shots
 
 _GRID_STEP_M = 0.5
 _FUNCTIONS = 20

@@ -22,8 +22,8 @@ from PIL import Image
 from lalaloc_core.bench.homes import home_of_area
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.synth.materials import MaterialLibrary
-from lalaloc_core.synth.panorama import PanoramaRenderer, sample_shots
+from lalaloc_core.synth.rendering.panorama import PanoramaRenderer, sample_shots
+from lalaloc_core.synth.scene.materials import MaterialLibrary
 
 _REQUESTS = 40
 _STARTUP_SECONDS = 60.0

@@ -16,7 +16,7 @@ from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.data.drawn_openings import DrawnOpening
 from lalaloc_core.data.drawn_rooms import DrawnRoom, plan_of_rooms
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.synth.plans import generate_home
+from lalaloc_core.synth.homes.plans import generate_home
 
 GALLERY_ROOMS = 20
 # At most so many of the others are rooms that somebody drew; the rest are generated.

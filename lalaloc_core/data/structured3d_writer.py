@@ -20,7 +20,7 @@ from PIL import Image
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.data.structured3d import ANNOTATION_FILE, PANORAMA_SIZE
 from lalaloc_core.floorplan import FloorPlan, Room
-from lalaloc_core.synth.openings import Opening
+from lalaloc_core.synth.homes.openings import Opening
 
 _MM_PER_M = 1000.0
 _MAX_DEPTH_MM = 65535.0

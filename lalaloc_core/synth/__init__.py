@@ -1,12 +1,11 @@
 """The generator of training data: procedural homes, and photographs of them rendered in torch.
 
-Begin with `panorama.py`, the panorama renderer. A home comes from `plans.py` (`partition.py`, `openings.py`), its
-furniture from `furniture.py`, cameras from `shots.py`. `build.py` puts what one camera sees into a `RenderScene`
-(`render_scene.py`), `cast.py` casts its rays, `shading.py` lights what they hit, `camera.py` exposes the picture.
+Begin with `rendering/panorama.py`, the panorama renderer. `homes/` draws floor plans with doors and windows,
+`furniture/` furnishes their rooms; `scene/` puts what one camera sees into a `RenderScene`, `rendering/` casts its rays
+and lights what they hit, `camera/` exposes the picture. `records.py` is how scenes keep rows of numbers.
 Only what needs no torch is re-exported: data sets use plans of the generator without it.
 """
 
-from lalaloc_core.synth.openings import Opening
-from lalaloc_core.synth.plans import Home, generate_home
+from lalaloc_core.synth.homes import Home, Opening, generate_home
 
 __all__ = ["Home", "Opening", "generate_home"]

@@ -15,8 +15,8 @@ import torch
 from jaxtyping import Bool, Int, UInt8
 from torch import Tensor
 
-from lalaloc_core.synth.panorama import PanoramaRenderer
-from lalaloc_core.synth.render_scene import RenderScene
+from lalaloc_core.synth.rendering.panorama import PanoramaRenderer
+from lalaloc_core.synth.scene.render_scene import RenderScene
 from lalaloc_core.training.batches import Batch, stacked
 from lalaloc_core.training.rotation import Rotation
 

@@ -7,7 +7,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from lalaloc_core.conventions import TWO_PI
-from lalaloc_core.synth.jpeg import compress
+from lalaloc_core.synth.camera.jpeg import compress
 
 # Spreads (normal) of the logarithms at full strength, and of the noise's standard deviation (share of the range).
 _GAIN, _GAMMA, _BALANCE, _CONTRAST = 0.12, 0.15, 0.04, 0.12

@@ -22,11 +22,11 @@ from lalaloc_core.data.synthetic.generated import RendererCache
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.sampling import PoseSet, TripletSampling, sample_neighbours, sample_triplets
-from lalaloc_core.synth.build import build_scene
-from lalaloc_core.synth.materials import MaterialLibrary
-from lalaloc_core.synth.panorama import PanoramaRenderer
-from lalaloc_core.synth.shots import CEILING_CLEARANCE_M, sample_shots
-from lalaloc_core.synth.splits import TRAIN, home_of
+from lalaloc_core.synth.homes.splits import TRAIN, home_of
+from lalaloc_core.synth.rendering.panorama import PanoramaRenderer
+from lalaloc_core.synth.scene.build import build_scene
+from lalaloc_core.synth.scene.materials import MaterialLibrary
+from lalaloc_core.synth.scene.shots import CEILING_CLEARANCE_M, sample_shots
 from lalaloc_core.training.config import TrainConfig
 from lalaloc_core.training.deferred import DeferredScene
 

@@ -13,7 +13,7 @@ from lalaloc_core.data.structured3d_annotation import read_annotation
 from lalaloc_core.data.structured3d_writer import build_annotation
 from lalaloc_core.data.zind import Zind
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.synth.plans import generate_home
+from lalaloc_core.synth.homes.plans import generate_home
 from tests.strategies import crooked_flat
 from tests.zind_home import FLOOR, PANORAMAS, write_home
 

@@ -16,7 +16,7 @@ from lalaloc_core.evaluation.factories import build_dataset, choose_appearance
 from lalaloc_core.evaluation.predictions import PREDICTIONS_FILE, Prediction, RunFolder, RunInfo
 from lalaloc_core.evaluation.run import run_evaluation
 from lalaloc_core.evaluation.score import heading_errors_deg, position_errors_m, score
-from lalaloc_core.synth.facts import facts_of
+from lalaloc_core.synth.scene.facts import facts_of
 
 OWN_DATA = Path(__file__).parents[2] / "examples" / "own_data"
 

@@ -15,8 +15,8 @@ from lalaloc_core.localise.layouts import layouts_at
 from lalaloc_core.localise.poses import LatentGrid, PredictedOpenings, PredictedProfile, Query, rolled
 from lalaloc_core.localise.retrieval import grid_costs, retrieve
 from lalaloc_core.sampling import PoseSet, pose_grid, random_poses
-from lalaloc_core.synth.buildings import Building, building_of
-from lalaloc_core.synth.splits import VALIDATION
+from lalaloc_core.synth.homes.buildings import Building, building_of
+from lalaloc_core.synth.homes.splits import VALIDATION
 from tests.strategies import seeds
 
 STEP_M, COLUMNS, HYPOTHESES, QUERIES = 0.7, 64, 32, 24

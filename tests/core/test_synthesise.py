@@ -35,14 +35,14 @@ from lalaloc_core.data.synthetic.writing import Synthesis, share_out, synthesise
 from lalaloc_core.errors import DatasetError, InvalidInputError
 from lalaloc_core.render.depth import layout_depth
 from lalaloc_core.render.profile import wall_profile
-from lalaloc_core.synth.build import build_scene
-from lalaloc_core.synth.furniture import FURNITURE_LEVELS
-from lalaloc_core.synth.lighting import MOODS
-from lalaloc_core.synth.materials import MaterialLibrary
-from lalaloc_core.synth.plans import Home, generate_home
-from lalaloc_core.synth.render_scene import RenderScene
-from lalaloc_core.synth.shots import POSE_MARGIN_M, stage_rooms
-from lalaloc_core.synth.splits import TEST, TRAIN, home_of
+from lalaloc_core.synth.furniture.furnish import FURNITURE_LEVELS
+from lalaloc_core.synth.homes.plans import Home, generate_home
+from lalaloc_core.synth.homes.splits import TEST, TRAIN, home_of
+from lalaloc_core.synth.scene.build import build_scene
+from lalaloc_core.synth.scene.lighting import MOODS
+from lalaloc_core.synth.scene.materials import MaterialLibrary
+from lalaloc_core.synth.scene.render_scene import RenderScene
+from lalaloc_core.synth.scene.shots import POSE_MARGIN_M, stage_rooms
 
 # A seed whose first homes have four rooms each.
 HEIGHT, SEED = 32, 267

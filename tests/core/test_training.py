@@ -29,7 +29,7 @@ from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
 from lalaloc_core.render.depth import back_project, layout_depth
 from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.sampling import TripletSampling, random_poses
-from lalaloc_core.synth.splits import TEST, TRAIN, VALIDATION, home_of
+from lalaloc_core.synth.homes.splits import TEST, TRAIN, VALIDATION, home_of
 from lalaloc_core.training import batches, objective, sources
 from lalaloc_core.training.batch_streams import LayoutBatches, PanoramaBatches
 from lalaloc_core.training.batches import Batch, load_batches

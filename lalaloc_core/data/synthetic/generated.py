@@ -14,12 +14,12 @@ from jaxtyping import Float, UInt8
 from lalaloc_core.data.dataset import Appearance, Camera, Scene, Split
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.synth.facts import facts_of
-from lalaloc_core.synth.furniture import FurnitureLevel
-from lalaloc_core.synth.materials import MaterialLibrary
-from lalaloc_core.synth.panorama import PanoramaRenderer
-from lalaloc_core.synth.shots import Shot, sample_shots
-from lalaloc_core.synth.splits import TEST, TRAIN, VALIDATION, home_of
+from lalaloc_core.synth.furniture.furnish import FurnitureLevel
+from lalaloc_core.synth.homes.splits import TEST, TRAIN, VALIDATION, home_of
+from lalaloc_core.synth.rendering.panorama import PanoramaRenderer
+from lalaloc_core.synth.scene.facts import facts_of
+from lalaloc_core.synth.scene.materials import MaterialLibrary
+from lalaloc_core.synth.scene.shots import Shot, sample_shots
 
 _DEPTH_HEIGHT = 256
 _PHOTOGRAPH_RAYS = (2, 2)
@@ -114,7 +114,7 @@ class RenderedPhotograph:
 
     @cached_property
     def facts(self) -> frozenset[str]:
-        """What makes the shot hard, see `synth.facts`."""
+        """What makes the shot hard, see `synth.scene.facts`."""
         return frozenset(facts_of(self.shot))
 
     def image(self, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:

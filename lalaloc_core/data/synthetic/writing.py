@@ -35,12 +35,12 @@ from lalaloc_core.data.structured3d_writer import room_id, write_annotation, wri
 from lalaloc_core.data.synthetic.generated import SPLIT_NUMBERS, renderer_cache_of
 from lalaloc_core.errors import DatasetError, InvalidInputError
 from lalaloc_core.files import PART_SUFFIX, atomic_write
-from lalaloc_core.synth.furniture import FURNITURE_LEVELS
-from lalaloc_core.synth.lighting import MOODS
-from lalaloc_core.synth.materials import CATEGORIES
-from lalaloc_core.synth.panorama import PanoramaRenderer
-from lalaloc_core.synth.shots import Shot, stage_rooms
-from lalaloc_core.synth.splits import home_of
+from lalaloc_core.synth.furniture.furnish import FURNITURE_LEVELS
+from lalaloc_core.synth.homes.splits import home_of
+from lalaloc_core.synth.rendering.panorama import PanoramaRenderer
+from lalaloc_core.synth.scene.lighting import MOODS
+from lalaloc_core.synth.scene.materials import CATEGORIES
+from lalaloc_core.synth.scene.shots import Shot, stage_rooms
 
 PICTURES_PER_ROOM = len(FURNITURE_LEVELS) * len(MOODS)
 _MIN_HEIGHT, _MAX_HEIGHT = 16, 4096
