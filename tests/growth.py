@@ -7,9 +7,9 @@ import time
 from collections.abc import Callable
 
 # Twice the input may take so many times as long: linear growth, and what a busy machine adds to it.
-_MOST = 2.5
+_MAX_RATIO = 2.5
 # Work that is over sooner is repeated: clocks are not that fine.
-_LEAST_S = 0.02
+_MIN_S = 0.02
 _TRIES = 12
 
 
@@ -22,13 +22,13 @@ def assert_no_worse_than_linear(work_of: Callable[[int], Callable[[], object]], 
     """
     small, large = work_of(size), work_of(2 * size)
     repeats = 1
-    while _time_of(small, repeats) < _LEAST_S:
+    while _time_of(small, repeats) < _MIN_S:
         repeats *= 2
     small_s = large_s = math.inf
     for _ in range(_TRIES):
         # Others on the machine only ever make it slower: the fastest of some tries counts.
         small_s, large_s = min(small_s, _time_of(small, repeats)), min(large_s, _time_of(large, repeats))
-        if large_s <= _MOST * small_s:
+        if large_s <= _MAX_RATIO * small_s:
             return
     raise AssertionError(f"twice the input takes {large_s / small_s:.1f} times as long")
 

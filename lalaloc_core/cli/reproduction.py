@@ -47,9 +47,9 @@ def _reproduce(arguments: argparse.Namespace) -> None:
         raise InvalidInputError("--data is missing: Structured3D, or what `lalaloc synth` writes")
 
     from lalaloc_core.reproduce.result_tables import markdown
-    from lalaloc_core.reproduce.run import Workbench
+    from lalaloc_core.reproduce.run import TableMaker
 
-    workbench = Workbench(
+    table_maker = TableMaker(
         data=arguments.data,
         out=arguments.out,
         budget=arguments.budget,
@@ -60,4 +60,4 @@ def _reproduce(arguments: argparse.Namespace) -> None:
         command=shlex.join(["lalaloc", *sys.argv[1:]]),
     )
     for table in chosen:
-        print(markdown(workbench.make(table)))
+        print(markdown(table_maker.make(table)))

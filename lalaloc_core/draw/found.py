@@ -8,7 +8,7 @@ from lalaloc_core.draw.answer import DrawnAnswer, Rival
 from lalaloc_core.draw.heat import posterior_map
 from lalaloc_core.draw.plan import Marker
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.covariance import spread_of
+from lalaloc_core.localise.covariance import pose_uncertainty
 from lalaloc_core.localise.pipeline import Localisation, panorama_heading
 from lalaloc_core.localise.poses import Candidate, LatentGrid, Query
 from lalaloc_core.localise.probability_map import probability_map
@@ -32,7 +32,7 @@ def drawn_answer(
     best, *others = found.candidates
     spread = None
     if model is not None and best.information is not None:
-        spread = spread_of(best.information, plan.rooms[best.room_index], model)
+        spread = pose_uncertainty(best.information, plan.rooms[best.room_index], model)
     covariance = None
     if spread is not None:
         (xx, xy), (_, yy) = spread.position_m2.tolist()

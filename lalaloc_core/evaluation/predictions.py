@@ -44,7 +44,7 @@ class Pose:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Rival:
+class PredictedCandidate:
     """One candidate for an answer: its pose, what each term of the evidence says of it, and its posterior."""
 
     pose: Pose
@@ -87,7 +87,7 @@ class Prediction:
     room_rank: int | None = None
     signals: dict[str, dict[str, float]] = field(default_factory=dict)
     information: tuple[tuple[float, ...], ...] | None = None
-    candidates: tuple[Rival, ...] = ()
+    candidates: tuple[PredictedCandidate, ...] = ()
     confidence: float | None = None
     heading_confidence: float | None = None
     found_height_m: float | None = None

@@ -26,7 +26,7 @@ from lalaloc_core.conventions import heading_to_degrees
 from lalaloc_core.data.dataset import Appearance, Camera, Dataset, Scene, facts_of_photograph, load_scenes
 from lalaloc_core.errors import DatasetError, InvalidInputError, RunError
 from lalaloc_core.evaluation.factories import build_dataset, build_method
-from lalaloc_core.evaluation.predictions import Pose, Prediction, Rival, RunFolder, RunInfo
+from lalaloc_core.evaluation.predictions import Pose, PredictedCandidate, Prediction, RunFolder, RunInfo
 from lalaloc_core.methods.method import Answer, Found, Method, Question
 from lalaloc_core.methods.similarity import ChamferGrid, true_layout
 from lalaloc_core.sampling import PoseSet, pose_grid
@@ -208,7 +208,8 @@ class _SceneEvaluator:
             signals=answer.signals,
             information=None if answer.information is None else tuple(map(tuple, answer.information.tolist())),
             candidates=tuple(
-                Rival(pose=_pose(one.pose), terms=one.terms, probability=one.probability) for one in answer.candidates
+                PredictedCandidate(pose=_pose(one.pose), terms=one.terms, probability=one.probability)
+                for one in answer.candidates
             ),
             confidence=answer.confidence,
             heading_confidence=answer.heading_confidence,

@@ -17,7 +17,7 @@ _AZIMUTHS = 16
 # Width of the bins of log distance: 5 cm at a distance of 1 m.
 _BIN = 0.05
 # Walls are that far (m) from the poses of a grid, or count as nearer or farther ones.
-_NEAREST_M, _FARTHEST_M = 0.1, 500.0
+_MIN_DISTANCE_M, _MAX_DISTANCE_M = 0.1, 500.0
 # Classes of openings that have a row at every azimuth: all but walls.
 OPENING_ROWS = len(OPENING_CLASSES) - 1
 
@@ -42,7 +42,8 @@ class BinnedLayouts:
         width = layouts.log_profile.shape[1]
         count = min(_AZIMUTHS, width)
         columns = np.arange(count) * width // count
-        log_m = np.clip(layouts.log_profile[:, columns].astype(np.float32), math.log(_NEAREST_M), math.log(_FARTHEST_M))
+        log_m = layouts.log_profile[:, columns].astype(np.float32)
+        log_m = np.clip(log_m, math.log(_MIN_DISTANCE_M), math.log(_MAX_DISTANCE_M))
         number = np.floor(log_m / _BIN).astype(np.int32)
         low, bins = int(number.min()), int(np.ptp(number)) + 1
         at = number - low + np.arange(count, dtype=np.int32) * bins

@@ -34,7 +34,7 @@ _STEP_M = 0.5
 # these does, as the very best is a matter of luck.
 _COMPARED, _BEST = 64, 8
 # Costs are compared above this: it is what the best of pictures costs.
-_LEAST_COST = 0.01
+_MIN_COST = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,4 +127,4 @@ def log_cost_to_chance(
     pose = np.argsort(rough[np.arange(len(rough)), hypothesis], kind="stable")[:_COMPARED]
     by_chance, _ = evidence.pairs(cohort.layouts, pose, hypothesis[pose])
     best = np.sort(by_chance)[:_BEST]
-    return math.log((cost + _LEAST_COST) / (float(best.mean()) + _LEAST_COST))
+    return math.log((cost + _MIN_COST) / (float(best.mean()) + _MIN_COST))

@@ -23,7 +23,7 @@ _ANY_HEADING_STD = math.pi / math.sqrt(3.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Spread:
+class PoseUncertainty:
     """How sure a pose is.
 
     Attributes:
@@ -35,8 +35,10 @@ class Spread:
     heading_std: float | None
 
 
-def spread_of(information: Float[np.ndarray, "p p"], room: Room, model: ConfidenceModel) -> Spread | None:
-    """The spread of a pose in a room; None where the model has no factors for it.
+def pose_uncertainty(
+    information: Float[np.ndarray, "p p"], room: Room, model: ConfidenceModel
+) -> PoseUncertainty | None:
+    """The uncertainty of a pose in a room; None where the model has no factors for it.
 
     A direction that the picture says nothing of, as along a corridor without ends, is no more uncertain than a place
     anywhere in the room is: its standard deviation is at most the room's longest extent over √12. That of a heading is
@@ -54,7 +56,7 @@ def spread_of(information: Float[np.ndarray, "p p"], room: Room, model: Confiden
     heading_std = None
     if by_heading is not None and model.heading_factor is not None:
         heading_std = _heading_std(by_heading, model.heading_factor)
-    return Spread(0.5 * (covariance + covariance.T), heading_std)
+    return PoseUncertainty(0.5 * (covariance + covariance.T), heading_std)
 
 
 def marginal_information(

@@ -35,9 +35,9 @@ from lalaloc_core.localise.layouts import Layouts
 from lalaloc_core.localise.poses import PredictedCeiling, PredictedRoomType, Query
 
 # A prediction is never trusted beyond this: the scale of log distance of a centimetre at ten metres.
-_SHARPEST = 1e-3
+_MIN_SCALE = 1e-3
 # A predicted ceiling height is never trusted beyond this, as plans round their ceilings.
-_SHARPEST_CEILING = 0.04
+_MIN_CEILING_SCALE = 0.04
 _MIN_CLEARANCE_M = 0.05
 # Logarithms are dear: of so many factors, none above the limit, the product is taken before.
 _FACTORS, _MAX_FACTOR = 4, 1e9
@@ -343,7 +343,7 @@ class Evidence:
 def precisions(query: Query, reach_m: float, config: EvidenceConfig) -> Float[np.ndarray, "k w"]:
     """1 / (κ s), which differences of log distance are multiplied with, for every hypothesis."""
     assert query.profile is not None
-    scale = np.maximum(np.exp(query.profile.log_scale), _SHARPEST)
+    scale = np.maximum(np.exp(query.profile.log_scale), _MIN_SCALE)
     return 1.0 / (config.tail * np.hypot(scale, reach_m * np.exp(-query.profile.log_m)))
 
 
@@ -355,7 +355,7 @@ def ceiling_costs(
 ) -> Float[np.ndarray, "*n"]:
     """Cost of ceilings that are so far (m) above the camera, each at a δ."""
     difference = np.log(np.maximum(clearance_m, _MIN_CLEARANCE_M)) - (predicted.log_m + offset)
-    scale = config.tail * np.hypot(np.exp(predicted.log_scale), _SHARPEST_CEILING)
+    scale = config.tail * np.hypot(np.exp(predicted.log_scale), _MIN_CEILING_SCALE)
     return np.log1p(np.square(difference / scale))
 
 

@@ -33,10 +33,10 @@ _FIRST_CHUNK, _LAST_CHUNK, _BOUNDED_CHUNK = 128, 1024, 4096
 # So many neighbouring hypotheses share a bound.
 _NEIGHBOURS = 2
 # Sums of bounds stay below this, which is almost what a short integer holds.
-_MOST = 30_000
+_MAX_SUM = 30_000
 
 
-class Fewest:
+class LowestCosts:
     """Of pairs of a pose and a hypothesis that are offered, slice by slice, those of least cost."""
 
     def __init__(self, limit: int) -> None:
@@ -61,7 +61,7 @@ class Fewest:
         if self._kept > 2 * self._limit:
             self._drop()
 
-    def told(self) -> tuple[Float[np.ndarray, "m"], Int[np.ndarray, "m"]]:
+    def ranked(self) -> tuple[Float[np.ndarray, "m"], Int[np.ndarray, "m"]]:
         """Their costs, rising, and their places: pose times the number of hypotheses, plus hypothesis."""
         self._drop()
         cost, place = self._cost[0], self._place[0]
@@ -78,17 +78,17 @@ class Fewest:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Wanted:
+class PairLimits:
     """Which pairs of a pose and a hypothesis are looked for.
 
     Attributes:
-        limit: at most so many.
-        least: so many at least, if there are as many.
+        at_most: so many at most.
+        at_least: so many at least, if there are as many.
         window: the others only if they cost at most this more than the best.
     """
 
-    limit: int
-    least: int
+    at_most: int
+    at_least: int
     window: float = 0.0
 
 
@@ -96,7 +96,7 @@ def likeliest(
     binned: BinnedLayouts,
     evidence: Evidence,
     room_index: Int[np.ndarray, "n"],
-    wanted: Wanted,
+    wanted: PairLimits,
     against: Float[np.ndarray, "n"] | None = None,
 ) -> tuple[Float[np.ndarray, "m"], Int[np.ndarray, "m"]]:
     """Rough costs, rising, and places (pose times the number of hypotheses, plus hypothesis) of the likeliest pairs.
@@ -114,7 +114,7 @@ def likeliest(
     # Short integers are sorted in no time.
     order = possible[np.argsort(_shortened(bound[possible]), kind="stable")]
     least_after = np.minimum.accumulate(bound[order][::-1])[::-1]
-    best, least = Fewest(wanted.limit), Fewest(wanted.least)
+    best, least = LowestCosts(wanted.at_most), LowestCosts(wanted.at_least)
     lowest, first, count = np.inf, 0, _FIRST_CHUNK
     while first < len(order) and least_after[first] <= min(best.bound, max(lowest + wanted.window, least.bound)):
         pose = order[first : first + count]
@@ -124,13 +124,13 @@ def likeliest(
         least.offer(pose, cost)
         lowest = min(lowest, float(cost.min()))
         first, count = first + count, min(2 * count, _LAST_CHUNK)
-    return best.told()
+    return best.ranked()
 
 
 def _shortened(bound: Float[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
     """Numbers in about the same order."""
     low, span = float(bound.min(initial=np.inf)), float(np.ptp(bound)) if len(bound) else 0.0
-    return ((bound - low) * (_MOST / max(span, 1e-9))).astype(np.int16)
+    return ((bound - low) * (_MAX_SUM / max(span, 1e-9))).astype(np.int16)
 
 
 def _bounds(binned: BinnedLayouts, table: Float[np.ndarray, "r j k"]) -> Float[np.ndarray, "n"]:
@@ -140,7 +140,7 @@ def _bounds(binned: BinnedLayouts, table: Float[np.ndarray, "r j k"]) -> Float[n
     walls, openings = np.split(least, [azimuths * len(binned.bins)])
     # Every azimuth has one row of walls, and at most one of openings.
     most = azimuths * float(np.abs(walls).max() + np.abs(openings).max(initial=0.0))
-    scale = _MOST / max(most, 1e-6)
+    scale = _MAX_SUM / max(most, 1e-6)
     short = np.floor(least * scale).astype(np.int16)
     bound = np.empty(len(binned), np.float32)
     for first in range(0, len(binned), _BOUNDED_CHUNK):

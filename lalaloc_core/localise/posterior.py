@@ -151,11 +151,11 @@ def posterior_of(
         log_weight += _width_corrections(log_weight, mode, temperature * np.array([end.total_cost for end in ends]))
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
-    return told_of(pose, position, heading, weight, len(grid.poses), query, candidates)
+    return posterior_from_weights(pose, position, heading, weight, len(grid.poses), query, candidates)
 
 
 def _width_corrections(
-    log_weight: Float[np.ndarray, "m"], mode: Int[np.ndarray, "m"], depth: Float[np.ndarray, "r"]
+    log_weight: Float[np.ndarray, "m"], mode: Int[np.ndarray, "m"], nll: Float[np.ndarray, "r"]
 ) -> Float[np.ndarray, "m"]:
     """What makes refined modes as wide as the deepest of them.
 
@@ -163,16 +163,16 @@ def _width_corrections(
     differ in it.
 
     Args:
-        depth: (r,) negative log likelihood of each refined mode at its end.
+        nll: (r,) negative log likelihood of each refined mode at its end.
     """
-    correction, members = np.zeros(len(log_weight)), [mode == index for index in range(len(depth))]
+    correction, members = np.zeros(len(log_weight)), [mode == index for index in range(len(nll))]
     width = {
-        index: np.logaddexp.reduce(log_weight[member]) + depth[index]
+        index: np.logaddexp.reduce(log_weight[member]) + nll[index]
         for index, member in enumerate(members)
         if member.any()
     }
     if width:
-        deepest = width[min(width, key=lambda index: depth[index])]
+        deepest = width[min(width, key=lambda index: nll[index])]
         for index in width:
             correction[members[index]] = deepest - width[index]
     return correction
@@ -213,7 +213,7 @@ def _turned_alike(heading: Float[np.ndarray, "m"], query: Query, candidate: Cand
     return np.abs(turned) <= TURNED_APART
 
 
-def told_of(
+def posterior_from_weights(
     pose: Int[np.ndarray, "m"],
     position: Float[np.ndarray, "m 2"],
     heading: Float[np.ndarray, "m"],

@@ -15,14 +15,14 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.evidence import Evidence, EvidenceConfig, latent_distances
-from lalaloc_core.localise.first_look import Wanted, likeliest
+from lalaloc_core.localise.first_look import PairLimits, likeliest
 from lalaloc_core.localise.hints import NO_HINTS, HintName, Hints
 from lalaloc_core.localise.poses import Candidate, LatentGrid, Query
 from lalaloc_core.localise.posterior import NEGLIGIBLE, TURNED_APART, GridCosts
 from lalaloc_core.sampling import PoseSet, pose_grid
 
 # Pairs of a pose and a hypothesis that are compared in full: so many, and up to so many of those that may be probable.
-_LEAST_COMPARED, _MOST_COMPARED = 1024, 4096
+_MIN_COMPARED, _MAX_COMPARED = 1024, 4096
 # Where there are no more than that, all of them, as in a single room.
 _ALL_COMPARED = 2560
 # Of so many the cost is estimated by the first look, as they share what is probable.
@@ -31,7 +31,7 @@ _ESTIMATED = 65_536
 # nothing.
 _MARGIN = 0.35
 # The last so many of those compared in full tell how the first look errs about those that were not.
-_TELLING = 256
+_CALIBRATING = 256
 # The best pairs, which are looked at for distinct candidates; more if they hold too few.
 _FIRST_RANKED = 1024
 
@@ -104,7 +104,7 @@ class _Chosen(NamedTuple):
         """
         if not len(self.estimate):
             return 0.0
-        last = slice(max(len(self.seen) - _TELLING, 0), len(self.seen))
+        last = slice(max(len(self.seen) - _CALIBRATING, 0), len(self.seen))
         weight = -temperature * (cost[: len(self.seen)][last] - self.seen[last]).astype(np.float64)
         return float(np.log(len(weight)) - np.logaddexp.reduce(weight)) / temperature
 
@@ -128,15 +128,15 @@ def _chosen(
         return _Chosen(np.arange(pairs), pairs, nothing, nothing)
     window = _MARGIN + NEGLIGIBLE / temperature
     binned, room_index = grid.binned(plan), grid.poses.room_index
-    wanted = Wanted(limit=_ESTIMATED, least=_LEAST_COMPARED, window=window)
+    wanted = PairLimits(at_most=_ESTIMATED, at_least=_MIN_COMPARED, window=window)
     total, pair = likeliest(binned, evidence, room_index, wanted, against)
     probable = int(np.searchsorted(total, total[0] + window))
-    compared = min(max(probable, _LEAST_COMPARED), _MOST_COMPARED, len(pair))
+    compared = min(max(probable, _MIN_COMPARED), _MAX_COMPARED, len(pair))
     cost = total if against is None else total - against[pair // evidence.hypotheses]
     seen, estimate = cost[:compared], cost[compared:probable]
     first, others = pair[:compared], pair[compared:probable]
     if doubted is not None:
-        wanted = Wanted(limit=_LEAST_COMPARED, least=_LEAST_COMPARED)
+        wanted = PairLimits(at_most=_MIN_COMPARED, at_least=_MIN_COMPARED)
         beyond = likeliest(binned, evidence, room_index, wanted, doubted)[1]
         first = np.append(first, np.setdiff1d(beyond, pair[:probable]))
     return _Chosen(np.append(first, others), len(first), seen, estimate)

@@ -25,7 +25,7 @@ from lalaloc_core.render.profile import inverse_crossings
 _MAX_DISTANCE_M = 1e6
 
 
-class Sensitivity(NamedTuple):
+class ProfileJacobian(NamedTuple):
     """Log wall profiles and what they change by.
 
     Attributes:
@@ -41,7 +41,7 @@ class Sensitivity(NamedTuple):
 
 def log_profile_gradient(
     position_m: Float[Array, "b 2"], heading: Float[Array, "b"], walls_m: Float[Array, "b n 4"], columns: int
-) -> Sensitivity:
+) -> ProfileJacobian:
     """What `log(wall_profile(...))` is and how it changes, for the cost of little more than the profile.
 
     Args:
@@ -57,7 +57,7 @@ def log_profile_gradient(
 
 def log_distance_gradient(
     origin_m: Float[Array, "b 2"], azimuth: Float[Array, "b c"], walls_m: Float[Array, "b n 4"]
-) -> Sensitivity:
+) -> ProfileJacobian:
     """As `log_profile_gradient`, along any azimuths (radians)."""
     xp = array_namespace(origin_m, azimuth, walls_m)
     crossings = inverse_crossings(origin_m, azimuth, walls_m)
@@ -66,4 +66,4 @@ def log_distance_gradient(
     edge_x = xp.take_along_axis(crossings.edge_x, wall, axis=1)
     edge_y = xp.take_along_axis(crossings.edge_y, wall, axis=1)
     turned = -(xp.cos(azimuth) * edge_y + xp.sin(azimuth) * edge_x) / inverse_m
-    return Sensitivity(-xp.log(inverse_m), xp.stack([-edge_y, edge_x, turned], axis=1), wall)
+    return ProfileJacobian(-xp.log(inverse_m), xp.stack([-edge_y, edge_x, turned], axis=1), wall)

@@ -36,7 +36,7 @@ _TIMED_LIMIT = 20
 
 
 @dataclass(frozen=True, kw_only=True)
-class Workbench:
+class TableMaker:
     """Where tables are made.
 
     Attributes:

@@ -17,7 +17,7 @@ from lalaloc_core.training.stretching import stretched
 
 # Rooms are drawn out or pushed together along two axes by factors between these, evenly in logs: half of the
 # photographs without labels that there are were taken in halls, which so become rooms.
-_LEAST_STRETCH, _MOST_STRETCH = 0.5, 1.6
+_MIN_STRETCH, _MAX_STRETCH = 0.5, 1.6
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class Photographs:
         chosen = torch.randint(len(self.images), (count,), generator=generator)
         shifts = torch.randint(width, (count,), generator=generator)
         mirrored = torch.randint(2, (count,), generator=generator).bool()
-        low, high = np.log(_LEAST_STRETCH), np.log(_MOST_STRETCH)
+        low, high = np.log(_MIN_STRETCH), np.log(_MAX_STRETCH)
         factors = torch.exp(low + (high - low) * torch.rand(count, 2, generator=generator))
         turns = list(zip(chosen.tolist(), shifts.tolist(), strict=True))
         images, openings, log_distance = (

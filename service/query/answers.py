@@ -10,7 +10,7 @@ from lalaloc_core.bundle import Bundle
 from lalaloc_core.conventions import heading_to_degrees
 from lalaloc_core.earth import Anchor
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.covariance import spread_of
+from lalaloc_core.localise.covariance import pose_uncertainty
 from lalaloc_core.localise.pipeline import Localisation, panorama_heading
 from lalaloc_core.localise.poses import Candidate, Query
 from service.query.geopose import geopose_of
@@ -64,7 +64,7 @@ def compose(
     answer, spread = found.best[found.stage], None
     if model is not None and answer.information is not None:
         at = places(answer)
-        spread = spread_of(answer.information, at.plan.rooms[at.candidate.room_index], model)
+        spread = pose_uncertainty(answer.information, at.plan.rooms[at.candidate.room_index], model)
     fits = None if model is None else found.fit_probability(model)
     fits = None if fits is None else fits * share
     candidates = [

@@ -9,12 +9,12 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
 
 from lalaloc_core.localise.sequence import Motion
-from lalaloc_core.localise.sequence.motion import LEAST_ANGLE_STD, LEAST_DISTANCE_STD_M, MAX_DISTANCE_M
+from lalaloc_core.localise.sequence.motion import MAX_DISTANCE_M, MIN_ANGLE_STD, MIN_DISTANCE_STD_M
 from service.schemas.camera_fields import CameraFields
 from service.schemas.fields import Finite
 
 Angle = Annotated[float, Finite, Field(ge=-360, le=360)]
-AngleStd = Annotated[float, Finite, Field(ge=math.degrees(LEAST_ANGLE_STD), le=180)]
+AngleStd = Annotated[float, Finite, Field(ge=math.degrees(MIN_ANGLE_STD), le=180)]
 _UNKNOWN = Motion()
 
 
@@ -31,7 +31,7 @@ class StatedMotion(BaseModel):
         None, ge=0, le=MAX_DISTANCE_M, description="Between the two places, as the crow flies."
     )
     distance_std_m: Annotated[float, Finite] = Field(
-        _UNKNOWN.distance_std_m, ge=LEAST_DISTANCE_STD_M, le=MAX_DISTANCE_M, description="Its standard deviation."
+        _UNKNOWN.distance_std_m, ge=MIN_DISTANCE_STD_M, le=MAX_DISTANCE_M, description="Its standard deviation."
     )
     turn_deg: Angle | None = Field(
         None, description="Heading of the second panorama minus that of the first, clockwise seen from above."

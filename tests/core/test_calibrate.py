@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from lalaloc_core.bundle import Bundle, ConfidenceModel, EvidenceModel, LogisticModel, write_manifest
 from lalaloc_core.calibrate import Answers, calibrate, fit_confidence, fit_evidence
-from lalaloc_core.evaluation.predictions import Pose, Prediction, Rival
+from lalaloc_core.evaluation.predictions import Pose, PredictedCandidate, Prediction
 from lalaloc_core.evaluation.score import expected_calibration_error, position_errors_m
 from tests.strategies import seeds
 
@@ -193,7 +193,7 @@ class TestEvidence:
         score = -(terms @ weights)
         right = rng.choice(10, p=np.exp(score) / np.exp(score).sum())
         rivals = [
-            Rival(
+            PredictedCandidate(
                 pose=dataclasses.replace(TRUTH, x_m=0.2 if k == right else 3.0 + k),
                 terms=dict(zip(("walls", "openings", "ceiling", "room_type"), map(float, row), strict=True))
                 | {"height": 0.0},

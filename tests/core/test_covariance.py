@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from lalaloc_core.bundle import ConfidenceModel
 from lalaloc_core.floorplan import Room
-from lalaloc_core.localise.covariance import Spread, marginal_information, spread_of
+from lalaloc_core.localise.covariance import PoseUncertainty, marginal_information, pose_uncertainty
 from tests.strategies import plan_of, rectangle, seeds
 
 MODEL = ConfidenceModel(
@@ -34,8 +34,8 @@ def information(seed: int, size: int, rank: int | None = None) -> np.ndarray:
     return (10.0 * full).astype(np.float32)
 
 
-def spread(given: np.ndarray, room: Room, model: ConfidenceModel = MODEL) -> Spread:
-    found = spread_of(given, room, model)
+def spread(given: np.ndarray, room: Room, model: ConfidenceModel = MODEL) -> PoseUncertainty:
+    found = pose_uncertainty(given, room, model)
     assert found is not None
     return found
 
@@ -86,9 +86,11 @@ class TestSpread:
     )
     def test_a_model_without_the_factor_has_none(self, room: Room, size: int, missing: str) -> None:
         model = dataclasses.replace(MODEL, **{missing: None})
-        assert spread_of(information(0, size), room, model) is None
+        assert pose_uncertainty(information(0, size), room, model) is None
         other = 5 - size
-        assert (spread_of(information(0, other), room, model) is None) == (missing == "heading_factor" and other == 3)
+        assert (pose_uncertainty(information(0, other), room, model) is None) == (
+            missing == "heading_factor" and other == 3
+        )
 
 
 class TestMarginalInformation:

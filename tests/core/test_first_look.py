@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from lalaloc_core.bundle import EvidenceModel
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.evidence import Evidence, EvidenceConfig
-from lalaloc_core.localise.first_look import Fewest, Wanted, _bounds, _table, first_costs, likeliest
+from lalaloc_core.localise.first_look import LowestCosts, PairLimits, _bounds, _table, first_costs, likeliest
 from lalaloc_core.localise.layouts import layouts_at
 from lalaloc_core.localise.poses import LatentGrid, PredictedOpenings, PredictedProfile, Query, rolled
 from lalaloc_core.localise.retrieval import grid_costs, retrieve
@@ -94,8 +94,8 @@ def test_the_best_place_and_the_posterior_are_those_of_comparing_everything(
 def test_what_is_only_estimated_has_its_share_of_the_probability(
     building: Building, grid: LatentGrid, queries: list[Query], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("lalaloc_core.localise.retrieval._LEAST_COMPARED", 64)
-    monkeypatch.setattr("lalaloc_core.localise.retrieval._MOST_COMPARED", 64)
+    monkeypatch.setattr("lalaloc_core.localise.retrieval._MIN_COMPARED", 64)
+    monkeypatch.setattr("lalaloc_core.localise.retrieval._MAX_COMPARED", 64)
     # So little sure of anything that thousands of pairs share what is probable.
     unsure = EvidenceModel(temperature=8.0, openings=0.4)
     ratios = []
@@ -125,10 +125,12 @@ def test_openings_and_what_lies_behind_them_count_for_pairs_as_for_all(
     assert (found == offset[hypothesis, pose]).mean() > 0.99
 
 
-@pytest.mark.parametrize("wanted", [Wanted(limit=6000, least=200, window=0.5), Wanted(limit=300, least=300)])
+@pytest.mark.parametrize(
+    "wanted", [PairLimits(at_most=6000, at_least=200, window=0.5), PairLimits(at_most=300, at_least=300)]
+)
 @pytest.mark.parametrize("hinted", [False, True])
 def test_the_likeliest_pairs_are_those_of_a_first_look_at_all(
-    building: Building, grid: LatentGrid, queries: list[Query], wanted: Wanted, hinted: bool
+    building: Building, grid: LatentGrid, queries: list[Query], wanted: PairLimits, hinted: bool
 ) -> None:
     looked_at, rng = 0, np.random.default_rng(2)
     for query in queries[:8]:
@@ -139,10 +141,10 @@ def test_the_likeliest_pairs_are_those_of_a_first_look_at_all(
         every = every if against is None else every + against[:, None]
         found, place = likeliest(binned, evidence, room_index, wanted, against)
         count = int((every <= every.min() + wanted.window).sum())
-        count = min(max(count, wanted.least), wanted.limit)
+        count = min(max(count, wanted.at_least), wanted.at_most)
         np.testing.assert_allclose(found[:count], np.sort(every.ravel())[:count], atol=1e-6)
         np.testing.assert_allclose(every.ravel()[place], found, atol=1e-6)
-        assert len(np.unique(place)) == len(place) <= wanted.limit
+        assert len(np.unique(place)) == len(place) <= wanted.at_most
         looked_at += len(np.unique(place // HYPOTHESES))
     assert looked_at < 8 * len(grid.poses)
 
@@ -167,10 +169,10 @@ def test_the_fewest_of_slices_are_those_of_the_whole(seed: int, limit: int) -> N
     rng = np.random.default_rng(seed)
     cost = rng.normal(size=(90, 3))
     cost[rng.random(cost.shape) < 0.2] = np.inf
-    fewest = Fewest(limit)
+    fewest = LowestCosts(limit)
     for first in range(0, 90, 16):
         fewest.offer(np.arange(first, min(first + 16, 90)), cost[first : first + 16])
-    found, place = fewest.told()
+    found, place = fewest.ranked()
     finite = np.sort(cost[np.isfinite(cost)])
     np.testing.assert_array_equal(found, finite[:limit])
     np.testing.assert_array_equal(cost.ravel()[place], found)

@@ -139,8 +139,8 @@ def test_of_large_grids_what_hints_allow_is_compared_however_badly_it_fits(
     plan: FloorPlan, grid: LatentGrid, encoders: Encoders, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("lalaloc_core.localise.retrieval._ALL_COMPARED", 0)
-    monkeypatch.setattr("lalaloc_core.localise.retrieval._LEAST_COMPARED", 8)
-    monkeypatch.setattr("lalaloc_core.localise.retrieval._MOST_COMPARED", 8)
+    monkeypatch.setattr("lalaloc_core.localise.retrieval._MIN_COMPARED", 8)
+    monkeypatch.setattr("lalaloc_core.localise.retrieval._MAX_COMPARED", 8)
     query = sees(encoders, plan, PoseSet(np.array([[2.1, 5.7]]), np.array([2])))
     hints = Hints(rooms=frozenset({1}), strict=True)
     costs = grid_costs(plan, grid, query, encoders.manifest.evidence, EvidenceConfig(), hints)

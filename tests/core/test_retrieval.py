@@ -185,8 +185,8 @@ class TestRetrieval:
         )
         everything = best_places(grid, query, top_k=3)
         monkeypatch.setattr("lalaloc_core.localise.retrieval._ALL_COMPARED", 0)
-        monkeypatch.setattr("lalaloc_core.localise.retrieval._LEAST_COMPARED", 50)
-        monkeypatch.setattr("lalaloc_core.localise.retrieval._MOST_COMPARED", 50)
+        monkeypatch.setattr("lalaloc_core.localise.retrieval._MIN_COMPARED", 50)
+        monkeypatch.setattr("lalaloc_core.localise.retrieval._MAX_COMPARED", 50)
         costs = grid_costs(PLAN, grid, query, EvidenceModel(), EvidenceConfig())
         assert costs.compared == 50
         assert best_places(grid, query, top_k=3)[:2] == everything[:2]

@@ -20,7 +20,7 @@ from lalaloc_core.localise.poses import LatentGrid, PredictedProfile, Query
 from lalaloc_core.localise.retrieval import build_grid
 from lalaloc_core.localise.sequence.chain import best_paths, forward_backward
 from lalaloc_core.localise.sequence.joint import motion_residuals, refine_sequence
-from lalaloc_core.localise.sequence.motion import FLOOR, Link, Motion, States, link
+from lalaloc_core.localise.sequence.motion import FLOOR, Motion, States, Transition, transition
 from lalaloc_core.localise.sequence.search import SequenceRefiner, localise_sequence
 from lalaloc_core.sampling import PoseSet
 from tests.strategies import plan_of, rectangle
@@ -40,8 +40,8 @@ def states(seed: int, places: int, headings: int) -> States:
     return States(rng.uniform(0.0, 2.0, (places, 2)), 0.3 * seed + sector * np.arange(headings), sector)
 
 
-def dense(made: Link, motion: Motion) -> np.ndarray:
-    """What a link says of every pair of states, (n k, m l)."""
+def dense(made: Transition, motion: Motion) -> np.ndarray:
+    """What a transition says of every pair of states, (n k, m l)."""
     n, k, m, after = made.sizes
     places = np.ones((m, k, n))
     if made.places is not None:
@@ -55,19 +55,19 @@ def dense(made: Link, motion: Motion) -> np.ndarray:
 
 
 @pytest.fixture(params=MOTIONS, ids=str)
-def chain(request: Any) -> tuple[list[np.ndarray], list[Link], np.ndarray, list[np.ndarray]]:
+def chain(request: Any) -> tuple[list[np.ndarray], list[Transition], np.ndarray, list[np.ndarray]]:
     motion = MOTIONS[request.param]
     pictures = [states(0, 5, 4), states(1, 4, 3), states(2, 6, 1)]
     rng = np.random.default_rng(5)
     log_likelihood = [rng.normal(0.0, 2.0, (2, len(one.position_m), len(one.heading))) for one in pictures]
-    links = [link(motion, *pair, 0.5) for pair in itertools.pairwise(pictures)]
-    return log_likelihood, links, np.log([0.3, 0.7]), [dense(one, motion) for one in links]
+    transitions = [transition(motion, *pair, 0.5) for pair in itertools.pairwise(pictures)]
+    return log_likelihood, transitions, np.log([0.3, 0.7]), [dense(one, motion) for one in transitions]
 
 
 class TestChain:
     def test_sums_over_paths_are_those_of_all_of_them(self, chain: Any) -> None:
-        log_likelihood, links, log_prior, pairs = chain
-        found = forward_backward(log_likelihood, links, log_prior)
+        log_likelihood, transitions, log_prior, pairs = chain
+        found = forward_backward(log_likelihood, transitions, log_prior)
         shape = [one[0].size for one in log_likelihood]
         total, height, state = 0.0, np.zeros(2), [np.zeros(size) for size in shape]
         for j in range(2):
@@ -86,15 +86,15 @@ class TestChain:
             np.testing.assert_allclose(one.ravel(), expected / total, atol=1e-12)
 
     def test_the_best_path_through_every_state_is_the_best_of_all_through_it(self, chain: Any) -> None:
-        log_likelihood, links, _, pairs = chain
+        log_likelihood, transitions, _, pairs = chain
         one_height = [one[0] for one in log_likelihood]
-        found = best_paths(one_height, links)
+        found = best_paths(one_height, transitions)
         shape = [one.size for one in one_height]
         best = [np.full(size, -np.inf) for size in shape]
         # Of a sum of what is measured and the floor, the better counts.
         parts = [
             np.log(np.maximum(pair - (FLOOR if made.floor else 0.0), made.floor))
-            for pair, made in zip(pairs, links, strict=True)
+            for pair, made in zip(pairs, transitions, strict=True)
         ]
 
         def score(path: tuple[int, ...]) -> float:
@@ -112,14 +112,16 @@ class TestChain:
                 assert score(tuple(path)) == pytest.approx(expected[s], abs=1e-9)
 
     def test_some_of_the_poses_alone_are_the_same_chain(self, chain: Any) -> None:
-        log_likelihood, links, log_prior, _ = chain
+        log_likelihood, transitions, log_prior, _ = chain
         kept = [np.array([0, 2, 3]), np.array([1, 3]), np.array([0, 4, 5])]
         part = [one[:, index] for one, index in zip(log_likelihood, kept, strict=True)]
-        among = [made.among(*pair) for made, pair in zip(links, itertools.pairwise(kept), strict=True)]
+        among = [made.among(*pair) for made, pair in zip(transitions, itertools.pairwise(kept), strict=True)]
         masked = [np.full_like(one, -1e3) for one in log_likelihood]
         for one, whole, index in zip(masked, log_likelihood, kept, strict=True):
             one[:, index] = whole[:, index]
-        found, expected = (forward_backward(one, made, log_prior) for one, made in ((part, among), (masked, links)))
+        found, expected = (
+            forward_backward(one, made, log_prior) for one, made in ((part, among), (masked, transitions))
+        )
         assert found.log_evidence == pytest.approx(expected.log_evidence, abs=1e-9)
         for one, whole, index in zip(found.state, expected.state, kept, strict=True):
             np.testing.assert_allclose(one, whole[index], atol=1e-12)
@@ -128,8 +130,8 @@ class TestChain:
         rng = np.random.default_rng(1)
         log_likelihood = [rng.normal(0.0, 3.0, (3, 6, 4)) for _ in range(3)]
         pictures = [states(seed, 6, 4) for seed in range(3)]
-        links = [link(Motion(), *pair, 0.5) for pair in itertools.pairwise(pictures)]
-        found = forward_backward(log_likelihood, links, np.log(np.full(3, 1 / 3)))
+        transitions = [transition(Motion(), *pair, 0.5) for pair in itertools.pairwise(pictures)]
+        found = forward_backward(log_likelihood, transitions, np.log(np.full(3, 1 / 3)))
         by_height = np.exp(sum(np.logaddexp.reduce(one.reshape(3, -1), axis=1) for one in log_likelihood))
         np.testing.assert_allclose(found.height, by_height / by_height.sum())
         for one, state in zip(log_likelihood, found.state, strict=True):
@@ -158,12 +160,12 @@ def test_a_direction_that_says_next_to_nothing_costs_no_more_than_a_distance() -
     position = np.stack(np.meshgrid(np.arange(side), np.arange(side)), axis=-1).reshape(-1, 2) * 0.5
     many = States(position, np.linspace(0.0, math.tau, 64, endpoint=False), math.tau / 64)
     vague = Motion(distance_m=2.0, distance_std_m=1000.0, direction=0.3, direction_std=math.pi)
-    made = link(vague, many, many, 0.5)
+    made = transition(vague, many, many, 0.5)
     assert made.places is not None
     assert not made.is_directed
     assert made.places.nnz <= len(position) ** 2
     # A walk with usual odometry keeps its direction.
-    usual = link(Motion(distance_m=2.4, distance_std_m=0.12, direction=0.3, direction_std=0.035), many, many, 0.5)
+    usual = transition(Motion(distance_m=2.4, distance_std_m=0.12, direction=0.3, direction_std=0.035), many, many, 0.5)
     assert usual.is_directed
     assert usual.places is not None
     assert usual.places.nnz < 4_000_000

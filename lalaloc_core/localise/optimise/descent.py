@@ -13,7 +13,7 @@ from lalaloc_core.localise.optimise.config import LpoConfig
 from lalaloc_core.localise.optimise.problem import Evaluation, Problem
 
 
-class Outcome(NamedTuple):
+class DescentResult(NamedTuple):
     """Where poses ended, what they are there, whether they converged, and how many evaluations it took."""
 
     pose: Float[Tensor, "k p"]
@@ -22,7 +22,7 @@ class Outcome(NamedTuple):
     evaluations: int
 
 
-def levenberg_marquardt(problem: Problem, config: LpoConfig) -> Outcome:
+def levenberg_marquardt(problem: Problem, config: LpoConfig) -> DescentResult:
     """Damped Gauss-Newton with Marquardt's scaling; each pose has its own damping and stops on its own."""
     pose = problem.start.clone()
     here = problem.evaluate(pose)
@@ -57,7 +57,7 @@ def levenberg_marquardt(problem: Problem, config: LpoConfig) -> Outcome:
         pose[rows[chosen]] += step[chosen]
         here.take_over(rows[chosen], there.rows(chosen))
         damping[rows] = (damping[rows] * torch.where(better, 0.2, 6.0)).clamp(1e-6, 1e8)
-    return Outcome(pose, here, converged, evaluations)
+    return DescentResult(pose, here, converged, evaluations)
 
 
 def _step(here: Evaluation, damping: Float[Tensor, "k"]) -> Float[Tensor, "k p"]:
@@ -72,7 +72,7 @@ def _worth_going_on(problem: Problem, here: Evaluation, config: LpoConfig) -> Te
     return nearest + config.prune_margin if problem.norm == "cauchy" else config.prune_ratio * nearest
 
 
-def adam(problem: Problem, config: LpoConfig) -> Outcome:
+def adam(problem: Problem, config: LpoConfig) -> DescentResult:
     """Adam, its rate halved on plateaus, stopped when the cost no longer falls (paper, section A.3)."""
     pose = problem.start
     count = len(pose)
@@ -104,4 +104,4 @@ def adam(problem: Problem, config: LpoConfig) -> Outcome:
         second = 0.999 * second + 0.001 * gradient.square()
         direction = first / (1.0 - 0.9**step_number) / ((second / (1.0 - 0.999**step_number)).sqrt() + 1e-8)
         pose = pose + problem.stay_inside(pose, -rate[:, None] * direction, config)
-    return Outcome(best_pose, problem.evaluate(best_pose), stop_age >= config.adam_stop_patience, step_number)
+    return DescentResult(best_pose, problem.evaluate(best_pose), stop_age >= config.adam_stop_patience, step_number)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from lalaloc_core.localise.optimise.config import LpoConfig
 from lalaloc_core.localise.poses import RefinementJob
-from lalaloc_core.render.gradient import Sensitivity, log_distance_gradient, log_profile_gradient
+from lalaloc_core.render.gradient import ProfileJacobian, log_distance_gradient, log_profile_gradient
 
 # What is compared with the targets (k, d): a function of wall profiles (k, columns), camera and ceiling heights (k,).
 Embedding = Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -121,7 +121,7 @@ class Problem:
             residual, jacobian = residual * self._precision, jacobian * self._precision[:, None]
         return self._weighed(pose, residual, jacobian)
 
-    def _embedded(self, layout: Sensitivity) -> tuple[Float[Tensor, "k d"], Float[Tensor, "k m d"]]:
+    def _embedded(self, layout: ProfileJacobian) -> tuple[Float[Tensor, "k d"], Float[Tensor, "k m d"]]:
         """What the embedding makes of layouts, and its derivatives by the unknowns that move them."""
         by_pose = layout.by_pose[:, : self._moving]
         if self._embedding is None:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy.sparse import csr_array
 
-from lalaloc_core.localise.sequence.motion import Link
+from lalaloc_core.localise.sequence.motion import Transition
 
 # Pairs of places times headings that are compared at a time, to bound memory.
 _COMPARED = 4_000_000
@@ -35,13 +35,15 @@ class Marginals:
 
 
 def forward_backward(
-    log_likelihood: Sequence[Float[np.ndarray, "j _ _"]], links: Sequence[Link], log_prior: Float[np.ndarray, "j"]
+    log_likelihood: Sequence[Float[np.ndarray, "j _ _"]],
+    transitions: Sequence[Transition],
+    log_prior: Float[np.ndarray, "j"],
 ) -> Marginals:
     """Sum over all paths.
 
     Args:
         log_likelihood: of every picture, by height and state.
-        links: between neighbours.
+        transitions: between neighbours.
         log_prior: of the heights.
     """
     peak = [float(one.max()) for one in log_likelihood]
@@ -50,7 +52,7 @@ def forward_backward(
     message = np.ones((len(log_prior), 1, 1))
     for index, one in enumerate(likelihood):
         if index:
-            message = _onwards(links[index - 1], forward[-1])
+            message = _onwards(transitions[index - 1], forward[-1])
         joint, log_scale = _scaled(message * one)
         log_sum = log_sum + log_scale
         forward.append(joint)
@@ -60,7 +62,7 @@ def forward_backward(
     behind = np.ones((len(log_prior), 1, 1))
     for index in reversed(range(len(forward))):
         if index + 1 < len(forward):
-            behind = _scaled(_back(links[index], behind * likelihood[index + 1]))[0]
+            behind = _scaled(_back(transitions[index], behind * likelihood[index + 1]))[0]
         both = forward[index] * behind
         total = both.sum(axis=(1, 2), keepdims=True)
         state[index] = (both * (height[:, None, None] / np.where(total > 0.0, total, 1.0))).sum(axis=0)
@@ -75,40 +77,40 @@ def _scaled(values: Float[np.ndarray, "j n k"]) -> tuple[Float[np.ndarray, "j n 
         return values / safe[:, None, None], np.log(total)
 
 
-def _onwards(link: Link, message: Float[np.ndarray, "j n k"]) -> Float[np.ndarray, "j m l"]:
-    """Sum over the states of the first picture of a link."""
-    heights, (_, k, m, after) = len(message), link.sizes
+def _onwards(transition: Transition, message: Float[np.ndarray, "j n k"]) -> Float[np.ndarray, "j m l"]:
+    """Sum over the states of the first picture of a transition."""
+    heights, (_, k, m, after) = len(message), transition.sizes
     total = message.sum(axis=(1, 2), keepdims=True)
-    if link.places is None:
+    if transition.places is None:
         placed = np.broadcast_to(message.sum(axis=1, keepdims=True), (heights, m, k))
-    elif link.is_directed:
-        placed = (link.places @ message.reshape(heights, -1).T).T.reshape(heights, m, k)
+    elif transition.is_directed:
+        placed = (transition.places @ message.reshape(heights, -1).T).T.reshape(heights, m, k)
     else:
         columns = message.transpose(1, 0, 2).reshape(message.shape[1], -1)
-        placed = (link.places @ columns).reshape(m, heights, k).transpose(1, 0, 2)
-    if link.turns is None:
+        placed = (transition.places @ columns).reshape(m, heights, k).transpose(1, 0, 2)
+    if transition.turns is None:
         turned = np.broadcast_to(placed.sum(axis=2, keepdims=True), (heights, m, after))
     else:
-        turned = placed @ link.turns
-    return turned + link.floor * total
+        turned = placed @ transition.turns
+    return turned + transition.floor * total
 
 
-def _back(link: Link, message: Float[np.ndarray, "j m l"]) -> Float[np.ndarray, "j n k"]:
-    """Sum over the states of the second picture of a link."""
-    heights, (n, k, m, _) = len(message), link.sizes
+def _back(transition: Transition, message: Float[np.ndarray, "j m l"]) -> Float[np.ndarray, "j n k"]:
+    """Sum over the states of the second picture of a transition."""
+    heights, (n, k, m, _) = len(message), transition.sizes
     total = message.sum(axis=(1, 2), keepdims=True)
-    if link.turns is None:
+    if transition.turns is None:
         turned = np.broadcast_to(message.sum(axis=2, keepdims=True), (heights, m, k))
     else:
-        turned = message @ link.turns.T
-    if link.places is None:
+        turned = message @ transition.turns.T
+    if transition.places is None:
         placed = np.broadcast_to(turned.sum(axis=1, keepdims=True), (heights, n, k))
-    elif link.is_directed:
-        placed = (link.places.T @ turned.reshape(heights, -1).T).T.reshape(heights, n, k)
+    elif transition.is_directed:
+        placed = (transition.places.T @ turned.reshape(heights, -1).T).T.reshape(heights, n, k)
     else:
         columns = turned.transpose(1, 0, 2).reshape(m, -1)
-        placed = (link.places.T @ columns).reshape(n, heights, k).transpose(1, 0, 2)
-    return placed + link.floor * total
+        placed = (transition.places.T @ columns).reshape(n, heights, k).transpose(1, 0, 2)
+    return placed + transition.floor * total
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,48 +137,51 @@ class BestPaths:
         return path
 
 
-def best_paths(log_likelihood: Sequence[Float[np.ndarray, "_ _"]], links: Sequence[Link]) -> BestPaths:
+def best_paths(log_likelihood: Sequence[Float[np.ndarray, "_ _"]], transitions: Sequence[Transition]) -> BestPaths:
     """Viterbi's algorithm in both directions, at one height."""
     count = len(log_likelihood)
     reached, left = list(log_likelihood), [np.zeros_like(one) for one in log_likelihood]
     nothing = [np.full(one.shape, -1) for one in log_likelihood]
     before, after = list(nothing), list(nothing)
     for index in range(1, count):
-        best, before[index] = _best_onwards(links[index - 1], reached[index - 1])
+        best, before[index] = _best_onwards(transitions[index - 1], reached[index - 1])
         reached[index] = best + log_likelihood[index]
     for index in reversed(range(count - 1)):
-        left[index], after[index] = _best_back(links[index], left[index + 1] + log_likelihood[index + 1])
+        left[index], after[index] = _best_back(transitions[index], left[index + 1] + log_likelihood[index + 1])
     return BestPaths([one + other for one, other in zip(reached, left, strict=True)], before, after)
 
 
 _Best = tuple[Float[np.ndarray, "_ _"], Int[np.ndarray, "_ _"]]
 
 
-def _best_onwards(link: Link, score: Float[np.ndarray, "n k"]) -> _Best:
-    """The best first state for every second one of a link."""
-    _, k, m, after = link.sizes
-    placed, place = _best_place(link, score, m)
-    turned, heading = _best_heading(placed, link.turns, after)
+def _best_onwards(transition: Transition, score: Float[np.ndarray, "n k"]) -> _Best:
+    """The best first state for every second one of a transition."""
+    _, k, m, after = transition.sizes
+    placed, place = _best_place(transition, score, m)
+    turned, heading = _best_heading(placed, transition.turns, after)
     state = np.take_along_axis(place, heading, axis=1) * k + heading
-    return _or_floor(link, score, turned, state)
+    return _or_floor(transition, score, turned, state)
 
 
-def _best_back(link: Link, score: Float[np.ndarray, "m l"]) -> _Best:
-    """The best second state for every first one of a link."""
-    n, k, _, after = link.sizes
-    turned, heading = _best_heading(score, None if link.turns is None else link.turns.T, k)
-    placed, place = _best_place(link, turned, n, backwards=True)
+def _best_back(transition: Transition, score: Float[np.ndarray, "m l"]) -> _Best:
+    """The best second state for every first one of a transition."""
+    n, k, _, after = transition.sizes
+    turned, heading = _best_heading(score, None if transition.turns is None else transition.turns.T, k)
+    placed, place = _best_place(transition, turned, n, backwards=True)
     state = place * after + np.take_along_axis(heading, place, axis=0)
-    return _or_floor(link, score, placed, state)
+    return _or_floor(transition, score, placed, state)
 
 
 def _or_floor(
-    link: Link, score: Float[np.ndarray, "n k"], found: Float[np.ndarray, "m l"], state: Int[np.ndarray, "m l"]
+    transition: Transition,
+    score: Float[np.ndarray, "n k"],
+    found: Float[np.ndarray, "m l"],
+    state: Int[np.ndarray, "m l"],
 ) -> _Best:
-    """What was found, or the best state of all where the link has nothing better than its floor."""
-    if not link.floor:
+    """What was found, or the best state of all where the transition has nothing better than its floor."""
+    if not transition.floor:
         return found, state
-    anywhere = float(score.max()) + np.log(link.floor)
+    anywhere = float(score.max()) + np.log(transition.floor)
     wrong = found < anywhere
     return np.where(wrong, anywhere, found), np.where(wrong, int(score.argmax()), state)
 
@@ -198,15 +203,17 @@ def _best_heading(score: Float[np.ndarray, "n k"], turns: Float[np.ndarray, "k l
     return value, best
 
 
-def _best_place(link: Link, score: Float[np.ndarray, "n k"], places: int, *, backwards: bool = False) -> _Best:
+def _best_place(
+    transition: Transition, score: Float[np.ndarray, "n k"], places: int, *, backwards: bool = False
+) -> _Best:
     """The best of the places before for every one after, heading by heading of the first picture."""
     headings = score.shape[1]
-    if link.places is None:
+    if transition.places is None:
         best = score.argmax(axis=0)[None]
         value = np.take_along_axis(score, best, axis=0)
         return np.repeat(value, places, axis=0), np.repeat(best, places, axis=0)
-    pairs = link.places.T.tocsr() if backwards else link.places
-    if link.is_directed:
+    pairs = transition.places.T.tocsr() if backwards else transition.places
+    if transition.is_directed:
         value, best = _best_of_rows(pairs, score.reshape(-1, 1))
         return value.reshape(places, headings), best.reshape(places, headings) // headings
     return _best_of_rows(pairs, score)

@@ -28,17 +28,17 @@ from lalaloc_core.errors import InvalidMotionError
 # Likelihood of a measurement that is wrong altogether, in units of that of a perfect one.
 FLOOR = 1e-4
 # Pairs that are off by more deviations than these are no more likely than the floor.
-_FARTHEST = math.sqrt(-2.0 * math.log(FLOOR))
+_MAX_DEVIATIONS = math.sqrt(-2.0 * math.log(FLOOR))
 MAX_DISTANCE_M = 1000.0
 # Deviations must be more than nothing: exact measurements would leave no pair of grid poses.
-LEAST_DISTANCE_STD_M, LEAST_ANGLE_STD = 1e-3, math.radians(0.01)
+MIN_DISTANCE_STD_M, MIN_ANGLE_STD = 1e-3, math.radians(0.01)
 # How far grid poses are from where the camera is, along any direction, as a share of the grid's step.
 _OFF_GRID = 0.5
 # Pairs of places times headings that are compared for one motion, and pairs of states that are kept: more of them than
 # this cost seconds and gigabytes, and come of measurements that say next to nothing.
 _MAX_COMPARED, _MAX_KEPT = 64_000_000, 4_000_000
 # Sideways errors of short distances do not vanish with them.
-_LEAST_ACROSS_M = 0.05
+_MIN_ACROSS_STD_M = 0.05
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,10 +60,10 @@ class Motion:
 
     def __post_init__(self) -> None:
         _check("distance_m", self.distance_m, 0.0, MAX_DISTANCE_M)
-        _check("distance_std_m", self.distance_std_m, LEAST_DISTANCE_STD_M, MAX_DISTANCE_M)
+        _check("distance_std_m", self.distance_std_m, MIN_DISTANCE_STD_M, MAX_DISTANCE_M)
         for name in ("turn", "direction"):
             _check(name, getattr(self, name), -2.0 * math.tau, 2.0 * math.tau)
-            _check(f"{name}_std", getattr(self, f"{name}_std"), LEAST_ANGLE_STD, math.tau)
+            _check(f"{name}_std", getattr(self, f"{name}_std"), MIN_ANGLE_STD, math.tau)
         if self.direction is not None and self.distance_m is None:
             raise InvalidMotionError("a direction needs the distance, distance_m is missing")
 
@@ -76,7 +76,7 @@ class Motion:
     def across_std_m(self) -> float:
         """Deviation (m) at right angles to the measured direction."""
         assert self.distance_m is not None
-        return max(self.distance_m * self.direction_std, _LEAST_ACROSS_M)
+        return max(self.distance_m * self.direction_std, _MIN_ACROSS_STD_M)
 
 
 def _check(name: str, value: float | None, least: float, most: float) -> None:
@@ -99,7 +99,7 @@ class States:
 
 
 @dataclass(frozen=True, eq=False)
-class Link:
+class Transition:
     """How likely a motion makes all pairs of states of two pictures.
 
     Attributes:
@@ -126,8 +126,8 @@ class Link:
             return turned
         return turned * float(self.places[j * k + a, first] if self.is_directed else self.places[j, i])
 
-    def among(self, first: np.ndarray, second: np.ndarray) -> Link:
-        """The link between some of the poses alone, by their numbers."""
+    def among(self, first: np.ndarray, second: np.ndarray) -> Transition:
+        """The transition between some of the poses alone, by their numbers."""
         _, k, _, after = self.sizes
         places = self.places
         if places is not None:
@@ -135,14 +135,14 @@ class Link:
             if self.is_directed:
                 rows, columns = (_states(index, k) for index in (second, first))
             places = places[rows][:, columns]
-        return Link(places, self.turns, (len(first), k, len(second), after), self.floor, self.is_directed)
+        return Transition(places, self.turns, (len(first), k, len(second), after), self.floor, self.is_directed)
 
 
 def _states(poses: np.ndarray, headings: int) -> np.ndarray:
     return (poses[:, None] * headings + np.arange(headings)).ravel()
 
 
-def link(motion: Motion, first: States, second: States, step_m: float) -> Link:
+def transition(motion: Motion, first: States, second: States, step_m: float) -> Transition:
     """What a motion says of two pictures whose poses are of a grid.
 
     Args:
@@ -156,15 +156,15 @@ def link(motion: Motion, first: States, second: States, step_m: float) -> Link:
         turns = np.exp(-0.5 * np.square(off / spread))
     floor = 0.0 if motion.is_unknown else FLOOR
     if motion.distance_m is None:
-        return Link(None, turns, sizes, floor)
+        return Transition(None, turns, sizes, floor)
     off_m = _OFF_GRID * step_m
     pairs = _pairs_at_distance(motion.distance_m, math.hypot(motion.distance_std_m, off_m), first, second)
     if motion.direction is not None:
         directed = _directed(motion, pairs, first, second, off_m)
         if directed is not None:
-            return Link(directed, turns, sizes, floor, is_directed=True)
+            return Transition(directed, turns, sizes, floor, is_directed=True)
     places = csr_array((np.exp(-0.5 * np.square(pairs.off)), (pairs.target, pairs.source)), shape=(sizes[2], sizes[0]))
-    return Link(places, turns, sizes, floor)
+    return Transition(places, turns, sizes, floor)
 
 
 class _Pairs(NamedTuple):
@@ -178,13 +178,13 @@ class _Pairs(NamedTuple):
 
 def _pairs_at_distance(distance_m: float, std_m: float, first: States, second: States) -> _Pairs:
     """The pairs of places that are about so far apart."""
-    near = KDTree(second.position_m).query_ball_point(first.position_m, distance_m + _FARTHEST * std_m)
+    near = KDTree(second.position_m).query_ball_point(first.position_m, distance_m + _MAX_DEVIATIONS * std_m)
     count = np.array([len(one) for one in near])
     source = np.repeat(np.arange(len(near)), count)
     target = np.concatenate([np.asarray(one, dtype=int) for one in near]) if count.any() else np.empty(0, int)
     moved_m = second.position_m[target] - first.position_m[source]
     off = (np.hypot(moved_m[:, 0], moved_m[:, 1]) - distance_m) / std_m
-    kept = np.abs(off) < _FARTHEST
+    kept = np.abs(off) < _MAX_DEVIATIONS
     return _Pairs(source[kept], target[kept], moved_m[kept], off[kept])
 
 
@@ -207,7 +207,7 @@ def _directed(motion: Motion, pairs: _Pairs, first: States, second: States, off_
         along = (pairs.moved_m @ ahead - motion.distance_m) / along_std
         across = (pairs.moved_m[:, 0] * ahead[1] - pairs.moved_m[:, 1] * ahead[0]) / across_std
         squared = np.square(along) + np.square(across)
-        kept = squared < _FARTHEST**2
+        kept = squared < _MAX_DEVIATIONS**2
         found += int(kept.sum())
         if found > _MAX_KEPT:
             return None

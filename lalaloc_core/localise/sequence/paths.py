@@ -1,8 +1,8 @@
 """How probable paths are, and with them the places of every picture.
 
 As in `localise.posterior`, the optimiser tells how far down the cost of a path goes. The states around a path are its
-*basin*. A path that was refined has as much probability as its depth says, with all basins as wide as that of the
-deepest is on the grid; all other paths gain what these gain usually.
+*basin*. A path that was refined has as much probability as its negative log likelihood says, with all basins as wide as
+that of the likeliest is on the grid; all other paths gain what these gain usually.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from jaxtyping import Float
 
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.localise.poses import Candidate, Query
-from lalaloc_core.localise.posterior import TURNED_APART, Posterior, told_of
+from lalaloc_core.localise.posterior import TURNED_APART, Posterior, posterior_from_weights
 from lalaloc_core.localise.sequence.chain import Marginals, forward_backward
-from lalaloc_core.localise.sequence.motion import Link, States
+from lalaloc_core.localise.sequence.motion import States, Transition
 from lalaloc_core.sampling import PoseSet
 
 # States that are less probable than this are nowhere to be seen.
@@ -26,7 +26,7 @@ _NEGLIGIBLE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class Observation:
     """One picture as the chain has it.
 
     Attributes:
@@ -49,15 +49,15 @@ class Path:
     """One path: a state of each picture as the grid has it, and where refinement took it.
 
     Attributes:
-        depth: its negative log likelihood on the grid.
-        refined_depth: the same of where it ended; None where it was not refined.
+        nll: its negative log likelihood on the grid.
+        refined_nll: the same of where it ended; None where it was not refined.
     """
 
     states: tuple[int, ...]
     starts: tuple[Candidate, ...]
-    depth: float
+    nll: float
     ends: tuple[Candidate, ...]
-    refined_depth: float | None = None
+    refined_nll: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,32 +77,34 @@ class _Basin:
 
 
 def path_posterior(
+    pictures: Sequence[Observation],
+    transitions: Sequence[Transition],
+    paths: Sequence[Path],
+    *,
     poses: PoseSet,
-    pictures: Sequence[Picture],
-    links: Sequence[Link],
     log_heights: Float[np.ndarray, "j"],
     whole: Marginals,
-    paths: Sequence[Path],
     candidates: Sequence[Sequence[Candidate]],
     separation_m: float,
 ) -> PathPosterior:
     """The posterior over paths.
 
     Args:
+        poses: of the grid.
         whole: what the chain says of all states.
         candidates: of each picture, what probabilities are wanted of, the answer first.
     """
-    basins = [_basin(pictures, links, log_heights, path, separation_m) for path in paths]
+    basins = [_basin(pictures, transitions, log_heights, path, separation_m) for path in paths]
     log_mass = np.array([basin.marginals.log_evidence for basin in basins])
     on_grid = np.exp(log_mass - whole.log_evidence)
     left = max(1.0 - float(on_grid.sum()), 0.0)
     with np.errstate(divide="ignore"):
         log_rest = whole.log_evidence + np.log(left)
-    if paths[0].refined_depth is not None:
-        depth = np.array([path.refined_depth for path in paths], dtype=float)
-        deepest = int(depth.argmin())
-        gains = np.array([path.depth for path in paths]) - depth
-        log_mass = log_mass[deepest] + paths[deepest].depth - depth
+    if paths[0].refined_nll is not None:
+        nll = np.array([path.refined_nll for path in paths], dtype=float)
+        likeliest = int(nll.argmin())
+        gains = np.array([path.nll for path in paths]) - nll
+        log_mass = log_mass[likeliest] + paths[likeliest].nll - nll
         log_rest += float(np.median(gains))
     highest = max(float(log_mass.max()), float(log_rest))
     mass, rest = np.exp(log_mass - highest), float(np.exp(log_rest - highest))
@@ -119,15 +121,15 @@ def path_posterior(
         for path, basin, share in zip(paths, basins, mass, strict=True):
             inside = np.zeros_like(weight)
             inside[basin.kept[t]] = share * basin.marginals.state[t]
-            moved = None if path.refined_depth is None else (path.starts[t], path.ends[t])
+            moved = None if path.refined_nll is None else (path.starts[t], path.ends[t])
             parts.append(_weighted(picture, inside, moved))
         position, heading, value, pose = (np.concatenate(one) for one in zip(*parts, strict=True))
-        found.append(told_of(pose, position, heading, value, len(poses), picture.query, candidates[t]))
+        found.append(posterior_from_weights(pose, position, heading, value, len(poses), picture.query, candidates[t]))
     return PathPosterior(mass, found)
 
 
 def _weighted(
-    picture: Picture, weight: Float[np.ndarray, "n k"], moved: tuple[Candidate, Candidate] | None
+    picture: Observation, weight: Float[np.ndarray, "n k"], moved: tuple[Candidate, Candidate] | None
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Places, headings, weights and grid poses of all states that count, moved and turned by refinement."""
     row, hypothesis = np.nonzero(weight > _NEGLIGIBLE)
@@ -142,8 +144,8 @@ def _weighted(
 
 
 def _basin(
-    pictures: Sequence[Picture],
-    links: Sequence[Link],
+    pictures: Sequence[Observation],
+    transitions: Sequence[Transition],
     log_heights: Float[np.ndarray, "j"],
     path: Path,
     separation_m: float,
@@ -159,5 +161,5 @@ def _basin(
         likelihood[:, :, turned] = -np.inf
         kept.append(rows)
         inside.append(likelihood)
-    among = [one.among(*pair) for one, pair in zip(links, itertools.pairwise(kept), strict=True)]
+    among = [one.among(*pair) for one, pair in zip(transitions, itertools.pairwise(kept), strict=True)]
     return _Basin(kept, forward_backward(inside, among, log_heights))

@@ -29,14 +29,14 @@ from lalaloc_core.localise.pipeline import (
     distinct,
     panorama_heading,
 )
-from lalaloc_core.localise.poses import Candidate, LatentGrid, Query, RefinementResult
+from lalaloc_core.localise.poses import Candidate, LatentGrid, Query, RefinementJob, RefinementResult
 from lalaloc_core.localise.posterior import TURNED_APART, area_shares
 from lalaloc_core.localise.refinement import refined, refinement_job, with_latents
 from lalaloc_core.localise.retrieval import contradicted, suppress
 from lalaloc_core.localise.sequence.chain import best_paths, forward_backward
 from lalaloc_core.localise.sequence.joint import SequenceJob, SequenceResult, motion_costs
-from lalaloc_core.localise.sequence.motion import FLOOR, Link, Motion, States, link
-from lalaloc_core.localise.sequence.paths import Path, Picture, path_posterior
+from lalaloc_core.localise.sequence.motion import FLOOR, Motion, States, Transition, transition
+from lalaloc_core.localise.sequence.paths import Observation, Path, path_posterior
 from lalaloc_core.sampling import PoseSet
 
 SequenceRefine = Literal["none", "lpo"]
@@ -136,19 +136,20 @@ def localise_sequence_steps(
     weights, height = encoders.manifest.evidence, queries[0].camera_height
     with clock.stage("retrieve"):
         pictures = [_picture(plan, grid, query, weights, config) for query in queries]
-        links = [
-            link(motion, first.states, second.states, grid.step_m)
+        transitions = [
+            transition(motion, first.states, second.states, grid.step_m)
             for motion, (first, second) in zip(motions, itertools.pairwise(pictures), strict=True)
         ]
         log_heights = -height.penalty(_offsets(pictures[0].query, config))
         log_heights = log_heights - np.logaddexp.reduce(log_heights)
-        whole = forward_backward([one.log_likelihood for one in pictures], links, log_heights)
+        whole = forward_backward([one.log_likelihood for one in pictures], transitions, log_heights)
         at = int(whole.height.argmax())
-        paths = _paths(grid, pictures, links, at, float(log_heights[at]), config)
+        paths = _paths(grid, pictures, transitions, at, float(log_heights[at]), config)
     stage: Literal["retrieval", "lpo"] = "retrieval"
     if refine == "lpo" and all(config.evidence.compares_profiles(one.query) for one in pictures):
         with clock.stage("lpo"):
-            job = _job(plan, grid, pictures, paths, links, motions, weights, config)
+            parts = _parts(plan, grid, pictures, paths, weights, config)
+            job = _job(parts, pictures, paths, transitions, motions, weights.temperature)
             result = yield job
             if result is not None:
                 paths = _ended(plan, encoders, pictures, motions, paths, result, config)
@@ -157,7 +158,16 @@ def localise_sequence_steps(
         distinct([path.ends[t] for path in paths], picture.query, config.separation_m, top_k)
         for t, picture in enumerate(pictures)
     ]
-    found = path_posterior(grid.poses, pictures, links, log_heights, whole, paths, candidates, config.separation_m)
+    found = path_posterior(
+        pictures,
+        transitions,
+        paths,
+        poses=grid.poses,
+        log_heights=log_heights,
+        whole=whole,
+        candidates=candidates,
+        separation_m=config.separation_m,
+    )
     if stage == "retrieval" and config.evidence.compares_profiles(pictures[0].query):
         candidates = [
             with_latents(plan, encoders, picture.query, answers, grid.camera_height_m)
@@ -173,13 +183,13 @@ def localise_sequence_steps(
     missed = tuple(int(index) for index in np.flatnonzero(costs > _CONTRADICTED))
     if stage == "retrieval":
         # The places of a grid are off themselves.
-        pairs = zip(links, itertools.pairwise(paths[0].states), strict=True)
+        pairs = zip(transitions, itertools.pairwise(paths[0].states), strict=True)
         missed = tuple(s for s, (one, pair) in enumerate(pairs) if one.floor and one.likelihood(*pair) <= FLOOR)
     return SequenceLocalisation(told, float(found.path[0]), stage, missed, clock.timings_ms)
 
 
 def _cost_to_chance(
-    plan: FloorPlan, grid: LatentGrid, encoders: Encoders, picture: Picture, config: LocaliseConfig
+    plan: FloorPlan, grid: LatentGrid, encoders: Encoders, picture: Observation, config: LocaliseConfig
 ) -> float:
     """See `Signals`; heights that nobody expects cost what they do of a single picture."""
     query, weights = picture.query, encoders.manifest.evidence
@@ -196,7 +206,7 @@ def _offsets(query: Query, config: LocaliseConfig) -> Float[np.ndarray, "j"]:
 
 def _picture(
     plan: FloorPlan, grid: LatentGrid, query: Query, weights: EvidenceModel, config: LocaliseConfig
-) -> Picture:
+) -> Observation:
     """Compare a picture with the grid at every height."""
     evidence = config.evidence
     doubted = contradicted(plan, grid, query, weights, evidence)
@@ -221,14 +231,19 @@ def _picture(
     prior = area_shares(grid.poses, plan.areas_m2)
     prior = prior - np.logaddexp.reduce(prior) - math.log(len(query.roll))
     states = States(grid.poses.position_m[index], query.roll + query.frame_heading, query.sector)
-    return Picture(query, index, states, cost, -weights.temperature * cost + prior[index][None, :, None], doubted)
+    return Observation(query, index, states, cost, -weights.temperature * cost + prior[index][None, :, None], doubted)
 
 
 def _paths(
-    grid: LatentGrid, pictures: list[Picture], links: list[Link], at: int, log_height: float, config: LocaliseConfig
+    grid: LatentGrid,
+    pictures: list[Observation],
+    transitions: list[Transition],
+    at: int,
+    log_height: float,
+    config: LocaliseConfig,
 ) -> list[Path]:
     """The best paths of which no two are alike, at one of the heights."""
-    found = best_paths([one.log_likelihood[at] for one in pictures], links)
+    found = best_paths([one.log_likelihood[at] for one in pictures], transitions)
     through: dict[tuple[int, ...], float] = {}
     for t, picture in enumerate(pictures):
         score, headings = found.score[t], len(picture.states.heading)
@@ -255,7 +270,7 @@ def _paths(
     return kept
 
 
-def _start(grid: LatentGrid, picture: Picture, state: int, at: int) -> Candidate:
+def _start(grid: LatentGrid, picture: Observation, state: int, at: int) -> Candidate:
     """A state of a picture as a candidate."""
     row, hypothesis = divmod(state, len(picture.states.heading))
     pose, query = int(picture.index[row]), picture.query
@@ -273,7 +288,7 @@ def _start(grid: LatentGrid, picture: Picture, state: int, at: int) -> Candidate
 
 
 def _alike(
-    pictures: Sequence[Picture],
+    pictures: Sequence[Observation],
     one: Sequence[Candidate],
     other: Sequence[Candidate],
     within_m: float,
@@ -288,28 +303,37 @@ def _alike(
     return True
 
 
-def _job(
+def _parts(
     plan: FloorPlan,
     grid: LatentGrid,
-    pictures: list[Picture],
+    pictures: list[Observation],
     paths: list[Path],
-    links: list[Link],
-    motions: Sequence[Motion],
     weights: EvidenceModel,
     config: LocaliseConfig,
-) -> SequenceJob:
-    """What the optimiser needs: of every picture as if it were alone, and the motions that a path goes by."""
-    parts = [
+) -> list[RefinementJob]:
+    """What the optimiser would need of every picture if it were alone."""
+    return [
         refinement_job(
             plan, one.query, [path.starts[t] for path in paths], grid.camera_height_m, weights, config.evidence
         )
         for t, one in enumerate(pictures)
     ]
+
+
+def _job(
+    parts: list[RefinementJob],
+    pictures: list[Observation],
+    paths: list[Path],
+    transitions: list[Transition],
+    motions: Sequence[Motion],
+    temperature: float,
+) -> SequenceJob:
+    """What the optimiser needs of all pictures, and the motions that a path goes by."""
     rolls = [one.query.roll[[path.starts[t].hypothesis for path in paths]] for t, one in enumerate(pictures)]
     trusted = [
         [
             not one.floor or one.likelihood(*pair) > FLOOR
-            for one, pair in zip(links, itertools.pairwise(path.states), strict=True)
+            for one, pair in zip(transitions, itertools.pairwise(path.states), strict=True)
         ]
         for path in paths
     ]
@@ -327,7 +351,7 @@ def _job(
         precision=np.stack([part.precision for part in parts if part.precision is not None], axis=1),
         motions=tuple(motions),
         trusted=np.array(trusted, dtype=bool).reshape(len(paths), len(motions)),
-        motion_scale=math.sqrt(0.5 * log_profile.shape[2] / weights.temperature),
+        motion_scale=math.sqrt(0.5 * log_profile.shape[2] / temperature),
         height_offset=np.array([path.starts[0].height_offset for path in paths]),
         height_free=not height.is_exact,
         height_stiffness=parts[0].height_stiffness,
@@ -338,7 +362,7 @@ def _job(
 def _ended(
     plan: FloorPlan,
     encoders: Encoders,
-    pictures: list[Picture],
+    pictures: list[Observation],
     motions: Sequence[Motion],
     paths: list[Path],
     result: SequenceResult,
@@ -371,26 +395,26 @@ def _ended(
     for path, log_motion in zip(moved, log_motions, strict=True):
         # Every picture counts the prior of the one height that they share.
         height = path.ends[0].terms["height"]
-        depth = temperature * sum(end.cost for end in path.ends) - (len(path.ends) - 1) * height - log_motion.sum()
+        nll = temperature * sum(end.cost for end in path.ends) - (len(path.ends) - 1) * height - log_motion.sum()
         priors = sum(
             _log_prior(picture, state, temperature) for picture, state in zip(pictures, path.states, strict=True)
         )
-        found.append(replace(path, refined_depth=float(depth - priors)))
+        found.append(replace(path, refined_nll=float(nll - priors)))
     kept: list[Path] = []
-    for path in sorted(found, key=lambda one: one.refined_depth or 0.0):
+    for path in sorted(found, key=lambda one: one.refined_nll or 0.0):
         if not any(_alike(pictures, path.ends, other.ends, _SAME_M, _SAME_TURN) for other in kept):
             kept.append(path)
     return kept
 
 
-def _log_prior(picture: Picture, state: int, temperature: float) -> float:
+def _log_prior(picture: Observation, state: int, temperature: float) -> float:
     """That of a state."""
     row, hypothesis = divmod(state, len(picture.states.heading))
     return float((picture.log_likelihood + temperature * picture.cost)[0, row, hypothesis])
 
 
 def _motion_costs(
-    pictures: Sequence[Picture], motions: Sequence[Motion], paths: Sequence[Path]
+    pictures: Sequence[Observation], motions: Sequence[Motion], paths: Sequence[Path]
 ) -> Float[np.ndarray, "m s"]:
     """Half the squared residuals of every motion along some paths."""
     position_m = np.array([[end.position_m for end in path.ends] for path in paths])

@@ -34,7 +34,7 @@ SCANNED, COMPARED = 40_000_000, 20_000
 # Candidates for the last stage, of each hypothesis: so many times its share, as one may have more of the best.
 _MORE = 6
 # Pairs that are compared at a time, and rows that are read at a time, to bound memory.
-_AT_ONCE = 65_536
+_BATCH_SIZE = 65_536
 # A cell is told by the upper bits of a key by which prototypes are sorted, what they say by the lower ones.
 _CELL_SHIFT = np.uint64(48)
 
@@ -153,8 +153,8 @@ class PlanIndex:
     def _all(self, k: int, j: int) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         """All pairs: members, and the hypotheses of heading and height."""
         shape = len(self.member), k, j
-        for begin in range(0, len(self.member) * k * j, _AT_ONCE):
-            pair = np.arange(begin, min(begin + _AT_ONCE, len(self.member) * k * j))
+        for begin in range(0, len(self.member) * k * j, _BATCH_SIZE):
+            pair = np.arange(begin, min(begin + _BATCH_SIZE, len(self.member) * k * j))
             member, hypothesis, offset = np.unravel_index(pair, shape)
             yield member, hypothesis, offset
 
@@ -180,8 +180,8 @@ class PlanIndex:
         order = np.argsort(member, kind="stable")
         member, turned = member[order], turned[order]
         hypothesis, offset = np.divmod(turned, j)
-        for begin in range(0, len(member), _AT_ONCE):
-            part = slice(begin, begin + _AT_ONCE)
+        for begin in range(0, len(member), _BATCH_SIZE):
+            part = slice(begin, begin + _BATCH_SIZE)
             yield member[part], hypothesis[part], offset[part]
 
     def _looked_into(self, costs: PrototypeCosts, scanned: int) -> dict[int, Bool[np.ndarray, "l k j"]]:
@@ -210,9 +210,9 @@ class PlanIndex:
         scans = {}
         for family, cell in self._filled.items():
             begin, end = int(self.first[cell[0]]), int(self.first[cell[-1] + 1])
-            parts = range(begin, end, _AT_ONCE)
+            parts = range(begin, end, _BATCH_SIZE)
             code = np.concatenate(
-                [codes_of(self._raw[self.member[at : min(at + _AT_ONCE, end)]].view(ROW)) for at in parts]
+                [codes_of(self._raw[self.member[at : min(at + _BATCH_SIZE, end)]].view(ROW)) for at in parts]
             )
             scans[family] = begin, CodeScan(code, np.append(self.first[cell], end) - begin)
         return scans
@@ -251,8 +251,8 @@ def _keys(rows: np.ndarray, member: Int[np.ndarray, "n"]) -> UInt64[np.ndarray, 
     words = -(-ROW.itemsize // 8)
     # Odd numbers, as random as need be.
     factor = np.random.default_rng(0).integers(2**62, size=words, dtype=np.uint64) * np.uint64(2) + np.uint64(1)
-    for begin in range(0, len(member), _AT_ONCE):
-        part = raw[member[begin : begin + _AT_ONCE]]
+    for begin in range(0, len(member), _BATCH_SIZE):
+        part = raw[member[begin : begin + _BATCH_SIZE]]
         content = np.zeros((len(part), 8 * words), np.uint8)
         content[:, : ROW.itemsize] = part.view(np.uint8).reshape(len(part), -1)
         hashed = (content.view(np.uint64) * factor).sum(axis=1, dtype=np.uint64)

@@ -25,14 +25,14 @@ from lalaloc_core.localise.venue.prototypes import AZIMUTHS
 _VALUES = 16
 # Where one value of a distance (m) ends and the next one begins: finest where rooms of homes end.
 _EDGES_M = (0.6, 0.85, 1.1, 1.4, 1.7, 2.05, 2.4, 2.8, 3.2, 3.7, 4.4, 5.4, 7.0, 9.5, 15.0)
-_NEAREST_M, _FARTHEST_M = 0.35, 25.0
+_MIN_DISTANCE_M, _MAX_DISTANCE_M = 0.35, 25.0
 # Distances within one value whose costs are averaged.
 _WITHIN = 4
 # The same of ceilings (m), with what is taken for those below and above all of them.
 _CEILING_EDGES_M = (2.1, 2.2, 2.3, 2.4, 2.5, 2.6, 2.7, 2.8, 2.95, 3.1, 3.3, 3.6, 4.0, 5.0, 7.0)
-_LOWEST_CEILING_M, _HIGHEST_CEILING_M = 2.0, 9.0
+_MIN_CEILING_M, _MAX_CEILING_M = 2.0, 9.0
 # Tables are rounded in proportion to the largest: what the ceiling alone can say against a prototype is bounded.
-_MOST_OF_ONE = 0.25
+_MAX_CEILING_COST = 0.25
 _PARTS = AZIMUTHS + AZIMUTHS // 2 + 2
 CODE_BYTES = _PARTS // 2
 # What a list holds for each code, with its number; in blocks of 32, of which the last one may be half empty.
@@ -107,7 +107,7 @@ def tables_of(costs: PrototypeCosts, claims: int) -> Float[np.ndarray, "k j p c"
     """What each value of a code costs under the hypotheses of the heading and the height, for plans of some claims."""
     (k, j), azimuth = costs.shape, np.arange(AZIMUTHS)
     tables = np.zeros((k, j, _PARTS, _VALUES), np.float32)
-    distance = _within(np.log((_NEAREST_M, *_EDGES_M, _FARTHEST_M)))
+    distance = _within(np.log((_MIN_DISTANCE_M, *_EDGES_M, _MAX_DISTANCE_M)))
     centre = costs.centre[:, None] + costs.offsets[None, :, None].astype(np.float32)
     residual = (distance - centre[..., None, None]) * costs.precision[:, None, :, None, None]
     tables[:, :, azimuth] = np.log1p(np.square(residual)).mean(axis=-1) / AZIMUTHS
@@ -116,8 +116,8 @@ def tables_of(costs: PrototypeCosts, claims: int) -> Float[np.ndarray, "k j p c"
         loss, classes = costs.opening_loss[claims], len(OPENING_CLASSES)
         pair = loss[:, 1::2, :, None] + loss[:, ::2, None, :]
         tables[:, :, AZIMUTHS:-2] = pair.reshape(k, 1, AZIMUTHS // 2, classes * classes)
-    ceiling_m = _within(np.array((_LOWEST_CEILING_M, *_CEILING_EDGES_M, _HIGHEST_CEILING_M))).mean(axis=-1)
-    tables[:, :, -2] = np.minimum(costs.of_ceilings(ceiling_m), _MOST_OF_ONE) + costs.penalty[:, None]
+    ceiling_m = _within(np.array((_MIN_CEILING_M, *_CEILING_EDGES_M, _MAX_CEILING_M))).mean(axis=-1)
+    tables[:, :, -2] = np.minimum(costs.of_ceilings(ceiling_m), _MAX_CEILING_COST) + costs.penalty[:, None]
     tables[:, :, -1] = costs.of_room_types
     return tables
 
