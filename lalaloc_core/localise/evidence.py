@@ -221,7 +221,7 @@ class Evidence:
             shut = factor[seen.row, seen.column]
             # Where the wall fits, its being shut in a door costs nothing: networks learn to see the wall there.
             factor[seen.row, seen.column] = np.maximum(1.0 / (1.0 / shut + self._open_odds(seen.kind) / behind), 1.0)
-        return _mean_log(factor)
+        return mean_log(factor)
 
     def _walls_of(
         self,
@@ -252,7 +252,7 @@ class Evidence:
                 beyond = np.square(behind - shift[:, 0] * sharp) + 1.0
                 shut = factor[row, column]
                 factor[row, column] = np.maximum(1.0 / (1.0 / shut + odds / beyond), 1.0)
-            cost[j] = _mean_log(factor)
+            cost[j] = mean_log(factor)
         return cost
 
     def _openings_of(
@@ -371,13 +371,20 @@ def latent_distances(latents: Float[np.ndarray, "n d"], targets: Float[np.ndarra
     return np.sqrt(np.maximum(2.0 - 2.0 * (targets @ latents.T), 0.0))
 
 
-def _mean_log(factor: Float[np.ndarray, "n w"]) -> Float[np.ndarray, "n"]:
-    """Mean of the logarithms of each row, of values from 1 on."""
+def mean_log(
+    factor: Float[np.ndarray, "n w"], *, factors: int = _FACTORS, max_factor: float = _MAX_FACTOR
+) -> Float[np.ndarray, "n"]:
+    """Mean of the logarithms of each row, of values from 1 on, which are overwritten.
+
+    Args:
+        factors: of so many the product is taken before the logarithm, if they divide the columns.
+        max_factor: larger ones count as this, so that products stay finite.
+    """
     columns = factor.shape[1]
-    if columns % _FACTORS:
+    if columns % factors:
         return np.log(factor).mean(axis=1)
-    np.minimum(factor, _MAX_FACTOR, out=factor)
-    width = columns // _FACTORS
+    np.minimum(factor, max_factor, out=factor)
+    width = columns // factors
     product = factor[:, :width].copy()
     for begin in range(width, columns, width):
         product *= factor[:, begin : begin + width]

@@ -27,6 +27,7 @@ from lalaloc_core.localise.poses import Candidate, LatentGrid, Query, Refinement
 from lalaloc_core.localise.posterior import Posterior, area_shares, posterior_of
 from lalaloc_core.localise.refinement import refined, refinement_job, with_latents
 from lalaloc_core.localise.retrieval import contradicted, grid_costs, missed_hints, retrieve, suppress
+from lalaloc_core.localise.steps import run_steps
 from lalaloc_core.localise.vogel import resample
 
 SearchStage = Literal["retrieval", "vdr", "lpo"]
@@ -81,7 +82,7 @@ class LocaliseConfig:
         return max(least, min(alike, self.max_candidates))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Localisation:
     """Distinct candidates, best first, and how they came about.
 
@@ -183,25 +184,7 @@ def localise(
     steps = localise_steps(
         plan, grid, encoders, query, refine=refine, top_k=top_k, config=config, clock=clock, hints=hints
     )
-    result: RefinementResult | None = None
-    while True:
-        step = next_step(steps, result)
-        if isinstance(step, Localisation):
-            return step
-        assert refiner is not None
-        result = refiner(step)
-
-
-def next_step(steps: Steps, result: RefinementResult | None) -> RefinementJob | Localisation:
-    """Go on with a search: what is to be refined next, or what was found.
-
-    Args:
-        result: of the job that the last step gave; None at first, and where nobody could refine it (in time).
-    """
-    try:
-        return steps.send(result)
-    except StopIteration as done:
-        return done.value
+    return run_steps(steps, refiner)
 
 
 def localise_steps(
@@ -216,10 +199,10 @@ def localise_steps(
     clock: StageClock | None = None,
     hints: Hints = NO_HINTS,
 ) -> Steps:
-    """`localise` for who waits for the optimiser elsewhere: stops where poses are to be optimised; see `next_step`."""
+    """`localise` for who waits for the optimiser elsewhere: stops where poses are to be optimised; see `steps`."""
     config, clock = config or LocaliseConfig(), clock or StageClock()
     hints.check(plan)
-    search = _Search(plan, grid, encoders, query, config, clock, hints, top_k)
+    search = _Search(plan, grid, encoders, query, config=config, clock=clock, hints=hints, top_k=top_k)
     resampling = refine != "none" and config.vdr_candidates > 0
     if refine != "lpo":
         return search.answer(search.without_lpo(resampling=resampling))
@@ -251,6 +234,7 @@ class _Search:
         grid: LatentGrid,
         encoders: Encoders,
         query: Query,
+        *,
         config: LocaliseConfig,
         clock: StageClock,
         hints: Hints,
@@ -343,22 +327,29 @@ class _Search:
         if hints.strict:
             missed = missed_hints(self._plan, self._costs, self._encoders.manifest.evidence, hints)
         return Localisation(
-            self.query,
-            answers,
-            found,
-            self._stage,
-            self._signals,
-            self._doubted,
-            missed,
-            self._best,
-            self._clock.timings_ms,
+            query=self.query,
+            candidates=answers,
+            posterior=found,
+            stage=self._stage,
+            signals=self._signals,
+            heading_contradicted=self._doubted,
+            hints_missed=missed,
+            best=self._best,
+            timings_ms=self._clock.timings_ms,
         )
 
     def _posterior(self, first: list[Candidate]) -> Posterior:
         """The posterior by what is known by now, with the probabilities of some candidates."""
-        ends, temperature = self._ends, self._encoders.manifest.evidence.temperature
-        begun, apart_m = self.modes[: len(ends)], self._config.separation_m
-        return posterior_of(self._costs, self._prior, self.query, begun, ends, first, temperature, apart_m)
+        return posterior_of(
+            self._costs,
+            self._prior,
+            self.query,
+            starts=self.modes[: len(self._ends)],
+            ends=self._ends,
+            candidates=first,
+            temperature=self._encoders.manifest.evidence.temperature,
+            separation_m=self._config.separation_m,
+        )
 
     def _tell(self, stage: SearchStage, candidate: Candidate, found: Posterior) -> None:
         self._stage, self._best[stage] = stage, candidate

@@ -246,6 +246,30 @@ class Candidate:
         return self.cost + self.hint_cost
 
 
+def grid_candidate(
+    grid: LatentGrid,
+    pose: int,
+    query: Query,
+    hypothesis: int,
+    *,
+    cost: float,
+    height_offset: float = 0.0,
+    hint_cost: float = 0.0,
+) -> Candidate:
+    """A pose of a grid under one of the hypotheses of a query, by their numbers."""
+    return Candidate(
+        x_m=float(grid.poses.position_m[pose, 0]),
+        y_m=float(grid.poses.position_m[pose, 1]),
+        room_index=int(grid.poses.room_index[pose]),
+        frame_heading=query.frame_heading,
+        hypothesis=hypothesis,
+        cost=cost,
+        latent_distance=grid.latent_distance(pose, query.latents[hypothesis]),
+        height_offset=height_offset,
+        hint_cost=hint_cost,
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class RefinementJob:
     """Starting poses for pose optimisation, each with its own targets and room.

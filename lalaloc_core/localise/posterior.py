@@ -116,6 +116,7 @@ def posterior_of(
     grid: GridCosts,
     prior: Float[np.ndarray, "n"],
     query: Query,
+    *,
     starts: Sequence[Candidate],
     ends: Sequence[Candidate],
     candidates: Sequence[Candidate],

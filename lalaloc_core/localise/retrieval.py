@@ -17,7 +17,7 @@ from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.evidence import Evidence, EvidenceConfig, latent_distances
 from lalaloc_core.localise.first_look import PairLimits, likeliest
 from lalaloc_core.localise.hints import NO_HINTS, HintName, Hints
-from lalaloc_core.localise.poses import Candidate, LatentGrid, Query
+from lalaloc_core.localise.poses import Candidate, LatentGrid, Query, grid_candidate
 from lalaloc_core.localise.posterior import NEGLIGIBLE, TURNED_APART, GridCosts
 from lalaloc_core.sampling import PoseSet, pose_grid
 
@@ -207,15 +207,12 @@ def retrieve(
 
 
 def _candidate(costs: GridCosts, query: Query, grid: LatentGrid, pair: int) -> Candidate:
-    pose, hypothesis = int(costs.pose[pair]), int(costs.hypothesis[pair])
-    return Candidate(
-        x_m=float(grid.poses.position_m[pose, 0]),
-        y_m=float(grid.poses.position_m[pose, 1]),
-        room_index=int(grid.poses.room_index[pose]),
-        frame_heading=query.frame_heading,
-        hypothesis=hypothesis,
+    return grid_candidate(
+        grid,
+        int(costs.pose[pair]),
+        query,
+        int(costs.hypothesis[pair]),
         cost=float(costs.cost[pair]),
-        latent_distance=grid.latent_distance(pose, query.latents[hypothesis]),
         height_offset=float(costs.offset[pair]),
         hint_cost=0.0 if costs.hint_cost is None else float(costs.hint_cost[pair]),
     )

@@ -14,9 +14,7 @@ from jaxtyping import Float, Int
 from lalaloc_core.conventions import DOOR_CODE, PASSAGE_CODE, Array, column_azimuths
 from lalaloc_core.floorplan import PlanGeometry
 from lalaloc_core.render.profile import cast_rays, nearest_walls
-
-# How far beyond the threshold a ray goes on, so that it does not meet the very wall that it has come through.
-_BEYOND_M = 1e-3
+from lalaloc_core.render.tolerances import BEYOND_M
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,7 +125,7 @@ def _look_through(
     exit_m = cast_rays(eye_m, ray, geometry.exit_m[room, number][:, None, :])[:, 0]
     is_through = xp.isfinite(exit_m)
     # Not going on from infinity keeps NaN out of the gradients.
-    leave_m = xp.maximum(xp.where(is_through, exit_m, wall_m), wall_m) + _BEYOND_M
+    leave_m = xp.maximum(xp.where(is_through, exit_m, wall_m), wall_m) + BEYOND_M
     direction = xp.concat([xp.sin(ray), xp.cos(ray)], axis=1)
     further_m = cast_rays(eye_m + leave_m[:, None] * direction, ray, geometry.walls_m[behind])[:, 0]
     is_through = is_through & xp.isfinite(further_m)

@@ -14,12 +14,9 @@ from array_api_compat import array_namespace, device
 from jaxtyping import Float, Int
 
 from lalaloc_core.conventions import Array, column_azimuths
+from lalaloc_core.render.tolerances import CORNER_TOLERANCE, EDGE_ON
 
-# A ray may miss both of two adjoining walls at their common corner by rounding; widen each wall by this share.
-_CORNER_TOLERANCE = 1e-5
 _PARALLEL = 1e-12
-# A wall whose line passes the origin nearer than this (m, times the wall's length) is seen edge-on, so not at all.
-_EDGE_ON = 1e-9
 
 
 def cast_rays(
@@ -84,11 +81,11 @@ def inverse_crossings(
     start_x, start_y = walls_m[:, :, 0] - origin_m[:, :1], walls_m[:, :, 1] - origin_m[:, 1:]
     edge_x, edge_y = walls_m[:, :, 2] - walls_m[:, :, 0], walls_m[:, :, 3] - walls_m[:, :, 1]
     area = start_x * edge_y - start_y * edge_x
-    edge_on = xp.abs(area) < _EDGE_ON
+    edge_on = xp.abs(area) < EDGE_ON
     inverse_area = 1.0 / xp.where(edge_on, xp.ones_like(area), area)
     inverse_area = xp.where(edge_on, xp.zeros_like(area), inverse_area)
     by_x, by_y = edge_x * inverse_area, edge_y * inverse_area
-    low, high = -_CORNER_TOLERANCE, 1.0 + _CORNER_TOLERANCE
+    low, high = -CORNER_TOLERANCE, 1.0 + CORNER_TOLERANCE
     crossed_x = xp.concat([by_x, start_x + low * edge_x, start_x + high * edge_x], axis=1)
     crossed_y = xp.concat([by_y, start_y + low * edge_y, start_y + high * edge_y], axis=1)
     direction = xp.stack([xp.sin(azimuth), xp.cos(azimuth)], axis=1)
@@ -129,7 +126,7 @@ def cross_walls(direction: tuple[Array, Array], start_m: tuple[Array, Array], ed
     inverse = 1.0 / xp.where(parallel, xp.ones_like(determinant), determinant)
     t = (start_x * edge_y - start_y * edge_x) * inverse
     s = (start_x * direction_y - start_y * direction_x) * inverse
-    hit = ~parallel & (t > 0.0) & (s >= -_CORNER_TOLERANCE) & (s <= 1.0 + _CORNER_TOLERANCE)
+    hit = ~parallel & (t > 0.0) & (s >= -CORNER_TOLERANCE) & (s <= 1.0 + CORNER_TOLERANCE)
     return Crossings(xp.where(hit, t, xp.full_like(t, xp.inf)), s, determinant)
 
 

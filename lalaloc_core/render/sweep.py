@@ -16,15 +16,10 @@ from jaxtyping import Float, Int, UInt8
 
 from lalaloc_core.conventions import DOOR_CODE, PASSAGE_CODE, TWO_PI, WALL_CODE, column_azimuths
 from lalaloc_core.floorplan.wall_table import WallTable
+from lalaloc_core.render.tolerances import BEYOND_M, CORNER_TOLERANCE, EDGE_ON
 
 # Pairs of a pose and a wall, or of a ray and a wall, that are looked at together, to bound memory.
 _PAIRS = 1 << 16
-# A wall whose line passes the pose nearer than this (m, times the wall's length) is seen edge-on, so not at all.
-_EDGE_ON = 1e-9
-# A ray may miss both of two adjoining walls at their common corner by rounding; widen each wall by this share.
-_CORNER_TOLERANCE = 1e-5
-# How far beyond the threshold a ray goes on, so that it does not meet the very wall that it has come through.
-_BEYOND_M = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +135,7 @@ def _nearest(
     edge = end - start
     area = start[:, 0] * edge[:, 1] - start[:, 1] * edge[:, 0]
     # Only free-standing walls have a back that can be seen.
-    faces = np.flatnonzero(np.where(walls.is_free[wall], np.abs(area), area) >= _EDGE_ON)
+    faces = np.flatnonzero(np.where(walls.is_free[wall], np.abs(area), area) >= EDGE_ON)
     pose, wall, start, end, area = (one[faces] for one in (pose, wall, start, end, area))
     by_x, by_y = edge[faces, 0] / area, edge[faces, 1] / area
     # Azimuths fall from the start of a wall to its end, as the room lies to its left.
@@ -222,7 +217,7 @@ def _behind(
     seen_m = distance_m.copy()
     for begin in range(0, len(through), _PAIRS // 16):
         rays = through[begin : begin + _PAIRS // 16]
-        leave_m = np.maximum(1.0 / inverse_m[rays], distance_m[rays]) + _BEYOND_M
+        leave_m = np.maximum(1.0 / inverse_m[rays], distance_m[rays]) + BEYOND_M
         origin_m = eye_m[rays] + leave_m[:, None] * direction[rays]
         ray, wall = _each_with(walls, walls.behind[number[rays]])
         from_m, to_m = walls.start_m[wall] - origin_m[ray], walls.end_m[wall] - origin_m[ray]
@@ -239,8 +234,8 @@ def _inverse_crossings(
     """Inverse distances (1/m) along one ray each to one wall each, counted from the ray's origin; 0 where it misses."""
     edge = end_m - start_m
     area = start_m[:, 0] * edge[:, 1] - start_m[:, 1] * edge[:, 0]
-    low, high = start_m - _CORNER_TOLERANCE * edge, end_m + _CORNER_TOLERANCE * edge
+    low, high = start_m - CORNER_TOLERANCE * edge, end_m + CORNER_TOLERANCE * edge
     sides = [one[:, 0] * direction[:, 1] - one[:, 1] * direction[:, 0] for one in (low, high)]
     inverse_m = direction[:, 0] * edge[:, 1] - direction[:, 1] * edge[:, 0]
-    meets = (sides[0] * sides[1] <= 0.0) & (np.abs(area) >= _EDGE_ON)
+    meets = (sides[0] * sides[1] <= 0.0) & (np.abs(area) >= EDGE_ON)
     return np.maximum(np.divide(inverse_m, area, out=np.zeros_like(area), where=meets), 0.0)

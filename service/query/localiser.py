@@ -14,9 +14,10 @@ from lalaloc_core.draw.answer import PHOTOGRAPH_SIZE, Picture, draw_answer
 from lalaloc_core.draw.found import drawn_answer
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.pipeline import Localisation, StageClock, Steps, localise_steps, next_step
+from lalaloc_core.localise.pipeline import Localisation, StageClock, Steps, localise_steps
 from lalaloc_core.localise.poses import LatentGrid, Query
-from lalaloc_core.localise.sequence.search import SequenceLocalisation, localise_sequence_steps, next_sequence_step
+from lalaloc_core.localise.sequence.search import SequenceLocalisation, localise_sequence_steps
+from lalaloc_core.localise.steps import next_step
 from lalaloc_core.panorama.images import Panorama
 from service.errors import DeadlineExceededError, PlanFailedError, PlanNotReadyError
 from service.grids import GridProvider, grid_height_m
@@ -234,11 +235,11 @@ class Localiser:
         steps = localise_sequence_steps(
             plan, grid, self._encoders, queries, motions, refine=form.refine, top_k=form.top_k, clock=clock
         )
-        step = await self.compute(party, partial(next_sequence_step, steps, None), deadline)
+        step = await self.compute(party, partial(next_step, steps, None), deadline)
         while not isinstance(step, SequenceLocalisation):
             timeout_s = min(self._settings.lpo_deadline_s, deadline - monotonic() - _ANSWER_S)
             result = await self._pool.refine_sequence(step, timeout_s, party)
-            step = await self.compute(party, partial(next_sequence_step, steps, result), deadline)
+            step = await self.compute(party, partial(next_step, steps, result), deadline)
         timings_ms = clock.timings_ms | {"total": (monotonic() - begin) * 1e3}
         self.observe(timings_ms, step.stage)
         places, alone = places_in(record), []

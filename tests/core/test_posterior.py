@@ -38,7 +38,16 @@ def shares(
 ) -> Posterior:
     ends = starts if ends is None else ends
     answers = sorted(ends, key=lambda one: one.cost)
-    return posterior_of(grid, np.zeros(len(grid.poses)), query, starts, ends, answers, 16.0, 1.0)
+    return posterior_of(
+        grid,
+        np.zeros(len(grid.poses)),
+        query,
+        starts=starts,
+        ends=ends,
+        candidates=answers,
+        temperature=16.0,
+        separation_m=1.0,
+    )
 
 
 def test_the_map_is_of_the_places_where_candidates_ended_and_not_of_where_they_began() -> None:
@@ -131,7 +140,16 @@ def test_candidates_that_end_at_one_place_are_one_mode() -> None:
     grid = along([0.0, 1.2, 10.0], np.array([0.05, 0.05, 0.05]))
     starts = [candidate(0.0, 0.05), candidate(1.2, 0.05), candidate(10.0, 0.05)]
     ends = [candidate(0.6, 0.01), candidate(0.6, 0.01), candidate(10.6, 0.01)]
-    found = posterior_of(grid, np.zeros(3), PLAIN, starts, ends, [ends[0], ends[2]], 16.0, 1.0)
+    found = posterior_of(
+        grid,
+        np.zeros(3),
+        PLAIN,
+        starts=starts,
+        ends=ends,
+        candidates=[ends[0], ends[2]],
+        temperature=16.0,
+        separation_m=1.0,
+    )
     assert found.candidate == pytest.approx((0.5, 0.5))
 
 

@@ -115,7 +115,14 @@ def test_what_is_overruled_is_said_with_both_values() -> None:
     answer = Candidate(1.0, 4.5, 2, 0.0, 0, 0.1, 0.2)
     posterior = Posterior(np.ones(1), 1.0, (1.0,), 1.0, Support(np.zeros(1, int), np.zeros((1, 2)), np.ones(1)))
     hints = Hints(near=Near(6.0, 4.5, 3.0), rooms=frozenset({0, 1}))
-    found = Localisation(query, [answer], posterior, "lpo", {}, hints_missed=("near", "rooms"))
+    found = Localisation(
+        query=query,
+        candidates=[answer],
+        posterior=posterior,
+        stage="lpo",
+        signals={},
+        hints_missed=("near", "rooms"),
+    )
     assert hint_warnings(hints, found, plan) == [
         "near is within 3 m of (6, 4.5), which the panorama contradicts: the answer is 5.0 m from there",
         "rooms is 'bedroom', 'bedroom-2', which the panorama contradicts: the answer lies in room 'hall'",

@@ -12,10 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from lalaloc_core.bundle import EvidenceModel
-from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.errors import InvalidMotionError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.floorplan.geometry import pad_walls
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.cohort import log_cost_to_chance
 from lalaloc_core.localise.confidence import Signals, signals_of
@@ -27,17 +25,17 @@ from lalaloc_core.localise.pipeline import (
     SearchStage,
     StageClock,
     distinct,
-    panorama_heading,
 )
-from lalaloc_core.localise.poses import Candidate, LatentGrid, Query, RefinementJob, RefinementResult
+from lalaloc_core.localise.poses import Candidate, LatentGrid, Query, grid_candidate
 from lalaloc_core.localise.posterior import TURNED_APART, area_shares
-from lalaloc_core.localise.refinement import refined, refinement_job, with_latents
+from lalaloc_core.localise.refinement import with_latents
 from lalaloc_core.localise.retrieval import contradicted, suppress
 from lalaloc_core.localise.sequence.chain import best_paths, forward_backward
-from lalaloc_core.localise.sequence.joint import SequenceJob, SequenceResult, motion_costs
+from lalaloc_core.localise.sequence.joint import SequenceJob, SequenceResult
 from lalaloc_core.localise.sequence.motion import FLOOR, Motion, States, Transition, transition
 from lalaloc_core.localise.sequence.paths import Observation, Path, path_posterior
-from lalaloc_core.sampling import PoseSet
+from lalaloc_core.localise.sequence.refinement import are_alike, ended_paths, job_parts, path_motion_costs, sequence_job
+from lalaloc_core.localise.steps import run_steps
 
 SequenceRefine = Literal["none", "lpo"]
 # Runs joint optimisation; None when it could not answer (in time).
@@ -46,8 +44,6 @@ SequenceRefiner = Callable[[SequenceJob], SequenceResult | None]
 _MAX_PLACES, _STRIDE = 2048, 4
 # Paths that are optimised, and how many modes of each picture they are looked for through.
 _PATHS, _MODES = 8, 8
-# Paths that end as near as this, and turned as alike (radians), are one.
-_SAME_M, _SAME_TURN = 0.2, math.radians(5.0)
 # A motion is contradicted by what is less likely than four standard deviations off.
 _CONTRADICTED = 0.5 * 4.0**2
 
@@ -100,21 +96,7 @@ def localise_sequence(
     """
     refine: SequenceRefine = "none" if refiner is None else "lpo"
     steps = localise_sequence_steps(plan, grid, encoders, queries, motions, refine=refine, top_k=top_k, config=config)
-    result: SequenceResult | None = None
-    while True:
-        step = next_sequence_step(steps, result)
-        if isinstance(step, SequenceLocalisation):
-            return step
-        assert refiner is not None
-        result = refiner(step)
-
-
-def next_sequence_step(steps: SequenceSteps, result: SequenceResult | None) -> SequenceJob | SequenceLocalisation:
-    """As `pipeline.next_step`."""
-    try:
-        return steps.send(result)
-    except StopIteration as done:
-        return done.value
+    return run_steps(steps, refiner)
 
 
 def localise_sequence_steps(
@@ -148,11 +130,11 @@ def localise_sequence_steps(
     stage: Literal["retrieval", "lpo"] = "retrieval"
     if refine == "lpo" and all(config.evidence.compares_profiles(one.query) for one in pictures):
         with clock.stage("lpo"):
-            parts = _parts(plan, grid, pictures, paths, weights, config)
-            job = _job(parts, pictures, paths, transitions, motions, weights.temperature)
+            parts = job_parts(plan, grid, pictures, paths, weights, config)
+            job = sequence_job(parts, pictures, paths, transitions, motions, weights.temperature)
             result = yield job
             if result is not None:
-                paths = _ended(plan, encoders, pictures, motions, paths, result, config)
+                paths = ended_paths(plan, encoders, pictures, motions, paths, result, config)
                 stage = "lpo"
     candidates = [
         distinct([path.ends[t] for path in paths], picture.query, config.separation_m, top_k)
@@ -178,8 +160,18 @@ def localise_sequence_steps(
         to_chance = _cost_to_chance(plan, grid, encoders, picture, config)
         signals: dict[SearchStage, Signals] = {stage: signals_of(picture.query, answers[0], posterior, to_chance)}
         best: dict[SearchStage, Candidate] = {stage: answers[0]}
-        told.append(Localisation(picture.query, answers, posterior, stage, signals, picture.doubted, best=best))
-    costs = _motion_costs(pictures, motions, [paths[0]])[0]
+        told.append(
+            Localisation(
+                query=picture.query,
+                candidates=answers,
+                posterior=posterior,
+                stage=stage,
+                signals=signals,
+                heading_contradicted=picture.doubted,
+                best=best,
+            )
+        )
+    costs = path_motion_costs(pictures, motions, [paths[0]])[0]
     missed = tuple(int(index) for index in np.flatnonzero(costs > _CONTRADICTED))
     if stage == "retrieval":
         # The places of a grid are off themselves.
@@ -262,7 +254,7 @@ def _paths(
     kept: list[Path] = []
     for states in sorted(through, key=lambda one: -through[one]):
         starts = tuple(_start(grid, picture, state, at) for picture, state in zip(pictures, states, strict=True))
-        alike = (_alike(pictures, starts, path.ends, config.separation_m, TURNED_APART) for path in kept)
+        alike = (are_alike(pictures, starts, path.ends, config.separation_m, TURNED_APART) for path in kept)
         if not any(alike):
             kept.append(Path(states, starts, -through[states] - log_height, starts))
         if len(kept) == _PATHS:
@@ -275,149 +267,11 @@ def _start(grid: LatentGrid, picture: Observation, state: int, at: int) -> Candi
     row, hypothesis = divmod(state, len(picture.states.heading))
     pose, query = int(picture.index[row]), picture.query
     offsets = query.camera_height.offsets
-    return Candidate(
-        x_m=float(grid.poses.position_m[pose, 0]),
-        y_m=float(grid.poses.position_m[pose, 1]),
-        room_index=int(grid.poses.room_index[pose]),
-        frame_heading=query.frame_heading,
-        hypothesis=hypothesis,
+    return grid_candidate(
+        grid,
+        pose,
+        query,
+        hypothesis,
         cost=float(picture.cost[at, row, hypothesis]),
-        latent_distance=grid.latent_distance(pose, query.latents[hypothesis]),
         height_offset=float(offsets[at]) if picture.cost.shape[0] == len(offsets) else 0.0,
     )
-
-
-def _alike(
-    pictures: Sequence[Observation],
-    one: Sequence[Candidate],
-    other: Sequence[Candidate],
-    within_m: float,
-    within_angle: float,
-) -> bool:
-    """Whether two paths are at the same places, turned alike, in every picture."""
-    for picture, first, second in zip(pictures, one, other, strict=True):
-        apart_m = np.linalg.norm(first.position_m - second.position_m)
-        turned = wrap_angle(panorama_heading(picture.query, first) - panorama_heading(picture.query, second))
-        if apart_m >= within_m or abs(turned) > within_angle:
-            return False
-    return True
-
-
-def _parts(
-    plan: FloorPlan,
-    grid: LatentGrid,
-    pictures: list[Observation],
-    paths: list[Path],
-    weights: EvidenceModel,
-    config: LocaliseConfig,
-) -> list[RefinementJob]:
-    """What the optimiser would need of every picture if it were alone."""
-    return [
-        refinement_job(
-            plan, one.query, [path.starts[t] for path in paths], grid.camera_height_m, weights, config.evidence
-        )
-        for t, one in enumerate(pictures)
-    ]
-
-
-def _job(
-    parts: list[RefinementJob],
-    pictures: list[Observation],
-    paths: list[Path],
-    transitions: list[Transition],
-    motions: Sequence[Motion],
-    temperature: float,
-) -> SequenceJob:
-    """What the optimiser needs of all pictures, and the motions that a path goes by."""
-    rolls = [one.query.roll[[path.starts[t].hypothesis for path in paths]] for t, one in enumerate(pictures)]
-    trusted = [
-        [
-            not one.floor or one.likelihood(*pair) > FLOOR
-            for one, pair in zip(transitions, itertools.pairwise(path.states), strict=True)
-        ]
-        for path in paths
-    ]
-    longest = max(part.walls_m.shape[1] for part in parts)
-    walls_m = [np.stack([pad_walls(room_m, longest) for room_m in part.walls_m]) for part in parts]
-    log_profile = np.stack([part.log_profile for part in parts if part.log_profile is not None], axis=1)
-    height = pictures[0].query.camera_height
-    return SequenceJob(
-        position_m=np.stack([part.position_m for part in parts], axis=1),
-        heading=np.stack([part.heading for part in parts], axis=1),
-        roll=np.stack(rolls, axis=1),
-        turnable=np.array([part.optimise_heading for part in parts]),
-        walls_m=np.stack(walls_m, axis=1),
-        log_profile=log_profile.astype(np.float64),
-        precision=np.stack([part.precision for part in parts if part.precision is not None], axis=1),
-        motions=tuple(motions),
-        trusted=np.array(trusted, dtype=bool).reshape(len(paths), len(motions)),
-        motion_scale=math.sqrt(0.5 * log_profile.shape[2] / temperature),
-        height_offset=np.array([path.starts[0].height_offset for path in paths]),
-        height_free=not height.is_exact,
-        height_stiffness=parts[0].height_stiffness,
-        height_bounds=parts[0].height_bounds,
-    )
-
-
-def _ended(
-    plan: FloorPlan,
-    encoders: Encoders,
-    pictures: list[Observation],
-    motions: Sequence[Motion],
-    paths: list[Path],
-    result: SequenceResult,
-    config: LocaliseConfig,
-) -> list[Path]:
-    """The paths where the optimiser took them, best first, of those that met only the best."""
-    temperature = encoders.manifest.evidence.temperature
-    ends: list[list[Candidate]] = []
-    for t, picture in enumerate(pictures):
-        starts = [path.starts[t] for path in paths]
-        poses = PoseSet(result.position_m[:, t], np.array([start.room_index for start in starts]))
-        height_m = picture.query.camera_height.height_m
-        latents, _ = encoders.poses(plan, poses, result.heading[:, t], height_m)
-        targets = picture.query.latents[[start.hypothesis for start in starts]]
-        distance = np.linalg.norm(latents - targets, axis=1)
-        alone = RefinementResult(
-            position_m=result.position_m[:, t],
-            heading=result.heading[:, t],
-            cost=distance,
-            latent_distance=distance,
-            information=result.information[t],
-            converged=np.ones(len(paths), bool),
-            evaluations=np.zeros(len(paths), int),
-            height_offset=result.height_offset,
-        )
-        ends.append(refined(plan, encoders, picture.query, starts, alone, config.evidence))
-    moved = [replace(path, ends=tuple(one[m] for one in ends)) for m, path in enumerate(paths)]
-    log_motions = np.log(np.exp(-_motion_costs(pictures, motions, moved)) + FLOOR)
-    found = []
-    for path, log_motion in zip(moved, log_motions, strict=True):
-        # Every picture counts the prior of the one height that they share.
-        height = path.ends[0].terms["height"]
-        nll = temperature * sum(end.cost for end in path.ends) - (len(path.ends) - 1) * height - log_motion.sum()
-        priors = sum(
-            _log_prior(picture, state, temperature) for picture, state in zip(pictures, path.states, strict=True)
-        )
-        found.append(replace(path, refined_nll=float(nll - priors)))
-    kept: list[Path] = []
-    for path in sorted(found, key=lambda one: one.refined_nll or 0.0):
-        if not any(_alike(pictures, path.ends, other.ends, _SAME_M, _SAME_TURN) for other in kept):
-            kept.append(path)
-    return kept
-
-
-def _log_prior(picture: Observation, state: int, temperature: float) -> float:
-    """That of a state."""
-    row, hypothesis = divmod(state, len(picture.states.heading))
-    return float((picture.log_likelihood + temperature * picture.cost)[0, row, hypothesis])
-
-
-def _motion_costs(
-    pictures: Sequence[Observation], motions: Sequence[Motion], paths: Sequence[Path]
-) -> Float[np.ndarray, "m s"]:
-    """Half the squared residuals of every motion along some paths."""
-    position_m = np.array([[end.position_m for end in path.ends] for path in paths])
-    queries = [picture.query for picture in pictures]
-    headings = [[panorama_heading(*pair) for pair in zip(queries, path.ends, strict=True)] for path in paths]
-    return motion_costs(motions, position_m, np.array(headings))

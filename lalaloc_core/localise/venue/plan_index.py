@@ -39,7 +39,7 @@ _BATCH_SIZE = 65_536
 _CELL_SHIFT = np.uint64(48)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class PlanIndex:
     """Prototypes of plans by the cells that they lie in.
 
@@ -87,14 +87,14 @@ class PlanIndex:
         small = np.int32 if len(rows) < 2**31 else np.int64
         owners = np.append(owners, len(plan))
         return cls(
-            rows,
-            step_m,
-            cells,
-            len(count),
-            member[order[owners[:-1]]].astype(small),
-            plan[order],
-            owners.astype(small),
-            first,
+            rows=rows,
+            step_m=step_m,
+            cells=cells,
+            plans=len(count),
+            member=member[order[owners[:-1]]].astype(small),
+            plan=plan[order],
+            owners=owners.astype(small),
+            first=first,
         )
 
     @classmethod

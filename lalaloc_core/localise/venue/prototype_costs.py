@@ -16,7 +16,14 @@ from jaxtyping import Float, Int
 
 from lalaloc_core.bundle import EvidenceModel
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, WALL_CODE
-from lalaloc_core.localise.evidence import EvidenceConfig, ceiling_costs, precisions, room_type_losses, smoothed
+from lalaloc_core.localise.evidence import (
+    EvidenceConfig,
+    ceiling_costs,
+    mean_log,
+    precisions,
+    room_type_losses,
+    smoothed,
+)
 from lalaloc_core.localise.poses import PredictedCeiling, Query
 from lalaloc_core.localise.venue.prototypes import AZIMUTHS, PER_BYTE, STEPS, azimuths, unpacked_openings
 
@@ -160,9 +167,4 @@ def _walls(factor: Float[np.ndarray, "n a"], precision: Float[np.ndarray, "n a"]
     factor *= precision
     np.square(factor, out=factor)
     factor += 1.0
-    np.minimum(factor, _MAX_FACTOR, out=factor)
-    width = AZIMUTHS // _FACTORS
-    product = factor[:, :width].copy()
-    for begin in range(width, AZIMUTHS, width):
-        product *= factor[:, begin : begin + width]
-    return np.log(product).sum(axis=1) / AZIMUTHS
+    return mean_log(factor, factors=_FACTORS, max_factor=_MAX_FACTOR)

@@ -1,0 +1,163 @@
+"""What goes to the joint optimiser, and what comes back: paths with all the evidence weighed at their new poses."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from lalaloc_core.bundle import EvidenceModel
+from lalaloc_core.conventions import wrap_angle
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.floorplan.geometry import pad_walls
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.pipeline import LocaliseConfig, panorama_heading
+from lalaloc_core.localise.poses import Candidate, LatentGrid, RefinementJob, RefinementResult
+from lalaloc_core.localise.refinement import refined, refinement_job
+from lalaloc_core.localise.sequence.joint import SequenceJob, SequenceResult, motion_costs
+from lalaloc_core.localise.sequence.motion import FLOOR, Motion, Transition
+from lalaloc_core.localise.sequence.paths import Observation, Path
+from lalaloc_core.sampling import PoseSet
+
+# Paths that end as near as this, and turned as alike (radians), are one.
+_SAME_M, _SAME_TURN = 0.2, math.radians(5.0)
+
+
+def are_alike(
+    pictures: Sequence[Observation],
+    one: Sequence[Candidate],
+    other: Sequence[Candidate],
+    within_m: float,
+    within_angle: float,
+) -> bool:
+    """Whether two paths are at the same places, turned alike, in every picture."""
+    for picture, first, second in zip(pictures, one, other, strict=True):
+        apart_m = np.linalg.norm(first.position_m - second.position_m)
+        turned = wrap_angle(panorama_heading(picture.query, first) - panorama_heading(picture.query, second))
+        if apart_m >= within_m or abs(turned) > within_angle:
+            return False
+    return True
+
+
+def job_parts(
+    plan: FloorPlan,
+    grid: LatentGrid,
+    pictures: list[Observation],
+    paths: list[Path],
+    weights: EvidenceModel,
+    config: LocaliseConfig,
+) -> list[RefinementJob]:
+    """What the optimiser would need of every picture if it were alone."""
+    return [
+        refinement_job(
+            plan, one.query, [path.starts[t] for path in paths], grid.camera_height_m, weights, config.evidence
+        )
+        for t, one in enumerate(pictures)
+    ]
+
+
+def sequence_job(
+    parts: list[RefinementJob],
+    pictures: list[Observation],
+    paths: list[Path],
+    transitions: list[Transition],
+    motions: Sequence[Motion],
+    temperature: float,
+) -> SequenceJob:
+    """What the optimiser needs of all pictures, and the motions that a path goes by."""
+    rolls = [one.query.roll[[path.starts[t].hypothesis for path in paths]] for t, one in enumerate(pictures)]
+    trusted = [
+        [
+            not one.floor or one.likelihood(*pair) > FLOOR
+            for one, pair in zip(transitions, itertools.pairwise(path.states), strict=True)
+        ]
+        for path in paths
+    ]
+    longest = max(part.walls_m.shape[1] for part in parts)
+    walls_m = [np.stack([pad_walls(room_m, longest) for room_m in part.walls_m]) for part in parts]
+    log_profile = np.stack([part.log_profile for part in parts if part.log_profile is not None], axis=1)
+    height = pictures[0].query.camera_height
+    return SequenceJob(
+        position_m=np.stack([part.position_m for part in parts], axis=1),
+        heading=np.stack([part.heading for part in parts], axis=1),
+        roll=np.stack(rolls, axis=1),
+        turnable=np.array([part.optimise_heading for part in parts]),
+        walls_m=np.stack(walls_m, axis=1),
+        log_profile=log_profile.astype(np.float64),
+        precision=np.stack([part.precision for part in parts if part.precision is not None], axis=1),
+        motions=tuple(motions),
+        trusted=np.array(trusted, dtype=bool).reshape(len(paths), len(motions)),
+        motion_scale=math.sqrt(0.5 * log_profile.shape[2] / temperature),
+        height_offset=np.array([path.starts[0].height_offset for path in paths]),
+        height_free=not height.is_exact,
+        height_stiffness=parts[0].height_stiffness,
+        height_bounds=parts[0].height_bounds,
+    )
+
+
+def ended_paths(
+    plan: FloorPlan,
+    encoders: Encoders,
+    pictures: list[Observation],
+    motions: Sequence[Motion],
+    paths: list[Path],
+    result: SequenceResult,
+    config: LocaliseConfig,
+) -> list[Path]:
+    """The paths where the optimiser took them, best first, of those that met only the best."""
+    temperature = encoders.manifest.evidence.temperature
+    ends: list[list[Candidate]] = []
+    for t, picture in enumerate(pictures):
+        starts = [path.starts[t] for path in paths]
+        poses = PoseSet(result.position_m[:, t], np.array([start.room_index for start in starts]))
+        height_m = picture.query.camera_height.height_m
+        latents, _ = encoders.poses(plan, poses, result.heading[:, t], height_m)
+        targets = picture.query.latents[[start.hypothesis for start in starts]]
+        distance = np.linalg.norm(latents - targets, axis=1)
+        alone = RefinementResult(
+            position_m=result.position_m[:, t],
+            heading=result.heading[:, t],
+            cost=distance,
+            latent_distance=distance,
+            information=result.information[t],
+            converged=np.ones(len(paths), bool),
+            evaluations=np.zeros(len(paths), int),
+            height_offset=result.height_offset,
+        )
+        ends.append(refined(plan, encoders, picture.query, starts, alone, config.evidence))
+    moved = [replace(path, ends=tuple(one[m] for one in ends)) for m, path in enumerate(paths)]
+    log_motions = np.log(np.exp(-path_motion_costs(pictures, motions, moved)) + FLOOR)
+    found = []
+    for path, log_motion in zip(moved, log_motions, strict=True):
+        # Every picture counts the prior of the one height that they share.
+        height = path.ends[0].terms["height"]
+        nll = temperature * sum(end.cost for end in path.ends) - (len(path.ends) - 1) * height - log_motion.sum()
+        priors = sum(
+            _log_prior(picture, state, temperature) for picture, state in zip(pictures, path.states, strict=True)
+        )
+        found.append(replace(path, refined_nll=float(nll - priors)))
+    kept: list[Path] = []
+    for path in sorted(found, key=lambda one: one.refined_nll or 0.0):
+        if not any(are_alike(pictures, path.ends, other.ends, _SAME_M, _SAME_TURN) for other in kept):
+            kept.append(path)
+    return kept
+
+
+def _log_prior(picture: Observation, state: int, temperature: float) -> float:
+    """That of a state."""
+    row, hypothesis = divmod(state, len(picture.states.heading))
+    return float((picture.log_likelihood + temperature * picture.cost)[0, row, hypothesis])
+
+
+def path_motion_costs(
+    pictures: Sequence[Observation], motions: Sequence[Motion], paths: Sequence[Path]
+) -> Float[np.ndarray, "m s"]:
+    """Half the squared residuals of every motion along some paths."""
+    position_m = np.array([[end.position_m for end in path.ends] for path in paths])
+    queries = [picture.query for picture in pictures]
+    headings = [[panorama_heading(*pair) for pair in zip(queries, path.ends, strict=True)] for path in paths]
+    return motion_costs(motions, position_m, np.array(headings))
