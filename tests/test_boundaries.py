@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from functools import cache
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -176,6 +177,14 @@ def test_every_module_imports_only_from_lower_layers_or_its_own_folder(module: s
         assert target_layer is not None, f"{module} imports {target}, which has no layer"
         neighbour = target_layer == layer and _folder(target) == _folder(module)
         assert target_layer < layer or neighbour, f"{module} (layer {layer}) imports {target} (layer {target_layer})"
+
+
+def test_no_modules_import_each_other_in_a_circle() -> None:
+    graph = {module: _imported(module, ast.walk(_tree(module))) & MODULES.keys() for module in MODULES}
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        pytest.fail(" <- ".join(error.args[1]))
 
 
 @pytest.mark.parametrize("package", sorted(PACKAGES))
