@@ -24,7 +24,7 @@ from lalaloc_core.evaluation.score import position_errors_m
 from lalaloc_core.files import atomic_write
 from lalaloc_core.localise.cohort import Cohort
 from lalaloc_core.localise.covariance import marginal_information
-from lalaloc_core.localise.posterior import RIGHT_WITHIN_M, TURNED_APART
+from lalaloc_core.localise.posterior import HEADING_SEPARATION, RIGHT_WITHIN_M
 from lalaloc_core.metrics import Accuracy
 
 # Of all that is fitted on, photographs of something else than the plan's home weigh so much: enough to tell them, too
@@ -115,7 +115,7 @@ def _is_right(pose: Pose, prediction: Prediction) -> bool:
     truth = prediction.truth
     turned = wrap_angle(heading_from_degrees(pose.heading_deg - truth.heading_deg))
     near = np.hypot(pose.x_m - truth.x_m, pose.y_m - truth.y_m) < RIGHT_WITHIN_M
-    return bool(near and abs(turned) <= TURNED_APART)
+    return bool(near and abs(turned) <= HEADING_SEPARATION)
 
 
 def store_cohort(bundle: Bundle, cohort: Cohort) -> Bundle:

@@ -24,7 +24,7 @@ from lalaloc_core.sampling import PoseSet
 RIGHT_WITHIN_M = 1.0
 HEADING_WITHIN = np.radians(5.0)
 # Two poses at one place are of different modes if they are turned against each other by this much (radians).
-TURNED_APART = np.radians(25.0)
+HEADING_SEPARATION = np.radians(25.0)
 # Pairs that are less likely than the best by this factor's logarithm weigh nothing.
 NEGLIGIBLE = 12.0
 
@@ -211,7 +211,7 @@ def _modes(
 
 def _turned_alike(heading: Float[np.ndarray, "m"], query: Query, candidate: Candidate) -> Bool[np.ndarray, "m"]:
     turned = wrap_angle(heading - query.roll[candidate.hypothesis] - candidate.frame_heading)
-    return np.abs(turned) <= TURNED_APART
+    return np.abs(turned) <= HEADING_SEPARATION
 
 
 def posterior_from_weights(

@@ -18,7 +18,7 @@ from lalaloc_core.localise.evidence import Evidence, EvidenceConfig, latent_dist
 from lalaloc_core.localise.first_look import PairLimits, likeliest
 from lalaloc_core.localise.hints import NO_HINTS, HintName, Hints
 from lalaloc_core.localise.poses import Candidate, LatentGrid, Query, grid_candidate
-from lalaloc_core.localise.posterior import NEGLIGIBLE, TURNED_APART, GridCosts
+from lalaloc_core.localise.posterior import HEADING_SEPARATION, NEGLIGIBLE, GridCosts
 from lalaloc_core.sampling import PoseSet, pose_grid
 
 # Pairs of a pose and a hypothesis that are compared in full: so many, and up to so many of those that may be probable.
@@ -267,7 +267,7 @@ def suppress(
         kept.append(index)
         apart = np.linalg.norm(position_m[remaining] - position_m[index], axis=1) >= separation_m
         if heading is not None:
-            apart |= np.abs(wrap_angle(heading[remaining] - heading[index])) > TURNED_APART
+            apart |= np.abs(wrap_angle(heading[remaining] - heading[index])) > HEADING_SEPARATION
             apart[0] = False
         remaining = remaining[apart]
     return kept

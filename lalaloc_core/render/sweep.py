@@ -231,7 +231,11 @@ def _behind(
 def _inverse_crossings(
     start_m: Float[np.ndarray, "k 2"], end_m: Float[np.ndarray, "k 2"], direction: Float[np.ndarray, "k 2"]
 ) -> Float[np.ndarray, "k"]:
-    """Inverse distances (1/m) along one ray each to one wall each, counted from the ray's origin; 0 where it misses."""
+    """Inverse distances (1/m) along one ray each to one wall each, counted from the ray's origin; 0 where it misses.
+
+    The formula of `profile.inverse_crossings`, which takes all rays with all walls in one product of matrices: for
+    pairs, of which there is one in hundreds, that would be nearly all in vain.
+    """
     edge = end_m - start_m
     area = start_m[:, 0] * edge[:, 1] - start_m[:, 1] * edge[:, 0]
     low, high = start_m - CORNER_TOLERANCE * edge, end_m + CORNER_TOLERANCE * edge

@@ -12,7 +12,7 @@ from service.storage import Store
 from service.telemetry import LOGGER_NAME
 
 # Revisions that one query asks about.
-_AT_ONCE = 500
+_BATCH_SIZE = 500
 _POLL_S = 0.5
 _PURGE_EVERY_S = 3600.0
 
@@ -46,8 +46,8 @@ class Sweeper:
         Grids of theirs that are being computed, or wait for it, are not any more.
         """
         in_memory = sorted(self._grids.revisions() | self._store.plan_cache.revisions())
-        for first in range(0, len(in_memory), _AT_ONCE):
-            asked = in_memory[first : first + _AT_ONCE]
+        for first in range(0, len(in_memory), _BATCH_SIZE):
+            asked = in_memory[first : first + _BATCH_SIZE]
             gone = set(asked) - self._store.plans.current(asked)
             if gone:
                 self._grids.forget(gone)

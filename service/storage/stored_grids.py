@@ -26,7 +26,7 @@ from service.storage.tables import FLOORPLANS, GRID_CHUNKS, GRID_LEASES, LATENT_
 from service.telemetry import LOGGER_NAME
 
 # Grids in one statement.
-_AT_ONCE = 1000
+_BATCH_SIZE = 1000
 
 
 class StoredGrids:
@@ -58,9 +58,9 @@ class StoredGrids:
         """Prototypes of stored grids by the grids' ids, those that there are."""
         found: dict[int, SortedPrototypes] = {}
         columns = LATENT_GRIDS.c
-        for first in range(0, len(grid_ids), _AT_ONCE):
+        for first in range(0, len(grid_ids), _BATCH_SIZE):
             query = select(columns.id, columns.prototypes).where(
-                columns.id.in_(grid_ids[first : first + _AT_ONCE]), columns.prototypes.is_not(None)
+                columns.id.in_(grid_ids[first : first + _BATCH_SIZE]), columns.prototypes.is_not(None)
             )
             with self._database.reading() as connection:
                 rows = connection.execute(query).all()

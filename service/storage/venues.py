@@ -45,7 +45,7 @@ from service.storage.tables import FLOORPLANS, LATENT_GRIDS, REVISIONS, VENUE_PL
 # Whoever makes venues takes turns on PostgreSQL, so that their number is exact; differs from the other locks.
 _COUNT_LOCK = 5_210_003
 # Ids in one statement.
-_AT_ONCE = 1000
+_BATCH_SIZE = 1000
 # Ids in one refusal.
 _NAMED = 5
 # What a query needs to know of a plan, but for its level and its name.
@@ -395,4 +395,4 @@ def _named(ids: Sequence[str]) -> str:
 
 
 def _parts(ids: Sequence[str]) -> Iterable[Sequence[str]]:
-    return (ids[first : first + _AT_ONCE] for first in range(0, len(ids), _AT_ONCE))
+    return (ids[first : first + _BATCH_SIZE] for first in range(0, len(ids), _BATCH_SIZE))

@@ -25,7 +25,7 @@ from lalaloc_core.localise.poses import (
     RefinementJob,
     RefinementResult,
 )
-from lalaloc_core.localise.posterior import TURNED_APART
+from lalaloc_core.localise.posterior import HEADING_SEPARATION
 from lalaloc_core.localise.retrieval import build_grid
 from lalaloc_core.sampling import PoseSet, random_poses
 from tests.strategies import crooked_flat, plan_of, rectangle, seeds
@@ -110,7 +110,7 @@ class TestAnswer:
         assert 1 <= len(positions) <= top_k
         gaps = np.linalg.norm(positions[:, None] - positions[None], axis=-1) + 10.0 * np.eye(len(positions))
         turns = np.array([panorama_heading(query, candidate) for candidate in found.candidates])
-        turned = np.abs(wrap_angle(turns[:, None] - turns[None])) > TURNED_APART
+        turned = np.abs(wrap_angle(turns[:, None] - turns[None])) > HEADING_SEPARATION
         assert np.all((gaps >= 1.0) | turned)
         refined = [candidate.cost for candidate in found.candidates if candidate.information is not None]
         others = [candidate.cost for candidate in found.candidates if candidate.information is None]

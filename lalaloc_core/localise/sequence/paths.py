@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.localise.poses import Candidate, Query
-from lalaloc_core.localise.posterior import TURNED_APART, Posterior, posterior_from_weights
+from lalaloc_core.localise.posterior import HEADING_SEPARATION, Posterior, posterior_from_weights
 from lalaloc_core.localise.sequence.chain import Marginals, forward_backward
 from lalaloc_core.localise.sequence.motion import States, Transition
 from lalaloc_core.sampling import PoseSet
@@ -156,7 +156,7 @@ def _basin(
         near = np.linalg.norm(picture.states.position_m - start.position_m, axis=1) < separation_m
         rows = np.flatnonzero(near)
         heading = picture.query.roll[start.hypothesis] + start.frame_heading
-        turned = np.abs(wrap_angle(picture.states.heading - heading)) > TURNED_APART
+        turned = np.abs(wrap_angle(picture.states.heading - heading)) > HEADING_SEPARATION
         likelihood = picture.log_likelihood[:, rows].copy()
         likelihood[:, :, turned] = -np.inf
         kept.append(rows)

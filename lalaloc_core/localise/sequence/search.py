@@ -27,7 +27,7 @@ from lalaloc_core.localise.pipeline import (
     distinct,
 )
 from lalaloc_core.localise.poses import Candidate, LatentGrid, Query, grid_candidate
-from lalaloc_core.localise.posterior import TURNED_APART, area_shares
+from lalaloc_core.localise.posterior import HEADING_SEPARATION, area_shares
 from lalaloc_core.localise.refinement import with_latents
 from lalaloc_core.localise.retrieval import contradicted, suppress
 from lalaloc_core.localise.sequence.chain import best_paths, forward_backward
@@ -254,7 +254,7 @@ def _paths(
     kept: list[Path] = []
     for states in sorted(through, key=lambda one: -through[one]):
         starts = tuple(_start(grid, picture, state, at) for picture, state in zip(pictures, states, strict=True))
-        alike = (are_alike(pictures, starts, path.ends, config.separation_m, TURNED_APART) for path in kept)
+        alike = (are_alike(pictures, starts, path.ends, config.separation_m, HEADING_SEPARATION) for path in kept)
         if not any(alike):
             kept.append(Path(states, starts, -through[states] - log_height, starts))
         if len(kept) == _PATHS:

@@ -16,7 +16,7 @@ down_revision = "0005"
 
 _COLUMNS = ("centre_x_m", "centre_y_m", "reach_m", "latitude", "longitude")
 # Plans that are read at a time.
-_AT_ONCE = 500
+_BATCH_SIZE = 500
 
 
 def upgrade() -> None:
@@ -33,14 +33,14 @@ def upgrade() -> None:
             .join_from(plans, revisions, plans.c.revision_id == revisions.c.id)
             .where(plans.c.id > last)
             .order_by(plans.c.id)
-            .limit(_AT_ONCE)
+            .limit(_BATCH_SIZE)
         )
         rows = connection.execute(query).all()
         for row in rows:
             values = _place(row.document)
             if values is not None:
                 connection.execute(plans.update().where(plans.c.id == row.id).values(**values))
-        if len(rows) < _AT_ONCE:
+        if len(rows) < _BATCH_SIZE:
             return
         last = rows[-1].id
 
