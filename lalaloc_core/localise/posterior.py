@@ -29,7 +29,7 @@ HEADING_SEPARATION = np.radians(25.0)
 NEGLIGIBLE = 12.0
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class GridCosts:
     """What retrieval found for pairs of a grid's pose and a hypothesis.
 
@@ -63,7 +63,15 @@ class GridCosts:
         """Of every pose under every hypothesis."""
         hypothesis, pose = np.indices(cost.shape).reshape(2, -1)
         against = None if hint_cost is None else hint_cost[pose]
-        return cls(poses, pose, hypothesis, cost.ravel(), offset.ravel(), against, cost.size)
+        return cls(
+            poses=poses,
+            pose=pose,
+            hypothesis=hypothesis,
+            cost=cost.ravel(),
+            offset=offset.ravel(),
+            hint_cost=against,
+            compared=cost.size,
+        )
 
     @cached_property
     def total(self) -> Float[np.ndarray, "m"]:
@@ -152,7 +160,9 @@ def posterior_of(
         log_weight += _width_corrections(log_weight, mode, temperature * np.array([end.total_cost for end in ends]))
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
-    return posterior_from_weights(pose, position, heading, weight, len(grid.poses), query, candidates)
+    return posterior_from_weights(
+        query, candidates, pose=pose, position=position, heading=heading, weight=weight, poses=len(grid.poses)
+    )
 
 
 def _width_corrections(
@@ -215,13 +225,14 @@ def _turned_alike(heading: Float[np.ndarray, "m"], query: Query, candidate: Cand
 
 
 def posterior_from_weights(
+    query: Query,
+    candidates: Sequence[Candidate],
+    *,
     pose: Int[np.ndarray, "m"],
     position: Float[np.ndarray, "m 2"],
     heading: Float[np.ndarray, "m"],
     weight: Float[np.ndarray, "m"],
     poses: int,
-    query: Query,
-    candidates: Sequence[Candidate],
 ) -> Posterior:
     """What weights of places, which sum to one, say of candidates.
 

@@ -78,7 +78,13 @@ def grid_costs(
     estimated = np.maximum(chosen.estimate + chosen.error(cost, weights.temperature), cost.min())
     cost, offset = np.append(cost, estimated), np.append(offset, np.zeros(len(estimated)))
     return GridCosts(
-        grid.poses, pose, hypothesis, cost, offset, None if against is None else against[pose], chosen.compared
+        poses=grid.poses,
+        pose=pose,
+        hypothesis=hypothesis,
+        cost=cost,
+        offset=offset,
+        hint_cost=None if against is None else against[pose],
+        compared=chosen.compared,
     )
 
 

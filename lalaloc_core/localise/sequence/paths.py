@@ -124,7 +124,17 @@ def path_posterior(
             moved = None if path.refined_nll is None else (path.starts[t], path.ends[t])
             parts.append(_weighted(picture, inside, moved))
         position, heading, value, pose = (np.concatenate(one) for one in zip(*parts, strict=True))
-        found.append(posterior_from_weights(pose, position, heading, value, len(poses), picture.query, candidates[t]))
+        found.append(
+            posterior_from_weights(
+                picture.query,
+                candidates[t],
+                pose=pose,
+                position=position,
+                heading=heading,
+                weight=value,
+                poses=len(poses),
+            )
+        )
     return PathPosterior(mass, found)
 
 

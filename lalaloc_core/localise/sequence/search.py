@@ -16,18 +16,17 @@ from lalaloc_core.errors import InvalidMotionError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.cohort import log_cost_to_chance
-from lalaloc_core.localise.confidence import Signals, signals_of
+from lalaloc_core.localise.confidence import signals_of
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.evidence import Evidence, latent_distances
 from lalaloc_core.localise.pipeline import (
     Localisation,
     LocaliseConfig,
-    SearchStage,
     StageClock,
     distinct,
 )
 from lalaloc_core.localise.poses import Candidate, LatentGrid, Query, grid_candidate
-from lalaloc_core.localise.posterior import HEADING_SEPARATION, area_shares
+from lalaloc_core.localise.posterior import HEADING_SEPARATION, Posterior, area_shares
 from lalaloc_core.localise.refinement import with_latents
 from lalaloc_core.localise.retrieval import contradicted, suppress
 from lalaloc_core.localise.sequence.chain import best_paths, forward_backward
@@ -155,29 +154,47 @@ def localise_sequence_steps(
             with_latents(plan, encoders, picture.query, answers, grid.camera_height_m)
             for picture, answers in zip(pictures, candidates, strict=True)
         ]
-    told = []
-    for picture, answers, posterior in zip(pictures, candidates, found.pictures, strict=True):
-        to_chance = _cost_to_chance(plan, grid, encoders, picture, config)
-        signals: dict[SearchStage, Signals] = {stage: signals_of(picture.query, answers[0], posterior, to_chance)}
-        best: dict[SearchStage, Candidate] = {stage: answers[0]}
-        told.append(
-            Localisation(
-                query=picture.query,
-                candidates=answers,
-                posterior=posterior,
-                stage=stage,
-                signals=signals,
-                heading_contradicted=picture.doubted,
-                best=best,
-            )
-        )
-    costs = path_motion_costs(pictures, motions, [paths[0]])[0]
-    missed = tuple(int(index) for index in np.flatnonzero(costs > _CONTRADICTED))
+    told = [
+        _localisation(picture, answers, posterior, stage, _cost_to_chance(plan, grid, encoders, picture, config))
+        for picture, answers, posterior in zip(pictures, candidates, found.pictures, strict=True)
+    ]
+    missed = _contradicted_motions(pictures, motions, transitions, paths[0], stage)
+    return SequenceLocalisation(told, float(found.path[0]), stage, missed, clock.timings_ms)
+
+
+def _localisation(
+    picture: Observation,
+    answers: list[Candidate],
+    posterior: Posterior,
+    stage: Literal["retrieval", "lpo"],
+    cost_to_chance: float,
+) -> Localisation:
+    """What is told of one picture."""
+    return Localisation(
+        query=picture.query,
+        candidates=answers,
+        posterior=posterior,
+        stage=stage,
+        signals={stage: signals_of(picture.query, answers[0], posterior, cost_to_chance)},
+        heading_contradicted=picture.doubted,
+        best={stage: answers[0]},
+    )
+
+
+def _contradicted_motions(
+    pictures: Sequence[Observation],
+    motions: Sequence[Motion],
+    transitions: Sequence[Transition],
+    path: Path,
+    stage: Literal["retrieval", "lpo"],
+) -> tuple[int, ...]:
+    """Numbers of the motions that a path differs from by more than they allow for."""
     if stage == "retrieval":
         # The places of a grid are off themselves.
-        pairs = zip(transitions, itertools.pairwise(paths[0].states), strict=True)
-        missed = tuple(s for s, (one, pair) in enumerate(pairs) if one.floor and one.likelihood(*pair) <= FLOOR)
-    return SequenceLocalisation(told, float(found.path[0]), stage, missed, clock.timings_ms)
+        pairs = zip(transitions, itertools.pairwise(path.states), strict=True)
+        return tuple(s for s, (one, pair) in enumerate(pairs) if one.floor and one.likelihood(*pair) <= FLOOR)
+    costs = path_motion_costs(pictures, motions, [path])[0]
+    return tuple(int(index) for index in np.flatnonzero(costs > _CONTRADICTED))
 
 
 def _cost_to_chance(
