@@ -133,11 +133,11 @@ def _around_the_corner(
 
 def _tall_unit(body: Finish, height: float) -> Piece:
     half, front = 0.5 * _TALL_UNIT_M, 0.31
-    oven = box(at=(0, front - 0.01), half=(half - 0.03, 0.012), z=(0.9, 1.45), finish="dark")
+    oven = box(at=(0.0, front - 0.01), half=(half - 0.03, 0.012), z=(0.9, 1.45), finish="dark")
     parts = (
-        box(at=(0, -0.01), half=(half, front - 0.01), z=(0.0, height), finish=body),
+        box(at=(0.0, -0.01), half=(half, front - 0.01), z=(0.0, height), finish=body),
         oven,
-        box(at=(0, front - 0.005), half=(half - 0.01, 0.008), z=(1.5, height - 0.02), finish=body),
+        box(at=(0.0, front - 0.005), half=(half - 0.01, 0.008), z=(1.5, height - 0.02), finish=body),
     )
     return Piece(_TALL_UNIT_M, 0.62, parts, label="counter")
 
@@ -146,9 +146,9 @@ def _block(width: float, depth: float, height: float, body: Finish) -> Piece:
     """Base units under a worktop that can be walked around."""
     hx, hy = 0.5 * width, 0.5 * depth
     parts = [
-        box(at=(0, 0), half=(hx - 0.05, hy - 0.05), z=(0.0, 0.1), finish="dark"),
-        box(at=(0, 0), half=(hx - 0.02, hy - 0.03), z=(0.1, height - 0.04), finish=body),
-        box(at=(0, 0), half=(hx, hy), z=(height - 0.04, height), finish="stone"),
+        box(at=(0.0, 0.0), half=(hx - 0.05, hy - 0.05), z=(0.0, 0.1), finish="dark"),
+        box(at=(0.0, 0.0), half=(hx - 0.02, hy - 0.03), z=(0.1, height - 0.04), finish=body),
+        box(at=(0.0, 0.0), half=(hx, hy), z=(height - 0.04, height), finish="stone"),
     ]
     for k in range(max(1, math.floor(width / 0.6))):
         x = -hx + width * (k + 0.5) / max(1, math.floor(width / 0.6))

@@ -281,7 +281,7 @@ def _rugs(floor: _Floor, rng: np.random.Generator, first_number: int) -> list[Pr
         pose = floor.lay(half_a, half_b, rng)
         if pose is not None:
             shape = cylinder if rng.random() < 0.2 else box
-            part = shape(at=(0, 0), half=(half_a, half_b), z=(0.0, 0.012), finish="fabric")
+            part = shape(at=(0.0, 0.0), half=(half_a, half_b), z=(0.0, 0.012), finish="fabric")
             rug = Piece(2 * half_a, 2 * half_b, (part,), against_wall=False)
             prisms += place(rug, *pose, first_number + number)
     return prisms

@@ -15,16 +15,16 @@ def bed(rng: np.random.Generator) -> Piece:
     hx, hy = 0.5 * width, 0.5 * depth
     linen: Finish = "white" if rng.random() < 0.6 else "fabric"
     parts = [
-        box(at=(0, 0), half=(hx, hy), z=(0.08, 0.6 * height), finish="wood"),
-        box(at=(0, 0.02), half=(hx - 0.03, hy - 0.03), z=(0.6 * height, height), finish="white"),
-        box(at=(0, 0.2 * depth), half=(hx, 0.3 * depth), z=(0.5 * height, height + 0.05), finish=linen),
+        box(at=(0.0, 0.0), half=(hx, hy), z=(0.08, 0.6 * height), finish="wood"),
+        box(at=(0.0, 0.02), half=(hx - 0.03, hy - 0.03), z=(0.6 * height, height), finish="white"),
+        box(at=(0.0, 0.2 * depth), half=(hx, 0.3 * depth), z=(0.5 * height, height + 0.05), finish=linen),
     ]
     pillows = 2 if width > 1.3 else 1
     for k in range(pillows):
         x = (k - 0.5 * (pillows - 1)) * width / pillows
         parts.append(box(at=(x, -hy + 0.3), half=(0.3, 0.2), z=(height, height + 0.12), finish="white"))
     if rng.random() < 0.7:
-        parts.append(box(at=(0, -hy + 0.03), half=(hx, 0.03), z=(0.0, rng.uniform(0.8, 1.3)), finish="wood"))
+        parts.append(box(at=(0.0, -hy + 0.03), half=(hx, 0.03), z=(0.0, rng.uniform(0.8, 1.3)), finish="wood"))
     return Piece(width, depth, tuple(parts))
 
 
@@ -33,10 +33,10 @@ def sofa(rng: np.random.Generator) -> Piece:
     width, depth = rng.uniform(0.75, 2.6), rng.uniform(0.8, 1.0)
     hx, hy, seat, back = 0.5 * width, 0.5 * depth, rng.uniform(0.38, 0.46), rng.uniform(0.7, 0.95)
     parts = [
-        box(at=(0, 0.08), half=(hx, hy - 0.08), z=(0.06, seat), finish="fabric"),
-        box(at=(0, -hy + 0.12), half=(hx, 0.12), z=(0.06, back), finish="fabric"),
-        box(at=(-hx + 0.09, 0), half=(0.09, hy), z=(0.06, seat + 0.18), finish="fabric"),
-        box(at=(hx - 0.09, 0), half=(0.09, hy), z=(0.06, seat + 0.18), finish="fabric"),
+        box(at=(0.0, 0.08), half=(hx, hy - 0.08), z=(0.06, seat), finish="fabric"),
+        box(at=(0.0, -hy + 0.12), half=(hx, 0.12), z=(0.06, back), finish="fabric"),
+        box(at=(-hx + 0.09, 0.0), half=(0.09, hy), z=(0.06, seat + 0.18), finish="fabric"),
+        box(at=(hx - 0.09, 0.0), half=(0.09, hy), z=(0.06, seat + 0.18), finish="fabric"),
     ]
     for x in np.arange(-hx + 0.4, hx - 0.3, 0.7):
         if rng.random() < 0.5:
@@ -58,12 +58,12 @@ def dining_table(rng: np.random.Generator) -> Piece:
     hx, hy = 0.5 * width, 0.5 * depth
     if rng.random() < 0.25:
         parts = [
-            cylinder(at=(0, 0), half=(hx, hy), z=(height - 0.04, height), finish="wood"),
-            cylinder(at=(0, 0), half=(0.06, 0.06), z=(0.0, height - 0.04), finish="metal"),
+            cylinder(at=(0.0, 0.0), half=(hx, hy), z=(height - 0.04, height), finish="wood"),
+            cylinder(at=(0.0, 0.0), half=(0.06, 0.06), z=(0.0, height - 0.04), finish="metal"),
         ]
     else:
         parts = [
-            box(at=(0, 0), half=(hx, hy), z=(height - 0.04, height), finish="wood"),
+            box(at=(0.0, 0.0), half=(hx, hy), z=(height - 0.04, height), finish="wood"),
             *square_legs(hx, hy, 0.07, height - 0.04, "wood"),
         ]
     reach = rng.uniform(0.0, 0.3)
@@ -88,14 +88,14 @@ def low_table(rng: np.random.Generator) -> Piece:
     """A coffee table, round or on four legs, sometimes with something on it."""
     width, depth, height = rng.uniform(0.5, 1.3), rng.uniform(0.45, 0.7), rng.uniform(0.32, 0.5)
     hx, hy, is_round = 0.5 * width, 0.5 * depth, bool(rng.random() < 0.3)
-    top = (cylinder if is_round else box)(at=(0, 0), half=(hx, hy), z=(height - 0.04, height), finish="wood")
+    top = (cylinder if is_round else box)(at=(0.0, 0.0), half=(hx, hy), z=(height - 0.04, height), finish="wood")
     legs = (
-        [cylinder(at=(0, 0), half=(0.15, 0.15), z=(0, height - 0.04), finish="metal")]
+        [cylinder(at=(0.0, 0.0), half=(0.15, 0.15), z=(0.0, height - 0.04), finish="metal")]
         if is_round
         else square_legs(hx, hy, 0.05, height, "wood")
     )
     thing = box(
-        at=(rng.uniform(-0.15, 0.15), 0),
+        at=(rng.uniform(-0.15, 0.15), 0.0),
         half=(0.12, 0.08),
         z=(height, height + rng.uniform(0.02, 0.2)),
         finish="accent",
@@ -109,10 +109,10 @@ def desk(rng: np.random.Generator) -> Piece:
     hx, hy = 0.5 * width, 0.5 * depth
     back = 0.25
     parts = [
-        box(at=(0, -back), half=(hx, hy), z=(height - 0.03, height), finish="wood"),
+        box(at=(0.0, -back), half=(hx, hy), z=(height - 0.03, height), finish="wood"),
         *(leg._replace(y=leg.y - back) for leg in square_legs(hx, hy, 0.05, height, "metal")),
-        box(at=(0, -hy - back + 0.2), half=(0.28, 0.015), z=(height + 0.1, height + 0.45), finish="dark"),
-        box(at=(0, -hy - back + 0.2), half=(0.04, 0.04), z=(height, height + 0.12), finish="dark"),
+        box(at=(0.0, -hy - back + 0.2), half=(0.28, 0.015), z=(height + 0.1, height + 0.45), finish="dark"),
+        box(at=(0.0, -hy - back + 0.2), half=(0.04, 0.04), z=(height, height + 0.12), finish="dark"),
         *_chair_parts(rng.uniform(-0.2, 0.2), hy - back + 0.1, 1, "dark"),
     ]
     if rng.random() < 0.5:
@@ -131,7 +131,7 @@ def wardrobe_run(rng: np.random.Generator, width: float, height: float) -> Piece
     doors = max(1, round(width / rng.uniform(0.45, 0.62)))
     depth, body = rng.uniform(0.35, 0.65), cast(Finish, "white" if rng.random() < 0.5 else "wood")
     has_handles, front = rng.random() < 0.75, 0.5 * depth
-    parts = [box(at=(0, -0.01), half=(0.5 * width, front - 0.01), z=(0.0, height), finish=body)]
+    parts = [box(at=(0.0, -0.01), half=(0.5 * width, front - 0.01), z=(0.0, height), finish=body)]
     pitch = width / doors
     for k in range(doors):
         x = -0.5 * width + (k + 0.5) * pitch
@@ -153,12 +153,12 @@ def bookcase(rng: np.random.Generator) -> Piece:
     """Uprights, boards and books."""
     width, depth, height = rng.uniform(0.6, 1.8), rng.uniform(0.25, 0.4), rng.uniform(0.8, 2.3)
     hx, hy = 0.5 * width, 0.5 * depth
-    parts = [box(at=(0, -hy + 0.01), half=(hx, 0.01), z=(0.0, height), finish="wood")]
-    parts += [box(at=(sign * (hx - 0.015), 0), half=(0.015, hy), z=(0.0, height), finish="wood") for sign in (-1, 1)]
+    parts = [box(at=(0.0, -hy + 0.01), half=(hx, 0.01), z=(0.0, height), finish="wood")]
+    parts += [box(at=(sign * (hx - 0.015), 0.0), half=(0.015, hy), z=(0.0, height), finish="wood") for sign in (-1, 1)]
     levels = max(2, round(height / 0.38))
     for k in range(levels + 1):
         z = 0.05 + k * (height - 0.08) / levels
-        parts.append(box(at=(0, 0), half=(hx - 0.02, hy), z=(z, z + 0.025), finish="wood"))
+        parts.append(box(at=(0.0, 0.0), half=(hx - 0.02, hy), z=(z, z + 0.025), finish="wood"))
         if k < levels and rng.random() < 0.8:
             span = rng.uniform(0.3, 0.95) * (hx - 0.04)
             x = rng.uniform(-1, 1) * (hx - 0.04 - span)
@@ -179,23 +179,23 @@ def sideboard(rng: np.random.Generator) -> Piece:
     width, depth, height = rng.uniform(0.5, 2.2), rng.uniform(0.35, 0.5), rng.uniform(0.35, 1.0)
     hy = 0.5 * depth
     finish: Finish = "white" if rng.random() < 0.4 else "wood"
-    parts = [box(at=(0, -0.01), half=(0.5 * width, hy - 0.01), z=(0.0, height), finish=finish)]
+    parts = [box(at=(0.0, -0.01), half=(0.5 * width, hy - 0.01), z=(0.0, height), finish=finish)]
     drawers = int(rng.integers(1, 4))
     for k in range(drawers):
         z0, z1 = 0.04 + k * (height - 0.06) / drawers, 0.02 + (k + 1) * (height - 0.06) / drawers
-        parts.append(box(at=(0, hy - 0.01), half=(0.5 * width - 0.015, 0.01), z=(z0, z1), finish=finish))
+        parts.append(box(at=(0.0, hy - 0.01), half=(0.5 * width - 0.015, 0.01), z=(z0, z1), finish=finish))
         parts.append(
-            box(at=(0, hy + 0.01), half=(0.06, 0.01), z=(0.5 * (z0 + z1), 0.5 * (z0 + z1) + 0.02), finish="metal")
+            box(at=(0.0, hy + 0.01), half=(0.06, 0.01), z=(0.5 * (z0 + z1), 0.5 * (z0 + z1) + 0.02), finish="metal")
         )
     if height < 0.75 and rng.random() < 0.6:
         half = min(rng.uniform(0.35, 0.7), 0.5 * width + 0.05)
         parts.append(
-            box(at=(0, -hy + 0.1), half=(half, 0.02), z=(height + 0.06, height + 0.06 + 1.15 * half), finish="dark")
+            box(at=(0.0, -hy + 0.1), half=(half, 0.02), z=(height + 0.06, height + 0.06 + 1.15 * half), finish="dark")
         )
     elif rng.random() < 0.7:
         x = rng.uniform(-0.3, 0.3) * width
         parts.append(
-            cylinder(at=(x, 0), half=(0.08, 0.08), z=(height, height + rng.uniform(0.1, 0.45)), finish="accent")
+            cylinder(at=(x, 0.0), half=(0.08, 0.08), z=(height, height + rng.uniform(0.1, 0.45)), finish="accent")
         )
     return Piece(width, depth, tuple(parts))
 
@@ -205,10 +205,10 @@ def nightstand(rng: np.random.Generator) -> Piece:
     width, height = rng.uniform(0.35, 0.55), rng.uniform(0.4, 0.6)
     half = 0.5 * width
     parts = (
-        box(at=(0, 0), half=(half, 0.2), z=(0.0, height), finish="wood"),
-        box(at=(0, 0.2), half=(half - 0.02, 0.01), z=(0.1, height - 0.04), finish="wood"),
-        cylinder(at=(0, 0), half=(0.03, 0.03), z=(height, height + 0.2), finish="metal"),
-        cylinder(at=(0, 0), half=(0.13, 0.13), z=(height + 0.2, height + 0.42), finish="glow"),
+        box(at=(0.0, 0.0), half=(half, 0.2), z=(0.0, height), finish="wood"),
+        box(at=(0.0, 0.2), half=(half - 0.02, 0.01), z=(0.1, height - 0.04), finish="wood"),
+        cylinder(at=(0.0, 0.0), half=(0.03, 0.03), z=(height, height + 0.2), finish="metal"),
+        cylinder(at=(0.0, 0.0), half=(0.13, 0.13), z=(height + 0.2, height + 0.42), finish="glow"),
     )
     return Piece(width, 0.42, parts)
 
@@ -217,8 +217,8 @@ def plant(rng: np.random.Generator) -> Piece:
     """A pot and a few leafy blobs."""
     pot, height = rng.uniform(0.1, 0.22), rng.uniform(0.5, 1.9)
     parts = [
-        cylinder(at=(0, 0), half=(pot, pot), z=(0.0, 1.6 * pot), finish="accent"),
-        cylinder(at=(0, 0), half=(0.02, 0.02), z=(1.6 * pot, height - 0.1), finish="wood"),
+        cylinder(at=(0.0, 0.0), half=(pot, pot), z=(0.0, 1.6 * pot), finish="accent"),
+        cylinder(at=(0.0, 0.0), half=(0.02, 0.02), z=(1.6 * pot, height - 0.1), finish="wood"),
     ]
     for _ in range(int(rng.integers(3, 7))):
         x, y = rng.uniform(-0.8 * pot, 0.8 * pot, 2)
@@ -233,9 +233,9 @@ def floor_lamp(rng: np.random.Generator) -> Piece:
     """Foot, pole and shade."""
     height, radius = rng.uniform(1.3, 1.8), rng.uniform(0.12, 0.25)
     parts = (
-        cylinder(at=(0, 0), half=(0.14, 0.14), z=(0.0, 0.03), finish="dark"),
-        cylinder(at=(0, 0), half=(0.012, 0.012), z=(0.03, height), finish="metal"),
-        cylinder(at=(0, 0), half=(radius, radius), z=(height - 0.25, height), finish="glow"),
+        cylinder(at=(0.0, 0.0), half=(0.14, 0.14), z=(0.0, 0.03), finish="dark"),
+        cylinder(at=(0.0, 0.0), half=(0.012, 0.012), z=(0.03, height), finish="metal"),
+        cylinder(at=(0.0, 0.0), half=(radius, radius), z=(height - 0.25, height), finish="glow"),
     )
     return Piece(2 * radius, 2 * radius, parts)
 
@@ -245,11 +245,14 @@ def carton(rng: np.random.Generator) -> Piece:
     width, depth, height = rng.uniform(0.2, 0.8, 3)
     finish: Finish = ("wood", "accent", "fabric", "dark", "white", "metal")[int(rng.integers(6))]
     shape = cylinder if rng.random() < 0.2 else box
-    parts = [shape(at=(0, 0), half=(0.5 * width, 0.5 * depth), z=(0.0, height), finish=finish)]
+    parts = [shape(at=(0.0, 0.0), half=(0.5 * width, 0.5 * depth), z=(0.0, height), finish=finish)]
     if rng.random() < 0.4:
         parts.append(
             box(
-                at=(0, 0), half=(0.3 * width, 0.35 * depth), z=(height, height + rng.uniform(0.1, 0.4)), finish="accent"
+                at=(0.0, 0.0),
+                half=(0.3 * width, 0.35 * depth),
+                z=(height, height + rng.uniform(0.1, 0.4)),
+                finish="accent",
             )
         )
     return Piece(width, depth, tuple(parts), against_wall=bool(rng.random() < 0.7))
@@ -260,9 +263,9 @@ def bench(rng: np.random.Generator) -> Piece:
     width = rng.uniform(0.6, 1.4)
     hx = 0.5 * width
     parts = (
-        box(at=(0, 0), half=(hx, 0.17), z=(0.4, 0.45), finish="wood"),
+        box(at=(0.0, 0.0), half=(hx, 0.17), z=(0.4, 0.45), finish="wood"),
         *square_legs(hx, 0.17, 0.05, 0.4, "wood"),
-        box(at=(0, -0.16), half=(hx, 0.01), z=(1.6, 1.7), finish="wood"),
+        box(at=(0.0, -0.16), half=(hx, 0.01), z=(1.6, 1.7), finish="wood"),
         box(at=(rng.uniform(-0.5, 0.5) * hx, -0.1), half=(0.2, 0.07), z=(0.9, 1.65), finish="fabric"),
     )
     return Piece(width, 0.36, parts)
