@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from lalaloc_core.configuration import build_config
-from lalaloc_core.errors import BundleError
+from lalaloc_core.errors import BundleError, ConfigError
 from lalaloc_core.files import atomic_write
 
 MANIFEST_NAME = "manifest.json"
@@ -174,10 +174,15 @@ class Manifest:
         """
         try:
             raw = json.loads(text)
-            if raw.get("format_version") != FORMAT_VERSION:
-                raise BundleError(f"manifest format {raw.get('format_version')!r}, this code reads {FORMAT_VERSION}")
+        except ValueError as error:
+            raise BundleError(f"{MANIFEST_NAME} is not JSON: {error}") from error
+        if not isinstance(raw, dict):
+            raise BundleError(f"{MANIFEST_NAME} must be a JSON object, not {type(raw).__name__}")
+        if raw.get("format_version") != FORMAT_VERSION:
+            raise BundleError(f"manifest format {raw.get('format_version')!r}, this code reads {FORMAT_VERSION}")
+        try:
             return build_config(cls, raw, path="manifest")
-        except (ValueError, AttributeError) as error:
+        except ConfigError as error:
             raise BundleError(f"not a valid {MANIFEST_NAME}: {error}") from error
 
 

@@ -1,7 +1,8 @@
 """Dataclasses from plain data, strictly: configurations, manifests and results travel as JSON and in checkpoints.
 
 Read by pydantic, which checks every value against the dataclass's own annotations: no key may be unknown, no type is
-converted but whole numbers where a float is wanted, tuples have their length, and every arm of a union is tried.
+converted but whole numbers where a float is wanted, numbers are finite, tuples have their length, and every arm of a
+union is tried.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import json
 from functools import cache
 from typing import Any, TypeVar
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
 from lalaloc_core.errors import ConfigError
@@ -29,7 +30,7 @@ def build_config(kind: type[_Kind], raw: Any, *, path: str = "config") -> _Kind:
     """
     try:
         # As JSON, because that has one kind of sequence: checkpoints keep tuples, files have lists.
-        return _adapter(kind).validate_json(json.dumps(raw), strict=True, extra="forbid")
+        return _adapter(kind).validate_json(json.dumps([raw]), strict=True, extra="forbid")[0]
     except ValidationError as error:
         raise _explained(error.errors()[0], path) from error
     except TypeError as error:
@@ -38,7 +39,8 @@ def build_config(kind: type[_Kind], raw: Any, *, path: str = "config") -> _Kind:
 
 @cache
 def _adapter(kind: type[Any]) -> Any:
-    return TypeAdapter(kind)
+    # In a tuple, because that may have settings, which hold for the dataclasses inside; a dataclass itself may not.
+    return TypeAdapter(tuple[kind], config=ConfigDict(allow_inf_nan=False))
 
 
 def _explained(problem: ErrorDetails, path: str) -> ConfigError:
@@ -47,7 +49,7 @@ def _explained(problem: ErrorDetails, path: str) -> ConfigError:
     if isinstance(cause, ConfigError):
         # Raised by the dataclass itself, about values that do not go together.
         return cause
-    where, kind = [path, *problem["loc"]], problem["type"]
+    where, kind = [path, *problem["loc"][1:]], problem["type"]
     if kind == "unexpected_keyword_argument":
         return ConfigError(f"{_joined(where[:-1])} has no key '{where[-1]}'")
     if kind == "missing" and isinstance(where[-1], int):

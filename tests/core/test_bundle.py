@@ -220,10 +220,26 @@ class TestReading:
         with pytest.raises(BundleError):
             Bundle.open(copied)
 
-    @pytest.mark.parametrize("text", ["", "{", "[]", "null", "3"])
-    def test_a_manifest_that_is_no_object_is_refused(self, text: str) -> None:
-        with pytest.raises(BundleError):
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ("", "manifest.json is not JSON"),
+            ("{", "manifest.json is not JSON"),
+            ("[]", "manifest.json must be a JSON object, not list"),
+            ("null", "manifest.json must be a JSON object, not NoneType"),
+            ("3", "manifest.json must be a JSON object, not int"),
+        ],
+    )
+    def test_a_manifest_that_is_no_object_is_refused(self, text: str, message: str) -> None:
+        with pytest.raises(BundleError, match=message):
             Manifest.from_json(text)
+
+    @pytest.mark.parametrize("number", ["NaN", "Infinity", "-Infinity"])
+    def test_numbers_of_a_manifest_are_finite(self, opened_bundle: Bundle, number: str) -> None:
+        raw = json.loads(opened_bundle.manifest.to_json())
+        raw["image_mean"] = [0.5, float(number), 0.5]
+        with pytest.raises(BundleError, match=r"manifest\.image_mean\[1\] is -?(nan|inf)"):
+            Manifest.from_json(json.dumps(raw))
 
     def test_a_manifest_without_a_required_key_is_refused(self, opened_bundle: Bundle) -> None:
         raw = json.loads(opened_bundle.manifest.to_json())

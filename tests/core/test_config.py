@@ -55,6 +55,8 @@ def test_whole_numbers_are_fine_where_a_float_is_wanted() -> None:
         (["ring", "image_widths"], 3, r"config\.ring\.image_widths is 3"),
         (["ring", "image_widths"], [8, "x"], r"config\.ring\.image_widths\[1\] is 'x'"),
         (["image", "supersample"], [1, 2, 1, 2], r"config\.image\.supersample is \[1, 2, 1, 2\]"),
+        (["image", "l2_weight"], float("nan"), r"config\.image\.l2_weight is nan: Input should be a finite number"),
+        (["image", "minutes"], float("inf"), r"config\.image\.minutes is inf: Input should be a finite number"),
         (["image", "supersample"], [1], r"config\.image\.supersample is \[1\]: it has too few items"),
         (["layout", "triplets", "positives"], 1.5, r"config\.layout\.triplets\.positives"),
     ],
