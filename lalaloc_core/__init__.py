@@ -1,10 +1,11 @@
 """LaLaLoc: where in this floor plan was this panorama taken?
 
-    floorplan/   plans: validated rooms and openings        sampling.py  camera poses in a plan
-    panorama/    pictures as files                          bundle.py    a model on disk
-    render/      the layout renderer                        conventions.py  axes, units, pixels
-    nets/        the networks in torch                      metrics.py, azimuth_metrics.py  scores
-    localise/    the search: evidence, retrieval, optimiser calibrate.py fits confidence
+    floorplan/   plans: validated rooms and openings         sampling.py     camera poses in a plan
+    plans/       plan files of other tools, read and written bundle.py       a model on disk
+    panorama/    pictures as files                           conventions.py  axes, units, pixels
+    render/      the layout renderer                         metrics.py, azimuth_metrics.py  scores
+    nets/        the networks in torch                       calibrate.py    fits confidence
+    localise/    the search: evidence, retrieval, optimiser  configuration.py  dataclasses from plain data
     synth/       the generator of training data
     unfamiliar/  another generator, for reporting only
     draw/        pictures of plans and answers

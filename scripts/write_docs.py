@@ -23,6 +23,16 @@ from service.settings import PREFIX, Settings
 
 ROOT = Path(__file__).resolve().parent.parent
 _PACKAGES = ("lalaloc_core", "service", "lalaloc_client", "examples", "scripts", "benchmarks")
+# Folders without a docstring: what each is for, and what to begin with.
+_OTHER_FOLDERS = {
+    "web": ("The web pages, in TypeScript; `make web` builds `service/web/` of them.", "src/app.ts"),
+    "models/default": ("The model that ships, with its card.", "README.md"),
+    "docker": ("Image, compose files, nginx, Kubernetes, Grafana dashboard.", "compose.yaml"),
+    "tests": (
+        "Tests, in folders named as what they test: `core/`, `plans/` (plan files), `service/`, `client/`, `web/`.",
+        "test_boundaries.py",
+    ),
+}
 
 
 def main() -> None:
@@ -62,7 +72,11 @@ def settings_table() -> str:
 
 
 def folder_map() -> str:
-    """Every package, what its docstring says it is for and where to begin, as a Markdown table."""
+    """Every package, what its docstring says it is for and where to begin, as a Markdown table; then other folders.
+
+    Raises:
+        FileNotFoundError: what one of those others is to be begun with is gone.
+    """
     rows = ["| folder | what it is for | begin with |", "|---|---|---|"]
     for package in _PACKAGES:
         for path in sorted((ROOT / package).rglob("__init__.py"), key=lambda path: path.parent):
@@ -70,6 +84,10 @@ def folder_map() -> str:
             summary = " ".join(docstring.split("\n\n")[0].split()).replace("|", "\\|")
             begin = re.search(r"Begin\s+with\s+`([^`]+)`", docstring)
             rows.append(f"| `{path.parent.relative_to(ROOT)}/` | {summary} | {f'`{begin[1]}`' if begin else ''} |")
+    for folder, (purpose, first) in _OTHER_FOLDERS.items():
+        if not (ROOT / folder / first).exists():
+            raise FileNotFoundError(f"the map of folders names '{folder}/{first}', which is gone")
+        rows.append(f"| `{folder}/` | {purpose} | `{first}` |")
     return "\n".join(rows)
 
 

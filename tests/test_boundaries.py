@@ -194,6 +194,14 @@ def test_every_package_says_what_it_is_for_and_where_to_begin(package: str) -> N
     assert (MODULES[package].parent / begin[1]).exists()
 
 
+@pytest.mark.parametrize("package", sorted(PACKAGES))
+def test_every_file_that_a_package_s_docstring_names_exists(package: str) -> None:
+    folder = MODULES[package].parent
+    named = re.findall(r"`([\w/]+\.py)`", ast.get_docstring(_tree(package)) or "")
+    # Named from the folder itself, from that around it, or from the top.
+    assert [name for name in named if not any((base / name).exists() for base in (folder, folder.parent, ROOT))] == []
+
+
 def test_the_layer_table_names_no_module_that_is_gone() -> None:
     assert [name for name in LAYERS if name not in MODULES] == []
 

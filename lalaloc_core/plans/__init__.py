@@ -3,7 +3,7 @@
 `import_plan` and `import_plans` take the bytes of a file and find out by its content what it is. Every importer gives a
 document in the native format (docs/conventions.md) and a report of what it used and what is likely wrong.
 
-formats/   an importer for each format; `native.py` is the shortest
+formats/   an importer for each format; `formats/native.py` is the plainest
 drawing/   vector drawings, whatever the format: which lines are walls, what they enclose
 picture/   scans and photographs of drawings
 model/     what importers share: options, limits, the sketch that they fill in, and the plan that becomes of it

@@ -1,7 +1,7 @@
 """Evaluations to look at: one HTML page about runs, contact sheets of their worst queries, annotated photographs.
 
 Begin with `html.py`, the page. `worst.py` draws what fails most, `photographs.py` what a model reads from photographs
-of real rooms; `plan.py` and `pictures.py` draw plans and panoramas for all of them.
+of real rooms; `pictures.py` draws plans and panoramas for all of them, `charts.py` curves.
 """
 
 from lalaloc_core.report.html import write_report

@@ -106,8 +106,8 @@ class ImageStageConfig:
         log_ratio_weight: weight of the log-ratio loss with the panorama as anchor and layouts as neighbours, drawn as
             in stage 1.
         kd_weight: weight of the same loss with the layout encoder's distances in place of the Chamfer distances.
-        ring_weight: weight of distilling ring features (architecture `ring`).
-        profile_weight: weight of the Laplace likelihood of the wall profile (architecture `ring`).
+        ring_weight: weight of distilling ring features (architectures `ring` and `trunk`).
+        profile_weight: weight of the Laplace likelihood of the wall profile (architectures `ring` and `trunk`).
         optics: strength, 0 to 1, of random changes by lens and file: blur, vignetting, seams, tone curves, JPEG.
         pretrained: begin with the trunk's weights of ImageNet (architecture `trunk`).
         opening_weight: weight of the cross entropy of what is met at each azimuth (architecture `trunk`, like the

@@ -1,6 +1,7 @@
 """What persists, behind `Store`: SQLAlchemy on SQLite or PostgreSQL, every call one transaction.
 
     floorplans       id, tenant, name, current revision, created_at, updated_at
+    ├── kept_answers     answers to pictures, where queries ask to keep them; tenant, created_at
     └── revisions        id, number, document, digest of the original, rooms, area, camera height, failure
         ├── original_chunks  the uploaded bytes, 1 MiB each
         ├── latent_grids     model, grid step, camera height, poses

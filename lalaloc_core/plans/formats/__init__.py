@@ -1,5 +1,5 @@
 """Importers, a module for each format of files.
 
-Begin with `native.py`, the shortest. Drawings (`dxf.py`, `svg.py`, `pdf.py`) leave it to `plans.drawing` to find the
+Begin with `native.py`, the plainest. Drawings (`dxf.py`, `svg.py`, `pdf.py`) leave it to `plans.drawing` to find the
 rooms; in `ifc.py`, `geojson.py` and `imdf.py` they stand in the file.
 """
