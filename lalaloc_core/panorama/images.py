@@ -23,7 +23,7 @@ from lalaloc_core.file_kinds import kind_of
 from lalaloc_core.panorama.jpeg import count_scans
 from lalaloc_core.panorama.levelling import level
 from lalaloc_core.panorama.photo_sphere import PhotoSphere, SpherePart, read_photo_sphere
-from lalaloc_core.panorama.pieces import check_pieces
+from lalaloc_core.panorama.segments import check_segments
 
 FORMATS = ("JPEG", "PNG", "WEBP")
 # What stands where a picture shows nothing: the mean that encoders subtract.
@@ -92,7 +92,7 @@ def open_panorama(content: bytes, *, height: int, width: int, limits: PanoramaLi
     if not content:
         raise InvalidPanoramaError("the panorama is empty")
     _check_webp_size(content, limits)
-    check_pieces(content)
+    check_segments(content)
     with _named_errors(content, limits), Image.open(io.BytesIO(content), formats=FORMATS) as image:
         _check_pixels(*image.size, limits)
         _check_scans(content, limits)

@@ -15,7 +15,7 @@ from lalaloc_core.errors import InvalidFloorPlanError, InvalidPanoramaError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.panorama.images import open_panorama
 from lalaloc_core.panorama.photo_sphere import read_photo_sphere
-from lalaloc_core.panorama.pieces import check_pieces
+from lalaloc_core.panorama.segments import check_segments
 from tests.growth import assert_no_worse_than_linear
 
 _PACKET = 60_000
@@ -147,7 +147,7 @@ def test_a_picture_of_a_million_pieces_is_refused_before_it_is_read() -> None:
 def test_pictures_of_as_many_pieces_as_encoders_write_are_read() -> None:
     jpeg, png = _picture("JPEG"), _picture("PNG")
     # 40 MB of metadata in the largest segments there are, and pixels in the smallest chunks that encoders write.
-    check_pieces(jpeg[:2] + _segment(0xE2, bytes(65_000)) * 640 + jpeg[2:])
-    check_pieces(png[:33] + _chunk(b"IDAT", bytes(4096)) * 10_000)
+    check_segments(jpeg[:2] + _segment(0xE2, bytes(65_000)) * 640 + jpeg[2:])
+    check_segments(png[:33] + _chunk(b"IDAT", bytes(4096)) * 10_000)
     for content in (jpeg, png, _picture("WEBP"), b"", b"\xff\xd8", b"\x89PNG\r\n\x1a\n"):
-        check_pieces(content)
+        check_segments(content)

@@ -1,4 +1,4 @@
-"""Of how many pieces a picture's file is put together, counted before anything is made of them.
+"""Of how many segments or chunks a picture's file is put together, counted before anything is made of them.
 
 Reading a piece takes microseconds, so millions of empty ones keep a reader busy for as long as decoding would; pieces
 of Exif are put together one by one, in time that grows with the square of their number.
@@ -6,54 +6,44 @@ of Exif are put together one by one, in time that grows with the square of their
 
 from __future__ import annotations
 
-import re
-
 from lalaloc_core.errors import InvalidPanoramaError
+from lalaloc_core.panorama import jpeg
 
 # Of 64 KiB at most each: more than any metadata need. Cameras write one piece of Exif, or a few.
 _MAX_SEGMENTS, _MAX_EXIF_SEGMENTS = 2_000, 16
 # Encoders write pixels in pieces of 8 KiB and more.
 _MAX_CHUNKS = 20_000
-_JPEG, _PNG = b"\xff\xd8", b"\x89PNG\r\n\x1a\n"
-_APP1, _END_OF_IMAGE, _START_OF_SCAN = 0xE1, 0xD9, 0xDA
-# Alone, without a length.
-_ALONE = frozenset({0x01, *range(0xD0, 0xD8)})
-_MARKER = re.compile(rb"\xff([^\x00\xff])")
+_PNG = b"\x89PNG\r\n\x1a\n"
 # Length before, checksum after each.
 _CHUNK_FRAME = 12
 
 
-def check_pieces(content: bytes) -> None:
+def check_segments(content: bytes) -> None:
     """Refuse a JPEG or PNG of too many pieces; anything else is left to others.
 
     Raises:
         InvalidPanoramaError: it has more than any encoder writes.
     """
-    if content.startswith(_JPEG):
-        _check_segments(content)
+    if content.startswith(jpeg.START):
+        _check_jpeg(content)
     elif content.startswith(_PNG):
-        _check_chunks(content)
+        _check_png(content)
 
 
-def _check_segments(content: bytes) -> None:
+def _check_jpeg(content: bytes) -> None:
     """Those before the first scan, which are read when a JPEG is opened."""
-    segments = exif = 0
-    at = len(_JPEG)
-    while (found := _MARKER.search(content, at)) is not None:
-        marker, at = found[1][0], found.end()
-        if marker in (_START_OF_SCAN, _END_OF_IMAGE):
+    exif = 0
+    for segments, (marker, at) in enumerate(jpeg.markers(content), start=1):
+        if marker == jpeg.START_OF_SCAN:
             return
-        segments += 1
-        if marker not in _ALONE:
-            exif += marker == _APP1 and content.startswith(b"Exif\0\0", at + 2)
-            at += int.from_bytes(content[at : at + 2], "big")
+        exif += marker == jpeg.APP1 and content.startswith(b"Exif\0\0", at + 2)
         if segments > _MAX_SEGMENTS:
             raise InvalidPanoramaError(f"the panorama is a JPEG of more than {_MAX_SEGMENTS} segments")
         if exif > _MAX_EXIF_SEGMENTS:
             raise InvalidPanoramaError(f"the panorama is a JPEG with more than {_MAX_EXIF_SEGMENTS} segments of Exif")
 
 
-def _check_chunks(content: bytes) -> None:
+def _check_png(content: bytes) -> None:
     chunks, at = 0, len(_PNG)
     while at < len(content):
         chunks += 1
