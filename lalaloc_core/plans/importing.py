@@ -17,7 +17,7 @@ from lalaloc_core.plans.model.options import DEFAULT_OPTIONS, ImportOptions
 
 FORMATS = ("native", "geojson", "archive", "svg", "dxf", "ifc", "pdf", "picture")
 # How a refusal speaks of them.
-_SPOKEN = {
+_FORMAT_NAMES = {
     "native": "plan in the native format",
     "geojson": "GeoJSON file",
     "archive": "zip archive",
@@ -210,7 +210,7 @@ def _import(
     try:
         return _import_with(format, content, document, options, budget)
     except ModuleNotFoundError as error:
-        raise missing_extra(error, f"reading a {_SPOKEN[format]}") from error
+        raise missing_extra(error, f"reading a {_FORMAT_NAMES[format]}") from error
 
 
 def _import_with(

@@ -16,6 +16,9 @@ from shapely.geometry.base import BaseGeometry
 from lalaloc_core.plans.model.words import Role
 
 # Curves are followed to this share of their size.
+# Fills of less luminance (of 255) may be walls; a curve becomes so many straight pieces.
+DARK = 110.0
+CURVE_STEPS = 12
 _STEPS = 24
 _QUARTER_DEG = (55.0, 125.0)
 _ROUND = 0.03
@@ -127,3 +130,8 @@ def arc_points(
     sweep = (end_deg - start_deg) % 360.0 or 360.0
     angles = np.radians(start_deg + np.linspace(0.0, sweep, max(4, math.ceil(_STEPS * sweep / 90.0) + 1)))
     return np.array(centre) + radius * np.column_stack([np.cos(angles), np.sin(angles)])
+
+
+def luminance(red: float, green: float, blue: float) -> float:
+    """Of a colour, 0 to 255 like its channels (ITU-R BT.601)."""
+    return 0.299 * red + 0.587 * green + 0.114 * blue

@@ -20,7 +20,7 @@ from lalaloc_core.plans.drawing.shapes import Area, Drawing, Lettering, Swing
 from lalaloc_core.plans.drawing.walls import DEFAULT_WALLS, Enclosed, Gap, WallConfig, enclose
 from lalaloc_core.plans.model.geometry import opening_line
 from lalaloc_core.plans.model.limits import Budget
-from lalaloc_core.plans.model.report import Notebook
+from lalaloc_core.plans.model.report import ReportBuilder
 from lalaloc_core.plans.model.sketch import OpeningKind, Sketch, SketchedOpening, SketchedRoom
 from lalaloc_core.plans.model.words import type_of_room
 
@@ -41,7 +41,7 @@ _OFF_WALL_M = 0.03
 _MAX_SEGMENTS = 60_000
 
 
-def understand(drawing: Drawing, notebook: Notebook, budget: Budget, config: WallConfig = DEFAULT_WALLS) -> Sketch:
+def understand(drawing: Drawing, builder: ReportBuilder, budget: Budget, config: WallConfig = DEFAULT_WALLS) -> Sketch:
     """Make a sketch of a drawing in metres, y up.
 
     Raises:
@@ -52,22 +52,22 @@ def understand(drawing: Drawing, notebook: Notebook, budget: Budget, config: Wal
     sketch.obstacles = [area.shape for area in drawing.areas if area.role == "obstacle"]
     gaps: Sequence[Gap] = ()
     if rooms:
-        shapes = _without_containers(rooms, notebook)
-        sketch.stubs = _free_standing(drawing, shapes)
-        notebook.notes.append("rooms are the areas that the file names so")
+        shapes = _without_containers(rooms, builder)
+        sketch.inner_walls = _free_standing(drawing, shapes)
+        builder.notes.append("rooms are the areas that the file names so")
     else:
         enclosed, what = _enclosed(drawing, budget, config)
         gaps = enclosed.gaps
         shapes = [Area(shape, "", "room") for shape in enclosed.rooms]
-        notebook.notes.append(f"rooms are what {what} enclose; gaps up to {config.widest_gap:g} m were closed")
-    sketch.rooms = named_rooms(shapes, drawing.letterings, notebook)
+        builder.notes.append(f"rooms are what {what} enclose; gaps up to {config.widest_gap:g} m were closed")
+    sketch.rooms = named_rooms(shapes, drawing.letterings, builder)
     sketch.openings = [*_symbols(drawing), *_swings(drawing.swings, gaps, shapes)]
     taken = shapely.union_all([opening.line.buffer(0.3) for opening in sketch.openings])
     for gap in gaps:
         line = shapely.LineString([gap.start, gap.end])
         if taken.is_empty or shapely.intersection(line, taken).length < 0.3 * line.length:
             sketch.openings.append(SketchedOpening("passage", gap.start, gap.end))
-            notebook.unsure.append(
+            builder.unsure.append(
                 f"the gap of {gap.width:.2f} m at ({gap.start[0]:.2f}, {gap.start[1]:.2f}) has no symbol of a door or "
                 "window; it was taken for a passage"
             )
@@ -83,7 +83,7 @@ def _free_standing(drawing: Drawing, rooms: Sequence[Area]) -> list[shapely.Line
     return [piece for piece in pieces if len(tree.query(piece, predicate="within"))]
 
 
-def _without_containers(rooms: Sequence[Area], notebook: Notebook) -> list[Area]:
+def _without_containers(rooms: Sequence[Area], builder: ReportBuilder) -> list[Area]:
     """Rooms without the outlines of flats and storeys around them, and each shape once."""
     tree = shapely.STRtree([room.shape for room in rooms])
     kept = []
@@ -94,7 +94,7 @@ def _without_containers(rooms: Sequence[Area], notebook: Notebook) -> list[Area]
             continue
         smaller = [rooms[k].shape for k in inside if k not in same]
         if sum(shape.area for shape in smaller) > 0.5 * room.shape.area:
-            notebook.notes.append(f"an outline of {room.shape.area:.1f} m² around {len(smaller)} rooms is no room")
+            builder.notes.append(f"an outline of {room.shape.area:.1f} m² around {len(smaller)} rooms is no room")
             continue
         kept.append(room)
     return kept
@@ -159,7 +159,7 @@ def _sides(shape: BaseGeometry) -> tuple[float, float]:
     return float(min(first, second)), float(max(first, second))
 
 
-def named_rooms(shapes: Sequence[Area], letterings: Sequence[Lettering], notebook: Notebook) -> list[SketchedRoom]:
+def named_rooms(shapes: Sequence[Area], letterings: Sequence[Lettering], builder: ReportBuilder) -> list[SketchedRoom]:
     """Rooms with the lettering that stands in them as their names: the first that has letters and is no size."""
     tree = shapely.STRtree([area.shape for area in shapes])
     texts: dict[int, list[str]] = {}
@@ -176,7 +176,7 @@ def named_rooms(shapes: Sequence[Area], letterings: Sequence[Lettering], noteboo
         rooms.append(SketchedRoom(area.shape, name, type_of_room(area.kind) or type_of_room(name)))
     without = sum(room.name is None for room in rooms)
     if without:
-        notebook.notes.append(f"{without} rooms have no name in the file")
+        builder.notes.append(f"{without} rooms have no name in the file")
     return rooms
 
 

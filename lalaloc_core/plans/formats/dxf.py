@@ -30,7 +30,7 @@ from lalaloc_core.plans.model.checks import likely_unit
 from lalaloc_core.plans.model.geometry import polygons_of
 from lalaloc_core.plans.model.limits import Budget
 from lalaloc_core.plans.model.options import ImportOptions
-from lalaloc_core.plans.model.report import Notebook
+from lalaloc_core.plans.model.report import ReportBuilder
 from lalaloc_core.plans.model.words import Role, role_of
 
 FORMAT = "dxf"
@@ -62,16 +62,16 @@ def import_dxf(content: bytes, options: ImportOptions, budget: Budget) -> tuple[
     """
     document = _open(content)
     _check_blocks(document, budget)
-    notebook = Notebook()
-    drawing = _read(document, options, notebook, budget)
-    factor, source = _unit(document, drawing, options, notebook)
+    builder = ReportBuilder()
+    drawing = _read(document, options, builder, budget)
+    factor, source = _unit(document, drawing, options, builder)
     if options.y_axis is None and document.header.get("$UCSYDIR", (0.0, 1.0, 0.0))[1] < -0.5:
-        notebook.warnings.append(
+        builder.warnings.append(
             "the file's own axes say that y points down ($UCSYDIR); say y_axis=down if it is mirrored"
         )
     drawing = drawing.scaled(factor, turn_over=options.y_axis == "down")
-    sketch = understand(drawing, notebook, budget)
-    return (assemble(sketch, notebook, options, format=FORMAT, metres_per_unit=factor, scale_source=source),)
+    sketch = understand(drawing, builder, budget)
+    return (assemble(sketch, builder, options, format=FORMAT, metres_per_unit=factor, scale_source=source),)
 
 
 def _open(content: bytes) -> DxfDocument:
@@ -134,20 +134,20 @@ def _weight(entity: DXFEntity) -> int:
     return 1
 
 
-def _read(document: DxfDocument, options: ImportOptions, notebook: Notebook, budget: Budget) -> Drawing:
+def _read(document: DxfDocument, options: ImportOptions, builder: ReportBuilder, budget: Budget) -> Drawing:
     drawing = Drawing()
     hidden = {layer.dxf.name.casefold() for layer in document.layers if layer.is_off() or layer.is_frozen()}
     sag = _sag(document)
     for entity, place in _walk(document.modelspace(), None, 0):
         budget.check_time()
         if place.layer.casefold() in hidden:
-            notebook.use(place.layer, "ignored (layer is off)")
+            builder.use(place.layer, "ignored (layer is off)")
         elif place.role == "ignored" or not options.wants_layer(place.layer):
-            notebook.use(place.layer, "ignored")
+            builder.use(place.layer, "ignored")
         else:
-            _add(entity, place, drawing, notebook, sag)
+            _add(entity, place, drawing, builder, sag)
     if options.layers and not drawing.areas and not drawing.strokes:
-        there = sorted({layer for layer, _ in notebook.uses})[:_MAX_NAMED_LAYERS]
+        there = sorted({layer for layer, _ in builder.uses})[:_MAX_NAMED_LAYERS]
         raise InvalidFloorPlanError(
             f"nothing lies on the layers {', '.join(options.layers)[:200]}; "
             f"the drawing has {', '.join(repr(layer) for layer in there) or 'nothing on any layer'}"
@@ -181,7 +181,7 @@ def _walk(entities: object, around: _Place | None, depth: int) -> Iterator[tuple
             yield entity, _Place(on, role)
 
 
-def _add(entity: DXFGraphic, place: _Place, drawing: Drawing, notebook: Notebook, sag: float) -> None:
+def _add(entity: DXFGraphic, place: _Place, drawing: Drawing, builder: ReportBuilder, sag: float) -> None:
     kind, role = entity.dxftype(), place.role
     if kind in _TEXTS:
         text = entity.plain_text() if hasattr(entity, "plain_text") else entity.dxf.get("text", "")  # type: ignore[attr-defined]
@@ -189,42 +189,42 @@ def _add(entity: DXFGraphic, place: _Place, drawing: Drawing, notebook: Notebook
         if at is not None and text.strip():
             where = (float(at[0]), float(at[1]))
             drawing.letterings += [Lettering(line[:200], where, place.layer) for line in text.splitlines()[:20]]
-            notebook.use(place.layer, "texts")
+            builder.use(place.layer, "texts")
         return
     if role == "text":
-        notebook.use(place.layer, "ignored")
+        builder.use(place.layer, "ignored")
         return
     if isinstance(entity, Insert):
-        _add_block(entity, place, drawing, notebook, sag)
+        _add_block(entity, place, drawing, builder, sag)
     elif kind in _FILLED:
         shapes = _filled(entity, sag)
         is_solid = kind != "HATCH" or entity.dxf.get("solid_fill", 0) == 1
         drawing.areas += [Area(shape, place.layer, role, is_dark=is_solid) for shape in shapes]
-        notebook.use(place.layer, f"hatches: {role or 'perhaps walls'}", max(len(shapes), 1))
+        builder.use(place.layer, f"hatches: {role or 'perhaps walls'}", max(len(shapes), 1))
     elif kind in _LINES:
-        _add_line(entity, place, drawing, notebook, sag)
+        _add_line(entity, place, drawing, builder, sag)
     else:
-        notebook.use(place.layer, f"ignored ({kind})")
+        builder.use(place.layer, f"ignored ({kind})")
 
 
-def _add_block(entity: Insert, place: _Place, drawing: Drawing, notebook: Notebook, sag: float) -> None:
+def _add_block(entity: Insert, place: _Place, drawing: Drawing, builder: ReportBuilder, sag: float) -> None:
     """A window (column, passage) that is a block: the box around what it draws, along its longer side."""
     inner = Drawing()
     for part, _ in _walk(entity.virtual_entities(), place, 1):
         if part.dxftype() in _LINES | _FILLED:
-            _add(part, place, inner, Notebook(), sag)
+            _add(part, place, inner, ReportBuilder(), sag)
     shapes = [*(area.shape for area in inner.areas), *(stroke.line for stroke in inner.strokes)]
     if not shapes:
         return
     box = shapely.minimum_rotated_rectangle(shapely.GeometryCollection(shapes))
-    notebook.use(place.layer, f"blocks: {place.role}")
+    builder.use(place.layer, f"blocks: {place.role}")
     if isinstance(box, shapely.Polygon):
         drawing.areas.append(Area(box, place.layer, place.role))
     elif isinstance(box, shapely.LineString):
         drawing.strokes.append(Stroke(box, place.layer, place.role))
 
 
-def _add_line(entity: DXFGraphic, place: _Place, drawing: Drawing, notebook: Notebook, sag: float) -> None:
+def _add_line(entity: DXFGraphic, place: _Place, drawing: Drawing, builder: ReportBuilder, sag: float) -> None:
     points = _points(entity, sag)
     if len(points) < 2:
         return
@@ -233,16 +233,16 @@ def _add_line(entity: DXFGraphic, place: _Place, drawing: Drawing, notebook: Not
         swing = swing_of(points, place.layer)
         if swing is not None:
             drawing.swings.append(swing)
-            notebook.use(place.layer, "swings of doors")
+            builder.use(place.layer, "swings of doors")
             return
     closed = bool(getattr(entity, "is_closed", False)) or (len(points) > 3 and bool(np.allclose(points[0], points[-1])))
     if closed and len(points) >= 3:
         shapes = polygons_of(shapely.Polygon(points))
         drawing.areas += [Area(shape, place.layer, role) for shape in shapes]
-        notebook.use(place.layer, f"closed lines: {role or 'perhaps walls or rooms'}", max(len(shapes), 1))
+        builder.use(place.layer, f"closed lines: {role or 'perhaps walls or rooms'}", max(len(shapes), 1))
     elif shapely.LineString(points).length > 0.0:
         drawing.strokes.append(Stroke(shapely.LineString(points), place.layer, role))
-        notebook.use(place.layer, f"lines: {role or 'perhaps walls'}")
+        builder.use(place.layer, f"lines: {role or 'perhaps walls'}")
 
 
 def _points(entity: DXFGraphic, sag: float) -> np.ndarray:
@@ -279,7 +279,7 @@ def _sag(document: DxfDocument) -> float:
     return _SAG * size if 0.0 < size < 1e9 else 0.01
 
 
-def _unit(document: DxfDocument, drawing: Drawing, options: ImportOptions, notebook: Notebook) -> tuple[float, str]:
+def _unit(document: DxfDocument, drawing: Drawing, options: ImportOptions, builder: ReportBuilder) -> tuple[float, str]:
     """(metres per unit, where that was read): options, $INSUNITS, or a refusal that names the likely unit."""
     code = document.header.get("$INSUNITS", 0)
     said = _INSUNITS.get(code)
@@ -300,7 +300,7 @@ def _unit(document: DxfDocument, drawing: Drawing, options: ImportOptions, noteb
     if not _USUAL_EXTENT_M[0] <= extent * factor <= 1000.0:
         fitting = likely_unit(extent, _USUAL_EXTENT_M)
         hint = f"; it looks like {fitting}: units={fitting}" if fitting and said and fitting != said[1] else ""
-        notebook.warnings.append(f"the drawing is {extent * factor:.4g} m across{hint}")
+        builder.warnings.append(f"the drawing is {extent * factor:.4g} m across{hint}")
     return factor, source
 
 

@@ -24,7 +24,7 @@ from lalaloc_core.plans.model.geometry import opening_line, polygons_of
 from lalaloc_core.plans.model.levels import chosen_levels
 from lalaloc_core.plans.model.limits import Budget
 from lalaloc_core.plans.model.options import METRES_PER_UNIT, ImportOptions
-from lalaloc_core.plans.model.report import Notebook
+from lalaloc_core.plans.model.report import ReportBuilder
 from lalaloc_core.plans.model.sketch import Level, Sketch, SketchedOpening, SketchedRoom
 from lalaloc_core.plans.model.words import Role, role_of, type_of_room
 
@@ -108,16 +108,16 @@ def import_features(
     by_level = _with_rooms(by_level)
     plans = []
     for level, members in chosen_levels(by_level, options):
-        notebook = Notebook()
+        builder = ReportBuilder()
         sketch = Sketch(level=level if len(by_level) > 1 or level.name != "0" else None, anchor=anchor)
         if anchor is not None:
             sketch.north_deg = anchor.north_deg
         sketch.name = level.name if len(by_level) > 1 else None
         for feature in members:
-            _sort_in(feature, project(feature.shape), sketch, options, notebook)
+            _sort_in(feature, project(feature.shape), sketch, options, builder)
             budget.check_time()
         plans.append(
-            assemble(sketch, notebook, options, format=format, metres_per_unit=metres_per_unit, scale_source=source)
+            assemble(sketch, builder, options, format=format, metres_per_unit=metres_per_unit, scale_source=source)
         )
     return tuple(plans)
 
@@ -308,29 +308,29 @@ def _opening_role(says: Mapping[str, Any], category: str) -> Role:
 
 
 def _sort_in(
-    feature: _Feature, shape: BaseGeometry, sketch: Sketch, options: ImportOptions, notebook: Notebook
+    feature: _Feature, shape: BaseGeometry, sketch: Sketch, options: ImportOptions, builder: ReportBuilder
 ) -> None:
     """Put one feature where it belongs in the sketch."""
     says, role = feature.says, _role(feature)
     layer = str(says.get("feature_type") or says.get("indoor") or says.get("kind") or says.get("type") or "")[:100]
     name = _name(says)
     if not options.wants_layer(layer, str(says.get("category") or "")):
-        notebook.use(layer, "ignored (not among the layers asked for)")
+        builder.use(layer, "ignored (not among the layers asked for)")
         return
     if role == "room":
         parts = polygons_of(shape)
-        notebook.use(layer, "rooms" if parts else "ignored", max(len(parts), 1))
+        builder.use(layer, "rooms" if parts else "ignored", max(len(parts), 1))
         kind = _room_type(says, name)
         ceiling = _number(says, "ceiling_height_m", "ceiling_height", "height")
         only = feature.id if len(parts) == 1 else None
         sketch.rooms += [SketchedRoom(part, name, kind, ceiling, only) for part in parts]
     elif role == "obstacle":
         parts = polygons_of(shape)
-        notebook.use(layer, "holes" if parts else "ignored", max(len(parts), 1))
+        builder.use(layer, "holes" if parts else "ignored", max(len(parts), 1))
         sketch.obstacles += parts
     elif role in ("door", "window", "passage"):
         ends = opening_line(shape)
-        notebook.use(layer, role if ends is not None else "ignored (a point has no width)")
+        builder.use(layer, role if ends is not None else "ignored (a point has no width)")
         if ends is not None:
             sill, head = _number(says, "sill_m"), _number(says, "head_m")
             sketch.openings.append(SketchedOpening(role, *ends, name, sill, head))
@@ -339,10 +339,10 @@ def _sort_in(
         pieces = [
             shapely.LineString(pair) for line in lines for pair in zip(line.coords, line.coords[1:], strict=False)
         ]
-        notebook.use(layer, "free-standing walls", max(len(pieces), 1))
-        sketch.stubs += pieces
+        builder.use(layer, "free-standing walls", max(len(pieces), 1))
+        sketch.inner_walls += pieces
     else:
-        notebook.use(layer, "ignored")
+        builder.use(layer, "ignored")
 
 
 def _name(says: Mapping[str, Any]) -> str | None:

@@ -22,7 +22,7 @@ from lalaloc_core.plans.model.geometry import opening_line, polygons_of
 from lalaloc_core.plans.model.levels import chosen_levels
 from lalaloc_core.plans.model.limits import Budget
 from lalaloc_core.plans.model.options import ImportOptions
-from lalaloc_core.plans.model.report import Notebook
+from lalaloc_core.plans.model.report import ReportBuilder
 from lalaloc_core.plans.model.sketch import Level, OpeningKind, Sketch, SketchedOpening, SketchedRoom
 from lalaloc_core.plans.model.words import role_of
 
@@ -59,19 +59,19 @@ def import_ifc(content: bytes, options: ImportOptions, budget: Budget) -> tuple[
     anchor = _anchor(model)
     plans = []
     for level, (storey, spaces) in chosen_levels(storeys, options):
-        notebook = Notebook()
+        builder = ReportBuilder()
         sketch = Sketch(level=level, anchor=anchor, name=level.name)
         sketch.north_deg = None if anchor is None else anchor.north_deg
-        floor_m = _add_spaces(spaces, sketch, notebook, budget)
-        _add_elements(storey, floor_m, sketch, notebook, budget)
-        _join_touching(sketch, notebook)
+        floor_m = _add_spaces(spaces, sketch, builder, budget)
+        _add_elements(storey, floor_m, sketch, builder, budget)
+        _join_touching(sketch, builder)
         if not sketch.rooms:
             raise InvalidFloorPlanError(f"the spaces of level '{level.name}' have no geometry")
         kinds = {opening.kind for opening in sketch.openings}
         sketch.opening_kinds = tuple(kind for kind in ("door", "window", "passage") if kind in kinds)
         plans.append(
             assemble(
-                sketch, notebook, options, format=FORMAT, metres_per_unit=_unit(model), scale_source="the model's unit"
+                sketch, builder, options, format=FORMAT, metres_per_unit=_unit(model), scale_source="the model's unit"
             )
         )
     return tuple(plans)
@@ -134,14 +134,14 @@ def _storey_of(element: Any) -> Any:
     return None
 
 
-def _add_spaces(spaces: Iterable[Any], sketch: Sketch, notebook: Notebook, budget: Budget) -> float:
+def _add_spaces(spaces: Iterable[Any], sketch: Sketch, builder: ReportBuilder, budget: Budget) -> float:
     """Add rooms; gives the height of the usual floor (m)."""
     floors = []
     for space in spaces:
         budget.check_time()
         mesh = _mesh(space)
         if mesh is None:
-            notebook.use("IfcSpace", "ignored (no geometry)")
+            builder.use("IfcSpace", "ignored (no geometry)")
             continue
         vertices, triangles = mesh
         low, high = float(vertices[:, 2].min()), float(vertices[:, 2].max())
@@ -149,19 +149,19 @@ def _add_spaces(spaces: Iterable[Any], sketch: Sketch, notebook: Notebook, budge
         name = str(space.LongName or space.Name or "")
         if role_of(name) == "obstacle":
             sketch.obstacles += parts
-            notebook.use("IfcSpace", "holes (shafts)")
+            builder.use("IfcSpace", "holes (shafts)")
             continue
         height = high - low
         ceiling = height if _HEIGHT_M[0] <= height <= _HEIGHT_M[1] else None
         if ceiling is None:
-            notebook.warnings.append(f"space '{name}' is {height:.2f} m high; the usual ceiling was taken instead")
+            builder.warnings.append(f"space '{name}' is {height:.2f} m high; the usual ceiling was taken instead")
         sketch.rooms += [SketchedRoom(part, name or None, None, ceiling) for part in parts]
         floors.append(low)
-        notebook.use("IfcSpace", "rooms")
+        builder.use("IfcSpace", "rooms")
     return float(np.median(floors)) if floors else 0.0
 
 
-def _add_elements(storey: Any, floor_m: float, sketch: Sketch, notebook: Notebook, budget: Budget) -> None:
+def _add_elements(storey: Any, floor_m: float, sketch: Sketch, builder: ReportBuilder, budget: Budget) -> None:
     """Doors, windows and columns that the storey contains."""
     for relation in getattr(storey, "ContainsElements", None) or ():
         for element in relation.RelatedElements:
@@ -169,17 +169,17 @@ def _add_elements(storey: Any, floor_m: float, sketch: Sketch, notebook: Noteboo
             kind = next((kind for name, kind in _KINDS.items() if element.is_a(name)), None)
             if kind is not None:
                 opening = _opening(element, kind, floor_m)  # type: ignore[arg-type]
-                notebook.use(element.is_a(), kind if opening is not None else "ignored (no geometry)")
+                builder.use(element.is_a(), kind if opening is not None else "ignored (no geometry)")
                 if opening is not None:
                     sketch.openings.append(opening)
             elif element.is_a("IfcColumn"):
                 mesh = _mesh(element)
-                notebook.use("IfcColumn", "holes" if mesh is not None else "ignored (no geometry)")
+                builder.use("IfcColumn", "holes" if mesh is not None else "ignored (no geometry)")
                 if mesh is not None:
                     sketch.obstacles += _projection(*mesh)
 
 
-def _join_touching(sketch: Sketch, notebook: Notebook) -> None:
+def _join_touching(sketch: Sketch, builder: ReportBuilder) -> None:
     """Spaces with nothing between them are open to each other; unless all are drawn to the middle of their walls."""
     shapes = [room.shape for room in sketch.rooms]
     tree = shapely.STRtree(shapes)
@@ -194,7 +194,7 @@ def _join_touching(sketch: Sketch, notebook: Notebook) -> None:
             for start, end in pairwise(part.coords):
                 if math.dist(start, end) > _TOUCHING_PASSAGE_M:
                     sketch.openings.append(SketchedOpening("passage", start[:2], end[:2]))
-                    notebook.use("IfcSpace", "passages between touching spaces")
+                    builder.use("IfcSpace", "passages between touching spaces")
 
 
 def _opening(element: Any, kind: OpeningKind, floor_m: float) -> SketchedOpening | None:

@@ -12,7 +12,7 @@ from lalaloc_core.plans.model.assemble import ImportedPlan
 from lalaloc_core.plans.model.checks import USUAL_CEILING_M, check_document, likely_unit
 from lalaloc_core.plans.model.limits import Budget
 from lalaloc_core.plans.model.options import METRES_PER_UNIT, ImportOptions
-from lalaloc_core.plans.model.report import Notebook
+from lalaloc_core.plans.model.report import ReportBuilder
 
 FORMAT = "native"
 # JSON has numbers of any size.
@@ -42,22 +42,22 @@ def import_native(document: Any, options: ImportOptions, budget: Budget) -> tupl
         plan["name"] = options.name
     if options.ceiling_height_m is not None:
         plan.setdefault("ceiling_height_m", options.ceiling_height_m)
-    notebook = Notebook()
+    builder = ReportBuilder()
     factor = METRES_PER_UNIT[units]
     y_factor = -factor if y_axis == "down" else factor
     if factor != 1.0 or y_factor != factor:
         plan = _converted(plan, factor, y_factor)
-        notebook.notes.append(f"coordinates were converted from {units}" if factor != 1.0 else "y was turned over")
+        builder.notes.append(f"coordinates were converted from {units}" if factor != 1.0 else "y was turned over")
     _refuse_other_units(plan)
     limits = budget.limits.plan
     parsed = FloorPlan.from_dict(plan, limits)
     rooms = plan["rooms"]
     budget.spend(len(rooms))
-    notebook.use("rooms", "rooms", len(rooms))
+    builder.use("rooms", "rooms", len(rooms))
     for opening in plan.get("openings") or ():
-        notebook.use("openings", str(opening["kind"]))
-    notebook.warnings.extend(check_document(parsed.to_dict()))
-    report = notebook.close(FORMAT, factor, "units" if "units" in document or options.units else "the format: metres")
+        builder.use("openings", str(opening["kind"]))
+    builder.warnings.extend(check_document(parsed.to_dict()))
+    report = builder.build(FORMAT, factor, "units" if "units" in document or options.units else "the format: metres")
     return (ImportedPlan(plan, report, anchor=parsed.anchor, checked=(limits, parsed)),)
 
 

@@ -17,7 +17,7 @@ from lalaloc_core.plans.formats.pdf_page import PageContent, open_page, read_pag
 from lalaloc_core.plans.model.assemble import ImportedPlan, assemble
 from lalaloc_core.plans.model.limits import Budget
 from lalaloc_core.plans.model.options import ImportOptions
-from lalaloc_core.plans.model.report import Notebook
+from lalaloc_core.plans.model.report import ReportBuilder
 from lalaloc_core.plans.model.sketch import Sketch
 from lalaloc_core.plans.picture import sketch_picture
 
@@ -43,32 +43,30 @@ def import_pdf(content: bytes, options: ImportOptions, budget: Budget) -> tuple[
         # A unit of the page is a point, whatever somebody says of units.
         asked = replace(options, units=None)
         factor, source = drawing_scale(asked, "the PDF", paper_m_per_unit=_METRES_PER_POINT, texts=texts)
-        notebook = Notebook()
-        sketch = _as_drawing(found, factor, notebook, budget)
+        builder = ReportBuilder()
+        sketch = _as_drawing(found, factor, builder, budget)
         if sketch is None or not sketch.rooms:
-            notebook = Notebook()
-            notebook.notes.append(f"page {options.page} was read as a picture")
-            sketch = _as_picture(page, found, factor, notebook, budget)
+            builder = ReportBuilder()
+            builder.notes.append(f"page {options.page} was read as a picture")
+            sketch = _as_picture(page, found, factor, builder, budget)
     finally:
         document.close()
-    plan = assemble(
-        sketch, notebook, options, format=FORMAT, metres_per_unit=factor, scale_source=source, is_draft=True
-    )
+    plan = assemble(sketch, builder, options, format=FORMAT, metres_per_unit=factor, scale_source=source, is_draft=True)
     return (plan,)
 
 
-def _as_drawing(found: PageContent, factor: float, notebook: Notebook, budget: Budget) -> Sketch | None:
+def _as_drawing(found: PageContent, factor: float, builder: ReportBuilder, budget: Budget) -> Sketch | None:
     drawing = found.drawing
     if len(drawing.strokes) + len(drawing.areas) < _MIN_LINES or found.picture_share > _MOSTLY:
         return None
-    notebook.use("lines", "perhaps walls", len(drawing.strokes))
-    notebook.use("areas", "perhaps walls", len(drawing.areas))
-    notebook.use("curves", "swings of doors", len(drawing.swings))
-    notebook.use("texts", "names", len(drawing.letterings))
-    return understand(drawing.scaled(factor, turn_over=False), notebook, budget)
+    builder.use("lines", "perhaps walls", len(drawing.strokes))
+    builder.use("areas", "perhaps walls", len(drawing.areas))
+    builder.use("curves", "swings of doors", len(drawing.swings))
+    builder.use("texts", "names", len(drawing.letterings))
+    return understand(drawing.scaled(factor, turn_over=False), builder, budget)
 
 
-def _as_picture(page: object, found: PageContent, factor: float, notebook: Notebook, budget: Budget) -> Sketch:
+def _as_picture(page: object, found: PageContent, factor: float, builder: ReportBuilder, budget: Budget) -> Sketch:
     """Draw the page, as finely as it needs and may be."""
     width, height = found.size_pt
     metres_per_pixel = max(_FINEST_M, factor * 0.25)
@@ -80,8 +78,8 @@ def _as_picture(page: object, found: PageContent, factor: float, notebook: Noteb
         )
     bitmap = page.render(scale=scale, grayscale=True)  # type: ignore[attr-defined]
     gray = np.asarray(bitmap.to_numpy()).reshape(bitmap.height, bitmap.width, -1)[:, :, 0]
-    sketch = sketch_picture(gray, factor / scale, notebook, budget)
+    sketch = sketch_picture(gray, factor / scale, builder, budget)
     # A scan that was made searchable has its lettering beside the picture.
     texts = found.drawing.scaled(factor, turn_over=False).letterings
-    sketch.rooms = named_rooms([Area(room.shape, "", "room") for room in sketch.rooms], texts, notebook)
+    sketch.rooms = named_rooms([Area(room.shape, "", "room") for room in sketch.rooms], texts, builder)
     return sketch

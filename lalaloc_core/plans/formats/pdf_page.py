@@ -15,13 +15,20 @@ from jaxtyping import Float
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.plans.drawing.shapes import Area, Drawing, Lettering, Stroke, swing_of
+from lalaloc_core.plans.drawing.shapes import (
+    CURVE_STEPS,
+    DARK,
+    Area,
+    Drawing,
+    Lettering,
+    Stroke,
+    luminance,
+    swing_of,
+)
 from lalaloc_core.plans.model.geometry import polygons_of
 from lalaloc_core.plans.model.limits import Budget
 
 _MAX_FORM_DEPTH = 8
-_STEPS_OF_CURVE = 12
-_DARK = 110.0
 _MAX_TEXTS, _MAX_LENGTH = 5000, 200
 Matrix = Float[np.ndarray, "3 3"]
 
@@ -106,7 +113,7 @@ def _add_path(item: Any, matrix: Matrix, drawing: Drawing, budget: Budget) -> No
     if not pdfium.FPDFPath_GetDrawMode(item, fill, stroke):
         return
     is_filled, is_stroked = fill.value != pdfium.FPDF_FILLMODE_NONE, bool(stroke.value)
-    is_dark = is_filled and _luminance(item) < _DARK
+    is_dark = is_filled and _fill_luminance(item) < DARK
     width = ctypes.c_float()
     pdfium.FPDFPageObj_GetStrokeWidth(item, width)
     pen = float(width.value) * float(np.sqrt(abs(np.linalg.det(matrix[:2, :2])))) if is_stroked else 0.0
@@ -160,7 +167,7 @@ def _subpaths(item: Any, budget: Budget) -> list[_Subpath]:
 
 def _add_curve(path: _Subpath, control: list[tuple[float, float]]) -> None:
     start, (a, b, end) = np.array(path.points[-1]), (np.array(point) for point in control)
-    t = np.linspace(0.0, 1.0, _STEPS_OF_CURVE + 1)[1:, None]
+    t = np.linspace(0.0, 1.0, CURVE_STEPS + 1)[1:, None]
     points = (1 - t) ** 3 * start + 3 * (1 - t) ** 2 * t * a + 3 * (1 - t) * t**2 * b + t**3 * end
     piece = [(float(px), float(py)) for px, py in points]
     if path.was_curved:
@@ -176,11 +183,11 @@ def _applied(matrix: Matrix, points: list[tuple[float, float]]) -> Float[np.ndar
     return array @ matrix[:2, :2].T + matrix[:2, 2]
 
 
-def _luminance(item: Any) -> float:
+def _fill_luminance(item: Any) -> float:
     red, green, blue, alpha = (ctypes.c_uint() for _ in range(4))
     if not pdfium.FPDFPageObj_GetFillColor(item, red, green, blue, alpha) or alpha.value < 60:
         return 255.0
-    return 0.299 * red.value + 0.587 * green.value + 0.114 * blue.value
+    return luminance(red.value, green.value, blue.value)
 
 
 def _letterings(page: pypdfium2.PdfPage) -> list[Lettering]:

@@ -20,14 +20,23 @@ from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.plans.drawing.scale import drawing_scale
-from lalaloc_core.plans.drawing.shapes import Area, Drawing, Lettering, Stroke, swing_of
+from lalaloc_core.plans.drawing.shapes import (
+    CURVE_STEPS,
+    DARK,
+    Area,
+    Drawing,
+    Lettering,
+    Stroke,
+    luminance,
+    swing_of,
+)
 from lalaloc_core.plans.drawing.understand import understand
 from lalaloc_core.plans.formats.xml_text import read_xml
 from lalaloc_core.plans.model.assemble import ImportedPlan, assemble
 from lalaloc_core.plans.model.geometry import polygons_of
 from lalaloc_core.plans.model.limits import Budget
 from lalaloc_core.plans.model.options import ImportOptions
-from lalaloc_core.plans.model.report import Notebook
+from lalaloc_core.plans.model.report import ReportBuilder
 from lalaloc_core.plans.model.words import Role, role_of
 
 FORMAT = "svg"
@@ -41,9 +50,7 @@ _AUTOMATIC = re.compile(
 )
 _METRES = {"mm": 1e-3, "cm": 1e-2, "in": 0.0254, "pt": 0.0254 / 72.0, "pc": 0.0254 / 6.0, "px": 0.0254 / 96.0}
 _LENGTH = re.compile(r"\s*([0-9.eE+-]+)\s*(mm|cm|in|pt|pc|px|)\s*")
-_STEPS_OF_CURVE = 12
 _BYTES_PER_ENTITY = 12
-_DARK = 110.0
 
 
 @dataclass(frozen=True)
@@ -79,15 +86,15 @@ def import_svg(content: bytes, options: ImportOptions, budget: Budget) -> tuple[
         raise InvalidFloorPlanError(f"the root element is <{root.tag.rpartition('}')[2][:50]}>, not <svg>")
     _check_uses(root, budget)
     paper_m, said = _size_on_paper(root), _own_scale(root)
-    notebook = Notebook()
-    drawing = _read(root, options, notebook, budget)
+    builder = ReportBuilder()
+    drawing = _read(root, options, builder, budget)
     texts = [lettering.text for lettering in drawing.letterings]
     factor, source = drawing_scale(options, "the SVG", paper_m_per_unit=paper_m, said=said, texts=texts)
     if options.y_axis != "up":
-        notebook.notes.append("y points down in SVG and was turned over")
+        builder.notes.append("y points down in SVG and was turned over")
     drawing = drawing.scaled(factor, turn_over=options.y_axis != "up")
-    sketch = understand(drawing, notebook, budget)
-    plan = assemble(sketch, notebook, options, format=FORMAT, metres_per_unit=factor, scale_source=source)
+    sketch = understand(drawing, builder, budget)
+    plan = assemble(sketch, builder, options, format=FORMAT, metres_per_unit=factor, scale_source=source)
     return (plan,)
 
 
@@ -137,7 +144,7 @@ def _own_scale(root: Element) -> tuple[float, str] | None:
     return (value, SCALE_ATTRIBUTE) if 1e-6 <= value <= 1e3 else None
 
 
-def _read(root: Element, options: ImportOptions, notebook: Notebook, budget: Budget) -> Drawing:
+def _read(root: Element, options: ImportOptions, builder: ReportBuilder, budget: Budget) -> Drawing:
     """Everything that is drawn, in user units."""
     for key in ("width", "height", "viewBox", "preserveAspectRatio", "transform"):
         root.attrib.pop(key, None)
@@ -163,11 +170,11 @@ def _read(root: Element, options: ImportOptions, notebook: Notebook, budget: Bud
         if _is_hidden(element):
             continue
         if place.role == "ignored" or not options.wants_layer(*place.labels):
-            notebook.use(place.layer, "ignored")
+            builder.use(place.layer, "ignored")
         elif isinstance(element, svgelements.Text):
             _add_text(element, place, drawing)
         elif isinstance(element, svgelements.Shape):
-            _add_shape(element, place, drawing, notebook, budget)
+            _add_shape(element, place, drawing, builder, budget)
     return drawing
 
 
@@ -192,11 +199,11 @@ def _add_text(element: Any, place: _Place, drawing: Drawing) -> None:
         drawing.letterings.append(Lettering(text, (float(at.x), float(at.y)), place.layer))
 
 
-def _add_shape(element: Any, place: _Place, drawing: Drawing, notebook: Notebook, budget: Budget) -> None:
+def _add_shape(element: Any, place: _Place, drawing: Drawing, builder: ReportBuilder, budget: Budget) -> None:
     name = _name_of(element, place)
     fill: Any = element.fill
     is_filled = fill is not None and fill.value is not None and fill.opacity > 0.2
-    is_dark = bool(is_filled and _luminance(fill) < _DARK)
+    is_dark = bool(is_filled and luminance(fill.red, fill.green, fill.blue) < DARK)
     width = element.stroke_width if element.stroke is not None and element.stroke.value is not None else 0.0
     shells: list[shapely.Polygon] = []
     for points, closed, curves in _outlines(svgelements.Path(element), budget):
@@ -204,19 +211,15 @@ def _add_shape(element: Any, place: _Place, drawing: Drawing, notebook: Notebook
         leaves = [swing for swing in swings if swing is not None] if len(swings) <= 2 else []
         if leaves:
             drawing.swings += leaves
-            notebook.use(place.layer, "swings of doors", len(leaves))
+            builder.use(place.layer, "swings of doors", len(leaves))
         elif len(points) >= 4 and (closed or (place.role in ("room", "wall", "obstacle") and is_filled)):
             shells += polygons_of(shapely.Polygon(points))
         elif len(points) >= 2 and shapely.LineString(points).length > 0.0:
             drawing.strokes.append(Stroke(shapely.LineString(points), place.layer, place.role, float(width or 0.0)))
-            notebook.use(place.layer, f"lines: {place.role or 'perhaps walls'}")
+            builder.use(place.layer, f"lines: {place.role or 'perhaps walls'}")
     for shape in _with_holes(shells):
         drawing.areas.append(Area(shape, place.layer, place.role, name, place.kind, is_dark))
-        notebook.use(place.layer, f"areas: {place.role or 'perhaps rooms'}")
-
-
-def _luminance(colour: Any) -> float:
-    return 0.299 * colour.red + 0.587 * colour.green + 0.114 * colour.blue
+        builder.use(place.layer, f"areas: {place.role or 'perhaps rooms'}")
 
 
 def _outlines(path: svgelements.Path, budget: Budget) -> Iterator[tuple[np.ndarray, bool, list[np.ndarray]]]:
@@ -231,7 +234,7 @@ def _outlines(path: svgelements.Path, budget: Budget) -> Iterator[tuple[np.ndarr
             if segment.start is None or segment.end is None:
                 continue
             is_curved = not isinstance(segment, svgelements.Line | svgelements.Close)
-            steps = _STEPS_OF_CURVE if is_curved else 1
+            steps = CURVE_STEPS if is_curved else 1
             budget.spend(steps)
             piece = [complex(*segment.point(k / steps)) for k in range(steps + 1)]
             points += piece if not points else piece[1:]

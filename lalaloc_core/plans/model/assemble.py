@@ -18,7 +18,7 @@ from lalaloc_core.floorplan import DEFAULT_LIMITS, FloorPlan, PlanLimits, anchor
 from lalaloc_core.plans.model.checks import check_document
 from lalaloc_core.plans.model.geometry import polygons_of
 from lalaloc_core.plans.model.options import ImportOptions
-from lalaloc_core.plans.model.report import ImportReport, Notebook
+from lalaloc_core.plans.model.report import ImportReport, ReportBuilder
 from lalaloc_core.plans.model.settle import settle_openings
 from lalaloc_core.plans.model.sketch import Level, Sketch, SketchedOpening, SketchedRoom
 from lalaloc_core.plans.model.words import type_of_room
@@ -28,7 +28,7 @@ DEFAULT_CEILING_HEIGHT_M = 2.5
 _STRAIGHT_M, _SLIVER_M2 = 0.002, 0.01
 _FAR_M = 10_000.0
 # As far from an anchor directions and lengths are right to a few centimetres.
-_FARTHEST_ANCHOR_M = 20_000.0
+_MAX_ANCHOR_SHIFT_M = 20_000.0
 # A tenth of a millimetre is finer than anything that is built.
 _GRID_M, _DECIMALS = 1e-4, 4
 _MAX_NAMED = 5
@@ -65,7 +65,7 @@ class ImportedPlan:
 
 def assemble(
     sketch: Sketch,
-    notebook: Notebook,
+    builder: ReportBuilder,
     options: ImportOptions,
     *,
     format: str,
@@ -78,36 +78,36 @@ def assemble(
     Raises:
         InvalidFloorPlanError: no rooms, or a plan that breaks the format's rules.
     """
-    rooms = [room for each in sketch.rooms for room in _clean(each, sketch.obstacles, notebook)]
+    rooms = [room for each in sketch.rooms for room in _clean(each, sketch.obstacles, builder)]
     if not rooms:
-        raise InvalidFloorPlanError(f"no room was found in the {format} file; {_what_was_there(notebook)}")
-    rooms, moved = _near_origin(rooms, notebook)
+        raise InvalidFloorPlanError(f"no room was found in the {format} file; {_what_was_there(builder)}")
+    rooms, moved = _near_origin(rooms, builder)
     openings = [_moved(opening, moved) for opening in sketch.openings]
     settled = settle_openings(openings, [room.shape for room in rooms])
-    if settled.astray:
-        places = ", ".join(f"({o.start[0]:.2f}, {o.start[1]:.2f})" for o in settled.astray[:_MAX_NAMED])
-        notebook.warnings.append(
-            f"{len(settled.astray)} openings lie on no wall and were left out, such as at {places}"
+    if settled.off_wall:
+        places = ", ".join(f"({o.start[0]:.2f}, {o.start[1]:.2f})" for o in settled.off_wall[:_MAX_NAMED])
+        builder.warnings.append(
+            f"{len(settled.off_wall)} openings lie on no wall and were left out, such as at {places}"
         )
     if settled.merged:
-        notebook.notes.append(f"{settled.merged} openings that overlap others were left out")
+        builder.notes.append(f"{settled.merged} openings that overlap others were left out")
     document: dict[str, Any] = {"name": options.name or clean_name(sketch.name) or "floor plan"}
     if sketch.north_deg is not None:
         document["north_deg"] = round(sketch.north_deg % 360.0, 6)
-    anchor = _anchor_moved(sketch.anchor, moved, notebook)
+    anchor = _anchor_moved(sketch.anchor, moved, builder)
     if anchor is not None:
         document["north_deg"] = round(anchor.north_deg % 360.0, 6)
         document["anchor"] = anchor_document(anchor)
-    document["ceiling_height_m"] = _usual_ceiling(rooms, options, notebook)
+    document["ceiling_height_m"] = _usual_ceiling(rooms, options, builder)
     document["rooms"] = [_room(room, document["ceiling_height_m"], sketch, moved) for room in rooms]
     if settled.openings:
         document["openings"] = [_opening(opening) for opening in settled.openings]
     if sketch.opening_kinds is not None:
         document["opening_kinds"] = list(sketch.opening_kinds)
-    notebook.warnings.extend(check_document(document))
+    builder.warnings.extend(check_document(document))
     # Refused here, with what the file says, rather than at whoever uses the plan.
     checked = (DEFAULT_LIMITS, FloorPlan.from_dict(document))
-    report = notebook.close(format, metres_per_unit, scale_source, is_draft=is_draft)
+    report = builder.build(format, metres_per_unit, scale_source, is_draft=is_draft)
     return ImportedPlan(document, report, sketch.level, anchor, checked)
 
 
@@ -119,7 +119,7 @@ def clean_name(name: str | None, limit: int = DEFAULT_LIMITS.max_name_length) ->
     return " ".join(spaced.split())[:limit] or None
 
 
-def _clean(room: SketchedRoom, obstacles: list[shapely.Polygon], notebook: Notebook) -> list[SketchedRoom]:
+def _clean(room: SketchedRoom, obstacles: list[shapely.Polygon], builder: ReportBuilder) -> list[SketchedRoom]:
     shape = room.shape
     for obstacle in obstacles:
         if obstacle.intersects(shape):
@@ -130,10 +130,10 @@ def _clean(room: SketchedRoom, obstacles: list[shapely.Polygon], notebook: Noteb
     if not floors and room.shape.area < _SLIVER_M2:
         return []
     if not floors:
-        notebook.notes.append(f"{label} of {room.shape.area:.2g} m² was left out: too small for a room")
+        builder.notes.append(f"{label} of {room.shape.area:.2g} m² was left out: too small for a room")
         return []
     if len(floors) > 1:
-        notebook.warnings.append(f"{label} falls into {len(floors)} parts; each became a room")
+        builder.warnings.append(f"{label} falls into {len(floors)} parts; each became a room")
     cleaned = []
     for floor in floors:
         holes = [ring for ring in floor.interiors if shapely.Polygon(ring).area >= _SLIVER_M2]
@@ -156,24 +156,24 @@ def _simple(floor: BaseGeometry) -> list[shapely.Polygon]:
     return found
 
 
-def _near_origin(rooms: list[SketchedRoom], notebook: Notebook) -> tuple[list[SketchedRoom], tuple[float, float]]:
+def _near_origin(rooms: list[SketchedRoom], builder: ReportBuilder) -> tuple[list[SketchedRoom], tuple[float, float]]:
     """Plans far from their origin (national grids) are moved to it; how far, says the report."""
     x0, y0, x1, y1 = shapely.total_bounds([room.shape for room in rooms])
     if max(abs(x0), abs(y0), abs(x1), abs(y1)) <= _FAR_M:
         return rooms, (0.0, 0.0)
     dx, dy = -math.floor(x0), -math.floor(y0)
-    notebook.notes.append(f"the plan was moved by ({dx}, {dy}) m, so that it lies near its origin")
+    builder.notes.append(f"the plan was moved by ({dx}, {dy}) m, so that it lies near its origin")
     moved = [SketchedRoom(affinity.translate(r.shape, dx, dy), r.name, r.type, r.ceiling_height_m, r.id) for r in rooms]
     return moved, (dx, dy)
 
 
-def _anchor_moved(anchor: Anchor | None, by: tuple[float, float], notebook: Notebook) -> Anchor | None:
+def _anchor_moved(anchor: Anchor | None, by: tuple[float, float], builder: ReportBuilder) -> Anchor | None:
     """The anchor of the moved plan; where it was moved far, its place cannot be told any more."""
     if anchor is None or by == (0.0, 0.0):
         return anchor
-    if math.hypot(*by) > _FARTHEST_ANCHOR_M:
+    if math.hypot(*by) > _MAX_ANCHOR_SHIFT_M:
         away_km = math.hypot(*by) / 1000.0
-        notebook.warnings.append(f"the file's origin lies {away_km:.0f} km away: the place on Earth was left out")
+        builder.warnings.append(f"the file's origin lies {away_km:.0f} km away: the place on Earth was left out")
         return None
     return anchor.moved((-by[0], -by[1]))
 
@@ -184,13 +184,13 @@ def _moved(opening: SketchedOpening, by: tuple[float, float]) -> SketchedOpening
     return SketchedOpening(opening.kind, *ends, opening.name, opening.sill_m, opening.head_m)
 
 
-def _usual_ceiling(rooms: list[SketchedRoom], options: ImportOptions, notebook: Notebook) -> float:
+def _usual_ceiling(rooms: list[SketchedRoom], options: ImportOptions, builder: ReportBuilder) -> float:
     known = [room.ceiling_height_m for room in rooms if room.ceiling_height_m is not None]
     if options.ceiling_height_m is not None:
         return options.ceiling_height_m
     if known:
         return round(float(np.median(known)), 4)
-    notebook.unsure.append(
+    builder.unsure.append(
         f"the file gives no ceiling height, {DEFAULT_CEILING_HEIGHT_M:g} m was assumed; ceiling_height_m says another"
     )
     return DEFAULT_CEILING_HEIGHT_M
@@ -204,10 +204,10 @@ def _room(room: SketchedRoom, ceiling_m: float, sketch: Sketch, moved: tuple[flo
         said["type"] = room.type
     if room.shape.interiors:
         said["holes"] = [_ring(ring) for ring in room.shape.interiors]
-    stubs = [affinity.translate(stub, *moved) for stub in sketch.stubs]
-    inner = [stub for stub in stubs if room.shape.contains(stub)]
-    if inner:
-        said["walls"] = [[_xy(point) for point in stub.coords] for stub in inner]
+    walls = [affinity.translate(wall, *moved) for wall in sketch.inner_walls]
+    inner_walls = [wall for wall in walls if room.shape.contains(wall)]
+    if inner_walls:
+        said["walls"] = [[_xy(point) for point in wall.coords] for wall in inner_walls]
     if room.ceiling_height_m is not None and abs(room.ceiling_height_m - ceiling_m) > 1e-6:
         said["ceiling_height_m"] = round(room.ceiling_height_m, 4)
     return said
@@ -235,6 +235,6 @@ def _xy(point: tuple[float, ...]) -> list[float]:
     return [round(float(point[0]), _DECIMALS) + 0.0, round(float(point[1]), _DECIMALS) + 0.0]
 
 
-def _what_was_there(notebook: Notebook) -> str:
-    used = [f"{count} {use} on '{layer}'" for (layer, use), count in sorted(notebook.uses.items())][:_MAX_NAMED]
+def _what_was_there(builder: ReportBuilder) -> str:
+    used = [f"{count} {use} on '{layer}'" for (layer, use), count in sorted(builder.uses.items())][:_MAX_NAMED]
     return "it has " + ", ".join(used) if used else "it holds nothing that could be one"

@@ -45,5 +45,10 @@ def opening_line(shape: BaseGeometry) -> tuple[tuple[float, float], tuple[float,
     return _xy(0.5 * (corners[0] + corners[3])), _xy(0.5 * (corners[1] + corners[2]))
 
 
+def cross(a: Float[np.ndarray, "2"], b: Float[np.ndarray, "2"]) -> float:
+    """The third component of a cross product: positive where b points to the left of a."""
+    return float(a[0] * b[1] - a[1] * b[0])
+
+
 def _xy(point: Float[np.ndarray, "2"]) -> tuple[float, float]:
     return float(point[0]), float(point[1])

@@ -58,8 +58,8 @@ class ImportReport:
 
 
 @dataclass
-class Notebook:
-    """Collects a report while a file is read."""
+class ReportBuilder:
+    """What a report is made of while a file is read."""
 
     notes: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
@@ -70,18 +70,18 @@ class Notebook:
         """Count entities of a layer that were used as something, `ignored` included."""
         self.uses[layer or "(none)", used_as] += entities
 
-    def close(self, format: str, metres_per_unit: float, scale_source: str, *, is_draft: bool = False) -> ImportReport:
+    def build(self, format: str, metres_per_unit: float, scale_source: str, *, is_draft: bool = False) -> ImportReport:
         """The report."""
         layers = [LayerUse(layer, count, used_as) for (layer, used_as), count in sorted(self.uses.items())]
         return ImportReport(
-            format,
-            metres_per_unit,
-            scale_source,
-            is_draft,
-            tuple(layers[:_MAX_LINES]),
-            _bounded(self.notes),
-            _bounded(self.warnings),
-            _bounded(self.unsure),
+            format=format,
+            metres_per_unit=metres_per_unit,
+            scale_source=scale_source,
+            is_draft=is_draft,
+            layers=tuple(layers[:_MAX_LINES]),
+            notes=_bounded(self.notes),
+            warnings=_bounded(self.warnings),
+            unsure=_bounded(self.unsure),
         )
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
+from lalaloc_core.plans.model.geometry import cross
 from lalaloc_core.plans.model.sketch import SketchedOpening
 
 # Of what lies beside an opening: walls are thinner, drawn lines are straighter, and a jamb is no opening.
@@ -23,15 +24,15 @@ _KIND_RANK = {"door": 0, "window": 1, "passage": 2}
 
 
 @dataclass(frozen=True)
-class Settled:
+class SettledOpenings:
     """Openings on walls, and those that lie on none."""
 
     openings: list[SketchedOpening]
-    astray: list[SketchedOpening]
+    off_wall: list[SketchedOpening]
     merged: int
 
 
-def settle_openings(openings: Sequence[SketchedOpening], rooms: Sequence[shapely.Polygon]) -> Settled:
+def settle_openings(openings: Sequence[SketchedOpening], rooms: Sequence[shapely.Polygon]) -> SettledOpenings:
     """Put every opening on the walls beside it.
 
     Of two openings that overlap in a wall, the door stays before the window, and the window before the passage.
@@ -39,11 +40,11 @@ def settle_openings(openings: Sequence[SketchedOpening], rooms: Sequence[shapely
     edges = _edges(rooms)
     tree = shapely.STRtree([_segment(edge) for edge in edges])
     kept: list[SketchedOpening] = []
-    astray, merged = [], 0
+    off_wall, merged = [], 0
     for opening in sorted(openings, key=lambda each: (_KIND_RANK[each.kind], -each.line.length)):
         placed = _place(opening, edges, tree)
         if placed is None:
-            astray.append(opening)
+            off_wall.append(opening)
             continue
         free = _beside(placed, kept)
         if free is None:
@@ -51,7 +52,7 @@ def settle_openings(openings: Sequence[SketchedOpening], rooms: Sequence[shapely
             _stack(placed, kept)
         else:
             kept.append(free)
-    return Settled(kept, astray, merged)
+    return SettledOpenings(kept, off_wall, merged)
 
 
 def _edges(rooms: Sequence[shapely.Polygon]) -> Float[np.ndarray, "n 4"]:
@@ -78,13 +79,13 @@ def _place(opening: SketchedOpening, edges: Float[np.ndarray, "n 4"], tree: shap
         first, second = edge[:2], edge[2:]
         direction = second - first
         size = float(np.linalg.norm(direction))
-        if size < 1e-6 or abs(_cross(along, direction / size)) > _STRAIGHT:
+        if size < 1e-6 or abs(cross(along, direction / size)) > _STRAIGHT:
             continue
         a, b = sorted((float((first - start) @ along), float((second - start) @ along)))
         shared = min(b, length) - max(a, 0.0)
         if shared < min(0.5 * length, 0.5):
             continue
-        offset = _cross(along, 0.5 * (first + second) - start)
+        offset = cross(along, 0.5 * (first + second) - start)
         if abs(offset) <= MAX_WALL_THICKNESS_M:
             # The room lies to the left of its edges.
             side = 1.0 if direction @ along > 0.0 else -1.0
@@ -118,7 +119,7 @@ def _beside(opening: SketchedOpening, kept: Sequence[SketchedOpening]) -> Sketch
     free = [(0.0, length)]
     for other in kept:
         a, b = np.array(other.start) - start, np.array(other.end) - start
-        apart = max(abs(_cross(along, a)), abs(_cross(along, b)))
+        apart = max(abs(cross(along, a)), abs(cross(along, b)))
         if apart > 0.5 * MAX_WALL_THICKNESS_M:
             continue
         low, high = sorted((float(a @ along), float(b @ along)))
@@ -140,10 +141,6 @@ def _stack(opening: SketchedOpening, kept: list[SketchedOpening]) -> None:
             continue
         sills = [each.sill_m or 0.0 for each in (opening, other)]
         kept[index] = replace(other, sill_m=min(sills), head_m=max(opening.head_m, other.head_m))
-
-
-def _cross(a: Float[np.ndarray, "2"], b: Float[np.ndarray, "2"]) -> float:
-    return float(a[0] * b[1] - a[1] * b[0])
 
 
 def _point(point_m: Float[np.ndarray, "2"]) -> tuple[float, float]:

@@ -65,7 +65,7 @@ class Sketch:
     # What stands in rooms and is no floor: cut out of the rooms that it lies in.
     obstacles: list[shapely.Polygon] = field(default_factory=list)
     # Free-standing walls.
-    stubs: list[shapely.LineString] = field(default_factory=list)
+    inner_walls: list[shapely.LineString] = field(default_factory=list)
     name: str | None = None
     north_deg: float | None = None
     level: Level | None = None

@@ -24,7 +24,7 @@ _FAINT, _DIP, _RISE = 22.0, 30.0, 12.0
 
 
 @dataclass(frozen=True)
-class Seen:
+class GapContent:
     """What was seen in a gap, and how sure that is (0 to 1).
 
     `swing`: the arc of a door; `pane`: two or more lines along the wall; `line`: a single one. `warmth` is that of
@@ -32,7 +32,7 @@ class Seen:
     """
 
     kind: Literal["swing", "pane", "line", "nothing"]
-    sureness: float
+    confidence: float
     warmth: float = 0.0
 
 
@@ -46,17 +46,17 @@ class GapReader:
         lines = ink.lines & ~walls.mask
         self._near = cv2.dilate(lines.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
 
-    def look(self, gap: Gap) -> Seen:
+    def look(self, gap: Gap) -> GapContent:
         """The most likely content of a gap."""
         arc = self._arc(gap) if _DOOR_M[0] <= gap.width <= _DOOR_M[1] else 0.0
         if arc >= _ARC:
-            return Seen("swing", arc)
+            return GapContent("swing", arc)
         lines, share, warmth = self._lines(gap)
         if lines >= 2:
-            return Seen("pane", share, warmth)
+            return GapContent("pane", share, warmth)
         if lines == 1 and share >= _ONE_LINE:
-            return Seen("line", share, warmth)
-        return Seen("nothing", 1.0 - max(arc, share if lines else 0.0))
+            return GapContent("line", share, warmth)
+        return GapContent("nothing", 1.0 - max(arc, share if lines else 0.0))
 
     def _arc(self, gap: Gap) -> float:
         """How much of the best quarter circle about an end of the gap is inked, one leaf or two."""

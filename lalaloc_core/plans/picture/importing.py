@@ -15,7 +15,7 @@ from lalaloc_core.plans.drawing.scale import drawing_scale
 from lalaloc_core.plans.model.assemble import ImportedPlan, assemble
 from lalaloc_core.plans.model.limits import Budget
 from lalaloc_core.plans.model.options import ImportOptions
-from lalaloc_core.plans.model.report import Notebook
+from lalaloc_core.plans.model.report import ReportBuilder
 from lalaloc_core.plans.picture.sketching import sketch_picture
 
 FORMAT = "picture"
@@ -38,8 +38,8 @@ def import_picture(content: bytes, options: ImportOptions, budget: Budget) -> tu
             f"the picture is {columns * factor:.0f} m by {rows * factor:.0f} m at {factor:g} m per pixel, at most "
             f"{_MAX_EXTENT_M:g} m are read; is the scale right?"
         )
-    notebook = Notebook()
-    sketch = sketch_picture(gray, factor, notebook, budget, warmth)
+    builder = ReportBuilder()
+    sketch = sketch_picture(gray, factor, builder, budget, warmth)
     if not sketch.rooms:
         raise InvalidFloorPlanError(
             f"no walls that enclose a room were found in the picture, which is {columns * factor:.1f} m by "
@@ -47,7 +47,7 @@ def import_picture(content: bytes, options: ImportOptions, budget: Budget) -> tu
             "drawn with two lines?"
         )
     return (
-        assemble(sketch, notebook, options, format=FORMAT, metres_per_unit=factor, scale_source=source, is_draft=True),
+        assemble(sketch, builder, options, format=FORMAT, metres_per_unit=factor, scale_source=source, is_draft=True),
     )
 
 

@@ -85,7 +85,15 @@ def read_ink(
         warmth = None if warmth is None else _turned(warmth, skew_deg, fill=COLOURLESS)
     mask = even < threshold
     size = (int(gray.shape[0]), int(gray.shape[1]))
-    return Ink(even, warmth, mask, mask | _faint_lines(even, metres_per_pixel), metres_per_pixel, skew_deg, size)
+    return Ink(
+        gray=even,
+        warmth=warmth,
+        mask=mask,
+        lines=mask | _faint_lines(even, metres_per_pixel),
+        metres_per_pixel=metres_per_pixel,
+        skew_deg=skew_deg,
+        size=size,
+    )
 
 
 def _faint_lines(even: UInt8[np.ndarray, "h w"], metres_per_pixel: float) -> Bool[np.ndarray, "h w"]:

@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 from jaxtyping import Bool, Float, Int
 
-from lalaloc_core.plans.model.geometry import polygons_of
+from lalaloc_core.plans.model.geometry import cross, polygons_of
 from lalaloc_core.plans.picture.ink import Ink
 
 # Lengths in metres.
@@ -182,17 +182,13 @@ def _sharp_ring(points: np.ndarray) -> np.ndarray:
         before, a, b, after = (kept[(index + k) % len(kept)] for k in (-1, 0, 1, 2))
         first, edge, last = a - before, b - a, after - b
         lengths = [float(np.linalg.norm(step)) for step in (first, edge, last)]
-        turns = _cross(first, edge), _cross(edge, last), _cross(first, last)
+        turns = cross(first, edge), cross(edge, last), cross(first, last)
         is_cut = 0.0 < lengths[1] < _CUT_CORNER_M and min(lengths[0], lengths[2]) > lengths[1]
         if is_cut and turns[0] * turns[1] > 0.0 and abs(turns[2]) > _SQUARE * lengths[0] * lengths[2]:
-            kept[index] = a + first * (_cross(edge, last) / turns[2])
+            kept[index] = a + first * (cross(edge, last) / turns[2])
             del kept[(index + 1) % len(kept)]
         index += 1
     return np.array(kept)
-
-
-def _cross(a: np.ndarray, b: np.ndarray) -> float:
-    return float(a[0] * b[1] - a[1] * b[0])
 
 
 def _straight_ring(points: np.ndarray, tolerance_deg: float, reach_m: float) -> np.ndarray:

@@ -13,9 +13,9 @@ from jaxtyping import UInt8
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.plans.drawing.walls import Enclosed, Gap, WallConfig, enclose
 from lalaloc_core.plans.model.limits import Budget
-from lalaloc_core.plans.model.report import Notebook
+from lalaloc_core.plans.model.report import ReportBuilder
 from lalaloc_core.plans.model.sketch import OpeningKind, Sketch, SketchedOpening, SketchedRoom
-from lalaloc_core.plans.picture.gaps import GapReader, Seen
+from lalaloc_core.plans.picture.gaps import GapContent, GapReader
 from lalaloc_core.plans.picture.ink import Ink, read_ink
 from lalaloc_core.plans.picture.masks import WallMask, bodies_of, dark_walls, outlined_walls, straightened
 from lalaloc_core.plans.picture.panes import windows_in_walls
@@ -41,7 +41,7 @@ _COLOURED = 25.0
 class _Reading:
     walls: WallMask
     enclosed: Enclosed
-    seen: dict[int, Seen]
+    seen: dict[int, GapContent]
     is_dark: bool
 
     @property
@@ -52,7 +52,7 @@ class _Reading:
 def sketch_picture(
     gray: UInt8[np.ndarray, "h w"],
     metres_per_pixel: float,
-    notebook: Notebook,
+    builder: ReportBuilder,
     budget: Budget,
     warmth: UInt8[np.ndarray, "h w"] | None = None,
 ) -> Sketch:
@@ -74,23 +74,23 @@ def sketch_picture(
     budget.check_time()
     readings = [_read(walls, ink, is_dark, budget) for walls, is_dark in _hypotheses(ink) if walls is not None]
     if not readings:
-        notebook.use("ink", "nothing that could be walls", 1)
+        builder.use("ink", "nothing that could be walls", 1)
         return Sketch()
     best = readings[0]
     for other in readings[1:]:
         if other.area_m2 > _MORE * best.area_m2:
             best = other
-    notebook.use("ink", "walls", len(shapely.get_parts(best.enclosed.walls)))
+    builder.use("ink", "walls", len(shapely.get_parts(best.enclosed.walls)))
     if best.walls.thickness_m > _MAX_WALL_THICKNESS_M:
         raise InvalidFloorPlanError(
             f"the walls would be {best.walls.thickness_m:.2f} m thick at {metres_per_pixel:g} m per pixel, at most "
             f"{_MAX_WALL_THICKNESS_M:g} m are; is the scale right?"
         )
-    _tell(best, ink, metres_per_pixel, notebook)
-    rooms = [SketchedRoom(straightened(_without_islands(room, notebook))) for room in best.enclosed.rooms]
-    openings = _openings(best, ink, notebook)
+    _tell(best, ink, metres_per_pixel, builder)
+    rooms = [SketchedRoom(straightened(_without_islands(room, builder))) for room in best.enclosed.rooms]
+    openings = _openings(best, ink, builder)
     if openings:
-        notebook.unsure.append(
+        builder.unsure.append(
             "openings are drawn, but count for nothing until opening_kinds names the kinds that are shown completely"
         )
     # A door that was taken for a window, or one that was missed, would speak against the right place.
@@ -103,7 +103,7 @@ def _hypotheses(ink: Ink) -> Sequence[tuple[WallMask | None, bool]]:
 
 def _read(walls: WallMask, ink: Ink, is_dark: bool, budget: Budget) -> _Reading:
     reader = GapReader(ink, walls)
-    seen: dict[int, Seen] = {}
+    seen: dict[int, GapContent] = {}
 
     def judge(gap: Gap) -> int | None:
         seen[id(gap)] = found = reader.look(gap)
@@ -120,16 +120,16 @@ def _read(walls: WallMask, ink: Ink, is_dark: bool, budget: Budget) -> _Reading:
     return _Reading(walls, Enclosed(rooms, enclosed.gaps, enclosed.walls), seen, is_dark)
 
 
-def _without_islands(room: shapely.Polygon, notebook: Notebook) -> shapely.Polygon:
+def _without_islands(room: shapely.Polygon, builder: ReportBuilder) -> shapely.Polygon:
     """Letters and furniture that were taken for walls stand in rooms; so may columns, which are lost with them."""
     small = [ring for ring in room.interiors if shapely.Polygon(ring).area <= _MAX_ISLAND_M2]
     if small:
-        notebook.unsure.append(f"{len(small)} dark shapes inside a room were taken for furniture, not for columns")
+        builder.unsure.append(f"{len(small)} dark shapes inside a room were taken for furniture, not for columns")
     large = [ring for ring in room.interiors if shapely.Polygon(ring).area > _MAX_ISLAND_M2]
     return shapely.Polygon(room.exterior, large)
 
 
-def _openings(reading: _Reading, ink: Ink, notebook: Notebook) -> list[SketchedOpening]:
+def _openings(reading: _Reading, ink: Ink, builder: ReportBuilder) -> list[SketchedOpening]:
     """Gaps by what was seen in them and what lies at their sides, and panes that are drawn into walls."""
     rooms = reading.enclosed.rooms
     outside = shapely.unary_union([room.buffer(0.05) for room in rooms])
@@ -138,7 +138,7 @@ def _openings(reading: _Reading, ink: Ink, notebook: Notebook) -> list[SketchedO
     seen = [(gap.start, gap.end, what) for gap, what in gaps]
     if not reading.is_dark:
         panes = windows_in_walls(reading.walls, ink)
-        seen += [(pane.start, pane.end, Seen("pane", 1.0)) for pane in panes]
+        seen += [(pane.start, pane.end, GapContent("pane", 1.0)) for pane in panes]
     found = []
     for start, end, what in seen:
         width = math.dist(start, end)
@@ -147,11 +147,11 @@ def _openings(reading: _Reading, ink: Ink, notebook: Notebook) -> list[SketchedO
         found.append(SketchedOpening(kind, start, end))
         if (why := _doubt(what, kind)) is not None:
             where = f"({start[0]:.2f}, {start[1]:.2f})"
-            notebook.unsure.append(f"a gap of {width:.2f} m at {where} was taken for a {kind}: {why}")
+            builder.unsure.append(f"a gap of {width:.2f} m at {where} was taken for a {kind}: {why}")
     return found
 
 
-def _kind(seen: Seen, width: float, *, is_inner: bool) -> OpeningKind:
+def _kind(seen: GapContent, width: float, *, is_inner: bool) -> OpeningKind:
     """Doors are drawn without their swing, too: lines in an inner wall are a leaf, those in an outer one panes."""
     if seen.kind == "swing":
         return "door"
@@ -175,7 +175,7 @@ def _is_between_rooms(
     return all(any(room.covers(side) for room in rooms) for side in sides)
 
 
-def _doubt(seen: Seen, kind: OpeningKind) -> str | None:
+def _doubt(seen: GapContent, kind: OpeningKind) -> str | None:
     """Why an opening may be of another kind; None where nothing speaks for that."""
     if seen.kind == "nothing":
         return "nothing is drawn in it"
@@ -183,16 +183,16 @@ def _doubt(seen: Seen, kind: OpeningKind) -> str | None:
         return "a single line is drawn in it"
     if seen.kind == "pane" and kind == "door":
         return "it is drawn like a window, but " + ("brown" if seen.warmth >= _COLOURED else "in an inner wall")
-    return f"{seen.sureness:.0%} of its symbol is drawn" if seen.sureness < _SURE else None
+    return f"{seen.confidence:.0%} of its symbol is drawn" if seen.confidence < _SURE else None
 
 
-def _tell(reading: _Reading, ink: Ink, metres_per_pixel: float, notebook: Notebook) -> None:
+def _tell(reading: _Reading, ink: Ink, metres_per_pixel: float, builder: ReportBuilder) -> None:
     what = "dark and thick" if reading.is_dark else "drawn with two lines"
-    notebook.notes.append(f"walls are {what}, usually {reading.walls.thickness_m:.2f} m thick")
+    builder.notes.append(f"walls are {what}, usually {reading.walls.thickness_m:.2f} m thick")
     if ink.skew_deg:
-        notebook.notes.append(f"the picture was turned by {ink.skew_deg:.2f}° to be straight")
-    notebook.notes.append("lettering is not read: name the rooms")
+        builder.notes.append(f"the picture was turned by {ink.skew_deg:.2f}° to be straight")
+    builder.notes.append("lettering is not read: name the rooms")
     if metres_per_pixel > _COARSE_M:
-        notebook.unsure.append(
+        builder.unsure.append(
             f"a pixel is {100 * metres_per_pixel:.1f} cm, walls are a few pixels thick: a larger picture reads better"
         )
