@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Float
 
 from lalaloc_core.floorplan import DEFAULT_OPENING_TOLERANCE_M
+from lalaloc_core.floorplan.openings import TOUCHING_M, is_above
 
 # What is shorter is a slip of the drawing.
 _MIN_LENGTH_M = 0.02
-_TOUCHING_M = 0.01
 # Openings are the same wall's when their lines are parallel to 15 degrees.
 _MIN_COSINE = 0.966
 
@@ -52,7 +52,7 @@ def opening_entries(drawn: Sequence[DrawnOpening], ids: dict[str, str]) -> tuple
             warnings.append(f"a {opening.kind} of {length_m:.2f} m is left out: it is shorter than {_MIN_LENGTH_M:g} m")
             continue
         shared_m = max((_shared_m(other, opening) for other in kept), default=0.0)
-        if shared_m > _TOUCHING_M:
+        if shared_m > TOUCHING_M:
             if shared_m < 0.5 * length_m:
                 x, y = opening.line_m.mean(axis=0)
                 warnings.append(f"a {opening.kind} at ({x:.2f}, {y:.2f}) m is left out: it overlaps another opening")
@@ -63,7 +63,7 @@ def opening_entries(drawn: Sequence[DrawnOpening], ids: dict[str, str]) -> tuple
 
 def _shared_m(first: DrawnOpening, second: DrawnOpening) -> float:
     """Length that two openings share of one wall, 0 where they are not in one or stand above each other."""
-    if _is_above(first, second) or _is_above(second, first):
+    if is_above(first.sill_m, second.head_m) or is_above(second.sill_m, first.head_m):
         return 0.0
     start = first.line_m[0]
     along = first.line_m[1] - start
@@ -77,10 +77,6 @@ def _shared_m(first: DrawnOpening, second: DrawnOpening) -> float:
         return 0.0
     low, high = np.sort(other @ along)
     return float(min(length_m, high) - max(0.0, low))
-
-
-def _is_above(upper: DrawnOpening, lower: DrawnOpening) -> bool:
-    return upper.sill_m is not None and lower.head_m is not None and upper.sill_m >= lower.head_m
 
 
 def _entry(opening: DrawnOpening, ids: dict[str, str]) -> dict[str, Any]:

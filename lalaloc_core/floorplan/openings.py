@@ -29,7 +29,7 @@ _MIN_COSINE = float(np.cos(np.radians(15.0)))
 # What is shorter on a wall is the end of an opening that lies beside it; half of a narrow opening is never that.
 _MIN_PIECE_M = 0.1
 # Openings that share less than this of a wall touch.
-_TOUCHING_M = 0.01
+TOUCHING_M = 0.01
 _ROUNDING_M = 1e-6
 
 
@@ -209,7 +209,7 @@ def _contacts(
             side,
         )
         shared_m = [_shared(contact, other) * length_m for other in contacts if other.room == contact.room]
-        if max(shared_m, default=0.0) <= _TOUCHING_M:
+        if max(shared_m, default=0.0) <= TOUCHING_M:
             contacts.append(contact)
     return sorted(contacts, key=lambda contact: (contact.room, contact.wall))
 
@@ -224,7 +224,7 @@ def _faces(
     """A contact cut where the room behind changes."""
     start, along = opening.line_m[0], opening.line_m[1] - opening.line_m[0]
     beyond = [contact] if contact.side == 0 else [other for other in contacts if other.side == -contact.side]
-    least = _TOUCHING_M / float(np.hypot(*along))
+    least = TOUCHING_M / float(np.hypot(*along))
     ends_beyond = {at for other in beyond for at in (other.low, other.high)}
     cuts = {at for at in ends_beyond if contact.low + least < at < contact.high - least}
     faces = []
@@ -262,18 +262,23 @@ def _check_overlaps(openings: Sequence[Opening], faces: Sequence[OpeningFace], r
         group.sort(key=lambda face: face.start)
         for k, face in enumerate(group):
             for other in group[k + 1 :]:
-                if (min(face.end, other.end) - other.start) * length_m <= _TOUCHING_M:
+                if (min(face.end, other.end) - other.start) * length_m <= TOUCHING_M:
                     break
                 first, second = openings[face.opening], openings[other.opening]
-                if face.opening != other.opening and not _is_above(first, second) and not _is_above(second, first):
+                if face.opening != other.opening and not _stacked(first, second):
                     raise InvalidFloorPlanError(
                         f"{label(first, face.opening)} and {label(second, other.opening)} overlap",
                         room=rooms[room].name,
                     )
 
 
-def _is_above(upper: Opening, lower: Opening) -> bool:
-    return upper.sill_m is not None and lower.head_m is not None and upper.sill_m >= lower.head_m
+def _stacked(first: Opening, second: Opening) -> bool:
+    return is_above(first.sill_m, second.head_m) or is_above(second.sill_m, first.head_m)
+
+
+def is_above(sill_m: float | None, head_m: float | None) -> bool:
+    """Whether an opening with this sill is known to stand above one with this head; None is not known."""
+    return sill_m is not None and head_m is not None and sill_m >= head_m
 
 
 def kinds_that_occur(openings: Collection[Opening]) -> frozenset[str]:

@@ -87,8 +87,15 @@ def _read_room(raw: Any, fallback_name: str, default_ceiling_m: float | None, li
         raise InvalidFloorPlanError(
             f"the area is {shape.area:.3g} m², at least {limits.min_room_area_m2:g} m² is needed", room=name
         )
-    walls_m = _read_walls(raw.get("walls"), shape, name, limits)
-    return Room(name, outline_m, height_m, key, kind, holes_m, walls_m)
+    return Room(
+        name=name,
+        polygon_m=outline_m,
+        ceiling_height_m=height_m,
+        id=key,
+        type=kind,
+        holes_m=holes_m,
+        inner_walls_m=_read_walls(raw.get("walls"), shape, name, limits),
+    )
 
 
 def _read_ring(raw: Any, what: str, room: str, limits: PlanLimits, *, is_hole: bool = False) -> np.ndarray:
