@@ -22,7 +22,7 @@ STYLES: tuple[Style, ...] = get_args(Style)
 WIDEST_BARE_OPENING_M = 1.9
 _MARGIN_M = 1.5
 # Walls between slanted rooms are wedges; an opening leads through one that is no deeper than this.
-_DEEPEST_WALL_M = 0.8
+_MAX_WALL_DEPTH_M = 0.8
 _PIXELS_PER_M = {"thin": 80.0, "thick": 80.0, "hatched": 80.0, "coloured": 80.0, "scanned": 60.0}
 _HOME = HomeConfig(rotated_share=0.0, sheared_share=0.0, rooms=(3, 9), area_m2=(30.0, 140.0))
 _PALE = ((250, 240, 220), (226, 240, 250), (232, 246, 228), (250, 232, 238), (246, 246, 236))
@@ -30,7 +30,7 @@ _SHIFT = 4
 
 
 @dataclass(frozen=True)
-class DrawnOpening:
+class OpeningSymbol:
     """An opening that a drawing shows: its quadrilateral in the wall, its middle line, and what is cut out of walls."""
 
     kind: Literal["door", "window", "passage"]
@@ -47,7 +47,7 @@ class DrawnPlan:
     picture: UInt8[np.ndarray, "h w 3"]
     metres_per_pixel: float
     rooms: list[shapely.Polygon]
-    openings: list[DrawnOpening]
+    openings: list[OpeningSymbol]
 
     def png(self) -> bytes:
         """The picture as a file."""
@@ -68,7 +68,7 @@ class _Model:
 
     rooms: list[shapely.Polygon]
     names: list[str]
-    openings: list[DrawnOpening]
+    openings: list[OpeningSymbol]
     walls: BaseGeometry
     size_m: tuple[float, float]
 
@@ -110,8 +110,8 @@ def _model(home: Home, thickness: float) -> _Model:
     return _Model(rooms, [room.name for room in home.plan.rooms], openings, walls, (float(size[0]), float(size[1])))
 
 
-def _openings(home: Home, origin: np.ndarray, thickness: float, inside: BaseGeometry) -> list[DrawnOpening]:
-    found: list[DrawnOpening] = []
+def _openings(home: Home, origin: np.ndarray, thickness: float, inside: BaseGeometry) -> list[OpeningSymbol]:
+    found: list[OpeningSymbol] = []
     for opening in home.openings:
         x0, y0, x1, y1 = home.plan.rooms[opening.room].walls_m[opening.wall]
         along = np.array([x1 - x0, y1 - y0]) / math.hypot(x1 - x0, y1 - y0)
@@ -127,7 +127,7 @@ def _openings(home: Home, origin: np.ndarray, thickness: float, inside: BaseGeom
         middle = 0.5 * thickness * outward
         a, b = start + middle, end + middle
         cut = _cut_through(start, end, outward, shape, inside)
-        found.append(DrawnOpening(kind, shape, (float(a[0]), float(a[1])), (float(b[0]), float(b[1])), cut))  # type: ignore[arg-type]
+        found.append(OpeningSymbol(kind, shape, (float(a[0]), float(a[1])), (float(b[0]), float(b[1])), cut))  # type: ignore[arg-type]
     return found
 
 
@@ -141,7 +141,7 @@ def _cut_through(
     """What an opening takes out of walls: all of the wall up to a room behind it, which may be slanted against it."""
     deep = []
     for corner in (start, 0.5 * (start + end), end):
-        ray = shapely.LineString([corner + 0.01 * outward, corner + _DEEPEST_WALL_M * outward])
+        ray = shapely.LineString([corner + 0.01 * outward, corner + _MAX_WALL_DEPTH_M * outward])
         behind = shapely.intersection(ray, inside)
         if behind.is_empty:
             return shape
@@ -150,7 +150,7 @@ def _cut_through(
     return shapely.union(shape, shapely.difference(shapely.Polygon([start, end, end + far, start + far]), inside))
 
 
-def _as_seen(model: _Model) -> tuple[list[shapely.Polygon], list[DrawnOpening]]:
+def _as_seen(model: _Model) -> tuple[list[shapely.Polygon], list[OpeningSymbol]]:
     """Rooms and openings as a drawing shows them: wide bare openings join rooms."""
     wide = [o for o in model.openings if o.kind == "passage" and math.dist(o.start, o.end) > WIDEST_BARE_OPENING_M]
     joined = shapely.unary_union([*model.rooms, *(o.shape.buffer(1e-3, join_style="mitre") for o in wide)])
@@ -272,7 +272,7 @@ class _Sheet:
             elif opening.kind == "door":
                 self._door(opening)
 
-    def _door(self, opening: DrawnOpening) -> None:
+    def _door(self, opening: OpeningSymbol) -> None:
         """Leaf and arc, into the room that the opening belongs to; wide doors have two leaves."""
         corners = np.asarray(opening.shape.exterior.coords)[:2]
         start, end = corners

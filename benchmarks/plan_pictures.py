@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import shapely
 
-from benchmarks.plan_drawing import STYLES, DrawnOpening, DrawnPlan, Style, draw_plan
+from benchmarks.plan_drawing import STYLES, DrawnPlan, OpeningSymbol, Style, draw_plan
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.plans import ImportOptions, import_plan
 
@@ -71,7 +71,7 @@ def _iou(a: shapely.Polygon, b: shapely.Polygon) -> float:
     return shared / (a.area + b.area - shared)
 
 
-def _matches(truth: Sequence[DrawnOpening], told: Sequence[shapely.LineString]) -> int:
+def _matches(truth: Sequence[OpeningSymbol], told: Sequence[shapely.LineString]) -> int:
     free = list(told)
     found = 0
     for opening in truth:

@@ -35,7 +35,7 @@ from lalaloc_core.synth.scene.shots import Shot, sample_shots
 
 # Places that a walk may go through, and how far apart neighbours on it are.
 _PLACES, _STRIDE_M = 80, (0.8, 3.5)
-_LEAST_DISTANCE_STD_M = 0.03
+_MIN_DISTANCE_STD_M = 0.03
 _GRID_STEP_M = 0.5
 _CLEARANCE_M = 0.3
 
@@ -84,7 +84,7 @@ def odometry(
     for first, second in itertools.pairwise(shots):
         moved = second.position_m - first.position_m
         length_m = float(np.hypot(*moved))
-        std_m = max(share * length_m, _LEAST_DISTANCE_STD_M)
+        std_m = max(share * length_m, _MIN_DISTANCE_STD_M)
         turn, direction = rng.normal(0.0, angle_std, 2)
         motion = Motion(
             distance_m=max(length_m + rng.normal(0.0, std_m), 0.0),

@@ -43,7 +43,7 @@ _FIRST = 20
 # Variants of plans are longer and wider by at most so much.
 _DRAWN_OUT = 0.1
 # Pairs that are compared as they are where brute force compares all by codes.
-_MOST_COMPARED = 1_000_000
+_MAX_COMPARED = 1_000_000
 _STEP_M = 0.5
 
 
@@ -160,7 +160,7 @@ def main() -> None:
         for number, name, query in queries(bundle, homes, asked.seed):
             pairs = int(count.sum()) * min(len(query.roll), AZIMUTHS) * len(query.camera_height.offsets)
             how = "brute force" if pairs <= asked.exact else "all codes"
-            compared = 10**15 if pairs <= asked.exact else _MOST_COMPARED
+            compared = 10**15 if pairs <= asked.exact else _MAX_COMPARED
             brute = _best(index.log_masses(query, weights, config, compared=compared, scanned=10**15))
             for scanned in asked.scanned:
                 begin, began = time.process_time(), time.perf_counter()

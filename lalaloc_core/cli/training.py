@@ -96,7 +96,7 @@ def add_commands(commands: Any) -> None:
 def _train(arguments: argparse.Namespace) -> None:
     import torch
 
-    from lalaloc_core.data.opening import open_dataset
+    from lalaloc_core.data.dataset_detection import open_dataset
     from lalaloc_core.data.synthetic.unfamiliar import UnfamiliarScenes
     from lalaloc_core.training.config import PRESETS
     from lalaloc_core.training.data import TrainingData

@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M, ROOM_TYPES
 from lalaloc_core.data.drawn_openings import DrawnOpening, opening_entries
-from lalaloc_core.data.rings import uncrossed
+from lalaloc_core.data.polygon_rings import uncrossed
 from lalaloc_core.errors import DatasetError, InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_CAMERA_HEIGHT_M, DEFAULT_LIMITS, FloorPlan
 
@@ -24,7 +24,7 @@ _MIN_SHARE_UNCROSSED = 0.9
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Outline:
+class RoomOutline:
     """A room as a data set draws it; `warnings` say what was odd about it."""
 
     name: str
@@ -36,7 +36,7 @@ class Outline:
 
 def assemble_plan(
     scene: str,
-    outlines: Sequence[Outline],
+    outlines: Sequence[RoomOutline],
     *,
     path: Path,
     units: str,
@@ -79,7 +79,7 @@ def assemble_plan(
 
 
 def _room_entries(
-    scene: str, outlines: Sequence[Outline], *, path: Path, units: str
+    scene: str, outlines: Sequence[RoomOutline], *, path: Path, units: str
 ) -> tuple[list[dict[str, Any]], list[str]]:
     """Entries of a plan's `rooms`, and what was odd about the outlines; see `assemble_plan`."""
     warnings = [warning for outline in outlines for warning in outline.warnings]

@@ -22,9 +22,9 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
-from lalaloc_core.data.assembly import Outline, assemble_plan, is_number, read_json
+from lalaloc_core.data.assembly import RoomOutline, assemble_plan, is_number, read_json
 from lalaloc_core.data.drawn_openings import DrawnOpening
-from lalaloc_core.data.rings import OpenRingError, chain_rings, signed_area
+from lalaloc_core.data.polygon_rings import OpenRingError, chain_rings, signed_area
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan, room_type_of
 
@@ -76,7 +76,7 @@ class _Reader:
                 raise self._error(f"'{key}' must be a list" if key in document else f"'{key}' is missing")
 
     def annotation(self) -> Annotation:
-        outlines: list[Outline] = []
+        outlines: list[RoomOutline] = []
         heights: list[tuple[str, float]] = []
         seen: Counter[str] = Counter()
         for number, semantic in enumerate(self._document["semantics"]):
@@ -108,7 +108,7 @@ class _Reader:
             floors[identity] = (*floors.get(identity, ()), *kept)
         return Annotation(plan, floors)
 
-    def _outlines(self, room: str, planes: list[Any]) -> list[tuple[Outline, float]]:
+    def _outlines(self, room: str, planes: list[Any]) -> list[tuple[RoomOutline, float]]:
         """A room's outline with its floor's height, once for each of its floors."""
         of_kind: dict[str, list[int]] = {"floor": [], "ceiling": []}
         for plane in planes:
@@ -126,7 +126,7 @@ class _Reader:
         for plane in of_kind["floor"]:
             corners_m, warnings = self._floor_m(plane, room)
             floor_z_m, floor_warnings = _level(corners_m[:, 2], "floor", room)
-            outline = Outline(
+            outline = RoomOutline(
                 name=room,
                 polygon_m=corners_m[:, :2],
                 ceiling_height_m=ceiling_z_m - floor_z_m,
@@ -136,7 +136,9 @@ class _Reader:
             found.append((outline, floor_z_m))
         return found
 
-    def _openings(self, outlines: list[Outline], floors_z_m: list[float]) -> tuple[list[DrawnOpening], tuple[str, ...]]:
+    def _openings(
+        self, outlines: list[RoomOutline], floors_z_m: list[float]
+    ) -> tuple[list[DrawnOpening], tuple[str, ...]]:
         """Doors and windows: boxes between two walls, or single faces; what cannot be read is a warning."""
         shapes = [shapely.Polygon(outline.polygon_m) for outline in outlines]
         found, faults = [], []

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Float
 
 from lalaloc_core.conventions import heading_from_degrees
-from lalaloc_core.data.assembly import Outline, assemble_plan, inside, is_number, pose_fault, read_json
+from lalaloc_core.data.assembly import RoomOutline, assemble_plan, inside, is_number, pose_fault, read_json
 from lalaloc_core.data.dataset import Appearance, Camera, Scene, Split
 from lalaloc_core.data.drawn_openings import DrawnOpening
 from lalaloc_core.data.photographs import FilePhotograph
@@ -119,7 +119,7 @@ class _FloorReader:
         self._panoramas = list(self._walk(merger[floor]))
 
     def scene(self, problems: list[DatasetError] | None) -> Scene:
-        outlines: dict[str, Outline] = {}
+        outlines: dict[str, RoomOutline] = {}
         openings: list[DrawnOpening] = []
         faults: list[str] = []
         for panorama in self._panoramas:
@@ -157,7 +157,7 @@ class _FloorReader:
                     name = f"{partial_room}_{pano}"
                     yield _Panorama(complete_room=complete_room, name=name, data=self._object(data, name))
 
-    def _outline(self, panorama: _Panorama, layout: Any) -> Outline:
+    def _outline(self, panorama: _Panorama, layout: Any) -> RoomOutline:
         vertices = layout.get("vertices") if isinstance(layout, dict) else None
         if not isinstance(vertices, list) or len(vertices) < 3:
             raise self._error("layout_complete has no list of at least three 'vertices'", panorama.name)
@@ -165,7 +165,7 @@ class _FloorReader:
         transform = self._transform(panorama)
         ceiling = self._number(panorama.data, "ceiling_height", panorama)
         label = str(panorama.data.get("label", "")).strip()
-        return Outline(
+        return RoomOutline(
             name=f"{label} {panorama.complete_room}".strip(),
             polygon_m=transform.to_plan_m(polygon),
             ceiling_height_m=ceiling * transform.unit_m,

@@ -14,7 +14,7 @@ from PIL import Image
 from lalaloc_core.conventions import heading_from_degrees
 from lalaloc_core.draw.canvas import FOUND, INK, MUTED, RULE, Number, document, draw_cross, jpeg, shortened, words
 from lalaloc_core.draw.heat import HeatMap, colour_bar, heat_image
-from lalaloc_core.draw.outline import Outline, outline_of
+from lalaloc_core.draw.outline import LayoutOutline, outline_of
 from lalaloc_core.draw.photograph import photograph_key, photograph_part
 from lalaloc_core.draw.plan import ELLIPSE_STDS, Marker, draw_camera, extent_m, plan_part, shape_of
 from lalaloc_core.floorplan import FloorPlan
@@ -27,14 +27,14 @@ _WIDTH, _PAD = 1600.0, 36.0
 PHOTOGRAPH_SIZE = (1528, 764)
 _HEADER, _KEY, _LEGEND = 104.0, 52.0, 400.0
 # Between them the plan's drawing is as high as its shape asks for.
-_LEAST_PLAN, _MOST_PLAN = 560.0, 1150.0
+_MIN_PLAN, _MAX_PLAN = 560.0, 1150.0
 # Less probable rivals say nothing.
-_LEAST_RIVAL = 0.001
+_MIN_PROBABILITY = 0.001
 _CHARACTERS = 52
 
 
 @dataclass(frozen=True)
-class Rival:
+class DrawnCandidate:
     """Another place that the photograph may have been taken at."""
 
     x_m: float
@@ -63,12 +63,12 @@ class DrawnAnswer:
     camera_height_m: float
     heading_source: str
     confidence: float | None
-    rivals: tuple[Rival, ...] = ()
+    rivals: tuple[DrawnCandidate, ...] = ()
     heat: HeatMap | None = None
     truth: Marker | None = None
 
     @property
-    def outline(self) -> Outline:
+    def outline(self) -> LayoutOutline:
         """The layout that the answer says the photograph shows."""
         position_m = np.array([self.camera.x_m, self.camera.y_m])
         heading = heading_from_degrees(self.camera.heading_deg or 0.0)
@@ -105,7 +105,7 @@ def draw_answer(
     if picture != "photograph":
         seen = [(one.x_m, one.y_m) for one in (answer.camera, answer.truth) if one is not None]
         width = _WIDTH - 3 * _PAD - _LEGEND
-        height = min(max(width / shape_of(answer.plan, seen), _LEAST_PLAN), _MOST_PLAN)
+        height = min(max(width / shape_of(answer.plan, seen), _MIN_PLAN), _MAX_PLAN)
         heat = "" if answer.heat is None else heat_image(answer.heat, answer.plan)
         marks = _marks(answer)
         box = (_PAD, y, width, height)
@@ -201,8 +201,8 @@ def _sized(photograph: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3
     return np.asarray(Image.fromarray(photograph).resize(PHOTOGRAPH_SIZE, Image.Resampling.BICUBIC))
 
 
-def _shown(rivals: Sequence[Rival]) -> list[Rival]:
-    return [one for one in rivals if one.probability is None or one.probability >= _LEAST_RIVAL]
+def _shown(rivals: Sequence[DrawnCandidate]) -> list[DrawnCandidate]:
+    return [one for one in rivals if one.probability is None or one.probability >= _MIN_PROBABILITY]
 
 
 def _length(metres: float) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from lalaloc_core.bundle import ConfidenceModel
 from lalaloc_core.conventions import heading_to_degrees
-from lalaloc_core.draw.answer import DrawnAnswer, Rival
+from lalaloc_core.draw.answer import DrawnAnswer, DrawnCandidate
 from lalaloc_core.draw.heat import posterior_map
 from lalaloc_core.draw.plan import Marker
 from lalaloc_core.floorplan import FloorPlan
@@ -38,7 +38,7 @@ def drawn_answer(
         (xx, xy), (_, yy) = spread.position_m2.tolist()
         covariance = (xx, xy, yy)
     rivals = [
-        Rival(
+        DrawnCandidate(
             one.x_m,
             one.y_m,
             _heading_deg(found.query, one),

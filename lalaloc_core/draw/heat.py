@@ -22,7 +22,7 @@ from lalaloc_core.sampling import PoseSet
 # ColorBrewer's YlGnBu, which is safe for the colour-blind and still a scale when it is printed in grey.
 _COLOURS = ["#ffffe5", "#f7fcb9", "#d9f0a3", "#a6dba0", "#5cc2b0", "#2fa4c0", "#2a7ab9", "#27509b", "#132a6b"]
 # So many cells along the longer side of a plan, and none smaller than this.
-_CELLS, _LEAST_CELL_M = 220, 0.04
+_CELLS, _MIN_CELL_M = 220, 0.04
 # Places are spread by a normal distribution: its deviation in steps of the grid, and how many of them it reaches.
 _SPREAD, _REACH = 0.4, 5.0
 # Bilinear, which is fast, where drawn by resvg; browsers do it anyway.
@@ -49,7 +49,7 @@ class Cells:
     def of(cls, plan: FloorPlan, size_m: float | None = None) -> Cells:
         """Cut a plan; by default into as many cells as are seen."""
         x_min, y_min, x_max, y_max = plan.bounds_m
-        size_m = size_m or max(max(x_max - x_min, y_max - y_min) / _CELLS, _LEAST_CELL_M)
+        size_m = size_m or max(max(x_max - x_min, y_max - y_min) / _CELLS, _MIN_CELL_M)
         # One empty cell all around, for the edges to grow into.
         xs = np.arange(x_min - 0.5 * size_m, x_max + size_m, size_m)
         ys = np.arange(y_min - 0.5 * size_m, y_max + size_m, size_m)

@@ -32,7 +32,7 @@ Line = Float[np.ndarray, "_ 2"]
 
 
 @dataclass(frozen=True, eq=False)
-class DrawnOpening:
+class OpeningOutline:
     """An opening, or the part of it that is seen: a closed line around it."""
 
     kind: str
@@ -40,7 +40,7 @@ class DrawnOpening:
 
 
 @dataclass(frozen=True, eq=False)
-class Outline:
+class LayoutOutline:
     """Lines of a layout in a panorama, as shares (x, y) of its width and height, y pointing down.
 
     Attributes:
@@ -52,12 +52,12 @@ class Outline:
     floor: Line
     ceiling: Line
     corners: Float[np.ndarray, "k 2 2"]
-    openings: tuple[DrawnOpening, ...]
+    openings: tuple[OpeningOutline, ...]
 
 
 def outline_of(
     plan: FloorPlan, position_m: Float[np.ndarray, "2"], room_index: int, heading: float, camera_height_m: float
-) -> Outline:
+) -> LayoutOutline:
     """The outline of a room as a camera in it sees it.
 
     Args:
@@ -85,7 +85,7 @@ def outline_of(
         if face.room == room_index
         for drawn in _opening(plan, face, position_m, heading, camera_height_m, walls_m)
     ]
-    return Outline(
+    return LayoutOutline(
         points_at(azimuth, distance_m, -camera_height_m),
         points_at(azimuth, distance_m, above_m),
         corners,
@@ -134,7 +134,7 @@ def _opening(
     heading: float,
     camera_height_m: float,
     walls_m: Float[np.ndarray, "w 4"],
-) -> list[DrawnOpening]:
+) -> list[OpeningOutline]:
     opening = plan.openings[face.opening]
     usual_sill_m, usual_head_m = USUAL_HEIGHTS_M[opening.kind]
     low_m = usual_sill_m if opening.sill_m is None else opening.sill_m
@@ -158,5 +158,5 @@ def _opening(
             if len(run) > 1:
                 lower = points_at(relative[run], distance_m[run], low_m - camera_height_m)
                 upper = points_at(relative[run], distance_m[run], high_m - camera_height_m)
-                drawn.append(DrawnOpening(opening.kind, np.concatenate([lower, upper[::-1], lower[:1]])))
+                drawn.append(OpeningOutline(opening.kind, np.concatenate([lower, upper[::-1], lower[:1]])))
     return drawn

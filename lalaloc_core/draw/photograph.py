@@ -10,7 +10,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from lalaloc_core.draw.canvas import INK, Box, Number, document, image, path, pixels, png, words
-from lalaloc_core.draw.outline import Outline
+from lalaloc_core.draw.outline import LayoutOutline
 
 # Told apart by all who see little colour, on bright walls and dark furniture alike.
 WALL_COLOUR = "#ffb000"
@@ -41,7 +41,11 @@ def wall_line(profile_m: Float[np.ndarray, "w"], rise_m: float, height: int) -> 
 
 
 def wall_stroke(
-    outline: Outline, size: tuple[int, int], colour: str = WALL_COLOUR, width: float = 2.0, edge_width: float = 3.0
+    outline: LayoutOutline,
+    size: tuple[int, int],
+    colour: str = WALL_COLOUR,
+    width: float = 2.0,
+    edge_width: float = 3.0,
 ) -> Stroke:
     """Floor line, ceiling line and corners of an outline in a picture of a size (width, height)."""
     return Stroke(
@@ -49,7 +53,7 @@ def wall_stroke(
     )
 
 
-def photograph_part(content: bytes, kind: str, outline: Outline, box: Box) -> str:
+def photograph_part(content: bytes, kind: str, outline: LayoutOutline, box: Box) -> str:
     """A photograph with a layout in it as a part of a larger drawing.
 
     Args:
@@ -73,7 +77,7 @@ def photograph_part(content: bytes, kind: str, outline: Outline, box: Box) -> st
     return f'<g class="photograph" transform="translate({x:.1f} {y:.1f})">{"".join(parts)}</g>'
 
 
-def photograph_key(outline: Outline, x: Number, y: Number) -> str:
+def photograph_key(outline: LayoutOutline, x: Number, y: Number) -> str:
     """What the lines in a photograph are; `y` is the base line of its words."""
     kinds = sorted({opening.kind for opening in outline.openings}, key=list(OPENING_COLOURS).index)
     parts = []

@@ -11,7 +11,7 @@ import torch
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.configuration import build_config
 from lalaloc_core.data.dataset import Appearance, Dataset
-from lalaloc_core.data.opening import open_dataset
+from lalaloc_core.data.dataset_detection import open_dataset
 from lalaloc_core.data.synthetic.copied import CopiedScenes
 from lalaloc_core.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.data.synthetic.mismatched import MismatchedScenes

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from lalaloc_core.bundle import IMAGE_WEIGHTS, LAYOUT_WEIGHTS, Bundle
-from lalaloc_core.export.bundle import export_again, export_bundle
+from lalaloc_core.export.bundle_export import export_again, export_bundle
 from lalaloc_core.nets import load_layout_encoder
 from lalaloc_core.training.best import best_path
 from lalaloc_core.training.checkpoint import Checkpoint

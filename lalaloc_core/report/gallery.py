@@ -23,7 +23,7 @@ from lalaloc_core.report.pictures import (
     PANORAMA_HEIGHT,
     PANORAMA_WIDTH,
     DrawnMap,
-    Picture,
+    EncodedPicture,
     draw_map,
     draw_panorama,
 )
@@ -50,7 +50,7 @@ class Card:
     error_m: float | None
     heading_error_deg: float | None
     confidence: float | None
-    pictures: tuple[Picture, ...]
+    pictures: tuple[EncodedPicture, ...]
 
     @property
     def bytes(self) -> int:
@@ -163,7 +163,7 @@ class _CardWriter:
             ),
         )
 
-    def _panorama(self, scene: Scene, camera: Camera, prediction: Prediction) -> list[Picture]:
+    def _panorama(self, scene: Scene, camera: Camera, prediction: Prediction) -> list[EncodedPicture]:
         try:
             image = scene.photograph(camera, self._appearance).image(PANORAMA_HEIGHT, PANORAMA_WIDTH)
         except (LaLaLocError, OSError) as error:

@@ -26,7 +26,7 @@ _MAP_WIDTH, _MAP_HEAD, _MAP_FOOT, _MAP_PAD = 640, 32, 84, 12
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Picture:
+class EncodedPicture:
     """An encoded picture: `kind` is "jpeg" or "png", `name` what it is among a query's, `alt` says what it shows."""
 
     name: str
@@ -59,7 +59,7 @@ class DrawnMap:
 
 def draw_panorama(
     image: UInt8[np.ndarray, "h w 3"], plan: FloorPlan, camera_height_m: float, truth: Pose, found: Pose | None
-) -> Picture:
+) -> EncodedPicture:
     """A panorama with the wall-floor and wall-ceiling lines of the true pose's layout, and of the found one's."""
     height, width, _ = image.shape
     # The truth is broader and lies below, so that both show where they agree.
@@ -72,7 +72,7 @@ def draw_panorama(
     draw_strokes(image, strokes).save(buffer, "JPEG", quality=_JPEG_QUALITY, optimize=True)
     what = "the true layout" if found is None else "the true and the found layout"
     alt = f"Panorama with the outlines of {what} drawn over it"
-    return Picture(name="panorama", content=buffer.getvalue(), kind="jpeg", width=width, height=height, alt=alt)
+    return EncodedPicture(name="panorama", content=buffer.getvalue(), kind="jpeg", width=width, height=height, alt=alt)
 
 
 def layout_lines(
@@ -85,7 +85,7 @@ def layout_lines(
     return [wall_line(profile, rise_m, height) for rise_m in (-over_floor, under_ceiling)]
 
 
-def draw_map(plan: FloorPlan, drawn: DrawnMap, truth: Pose, found: Pose | None) -> Picture:
+def draw_map(plan: FloorPlan, drawn: DrawnMap, truth: Pose, found: Pose | None) -> EncodedPicture:
     """A plan with a map of distances, the true position (×) and the found pose (dot and heading)."""
     extent = extent_m(plan)
     heat = distance_map(drawn.cells, drawn.distance, drawn.scale)
@@ -104,4 +104,6 @@ def draw_map(plan: FloorPlan, drawn: DrawnMap, truth: Pose, found: Pose | None) 
     ]
     content = rasterise(document(width, height, drawn.title, parts))
     alt = f"Floor plan coloured by {drawn.title}"
-    return Picture(name=drawn.title.replace(" ", "-"), content=content, kind="png", width=width, height=height, alt=alt)
+    return EncodedPicture(
+        name=drawn.title.replace(" ", "-"), content=content, kind="png", width=width, height=height, alt=alt
+    )

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import torch
 
-from lalaloc_core.data.opening import open_dataset
+from lalaloc_core.data.dataset_detection import open_dataset
 from lalaloc_core.evaluation.factories import choose_appearance, describe_model
 from lalaloc_core.evaluation.predictions import Prediction, RunFolder, RunInfo
 from lalaloc_core.evaluation.run import run_evaluation

@@ -16,9 +16,9 @@ from lalaloc_core.cli import main
 from lalaloc_core.conventions import OPENING_CLASSES, TWO_PI, column_azimuths
 from lalaloc_core.data.annotated import GALLERIES, AnnotatedPhotographs, GalleryKey
 from lalaloc_core.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph, read_annotation
+from lalaloc_core.data.dataset_detection import open_dataset
 from lalaloc_core.data.drawn_openings import DrawnOpening
 from lalaloc_core.data.drawn_rooms import DrawnRoom
-from lalaloc_core.data.opening import open_dataset
 from lalaloc_core.data.room_gallery import GALLERY_ROOMS, build_gallery
 from lalaloc_core.errors import DatasetError, InvalidInputError
 from lalaloc_core.evaluation.galleries import answers_in_galleries, describe_answers, score_galleries

@@ -30,8 +30,8 @@ from lalaloc_core.bundle import (
     write_manifest,
 )
 from lalaloc_core.errors import BundleError, ExportError
-from lalaloc_core.export import bundle as export
-from lalaloc_core.export.bundle import PARITY_TOLERANCE, export_bundle
+from lalaloc_core.export import bundle_export as export
+from lalaloc_core.export.bundle_export import PARITY_TOLERANCE, export_bundle
 from lalaloc_core.export.run import export_bundle_again
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders

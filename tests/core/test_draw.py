@@ -13,7 +13,7 @@ from PIL import Image
 
 from lalaloc_core.conventions import TWO_PI, column_azimuths, wrap_angle
 from lalaloc_core.draw import rasterise
-from lalaloc_core.draw.answer import DrawnAnswer, Picture, Rival, confidence_words, draw_answer, ellipse_m
+from lalaloc_core.draw.answer import DrawnAnswer, DrawnCandidate, Picture, confidence_words, draw_answer, ellipse_m
 from lalaloc_core.draw.heat import Cells, HeatMap, distance_map, heat_image, posterior_map
 from lalaloc_core.draw.outline import outline_of
 from lalaloc_core.draw.photograph import Stroke, draw_strokes, wall_line
@@ -51,7 +51,10 @@ def answer(**changes: Any) -> DrawnAnswer:
         "camera_height_m": EYE_M,
         "heading_source": "given",
         "confidence": 0.7,
-        "rivals": (Rival(5.0, 4.0, 210.0, "<kitchen> & more", 0.2), Rival(7.0, 1.0, 0.0, "hall", 0.0)),
+        "rivals": (
+            DrawnCandidate(5.0, 4.0, 210.0, "<kitchen> & more", 0.2),
+            DrawnCandidate(7.0, 1.0, 0.0, "hall", 0.0),
+        ),
     }
     return DrawnAnswer(**(values | changes))
 
@@ -222,7 +225,7 @@ def test_a_picture_of_the_photograph_needs_one() -> None:
 
 
 def test_a_model_without_confidence_leaves_it_out() -> None:
-    bare = answer(confidence=None, rivals=(Rival(5.0, 4.0, 210.0, "kitchen", None),))
+    bare = answer(confidence=None, rivals=(DrawnCandidate(5.0, 4.0, 210.0, "kitchen", None),))
     words = " ".join(ElementTree.fromstring(draw_answer(bare, picture="plan")).itertext())
     assert "within 1 m" not in words
     assert "kitchen" in words

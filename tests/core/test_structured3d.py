@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from lalaloc_core.data.dataset import Appearance, load_scenes
-from lalaloc_core.data.rings import OpenRingError, chain_rings, signed_area, uncrossed
+from lalaloc_core.data.polygon_rings import OpenRingError, chain_rings, signed_area, uncrossed
 from lalaloc_core.data.structured3d import Structured3D
 from lalaloc_core.data.structured3d_annotation import Annotation, read_annotation
 from lalaloc_core.data.structured3d_splits import EXCLUDED_BY_PAPER, OFFICIAL, bad_scenes, scene_numbers

@@ -17,7 +17,7 @@ from torch.nn import functional
 from lalaloc_core.bundle import IMAGE_ONNX, MANIFEST_NAME, Bundle
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.errors import BundleError, ConfigError
-from lalaloc_core.export.bundle import export_bundle
+from lalaloc_core.export.bundle_export import export_bundle
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.poses import rolled

@@ -9,7 +9,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 WEB, BUILT = ROOT / "web", ROOT / "service" / "web"
 # All that a visitor may load.
-MOST_BYTES = 1_500_000
+MAX_BYTES = 1_500_000
 
 
 def _digest(path: Path) -> str:
@@ -32,7 +32,7 @@ def test_what_is_served_was_built_from_the_sources_that_are_here() -> None:
 
 
 def test_the_pages_are_small() -> None:
-    assert sum(path.stat().st_size for path in BUILT.iterdir()) < MOST_BYTES
+    assert sum(path.stat().st_size for path in BUILT.iterdir()) < MAX_BYTES
 
 
 def test_the_example_on_the_page_is_that_of_the_examples() -> None:

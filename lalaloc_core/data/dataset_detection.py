@@ -1,4 +1,4 @@
-"""Opening a data set by its folder: which of the formats it holds shows in its files."""
+"""Which format of data set a folder holds, as its files show, and the reader of it."""
 
 from __future__ import annotations
 
