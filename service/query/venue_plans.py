@@ -76,7 +76,7 @@ class ChosenPlans:
 
     Attributes:
         members: the plans as `Venues.searched` tells them.
-        log_mass: (p,) of all plans that are ready, chosen or not; see `localise.plan_index`.
+        log_mass: (p,) of all plans that are ready, chosen or not; see `localise.venue.plan_index`.
         index: (m,) which of those were chosen.
     """
 
