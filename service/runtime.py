@@ -16,6 +16,7 @@ from lalaloc_core.bundle import Bundle
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from service.conversion import Converter
+from service.fair_share import with_headroom
 from service.grids import GridProvider, Sweeper
 from service.http import Admission, AdmissionLimits
 from service.http.events import HEARTBEAT_S, PlanEvents
@@ -33,7 +34,6 @@ from service.query import (
 from service.schemas import ModelAnswer
 from service.security import AccessControl
 from service.settings import Settings
-from service.sharing import with_spare
 from service.storage import PlanLookup, Store, open_store
 from service.telemetry import LOGGER_NAME, Telemetry
 from service.telemetry.tracing import Tracing, otlp_exporter
@@ -42,7 +42,7 @@ from service.threads import BoundedReads, Threads
 # Queries read little: their plan, and a grid that is not in memory.
 _READ_THREADS = 4
 # Small grids are computed on them: more of one tenant would take the cores from queries.
-_UPLOAD_THREADS = with_spare(2)
+_UPLOAD_THREADS = with_headroom(2)
 # Drawings in memory, and revisions that wait to be drawn.
 # Poses of the plans of a venue that are searched together, besides a single larger plan: they are copied for a query.
 _VENUE_POSES = 40_000
@@ -159,7 +159,7 @@ def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack, 
     )
     uploads = kept(Threads("lalaloc-uploads", _UPLOAD_THREADS))
     # As many as may be read at a time, and after the converter in being closed: what waits for it must be let go first.
-    file_uploads = kept(Threads("lalaloc-files", with_spare(settings.import_workers)))
+    file_uploads = kept(Threads("lalaloc-files", with_headroom(settings.import_workers)))
     converter = kept(Converter(settings, telemetry))
     localiser = kept(
         Localiser(

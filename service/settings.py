@@ -17,7 +17,7 @@ from lalaloc_core.floorplan import PlanLimits
 from lalaloc_core.panorama.images import PanoramaLimits
 from lalaloc_core.plans import ImportLimits
 from service.cores import CoreShares, share_cores, usable_cores
-from service.sharing import with_spare
+from service.fair_share import with_headroom
 
 PREFIX = "LALALOC_"
 _DEFAULT_BUNDLE = default_bundle().resolve()
@@ -376,7 +376,7 @@ class Settings(BaseSettings):
     @property
     def query_limit(self) -> int:
         """Queries that may be computed or wait for it."""
-        return self.max_queries or with_spare(2 * (self.cores.workers + self.cores.compute_threads))
+        return self.max_queries or with_headroom(2 * (self.cores.workers + self.cores.compute_threads))
 
     @property
     def resolved_database_url(self) -> str:

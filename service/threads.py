@@ -10,7 +10,7 @@ from contextvars import copy_context
 from typing import Any, ParamSpec, TypeVar
 
 from service.errors import StoreUnavailableError
-from service.sharing import FairTurns
+from service.fair_share import FairSemaphore
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -22,25 +22,25 @@ class Threads:
     def __init__(self, name: str, count: int) -> None:
         """
         Args:
-            count: how many there are; `run` shares them out between parties.
+            count: how many there are; `run` shares them out between clients.
         """
         self._executor = ThreadPoolExecutor(count, thread_name_prefix=name)
-        self._turns = FairTurns(count)
+        self._semaphore = FairSemaphore(count)
 
-    async def run(self, party: str, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
-        """The outcome of a party's call; one that has begun runs to its end, whether or not its caller waits."""
-        await self._turns.acquire(party)
+    async def run(self, client: str, work: Callable[P, T], *args: P.args, **kwargs: P.kwargs) -> T:
+        """The outcome of a client's call; one that has begun runs to its end, whether or not its caller waits."""
+        await self._semaphore.acquire(client)
         loop = asyncio.get_running_loop()
 
         def release(_future: Future[T]) -> None:
-            # A loop that is closed has no turns to give.
+            # A loop that is closed has nobody to wake.
             with suppress(RuntimeError):
-                loop.call_soon_threadsafe(self._turns.release, party)
+                loop.call_soon_threadsafe(self._semaphore.release, client)
 
         try:
             future = self.submit(work, *args, **kwargs)
         except BaseException:
-            self._turns.release(party)
+            self._semaphore.release(client)
             raise
         # Not when its caller leaves: the thread is busy for longer.
         future.add_done_callback(release)

@@ -70,7 +70,7 @@ LAYERS = {
 }
 # The service's layers lie above all of the core's, lowest first.
 SERVICE_LAYERS = (
-    "sharing",
+    "fair_share",
     # `workers` is what runs in worker processes: it loads nothing of what watches over them.
     "cores settings errors problem_kinds schemas threads bounded_cache telemetry workers",
     "pools storage",

@@ -50,7 +50,7 @@ class Converter:
             return PoolState(workers=self._settings.import_workers, ready=0, warmed_up=False, fault=None)
         return pool.state
 
-    def read(self, content: bytes, options: ImportOptions, party: str) -> Imported:
+    def read(self, content: bytes, options: ImportOptions, client: str) -> Imported:
         """What there is in the file of a plan; blocks, for `import_deadline_s` at most.
 
         Raises:
@@ -64,7 +64,7 @@ class Converter:
         """
         limit_s = self._settings.import_deadline_s
         try:
-            future = self._started().submit(ImportJob(content, options), limit_s, party)
+            future = self._started().submit(ImportJob(content, options), limit_s, client)
             done, _ = wait([future], limit_s)
             if not done:
                 future.cancel()
@@ -77,7 +77,7 @@ class Converter:
         assert isinstance(answer, Imported)
         return answer
 
-    async def write(self, plan: FloorPlan, format: str, party: str) -> bytes:
+    async def write(self, plan: FloorPlan, format: str, client: str) -> bytes:
         """A plan as the file of another tool.
 
         Args:
@@ -89,7 +89,7 @@ class Converter:
         """
         job = ExportJob(json.dumps(plan.to_dict()), format)
         try:
-            answer = await self._started().answer(job, self._settings.import_deadline_s, party)
+            answer = await self._started().answer(job, self._settings.import_deadline_s, client)
         except JobLostError as error:
             self._lost(error)
         if isinstance(answer, Refusal):

@@ -41,7 +41,7 @@ def seems_native(content: bytes) -> bool:
 
 
 def understand(
-    content: bytes, options: ImportOptions, converter: Converter, settings: Settings, party: str
+    content: bytes, options: ImportOptions, converter: Converter, settings: Settings, client: str
 ) -> PlanFile:
     """Read the file of a plan; blocks.
 
@@ -60,5 +60,5 @@ def understand(
     elif not is_json(content):
         # Known at a glance, and refused at once where it is nothing known.
         detect_format(content, limits)
-    read = converter.read(content, options, party)
+    read = converter.read(content, options, client)
     return PlanFile(FloorPlan.from_dict(read.document, limits.plan), read.report, read.media_type)

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from time import monotonic
 
 from service.errors import DeadlineExceededError, OverloadedError, ShareExceededError, StoppingError
+from service.fair_share import FairQueue, FairSemaphore, Shares
 from service.settings import Settings
-from service.sharing import FairQueue, FairTurns, Shares
 from service.telemetry import Telemetry
 
 EXEMPT = frozenset({"/healthz", "/readyz", "/metrics"})
@@ -42,13 +42,13 @@ def is_stream(method: str, path: str) -> bool:
 
 
 class Slots:
-    """How many requests of one kind may be in work, and of these of one party (`Shares`); for one event loop."""
+    """How many requests of one kind may be in work, and of these of one client (`Shares`); for one event loop."""
 
     def __init__(self, limit: int, max_waiting: int = 0) -> None:
         """
         Args:
             limit: how many may be in work.
-            max_waiting: how many more may wait for that, in `wait_and_hold`; parties share these places as well.
+            max_waiting: how many more may wait for that, in `wait_and_hold`; clients share these places as well.
         """
         self._shares = Shares(limit)
         self._places = Shares(max_waiting)
@@ -66,69 +66,69 @@ class Slots:
         return self._places.in_use
 
     @contextmanager
-    def hold(self, party: str) -> Iterator[None]:
+    def hold(self, client: str) -> Iterator[None]:
         """Hold a slot.
 
         Raises:
-            OverloadedError: all are in use, or all that the party may have.
+            OverloadedError: all are in use, or all that the client may have.
         """
-        if not self._shares.may_take(party):
-            raise self._refusal(party)
-        self._shares.take(party)
-        with self._held(party):
+        if not self._shares.may_take(client):
+            raise self._refusal(client)
+        self._shares.take(client)
+        with self._held(client):
             yield
 
     @asynccontextmanager
-    async def wait_and_hold(self, party: str, deadline: float) -> AsyncIterator[None]:
-        """Hold a slot as soon as one is free; parties take turns.
+    async def wait_and_hold(self, client: str, deadline: float) -> AsyncIterator[None]:
+        """Hold a slot as soon as one is free; clients take turns.
 
         Args:
             deadline: until when (`monotonic`) it is worth waiting.
 
         Raises:
-            OverloadedError: as many wait already as may, or as many of the party, or none was free in time.
+            OverloadedError: as many wait already as may, or as many of the client, or none was free in time.
         """
-        await self._take_turn(party, deadline)
-        with self._held(party):
+        await self._take_turn(client, deadline)
+        with self._held(client):
             yield
 
     @contextmanager
-    def released(self, party: str) -> Iterator[None]:
+    def released(self, client: str) -> Iterator[None]:
         """Lend the slot that one holds to others while the block only waits."""
-        self._give_back(party)
+        self._give_back(client)
         try:
             yield
         finally:
             # Whoever was let in is not sent away again: for a while there may be more than the limit.
-            self._shares.take(party)
+            self._shares.take(client)
 
-    def check(self, party: str) -> None:
+    def check(self, client: str) -> None:
         """Raises:
-        OverloadedError: all are in use, or all that the party may have, and there is no place to wait for one either;
+        OverloadedError: all are in use, or all that the client may have, and there is no place to wait for one either;
             by the time it says, those that are before it will be through.
         """
-        if not self._shares.may_take(party) and not self._places.may_take(party):
-            raise self._refusal(party)
+        if not self._shares.may_take(client) and not self._places.may_take(client):
+            raise self._refusal(client)
 
     @contextmanager
-    def _held(self, party: str) -> Iterator[None]:
+    def _held(self, client: str) -> Iterator[None]:
         begin = monotonic()
         try:
             yield
         finally:
             self._held_s += _NEWEST * (monotonic() - begin - self._held_s)
-            self._give_back(party)
+            self._give_back(client)
 
-    async def _take_turn(self, party: str, deadline: float) -> None:
-        # Whoever waits is of a party that may take none.
-        if self._shares.may_take(party):
-            self._shares.take(party)
+    async def _take_turn(self, client: str, deadline: float) -> None:
+        # Whoever waits is of a client that may take none.
+        if self._shares.may_take(client):
+            self._shares.take(client)
             return
-        if not self._places.may_take(party):
-            raise self._refusal(party)
+        if not self._places.may_take(client):
+            raise self._refusal(client)
         turn = asyncio.get_running_loop().create_future()
-        self._places.take(party)
-        self._waiting.append(party, turn)
+        self._places.take(client)
+        self._waiting.append(client, turn)
         try:
             async with asyncio.timeout(max(deadline - monotonic(), 0.0)):
                 await turn
@@ -136,26 +136,26 @@ class Slots:
             self._waiting.drop(lambda other: other is turn)
             if turn.done() and not turn.cancelled():
                 # It came at the very moment when nobody waited any more.
-                self._give_back(party)
+                self._give_back(client)
             if isinstance(error, TimeoutError):
-                raise self._refusal(party) from error
+                raise self._refusal(client) from error
             raise
         finally:
-            self._places.give_back(party)
+            self._places.give_back(client)
 
-    def _give_back(self, party: str) -> None:
-        self._shares.give_back(party)
+    def _give_back(self, client: str) -> None:
+        self._shares.give_back(client)
         while (found := self._waiting.take(self._shares.may_take)) is not None:
-            next_party, turn = found
+            next_client, turn = found
             if not turn.done():
-                self._shares.take(next_party)
+                self._shares.take(next_client)
                 turn.set_result(None)
 
-    def _refusal(self, party: str) -> OverloadedError:
+    def _refusal(self, client: str) -> OverloadedError:
         rounds = 1.0 + self.waiting / max(self._shares.limit, 1)
         retry_after_s = min(max(math.ceil(rounds * self._held_s), 1), _MAX_RETRY_AFTER_S)
         if self.in_use < self._shares.limit:
-            return ShareExceededError(self._shares.held_by(party), self._shares.limit, retry_after_s)
+            return ShareExceededError(self._shares.held_by(client), self._shares.limit, retry_after_s)
         return OverloadedError(self._shares.limit, retry_after_s)
 
 
@@ -205,7 +205,7 @@ class Admission:
         self.reads = Slots(limits.reads)
         self.streams = Slots(limits.streams)
         # Reads compute a few at a time: more threads would only take the interpreter from queries.
-        self.reading = FairTurns(_READS_AT_A_TIME)
+        self.reading = FairSemaphore(_READS_AT_A_TIME)
         self.draining = False
         self.stopping = False
         telemetry.gauge(
@@ -234,12 +234,12 @@ class Admission:
         return self.requests.in_use == self.reads.in_use == 0
 
     @contextmanager
-    def slot_for(self, party: str, method: str, path: str) -> Iterator[None]:
-        """Hold a slot for a request of a party whose head has arrived.
+    def slot_for(self, client: str, method: str, path: str) -> Iterator[None]:
+        """Hold a slot for a request of a client whose head has arrived.
 
         Raises:
             StoppingError: no more requests are taken.
-            OverloadedError: all slots of its kind are in use, or all that the party may have.
+            OverloadedError: all slots of its kind are in use, or all that the client may have.
         """
         if self.stopping:
             raise StoppingError()
@@ -251,6 +251,6 @@ class Admission:
             slots = self.requests
             if path in _QUERIES:
                 # A body that nobody could do anything with is not worth reading.
-                self.queries.check(party)
-        with slots.hold(party):
+                self.queries.check(client)
+        with slots.hold(client):
             yield

@@ -11,9 +11,9 @@ from ray.serve.experimental.consistent_hash_router import ConsistentHashRouter
 
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.errors import ConfigError
+from service.fair_share import with_headroom
 from service.on_ray.replicas import EncoderReplica, IngressReplica, LpoReplica, SearchReplica
 from service.settings import Settings
-from service.sharing import with_spare
 
 Replicas = Annotated[int, Field(ge=1, le=1000)]
 
@@ -63,7 +63,7 @@ def application(settings: Settings, options: RayOptions) -> serve.Application:
     of_search = settings.model_copy(update={"workers": 0, "compute_threads": _SEARCH_THREADS, "onnx_threads": threads})
     per_search = of_search.query_limit + of_search.max_waiting_queries
     # As many as all replicas that there may be take: else there would never be more of them.
-    most = settings.max_queries or with_spare(options.search_max * of_search.query_limit)
+    most = settings.max_queries or with_headroom(options.search_max * of_search.query_limit)
     # Panoramas are decoded where they are searched for.
     of_ingress = settings.model_copy(update={"workers": 0, "decode_workers": 1, "max_queries": most})
     single = settings.model_copy(update={"onnx_threads": threads})

@@ -88,13 +88,13 @@ class RemoteRefining:
         workers = 0 if self._lpo is None else 1
         return PoolState(workers=workers, ready=workers, warmed_up=True, fault=None)
 
-    async def refine(self, job: RefinementJob, timeout_s: float, party: str = "") -> RefinementResult | None:
-        """See `LpoPool.refine`; parties do not take turns."""
+    async def refine(self, job: RefinementJob, timeout_s: float, client: str = "") -> RefinementResult | None:
+        """See `LpoPool.refine`; clients do not take turns."""
         result = await self._answer(job, timeout_s)
         assert not isinstance(result, SequenceResult)
         return result
 
-    async def refine_sequence(self, job: SequenceJob, timeout_s: float, party: str = "") -> SequenceResult | None:
+    async def refine_sequence(self, job: SequenceJob, timeout_s: float, client: str = "") -> SequenceResult | None:
         """As `refine`, of paths."""
         result = await self._answer(job, timeout_s)
         assert not isinstance(result, RefinementResult)
@@ -187,10 +187,10 @@ class RemoteAnswering(_Asking):
         return self._model
 
     async def answer(
-        self, record: PlanRecord, form: LocaliseForm, content: bytes, begin: float, clock: StageClock, party: str
+        self, record: PlanRecord, form: LocaliseForm, content: bytes, begin: float, clock: StageClock, client: str
     ) -> LocaliseAnswer:
         """See `Localiser.answer`, for the errors as well."""
-        found = await self._ask("answer", record.id, begin, clock, record.tenant, record.id, form, content, party)
+        found = await self._ask("answer", record.id, begin, clock, record.tenant, record.id, form, content, client)
         self._observe(found)
         return found
 
@@ -201,11 +201,11 @@ class RemoteAnswering(_Asking):
         content: bytes,
         begin: float,
         clock: StageClock,
-        party: str,
+        client: str,
         asked: AskedPicture,
     ) -> tuple[LocaliseAnswer, bytes]:
         """See `Localiser.picture`."""
-        arguments = record.tenant, record.id, form, content, party, asked
+        arguments = record.tenant, record.id, form, content, client, asked
         found, drawn = await self._ask("picture", record.id, begin, clock, *arguments)
         self._observe(found)
         return found, drawn
@@ -217,10 +217,10 @@ class RemoteAnswering(_Asking):
         contents: list[bytes],
         begin: float,
         clock: StageClock,
-        party: str,
+        client: str,
     ) -> SequenceAnswer:
         """See `Localiser.answer_sequence`."""
-        arguments = record.tenant, record.id, form, contents, party
+        arguments = record.tenant, record.id, form, contents, client
         found = await self._ask("answer_sequence", record.id, begin, clock, *arguments)
         self._observe(found)
         return found
@@ -230,10 +230,12 @@ class RemoteVenueAnswering(_Asking):
     """Answers queries about venues, as `VenueLocaliser` does."""
 
     async def answer(
-        self, venue: VenueRecord, form: LocaliseForm, content: bytes, begin: float, clock: StageClock, party: str
+        self, venue: VenueRecord, form: LocaliseForm, content: bytes, begin: float, clock: StageClock, client: str
     ) -> LocaliseAnswer:
         """See `VenueLocaliser.answer`."""
-        found = await self._ask("answer_in_venue", venue.id, begin, clock, venue.tenant, venue.id, form, content, party)
+        found = await self._ask(
+            "answer_in_venue", venue.id, begin, clock, venue.tenant, venue.id, form, content, client
+        )
         self._observe(found)
         return found
 
@@ -246,10 +248,10 @@ class RemoteVenueAnswering(_Asking):
         content: bytes,
         begin: float,
         clock: StageClock,
-        party: str,
+        client: str,
     ) -> LocaliseAnswer:
         """See `VenueLocaliser.answer_near`."""
-        arguments = tenant, place, within_m, form, content, party
+        arguments = tenant, place, within_m, form, content, client
         found = await self._ask("answer_near", str(place), begin, clock, *arguments)
         self._observe(found)
         return found

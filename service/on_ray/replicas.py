@@ -82,7 +82,7 @@ class SearchReplica:
         self._runtime = start_runtime(settings, Telemetry(), self._cleanup, elsewhere)
 
     async def answer(
-        self, tenant: str, plan_id: str, form: LocaliseForm, content: bytes, party: str, spent_s: float
+        self, tenant: str, plan_id: str, form: LocaliseForm, content: bytes, client: str, spent_s: float
     ) -> Answered[Any] | Refused:
         """See `Localiser.answer`.
 
@@ -92,7 +92,7 @@ class SearchReplica:
 
         async def ask(begin: float, clock: StageClock) -> Any:
             record = await self._plan(tenant, plan_id)
-            return await self._runtime.localiser.answer(record, form, content, begin, clock, party)
+            return await self._runtime.localiser.answer(record, form, content, begin, clock, client)
 
         return await _outcome(ask, spent_s)
 
@@ -102,7 +102,7 @@ class SearchReplica:
         plan_id: str,
         form: LocaliseForm,
         content: bytes,
-        party: str,
+        client: str,
         asked: AskedPicture,
         spent_s: float,
     ) -> Answered[Any] | Refused:
@@ -110,29 +110,29 @@ class SearchReplica:
 
         async def ask(begin: float, clock: StageClock) -> Any:
             record = await self._plan(tenant, plan_id)
-            return await self._runtime.localiser.picture(record, form, content, begin, clock, party, asked)
+            return await self._runtime.localiser.picture(record, form, content, begin, clock, client, asked)
 
         return await _outcome(ask, spent_s)
 
     async def answer_sequence(
-        self, tenant: str, plan_id: str, form: SequenceForm, contents: list[bytes], party: str, spent_s: float
+        self, tenant: str, plan_id: str, form: SequenceForm, contents: list[bytes], client: str, spent_s: float
     ) -> Answered[Any] | Refused:
         """See `Localiser.answer_sequence`."""
 
         async def ask(begin: float, clock: StageClock) -> Any:
             record = await self._plan(tenant, plan_id)
-            return await self._runtime.localiser.answer_sequence(record, form, contents, begin, clock, party)
+            return await self._runtime.localiser.answer_sequence(record, form, contents, begin, clock, client)
 
         return await _outcome(ask, spent_s)
 
     async def answer_in_venue(
-        self, tenant: str, venue_id: str, form: LocaliseForm, content: bytes, party: str, spent_s: float
+        self, tenant: str, venue_id: str, form: LocaliseForm, content: bytes, client: str, spent_s: float
     ) -> Answered[Any] | Refused:
         """See `VenueLocaliser.answer`."""
 
         async def ask(begin: float, clock: StageClock) -> Any:
             venue = await self._venue(tenant, venue_id)
-            return await self._runtime.venue_localiser.answer(venue, form, content, begin, clock, party)
+            return await self._runtime.venue_localiser.answer(venue, form, content, begin, clock, client)
 
         return await _outcome(ask, spent_s)
 
@@ -143,14 +143,14 @@ class SearchReplica:
         within_m: float,
         form: LocaliseForm,
         content: bytes,
-        party: str,
+        client: str,
         spent_s: float,
     ) -> Answered[Any] | Refused:
         """See `VenueLocaliser.answer_near`."""
 
         async def ask(begin: float, clock: StageClock) -> Any:
             near = self._runtime.venue_localiser.answer_near
-            return await near(tenant, place, within_m, form, content, begin, clock, party)
+            return await near(tenant, place, within_m, form, content, begin, clock, client)
 
         return await _outcome(ask, spent_s)
 

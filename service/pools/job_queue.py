@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from cachetools import TTLCache
 
-from service.sharing import FairQueue, Shares
+from service.fair_share import FairQueue, Shares
 
 LostReason = Literal["not-ready", "queue-full", "deadline", "poisoned", "stalled", "fault", "died", "closing"]
 
@@ -39,11 +39,11 @@ class JobLostError(Exception):
 class Ticket:
     """One job on its way through the pool."""
 
-    def __init__(self, content: bytes, digest: bytes, deadline: float, party: str = "") -> None:
+    def __init__(self, content: bytes, digest: bytes, deadline: float, client: str = "") -> None:
         self.content = content
         self.digest = digest
         self.deadline = deadline
-        self.party = party
+        self.client = client
         self.deaths = 0
         self.stalled = False
         self.future: Future[Any] = Future()
@@ -61,14 +61,14 @@ class Ticket:
 
 
 class JobQueue:
-    """Jobs that wait for a worker, oldest first and parties in turn; may be used from any thread."""
+    """Jobs that wait for a worker, oldest first and clients in turn; may be used from any thread."""
 
     def __init__(self, limit: int, served_by: Callable[[float], bool], workers: Shares | None = None) -> None:
         """
         Args:
             limit: jobs that may wait, besides those at work.
             served_by: whether a worker is expected to be warm at a time (`monotonic`).
-            workers: those that parties share; None where a party may have all of them.
+            workers: those that clients share; None where a client may have all of them.
         """
         self._served_by = served_by
         self._workers = workers
@@ -96,14 +96,14 @@ class JobQueue:
             reason = self._refusal(ticket)
             if reason is not None:
                 raise JobLostError(reason)
-            self._room.take(ticket.party)
-            self._waiting.append(ticket.party, ticket)
+            self._room.take(ticket.client)
+            self._waiting.append(ticket.client, ticket)
             self._changed.notify()
 
     def take(self) -> Ticket | None:
         """The next job that is still of use, now running; None when none came in a short while.
 
-        Its party holds a worker until `release`.
+        Its client holds a worker until `release`.
         """
         with self._changed:
             ticket = self._next()
@@ -123,7 +123,7 @@ class JobQueue:
         """The worker that had this job can take another one, or is not coming back."""
         if self._workers is not None:
             with self._changed:
-                self._workers.give_back(ticket.party)
+                self._workers.give_back(ticket.client)
                 # Whichever idle worker looks first: what waits may not have been anybody's to take before.
                 self._changed.notify()
 
@@ -144,8 +144,8 @@ class JobQueue:
                 reason = "died"
             else:
                 # Past the limit by at most one job per worker, and in front of those that came later.
-                self._room.take(ticket.party)
-                self._waiting.append_first(ticket.party, ticket)
+                self._room.take(ticket.client)
+                self._waiting.append_first(ticket.client, ticket)
                 self._changed.notify()
         if reason is not None:
             ticket.lose(reason)
@@ -173,21 +173,21 @@ class JobQueue:
             return "poisoned"
         if not self._served_by(ticket.deadline):
             return "not-ready"
-        if not self._room.may_take(ticket.party):
+        if not self._room.may_take(ticket.client):
             self._drop_unwanted()
-        return None if self._room.may_take(ticket.party) else "queue-full"
+        return None if self._room.may_take(ticket.client) else "queue-full"
 
     def _next(self) -> Ticket | None:
         found = self._waiting.take(self._workers.may_take) if self._workers is not None else self._waiting.take()
         if found is None:
             return None
         ticket = found[1]
-        self._room.give_back(ticket.party)
+        self._room.give_back(ticket.client)
         if self._workers is not None:
-            self._workers.take(ticket.party)
+            self._workers.take(ticket.client)
         return ticket
 
     def _drop_unwanted(self) -> None:
         for ticket in self._waiting.drop(lambda ticket: not ticket.wanted):
-            self._room.give_back(ticket.party)
+            self._room.give_back(ticket.client)
             ticket.lose("deadline")

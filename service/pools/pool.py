@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from time import monotonic
 from typing import Any, Generic, TypeVar
 
+from service.fair_share import Shares
 from service.pools.job_queue import JobLostError, JobQueue, Ticket
 from service.pools.supervisor import Supervisor, WorkerSpec
-from service.sharing import Shares
 
 # So that nobody waits while large jobs of others are copied.
 _SUBMITTING_THREADS = 8
@@ -86,8 +86,8 @@ class WorkerPool(Generic[Job, Answer]):
         """Whether the pool shuts down."""
         return self._queue.closed
 
-    def submit(self, job: Job, timeout_s: float, party: str = "") -> Future[Answer]:
-        """Queue a job of a party. Cancelling the future takes it out of the queue again; at work it is finished.
+    def submit(self, job: Job, timeout_s: float, client: str = "") -> Future[Answer]:
+        """Queue a job of a client. Cancelling the future takes it out of the queue again; at work it is finished.
 
         Returns:
             a future that gives the answer or raises `JobLostError`; it may do so later than the deadline.
@@ -96,12 +96,12 @@ class WorkerPool(Generic[Job, Answer]):
             JobLostError: there is no use in waiting.
         """
         content = pickle.dumps(job, protocol=pickle.HIGHEST_PROTOCOL)
-        ticket = Ticket(content, hashlib.sha256(content).digest(), monotonic() + timeout_s, party)
+        ticket = Ticket(content, hashlib.sha256(content).digest(), monotonic() + timeout_s, client)
         self._queue.put(ticket)
         return ticket.future
 
-    async def answer(self, job: Job, timeout_s: float, party: str = "") -> Answer:
-        """The answer to a party's job, awaited; a job that is no longer awaited is not started.
+    async def answer(self, job: Job, timeout_s: float, client: str = "") -> Answer:
+        """The answer to a client's job, awaited; a job that is no longer awaited is not started.
 
         Raises:
             JobLostError: there is none within `timeout_s`.
@@ -109,7 +109,7 @@ class WorkerPool(Generic[Job, Answer]):
         if self._queue.closed:
             raise JobLostError("closing")
         # On a thread: copying and hashing a large job would hold up everybody else.
-        submitted = self._submitting.submit(self.submit, job, timeout_s, party)
+        submitted = self._submitting.submit(self.submit, job, timeout_s, client)
         try:
             async with asyncio.timeout(timeout_s):
                 return await asyncio.wrap_future(await asyncio.wrap_future(submitted))

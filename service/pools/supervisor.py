@@ -72,7 +72,7 @@ class Supervisor:
         self._start_s = self._spec.start_s
         self._starts_at = monotonic()
         self._process: BaseProcess | None = None
-        # The job that the worker has, or had when it died: its party waits for the next worker, and no one else.
+        # The job that the worker has, or had when it died: its client waits for the next worker, and no one else.
         self._held: Ticket | None = None
         self._thread = threading.Thread(target=self._run, name=f"{self._spec.name}-supervisor-{index}", daemon=True)
 

@@ -17,7 +17,7 @@ class Answering(Protocol):
     def model(self) -> ModelAnswer: ...
 
     async def answer(
-        self, record: PlanRecord, form: LocaliseForm, content: bytes, begin: float, clock: StageClock, party: str
+        self, record: PlanRecord, form: LocaliseForm, content: bytes, begin: float, clock: StageClock, client: str
     ) -> LocaliseAnswer: ...
 
     async def picture(
@@ -27,7 +27,7 @@ class Answering(Protocol):
         content: bytes,
         begin: float,
         clock: StageClock,
-        party: str,
+        client: str,
         asked: AskedPicture,
     ) -> tuple[LocaliseAnswer, bytes]: ...
 
@@ -38,7 +38,7 @@ class Answering(Protocol):
         contents: list[bytes],
         begin: float,
         clock: StageClock,
-        party: str,
+        client: str,
     ) -> SequenceAnswer: ...
 
 
@@ -46,7 +46,7 @@ class VenueAnswering(Protocol):
     """Answers queries about venues; `VenueLocaliser` documents and implements it."""
 
     async def answer(
-        self, venue: VenueRecord, form: LocaliseForm, content: bytes, begin: float, clock: StageClock, party: str
+        self, venue: VenueRecord, form: LocaliseForm, content: bytes, begin: float, clock: StageClock, client: str
     ) -> LocaliseAnswer: ...
 
     async def answer_near(
@@ -58,7 +58,7 @@ class VenueAnswering(Protocol):
         content: bytes,
         begin: float,
         clock: StageClock,
-        party: str,
+        client: str,
     ) -> LocaliseAnswer: ...
 
     async def check_hints(self, venue: VenueRecord, form: LocaliseForm) -> None: ...

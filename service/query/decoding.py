@@ -1,7 +1,7 @@
 """Decoding panoramas, and making pixels of drawings, in worker processes that are bounded in memory and time.
 
 A picture that kills such a process gets a second try, one that takes too long none, and neither harms anything else.
-No party keeps all the processes busy.
+No client keeps all the processes busy.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class Decoder:
         return self._pool.state
 
     async def decode(
-        self, content: bytes, deadline: float, party: str = "", *, size: tuple[int, int] | None = None
+        self, content: bytes, deadline: float, client: str = "", *, size: tuple[int, int] | None = None
     ) -> Panorama:
         """The panorama in an uploaded file, by a deadline (`monotonic`).
 
@@ -80,25 +80,25 @@ class Decoder:
             StoppingError: the service is shutting down.
         """
         height, width = size or self._size
-        answer = await self._answer(Upload(content, height, width), deadline, party)
+        answer = await self._answer(Upload(content, height, width), deadline, client)
         if isinstance(answer, Refusal):
             raise InvalidPanoramaError(answer.reason)
         assert isinstance(answer, Panorama)
         return answer
 
-    async def rasterise(self, svg: str, deadline: float, party: str = "") -> bytes:
+    async def rasterise(self, svg: str, deadline: float, client: str = "") -> bytes:
         """A drawing as PNG, by a deadline (`monotonic`).
 
         Raises:
             OverloadedError, DeadlineExceededError, DecoderNotReadyError, StoppingError: as `decode`.
         """
-        answer = await self._answer(Drawing(svg), deadline, party)
+        answer = await self._answer(Drawing(svg), deadline, client)
         assert isinstance(answer, bytes)
         return answer
 
-    async def _answer(self, job: Upload | Drawing, deadline: float, party: str) -> Panorama | Refusal | bytes:
+    async def _answer(self, job: Upload | Drawing, deadline: float, client: str) -> Panorama | Refusal | bytes:
         try:
-            return await self._pool.answer(job, max(deadline - monotonic(), 0.0), party)
+            return await self._pool.answer(job, max(deadline - monotonic(), 0.0), client)
         except JobLostError as error:
             raise self._explained(error, job) from error
 

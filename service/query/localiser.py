@@ -20,6 +20,7 @@ from lalaloc_core.localise.sequence.search import SequenceLocalisation, localise
 from lalaloc_core.localise.steps import next_step
 from lalaloc_core.panorama.images import Panorama
 from service.errors import DeadlineExceededError, PlanFailedError, PlanNotReadyError
+from service.fair_share import with_headroom
 from service.grids import GridProvider, grid_height_m
 from service.http.admission_control import Slots
 from service.query.answers import compose, heading_contradiction, model_answer, places_in
@@ -32,7 +33,6 @@ from service.query.refining import Refining
 from service.query.sequence_answers import sequence_answer
 from service.schemas import LocaliseAnswer, LocaliseForm, ModelAnswer, SequenceAnswer, SequenceForm
 from service.settings import Settings
-from service.sharing import with_spare
 from service.storage.records import PlanRecord
 from service.telemetry import Telemetry
 from service.threads import BoundedReads, Threads
@@ -94,7 +94,7 @@ class Localiser:
         self._queries = queries
         self._reads = reads
         self._telemetry = telemetry
-        self._threads = Threads("localise", with_spare(settings.cores.compute_threads))
+        self._threads = Threads("localise", with_headroom(settings.cores.compute_threads))
 
     @property
     def model(self) -> ModelAnswer:
@@ -102,12 +102,12 @@ class Localiser:
         return model_answer(self._bundle)
 
     async def answer(
-        self, record: PlanRecord, form: LocaliseForm, content: bytes, begin: float, clock: StageClock, party: str
+        self, record: PlanRecord, form: LocaliseForm, content: bytes, begin: float, clock: StageClock, client: str
     ) -> LocaliseAnswer:
         """Localise an encoded panorama in a stored plan.
 
         Args:
-            party: whose turn it is at decoders and threads; see `service.sharing`.
+            client: whose turn it is at decoders and threads; see `service.fair_share`.
             begin: when (`monotonic`) the query was there as a whole; its deadline counts from then.
             clock: times the stages, the wait for the plan's grid included, also when they fail.
 
@@ -121,8 +121,8 @@ class Localiser:
             StoreUnavailableError: the grid is not in memory, and the database is away or silent.
             OverloadedError: too many queries are in work and wait for that, or grids to be computed on demand.
         """
-        async with self._queries.wait_and_hold(party, begin + self._settings.request_deadline_s):
-            return (await self._answer(record, form, content, begin, clock, party)).answer
+        async with self._queries.wait_and_hold(client, begin + self._settings.request_deadline_s):
+            return (await self._answer(record, form, content, begin, clock, client)).answer
 
     async def picture(
         self,
@@ -131,7 +131,7 @@ class Localiser:
         content: bytes,
         begin: float,
         clock: StageClock,
-        party: str,
+        client: str,
         asked: AskedPicture,
     ) -> tuple[LocaliseAnswer, bytes]:
         """As `answer`, with a picture of it: encoded, PNG or SVG.
@@ -140,52 +140,52 @@ class Localiser:
             DrawingFailedError: the picture could not be made.
             LaLaLocError: see `answer`.
         """
-        async with self._queries.wait_and_hold(party, begin + self._settings.request_deadline_s):
-            answered = await self._answer(record, form, content, begin, clock, party)
+        async with self._queries.wait_and_hold(client, begin + self._settings.request_deadline_s):
+            answered = await self._answer(record, form, content, begin, clock, client)
             with clock.stage("draw"):
-                picture = await self._draw(record, answered, content, begin, party, asked)
+                picture = await self._draw(record, answered, content, begin, client, asked)
             self._telemetry.stage_seconds.labels("draw").observe(clock.timings_ms["draw"] / 1e3)
             return answered.answer, picture
 
     async def _draw(
-        self, record: PlanRecord, answered: _Answered, content: bytes, begin: float, party: str, asked: AskedPicture
+        self, record: PlanRecord, answered: _Answered, content: bytes, begin: float, client: str, asked: AskedPicture
     ) -> bytes:
         deadline = begin + self._settings.request_deadline_s
         photograph = None
         if asked.picture != "plan":
             # Once more, as the encoder takes fewer pixels than one likes to look at.
             width, height = PHOTOGRAPH_SIZE
-            photograph = (await self._decoder.decode(content, deadline, party, size=(height, width))).pixels
+            photograph = (await self._decoder.decode(content, deadline, client, size=(height, width))).pixels
 
         def draw() -> str:
             model, source = self._bundle.manifest.confidence, _SOURCES[answered.answer.heading_source]
             drawn = drawn_answer(record.plan, answered.grid, answered.found, model, source)
             return draw_answer(drawn, photograph, asked.picture, rooms=asked.rooms)
 
-        svg = await self.compute(party, draw, deadline)
-        return await self._decoder.rasterise(svg, deadline, party) if asked.pixels else svg.encode()
+        svg = await self.compute(client, draw, deadline)
+        return await self._decoder.rasterise(svg, deadline, client) if asked.pixels else svg.encode()
 
     async def _answer(
-        self, record: PlanRecord, form: LocaliseForm, content: bytes, begin: float, clock: StageClock, party: str
+        self, record: PlanRecord, form: LocaliseForm, content: bytes, begin: float, clock: StageClock, client: str
     ) -> _Answered:
         deadline = begin + self._settings.request_deadline_s
         height, hints = stated_height(form, record), stated_hints(form, record.plan)
         # The picture first: a bad one is refused without waiting for the plan.
         with clock.stage("decode"):
-            panorama = await self._decoder.decode(content, deadline, party)
+            panorama = await self._decoder.decode(content, deadline, client)
         known = known_heading(form, record.plan.north, panorama, self._settings.compass_tolerance_deg)
         if not hints.are_none:
             # Looking at many rooms takes a while.
-            await self.compute(party, partial(hints.check, record.plan), deadline)
-        query = await self.compute(party, lambda: self.encode(panorama, known, height, clock), deadline)
+            await self.compute(client, partial(hints.check, record.plan), deadline)
+        query = await self.compute(client, lambda: self.encode(panorama, known, height, clock), deadline)
         latents_alone = not self._encoders.predicts_profile
         with clock.stage("grid"):
             grid_m = grid_height_m(record, height.height_m, latents_alone=latents_alone)
-            grid = await self._grid(record, grid_m, deadline, party)
+            grid = await self._grid(record, grid_m, deadline, client)
         steps = localise_steps(
             record.plan, grid, self._encoders, query, refine=form.refine, top_k=form.top_k, clock=clock, hints=hints
         )
-        found = await self.finished(steps, deadline, party)
+        found = await self.finished(steps, deadline, client)
         timings_ms = clock.timings_ms | {"total": (monotonic() - begin) * 1e3}
         self.observe(timings_ms, found.stage)
         warnings = [heading_contradiction(known)] if found.heading_contradicted else []
@@ -202,11 +202,11 @@ class Localiser:
         contents: list[bytes],
         begin: float,
         clock: StageClock,
-        party: str,
+        client: str,
     ) -> SequenceAnswer:
         """Localise several panoramas of one visit jointly; arguments and errors as of `answer`."""
-        async with self._queries.wait_and_hold(party, begin + self._settings.request_deadline_s):
-            return await self._answer_sequence(record, form, contents, begin, clock, party)
+        async with self._queries.wait_and_hold(client, begin + self._settings.request_deadline_s):
+            return await self._answer_sequence(record, form, contents, begin, clock, client)
 
     async def _answer_sequence(
         self,
@@ -215,31 +215,31 @@ class Localiser:
         contents: list[bytes],
         begin: float,
         clock: StageClock,
-        party: str,
+        client: str,
     ) -> SequenceAnswer:
         deadline = begin + self._settings.request_deadline_s
         height, plan, compass_deg = stated_height(form, record), record.plan, self._settings.compass_tolerance_deg
         # One after another: no query keeps more than one decoder busy.
         with clock.stage("decode"):
-            panoramas = [await self._decoder.decode(content, deadline, party) for content in contents]
+            panoramas = [await self._decoder.decode(content, deadline, client) for content in contents]
         known = [
             known_heading(form.heading_of(index), plan.north, panorama, compass_deg)
             for index, panorama in enumerate(panoramas)
         ]
-        queries = await self.compute(party, partial(self._encode_all, panoramas, known, height, clock), deadline)
+        queries = await self.compute(client, partial(self._encode_all, panoramas, known, height, clock), deadline)
         latents_alone = not self._encoders.predicts_profile
         with clock.stage("grid"):
             grid_m = grid_height_m(record, height.height_m, latents_alone=latents_alone)
-            grid = await self._grid(record, grid_m, deadline, party)
+            grid = await self._grid(record, grid_m, deadline, client)
         motions = form.steps(len(contents))
         steps = localise_sequence_steps(
             plan, grid, self._encoders, queries, motions, refine=form.refine, top_k=form.top_k, clock=clock
         )
-        step = await self.compute(party, partial(next_step, steps, None), deadline)
+        step = await self.compute(client, partial(next_step, steps, None), deadline)
         while not isinstance(step, SequenceLocalisation):
             timeout_s = min(self._settings.lpo_deadline_s, deadline - monotonic() - _ANSWER_S)
-            result = await self._pool.refine_sequence(step, timeout_s, party)
-            step = await self.compute(party, partial(next_step, steps, result), deadline)
+            result = await self._pool.refine_sequence(step, timeout_s, client)
+            step = await self.compute(client, partial(next_step, steps, result), deadline)
         timings_ms = clock.timings_ms | {"total": (monotonic() - begin) * 1e3}
         self.observe(timings_ms, step.stage)
         places, alone = places_in(record), []
@@ -252,7 +252,7 @@ class Localiser:
         """Finish what is being computed."""
         self._threads.close()
 
-    async def compute(self, party: str, work: Callable[[], T], deadline: float) -> T:
+    async def compute(self, client: str, work: Callable[[], T], deadline: float) -> T:
         """Run CPU work on a thread; past the deadline it is not started, or its outcome dropped."""
 
         def run() -> T:
@@ -261,11 +261,11 @@ class Localiser:
 
         try:
             async with asyncio.timeout(max(deadline - monotonic(), 0.0)):
-                return await self._threads.run(party, run)
+                return await self._threads.run(client, run)
         except TimeoutError as error:
             raise DeadlineExceededError(self._settings.request_deadline_s) from error
 
-    async def _grid(self, record: PlanRecord, height_m: float, deadline: float, party: str) -> LatentGrid:
+    async def _grid(self, record: PlanRecord, height_m: float, deadline: float, client: str) -> LatentGrid:
         """The plan's grid for a camera height, computed on demand, waited for until the deadline."""
         key = self._grids.key(record.revision_id, height_m)
         grid = self._grids.cached(key)
@@ -281,7 +281,7 @@ class Localiser:
         begin = monotonic()
         try:
             async with asyncio.timeout(max(deadline - begin, 0.0)):
-                with self._queries.released(party):
+                with self._queries.released(client):
                     return await asyncio.wrap_future(future)
         except TimeoutError as error:
             raise PlanNotReadyError(record.id, monotonic() - begin, self._grids.progress(key)) from error
@@ -300,13 +300,13 @@ class Localiser:
                 for panorama, one in zip(panoramas, known, strict=True)
             ]
 
-    async def finished(self, steps: Steps, deadline: float, party: str) -> Localisation:
+    async def finished(self, steps: Steps, deadline: float, client: str) -> Localisation:
         """Run a search on the threads of the localiser, which do something else while LPO is waited for."""
-        step = await self.compute(party, partial(next_step, steps, None), deadline)
+        step = await self.compute(client, partial(next_step, steps, None), deadline)
         while not isinstance(step, Localisation):
             timeout_s = min(self._settings.lpo_deadline_s, deadline - monotonic() - _ANSWER_S)
-            result = await self._pool.refine(step, timeout_s, party)
-            step = await self.compute(party, partial(next_step, steps, result), deadline)
+            result = await self._pool.refine(step, timeout_s, client)
+            step = await self.compute(client, partial(next_step, steps, result), deadline)
         return step
 
     def observe(self, timings_ms: dict[str, float], stage: str) -> None:

@@ -55,28 +55,28 @@ class LpoPool:
         """How many workers are wanted and warm."""
         return self._workers.state
 
-    async def refine(self, job: RefinementJob, timeout_s: float, party: str = "") -> RefinementResult | None:
+    async def refine(self, job: RefinementJob, timeout_s: float, client: str = "") -> RefinementResult | None:
         """The result of a job, or None when there is none within `timeout_s`, whatever the reason.
 
-        Cancelling it takes a job that was not started out of the queue. Parties take turns.
+        Cancelling it takes a job that was not started out of the queue. Clients take turns.
         """
-        result = await self._answer(job, timeout_s, party)
+        result = await self._answer(job, timeout_s, client)
         assert not isinstance(result, SequenceResult)
         return result
 
-    async def refine_sequence(self, job: SequenceJob, timeout_s: float, party: str = "") -> SequenceResult | None:
+    async def refine_sequence(self, job: SequenceJob, timeout_s: float, client: str = "") -> SequenceResult | None:
         """As `refine`, of paths."""
-        result = await self._answer(job, timeout_s, party)
+        result = await self._answer(job, timeout_s, client)
         assert not isinstance(result, RefinementResult)
         return result
 
     async def _answer(
-        self, job: RefinementJob | SequenceJob, timeout_s: float, party: str
+        self, job: RefinementJob | SequenceJob, timeout_s: float, client: str
     ) -> RefinementResult | SequenceResult | None:
         if self.state.workers == 0 or timeout_s <= 0.0:
             return None
         try:
-            return await self._workers.answer(job, timeout_s, party)
+            return await self._workers.answer(job, timeout_s, client)
         except JobLostError as error:
             self._telemetry.lpo_missed.labels(error.reason).inc()
             return None

@@ -106,20 +106,20 @@ class VenueLocaliser:
         self._queries = queries
 
     async def answer(
-        self, venue: VenueRecord, form: LocaliseForm, content: bytes, begin: float, clock: StageClock, party: str
+        self, venue: VenueRecord, form: LocaliseForm, content: bytes, begin: float, clock: StageClock, client: str
     ) -> LocaliseAnswer:
         """Localise an encoded panorama in the plans of a venue.
 
         Args:
-            begin, clock, party: see `Localiser.answer`.
+            begin, clock, client: see `Localiser.answer`.
 
         Raises:
             VenueUnsearchableError: the venue has no plan that is ready or will be.
             VenueNotReadyError: none of its plans was ready by the deadline.
             LaLaLocError: see `Localiser.answer`.
         """
-        async with self._queries.wait_and_hold(party, begin + self._settings.request_deadline_s):
-            return await self._answer(venue, form, content, begin, clock, party)
+        async with self._queries.wait_and_hold(client, begin + self._settings.request_deadline_s):
+            return await self._answer(venue, form, content, begin, clock, client)
 
     async def check_hints(self, venue: VenueRecord, form: LocaliseForm) -> None:
         """Raises:
@@ -136,7 +136,7 @@ class VenueLocaliser:
         content: bytes,
         begin: float,
         clock: StageClock,
-        party: str,
+        client: str,
     ) -> LocaliseAnswer:
         """As `answer`, in all plans of a tenant with an anchor that lie so near a place on Earth.
 
@@ -159,9 +159,9 @@ class VenueLocaliser:
             created_at=now,
             updated_at=now,
         )
-        async with self._queries.wait_and_hold(party, begin + self._settings.request_deadline_s):
+        async with self._queries.wait_and_hold(client, begin + self._settings.request_deadline_s):
             return await self._answer(
-                of_place, form, content, begin, clock, party, partial(self._plans.near, tenant, place, within_m)
+                of_place, form, content, begin, clock, client, partial(self._plans.near, tenant, place, within_m)
             )
 
     async def _answer(
@@ -171,21 +171,21 @@ class VenueLocaliser:
         content: bytes,
         begin: float,
         clock: StageClock,
-        party: str,
+        client: str,
         members: Members | None = None,
     ) -> LocaliseAnswer:
         deadline = begin + self._settings.request_deadline_s
         hints = VenueHints.of(form, venue.anchor)
         with clock.stage("decode"):
-            panorama = await self._decoder.decode(content, deadline, party)
+            panorama = await self._decoder.decode(content, deadline, client)
         north = None if venue.anchor is None else heading_from_degrees(venue.anchor.north_deg)
         known = known_heading(form, north, panorama, self._settings.compass_tolerance_deg)
         with clock.stage("wait"):
             ready, warnings = await self._ready(
-                venue, members or partial(self._plans.members, venue.id), hints, deadline, party
+                venue, members or partial(self._plans.members, venue.id), hints, deadline, client
             )
         height = venue_height(form, ready)
-        compute = partial(self._localiser.compute, party, deadline=deadline)
+        compute = partial(self._localiser.compute, client, deadline=deadline)
         query = await compute(lambda: self._localiser.encode(panorama, known, height, clock))
         with clock.stage("shortlist"):
             searched = await self._searched(venue, ready, query, form, hints, warnings, compute)
@@ -201,14 +201,14 @@ class VenueLocaliser:
             clock=clock,
             hints=searched.hints,
         )
-        found = await self._localiser.finished(steps, deadline, party)
+        found = await self._localiser.finished(steps, deadline, client)
         timings_ms = clock.timings_ms | {"total": (monotonic() - begin) * 1e3}
         self._localiser.observe(timings_ms, found.stage)
         contradicted = hints.warnings(searched.hints, found, searched.rows, merged)
         return self._compose(venue, searched, found, known, form.top_k, contradicted, timings_ms)
 
     async def _ready(
-        self, venue: VenueRecord, tell: Members, hints: VenueHints, deadline: float, party: str
+        self, venue: VenueRecord, tell: Members, hints: VenueHints, deadline: float, client: str
     ) -> tuple[Sequence[Row[Any]], list[str]]:
         """The plans that can be asked about, waited for while there is none, and what is to be said of the others."""
         begin = monotonic()
@@ -224,7 +224,7 @@ class VenueLocaliser:
                 raise VenueUnsearchableError(venue.id, len(members))
             if monotonic() + _LOOK_EVERY_S >= deadline:
                 raise VenueNotReadyError(venue.id, len(members), monotonic() - begin)
-            with self._queries.released(party):
+            with self._queries.released(client):
                 await asyncio.sleep(_LOOK_EVERY_S)
         waiting = len(members) - len(ready) - len(failed)
         warnings = []

@@ -21,14 +21,14 @@ async def _tenant_of(request: Request) -> str:
     return caller_of(request.scope).tenant
 
 
-async def _party_of(request: Request) -> str:
-    return caller_of(request.scope).party
+async def _client_of(request: Request) -> str:
+    return caller_of(request.scope).client
 
 
 Running = Annotated[Runtime, Depends(runtime_of)]
 Tenant = Annotated[str, Depends(_tenant_of)]
-# With whom the request shares what the service can do at a time; see `service.sharing`.
-Party = Annotated[str, Depends(_party_of)]
+# With whom the request shares what the service can do at a time; see `service.fair_share`.
+Client = Annotated[str, Depends(_client_of)]
 
 
 def stored_plan(tenant: str, floorplan_id: str, plans: Plans) -> PlanRecord:

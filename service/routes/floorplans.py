@@ -31,7 +31,7 @@ from service.routes.dependencies import (
     NO_CONTROLS,
     NOT_MODIFIED,
     UNLESS_CHANGED,
-    Party,
+    Client,
     Running,
     Tenant,
     plan_at_revision,
@@ -60,7 +60,7 @@ _MAX_LISTED = 500
         *REFUSED_UPLOADS, TooManyFloorPlansError, IdempotencyKeyReusedError, IdempotencyInProgressError
     ),
 )
-async def create_floorplan(request: Request, runtime: Running, tenant: Tenant, party: Party) -> Response:
+async def create_floorplan(request: Request, runtime: Running, tenant: Tenant, client: Client) -> Response:
     """Store a floor plan, from whatever file there is of it.
 
     Its format is found out by its content: JSON in the native format, GeoJSON, an IMDF archive, SVG, DXF, IFC, PDF, or
@@ -72,7 +72,7 @@ async def create_floorplan(request: Request, runtime: Running, tenant: Tenant, p
     uploaded = await read_upload(request, runtime)
 
     def store(token: str) -> Response:
-        plan, original, grid = _prepared(uploaded, runtime, party)
+        plan, original, grid = _prepared(uploaded, runtime, client)
         limit = runtime.settings.max_floorplans
         record = runtime.store.plans.add(tenant, token, plan, original=original, limit=limit, grid=grid)
         if record.plan is plan:
@@ -86,7 +86,7 @@ async def create_floorplan(request: Request, runtime: Running, tenant: Tenant, p
         return _written(request, record, state, runtime, status.HTTP_201_CREATED)
 
     # One call from the claim to the answer: a client that hangs up meanwhile does not leave it half-way.
-    return await uploaded.threads(runtime).run(party, idempotent.run, uploaded.parts, store)
+    return await uploaded.threads(runtime).run(client, idempotent.run, uploaded.parts, store)
 
 
 @router.get("", summary="List floor plans", responses=problem_responses(InvalidRequestError, StoreUnavailableError))
@@ -146,18 +146,18 @@ def get_floorplan(
     responses=problem_responses(*REFUSED_UPLOADS, UnknownFloorPlanError, RevisionMismatchError),
 )
 async def replace_floorplan(
-    floorplan_id: str, request: Request, runtime: Running, tenant: Tenant, party: Party
+    floorplan_id: str, request: Request, runtime: Running, tenant: Tenant, client: Client
 ) -> Response:
     """Store a new revision of a plan that there is, from a file of any format that `POST /floorplans` takes.
 
     Queries in work are answered by the revision that they began with, and say which (`floorplan_revision`).
     """
-    current = await runtime.uploads.run(party, plan_summary, tenant, floorplan_id, runtime.store.plans)
+    current = await runtime.uploads.run(client, plan_summary, tenant, floorplan_id, runtime.store.plans)
     expected = expected_revision(request, current.id, current.revision_id)
     uploaded = await read_upload(request, runtime)
 
     def store() -> Response:
-        plan, original, grid = _prepared(uploaded, runtime, party)
+        plan, original, grid = _prepared(uploaded, runtime, client)
         keep = runtime.settings.max_revisions
         record = runtime.store.plans.add_revision(
             tenant, current.id, plan, original=original, keep=keep, expected=expected, grid=grid
@@ -167,7 +167,7 @@ async def replace_floorplan(
         runtime.grids.on_plan_stored(record, grid)
         return _written(request, record, GridState.after_upload(grid), runtime, status.HTTP_200_OK)
 
-    return await uploaded.threads(runtime).run(party, store)
+    return await uploaded.threads(runtime).run(client, store)
 
 
 @router.delete(
@@ -192,9 +192,9 @@ def delete_floorplan(floorplan_id: str, request: Request, runtime: Running, tena
     runtime.grids.forget({current.revision_id})
 
 
-def _prepared(uploaded: Upload, runtime: Runtime, party: str) -> tuple[FloorPlan, Original, ComputedGrid | None]:
+def _prepared(uploaded: Upload, runtime: Runtime, client: str) -> tuple[FloorPlan, Original, ComputedGrid | None]:
     """The plan in an uploaded file, the file as it is stored, and the plan's grid if that is computed at once."""
-    file = understand(uploaded.content, uploaded.options, runtime.converter, runtime.settings, party)
+    file = understand(uploaded.content, uploaded.options, runtime.converter, runtime.settings, client)
     runtime.grids.check_size(file.plan)
     original = Original(uploaded.content, file.media_type, json.dumps(file.report))
     return file.plan, original, runtime.grids.prepare(file.plan)

@@ -24,7 +24,7 @@ from service.http.json_body import parse_document
 from service.http.problems import problem_responses
 from service.http.uploads import JSON, Parts, UploadLimits, media_type, read_body
 from service.query.oscp import answer_of, away_m, picture_of, place_of, unused_warnings
-from service.routes.dependencies import IDEMPOTENCY_KEY, Party, Running, Tenant, plan_for_query, venue_for_query
+from service.routes.dependencies import IDEMPOTENCY_KEY, Client, Running, Tenant, plan_for_query, venue_for_query
 from service.routes.localise import QUERY_ERRORS
 from service.runtime import Runtime
 from service.schemas import LocaliseAnswer, LocaliseForm
@@ -61,7 +61,7 @@ async def geopose(
     request: Request,
     runtime: Running,
     tenant: Tenant,
-    party: Party,
+    client: Client,
     floorplan_id: Annotated[str | None, Query(description="The floor plan that the device is in.")] = None,
     venue_id: Annotated[str | None, Query(description="The venue that it is in.")] = None,
 ) -> Response:
@@ -91,8 +91,8 @@ async def geopose(
         return parsed, content
 
     async def answer() -> Response:
-        asked, content = await runtime.uploads.run(party, read)
-        query = _Query(runtime, tenant, party, asked, content, begin, clock)
+        asked, content = await runtime.uploads.run(client, read)
+        query = _Query(runtime, tenant, client, asked, content, begin, clock)
         found, warnings = await query.answer(floorplan_id, venue_id)
         note(request, plan=found.floorplan_id, revision=found.floorplan_revision, stage=found.stage)
         told = answer_of(asked, found, [*unused_warnings(asked), *warnings])
@@ -109,7 +109,7 @@ class _Query:
         self,
         runtime: Runtime,
         tenant: str,
-        party: str,
+        client: str,
         asked: OscpRequest,
         content: bytes,
         begin: float,
@@ -118,7 +118,7 @@ class _Query:
         self._runtime = runtime
         self._tenant = tenant
         self._asked = asked
-        self._rest = (content, begin, clock, party)
+        self._rest = (content, begin, clock, client)
         reading = asked.geolocation
         self._place = None if reading is None else place_of(reading)
 

@@ -6,9 +6,9 @@ from typing import Annotated
 
 from fastapi import APIRouter, Depends
 
+from service.fair_share import max_per_client
 from service.runtime import Runtime, runtime_of
 from service.schemas import LimitsAnswer
-from service.sharing import most_of_one
 
 router = APIRouter(tags=["operations"])
 
@@ -20,7 +20,7 @@ async def limits(runtime: Annotated[Runtime, Depends(runtime_of)]) -> LimitsAnsw
     # As they are in effect: the settings may leave these numbers to the service.
     resolved = {
         "max_queries": settings.query_limit,
-        "max_queries_per_tenant": most_of_one(settings.query_limit),
+        "max_queries_per_tenant": max_per_client(settings.query_limit),
         "max_pending_requests": settings.pending_limit,
     }
     told = {name: getattr(settings, name) for name in LimitsAnswer.model_fields.keys() - resolved.keys()}

@@ -49,7 +49,7 @@ from service.http.uploads import (
 )
 from service.query.geopose import feature_of
 from service.query.localiser import AskedPicture
-from service.routes.dependencies import IDEMPOTENCY_KEY, Party, Running, Tenant, plan_for_query, venue_for_query
+from service.routes.dependencies import IDEMPOTENCY_KEY, Client, Running, Tenant, plan_for_query, venue_for_query
 from service.runtime import Runtime
 from service.schemas import LocaliseAnswer, LocaliseForm
 from service.telemetry import note
@@ -124,7 +124,7 @@ async def localise(
     request: Request,
     runtime: Running,
     tenant: Tenant,
-    party: Party,
+    client: Client,
     picture: Annotated[
         Picture | None,
         Query(
@@ -168,7 +168,7 @@ async def localise(
         if form.venue_id is not None:
             venue = await venue_for_query(tenant, form.venue_id, runtime)
             note(request, venue=venue.id)
-            found = await runtime.venue_localiser.answer(venue, form, content, begin, clock, party)
+            found = await runtime.venue_localiser.answer(venue, form, content, begin, clock, client)
             note(request, plan=found.floorplan_id, revision=found.floorplan_revision, stage=found.stage)
             return await _told(found, media, tenant, runtime)
         assert form.floorplan_id is not None
@@ -177,12 +177,12 @@ async def localise(
         if media == GEOJSON and record.plan.anchor is None:
             raise UnanchoredPlanError(record.id)
         if media in (JSON, GEOJSON):
-            found = await runtime.localiser.answer(record, form, content, begin, clock, party)
+            found = await runtime.localiser.answer(record, form, content, begin, clock, client)
             note(request, stage=found.stage)
             return await _told(found, media, tenant, runtime)
         rooms = await runtime.drawings.rooms(record)
         asked = AskedPicture(picture=picture or "both", pixels=media == _PNG, rooms=rooms)
-        found, drawn = await runtime.localiser.picture(record, form, content, begin, clock, party, asked)
+        found, drawn = await runtime.localiser.picture(record, form, content, begin, clock, client, asked)
         note(request, stage=found.stage)
         return Response(drawn, headers=_VARY | _POLICY, media_type=media)
 

@@ -28,7 +28,7 @@ from service.http.uploads import (
     validate_fields,
 )
 from service.query.geopose import features_of
-from service.routes.dependencies import IDEMPOTENCY_KEY, Party, Running, Tenant, plan_for_query
+from service.routes.dependencies import IDEMPOTENCY_KEY, Client, Running, Tenant, plan_for_query
 from service.routes.localise import QUERY_ERRORS
 from service.schemas import SequenceAnswer, SequenceForm
 from service.settings import Settings
@@ -64,7 +64,7 @@ def _body_schema() -> dict[str, Any]:
     }
     | problem_responses(InvalidMotionError, UnanchoredPlanError, *QUERY_ERRORS),
 )
-async def localise_sequence(request: Request, runtime: Running, tenant: Tenant, party: Party) -> Response:
+async def localise_sequence(request: Request, runtime: Running, tenant: Tenant, client: Client) -> Response:
     """Find where in a stored floor plan several panoramas of one visit were taken, all of them together.
 
     What was measured of the motions between them tells places apart that look alike. With `Accept:
@@ -101,7 +101,7 @@ async def localise_sequence(request: Request, runtime: Running, tenant: Tenant, 
         note(request, plan=record.id, revision=record.revision_id)
         if media == GEOJSON and record.plan.anchor is None:
             raise UnanchoredPlanError(record.id)
-        found = await runtime.localiser.answer_sequence(record, form, contents, begin, clock, party)
+        found = await runtime.localiser.answer_sequence(record, form, contents, begin, clock, client)
         note(request, stage=found.stage)
         content = found.model_dump_json() if media == JSON else json.dumps(features_of(found))
         return Response(content, headers={"Vary": "Accept"}, media_type=media)

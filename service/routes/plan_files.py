@@ -22,7 +22,7 @@ from service.errors import (
 from service.http.conditional import conditional_answer, content_etag
 from service.http.problems import problem_responses
 from service.http.uploads import JSON
-from service.routes.dependencies import IF_NONE_MATCH, NOT_MODIFIED, Party, Running, Tenant, plan_summary, stored_plan
+from service.routes.dependencies import IF_NONE_MATCH, NOT_MODIFIED, Client, Running, Tenant, plan_summary, stored_plan
 from service.storage.records import PlanRecord
 from service.telemetry import note
 
@@ -87,7 +87,7 @@ async def get_export(
     request: Request,
     runtime: Running,
     tenant: Tenant,
-    party: Party,
+    client: Client,
     format: Annotated[
         ExportFormat, Query(description="IMDF needs a plan with an `anchor`; GeoJSON uses it.")
     ] = "native",
@@ -96,7 +96,7 @@ async def get_export(
     record = _noted(request, await run_in_threadpool(stored_plan, tenant, floorplan_id, runtime.store.plans))
     if format == "imdf" and record.plan.anchor is None:
         raise UnanchoredPlanError(record.id)
-    content = await runtime.converter.write(record.plan, format, party)
+    content = await runtime.converter.write(record.plan, format, client)
     kept = {"Content-Disposition": f'attachment; filename="plan.{ENDINGS[format]}"'}
     return conditional_answer(request, content, MEDIA_TYPES[format], content_etag(content), kept)
 

@@ -35,7 +35,7 @@ from service.routes.dependencies import (
     NO_CONTROLS,
     NOT_MODIFIED,
     UNLESS_CHANGED,
-    Party,
+    Client,
     Running,
     Tenant,
     is_id,
@@ -82,7 +82,7 @@ def _body(model: type[BaseModel]) -> dict[str, Any]:
         *_REFUSED_BODIES, TooManyVenuesError, IdempotencyKeyReusedError, IdempotencyInProgressError
     ),
 )
-async def create_venue(request: Request, runtime: Running, tenant: Tenant, party: Party) -> Response:
+async def create_venue(request: Request, runtime: Running, tenant: Tenant, client: Client) -> Response:
     """Group stored floor plans, each with the number of its level, so that a panorama is searched for in all of them.
 
     A plan may belong to several venues. One that is deleted leaves them.
@@ -97,7 +97,7 @@ async def create_venue(request: Request, runtime: Running, tenant: Tenant, party
         record = runtime.store.venues.add(tenant, token, document.name, _anchor(document.anchor), members, limit=limit)
         return _written(request, record, runtime, status.HTTP_201_CREATED)
 
-    return await runtime.uploads.run(party, idempotent.run, Parts({}, {"body": content}), store)
+    return await runtime.uploads.run(client, idempotent.run, Parts({}, {"body": content}), store)
 
 
 @router.get("", summary="List venues", responses=problem_responses(InvalidRequestError, StoreUnavailableError))
@@ -167,7 +167,7 @@ def list_venue_plans(
     openapi_extra={"requestBody": _body(VenueDocument), "parameters": UNLESS_CHANGED},
     responses=problem_responses(*_REFUSED_BODIES, UnknownVenueError, RevisionMismatchError),
 )
-async def replace_venue(venue_id: str, request: Request, runtime: Running, tenant: Tenant, party: Party) -> Response:
+async def replace_venue(venue_id: str, request: Request, runtime: Running, tenant: Tenant, client: Client) -> Response:
     """Give a venue another name, anchor and plans: what is left out, it has no more."""
     content = await _read(request, runtime)
 
@@ -188,7 +188,7 @@ async def replace_venue(venue_id: str, request: Request, runtime: Running, tenan
         )
         return _written(request, record, runtime, status.HTTP_200_OK)
 
-    return await runtime.uploads.run(party, store)
+    return await runtime.uploads.run(client, store)
 
 
 @router.patch(
@@ -198,7 +198,7 @@ async def replace_venue(venue_id: str, request: Request, runtime: Running, tenan
     openapi_extra={"requestBody": _body(VenueChangeDocument), "parameters": UNLESS_CHANGED},
     responses=problem_responses(*_REFUSED_BODIES, UnknownVenueError, RevisionMismatchError),
 )
-async def change_venue(venue_id: str, request: Request, runtime: Running, tenant: Tenant, party: Party) -> Response:
+async def change_venue(venue_id: str, request: Request, runtime: Running, tenant: Tenant, client: Client) -> Response:
     """Change the name or the anchor of a venue, or some of its plans."""
     content = await _read(request, runtime)
 
@@ -222,7 +222,7 @@ async def change_venue(venue_id: str, request: Request, runtime: Running, tenant
         )
         return _written(request, record, runtime, status.HTTP_200_OK)
 
-    return await runtime.uploads.run(party, store)
+    return await runtime.uploads.run(client, store)
 
 
 @router.delete(

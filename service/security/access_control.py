@@ -78,7 +78,7 @@ class AccessControl:
         note(request, key=key.id, tenant=key.tenant)
         await self._rates.count(key)
         scopes = frozenset(scope for scope in Permission if scope in key.scopes)
-        caller = Caller(key.tenant, key.id, scopes, party=key.tenant)
+        caller = Caller(key.tenant, key.id, scopes, client=key.tenant)
         needed = _needed(request)
         if needed not in caller.permissions:
             raise InsufficientScopeError(needed, caller.permissions)

@@ -70,13 +70,13 @@ class Caller:
         tenant: whose plans it may see.
         key_id: id of its API key, None where there are no keys.
         permissions: what it may do.
-        party: with whom it shares what the service can do at a time: its tenant, or without keys its client address.
+        client: with whom it shares what the service can do at a time: its tenant, or without keys its client address.
     """
 
     tenant: str
     key_id: str | None
     permissions: frozenset[Permission]
-    party: str
+    client: str
 
 
 def anyone(client: str) -> Caller:

@@ -105,9 +105,9 @@ def test_those_that_wait_for_a_slot_are_few_and_take_turns() -> None:
     async def scenario() -> None:
         slots, order, goes_on = Slots(2, 4), list[str](), asyncio.Event()
 
-        async def query(party: str, wait_s: float = 30.0) -> None:
-            async with slots.wait_and_hold(party, monotonic() + wait_s):
-                order.append(party)
+        async def query(client: str, wait_s: float = 30.0) -> None:
+            async with slots.wait_and_hold(client, monotonic() + wait_s):
+                order.append(client)
                 await goes_on.wait()
 
         # One in work and three that wait leave one of each to others.
@@ -133,7 +133,7 @@ def test_those_that_wait_for_a_slot_are_few_and_take_turns() -> None:
         goes_on.set()
         outcomes = await asyncio.gather(*own, late, others[0], return_exceptions=True)
         assert [type(outcome) for outcome in outcomes].count(ShareExceededError) == 2
-        # Whoever came last waits for one of the other party, not for all.
+        # Whoever came last waits for one of the other client, not for all.
         assert sorted(order) == ["a", "a", "a", "a", "b", "c"]
         assert order.index("c") <= 3
         assert slots.in_use == slots.waiting == 0

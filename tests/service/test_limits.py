@@ -9,9 +9,9 @@ from typing import Any
 import httpx
 import pytest
 
+from service.fair_share import max_per_client
 from service.schemas import LimitsAnswer
 from service.settings import Settings
-from service.sharing import most_of_one
 from tests.service.conftest import FLAT, StartApp, assert_problem, encode_picture, localise, upload
 
 
@@ -29,7 +29,7 @@ def test_every_limit_is_a_setting_and_is_told(client: httpx.Client) -> None:
     # Left to the number of cores; this app has no LPO workers.
     resolved = Settings(workers=0, onnx_threads=1)
     assert told.pop("max_queries") == resolved.query_limit > 0
-    assert told.pop("max_queries_per_tenant") == most_of_one(resolved.query_limit) < resolved.query_limit
+    assert told.pop("max_queries_per_tenant") == max_per_client(resolved.query_limit) < resolved.query_limit
     assert told.pop("max_pending_requests") == resolved.pending_limit > resolved.query_limit
     assert told == {name: getattr(settings, name) for name in told}
 

@@ -248,20 +248,20 @@ def test_a_full_queue_refuses_at_once_and_places_given_up_are_free_again(log: Pa
         assert second.result(20.0) == 2
 
 
-def test_parties_take_turns_at_the_workers(log: Path) -> None:
+def test_clients_take_turns_at_the_workers(log: Path) -> None:
     done: list[str] = []
     with _warm_pool(log, queue_limit=20) as pool:
         busy = pool.submit(("sleep", 1.0), 20.0, "many")
         wait_for(lambda: _count(log, "sleep") == 1)
-        for party in ("many", "many", "many", "many", "few", "few", "one"):
-            job = pool.submit(("echo", party), 20.0, party)
+        for client in ("many", "many", "many", "many", "few", "few", "one"):
+            job = pool.submit(("echo", client), 20.0, client)
             job.add_done_callback(lambda future: done.append(future.result()))
         busy.result(20.0)
         wait_for(lambda: len(done) == 7)
     assert done == ["many", "few", "one", "many", "few", "many", "many"]
 
 
-def test_one_party_cannot_fill_the_queue(log: Path) -> None:
+def test_one_client_cannot_fill_the_queue(log: Path) -> None:
     with _warm_pool(log, queue_limit=4) as pool:
         busy = pool.submit(("sleep", 1.0), 20.0, "many")
         wait_for(lambda: _count(log, "sleep") == 1)

@@ -10,11 +10,11 @@ from starlette.requests import Request
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.errors import DeadlineExceededError, OverloadedError, StoppingError
+from service.fair_share import FairSemaphore
 from service.http.admission_control import EXEMPT, Admission, is_read, is_stream
 from service.http.problems import problem_answer
 from service.security.access_control import routed_path
 from service.security.permissions import caller_of
-from service.sharing import FairTurns
 
 
 class AdmissionMiddleware:
@@ -31,43 +31,43 @@ class AdmissionMiddleware:
             await self._app(scope, receive, send)
             return
         try:
-            party = caller_of(scope).party
-            with admission.slot_for(party, scope["method"], path):
-                await self._handle(admission, party, scope, receive, send)
+            client = caller_of(scope).client
+            with admission.slot_for(client, scope["method"], path):
+                await self._handle(admission, client, scope, receive, send)
         except (OverloadedError, StoppingError) as error:
             await problem_answer(Request(scope), error)(scope, receive, send)
 
-    async def _handle(self, admission: Admission, party: str, scope: Scope, receive: Receive, send: Send) -> None:
+    async def _handle(self, admission: Admission, client: str, scope: Scope, receive: Receive, send: Send) -> None:
         path = routed_path(scope)
-        turns = admission.reading if is_read(scope["method"], path) else None
-        client = _Client(receive, send)
+        semaphore = admission.reading if is_read(scope["method"], path) else None
+        connection = _Connection(receive, send)
         limit_s = None if is_stream(scope["method"], path) else admission.limits.deadline_s
         try:
-            async with asyncio.timeout(limit_s), client, _Turn(turns, party) as turn:
-                client.on_answer = turn.end
-                await self._app(scope, client.receive, client.send)
+            async with asyncio.timeout(limit_s), connection, _Permit(semaphore, client) as permit:
+                connection.on_answer = permit.end
+                await self._app(scope, connection.receive, connection.send)
         except asyncio.CancelledError:
             # The server, stopping, ends what did not finish in time.
-            if not admission.stopping or client.answered:
+            if not admission.stopping or connection.answered:
                 raise
             await problem_answer(Request(scope), StoppingError())(scope, receive, send)
         except TimeoutError:
-            if not client.answered:
+            if not connection.answered:
                 error = DeadlineExceededError(admission.limits.deadline_s)
                 await problem_answer(Request(scope), error)(scope, receive, send)
 
 
-class _Turn:
-    """A party's turn to compute an answer, which ends when the answer begins: what is sent may take its time."""
+class _Permit:
+    """A client's permit to compute an answer, held until the answer begins: what is sent may take its time."""
 
-    def __init__(self, turns: FairTurns | None, party: str) -> None:
-        self._turns = turns
-        self._party = party
+    def __init__(self, semaphore: FairSemaphore | None, client: str) -> None:
+        self._semaphore = semaphore
+        self._client = client
         self._held = False
 
-    async def __aenter__(self) -> _Turn:
-        if self._turns is not None:
-            await self._turns.acquire(self._party)
+    async def __aenter__(self) -> _Permit:
+        if self._semaphore is not None:
+            await self._semaphore.acquire(self._client)
             self._held = True
         return self
 
@@ -76,12 +76,12 @@ class _Turn:
 
     def end(self) -> None:
         """Give it back, once."""
-        if self._held and self._turns is not None:
+        if self._held and self._semaphore is not None:
             self._held = False
-            self._turns.release(self._party)
+            self._semaphore.release(self._client)
 
 
-class _Client:
+class _Connection:
     """The other end of a request. Once its body is there, a hang-up cancels whoever works on the answer."""
 
     def __init__(self, receive: Receive, send: Send) -> None:
@@ -93,7 +93,7 @@ class _Client:
         self._watch: asyncio.Task[None] | None = None
         self._worker: asyncio.Task[object] | None = None
 
-    async def __aenter__(self) -> _Client:
+    async def __aenter__(self) -> _Connection:
         self._worker = asyncio.current_task()
         return self
 

@@ -1,4 +1,4 @@
-"""What is scarce is shared: no party gets all of it, and those that wait are served in turn."""
+"""What is scarce is shared: no client gets all of it, and those that wait are served in turn."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from service.fair_share import FairQueue, FairSemaphore, Shares, max_per_client, with_headroom
 from service.security.client_network import network_of
-from service.sharing import FairQueue, FairTurns, Shares, most_of_one, with_spare
 from service.threads import Threads
 from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upload, wait_for
 
@@ -24,17 +24,17 @@ WORST = "127.0.0.2"
 
 
 @pytest.mark.parametrize(("limit", "alone"), [(1, 1), (2, 1), (3, 2), (4, 3), (6, 4), (32, 24), (64, 48)])
-def test_alone_a_party_gets_three_quarters_and_leaves_some(limit: int, alone: int) -> None:
+def test_alone_a_client_gets_three_quarters_and_leaves_some(limit: int, alone: int) -> None:
     shares = Shares(limit)
     while shares.may_take("a"):
         shares.take("a")
-    assert shares.held_by("a") == shares.in_use == alone == most_of_one(limit)
+    assert shares.held_by("a") == shares.in_use == alone == max_per_client(limit)
     assert shares.may_take("b") == (limit > 1)
 
 
 @given(st.integers(1, 100))
-def test_with_a_spare_a_party_gets_what_it_was_meant_to(count: int) -> None:
-    shares = Shares(with_spare(count))
+def test_with_headroom_a_client_gets_what_it_was_meant_to(count: int) -> None:
+    shares = Shares(with_headroom(count))
     while shares.may_take("a"):
         shares.take("a")
     assert count <= shares.held_by("a") < shares.limit
@@ -45,18 +45,18 @@ def test_whoever_holds_nothing_gets_one_while_any_is_left_and_no_more_than_all_a
     limit: int, steps: list[tuple[str, bool]]
 ) -> None:
     shares = Shares(limit)
-    for party, takes in steps:
-        if takes and shares.may_take(party):
-            shares.take(party)
-        elif not takes and shares.held_by(party):
-            shares.give_back(party)
+    for client, takes in steps:
+        if takes and shares.may_take(client):
+            shares.take(client)
+        elif not takes and shares.held_by(client):
+            shares.give_back(client)
         assert shares.in_use == sum(shares.held_by(one) for one in "abcd") <= limit
         assert shares.may_take("newcomer") == (shares.in_use < limit)
 
 
 @given(st.integers(8, 200), st.integers(2, 4))
-def test_parties_that_want_all_they_can_get_end_with_about_the_same(limit: int, parties: int) -> None:
-    shares, names = Shares(limit), range(parties)
+def test_clients_that_want_all_they_can_get_end_with_about_the_same(limit: int, clients: int) -> None:
+    shares, names = Shares(limit), range(clients)
     while shares.may_take(0):
         shares.take(0)
     # Work ends in the order in which it began, and the place goes to whoever may have it.
@@ -71,19 +71,19 @@ def test_parties_that_want_all_they_can_get_end_with_about_the_same(limit: int, 
 
 
 @given(st.lists(st.sampled_from("abc"), max_size=40))
-def test_those_that_wait_are_served_one_of_each_and_oldest_first(parties: list[str]) -> None:
+def test_those_that_wait_are_served_one_of_each_and_oldest_first(clients: list[str]) -> None:
     queue: FairQueue[int] = FairQueue()
-    for number, party in enumerate(parties):
-        queue.append(party, number)
-    served = [queue.take() for _ in parties]
+    for number, client in enumerate(clients):
+        queue.append(client, number)
+    served = [queue.take() for _ in clients]
     assert queue.take() is None
-    for party in "abc":
-        own = [found[1] for found in served if found is not None and found[0] == party]
-        assert own == [number for number, other in enumerate(parties) if other == party]
+    for client in "abc":
+        own = [found[1] for found in served if found is not None and found[0] == client]
+        assert own == [number for number, other in enumerate(clients) if other == client]
     # Whoever has one waits for no more than one of every other.
-    for party in set(parties):
-        first = next(place for place, found in enumerate(served) if found is not None and found[0] == party)
-        assert first < len(set(parties))
+    for client in set(clients):
+        first = next(place for place, found in enumerate(served) if found is not None and found[0] == client)
+        assert first < len(set(clients))
 
 
 def test_what_nobody_wants_any_more_is_dropped() -> None:
@@ -98,38 +98,38 @@ def test_what_nobody_wants_any_more_is_dropped() -> None:
 
 def test_turns_go_round_and_one_is_left_to_others() -> None:
     async def scenario() -> list[str]:
-        turns, order = FairTurns(2), list[str]()
+        semaphore, order = FairSemaphore(2), list[str]()
 
-        async def take(party: str) -> None:
-            await turns.acquire(party)
-            order.append(party)
+        async def take(client: str) -> None:
+            await semaphore.acquire(client)
+            order.append(client)
             await asyncio.sleep(0)
-            turns.release(party)
+            semaphore.release(client)
 
-        await turns.acquire("a")
-        waiting = [asyncio.create_task(take(party)) for party in "aaab"]
+        await semaphore.acquire("a")
+        waiting = [asyncio.create_task(take(client)) for client in "aaab"]
         gone = asyncio.create_task(take("a"))
         await asyncio.sleep(0)
         gone.cancel()
         await asyncio.sleep(0.01)
         # The other one is not a's to take, so b had it at once.
         assert order == ["b"]
-        turns.release("a")
+        semaphore.release("a")
         await asyncio.gather(*waiting)
         # Given up at the very moment when it came: it goes on to the next.
-        await turns.acquire("a")
-        late = asyncio.create_task(turns.acquire("a"))
+        await semaphore.acquire("a")
+        late = asyncio.create_task(semaphore.acquire("a"))
         await asyncio.sleep(0)
-        turns.release("a")
+        semaphore.release("a")
         late.cancel()
         await asyncio.gather(late, return_exceptions=True)
-        await asyncio.wait_for(turns.acquire("a"), 1.0)
+        await asyncio.wait_for(semaphore.acquire("a"), 1.0)
         return order
 
     assert asyncio.run(scenario()) == ["b", "a", "a", "a"]
 
 
-def test_a_thread_whose_caller_left_is_still_its_party_s() -> None:
+def test_a_thread_whose_caller_left_is_still_its_client_s() -> None:
     async def scenario() -> None:
         threads, goes_on = Threads("test", 2), threading.Event()
         try:
@@ -157,7 +157,7 @@ def test_the_addresses_of_a_network_count_as_one(address: str, network: str) -> 
     assert network_of(address) == network
 
 
-# The running service. Without keys, every client address is a party.
+# The running service. Without keys, every client address is a client.
 
 
 @contextmanager
