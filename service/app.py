@@ -29,7 +29,7 @@ from service.http.parameters import check_parameters
 from service.http.problems import install_problem_handlers
 from service.problem_kinds import HTTP_PROBLEMS, PROBLEMS
 from service.routes import ROUTERS
-from service.runtime import HERE, Elsewhere, start_runtime
+from service.runtime import LOCAL_BACKENDS, Backends, start_runtime
 from service.settings import Settings
 from service.telemetry import Telemetry, configure_logging
 
@@ -41,12 +41,12 @@ _DESCRIPTION = (
 )
 
 
-def create_app(settings: Settings | None = None, elsewhere: Elsewhere = HERE) -> FastAPI:
+def create_app(settings: Settings | None = None, backends: Backends = LOCAL_BACKENDS) -> FastAPI:
     """Make an application.
 
     Args:
         settings: by default read from the environment when the application starts.
-        elsewhere: what is not in this process.
+        backends: what may be in other processes.
     """
     telemetry = Telemetry()
     # Shown as 0 from the start, so that the first one is a rise.
@@ -57,7 +57,7 @@ def create_app(settings: Settings | None = None, elsewhere: Elsewhere = HERE) ->
         version=__version__,
         description=_DESCRIPTION,
         dependencies=[Depends(check_parameters)],
-        lifespan=partial(_lifespan, settings, telemetry, elsewhere),
+        lifespan=partial(_lifespan, settings, telemetry, backends),
         # The stock documentation pages load their scripts from elsewhere; `routes.pages` has one that does not.
         docs_url=None,
         redoc_url=None,
@@ -84,12 +84,12 @@ def _layers(app: FastAPI, telemetry: Telemetry, routes: list[BaseRoute]) -> ASGI
 
 @asynccontextmanager
 async def _lifespan(
-    settings: Settings | None, telemetry: Telemetry, elsewhere: Elsewhere, app: FastAPI
+    settings: Settings | None, telemetry: Telemetry, backends: Backends, app: FastAPI
 ) -> AsyncIterator[None]:
     settings = settings or Settings.load()
     logger = configure_logging(settings.log_level)
     with ExitStack() as cleanup:
-        runtime = app.state.runtime = await asyncio.to_thread(start_runtime, settings, telemetry, cleanup, elsewhere)
+        runtime = app.state.runtime = await asyncio.to_thread(start_runtime, settings, telemetry, cleanup, backends)
         app.state.cors_origins = settings.cors_origin_set
         app.state.admission = runtime.admission
         app.state.access_control = runtime.access_control

@@ -22,13 +22,13 @@ from service.http import Admission, AdmissionLimits
 from service.http.events import HEARTBEAT_S, PlanEvents
 from service.preview import Drawings
 from service.query import (
-    Answering,
     Decoder,
     Localiser,
+    LocaliserBackend,
     LpoPool,
-    Refining,
-    VenueAnswering,
+    OptimiserBackend,
     VenueLocaliser,
+    VenueLocaliserBackend,
     VenuePlans,
 )
 from service.schemas import ModelAnswer
@@ -43,9 +43,9 @@ from service.threads import BoundedReads, Threads
 _READ_THREADS = 4
 # Small grids are computed on them: more of one tenant would take the cores from queries.
 _UPLOAD_THREADS = with_headroom(2)
-# Drawings in memory, and revisions that wait to be drawn.
 # Poses of the plans of a venue that are searched together, besides a single larger plan: they are copied for a query.
 _VENUE_POSES = 40_000
+# Drawings in memory, and revisions that wait to be drawn.
 _DRAWINGS_BYTES, _MAX_DRAWN = 32 * 2**20, 16
 # With keys that are not remembered, streams still look no more often.
 _MIN_HEARTBEAT_S = 1.0
@@ -57,7 +57,7 @@ class _Closable(Protocol):
     close: Callable[..., None]
 
 
-Closed = TypeVar("Closed", bound=_Closable)
+Part = TypeVar("Part", bound=_Closable)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,11 +76,11 @@ class Runtime:
     store: Store
     grids: GridProvider
     plan_lookup: PlanLookup
-    pool: Refining
+    optimiser: OptimiserBackend
     decoder: Decoder
     converter: Converter
-    localiser: Answering
-    venue_localiser: VenueAnswering
+    localiser: LocaliserBackend
+    venue_localiser: VenueLocaliserBackend
     admission: Admission
     access_control: AccessControl
     events: PlanEvents
@@ -92,22 +92,24 @@ class Runtime:
     @property
     def ready(self) -> bool:
         """Whether workers are warm, as the model is before the first request is taken, and the service goes on."""
-        return not self.admission.draining and self.pool.state.warmed_up and self.decoder.state.warmed_up
+        return not self.admission.draining and self.optimiser.state.warmed_up and self.decoder.state.warmed_up
 
 
 @dataclass(frozen=True, kw_only=True)
-class Elsewhere:
-    """What makes those parts that may be in other processes than the service's own and its workers; by default none is.
+class Backends:
+    """What makes those parts that may be in other processes than the service's own and its workers.
 
     Attributes:
-        pool: who optimises poses.
+        optimiser: who optimises poses.
         encoders: the networks, warm.
-        queries: who answers queries; None: this process.
+        localisers: who answers queries; None: this process.
     """
 
-    pool: Callable[[Bundle, Settings, Telemetry], Refining]
+    optimiser: Callable[[Bundle, Settings, Telemetry], OptimiserBackend]
     encoders: Callable[[Bundle, Settings], Encoders]
-    queries: Callable[[ModelAnswer, Settings, Telemetry], tuple[Answering, VenueAnswering]] | None = None
+    localisers: Callable[[ModelAnswer, Settings, Telemetry], tuple[LocaliserBackend, VenueLocaliserBackend]] | None = (
+        None
+    )
 
 
 def warm_encoders(bundle: Bundle, settings: Settings) -> Encoders:
@@ -120,108 +122,159 @@ def warm_encoders(bundle: Bundle, settings: Settings) -> Encoders:
     return encoders
 
 
-HERE = Elsewhere(pool=LpoPool, encoders=warm_encoders)
+# None is in another process.
+LOCAL_BACKENDS = Backends(optimiser=LpoPool, encoders=warm_encoders)
 
 
-def start_runtime(settings: Settings, telemetry: Telemetry, cleanup: ExitStack, elsewhere: Elsewhere = HERE) -> Runtime:
-    """Open the store, load and warm the model, start the LPO pool, and queue unfinished grids.
+def start_runtime(
+    settings: Settings, telemetry: Telemetry, cleanup: ExitStack, backends: Backends = LOCAL_BACKENDS
+) -> Runtime:
+    """Open the store, load and warm the model, start the worker processes, and queue unfinished grids.
 
-    Blocks for as long as the model loads; the pool warms up in the background.
+    Blocks for as long as the model loads; the workers warm up in the background.
 
     Args:
         cleanup: takes what has to be closed, also when starting fails half-way.
-        elsewhere: what is not in this process.
+        backends: what may be in other processes.
 
     Raises:
         ConfigError: the data folder or the database cannot be used.
         BundleError: there is no usable model.
     """
-
-    def kept(part: Closed, *arguments: float) -> Closed:
-        cleanup.callback(part.close, *arguments)
-        return part
-
     if settings.otlp_endpoint is not None:
-        telemetry.tracing = kept(Tracing(otlp_exporter(settings.otlp_endpoint), __version__))
+        telemetry.tracing = _closing(cleanup, Tracing(otlp_exporter(settings.otlp_endpoint), __version__))
     bundle = Bundle.open(settings.bundle)
-    store = kept(open_store(settings))
-    access_control = kept(AccessControl(store.keys, settings))
-    # The pool first: loading torch in the workers overlaps with loading the model here.
-    pool = kept(elsewhere.pool(bundle, settings, telemetry), _LPO_DRAIN * settings.stop_deadline_s)
-    pool.start()
-    decoder = kept(Decoder(bundle.manifest, settings, telemetry))
-    decoder.start()
-    encoders = elsewhere.encoders(bundle, settings)
-    grids = kept(GridProvider(store, encoders, bundle.sha256, settings, telemetry))
-    admission = Admission(AdmissionLimits.of(settings), telemetry)
-    reads = kept(
-        BoundedReads(threads=_READ_THREADS, max_pending=settings.pending_limit, wait_s=settings.database_wait_s)
-    )
-    uploads = kept(Threads("lalaloc-uploads", _UPLOAD_THREADS))
+    store = _closing(cleanup, open_store(settings))
+    access_control = _closing(cleanup, AccessControl(store.keys, settings))
+    searching = _Searching.start(settings, telemetry, cleanup, backends, bundle, store)
+    uploads = _closing(cleanup, Threads("lalaloc-uploads", _UPLOAD_THREADS))
     # As many as may be read at a time, and after the converter in being closed: what waits for it must be let go first.
-    file_uploads = kept(Threads("lalaloc-files", with_headroom(settings.import_workers)))
-    converter = kept(Converter(settings, telemetry))
-    localiser = kept(
-        Localiser(
-            settings=settings,
-            bundle=bundle,
-            encoders=encoders,
-            grids=grids,
-            pool=pool,
-            decoder=decoder,
-            queries=admission.queries,
-            reads=reads,
-            telemetry=telemetry,
-        )
-    )
-    sweeper = kept(Sweeper(store, grids, sweep_s=settings.sweep_s, keep_answers_s=settings.keep_answers_s))
-    sweeper.start()
-    # One look at a time, which takes no thread from queries while the database is silent.
-    looks = kept(BoundedReads(threads=1, max_pending=1, wait_s=settings.database_wait_s))
-    answering: Answering = localiser
-    venue_answering: VenueAnswering = VenueLocaliser(
-        settings=settings,
-        bundle=bundle,
-        encoders=encoders,
-        plans=kept(_venue_plans(store, grids, reads, settings)),
-        localiser=localiser,
-        decoder=decoder,
-        queries=admission.queries,
-    )
-    if elsewhere.queries is not None:
-        answering, venue_answering = elsewhere.queries(localiser.model, settings, telemetry)
-    _tell_start(bundle, grids, telemetry)
+    file_uploads = _closing(cleanup, Threads("lalaloc-files", with_headroom(settings.import_workers)))
+    converter = _closing(cleanup, Converter(settings, telemetry))
+    grids, localiser = searching.grids, _closing(cleanup, searching.localiser())
+    sweeper = Sweeper(store, grids, sweep_s=settings.sweep_s, keep_answers_s=settings.keep_answers_s)
+    _closing(cleanup, sweeper).start()
+    # One read at a time, which takes no thread from queries while the database is silent.
+    event_reads = _closing(cleanup, _reads(settings, threads=1, max_pending=1))
+    venue_localiser = searching.venue_localiser(localiser, _closing(cleanup, searching.venue_plans()))
+    if backends.localisers is None:
+        localisers = localiser, venue_localiser
+    else:
+        localisers = backends.localisers(localiser.model, settings, telemetry)
+    _log_start(bundle, grids, telemetry)
     return Runtime(
         settings=settings,
         telemetry=telemetry,
         store=store,
         grids=grids,
         plan_lookup=PlanLookup(store, max_age_s=settings.plan_cache_age_s),
-        pool=pool,
-        decoder=decoder,
+        optimiser=searching.optimiser,
+        decoder=searching.decoder,
         converter=converter,
-        localiser=answering,
-        venue_localiser=venue_answering,
-        admission=admission,
+        localiser=localisers[0],
+        venue_localiser=localisers[1],
+        admission=searching.admission,
         access_control=access_control,
-        events=_plan_events(store, grids, admission, looks, settings),
+        events=_plan_events(store, grids, searching.admission, event_reads, settings),
         uploads=uploads,
         file_uploads=file_uploads,
-        reads=reads,
-        drawings=kept(Drawings(limit_bytes=_DRAWINGS_BYTES, max_waiting=_MAX_DRAWN)),
+        reads=searching.reads,
+        drawings=_closing(cleanup, Drawings(limit_bytes=_DRAWINGS_BYTES, max_waiting=_MAX_DRAWN)),
     )
 
 
-def _venue_plans(store: Store, grids: GridProvider, reads: BoundedReads, settings: Settings) -> VenuePlans:
-    return VenuePlans(
-        store,
-        grids,
-        reads,
-        path=settings.data_dir / "prototypes.bin",
-        file_bytes=settings.venue_file_bytes,
-        limit_bytes=settings.venue_cache_bytes,
-        max_poses=min(settings.max_grid_poses, _VENUE_POSES),
-    )
+@dataclass(frozen=True, kw_only=True)
+class _Searching:
+    """What queries are answered with in this process."""
+
+    settings: Settings
+    telemetry: Telemetry
+    bundle: Bundle
+    store: Store
+    encoders: Encoders
+    grids: GridProvider
+    optimiser: OptimiserBackend
+    decoder: Decoder
+    admission: Admission
+    reads: BoundedReads
+
+    @classmethod
+    def start(
+        cls,
+        settings: Settings,
+        telemetry: Telemetry,
+        cleanup: ExitStack,
+        backends: Backends,
+        bundle: Bundle,
+        store: Store,
+    ) -> _Searching:
+        """Start the worker processes, which warm up in the background, and load the model."""
+        # The workers first: loading torch in them overlaps with loading the model here.
+        optimiser = backends.optimiser(bundle, settings, telemetry)
+        _closing(cleanup, optimiser, _LPO_DRAIN * settings.stop_deadline_s).start()
+        decoder = _closing(cleanup, Decoder(bundle.manifest, settings, telemetry))
+        decoder.start()
+        encoders = backends.encoders(bundle, settings)
+        return cls(
+            settings=settings,
+            telemetry=telemetry,
+            bundle=bundle,
+            store=store,
+            encoders=encoders,
+            grids=_closing(cleanup, GridProvider(store, encoders, bundle.sha256, settings, telemetry)),
+            optimiser=optimiser,
+            decoder=decoder,
+            admission=Admission(AdmissionLimits.of(settings), telemetry),
+            reads=_closing(cleanup, _reads(settings, threads=_READ_THREADS, max_pending=settings.pending_limit)),
+        )
+
+    def localiser(self) -> Localiser:
+        """What answers queries about plans."""
+        return Localiser(
+            settings=self.settings,
+            bundle=self.bundle,
+            encoders=self.encoders,
+            grids=self.grids,
+            optimiser=self.optimiser,
+            decoder=self.decoder,
+            queries=self.admission.queries,
+            reads=self.reads,
+            telemetry=self.telemetry,
+        )
+
+    def venue_plans(self) -> VenuePlans:
+        """What finds the plans of a venue."""
+        return VenuePlans(
+            self.store,
+            self.grids,
+            self.reads,
+            path=self.settings.data_dir / "prototypes.bin",
+            file_bytes=self.settings.venue_file_bytes,
+            limit_bytes=self.settings.venue_cache_bytes,
+            max_poses=min(self.settings.max_grid_poses, _VENUE_POSES),
+        )
+
+    def venue_localiser(self, localiser: Localiser, plans: VenuePlans) -> VenueLocaliser:
+        """What answers queries about venues."""
+        return VenueLocaliser(
+            settings=self.settings,
+            bundle=self.bundle,
+            encoders=self.encoders,
+            plans=plans,
+            localiser=localiser,
+            decoder=self.decoder,
+            queries=self.admission.queries,
+        )
+
+
+def _closing(cleanup: ExitStack, part: Part, *arguments: float) -> Part:
+    """A part, which is closed with everything else."""
+    cleanup.callback(part.close, *arguments)
+    return part
+
+
+def _reads(settings: Settings, *, threads: int, max_pending: int) -> BoundedReads:
+    return BoundedReads(threads=threads, max_pending=max_pending, wait_s=settings.database_wait_s)
 
 
 async def runtime_of(request: Request) -> Runtime:
@@ -233,14 +286,14 @@ async def runtime_of(request: Request) -> Runtime:
 
 
 def _plan_events(
-    store: Store, grids: GridProvider, admission: Admission, looks: BoundedReads, settings: Settings
+    store: Store, grids: GridProvider, admission: Admission, reads: BoundedReads, settings: Settings
 ) -> PlanEvents:
     # Their callers' keys are looked at again as often.
     heartbeat_s = max(min(settings.key_cache_s, HEARTBEAT_S), _MIN_HEARTBEAT_S) if settings.api_keys else HEARTBEAT_S
-    return PlanEvents(store, grids, admission, looks, max_s=settings.stream_deadline_s, heartbeat_s=heartbeat_s)
+    return PlanEvents(store, grids, admission, reads, max_s=settings.stream_deadline_s, heartbeat_s=heartbeat_s)
 
 
-def _tell_start(bundle: Bundle, grids: GridProvider, telemetry: Telemetry) -> None:
+def _log_start(bundle: Bundle, grids: GridProvider, telemetry: Telemetry) -> None:
     manifest = bundle.manifest
     telemetry.describe_build(__version__, manifest.name, manifest.version, bundle.sha256)
     fields = {"model": manifest.name, "sha256": bundle.sha256, "grids_to_compute": grids.preparing}

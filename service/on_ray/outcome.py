@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from functools import wraps
+from typing import Any, Concatenate, Generic, ParamSpec, TypeVar
 
 from lalaloc_core.errors import LaLaLocError
 
+P = ParamSpec("P")
+S = TypeVar("S")
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Answered(Generic[T]):
+class Success(Generic[T]):
     """An answer."""
 
     value: T
 
 
 @dataclass(frozen=True)
-class Refused:
+class Failure:
     """An error that is meant for whoever asked.
 
     Errors are not sent as they are: pickling makes them anew of the text that they end with, which is seldom what
@@ -31,7 +34,7 @@ class Refused:
     attributes: Mapping[str, Any]
 
     @classmethod
-    def of(cls, error: LaLaLocError) -> Refused:
+    def of(cls, error: LaLaLocError) -> Failure:
         """What an error says."""
         return cls(type(error), error.args, dict(error.__dict__))
 
@@ -42,3 +45,18 @@ class Refused:
         error.args = self.text
         error.__dict__.update(self.attributes)
         return error
+
+
+def telling_failures(
+    method: Callable[Concatenate[S, P], Awaitable[T]],
+) -> Callable[Concatenate[S, P], Coroutine[Any, Any, Success[T] | Failure]]:
+    """A method of a replica that returns an outcome: what this one returns, or the `LaLaLocError` that it raises."""
+
+    @wraps(method)
+    async def told(self: S, *args: P.args, **kwargs: P.kwargs) -> Success[T] | Failure:
+        try:
+            return Success(await method(self, *args, **kwargs))
+        except LaLaLocError as error:
+            return Failure.of(error)
+
+    return told

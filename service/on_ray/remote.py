@@ -15,14 +15,13 @@ from ray.serve.handle import DeploymentHandle
 from lalaloc_core.bundle import Bundle
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.pipeline import StageClock
 from lalaloc_core.localise.poses import Query, RefinementJob, RefinementResult
 from lalaloc_core.localise.sequence import SequenceJob, SequenceResult
 from service.errors import DeadlineExceededError, OverloadedError
-from service.on_ray.outcome import Answered, Refused
+from service.on_ray.outcome import Failure, Success
 from service.pools import LostReason, PoolState
-from service.query.localiser import AskedPicture
-from service.schemas import EarthPoint, LocaliseAnswer, LocaliseForm, ModelAnswer, SequenceAnswer, SequenceForm
+from service.query import PanoramaQuery, PictureRequest, QueryContext, SequenceQuery
+from service.schemas import EarthPoint, LocaliseAnswer, LocaliseForm, ModelAnswer, SequenceAnswer
 from service.settings import Settings
 from service.storage.records import PlanRecord, VenueRecord
 from service.telemetry import Telemetry
@@ -68,7 +67,7 @@ class RemoteEncoders(Encoders):
         raise DeadlineExceededError(self._deadline_s, "the panorama was not encoded")
 
 
-class RemoteRefining:
+class RemoteOptimiser:
     """LPO elsewhere, whose jobs may fail for any reason: the caller then does without, as with `LpoPool`."""
 
     def __init__(self, lpo: DeploymentHandle | None, telemetry: Telemetry) -> None:
@@ -127,7 +126,7 @@ class RemoteRefining:
         self._telemetry.lpo_missed.labels(reason).inc()
 
 
-class _Asking:
+class _SearchCaller:
     """Asks the replicas that search, the same one about the same plan or venue while there is no change in them."""
 
     def __init__(self, search: DeploymentHandle, settings: Settings, telemetry: Telemetry) -> None:
@@ -135,26 +134,24 @@ class _Asking:
         self._settings = settings
         self._telemetry = telemetry
 
-    async def _ask(self, method: str, of_id: str, begin: float, clock: StageClock, *arguments: Any) -> Any:
+    async def _call(self, method: str, of_id: str, context: QueryContext, *arguments: Any) -> Any:
         """
         Args:
             of_id: the plan or venue.
-            begin: when (`monotonic`) the query was there as a whole.
+            context: of the query.
 
         Raises:
             LaLaLocError: what the replica raised.
             OverloadedError: as many wait already as may.
             DeadlineExceededError: no answer came in time, or two replicas died over it.
         """
-        deadline_s = self._settings.request_deadline_s
-        with clock.stage("search"):
+        with context.clock.stage("search"):
             for _ in range(_ATTEMPTS):
-                spent_s = monotonic() - begin
                 call = getattr(self._search.options(session_id=of_id), method)
-                response = call.remote(*arguments, spent_s)
+                response = call.remote(*arguments)
                 try:
-                    async with asyncio.timeout(max(deadline_s + _ON_THE_WAY_S - spent_s, 0.0)):
-                        outcome: Answered[Any] | Refused = await response
+                    async with asyncio.timeout(max(context.left_s + _ON_THE_WAY_S, 0.0)):
+                        outcome: Success[Any] | Failure = await response
                 except TimeoutError:
                     response.cancel()
                     break
@@ -162,10 +159,10 @@ class _Asking:
                     raise OverloadedError(self._settings.query_limit) from error
                 except RayError:
                     continue
-                if isinstance(outcome, Refused):
+                if isinstance(outcome, Failure):
                     raise outcome.error
                 return outcome.value
-        raise DeadlineExceededError(deadline_s)
+        raise DeadlineExceededError(self._settings.request_deadline_s)
 
     def _observe(self, answer: LocaliseAnswer | SequenceAnswer) -> None:
         """Count an answer here as well, where metrics are asked for."""
@@ -174,7 +171,7 @@ class _Asking:
         self._telemetry.answers.labels(answer.stage).inc()
 
 
-class RemoteAnswering(_Asking):
+class RemoteLocaliser(_SearchCaller):
     """Answers queries about plans, as `Localiser` does."""
 
     def __init__(self, model: ModelAnswer, search: DeploymentHandle, settings: Settings, telemetry: Telemetry) -> None:
@@ -186,76 +183,45 @@ class RemoteAnswering(_Asking):
         """See `Localiser.model`."""
         return self._model
 
-    async def answer(
-        self, record: PlanRecord, form: LocaliseForm, content: bytes, begin: float, clock: StageClock, client: str
-    ) -> LocaliseAnswer:
+    async def answer(self, record: PlanRecord, query: PanoramaQuery) -> LocaliseAnswer:
         """See `Localiser.answer`, for the errors as well."""
-        found = await self._ask("answer", record.id, begin, clock, record.tenant, record.id, form, content, client)
+        found = await self._call("answer", record.id, query.context, record.tenant, record.id, query)
         self._observe(found)
         return found
 
     async def picture(
-        self,
-        record: PlanRecord,
-        form: LocaliseForm,
-        content: bytes,
-        begin: float,
-        clock: StageClock,
-        client: str,
-        asked: AskedPicture,
+        self, record: PlanRecord, query: PanoramaQuery, wanted: PictureRequest
     ) -> tuple[LocaliseAnswer, bytes]:
         """See `Localiser.picture`."""
-        arguments = record.tenant, record.id, form, content, client, asked
-        found, drawn = await self._ask("picture", record.id, begin, clock, *arguments)
+        found, drawn = await self._call("picture", record.id, query.context, record.tenant, record.id, query, wanted)
         self._observe(found)
         return found, drawn
 
-    async def answer_sequence(
-        self,
-        record: PlanRecord,
-        form: SequenceForm,
-        contents: list[bytes],
-        begin: float,
-        clock: StageClock,
-        client: str,
-    ) -> SequenceAnswer:
+    async def answer_sequence(self, record: PlanRecord, query: SequenceQuery) -> SequenceAnswer:
         """See `Localiser.answer_sequence`."""
-        arguments = record.tenant, record.id, form, contents, client
-        found = await self._ask("answer_sequence", record.id, begin, clock, *arguments)
+        found = await self._call("answer_sequence", record.id, query.context, record.tenant, record.id, query)
         self._observe(found)
         return found
 
 
-class RemoteVenueAnswering(_Asking):
+class RemoteVenueLocaliser(_SearchCaller):
     """Answers queries about venues, as `VenueLocaliser` does."""
 
-    async def answer(
-        self, venue: VenueRecord, form: LocaliseForm, content: bytes, begin: float, clock: StageClock, client: str
-    ) -> LocaliseAnswer:
+    async def answer(self, venue: VenueRecord, query: PanoramaQuery) -> LocaliseAnswer:
         """See `VenueLocaliser.answer`."""
-        found = await self._ask(
-            "answer_in_venue", venue.id, begin, clock, venue.tenant, venue.id, form, content, client
-        )
+        found = await self._call("answer_in_venue", venue.id, query.context, venue.tenant, venue.id, query)
         self._observe(found)
         return found
 
     async def answer_near(
-        self,
-        tenant: str,
-        place: EarthPoint,
-        within_m: float,
-        form: LocaliseForm,
-        content: bytes,
-        begin: float,
-        clock: StageClock,
-        client: str,
+        self, tenant: str, place: EarthPoint, within_m: float, query: PanoramaQuery
     ) -> LocaliseAnswer:
         """See `VenueLocaliser.answer_near`."""
-        arguments = tenant, place, within_m, form, content, client
-        found = await self._ask("answer_near", str(place), begin, clock, *arguments)
+        found = await self._call("answer_near", str(place), query.context, tenant, place, within_m, query)
         self._observe(found)
         return found
 
     async def check_hints(self, venue: VenueRecord, form: LocaliseForm) -> None:
         """See `VenueLocaliser.check_hints`."""
-        await self._ask("check_hints", venue.id, monotonic(), StageClock(), venue.tenant, venue.id, form)
+        context = QueryContext.starting(venue.tenant, self._settings.request_deadline_s)
+        await self._call("check_hints", venue.id, context, venue.tenant, venue.id, form)

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
 from contextlib import ExitStack
 from copy import deepcopy
 from pathlib import Path
-from time import monotonic
-from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
@@ -16,18 +13,16 @@ from ray.serve.handle import DeploymentHandle
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from lalaloc_core.bundle import Bundle
-from lalaloc_core.errors import LaLaLocError
 from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.pipeline import StageClock
 from lalaloc_core.localise.poses import Query, RefinementJob, RefinementResult
 from lalaloc_core.localise.sequence import SequenceJob, SequenceResult
 from service.app import create_app
 from service.errors import UnknownFloorPlanError, UnknownVenueError
-from service.on_ray.outcome import Answered, Refused
-from service.on_ray.remote import RemoteAnswering, RemoteEncoders, RemoteRefining, RemoteVenueAnswering
-from service.query.localiser import AskedPicture
-from service.runtime import Elsewhere, start_runtime, warm_encoders
-from service.schemas import EarthPoint, LocaliseForm, ModelAnswer, SequenceForm
+from service.on_ray.outcome import telling_failures
+from service.on_ray.remote import RemoteEncoders, RemoteLocaliser, RemoteOptimiser, RemoteVenueLocaliser
+from service.query import PanoramaQuery, PictureRequest, SequenceQuery
+from service.runtime import Backends, start_runtime, warm_encoders
+from service.schemas import EarthPoint, LocaliseAnswer, LocaliseForm, ModelAnswer, SequenceAnswer
 from service.settings import Settings
 from service.storage.records import PlanRecord, VenueRecord
 from service.telemetry import Telemetry, configure_logging
@@ -74,95 +69,46 @@ class SearchReplica:
         """See `EncoderReplica`."""
         _same_bundle(settings, model_sha256)
         configure_logging(settings.log_level)
-        elsewhere = Elsewhere(
-            pool=lambda _bundle, _settings, telemetry: RemoteRefining(lpo, telemetry),
+        backends = Backends(
+            optimiser=lambda _bundle, _settings, telemetry: RemoteOptimiser(lpo, telemetry),
             encoders=lambda bundle, settings: RemoteEncoders(bundle, settings, encoder),
         )
         self._cleanup = ExitStack()
-        self._runtime = start_runtime(settings, Telemetry(), self._cleanup, elsewhere)
+        self._runtime = start_runtime(settings, Telemetry(), self._cleanup, backends)
 
-    async def answer(
-        self, tenant: str, plan_id: str, form: LocaliseForm, content: bytes, client: str, spent_s: float
-    ) -> Answered[Any] | Refused:
-        """See `Localiser.answer`.
+    @telling_failures
+    async def answer(self, tenant: str, plan_id: str, query: PanoramaQuery) -> LocaliseAnswer:
+        """See `Localiser.answer`."""
+        return await self._runtime.localiser.answer(await self._plan(tenant, plan_id), query)
 
-        Args:
-            spent_s: how long the query has been there as a whole; clocks of machines differ.
-        """
-
-        async def ask(begin: float, clock: StageClock) -> Any:
-            record = await self._plan(tenant, plan_id)
-            return await self._runtime.localiser.answer(record, form, content, begin, clock, client)
-
-        return await _outcome(ask, spent_s)
-
+    @telling_failures
     async def picture(
-        self,
-        tenant: str,
-        plan_id: str,
-        form: LocaliseForm,
-        content: bytes,
-        client: str,
-        asked: AskedPicture,
-        spent_s: float,
-    ) -> Answered[Any] | Refused:
+        self, tenant: str, plan_id: str, query: PanoramaQuery, wanted: PictureRequest
+    ) -> tuple[LocaliseAnswer, bytes]:
         """See `Localiser.picture`."""
+        return await self._runtime.localiser.picture(await self._plan(tenant, plan_id), query, wanted)
 
-        async def ask(begin: float, clock: StageClock) -> Any:
-            record = await self._plan(tenant, plan_id)
-            return await self._runtime.localiser.picture(record, form, content, begin, clock, client, asked)
-
-        return await _outcome(ask, spent_s)
-
-    async def answer_sequence(
-        self, tenant: str, plan_id: str, form: SequenceForm, contents: list[bytes], client: str, spent_s: float
-    ) -> Answered[Any] | Refused:
+    @telling_failures
+    async def answer_sequence(self, tenant: str, plan_id: str, query: SequenceQuery) -> SequenceAnswer:
         """See `Localiser.answer_sequence`."""
+        return await self._runtime.localiser.answer_sequence(await self._plan(tenant, plan_id), query)
 
-        async def ask(begin: float, clock: StageClock) -> Any:
-            record = await self._plan(tenant, plan_id)
-            return await self._runtime.localiser.answer_sequence(record, form, contents, begin, clock, client)
-
-        return await _outcome(ask, spent_s)
-
-    async def answer_in_venue(
-        self, tenant: str, venue_id: str, form: LocaliseForm, content: bytes, client: str, spent_s: float
-    ) -> Answered[Any] | Refused:
+    @telling_failures
+    async def answer_in_venue(self, tenant: str, venue_id: str, query: PanoramaQuery) -> LocaliseAnswer:
         """See `VenueLocaliser.answer`."""
+        return await self._runtime.venue_localiser.answer(await self._venue(tenant, venue_id), query)
 
-        async def ask(begin: float, clock: StageClock) -> Any:
-            venue = await self._venue(tenant, venue_id)
-            return await self._runtime.venue_localiser.answer(venue, form, content, begin, clock, client)
-
-        return await _outcome(ask, spent_s)
-
+    @telling_failures
     async def answer_near(
-        self,
-        tenant: str,
-        place: EarthPoint,
-        within_m: float,
-        form: LocaliseForm,
-        content: bytes,
-        client: str,
-        spent_s: float,
-    ) -> Answered[Any] | Refused:
+        self, tenant: str, place: EarthPoint, within_m: float, query: PanoramaQuery
+    ) -> LocaliseAnswer:
         """See `VenueLocaliser.answer_near`."""
+        return await self._runtime.venue_localiser.answer_near(tenant, place, within_m, query)
 
-        async def ask(begin: float, clock: StageClock) -> Any:
-            near = self._runtime.venue_localiser.answer_near
-            return await near(tenant, place, within_m, form, content, begin, clock, client)
-
-        return await _outcome(ask, spent_s)
-
-    async def check_hints(
-        self, tenant: str, venue_id: str, form: LocaliseForm, spent_s: float
-    ) -> Answered[Any] | Refused:
+    @telling_failures
+    async def check_hints(self, tenant: str, venue_id: str, form: LocaliseForm) -> None:
         """See `VenueLocaliser.check_hints`."""
-
-        async def ask(_begin: float, _clock: StageClock) -> Any:
-            await self._runtime.venue_localiser.check_hints(await self._venue(tenant, venue_id), form)
-
-        return await _outcome(ask, spent_s)
+        await self._runtime.venue_localiser.check_hints(await self._venue(tenant, venue_id), form)
 
     async def revisions(self) -> frozenset[str]:
         """The revisions of plans whose latent grids are in memory here."""
@@ -198,18 +144,18 @@ class IngressReplica:
         self._search = search
 
     def __serve_build_asgi_app__(self) -> ASGIApp:
-        def queries(
+        def localisers(
             model: ModelAnswer, settings: Settings, telemetry: Telemetry
-        ) -> tuple[RemoteAnswering, RemoteVenueAnswering]:
-            plans = RemoteAnswering(model, self._search, settings, telemetry)
-            return plans, RemoteVenueAnswering(self._search, settings, telemetry)
+        ) -> tuple[RemoteLocaliser, RemoteVenueLocaliser]:
+            plans = RemoteLocaliser(model, self._search, settings, telemetry)
+            return plans, RemoteVenueLocaliser(self._search, settings, telemetry)
 
-        elsewhere = Elsewhere(
-            pool=lambda _bundle, _settings, telemetry: RemoteRefining(self._lpo, telemetry),
+        backends = Backends(
+            optimiser=lambda _bundle, _settings, telemetry: RemoteOptimiser(self._lpo, telemetry),
             encoders=warm_encoders,
-            queries=queries,
+            localisers=localisers,
         )
-        return named_once(create_app(self._settings, elsewhere))
+        return named_once(create_app(self._settings, backends))
 
 
 def named_once(app: ASGIApp) -> ASGIApp:
@@ -225,13 +171,6 @@ def named_once(app: ASGIApp) -> ASGIApp:
         await app(scope, receive, told)
 
     return without_id
-
-
-async def _outcome(ask: Callable[[float, StageClock], Awaitable[Any]], spent_s: float) -> Answered[Any] | Refused:
-    try:
-        return Answered(await ask(monotonic() - spent_s, StageClock()))
-    except LaLaLocError as error:
-        return Refused.of(error)
 
 
 def _same_bundle(settings: Settings, model_sha256: str) -> Bundle:

@@ -36,17 +36,18 @@ class Place:
     level: float | None = None
 
 
-Places = Callable[[Candidate], Place]
+# Tells where a candidate is.
+Locate = Callable[[Candidate], Place]
 
 
-def places_in(record: PlanRecord) -> Places:
+def locate_in(record: PlanRecord) -> Locate:
     """Where the candidates of a search in a single plan are."""
     return lambda candidate: Place(record.id, record.revision_id, record.plan, candidate, record.plan.anchor)
 
 
 def compose(
     found: Localisation,
-    places: Places,
+    locate: Locate,
     known: KnownHeading,
     warnings: list[str],
     timings_ms: dict[str, float],
@@ -57,21 +58,21 @@ def compose(
     """An answer.
 
     Args:
-        places: where each candidate is.
+        locate: tells where each candidate is.
         share: how probable it is that the place is among those that were searched.
     """
     model = bundle.manifest.confidence
     answer, spread = found.best[found.stage], None
     if model is not None and answer.information is not None:
-        at = places(answer)
+        at = locate(answer)
         spread = pose_uncertainty(answer.information, at.plan.rooms[at.candidate.room_index], model)
     fits = None if model is None else found.fit_probability(model)
     fits = None if fits is None else fits * share
     candidates = [
-        _candidate(places(candidate), found.query, None if fits is None else fits * probability)
+        _candidate(locate(candidate), found.query, None if fits is None else fits * probability)
         for candidate, probability in zip(found.candidates, found.posterior.candidate, strict=True)
     ]
-    best, place = candidates[0], places(found.candidates[0])
+    best, place = candidates[0], locate(found.candidates[0])
     return LocaliseAnswer(
         floorplan_id=place.plan_id,
         floorplan_revision=place.revision_id,
@@ -102,12 +103,14 @@ def model_answer(bundle: Bundle) -> ModelAnswer:
     return ModelAnswer(name=bundle.manifest.name, version=bundle.manifest.version, sha256=bundle.sha256)
 
 
-def heading_contradiction(known: KnownHeading) -> str:
-    """Says that a heading was not followed."""
+def heading_warnings(found: Localisation, known: KnownHeading) -> list[str]:
+    """Says that a heading was not followed, where it was not."""
+    if not found.heading_contradicted:
+        return []
     assert known.heading is not None
     origin = "heading_deg" if known.source == "given" else "the panorama's compass heading"
     degrees = heading_to_degrees(known.heading)
-    return f"{origin} is {degrees:.4g}, which the panorama contradicts: the heading was searched for instead"
+    return [f"{origin} is {degrees:.4g}, which the panorama contradicts: the heading was searched for instead"]
 
 
 def _candidate(place: Place, query: Query, probability: float | None) -> CandidateAnswer:

@@ -20,18 +20,19 @@ from lalaloc_core.earth import Anchor
 from lalaloc_core.errors import InvalidPoseError
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.hints import Hints
-from lalaloc_core.localise.pipeline import Localisation, LocaliseConfig, StageClock, localise_steps
+from lalaloc_core.localise.pipeline import Localisation, LocaliseConfig, localise_steps
 from lalaloc_core.localise.poses import Candidate, LatentGrid, Query
 from lalaloc_core.localise.venue.merged_plans import MergedPlans
 from lalaloc_core.localise.venue.prototypes import share_searched
 from service.errors import NoPlanNearbyError, VenueNotReadyError, VenueUnsearchableError
 from service.grids import check_height_m
 from service.http.admission_control import Slots
-from service.query.answers import Place, compose, heading_contradiction
+from service.query.answers import Place, compose, heading_warnings
 from service.query.decoding import Decoder
 from service.query.geopose import anchor_of
-from service.query.heading import KnownHeading, known_heading
+from service.query.heading import known_heading
 from service.query.localiser import Localiser
+from service.query.panorama_query import PanoramaQuery, QueryContext
 from service.query.venue_hints import VenueHints
 from service.query.venue_plans import VenuePlans, not_excluded, venue_height
 from service.schemas import EarthPoint, LocaliseAnswer, LocaliseForm, PlanProbability
@@ -41,7 +42,7 @@ from service.storage.records import PlanRecord, VenueRecord
 # The right one of many plans is often not the first by its grid, so more candidates than in a single plan are refined.
 VENUE_CONFIG = LocaliseConfig(by_probability=True, profile_candidates=32, profile_candidates_turned=48)
 # How often a venue is looked at none of whose plans is ready.
-_LOOK_EVERY_S = 0.25
+_POLL_INTERVAL_S = 0.25
 # Tells the plans that are asked about, as they are at the moment.
 Members = Callable[[], Awaitable[Sequence[Row[Any]]]]
 
@@ -105,21 +106,15 @@ class VenueLocaliser:
         self._decoder = decoder
         self._queries = queries
 
-    async def answer(
-        self, venue: VenueRecord, form: LocaliseForm, content: bytes, begin: float, clock: StageClock, client: str
-    ) -> LocaliseAnswer:
+    async def answer(self, venue: VenueRecord, query: PanoramaQuery) -> LocaliseAnswer:
         """Localise an encoded panorama in the plans of a venue.
-
-        Args:
-            begin, clock, client: see `Localiser.answer`.
 
         Raises:
             VenueUnsearchableError: the venue has no plan that is ready or will be.
             VenueNotReadyError: none of its plans was ready by the deadline.
             LaLaLocError: see `Localiser.answer`.
         """
-        async with self._queries.wait_and_hold(client, begin + self._settings.request_deadline_s):
-            return await self._answer(venue, form, content, begin, clock, client)
+        return await self._answer(venue, query, partial(self._plans.members, venue.id))
 
     async def check_hints(self, venue: VenueRecord, form: LocaliseForm) -> None:
         """Raises:
@@ -128,15 +123,7 @@ class VenueLocaliser:
         VenueHints.of(form, venue.anchor).check(await self._plans.members(venue.id))
 
     async def answer_near(
-        self,
-        tenant: str,
-        place: EarthPoint,
-        within_m: float,
-        form: LocaliseForm,
-        content: bytes,
-        begin: float,
-        clock: StageClock,
-        client: str,
+        self, tenant: str, place: EarthPoint, within_m: float, query: PanoramaQuery
     ) -> LocaliseAnswer:
         """As `answer`, in all plans of a tenant with an anchor that lie so near a place on Earth.
 
@@ -159,56 +146,52 @@ class VenueLocaliser:
             created_at=now,
             updated_at=now,
         )
-        async with self._queries.wait_and_hold(client, begin + self._settings.request_deadline_s):
-            return await self._answer(
-                of_place, form, content, begin, clock, client, partial(self._plans.near, tenant, place, within_m)
-            )
+        return await self._answer(of_place, query, partial(self._plans.near, tenant, place, within_m))
 
-    async def _answer(
-        self,
-        venue: VenueRecord,
-        form: LocaliseForm,
-        content: bytes,
-        begin: float,
-        clock: StageClock,
-        client: str,
-        members: Members | None = None,
-    ) -> LocaliseAnswer:
-        deadline = begin + self._settings.request_deadline_s
+    async def _answer(self, venue: VenueRecord, query: PanoramaQuery, members: Members) -> LocaliseAnswer:
+        async with self._queries.wait_and_hold(query.context.client, query.context.deadline):
+            return await self._answer_in_slot(venue, query, members)
+
+    async def _answer_in_slot(self, venue: VenueRecord, query: PanoramaQuery, members: Members) -> LocaliseAnswer:
+        form, context, clock = query.form, query.context, query.context.clock
         hints = VenueHints.of(form, venue.anchor)
         with clock.stage("decode"):
-            panorama = await self._decoder.decode(content, deadline, client)
+            panorama = await self._decoder.decode(query.content, context.deadline, context.client)
         north = None if venue.anchor is None else heading_from_degrees(venue.anchor.north_deg)
         known = known_heading(form, north, panorama, self._settings.compass_tolerance_deg)
         with clock.stage("wait"):
-            ready, warnings = await self._ready(
-                venue, members or partial(self._plans.members, venue.id), hints, deadline, client
-            )
+            ready, warnings = await self._ready(venue, members, hints, context)
         height = venue_height(form, ready)
-        compute = partial(self._localiser.compute, client, deadline=deadline)
-        query = await compute(lambda: self._localiser.encode(panorama, known, height, clock))
+        compute = partial(self._localiser.compute, context)
+        encoded = (await compute(lambda: self._localiser.encode([panorama], [known], height, clock)))[0]
         with clock.stage("shortlist"):
-            searched = await self._searched(venue, ready, query, form, hints, warnings, compute)
+            searched = await self._searched(venue, ready, encoded, form, hints, warnings, compute)
         merged = searched.merged
         steps = localise_steps(
             merged.plan,
             merged.grid,
             self._encoders,
-            query,
+            encoded,
             refine=form.refine,
             top_k=form.top_k,
             config=VENUE_CONFIG,
             clock=clock,
             hints=searched.hints,
         )
-        found = await self._localiser.finished(steps, deadline, client)
-        timings_ms = clock.timings_ms | {"total": (monotonic() - begin) * 1e3}
-        self._localiser.observe(timings_ms, found.stage)
-        contradicted = hints.warnings(searched.hints, found, searched.rows, merged)
-        return self._compose(venue, searched, found, known, form.top_k, contradicted, timings_ms)
+        found = await self._localiser.finished(steps, context)
+        timings_ms = self._localiser.observe(context, found.stage)
+        warnings = [
+            *heading_warnings(found, known),
+            *hints.warnings(searched.hints, found, searched.rows, merged),
+            *searched.warnings,
+        ]
+        share, probability = searched.shares(found)
+        answer = compose(found, searched.place, known, warnings, timings_ms, self._bundle, share=share)
+        plans = self._plan_probabilities(searched.rows, found, share, probability)
+        return answer.model_copy(update={"venue_id": venue.id, "plans": plans[: form.top_k]})
 
     async def _ready(
-        self, venue: VenueRecord, tell: Members, hints: VenueHints, deadline: float, client: str
+        self, venue: VenueRecord, tell: Members, hints: VenueHints, context: QueryContext
     ) -> tuple[Sequence[Row[Any]], list[str]]:
         """The plans that can be asked about, waited for while there is none, and what is to be said of the others."""
         begin = monotonic()
@@ -222,10 +205,10 @@ class VenueLocaliser:
                 break
             if len(failed) == len(members):
                 raise VenueUnsearchableError(venue.id, len(members))
-            if monotonic() + _LOOK_EVERY_S >= deadline:
+            if context.left_s <= _POLL_INTERVAL_S:
                 raise VenueNotReadyError(venue.id, len(members), monotonic() - begin)
-            with self._queries.released(client):
-                await asyncio.sleep(_LOOK_EVERY_S)
+            with self._queries.released(context.client):
+                await asyncio.sleep(_POLL_INTERVAL_S)
         waiting = len(members) - len(ready) - len(failed)
         warnings = []
         if waiting:
@@ -281,36 +264,25 @@ class VenueLocaliser:
             ),
         )
 
-    def _compose(
-        self,
-        venue: VenueRecord,
-        searched: _Searched,
-        found: Localisation,
-        known: KnownHeading,
-        top_k: int,
-        contradicted: list[str],
-        timings_ms: dict[str, float],
-    ) -> LocaliseAnswer:
-        share, probability = searched.shares(found)
-        warnings = [heading_contradiction(known)] if found.heading_contradicted else []
-        warnings += contradicted
-        answer = compose(
-            found, searched.place, known, warnings + searched.warnings, timings_ms, self._bundle, share=share
-        )
+    def _plan_probabilities(
+        self, rows: Sequence[Row[Any]], found: Localisation, share: float, probability: Float[np.ndarray, "m"]
+    ) -> list[PlanProbability]:
+        """The plans that were searched, the most probable first.
+
+        Args:
+            share, probability: see `_Searched.shares`.
+        """
         model = self._bundle.manifest.confidence
         fits = None if model is None else found.fit_probability(model)
-        plans = [
+        return [
             PlanProbability(
                 floorplan_id=row.plan_id,
                 level=row.level,
                 name=row.name,
                 probability=None if fits is None else min(fits * share * of_plan, 1.0),
             )
-            for of_plan, row in sorted(zip(probability.tolist(), searched.rows, strict=True), key=lambda one: -one[0])[
-                :top_k
-            ]
+            for of_plan, row in sorted(zip(probability.tolist(), rows, strict=True), key=lambda one: -one[0])
         ]
-        return answer.model_copy(update={"venue_id": venue.id, "plans": plans})
 
 
 def _may_stand(record: PlanRecord, form: LocaliseForm) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from time import monotonic
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
@@ -23,9 +22,10 @@ from service.http import IdempotentRequest
 from service.http.json_body import parse_document
 from service.http.problems import problem_responses
 from service.http.uploads import JSON, Parts, UploadLimits, media_type, read_body
+from service.query import PanoramaQuery, QueryContext
 from service.query.oscp import answer_of, away_m, picture_of, place_of, unused_warnings
 from service.routes.dependencies import IDEMPOTENCY_KEY, Client, Running, Tenant, plan_for_query, venue_for_query
-from service.routes.localise import QUERY_ERRORS
+from service.routes.query_request import QUERY_ERRORS
 from service.runtime import Runtime
 from service.schemas import LocaliseAnswer, LocaliseForm
 from service.schemas.oscp import OscpAnswer, OscpRequest
@@ -81,7 +81,7 @@ async def geopose(
     with clock.stage("upload"):
         limits = UploadLimits.of(settings, "max_panorama_bytes")
         body = await read_body(request, replace(limits, max_bytes=4 * -(-most // 3) + _ENVELOPE_BYTES))
-    begin = monotonic()
+    context = QueryContext.starting(client, settings.request_deadline_s, clock)
 
     def read() -> tuple[OscpRequest, bytes]:
         parsed = parse_document(OscpRequest, body)
@@ -92,7 +92,7 @@ async def geopose(
 
     async def answer() -> Response:
         asked, content = await runtime.uploads.run(client, read)
-        query = _Query(runtime, tenant, client, asked, content, begin, clock)
+        query = _Query(runtime, tenant, asked, content, context)
         found, warnings = await query.answer(floorplan_id, venue_id)
         note(request, plan=found.floorplan_id, revision=found.floorplan_revision, stage=found.stage)
         told = answer_of(asked, found, [*unused_warnings(asked), *warnings])
@@ -106,19 +106,12 @@ class _Query:
     """One request, once it is read."""
 
     def __init__(
-        self,
-        runtime: Runtime,
-        tenant: str,
-        client: str,
-        asked: OscpRequest,
-        content: bytes,
-        begin: float,
-        clock: StageClock,
+        self, runtime: Runtime, tenant: str, asked: OscpRequest, content: bytes, context: QueryContext
     ) -> None:
         self._runtime = runtime
         self._tenant = tenant
-        self._asked = asked
-        self._rest = (content, begin, clock, client)
+        self._content = content
+        self._context = context
         reading = asked.geolocation
         self._place = None if reading is None else place_of(reading)
 
@@ -134,7 +127,7 @@ class _Query:
         place, radius_m = self._place
         # Plans near a place are asked about as a venue is.
         form = self._form(venue_id="near").model_copy(update={"near": place, "radius_m": radius_m})
-        found = await self._runtime.venue_localiser.answer_near(self._tenant, place, radius_m, form, *self._rest)
+        found = await self._runtime.venue_localiser.answer_near(self._tenant, place, radius_m, self._about(form))
         return found, []
 
     async def _in_plan(self, floorplan_id: str) -> tuple[LocaliseAnswer, list[str]]:
@@ -148,7 +141,7 @@ class _Query:
                 form = form.model_copy(update={"near": place, "radius_m": radius_m})
             else:
                 warnings = [_contradicted(f"is {off_m:.3g} m from the floor plan, its accuracy is {radius_m:g} m")]
-        return await self._runtime.localiser.answer(record, form, *self._rest), warnings
+        return await self._runtime.localiser.answer(record, self._about(form)), warnings
 
     async def _in_venue(self, venue_id: str) -> tuple[LocaliseAnswer, list[str]]:
         venue, localiser = await venue_for_query(self._tenant, venue_id, self._runtime), self._runtime.venue_localiser
@@ -161,7 +154,10 @@ class _Query:
                 form = near
             except InvalidHintError as error:
                 warnings = [_contradicted(f"has no say: {error.reason}")]
-        return await localiser.answer(venue, form, *self._rest), warnings
+        return await localiser.answer(venue, self._about(form)), warnings
+
+    def _about(self, form: LocaliseForm) -> PanoramaQuery:
+        return PanoramaQuery(form, self._content, self._context)
 
     def _form(self, **about: str) -> LocaliseForm:
         form = LocaliseForm.model_validate(about)

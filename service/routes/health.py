@@ -41,7 +41,7 @@ async def readyz(runtime: Annotated[Runtime, Depends(runtime_of)], response: Res
     return ReadyAnswer(
         ready=runtime.ready,
         model=runtime.localiser.model,
-        lpo_pool=_pool(runtime.pool.state),
+        lpo_pool=_pool(runtime.optimiser.state),
         decode_pool=_pool(runtime.decoder.state),
         import_pool=_pool(runtime.converter.state),
         plans_preparing=runtime.grids.preparing,

@@ -26,7 +26,7 @@ ray = pytest.importorskip("ray", reason="Ray is not installed: pip install -c co
 from ray import serve  # noqa: E402
 
 from service.on_ray import app  # noqa: E402
-from service.on_ray.outcome import Refused  # noqa: E402
+from service.on_ray.outcome import Failure  # noqa: E402
 from tests.service.ray_cluster import NAME  # noqa: E402
 
 
@@ -139,7 +139,7 @@ def test_numbers_of_replicas_that_cannot_be_are_refused_by_name(
     ],
 )
 def test_errors_arrive_with_all_that_they_say(error: Any) -> None:
-    arrived = pickle.loads(pickle.dumps(Refused.of(error))).error
+    arrived = pickle.loads(pickle.dumps(Failure.of(error))).error
     assert type(arrived) is type(error)
     assert str(arrived) == str(error)
     assert vars(arrived) == vars(error)
