@@ -9,7 +9,7 @@ from typing import ParamSpec, TypeVar
 import httpx
 
 from lalaloc_client import operations
-from lalaloc_client.async_turns import AsyncTurns
+from lalaloc_client.async_concurrency import AsyncConcurrencyLimit
 from lalaloc_client.connection import checked_max_queries, http_options, request_to_send
 from lalaloc_client.operations import Patience, Reply, Steps, Wait
 from lalaloc_client.requests import Request
@@ -34,7 +34,7 @@ class AsyncSender:
         """See `Client`."""
         self._http = httpx.AsyncClient(**http_options(base_url, api_key, timeout_s))
         self._patience = Patience(retry or RetryPolicy())
-        self._turns = AsyncTurns(
+        self._concurrency = AsyncConcurrencyLimit(
             checked_max_queries(max_queries), lambda: self._run(operations.queries_at_a_time(self._patience))
         )
 
@@ -50,7 +50,7 @@ class AsyncSender:
         **options: P.kwargs,
     ) -> T:
         """See `Sender._query`."""
-        async with self._turns.hold():
+        async with self._concurrency.hold():
             # On a thread: reading and encoding a picture takes a while.
             request = await asyncio.to_thread(make, *arguments, **options)
             return await self._run(operation(request, self._patience))

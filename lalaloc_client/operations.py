@@ -35,7 +35,7 @@ T = TypeVar("T")
 _FIRST_POLL_S, _MAX_POLL_S = 0.1, 2.0
 _SHOWN_CHARACTERS = 500
 # Where the service does not say how many it takes: less than on any machine.
-_UNTOLD_QUERIES = 3
+_DEFAULT_MAX_QUERIES = 3
 # What fails before any of a request has left.
 _UNSENT = (httpx.ConnectError, httpx.ConnectTimeout, httpx.PoolTimeout)
 
@@ -189,9 +189,9 @@ def queries_at_a_time(patience: Patience) -> Steps[int]:
         told = yield from limits(patience)
     except ProblemError:
         # A key that may ask, but not read.
-        return _UNTOLD_QUERIES
+        return _DEFAULT_MAX_QUERIES
     own = told.get("max_queries_per_tenant")
-    return own if isinstance(own, int) and own > 0 else _UNTOLD_QUERIES
+    return own if isinstance(own, int) and own > 0 else _DEFAULT_MAX_QUERIES
 
 
 def readiness(patience: Patience) -> Steps[Readiness]:

@@ -1,4 +1,8 @@
-"""Dataclasses from the JSON of answers: strict about what they know, blind to what they do not."""
+"""Dataclasses from the JSON of answers: strict about what they know, blind to what they do not.
+
+By hand, as httpx is all that the client depends on. Of unions it knows those of a type and None, which are all that
+answers have.
+"""
 
 from __future__ import annotations
 
@@ -34,7 +38,8 @@ def _value(wanted: Any, data: object, where: str) -> Any:
     if origin in (Union, types.UnionType):
         if data is None:
             return None
-        return _value(next(one for one in arguments if one is not type(None)), data, where)
+        (other,) = (one for one in arguments if one is not type(None))
+        return _value(other, data, where)
     if is_dataclass(wanted):
         return _record(wanted, data, where)
     if origin is tuple:

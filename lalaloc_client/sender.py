@@ -9,11 +9,11 @@ from typing import ParamSpec, TypeVar
 import httpx
 
 from lalaloc_client import operations
+from lalaloc_client.concurrency import ConcurrencyLimit
 from lalaloc_client.connection import checked_max_queries, http_options, request_to_send
 from lalaloc_client.operations import Patience, Reply, Steps, Wait
 from lalaloc_client.requests import Request
 from lalaloc_client.retry import RetryPolicy
-from lalaloc_client.turns import Turns
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -42,7 +42,7 @@ class Sender:
         """
         self._http = httpx.Client(**http_options(base_url, api_key, timeout_s))
         self._patience = Patience(retry or RetryPolicy())
-        self._turns = Turns(
+        self._concurrency = ConcurrencyLimit(
             checked_max_queries(max_queries), lambda: self._run(operations.queries_at_a_time(self._patience))
         )
 
@@ -58,7 +58,7 @@ class Sender:
         **options: P.kwargs,
     ) -> T:
         """Make a request that the service computes for, and send it, both as soon as it is its turn."""
-        with self._turns.hold():
+        with self._concurrency.hold():
             return self._run(operation(make(*arguments, **options), self._patience))
 
     def _run(self, steps: Steps[T]) -> T:

@@ -19,9 +19,9 @@ from service.errors import ConverterNotReadyError, DeadlineExceededError, Overlo
 from service.pools import JobLostError, PoolState, WorkerPool, WorkerSpec
 from service.settings import Settings
 from service.telemetry import Telemetry
-from service.workers.convert import ExportJob, Imported, ImportJob, Refusal, run_converter
+from service.workers.convert import ConversionRefusal, ExportJob, Imported, ImportJob, run_converter
 
-_Pool = WorkerPool[ImportJob | ExportJob, Imported | bytes | Refusal]
+_Pool = WorkerPool[ImportJob | ExportJob, Imported | bytes | ConversionRefusal]
 
 
 class Converter:
@@ -72,7 +72,7 @@ class Converter:
             answer = future.result()
         except JobLostError as error:
             self._lost(error)
-        if isinstance(answer, Refusal):
+        if isinstance(answer, ConversionRefusal):
             raise answer.error()
         assert isinstance(answer, Imported)
         return answer
@@ -92,7 +92,7 @@ class Converter:
             answer = await self._started().answer(job, self._settings.import_deadline_s, client)
         except JobLostError as error:
             self._lost(error)
-        if isinstance(answer, Refusal):
+        if isinstance(answer, ConversionRefusal):
             raise answer.error()
         assert isinstance(answer, bytes)
         return answer

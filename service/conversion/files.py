@@ -17,7 +17,7 @@ from service.conversion.converter import Converter
 from service.settings import Settings
 from service.workers.convert import report_of
 
-_LARGEST_HERE_BYTES = 2 * 2**20
+_MAX_IN_PROCESS_BYTES = 2 * 2**20
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class PlanFile:
 
 def seems_native(content: bytes) -> bool:
     """Whether a file is read here, as far as a glance can tell."""
-    return len(content) <= _LARGEST_HERE_BYTES and is_json(content) and kind_of(content) is None
+    return len(content) <= _MAX_IN_PROCESS_BYTES and is_json(content) and kind_of(content) is None
 
 
 def understand(

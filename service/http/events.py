@@ -23,7 +23,7 @@ from service.storage import Store
 from service.telemetry import LOGGER_NAME
 from service.threads import BoundedReads
 
-_LOOK_EVERY_S = 0.25
+_POLL_INTERVAL_S = 0.25
 HEARTBEAT_S = 15.0
 # How long a browser waits before it asks again after a stream has ended.
 _ASK_AGAIN_MS = 3000
@@ -142,7 +142,7 @@ class PlanEvents:
             if self._admission.stopping:
                 for subscriber in list(self._subscribers):
                     subscriber.tell(None)
-            await asyncio.sleep(_LOOK_EVERY_S)
+            await asyncio.sleep(_POLL_INTERVAL_S)
 
     def _look(self, plan_ids: set[str]) -> dict[str, PlanEvent]:
         summaries = self._store.plans.summaries(plan_ids)

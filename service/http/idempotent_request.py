@@ -33,7 +33,7 @@ from service.http.problems import problem_answer
 from service.http.uploads import Parts
 from service.pools import JobLostError
 from service.storage.idempotency_keys import IdempotencyKeys
-from service.storage.records import Conflict, Fresh, InProgress, StoredAnswer
+from service.storage.records import Claimed, Conflict, InProgress, StoredAnswer
 from service.telemetry import LOGGER_NAME
 from service.threads import BoundedReads
 
@@ -41,7 +41,7 @@ HEADER, REPLAYED = "Idempotency-Key", "Idempotency-Replayed"
 MAX_KEY_CHARACTERS = 255
 _KEY = re.compile(rf"[\x21-\x7e]{{1,{MAX_KEY_CHARACTERS}}}")
 # What the request itself is to blame for, and will be tomorrow. Others are not kept, whatever their status.
-_FOR_GOOD = (
+_PERMANENT_ERRORS = (
     InvalidFloorPlanError,
     InvalidHintError,
     InvalidPanoramaError,
@@ -129,7 +129,7 @@ class IdempotentRequest:
             return uuid.uuid4().hex
         claim = self._claims.begin(*self._place, self._key, parts_sha256(parts))
         match claim:
-            case Fresh():
+            case Claimed():
                 return claim.token
             case StoredAnswer():
                 return Response(claim.body, claim.status, {**claim.headers, REPLAYED: "true"})
@@ -161,7 +161,7 @@ class IdempotentRequest:
         if self._key is None:
             return None
         # A picture that decoders were lost over may have had bad luck.
-        if isinstance(error, _FOR_GOOD) and not isinstance(error.__cause__, JobLostError):
+        if isinstance(error, _PERMANENT_ERRORS) and not isinstance(error.__cause__, JobLostError):
             return self._keep(token, problem_answer(self._request, error))
         self._abandon(token)
         return None

@@ -23,7 +23,7 @@ from service.problem_kinds import HTTP_PROBLEMS, INTERNAL, PROBLEMS, ProblemKind
 from service.schemas import Fault, Problem
 from service.security.access_control import routed_path
 from service.security.permissions import permissions_needed
-from service.telemetry import note, request_id_of
+from service.telemetry import add_log_fields, request_id_of
 
 PROBLEM_JSON = "application/problem+json"
 _HIDDEN = "something went wrong in the service; its log has the details under this request_id"
@@ -117,7 +117,7 @@ def _answer(
     faults: list[tuple[str, str]] | None = None,
 ) -> JSONResponse:
     if kind is not INTERNAL:
-        note(request, rejection=kind.slug)
+        add_log_fields(request, rejection=kind.slug)
     problem = Problem(
         type=kind.type,
         title=kind.title,

@@ -36,7 +36,7 @@ class JobLostError(Exception):
         super().__init__(f"the job has no answer: {reason}")
 
 
-class Ticket:
+class PendingJob:
     """One job on its way through the pool."""
 
     def __init__(self, content: bytes, digest: bytes, deadline: float, client: str = "") -> None:
@@ -53,7 +53,7 @@ class Ticket:
         """Whether starting it is of use: it has time left, and nobody gave it up."""
         return monotonic() < self.deadline and not self.future.cancelled()
 
-    def lose(self, reason: LostReason) -> None:
+    def fail(self, reason: LostReason) -> None:
         """End it without an answer."""
         # Whoever waited may have given up at this very moment.
         if self.future.running() or self.future.set_running_or_notify_cancel():
@@ -72,7 +72,7 @@ class JobQueue:
         """
         self._served_by = served_by
         self._workers = workers
-        self._waiting: FairQueue[Ticket] = FairQueue()
+        self._waiting: FairQueue[PendingJob] = FairQueue()
         self._room = Shares(limit)
         self._poisoned: TTLCache[bytes, bool] = TTLCache(_POISON_MEMORY, _POISON_MEMORY_S, monotonic)
         self._changed = threading.Condition()
@@ -86,69 +86,69 @@ class JobQueue:
         """Whether there will be no more jobs."""
         return self._closed
 
-    def put(self, ticket: Ticket) -> None:
+    def put(self, pending: PendingJob) -> None:
         """Let a job wait.
 
         Raises:
             JobLostError: there is no use in waiting.
         """
         with self._changed:
-            reason = self._refusal(ticket)
+            reason = self._refusal(pending)
             if reason is not None:
                 raise JobLostError(reason)
-            self._room.take(ticket.client)
-            self._waiting.append(ticket.client, ticket)
+            self._room.take(pending.client)
+            self._waiting.append(pending.client, pending)
             self._changed.notify()
 
-    def take(self) -> Ticket | None:
+    def take(self) -> PendingJob | None:
         """The next job that is still of use, now running; None when none came in a short while.
 
         Its client holds a worker until `release`.
         """
         with self._changed:
-            ticket = self._next()
-            if ticket is None and not self._closed:
+            pending = self._next()
+            if pending is None and not self._closed:
                 self._changed.wait(_IDLE_CHECK_S)
-                ticket = self._next()
-        if ticket is None:
+                pending = self._next()
+        if pending is None:
             return None
-        if monotonic() >= ticket.deadline:
-            ticket.lose("deadline")
-        elif ticket.future.running() or ticket.future.set_running_or_notify_cancel():
-            return ticket
-        self.release(ticket)
+        if monotonic() >= pending.deadline:
+            pending.fail("deadline")
+        elif pending.future.running() or pending.future.set_running_or_notify_cancel():
+            return pending
+        self.release(pending)
         return None
 
-    def release(self, ticket: Ticket) -> None:
+    def release(self, pending: PendingJob) -> None:
         """The worker that had this job can take another one, or is not coming back."""
         if self._workers is not None:
             with self._changed:
-                self._workers.give_back(ticket.client)
+                self._workers.give_back(pending.client)
                 # Whichever idle worker looks first: what waits may not have been anybody's to take before.
                 self._changed.notify()
 
-    def give_back(self, ticket: Ticket) -> None:
+    def give_back(self, pending: PendingJob) -> None:
         """The worker with this job died or stalled; let another one try, if the job may and has the time."""
         reason: LostReason | None = None
         with self._changed:
-            if ticket.stalled:
+            if pending.stalled:
                 # Not once more: it would take as long again. But when it is sent again it is tried, as a worker may
                 # also stall because the machine is busy.
                 reason = "stalled"
-            elif ticket.deaths >= _TRIES_PER_JOB:
+            elif pending.deaths >= _TRIES_PER_JOB:
                 reason = "poisoned"
-                self._poisoned[ticket.digest] = True
+                self._poisoned[pending.digest] = True
             elif self._closed:
                 reason = "closing"
-            elif not ticket.wanted or not self._served_by(ticket.deadline):
+            elif not pending.wanted or not self._served_by(pending.deadline):
                 reason = "died"
             else:
                 # Past the limit by at most one job per worker, and in front of those that came later.
-                self._room.take(ticket.client)
-                self._waiting.append_first(ticket.client, ticket)
+                self._room.take(pending.client)
+                self._waiting.append_first(pending.client, pending)
                 self._changed.notify()
         if reason is not None:
-            ticket.lose(reason)
+            pending.fail(reason)
 
     def rest(self, duration_s: float) -> None:
         """Wait, but not longer than until the queue is closed."""
@@ -161,33 +161,33 @@ class JobQueue:
             self._closed = True
             waiting = self._waiting.drop(lambda _ticket: True)
             self._changed.notify_all()
-        for ticket in waiting:
-            ticket.lose("closing")
+        for pending in waiting:
+            pending.fail("closing")
 
-    def _refusal(self, ticket: Ticket) -> LostReason | None:
+    def _refusal(self, pending: PendingJob) -> LostReason | None:
         if self._closed:
             return "closing"
-        if not ticket.wanted:
+        if not pending.wanted:
             return "deadline"
-        if ticket.digest in self._poisoned:
+        if pending.digest in self._poisoned:
             return "poisoned"
-        if not self._served_by(ticket.deadline):
+        if not self._served_by(pending.deadline):
             return "not-ready"
-        if not self._room.may_take(ticket.client):
+        if not self._room.may_take(pending.client):
             self._drop_unwanted()
-        return None if self._room.may_take(ticket.client) else "queue-full"
+        return None if self._room.may_take(pending.client) else "queue-full"
 
-    def _next(self) -> Ticket | None:
+    def _next(self) -> PendingJob | None:
         found = self._waiting.take(self._workers.may_take) if self._workers is not None else self._waiting.take()
         if found is None:
             return None
-        ticket = found[1]
-        self._room.give_back(ticket.client)
+        pending = found[1]
+        self._room.give_back(pending.client)
         if self._workers is not None:
-            self._workers.take(ticket.client)
-        return ticket
+            self._workers.take(pending.client)
+        return pending
 
     def _drop_unwanted(self) -> None:
-        for ticket in self._waiting.drop(lambda ticket: not ticket.wanted):
-            self._room.give_back(ticket.client)
-            ticket.lose("deadline")
+        for pending in self._waiting.drop(lambda pending: not pending.wanted):
+            self._room.give_back(pending.client)
+            pending.fail("deadline")

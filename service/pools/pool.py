@@ -12,7 +12,7 @@ from time import monotonic
 from typing import Any, Generic, TypeVar
 
 from service.fair_share import Shares
-from service.pools.job_queue import JobLostError, JobQueue, Ticket
+from service.pools.job_queue import JobLostError, JobQueue, PendingJob
 from service.pools.supervisor import Supervisor, WorkerSpec
 
 # So that nobody waits while large jobs of others are copied.
@@ -96,9 +96,9 @@ class WorkerPool(Generic[Job, Answer]):
             JobLostError: there is no use in waiting.
         """
         content = pickle.dumps(job, protocol=pickle.HIGHEST_PROTOCOL)
-        ticket = Ticket(content, hashlib.sha256(content).digest(), monotonic() + timeout_s, client)
-        self._queue.put(ticket)
-        return ticket.future
+        pending = PendingJob(content, hashlib.sha256(content).digest(), monotonic() + timeout_s, client)
+        self._queue.put(pending)
+        return pending.future
 
     async def answer(self, job: Job, timeout_s: float, client: str = "") -> Answer:
         """The answer to a client's job, awaited; a job that is no longer awaited is not started.

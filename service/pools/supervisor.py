@@ -15,9 +15,9 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
-from service.pools.job_queue import JobQueue, Ticket
+from service.pools.job_queue import JobQueue, PendingJob
 from service.telemetry import LOGGER_NAME
-from service.workers.process import Answered, Fault, Ready
+from service.workers.process import JobResult, Ready, WorkerFailure
 
 # A worker that dies this soon after it was warm, or before, is replaced more and more slowly; the first time at once.
 _HEALTHY_S = 5.0
@@ -73,7 +73,7 @@ class Supervisor:
         self._starts_at = monotonic()
         self._process: BaseProcess | None = None
         # The job that the worker has, or had when it died: its client waits for the next worker, and no one else.
-        self._held: Ticket | None = None
+        self._held: PendingJob | None = None
         self._thread = threading.Thread(target=self._run, name=f"{self._spec.name}-supervisor-{index}", daemon=True)
 
     def start(self) -> None:
@@ -182,7 +182,7 @@ class Supervisor:
             message = _receive(connection)
         if isinstance(message, Ready):
             return None
-        if isinstance(message, Fault):
+        if isinstance(message, WorkerFailure):
             return message.reason
         late = f"the worker did not start within {self._spec.max_start_s:g} s"
         return late if watchdog.expired else "the worker died starting"
@@ -192,23 +192,23 @@ class Supervisor:
         while not self._queue.closed:
             if not process.is_alive():
                 return "died idle"
-            ticket = self._queue.take()
-            if ticket is None:
+            pending = self._queue.take()
+            if pending is None:
                 continue
-            self._held = ticket
+            self._held = pending
             with _Watchdog(process, self._spec.stall_s) as watchdog:
                 # A worker that died before it had the whole job did not die over it.
-                sent = process.is_alive() and _send(connection, ticket.content)
+                sent = process.is_alive() and _send(connection, pending.content)
                 answer = _receive(connection) if sent else None
             if answer is None:
                 self.ready = False
                 self._starts_at = monotonic()
-                ticket.stalled = sent and watchdog.expired
-                ticket.deaths += sent and not watchdog.expired
-                self._queue.give_back(ticket)
+                pending.stalled = sent and watchdog.expired
+                pending.deaths += sent and not watchdog.expired
+                self._queue.give_back(pending)
                 return "stalled" if watchdog.expired else "died at work" if sent else "died idle"
             self._release()
-            self._settle(ticket, answer)
+            self._settle(pending, answer)
         return "closing"
 
     def _release(self) -> None:
@@ -216,14 +216,14 @@ class Supervisor:
             self._queue.release(self._held)
             self._held = None
 
-    def _settle(self, ticket: Ticket, answer: object) -> None:
-        if isinstance(answer, Answered):
-            ticket.future.set_result(answer.value)
+    def _settle(self, pending: PendingJob, answer: object) -> None:
+        if isinstance(answer, JobResult):
+            pending.future.set_result(answer.value)
             return
-        reason = answer.reason if isinstance(answer, Fault) else f"unexpected message {type(answer).__name__}"
+        reason = answer.reason if isinstance(answer, WorkerFailure) else f"unexpected message {type(answer).__name__}"
         fields = {"pool": self._spec.name, "worker": self._index, "reason": reason}
         logging.getLogger(LOGGER_NAME).error("job failed", extra={"fields": fields})
-        ticket.lose("fault")
+        pending.fail("fault")
 
 
 class _Watchdog:

@@ -21,7 +21,7 @@ from service.errors import (
 from service.pools import JobLostError, PoolState, WorkerPool, WorkerSpec
 from service.settings import Settings
 from service.telemetry import Telemetry
-from service.workers.decode import Drawing, Refusal, Upload, run_decoder
+from service.workers.decode import DecodeJob, DecodeRefusal, RasteriseJob, run_decoder
 
 
 class Decoder:
@@ -30,7 +30,7 @@ class Decoder:
     def __init__(self, manifest: Manifest, settings: Settings, telemetry: Telemetry) -> None:
         self._settings = settings
         self._size = manifest.image_height, manifest.image_width
-        self._pool: WorkerPool[Upload | Drawing, Panorama | Refusal | bytes] = WorkerPool(
+        self._pool: WorkerPool[DecodeJob | RasteriseJob, Panorama | DecodeRefusal | bytes] = WorkerPool(
             WorkerSpec(
                 "decode",
                 run_decoder,
@@ -80,8 +80,8 @@ class Decoder:
             StoppingError: the service is shutting down.
         """
         height, width = size or self._size
-        answer = await self._answer(Upload(content, height, width), deadline, client)
-        if isinstance(answer, Refusal):
+        answer = await self._answer(DecodeJob(content, height, width), deadline, client)
+        if isinstance(answer, DecodeRefusal):
             raise InvalidPanoramaError(answer.reason)
         assert isinstance(answer, Panorama)
         return answer
@@ -92,11 +92,13 @@ class Decoder:
         Raises:
             OverloadedError, DeadlineExceededError, DecoderNotReadyError, StoppingError: as `decode`.
         """
-        answer = await self._answer(Drawing(svg), deadline, client)
+        answer = await self._answer(RasteriseJob(svg), deadline, client)
         assert isinstance(answer, bytes)
         return answer
 
-    async def _answer(self, job: Upload | Drawing, deadline: float, client: str) -> Panorama | Refusal | bytes:
+    async def _answer(
+        self, job: DecodeJob | RasteriseJob, deadline: float, client: str
+    ) -> Panorama | DecodeRefusal | bytes:
         try:
             return await self._pool.answer(job, max(deadline - monotonic(), 0.0), client)
         except JobLostError as error:
@@ -106,10 +108,10 @@ class Decoder:
         """End all workers and wait for them."""
         self._pool.close()
 
-    def _explained(self, error: JobLostError, job: Upload | Drawing) -> Exception:
-        if isinstance(job, Drawing) and error.reason in ("poisoned", "fault"):
+    def _explained(self, error: JobLostError, job: DecodeJob | RasteriseJob) -> Exception:
+        if isinstance(job, RasteriseJob) and error.reason in ("poisoned", "fault"):
             return DrawingFailedError(error.reason)
-        if isinstance(job, Drawing) and error.reason == "stalled":
+        if isinstance(job, RasteriseJob) and error.reason == "stalled":
             # Drawings are of bounded size: it is the machine that is slow.
             return DeadlineExceededError(self._settings.decode_stall_s)
         match error.reason:

@@ -9,13 +9,13 @@ from lalaloc_core.localise.probability_map import probability_map
 from service.schemas import PosteriorAnswer
 
 # What is less probable would be told as 0.
-_LEAST = 5e-7
+_MIN_PROBABILITY = 5e-7
 
 
 def posterior_answer(plan: FloorPlan, grid: LatentGrid, posterior: Posterior) -> PosteriorAnswer:
     """Places with their probabilities, without those that have next to none."""
     places = probability_map(plan, grid.poses, posterior)
-    told = places.probability >= _LEAST
+    told = places.probability >= _MIN_PROBABILITY
     position_m = places.position_m[told]
     return PosteriorAnswer(
         step_m=grid.step_m,

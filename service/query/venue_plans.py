@@ -37,15 +37,15 @@ from service.storage.records import PlanRecord, VenueState
 from service.telemetry import LOGGER_NAME
 from service.threads import BoundedReads
 
-# Plans that are searched in full, and what that may come to: poses of all of them, as many as one plan may have, and
-# of these times hypotheses of the heading times camera heights.
+# Plans that are searched in full, and what that may come to: poses times hypotheses of the heading times camera
+# heights. How many poses their grids may have besides is an argument of `VenuePlans`.
 MAX_SEARCHED = 128
 _MAX_COMPARISONS = 8_000_000
 # The largest circle around a plan, whose centre may be as far from a place that it covers; and plans near one place.
-_LARGEST_REACH_M = 1000.0
+_MAX_REACH_M = 1000.0
 _MAX_NEAR = 2000
 # Prototypes that are read at a time, so that one read is short.
-_AT_ONCE = 1000
+_BATCH_SIZE = 1000
 # About what a plan takes in memory besides its prototypes: its row.
 _ROW_BYTES = 600
 
@@ -131,7 +131,7 @@ class VenuePlans:
     async def near(self, tenant: str, place: EarthPoint, within_m: float) -> Sequence[Row[Any]]:
         """Plans of a tenant with an anchor that lie so near a place, the nearest first."""
         latitude, longitude = place.latitude, place.longitude
-        reach_m = within_m + _LARGEST_REACH_M
+        reach_m = within_m + _MAX_REACH_M
         near = self._store.venues.searched_near
         rows = await self._reads.run(near, tenant, latitude, longitude, reach_m, *self._grids.model)
         away_m = distances_m(rows, None, latitude, longitude)
@@ -221,8 +221,8 @@ class VenuePlans:
     async def _fetched(self, rows: Sequence[Row[Any]]) -> dict[BlockKey, SortedPrototypes]:
         """Prototypes of some plans from the database; those that it has not are made, of grids that are still there."""
         fetched: dict[BlockKey, SortedPrototypes] = {}
-        for first in range(0, len(rows), _AT_ONCE):
-            part = rows[first : first + _AT_ONCE]
+        for first in range(0, len(rows), _BATCH_SIZE):
+            part = rows[first : first + _BATCH_SIZE]
             stored = await self._reads.run(self._store.grids.prototypes, [row.grid_id for row in part])
             for row in part:
                 prototypes = stored.get(row.grid_id)

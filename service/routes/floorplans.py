@@ -39,11 +39,11 @@ from service.routes.dependencies import (
     stored_plan,
 )
 from service.routes.plan_answers import list_entries, plan_representation, plan_state
-from service.routes.plan_uploads import REFUSED_UPLOADS, UPLOAD_BODY, Upload, read_upload
+from service.routes.plan_uploads import REFUSED_UPLOADS, UPLOAD_BODY, PlanUpload, read_upload
 from service.runtime import Runtime
 from service.schemas import FloorPlanAnswer, FloorPlanList
 from service.storage.records import ComputedGrid, Cursor, Original, PlanRecord
-from service.telemetry import note
+from service.telemetry import add_log_fields
 
 router = APIRouter(prefix="/floorplans", tags=["floor plans"])
 
@@ -132,7 +132,7 @@ def get_floorplan(
     superseded = revision is not None and revision != record.revision_id
     if revision is not None and superseded:
         record = plan_at_revision(record, revision, runtime.store.plans)
-    note(request, plan=record.id, revision=record.revision_id)
+    add_log_fields(request, plan=record.id, revision=record.revision_id)
     step_m = runtime.settings.grid_step_m
     content, etag = plan_representation(record, plan_state(record, runtime.grids), step_m, superseded=superseded)
     return conditional_answer(request, content, JSON, etag)
@@ -185,14 +185,14 @@ def delete_floorplan(floorplan_id: str, request: Request, runtime: Running, tena
     A latent grid that is being computed is not any more. The venues that the plan belongs to get a revision without it.
     """
     current = plan_summary(tenant, floorplan_id, runtime.store.plans)
-    note(request, plan=current.id, revision=current.revision_id)
+    add_log_fields(request, plan=current.id, revision=current.revision_id)
     expected = expected_revision(request, current.id, current.revision_id)
     if not runtime.store.plans.delete(tenant, current.id, expected=expected):
         raise UnknownFloorPlanError(floorplan_id)
     runtime.grids.forget({current.revision_id})
 
 
-def _prepared(uploaded: Upload, runtime: Runtime, client: str) -> tuple[FloorPlan, Original, ComputedGrid | None]:
+def _prepared(uploaded: PlanUpload, runtime: Runtime, client: str) -> tuple[FloorPlan, Original, ComputedGrid | None]:
     """The plan in an uploaded file, the file as it is stored, and the plan's grid if that is computed at once."""
     file = understand(uploaded.content, uploaded.options, runtime.converter, runtime.settings, client)
     runtime.grids.check_size(file.plan)
@@ -201,7 +201,7 @@ def _prepared(uploaded: Upload, runtime: Runtime, client: str) -> tuple[FloorPla
 
 
 def _written(request: Request, record: PlanRecord, state: GridState, runtime: Runtime, code: int) -> Response:
-    note(request, plan=record.id, revision=record.revision_id)
+    add_log_fields(request, plan=record.id, revision=record.revision_id)
     content, etag = plan_representation(record, state, runtime.settings.grid_step_m)
     path = str(request.app.url_path_for("get_floorplan", floorplan_id=record.id))
     # The tag is that of this answer, which is what a GET from there gives, and not of what was uploaded.

@@ -29,7 +29,7 @@ from service.routes.query_request import QUERY_ERRORS
 from service.runtime import Runtime
 from service.schemas import LocaliseAnswer, LocaliseForm
 from service.schemas.oscp import OscpAnswer, OscpRequest
-from service.telemetry import note
+from service.telemetry import add_log_fields
 
 router = APIRouter(tags=["localisation"])
 # What a request has beside its picture.
@@ -77,7 +77,7 @@ async def geopose(
     idempotent = IdempotentRequest(runtime.store.idempotency_keys, request, tenant, "POST /geopose")
     media_type(request, (JSON,))
     clock, most = StageClock(), settings.max_panorama_bytes
-    note(request, clock=clock)
+    add_log_fields(request, clock=clock)
     with clock.stage("upload"):
         limits = UploadLimits.of(settings, "max_panorama_bytes")
         body = await read_body(request, replace(limits, max_bytes=4 * -(-most // 3) + _ENVELOPE_BYTES))
@@ -94,7 +94,7 @@ async def geopose(
         asked, content = await runtime.uploads.run(client, read)
         query = _Query(runtime, tenant, asked, content, context)
         found, warnings = await query.answer(floorplan_id, venue_id)
-        note(request, plan=found.floorplan_id, revision=found.floorplan_revision, stage=found.stage)
+        add_log_fields(request, plan=found.floorplan_id, revision=found.floorplan_revision, stage=found.stage)
         told = answer_of(asked, found, [*unused_warnings(asked), *warnings])
         return Response(told.model_dump_json(), media_type=JSON)
 

@@ -28,7 +28,7 @@ from service.routes.dependencies import Client, Running, Tenant, plan_for_query,
 from service.routes.query_request import PANORAMA, QUERY_ERRORS, body_schema, check_idempotent_media, read_query
 from service.runtime import Runtime
 from service.schemas import LocaliseAnswer, LocaliseForm
-from service.telemetry import note
+from service.telemetry import add_log_fields
 
 router = APIRouter(tags=["localisation"])
 _PNG, _SVG = "image/png", "image/svg+xml"
@@ -106,23 +106,23 @@ async def localise(
         query = PanoramaQuery(form, parts.files[PANORAMA], context)
         if form.venue_id is not None:
             venue = await venue_for_query(tenant, form.venue_id, runtime)
-            note(request, venue=venue.id)
+            add_log_fields(request, venue=venue.id)
             found = await runtime.venue_localiser.answer(venue, query)
-            note(request, plan=found.floorplan_id, revision=found.floorplan_revision, stage=found.stage)
+            add_log_fields(request, plan=found.floorplan_id, revision=found.floorplan_revision, stage=found.stage)
             return await _told(found, media, tenant, runtime)
         assert form.floorplan_id is not None
         record = await plan_for_query(tenant, form.floorplan_id, runtime)
-        note(request, plan=record.id, revision=record.revision_id)
+        add_log_fields(request, plan=record.id, revision=record.revision_id)
         if media == GEOJSON and record.plan.anchor is None:
             raise UnanchoredPlanError(record.id)
         if media in (JSON, GEOJSON):
             found = await runtime.localiser.answer(record, query)
-            note(request, stage=found.stage)
+            add_log_fields(request, stage=found.stage)
             return await _told(found, media, tenant, runtime)
         rooms = await runtime.drawings.rooms(record)
         wanted = PictureRequest(picture=picture or "both", pixels=media == _PNG, rooms=rooms)
         found, drawn = await runtime.localiser.picture(record, query, wanted)
-        note(request, stage=found.stage)
+        add_log_fields(request, stage=found.stage)
         return Response(drawn, headers=_VARY | _POLICY, media_type=media)
 
     return await idempotent.run_async(parts, answer, runtime.reads)

@@ -19,7 +19,7 @@ from service.routes.dependencies import Client, Running, Tenant, plan_for_query
 from service.routes.query_request import PANORAMA, QUERY_ERRORS, body_schema, check_idempotent_media, read_query
 from service.schemas import SequenceAnswer, SequenceForm
 from service.settings import Settings
-from service.telemetry import note
+from service.telemetry import add_log_fields
 
 router = APIRouter(tags=["localisation"])
 _MIN_PANORAMAS = 2
@@ -63,11 +63,11 @@ async def localise_sequence(request: Request, runtime: Running, tenant: Tenant, 
 
     async def answer() -> Response:
         record = await plan_for_query(tenant, form.floorplan_id, runtime)
-        note(request, plan=record.id, revision=record.revision_id)
+        add_log_fields(request, plan=record.id, revision=record.revision_id)
         if media == GEOJSON and record.plan.anchor is None:
             raise UnanchoredPlanError(record.id)
         found = await runtime.localiser.answer_sequence(record, query)
-        note(request, stage=found.stage)
+        add_log_fields(request, stage=found.stage)
         content = found.model_dump_json() if media == JSON else json.dumps(features_of(found))
         return Response(content, headers={"Vary": "Accept"}, media_type=media)
 

@@ -12,7 +12,7 @@ from service.errors import InvalidRequestError, StoreUnavailableError, UnknownFl
 from service.http.events import EventStream
 from service.http.problems import problem_responses
 from service.routes.dependencies import Running, Tenant, stored_plan
-from service.telemetry import note
+from service.telemetry import add_log_fields
 
 router = APIRouter(prefix="/floorplans", tags=["floor plans"])
 
@@ -37,5 +37,5 @@ async def follow_floorplan(floorplan_id: str, request: Request, runtime: Running
     after `stream_deadline_s`, soon after the caller's API key was revoked, and when the service stops: ask anew.
     """
     record = await asyncio.to_thread(stored_plan, tenant, floorplan_id, runtime.store.plans)
-    note(request, plan=record.id, revision=record.revision_id)
+    add_log_fields(request, plan=record.id, revision=record.revision_id)
     return runtime.events.answer(record.id, partial(runtime.access_control.still_authorised, request))

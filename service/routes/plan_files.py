@@ -24,7 +24,7 @@ from service.http.problems import problem_responses
 from service.http.uploads import JSON
 from service.routes.dependencies import IF_NONE_MATCH, NOT_MODIFIED, Client, Running, Tenant, plan_summary, stored_plan
 from service.storage.records import PlanRecord
-from service.telemetry import note
+from service.telemetry import add_log_fields
 
 router = APIRouter(prefix="/floorplans", tags=["floor plans"])
 
@@ -54,7 +54,7 @@ _CONDITIONAL = {"parameters": [IF_NONE_MATCH]}
 def get_original(floorplan_id: str, request: Request, runtime: Running, tenant: Tenant) -> Response:
     """The bytes that were uploaded, unchanged, with the media type that their content has; of the current revision."""
     current = plan_summary(tenant, floorplan_id, runtime.store.plans)
-    note(request, plan=current.id, revision=current.revision_id)
+    add_log_fields(request, plan=current.id, revision=current.revision_id)
     original = runtime.store.plans.original(tenant, current.id)
     if original is None:
         raise UnknownFloorPlanError(floorplan_id)
@@ -167,7 +167,7 @@ async def get_mesh(floorplan_id: str, request: Request, runtime: Running, tenant
 
 
 def _noted(request: Request, record: PlanRecord) -> PlanRecord:
-    note(request, plan=record.id, revision=record.revision_id)
+    add_log_fields(request, plan=record.id, revision=record.revision_id)
     return record
 
 

@@ -21,7 +21,7 @@ from service.routes.dependencies import (
 )
 from service.schemas import LayoutAnswer, OpeningFaceAnswer, RoomLayoutAnswer
 from service.storage.records import PlanRecord
-from service.telemetry import note
+from service.telemetry import add_log_fields
 
 router = APIRouter(prefix="/floorplans", tags=["floor plans"])
 
@@ -49,7 +49,7 @@ def get_layout(
     record = stored_plan(tenant, floorplan_id, runtime.store.plans)
     if revision is not None:
         record = plan_at_revision(record, revision, runtime.store.plans)
-    note(request, plan=record.id, revision=record.revision_id)
+    add_log_fields(request, plan=record.id, revision=record.revision_id)
     content = _layout(record).model_dump_json().encode()
     return conditional_answer(request, content, JSON, content_etag(content))
 

@@ -83,7 +83,7 @@ UPLOAD_BODY: dict[str, Any] = {
 
 
 @dataclass(frozen=True)
-class Upload:
+class PlanUpload:
     """What was sent: the bytes of a file, and what was said of it."""
 
     content: bytes
@@ -100,7 +100,7 @@ class Upload:
         return runtime.uploads if seems_native(self.content) else runtime.file_uploads
 
 
-async def read_upload(request: Request, runtime: Runtime) -> Upload:
+async def read_upload(request: Request, runtime: Runtime) -> PlanUpload:
     """The file in a request, with its options.
 
     Raises:
@@ -110,10 +110,10 @@ async def read_upload(request: Request, runtime: Runtime) -> Upload:
     """
     limits = UploadLimits.of(runtime.settings, "max_plan_bytes")
     if media_type(request, (MULTIPART, *_FILES)) != MULTIPART:
-        return Upload(await read_body(request, limits), ImportOptions(), {})
+        return PlanUpload(await read_body(request, limits), ImportOptions(), {})
     known = set(ImportForm.model_fields)
     parts = await read_parts(request, limits, files={_FILE}, fields=known, check=_faults)
-    return Upload(parts.files[_FILE], ImportOptions.from_text(parts.fields), parts.fields)
+    return PlanUpload(parts.files[_FILE], ImportOptions.from_text(parts.fields), parts.fields)
 
 
 def _faults(fields: Mapping[str, str]) -> list[tuple[str, str]]:

@@ -34,7 +34,7 @@ from service.query import QueryContext
 from service.routes.dependencies import IDEMPOTENCY_KEY
 from service.schemas import LocaliseForm, SequenceForm
 from service.settings import Settings
-from service.telemetry import note
+from service.telemetry import add_log_fields
 
 PANORAMA = "panorama"
 Form = TypeVar("Form", LocaliseForm, SequenceForm)
@@ -104,7 +104,7 @@ async def read_query(
         InvalidRequestError: a part or a field that is missing, unknown, or has a value that it cannot have.
     """
     clock = StageClock()
-    note(request, clock=clock)
+    add_log_fields(request, clock=clock)
     bounds = {"max_top_k": settings.max_top_k}
     with clock.stage("upload"):
         parts = await read_parts(

@@ -52,7 +52,7 @@ from service.schemas import (
     VenuePlanList,
 )
 from service.storage.records import Cursor, VenueMember, VenuePlace, VenueRecord
-from service.telemetry import note
+from service.telemetry import add_log_fields
 
 router = APIRouter(prefix="/venues", tags=["venues"])
 
@@ -284,7 +284,7 @@ def _removed(document: VenueChangeDocument) -> set[str]:
 
 
 def _written(request: Request, record: VenueRecord, runtime: Runtime, code: int) -> Response:
-    note(request, venue=record.id, revision=record.revision_id)
+    add_log_fields(request, venue=record.id, revision=record.revision_id)
     content, etag = venue_representation(record, runtime)
     path = str(request.app.url_path_for("get_venue", venue_id=record.id))
     headers = {"Content-Location": path, "ETag": etag}

@@ -20,7 +20,7 @@ problem_details  errors
 Begin with `localise_answer.py`.
 """
 
-from service.schemas.fields import Answer
+from service.schemas.fields import ResponseModel
 from service.schemas.geopose import GeoPose, GeoPoseAngles, GeoPosePosition
 from service.schemas.hint_fields import EarthPoint, PlanPoint
 from service.schemas.layout import LayoutAnswer, OpeningFaceAnswer, RoomLayoutAnswer
@@ -73,7 +73,6 @@ from service.schemas.venues import (
 )
 
 __all__ = [
-    "Answer",
     "BoundsAnswer",
     "CandidateAnswer",
     "EarthPoint",
@@ -109,6 +108,7 @@ __all__ = [
     "PosteriorAnswer",
     "Problem",
     "ReadyAnswer",
+    "ResponseModel",
     "Ring",
     "RoomAnswer",
     "RoomDocument",

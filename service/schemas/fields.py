@@ -29,7 +29,7 @@ Score = Annotated[float, _rounded(4)]
 Mass = Annotated[float, Field(ge=0, le=1), _rounded(6)]
 
 
-class Answer(BaseModel):
+class ResponseModel(BaseModel):
     """Base of all answers."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from service.schemas.fields import Answer
+from service.schemas.fields import ResponseModel
 
 
-class GeoPosePosition(Answer):
+class GeoPosePosition(ResponseModel):
     """A place, WGS84."""
 
     lat: float = Field(ge=-90, le=90, description="Latitude, degrees.")
@@ -18,7 +18,7 @@ class GeoPosePosition(Answer):
     )
 
 
-class GeoPoseAngles(Answer):
+class GeoPoseAngles(ResponseModel):
     """Rotations about up, north and east, in degrees; a camera that looks north, level, has none."""
 
     yaw: float = Field(gt=-180, le=180, description="Counterclockwise from north seen from above.")
@@ -26,7 +26,7 @@ class GeoPoseAngles(Answer):
     roll: float = Field(description="Always 0.")
 
 
-class GeoPose(Answer):
+class GeoPose(ResponseModel):
     """A pose on Earth, as OGC GeoPose 1.0 (21-056r11) writes it: Basic-YPR."""
 
     position: GeoPosePosition

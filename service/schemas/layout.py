@@ -6,13 +6,13 @@ from typing import Annotated
 
 from pydantic import Field
 
-from service.schemas.fields import Answer
+from service.schemas.fields import ResponseModel
 from service.schemas.native_plan import OpeningKind, Ring
 
 Wall = Annotated[list[float], Field(min_length=4, max_length=4)]
 
 
-class OpeningFaceAnswer(Answer):
+class OpeningFaceAnswer(ResponseModel):
     """The piece of one wall that a door, window or passage takes up."""
 
     kind: OpeningKind
@@ -23,7 +23,7 @@ class OpeningFaceAnswer(Answer):
     head_m: float | None = Field(description="Height of its upper edge over the floor, null where the plan has none.")
 
 
-class RoomLayoutAnswer(Answer):
+class RoomLayoutAnswer(ResponseModel):
     """What a camera in one room sees of it: its own walls, with what is in them."""
 
     id: str
@@ -35,7 +35,7 @@ class RoomLayoutAnswer(Answer):
     openings: list[OpeningFaceAnswer]
 
 
-class LayoutAnswer(Answer):
+class LayoutAnswer(ResponseModel):
     """The walls of a floor plan at one of its revisions, room by room."""
 
     floorplan_id: str

@@ -6,7 +6,17 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from service.schemas.fields import Answer, Degrees, HeadingDeg, Mass, Metres, Milliseconds, Score, Share, Variance
+from service.schemas.fields import (
+    Degrees,
+    HeadingDeg,
+    Mass,
+    Metres,
+    Milliseconds,
+    ResponseModel,
+    Score,
+    Share,
+    Variance,
+)
 from service.schemas.geopose import GeoPose
 from service.schemas.localise_query import HEADING_MEANING
 
@@ -26,14 +36,14 @@ Pair = Annotated[list[Variance], Field(min_length=2, max_length=2)]
 Covariance = Annotated[list[Pair], Field(min_length=2, max_length=2)]
 
 
-class Position(Answer):
+class Position(ResponseModel):
     """A point of the plan frame."""
 
     x_m: Metres = Field(description="To the right on the drawing.")
     y_m: Metres = Field(description="Up on the drawing.")
 
 
-class CandidateAnswer(Answer):
+class CandidateAnswer(ResponseModel):
     """One possible pose; no two candidates are closer than 1 m and turned alike."""
 
     floorplan_id: str = Field(description="The plan that it lies in.")
@@ -51,7 +61,7 @@ class CandidateAnswer(Answer):
     geopose: GeoPose | None = Field(None, description=_GEOPOSE)
 
 
-class PosteriorAnswer(Answer):
+class PosteriorAnswer(ResponseModel):
     """How probable places are, given that the panorama is of this plan: lists of one length, a place each."""
 
     step_m: float = Field(
@@ -62,7 +72,7 @@ class PosteriorAnswer(Answer):
     probability: list[Mass] = Field(description="They sum to 1; places of less than 0.0000005 are left out.")
 
 
-class PlanProbability(Answer):
+class PlanProbability(ResponseModel):
     """How probable it is that a panorama was taken in one plan of a venue."""
 
     floorplan_id: str
@@ -71,7 +81,7 @@ class PlanProbability(Answer):
     probability: Share | None = Field(description="Null for a model without confidence.")
 
 
-class TimingsAnswer(Answer):
+class TimingsAnswer(ResponseModel):
     """Milliseconds per stage, 0 where a stage did not run."""
 
     decode: Milliseconds
@@ -83,7 +93,7 @@ class TimingsAnswer(Answer):
     total: Milliseconds = Field(description="From the complete upload to the answer, waits included.")
 
 
-class ModelAnswer(Answer):
+class ModelAnswer(ResponseModel):
     """The model that answered."""
 
     name: str
@@ -91,7 +101,7 @@ class ModelAnswer(Answer):
     sha256: str = Field(description="Digest over the model's files.")
 
 
-class LocaliseAnswer(Answer):
+class LocaliseAnswer(ResponseModel):
     """Where the panorama was taken."""
 
     floorplan_id: str = Field(description="The plan that the position lies in.")

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 from pydantic.alias_generators import to_camel
 
-from service.schemas.fields import Answer, Finite, HeadingDeg, Share
+from service.schemas.fields import Finite, HeadingDeg, ResponseModel, Share
 from service.schemas.geopose import GeoPosePosition
 from service.schemas.localise_answer import Position
 
@@ -101,7 +101,7 @@ class OscpRequest(_Sent):
         return max(self.sensor_readings.geolocation_readings, key=lambda one: one.timestamp, default=None)
 
 
-class OscpQuaternion(Answer):
+class OscpQuaternion(ResponseModel):
     """A rotation from the camera (x right, y where the panorama's centre looks, z up) to east, north, up."""
 
     x: float
@@ -110,21 +110,21 @@ class OscpQuaternion(Answer):
     w: float
 
 
-class OscpGeoPose(Answer):
+class OscpGeoPose(ResponseModel):
     """A pose on Earth: GeoPose Basic-Quaternion."""
 
     position: GeoPosePosition
     quaternion: OscpQuaternion
 
 
-class OscpAccuracy(Answer):
+class OscpAccuracy(ResponseModel):
     """How far off the pose may be: root of the mean square over its candidates, as probable as they are."""
 
     position: float = Field(description="Metres, horizontally.")
     orientation: float = Field(description="Degrees about the vertical.")
 
 
-class OscpFound(Answer):
+class OscpFound(ResponseModel):
     """What the protocol has no place for."""
 
     floorplan_id: str
@@ -137,7 +137,7 @@ class OscpFound(Answer):
     warnings: list[str] = Field(description="What was sent and not used or not followed.")
 
 
-class OscpAnswer(Answer):
+class OscpAnswer(ResponseModel):
     """A GeoPoseResp of the protocol, with `lalaloc` beside it."""
 
     id: str

@@ -6,7 +6,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from service.schemas.fields import Answer
+from service.schemas.fields import ResponseModel
 
 
 class ImportForm(BaseModel):
@@ -38,7 +38,7 @@ class ImportForm(BaseModel):
     name: str | None = Field(None, max_length=200, description="What to call the plan.")
 
 
-class LayerAnswer(Answer):
+class LayerAnswer(ResponseModel):
     """What was made of one layer, group, class or type of entities."""
 
     layer: str
@@ -46,7 +46,7 @@ class LayerAnswer(Answer):
     used_as: str
 
 
-class LevelAnswer(Answer):
+class LevelAnswer(ResponseModel):
     """The storey of the file that the plan is of."""
 
     name: str
@@ -54,7 +54,7 @@ class LevelAnswer(Answer):
     elevation_m: float | None = Field(description="Height of its floor in the file; null where that is not known.")
 
 
-class ImportReport(Answer):
+class ImportReport(ResponseModel):
     """How the file of a plan was read."""
 
     format: str = Field(description="As it was recognised by the content.")

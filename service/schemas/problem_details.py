@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pydantic import BaseModel, Field
 
-from service.schemas.fields import Answer
+from service.schemas.fields import ResponseModel
 
 
-class Fault(Answer):
+class Fault(ResponseModel):
     """One field at fault."""
 
     field: str

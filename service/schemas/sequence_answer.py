@@ -6,12 +6,12 @@ from typing import Literal
 
 from pydantic import Field
 
-from service.schemas.fields import Answer, Degrees, HeadingDeg, Metres, Score, Share
+from service.schemas.fields import Degrees, HeadingDeg, Metres, ResponseModel, Score, Share
 from service.schemas.geopose import GeoPose
 from service.schemas.localise_answer import CandidateAnswer, Covariance, ModelAnswer, Position, TimingsAnswer
 
 
-class SequencePoseAnswer(Answer):
+class SequencePoseAnswer(ResponseModel):
     """Where one of the panoramas was taken, by all of them together; fields as in the answer of `POST /localise`."""
 
     position: Position
@@ -32,7 +32,7 @@ class SequencePoseAnswer(Answer):
     )
 
 
-class SequenceAnswer(Answer):
+class SequenceAnswer(ResponseModel):
     """Where the panoramas of one visit were taken."""
 
     floorplan_id: str

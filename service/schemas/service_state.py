@@ -6,11 +6,11 @@ from typing import Literal
 
 from pydantic import Field
 
-from service.schemas.fields import Answer
+from service.schemas.fields import ResponseModel
 from service.schemas.localise_answer import ModelAnswer
 
 
-class LimitsAnswer(Answer):
+class LimitsAnswer(ResponseModel):
     """What requests may be; most are the setting of the same name, and named by the error about it."""
 
     max_plan_bytes: int = Field(description="Upload of a floor plan, whatever its format.")
@@ -52,13 +52,13 @@ class LimitsAnswer(Answer):
     request_deadline_s: float = Field(description="Longest a query may take once it is uploaded.")
 
 
-class HealthAnswer(Answer):
+class HealthAnswer(ResponseModel):
     """The process is alive."""
 
     status: Literal["ok"]
 
 
-class PoolAnswer(Answer):
+class PoolAnswer(ResponseModel):
     """State of a pool of worker processes."""
 
     workers: int = Field(description="Worker processes wanted.")
@@ -67,7 +67,7 @@ class PoolAnswer(Answer):
     fault: str | None = Field(description="Why a worker could not start last time, null when all is well.")
 
 
-class ReadyAnswer(Answer):
+class ReadyAnswer(ResponseModel):
     """Whether the service can answer at full quality."""
 
     ready: bool

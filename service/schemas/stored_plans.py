@@ -7,14 +7,14 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, WithJsonSchema
 
-from service.schemas.fields import Answer, Metres, Share, SquareMetres
+from service.schemas.fields import Metres, ResponseModel, Share, SquareMetres
 from service.schemas.native_plan import RoomType
 from service.schemas.plan_import import ImportReport
 
 PlanStatus = Literal["preparing", "ready", "failed"]
 
 
-class RoomAnswer(Answer):
+class RoomAnswer(ResponseModel):
     """One room of a stored plan."""
 
     id: str = Field(description="Tells rooms of one name apart.")
@@ -25,14 +25,14 @@ class RoomAnswer(Answer):
     vertices: int = Field(description="Corners of the polygon.")
 
 
-class GridAnswer(Answer):
+class GridAnswer(ResponseModel):
     """The plan's latent grid."""
 
     step_m: float = Field(description="Distance of neighbouring poses.")
     poses: int = Field(description="Number of poses; an estimate until the plan is ready.")
 
 
-class BoundsAnswer(Answer):
+class BoundsAnswer(ResponseModel):
     """Smallest axis-parallel box around the plan."""
 
     x_min_m: Metres
@@ -41,7 +41,7 @@ class BoundsAnswer(Answer):
     y_max_m: Metres
 
 
-class FloorPlanAnswer(Answer):
+class FloorPlanAnswer(ResponseModel):
     """A stored floor plan."""
 
     id: str = Field(description="Identifier for later requests.")
@@ -73,7 +73,7 @@ class FloorPlanAnswer(Answer):
     updated_at: datetime = Field(description="When this revision was uploaded, UTC.")
 
 
-class FloorPlanSummary(Answer):
+class FloorPlanSummary(ResponseModel):
     """A stored floor plan in a listing."""
 
     id: str
@@ -87,14 +87,14 @@ class FloorPlanSummary(Answer):
     updated_at: datetime
 
 
-class FloorPlanList(Answer):
+class FloorPlanList(ResponseModel):
     """A page of stored floor plans, newest first."""
 
     floorplans: list[FloorPlanSummary]
     next_cursor: str | None = Field(description="The `cursor` of the next page, null on the last one.")
 
 
-class PlanEvent(Answer):
+class PlanEvent(ResponseModel):
     """How far a floor plan is; one event of a stream."""
 
     status: PlanStatus | Literal["deleted"]

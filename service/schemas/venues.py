@@ -8,7 +8,7 @@ from typing import Annotated
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from service.schemas.fields import Answer, Share, SquareMetres
+from service.schemas.fields import ResponseModel, Share, SquareMetres
 from service.schemas.stored_plans import PlanStatus
 
 _NOT_TEXT = {"Cc", "Cs"}
@@ -82,7 +82,7 @@ class VenueChangeDocument(Document):
     remove: list[str] = Field([], description="Ids of plans that leave the venue.")
 
 
-class VenueAnchorAnswer(Answer):
+class VenueAnchorAnswer(ResponseModel):
     """Where on Earth the origin of a venue's plans lies, WGS84."""
 
     latitude: float
@@ -91,7 +91,7 @@ class VenueAnchorAnswer(Answer):
     north_deg: float
 
 
-class VenueSummary(Answer):
+class VenueSummary(ResponseModel):
     """A stored venue in a listing."""
 
     id: str = Field(description="Identifier for later requests.")
@@ -111,14 +111,14 @@ class VenueAnswer(VenueSummary):
     plans_failed: int = Field(description="Plans that never will be, unless they are replaced.")
 
 
-class VenueList(Answer):
+class VenueList(ResponseModel):
     """A page of stored venues, newest first."""
 
     venues: list[VenueSummary]
     next_cursor: str | None = Field(description="The `cursor` of the next page, null on the last one.")
 
 
-class VenuePlanAnswer(Answer):
+class VenuePlanAnswer(ResponseModel):
     """A plan of a venue."""
 
     floorplan_id: str
@@ -131,7 +131,7 @@ class VenuePlanAnswer(Answer):
     area_m2: SquareMetres
 
 
-class VenuePlanList(Answer):
+class VenuePlanList(ResponseModel):
     """A page of the plans of a venue, by level."""
 
     plans: list[VenuePlanAnswer]

@@ -23,7 +23,7 @@ from service.security.rate_limits import RateLimits
 from service.settings import Settings
 from service.storage.api_keys import ApiKeys
 from service.storage.records import ApiKey
-from service.telemetry import note
+from service.telemetry import add_log_fields
 
 # What `AuthorisationMiddleware` refuses with, besides 404 and 405.
 REFUSALS = (
@@ -75,7 +75,7 @@ class AccessControl:
         if is_read and is_page(routed_path(request.scope)) and "authorization" not in request.headers:
             return anyone(_client_of(request))
         key = await self._key_of(request)
-        note(request, key=key.id, tenant=key.tenant)
+        add_log_fields(request, key=key.id, tenant=key.tenant)
         await self._rates.count(key)
         scopes = frozenset(scope for scope in Permission if scope in key.scopes)
         caller = Caller(key.tenant, key.id, scopes, client=key.tenant)

@@ -15,12 +15,11 @@ from service.bounded_cache import BoundedCache
 from service.errors import StoreBusyError, StoreUnavailableError
 from service.security.keys import PresentedKey
 from service.storage.api_keys import ApiKeys
+from service.storage.circuit_breaker import CircuitBreaker
 from service.storage.records import ApiKey
 
 # How long a key goes on working while the database is away.
 _TRUSTED_S = 600.0
-# After the database was away, it is asked again for keys that are not known after this.
-_AWAY_S = 1.0
 _TOUCHED_EVERY = timedelta(minutes=1)
 # Look-ups do not wait behind queries and uploads for a thread.
 _THREADS = 2
@@ -52,7 +51,7 @@ class KeyCache:
         self._clock = clock
         self._known: BoundedCache[str, _Known] = BoundedCache(_MEMORY_BYTES, lambda _: _RECORD_BYTES)
         self._threads = ThreadPoolExecutor(_THREADS, thread_name_prefix="lalaloc-keys")
-        self._away_until_s = -float("inf")
+        self._breaker = CircuitBreaker(clock)
 
     def remembers(self, presented: PresentedKey) -> bool:
         """Whether the key was valid not long ago."""
@@ -108,14 +107,14 @@ class KeyCache:
 
     def _find(self, key_hash: str) -> ApiKey | None:
         # One after the other would wait for a database that does not answer.
-        if self._clock() < self._away_until_s:
+        if self._breaker.is_open:
             raise StoreUnavailableError()
         try:
             return self._keys.find(key_hash)
         except StoreBusyError:
             raise
         except StoreUnavailableError:
-            self._away_until_s = self._clock() + _AWAY_S
+            self._breaker.trip()
             raise
 
     def _touch(self, key_id: str) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 from sqlalchemy import ColumnElement, Connection, delete, select, update
 
 from service.storage.database import Database
-from service.storage.records import Claim, Conflict, Fresh, InProgress, StoredAnswer
+from service.storage.records import Claim, Claimed, Conflict, InProgress, StoredAnswer
 from service.storage.tables import IDEMPOTENCY
 
 KEPT_FOR = timedelta(hours=24)
@@ -35,7 +35,7 @@ class IdempotencyKeys:
         """Say that a request is about to be carried out.
 
         Returns:
-            Fresh to whoever is to carry it out, and then calls `finish` or `abandon`; else why not to.
+            Claimed to whoever is to carry it out, and then calls `finish` or `abandon`; else why not to.
         """
         own = _where(tenant, route, key)
         token, now = uuid.uuid4().hex, datetime.now(UTC)
@@ -54,7 +54,7 @@ class IdempotencyKeys:
                 created_at=now,
             )
             if connection.scalar(statement.on_conflict_do_nothing().returning(_COLUMNS.token)) == token:
-                return Fresh(token)
+                return Claimed(token)
             return self._repeated(connection, own, body_sha256, until_s)
 
     def finish(self, tenant: str, route: str, key: str, token: str, answer: StoredAnswer) -> None:
@@ -93,7 +93,7 @@ class IdempotencyKeys:
         ran_out = ~self._database.is_live(_COLUMNS.lease_until_s, _COLUMNS.lease_s)
         values = {"lease_until_s": until_s, "lease_s": self._lease_s}
         taken = connection.execute(update(IDEMPOTENCY).where(*own, ran_out).values(**values))
-        return Fresh(row.token) if taken.rowcount == 1 else InProgress()
+        return Claimed(row.token) if taken.rowcount == 1 else InProgress()
 
 
 def _where(tenant: str, route: str, key: str) -> list[ColumnElement[bool]]:

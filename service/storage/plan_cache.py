@@ -30,7 +30,7 @@ class PlanCache:
         entry = self._records.get((tenant, plan_id))
         return None if entry is None or entry[0].revision_id != revision_id else entry[0].plan
 
-    def lately(self, tenant: str, plan_id: str, max_age_s: float) -> PlanRecord | None:
+    def recent(self, tenant: str, plan_id: str, max_age_s: float) -> PlanRecord | None:
         """A plan as the database last had it, where that is not too long ago."""
         entry = self._records.get((tenant, plan_id))
         return None if entry is None or monotonic() - entry[1] > max_age_s else entry[0]

@@ -5,12 +5,10 @@ from __future__ import annotations
 from time import monotonic
 
 from service.errors import StoreBusyError, StoreUnavailableError
+from service.storage.circuit_breaker import CircuitBreaker
 from service.storage.records import PlanRecord
 from service.storage.store import Store
 from service.threads import BoundedReads
-
-# After a failure the database is left alone for so long by queries that can be answered without it.
-_LEFT_ALONE_S = 1.0
 
 
 class PlanLookup:
@@ -23,7 +21,7 @@ class PlanLookup:
         """
         self._store = store
         self._max_age_s = max_age_s
-        self._away_until = 0.0
+        self._breaker = CircuitBreaker()
 
     def get(self, tenant: str, plan_id: str) -> PlanRecord | None:
         """A plan at its current revision; while the database is away, at the one that it last had.
@@ -39,11 +37,8 @@ class PlanLookup:
         except StoreBusyError:
             # It is there, and the plan may be gone.
             raise
-        except StoreUnavailableError:
-            self._note_outage()
-            if (known := self._lately(tenant, plan_id)) is None:
-                raise
-            return known
+        except StoreUnavailableError as error:
+            return self._despite(error, tenant, plan_id)
 
     async def find(self, tenant: str, plan_id: str, reads: BoundedReads) -> PlanRecord | None:
         """As `get`, for whoever must not wait for a database that is silent instead of failing.
@@ -56,22 +51,26 @@ class PlanLookup:
         begin_s = monotonic()
         try:
             return await reads.run(self.get, tenant, plan_id)
-        except StoreUnavailableError:
+        except StoreUnavailableError as error:
             if self._store.answered_since(begin_s):
                 # It is there, and the plan may be gone.
                 raise
-            self._note_outage()
-            if (known := self._during_outage(tenant, plan_id)) is None:
-                raise
-            return known
+            return self._despite(error, tenant, plan_id)
 
     def _during_outage(self, tenant: str, plan_id: str) -> PlanRecord | None:
         """A plan that was read lately, if the database was away a moment ago; from memory, at once."""
-        return self._lately(tenant, plan_id) if monotonic() < self._away_until else None
+        return self._recent(tenant, plan_id) if self._breaker.is_open else None
 
-    def _note_outage(self) -> None:
-        """The database does not answer: leave it alone for a moment."""
-        self._away_until = monotonic() + _LEFT_ALONE_S
+    def _despite(self, error: StoreUnavailableError, tenant: str, plan_id: str) -> PlanRecord:
+        """A plan that was read lately, as the database is away.
 
-    def _lately(self, tenant: str, plan_id: str) -> PlanRecord | None:
-        return self._store.plan_cache.lately(tenant, plan_id, self._max_age_s)
+        Raises:
+            StoreUnavailableError: it was not.
+        """
+        self._breaker.trip()
+        if (known := self._recent(tenant, plan_id)) is None:
+            raise error
+        return known
+
+    def _recent(self, tenant: str, plan_id: str) -> PlanRecord | None:
+        return self._store.plan_cache.recent(tenant, plan_id, self._max_age_s)

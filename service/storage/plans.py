@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Any
 
-from sqlalchemy import Connection, Row, and_, delete, func, or_, select, text, update
+from sqlalchemy import Connection, Row, delete, func, select, text, update
 
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import DEFAULT_STD_M
@@ -18,6 +18,7 @@ from service.errors import DamagedDataError, RevisionMismatchError, TooManyFloor
 from service.storage.chunks import read_chunks, write_chunks
 from service.storage.database import Database
 from service.storage.grid_format import PackedGrid, pack
+from service.storage.pages import newest_first
 from service.storage.plan_cache import PlanCache
 from service.storage.plan_document import PlanDocument
 from service.storage.plan_places import place_columns
@@ -205,13 +206,8 @@ class Plans:
             after: the last plan of the page before.
             name: only plans with this in their name, whatever the case of letters.
         """
-        age, plan_id = FLOORPLANS.c.created_at, FLOORPLANS.c.id
         query = select_summaries().where(FLOORPLANS.c.tenant == tenant)
-        if name:
-            query = query.where(FLOORPLANS.c.folded_name.contains(name.casefold(), autoescape=True))
-        if after is not None:
-            query = query.where(or_(age < after.created_at, and_(age == after.created_at, plan_id < after.id)))
-        return self._summaries(query.order_by(age.desc(), plan_id.desc()).limit(limit))
+        return self._summaries(newest_first(query, FLOORPLANS, limit=limit, after=after, name=name))
 
     def summaries(self, plan_ids: Collection[str]) -> list[PlanSummary]:
         """Those of some plans that there are, whoever's they are: for callers that were let at them before."""

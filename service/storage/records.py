@@ -213,7 +213,7 @@ class StoredAnswer:
 
 
 @dataclass(frozen=True)
-class Fresh:
+class Claimed:
     """The request is to be carried out.
 
     Attributes:
@@ -234,7 +234,7 @@ class InProgress:
     """The same request is being carried out at this moment."""
 
 
-Claim = StoredAnswer | Fresh | Conflict | InProgress
+Claim = StoredAnswer | Claimed | Conflict | InProgress
 
 
 def millimetres(height_m: float) -> int:

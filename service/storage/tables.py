@@ -24,8 +24,8 @@ from sqlalchemy.types import TypeDecorator
 METADATA = MetaData()
 
 
-class Moment(TypeDecorator[datetime]):
-    """A moment in UTC. SQLite forgets the time zone, PostgreSQL may answer in another one."""
+class UtcDateTime(TypeDecorator[datetime]):
+    """A time in UTC. SQLite forgets the time zone, PostgreSQL may answer in another one."""
 
     impl = DateTime(timezone=True)
     cache_ok = True
@@ -56,8 +56,8 @@ FLOORPLANS = Table(
     Column("folded_name", Text, nullable=False),
     # The current revision; no foreign key, as revisions already refer to their plan.
     Column("revision_id", String(32), nullable=False),
-    Column("created_at", Moment, nullable=False),
-    Column("updated_at", Moment, nullable=False),
+    Column("created_at", UtcDateTime, nullable=False),
+    Column("updated_at", UtcDateTime, nullable=False),
     # The circle around the plan, in its own frame; nothing where an earlier version stored what cannot be read now.
     Column("centre_x_m", Double),
     Column("centre_y_m", Double),
@@ -76,7 +76,7 @@ REVISIONS = Table(
     Column("id", String(32), primary_key=True),
     Column("plan_id", String(32), ForeignKey("floorplans.id", ondelete="CASCADE"), nullable=False),
     Column("number", Integer, nullable=False),
-    Column("created_at", Moment, nullable=False),
+    Column("created_at", UtcDateTime, nullable=False),
     Column("document", Text, nullable=False),
     # Nothing where an earlier version of the service stored the plan.
     Column("document_sha256", String(64)),
@@ -159,8 +159,8 @@ VENUES = Table(
     Column("longitude", Double),
     Column("altitude_m", Double),
     Column("north_deg", Double),
-    Column("created_at", Moment, nullable=False),
-    Column("updated_at", Moment, nullable=False),
+    Column("created_at", UtcDateTime, nullable=False),
+    Column("updated_at", UtcDateTime, nullable=False),
     Index("venues_by_tenant_and_age", "tenant", "created_at", "id"),
 )
 
@@ -185,9 +185,9 @@ API_KEYS = Table(
     Column("hash", String(64), nullable=False, unique=True),
     Column("scopes", Text, nullable=False),
     Column("rate_per_minute", Integer),
-    Column("created_at", Moment, nullable=False),
-    Column("revoked_at", Moment),
-    Column("last_used_at", Moment),
+    Column("created_at", UtcDateTime, nullable=False),
+    Column("revoked_at", UtcDateTime),
+    Column("last_used_at", UtcDateTime),
 )
 
 KEPT_ANSWERS = Table(
@@ -196,7 +196,7 @@ KEPT_ANSWERS = Table(
     Column("id", String(32), primary_key=True),
     Column("tenant", String(64), nullable=False),
     Column("plan_id", String(32), ForeignKey("floorplans.id", ondelete="CASCADE"), nullable=False),
-    Column("created_at", Moment, nullable=False),
+    Column("created_at", UtcDateTime, nullable=False),
     Column("content", Text, nullable=False),
     Index("kept_answers_by_tenant_and_age", "tenant", "created_at"),
     Index("kept_answers_by_age", "created_at"),
@@ -214,7 +214,7 @@ IDEMPOTENCY = Table(
     Column("lease_until_s", Double, nullable=False),
     # Nothing where an earlier version of the service took it.
     Column("lease_s", Double),
-    Column("created_at", Moment, nullable=False),
+    Column("created_at", UtcDateTime, nullable=False),
     Column("status", Integer),
     Column("headers", Text),
     Column("body", LargeBinary),

@@ -30,6 +30,7 @@ from sqlalchemy import (
 from lalaloc_core.earth import Anchor
 from service.errors import InvalidRequestError, RevisionMismatchError, TooManyVenuesError, UnknownVenueError
 from service.storage.database import Database
+from service.storage.pages import newest_first
 from service.storage.plan_places import may_lie_near
 from service.storage.records import (
     Cursor,
@@ -174,16 +175,9 @@ class Venues:
             after: the last venue of the page before.
             name: only venues with this in their name, whatever the case of letters.
         """
-        age, venue_id = VENUES.c.created_at, VENUES.c.id
-        query = _select(VENUES.c.tenant == tenant)
-        if name:
-            query = query.where(VENUES.c.folded_name.contains(name.casefold(), autoescape=True))
-        if after is not None:
-            query = query.where(or_(age < after.created_at, and_(age == after.created_at, venue_id < after.id)))
+        page = newest_first(_select(VENUES.c.tenant == tenant), VENUES, limit=limit, after=after, name=name)
         with self._database.reading() as connection:
-            return [
-                _record(row) for row in connection.execute(query.order_by(age.desc(), venue_id.desc()).limit(limit))
-            ]
+            return [_record(row) for row in connection.execute(page)]
 
     def plans(
         self, venue_id: str, *, limit: int, after: VenuePlace | None = None, level: float | None = None

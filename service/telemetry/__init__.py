@@ -1,17 +1,17 @@
 """What the service tells of itself: metrics, log lines as JSON, and, when asked for, OpenTelemetry spans.
 
-Begin with `metrics.py`. `facts.py` is what is told of one request; `service.http.middleware.telemetry` tells it.
+Begin with `metrics.py`. `log_fields.py` is what is told of one request; `service.http.middleware.telemetry` tells it.
 """
 
-from service.telemetry.facts import RequestFacts, note, request_id_of
+from service.telemetry.log_fields import RequestLogFields, add_log_fields, request_id_of
 from service.telemetry.logs import LOGGER_NAME, configure_logging
 from service.telemetry.metrics import Telemetry
 
 __all__ = [
     "LOGGER_NAME",
-    "RequestFacts",
+    "RequestLogFields",
     "Telemetry",
+    "add_log_fields",
     "configure_logging",
-    "note",
     "request_id_of",
 ]

@@ -6,7 +6,7 @@ import json
 import logging
 from datetime import UTC, datetime
 
-from service.telemetry.facts import current_facts
+from service.telemetry.log_fields import current_log_fields
 
 LOGGER_NAME = "lalaloc"
 # The HTTP server's own: its log of accesses holds query strings, and says nothing that ours does not.
@@ -23,13 +23,13 @@ class JsonFormatter(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         """The line, plain ASCII."""
-        facts = current_facts.get()
+        log_fields = current_log_fields.get()
         line: dict[str, object] = {
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
             "level": record.levelname.lower(),
             "message": record.getMessage(),
-            "request_id": facts and facts.request_id,
-            "trace_id": facts and facts.trace.trace_id,
+            "request_id": log_fields and log_fields.request_id,
+            "trace_id": log_fields and log_fields.trace.trace_id,
         }
         line.update(getattr(record, "fields", {}))
         if record.exc_info:

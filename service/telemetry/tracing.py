@@ -7,7 +7,7 @@ from time import perf_counter, time_ns
 from typing import TYPE_CHECKING
 
 from lalaloc_core.errors import ConfigError
-from service.telemetry.facts import RequestFacts
+from service.telemetry.log_fields import RequestLogFields
 from service.telemetry.trace_context import TraceContext
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ class Tracing:
         ids = TraceContext(f"{own.trace_id:032x}", f"{own.span_id:016x}", own.trace_flags.sampled)
         return ids, OpenSpan(span, began_ns, began_s)
 
-    def end(self, opened: OpenSpan, facts: RequestFacts, *, method: str, route: str, status: int) -> None:
+    def end(self, opened: OpenSpan, log_fields: RequestLogFields, *, method: str, route: str, status: int) -> None:
         """Close a request's span, with one below it for every stage that was timed."""
         from opentelemetry import trace
 
@@ -88,19 +88,19 @@ class Tracing:
             "http.request.method": method,
             "http.route": route,
             "http.response.status_code": status,
-            "lalaloc.request_id": facts.request_id,
-            "lalaloc.plan": facts.plan,
-            "lalaloc.venue": facts.venue,
-            "lalaloc.revision": facts.revision,
-            "lalaloc.stage": facts.stage,
-            "lalaloc.rejection": facts.rejection,
-            "lalaloc.tenant": facts.tenant,
+            "lalaloc.request_id": log_fields.request_id,
+            "lalaloc.plan": log_fields.plan,
+            "lalaloc.venue": log_fields.venue,
+            "lalaloc.revision": log_fields.revision,
+            "lalaloc.stage": log_fields.stage,
+            "lalaloc.rejection": log_fields.rejection,
+            "lalaloc.tenant": log_fields.tenant,
         }
         span.set_attributes({name: value for name, value in attributes.items() if value is not None})
         if status >= 500:
             span.set_status(trace.StatusCode.ERROR)
         inside = trace.set_span_in_context(span)
-        for name, (begun_s, duration_s) in (facts.clock.spans() if facts.clock else {}).items():
+        for name, (begun_s, duration_s) in (log_fields.clock.spans() if log_fields.clock else {}).items():
             stage = self._tracer.start_span(name, inside, start_time=opened.at_ns(begun_s))
             stage.end(opened.at_ns(begun_s + duration_s))
         span.end()

@@ -1,7 +1,7 @@
 """The body of a conversion worker process: the only place of the service that reads drawings and models.
 
-From `ImportJob` to `Imported`, from `ExportJob` to bytes, or to the `Refusal` of what cannot be read or written. The
-libraries of a format are loaded with its first file; `service.workers.process` has the rest.
+From `ImportJob` to `Imported`, from `ExportJob` to bytes, or to the `ConversionRefusal` of what cannot be read or
+written. The libraries of a format are loaded with its first file; `service.workers.process` has the rest.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Imported:
 
 
 @dataclass(frozen=True)
-class Refusal:
+class ConversionRefusal:
     """Why a file is no plan, or a plan no such file; `kind` says which error that is."""
 
     reason: str
@@ -73,7 +73,7 @@ class Refusal:
     names: tuple[str, ...] = field(default=())
 
     @classmethod
-    def of(cls, error: InvalidFloorPlanError | MissingExtraError) -> Refusal:
+    def of(cls, error: InvalidFloorPlanError | MissingExtraError) -> ConversionRefusal:
         """The refusal that an error is."""
         if isinstance(error, MissingExtraError):
             return cls(str(error), "extra", names=(error.what, error.extra))
@@ -116,14 +116,16 @@ def run_converter(connection: Connection, limits: ImportLimits, memory_bytes: in
     serve_jobs(connection, lambda: _converting(limits), is_fit)
 
 
-def _converting(limits: ImportLimits) -> Callable[[ImportJob | ExportJob], Imported | bytes | Refusal]:
-    def convert(job: ImportJob | ExportJob) -> Imported | bytes | Refusal:
+def _converting(limits: ImportLimits) -> Callable[[ImportJob | ExportJob], Imported | bytes | ConversionRefusal]:
+    def convert(job: ImportJob | ExportJob) -> Imported | bytes | ConversionRefusal:
         try:
             return _export(job) if isinstance(job, ExportJob) else _import(job, limits)
         except (InvalidFloorPlanError, MissingExtraError) as error:
-            return Refusal.of(error)
+            return ConversionRefusal.of(error)
         except MemoryError:
-            return Refusal("the file takes more memory than there is for one (import_memory_bytes); make it simpler")
+            return ConversionRefusal(
+                "the file takes more memory than there is for one (import_memory_bytes); make it simpler"
+            )
 
     return convert
 

@@ -1,7 +1,7 @@
 """The body of a decoding worker process: the only place of the service that opens pictures it was sent.
 
-From the bytes of an upload to a `Panorama`, or to the `Refusal` of what is none; and, as that keeps the interpreter
-busy for as long, from drawings to pixels. The rest is in `service.workers.process`.
+From the bytes of an upload to a `Panorama`, or to the `DecodeRefusal` of what is none; and, as that keeps the
+interpreter busy for as long, from drawings to pixels. The rest is in `service.workers.process`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from service.workers.process import limit_memory, serve_jobs
 
 
 @dataclass(frozen=True)
-class Upload:
+class DecodeJob:
     """An uploaded picture, and the size that its pixels are wanted in."""
 
     content: bytes
@@ -26,14 +26,14 @@ class Upload:
 
 
 @dataclass(frozen=True)
-class Drawing:
+class RasteriseJob:
     """A drawing that is wanted as PNG."""
 
     svg: str
 
 
 @dataclass(frozen=True)
-class Refusal:
+class DecodeRefusal:
     """Why a picture is no usable panorama."""
 
     reason: str
@@ -51,16 +51,16 @@ def run_decoder(connection: Connection, height: int, width: int, limits: Panoram
 
 def _load(
     height: int, width: int, limits: PanoramaLimits, memory_bytes: int
-) -> Callable[[Upload | Drawing], Panorama | Refusal | bytes]:
+) -> Callable[[DecodeJob | RasteriseJob], Panorama | DecodeRefusal | bytes]:
     warm_up(height=height, width=width)
     limit_memory(memory_bytes)
 
-    def work(job: Upload | Drawing) -> Panorama | Refusal | bytes:
-        if isinstance(job, Drawing):
+    def work(job: DecodeJob | RasteriseJob) -> Panorama | DecodeRefusal | bytes:
+        if isinstance(job, RasteriseJob):
             return rasterise(job.svg)
         try:
             return open_panorama(job.content, height=job.height, width=job.width, limits=limits)
         except InvalidPanoramaError as error:
-            return Refusal(str(error))
+            return DecodeRefusal(str(error))
 
     return work

@@ -24,14 +24,14 @@ class Ready:
 
 
 @dataclass(frozen=True)
-class Answered:
+class JobResult:
     """A job's answer."""
 
     value: Any
 
 
 @dataclass(frozen=True)
-class Fault:
+class WorkerFailure:
     """What a worker says instead of an answer, or instead of being ready."""
 
     reason: str
@@ -54,18 +54,18 @@ def serve_jobs(
     try:
         work = load()
     except Exception as error:
-        _send(connection, Fault(f"{type(error).__name__}: {error}"))
+        _send(connection, WorkerFailure(f"{type(error).__name__}: {error}"))
         return
-    message: Ready | Answered | Fault = Ready()
+    message: Ready | JobResult | WorkerFailure = Ready()
     while _send(connection, message) and is_fit():
         try:
             job = connection.recv()
         except (EOFError, OSError):
             return
         try:
-            message = Answered(work(job))
+            message = JobResult(work(job))
         except Exception as error:
-            message = Fault(f"{type(error).__name__}: {error}")
+            message = WorkerFailure(f"{type(error).__name__}: {error}")
 
 
 def limit_memory(memory_bytes: int) -> None:
@@ -93,7 +93,7 @@ def _die_with_parent() -> None:
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
-def _send(connection: Connection, message: Ready | Answered | Fault) -> bool:
+def _send(connection: Connection, message: Ready | JobResult | WorkerFailure) -> bool:
     """False when the parent is gone."""
     try:
         connection.send(message)

@@ -96,7 +96,7 @@ def test_what_nobody_wants_any_more_is_dropped() -> None:
     assert [queue.take() for _ in range(4)] == [("a", 6), ("a", 2), ("a", 4), None]
 
 
-def test_turns_go_round_and_one_is_left_to_others() -> None:
+def test_permits_go_round_and_one_is_left_to_others() -> None:
     async def scenario() -> list[str]:
         semaphore, order = FairSemaphore(2), list[str]()
 

@@ -31,7 +31,7 @@ from service.http.idempotent_request import IdempotentRequest, parts_sha256
 from service.http.uploads import Parts
 from service.pools.job_queue import JobLostError
 from service.storage.idempotency_keys import IdempotencyKeys
-from service.storage.records import Fresh, Original
+from service.storage.records import Claimed, Original
 from service.storage.store import Store
 from service.storage.stored_grids import StoredGrids
 from service.storage.tables import IDEMPOTENCY
@@ -180,7 +180,7 @@ def test_what_a_process_that_died_had_stored_is_found_by_the_next(
         # As the one that died left it: the plan is stored, the answer is not.
         digest = parts_sha256(Parts({}, {"file": CONTENT}))
         claim = IdempotencyKeys(store._database, lease_s=1.0).begin("default", "POST /floorplans", "a", digest)
-        assert isinstance(claim, Fresh)
+        assert isinstance(claim, Claimed)
         plan_id = claim.token
         headers = _keyed("a") | {"Content-Type": "application/json"}
 
@@ -332,7 +332,7 @@ def test_who_is_gone_before_their_claim_is_made_leaves_none(store: Store, leaves
     asyncio.run(ask())
     claims = store.idempotency_keys
     wait_for(lambda: _token_of(store) is not None, 10.0)
-    again = Fresh(_token_of(store) or "")
+    again = Claimed(_token_of(store) or "")
     wait_for(lambda: claims.begin("default", "POST /x", "a", parts_sha256(NOTHING)) == again, 10.0)
 
 

@@ -41,10 +41,10 @@ from service.storage.grid_format import pack
 from service.storage.idempotency_keys import KEPT_FOR, IdempotencyKeys
 from service.storage.plan_document import PlanDocument
 from service.storage.records import (
+    Claimed,
     ComputedGrid,
     Conflict,
     Cursor,
-    Fresh,
     GridKey,
     InProgress,
     Original,
@@ -646,19 +646,19 @@ ANSWER = StoredAnswer(201, {"location": "/floorplans/x"}, b'{"id": "x"}')
 def test_a_request_is_carried_out_once_and_its_answer_kept(open_store: OpenStore) -> None:
     first, second = open_store(), open_store()
     claim = first.idempotency_keys.begin("t", "POST /floorplans", "k", "body")
-    assert isinstance(claim, Fresh)
+    assert isinstance(claim, Claimed)
     assert second.idempotency_keys.begin("t", "POST /floorplans", "k", "body") == InProgress()
     assert second.idempotency_keys.begin("t", "POST /floorplans", "k", "another") == Conflict()
     first.idempotency_keys.finish("t", "POST /floorplans", "k", claim.token, ANSWER)
     assert second.idempotency_keys.begin("t", "POST /floorplans", "k", "body") == ANSWER
     assert second.idempotency_keys.begin("t", "POST /floorplans", "k", "another") == Conflict()
     for other in (("u", "POST /floorplans", "k"), ("t", "POST /localise", "k"), ("t", "POST /floorplans", "l")):
-        assert isinstance(second.idempotency_keys.begin(*other, "body"), Fresh)
+        assert isinstance(second.idempotency_keys.begin(*other, "body"), Claimed)
 
 
 def test_an_abandoned_request_may_be_sent_again_an_answered_one_not(store: Store) -> None:
     claim = store.idempotency_keys.begin("t", "r", "k", "body")
-    assert isinstance(claim, Fresh)
+    assert isinstance(claim, Claimed)
     store.idempotency_keys.abandon("t", "r", "k", "not the token")
     assert store.idempotency_keys.begin("t", "r", "k", "body") == InProgress()
     store.idempotency_keys.abandon("t", "r", "k", claim.token)
@@ -674,11 +674,11 @@ def test_an_abandoned_request_may_be_sent_again_an_answered_one_not(store: Store
 def test_the_request_of_a_dead_owner_is_taken_over_once_under_the_same_token(open_store: OpenStore) -> None:
     stores = [open_store(), open_store()]
     dead = IdempotencyKeys(stores[0]._database, lease_s=0.2).begin("t", "r", "k", "body")
-    assert isinstance(dead, Fresh)
+    assert isinstance(dead, Claimed)
     time.sleep(0.3)
     with ThreadPoolExecutor(4) as threads:
         claims = list(threads.map(lambda n: stores[n % 2].idempotency_keys.begin("t", "r", "k", "body"), range(4)))
-    assert [claim for claim in claims if claim != InProgress()] == [Fresh(dead.token)]
+    assert [claim for claim in claims if claim != InProgress()] == [Claimed(dead.token)]
     # Should the dead one have lived, its answer no longer counts.
     stores[0].idempotency_keys.finish("t", "r", "k", dead.token, ANSWER)
     stores[1].idempotency_keys.finish("t", "r", "k", dead.token, dataclasses.replace(ANSWER, body=b"late"))
@@ -688,13 +688,13 @@ def test_the_request_of_a_dead_owner_is_taken_over_once_under_the_same_token(ope
 def test_answers_are_kept_for_a_day(store: Store) -> None:
     for key in ("old", "new"):
         claim = store.idempotency_keys.begin("t", "r", key, "body")
-        assert isinstance(claim, Fresh)
+        assert isinstance(claim, Claimed)
         store.idempotency_keys.finish("t", "r", key, claim.token, ANSWER)
     with store._database.writing() as connection:
         yesterday = datetime.now(UTC) - KEPT_FOR - timedelta(minutes=1)
         connection.execute(update(IDEMPOTENCY).where(IDEMPOTENCY.c.key == "old").values(created_at=yesterday))
     # Not given out any more, also before it is swept away.
-    assert isinstance(store.idempotency_keys.begin("t", "r", "old", "another"), Fresh)
+    assert isinstance(store.idempotency_keys.begin("t", "r", "old", "another"), Claimed)
     with store._database.writing() as connection:
         connection.execute(update(IDEMPOTENCY).where(IDEMPOTENCY.c.key == "old").values(created_at=yesterday))
     assert store.idempotency_keys.purge() == 1
@@ -720,7 +720,7 @@ def test_keys_are_found_by_hash_until_revoked(store: Store) -> None:
 
 def test_a_claim_from_a_clock_that_was_ahead_is_dead(store: Store) -> None:
     claim = store.idempotency_keys.begin("t", "r", "k", "body")
-    assert isinstance(claim, Fresh)
+    assert isinstance(claim, Claimed)
     assert isinstance(store.idempotency_keys.begin("t", "r", "k", "body"), InProgress)
     with store._database.writing() as connection:
         connection.execute(update(IDEMPOTENCY).values(lease_until_s=IDEMPOTENCY.c.lease_until_s + 48 * 3600.0))

@@ -27,7 +27,7 @@ from opentelemetry.trace import SpanContext
 
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.localise.pipeline import StageClock
-from service.telemetry import LOGGER_NAME, RequestFacts
+from service.telemetry import LOGGER_NAME, RequestLogFields
 from service.telemetry.logs import JsonFormatter
 from service.telemetry.trace_context import TraceContext, child_of, parse_traceparent
 from service.telemetry.tracing import Tracing, otlp_exporter
@@ -278,7 +278,7 @@ def test_spans_of_stages_lie_inside_that_of_the_request() -> None:
         pass
     with pytest.raises(RuntimeError), clock.stage("encode"):
         raise RuntimeError("fails, and is timed all the same")
-    facts = RequestFacts("r-1", ids, plan="p", rejection="overloaded", clock=clock)
+    facts = RequestLogFields("r-1", ids, plan="p", rejection="overloaded", clock=clock)
     tracing.end(opened, facts, method="POST", route="/localise", status=503)
     tracing.close()
     spans = {span.name: span for span in exporter.get_finished_spans()}
@@ -303,7 +303,7 @@ def test_a_trace_that_its_caller_does_not_record_is_not_exported() -> None:
     exporter = InMemorySpanExporter()
     tracing = Tracing(exporter, "0")
     ids, opened = tracing.begin(TraceContext(TRACE, SPAN, sampled=False))
-    tracing.end(opened, RequestFacts("r-1", ids), method="GET", route="/healthz", status=200)
+    tracing.end(opened, RequestLogFields("r-1", ids), method="GET", route="/healthz", status=200)
     tracing.close()
     assert (ids.trace_id, ids.sampled) == (TRACE, False)
     assert exporter.get_finished_spans() == ()

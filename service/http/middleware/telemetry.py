@@ -13,7 +13,7 @@ from starlette.datastructures import Headers, MutableHeaders
 from starlette.routing import Route
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.telemetry.facts import RequestFacts, current_facts, put_facts
+from service.telemetry.log_fields import RequestLogFields, attach_log_fields, current_log_fields
 from service.telemetry.logs import LOGGER_NAME
 from service.telemetry.metrics import Telemetry
 from service.telemetry.trace_context import child_of, parse_traceparent
@@ -48,10 +48,10 @@ class TelemetryMiddleware:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
-        facts, opened = self._begin(Headers(scope=scope))
-        put_facts(scope, facts)
-        token = current_facts.set(facts)
-        exchange = _Exchange(facts, receive, send)
+        log_fields, opened = self._begin(Headers(scope=scope))
+        attach_log_fields(scope, log_fields)
+        token = current_log_fields.set(log_fields)
+        exchange = _Exchange(log_fields, receive, send)
         begin = perf_counter()
         try:
             await self._app(scope, exchange.receive, exchange.send)
@@ -61,10 +61,10 @@ class TelemetryMiddleware:
             if not exchange.complete:
                 raise
         finally:
-            self._end(scope, facts, opened, exchange.status, perf_counter() - begin)
-            current_facts.reset(token)
+            self._end(scope, log_fields, opened, exchange.status, perf_counter() - begin)
+            current_log_fields.reset(token)
 
-    def _begin(self, headers: Headers) -> tuple[RequestFacts, OpenSpan | None]:
+    def _begin(self, headers: Headers) -> tuple[RequestLogFields, OpenSpan | None]:
         given = headers.get("x-request-id", "")
         request_id = given if _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex
         parent = parse_traceparent(headers.getlist("traceparent"))
@@ -73,39 +73,41 @@ class TelemetryMiddleware:
             trace = child_of(parent)
         else:
             trace, opened = tracing.begin(parent)
-        return RequestFacts(request_id, trace), opened
+        return RequestLogFields(request_id, trace), opened
 
-    def _end(self, scope: Scope, facts: RequestFacts, opened: OpenSpan | None, status: int, duration_s: float) -> None:
+    def _end(
+        self, scope: Scope, log_fields: RequestLogFields, opened: OpenSpan | None, status: int, duration_s: float
+    ) -> None:
         route = self._template(scope)
         method = scope["method"] if scope["method"] in _METHODS else "OTHER"
-        if facts.plan is None:
-            facts.plan = _plan_in_path(scope)
+        if log_fields.plan is None:
+            log_fields.plan = _plan_in_path(scope)
         telemetry = self._telemetry
         telemetry.requests.labels(method, route, str(status)).inc()
         telemetry.request_seconds.labels(route).observe(duration_s)
-        if facts.rejection is not None:
-            telemetry.rejections.labels(facts.rejection).inc()
-        if facts.gave_up:
+        if log_fields.rejection is not None:
+            telemetry.rejections.labels(log_fields.rejection).inc()
+        if log_fields.gave_up:
             telemetry.disconnects.labels(route).inc()
         if opened is not None and telemetry.tracing is not None:
-            telemetry.tracing.end(opened, facts, method=method, route=route, status=status)
-        spans = facts.clock.spans() if facts.clock is not None else {}
+            telemetry.tracing.end(opened, log_fields, method=method, route=route, status=status)
+        spans = log_fields.clock.spans() if log_fields.clock is not None else {}
         fields: dict[str, Any] = {
             "method": method,
             "route": route,
             "status": status,
             "ms": round(duration_s * 1e3, 1),
-            "bytes_in": facts.bytes_in,
-            "plan": facts.plan,
-            "venue": facts.venue,
-            "revision": facts.revision,
-            "stage": facts.stage,
+            "bytes_in": log_fields.bytes_in,
+            "plan": log_fields.plan,
+            "venue": log_fields.venue,
+            "revision": log_fields.revision,
+            "stage": log_fields.stage,
             "stages_ms": {name: round(spent_s * 1e3, 1) for name, (_, spent_s) in spans.items()},
-            "gave_up": facts.gave_up,
-            "rejection": facts.rejection,
-            "key": facts.key,
-            "tenant": facts.tenant,
-            "span_id": facts.trace.span_id,
+            "gave_up": log_fields.gave_up,
+            "rejection": log_fields.rejection,
+            "key": log_fields.key,
+            "tenant": log_fields.tenant,
+            "span_id": log_fields.trace.span_id,
         }
         level = logging.DEBUG if route in _PROBES else logging.INFO
         logging.getLogger(LOGGER_NAME).log(level, "request", extra={"fields": fields})
@@ -121,8 +123,8 @@ class TelemetryMiddleware:
 class _Exchange:
     """Watches what goes in and out of one request."""
 
-    def __init__(self, facts: RequestFacts, receive: Receive, send: Send) -> None:
-        self._facts = facts
+    def __init__(self, log_fields: RequestLogFields, receive: Receive, send: Send) -> None:
+        self._log_fields = log_fields
         self._receive = receive
         self._send = send
         self._status: int | None = None
@@ -133,15 +135,15 @@ class _Exchange:
         """The status that was answered, or stands for why there was no answer."""
         if self._status is not None:
             return self._status
-        return _CLIENT_CLOSED if self._facts.gave_up else 500
+        return _CLIENT_CLOSED if self._log_fields.gave_up else 500
 
     async def receive(self) -> Message:
         """The next part of the body, counted."""
         message = await self._receive()
         if message["type"] == "http.request":
-            self._facts.bytes_in += len(message.get("body", b""))
+            self._log_fields.bytes_in += len(message.get("body", b""))
         elif message["type"] == "http.disconnect" and not self.complete:
-            self._facts.gave_up = True
+            self._log_fields.gave_up = True
         return message
 
     async def send(self, message: Message) -> None:
@@ -149,8 +151,8 @@ class _Exchange:
         if message["type"] == "http.response.start":
             self._status = message["status"]
             headers = MutableHeaders(scope=message)
-            headers["X-Request-ID"] = self._facts.request_id
-            headers["traceparent"] = self._facts.trace.header
+            headers["X-Request-ID"] = self._log_fields.request_id
+            headers["traceparent"] = self._log_fields.trace.header
         elif message["type"] == "http.response.body" and not message.get("more_body", False):
             self.complete = True
         await self._send(message)

@@ -12,8 +12,8 @@ import httpx
 import pytest
 
 from lalaloc_client import AsyncClient, Client, RetryPolicy
-from lalaloc_client.async_turns import AsyncTurns
-from lalaloc_client.turns import Turns
+from lalaloc_client.async_concurrency import AsyncConcurrencyLimit
+from lalaloc_client.concurrency import ConcurrencyLimit
 from tests.client.conftest import FailingServer, Planned
 from tests.client.test_retries import LOCALISATION
 from tests.service.conftest import FLAT, StartApp, upload
@@ -108,7 +108,7 @@ def test_as_many_are_under_way_as_the_service_says(failing: FailingServer, told:
 
         def hold() -> None:
             nonlocal most, under_way
-            with client._turns.hold():
+            with client._concurrency.hold():
                 with lock:
                     under_way += 1
                     most = max(most, under_way)
@@ -138,11 +138,11 @@ def test_who_cannot_ask_fails_and_the_next_asks_again() -> None:
             raise answer
         return answer
 
-    turns = Turns(None, ask)
-    with turns.hold():
-        with pytest.raises(OSError, match="away"), turns.hold():
+    limit = ConcurrencyLimit(None, ask)
+    with limit.hold():
+        with pytest.raises(OSError, match="away"), limit.hold():
             pass
-        with turns.hold():
+        with limit.hold():
             pass
     assert not answers
 
@@ -152,10 +152,10 @@ def test_a_task_that_is_cancelled_while_it_waits_takes_no_turn() -> None:
         async def two() -> int:
             return 2
 
-        turns, goes_on, held = AsyncTurns(None, two), asyncio.Event(), list[int]()
+        limit, goes_on, held = AsyncConcurrencyLimit(None, two), asyncio.Event(), list[int]()
 
         async def hold(number: int) -> None:
-            async with turns.hold():
+            async with limit.hold():
                 held.append(number)
                 await goes_on.wait()
 

@@ -1,4 +1,4 @@
-"""What a request turned out to be about, noted by whoever learns it and told in its one log line."""
+"""The fields of a request's one log line: what it turned out to be about, added by whoever learns it."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from service.telemetry.trace_context import TraceContext
 if TYPE_CHECKING:
     from lalaloc_core.localise.pipeline import StageClock
 
-_SCOPE_KEY = "lalaloc.facts"
+_SCOPE_KEY = "lalaloc.log_fields"
 
 
 @dataclass
-class RequestFacts:
-    """Facts of one request; what was not learnt is None.
+class RequestLogFields:
+    """Fields of one request; what was not learnt is None.
 
     Attributes:
         request_id: names the request in answers and log lines.
@@ -51,15 +51,15 @@ class RequestFacts:
 
 
 # Of the request that the running code works for; log lines tell its ids.
-current_facts: ContextVar[RequestFacts | None] = ContextVar("lalaloc_request", default=None)
+current_log_fields: ContextVar[RequestLogFields | None] = ContextVar("lalaloc_request", default=None)
 
 
-def put_facts(scope: MutableMapping[str, Any], facts: RequestFacts) -> None:
-    """Attach the facts to a request."""
-    scope[_SCOPE_KEY] = facts
+def attach_log_fields(scope: MutableMapping[str, Any], log_fields: RequestLogFields) -> None:
+    """Attach the fields to a request."""
+    scope[_SCOPE_KEY] = log_fields
 
 
-def note(
+def add_log_fields(
     request: HTTPConnection,
     *,
     plan: str | None = None,
@@ -71,9 +71,9 @@ def note(
     key: str | None = None,
     tenant: str | None = None,
 ) -> None:
-    """Put facts on a request; what is left out stays as it was. They must never be secrets."""
-    facts = _facts_of(request.scope)
-    if facts is None:
+    """Add to the fields of a request; what is left out stays as it was. They must never be secrets."""
+    log_fields = _log_fields_of(request.scope)
+    if log_fields is None:
         return
     given = {
         "plan": plan,
@@ -87,14 +87,14 @@ def note(
     }
     for name, value in given.items():
         if value is not None:
-            setattr(facts, name, value)
+            setattr(log_fields, name, value)
 
 
 def request_id_of(scope: Mapping[str, Any]) -> str | None:
     """The id of the request with this scope."""
-    facts = _facts_of(scope)
-    return None if facts is None else facts.request_id
+    log_fields = _log_fields_of(scope)
+    return None if log_fields is None else log_fields.request_id
 
 
-def _facts_of(scope: Mapping[str, Any]) -> RequestFacts | None:
+def _log_fields_of(scope: Mapping[str, Any]) -> RequestLogFields | None:
     return scope.get(_SCOPE_KEY)

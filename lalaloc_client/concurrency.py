@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 
-class Turns:
+class ConcurrencyLimit:
     """Lets as many queries be under way as the service takes.
 
     One alone is sent at once; how many more may be is asked for when there is a second one.
@@ -26,7 +26,7 @@ class Turns:
 
     @contextmanager
     def hold(self) -> Iterator[None]:
-        """Wait for one's turn, and have it for the block."""
+        """Wait until one more query may be under way, and let it be for the block."""
         if not self._slots.acquire(blocking=False):
             self._learn()
             self._slots.acquire()

@@ -7,11 +7,11 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 
 
-class AsyncTurns:
-    """As `Turns`."""
+class AsyncConcurrencyLimit:
+    """As `ConcurrencyLimit`."""
 
     def __init__(self, max_queries: int | None, ask: Callable[[], Awaitable[int]]) -> None:
-        """See `Turns`."""
+        """See `ConcurrencyLimit`."""
         self._slots = asyncio.Semaphore(max_queries or 1)
         self._known = max_queries is not None
         self._ask = ask
@@ -19,7 +19,7 @@ class AsyncTurns:
 
     @asynccontextmanager
     async def hold(self) -> AsyncIterator[None]:
-        """See `Turns.hold`."""
+        """See `ConcurrencyLimit.hold`."""
         if self._slots.locked():
             await self._learn()
         async with self._slots:
