@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Self
 
-from pydantic import Field, ValidationError, field_validator, model_validator
+from pydantic import Field, ValidationError, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from lalaloc_core.bundle import default_bundle
@@ -18,18 +17,11 @@ from lalaloc_core.panorama.images import PanoramaLimits
 from lalaloc_core.plans import ImportLimits
 from service.cores import CoreShares, share_cores, usable_cores
 from service.fair_share import with_headroom
+from service.setting_types import Count, HostNames, Metres, Origins, PortMapping, Seconds
 
 PREFIX = "LALALOC_"
 _DEFAULT_BUNDLE = default_bundle().resolve()
 
-Count = Annotated[int, Field(ge=1)]
-Seconds = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-Metres = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
-
-
-_HOST_NAME = re.compile(r"|\*|[A-Za-z0-9._-]+|[0-9A-Fa-f:]*:[0-9A-Fa-f:.]*")
-_ORIGIN = re.compile(r"|\*|https?://(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\])(?::[0-9]{1,5})?")
-_PUBLISHED = re.compile(r"|(?:(?:[0-9.]+|\[[0-9A-Fa-f:.]+\]):)?[0-9]{1,5}")
 # Requests that may be uploading, besides queries in work.
 _UPLOADS = 38
 
@@ -128,17 +120,17 @@ class Settings(BaseSettings):
         description="Without API keys, listen to others than this machine as well: where something else decides who "
         "gets here.",
     )
-    allowed_hosts: str = Field(
+    allowed_hosts: HostNames = Field(
         default="",
         description="Without API keys, names besides this machine's that requests may be for (`Host`) and pages come "
         "from (`Origin`), separated by commas; `*` for any.",
     )
-    cors_origins: str = Field(
+    cors_origins: Origins = Field(
         default="",
         description="Origins whose pages may ask from a browser (CORS), separated by commas, such as "
         "`https://plans.example`; `*` for any, which needs `api_keys`.",
     )
-    published_on: str = Field(
+    published_on: PortMapping = Field(
         default="",
         description="Where the port is published if not where the service listens, as Docker has it: `127.0.0.1:8000`, "
         "or `8000` for every address. Without API keys, addresses of this machine only, unless `allow_anonymous`.",
@@ -294,29 +286,6 @@ class Settings(BaseSettings):
         default=20, description="Scans of a panorama that is a progressive JPEG; encoders write 3 to 12."
     )
     max_top_k: Annotated[int, Field(ge=1, le=100)] = Field(default=10, description="Candidates of an answer.")
-
-    @field_validator("allowed_hosts")
-    @classmethod
-    def _names_only(cls, value: str) -> str:
-        for name in value.split(","):
-            if not _HOST_NAME.fullmatch(name.strip()):
-                raise ValueError(f"'{name.strip()}' is neither a bare name or address nor *, without scheme and port")
-        return value
-
-    @field_validator("cors_origins")
-    @classmethod
-    def _origins_only(cls, value: str) -> str:
-        for origin in value.split(","):
-            if not _ORIGIN.fullmatch(origin.strip()):
-                raise ValueError(f"'{origin.strip()}' is neither an origin such as https://plans.example nor *")
-        return value
-
-    @field_validator("published_on")
-    @classmethod
-    def _port_mapping(cls, value: str) -> str:
-        if not _PUBLISHED.fullmatch(value):
-            raise ValueError("neither ADDRESS:PORT, with IPv6 addresses in brackets, nor PORT")
-        return value
 
     @model_validator(mode="after")
     def _any_page_needs_keys(self) -> Self:

@@ -72,7 +72,7 @@ LAYERS = {
 SERVICE_LAYERS = (
     "fair_share",
     # `workers` is what runs in worker processes: it loads nothing of what watches over them.
-    "cores settings errors problem_kinds schemas threads bounded_cache telemetry workers",
+    "cores settings setting_types errors problem_kinds schemas threads bounded_cache telemetry workers",
     "pools storage",
     "grids preview security conversion",
     "http",
