@@ -15,7 +15,7 @@ telemetry/  metrics, logs and traces
 preview/    drawings and meshes of plans
 web/        the web pages, built from web/ beside this package
 
-Beside them: `settings.py` (`setting_types.py` checks their values), `errors.py` (what errors mean over HTTP), `cores.py`
-(which part gets how many), `fair_share.py` (that no tenant takes everything), `threads.py`, `bounded_cache.py`, and the
-command lines `cli.py`, `openapi.py`, `__main__.py`.
+Beside them: `settings.py`, `setting_types.py`, `errors.py` (what errors mean over HTTP), `cores.py` (which part gets
+how many), `fair_share.py` (that no tenant takes everything), `threads.py`, `bounded_cache.py`, and the command lines
+`cli.py`, `openapi.py`, `__main__.py`.
 """

@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import pickle
 from collections.abc import Iterator
@@ -18,6 +19,7 @@ import pytest
 from lalaloc_core.errors import ConfigError
 from service.errors import DeadlineExceededError, InvalidRequestError, PlanNotReadyError
 from service.problem_kinds import PROBLEMS, problem_kind
+from service.query import QueryContext
 from service.settings import Settings
 from tests.service.conftest import FLAT, StartApp, assert_problem, localise, serving, upload, wait_for
 
@@ -26,7 +28,7 @@ ray = pytest.importorskip("ray", reason="Ray is not installed: pip install -c co
 from ray import serve  # noqa: E402
 
 from service.on_ray import app  # noqa: E402
-from service.on_ray.outcome import Failure  # noqa: E402
+from service.on_ray.outcome import Failure, Success, telling_failures  # noqa: E402
 from tests.service.ray_cluster import NAME  # noqa: E402
 
 
@@ -145,3 +147,30 @@ def test_errors_arrive_with_all_that_they_say(error: Any) -> None:
     assert vars(arrived) == vars(error)
     assert problem_kind(arrived) is problem_kind(error)
     assert type(error) in PROBLEMS
+
+
+def test_a_context_arrives_with_the_time_that_was_spent() -> None:
+    sent = QueryContext.starting("tenant", 10.0, spent_s=4.0)
+    arrived = pickle.loads(pickle.dumps(sent))
+    assert arrived.client == "tenant"
+    assert arrived.spent_s == pytest.approx(sent.spent_s, abs=1.0)
+    assert arrived.deadline - arrived.begin == pytest.approx(10.0)
+    assert arrived.clock is not sent.clock
+
+
+def test_a_replica_tells_what_it_refuses_and_raises_what_it_should_not() -> None:
+    class Replica:
+        @telling_failures
+        async def half(self, number: int) -> int:
+            if number < 0:
+                raise DeadlineExceededError(10.0)
+            if number % 2:
+                raise AssertionError(number)
+            return number // 2
+
+    assert asyncio.run(Replica().half(4)) == Success(2)
+    refused = asyncio.run(Replica().half(-1))
+    assert isinstance(refused, Failure)
+    assert str(refused.error) == str(DeadlineExceededError(10.0))
+    with pytest.raises(AssertionError):
+        asyncio.run(Replica().half(3))
