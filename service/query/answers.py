@@ -47,12 +47,12 @@ def locate_in(record: PlanRecord) -> Locate:
 
 def compose(
     found: Localisation,
+    *,
     locate: Locate,
     known: KnownHeading,
     warnings: list[str],
     timings_ms: dict[str, float],
     bundle: Bundle,
-    *,
     share: float = 1.0,
 ) -> LocaliseAnswer:
     """An answer.

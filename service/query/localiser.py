@@ -171,7 +171,14 @@ class Localiser:
         found = await self.finished(steps, context)
         timings_ms = self.observe(context, found.stage)
         warnings = heading_warnings(found, known) + hint_warnings(hints, found, record.plan)
-        answer = compose(found, locate_in(record), known, warnings, timings_ms, self._bundle)
+        answer = compose(
+            found,
+            locate=locate_in(record),
+            known=known,
+            warnings=warnings,
+            timings_ms=timings_ms,
+            bundle=self._bundle,
+        )
         if form.include == "posterior":
             answer = answer.model_copy(update={"posterior": posterior_answer(record.plan, grid, found.posterior)})
         return _Answered(answer, found, grid)
@@ -200,7 +207,14 @@ class Localiser:
             step = await self.compute(context, partial(next_step, steps, result))
         timings_ms = self.observe(context, step.stage)
         alone = [
-            compose(found, locate_in(record), one, heading_warnings(found, one), timings_ms, self._bundle)
+            compose(
+                found,
+                locate=locate_in(record),
+                known=one,
+                warnings=heading_warnings(found, one),
+                timings_ms=timings_ms,
+                bundle=self._bundle,
+            )
             for one, found in zip(known, step.pictures, strict=True)
         ]
         return sequence_answer(alone, step, motions, self._bundle.manifest.confidence)

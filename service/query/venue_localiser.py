@@ -165,7 +165,9 @@ class VenueLocaliser:
         compute = partial(self._localiser.compute, context)
         encoded = (await compute(lambda: self._localiser.encode([panorama], [known], height, clock)))[0]
         with clock.stage("shortlist"):
-            searched = await self._searched(venue, ready, encoded, form, hints, warnings, compute)
+            searched = await self._searched(
+                venue, ready, encoded, form=form, hints=hints, warnings=warnings, compute=compute
+            )
         merged = searched.merged
         steps = localise_steps(
             merged.plan,
@@ -186,7 +188,15 @@ class VenueLocaliser:
             *searched.warnings,
         ]
         share, probability = searched.shares(found)
-        answer = compose(found, searched.place, known, warnings, timings_ms, self._bundle, share=share)
+        answer = compose(
+            found,
+            locate=searched.place,
+            known=known,
+            warnings=warnings,
+            timings_ms=timings_ms,
+            bundle=self._bundle,
+            share=share,
+        )
         plans = self._plan_probabilities(searched.rows, found, share, probability)
         return answer.model_copy(update={"venue_id": venue.id, "plans": plans[: form.top_k]})
 
@@ -222,6 +232,7 @@ class VenueLocaliser:
         venue: VenueRecord,
         ready: Sequence[Row[Any]],
         query: Query,
+        *,
         form: LocaliseForm,
         hints: VenueHints,
         warnings: list[str],
