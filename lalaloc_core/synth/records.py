@@ -92,5 +92,6 @@ class Records:
 def _together(parts: list[int | slice]) -> slice:
     """The columns of several indices that follow each other."""
     spans = [slice(part, part + 1) if isinstance(part, int) else part for part in parts]
-    assert all(one.stop == following.start for one, following in pairwise(spans)), "columns that are not neighbours"
+    if any(one.stop != following.start for one, following in pairwise(spans)):
+        raise ValueError(f"columns {spans} are joined, but are not neighbours")
     return slice(spans[0].start, spans[-1].stop)

@@ -69,7 +69,7 @@ class _Builder:
             if mirror is not None:
                 self._facts.add("mirror")
                 in_room += tables.prisms[before_lamps:]
-                add_mirror(tables, self._style, mirror, self._room, in_room, lights, rng)
+                add_mirror(tables, self._style, mirror, room=self._room, prisms=in_room, lights=lights, rng=rng)
         tables.add_jambs()
         if self._is_bright and any(opening.kind == "window" for opening in self._openings):
             self._facts.add("bare_bright")
@@ -97,7 +97,7 @@ class _Builder:
         self._streams.begin(ScenePart.OPENING, number)
         if opening.kind != "window":
             slot_behind = self._slot_rooms.index(opening.neighbour) if is_own and opening.is_see_through else None
-            add_door(tables, style, self._home, wall, opening, slot_behind, rng)
+            add_door(tables, style, self._home, opening, wall=wall, slot_behind=slot_behind, rng=rng)
             return
         add_window(tables, style, wall, opening, rng)
         if is_own:

@@ -25,8 +25,9 @@ def add_door(
     tables: SceneTables,
     style: HouseStyle,
     home: Home,
-    wall: int,
     opening: Opening,
+    *,
+    wall: int,
     slot_behind: int | None,
     rng: np.random.Generator,
 ) -> None:
@@ -36,8 +37,8 @@ def add_door(
         tables: of the scene.
         style: the house's.
         home: the home.
-        wall: the opening's wall in the tables.
         opening: the opening, not a window.
+        wall: its wall in the tables.
         slot_behind: slot of the room that one sees through it; with None it is shut or dark.
         rng: source of randomness.
     """
@@ -54,7 +55,7 @@ def add_door(
         tables.add_decal(wall, s_m=(s0, s1), z_m=(_BELOW_M, head), surface=cheeks, slot=slot_behind, depth_m=depth)
         _add_threshold(tables, style, room, opening, depth, rng)
         if opening.kind == "door_open":
-            _add_leaves(tables, style, room, neighbour, opening, depth, rng)
+            _add_leaves(tables, style, opening, room=room, neighbour=neighbour, depth_m=depth, rng=rng)
     elif opening.kind == "door_shut" or (opening.kind == "door_open" and rng.random() < 0.5):
         _add_shut_door(tables, style, wall, opening, rng)
     else:
@@ -99,9 +100,10 @@ def _add_shut_door(
 def _add_leaves(
     tables: SceneTables,
     style: HouseStyle,
+    opening: Opening,
+    *,
     room: Room,
     neighbour: Room,
-    opening: Opening,
     depth_m: float,
     rng: np.random.Generator,
 ) -> None:

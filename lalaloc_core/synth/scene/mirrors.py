@@ -63,6 +63,7 @@ def add_mirror(
     tables: SceneTables,
     style: HouseStyle,
     mirror: Mirror,
+    *,
     room: Room,
     prisms: Iterable[Row],
     lights: Lights,
