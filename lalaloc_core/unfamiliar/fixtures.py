@@ -267,9 +267,9 @@ def picture(rng: np.random.Generator) -> Piece:
 
 def curtain(rng: np.random.Generator, width: float, top: float) -> Part:
     """One cloth of a pair of curtains, from x = 0 on."""
-    return folded_sheet("curtain", width, rng.choice([0.03, 0.6], p=[0.8, 0.2]), top, width / 0.13, 0.035).moved(
-        y_m=0.09
-    )
+    low_m = rng.choice([0.03, 0.6], p=[0.8, 0.2])
+    cloth = folded_sheet("curtain", width_m=width, low_m=low_m, high_m=top, folds=width / 0.13, depth_m=0.035)
+    return cloth.moved(y_m=0.09)
 
 
 def pendant(rng: np.random.Generator, ceiling_m: float, drop_m: float) -> tuple[Part, ...]:

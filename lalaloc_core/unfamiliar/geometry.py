@@ -148,7 +148,14 @@ def crumpled(part: Part, depth: Number, rng: np.random.Generator) -> Part:
 
 
 def folded_sheet(
-    surface: str, width_m: Number, low_m: Number, high_m: Number, folds: Number, depth_m: Number, phase: Number = 0.0
+    surface: str,
+    *,
+    width_m: Number,
+    low_m: Number,
+    high_m: Number,
+    folds: Number,
+    depth_m: Number,
+    phase: Number = 0.0,
 ) -> Part:
     """A hanging cloth along x with folds like a sine."""
     columns = max(int(folds * 10), 4)

@@ -21,7 +21,7 @@ _LAMP_RADIUS_M = 0.22
 _MEAN_REFLECTANCE = 0.6
 # Corners are darker than the one bounce says: light from nearer than about this is held back.
 _NEAR_M = 0.25
-_BRIGHTEST = 2.0
+_MAX_BRIGHTNESS = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +175,7 @@ class Lights:
         distance = np.where(met, hits.distance_m, 0.0)
         light = materials.mean(number[hits.face]) * ambient * (distance / (distance + _NEAR_M))[:, None]
         # A few bright rays out of few would show as spots.
-        return np.minimum(light, _BRIGHTEST * self.ambient[room]).astype(np.float32)
+        return np.minimum(light, _MAX_BRIGHTNESS * self.ambient[room]).astype(np.float32)
 
 
 class _Pane(NamedTuple):

@@ -29,13 +29,15 @@ def _floor(kind: RoomKind, rng: np.random.Generator) -> Surface:
     turn = float(rng.choice([0.0, np.pi / 2, np.pi / 4, rng.uniform(0, 3.14)]))
     if pattern == "planks":
         colour = _woody(rng)
-        return Surface(pattern, colour, colour * 0.35, rng.uniform(0.6, 1.2), turn, rng.choice([0.0, 0.03, 0.08]))
+        size_m, gloss = rng.uniform(0.6, 1.2), rng.choice([0.0, 0.03, 0.08])
+        return Surface(pattern, colour, colour * 0.35, size_m=size_m, turn=turn, gloss=gloss)
     if pattern == "cloth":
         colour = _hsv(rng.random(), rng.uniform(0.0, 0.5), rng.uniform(0.35, 0.75))
-        return Surface(pattern, colour, colour * 0.6, 1.0, turn)
+        return Surface(pattern, colour, colour * 0.6, size_m=1.0, turn=turn)
     colour = _hsv(rng.uniform(0.0, 0.7), rng.uniform(0.0, 0.25), rng.uniform(0.5, 0.95))
     contrast = rng.uniform(0.15, 0.8)
-    return Surface(pattern, colour, colour * contrast, rng.uniform(0.3, 0.9), turn, rng.uniform(0.02, 0.12))
+    size_m, gloss = rng.uniform(0.3, 0.9), rng.uniform(0.02, 0.12)
+    return Surface(pattern, colour, colour * contrast, size_m=size_m, turn=turn, gloss=gloss)
 
 
 def _wall(kind: RoomKind, rng: np.random.Generator) -> Surface:
@@ -57,9 +59,8 @@ def _wall(kind: RoomKind, rng: np.random.Generator) -> Surface:
         colour = _hsv(rng.uniform(0.0, 0.09), rng.uniform(0.1, 0.65), rng.uniform(0.5, 0.85))
     second = np.clip(colour * rng.uniform(0.55, 0.9), 0, 1) if pattern != "brick" else np.full(3, 0.55)
     skirting = _hsv(0.08, rng.uniform(0, 0.4), rng.uniform(0.3, 0.95)) if rng.random() < 0.75 else None
-    return Surface(
-        pattern, colour, second, rng.uniform(0.25, 0.7), 0.0, 0.03 if kind == "bathroom" else 0.0, 0.0, skirting
-    )
+    size_m, gloss = rng.uniform(0.25, 0.7), 0.03 if kind == "bathroom" else 0.0
+    return Surface(pattern, colour, second, size_m=size_m, gloss=gloss, skirting=skirting)
 
 
 def room_surfaces(kinds: Sequence[RoomKind], rng: np.random.Generator) -> list[dict[str, Surface]]:
@@ -68,7 +69,8 @@ def room_surfaces(kinds: Sequence[RoomKind], rng: np.random.Generator) -> list[d
     uniform = rng.random() < 0.4
     white = _hsv(0.1, rng.uniform(0.0, 0.06), rng.uniform(0.88, 0.97))
     ceiling = Surface("plain", white, white)
-    wooden = Surface("planks", (beam := _woody(rng)), beam * 0.5, 0.9, float(rng.choice([0.0, np.pi / 2])))
+    beam = _woody(rng)
+    wooden = Surface("planks", beam, beam * 0.5, size_m=0.9, turn=float(rng.choice([0.0, np.pi / 2])))
     rooms = []
     for kind in kinds:
         wet = kind == "bathroom"
@@ -91,7 +93,7 @@ def thing_surfaces(rng: np.random.Generator) -> dict[str, Surface]:
             str(rng.choice(["cloth", "cloth", "stripes", "dots"])),
             colour,
             colour * rng.uniform(0.4, 0.8),
-            rng.uniform(0.06, 0.25),
+            size_m=rng.uniform(0.06, 0.25),
         )
 
     def wood() -> Surface:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -28,6 +28,7 @@ class Surface:
     pattern: str
     colour: Float[np.ndarray, "3"]
     second: Float[np.ndarray, "3"]
+    _: KW_ONLY
     size_m: float = 0.5
     turn: float = 0.0
     gloss: float = 0.0

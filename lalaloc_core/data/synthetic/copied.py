@@ -25,7 +25,7 @@ _MOVED_SHARE = 0.5
 _SEEN_COLUMNS, _COLUMNS = 2, 128
 # Doors keep so far (m) from corners and other openings, and are tried every so far along a wall; openings nearer to a
 # wall than its thickness may be are in it.
-_CLEAR_M, _STEP_M, _THICKEST_M = 0.15, 0.1, 0.5
+_CLEAR_M, _STEP_M, _MAX_THICKNESS_M = 0.15, 0.1, 0.5
 
 
 @dataclass(frozen=True)
@@ -128,7 +128,7 @@ def _free_line(
         along = (end - start) / length_m
         at = (lines - start) @ along
         apart = np.abs((lines - start) @ np.array([-along[1], along[0]])).max(axis=1)
-        taken = np.sort(at[apart < _THICKEST_M], axis=1)
+        taken = np.sort(at[apart < _MAX_THICKNESS_M], axis=1)
         for first in np.arange(_CLEAR_M, length_m - width_m - _CLEAR_M, _STEP_M):
             last = first + width_m
             if not np.any((taken[:, 0] < last + _CLEAR_M) & (taken[:, 1] > first - _CLEAR_M)):

@@ -19,12 +19,12 @@ from lalaloc_core.synth.homes.splits import home_of
 
 # Between what stands side by side (m).
 _GAP_M = 0.3
-_CORRIDOR_M, _LONGEST_CORRIDOR_M, _DOOR_M, _DOORS_EVERY_M = 2.5, 60.0, 0.9, 6.0
+_CORRIDOR_M, _MAX_CORRIDOR_M, _DOOR_M, _DOORS_EVERY_M = 2.5, 60.0, 0.9, 6.0
 # Halls: their area (m²), how far their columns are apart, and how thick they are.
 _HALL_M2, _COLUMNS_EVERY_M, _COLUMN_M = 900.0, 5.0, 0.5
 _CEILING_M = 3.0
 # Floor by length of the wings (m); gaps and courtyards make buildings more than twice as deep.
-_DEEPEST_M = 350.0
+_MAX_DEPTH_M = 350.0
 # Buildings are larger than what one may upload.
 _LIMITS = PlanLimits(max_rooms=10**6, max_plan_vertices=10**7, max_openings=10**6)
 
@@ -62,7 +62,7 @@ class _Builder:
         self._split, self._seed = split, seed
         self._area_m2, self._hall_share = area_m2, hall_share
         # Nearly square; large ones are wider, as a wing is as deep as its deepest home and they would be too long.
-        self._length_m = max(1.1 * math.sqrt(area_m2), area_m2 / _DEEPEST_M)
+        self._length_m = max(1.1 * math.sqrt(area_m2), area_m2 / _MAX_DEPTH_M)
         self._rooms: list[dict[str, Any]] = []
         self._openings: list[dict[str, Any]] = []
         self._homes: list[Home] = []
@@ -133,7 +133,7 @@ class _Builder:
 
     def _corridors(self, y_m: float) -> float:
         """Corridors one after the other along a wing that has ended; returns where they end."""
-        count = math.ceil(self._length_m / _LONGEST_CORRIDOR_M)
+        count = math.ceil(self._length_m / _MAX_CORRIDOR_M)
         length_m = self._length_m / count - _GAP_M
         for x_m in (np.arange(count) * (length_m + _GAP_M)).tolist():
             number = len(self._rooms)

@@ -27,8 +27,8 @@ from lalaloc_core.synth.scene.shots import Shot, sample_shots
 __all__ = ["PanoramaRenderer", "Shot", "sample_shots"]
 
 # Small batches stay in a CPU's caches, large ones fill a GPU.
-_PIXELS_AT_ONCE = {"cpu": 1 << 17}
-_PIXELS_AT_ONCE_ELSEWHERE = 1 << 21
+_BATCH_PIXELS = {"cpu": 1 << 17}
+_BATCH_PIXELS_ELSEWHERE = 1 << 21
 # What tables are padded with: walls of no room, decals on no wall, and a small box far away.
 _NO_ROOM = -(10**6)
 _PADDING = {
@@ -72,8 +72,8 @@ class PanoramaRenderer:
             raise InvalidInputError(f"{rays} rays per pixel along its two axes, at least 1 is needed along each")
         self._rays_per_pixel = rays
         rows, columns = height * rays[0], width * rays[1]
-        at_once = _PIXELS_AT_ONCE.get(self._device.type, _PIXELS_AT_ONCE_ELSEWHERE)
-        self._scenes_at_once = max(1, at_once // (rows * columns))
+        pixels = _BATCH_PIXELS.get(self._device.type, _BATCH_PIXELS_ELSEWHERE)
+        self._batch_size = max(1, pixels // (rows * columns))
         self._slope = self._tensor(np.tan(row_elevations(rows)))
         self._azimuth = self._tensor(column_azimuths(columns))
         # Pictures take differently rolled parts of one field of noise: drawing new noise would cost more than the rays.
@@ -86,10 +86,10 @@ class PanoramaRenderer:
     @torch.no_grad()
     def render_scenes(self, scenes: Sequence[RenderScene]) -> UInt8[Tensor, "b h w 3"]:
         """Photograph scenes that were built elsewhere, such as in worker processes, with the same materials."""
-        step = self._scenes_at_once
-        return torch.cat([self._render_at_once(scenes[k : k + step]) for k in range(0, len(scenes), step)])
+        step = self._batch_size
+        return torch.cat([self._render_batch(scenes[k : k + step]) for k in range(0, len(scenes), step)])
 
-    def _render_at_once(self, scenes: Sequence[RenderScene]) -> UInt8[Tensor, "b h w 3"]:
+    def _render_batch(self, scenes: Sequence[RenderScene]) -> UInt8[Tensor, "b h w 3"]:
         batch = stack_scenes(scenes, self._device)
         direction = self._directions(batch)
         return self._photograph(batch, trace(batch, direction, self._slope), direction)
