@@ -13,6 +13,8 @@ pools/      worker processes, kept alive and fed
 workers/    the programs that run in them
 telemetry/  metrics, logs and traces
 preview/    drawings and meshes of plans
+conversion/ files of plans, read and written in worker processes
+on_ray/     the service on several machines
 web/        the web pages, built from web/ beside this package
 
 Beside them: `settings.py`, `setting_types.py`, `errors.py` (what errors mean over HTTP), `cores.py` (which part gets
