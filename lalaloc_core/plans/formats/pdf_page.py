@@ -187,7 +187,7 @@ def _fill_luminance(item: Any) -> float:
     red, green, blue, alpha = (ctypes.c_uint() for _ in range(4))
     if not pdfium.FPDFPageObj_GetFillColor(item, red, green, blue, alpha) or alpha.value < 60:
         return 255.0
-    return luminance(red.value, green.value, blue.value)
+    return luminance(float(red.value), float(green.value), float(blue.value))
 
 
 def _letterings(page: pypdfium2.PdfPage) -> list[Lettering]:

@@ -203,7 +203,7 @@ def _add_shape(element: Any, place: _Place, drawing: Drawing, builder: ReportBui
     name = _name_of(element, place)
     fill: Any = element.fill
     is_filled = fill is not None and fill.value is not None and fill.opacity > 0.2
-    is_dark = bool(is_filled and luminance(fill.red, fill.green, fill.blue) < DARK)
+    is_dark = bool(is_filled and luminance(float(fill.red), float(fill.green), float(fill.blue)) < DARK)
     width = element.stroke_width if element.stroke is not None and element.stroke.value is not None else 0.0
     shells: list[shapely.Polygon] = []
     for points, closed, curves in _outlines(svgelements.Path(element), budget):
