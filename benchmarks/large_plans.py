@@ -94,7 +94,7 @@ def _measure(building: Building, bundle: Bundle, renderers: RendererCache, count
         grid = embed(
             plan, encoders, step_m=_STEP_M, camera_height_m=plan.camera_height_m, after_chunk=lambda _share, _s: None
         )
-        grid.sketch(plan)
+        grid.binned(plan)
         grids.append(grid)
 
     ready_s, _ = _timed(prepare)

@@ -203,7 +203,7 @@ def _add_shape(element: Any, place: _Place, drawing: Drawing, builder: ReportBui
     name = _name_of(element, place)
     fill: Any = element.fill
     is_filled = fill is not None and fill.value is not None and fill.opacity > 0.2
-    is_dark = bool(is_filled and luminance(float(fill.red), float(fill.green), float(fill.blue)) < DARK)
+    is_dark = is_filled and _luminance_of(fill) < DARK
     width = element.stroke_width if element.stroke is not None and element.stroke.value is not None else 0.0
     shells: list[shapely.Polygon] = []
     for points, closed, curves in _outlines(svgelements.Path(element), budget):
@@ -220,6 +220,10 @@ def _add_shape(element: Any, place: _Place, drawing: Drawing, builder: ReportBui
     for shape in _with_holes(shells):
         drawing.areas.append(Area(shape, place.layer, place.role, name, place.kind, is_dark))
         builder.use(place.layer, f"areas: {place.role or 'perhaps rooms'}")
+
+
+def _luminance_of(colour: Any) -> float:
+    return luminance(float(colour.red), float(colour.green), float(colour.blue))
 
 
 def _outlines(path: svgelements.Path, budget: Budget) -> Iterator[tuple[np.ndarray, bool, list[np.ndarray]]]:
