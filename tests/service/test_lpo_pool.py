@@ -153,8 +153,8 @@ def test_a_full_queue_means_no_answer_at_once(pool: LpoPool, job: RefinementJob)
         os.kill(pid, signal.SIGSTOP)
     with ThreadPoolExecutor(6) as threads:
         # Two jobs are at the workers, four fill what one client may have of the queue.
-        waiting = [threads.submit(_refine, pool, job, 1.5) for _ in range(6)]
-        wait_for(lambda: pool._workers.waiting == 4, 1.0)
+        waiting = [threads.submit(_refine, pool, job, 10.0) for _ in range(6)]
+        wait_for(lambda: pool._workers.waiting == 4, 8.0)
         begin = monotonic()
         assert _refine(pool, job, 20.0) is None
         assert monotonic() - begin < 0.5
