@@ -1,7 +1,7 @@
-"""Latent pose optimisation (LPO): move a pose until the latent of its layout meets the query's (paper, section 4.2.1).
+"""Pose optimisation (LPO; paper, section 4.2.1): move a pose until its layout fits what the picture says.
 
-`min over pose of | Φ_layout(Ω(pose, plan)) - f |₂`, with the closed-form renderer Ω. Where the model predicts a wall
-profile with its uncertainty, the layout's profile is compared with that, by the cost of `localise.evidence`. Two
+In the paper `min over pose of | Φ_layout(Ω(pose, plan)) - f |₂`, latents, with the renderer Ω. Where the model predicts
+a wall profile with its uncertainty, the layout's profile is compared with that, by the cost of `localise.evidence`. Two
 optimisers share one evaluation (residuals and their derivatives by 2 or 3 unknowns; the log of true over stated camera
 height is one more where profiles are compared):
 
