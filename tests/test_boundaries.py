@@ -43,6 +43,7 @@ LAYERS = {
     "lalaloc_core.synth.records": 2,
     "lalaloc_core.synth.homes": 2,
     "lalaloc_core.synth": 3,
+    "lalaloc_core.synth.augmentation": 4,
     "lalaloc_core.synth.camera": 3,
     "lalaloc_core.synth.furniture": 3,
     "lalaloc_core.synth.scene": 4,

@@ -14,12 +14,12 @@ from lalaloc_core.nets.image_encoder import TrunkImageEncoder
 from lalaloc_core.nets.image_features import ImageFeatures, StructureFeatures, first_of
 from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
 from lalaloc_core.nets.trunk import StyleMixing
+from lalaloc_core.synth.augmentation.photometric import jittered, optics
 from lalaloc_core.training import losses
 from lalaloc_core.training.batches import Batch
 from lalaloc_core.training.config import ImageStageConfig, TrainConfig
 from lalaloc_core.training.objective import anchors_with_neighbours, chamfer_to_anchors, embed
 from lalaloc_core.training.photographs import Photographs
-from lalaloc_core.training.photometric import jittered, optics
 from lalaloc_core.training.sources import Source
 from lalaloc_core.training.stages import build_image_encoder, panorama_batches
 

@@ -13,11 +13,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lalaloc_core.errors import ConfigError
+from lalaloc_core.synth.augmentation.photometric import jittered
 from lalaloc_core.training.batch_streams import PanoramaBatches
 from lalaloc_core.training.batches import Batch, load_batches
 from lalaloc_core.training.config import PRESETS, TrainConfig
 from lalaloc_core.training.image_stage import ImageStage
-from lalaloc_core.training.photometric import jittered
 from lalaloc_core.training.replay_buffer import ReplayBuffer
 from lalaloc_core.training.sources import GeneratedSource
 from lalaloc_core.training.stages import build_layout_encoder

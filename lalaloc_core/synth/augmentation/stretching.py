@@ -20,23 +20,34 @@ def stretched(
 ) -> tuple[UInt8[Tensor, "n h w 3"], Float[Tensor, "n w k"], Float[Tensor, "n w"]]:
     """Panoramas, and what is known by column, as if what they show were wider and deeper about the camera.
 
-    A point (x, y, z) comes to lie at (a x, b y, z), so what is seen in direction (u, v, t) was seen in
-    (u / a, v / b, t).
-
     Args:
         factors: (a, b), across and along the direction of the central column.
     """
-    height, width = images.shape[1:3]
-    azimuth = ((torch.arange(width) + 0.5) / width - 0.5) * TWO_PI
-    across, along = torch.sin(azimuth) / factors[:, :1], torch.cos(azimuth) / factors[:, 1:]
-    reach = torch.hypot(across, along)
-    column = (torch.atan2(across, along) / TWO_PI + 0.5) * width - 0.5
-    tangent = torch.tan((0.5 - (torch.arange(height) + 0.5) / height) * math.pi)
-    elevation = torch.atan(tangent[:, None] / reach[:, None, :])
-    row = (0.5 - elevation / math.pi) * height - 0.5
+    width = images.shape[2]
+    column, reach = _seen_at(width, factors)
     nearest = column.round().long() % width
     moved = openings.gather(1, nearest[..., None].expand_as(openings))
-    return _sampled(images, row, column), moved, log_distance.gather(1, nearest) - torch.log(reach)
+    return stretched_images(images, factors), moved, log_distance.gather(1, nearest) - torch.log(reach)
+
+
+def stretched_images(images: UInt8[Tensor, "n h w 3"], factors: Float[Tensor, "n 2"]) -> UInt8[Tensor, "n h w 3"]:
+    """Panoramas alone, as by `stretched`."""
+    height, width = images.shape[1:3]
+    column, reach = _seen_at(width, factors)
+    tangent = torch.tan((0.5 - (torch.arange(height) + 0.5) / height) * math.pi)
+    elevation = torch.atan(tangent[:, None] / reach[:, None, :])
+    return _sampled(images, (0.5 - elevation / math.pi) * height - 0.5, column)
+
+
+def _seen_at(width: int, factors: Float[Tensor, "n 2"]) -> tuple[Float[Tensor, "n w"], Float[Tensor, "n w"]]:
+    """In which column what is to be seen in each column was seen, and what part of its distance it had then.
+
+    A point (x, y, z) comes to lie at (a x, b y, z), so what is seen in direction (u, v, t) was seen in
+    (u / a, v / b, t).
+    """
+    azimuth = ((torch.arange(width) + 0.5) / width - 0.5) * TWO_PI
+    across, along = torch.sin(azimuth) / factors[:, :1], torch.cos(azimuth) / factors[:, 1:]
+    return (torch.atan2(across, along) / TWO_PI + 0.5) * width - 0.5, torch.hypot(across, along)
 
 
 def _sampled(
