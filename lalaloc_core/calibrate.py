@@ -4,8 +4,8 @@
   candidates the most probable (`fit_evidence`).
 * What fits a picture by chance (`localise.cohort`), from training homes.
 * The probability that a picture fits its plan, with which the posterior makes the probability of "within 1 m", and the
-  covariance (`fit_confidence`). Queries are photographs of the plan's home, and some of other homes and of none: what
-  fits nothing must not be trusted.
+  covariance (`fit_confidence`). Queries are photographs of the plan's home, the same disturbed, since real cameras and
+  plans are worse than rendered ones, and some of other homes and of none: what fits nothing must not be trusted.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from lalaloc_core.localise.posterior import HEADING_SEPARATION, RIGHT_WITHIN_M
 from lalaloc_core.metrics import Accuracy
 
 # Of all that is fitted on, photographs of something else than the plan's home weigh so much: enough to tell them, too
-# little to make answers about the home itself look less sure than they are.
-_MISMATCHED_SHARE = 0.2
+# little to make answers about the home itself look less sure than they are. Chosen by photographs of real rooms.
+_MISMATCHED_SHARE = 0.1
 # A weak pull to zero keeps the fit finite when the queries are perfectly separable.
 _RIDGE = 1e-3
 # A weak pull of the evidence's weights to what they are by default, in units of a query.
@@ -47,10 +47,12 @@ class Answers:
 
     Attributes:
         own: to photographs of the plan's home.
+        disturbed: to such photographs that are worse, or of rooms whose lengths differ from the plan's.
         mismatched: to photographs of anything else, which no answer is right about.
     """
 
     own: Sequence[Prediction]
+    disturbed: Sequence[Prediction] = ()
     mismatched: Sequence[Prediction] = ()
 
 
@@ -145,7 +147,7 @@ def _by_stage(answers: Answers) -> dict[str, LogisticModel]:
 
 def _fit_stage(stage: str, answers: Answers) -> LogisticModel:
     """Maximum-likelihood model of a picture fitting its plan, so that times the posterior the answer is right."""
-    own = [one for one in answers.own if stage in one.signals]
+    own = [one for one in (*answers.own, *answers.disturbed) if stage in one.signals]
     mismatched = [one for one in answers.mismatched if stage in one.signals]
     signals = [one.signals[stage] for one in own + mismatched]
     features = np.array([[1.0, *(one[name] for name in _SIGNALS)] for one in signals])

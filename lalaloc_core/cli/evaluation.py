@@ -232,6 +232,7 @@ def _calibrate(arguments: argparse.Namespace) -> None:
     strangers = training_plans(_COHORT_HOMES, arguments.seed)
     store_cohort(bundle, cohort_of(strangers, bundle.manifest.profile_columns, arguments.seed))
     own = _generated(arguments, None)
+    disturbed = own | {"generator": "disturbed"}
     mismatched = own | {"generator": "mismatched", "homes": max(arguments.homes // _PER_MISMATCHED_HOME, 1)}
     # Weights first: confidence is fitted on answers that were weighed by them.
     evidence = bundle.manifest.evidence
@@ -241,12 +242,16 @@ def _calibrate(arguments: argparse.Namespace) -> None:
         evidence = dataclasses.replace(evidence, openings=arguments.openings_weight)
     print_json(dataclasses.asdict(store_evidence(Bundle.open(arguments.bundle), evidence).manifest.evidence))
     known, searched = (
-        Answers(own=asked(own, heading, "own"), mismatched=asked(mismatched, heading, "mismatched"))
+        Answers(
+            own=asked(own, heading, "own"),
+            disturbed=asked(disturbed, heading, "disturbed"),
+            mismatched=asked(mismatched, heading, "mismatched"),
+        )
         for heading in (True, False)
     )
     description = (
         f"{len(known.own)} panoramas of {arguments.homes} generated validation homes, all furniture levels; confidence "
-        f"besides on {len(known.mismatched)} photographs of others or of no room"
+        f"besides on the same disturbed, and on {len(known.mismatched)} photographs of others or of no room"
     )
     bundle = calibrate(Bundle.open(arguments.bundle), known, searched, description)
     print_json(bundle.manifest.metrics)

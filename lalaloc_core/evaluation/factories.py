@@ -13,6 +13,7 @@ from lalaloc_core.configuration import build_config
 from lalaloc_core.data.dataset import Appearance, Dataset
 from lalaloc_core.data.dataset_detection import open_dataset
 from lalaloc_core.data.synthetic.copied import CopiedScenes
+from lalaloc_core.data.synthetic.disturbed import DisturbedScenes
 from lalaloc_core.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.data.synthetic.mismatched import MismatchedScenes
 from lalaloc_core.errors import InvalidInputError
@@ -96,6 +97,8 @@ def build_dataset(info: RunInfo) -> Dataset:
     homes = GeneratedScenes(**arguments)
     if generator == "copies":
         return CopiedScenes(homes)
+    if generator == "disturbed":
+        return DisturbedScenes(homes)
     # Runs of earlier versions say "strangers".
     return MismatchedScenes(homes) if generator in ("mismatched", "strangers") else homes
 

@@ -107,6 +107,29 @@ class TestConfidence:
         assert np.mean([confidence(model, one) for one in own]) > 0.95
         assert np.mean([confidence(model, one) for one in others]) < 0.1
 
+    def test_what_fits_as_disturbed_photographs_do_is_trusted_if_they_were_right(self) -> None:
+        rng = np.random.default_rng(3)
+        own = [result(0.2, 6.0, cost) for cost in rng.uniform(0.1, 0.2, 200)]
+        disturbed = [result(0.2, 6.0, cost) for cost in rng.uniform(0.2, 0.55, 200)]
+        others = [result(3.0, 6.0, cost) for cost in rng.uniform(0.6, 1.5, 200)]
+        between = result(0.2, 6.0, 0.5)
+        plain, taught = (
+            fit_confidence(Answers(own=own, disturbed=also, mismatched=others), Answers(own=own)).known_heading["lpo"]
+            for also in ([], disturbed)
+        )
+        assert confidence(plain, between) < 0.6
+        assert confidence(taught, between) > 0.8
+        assert np.mean([confidence(taught, one) for one in others]) < 0.1
+
+    def test_disturbed_photographs_say_nothing_of_the_covariance(self) -> None:
+        offsets = np.random.default_rng(5).normal(0.0, 0.1, (200, 2))
+        own = [bent(offset, 100.0 * np.eye(3)) for offset in offsets]
+        far = [bent(3.0 * offset, 100.0 * np.eye(3)) for offset in offsets]
+        model = fit_confidence(Answers(own=own, disturbed=far), Answers(own=own))
+        assert model.position_factor == pytest.approx(
+            fit_confidence(Answers(own=own), Answers(own=own)).position_factor
+        )
+
     @pytest.mark.parametrize("wrong_log_odds", [None, 0.0, 3.0], ids=["none", "like the others", "surer"])
     def test_mismatched_photographs_gain_nothing_where_hardly_an_answer_is_wrong(
         self, wrong_log_odds: float | None

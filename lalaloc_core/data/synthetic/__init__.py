@@ -1,8 +1,8 @@
 """Data sets that are drawn, not read, and writing them to disk.
 
-Begin with `generated.py`, homes of the generator rendered when they are looked at. `mismatched.py` asks them with
-photographs of others, for calibration; `unfamiliar.py` draws the out-of-family homes, which need the extra `oracle`;
-`writing.py` is `lalaloc synth`.
+Begin with `generated.py`, homes of the generator rendered when they are looked at. For calibration `mismatched.py`
+asks them with photographs of others, `disturbed.py` with worse ones; `unfamiliar.py` draws the out-of-family homes,
+which need the extra `oracle`; `writing.py` is `lalaloc synth`.
 """
 
 from lalaloc_core.data.synthetic.generated import GeneratedScenes, training_plans

@@ -1,0 +1,72 @@
+"""Questions as they are asked with real cameras and plans: worse pictures, and lengths that are a little off.
+
+Confidence learns from them how badly a right answer may fit (`lalaloc_core.calibrate`): renderings of exact plans alone
+fit better than any photograph does.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+
+from lalaloc_core.data.dataset import Appearance, Camera, Photograph, Scene, Split
+from lalaloc_core.data.synthetic.generated import GeneratedScenes
+from lalaloc_core.errors import DatasetError
+from lalaloc_core.synth.augmentation.photometric import jittered, optics
+from lalaloc_core.synth.augmentation.stretching import stretched_images
+
+# Standard deviation of the logarithm of how much longer rooms look than their plan says, along two axes.
+_LENGTH_ERROR = 0.1
+# Of what training does to pictures.
+_STRENGTH = 1.0
+
+
+@dataclass(frozen=True)
+class DisturbedScenes:
+    """Generated homes whose photographs are drawn out a little, and exposed, blurred and compressed anew."""
+
+    homes: GeneratedScenes
+
+    @property
+    def description(self) -> str:
+        return f"{self.homes.description}, disturbed"
+
+    @property
+    def appearances(self) -> Sequence[Appearance]:
+        return self.homes.appearances
+
+    def scenes(self, split: Split) -> Sequence[str]:
+        return self.homes.scenes(split)
+
+    def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
+        scene = self.homes.load(name, problems)
+        return dataclasses.replace(scene, cameras=tuple(_disturbed(camera) for camera in scene.cameras))
+
+
+def _disturbed(camera: Camera) -> Camera:
+    seed = int(1e3 * abs(camera.position_m).sum())
+    photographs = {look: DisturbedPhotograph(photograph, seed) for look, photograph in camera.photographs.items()}
+    return dataclasses.replace(camera, photographs=photographs)
+
+
+@dataclass(frozen=True, eq=False)
+class DisturbedPhotograph:
+    """A photograph of a room whose lengths are a little off, by a camera that is not the renderer's."""
+
+    photograph: Photograph
+    seed: int
+
+    def image(self, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
+        generator = torch.Generator().manual_seed(self.seed)
+        factors = torch.exp(_LENGTH_ERROR * torch.randn(1, 2, generator=generator))
+        image = stretched_images(torch.from_numpy(self.photograph.image(height, width))[None], factors)
+        image = optics(jittered(image, _STRENGTH, generator), _STRENGTH, generator)
+        return image[0].round().to(torch.uint8).numpy()
+
+    def depth_m(self) -> Float[np.ndarray, "h w"]:
+        raise DatasetError("a photograph that is drawn out has no depth")
