@@ -11,7 +11,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +20,7 @@ from scipy import optimize
 from lalaloc_core.bundle import COHORT, Bundle, ConfidenceModel, EvidenceModel, LogisticModel, write_manifest
 from lalaloc_core.conventions import heading_from_degrees, wrap_angle
 from lalaloc_core.evaluation.predictions import Pose, Prediction
-from lalaloc_core.evaluation.score import position_errors_m
+from lalaloc_core.evaluation.score import expected_calibration_error, position_errors_m
 from lalaloc_core.files import atomic_write
 from lalaloc_core.localise.cohort import Cohort
 from lalaloc_core.localise.covariance import marginal_information
@@ -34,6 +34,10 @@ _MISMATCHED_SHARE = 0.1
 _RIDGE = 1e-3
 # A weak pull of the evidence's weights to what they are by default, in units of a query.
 _WEIGHT_RIDGE = 0.5
+# What is told of a fit's confidence is asked of fits on the other parts of the homes.
+_PARTS = 5
+# Photographs of something else are to stay below this confidence.
+_UNBELIEVED = 0.1
 # Medians of the chi-squared distribution with one and with two degrees of freedom.
 _MEDIAN_CHI2 = {1: 0.4549, 2: 1.3863}
 # Signals of a picture that fits, or not; which place it is, is the posterior's to say.
@@ -54,6 +58,13 @@ class Answers:
     own: Sequence[Prediction]
     disturbed: Sequence[Prediction] = ()
     mismatched: Sequence[Prediction] = ()
+
+    def among(self, homes: Collection[str]) -> Answers:
+        """Those about some of the homes."""
+        own, disturbed, mismatched = (
+            [one for one in part if one.scene in homes] for part in (self.own, self.disturbed, self.mismatched)
+        )
+        return Answers(own=own, disturbed=disturbed, mismatched=mismatched)
 
 
 def fit_confidence(known: Answers, searched: Answers) -> ConfidenceModel:
@@ -136,8 +147,44 @@ def calibrate(bundle: Bundle, known: Answers, searched: Answers, description: st
     metrics = {**bundle.manifest.metrics, "validation_queries": description}
     for name, answers in (("validation", known), ("validation_heading_searched", searched)):
         metrics[name] = Accuracy.of(position_errors_m(answers.own)).to_dict()
+        metrics[f"{name}_confidence"] = cross_validate(answers)
     manifest = dataclasses.replace(bundle.manifest, confidence=fit_confidence(known, searched), metrics=metrics)
     return write_manifest(bundle.folder, manifest)
+
+
+def cross_validate(answers: Answers) -> dict[str, float]:
+    """How honest confidence after the last stage is about homes that it was not fitted on.
+
+    Returns:
+        `calibration_error` for photographs of the homes, `disturbed_calibration_error`, and `mismatched_believed`, the
+        share of photographs of something else with a confidence above 0.1; each where there are such answers.
+    """
+    homes = sorted({one.scene for one in (*answers.own, *answers.disturbed, *answers.mismatched)})
+    told: dict[str, list[tuple[float, bool]]] = {"own": [], "disturbed": [], "mismatched": []}
+    for part in range(_PARTS):
+        asked = set(homes[part::_PARTS])
+        rest = answers.among(set(homes) - asked)
+        if not rest.own:
+            continue
+        stage = list(rest.own[0].signals)[-1]
+        model = _fit_stage(stage, rest)
+        for name, pairs in told.items():
+            those = getattr(answers.among(asked), name)
+            pairs += [_confidence_and_rightness(model, stage, one) for one in those if stage in one.signals]
+    figures = {}
+    for name, figure in (("own", "calibration_error"), ("disturbed", "disturbed_calibration_error")):
+        if told[name]:
+            confidence, right = zip(*told[name], strict=True)
+            figures[figure] = expected_calibration_error(np.array(confidence), np.array(right))
+    if told["mismatched"]:
+        figures["mismatched_believed"] = float(np.mean([one > _UNBELIEVED for one, _ in told["mismatched"]]))
+    return figures
+
+
+def _confidence_and_rightness(model: LogisticModel, stage: str, one: Prediction) -> tuple[float, bool]:
+    signals, pose = one.signals[stage], one.stages[stage]
+    confidence = model.probability(**signals) / (1.0 + np.exp(-signals["log_odds"]))
+    return confidence, bool(np.hypot(pose.x_m - one.truth.x_m, pose.y_m - one.truth.y_m) < RIGHT_WITHIN_M)
 
 
 def _by_stage(answers: Answers) -> dict[str, LogisticModel]:

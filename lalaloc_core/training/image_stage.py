@@ -116,8 +116,9 @@ class ImageStage:
         assert seen.structure is not None
         openings, log_distance = (told.to(image.device) for told in (others.openings, others.log_distance))
         real = slice(len(image), None)
-        maps = losses.followed_maps(seen.structure.opening_logits[real], openings)
-        walls = losses.followed_walls(seen.log_profile[real], seen.log_scale[real], log_distance)
+        logits = seen.structure.opening_logits[real]
+        maps = losses.followed_maps(logits, openings)
+        walls = losses.followed_walls(seen.log_profile[real], seen.log_scale[real], log_distance, logits)
         followed = stage.photograph_weight * maps + stage.photograph_profile_weight * walls
         return first_of(seen, len(image)), {"photographs": followed}
 

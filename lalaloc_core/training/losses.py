@@ -70,10 +70,18 @@ def laplace(
 
 
 def followed_walls(
-    log_profile: Float[Tensor, "b w"], log_scale: Float[Tensor, "b w"], log_distance: Float[Tensor, "b w"]
+    log_profile: Float[Tensor, "b w"],
+    log_scale: Float[Tensor, "b w"],
+    log_distance: Float[Tensor, "b w"],
+    opening_logits: Float[Tensor, "b w c"],
 ) -> Tensor:
-    """`laplace` of a teacher's walls, whose log distances are nan where it sees none."""
-    known = torch.isfinite(log_distance)
+    """`laplace` of a teacher's walls, whose log distances are nan where it sees none.
+
+    Where the student sees a passage the teacher is not followed: it sees the wall of the room behind, and a room ends
+    in the plane of its own wall.
+    """
+    passage = torch.softmax(opening_logits.detach(), dim=2)[..., OPENING_CLASSES.index("passage")]
+    known = torch.isfinite(log_distance) & (passage < 0.5)
     error = (log_profile - log_distance.nan_to_num()).abs()
     each = error * torch.exp(-log_scale) + log_scale
     return (each * known).sum() / known.sum().clamp_min(1)

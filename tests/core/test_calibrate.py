@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from lalaloc_core.bundle import Bundle, ConfidenceModel, EvidenceModel, LogisticModel, write_manifest
-from lalaloc_core.calibrate import Answers, calibrate, fit_confidence, fit_evidence
+from lalaloc_core.calibrate import Answers, calibrate, cross_validate, fit_confidence, fit_evidence
 from lalaloc_core.evaluation.predictions import Pose, PredictedCandidate, Prediction
 from lalaloc_core.evaluation.score import expected_calibration_error, position_errors_m
 from tests.strategies import seeds
@@ -129,6 +129,29 @@ class TestConfidence:
         assert model.position_factor == pytest.approx(
             fit_confidence(Answers(own=own), Answers(own=own)).position_factor
         )
+
+    def test_what_is_told_of_it_is_of_homes_that_it_was_not_fitted_on(self) -> None:
+        # In each home costs mean something else, so that what was learnt in the others is wrong here.
+        def of_home(number: int, cost: float, *, right: bool) -> Prediction:
+            one = result(0.2 if right else 3.0, 6.0, cost)
+            return dataclasses.replace(one, scene=f"home-{number}")
+
+        alike = [of_home(number, 0.1 + 0.2 * (k % 2), right=k % 2 == 0) for number in range(5) for k in range(40)]
+        assert cross_validate(Answers(own=alike))["calibration_error"] < 0.05
+        turned = [
+            of_home(number, 0.1 + 0.2 * (k % 2), right=(k + number) % 2 == 0) for number in (0, 1) for k in range(40)
+        ]
+        assert cross_validate(Answers(own=turned))["calibration_error"] > 0.9
+
+    def test_it_tells_which_share_of_others_is_believed(self) -> None:
+        own = [dataclasses.replace(result(0.2, 6.0, 0.1), scene=f"home-{k % 5}") for k in range(100)]
+        others = [dataclasses.replace(result(3.0, 6.0, 0.8), scene=f"home-{k % 5}") for k in range(75)]
+        # A quarter cannot be told from the home's own photographs.
+        others += [dataclasses.replace(result(3.0, 6.0, 0.1), scene=f"home-{k % 5}") for k in range(25)]
+        figures = cross_validate(Answers(own=own, mismatched=others))
+        assert figures["mismatched_believed"] == pytest.approx(0.25)
+        assert "disturbed_calibration_error" not in figures
+        assert cross_validate(Answers(own=[])) == {}
 
     @pytest.mark.parametrize("wrong_log_odds", [None, 0.0, 3.0], ids=["none", "like the others", "surer"])
     def test_mismatched_photographs_gain_nothing_where_hardly_an_answer_is_wrong(

@@ -168,6 +168,20 @@ class TestStructure:
         (gradient,) = torch.autograd.grad(losses.followed_maps(without_door, taught), without_door)
         assert gradient[0, 0, 1] < 0.0 < gradient[0, 0, 0]
 
+    def test_following_walls_goes_on_where_they_are_seen_and_stops_at_passages(self) -> None:
+        log_profile = torch.zeros(1, 4, requires_grad=True)
+        taught = torch.tensor([[1.0, math.nan, 1.0, -1.0]])
+        # Wall, wall, passage, and a door that may be a passage.
+        probability = torch.tensor(
+            [[[0.9, 0.0, 0.0, 0.1], [0.9, 0.0, 0.0, 0.1], [0.1, 0.0, 0.0, 0.9], [0, 0.6, 0, 0.4]]]
+        )
+        logits = (probability + 1e-9).log().requires_grad_()
+        loss = losses.followed_walls(log_profile, torch.zeros(1, 4), taught, logits)
+        gradient, of_logits = torch.autograd.grad(loss, [log_profile, logits], allow_unused=True)
+        assert torch.equal(gradient.sign(), torch.tensor([[-1.0, 0.0, 0.0, 1.0]]))
+        # A student must not escape from a wall by calling it a passage.
+        assert of_logits is None
+
 
 class TestChamfer:
     @given(seeds(), st.integers(1, 12), st.integers(1, 12))
