@@ -21,7 +21,7 @@ from lalaloc_core.synth.scene.leaves import boards, hang_leaves
 from lalaloc_core.synth.scene.materials import MaterialLibrary
 from lalaloc_core.synth.scene.mirrors import Reflection
 from lalaloc_core.synth.scene.render_scene import Sun
-from lalaloc_core.synth.scene.shots import Shot, sample_shots, stage_rooms
+from lalaloc_core.synth.scene.shots import POSE_MARGIN_M, Shot, sample_shots, stage_rooms
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -43,6 +43,28 @@ def shots_of(homes: int) -> list[Shot]:
 @pytest.fixture(scope="module")
 def known() -> list[tuple[Shot, frozenset[str]]]:
     return [(shot, facts_of(shot)) for shot in shots_of(60)]
+
+
+def test_hard_places_are_in_openings_as_well_and_clear_of_walls() -> None:
+    """Within `POSE_MARGIN_M` of a room's outline only where it is open, and never on it."""
+    inside = 0
+    for index in range(40):
+        home, rng = home_of(TRAIN, 0, index)
+        for shot in sample_shots(home, 8, rng, hard_share=1.0):
+            room, here = home.plan.rooms[shot.room_index], shapely.Point(shot.position_m)
+            assert room.shape.contains(here)
+            walls = room.shape.boundary
+            for opening in home.openings:
+                if opening.room == shot.room_index and opening.is_see_through:
+                    start, along, _ = wall_frame(room, opening.wall)
+                    ends = [start + along * opening.start_m, start + along * opening.end_m]
+                    walls = walls.difference(shapely.LineString(ends).buffer(2e-3))
+            assert walls.distance(here) > POSE_MARGIN_M - 1e-6
+            nearest_m = room.shape.boundary.distance(here)
+            assert nearest_m > 0.029
+            inside += nearest_m < POSE_MARGIN_M - 1e-6
+    # Three in ten hard places are thresholds, if there is an opening, and every other one of them is in it.
+    assert 0.05 < inside / (8 * 40) < 0.2
 
 
 def test_every_hard_case_occurs_and_none_always(known: list[tuple[Shot, frozenset[str]]]) -> None:

@@ -12,6 +12,7 @@ from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.floorplan import Room
 from lalaloc_core.sampling import random_poses
 from lalaloc_core.synth.furniture.furnish import FURNITURE_LEVELS, FurnitureLevel, wall_frame
+from lalaloc_core.synth.homes.openings import Opening
 from lalaloc_core.synth.homes.plans import Home
 from lalaloc_core.synth.scene.lighting import Mood
 
@@ -20,7 +21,8 @@ POSE_MARGIN_M = 0.2
 CEILING_CLEARANCE_M = 0.3
 _LEVEL_SHARES = (0.3, 0.2, 0.5)
 _STAGED_HEIGHTS_M = (1.2, 1.7)
-_THRESHOLD_M = 0.55
+# Cameras on a threshold stand so far from the plane of the opening, those in it nearer than `POSE_MARGIN_M`.
+_IN_OPENING_M, _THRESHOLD_M = 0.03, 0.55
 _TRIES = 8
 
 
@@ -72,7 +74,7 @@ def sample_shots(
         level: how full the rooms are; None draws it for every shot.
         by_room_share: share of shots whose room is drawn first, all rooms alike: more of closets and corridors.
         hard_share: share of shots from places that are rare on the floor and hard to localise: close to a wall, on
-            the threshold of an open door, in the narrowest rooms.
+            the threshold of an open door or in it, in the narrowest rooms.
         unusual_heights_m: camera heights, evenly between, of the quarter that is not taken from 1.3 to 1.7 m.
         night_share: share of shots at night, with black windows.
     """
@@ -138,20 +140,15 @@ def _middle_of(room: Room) -> Float[np.ndarray, "2"]:
 
 
 def _hard_place(home: Home, rng: np.random.Generator) -> tuple[Float[np.ndarray, "2"], int]:
-    """A position and its room: on a threshold, beside a wall, in a corridor or another narrow room."""
+    """A position and its room: on a threshold or in an opening, beside a wall, in a corridor or another narrow room."""
     rooms = home.plan.rooms
     kind = rng.random()
     see_through = [opening for opening in home.openings if opening.is_see_through]
     if kind < 0.3 and see_through:
         opening = see_through[int(rng.integers(len(see_through)))]
-        room = rooms[opening.room]
-        start, along, inwards = wall_frame(room, opening.wall)
-        inner = room.shape.buffer(-POSE_MARGIN_M)
-        for _ in range(_TRIES):
-            at = start + along * rng.uniform(opening.start_m, opening.end_m)
-            at = at + inwards * rng.uniform(POSE_MARGIN_M, _THRESHOLD_M)
-            if shapely.contains_xy(inner, *at):
-                return at, opening.room
+        place = _on_threshold(rooms[opening.room], opening, rng)
+        if place is not None:
+            return place, opening.room
     if kind < 0.5:
         index = int(rng.integers(len(rooms)))
         places = np.stack([_position_in(rooms[index], rng) for _ in range(_TRIES)])
@@ -164,6 +161,20 @@ def _hard_place(home: Home, rng: np.random.Generator) -> tuple[Float[np.ndarray,
     narrowness = np.array([room.shape.length / room.area_m2 for room in rooms]) ** 2
     index = int(rng.choice(len(rooms), p=narrowness / narrowness.sum()))
     return _position_in(rooms[index], rng), index
+
+
+def _on_threshold(room: Room, opening: Opening, rng: np.random.Generator) -> Float[np.ndarray, "2"] | None:
+    """A position in front of an opening or, as often, in it, clear of the walls beside it; None if none is found."""
+    start, along, inwards = wall_frame(room, opening.wall)
+    ends = shapely.LineString([start + along * opening.start_m, start + along * opening.end_m])
+    # A hair wider than the opening itself, so that nothing of it is left.
+    walls = room.shape.boundary.difference(ends.buffer(1e-3))
+    low, high = (_IN_OPENING_M, POSE_MARGIN_M) if rng.random() < 0.5 else (POSE_MARGIN_M, _THRESHOLD_M)
+    for _ in range(_TRIES):
+        at = start + along * rng.uniform(opening.start_m, opening.end_m) + inwards * rng.uniform(low, high)
+        if shapely.contains_xy(room.shape, *at) and walls.distance(shapely.Point(at)) >= POSE_MARGIN_M:
+            return at
+    return None
 
 
 def _position_in(room: Room, rng: np.random.Generator) -> Float[np.ndarray, "2"]:
