@@ -21,7 +21,7 @@ from lalaloc_core.nets import load_layout_encoder
 from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
 from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.sampling import pose_grid, random_poses
-from lalaloc_core.training.config import PRESETS
+from lalaloc_core.training.presets import PRESETS
 from lalaloc_core.training.sources import GeneratedSource
 
 COLUMNS = 128

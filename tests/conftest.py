@@ -12,8 +12,8 @@ import torch
 def tiny_bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A real bundle: both stages of the `tiny` preset, trained for seconds and exported."""
     from lalaloc_core.export.run import export_run
-    from lalaloc_core.training.config import PRESETS
     from lalaloc_core.training.data import TrainingData
+    from lalaloc_core.training.presets import PRESETS
     from lalaloc_core.training.run import train_image, train_layout
 
     torch.set_num_threads(1)

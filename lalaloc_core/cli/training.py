@@ -98,8 +98,8 @@ def _train(arguments: argparse.Namespace) -> None:
 
     from lalaloc_core.data.dataset_detection import open_dataset
     from lalaloc_core.data.synthetic.unfamiliar import UnfamiliarScenes
-    from lalaloc_core.training.config import PRESETS
     from lalaloc_core.training.data import TrainingData
+    from lalaloc_core.training.presets import PRESETS
     from lalaloc_core.training.run import train_end_to_end, train_image, train_layout
 
     if arguments.data is not None and arguments.textures is not None:

@@ -6,8 +6,9 @@ run with its checkpoints. Batches come from `sources.py` (scenes) by way of `bat
 """
 
 from lalaloc_core.training.checkpoint import Checkpoint
-from lalaloc_core.training.config import PRESETS, TrainConfig
+from lalaloc_core.training.config import TrainConfig
 from lalaloc_core.training.data import TrainingData
+from lalaloc_core.training.presets import PRESETS
 from lalaloc_core.training.run import train_end_to_end, train_image, train_layout
 
 __all__ = ["PRESETS", "Checkpoint", "TrainConfig", "TrainingData", "train_end_to_end", "train_image", "train_layout"]

@@ -39,7 +39,8 @@ from lalaloc_core.localise.optimise import LatentPoseOptimiser
 from lalaloc_core.nets import load_decoder
 from lalaloc_core.nets.decoder import LayoutDecoder
 from lalaloc_core.training.checkpoint import Checkpoint
-from lalaloc_core.training.config import PRESETS, TrainConfig
+from lalaloc_core.training.config import TrainConfig
+from lalaloc_core.training.presets import PRESETS
 from lalaloc_core.training.stages import build_image_encoder, build_layout_encoder
 from tests.core.test_training import small_paper
 from tests.strategies import crooked_flat, scene_of

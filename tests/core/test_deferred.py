@@ -15,8 +15,9 @@ from lalaloc_core.cli import main
 from lalaloc_core.training.batch_streams import PanoramaBatches
 from lalaloc_core.training.batches import Batch, load_batches
 from lalaloc_core.training.checkpoint import Checkpoint
-from lalaloc_core.training.config import PRESETS, TrainConfig
+from lalaloc_core.training.config import TrainConfig
 from lalaloc_core.training.deferred import DeferredRenderer, turned
+from lalaloc_core.training.presets import PRESETS
 from lalaloc_core.training.rotation import Rotation
 from lalaloc_core.training.sources import GeneratedSource
 from lalaloc_core.training.stages import panorama_batches

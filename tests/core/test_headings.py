@@ -28,7 +28,7 @@ from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
 from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.sampling import PoseSet
-from lalaloc_core.training.config import PRESETS
+from lalaloc_core.training.presets import PRESETS
 from tests.strategies import Scene, crooked_flat, scenes
 
 RING = PRESETS["tiny"].ring

@@ -34,11 +34,12 @@ from lalaloc_core.training import batches, objective, sources
 from lalaloc_core.training.batch_streams import LayoutBatches, PanoramaBatches
 from lalaloc_core.training.batches import Batch, load_batches
 from lalaloc_core.training.checkpoint import Checkpoint
-from lalaloc_core.training.config import PRESETS, ImageStageConfig, OptimiserConfig, TrainConfig, Turns
+from lalaloc_core.training.config import ImageStageConfig, OptimiserConfig, TrainConfig, Turns
 from lalaloc_core.training.end_to_end import EndToEndStage
 from lalaloc_core.training.image_stage import ImageStage
 from lalaloc_core.training.layout_stage import LayoutStage
 from lalaloc_core.training.loop import run_stage
+from lalaloc_core.training.presets import PRESETS
 from lalaloc_core.training.rotation import sample_rotation
 from lalaloc_core.training.run import train_image
 from lalaloc_core.training.sources import GeneratedSource

@@ -25,8 +25,9 @@ from lalaloc_core.sampling import random_poses
 from lalaloc_core.training.batch_streams import LayoutBatches, PanoramaBatches
 from lalaloc_core.training.batches import Batch, load_batches
 from lalaloc_core.training.checkpoint import Checkpoint
-from lalaloc_core.training.config import PRESETS, TrainConfig
+from lalaloc_core.training.config import TrainConfig
 from lalaloc_core.training.data import TrainingData
+from lalaloc_core.training.presets import PRESETS
 from lalaloc_core.training.run import train_layout
 from lalaloc_core.training.sources import SceneSource
 from lalaloc_core.training.validate import ImageValidation, LayoutValidation

@@ -32,7 +32,7 @@ from lalaloc_core.nets.trunk import (
     _PadAround,
     load_pretrained,
 )
-from lalaloc_core.training.config import PRESETS
+from lalaloc_core.training.presets import PRESETS
 from lalaloc_core.training.stages import build_image_encoder, build_layout_encoder
 
 TINY = PRESETS["tiny-trunk"]

@@ -23,12 +23,13 @@ from lalaloc_core.nets.trunk import Trunk
 from lalaloc_core.training import losses, run
 from lalaloc_core.training.batch_streams import UNKNOWN, PanoramaBatches, opening_kinds
 from lalaloc_core.training.checkpoint import Checkpoint
-from lalaloc_core.training.config import PRESETS, OptimiserConfig, TrainConfig
+from lalaloc_core.training.config import OptimiserConfig, TrainConfig
 from lalaloc_core.training.data import TrainingData
 from lalaloc_core.training.end_to_end import EndToEndStage
 from lalaloc_core.training.image_stage import ImageStage
 from lalaloc_core.training.loop import run_stage
 from lalaloc_core.training.photographs import Photographs
+from lalaloc_core.training.presets import PRESETS
 from lalaloc_core.training.rotation import Rotation
 from lalaloc_core.training.sources import GeneratedSource
 from lalaloc_core.training.stages import build_image_encoder, build_layout_encoder, build_optimiser

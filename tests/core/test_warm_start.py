@@ -18,11 +18,12 @@ from lalaloc_core.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.errors import CheckpointError
 from lalaloc_core.export.run import export_run
 from lalaloc_core.training.checkpoint import Checkpoint
-from lalaloc_core.training.config import PRESETS, TrainConfig
+from lalaloc_core.training.config import TrainConfig
 from lalaloc_core.training.data import TrainingData
 from lalaloc_core.training.image_stage import ImageStage
 from lalaloc_core.training.loop import run_stage
 from lalaloc_core.training.picture_cache import cached_pictures
+from lalaloc_core.training.presets import PRESETS
 from lalaloc_core.training.run import train_image, train_layout
 from lalaloc_core.training.sources import GeneratedSource
 from lalaloc_core.training.stages import build_layout_encoder
