@@ -44,8 +44,9 @@ BUNDLE_FILES = (LAYOUT_ONNX, IMAGE_ONNX, HEAD_ONNX, LAYOUT_WEIGHTS, IMAGE_WEIGHT
 class LogisticModel:
     """Probability that a picture fits its plan by the signals of `localise.confidence`.
 
-    Before there was a posterior, `log_odds` stood for it in this model; models that are fitted now leave it at 0. Those
-    fitted before there was a cohort leave `cost_to_chance` at 0.
+    What a model was not fitted with it leaves at 0: the last two, and `cost_to_chance` before there was a cohort, in
+    models of earlier versions; in those that are fitted now `log_odds`, which stood for the posterior before there was
+    one, and `latent_distance` and `cost_to_chance`, in whose place the last two came.
     """
 
     bias: float
@@ -54,6 +55,8 @@ class LogisticModel:
     uncertainty: float
     latent_distance: float
     cost_to_chance: float = 0.0
+    answer_to_chance: float = 0.0
+    log_latent_distance: float = 0.0
 
     def probability(
         self,
@@ -63,11 +66,14 @@ class LogisticModel:
         uncertainty: float,
         latent_distance: float,
         cost_to_chance: float = 0.0,
+        answer_to_chance: float = 0.0,
+        log_latent_distance: float = 0.0,
     ) -> float:
         """Confidence of an answer with these signals."""
         logit = self.bias + self.log_odds * log_odds + self.cost * cost
         logit += self.uncertainty * uncertainty + self.latent_distance * latent_distance
-        logit += self.cost_to_chance * cost_to_chance
+        logit += self.cost_to_chance * cost_to_chance + self.answer_to_chance * answer_to_chance
+        logit += self.log_latent_distance * log_latent_distance
         return 1.0 / (1.0 + math.exp(-max(-30.0, min(30.0, logit))))
 
 

@@ -19,6 +19,7 @@ from scipy import optimize
 
 from lalaloc_core.bundle import COHORT, Bundle, ConfidenceModel, EvidenceModel, LogisticModel, write_manifest
 from lalaloc_core.conventions import heading_from_degrees, wrap_angle
+from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.evaluation.predictions import Pose, Prediction
 from lalaloc_core.evaluation.score import expected_calibration_error, position_errors_m
 from lalaloc_core.files import atomic_write
@@ -28,8 +29,8 @@ from lalaloc_core.localise.posterior import HEADING_SEPARATION, RIGHT_WITHIN_M
 from lalaloc_core.metrics import Accuracy
 
 # Of all that is fitted on, photographs of something else than the plan's home weigh so much: enough to tell them, too
-# little to make answers about the home itself look less sure than they are. Chosen by photographs of real rooms.
-_MISMATCHED_SHARE = 0.1
+# little to make answers about the home itself look less sure than they are.
+_MISMATCHED_SHARE = 0.2
 # A weak pull to zero keeps the fit finite when the queries are perfectly separable.
 _RIDGE = 1e-3
 # A weak pull of the evidence's weights to what they are by default, in units of a query.
@@ -41,7 +42,7 @@ _UNBELIEVED = 0.1
 # Medians of the chi-squared distribution with one and with two degrees of freedom.
 _MEDIAN_CHI2 = {1: 0.4549, 2: 1.3863}
 # Signals of a picture that fits, or not; which place it is, is the posterior's to say.
-_SIGNALS = ("cost", "uncertainty", "latent_distance", "cost_to_chance")
+_SIGNALS = ("cost", "uncertainty", "log_latent_distance", "answer_to_chance")
 _TERMS = ("walls", "openings", "ceiling", "room_type")
 
 
@@ -68,7 +69,11 @@ class Answers:
 
 
 def fit_confidence(known: Answers, searched: Answers) -> ConfidenceModel:
-    """Fit on answers to queries with known heading, and to queries whose heading was searched."""
+    """Fit on answers to queries with known heading, and to queries whose heading was searched.
+
+    Raises:
+        InvalidInputError: stored answers of an earlier version lack a signal.
+    """
     position, _ = _covariance_factors(known.own)
     position_searched, heading = _covariance_factors(searched.own)
     return ConfidenceModel(
@@ -197,6 +202,8 @@ def _fit_stage(stage: str, answers: Answers) -> LogisticModel:
     own = [one for one in (*answers.own, *answers.disturbed) if stage in one.signals]
     mismatched = [one for one in answers.mismatched if stage in one.signals]
     signals = [one.signals[stage] for one in own + mismatched]
+    if missing := [name for name in _SIGNALS if any(name not in one for one in signals)]:
+        raise InvalidInputError(f"stored answers of an earlier version lack {', '.join(missing)}; ask anew")
     features = np.array([[1.0, *(one[name] for name in _SIGNALS)] for one in signals])
     log_odds = np.array([one["log_odds"] for one in signals])
     posterior = 1.0 / (1.0 + np.exp(-log_odds))
@@ -217,7 +224,7 @@ def _fit_stage(stage: str, answers: Answers) -> LogisticModel:
     # Begins with trust in all: without mismatched photographs there is nothing that teaches otherwise.
     start = np.append(3.0, np.zeros(len(_SIGNALS)))
     bias, *weights = (optimize.minimize(loss, start, method="L-BFGS-B").x / scale).tolist()
-    return LogisticModel(bias=bias, log_odds=0.0, **dict(zip(_SIGNALS, weights, strict=True)))
+    return LogisticModel(bias=bias, log_odds=0.0, latent_distance=0.0, **dict(zip(_SIGNALS, weights, strict=True)))
 
 
 def _covariance_factors(predictions: Sequence[Prediction]) -> tuple[float | None, float | None]:

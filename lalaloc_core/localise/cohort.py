@@ -99,26 +99,25 @@ def cohort_of(plans: Iterable[FloorPlan], columns: int, seed: int) -> Cohort:
     return Cohort(log_profile[chosen], kind[chosen])
 
 
-def log_cost_to_chance(
+def cost_by_chance(
     cohort: Cohort | None,
     plan: FloorPlan,
     query: Query,
-    cost: float,
     reach_m: float,
     weights: EvidenceModel,
     config: EvidenceConfig,
-) -> float:
-    """Log of how badly a plan fits a picture, in units of how badly the cohort does: below 0 it fits better.
+) -> float | None:
+    """What a plan costs that fits a picture by chance.
 
     Args:
         plan: says which openings count.
-        cost: of the best pose of the plan's grid, and `reach_m` how far those may lie from the camera.
+        reach_m: how far the poses of the plan's grid may lie from the camera.
 
     Returns:
-        0 without a cohort, or where poses are compared by their latents.
+        None without a cohort, or where poses are compared by their latents.
     """
     if cohort is None or not config.compares_profiles(query):
-        return 0.0
+        return None
     # What is particular to a room is no matter of chance.
     alone = replace(config, use_ceiling=False, use_room_type=False, use_see_through=False)
     evidence = Evidence(plan, query, reach_m, weights, alone)
@@ -126,5 +125,9 @@ def log_cost_to_chance(
     hypothesis = rough.argmin(axis=1)
     pose = np.argsort(rough[np.arange(len(rough)), hypothesis], kind="stable")[:_COMPARED]
     by_chance, _ = evidence.pairs(cohort.layouts, pose, hypothesis[pose])
-    best = np.sort(by_chance)[:_BEST]
-    return math.log((cost + _MIN_COST) / (float(best.mean()) + _MIN_COST))
+    return float(np.sort(by_chance)[:_BEST].mean())
+
+
+def log_cost_to_chance(cost: float, by_chance: float | None) -> float:
+    """Log of a cost in units of what fits by chance: below 0 it fits better. 0 where that is not known."""
+    return 0.0 if by_chance is None else math.log((cost + _MIN_COST) / (by_chance + _MIN_COST))

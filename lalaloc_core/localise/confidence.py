@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from lalaloc_core.localise.cohort import log_cost_to_chance
 from lalaloc_core.localise.poses import Candidate, Query
 from lalaloc_core.localise.posterior import RIGHT_WITHIN_M, Posterior
 
@@ -18,6 +19,8 @@ __all__ = ["RIGHT_WITHIN_M", "Signals", "signals_of"]
 
 # No posterior is surer than this, either way.
 _MAX_LOG_ODDS = 6.0
+# Latents are never nearer to each other than this, when the logarithm of their distance is taken.
+_MIN_LATENT_DISTANCE = 0.01
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,6 +34,8 @@ class Signals:
         latent_distance: of the answer. Pictures of no room at all fit anywhere, as nothing is predicted of them with
             any certainty, but their latents are like no layout's.
         cost_to_chance: log of the cost of the plan's best grid pose in units of what fits by chance.
+        answer_to_chance: the same of the answer, whose cost refinement has lowered, most of all at the right place.
+        log_latent_distance: log of `latent_distance`.
     """
 
     log_odds: float
@@ -38,10 +43,19 @@ class Signals:
     uncertainty: float
     latent_distance: float
     cost_to_chance: float
+    answer_to_chance: float
+    log_latent_distance: float
 
 
-def signals_of(query: Query, answer: Candidate, posterior: Posterior, cost_to_chance: float) -> Signals:
-    """Signals of an answer, the first candidate of the posterior."""
+def signals_of(
+    query: Query, answer: Candidate, posterior: Posterior, grid_cost: float, by_chance: float | None
+) -> Signals:
+    """Signals of an answer, the first candidate of the posterior.
+
+    Args:
+        grid_cost: of the best pose of the plan's grid.
+        by_chance: what fits the query by chance, see `localise.cohort`.
+    """
     mass = min(max(posterior.position, 1e-9), 1.0 - 1e-9)
     log_odds = math.log(mass / (1.0 - mass))
     return Signals(
@@ -49,5 +63,7 @@ def signals_of(query: Query, answer: Candidate, posterior: Posterior, cost_to_ch
         cost=answer.cost,
         uncertainty=0.0 if query.profile is None else float(query.profile.log_scale.mean()),
         latent_distance=answer.latent_distance,
-        cost_to_chance=cost_to_chance,
+        cost_to_chance=log_cost_to_chance(grid_cost, by_chance),
+        answer_to_chance=log_cost_to_chance(answer.cost, by_chance),
+        log_latent_distance=math.log(answer.latent_distance + _MIN_LATENT_DISTANCE),
     )

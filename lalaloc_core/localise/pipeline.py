@@ -18,7 +18,7 @@ import numpy as np
 from lalaloc_core.bundle import ConfidenceModel
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.cohort import log_cost_to_chance
+from lalaloc_core.localise.cohort import cost_by_chance
 from lalaloc_core.localise.confidence import Signals, signals_of
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.evidence import EvidenceConfig
@@ -261,9 +261,8 @@ class _Search:
             )
             self._starts = config.starts(query, self.modes)
             reach_m = evidence.grid_reach * grid.step_m
-            self._cost_to_chance = log_cost_to_chance(
-                encoders.cohort, plan, query, float(costs.cost.min()), reach_m, weights, evidence
-            )
+            self._grid_cost = float(costs.cost.min())
+            self._by_chance = cost_by_chance(encoders.cohort, plan, query, reach_m, weights, evidence)
         self.by_walls = evidence.compares_profiles(query)
         self._prior = area_shares(grid.poses, plan.areas_m2)
         self._ends = list[Candidate]()
@@ -353,7 +352,7 @@ class _Search:
 
     def _tell(self, stage: SearchStage, candidate: Candidate, found: Posterior) -> None:
         self._stage, self._best[stage] = stage, candidate
-        self._signals[stage] = signals_of(self.query, candidate, found, self._cost_to_chance)
+        self._signals[stage] = signals_of(self.query, candidate, found, self._grid_cost, self._by_chance)
 
 
 def panorama_heading(query: Query, candidate: Candidate) -> float:

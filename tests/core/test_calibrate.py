@@ -13,13 +13,16 @@ from hypothesis import strategies as st
 
 from lalaloc_core.bundle import Bundle, ConfidenceModel, EvidenceModel, LogisticModel, write_manifest
 from lalaloc_core.calibrate import Answers, calibrate, cross_validate, fit_confidence, fit_evidence
+from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.evaluation.predictions import Pose, PredictedCandidate, Prediction
 from lalaloc_core.evaluation.score import expected_calibration_error, position_errors_m
 from tests.strategies import seeds
 
 TRUTH = Pose(x_m=0.0, y_m=0.0, room_index=0, heading_deg=0.0)
 # What made the answers of `believable`.
-MAKER = LogisticModel(bias=1.0, log_odds=0.0, cost=-6.0, uncertainty=-0.7, latent_distance=-3.0)
+MAKER = LogisticModel(
+    bias=-2.0, log_odds=0.0, cost=-6.0, uncertainty=-0.7, latent_distance=0.0, log_latent_distance=-1.5
+)
 
 
 def result(
@@ -27,12 +30,14 @@ def result(
     log_odds: float = 0.0,
     cost: float = 0.1,
     uncertainty: float = -3.0,
-    cost_to_chance: float = 0.0,
+    answer_to_chance: float = 0.0,
+    log_latent_distance: float = -2.0,
 ) -> Prediction:
     """A query that was answered that far off; NaN stands for no answer."""
     answered = not math.isnan(error_m)
-    signals = {"log_odds": log_odds, "cost": cost, "uncertainty": uncertainty, "latent_distance": 0.5 * cost}
-    signals["cost_to_chance"] = cost_to_chance
+    signals = {"log_odds": log_odds, "cost": cost, "uncertainty": uncertainty}
+    signals |= {"latent_distance": math.exp(log_latent_distance) - 0.01, "log_latent_distance": log_latent_distance}
+    signals |= {"cost_to_chance": answer_to_chance + 0.5, "answer_to_chance": answer_to_chance}
     return Prediction(
         scene="a",
         camera="0",
@@ -54,9 +59,12 @@ def believable(count: int, seed: int) -> list[Prediction]:
     """Queries that are right as often as `MAKER` says of their signals."""
     rng = np.random.default_rng(seed)
     results = []
-    for log_odds, cost, uncertainty in rng.uniform([-3.0, 0.0, -4.0], [4.0, 1.0, -2.0], (count, 3)):
-        one = result(0.2, log_odds, cost, uncertainty)
-        results.append(one if rng.random() < confidence(MAKER, one) else result(3.0, log_odds, cost, uncertainty))
+    drawn = rng.uniform([-3.0, 0.0, -4.0, -3.0], [4.0, 1.0, -2.0, -1.0], (count, 4))
+    for log_odds, cost, uncertainty, latent in drawn:
+        right, wrong = (
+            result(error_m, log_odds, cost, uncertainty, log_latent_distance=latent) for error_m in (0.2, 3.0)
+        )
+        results.append(right if rng.random() < confidence(MAKER, right) else wrong)
     return results
 
 
@@ -77,10 +85,12 @@ def bent(offset: np.ndarray, information: np.ndarray, turn_deg: float = 0.0) -> 
 class TestConfidence:
     def test_a_fit_finds_the_model_that_made_the_data(self) -> None:
         model = fitted(believable(8000, 0))
+        # What these stood for is told by their successors.
+        assert (model.latent_distance, model.cost_to_chance) == (0.0, 0.0)
         assert model.log_odds == 0.0
         assert model.uncertainty == pytest.approx(MAKER.uncertainty, abs=0.3)
-        # Latent distances of these queries are half their costs: only the sum can be told.
-        assert model.cost + 0.5 * model.latent_distance == pytest.approx(-7.5, abs=1.0)
+        assert model.cost == pytest.approx(MAKER.cost, abs=0.8)
+        assert model.log_latent_distance == pytest.approx(MAKER.log_latent_distance, abs=0.3)
 
     def test_what_fits_like_photographs_of_other_homes_is_not_trusted(self) -> None:
         # Of the home's own photographs none tells that a poor fit is bad: all have the same cost.
@@ -100,10 +110,10 @@ class TestConfidence:
 
     def test_what_fits_no_better_than_by_chance_is_not_believed_whatever_it_costs(self) -> None:
         rng = np.random.default_rng(7)
-        own = [result(0.2, 6.0, cost, cost_to_chance=rng.normal(-1.0, 0.3)) for cost in rng.uniform(0.1, 0.8, 200)]
-        others = [result(3.0, 6.0, cost, cost_to_chance=rng.normal(0.5, 0.3)) for cost in rng.uniform(0.1, 0.8, 200)]
+        own = [result(0.2, 6.0, cost, answer_to_chance=rng.normal(-1.0, 0.3)) for cost in rng.uniform(0.1, 0.8, 200)]
+        others = [result(3.0, 6.0, cost, answer_to_chance=rng.normal(0.5, 0.3)) for cost in rng.uniform(0.1, 0.8, 200)]
         model = fit_confidence(Answers(own=own, mismatched=others), Answers(own=own)).known_heading["lpo"]
-        assert model.cost_to_chance < 0.0
+        assert model.answer_to_chance < 0.0
         assert np.mean([confidence(model, one) for one in own]) > 0.95
         assert np.mean([confidence(model, one) for one in others]) < 0.1
 
@@ -129,6 +139,20 @@ class TestConfidence:
         assert model.position_factor == pytest.approx(
             fit_confidence(Answers(own=own), Answers(own=own)).position_factor
         )
+
+    def test_answers_that_were_stored_by_an_earlier_version_are_refused(self) -> None:
+        stored = result(0.2)
+        del stored.signals["lpo"]["answer_to_chance"]
+        with pytest.raises(InvalidInputError, match="lack answer_to_chance"):
+            fitted([result(0.2), stored])
+
+    def test_models_of_before_weigh_what_they_were_fitted_with(self) -> None:
+        weights = {"cost": -2.0, "uncertainty": -0.5, "latent_distance": -4.0, "cost_to_chance": -3.0}
+        model = LogisticModel(bias=1.0, log_odds=0.0, **weights)
+        told = {"log_odds": 0.0, "cost": 0.3, "uncertainty": -2.0, "latent_distance": 0.1, "cost_to_chance": -0.4}
+        logit = 1.0 + sum(weights[name] * told[name] for name in weights)
+        for more in ({}, {"answer_to_chance": -9.0, "log_latent_distance": 9.0}):
+            assert model.probability(**told, **more) == pytest.approx(1.0 / (1.0 + math.exp(-logit)))
 
     def test_what_is_told_of_it_is_of_homes_that_it_was_not_fitted_on(self) -> None:
         # In each home costs mean something else, so that what was learnt in the others is wrong here.

@@ -15,7 +15,7 @@ from lalaloc_core.data.synthetic import training_plans
 from lalaloc_core.errors import BundleError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.cohort import SIZE, Cohort, cohort_of, log_cost_to_chance
+from lalaloc_core.localise.cohort import SIZE, Cohort, cohort_of, cost_by_chance, log_cost_to_chance
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.evidence import EvidenceConfig
 from lalaloc_core.localise.optimise import LatentPoseOptimiser
@@ -47,7 +47,8 @@ def in_units_of_chance(encoders: Encoders, cohort: Cohort | None, plan: FloorPla
     weights, config = EvidenceModel(), EvidenceConfig()
     grid = build_grid(plan, encoders, step_m=0.5, camera_height_m=CAMERA_M)
     cost = float(grid_costs(plan, grid, query, weights, config).cost.min())
-    return log_cost_to_chance(cohort, plan, query, cost, config.grid_reach * 0.5, weights, config)
+    by_chance = cost_by_chance(cohort, plan, query, config.grid_reach * 0.5, weights, config)
+    return log_cost_to_chance(cost, by_chance)
 
 
 @pytest.mark.parametrize("log_scale", [-3.5, -2.0], ids=["clear", "dim"])
@@ -98,6 +99,9 @@ class TestBundles:
         assert len(signals) == 3
         for signal in signals.values():
             assert signal.cost_to_chance == pytest.approx(expected, abs=0.05)
+        # A perfect picture of a place between the grid's poses: refinement goes on where the grid ends.
+        assert signals["retrieval"].answer_to_chance == pytest.approx(expected, abs=0.05)
+        assert signals["lpo"].answer_to_chance < expected - 0.5
 
     def test_a_bundle_of_before_has_none(self, opened_bundle: Bundle) -> None:
         assert Cohort.of_bundle(opened_bundle) is None

@@ -163,12 +163,24 @@ class TestSignals:
         profile = PredictedProfile(np.zeros((2, 4)), np.array([[-3.0, -2.0, -3.0, -2.0]]).repeat(2, axis=0))
         query = dataclasses.replace(PLAIN, profile=profile)
         posterior = Posterior(np.ones(1), 0.8, (0.7,), 1.0, NOWHERE)
-        found = signals_of(query, candidate(5.0, 0.4), posterior, -0.6)
-        expected = Signals(log_odds=math.log(4.0), cost=0.4, uncertainty=-2.5, latent_distance=0.3, cost_to_chance=-0.6)
+        found = signals_of(query, candidate(5.0, 0.4), posterior, 0.6, 0.8)
+        expected = Signals(
+            log_odds=math.log(4.0),
+            cost=0.4,
+            uncertainty=-2.5,
+            latent_distance=0.3,
+            cost_to_chance=math.log(0.61 / 0.81),
+            answer_to_chance=math.log(0.41 / 0.81),
+            log_latent_distance=math.log(0.31),
+        )
         assert dataclasses.astuple(found) == pytest.approx(dataclasses.astuple(expected))
-        assert signals_of(PLAIN, candidate(5.0, 0.4), posterior, 0.0).uncertainty == 0.0
+
+    def test_without_a_profile_or_a_cohort_nothing_is_said_of_them(self) -> None:
+        posterior = Posterior(np.ones(1), 0.8, (0.7,), 1.0, NOWHERE)
+        found = signals_of(PLAIN, candidate(5.0, 0.4), posterior, 0.6, None)
+        assert (found.uncertainty, found.cost_to_chance, found.answer_to_chance) == (0.0, 0.0, 0.0)
 
     @pytest.mark.parametrize(("mass", "log_odds"), [(0.0, -6.0), (1.0, 6.0), (1.0 + 1e-12, 6.0)])
     def test_no_posterior_is_surer_than_it_can_be(self, mass: float, log_odds: float) -> None:
         posterior = Posterior(np.ones(1), mass, (mass,), 1.0, NOWHERE)
-        assert signals_of(PLAIN, candidate(0.0, 0.2), posterior, 0.0).log_odds == log_odds
+        assert signals_of(PLAIN, candidate(0.0, 0.2), posterior, 0.2, None).log_odds == log_odds

@@ -15,8 +15,8 @@ from lalaloc_core.bundle import EvidenceModel
 from lalaloc_core.errors import InvalidMotionError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.cohort import log_cost_to_chance
-from lalaloc_core.localise.confidence import signals_of
+from lalaloc_core.localise.cohort import cost_by_chance
+from lalaloc_core.localise.confidence import Signals, signals_of
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.evidence import Evidence, latent_distances
 from lalaloc_core.localise.pipeline import (
@@ -155,7 +155,9 @@ def localise_sequence_steps(
             for picture, answers in zip(pictures, candidates, strict=True)
         ]
     told = [
-        _localisation(picture, answers, posterior, stage, _cost_to_chance(plan, grid, encoders, picture, config))
+        _localisation(
+            picture, answers, posterior, stage, _signals(plan, grid, encoders, picture, answers[0], posterior, config)
+        )
         for picture, answers, posterior in zip(pictures, candidates, found.pictures, strict=True)
     ]
     missed = _contradicted_motions(pictures, motions, transitions, paths[0], stage)
@@ -167,7 +169,7 @@ def _localisation(
     answers: list[Candidate],
     posterior: Posterior,
     stage: Literal["retrieval", "lpo"],
-    cost_to_chance: float,
+    signals: Signals,
 ) -> Localisation:
     """What is told of one picture."""
     return Localisation(
@@ -175,7 +177,7 @@ def _localisation(
         candidates=answers,
         posterior=posterior,
         stage=stage,
-        signals={stage: signals_of(picture.query, answers[0], posterior, cost_to_chance)},
+        signals={stage: signals},
         heading_contradicted=picture.doubted,
         best={stage: answers[0]},
     )
@@ -197,15 +199,22 @@ def _contradicted_motions(
     return tuple(int(index) for index in np.flatnonzero(costs > _CONTRADICTED))
 
 
-def _cost_to_chance(
-    plan: FloorPlan, grid: LatentGrid, encoders: Encoders, picture: Observation, config: LocaliseConfig
-) -> float:
-    """See `Signals`; heights that nobody expects cost what they do of a single picture."""
+def _signals(
+    plan: FloorPlan,
+    grid: LatentGrid,
+    encoders: Encoders,
+    picture: Observation,
+    answer: Candidate,
+    posterior: Posterior,
+    config: LocaliseConfig,
+) -> Signals:
+    """Of one picture; heights that nobody expects cost what they do of a single picture."""
     query, weights = picture.query, encoders.manifest.evidence
     penalty = query.camera_height.penalty(_offsets(query, config)) / weights.temperature
-    cost = float((picture.cost.min(axis=(1, 2)) + penalty).min())
+    grid_cost = float((picture.cost.min(axis=(1, 2)) + penalty).min())
     reach_m = config.evidence.grid_reach * grid.step_m
-    return log_cost_to_chance(encoders.cohort, plan, query, cost, reach_m, weights, config.evidence)
+    by_chance = cost_by_chance(encoders.cohort, plan, query, reach_m, weights, config.evidence)
+    return signals_of(query, answer, posterior, grid_cost, by_chance)
 
 
 def _offsets(query: Query, config: LocaliseConfig) -> Float[np.ndarray, "j"]:
