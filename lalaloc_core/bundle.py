@@ -44,9 +44,9 @@ BUNDLE_FILES = (LAYOUT_ONNX, IMAGE_ONNX, HEAD_ONNX, LAYOUT_WEIGHTS, IMAGE_WEIGHT
 class LogisticModel:
     """Probability that a picture fits its plan by the signals of `localise.confidence`.
 
-    What a model was not fitted with it leaves at 0: the last two, and `cost_to_chance` before there was a cohort, in
-    models of earlier versions; in those that are fitted now `log_odds`, which stood for the posterior before there was
-    one, and `latent_distance` and `cost_to_chance`, in whose place the last two came.
+    What a model was not fitted with it leaves at 0: in models of earlier versions `answer_to_chance`, and
+    `cost_to_chance` before there was a cohort; in those that are fitted now `cost_to_chance`, in whose place
+    `answer_to_chance` came, and `log_odds`, which stood for the posterior before there was one.
     """
 
     bias: float
@@ -56,7 +56,6 @@ class LogisticModel:
     latent_distance: float
     cost_to_chance: float = 0.0
     answer_to_chance: float = 0.0
-    log_latent_distance: float = 0.0
 
     def probability(
         self,
@@ -67,13 +66,11 @@ class LogisticModel:
         latent_distance: float,
         cost_to_chance: float = 0.0,
         answer_to_chance: float = 0.0,
-        log_latent_distance: float = 0.0,
     ) -> float:
         """Confidence of an answer with these signals."""
         logit = self.bias + self.log_odds * log_odds + self.cost * cost
         logit += self.uncertainty * uncertainty + self.latent_distance * latent_distance
         logit += self.cost_to_chance * cost_to_chance + self.answer_to_chance * answer_to_chance
-        logit += self.log_latent_distance * log_latent_distance
         return 1.0 / (1.0 + math.exp(-max(-30.0, min(30.0, logit))))
 
 

@@ -28,9 +28,9 @@ from lalaloc_core.localise.covariance import marginal_information
 from lalaloc_core.localise.posterior import HEADING_SEPARATION, RIGHT_WITHIN_M
 from lalaloc_core.metrics import Accuracy
 
-# Of all that is fitted on, photographs of something else than the plan's home weigh so much: enough to tell them, too
-# little to make answers about the home itself look less sure than they are.
-_MISMATCHED_SHARE = 0.2
+# Of all that is fitted on, photographs of something else than the plan's home weigh so much: as seldom believed as if
+# the others were not disturbed, and too little to make answers about the home itself look less sure than they are.
+_MISMATCHED_SHARE = 0.25
 # A weak pull to zero keeps the fit finite when the queries are perfectly separable.
 _RIDGE = 1e-3
 # A weak pull of the evidence's weights to what they are by default, in units of a query.
@@ -42,7 +42,7 @@ _UNBELIEVED = 0.1
 # Medians of the chi-squared distribution with one and with two degrees of freedom.
 _MEDIAN_CHI2 = {1: 0.4549, 2: 1.3863}
 # Signals of a picture that fits, or not; which place it is, is the posterior's to say.
-_SIGNALS = ("cost", "uncertainty", "log_latent_distance", "answer_to_chance")
+_SIGNALS = ("cost", "uncertainty", "latent_distance", "answer_to_chance")
 _TERMS = ("walls", "openings", "ceiling", "room_type")
 
 
@@ -224,7 +224,7 @@ def _fit_stage(stage: str, answers: Answers) -> LogisticModel:
     # Begins with trust in all: without mismatched photographs there is nothing that teaches otherwise.
     start = np.append(3.0, np.zeros(len(_SIGNALS)))
     bias, *weights = (optimize.minimize(loss, start, method="L-BFGS-B").x / scale).tolist()
-    return LogisticModel(bias=bias, log_odds=0.0, latent_distance=0.0, **dict(zip(_SIGNALS, weights, strict=True)))
+    return LogisticModel(bias=bias, log_odds=0.0, **dict(zip(_SIGNALS, weights, strict=True)))
 
 
 def _covariance_factors(predictions: Sequence[Prediction]) -> tuple[float | None, float | None]:

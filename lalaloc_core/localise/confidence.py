@@ -19,8 +19,6 @@ __all__ = ["RIGHT_WITHIN_M", "Signals", "signals_of"]
 
 # No posterior is surer than this, either way.
 _MAX_LOG_ODDS = 6.0
-# Latents are never nearer to each other than this, when the logarithm of their distance is taken.
-_MIN_LATENT_DISTANCE = 0.01
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +33,6 @@ class Signals:
             any certainty, but their latents are like no layout's.
         cost_to_chance: log of the cost of the plan's best grid pose in units of what fits by chance.
         answer_to_chance: the same of the answer, whose cost refinement has lowered, most of all at the right place.
-        log_latent_distance: log of `latent_distance`.
     """
 
     log_odds: float
@@ -44,7 +41,6 @@ class Signals:
     latent_distance: float
     cost_to_chance: float
     answer_to_chance: float
-    log_latent_distance: float
 
 
 def signals_of(
@@ -65,5 +61,4 @@ def signals_of(
         latent_distance=answer.latent_distance,
         cost_to_chance=log_cost_to_chance(grid_cost, by_chance),
         answer_to_chance=log_cost_to_chance(answer.cost, by_chance),
-        log_latent_distance=math.log(answer.latent_distance + _MIN_LATENT_DISTANCE),
     )

@@ -20,9 +20,7 @@ from tests.strategies import seeds
 
 TRUTH = Pose(x_m=0.0, y_m=0.0, room_index=0, heading_deg=0.0)
 # What made the answers of `believable`.
-MAKER = LogisticModel(
-    bias=-2.0, log_odds=0.0, cost=-6.0, uncertainty=-0.7, latent_distance=0.0, log_latent_distance=-1.5
-)
+MAKER = LogisticModel(bias=1.0, log_odds=0.0, cost=-6.0, uncertainty=-0.7, latent_distance=-3.0)
 
 
 def result(
@@ -31,13 +29,16 @@ def result(
     cost: float = 0.1,
     uncertainty: float = -3.0,
     answer_to_chance: float = 0.0,
-    log_latent_distance: float = -2.0,
+    latent_distance: float = 0.1,
 ) -> Prediction:
     """A query that was answered that far off; NaN stands for no answer."""
     answered = not math.isnan(error_m)
     signals = {"log_odds": log_odds, "cost": cost, "uncertainty": uncertainty}
-    signals |= {"latent_distance": math.exp(log_latent_distance) - 0.01, "log_latent_distance": log_latent_distance}
-    signals |= {"cost_to_chance": answer_to_chance + 0.5, "answer_to_chance": answer_to_chance}
+    signals |= {
+        "latent_distance": latent_distance,
+        "cost_to_chance": answer_to_chance + 0.5,
+        "answer_to_chance": answer_to_chance,
+    }
     return Prediction(
         scene="a",
         camera="0",
@@ -59,11 +60,9 @@ def believable(count: int, seed: int) -> list[Prediction]:
     """Queries that are right as often as `MAKER` says of their signals."""
     rng = np.random.default_rng(seed)
     results = []
-    drawn = rng.uniform([-3.0, 0.0, -4.0, -3.0], [4.0, 1.0, -2.0, -1.0], (count, 4))
+    drawn = rng.uniform([-3.0, 0.0, -4.0, 0.0], [4.0, 1.0, -2.0, 0.5], (count, 4))
     for log_odds, cost, uncertainty, latent in drawn:
-        right, wrong = (
-            result(error_m, log_odds, cost, uncertainty, log_latent_distance=latent) for error_m in (0.2, 3.0)
-        )
+        right, wrong = (result(error_m, log_odds, cost, uncertainty, latent_distance=latent) for error_m in (0.2, 3.0))
         results.append(right if rng.random() < confidence(MAKER, right) else wrong)
     return results
 
@@ -85,12 +84,12 @@ def bent(offset: np.ndarray, information: np.ndarray, turn_deg: float = 0.0) -> 
 class TestConfidence:
     def test_a_fit_finds_the_model_that_made_the_data(self) -> None:
         model = fitted(believable(8000, 0))
-        # What these stood for is told by their successors.
-        assert (model.latent_distance, model.cost_to_chance) == (0.0, 0.0)
+        # What this stood for is told by its successor.
+        assert model.cost_to_chance == 0.0
         assert model.log_odds == 0.0
         assert model.uncertainty == pytest.approx(MAKER.uncertainty, abs=0.3)
         assert model.cost == pytest.approx(MAKER.cost, abs=0.8)
-        assert model.log_latent_distance == pytest.approx(MAKER.log_latent_distance, abs=0.3)
+        assert model.latent_distance == pytest.approx(MAKER.latent_distance, abs=0.8)
 
     def test_what_fits_like_photographs_of_other_homes_is_not_trusted(self) -> None:
         # Of the home's own photographs none tells that a poor fit is bad: all have the same cost.
@@ -151,7 +150,7 @@ class TestConfidence:
         model = LogisticModel(bias=1.0, log_odds=0.0, **weights)
         told = {"log_odds": 0.0, "cost": 0.3, "uncertainty": -2.0, "latent_distance": 0.1, "cost_to_chance": -0.4}
         logit = 1.0 + sum(weights[name] * told[name] for name in weights)
-        for more in ({}, {"answer_to_chance": -9.0, "log_latent_distance": 9.0}):
+        for more in ({}, {"answer_to_chance": -9.0}):
             assert model.probability(**told, **more) == pytest.approx(1.0 / (1.0 + math.exp(-logit)))
 
     def test_what_is_told_of_it_is_of_homes_that_it_was_not_fitted_on(self) -> None:

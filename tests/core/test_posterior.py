@@ -171,7 +171,6 @@ class TestSignals:
             latent_distance=0.3,
             cost_to_chance=math.log(0.61 / 0.81),
             answer_to_chance=math.log(0.41 / 0.81),
-            log_latent_distance=math.log(0.31),
         )
         assert dataclasses.astuple(found) == pytest.approx(dataclasses.astuple(expected))
 
