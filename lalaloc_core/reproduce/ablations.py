@@ -21,14 +21,9 @@ from lalaloc_core.export.run import export_run
 from lalaloc_core.nets.paper_encoders import PaperConfig
 from lalaloc_core.sampling import TripletSampling
 from lalaloc_core.training.checkpoint import Checkpoint
-from lalaloc_core.training.config import (
-    PRESETS,
-    ImageStageConfig,
-    LayoutStageConfig,
-    OptimiserConfig,
-    TrainConfig,
-)
+from lalaloc_core.training.config import ImageStageConfig, LayoutStageConfig, OptimiserConfig, TrainConfig
 from lalaloc_core.training.data import TrainingData
+from lalaloc_core.training.presets import PRESETS
 from lalaloc_core.training.run import train_end_to_end, train_image, train_layout
 
 Budget = Literal["small", "full"]
