@@ -28,8 +28,8 @@ from lalaloc_core.localise.covariance import marginal_information
 from lalaloc_core.localise.posterior import HEADING_SEPARATION, RIGHT_WITHIN_M
 from lalaloc_core.metrics import Accuracy
 
-# Of all that is fitted on, photographs of something else than the plan's home weigh so much: as seldom believed as if
-# the others were not disturbed, and too little to make answers about the home itself look less sure than they are.
+# Of all that is fitted on, photographs of something else than the plan's home weigh so much: with it they are believed
+# as seldom as by a fit without disturbed ones, and answers about the home itself look about as sure as they are.
 _MISMATCHED_SHARE = 0.25
 # A weak pull to zero keeps the fit finite when the queries are perfectly separable.
 _RIDGE = 1e-3
@@ -187,9 +187,14 @@ def cross_validate(answers: Answers) -> dict[str, float]:
 
 
 def _confidence_and_rightness(model: LogisticModel, stage: str, one: Prediction) -> tuple[float, bool]:
-    signals, pose = one.signals[stage], one.stages[stage]
-    confidence = model.probability(**signals) / (1.0 + np.exp(-signals["log_odds"]))
-    return confidence, bool(np.hypot(pose.x_m - one.truth.x_m, pose.y_m - one.truth.y_m) < RIGHT_WITHIN_M)
+    signals = one.signals[stage]
+    return model.probability(**signals) / (1.0 + np.exp(-signals["log_odds"])), _is_near(stage, one)
+
+
+def _is_near(stage: str, one: Prediction) -> bool:
+    """Whether the answer after a stage is within 1 m of the truth."""
+    pose = one.stages[stage]
+    return bool(np.hypot(pose.x_m - one.truth.x_m, pose.y_m - one.truth.y_m) < RIGHT_WITHIN_M)
 
 
 def _by_stage(answers: Answers) -> dict[str, LogisticModel]:
@@ -207,8 +212,7 @@ def _fit_stage(stage: str, answers: Answers) -> LogisticModel:
     features = np.array([[1.0, *(one[name] for name in _SIGNALS)] for one in signals])
     log_odds = np.array([one["log_odds"] for one in signals])
     posterior = 1.0 / (1.0 + np.exp(-log_odds))
-    distance = [np.hypot(one.stages[stage].x_m - one.truth.x_m, one.stages[stage].y_m - one.truth.y_m) for one in own]
-    right = np.append(np.array(distance) < RIGHT_WITHIN_M, np.zeros(len(mismatched), bool))
+    right = np.append([_is_near(stage, one) for one in own], np.zeros(len(mismatched), bool)).astype(bool)
     weight = np.ones(len(features))
     if mismatched:
         weight[len(own) :] = _MISMATCHED_SHARE / (1.0 - _MISMATCHED_SHARE) * len(own) / len(mismatched)

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from lalaloc_core.data.dataset import Appearance, Camera, Scene, Split
-from lalaloc_core.data.synthetic.generated import GeneratedScenes
+from lalaloc_core.data.dataset import Camera, Scene
+from lalaloc_core.data.synthetic.derived import DerivedScenes
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.render.layout import layout_view
@@ -29,7 +29,7 @@ _CLEAR_M, _STEP_M, _MAX_THICKNESS_M = 0.15, 0.1, 0.5
 
 
 @dataclass(frozen=True)
-class CopiedScenes:
+class CopiedScenes(DerivedScenes):
     """Generated homes as plans of so many copies in a row, of which one, drawn for each home, is photographed.
 
     In the other copies some of its doors are elsewhere in the room, of those that each camera sees at least one: then
@@ -37,19 +37,11 @@ class CopiedScenes:
     free. Cameras that see no door are left out.
     """
 
-    homes: GeneratedScenes
     copies: int = 4
 
     @property
     def description(self) -> str:
         return f"{self.homes.description}, {self.copies} copies that differ in their doors"
-
-    @property
-    def appearances(self) -> Sequence[Appearance]:
-        return self.homes.appearances
-
-    def scenes(self, split: Split) -> Sequence[str]:
-        return self.homes.scenes(split)
 
     def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
         scene = self.homes.load(name, problems)

@@ -7,15 +7,15 @@ fit better than any photograph does.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
-from lalaloc_core.data.dataset import Appearance, Camera, Photograph, Scene, Split
-from lalaloc_core.data.synthetic.generated import GeneratedScenes
+from lalaloc_core.data.dataset import Camera, Photograph, Scene
+from lalaloc_core.data.synthetic.derived import DerivedScenes, seed_of
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.synth.augmentation.photometric import jittered, optics
 from lalaloc_core.synth.augmentation.stretching import stretched_images
@@ -27,21 +27,10 @@ _STRENGTH = 1.0
 
 
 @dataclass(frozen=True)
-class DisturbedScenes:
+class DisturbedScenes(DerivedScenes):
     """Generated homes whose photographs are drawn out a little, and exposed, blurred and compressed anew."""
 
-    homes: GeneratedScenes
-
-    @property
-    def description(self) -> str:
-        return f"{self.homes.description}, disturbed"
-
-    @property
-    def appearances(self) -> Sequence[Appearance]:
-        return self.homes.appearances
-
-    def scenes(self, split: Split) -> Sequence[str]:
-        return self.homes.scenes(split)
+    asked: ClassVar[str] = "disturbed"
 
     def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
         scene = self.homes.load(name, problems)
@@ -49,7 +38,7 @@ class DisturbedScenes:
 
 
 def _disturbed(camera: Camera) -> Camera:
-    seed = int(1e3 * abs(camera.position_m).sum())
+    seed = seed_of(camera)
     photographs = {look: DisturbedPhotograph(photograph, seed) for look, photograph in camera.photographs.items()}
     return dataclasses.replace(camera, photographs=photographs)
 

@@ -6,14 +6,14 @@ Confidence learns from them what it looks like when nothing fits (`lalaloc_core.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from lalaloc_core.data.dataset import Appearance, Camera, Photograph, Scene, Split
-from lalaloc_core.data.synthetic.generated import GeneratedScenes
+from lalaloc_core.data.dataset import Appearance, Camera, Photograph, Scene
+from lalaloc_core.data.synthetic.derived import DerivedScenes, seed_of
 from lalaloc_core.errors import DatasetError
 
 # One of so many photographs shows no room, and one is the camera's own upside down; of every other home one is cut out.
@@ -23,24 +23,13 @@ _CUT_OUT = slice(0.3, 0.7), slice(0.25, 0.5)
 
 
 @dataclass(frozen=True)
-class MismatchedScenes:
+class MismatchedScenes(DerivedScenes):
     """Generated homes whose cameras show what those of the next home see, or nothing that can be localised.
 
     Poses and heights are those of the home's own cameras: where a camera stands has nothing to do with what it shows.
     """
 
-    homes: GeneratedScenes
-
-    @property
-    def description(self) -> str:
-        return f"{self.homes.description}, asked with photographs of others"
-
-    @property
-    def appearances(self) -> Sequence[Appearance]:
-        return self.homes.appearances
-
-    def scenes(self, split: Split) -> Sequence[str]:
-        return self.homes.scenes(split)
+    asked: ClassVar[str] = "asked with photographs of others"
 
     def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
         own = self.homes.load(name, problems)
@@ -62,7 +51,7 @@ def _shown(camera: Camera, other: Camera, k: int, home: int) -> dict[Appearance,
     if k % _EVERY == _EVERY - 2:
         return {look: TurnedOver(photograph) for look, photograph in camera.photographs.items()}
     if k % _EVERY == _EVERY - 1:
-        seed = int(1e3 * abs(camera.position_m).sum())
+        seed = seed_of(camera)
         return dict.fromkeys(camera.photographs, OutdoorPhotograph(seed))
     return dict(zip(camera.photographs, other.photographs.values(), strict=True))
 
