@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import onnxruntime
 
-from lalaloc_core.bundle import IMAGE_ONNX, Bundle
+from lalaloc_core.localise.bundle import IMAGE_ONNX, Bundle
 
 
 def main() -> None:

@@ -20,8 +20,8 @@ from typing import TypeVar
 import numpy as np
 from jaxtyping import UInt8
 
-from lalaloc_core.bundle import Bundle, default_bundle
-from lalaloc_core.data.synthetic.generated import RendererCache
+from lalaloc_core.localise.bundle import Bundle, default_bundle
+from lalaloc_core.learn.data.synthetic.generated import RendererCache
 from lalaloc_core.floorplan import FloorPlan, PlanLimits
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
@@ -29,11 +29,11 @@ from lalaloc_core.localise.evidence import Evidence, EvidenceConfig
 from lalaloc_core.localise.pipeline import localise
 from lalaloc_core.localise.poses import LatentGrid, Query
 from lalaloc_core.localise.retrieval import grid_costs
-from lalaloc_core.methods.lalaloc import local_refiner
-from lalaloc_core.synth.homes.buildings import Building, building_of
-from lalaloc_core.synth.homes.splits import VALIDATION
-from lalaloc_core.synth.scene.materials import MaterialLibrary
-from lalaloc_core.synth.scene.shots import Shot, sample_shots
+from lalaloc_core.evaluate.methods.lalaloc import local_refiner
+from lalaloc_core.learn.synth.homes.buildings import Building, building_of
+from lalaloc_core.learn.synth.homes.splits import VALIDATION
+from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
+from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
 from service.grids.embedding import embed, grid_bytes
 
 _AREAS_M2 = (100.0, 1000.0, 5000.0, 10_000.0, 50_000.0, 100_000.0, 200_000.0)

@@ -28,7 +28,7 @@ from benchmarks.load import Query, queries
 from benchmarks.processes import resident_mb
 from examples.launch import running_service
 from examples.truth import PLAN_PATH
-from lalaloc_core.bundle import Bundle
+from lalaloc_core.localise.bundle import Bundle
 from service.settings import Settings
 from service.storage import open_store
 

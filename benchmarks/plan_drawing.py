@@ -14,7 +14,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 from shapely.geometry.base import BaseGeometry
 
-from lalaloc_core.synth.homes.plans import Home, HomeConfig, generate_home
+from lalaloc_core.learn.synth.homes.plans import Home, HomeConfig, generate_home
 
 Style = Literal["thin", "thick", "hatched", "coloured", "scanned"]
 STYLES: tuple[Style, ...] = get_args(Style)

@@ -14,7 +14,7 @@ import shapely
 
 from benchmarks.plan_drawing import STYLES, DrawnPlan, OpeningSymbol, Style, draw_plan
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.plans import ImportOptions, import_plan
+from lalaloc_core.importers import ImportOptions, import_plan
 
 _IOU = 0.9
 # An opening is found where one of its kind overlaps it by half of the longer.

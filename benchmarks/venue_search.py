@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.venues import queries
-from lalaloc_core.bundle import Bundle
-from lalaloc_core.data.synthetic.generated import SPLIT_NUMBERS
+from lalaloc_core.localise.bundle import Bundle
+from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.evidence import EvidenceConfig
 from lalaloc_core.localise.pipeline import localise
@@ -27,8 +27,8 @@ from lalaloc_core.localise.venue.merged_plans import MergedPlans
 from lalaloc_core.localise.venue.plan_index import PlanIndex
 from lalaloc_core.localise.venue.prototype_cells import shipped_cells
 from lalaloc_core.localise.venue.prototypes import most_probable, prototypes_of
-from lalaloc_core.methods.lalaloc import local_refiner
-from lalaloc_core.synth.homes.splits import home_of
+from lalaloc_core.evaluate.methods.lalaloc import local_refiner
+from lalaloc_core.learn.synth.homes.splits import home_of
 from scripts.make_prototype_cells import grid_without_latents
 from service.query.venue_localiser import VENUE_CONFIG
 from service.query.venue_plans import MAX_SEARCHED, most_poses

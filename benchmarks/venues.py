@@ -24,8 +24,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lalaloc_core.bundle import Bundle
-from lalaloc_core.data.synthetic.generated import SPLIT_NUMBERS, RenderedPhotograph, renderer_cache_of
+from lalaloc_core.localise.bundle import Bundle
+from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, RenderedPhotograph, renderer_cache_of
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.evidence import EvidenceConfig
@@ -33,8 +33,8 @@ from lalaloc_core.localise.poses import Query
 from lalaloc_core.localise.venue.plan_index import COMPARED, SCANNED, PlanIndex
 from lalaloc_core.localise.venue.prototype_cells import shipped_cells
 from lalaloc_core.localise.venue.prototypes import AZIMUTHS, packed_openings, prototypes_of, unpacked_openings
-from lalaloc_core.synth.homes.splits import home_of
-from lalaloc_core.synth.scene.shots import sample_shots
+from lalaloc_core.learn.synth.homes.splits import home_of
+from lalaloc_core.learn.synth.scene.shots import sample_shots
 from scripts.make_prototype_cells import grid_without_latents
 from service.query.prototype_file import BlockKey, PrototypeFile
 

@@ -15,9 +15,9 @@ from PIL import Image
 
 from examples.truth import FOLDER, PLAN_PATH, TruePose, write_poses
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.synth.homes.plans import Home, Opening, OpeningKind
-from lalaloc_core.synth.rendering.panorama import PanoramaRenderer, Shot
-from lalaloc_core.synth.scene.materials import MaterialLibrary
+from lalaloc_core.learn.synth.homes.plans import Home, Opening, OpeningKind
+from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, Shot
+from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 
 HEIGHT, WIDTH = 512, 1024
 # Rays per pixel and axis, for smooth edges.

@@ -16,8 +16,8 @@ import torch
 from safetensors.torch import load_file
 
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.training.best import best_path
-from lalaloc_core.training.checkpoint import Checkpoint
+from lalaloc_core.learn.training.best import best_path
+from lalaloc_core.learn.training.checkpoint import Checkpoint
 
 
 def blended(

@@ -8,9 +8,9 @@ import json
 from pathlib import Path
 from typing import Any
 
-from lalaloc_core.reproduce.result import TableResult
-from lalaloc_core.reproduce.result_tables import markdown
-from lalaloc_core.reproduce.tables import TABLES
+from lalaloc_core.evaluate.reproduce.result import TableResult
+from lalaloc_core.evaluate.reproduce.result_tables import markdown
+from lalaloc_core.evaluate.reproduce.tables import TABLES
 
 ROOT = Path(__file__).resolve().parent.parent
 BENCH = ROOT / "docs" / "bench.json"

@@ -20,9 +20,9 @@ from lalaloc_core.localise.poses import LatentGrid
 from lalaloc_core.localise.venue.prototype_cells import CELLS_FILE, features, nearest
 from lalaloc_core.localise.venue.prototypes import AZIMUTHS, Prototypes, joined, prototypes_of, unpacked_openings
 from lalaloc_core.render.poses import profiles_at
-from lalaloc_core.sampling import pose_grid
-from lalaloc_core.synth.homes.plans import Home
-from lalaloc_core.synth.homes.splits import TRAIN, home_of
+from lalaloc_core.render.sampling import pose_grid
+from lalaloc_core.learn.synth.homes.plans import Home
+from lalaloc_core.learn.synth.homes.splits import TRAIN, home_of
 
 _STEP_M, _CAMERA_HEIGHT_M = 0.5, 1.5
 # The share of homes that are scaled, and the logs of the factors.

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from datetime import datetime
 
-from lalaloc_core.bundle import Bundle
+from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.errors import ConfigError, LaLaLocError
 from service.security import Permission, check_address
 from service.security.keys import hash_of, key_text, new_secret

@@ -12,7 +12,7 @@ import numpy as np
 from fastapi import Request
 
 from lalaloc_core import __version__
-from lalaloc_core.bundle import Bundle
+from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from service.conversion import Converter

@@ -11,10 +11,10 @@ import torch
 @pytest.fixture(scope="session")
 def tiny_bundle(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A real bundle: both stages of the `tiny` preset, trained for seconds and exported."""
-    from lalaloc_core.export.run import export_run
-    from lalaloc_core.training.data import TrainingData
-    from lalaloc_core.training.presets import PRESETS
-    from lalaloc_core.training.run import train_image, train_layout
+    from lalaloc_core.learn.export.run import export_run
+    from lalaloc_core.learn.training.data import TrainingData
+    from lalaloc_core.learn.training.presets import PRESETS
+    from lalaloc_core.learn.training.run import train_image, train_layout
 
     torch.set_num_threads(1)
     folder = tmp_path_factory.mktemp("tiny")

@@ -10,7 +10,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.sampling import PoseSet, random_poses
+from lalaloc_core.render.sampling import PoseSet, random_poses
 
 Polygon = list[list[float]]
 

@@ -11,10 +11,10 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from lalaloc_core.bundle import default_bundle
+from lalaloc_core.localise.bundle import default_bundle
 from lalaloc_core.cli.arguments import count, positive, processes
 from lalaloc_core.cli.printing import print_json, print_table
-from lalaloc_core.data.dataset import DATASET_FORMATS, SPLITS
+from lalaloc_core.learn.data.dataset import DATASET_FORMATS, SPLITS
 from lalaloc_core.errors import InvalidInputError
 
 # So many homes that calibration asks with their own photographs for one that it asks with those of others.
@@ -108,10 +108,10 @@ def _generator_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _evaluate(arguments: argparse.Namespace) -> None:
-    from lalaloc_core.evaluation.factories import build_dataset, choose_appearance, describe_model
-    from lalaloc_core.evaluation.predictions import RunFolder, RunInfo
-    from lalaloc_core.evaluation.run import run_evaluation
-    from lalaloc_core.evaluation.score import score_run
+    from lalaloc_core.evaluate.runs.factories import build_dataset, choose_appearance, describe_model
+    from lalaloc_core.evaluate.runs.predictions import RunFolder, RunInfo
+    from lalaloc_core.evaluate.runs.run import run_evaluation
+    from lalaloc_core.evaluate.runs.score import score_run
 
     method, panorama = arguments.method, arguments.kind == "panorama"
     bundle = None if method in ("oracle", "icp") else arguments.bundle
@@ -154,8 +154,8 @@ def _evaluate(arguments: argparse.Namespace) -> None:
 
 
 def _score(arguments: argparse.Namespace) -> None:
-    from lalaloc_core.evaluation.predictions import RunFolder
-    from lalaloc_core.evaluation.score import score_run
+    from lalaloc_core.evaluate.runs.predictions import RunFolder
+    from lalaloc_core.evaluate.runs.score import score_run
 
     reports = {str(path): score_run(RunFolder(path)) for path in arguments.runs}
     if arguments.json:
@@ -190,24 +190,24 @@ def _print_scores(report: dict[str, Any]) -> None:
 
 
 def _report(arguments: argparse.Namespace) -> None:
-    from lalaloc_core.report import write_report
+    from lalaloc_core.evaluate.report import write_report
 
     write_report(arguments.runs, arguments.out, pictures=arguments.pictures)
 
 
 def _worst(arguments: argparse.Namespace) -> None:
-    from lalaloc_core.report.worst import write_worst
+    from lalaloc_core.evaluate.report.worst import write_worst
 
     print_json(write_worst(arguments.folder, arguments.out, arguments.count))
 
 
 def _calibrate(arguments: argparse.Namespace) -> None:
-    from lalaloc_core.bundle import Bundle
-    from lalaloc_core.calibrate import Answers, calibrate, fit_evidence, store_cohort, store_evidence
-    from lalaloc_core.data.synthetic import training_plans
-    from lalaloc_core.evaluation.factories import describe_model
-    from lalaloc_core.evaluation.predictions import Prediction, RunFolder, RunInfo
-    from lalaloc_core.evaluation.run import run_evaluation
+    from lalaloc_core.localise.bundle import Bundle
+    from lalaloc_core.evaluate.calibrate import Answers, calibrate, fit_evidence, store_cohort, store_evidence
+    from lalaloc_core.learn.data.synthetic import training_plans
+    from lalaloc_core.evaluate.runs.factories import describe_model
+    from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
+    from lalaloc_core.evaluate.runs.run import run_evaluation
     from lalaloc_core.localise.cohort import cohort_of
 
     def asked(generated: dict[str, Any], known: bool, whose: str) -> list[Prediction]:

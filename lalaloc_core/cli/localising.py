@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lalaloc_core.bundle import Bundle, default_bundle
+from lalaloc_core.localise.bundle import Bundle, default_bundle
 from lalaloc_core.cli.arguments import heading, positive, tolerance
 from lalaloc_core.cli.plan_files import add_plan_options, check_picture_name, read_plan, write_picture
 from lalaloc_core.cli.printing import print_json, print_table
@@ -113,7 +113,7 @@ def _answers(arguments: argparse.Namespace, plan: FloorPlan, contents: list[byte
     from lalaloc_core.localise.pipeline import localise
     from lalaloc_core.localise.retrieval import build_grid
     from lalaloc_core.localise.stated_camera import known_heading, stated_height
-    from lalaloc_core.methods.lalaloc import local_refiner
+    from lalaloc_core.evaluate.methods.lalaloc import local_refiner
     from lalaloc_core.panorama.images import open_panorama
 
     bundle = Bundle.open(arguments.bundle)

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from lalaloc_core.bundle import default_bundle
+from lalaloc_core.localise.bundle import default_bundle
 from lalaloc_core.cli.arguments import count
 from lalaloc_core.cli.printing import print_json
 
@@ -44,12 +44,12 @@ def add_commands(commands: Any) -> None:
 
 def _bench(arguments: argparse.Namespace) -> None:
     if arguments.profile:
-        from lalaloc_core.bench.profile import profile_table
-        from lalaloc_core.bundle import Bundle
+        from lalaloc_core.evaluate.bench.profile import profile_table
+        from lalaloc_core.localise.bundle import Bundle
 
         print(profile_table(Bundle.open(arguments.bundle), arguments.queries, arguments.textures))
         return
-    from lalaloc_core.bench.report import run_bench
+    from lalaloc_core.evaluate.bench.report import run_bench
 
     groups = arguments.only or _GROUPS
     report = run_bench(arguments.bundle, groups, homes=arguments.homes, textures=arguments.textures)

@@ -8,9 +8,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from lalaloc_core.bundle import default_bundle
+from lalaloc_core.localise.bundle import default_bundle
 from lalaloc_core.cli.arguments import processes
-from lalaloc_core.data.annotated import GALLERIES
+from lalaloc_core.learn.data.annotated import GALLERIES
 
 
 def add_commands(commands: Any) -> None:
@@ -35,7 +35,7 @@ def add_commands(commands: Any) -> None:
 
 
 def _photographs(arguments: argparse.Namespace) -> None:
-    from lalaloc_core.report.photographs import SHEET_FILE, evaluate_photographs
+    from lalaloc_core.evaluate.report.photographs import SHEET_FILE, evaluate_photographs
 
     results = evaluate_photographs(
         arguments.data,

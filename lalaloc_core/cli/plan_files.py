@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from lalaloc_core.errors import InvalidFloorPlanError, InvalidInputError
 
 if TYPE_CHECKING:
-    from lalaloc_core.plans import ImportedPlan
+    from lalaloc_core.importers import ImportedPlan
 
 # The options of an import, as `plans.ImportOptions.from_text` takes them.
 _OPTIONS = {
@@ -39,7 +39,7 @@ def read_plans(file: Path, arguments: argparse.Namespace) -> tuple[ImportedPlan,
     Raises:
         InvalidFloorPlanError: the file cannot be read, or is no plan.
     """
-    from lalaloc_core.plans import ImportOptions, import_plans
+    from lalaloc_core.importers import ImportOptions, import_plans
 
     said = {name.replace("-", "_"): getattr(arguments, name.replace("-", "_")) for name in _OPTIONS}
     options = ImportOptions.from_text({name: value for name, value in said.items() if value is not None})

@@ -81,7 +81,7 @@ def _draw(arguments: argparse.Namespace) -> None:
 
 
 def _export(arguments: argparse.Namespace) -> None:
-    from lalaloc_core.plans import export_plan
+    from lalaloc_core.importers import export_plan
 
     plan = read_plan(arguments.file, arguments)
     anchor = plan.anchor if arguments.anchor is None else _anchor(arguments.anchor)
@@ -90,7 +90,7 @@ def _export(arguments: argparse.Namespace) -> None:
 
 
 def _anchor(text: str) -> Any:
-    from lalaloc_core.plans import Anchor
+    from lalaloc_core.importers import Anchor
 
     try:
         numbers = [float(part) for part in text.split(",")]

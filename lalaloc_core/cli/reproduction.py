@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from lalaloc_core.bundle import default_bundle
+from lalaloc_core.localise.bundle import default_bundle
 from lalaloc_core.cli.arguments import count, processes
 from lalaloc_core.errors import InvalidInputError
 
@@ -30,7 +30,7 @@ def add_commands(commands: Any) -> None:
 
 
 def _reproduce(arguments: argparse.Namespace) -> None:
-    from lalaloc_core.reproduce.tables import TABLES
+    from lalaloc_core.evaluate.reproduce.tables import TABLES
 
     if arguments.only_list:
         for table in TABLES:
@@ -46,8 +46,8 @@ def _reproduce(arguments: argparse.Namespace) -> None:
     if arguments.data is None:
         raise InvalidInputError("--data is missing: Structured3D, or what `lalaloc synth` writes")
 
-    from lalaloc_core.reproduce.result_tables import markdown
-    from lalaloc_core.reproduce.run import TableMaker
+    from lalaloc_core.evaluate.reproduce.result_tables import markdown
+    from lalaloc_core.evaluate.reproduce.run import TableMaker
 
     table_maker = TableMaker(
         data=arguments.data,

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from lalaloc_core.data.dataset import SPLITS
+from lalaloc_core.learn.data.dataset import SPLITS
 
 # What shells say of a command that Ctrl-C ended.
 _INTERRUPTED = 130
@@ -33,7 +33,7 @@ def add_commands(commands: Any) -> None:
 
 
 def _synth(arguments: argparse.Namespace) -> None:
-    from lalaloc_core.data.synthetic.writing import Synthesis, share_out, synthesise
+    from lalaloc_core.learn.data.synthetic.writing import Synthesis, share_out, synthesise
 
     settings = Synthesis(root=arguments.out, seed=arguments.seed, height=arguments.height, textures=arguments.textures)
     numbers = share_out(arguments.scenes, arguments.split)
@@ -49,6 +49,6 @@ def _synth(arguments: argparse.Namespace) -> None:
 def _contact_sheet(arguments: argparse.Namespace) -> None:
     import numpy as np
 
-    from lalaloc_core.synth.rendering.contact_sheet import contact_sheet
+    from lalaloc_core.learn.synth.rendering.contact_sheet import contact_sheet
 
     contact_sheet(arguments.out, np.random.default_rng(arguments.seed), arguments.textures)

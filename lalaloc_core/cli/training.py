@@ -11,7 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from lalaloc_core.bundle import Bundle
+from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.cli.printing import print_json
 from lalaloc_core.errors import InvalidInputError
 
@@ -96,11 +96,11 @@ def add_commands(commands: Any) -> None:
 def _train(arguments: argparse.Namespace) -> None:
     import torch
 
-    from lalaloc_core.data.dataset_detection import open_dataset
-    from lalaloc_core.data.synthetic.unfamiliar import UnfamiliarScenes
-    from lalaloc_core.training.data import TrainingData
-    from lalaloc_core.training.presets import PRESETS
-    from lalaloc_core.training.run import train_end_to_end, train_image, train_layout
+    from lalaloc_core.learn.data.dataset_detection import open_dataset
+    from lalaloc_core.learn.data.synthetic.unfamiliar import UnfamiliarScenes
+    from lalaloc_core.learn.training.data import TrainingData
+    from lalaloc_core.learn.training.presets import PRESETS
+    from lalaloc_core.learn.training.run import train_end_to_end, train_image, train_layout
 
     if arguments.data is not None and arguments.textures is not None:
         raise InvalidInputError("--textures is for generated homes, not for --data")
@@ -167,7 +167,7 @@ def _settings(pairs: list[str]) -> dict[str, Any]:
 
 
 def _export(arguments: argparse.Namespace) -> None:
-    from lalaloc_core.export.run import export_run
+    from lalaloc_core.learn.export.run import export_run
 
     pairs = [note.partition("=") for note in arguments.note]
     notes = {"hardware": platform.machine(), **{key: value for key, _, value in pairs}}
@@ -179,7 +179,7 @@ def _export(arguments: argparse.Namespace) -> None:
 
 
 def _export_again(arguments: argparse.Namespace) -> None:
-    from lalaloc_core.export.run import export_bundle_again
+    from lalaloc_core.learn.export.run import export_bundle_again
 
     before = Bundle.open(arguments.bundle)
     after = export_bundle_again(arguments.bundle)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lalaloc_core.bundle import ConfidenceModel
+from lalaloc_core.localise.bundle import ConfidenceModel
 from lalaloc_core.conventions import heading_to_degrees
 from lalaloc_core.draw.answer import DrawnAnswer, DrawnCandidate
 from lalaloc_core.draw.heat import posterior_map

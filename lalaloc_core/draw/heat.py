@@ -17,7 +17,7 @@ from lalaloc_core.draw.canvas import MUTED, RULE, Number, image, png, words, xml
 from lalaloc_core.draw.plan import floor_path
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.probability_map import ProbabilityMap
-from lalaloc_core.sampling import PoseSet
+from lalaloc_core.render.sampling import PoseSet
 
 # ColorBrewer's YlGnBu, which is safe for the colour-blind and still a scale when it is printed in grey.
 _COLOURS = ["#ffffe5", "#f7fcb9", "#d9f0a3", "#a6dba0", "#5cc2b0", "#2fa4c0", "#2a7ab9", "#27509b", "#132a6b"]

@@ -16,7 +16,7 @@ import shapely
 from jaxtyping import Float, Int
 
 from lalaloc_core.conventions import heading_from_degrees, heading_to_degrees
-from lalaloc_core.earth import Anchor
+from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.anchors import anchor_document, read_anchor
 from lalaloc_core.floorplan.arrays import frozen

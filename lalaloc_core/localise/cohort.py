@@ -17,7 +17,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from lalaloc_core.bundle import COHORT, Bundle, EvidenceModel
+from lalaloc_core.localise.bundle import COHORT, Bundle, EvidenceModel
 from lalaloc_core.errors import BundleError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.binned_layouts import BinnedLayouts
@@ -25,7 +25,7 @@ from lalaloc_core.localise.evidence import Evidence, EvidenceConfig
 from lalaloc_core.localise.first_look import first_costs
 from lalaloc_core.localise.layouts import Layouts, layouts_at
 from lalaloc_core.localise.poses import Query
-from lalaloc_core.sampling import pose_grid
+from lalaloc_core.render.sampling import pose_grid
 
 SIZE = 2048
 # Of the grids that poses are drawn from.

@@ -3,7 +3,7 @@
 Whether it fits is judged by signals that do not compare places: how badly the best one fits, also in units of how
 badly places of other homes do (`localise.cohort`), how sure the image encoder is, and how far the latents are apart.
 How these become a probability is fitted on validation queries and on photographs of something else
-(`lalaloc_core.calibrate`), and travels with the model (`bundle.ConfidenceModel`).
+(`lalaloc_core.evaluate.calibrate`), and travels with the model (`bundle.ConfidenceModel`).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """How far off a refined answer may be: from the curvature of the cost at its pose to a covariance.
 
 Near its minimum the cost is a parabola, and the inverse of its curvature (`Candidate.information`) is the covariance
-but for a factor, which is fitted on validation queries (`lalaloc_core.calibrate`). Where the heading was searched as
+but for a factor, which is fitted on validation queries (`lalaloc_core.evaluate.calibrate`). Where the heading was searched as
 well, each is told with the other integrated out.
 """
 
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from lalaloc_core.bundle import ConfidenceModel
+from lalaloc_core.localise.bundle import ConfidenceModel
 from lalaloc_core.floorplan import Room
 
 # Curvatures are single precision: what is smaller than this share of the largest is no information.

@@ -10,7 +10,7 @@ import numpy as np
 import onnxruntime
 from jaxtyping import Float, Int, UInt8
 
-from lalaloc_core.bundle import HEAD_ONNX, IMAGE_ONNX, LAYOUT_ONNX, Bundle, Manifest
+from lalaloc_core.localise.bundle import HEAD_ONNX, IMAGE_ONNX, LAYOUT_ONNX, Bundle, Manifest
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, TWO_PI, wrap_angle
 from lalaloc_core.errors import BundleError
 from lalaloc_core.floorplan import FloorPlan
@@ -26,7 +26,7 @@ from lalaloc_core.localise.poses import (
     rolled,
 )
 from lalaloc_core.render.poses import profiles_at
-from lalaloc_core.sampling import PoseSet
+from lalaloc_core.render.sampling import PoseSet
 
 # Larger batches fall out of the cache and gain nothing.
 _LAYOUT_BATCH = 256

@@ -2,7 +2,7 @@
 
 Every term is a negative log likelihood per azimuth, up to constants, and hardly above 0 where the picture fits as well
 as can be. Neighbouring azimuths err alike, so each term has a weight that says how much it may count, fitted on
-validation queries (`lalaloc_core.calibrate`), and is in units of the walls':
+validation queries (`lalaloc_core.evaluate.calibrate`), and is in units of the walls':
 
     cost(pose, δ) = walls + β_o openings + β_c ceiling + β_t room type + penalty(δ) / T
 
@@ -28,7 +28,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from lalaloc_core.bundle import EvidenceModel
+from lalaloc_core.localise.bundle import EvidenceModel
 from lalaloc_core.conventions import OPENING_CLASSES, PASSAGE_CODE, ROOM_TYPES, TWO_PI, WALL_CODE
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.layouts import Layouts

@@ -12,7 +12,7 @@ from lalaloc_core.conventions import WALL_CODE
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.render.sweep import swept_views
-from lalaloc_core.sampling import PoseSet
+from lalaloc_core.render.sampling import PoseSet
 
 
 @dataclass(frozen=True, eq=False)

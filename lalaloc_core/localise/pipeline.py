@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from lalaloc_core.bundle import ConfidenceModel
+from lalaloc_core.localise.bundle import ConfidenceModel
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.cohort import cost_by_chance

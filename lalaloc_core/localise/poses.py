@@ -13,7 +13,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.binned_layouts import BinnedLayouts
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.layouts import Layouts, layouts_at
-from lalaloc_core.sampling import PoseSet
+from lalaloc_core.render.sampling import PoseSet
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.localise.poses import Candidate, Query
-from lalaloc_core.sampling import PoseSet
+from lalaloc_core.render.sampling import PoseSet
 
 # An answer is right within this distance, and its heading within this angle (radians).
 RIGHT_WITHIN_M = 1.0

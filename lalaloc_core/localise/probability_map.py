@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.posterior import Posterior
-from lalaloc_core.sampling import PoseSet
+from lalaloc_core.render.sampling import PoseSet
 
 # Places that are nearer to each other than this are told as one.
 _APART_M = 0.01

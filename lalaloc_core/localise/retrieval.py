@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from lalaloc_core.bundle import EvidenceModel
+from lalaloc_core.localise.bundle import EvidenceModel
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.errors import InvalidHintError
 from lalaloc_core.floorplan import FloorPlan
@@ -19,7 +19,7 @@ from lalaloc_core.localise.first_look import PairLimits, likeliest
 from lalaloc_core.localise.hints import NO_HINTS, HintName, Hints
 from lalaloc_core.localise.poses import Candidate, LatentGrid, Query, grid_candidate
 from lalaloc_core.localise.posterior import HEADING_SEPARATION, NEGLIGIBLE, GridCosts
-from lalaloc_core.sampling import PoseSet, pose_grid
+from lalaloc_core.render.sampling import PoseSet, pose_grid
 
 # Pairs of a pose and a hypothesis that are compared in full: so many, and up to so many of those that may be probable.
 _MIN_COMPARED, _MAX_COMPARED = 1024, 4096

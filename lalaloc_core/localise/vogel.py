@@ -15,7 +15,7 @@ from lalaloc_core.localise.evidence import Evidence, EvidenceConfig, latent_dist
 from lalaloc_core.localise.hints import NO_HINTS, Hints
 from lalaloc_core.localise.layouts import layouts_at
 from lalaloc_core.localise.poses import Candidate, Query
-from lalaloc_core.sampling import PoseSet
+from lalaloc_core.render.sampling import PoseSet
 
 _GOLDEN_RATIO = (1.0 + math.sqrt(5.0)) / 2.0
 

@@ -14,7 +14,7 @@ from typing import NoReturn
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.plans import ImportOptions
+from lalaloc_core.importers import ImportOptions
 from service.errors import ConverterNotReadyError, DeadlineExceededError, OverloadedError, StoppingError
 from service.pools import JobLostError, PoolState, WorkerPool, WorkerSpec
 from service.settings import Settings
@@ -81,7 +81,7 @@ class Converter:
         """A plan as the file of another tool.
 
         Args:
-            format: one of `lalaloc_core.plans.EXPORT_FORMATS`.
+            format: one of `lalaloc_core.importers.EXPORT_FORMATS`.
 
         Raises:
             InvalidFloorPlanError: the plan has not what the format needs.

@@ -12,7 +12,7 @@ from typing import Any
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.file_kinds import kind_of
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.plans import ImportOptions, detect_format, import_if_native, is_json, media_type_of
+from lalaloc_core.importers import ImportOptions, detect_format, import_if_native, is_json, media_type_of
 from service.conversion.converter import Converter
 from service.settings import Settings
 from service.workers.convert import report_of

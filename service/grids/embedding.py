@@ -12,7 +12,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.layouts import joined_layouts
 from lalaloc_core.localise.poses import LatentGrid
-from lalaloc_core.sampling import PoseSet, grid_size, pose_grid
+from lalaloc_core.render.sampling import PoseSet, grid_size, pose_grid
 from service.errors import PlanTooLargeError
 from service.settings import Settings
 

@@ -12,7 +12,7 @@ from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.poses import LatentGrid
 from lalaloc_core.localise.venue.prototype_cells import shipped_cells
 from lalaloc_core.localise.venue.prototypes import prototypes_of
-from lalaloc_core.sampling import grid_size
+from lalaloc_core.render.sampling import grid_size
 from service.errors import OverloadedError, StoppingError
 from service.grids.builder import GridBuilder
 from service.grids.embedding import check_size, embed

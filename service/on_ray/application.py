@@ -9,7 +9,7 @@ from ray import serve
 from ray.serve.config import AutoscalingConfig, RequestRouterConfig
 from ray.serve.experimental.consistent_hash_router import ConsistentHashRouter
 
-from lalaloc_core.bundle import Bundle
+from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.errors import ConfigError
 from service.fair_share import with_headroom
 from service.on_ray.replicas import EncoderReplica, IngressReplica, LpoReplica, SearchReplica

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lalaloc_core.earth import Anchor
+from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.floorplan import MAX_FROM_ORIGIN_M, FloorPlan
 from service.schemas import GeoPose, GeoPoseAngles, GeoPosePosition, LocaliseAnswer, SequenceAnswer
 

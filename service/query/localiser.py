@@ -9,7 +9,7 @@ from functools import partial
 from time import monotonic
 from typing import TypeVar
 
-from lalaloc_core.bundle import Bundle
+from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.draw.answer import PHOTOGRAPH_SIZE, draw_answer
 from lalaloc_core.draw.found import drawn_answer
 from lalaloc_core.localise.camera_height import CameraHeight

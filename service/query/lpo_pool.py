@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import get_args
 
-from lalaloc_core.bundle import Bundle
+from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.poses import RefinementJob, RefinementResult
 from lalaloc_core.localise.sequence import SequenceJob, SequenceResult
 from service.pools import JobLostError, LostReason, PoolState, WorkerPool, WorkerSpec

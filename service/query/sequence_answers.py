@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from lalaloc_core.bundle import ConfidenceModel
+from lalaloc_core.localise.bundle import ConfidenceModel
 from lalaloc_core.localise.sequence import Motion
 from lalaloc_core.localise.sequence.search import SequenceLocalisation
 from service.schemas import LocaliseAnswer, SequenceAnswer, SequencePoseAnswer

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from sqlalchemy import Row
 
-from lalaloc_core.earth import Anchor
+from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.errors import InvalidHintError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.hints import HintName, Hints, NearInEach, log_factor, rooms_named

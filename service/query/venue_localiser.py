@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Float
 from sqlalchemy import Row
 
-from lalaloc_core.bundle import Bundle
+from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.conventions import heading_from_degrees
-from lalaloc_core.earth import Anchor
+from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.errors import InvalidPoseError
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.hints import Hints

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from sqlalchemy import Row
 
-from lalaloc_core.bundle import EvidenceModel
+from lalaloc_core.localise.bundle import EvidenceModel
 from lalaloc_core.errors import InvalidHintError
 from lalaloc_core.localise.camera_height import DEFAULT_STD_M, CameraHeight
 from lalaloc_core.localise.evidence import EvidenceConfig

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from lalaloc_core.sampling import grid_size
+from lalaloc_core.render.sampling import grid_size
 from service.grids import GridProvider, GridState
 from service.http.conditional import plan_etag
 from service.schemas import BoundsAnswer, FloorPlanAnswer, FloorPlanSummary, GridAnswer, ImportReport, RoomAnswer

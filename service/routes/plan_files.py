@@ -11,7 +11,7 @@ from starlette.concurrency import run_in_threadpool
 from lalaloc_core.draw.plan import Marker
 from lalaloc_core.errors import MissingExtraError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.plans import ENDINGS, MEDIA_TYPES, ExportFormat
+from lalaloc_core.importers import ENDINGS, MEDIA_TYPES, ExportFormat
 from service.errors import (
     ConverterNotReadyError,
     InvalidRequestError,

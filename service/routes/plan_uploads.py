@@ -9,7 +9,7 @@ from typing import Any
 from fastapi import Request
 
 from lalaloc_core.errors import InvalidFloorPlanError, MissingExtraError, SeveralLevelsError
-from lalaloc_core.plans import ImportOptions
+from lalaloc_core.importers import ImportOptions
 from service.conversion import seems_native
 from service.errors import (
     ConverterNotReadyError,

@@ -19,7 +19,7 @@ import numpy as np
 from lalaloc_core.localise.poses import LatentGrid
 from lalaloc_core.localise.venue.prototype_cells import Cells, shipped_cells
 from lalaloc_core.localise.venue.prototypes import ROW, Prototypes
-from lalaloc_core.sampling import PoseSet
+from lalaloc_core.render.sampling import PoseSet
 
 _HEADER = struct.Struct("<4s3I")
 _MAGIC, _MAGIC_WITHOUT_LATENTS = b"LLG1", b"LLG2"

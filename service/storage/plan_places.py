@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from sqlalchemy import ColumnElement, and_, or_
 
-from lalaloc_core.earth import Anchor, LocalFrame
+from lalaloc_core.floorplan.earth import Anchor, LocalFrame
 from lalaloc_core.floorplan import FloorPlan
 from service.storage.tables import FLOORPLANS
 

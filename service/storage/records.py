@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from datetime import datetime
 
-from lalaloc_core.earth import Anchor
+from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.poses import LatentGrid
 from service.storage.grid_format import SortedPrototypes

@@ -27,7 +27,7 @@ from sqlalchemy import (
     update,
 )
 
-from lalaloc_core.earth import Anchor
+from lalaloc_core.floorplan.earth import Anchor
 from service.errors import InvalidRequestError, RevisionMismatchError, TooManyVenuesError, UnknownVenueError
 from service.storage.database import Database
 from service.storage.pages import newest_first

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 from lalaloc_core.errors import InvalidFloorPlanError, MissingExtraError, SeveralLevelsError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.plans import (
+from lalaloc_core.importers import (
     ImportedPlan,
     ImportLimits,
     ImportOptions,

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lalaloc_core.bundle import Bundle, Manifest
+from lalaloc_core.localise.bundle import Bundle, Manifest
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.poses import RefinementJob, RefinementResult
 from lalaloc_core.localise.sequence.joint import SequenceJob, SequenceResult, refine_sequence

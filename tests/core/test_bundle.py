@@ -14,7 +14,7 @@ import pytest
 import safetensors.torch
 import torch
 
-from lalaloc_core.bundle import (
+from lalaloc_core.localise.bundle import (
     BUNDLE_FILES,
     DECODER_WEIGHTS,
     HEAD_ONNX,
@@ -30,18 +30,18 @@ from lalaloc_core.bundle import (
     write_manifest,
 )
 from lalaloc_core.errors import BundleError, ExportError
-from lalaloc_core.export import bundle_export as export
-from lalaloc_core.export.bundle_export import PARITY_TOLERANCE, export_bundle
-from lalaloc_core.export.run import export_bundle_again
+from lalaloc_core.learn.export import bundle_export as export
+from lalaloc_core.learn.export.bundle_export import PARITY_TOLERANCE, export_bundle
+from lalaloc_core.learn.export.run import export_bundle_again
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.optimise import LatentPoseOptimiser
 from lalaloc_core.nets import load_decoder
 from lalaloc_core.nets.decoder import LayoutDecoder
-from lalaloc_core.training.checkpoint import Checkpoint
-from lalaloc_core.training.config import TrainConfig
-from lalaloc_core.training.presets import PRESETS
-from lalaloc_core.training.stages import build_image_encoder, build_layout_encoder
+from lalaloc_core.learn.training.checkpoint import Checkpoint
+from lalaloc_core.learn.training.config import TrainConfig
+from lalaloc_core.learn.training.presets import PRESETS
+from lalaloc_core.learn.training.stages import build_image_encoder, build_layout_encoder
 from tests.core.test_training import small_paper
 from tests.strategies import crooked_flat, scene_of
 

@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lalaloc_core.bundle import Bundle, ConfidenceModel, EvidenceModel, LogisticModel, write_manifest
-from lalaloc_core.calibrate import Answers, calibrate, cross_validate, fit_confidence, fit_evidence
+from lalaloc_core.localise.bundle import Bundle, ConfidenceModel, EvidenceModel, LogisticModel, write_manifest
+from lalaloc_core.evaluate.calibrate import Answers, calibrate, cross_validate, fit_confidence, fit_evidence
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.evaluation.predictions import Pose, PredictedCandidate, Prediction
-from lalaloc_core.evaluation.score import expected_calibration_error, position_errors_m
+from lalaloc_core.evaluate.runs.predictions import Pose, PredictedCandidate, Prediction
+from lalaloc_core.evaluate.runs.score import expected_calibration_error, position_errors_m
 from tests.strategies import seeds
 
 TRUTH = Pose(x_m=0.0, y_m=0.0, room_index=0, heading_deg=0.0)

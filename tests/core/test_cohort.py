@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lalaloc_core.bundle import COHORT, Bundle, EvidenceModel, write_manifest
-from lalaloc_core.calibrate import store_cohort
-from lalaloc_core.data.synthetic import training_plans
+from lalaloc_core.localise.bundle import COHORT, Bundle, EvidenceModel, write_manifest
+from lalaloc_core.evaluate.calibrate import store_cohort
+from lalaloc_core.learn.data.synthetic import training_plans
 from lalaloc_core.errors import BundleError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import CameraHeight
@@ -22,7 +22,7 @@ from lalaloc_core.localise.optimise import LatentPoseOptimiser
 from lalaloc_core.localise.pipeline import LocaliseConfig, localise
 from lalaloc_core.localise.poses import PredictedProfile, Query
 from lalaloc_core.localise.retrieval import build_grid, grid_costs
-from lalaloc_core.sampling import PoseSet
+from lalaloc_core.render.sampling import PoseSet
 from tests.strategies import crooked_flat, plan_of, rectangle
 
 CAMERA_M = 1.5

@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 from lalaloc_core import __version__, bundle
-from lalaloc_core.bundle import Bundle, default_bundle
+from lalaloc_core.localise.bundle import Bundle, default_bundle
 from lalaloc_core.cli import main
 
 ROOT = Path(__file__).parents[2]
@@ -172,6 +172,6 @@ def test_a_wheel_brings_the_model_and_answers_in_an_empty_folder(tmp_path: Path)
     done = subprocess.run(asked, cwd=empty, env=environment, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)[0]["room"] == "kitchen"
-    where = [python, "-c", "from lalaloc_core.bundle import default_bundle; print(default_bundle())"]
+    where = [python, "-c", "from lalaloc_core.localise.bundle import default_bundle; print(default_bundle())"]
     found = subprocess.run(where, cwd=empty, env=environment, capture_output=True, text=True, check=True).stdout
     assert Path(found.strip()) == (installed / "share" / "lalaloc" / "models" / "default").resolve()

@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 
 from lalaloc_core.conventions import OPENING_CLASSES
-from lalaloc_core.data.dataset import Scene
-from lalaloc_core.data.synthetic.copied import CopiedScenes
-from lalaloc_core.data.synthetic.generated import GeneratedScenes
+from lalaloc_core.learn.data.dataset import Scene
+from lalaloc_core.learn.data.synthetic.copied import CopiedScenes
+from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.render.layout import layout_view

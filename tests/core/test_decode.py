@@ -11,9 +11,9 @@ import torch
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.evidence import EvidenceConfig
 from lalaloc_core.localise.pipeline import LocaliseConfig
-from lalaloc_core.methods.decode import VdrDecode
-from lalaloc_core.methods.lalaloc import LaLaLoc
-from lalaloc_core.methods.method import Question
+from lalaloc_core.evaluate.methods.decode import VdrDecode
+from lalaloc_core.evaluate.methods.lalaloc import LaLaLoc
+from lalaloc_core.evaluate.methods.method import Question
 from lalaloc_core.nets.decoder import DECODED_HEIGHT, DECODED_WIDTH, LayoutDecoder
 from lalaloc_core.render.depth import layout_depth
 from tests.core.questions import CAMERA_M, question_at

@@ -12,15 +12,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lalaloc_core.cli import main
-from lalaloc_core.training.batch_streams import PanoramaBatches
-from lalaloc_core.training.batches import Batch, load_batches
-from lalaloc_core.training.checkpoint import Checkpoint
-from lalaloc_core.training.config import TrainConfig
-from lalaloc_core.training.deferred import DeferredRenderer, turned
-from lalaloc_core.training.presets import PRESETS
-from lalaloc_core.training.rotation import Rotation
-from lalaloc_core.training.sources import GeneratedSource
-from lalaloc_core.training.stages import panorama_batches
+from lalaloc_core.learn.training.batch_streams import PanoramaBatches
+from lalaloc_core.learn.training.batches import Batch, load_batches
+from lalaloc_core.learn.training.checkpoint import Checkpoint
+from lalaloc_core.learn.training.config import TrainConfig
+from lalaloc_core.learn.training.deferred import DeferredRenderer, turned
+from lalaloc_core.learn.training.presets import PRESETS
+from lalaloc_core.learn.training.rotation import Rotation
+from lalaloc_core.learn.training.sources import GeneratedSource
+from lalaloc_core.learn.training.stages import panorama_batches
 
 CPU = torch.device("cpu")
 

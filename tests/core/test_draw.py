@@ -21,7 +21,7 @@ from lalaloc_core.draw.plan import Marker
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.probability_map import ProbabilityMap
 from lalaloc_core.render.poses import profiles_at
-from lalaloc_core.sampling import PoseSet, pose_grid
+from lalaloc_core.render.sampling import PoseSet, pose_grid
 
 SVG = "{http://www.w3.org/2000/svg}"
 PLAN = FloorPlan.from_dict(

@@ -7,16 +7,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lalaloc_core.bundle import EvidenceModel
+from lalaloc_core.localise.bundle import EvidenceModel
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.evidence import Evidence, EvidenceConfig
 from lalaloc_core.localise.first_look import LowestCosts, PairLimits, _bounds, _table, first_costs, likeliest
 from lalaloc_core.localise.layouts import layouts_at
 from lalaloc_core.localise.poses import LatentGrid, PredictedOpenings, PredictedProfile, Query, rolled
 from lalaloc_core.localise.retrieval import grid_costs, retrieve
-from lalaloc_core.sampling import PoseSet, pose_grid, random_poses
-from lalaloc_core.synth.homes.buildings import Building, building_of
-from lalaloc_core.synth.homes.splits import VALIDATION
+from lalaloc_core.render.sampling import PoseSet, pose_grid, random_poses
+from lalaloc_core.learn.synth.homes.buildings import Building, building_of
+from lalaloc_core.learn.synth.homes.splits import VALIDATION
 from tests.strategies import seeds
 
 STEP_M, COLUMNS, HYPOTHESES, QUERIES = 0.7, 64, 32, 24

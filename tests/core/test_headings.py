@@ -16,7 +16,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lalaloc_core.bundle import Bundle
+from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import CameraHeight
@@ -27,8 +27,8 @@ from lalaloc_core.localise.retrieval import build_grid
 from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
 from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
 from lalaloc_core.render.profile import wall_profile
-from lalaloc_core.sampling import PoseSet
-from lalaloc_core.training.presets import PRESETS
+from lalaloc_core.render.sampling import PoseSet
+from lalaloc_core.learn.training.presets import PRESETS
 from tests.strategies import Scene, crooked_flat, scenes
 
 RING = PRESETS["tiny"].ring

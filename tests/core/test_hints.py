@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lalaloc_core.bundle import Bundle
+from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.errors import InvalidHintError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import CameraHeight
@@ -22,7 +22,7 @@ from lalaloc_core.localise.optimise import LatentPoseOptimiser
 from lalaloc_core.localise.pipeline import Localisation, Refine, localise
 from lalaloc_core.localise.poses import LatentGrid, PredictedProfile, Query
 from lalaloc_core.localise.retrieval import build_grid, grid_costs
-from lalaloc_core.sampling import PoseSet
+from lalaloc_core.render.sampling import PoseSet
 from tests.strategies import plan_of, rectangle, seeds
 
 CAMERA_M = 1.5

@@ -19,7 +19,7 @@ from lalaloc_core.localise.optimise import LatentPoseOptimiser
 from lalaloc_core.localise.pipeline import Localisation, localise, panorama_heading
 from lalaloc_core.localise.poses import PredictedProfile, Query
 from lalaloc_core.localise.retrieval import build_grid
-from lalaloc_core.sampling import PoseSet
+from lalaloc_core.render.sampling import PoseSet
 from tests.strategies import crooked_flat, plan_of, rectangle
 
 CAMERA_M = 1.5

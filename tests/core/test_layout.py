@@ -14,8 +14,8 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.render.layout import LayoutView, layout_view
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.render.reference import reference_view
-from lalaloc_core.sampling import random_poses
-from lalaloc_core.synth.homes.plans import generate_home
+from lalaloc_core.render.sampling import random_poses
+from lalaloc_core.learn.synth.homes.plans import generate_home
 from tests.strategies import plan_document, plan_of, rectangle, rows_of_rooms, seeds
 
 COLUMNS = 48

@@ -10,8 +10,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lalaloc_core.metrics import Accuracy, chamfer_distance
-from lalaloc_core.training import losses
+from lalaloc_core.learn.metrics import Accuracy, chamfer_distance
+from lalaloc_core.learn.training import losses
 from tests.strategies import seeds
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from lalaloc_core.data.synthetic.generated import GeneratedScenes
-from lalaloc_core.data.synthetic.mismatched import CutOut, MismatchedScenes, OutdoorPhotograph, TurnedOver
+from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
+from lalaloc_core.learn.data.synthetic.mismatched import CutOut, MismatchedScenes, OutdoorPhotograph, TurnedOver
 
 HOMES = GeneratedScenes(homes=2, shots_per_home=4, furniture=None)
 LOOK = HOMES.appearances[0]

@@ -11,13 +11,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lalaloc_core.bundle import LAYOUT_WEIGHTS, Bundle
+from lalaloc_core.localise.bundle import LAYOUT_WEIGHTS, Bundle
 from lalaloc_core.errors import BundleError
 from lalaloc_core.localise.optimise import LatentPoseOptimiser, LpoConfig
 from lalaloc_core.localise.poses import RefinementJob, RefinementResult
 from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
 from lalaloc_core.render.profile import wall_profile
-from lalaloc_core.sampling import PoseSet
+from lalaloc_core.render.sampling import PoseSet
 from tests.strategies import Scene, convex_polygons, l_shape, plan_of, room_polygons, scene_of, seeds
 
 CAMERA_M = 1.4

@@ -27,7 +27,7 @@ from lalaloc_core.localise.poses import (
 )
 from lalaloc_core.localise.posterior import HEADING_SEPARATION
 from lalaloc_core.localise.retrieval import build_grid
-from lalaloc_core.sampling import PoseSet, random_poses
+from lalaloc_core.render.sampling import PoseSet, random_poses
 from tests.strategies import crooked_flat, plan_of, rectangle, seeds
 
 CAMERA_M = 1.5

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lalaloc_core.bundle import EvidenceModel
+from lalaloc_core.localise.bundle import EvidenceModel
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import CameraHeight
@@ -35,7 +35,7 @@ from lalaloc_core.localise.venue.prototypes import (
     unpacked_openings,
 )
 from lalaloc_core.render.poses import profiles_at
-from lalaloc_core.sampling import pose_grid
+from lalaloc_core.render.sampling import pose_grid
 
 COLUMNS, STEP_M = 64, 0.5
 WEIGHTS, CONFIG = EvidenceModel(temperature=40.0, openings=0.4, ceiling=0.1, room_type=0.05), EvidenceConfig()

@@ -13,7 +13,7 @@ import shapely
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan, PlanLimits, checks
 from lalaloc_core.render.poses import profiles_at
-from lalaloc_core.sampling import pose_grid
+from lalaloc_core.render.sampling import pose_grid
 from tests.growth import assert_no_worse_than_linear
 from tests.strategies import plan_document, rectangle
 
@@ -110,7 +110,7 @@ def test_a_grid_in_slivers_takes_time_by_their_boxes_and_memory_by_none() -> Non
 def test_a_lattice_looked_at_in_pieces_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     plan = FloorPlan.from_dict(plan_document(rectangle(7.3, 5.1), [[10, 0], [19, 2], [15, 9]]))
     whole = pose_grid(plan, 0.1)
-    monkeypatch.setattr("lalaloc_core.sampling._LATTICE_POINTS", 17)
+    monkeypatch.setattr("lalaloc_core.render.sampling._LATTICE_POINTS", 17)
     pieces = pose_grid(plan, 0.1)
     np.testing.assert_array_equal(pieces.position_m, whole.position_m)
     np.testing.assert_array_equal(pieces.room_index, whole.room_index)

@@ -16,7 +16,7 @@ from lalaloc_core.localise.confidence import Signals, signals_of
 from lalaloc_core.localise.poses import Candidate, PredictedProfile, Query
 from lalaloc_core.localise.posterior import GridCosts, Posterior, Support, area_shares, posterior_of
 from lalaloc_core.localise.probability_map import probability_map
-from lalaloc_core.sampling import PoseSet
+from lalaloc_core.render.sampling import PoseSet
 from tests.strategies import seeds
 
 NOWHERE = Support(np.zeros(1, int), np.zeros((1, 2)), np.ones(1))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lalaloc_core.synth.records import Column, Joined, Records
+from lalaloc_core.learn.synth.records import Column, Joined, Records
 
 
 class Points(Records):

@@ -13,15 +13,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lalaloc_core.errors import ConfigError
-from lalaloc_core.synth.augmentation.photometric import jittered
-from lalaloc_core.training.batch_streams import PanoramaBatches
-from lalaloc_core.training.batches import Batch, load_batches
-from lalaloc_core.training.config import TrainConfig
-from lalaloc_core.training.image_stage import ImageStage
-from lalaloc_core.training.presets import PRESETS
-from lalaloc_core.training.replay_buffer import ReplayBuffer
-from lalaloc_core.training.sources import GeneratedSource
-from lalaloc_core.training.stages import build_layout_encoder
+from lalaloc_core.learn.synth.augmentation.photometric import jittered
+from lalaloc_core.learn.training.batch_streams import PanoramaBatches
+from lalaloc_core.learn.training.batches import Batch, load_batches
+from lalaloc_core.learn.training.config import TrainConfig
+from lalaloc_core.learn.training.image_stage import ImageStage
+from lalaloc_core.learn.training.presets import PRESETS
+from lalaloc_core.learn.training.replay_buffer import ReplayBuffer
+from lalaloc_core.learn.training.sources import GeneratedSource
+from lalaloc_core.learn.training.stages import build_layout_encoder
 from tests.strategies import seeds
 
 TINY = PRESETS["tiny"]

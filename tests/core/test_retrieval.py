@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jaxtyping import Float
 
-from lalaloc_core.bundle import EvidenceModel
+from lalaloc_core.localise.bundle import EvidenceModel
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import CameraHeight
@@ -20,7 +20,7 @@ from lalaloc_core.localise.evidence import EvidenceConfig, latent_distances, pre
 from lalaloc_core.localise.poses import Candidate, LatentGrid, PredictedProfile, Query
 from lalaloc_core.localise.retrieval import contradicted, grid_costs, retrieve, suppress
 from lalaloc_core.localise.vogel import resample, vogel_disc
-from lalaloc_core.sampling import PoseSet
+from lalaloc_core.render.sampling import PoseSet
 from tests.strategies import plan_of, rectangle, seeds
 
 PLAN = plan_of(rectangle(6.0, 6.0))

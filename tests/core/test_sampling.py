@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.sampling import (
+from lalaloc_core.render.sampling import (
     WALL_MARGIN_M,
     PoseSet,
     TripletSampling,

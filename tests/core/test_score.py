@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lalaloc_core.errors import InvalidInputError, RunError
-from lalaloc_core.evaluation.predictions import PREDICTIONS_FILE, SCORES_FILE, Pose, Prediction, RunFolder, RunInfo
-from lalaloc_core.evaluation.score import (
+from lalaloc_core.evaluate.runs.predictions import PREDICTIONS_FILE, SCORES_FILE, Pose, Prediction, RunFolder, RunInfo
+from lalaloc_core.evaluate.runs.score import (
     expected_calibration_error,
     heading_errors_deg,
     position_errors_m,

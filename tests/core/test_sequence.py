@@ -22,7 +22,7 @@ from lalaloc_core.localise.sequence.chain import best_paths, forward_backward
 from lalaloc_core.localise.sequence.joint import motion_residuals, refine_sequence
 from lalaloc_core.localise.sequence.motion import FLOOR, Motion, States, Transition, transition
 from lalaloc_core.localise.sequence.search import SequenceRefiner, localise_sequence
-from lalaloc_core.sampling import PoseSet
+from lalaloc_core.render.sampling import PoseSet
 from tests.strategies import plan_of, rectangle
 
 MOTIONS = {

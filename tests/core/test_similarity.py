@@ -11,9 +11,9 @@ from hypothesis import given, settings
 
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.methods import similarity
-from lalaloc_core.methods.oracle import PoseOracle, SimilarityRetrieval
-from lalaloc_core.methods.similarity import (
+from lalaloc_core.evaluate.methods import similarity
+from lalaloc_core.evaluate.methods.oracle import PoseOracle, SimilarityRetrieval
+from lalaloc_core.evaluate.methods.similarity import (
     LAYOUT_METRICS,
     ChamferGrid,
     DepthGrid,
@@ -23,10 +23,10 @@ from lalaloc_core.methods.similarity import (
     edge_image,
     layout_grid,
 )
-from lalaloc_core.metrics import chamfer_distance
+from lalaloc_core.learn.metrics import chamfer_distance
 from lalaloc_core.render.depth import back_project, layout_depth
 from lalaloc_core.render.profile import wall_profile
-from lalaloc_core.sampling import PoseSet, random_poses
+from lalaloc_core.render.sampling import PoseSet, random_poses
 from tests.core.questions import CAMERA_M, question_at
 from tests.strategies import crooked_flat, plan_of, plans, rectangle, seeds
 

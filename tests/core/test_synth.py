@@ -18,16 +18,16 @@ from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.render.depth import layout_depth
 from lalaloc_core.render.profile import wall_profile
-from lalaloc_core.synth.furniture.catalogue import ROOM_PIECES
-from lalaloc_core.synth.furniture.furnish import CAMERA_CLEARANCE_M, FURNITURE_LEVELS, furnish, rectangle
-from lalaloc_core.synth.homes.plans import Home, generate_home
-from lalaloc_core.synth.homes.splits import TEST, TRAIN
-from lalaloc_core.synth.homes.splits import home_of as home_of_split
-from lalaloc_core.synth.rendering.contact_sheet import contact_sheet
-from lalaloc_core.synth.rendering.panorama import PanoramaRenderer, sample_shots
-from lalaloc_core.synth.scene.build import build_scene
-from lalaloc_core.synth.scene.facts import facts_of
-from lalaloc_core.synth.scene.materials import MaterialLibrary
+from lalaloc_core.learn.synth.furniture.catalogue import ROOM_PIECES
+from lalaloc_core.learn.synth.furniture.furnish import CAMERA_CLEARANCE_M, FURNITURE_LEVELS, furnish, rectangle
+from lalaloc_core.learn.synth.homes.plans import Home, generate_home
+from lalaloc_core.learn.synth.homes.splits import TEST, TRAIN
+from lalaloc_core.learn.synth.homes.splits import home_of as home_of_split
+from lalaloc_core.learn.synth.rendering.contact_sheet import contact_sheet
+from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, sample_shots
+from lalaloc_core.learn.synth.scene.build import build_scene
+from lalaloc_core.learn.synth.scene.facts import facts_of
+from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 
 ROWS, COLUMNS = 64, 128
 seeds = st.integers(0, 2**32 - 1)

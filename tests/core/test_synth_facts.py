@@ -11,17 +11,17 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lalaloc_core.synth.furniture.furnish import furnish, rectangle, wall_frame
-from lalaloc_core.synth.homes.plans import generate_home
-from lalaloc_core.synth.homes.splits import TRAIN, home_of
-from lalaloc_core.synth.rendering.panorama import PanoramaRenderer
-from lalaloc_core.synth.scene.build import build_scene
-from lalaloc_core.synth.scene.facts import FACTS, facts_of
-from lalaloc_core.synth.scene.leaves import boards, hang_leaves
-from lalaloc_core.synth.scene.materials import MaterialLibrary
-from lalaloc_core.synth.scene.mirrors import Reflection
-from lalaloc_core.synth.scene.render_scene import Sun
-from lalaloc_core.synth.scene.shots import POSE_MARGIN_M, Shot, sample_shots, stage_rooms
+from lalaloc_core.learn.synth.furniture.furnish import furnish, rectangle, wall_frame
+from lalaloc_core.learn.synth.homes.plans import generate_home
+from lalaloc_core.learn.synth.homes.splits import TRAIN, home_of
+from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer
+from lalaloc_core.learn.synth.scene.build import build_scene
+from lalaloc_core.learn.synth.scene.facts import FACTS, facts_of
+from lalaloc_core.learn.synth.scene.leaves import boards, hang_leaves
+from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
+from lalaloc_core.learn.synth.scene.mirrors import Reflection
+from lalaloc_core.learn.synth.scene.render_scene import Sun
+from lalaloc_core.learn.synth.scene.shots import POSE_MARGIN_M, Shot, sample_shots, stage_rooms
 
 seeds = st.integers(0, 2**32 - 1)
 

@@ -13,14 +13,14 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.synth.camera.develop import develop
-from lalaloc_core.synth.camera.exposure import Exposure, sample_exposure, sample_staged_exposure
-from lalaloc_core.synth.camera.jpeg import compress
-from lalaloc_core.synth.camera.lens import lens_gain, tilt
-from lalaloc_core.synth.camera.patches import cover_poles
-from lalaloc_core.synth.homes.plans import generate_home
-from lalaloc_core.synth.rendering.panorama import PanoramaRenderer, sample_shots
-from lalaloc_core.synth.scene.materials import MaterialLibrary
+from lalaloc_core.learn.synth.camera.develop import develop
+from lalaloc_core.learn.synth.camera.exposure import Exposure, sample_exposure, sample_staged_exposure
+from lalaloc_core.learn.synth.camera.jpeg import compress
+from lalaloc_core.learn.synth.camera.lens import lens_gain, tilt
+from lalaloc_core.learn.synth.camera.patches import cover_poles
+from lalaloc_core.learn.synth.homes.plans import generate_home
+from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, sample_shots
+from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 
 ROWS, COLUMNS = 64, 128
 seeds = st.integers(0, 2**32 - 1)

@@ -13,21 +13,21 @@ import shapely
 
 from lalaloc_core.cli.evaluation import add_commands
 from lalaloc_core.conventions import column_azimuths
-from lalaloc_core.data.dataset import Appearance, Dataset
-from lalaloc_core.data.synthetic.unfamiliar import UnfamiliarPhotograph, UnfamiliarScenes
+from lalaloc_core.learn.data.dataset import Appearance, Dataset
+from lalaloc_core.learn.data.synthetic.unfamiliar import UnfamiliarPhotograph, UnfamiliarScenes
 from lalaloc_core.errors import DatasetError, InvalidInputError
-from lalaloc_core.evaluation.factories import build_dataset
-from lalaloc_core.evaluation.predictions import RunInfo
+from lalaloc_core.evaluate.runs.factories import build_dataset
+from lalaloc_core.evaluate.runs.predictions import RunInfo
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.render.depth import layout_depth
 from lalaloc_core.render.profile import wall_profile
-from lalaloc_core.unfamiliar.furnish import LEVELS, Furnishing
-from lalaloc_core.unfamiliar.homes import WALL_MARGIN_M, HomeKey, UnfamiliarHome, home_of, traced_home
-from lalaloc_core.unfamiliar.openings import sample_openings
-from lalaloc_core.unfamiliar.outlines import AREAS_M2, sample_outline
-from lalaloc_core.unfamiliar.plans import MAX_AREA_M2, MAX_ROOMS, MIN_AREA_M2, MIN_ROOMS, sample_plan
-from lalaloc_core.unfamiliar.shell import shell_parts
-from lalaloc_core.unfamiliar.tracing import Tracer
+from lalaloc_core.learn.heldout.furnish import LEVELS, Furnishing
+from lalaloc_core.learn.heldout.homes import WALL_MARGIN_M, HomeKey, UnfamiliarHome, home_of, traced_home
+from lalaloc_core.learn.heldout.openings import sample_openings
+from lalaloc_core.learn.heldout.outlines import AREAS_M2, sample_outline
+from lalaloc_core.learn.heldout.plans import MAX_AREA_M2, MAX_ROOMS, MIN_AREA_M2, MIN_ROOMS, sample_plan
+from lalaloc_core.learn.heldout.shell import shell_parts
+from lalaloc_core.learn.heldout.tracing import Tracer
 
 PACKAGE = Path(__file__).parents[2] / "lalaloc_core" / "unfamiliar"
 HOMES = 4
@@ -50,7 +50,7 @@ class TestApart:
         imported = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
         ours = {name for name in imported if name is not None and name.startswith("lalaloc_core")}
         plain = {"lalaloc_core.floorplan", "lalaloc_core.conventions"}
-        assert {name for name in ours if not name.startswith("lalaloc_core.unfamiliar")} <= plain
+        assert {name for name in ours if not name.startswith("lalaloc_core.learn.heldout")} <= plain
 
 
 class TestPlans:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lalaloc_core.bundle import EvidenceModel
+from lalaloc_core.localise.bundle import EvidenceModel
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.evidence import Evidence, EvidenceConfig
@@ -15,7 +15,7 @@ from lalaloc_core.localise.poses import LatentGrid, PredictedProfile, Query
 from lalaloc_core.localise.venue.merged_plans import MergedPlans
 from lalaloc_core.localise.venue.prototypes import most_probable, share_searched
 from lalaloc_core.render.poses import profiles_at
-from lalaloc_core.sampling import pose_grid
+from lalaloc_core.render.sampling import pose_grid
 
 COLUMNS, STEP_M = 64, 0.5
 WEIGHTS, CONFIG = EvidenceModel(temperature=40.0), EvidenceConfig()

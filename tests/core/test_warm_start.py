@@ -12,22 +12,22 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from lalaloc_core.bundle import Bundle
+from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.cli import main
-from lalaloc_core.data.synthetic.generated import GeneratedScenes
+from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.errors import CheckpointError
-from lalaloc_core.export.run import export_run
-from lalaloc_core.training.checkpoint import Checkpoint
-from lalaloc_core.training.config import TrainConfig
-from lalaloc_core.training.data import TrainingData
-from lalaloc_core.training.image_stage import ImageStage
-from lalaloc_core.training.loop import run_stage
-from lalaloc_core.training.picture_cache import cached_pictures
-from lalaloc_core.training.presets import PRESETS
-from lalaloc_core.training.run import train_image, train_layout
-from lalaloc_core.training.sources import GeneratedSource
-from lalaloc_core.training.stages import build_layout_encoder
-from lalaloc_core.training.warm_start import load_warm_start
+from lalaloc_core.learn.export.run import export_run
+from lalaloc_core.learn.training.checkpoint import Checkpoint
+from lalaloc_core.learn.training.config import TrainConfig
+from lalaloc_core.learn.training.data import TrainingData
+from lalaloc_core.learn.training.image_stage import ImageStage
+from lalaloc_core.learn.training.loop import run_stage
+from lalaloc_core.learn.training.picture_cache import cached_pictures
+from lalaloc_core.learn.training.presets import PRESETS
+from lalaloc_core.learn.training.run import train_image, train_layout
+from lalaloc_core.learn.training.sources import GeneratedSource
+from lalaloc_core.learn.training.stages import build_layout_encoder
+from lalaloc_core.learn.training.warm_start import load_warm_start
 from tests.core.test_training import LineStage, same_weights
 
 CPU = torch.device("cpu")

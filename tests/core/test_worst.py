@@ -13,14 +13,14 @@ from PIL import Image, ImageColor
 from lalaloc_core.cli import main
 from lalaloc_core.draw.canvas import FOUND, TRUE
 from lalaloc_core.errors import RunError
-from lalaloc_core.evaluation.failures import Outcome, is_symmetric, outcomes, symmetric_by_chance
-from lalaloc_core.evaluation.predictions import Pose, Prediction, RunFolder, RunInfo
-from lalaloc_core.evaluation.run import run_evaluation
+from lalaloc_core.evaluate.runs.failures import Outcome, is_symmetric, outcomes, symmetric_by_chance
+from lalaloc_core.evaluate.runs.predictions import Pose, Prediction, RunFolder, RunInfo
+from lalaloc_core.evaluate.runs.run import run_evaluation
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.poses import PredictedProfile, Query
 from lalaloc_core.render.profile import wall_profile
-from lalaloc_core.report.sheets import PER_SHEET, Thumbnail, draw_sheet
-from lalaloc_core.report.worst import (
+from lalaloc_core.evaluate.report.sheets import PER_SHEET, Thumbnail, draw_sheet
+from lalaloc_core.evaluate.report.worst import (
     SUMMARY_FILE,
     choose_worst,
     predicted_profile_m,

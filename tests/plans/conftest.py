@@ -9,7 +9,7 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.plans import ImportedPlan
+from lalaloc_core.importers import ImportedPlan
 
 # Two rooms above a corridor, walls of 10 cm; a door to each room, a window, a column, a free-standing wall.
 FLAT = {

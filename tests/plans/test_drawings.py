@@ -9,8 +9,8 @@ import pytest
 from ezdxf.filemanagement import new as new_dxf
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.plans import ImportOptions, import_plan
-from lalaloc_core.plans.model.words import role_of, type_of_room
+from lalaloc_core.importers import ImportOptions, import_plan
+from lalaloc_core.importers.model.words import role_of, type_of_room
 from tests.plans.conftest import lines, shapes
 
 CUBICASA = b"""<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1000 600"><g id="Model"><g class="Floor">

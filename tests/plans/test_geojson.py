@@ -10,9 +10,9 @@ import numpy as np
 import pyproj
 import pytest
 
-from lalaloc_core.earth import LocalFrame
+from lalaloc_core.floorplan.earth import LocalFrame
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.plans import ImportLimits, ImportOptions, import_plan, import_plans
+from lalaloc_core.importers import ImportLimits, ImportOptions, import_plan, import_plans
 from tests.plans.conftest import lines, shapes
 
 PLACE = LocalFrame(longitude=-0.1276, latitude=51.5072)

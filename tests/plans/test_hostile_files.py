@@ -15,7 +15,7 @@ from ezdxf.filemanagement import new as new_dxf
 from PIL import Image
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.plans import ImportLimits, ImportOptions, detect_format, import_plans
+from lalaloc_core.importers import ImportLimits, ImportOptions, detect_format, import_plans
 from tests.plans.conftest import FLAT
 
 SVG = '<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink">{}</svg>'

@@ -10,7 +10,7 @@ import pyproj
 import pytest
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.plans import ImportedPlan, ImportOptions, import_plan, import_plans
+from lalaloc_core.importers import ImportedPlan, ImportOptions, import_plan, import_plans
 from tests.plans.conftest import lines, shapes
 
 ifcopenshell = pytest.importorskip("ifcopenshell")

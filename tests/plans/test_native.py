@@ -8,8 +8,8 @@ import pytest
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.plans import ImportOptions, KnownDistance, import_plan
-from lalaloc_core.plans.model.checks import check_document, likely_unit
+from lalaloc_core.importers import ImportOptions, KnownDistance, import_plan
+from lalaloc_core.importers.model.checks import check_document, likely_unit
 from tests.plans.conftest import FLAT, assert_same_plan
 
 FOOT = 0.3048

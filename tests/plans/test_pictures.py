@@ -17,8 +17,8 @@ from lalaloc_core.draw.canvas import rasterise
 from lalaloc_core.draw.plan import plan_svg
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.plans import ImportOptions, KnownDistance, import_plan
-from lalaloc_core.plans.picture.ink import find_skew
+from lalaloc_core.importers import ImportOptions, KnownDistance, import_plan
+from lalaloc_core.importers.picture.ink import find_skew
 from tests.plans.conftest import lines, shapes
 
 FLAT = Path(__file__).parents[2] / "examples" / "flat.json"

@@ -14,7 +14,7 @@ import pytest
 from lalaloc_client import Client
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.plans import Anchor, ImportOptions, import_plan
+from lalaloc_core.importers import Anchor, ImportOptions, import_plan
 from tests.plans.conftest import FLAT as PLAN
 from tests.plans.conftest import assert_same_plan
 from tests.service.conftest import FLAT, assert_problem, localise, upload

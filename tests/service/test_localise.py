@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from shapely import Point
 
-from lalaloc_core.bundle import Bundle, ConfidenceModel, LogisticModel, write_manifest
+from lalaloc_core.localise.bundle import Bundle, ConfidenceModel, LogisticModel, write_manifest
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise import pipeline
 from lalaloc_core.localise.camera_height import CameraHeight

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lalaloc_core.bundle import LAYOUT_WEIGHTS, Bundle
+from lalaloc_core.localise.bundle import LAYOUT_WEIGHTS, Bundle
 from lalaloc_core.localise.poses import RefinementJob, RefinementResult
 from service.query.lpo_pool import LpoPool
 from service.settings import Settings

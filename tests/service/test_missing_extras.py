@@ -8,7 +8,7 @@ import httpx
 import pytest
 
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.plans import export_plan
+from lalaloc_core.importers import export_plan
 from tests.plans.conftest import FLAT as PLAN
 from tests.plans.test_pictures import vector_pdf
 from tests.service.conftest import StartApp, assert_problem, encode_picture, upload

@@ -13,7 +13,7 @@ import httpx
 import numpy as np
 import pytest
 
-from lalaloc_core.earth import Anchor, LocalFrame
+from lalaloc_core.floorplan.earth import Anchor, LocalFrame
 from tests.service.conftest import FLAT, StartApp, assert_problem, upload
 
 ROOT = Path(__file__).parents[2]

@@ -22,7 +22,7 @@ from PIL import Image
 
 from benchmarks.plan_drawing import draw_plan
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.plans import Anchor, export_plan
+from lalaloc_core.importers import Anchor, export_plan
 from tests.plans.conftest import FLAT as PLAN
 from tests.plans.test_ifc import DUPLEX, ifc_flat
 from tests.plans.test_pictures import vector_pdf

@@ -26,7 +26,7 @@ from sqlalchemy import delete, event, func, select, update
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.poses import LatentGrid
-from lalaloc_core.sampling import PoseSet
+from lalaloc_core.render.sampling import PoseSet
 from service.errors import (
     DamagedDataError,
     RevisionMismatchError,

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lalaloc_core.bundle import LAYOUT_WEIGHTS, Bundle
+from lalaloc_core.localise.bundle import LAYOUT_WEIGHTS, Bundle
 from lalaloc_core.errors import BundleError, ConfigError
 from lalaloc_core.localise.optimise.config import LpoConfig
 from lalaloc_core.localise.optimise.descent import adam, levenberg_marquardt

@@ -19,7 +19,7 @@ from lalaloc_core.localise.poses import Candidate, Query
 from lalaloc_core.localise.posterior import HEADING_SEPARATION, Posterior, posterior_from_weights
 from lalaloc_core.localise.sequence.chain import Marginals, forward_backward
 from lalaloc_core.localise.sequence.motion import States, Transition
-from lalaloc_core.sampling import PoseSet
+from lalaloc_core.render.sampling import PoseSet
 
 # States that are less probable than this are nowhere to be seen.
 _NEGLIGIBLE = 1e-9

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from lalaloc_core.bundle import EvidenceModel
+from lalaloc_core.localise.bundle import EvidenceModel
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.floorplan.geometry import pad_walls
@@ -21,7 +21,7 @@ from lalaloc_core.localise.refinement import refined, refinement_job
 from lalaloc_core.localise.sequence.joint import SequenceJob, SequenceResult, motion_costs
 from lalaloc_core.localise.sequence.motion import FLOOR, Motion, Transition
 from lalaloc_core.localise.sequence.paths import Observation, Path
-from lalaloc_core.sampling import PoseSet
+from lalaloc_core.render.sampling import PoseSet
 
 # Paths that end as near as this, and turned as alike (radians), are one.
 _SAME_M, _SAME_TURN = 0.2, math.radians(5.0)

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from lalaloc_core.floorplan import FloorPlan, OpeningFace, Room
 from lalaloc_core.localise.layouts import joined_layouts
 from lalaloc_core.localise.poses import Candidate, LatentGrid
-from lalaloc_core.sampling import PoseSet
+from lalaloc_core.render.sampling import PoseSet
 
 # Between the boxes around two plans; farther than any two poses that are taken for one place.
 _GAP_M = 10.0

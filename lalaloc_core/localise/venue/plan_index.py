@@ -21,7 +21,7 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt64
 
-from lalaloc_core.bundle import EvidenceModel
+from lalaloc_core.localise.bundle import EvidenceModel
 from lalaloc_core.localise.evidence import EvidenceConfig
 from lalaloc_core.localise.poses import Query
 from lalaloc_core.localise.venue.prototype_cells import FAMILIES, Cells, claims_of

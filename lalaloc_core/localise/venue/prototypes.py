@@ -24,7 +24,7 @@ from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, WALL_CODE
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.layouts import layouts_at
 from lalaloc_core.localise.poses import LatentGrid
-from lalaloc_core.sampling import PoseSet
+from lalaloc_core.render.sampling import PoseSet
 
 AZIMUTHS = 32
 # Neighbouring prototypes are so many grid steps apart.

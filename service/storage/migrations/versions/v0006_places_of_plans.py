@@ -9,7 +9,7 @@ import numpy as np
 import sqlalchemy as sa
 from alembic import op
 
-from lalaloc_core.earth import Anchor
+from lalaloc_core.floorplan.earth import Anchor
 
 revision = "0006"
 down_revision = "0005"

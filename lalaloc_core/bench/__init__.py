@@ -1,8 +1,0 @@
-"""`lalaloc bench`: measure the figures of docs/results.md. Each group prints what it measured, with its n.
-
-Begin with `report.py`, which runs the groups, a module each.
-"""
-
-from lalaloc_core.bench.report import run_bench
-
-__all__ = ["run_bench"]

@@ -1,0 +1,1 @@
+"""The wing that measures models: methods, runs, reports, benchmarks and the paper's tables. Begin with `runs/run.py`."""

@@ -1,0 +1,119 @@
+"""How well the shipped model does on homes that training never draws."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from lalaloc_core.localise.bundle import Bundle
+from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
+from lalaloc_core.evaluate.runs.run import run_evaluation
+from lalaloc_core.evaluate.runs.score import StageScores, score
+from lalaloc_core.evaluate.methods.method import QueryKind
+
+# Homes of what is not among the first figures, and of the comparison of evidence, which asks the same six times.
+_MAX_HOMES_OF_MINOR = 100
+_MAX_HOMES_PER_EVIDENCE = 50
+
+
+@dataclass(frozen=True, kw_only=True)
+class Benchmark:
+    """What is asked of the model.
+
+    `unfamiliar`: in homes that another generator than training's drew; `copies`: in plans of four copies of a home that
+    differ in their doors.
+
+    Of a `minor` benchmark fewer homes are asked. `settings` are of the method "lalaloc".
+    """
+
+    kind: QueryKind = "panorama"
+    furniture: str = "full"
+    heading_known: bool = True
+    unfamiliar: bool = False
+    copies: bool = False
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    minor: bool = False
+
+
+_BENCHMARKS = {
+    "layout": Benchmark(kind="layout"),
+    "panorama_full": Benchmark(),
+    "panorama_empty": Benchmark(furniture="empty", minor=True),
+    "panorama_full_unknown_heading": Benchmark(heading_known=False),
+    "out_of_family_full": Benchmark(unfamiliar=True, minor=True),
+    "out_of_family_empty": Benchmark(unfamiliar=True, furniture="empty", minor=True),
+}
+
+
+def bench_accuracy(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
+    """Accuracy on generated test homes, 4 queries each, and on at most 100 unfurnished and out-of-family ones."""
+    return {name: summary_of(answers_to(bundle, asked, homes, textures)) for name, asked in _BENCHMARKS.items()}
+
+
+def bench_evidence(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
+    """What poses are compared by: the latent, the predicted wall profile, or both; heading known and unknown."""
+    homes = min(homes, _MAX_HOMES_PER_EVIDENCE)
+    return {
+        heading: {
+            evidence: summary_of(
+                answers_to(
+                    bundle,
+                    Benchmark(settings={"evidence": evidence}, heading_known=heading == "known_heading"),
+                    homes,
+                    textures,
+                )
+            )
+            for evidence in ("latent", "profile", "both")
+        }
+        for heading in ("known_heading", "unknown_heading")
+    }
+
+
+def answers_to(bundle: Bundle, benchmark: Benchmark, homes: int, textures: Path | None) -> list[Prediction]:
+    """The answers to a benchmark, 4 queries in each of some homes."""
+    homes = min(homes, _MAX_HOMES_OF_MINOR) if benchmark.minor else homes
+    generated: dict[str, Any] = {"homes": homes, "furniture": benchmark.furniture}
+    if benchmark.unfamiliar:
+        generated["generator"] = "unfamiliar"
+    else:
+        generated["textures"] = None if textures is None else str(textures)
+    if benchmark.copies:
+        generated["generator"] = "copies"
+    info = RunInfo(
+        label=f"{benchmark.kind}, {benchmark.furniture}",
+        method="lalaloc",
+        kind=benchmark.kind,
+        dataset="out-of-family homes" if benchmark.unfamiliar else "generated homes",
+        split="test",
+        settings=dict(benchmark.settings),
+        generated=generated,
+        bundle=str(bundle.folder),
+        furniture=benchmark.furniture if benchmark.kind == "panorama" else None,
+        heading_known=benchmark.heading_known,
+    )
+    with tempfile.TemporaryDirectory(prefix="lalaloc-bench-") as folder:
+        return run_evaluation(RunFolder(Path(folder)), info)
+
+
+def summary_of(predictions: list[Prediction]) -> dict[str, Any]:
+    """The figures that tables show of some answers."""
+    scores = score(predictions)
+    shares = ("within_1cm", "within_5cm", "within_10cm", "within_1m")
+
+    def figures(stage: StageScores) -> dict[str, float]:
+        return {name: getattr(stage, name).value for name in ("median_cm", *shares)}
+
+    interval = scores.final.within_1m
+    return {
+        "n": scores.n,
+        **figures(scores.final),
+        "within_1m_interval": [interval.low, interval.high],
+        "retrieval": figures(scores.stages["retrieval"]),
+        "correct_room": scores.final.correct_room.value,
+        "heading_within_2deg": scores.final.heading_within_2deg.value,
+        "median_ms": scores.median_ms,
+        "expected_calibration_error": scores.calibration_error,
+    }

@@ -1,0 +1,67 @@
+"""What the image encoder reads at each azimuth of homes that training never draws: walls and openings."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import UInt8
+
+from lalaloc_core.learn.azimuth_metrics import AzimuthMeasures, measure_azimuths, summarise_azimuths
+from lalaloc_core.localise.bundle import Bundle
+from lalaloc_core.conventions import OPENING_CLASSES
+from lalaloc_core.learn.data.dataset import Camera, Dataset
+from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
+from lalaloc_core.evaluate.runs.photograph_reading import read_azimuths
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.render.layout import layout_view
+
+_MAX_HOMES = 100
+
+
+def bench_azimuths(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
+    """Errors of walls and openings on the furnished test split and out-of-family, 4 panoramas in each of some homes."""
+    # Traced by embree, which only the extra `oracle` brings.
+    from lalaloc_core.learn.data.synthetic.unfamiliar import UnfamiliarScenes
+
+    encoders = Encoders(bundle, threads=1)
+    homes = min(homes, _MAX_HOMES)
+    datasets = {"test": GeneratedScenes(homes=homes, textures=textures), "out_of_family": UnfamiliarScenes(homes=homes)}
+    return {family: azimuth_figures(encoders, dataset) for family, dataset in datasets.items()}
+
+
+def azimuth_figures(encoders: Encoders, dataset: Dataset) -> dict[str, Any]:
+    """`AzimuthSummary` of a data set's test split, and `confusion`: of each true class, the share taken for each.
+
+    Raises:
+        BundleError: the model predicts no wall profile.
+    """
+    (appearance,) = dataset.appearances
+    measures = []
+    for name in dataset.scenes("test"):
+        scene = dataset.load(name)
+        for camera in scene.cameras:
+            image = camera.photographs[appearance].image(encoders.manifest.image_height, encoders.manifest.image_width)
+            measures.append(_measure(encoders, scene.plan, camera, image))
+    confusions = [one.confusion for one in measures if one.confusion is not None]
+    confusion = None
+    if confusions:
+        counts = np.sum(confusions, axis=0)
+        shares = (counts / counts.sum(axis=1, keepdims=True).clip(1)).tolist()
+        confusion = {
+            true: dict(zip(OPENING_CLASSES, row, strict=True))
+            for true, row in zip(OPENING_CLASSES, shares, strict=True)
+        }
+    return {**dataclasses.asdict(summarise_azimuths(measures, OPENING_CLASSES)), "confusion": confusion}
+
+
+def _measure(encoders: Encoders, plan: FloorPlan, camera: Camera, image: UInt8[np.ndarray, "h w 3"]) -> AzimuthMeasures:
+    """Compare what is read from a panorama with what the plan has around the camera."""
+    log_m, log_scale, scores = read_azimuths(encoders, image, camera.camera_height_m)
+    heading, room = np.array([camera.heading]), np.array([camera.room_index])
+    pose = (camera.position_m[None], heading, room, plan.geometry, len(log_m), camera.camera_height_m)
+    view = layout_view(*pose)
+    return measure_azimuths([view.distance_m[0]], log_m, log_scale, view.kind[0], scores)

@@ -1,0 +1,81 @@
+"""Where the time of a query goes: the production path in this process under cProfile."""
+
+from __future__ import annotations
+
+import cProfile
+import statistics
+from pathlib import Path
+from types import CodeType
+
+import numpy as np
+
+from lalaloc_core.evaluate.bench.homes import home_of_area
+from lalaloc_core.localise.bundle import Bundle
+from lalaloc_core.learn.data.synthetic.generated import RendererCache
+from lalaloc_core.localise.camera_height import CameraHeight
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.pipeline import StageClock, localise
+from lalaloc_core.localise.retrieval import build_grid
+from lalaloc_core.evaluate.methods.lalaloc import local_refiner
+from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
+from lalaloc_core.learn.synth.scene.shots import sample_shots
+
+_GRID_STEP_M = 0.5
+_FUNCTIONS = 20
+_STAGES = ("encode", "retrieve", "vdr", "lpo")
+
+
+def profile_table(bundle: Bundle, queries: int, textures: Path | None) -> str:
+    """A table of the stages of queries in the home nearest 100 m², one thread, and one of the dearest functions.
+
+    Stages are timed without the profiler, medians over the queries; functions with it, by the time spent in themselves.
+    """
+    home = home_of_area(100.0)
+    shots = sample_shots(home, queries, np.random.default_rng(1), "full")
+    renderers = RendererCache(MaterialLibrary.create(np.random.default_rng(1), textures))
+    encoders, refiner = Encoders(bundle, threads=1), local_refiner(bundle)
+    height, width = encoders.manifest.image_height, encoders.manifest.image_width
+    images = renderers.renderer(height, width).render(shots).cpu().numpy()
+    camera_m = home.plan.camera_height_m
+    latents = not encoders.predicts_profile
+    grid = build_grid(home.plan, encoders, step_m=_GRID_STEP_M, camera_height_m=camera_m, latents=latents)
+
+    def ask(index: int, *, known: bool) -> dict[str, float]:
+        clock, shot = StageClock(), shots[index]
+        with clock.stage("encode"):
+            heading = shot.heading if known else None
+            query = encoders.query(images[index], heading, CameraHeight(shot.camera_height_m))
+        localise(home.plan, grid, encoders, query, refiner=refiner, clock=clock)
+        return clock.timings_ms
+
+    lines = [f"| stage, median of {queries} queries | known heading | unknown heading |", "|---|---|---|"]
+    for known in (True, False):
+        ask(0, known=known)
+    timings = {known: [ask(index, known=known) for index in range(queries)] for known in (True, False)}
+    for stage in _STAGES:
+        medians = [statistics.median(timing[stage] for timing in timings[known]) for known in (True, False)]
+        lines.append(f"| {stage} | {medians[0]:.1f} ms | {medians[1]:.1f} ms |")
+    for known in (True, False):
+        profiler = cProfile.Profile()
+        profiler.enable()
+        for index in range(queries):
+            ask(index, known=known)
+        profiler.disable()
+        title = "known" if known else "unknown"
+        lines += ["", f"| function, {title} heading | calls per query | ms per query, itself |", "|---|---|---|"]
+        lines += _dearest(profiler, queries)
+    return "\n".join(lines)
+
+
+def _dearest(profiler: cProfile.Profile, queries: int) -> list[str]:
+    """Rows of the functions that took the most time themselves."""
+    ranked = sorted(profiler.getstats(), key=lambda entry: -entry.inlinetime)[:_FUNCTIONS]
+    return [
+        f"| {_name(entry.code)} | {entry.callcount / queries:.0f} | {1e3 * entry.inlinetime / queries:.2f} |"
+        for entry in ranked
+    ]
+
+
+def _name(code: CodeType | str) -> str:
+    """Where a function stands; of those that are not written in Python the profiler has a description."""
+    return f"`{code}`" if isinstance(code, str) else f"`{Path(code.co_filename).name}` {code.co_qualname}"

@@ -1,0 +1,36 @@
+"""All groups of figures in one report."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from lalaloc_core.evaluate.bench.accuracy import bench_accuracy, bench_evidence
+from lalaloc_core.evaluate.bench.azimuths import bench_azimuths
+from lalaloc_core.evaluate.bench.datasets import bench_datasets
+from lalaloc_core.evaluate.bench.methods import bench_methods
+from lalaloc_core.evaluate.bench.rendering import bench_rendering
+from lalaloc_core.evaluate.bench.service import bench_service
+from lalaloc_core.evaluate.bench.terms import bench_copies, bench_heights, bench_terms
+from lalaloc_core.localise.bundle import Bundle
+
+
+def run_bench(bundle_folder: Path, groups: Sequence[str], *, homes: int, textures: Path | None) -> dict[str, Any]:
+    """Measure the named groups of figures with one bundle."""
+    bundle = Bundle.open(bundle_folder)
+    measure: Mapping[str, Callable[[], dict[str, Any]]] = {
+        "rendering": lambda: bench_rendering(bundle),
+        "service": lambda: bench_service(bundle, textures),
+        "accuracy": lambda: bench_accuracy(bundle, homes, textures),
+        "evidence": lambda: bench_evidence(bundle, homes, textures),
+        "azimuths": lambda: bench_azimuths(bundle, homes, textures),
+        "terms": lambda: bench_terms(bundle, homes, textures),
+        "heights": lambda: bench_heights(bundle, homes, textures),
+        "copies": lambda: bench_copies(bundle, homes, textures),
+        "methods": lambda: bench_methods(bundle),
+        "datasets": lambda: bench_datasets(bundle, textures),
+    }
+    machine = {"bundle": bundle.manifest.name, "version": bundle.manifest.version, "cores": os.cpu_count()}
+    return machine | {group: measure[group]() for group in groups}

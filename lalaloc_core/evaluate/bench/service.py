@@ -1,0 +1,131 @@
+"""What the running service takes: latency over real HTTP, and memory."""
+
+from __future__ import annotations
+
+import io
+import os
+import socket
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+from PIL import Image
+
+from lalaloc_core.evaluate.bench.homes import home_of_area
+from lalaloc_core.localise.bundle import Bundle
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, sample_shots
+from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
+
+_REQUESTS = 40
+_STARTUP_SECONDS = 60.0
+_SMALL_PROCESS_MB = 50.0
+
+
+def bench_service(bundle: Bundle, textures: Path | None) -> dict[str, Any]:
+    """Latency of `POST /localise` from one client over real HTTP, and memory of the service's processes."""
+    home = home_of_area(100.0)
+    shots = sample_shots(home, _REQUESTS, np.random.default_rng(1), "full")
+    materials = MaterialLibrary.create(np.random.default_rng(1), textures)
+    pictures = [_jpeg(image) for image in PanoramaRenderer(materials, height=512, width=1024).render(shots).numpy()]
+    with running_service(bundle.folder) as (client, process):
+        plan_id = _upload(client, home.plan)
+        report: dict[str, Any] = {"requests": _REQUESTS, "panorama": "1024x512 JPEG"}
+        for name, known in (("known_heading", True), ("unknown_heading", False)):
+            answers = []
+            for index, (shot, picture) in enumerate([(shots[0], pictures[0]), *zip(shots, pictures, strict=True)]):
+                data = {"floorplan_id": plan_id, "camera_height_m": f"{shot.home.plan.camera_height_m}"}
+                if known:
+                    data["heading_deg"] = f"{np.degrees(shot.heading):.3f}"
+                begin = time.perf_counter()
+                answer = client.post("/localise", data=data, files={"panorama": ("p.jpg", picture, "image/jpeg")})
+                answer.raise_for_status()
+                # The first request warms up and is not counted.
+                if index:
+                    answers.append(((time.perf_counter() - begin) * 1e3, answer.json()))
+            times = [milliseconds for milliseconds, _ in answers]
+            report[name] = {
+                "p50_ms": statistics.median(times),
+                "p95_ms": float(np.quantile(times, 0.95)),
+                "stages": sorted({answer["stage"] for _, answer in answers}),
+                "median_stage_ms": {
+                    stage: statistics.median(answer["timings_ms"][stage] for _, answer in answers)
+                    for stage in answers[0][1]["timings_ms"]
+                },
+            }
+        report["service_resident_mb"] = resident_mb(process.pid)
+        sizes = [resident_mb(pid) for pid in children_of(process.pid)]
+        # Besides the workers there is Python's own small resource tracker.
+        report["workers_resident_mb"] = [size for size in sizes if size > _SMALL_PROCESS_MB]
+    return report
+
+
+@contextmanager
+def running_service(bundle_folder: Path) -> Iterator[tuple[httpx.Client, subprocess.Popen[bytes]]]:
+    """The production service on a free port with a temporary data folder; stopped at the end."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    command = [sys.executable, "-m", "uvicorn", "service.app:app", "--port", str(port), "--log-level", "warning"]
+    with tempfile.TemporaryDirectory(prefix="lalaloc-bench-") as data:
+        environment = {**os.environ, "LALALOC_DATA_DIR": data, "LALALOC_BUNDLE": str(bundle_folder.resolve())}
+        environment["LALALOC_LOG_LEVEL"] = "warning"
+        process = subprocess.Popen(command, env=environment)
+        try:
+            with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=60.0) as client:
+                _wait_until(lambda: _is_ready(client), "the service did not become ready")
+                yield client, process
+        finally:
+            process.terminate()
+            process.wait(timeout=30)
+
+
+def resident_mb(pid: int) -> float:
+    """Resident memory of a process in MB, as Linux reports it."""
+    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+        if line.startswith("VmRSS:"):
+            return int(line.split()[1]) / 1024.0
+    return float("nan")
+
+
+def children_of(pid: int) -> list[int]:
+    """Process ids of the direct children of a process (Linux)."""
+    listings = [path.read_text() for path in Path(f"/proc/{pid}/task").glob("*/children")]
+    return [int(child) for listing in listings for child in listing.split()]
+
+
+def _upload(client: httpx.Client, plan: FloorPlan) -> str:
+    answer = client.post("/floorplans", json=plan.to_dict())
+    answer.raise_for_status()
+    plan_id = answer.json()["id"]
+    _wait_until(lambda: client.get(f"/floorplans/{plan_id}").json()["status"] == "ready", "the plan did not get ready")
+    return plan_id
+
+
+def _is_ready(client: httpx.Client) -> bool:
+    try:
+        return client.get("/readyz").status_code == 200
+    except httpx.TransportError:
+        return False
+
+
+def _wait_until(condition: Callable[[], bool], complaint: str) -> None:
+    deadline = time.monotonic() + _STARTUP_SECONDS
+    while not condition():
+        if time.monotonic() > deadline:
+            raise TimeoutError(complaint)
+        time.sleep(0.1)
+
+
+def _jpeg(image: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "JPEG", quality=90)
+    return buffer.getvalue()

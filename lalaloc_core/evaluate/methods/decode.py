@@ -1,0 +1,83 @@
+"""VDR + Decode: the pose optimised against the layout that the training decoder makes of the query's latent.
+
+The paper's comparison of optimising in the latent space with optimising an explicit layout (section 6.1.2): retrieval
+and re-sampling are LaLaLoc's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch.nn import functional
+
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.evidence import EvidenceConfig
+from lalaloc_core.localise.optimise import LpoConfig
+from lalaloc_core.localise.pipeline import LocaliseConfig, StageClock, localise
+from lalaloc_core.localise.refinement import refinement_job
+from lalaloc_core.evaluate.methods.alignment import DepthAligner
+from lalaloc_core.evaluate.methods.lalaloc import LaLaLoc, encode, found_pose, grid_index, read_image
+from lalaloc_core.evaluate.methods.method import Answer, Question
+from lalaloc_core.nets.decoder import DECODED_HEIGHT, DECODED_WIDTH, LayoutDecoder
+
+
+class VdrDecode:
+    """Answers with a bundle and the decoder that its layout encoder was trained with."""
+
+    def __init__(
+        self,
+        encoders: Encoders,
+        decoder: LayoutDecoder,
+        *,
+        config: LocaliseConfig | None = None,
+        schedule: LpoConfig | None = None,
+    ) -> None:
+        self._lalaloc = LaLaLoc(encoders, refine="vdr")
+        # What the paper compares with is the latent alone.
+        self._config = replace(config or LocaliseConfig(), evidence=EvidenceConfig(use_profile=False))
+        self._decoder = decoder.eval().requires_grad_(False)
+        # Training shows the decoder every n-th column of the encoder's wall profile.
+        columns = encoders.manifest.profile_columns
+        thinning = max(columns // DECODED_WIDTH, 1)
+        self._width = len(range(0, columns, thinning))
+        self._aligner = DepthAligner(rows=DECODED_HEIGHT, columns=columns, thinning=thinning, config=schedule)
+
+    def answer(self, question: Question) -> Answer:
+        """Localise up to the Vogel disc, decode the query's latent, align."""
+        encoders, plan, clock = self._lalaloc.encoders, question.plan, StageClock()
+        image = read_image(encoders, question)
+        with clock.stage("encode"):
+            query = encode(encoders, question, image)
+        grid = self._lalaloc.grid(question)
+        found = localise(plan, grid, encoders, query, refine="vdr", config=self._config)
+        clock.timings_ms.update(found.timings_ms)
+        with clock.stage("decode"):
+            start = found.candidates[0]
+            job = refinement_job(
+                plan, query, [start], grid.camera_height_m, encoders.manifest.evidence, self._config.evidence
+            )
+            result = self._aligner.refine(replace(job, targets=self.decode(job.targets)))
+        aligned = replace(
+            start,
+            x_m=float(result.position_m[0, 0]),
+            y_m=float(result.position_m[0, 1]),
+            frame_heading=float(result.heading[0]),
+            cost=float(result.cost[0]),
+        )
+        best = {**found.best, "decode": aligned}
+        return Answer(
+            stages={stage: found_pose(query, candidate) for stage, candidate in best.items()},
+            retrieved=grid_index(grid, best["retrieval"]),
+            timings_ms=clock.timings_ms,
+        )
+
+    def decode(self, latents: Float[np.ndarray, "k d"]) -> Float[np.ndarray, "k pixels"]:
+        """Flattened layout depths (m) that the decoder makes of latents, as wide as the layouts to compare."""
+        with torch.no_grad():
+            depth = self._decoder(torch.from_numpy(np.asarray(latents, dtype=np.float32)))
+            # Where profiles are narrower than its images, training compares at their width.
+            narrowed = functional.interpolate(depth[:, None], (DECODED_HEIGHT, self._width))
+        return narrowed.flatten(1).numpy()

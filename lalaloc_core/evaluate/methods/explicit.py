@@ -1,0 +1,140 @@
+"""Localisation by an explicitly predicted layout: the paper's baseline "HorizonNet + Loc" (section 6.1).
+
+The wall profile that the image encoder predicts takes the place of HorizonNet's. Everything is compared by the mean
+absolute difference of layout depths: the nearest pose of the grid, the nearest of a Vogel disc around it, and then
+gradient descent. A wall profile says nothing of the ceiling, so the prediction takes that of the room it is compared
+with.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from operator import attrgetter
+from typing import Any
+
+import numpy as np
+from cachetools import LRUCache, cachedmethod
+from jaxtyping import Float, UInt8
+
+from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.optimise import LpoConfig
+from lalaloc_core.localise.pipeline import LocaliseConfig, StageClock
+from lalaloc_core.localise.poses import RefinementJob
+from lalaloc_core.localise.vogel import disc_poses
+from lalaloc_core.evaluate.methods.alignment import DepthAligner
+from lalaloc_core.evaluate.methods.caching import GRIDS_CACHED, grid_key
+from lalaloc_core.evaluate.methods.lalaloc import read_image
+from lalaloc_core.evaluate.methods.method import Answer, Found, Question
+from lalaloc_core.evaluate.methods.similarity import layouts_at
+from lalaloc_core.render.depth import layout_depth
+from lalaloc_core.render.sampling import PoseSet
+
+_ROWS = 32
+
+
+class ExplicitLayout:
+    """Answers with the wall profile that a bundle of architecture `ring` predicts; layout queries know theirs."""
+
+    def __init__(
+        self, encoders: Encoders, *, config: LocaliseConfig | None = None, schedule: LpoConfig | None = None
+    ) -> None:
+        self._encoders = encoders
+        self._config = config or LocaliseConfig()
+        self._columns = encoders.manifest.profile_columns
+        self._aligner = DepthAligner(rows=_ROWS, columns=self._columns, config=schedule)
+        self._grids: LRUCache[Any, _RenderedPoses] = LRUCache(GRIDS_CACHED)
+
+    def answer(self, question: Question) -> Answer:
+        """Predict the layout, retrieve, re-sample and align.
+
+        Raises:
+            InvalidInputError: the heading is unknown.
+            BundleError: the bundle predicts no wall profile.
+        """
+        if not question.heading_known:
+            raise InvalidInputError("localisation by an explicit layout needs the heading")
+        plan, clock = question.plan, StageClock()
+        grid = self._grid(question)
+        image = read_image(self._encoders, question)
+        with clock.stage("encode"):
+            profile_m, heading = self._profile(question, image)
+        with clock.stage("retrieve"):
+            retrieved, distance = grid.nearest(profile_m)
+        stages = {"retrieval": _found(question, question.grid, retrieved, distance)}
+        with clock.stage("vdr"):
+            config = self._config
+            radius_m = config.vdr_radius_steps * question.grid_step_m
+            centre = question.grid.position_m[retrieved]
+            disc, _ = disc_poses(plan, centre, samples=config.vdr_samples, radius_m=radius_m)
+            # The disc begins at its centre, so the nearest of it is no farther than the pose of the grid.
+            nearest, distance = self._rendered(question, disc, heading).nearest(profile_m)
+            stages["vdr"] = _found(question, disc, nearest, distance)
+        with clock.stage("align"):
+            stages["align"] = self._align(question, profile_m, heading, stages["vdr"])
+        return Answer(stages=stages, retrieved=retrieved, timings_ms=clock.timings_ms)
+
+    def _profile(
+        self, question: Question, image: UInt8[np.ndarray, "h w 3"] | None
+    ) -> tuple[Float[np.ndarray, "w"], float]:
+        """Wall profile (m) of the query, and the heading that layouts must have to be compared with it."""
+        if image is None:
+            return question.true_profile(self._columns), 0.0
+        return self._encoders.profile(image, question.camera.heading, question.camera.camera_height_m)
+
+    @cachedmethod(attrgetter("_grids"), key=grid_key)
+    def _grid(self, question: Question) -> _RenderedPoses:
+        return self._rendered(question, question.grid, heading=0.0)
+
+    def _rendered(self, question: Question, poses: PoseSet, heading: float) -> _RenderedPoses:
+        profile, camera, ceiling = layouts_at(
+            question.plan, poses, question.camera.camera_height_m, self._columns, heading
+        )
+        depth = layout_depth(profile, camera, ceiling, _ROWS).astype(np.float32)
+        return _RenderedPoses(depth, question.camera.camera_height_m, ceiling)
+
+    def _align(self, question: Question, profile_m: Float[np.ndarray, "w"], heading: float, start: Found) -> Found:
+        room = np.array([start.room_index])
+        camera, ceiling = np.array([question.camera.camera_height_m]), question.plan.ceiling_heights_m[room]
+        job = RefinementJob(
+            targets=layout_depth(profile_m[None], camera, ceiling, _ROWS).reshape(1, -1),
+            position_m=np.array([[start.x_m, start.y_m]]),
+            heading=np.array([heading]),
+            walls_m=question.plan.walls_m[room],
+            camera_height_m=camera,
+            ceiling_height_m=ceiling,
+            optimise_heading=False,
+        )
+        aligned = self._aligner.refine(job)
+        poses = PoseSet(aligned.position_m, room)
+        return _found(question, poses, 0, float(aligned.cost[0]))
+
+
+@dataclass(frozen=True, eq=False)
+class _RenderedPoses:
+    """Layout depths (m) of poses of one camera height, with the ceiling over each."""
+
+    depth_m: Float[np.ndarray, "n h w"]
+    camera_height_m: float
+    ceiling_height_m: Float[np.ndarray, "n"]
+
+    def nearest(self, profile_m: Float[np.ndarray, "w"]) -> tuple[int, float]:
+        """Number of the pose whose depth is nearest to that of a wall profile, and the distance (m)."""
+        distance = np.empty(len(self.depth_m))
+        camera = np.array([self.camera_height_m])
+        for ceiling in np.unique(self.ceiling_height_m):
+            below = self.ceiling_height_m == ceiling
+            depth = layout_depth(profile_m[None], camera, np.array([ceiling]), self.depth_m.shape[1])
+            distance[below] = np.abs(self.depth_m[below] - depth.astype(np.float32)).mean(axis=(1, 2))
+        index = int(distance.argmin())
+        return index, float(distance[index])
+
+
+def _found(question: Question, poses: PoseSet, index: int, distance: float) -> Found:
+    return Found(
+        x_m=float(poses.position_m[index, 0]),
+        y_m=float(poses.position_m[index, 1]),
+        room_index=int(poses.room_index[index]),
+        heading=question.camera.heading,
+        distance=distance,
+    )

@@ -1,0 +1,186 @@
+"""LaLaLoc itself as a method: retrieval, Vogel disc re-sampling, latent pose optimisation, as the service does it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from operator import attrgetter
+from typing import Any
+
+import numpy as np
+import torch
+from cachetools import LRUCache, cachedmethod
+from jaxtyping import UInt8
+
+from lalaloc_core.localise.bundle import Bundle
+from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M, TWO_PI
+from lalaloc_core.floorplan import DEFAULT_CAMERA_HEIGHT_M
+from lalaloc_core.localise.camera_height import DEFAULT_STD_M, CameraHeight
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.evidence import EvidenceConfig
+from lalaloc_core.localise.optimise import LatentPoseOptimiser, LpoConfig
+from lalaloc_core.localise.pipeline import (
+    LocaliseConfig,
+    Refine,
+    Refiner,
+    StageClock,
+    localise,
+    panorama_heading,
+)
+from lalaloc_core.localise.poses import Candidate, LatentGrid, PredictedProfile, Query
+from lalaloc_core.evaluate.methods.caching import GRIDS_CACHED, grid_key
+from lalaloc_core.evaluate.methods.method import Answer, Found, FoundCandidate, Question
+from lalaloc_core.render.sampling import PoseSet
+
+# Hypotheses of a layout query with unknown heading, where no ring says how many there are.
+_HEADINGS = 64
+# Candidates that answers keep: enough to learn from those that were wrong.
+_CANDIDATES = 20
+# How sure a layout query is of its wall profile: it is the truth, to single precision.
+_TRUE_LAYOUT_LOG_SCALE = -7.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class StatedHeight:
+    """What a method is told of the camera's height.
+
+    Attributes:
+        is_known: whether anything is.
+        error_m: by how much it is told wrong.
+        std_m: the standard deviation that is told with it.
+    """
+
+    is_known: bool = True
+    error_m: float = 0.0
+    std_m: float = DEFAULT_STD_M
+
+    def of(self, question: Question) -> CameraHeight:
+        """What is said of a question's camera."""
+        if not self.is_known:
+            return CameraHeight(DEFAULT_CAMERA_HEIGHT_M, math.inf)
+        return CameraHeight(max(question.camera.camera_height_m + self.error_m, MIN_CAMERA_HEIGHT_M), self.std_m)
+
+
+class LaLaLoc:
+    """Answers with one bundle.
+
+    As in the paper's table of times, neither embedding a plan's grid nor reading a photograph is counted.
+    """
+
+    def __init__(
+        self,
+        encoders: Encoders,
+        *,
+        refine: Refine = "lpo",
+        refiner: Refiner | None = None,
+        config: LocaliseConfig | None = None,
+        stated: StatedHeight = StatedHeight(),
+    ) -> None:
+        self.encoders = encoders
+        self._stated = stated
+        self._refine: Refine = refine
+        self._refiner = refiner
+        # What every stage found is what evaluations report.
+        self._config = dataclasses.replace(config or LocaliseConfig(), every_stage=True)
+        self._grids: LRUCache[Any, LatentGrid] = LRUCache(GRIDS_CACHED)
+
+    def answer(self, question: Question) -> Answer:
+        """Encode the query and run the service's search."""
+        clock = StageClock()
+        image = read_image(self.encoders, question)
+        with clock.stage("encode"):
+            query = encode(self.encoders, question, image, self._stated)
+        grid = self.grid(question)
+        found = localise(
+            question.plan,
+            grid,
+            self.encoders,
+            query,
+            refine=self._refine,
+            # All that are refined; how many are returned changes nothing about the search.
+            top_k=_CANDIDATES,
+            refiner=self._refiner,
+            config=self._config,
+        )
+        signals: dict[str, dict[str, float]] = {stage: dataclasses.asdict(one) for stage, one in found.signals.items()}
+        # Confidence is fitted on photographs that are compared as the service does.
+        calibrated = question.kind == "panorama" and self._config.evidence == EvidenceConfig()
+        model = self.encoders.manifest.confidence if calibrated else None
+        return Answer(
+            stages={stage: found_pose(found.query, candidate) for stage, candidate in found.best.items()},
+            candidates=tuple(
+                FoundCandidate(pose=found_pose(found.query, one), terms=one.terms, probability=probability)
+                for one, probability in zip(found.candidates, found.posterior.candidate, strict=True)
+            ),
+            retrieved=grid_index(grid, found.best["retrieval"]),
+            signals=signals,
+            information=found.best[found.stage].information,
+            confidence=None if model is None else found.confidence(model),
+            heading_confidence=None if model is None else found.heading_confidence(model),
+            camera_height_m=found.camera_height_m,
+            timings_ms={**clock.timings_ms, **found.timings_ms},
+        )
+
+    @cachedmethod(attrgetter("_grids"), key=grid_key)
+    def grid(self, question: Question) -> LatentGrid:
+        """Latents of the question's grid at its stated camera height; the last few are cached."""
+        height_m, poses = self._stated.of(question).height_m, question.grid
+        latents, profile_m = self.encoders.poses(question.plan, poses, np.zeros(len(poses)), height_m)
+        return LatentGrid(poses, latents, profile_m, question.grid_step_m, height_m)
+
+
+def local_refiner(bundle: Bundle, config: LpoConfig | None = None) -> Refiner:
+    """LPO in this process. Sets torch to one thread: its tensors are too small to share, and waiting costs more."""
+    torch.set_num_threads(1)
+    return LatentPoseOptimiser.from_bundle(bundle, config).refine
+
+
+def read_image(encoders: Encoders, question: Question) -> UInt8[np.ndarray, "h w 3"] | None:
+    """The photograph of a panorama query at the encoder's size; None for layout queries.
+
+    Raises:
+        DatasetError: it cannot be read.
+    """
+    if question.kind == "layout":
+        return None
+    return question.require_photograph().image(encoders.manifest.image_height, encoders.manifest.image_width)
+
+
+def encode(
+    encoders: Encoders,
+    question: Question,
+    image: UInt8[np.ndarray, "h w 3"] | None,
+    stated: StatedHeight = StatedHeight(),
+) -> Query:
+    """The query of a question: what the encoder says of a photograph, or the true layout where there is none."""
+    camera = question.camera
+    if image is not None:
+        return encoders.query(image, camera.heading if question.heading_known else None, stated.of(question))
+    rolls = np.array([camera.heading])
+    if not question.heading_known:
+        sectors = encoders.manifest.ring_sectors or _HEADINGS
+        rolls = np.arange(sectors) * (TWO_PI / sectors)
+    poses = PoseSet(np.repeat(camera.position_m[None], len(rolls), axis=0), np.full(len(rolls), camera.room_index))
+    latents, profile_m = encoders.poses(question.plan, poses, camera.heading - rolls, camera.camera_height_m)
+    profile = None
+    if encoders.predicts_profile:
+        profile = PredictedProfile(np.log(profile_m), np.full_like(profile_m, _TRUE_LAYOUT_LOG_SCALE))
+    height = CameraHeight(camera.camera_height_m, 0.0)
+    return Query(latents, rolls, 0.0, heading_known=question.heading_known, camera_height=height, profile=profile)
+
+
+def found_pose(query: Query, candidate: Candidate) -> Found:
+    """A candidate as a pose of the panorama."""
+    return Found(
+        x_m=candidate.x_m,
+        y_m=candidate.y_m,
+        room_index=candidate.room_index,
+        heading=panorama_heading(query, candidate),
+        distance=candidate.cost,
+    )
+
+
+def grid_index(grid: LatentGrid, candidate: Candidate) -> int:
+    """Number of the grid pose that a candidate of retrieval is."""
+    return int(np.linalg.norm(grid.poses.position_m - candidate.position_m, axis=1).argmin())

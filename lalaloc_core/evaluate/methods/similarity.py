@@ -1,0 +1,261 @@
+"""How alike two layouts are: the four metrics of the paper's table "Layout-similarity metric", against a grid of poses.
+
+Each class holds what belongs to one plan, one set of poses and one camera height, and compares a query with every pose.
+All layouts are seen at heading 0.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.ndimage import distance_transform_edt
+from scipy.spatial import KDTree
+
+from lalaloc_core.conventions import TWO_PI
+from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.evaluate.methods.method import Question
+from lalaloc_core.render.depth import back_project, layout_depth
+from lalaloc_core.render.poses import profiles_at
+from lalaloc_core.render.sampling import PoseSet
+
+LayoutMetric = Literal["edges", "depth", "relative-depth", "chamfer"]
+LAYOUT_METRICS: tuple[LayoutMetric, ...] = get_args(LayoutMetric)
+
+# A wall bends where its profile leaves a straight line by more than this (radians); less is rounding.
+_CORNER_BEND = 0.1
+# Parts in which `ChamferGrid.nearest` takes the points of each cloud, to give up on most poses after the first.
+_PARTS = 4
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Layout:
+    """A bare layout as seen from one place at heading 0; `profile_m` is its wall profile."""
+
+    profile_m: Float[np.ndarray, "w"]
+    camera_height_m: float
+    ceiling_height_m: float
+
+    def depth_m(self, rows: int) -> Float[np.ndarray, "{rows} w"]:
+        """Layout depth (m), one column per entry of the profile."""
+        heights = np.array([self.camera_height_m]), np.array([self.ceiling_height_m])
+        return layout_depth(self.profile_m[None], *heights, rows)[0]
+
+
+def true_layout(question: Question, columns: int) -> Layout:
+    """What would be seen at the true pose: what a layout query knows, and what oracles may use."""
+    return Layout(
+        profile_m=question.true_profile(columns),
+        camera_height_m=question.camera.camera_height_m,
+        ceiling_height_m=question.ceiling_height_m,
+    )
+
+
+def layouts_at(
+    plan: FloorPlan, poses: PoseSet, camera_height_m: float, columns: int, heading: float = 0.0
+) -> tuple[Float[np.ndarray, "n {columns}"], Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
+    """Wall profiles, camera and ceiling heights (m) of poses, all with one heading."""
+    rooms = poses.room_index
+    profile = profiles_at(plan, poses.position_m, rooms, np.full(len(poses), heading), columns)
+    return profile, np.full(len(poses), camera_height_m), plan.ceiling_heights_m[rooms]
+
+
+class ChamferGrid:
+    """Symmetric Chamfer distance (m) between back-projected point clouds, as `metrics.chamfer_distance` defines it."""
+
+    def __init__(
+        self, plan: FloorPlan, poses: PoseSet, camera_height_m: float, *, rows: int = 16, columns: int = 32
+    ) -> None:
+        self.columns = columns
+        self._depth_m = layout_depth(*layouts_at(plan, poses, camera_height_m, columns), rows)
+        self._clouds_m = back_project(self._depth_m)
+
+    def distances(self, query: Layout) -> Float[np.ndarray, "n"]:
+        """Distance of the query to every pose."""
+        pair = self._pair(query)
+        every = np.arange(len(self._clouds_m))
+        return pair.to_query(every, slice(None)) + np.array([pair.from_query(int(index)) for index in every])
+
+    def nearest(self, query: Layout) -> int:
+        """Number of the pose nearest to the query: the least of `distances`, without computing most of them.
+
+        Every term of a Chamfer distance is at least 0, so a sum over some of them bounds the whole from below; poses
+        whose bound exceeds the best distance so far are left alone. The cheap terms come first: distances to the query
+        need one search tree, distances from it one for every pose.
+        """
+        pair = self._pair(query)
+        bound = np.zeros(len(self._clouds_m))
+        alive = np.arange(len(bound))
+        best, best_index = math.inf, -1
+        for part in range(_PARTS):
+            bound[alive] += pair.to_query(alive, slice(part, None, _PARTS))
+            if part == 0:
+                # A good guess at the nearest pose makes the first bound to beat.
+                best_index = int(alive[bound[alive].argmin()])
+                best = pair.distance(best_index)
+            alive = alive[bound[alive] <= best]
+        for index in alive[np.argsort(bound[alive], kind="stable")]:
+            if bound[index] > best:
+                break
+            distance = bound[index] + pair.from_query(int(index))
+            if distance < best:
+                best, best_index = float(distance), int(index)
+        return best_index
+
+    def _pair(self, query: Layout) -> _Comparison:
+        _require_columns(query, self.columns)
+        return _Comparison(self._depth_m, self._clouds_m, query)
+
+
+class _Comparison:
+    """One query against the clouds of a `ChamferGrid`.
+
+    Pixels that see the same depth from both places are one point of both clouds: nearest neighbours at distance 0. At
+    equal heights that is true of most of the floor and ceiling, which are left out of the search.
+    """
+
+    def __init__(
+        self, depth_m: Float[np.ndarray, "n h w"], clouds_m: Float[np.ndarray, "n h*w 3"], query: Layout
+    ) -> None:
+        query_depth_m = query.depth_m(depth_m.shape[1])
+        self._clouds_m = clouds_m
+        self._query_m = back_project(query_depth_m[None])[0]
+        self._tree = KDTree(self._query_m)
+        self._differs = (depth_m != query_depth_m).reshape(len(depth_m), -1)
+
+    def distance(self, index: int) -> float:
+        """The whole Chamfer distance of one pose."""
+        return float(self.to_query(np.array([index]), slice(None))[0]) + self.from_query(index)
+
+    def to_query(self, poses: Int[np.ndarray, "k"], points: slice) -> Float[np.ndarray, "k"]:
+        """These points' share of the mean distance of each of these poses' clouds to the query's."""
+        differs = self._differs[poses, points]
+        distance = np.zeros(differs.shape)
+        distance[differs] = self._tree.query(self._clouds_m[poses, points][differs])[0]
+        return distance.sum(axis=1) / self._differs.shape[1]
+
+    def from_query(self, index: int) -> float:
+        """Mean distance of the query's cloud to a pose's."""
+        searched = self._query_m[self._differs[index]]
+        return float(KDTree(self._clouds_m[index]).query(searched)[0].sum()) / len(self._query_m)
+
+
+class DepthGrid:
+    """Mean absolute difference of layout depth images: in metres, or each scaled to a largest depth of 1."""
+
+    def __init__(
+        self,
+        plan: FloorPlan,
+        poses: PoseSet,
+        camera_height_m: float,
+        *,
+        relative: bool = False,
+        rows: int = 64,
+        columns: int = 128,
+    ) -> None:
+        self.columns = columns
+        self._relative = relative
+        self._depth = self._scaled(layout_depth(*layouts_at(plan, poses, camera_height_m, columns), rows))
+
+    def distances(self, query: Layout) -> Float[np.ndarray, "n"]:
+        """Distance of the query to every pose."""
+        _require_columns(query, self.columns)
+        depth = self._scaled(query.depth_m(self._depth.shape[1])[None])
+        return np.abs(self._depth - depth).mean(axis=(1, 2), dtype=np.float64)
+
+    def nearest(self, query: Layout) -> int:
+        """Number of the pose nearest to the query."""
+        return int(self.distances(query).argmin())
+
+    def _scaled(self, depth_m: Float[np.ndarray, "n h w"]) -> Float[np.ndarray, "n h w"]:
+        scale = depth_m.max(axis=(1, 2), keepdims=True) if self._relative else 1.0
+        return (depth_m / scale).astype(np.float32)
+
+
+class EdgeGrid:
+    """2-D Chamfer distance (pixels) between the edges of layouts drawn as panoramas; left and right borders meet."""
+
+    def __init__(
+        self, plan: FloorPlan, poses: PoseSet, camera_height_m: float, *, rows: int = 64, columns: int = 128
+    ) -> None:
+        self.columns = columns
+        self._rows = rows
+        edges = edge_image(*layouts_at(plan, poses, camera_height_m, columns), rows).reshape(len(poses), -1)
+        self._owner, self._pixel = np.nonzero(edges)
+        self._count = edges.sum(axis=1)
+        self._field = np.stack([distance_field(one.reshape(rows, columns)).ravel() for one in edges])
+
+    def distances(self, query: Layout) -> Float[np.ndarray, "n"]:
+        """Distance of the query to every pose."""
+        _require_columns(query, self.columns)
+        heights = np.array([query.camera_height_m]), np.array([query.ceiling_height_m])
+        edges = edge_image(query.profile_m[None], *heights, self._rows)[0]
+        to_poses = self._field[:, edges.ravel()].mean(axis=1, dtype=np.float64)
+        to_query = np.bincount(self._owner, weights=distance_field(edges).ravel()[self._pixel])
+        return to_poses + to_query / self._count
+
+    def nearest(self, query: Layout) -> int:
+        """Number of the pose nearest to the query."""
+        return int(self.distances(query).argmin())
+
+
+LayoutGrid = ChamferGrid | DepthGrid | EdgeGrid
+
+
+def layout_grid(metric: LayoutMetric, plan: FloorPlan, poses: PoseSet, camera_height_m: float) -> LayoutGrid:
+    """The poses of a plan, ready to be compared with queries by a metric."""
+    if metric == "chamfer":
+        return ChamferGrid(plan, poses, camera_height_m)
+    if metric == "edges":
+        return EdgeGrid(plan, poses, camera_height_m)
+    return DepthGrid(plan, poses, camera_height_m, relative=metric == "relative-depth")
+
+
+def edge_image(
+    profile_m: Float[np.ndarray, "n w"],
+    camera_height_m: Float[np.ndarray, "n"],
+    ceiling_height_m: Float[np.ndarray, "n"],
+    rows: int,
+) -> Bool[np.ndarray, "n {rows} w"]:
+    """Layouts drawn as edges: where walls meet floor and ceiling, and where two walls meet or one hides another."""
+
+    def row_of(elevation: Float[np.ndarray, "n w"]) -> Int[np.ndarray, "n 1 w"]:
+        return np.floor((0.5 - elevation / math.pi) * rows).astype(int)[:, None, :]
+
+    top = row_of(np.arctan((ceiling_height_m - camera_height_m)[:, None] / profile_m))
+    foot = row_of(-np.arctan(camera_height_m[:, None] / profile_m))
+    row = np.arange(rows)[None, :, None]
+    along = (row == top) | (row == foot)
+    return along | (_corners(profile_m)[:, None, :] & (row >= top) & (row <= foot))
+
+
+def distance_field(edges: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
+    """Distance (pixels) of every pixel to the nearest edge, around the horizon; every column has an edge."""
+    rows, columns = edges.shape
+    # An edge in its own column is never more than `rows` away, so none beyond that margin can be the nearest.
+    margin = min(rows, columns)
+    around = np.pad(edges, ((0, 0), (margin, margin)), mode="wrap")
+    distance = distance_transform_edt(~around)
+    assert isinstance(distance, np.ndarray)
+    return distance[:, margin : margin + columns].astype(np.float32)
+
+
+def _corners(profile_m: Float[np.ndarray, "n w"]) -> Bool[np.ndarray, "n w"]:
+    """Columns next to a corner.
+
+    Along one straight wall the inverse distance is a cosine of azimuth, u(a + δ) + u(a - δ) = 2 cos δ u(a); where that
+    fails, the wall bends between neighbouring columns or ends in front of another.
+    """
+    step = TWO_PI / profile_m.shape[1]
+    inverse = 1.0 / profile_m
+    neighbours = np.roll(inverse, 1, axis=1) + np.roll(inverse, -1, axis=1)
+    return np.abs(neighbours - 2.0 * math.cos(step) * inverse) > _CORNER_BEND * step * inverse
+
+
+def _require_columns(query: Layout, columns: int) -> None:
+    if len(query.profile_m) != columns:
+        raise InvalidInputError(f"the query's wall profile has {len(query.profile_m)} columns, {columns} are wanted")

@@ -1,0 +1,206 @@
+"""The queries worth looking at: which they are, and their pictures, for which data set and model are opened again."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from lalaloc_core.learn.data.dataset import Camera, Scene
+from lalaloc_core.draw.heat import Cells
+from lalaloc_core.errors import LaLaLocError
+from lalaloc_core.evaluate.runs.factories import build_dataset, choose_appearance
+from lalaloc_core.evaluate.runs.failures import Outcome, outcomes
+from lalaloc_core.evaluate.runs.predictions import Prediction, RunInfo
+from lalaloc_core.evaluate.runs.score import heading_errors_deg, position_errors_m
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.evidence import latent_distances
+from lalaloc_core.evaluate.methods.lalaloc import encode, read_image
+from lalaloc_core.evaluate.methods.method import Question
+from lalaloc_core.evaluate.methods.similarity import ChamferGrid, true_layout
+from lalaloc_core.evaluate.report.pictures import (
+    PANORAMA_HEIGHT,
+    PANORAMA_WIDTH,
+    DrawnMap,
+    EncodedPicture,
+    draw_map,
+    draw_panorama,
+)
+from lalaloc_core.evaluate.report.reading import Run
+from lalaloc_core.evaluate.report.reopening import ask_again, find_camera, open_model
+
+PER_GROUP = 3
+BEST, MEDIAN, WORST, MISALIGNED = "best", "median", "worst", "wrong alignment"
+# Methods that compare latents somewhere on their way.
+_LATENT_METHODS = ("lalaloc", "decode")
+# Cells of the maps; larger in plans that would have more of them than this.
+_CELL_M, _MAX_CELLS = 0.2, 5000
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Card:
+    """One query of the gallery; errors are None where there is no answer."""
+
+    scene: str
+    camera: str
+    room: str
+    found_room: str | None
+    outcome: Outcome
+    error_m: float | None
+    heading_error_deg: float | None
+    confidence: float | None
+    pictures: tuple[EncodedPicture, ...]
+
+    @property
+    def bytes(self) -> int:
+        """Size of its pictures."""
+        return sum(len(picture.content) for picture in self.pictures)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Gallery:
+    """Cards by group, in order, and a sentence for everything that was left out."""
+
+    groups: dict[str, list[Card]]
+    left_out: tuple[str, ...] = ()
+
+    @property
+    def bytes(self) -> int:
+        """Size of all pictures."""
+        return sum(card.bytes for cards in self.groups.values() for card in cards)
+
+
+def choose_queries(predictions: list[Prediction]) -> dict[str, list[int]]:
+    """Numbers of up to three queries per group, none twice.
+
+    The best and the median ones have an answer; the worst may have none. A fourth group has the worst alignments in
+    the right room, which seldom are among the worst of all.
+    """
+    errors_m = position_errors_m(predictions)
+    order = [int(index) for index in np.argsort(np.where(np.isnan(errors_m), np.inf, errors_m), kind="stable")]
+    answered = [index for index in order if not np.isnan(errors_m[index])]
+    middle = max((len(answered) - PER_GROUP) // 2, 0)
+    kinds = outcomes(predictions)
+    misaligned = [index for index in order if kinds[index] is Outcome.WRONG_ALIGNMENT]
+    wanted = {
+        BEST: answered[:PER_GROUP],
+        WORST: order[::-1][:PER_GROUP],
+        MEDIAN: answered[middle : middle + PER_GROUP],
+        MISALIGNED: misaligned[::-1][:PER_GROUP],
+    }
+    taken: set[int] = set()
+    chosen = {}
+    for group, indices in wanted.items():
+        chosen[group] = [index for index in indices if index not in taken]
+        taken.update(chosen[group])
+    return {group: chosen[group] for group in (BEST, MEDIAN, WORST, MISALIGNED) if chosen[group]}
+
+
+def build_gallery(run: Run) -> Gallery:
+    """Draw the queries of a run that are worth looking at.
+
+    What is needed and gone leaves the gallery, or a part of it, out, and is named in `left_out`.
+    """
+    left_out: list[str] = []
+    try:
+        writer = _CardWriter(run, left_out)
+    except (LaLaLocError, OSError) as error:
+        return Gallery(groups={}, left_out=(f"The gallery is left out, because its data cannot be opened: {error}.",))
+    groups: dict[str, list[Card]] = {}
+    for group, indices in choose_queries(run.predictions).items():
+        for index in indices:
+            try:
+                groups.setdefault(group, []).append(writer.card(index))
+            except (LaLaLocError, OSError) as error:
+                left_out.append(f"A query of the gallery is left out: {error}.")
+    return Gallery(groups=groups, left_out=tuple(dict.fromkeys(left_out)))
+
+
+class _CardWriter:
+    """Data set and model of a run, opened to draw its queries; what is gone is told in `left_out`."""
+
+    def __init__(self, run: Run, left_out: list[str]) -> None:
+        """Open them.
+
+        Raises:
+            DatasetError, InvalidInputError: the data set is not there, or not the one it was.
+        """
+        self._run = run
+        self._dataset = build_dataset(run.info)
+        self._appearance = choose_appearance(self._dataset, run.info.furniture, run.info.lighting)
+        self._left_out = left_out
+        self._encoders = _open_encoders(run.info, left_out)
+        self._errors_m = position_errors_m(run.predictions)
+        self._heading_errors_deg = heading_errors_deg(run.predictions)
+        self._outcomes = outcomes(run.predictions)
+
+    def card(self, index: int) -> Card:
+        """Draw one query.
+
+        Raises:
+            DatasetError: its scene is gone or has changed.
+        """
+        prediction = self._run.predictions[index]
+        scene, camera = find_camera(self._dataset, prediction)
+        question = ask_again(self._run.info, scene, camera, self._appearance)
+        found = prediction.answer
+        return Card(
+            scene=prediction.scene,
+            camera=prediction.camera,
+            room=prediction.room,
+            found_room=None if found is None else scene.plan.rooms[found.room_index].name,
+            outcome=self._outcomes[index],
+            error_m=None if found is None else float(self._errors_m[index]),
+            heading_error_deg=None if found is None else float(self._heading_errors_deg[index]),
+            confidence=prediction.confidence,
+            pictures=(
+                *self._panorama(scene, camera, prediction),
+                *(
+                    draw_map(scene.plan, one, prediction.truth, found)
+                    for one in _maps(question, self._encoders, self._left_out)
+                ),
+            ),
+        )
+
+    def _panorama(self, scene: Scene, camera: Camera, prediction: Prediction) -> list[EncodedPicture]:
+        try:
+            image = scene.photograph(camera, self._appearance).image(PANORAMA_HEIGHT, PANORAMA_WIDTH)
+        except (LaLaLocError, OSError) as error:
+            self._left_out.append(f"A panorama is left out: {error}.")
+            return []
+        return [draw_panorama(image, scene.plan, camera.camera_height_m, prediction.truth, prediction.answer)]
+
+
+def _open_encoders(info: RunInfo, left_out: list[str]) -> Encoders | None:
+    """The run's own model, None where there is none that the method compares latents with."""
+    if info.method not in _LATENT_METHODS:
+        left_out.append(f"Method “{info.method}” compares no latents, so there is no map of latent distances.")
+        return None
+    try:
+        return open_model(info)
+    except (LaLaLocError, OSError) as error:
+        left_out.append(f"The maps of latent distances are left out, because the model cannot be opened: {error}.")
+        return None
+
+
+def _maps(question: Question, encoders: Encoders | None, left_out: list[str]) -> list[DrawnMap]:
+    """How far the query is from every place of the plan: by latents where there is a model, and by true layouts."""
+    plan, camera = question.plan, question.camera
+    cells = Cells.of(plan, max(_CELL_M, math.sqrt(plan.area_m2 / _MAX_CELLS)))
+    maps = []
+    if encoders is not None:
+        try:
+            query = encode(encoders, question, read_image(encoders, question))
+        except (LaLaLocError, OSError) as error:
+            left_out.append(f"A map of latent distances is left out: {error}.")
+        else:
+            heading = np.full(len(cells.poses), query.frame_heading)
+            latents, _ = encoders.poses(plan, cells.poses, heading, camera.camera_height_m)
+            # At the best hypothesis of how the camera was turned.
+            distances = latent_distances(latents, query.latents).min(axis=0)
+            maps.append(DrawnMap("latent distance", "latent distance (log scale)", cells, distances))
+    layouts = ChamferGrid(plan, cells.poses, camera.camera_height_m)
+    distances = layouts.distances(true_layout(question, layouts.columns))
+    maps.append(DrawnMap("true layout distance", "Chamfer distance (m, log scale)", cells, distances))
+    return maps

@@ -1,0 +1,176 @@
+"""What a model makes of annotated photographs of real rooms: walls and openings per azimuth, and galleries of rooms.
+
+FOLDER/photographs.json   all figures, and those of every photograph
+FOLDER/photographs.png    every photograph with the true and the predicted lines, to look at
+FOLDER/known, unknown     the runs in galleries, heading known and searched, for `lalaloc worst` and `lalaloc report`
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from lalaloc_core.learn.azimuth_metrics import ClassScores, summarise_azimuths
+from lalaloc_core.localise.bundle import Bundle
+from lalaloc_core.conventions import OPENING_CLASSES
+from lalaloc_core.learn.data.annotated import AnnotatedPhotographs
+from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.evaluate.runs.factories import describe_model
+from lalaloc_core.evaluate.runs.galleries import (
+    GalleryAnswer,
+    answers_in_galleries,
+    describe_answers,
+    score_galleries,
+)
+from lalaloc_core.evaluate.runs.photograph_reading import ReadPhotograph, read_photographs
+from lalaloc_core.evaluate.runs.predictions import RunFolder, RunInfo, without_infinity
+from lalaloc_core.evaluate.runs.run import run_evaluation
+from lalaloc_core.files import atomic_write
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.evaluate.report.photograph_sheet import draw_photographs
+from lalaloc_core.evaluate.report.tables import percent
+
+FIGURES_FILE, SHEET_FILE = "photographs.json", "photographs.png"
+_HEADINGS = {"known": True, "unknown": False}
+
+
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class PhotographResults:
+    """A model on annotated photographs.
+
+    Attributes:
+        answers: in galleries, by what is said of the heading: "known" or "unknown".
+    """
+
+    read: Sequence[ReadPhotograph]
+    answers: Mapping[str, Sequence[GalleryAnswer]]
+
+    def figures(self) -> dict[str, Any]:
+        """All figures as plain data; those over photographs are of the ones that count."""
+        counting = [one.measures for one in self.read if one.photograph.counts]
+        scores = {heading: dataclasses.asdict(score_galleries(some)) for heading, some in self.answers.items()}
+        return without_infinity(
+            {
+                "azimuths": dataclasses.asdict(summarise_azimuths(counting, OPENING_CLASSES)),
+                "galleries": scores,
+                "photographs": [self._figures_of(one) for one in self.read],
+            }
+        )
+
+    def _figures_of(self, one: ReadPhotograph) -> dict[str, Any]:
+        measures, name = one.measures, one.photograph.name
+        galleries = {
+            heading: [dataclasses.asdict(answer) for answer in some if answer.photograph == name]
+            for heading, some in self.answers.items()
+        }
+        return {
+            "name": name,
+            "quality": one.photograph.quality,
+            "outline": measures.outline,
+            "median_error": measures.median_error,
+            "error_90": measures.error_90,
+            "bias": measures.bias,
+            "scale_ratio": measures.scale_ratio,
+            "galleries": galleries,
+        }
+
+    def markdown(self) -> str:
+        """The figures as two tables: all photographs together, and each of them."""
+        azimuths = summarise_azimuths([one.measures for one in self.read if one.photograph.counts], OPENING_CLASSES)
+        within = ", ".join(f"{percent(share)} within {float(q):.0%}" for q, share in azimuths.within.items())
+        rows = [
+            ("photographs, good or fair", str(azimuths.n)),
+            ("median of the median error of log distance", _number(azimuths.median_error)),
+            ("… of what nine in ten errors are below", _number(azimuths.error_90)),
+            ("errors within quantiles of the predicted scale", within),
+            ("errors by what the predicted scale says", f"{_number(azimuths.scale_ratio)} times as large"),
+            ("openings, balanced accuracy", _classes(azimuths.classes)),
+        ]
+        for heading, some in self.answers.items():
+            scores = score_galleries(some)
+            rows += [
+                (f"galleries, heading {heading}: located", f"{percent(scores.located)} of {scores.galleries}"),
+                ("… located, but turned by more than 10°", percent(scores.turned)),
+                ("… right room", percent(scores.right_room)),
+                ("… right room among the first three candidates", percent(scores.among_3)),
+                ("… expected calibration error of confidence", _number(scores.calibration_error)),
+            ]
+        columns = ["photograph", "quality", "median", "9 in 10", "bias", "by scale", *self.answers]
+        return _table(["what", "measured"], rows) + "\n" + _table(columns, [self._cells(one) for one in self.read])
+
+    def _cells(self, one: ReadPhotograph) -> list[str]:
+        measures, name = one.measures, one.photograph.name
+        numbers = (measures.median_error, measures.error_90, measures.bias, measures.scale_ratio)
+        located = (describe_answers(some, name) for some in self.answers.values())
+        return [name, one.photograph.quality, *map(_number, numbers), *located]
+
+
+def evaluate_photographs(
+    data: Path, bundle: Path, out: Path, *, galleries: int, workers: int | None, command: str = ""
+) -> PhotographResults:
+    """Measure a model on annotated photographs, and write everything to a folder; galleries that are there stay.
+
+    Args:
+        data: folder of `AnnotatedPhotographs`.
+        galleries: of every photograph, and for either heading.
+        workers: processes that answer in galleries, as in `run_evaluation`.
+        command: how to run it again.
+
+    Raises:
+        DatasetError: the photographs cannot be used.
+        BundleError: the model is gone, or predicts no wall profile.
+        RunError: `out` holds other runs.
+        InvalidInputError: no photograph is good enough for figures.
+    """
+    dataset = AnnotatedPhotographs(data)
+    if not any(one.counts for one in dataset.photographs):
+        raise InvalidInputError(f"all {len(dataset.photographs)} photographs at '{data}' are of quality 'poor'")
+    read = read_photographs(Encoders(Bundle.open(bundle), threads=1), dataset.photographs)
+    answers = {}
+    for heading, known in _HEADINGS.items():
+        info = RunInfo(
+            label=f"photographs in galleries, heading {heading}",
+            method="lalaloc",
+            kind="panorama",
+            dataset=dataset.description,
+            split="test",
+            data=str(data),
+            heading_known=known,
+            limit=len(dataset.keys(galleries)),
+            bundle=str(bundle),
+            model=describe_model(bundle),
+            command=command,
+        )
+        predictions = run_evaluation(RunFolder(out / heading), info, workers=workers)
+        answers[heading] = answers_in_galleries(predictions, dataset.photographs)
+    results = PhotographResults(read=read, answers=answers)
+    figures = {"command": command, "model": describe_model(bundle), **results.figures()}
+    atomic_write(out / FIGURES_FILE, json.dumps(figures, indent=2, allow_nan=False) + "\n")
+    draw_photographs(f"{len(read)} photographs, model {bundle}", read, answers).save(out / SHEET_FILE)
+    return results
+
+
+def _table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [columns, ["---"] * len(columns), *rows]
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+
+
+def _classes(classes: ClassScores | None) -> str:
+    if classes is None:
+        return "none predicted"
+    found = (
+        f"{name}s {_share(classes.recall[name])} found, {_share(classes.precision[name])} right"
+        for name in OPENING_CLASSES
+    )
+    return f"{percent(classes.balanced_accuracy)} ({'; '.join(found)})"
+
+
+def _share(share: float | None) -> str:
+    return "–" if share is None else percent(share)
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.3f}"

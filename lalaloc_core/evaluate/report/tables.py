@@ -1,0 +1,162 @@
+"""The tables of a report: figures as text."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lalaloc_core.evaluate.runs.failures import Outcome, count_outcomes
+from lalaloc_core.evaluate.runs.score import Estimate, SliceScores, StageScores
+from lalaloc_core.evaluate.report.charts import curves
+from lalaloc_core.evaluate.report.reading import Run
+from lalaloc_core.evaluate.report.times import stage_times
+
+CURVE_POINTS_M = (0.01, 0.05, 0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 20.0)
+METRICS = ("median", "< 1 cm", "< 5 cm", "< 10 cm", "< 1 m", "right room", "heading")
+NOTHING = "–"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A figure and, in small below it, its interval or share."""
+
+    text: str
+    below: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Row:
+    """One line of a table; `strong` for the one that counts."""
+
+    run: str
+    part: str
+    cells: tuple[Cell, ...]
+    strong: bool = False
+
+
+def metric_rows(runs: Sequence[Run]) -> list[Row]:
+    """Per run one row per stage, and one for the answer where it is not simply what the last stage gave."""
+    rows = []
+    for run in runs:
+        scores = run.scores
+        if scores is None:
+            continue
+        recalls = tuple(_share(recall) for recall in (scores.layout_recall, scores.pose_recall))
+        none = (Cell(NOTHING), Cell(NOTHING))
+        parts = dict(scores.stages)
+        if scores.final not in parts.values():
+            parts["answer"] = scores.final
+        for place, (stage, figures) in enumerate(parts.items()):
+            # What retrieval chose is a property of its own stage, the first.
+            cells = (Cell(str(scores.n)), *(recalls if place == 0 else none), *_metrics(figures))
+            rows.append(Row(run=run.name, part=stage, cells=cells, strong=place == len(parts) - 1))
+    return rows
+
+
+def curve_rows(runs: Sequence[Run]) -> list[Row]:
+    """Share of queries within each of `CURVE_POINTS_M`, per curve of the chart."""
+    rows = []
+    for name, errors_m in curves([run for run in runs if run.predictions]).items():
+        shares = [float(np.mean(errors_m <= limit_m)) for limit_m in CURVE_POINTS_M]
+        rows.append(Row(run=name, part="", cells=tuple(Cell(percent(share)) for share in shares)))
+    return rows
+
+
+def outcome_rows(runs: Sequence[Run]) -> list[Row]:
+    """How many queries had each outcome: by the first stage's pose where there are several, and by the answer."""
+    rows = []
+    for run in runs:
+        parts: list[tuple[str, str | None]] = [(run.stages[0], run.stages[0])] if len(run.stages) > 1 else []
+        for part, stage in [*parts, ("answer", None)] if run.predictions else []:
+            counts = count_outcomes(run.predictions, stage)
+            cells = tuple(Cell(str(counts[kind]), percent(counts[kind] / len(run.predictions))) for kind in Outcome)
+            rows.append(Row(run=run.name, part=part, cells=cells, strong=stage is None))
+    return rows
+
+
+def slice_rows(runs: Sequence[Run]) -> list[Row]:
+    """Per run with known facts one row per fact, the worst first, and all queries beside them."""
+    rows = []
+    for run in runs:
+        if run.scores is None or not run.scores.slices:
+            continue
+        parts: dict[str, SliceScores | StageScores] = {**run.scores.slices, "all queries": run.scores.final}
+        for name, figures in parts.items():
+            count = figures.n if isinstance(figures, SliceScores) else run.scores.n
+            cells = (
+                Cell(str(count), percent(count / run.scores.n)),
+                _share(figures.within_1m),
+                _share(figures.within_10cm),
+                _median(figures.median_cm, " cm"),
+            )
+            strong = isinstance(figures, StageScores)
+            rows.append(Row(run=run.name, part=name.replace("_", " "), cells=cells, strong=strong))
+    return rows
+
+
+def reliability_rows(runs: Sequence[Run]) -> list[Row]:
+    """The bins of the reliability diagrams."""
+    return [
+        Row(
+            run=run.name,
+            part=f"{100 * one.low:.0f}–{100 * one.high:.0f} %",
+            cells=(Cell(str(one.count)), Cell(percent(one.confidence)), Cell(percent(one.frequency))),
+        )
+        for run in runs
+        if run.scores is not None
+        for one in run.scores.reliability
+    ]
+
+
+def time_rows(runs: Sequence[Run]) -> list[Row]:
+    """Median and 95th percentile of each stage, and of whole queries."""
+    return [
+        Row(
+            run=run.name,
+            part=name,
+            cells=(Cell(str(time.count)), Cell(number(time.median_ms)), Cell(number(time.p95_ms))),
+            strong=name == "total",
+        )
+        for run in runs
+        for name, time in stage_times(run.predictions).items()
+    ]
+
+
+def percent(share: float) -> str:
+    """A share in percent, not broken into two lines."""
+    return f"{100.0 * share:.1f}\N{NO-BREAK SPACE}%"
+
+
+def number(value: float) -> str:
+    """Three digits that count, at most two of them after the point; ∞ where half of the queries have no answer."""
+    return "< 0.01" if 0.0 < value < 0.005 else _rounded(value)
+
+
+def distance(distance_m: float) -> str:
+    """Metres, or centimetres below one."""
+    return f"{number(distance_m)} m" if distance_m >= 1.0 else f"{number(100.0 * distance_m)} cm"
+
+
+def _rounded(value: float) -> str:
+    if math.isinf(value):
+        return "∞"
+    return f"{value:.2f}" if value < 10.0 else f"{value:.1f}" if value < 100.0 else f"{value:.0f}"
+
+
+def _metrics(figures: StageScores) -> tuple[Cell, ...]:
+    shares = (figures.within_1cm, figures.within_5cm, figures.within_10cm, figures.within_1m, figures.correct_room)
+    median, heading = figures.median_cm, figures.median_heading_error_deg
+    return (_median(median, " cm"), *(_share(share) for share in shares), _median(heading, "°"))
+
+
+def _share(estimate: Estimate | None) -> Cell:
+    if estimate is None:
+        return Cell(NOTHING)
+    return Cell(percent(estimate.value), f"{100.0 * estimate.low:.1f}–{100.0 * estimate.high:.1f}")
+
+
+def _median(estimate: Estimate, unit: str) -> Cell:
+    return Cell(number(estimate.value) + unit, f"{_rounded(estimate.low)}–{_rounded(estimate.high)}")

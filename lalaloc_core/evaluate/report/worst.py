@@ -1,0 +1,298 @@
+"""The worst queries of a run: as contact sheets to look at, and as counts of what they have in common.
+
+FOLDER/worst-01.png ...   panoramas with the true, the found and the predicted layout, the worst first
+FOLDER/worst.json         what they have in common, and every one of them
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from PIL import Image
+
+from lalaloc_core.localise.bundle import EvidenceModel
+from lalaloc_core.conventions import TWO_PI, column_azimuths, heading_from_degrees
+from lalaloc_core.learn.data.dataset import Camera, Scene
+from lalaloc_core.draw.photograph import Stroke, draw_strokes, wall_line
+from lalaloc_core.errors import LaLaLocError, RunError
+from lalaloc_core.evaluate.runs.factories import build_dataset, choose_appearance
+from lalaloc_core.evaluate.runs.failures import Outcome, is_symmetric, outcomes, symmetric_by_chance
+from lalaloc_core.evaluate.runs.predictions import Pose, Prediction, RunFolder, RunInfo
+from lalaloc_core.evaluate.runs.score import position_errors_m
+from lalaloc_core.files import atomic_write
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.evidence import Evidence, EvidenceConfig
+from lalaloc_core.localise.layouts import layouts_at
+from lalaloc_core.localise.poses import Query
+from lalaloc_core.evaluate.methods.lalaloc import encode, read_image
+from lalaloc_core.render.poses import profiles_at
+from lalaloc_core.evaluate.report.pictures import (
+    FOUND_COLOUR,
+    PREDICTED_COLOUR,
+    TRUE_COLOUR,
+    layout_lines,
+)
+from lalaloc_core.evaluate.report.reopening import ask_again, find_camera, open_model
+from lalaloc_core.evaluate.report.sheets import (
+    PER_SHEET,
+    PICTURE_HEIGHT,
+    PICTURE_WIDTH,
+    Thumbnail,
+    draw_sheet,
+)
+from lalaloc_core.evaluate.report.tables import distance, percent
+from lalaloc_core.render.sampling import PoseSet
+
+SUMMARY_FILE = "worst.json"
+_KEY = {TRUE_COLOUR: "true layout", FOUND_COLOUR: "found layout", PREDICTED_COLOUR: "predicted walls' floor line"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorstQuery:
+    """One of the worst queries.
+
+    Attributes:
+        error_m: None where there is no answer.
+        first_error_m: of the first stage's pose.
+        symmetric: the right room, taken for its mirror image; see `failures.is_symmetric`.
+        symmetric_by_chance: how probable that is for a wrong position anywhere in the room.
+        true_cost, found_cost: how badly the layouts of the true and of the found pose fit the predicted wall profile,
+            as in `localise.evidence`, or, for a layout query, the true one; None where the model predicts none. A true
+            pose that costs less was missed by the search; one that costs more is no longer to be found by any.
+        distance_bias: by how much walls are predicted too far (as a share; negative: too near), in the median azimuth.
+    """
+
+    scene: str
+    camera: str
+    room: str
+    found_room: str | None
+    outcome: Outcome
+    error_m: float | None
+    first_error_m: float | None
+    confidence: float | None
+    facts: tuple[str, ...]
+    symmetric: bool
+    symmetric_by_chance: float
+    true_cost: float | None = None
+    found_cost: float | None = None
+    distance_bias: float | None = None
+
+    @property
+    def caption(self) -> list[str]:
+        """What stands below its picture."""
+        where = f"{self.scene}/{self.camera} {self.room}"
+        if self.outcome is Outcome.WRONG_ROOM:
+            where += f", found in {self.found_room}"
+        how = "no answer" if self.error_m is None else f"{distance(self.error_m)} off"
+        if self.symmetric:
+            how += ", mirrored"
+        if self.confidence is not None:
+            how += f", confidence {percent(self.confidence)}"
+        if self.true_cost is not None and self.found_cost is not None:
+            how += f", cost {self.found_cost:.2f} (true {self.true_cost:.2f})"
+        if self.distance_bias is not None:
+            how += f", walls {100.0 * self.distance_bias:+.0f} %"
+        return [where, how, " ".join(self.facts)]
+
+
+def write_worst(run: Path, out: Path, count: int) -> dict[str, Any]:
+    """Draw the worst queries of a run and say what they have in common.
+
+    Args:
+        count: how many; those without an answer come first, then by error.
+
+    Returns:
+        what is written to `SUMMARY_FILE`, without the queries.
+
+    Raises:
+        RunError: no run there, or one without answers.
+        DatasetError, BundleError: data set or model are gone, or not what they were.
+    """
+    folder = RunFolder(run)
+    info, predictions = folder.read_info(), folder.read_predictions()
+    if not predictions:
+        raise RunError(f"the run at '{run}' has no answers yet")
+    chosen = choose_worst(predictions, count)
+    analyser = _QueryAnalyser(info)
+    queries: list[WorstQuery] = []
+    thumbnails: list[Thumbnail] = []
+    left_out: list[str] = []
+    for prediction in chosen:
+        try:
+            query, picture = analyser.analyse(prediction)
+        except (LaLaLocError, OSError) as error:
+            left_out.append(str(error))
+            continue
+        queries.append(query)
+        thumbnails.append(Thumbnail(picture, query.caption))
+    out.mkdir(parents=True, exist_ok=True)
+    pages = []
+    for first in range(0, len(thumbnails), PER_SHEET):
+        part = thumbnails[first : first + PER_SHEET]
+        pages.append(f"worst-{first // PER_SHEET + 1:02d}.png")
+        title = f"{info.label}: worst {first + 1} to {first + len(part)} of {len(predictions)}"
+        draw_sheet(title, _KEY, part).save(out / pages[-1])
+    summary = {"pages": pages, "left_out": left_out, **summarise(predictions, chosen, queries)}
+    content = {**summary, "worst": [dataclasses.asdict(query) for query in queries]}
+    atomic_write(out / SUMMARY_FILE, json.dumps(content, indent=2, allow_nan=False) + "\n")
+    return summary
+
+
+def choose_worst(predictions: Sequence[Prediction], count: int) -> list[Prediction]:
+    """The queries without an answer, then those that are farthest off, at most `count`."""
+    errors_m = position_errors_m(predictions)
+    order = np.argsort(-np.where(np.isnan(errors_m), np.inf, errors_m), kind="stable")
+    return [predictions[index] for index in order[:count]]
+
+
+def summarise(
+    predictions: Sequence[Prediction], chosen: Sequence[Prediction], examined: Sequence[WorstQuery]
+) -> dict[str, Any]:
+    """What the worst queries have in common, as plain data.
+
+    Args:
+        predictions: all of the run.
+        chosen: the worst of them.
+        examined: those of `chosen` that could be looked at again.
+    """
+    errors_m = position_errors_m(chosen)
+    answered = errors_m[~np.isnan(errors_m)]
+    misaligned = [one for one in examined if one.outcome is Outcome.WRONG_ALIGNMENT]
+    costs = [
+        (one.true_cost, one.found_cost) for one in examined if one.true_cost is not None and one.found_cost is not None
+    ]
+    biases = [one.distance_bias for one in examined if one.distance_bias is not None]
+    kinds = outcomes(chosen)
+    first = next((name for one in predictions for name in one.stages), None)
+    started_m = position_errors_m(chosen, first) if first is not None else np.full(len(chosen), np.nan)
+    return {
+        "queries": len(predictions),
+        "chosen": len(chosen),
+        "error_m": {"least": float(answered.min()), "most": float(answered.max())} if len(answered) else None,
+        "outcomes": {kind.value: kinds.count(kind) for kind in Outcome},
+        "mirrored": {
+            "among_wrong_alignment": sum(one.symmetric for one in misaligned),
+            "expected_by_chance": sum(one.symmetric_by_chance for one in misaligned),
+        },
+        "lost_after_first_stage": int(((started_m < 1.0) & ~(errors_m < 1.0)).sum()),
+        "true_pose_fits": {
+            "compared": len(costs),
+            "better_than_found": sum(true < found for true, found in costs),
+        },
+        "median_distance_bias": float(np.median(np.abs(biases))) if biases else None,
+        "mean_confidence": {"worst": _mean_confidence(chosen), "all": _mean_confidence(predictions)},
+        "facts": _lifts(predictions, chosen),
+    }
+
+
+def predicted_profile_m(query: Query, columns: int) -> Float[np.ndarray, "{columns}"]:
+    """The predicted wall profile (m) as seen by the photograph, which the query has turned by its first roll."""
+    assert query.profile is not None
+    known = column_azimuths(query.profile.log_m.shape[1])
+    return np.exp(np.interp(column_azimuths(columns) + query.roll[0], known, query.profile.log_m[0], period=TWO_PI))
+
+
+def _lifts(predictions: Sequence[Prediction], chosen: Sequence[Prediction]) -> dict[str, dict[str, float]]:
+    """By fact: its share among the worst and among all, and how many times larger the first is, largest first."""
+    lifts = {}
+    for fact in sorted({fact for one in predictions for fact in one.facts}):
+        worst, every = (sum(fact in one.facts for one in some) / len(some) for some in (chosen, predictions))
+        lifts[fact] = {"worst": worst, "all": every, "lift": worst / every}
+    return dict(sorted(lifts.items(), key=lambda item: -item[1]["lift"]))
+
+
+def _mean_confidence(predictions: Sequence[Prediction]) -> float | None:
+    known = [one.confidence for one in predictions if one.confidence is not None]
+    return float(np.mean(known)) if known else None
+
+
+class _QueryAnalyser:
+    """Data set and model of a run, opened to look at its queries again."""
+
+    def __init__(self, info: RunInfo) -> None:
+        self._info = info
+        self._dataset = build_dataset(info)
+        self._appearance = choose_appearance(self._dataset, info.furniture, info.lighting)
+        encoders = None if info.bundle is None else open_model(info)
+        self._encoders = encoders if encoders is not None and encoders.predicts_profile else None
+
+    def analyse(self, prediction: Prediction) -> tuple[WorstQuery, Image.Image]:
+        """What became of a query, and its picture.
+
+        Raises:
+            DatasetError: it is gone, or has changed.
+        """
+        scene, camera = find_camera(self._dataset, prediction)
+        image = scene.photograph(camera, self._appearance).image(PICTURE_HEIGHT, PICTURE_WIDTH)
+        found, height = prediction.answer, camera.camera_height_m
+        strokes = [_layout(scene, prediction.truth, height, TRUE_COLOUR, 3.0)]
+        if found is not None:
+            strokes.append(_layout(scene, found, height, FOUND_COLOUR, 1.5))
+        fit: dict[str, float | None] = {}
+        if self._encoders is not None:
+            query = self._encode(self._encoders, scene, camera)
+            floor = wall_line(predicted_profile_m(query, PICTURE_WIDTH), -height, PICTURE_HEIGHT)
+            strokes.append(Stroke([floor], PREDICTED_COLOUR, 1.5, 2.0))
+            weights = self._encoders.manifest.evidence
+            fit["true_cost"] = _cost(query, scene, prediction.truth, weights)
+            fit["found_cost"] = None if found is None else _cost(query, scene, found, weights)
+            fit["distance_bias"] = _distance_bias(query, scene, prediction.truth)
+        errors_m = position_errors_m([prediction])
+        first_m = position_errors_m([prediction], next(iter(prediction.stages), None))
+        (outcome,) = outcomes([prediction])
+        worst = WorstQuery(
+            scene=prediction.scene,
+            camera=prediction.camera,
+            room=prediction.room,
+            found_room=None if found is None else scene.plan.rooms[found.room_index].name,
+            outcome=outcome,
+            error_m=None if found is None else float(errors_m[0]),
+            first_error_m=None if found is None else float(first_m[0]),
+            confidence=prediction.confidence,
+            facts=prediction.facts,
+            symmetric=is_symmetric(scene.plan, prediction),
+            symmetric_by_chance=symmetric_by_chance(scene.plan, prediction),
+            **fit,
+        )
+        return worst, draw_strokes(image, strokes)
+
+    def _encode(self, encoders: Encoders, scene: Scene, camera: Camera) -> Query:
+        question = ask_again(self._info, scene, camera, self._appearance)
+        return encode(encoders, question, read_image(encoders, question))
+
+
+def _layout(scene: Scene, pose: Pose, camera_height_m: float, colour: str, width: float) -> Stroke:
+    lines = layout_lines(scene.plan, pose, camera_height_m, PICTURE_HEIGHT, PICTURE_WIDTH)
+    return Stroke(lines, colour, width, width + 1.0)
+
+
+def _cost(query: Query, scene: Scene, pose: Pose, weights: EvidenceModel) -> float:
+    """How badly the layout of a pose fits what is predicted."""
+    assert query.profile is not None
+    config = EvidenceConfig()
+    poses = PoseSet(np.array([[pose.x_m, pose.y_m]]), np.array([pose.room_index]))
+    heading = np.array([heading_from_degrees(pose.heading_deg) - query.roll[0]])
+    layouts = layouts_at(scene.plan, poses, heading, query.profile.log_m.shape[1])
+    cost, _ = Evidence(scene.plan, query, config.fine_reach_m, weights, config).costs(layouts, np.array([0]))
+    return float(cost[0, 0])
+
+
+def _distance_bias(query: Query, scene: Scene, truth: Pose) -> float:
+    """By how much walls are predicted too far, as a share, in the median azimuth."""
+    assert query.profile is not None
+    log_m = query.profile.log_m[0]
+    return float(np.expm1(np.median(log_m - _log_profile(query, scene, truth, len(log_m))[0])))
+
+
+def _log_profile(query: Query, scene: Scene, pose: Pose, columns: int) -> Float[np.ndarray, "1 {columns}"]:
+    """Log wall profile (m) of a pose, turned as the query's first hypothesis is."""
+    heading = np.array([heading_from_degrees(pose.heading_deg) - query.roll[0]])
+    position_m, room = np.array([[pose.x_m, pose.y_m]]), np.array([pose.room_index])
+    return np.log(profiles_at(scene.plan, position_m, room, heading, columns))

@@ -1,0 +1,209 @@
+"""The trained variants that the paper compares (section 6.2), each for a budget, and training one on a data set.
+
+"full" is the paper's schedule. "small" fits a CPU: narrower ResNets, smaller inputs, fewer neighbours and a schedule
+that learns fast from scratch, the same for every row of a table.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import torch
+
+from lalaloc_core.localise.bundle import MANIFEST_NAME, Bundle
+from lalaloc_core.learn.data.dataset import Dataset
+from lalaloc_core.errors import ConfigError
+from lalaloc_core.learn.export.run import export_run
+from lalaloc_core.nets.paper_encoders import PaperConfig
+from lalaloc_core.render.sampling import TripletSampling
+from lalaloc_core.learn.training.checkpoint import Checkpoint
+from lalaloc_core.learn.training.config import ImageStageConfig, LayoutStageConfig, OptimiserConfig, TrainConfig
+from lalaloc_core.learn.training.data import TrainingData
+from lalaloc_core.learn.training.presets import PRESETS
+from lalaloc_core.learn.training.run import train_end_to_end, train_image, train_layout
+
+Budget = Literal["small", "full"]
+BUDGETS: tuple[Budget, ...] = get_args(Budget)
+BASE = "paper"
+_BUNDLE = "bundle"
+_VALIDATION_SCENES = 12
+
+
+@dataclass(frozen=True, kw_only=True)
+class Ablation:
+    """A trained variant.
+
+    Attributes:
+        config: by budget.
+        stages: what is trained for it.
+        layout_from: the variant whose layout encoder it uses; None: its own, or that of end-to-end training.
+    """
+
+    config: dict[Budget, TrainConfig]
+    stages: tuple[Literal["layout", "image", "end-to-end"], ...]
+    layout_from: str | None = None
+
+
+_SMALL = TrainConfig(
+    name="small",
+    architecture="paper",
+    turns="none",
+    paper=PaperConfig(width=16, layout_height=32, profile_columns=64, image_height=64, image_width=128),
+    layout=LayoutStageConfig(
+        steps=700,
+        homes_per_step=16,
+        anchors_per_home=1,
+        triplets=TripletSampling(positives=1, negatives=7),
+        decode_anchors_only=True,
+        cloud_rows=8,
+        cloud_columns=32,
+        optimiser=OptimiserConfig(learning_rate=2e-3),
+    ),
+    image=ImageStageConfig(
+        steps=1500,
+        batch=16,
+        shots_per_home=1,
+        optimiser=OptimiserConfig(learning_rate=1e-3),
+    ),
+)
+_BASES: dict[Budget, TrainConfig] = {
+    "small": _SMALL,
+    # Queries of the paper come at a known heading, so nothing is turned.
+    "full": dataclasses.replace(PRESETS["paper"], turns="none"),
+}
+
+
+def _varied(name: str, **parts: dict[str, Any]) -> dict[Budget, TrainConfig]:
+    """The base of every budget with some settings of its parts replaced."""
+
+    def varied(base: TrainConfig) -> TrainConfig:
+        changed = {part: dataclasses.replace(getattr(base, part), **changes) for part, changes in parts.items()}
+        return dataclasses.replace(base, name=name, **changed)
+
+    return {budget: varied(base) for budget, base in _BASES.items()}
+
+
+def _following_layout(name: str, **weights: float) -> dict[Budget, TrainConfig]:
+    """Variants with neighbours train by the routine of the layout branch (section A.1.3); small ones by their own."""
+    configs = _varied(name, image=weights)
+    full = configs["full"]
+    routine = dataclasses.replace(
+        full.image,
+        steps=full.layout.steps,
+        batch=full.layout.homes_per_step * full.layout.anchors_per_home,
+        optimiser=full.layout.optimiser,
+    )
+    return {**configs, "full": dataclasses.replace(full, image=routine)}
+
+
+def _layout(name: str, **parts: dict[str, Any]) -> Ablation:
+    return Ablation(config=_varied(name, **parts), stages=("layout",))
+
+
+def _image(name: str, **weights: float) -> Ablation:
+    return Ablation(config=_following_layout(name, **weights), stages=("image",), layout_from=BASE)
+
+
+ABLATIONS: dict[str, Ablation] = {
+    BASE: Ablation(config=_varied(BASE), stages=("layout", "image")),
+    "layout-log-ratio": _layout("layout-log-ratio", layout={"decode_weight": 0.0}),
+    "layout-decode": _layout("layout-decode", layout={"log_ratio_weight": 0.0}),
+    "layout-resnet50": _layout("layout-resnet50", paper={"layout_depth": 50}),
+    "layout-mlp": _layout("layout-mlp", paper={"layout_predictor": "mlp"}),
+    "image-log-ratio": _image("image-log-ratio", l2_weight=0.0, log_ratio_weight=1.0),
+    "image-l2-log-ratio": _image("image-l2-log-ratio", log_ratio_weight=1.0),
+    "image-l2-kd": _image("image-l2-kd", kd_weight=1.0),
+    "end-to-end": Ablation(config=_following_layout("end-to-end"), stages=("end-to-end",)),
+}
+
+
+def train_ablation(
+    name: str,
+    budget: Budget,
+    dataset: Dataset,
+    out: Path,
+    *,
+    device: torch.device,
+    workers: int = 1,
+    resume: bool = True,
+    skip_bad: bool = False,
+) -> Bundle:
+    """Train a variant on a data set and export it to `out/<name>/bundle`.
+
+    What is finished is not done again, and what was interrupted goes on. Variants of the image branch use the layout
+    encoder of another variant, whose stage 1 is trained first where that has not been done.
+
+    Args:
+        name: a key of `ABLATIONS`.
+        budget: how much to spend.
+        dataset: its training scenes are learnt from, its validation scenes only looked at.
+        out: folder of all variants of one data set and budget.
+        device: where to train.
+        workers: processes that make batches; 0 makes them in this process.
+        resume: False trains this variant's own stages anew.
+        skip_bad: pass over files that cannot be used, naming each once.
+
+    Raises:
+        ConfigError: no such variant.
+        CheckpointError: `out` holds variants of another budget, configuration or data set.
+        DatasetError: a file of the data set cannot be used.
+    """
+    ablation = ABLATIONS.get(name)
+    if ablation is None:
+        raise ConfigError(f"no variant '{name}', there are {', '.join(ABLATIONS)}")
+    config, folder = ablation.config[budget], out / name
+    data = TrainingData(dataset=dataset, skip_bad=skip_bad, validation_scenes=_VALIDATION_SCENES)
+    common: dict[str, Any] = {"data": data, "device": device, "workers": workers}
+    teacher = folder
+    if ablation.layout_from is not None:
+        teacher = out / ablation.layout_from
+        _finish("layout", ABLATIONS[ablation.layout_from].config[budget], teacher, True, train_layout, common)
+    worked = False
+    for stage in ablation.stages:
+        if stage == "layout":
+            worked |= _finish(stage, config, folder, resume, train_layout, common)
+        elif stage == "image":
+            worked |= _finish(stage, config, folder, resume, train_image, {**common, "teacher": teacher})
+        else:
+            worked |= _finish(stage, config, folder, resume, train_end_to_end, common)
+    bundle = folder / _BUNDLE
+    if not worked and (bundle / MANIFEST_NAME).exists():
+        return Bundle.open(bundle)
+    return export_run(
+        folder,
+        bundle,
+        name=name,
+        version="1",
+        notes={"budget": budget},
+        layout_from=teacher,
+        layout_only=ablation.stages == ("layout",),
+        # Variants are compared after the same training, not each at its best.
+        last=True,
+    )
+
+
+def _finish(
+    stage: str,
+    config: TrainConfig,
+    folder: Path,
+    resume: bool,
+    train: Callable[..., Checkpoint],
+    arguments: dict[str, Any],
+) -> bool:
+    """Train a stage to its end; False when there was nothing left to do."""
+    path = folder / f"{stage}.pt"
+    begun = resume and path.exists()
+    if begun:
+        checkpoint = Checkpoint.load(path, stage=stage)
+        steps = config.layout.steps if stage == "layout" else config.image.steps
+        source = arguments["data"].source(config)
+        if checkpoint.config == config and checkpoint.data == source.data and checkpoint.step >= steps:
+            return False
+    # What was exported before is no longer what lies here.
+    (folder / _BUNDLE / MANIFEST_NAME).unlink(missing_ok=True)
+    train(config, folder, resume=begun, **arguments)
+    return True

@@ -1,0 +1,162 @@
+"""Running a table: train what it needs, ask what its rows ask, and put our figures beside the paper's.
+
+Everything is kept in one folder and used again: models by name, runs by what they asked. A run that was interrupted
+goes on.
+
+    OUT/models/NAME/        trained variants (`training.ablations`), each with its bundle
+    OUT/runs/NAME/          evaluation runs (`evaluation.predictions`), shared by the tables
+    OUT/tables/NAME.json    figures with intervals, n, data set, command (`TableResult`); NAME.md shows them
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+
+from lalaloc_core.learn.data.dataset_detection import open_dataset
+from lalaloc_core.evaluate.runs.factories import choose_appearance, describe_model
+from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
+from lalaloc_core.evaluate.runs.run import run_evaluation
+from lalaloc_core.evaluate.runs.score import Estimate, Scores, score
+from lalaloc_core.files import atomic_write
+from lalaloc_core.evaluate.reproduce.ablations import train_ablation
+from lalaloc_core.evaluate.reproduce.result import Budget, Figure, RowResult, TableResult
+from lalaloc_core.evaluate.reproduce.result_tables import draw_vogel_samples, markdown
+from lalaloc_core.evaluate.reproduce.table import SHIPPED, Column, Row, RowQuery, Table
+
+# Queries per row: enough to tell methods apart at a small budget, and few enough that times are taken one at a time.
+_SMALL_LIMIT = 75
+_TIMED_LIMIT = 20
+
+
+@dataclass(frozen=True, kw_only=True)
+class TableMaker:
+    """Where tables are made.
+
+    Attributes:
+        data: folder of the data set.
+        out: folder of models, runs and tables.
+        shipped: bundle of the rows `ring`.
+        limit: queries per row; None for the budget's own.
+        workers: processes; None takes one per core.
+        command: recorded in the tables.
+    """
+
+    data: Path
+    out: Path
+    budget: Budget
+    shipped: Path
+    limit: int | None = None
+    workers: int | None = None
+    skip_bad: bool = False
+    command: str = ""
+
+    def make(self, table: Table) -> TableResult:
+        """Make one table and write it down."""
+        bundles = {name: self._train(name) for name in table.models} | {SHIPPED: self.shipped}
+        rows = []
+        for row in table.rows:
+            info, predictions = self._ask(table, row.ask, bundles)
+            rows.append(_row_result(row, table, info, predictions))
+        result = TableResult(
+            name=table.name,
+            title=table.title,
+            source=table.source,
+            dataset=open_dataset(self.data).description,
+            split=table.split,
+            budget=self.budget,
+            command=self.command,
+            columns=table.columns,
+            rows=tuple(rows),
+        )
+        folder = self.out / "tables"
+        folder.mkdir(parents=True, exist_ok=True)
+        atomic_write(folder / f"{table.name}.json", result.to_json())
+        atomic_write(folder / f"{table.name}.md", markdown(result))
+        if table.form == "figure":
+            draw_vogel_samples(result, folder / f"{table.name}.png")
+        return result
+
+    def _train(self, name: str) -> Path:
+        return train_ablation(
+            name,
+            self.budget,
+            open_dataset(self.data),
+            self.out / "models",
+            device=torch.device("cuda" if torch.cuda.is_available() else "cpu"),
+            workers=1 if self.workers is None else self.workers,
+        ).folder
+
+    def _ask(self, table: Table, ask: RowQuery, bundles: Mapping[str, Path]) -> tuple[RunInfo, list[Prediction]]:
+        """The run of a row; tables that ask the same share it, except that times are taken one query at a time."""
+        timed = table.form == "times"
+        bundle = None if ask.model is None else bundles[ask.model]
+        dataset = open_dataset(self.data)
+        appearance = choose_appearance(dataset, ask.furniture, None) if ask.kind == "panorama" else None
+        limit = self.limit or (_SMALL_LIMIT if self.budget == "small" else None)
+        info = RunInfo(
+            label=" ".join(filter(None, (ask.method, ask.model, ask.kind, ask.furniture))),
+            method=ask.method,
+            kind=ask.kind,
+            dataset=dataset.description,
+            split=table.split,
+            settings=ask.run_settings,
+            data=str(self.data),
+            furniture=appearance and appearance.furniture,
+            lighting=appearance and appearance.lighting,
+            grid_step_m=ask.grid_step_m,
+            limit=min(limit or _TIMED_LIMIT, _TIMED_LIMIT) if timed else limit,
+            bundle=None if bundle is None else str(bundle),
+            model=None if bundle is None else describe_model(bundle),
+            skip_bad=self.skip_bad,
+            command=self.command,
+        )
+        folder = RunFolder(self.out / "runs" / _folder_name(ask, info, timed))
+        predictions = run_evaluation(folder, info, workers=0 if timed else self.workers)
+        # As the run left it: with what it skipped.
+        return folder.read_info(), predictions
+
+
+def _folder_name(ask: RowQuery, info: RunInfo, timed: bool) -> str:
+    """Readable, and different for everything that asks something else."""
+    asked = {
+        key: value
+        for key, value in dataclasses.asdict(info).items()
+        if key not in ("label", "command", "limit", "skipped", "bundle", "data")
+    }
+    digest = hashlib.sha256(json.dumps([asked, timed], sort_keys=True).encode()).hexdigest()[:8]
+    return "-".join(filter(None, (ask.method, ask.model, ask.kind, info.split, digest)))
+
+
+def _row_result(row: Row, table: Table, info: RunInfo, predictions: list[Prediction]) -> RowResult:
+    scores = score(predictions)
+    return RowResult(
+        group=row.group,
+        name=row.name,
+        n=scores.n,
+        skipped=len(info.skipped),
+        model=info.model,
+        figures={column: figure for column in table.columns if (figure := _figure(column, scores, row)) is not None},
+        paper=dict(row.paper),
+    )
+
+
+def _figure(column: Column, scores: Scores, row: Row) -> Figure | None:
+    if column.startswith("seconds"):
+        _, _, stage = column.partition(":")
+        times = scores.mean_ms if not stage else {stage: scores.mean_ms[stage]} if stage in scores.mean_ms else {}
+        return Figure(value=sum(times.values()) / 1e3) if times else None
+    if column in ("layout_recall", "pose_recall"):
+        return _estimated(getattr(scores, column))
+    stage_scores = scores.final if row.stage is None else scores.stages[row.stage]
+    return _estimated(getattr(stage_scores, column))
+
+
+def _estimated(estimate: Estimate | None) -> Figure | None:
+    return None if estimate is None else Figure(value=estimate.value, low=estimate.low, high=estimate.high)

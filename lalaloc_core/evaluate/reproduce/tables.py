@@ -1,0 +1,367 @@
+"""The tables of the paper and their figures, all measured by its authors on Structured3D.
+
+Shares are written as fractions. Rows of our own ("ours") have no figure there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from lalaloc_core.evaluate.runs.predictions import MethodName
+from lalaloc_core.evaluate.methods.method import QueryKind
+from lalaloc_core.evaluate.reproduce.table import SHIPPED, Column, Row, RowQuery, Table
+
+_ACCURACY = ("median_cm", "within_1cm", "within_5cm", "within_10cm", "within_1m")
+_RECALL = ("layout_recall", "pose_recall")
+_RETRIEVAL = (*_RECALL, "median_cm")
+_LAYOUT, _PANORAMA = "Layout", "Panorama"
+_NO_REFINEMENT = {"refine": "none"}
+
+
+def _paper(columns: Sequence[Column], *figures: float | None) -> dict[Column, float]:
+    return {column: figure for column, figure in zip(columns, figures, strict=True) if figure is not None}
+
+
+def _lalaloc(model: str, kind: QueryKind = "panorama", **asked: Any) -> RowQuery:
+    return RowQuery(method="lalaloc", model=model, kind=kind, **asked)
+
+
+def _localisation() -> Table:
+    columns = (*_RECALL, *_ACCURACY)
+    rows = [
+        Row(
+            group="",
+            name="Oracle (nearest layout by Chamfer)",
+            ask=RowQuery(method="oracle", kind="layout"),
+            paper=_paper(columns, 1.0, 0.911, 20.4, 0.003, 0.0361, 0.135, 0.929),
+        ),
+        Row(
+            group=_LAYOUT,
+            name="2D ICP",
+            ask=RowQuery(method="icp", kind="layout"),
+            paper=_paper(columns, None, None, 0.5, 0.879, 0.998, 0.998, 0.999),
+        ),
+        Row(
+            group=_LAYOUT,
+            name="Explicit layout + localisation",
+            ask=RowQuery(method="explicit", kind="layout", model=SHIPPED),
+        ),
+        Row(group=_LAYOUT, name="VDR + decode, `ring`", ask=RowQuery(method="decode", kind="layout", model=SHIPPED)),
+        Row(
+            group=_LAYOUT,
+            name="LaLaLoc `paper`",
+            ask=_lalaloc("paper", "layout"),
+            paper=_paper(columns, 0.901, 0.874, 0.2, 0.691, 0.824, 0.914, 0.949),
+        ),
+        Row(group=_LAYOUT, name="LaLaLoc `ring`", ask=_lalaloc(SHIPPED, "layout")),
+        Row(
+            group=_PANORAMA,
+            name="2D ICP on furnished depth",
+            ask=RowQuery(method="icp"),
+            paper=_paper(columns, None, None, 21.8, 0.095, 0.264, 0.356, 0.685),
+        ),
+        Row(
+            group=_PANORAMA,
+            name="Explicit layout + localisation (paper: HorizonNet)",
+            ask=RowQuery(method="explicit", model=SHIPPED),
+            paper=_paper(columns, 0.724, 0.680, 9.1, 0.033, 0.293, 0.534, 0.774),
+        ),
+        Row(group=_PANORAMA, name="VDR + decode, `ring`", ask=RowQuery(method="decode", model=SHIPPED)),
+        Row(
+            group=_PANORAMA,
+            name="LaLaLoc `paper`",
+            ask=_lalaloc("paper"),
+            paper=_paper(columns, 0.724, 0.706, 8.3, 0.036, 0.320, 0.580, 0.875),
+        ),
+        Row(group=_PANORAMA, name="LaLaLoc `ring`", ask=_lalaloc(SHIPPED)),
+    ]
+    return Table(
+        name="localisation",
+        title="Localisation with a floor plan prior",
+        source="tab:localisation",
+        split="test",
+        columns=columns,
+        rows=tuple(rows),
+    )
+
+
+def _coarse_grid() -> Table:
+    columns = ("median_cm", "within_1cm", "within_10cm", "within_1m")
+    coarse: dict[str, Any] = {"grid_step_m": 1.0}
+    rows = [
+        Row(
+            group="",
+            name="Retrieval oracle",
+            ask=RowQuery(method="oracle", kind="layout", **coarse),
+            paper=_paper(columns, 42.7, 0.0, 0.029, 0.757),
+        ),
+        Row(
+            group=_LAYOUT,
+            name="2D ICP",
+            ask=RowQuery(method="icp", kind="layout", **coarse),
+            paper=_paper(columns, 0.7, 0.769, 0.994, 0.996),
+        ),
+        Row(
+            group=_LAYOUT,
+            name="LaLaLoc `paper`",
+            ask=_lalaloc("paper", "layout", **coarse),
+            paper=_paper(columns, 0.5, 0.561, 0.705, 0.843),
+        ),
+        Row(group=_LAYOUT, name="LaLaLoc `ring`", ask=_lalaloc(SHIPPED, "layout", **coarse)),
+        Row(
+            group=_PANORAMA,
+            name="2D ICP on furnished depth",
+            ask=RowQuery(method="icp", **coarse),
+            paper=_paper(columns, 21.7, 0.073, 0.347, 0.694),
+        ),
+        Row(
+            group=_PANORAMA,
+            name="LaLaLoc `paper`",
+            ask=_lalaloc("paper", **coarse),
+            paper=_paper(columns, 11.5, 0.026, 0.461, 0.795),
+        ),
+        Row(group=_PANORAMA, name="LaLaLoc `ring`", ask=_lalaloc(SHIPPED, **coarse)),
+    ]
+    return Table(
+        name="coarse-grid",
+        title="Localisation on a 1 m grid",
+        source="tab:1m_refinement",
+        split="test",
+        columns=columns,
+        rows=tuple(rows),
+    )
+
+
+def _furniture() -> Table:
+    figures = {
+        "empty": (2.4, (0.764, 0.740, 5.7)),
+        "simple": (10.0, (0.748, 0.733, 6.7)),
+        "full": (23.0, (0.724, 0.706, 8.3)),
+    }
+    rows = []
+    for level, (icp, lalaloc) in figures.items():
+        group = level.capitalize()
+        rows += [
+            Row(
+                group=group,
+                name="2D ICP on furnished depth",
+                ask=RowQuery(method="icp", furniture=level),
+                paper={"median_cm": icp},
+            ),
+            Row(
+                group=group,
+                name="LaLaLoc `paper`",
+                ask=_lalaloc("paper", furniture=level),
+                paper=_paper(_RETRIEVAL, *lalaloc),
+            ),
+            Row(group=group, name="LaLaLoc `ring`", ask=_lalaloc(SHIPPED, furniture=level)),
+        ]
+    return Table(
+        name="furniture",
+        title="Level of furniture",
+        source="tab:furniture",
+        split="test",
+        columns=_RETRIEVAL,
+        rows=tuple(rows),
+    )
+
+
+def _refinement() -> Table:
+    columns = ("median_cm", "within_1cm", "within_5cm", "within_10cm")
+    figures: list[tuple[str, str | None, MethodName, dict[str, Any], tuple[float, ...]]] = [
+        ("Retrieval", "retrieval", "lalaloc", {}, (22.5, 0.003, 0.0319, 0.118)),
+        ("VDR only", "vdr", "lalaloc", {}, (11.0, 0.008, 0.151, 0.453)),
+        ("LPO only", None, "lalaloc", {"vdr_candidates": 0}, (10.5, 0.020, 0.274, 0.484)),
+        ("VDR + decode", None, "decode", {}, (12.2, 0.005, 0.132, 0.397)),
+        ("VDR + LPO", None, "lalaloc", {}, (8.3, 0.036, 0.320, 0.580)),
+    ]
+    rows = [
+        Row(
+            group=f"`{model}`",
+            name=name,
+            ask=RowQuery(method=method, model=model, settings=settings),
+            stage=stage,
+            paper=_paper(columns, *paper) if model == "paper" else {},
+        )
+        for model in ("paper", SHIPPED)
+        for name, stage, method, settings, paper in figures
+    ]
+    return Table(
+        name="refinement",
+        title="Pose refinement",
+        source="tab:refinement",
+        split="test",
+        columns=columns,
+        rows=tuple(rows),
+    )
+
+
+def _vogel_samples() -> Table:
+    columns = ("median_cm", "within_10cm")
+    rows = [Row(group="without VDR", name="Retrieval", ask=_lalaloc(SHIPPED), stage="retrieval")]
+    rows += [Row(group="without VDR", name="LPO", ask=_lalaloc(SHIPPED, settings={"vdr_candidates": 0}))]
+    for samples in (10, 25, 50, 100, 200):
+        settings = {} if samples == 200 else {"vdr_samples": samples}
+        for name, stage in (("VDR", "vdr"), ("VDR + LPO", None)):
+            ask = _lalaloc(SHIPPED, settings=settings)
+            rows.append(Row(group=f"{samples} samples", name=name, ask=ask, stage=stage))
+    return Table(
+        name="vogel-samples",
+        title="Samples of the Vogel disc, with and without LPO",
+        source="fig:vdr_sample",
+        split="test",
+        columns=columns,
+        rows=tuple(rows),
+        form="figure",
+    )
+
+
+def _similarity(name: str, source: str, grid_step_m: float, figures: dict[str, tuple[float, float, float]]) -> Table:
+    columns = ("pose_recall", "median_cm", "correct_room")
+    titles = {"edges": "Edges", "depth": "Depth", "relative-depth": "Relative depth", "chamfer": "Chamfer *"}
+    common: dict[str, Any] = {"kind": "layout", "grid_step_m": grid_step_m}
+    rows = [
+        Row(
+            group="",
+            name="Pose (nearest grid pose)",
+            ask=RowQuery(method="pose-oracle", **common),
+            paper=_paper(columns, *figures["pose"]),
+        )
+    ]
+    rows += [
+        Row(
+            group="",
+            name=title,
+            ask=RowQuery(method="similarity", settings={"metric": metric}, **common),
+            paper=_paper(columns, *figures[metric]),
+        )
+        for metric, title in titles.items()
+    ]
+    return Table(
+        name=name,
+        title=f"Layout-similarity metric, {grid_step_m:g} m grid",
+        source=source,
+        split="validation",
+        columns=columns,
+        rows=tuple(rows),
+    )
+
+
+def _oracle(paper: tuple[float, float, float]) -> Row:
+    return Row(
+        group="",
+        name="Oracle (nearest layout by Chamfer)",
+        ask=RowQuery(method="oracle", kind="layout"),
+        paper=_paper(_RETRIEVAL, *paper),
+    )
+
+
+def _trained(group: str, name: str, model: str, kind: QueryKind, *paper: float) -> Row:
+    """A row that compares trained models by their retrieval alone, as the paper's ablations do."""
+    ask = _lalaloc(model, kind, settings=_NO_REFINEMENT)
+    return Row(group=group, name=name, ask=ask, paper=_paper(_RETRIEVAL, *paper))
+
+
+def _ablation(name: str, title: str, source: str, *rows: Row) -> Table:
+    return Table(name=name, title=title, source=source, split="validation", columns=_RETRIEVAL, rows=rows)
+
+
+_ORACLE_ON_VALIDATION = (1.0, 0.908, 20.0)
+
+TABLES: tuple[Table, ...] = (
+    _localisation(),
+    _coarse_grid(),
+    _furniture(),
+    _refinement(),
+    _vogel_samples(),
+    _similarity(
+        "similarity",
+        "tab:oracle",
+        0.5,
+        {
+            "pose": (1.0, 19.8, 1.0),
+            "edges": (0.793, 20.3, 0.836),
+            "depth": (0.803, 20.1, 0.840),
+            "relative-depth": (0.771, 20.1, 0.854),
+            "chamfer": (0.908, 20.0, 0.921),
+        },
+    ),
+    _similarity(
+        "similarity-coarse",
+        "tab:1m_oracle",
+        1.0,
+        {
+            "pose": (1.0, 40.1, 0.997),
+            "edges": (0.556, 48.7, 0.592),
+            "depth": (0.552, 48.3, 0.595),
+            "relative-depth": (0.541, 48.5, 0.616),
+            "chamfer": (0.718, 42.7, 0.744),
+        },
+    ),
+    _ablation(
+        "training",
+        "End-to-end and two-stage training",
+        "tab:e2e",
+        _trained(_LAYOUT, "End-to-end", "end-to-end", "layout", 0.811, 0.804, 20.9),
+        _trained(_LAYOUT, "Two-stage *", "paper", "layout", 0.893, 0.876, 19.9),
+        _trained(_PANORAMA, "End-to-end", "end-to-end", "panorama", 0.244, 0.237, 62.7),
+        _trained(_PANORAMA, "Two-stage *", "paper", "panorama", 0.707, 0.705, 21.7),
+    ),
+    _ablation(
+        "layout-losses",
+        "Losses of the layout branch",
+        "tab:lalalearning",
+        _oracle(_ORACLE_ON_VALIDATION),
+        _trained(_LAYOUT, "log-ratio", "layout-log-ratio", "layout", 0.788, 0.773, 20.5),
+        _trained(_LAYOUT, "decode", "layout-decode", "layout", 0.909, 0.846, 20.1),
+        _trained(_LAYOUT, "log-ratio + decode *", "paper", "layout", 0.893, 0.876, 19.9),
+    ),
+    _ablation(
+        "layout-architecture",
+        "Architecture of the layout branch",
+        "tab:layoutarch",
+        _trained(_LAYOUT, "ResNet-18, FC *", "paper", "layout", 0.893, 0.876, 19.9),
+        _trained(_LAYOUT, "ResNet-50, FC", "layout-resnet50", "layout", 0.875, 0.853, 20.0),
+        _trained(_LAYOUT, "ResNet-18, MLP", "layout-mlp", "layout", 0.872, 0.863, 19.9),
+    ),
+    _ablation(
+        "image-losses",
+        "Losses of the image branch",
+        "tab:rgblearning",
+        _oracle(_ORACLE_ON_VALIDATION),
+        _trained(_PANORAMA, "L2 *", "paper", "panorama", 0.707, 0.705, 21.7),
+        _trained(_PANORAMA, "log-ratio′", "image-log-ratio", "panorama", 0.596, 0.569, 25.1),
+        _trained(_PANORAMA, "L2 + log-ratio′", "image-l2-log-ratio", "panorama", 0.607, 0.599, 24.6),
+        _trained(_PANORAMA, "L2 + distilled log-ratio", "image-l2-kd", "panorama", 0.589, 0.569, 25.0),
+    ),
+    Table(
+        name="time",
+        title="Time per stage",
+        source="tab:time",
+        split="test",
+        columns=("seconds:retrieve", "seconds:vdr", "seconds:lpo", "seconds"),
+        rows=(
+            Row(group="", name="2D ICP on furnished depth", ask=RowQuery(method="icp"), paper={"seconds": 20.1}),
+            Row(
+                group="`paper`",
+                name="LaLaLoc without VDR",
+                ask=_lalaloc("paper", settings={"vdr_candidates": 0}),
+                paper={"seconds:retrieve": 0.05, "seconds:lpo": 2.33, "seconds": 2.38},
+            ),
+            Row(
+                group="`paper`",
+                name="LaLaLoc",
+                ask=_lalaloc("paper"),
+                paper={"seconds:retrieve": 0.05, "seconds:vdr": 2.87, "seconds:lpo": 1.73, "seconds": 4.65},
+            ),
+            Row(
+                group="`ring`",
+                name="LaLaLoc without VDR",
+                ask=_lalaloc(SHIPPED, settings={"vdr_candidates": 0}),
+            ),
+            Row(group="`ring`", name="LaLaLoc", ask=_lalaloc(SHIPPED)),
+        ),
+        form="times",
+    ),
+)

@@ -1,0 +1,189 @@
+"""From what a run asked (`RunInfo`) to the data set and the method that answer it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import torch
+
+from lalaloc_core.localise.bundle import Bundle
+from lalaloc_core.configuration import build_config
+from lalaloc_core.learn.data.dataset import Appearance, Dataset
+from lalaloc_core.learn.data.dataset_detection import open_dataset
+from lalaloc_core.learn.data.synthetic.copied import CopiedScenes
+from lalaloc_core.learn.data.synthetic.disturbed import DisturbedScenes
+from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
+from lalaloc_core.learn.data.synthetic.mismatched import MismatchedScenes
+from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.evaluate.runs.predictions import RunInfo
+from lalaloc_core.localise.camera_height import DEFAULT_STD_M
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.evidence import EvidenceConfig
+from lalaloc_core.localise.optimise import LpoConfig
+from lalaloc_core.localise.pipeline import LocaliseConfig, Refine
+from lalaloc_core.evaluate.methods.decode import VdrDecode
+from lalaloc_core.evaluate.methods.explicit import ExplicitLayout
+from lalaloc_core.evaluate.methods.icp import Icp
+from lalaloc_core.evaluate.methods.lalaloc import LaLaLoc, StatedHeight, local_refiner
+from lalaloc_core.evaluate.methods.method import Method
+from lalaloc_core.evaluate.methods.oracle import PoseOracle, SimilarityRetrieval
+from lalaloc_core.evaluate.methods.similarity import LayoutMetric
+from lalaloc_core.nets import load_decoder
+
+
+@dataclass(frozen=True, kw_only=True)
+class LaLaLocSettings:
+    """Settings of method "lalaloc"; the defaults are the service's.
+
+    Attributes:
+        evidence: what poses are compared by: the predicted wall profile, where the model predicts one; the latent; or
+            the sum of both.
+        openings, ceiling, room_type, see_through: whether those are compared, where model and plan have them.
+        heading_doubt: probability that a known heading is held to be wrong.
+        camera_height: whether the camera's height is told with a deviation of `camera_height_std_m`, or not at all.
+        camera_height_error_m: by how much it is told wrong.
+    """
+
+    refine: Refine = "lpo"
+    vdr_samples: int = 200
+    vdr_candidates: int = 1
+    lpo_candidates: int = 5
+    evidence: Literal["profile", "latent", "both"] = "profile"
+    optimiser: Literal["levenberg-marquardt", "adam"] = "levenberg-marquardt"
+    openings: bool = True
+    ceiling: bool = True
+    room_type: bool = True
+    see_through: bool = True
+    heading_doubt: float = EvidenceConfig.heading_doubt
+    camera_height: Literal["stated", "unknown"] = "stated"
+    camera_height_std_m: float = DEFAULT_STD_M
+    camera_height_error_m: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimilaritySettings:
+    """Settings of method "similarity": by which metric layouts are compared."""
+
+    metric: LayoutMetric = "chamfer"
+
+
+@dataclass(frozen=True, kw_only=True)
+class NoSettings:
+    """Methods without settings."""
+
+
+_Settings = TypeVar("_Settings")
+
+
+def build_dataset(info: RunInfo) -> Dataset:
+    """The data set of a run.
+
+    Raises:
+        DatasetError: its folder is gone or holds no data set.
+    """
+    if info.data is not None:
+        return open_dataset(Path(info.data), info.data_format)
+    arguments: dict[str, Any] = dict(info.generated or {})
+    generator = arguments.pop("generator", "synth")
+    if generator == "unfamiliar":
+        # Traced by embree, which only the extra `oracle` brings.
+        from lalaloc_core.learn.data.synthetic.unfamiliar import UnfamiliarScenes
+
+        return UnfamiliarScenes(**arguments)
+    if arguments.get("textures") is not None:
+        arguments["textures"] = Path(arguments["textures"])
+    homes = GeneratedScenes(**arguments)
+    if generator == "copies":
+        return CopiedScenes(homes)
+    if generator == "disturbed":
+        return DisturbedScenes(homes)
+    # Runs of earlier versions say "strangers".
+    return MismatchedScenes(homes) if generator in ("mismatched", "strangers") else homes
+
+
+def build_method(info: RunInfo) -> Method:
+    """The method of a run, ready to answer, on one thread.
+
+    Raises:
+        BundleError: the model is gone, was altered, or lacks what the method needs.
+        ConfigError: settings that the method does not have.
+        InvalidInputError: the method needs a bundle and none was named.
+    """
+    if info.method == "similarity":
+        return SimilarityRetrieval(_settings(SimilaritySettings, info).metric)
+    settings = _settings(LaLaLocSettings if info.method == "lalaloc" else NoSettings, info)
+    if info.method == "oracle":
+        return SimilarityRetrieval()
+    if info.method == "pose-oracle":
+        return PoseOracle()
+    if info.method == "icp":
+        return Icp()
+    bundle = require_bundle(info)
+    encoders = Encoders(bundle, threads=1)
+    # Tensors of a few poses are too small to share between threads.
+    torch.set_num_threads(1)
+    if info.method == "explicit":
+        return ExplicitLayout(encoders)
+    if info.method == "decode":
+        return VdrDecode(encoders, load_decoder(bundle))
+    assert isinstance(settings, LaLaLocSettings)
+    return _lalaloc(bundle, encoders, settings)
+
+
+def _lalaloc(bundle: Bundle, encoders: Encoders, settings: LaLaLocSettings) -> LaLaLoc:
+    refiner = None
+    if settings.refine == "lpo":
+        refiner = local_refiner(bundle, LpoConfig(method=settings.optimiser))
+    config = LocaliseConfig(
+        vdr_samples=settings.vdr_samples,
+        vdr_candidates=settings.vdr_candidates,
+        lpo_candidates=settings.lpo_candidates,
+        evidence=EvidenceConfig(
+            use_profile=settings.evidence != "latent",
+            latent_weight=1.0 if settings.evidence == "both" else 0.0,
+            use_openings=settings.openings,
+            use_ceiling=settings.ceiling,
+            use_room_type=settings.room_type,
+            use_see_through=settings.see_through,
+            heading_doubt=settings.heading_doubt,
+        ),
+    )
+    stated = StatedHeight(
+        is_known=settings.camera_height == "stated",
+        error_m=settings.camera_height_error_m,
+        std_m=settings.camera_height_std_m,
+    )
+    return LaLaLoc(encoders, refine=settings.refine, refiner=refiner, config=config, stated=stated)
+
+
+def _settings(kind: type[_Settings], info: RunInfo) -> _Settings:
+    return build_config(kind, info.settings, path=f"settings of method '{info.method}'")
+
+
+def require_bundle(info: RunInfo) -> Bundle:
+    """The bundle of a run."""
+    if info.bundle is None:
+        raise InvalidInputError(f"method '{info.method}' needs a model bundle")
+    return Bundle.open(Path(info.bundle))
+
+
+def describe_model(folder: Path) -> dict[str, str]:
+    """What a run records of its model."""
+    bundle = Bundle.open(folder)
+    return {"name": bundle.manifest.name, "version": bundle.manifest.version, "sha256": bundle.sha256}
+
+
+def choose_appearance(dataset: Dataset, furniture: str | None, lighting: str | None) -> Appearance:
+    """How the photographs of a run look: what was asked for, else what the data set is usually asked with.
+
+    Raises:
+        InvalidInputError: the data set has no such photographs.
+    """
+    usual = dataset.appearances[0]
+    wanted = Appearance(furniture or usual.furniture, lighting or usual.lighting)
+    if wanted not in dataset.appearances:
+        known = ", ".join(str(one) for one in dataset.appearances)
+        raise InvalidInputError(f"{dataset.description} has no photographs '{wanted}', there are: {known}")
+    return wanted

@@ -1,0 +1,73 @@
+"""What a model reads from annotated photographs: walls and openings per azimuth, and how right that is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from lalaloc_core.learn.azimuth_metrics import AzimuthMeasures, measure_azimuths
+from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, AnnotatedPhotograph
+from lalaloc_core.errors import BundleError
+from lalaloc_core.localise.camera_height import CameraHeight
+from lalaloc_core.localise.encoders import Encoders
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ReadPhotograph:
+    """One photograph and what the model says of it.
+
+    Attributes:
+        profile_m: (w,) predicted wall profile.
+        class_scores: (w, classes) predicted log likelihoods but for a constant; None where the model predicts none.
+    """
+
+    photograph: AnnotatedPhotograph
+    profile_m: Float[np.ndarray, "w"]
+    class_scores: Float[np.ndarray, "w c"] | None
+    measures: AzimuthMeasures
+
+
+def read_photographs(encoders: Encoders, photographs: Sequence[AnnotatedPhotograph]) -> list[ReadPhotograph]:
+    """What a model says of each photograph, and how right it is.
+
+    Raises:
+        BundleError: the model predicts no wall profile.
+        DatasetError: a photograph cannot be read.
+    """
+    manifest = encoders.manifest
+    read = []
+    for one in photographs:
+        image = one.photograph.image(manifest.image_height, manifest.image_width)
+        log_m, log_scale, scores = read_azimuths(encoders, image, CAMERA_HEIGHT_M)
+        measures = measure_azimuths(
+            [one.profile_m(outline, len(log_m)) for outline in range(len(one.outlines))],
+            log_m,
+            log_scale,
+            one.classes(len(log_m)),
+            scores,
+        )
+        read.append(ReadPhotograph(photograph=one, profile_m=np.exp(log_m), class_scores=scores, measures=measures))
+    return read
+
+
+def read_azimuths(
+    encoders: Encoders, image: UInt8[np.ndarray, "height width 3"], camera_height_m: float
+) -> tuple[Float[np.ndarray, "w"], Float[np.ndarray, "w"], Float[np.ndarray, "w c"] | None]:
+    """What a model says of a panorama in its own frame.
+
+    Returns:
+        the log of the predicted wall profile (m), the log of its scale, and `ReadPhotograph.class_scores`.
+
+    Raises:
+        BundleError: the model predicts no wall profile.
+    """
+    query = encoders.query(image, 0.0, CameraHeight(camera_height_m, 0.0))
+    if query.profile is None:
+        raise BundleError(f"model '{encoders.manifest.name}' predicts no wall profile, which is what is measured")
+    # Relative to the shares of the classes, as poses are compared: every class counts alike in what is reported.
+    openings = query.openings
+    scores = None if openings is None else openings.log_probability[0] - np.log(openings.prior)
+    return query.profile.log_m[0], query.profile.log_scale[0], scores

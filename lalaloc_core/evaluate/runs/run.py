@@ -1,0 +1,245 @@
+"""Running an evaluation: every query of a split is answered and written down; scoring comes after and apart.
+
+Scenes are answered in parallel by processes of one thread each and written in order, so that a run that was
+interrupted goes on where it stopped and ends in the same file.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import multiprocessing
+import os
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from lalaloc_core.configuration import build_config
+from lalaloc_core.conventions import heading_to_degrees
+from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, Scene, facts_of_photograph, load_scenes
+from lalaloc_core.errors import DatasetError, InvalidInputError, RunError
+from lalaloc_core.evaluate.runs.factories import build_dataset, build_method
+from lalaloc_core.evaluate.runs.predictions import Pose, PredictedCandidate, Prediction, RunFolder, RunInfo
+from lalaloc_core.evaluate.methods.method import Answer, Found, Method, Question
+from lalaloc_core.evaluate.methods.similarity import ChamferGrid, true_layout
+from lalaloc_core.render.sampling import PoseSet, pose_grid
+
+# What may differ when a run goes on: how it was called, how far it goes, and what it found out.
+_MAY_DIFFER = {"command", "label", "limit", "skipped"}
+
+
+def run_evaluation(folder: RunFolder, info: RunInfo, *, workers: int | None = None) -> list[Prediction]:
+    """Answer every query of a run, or the rest of a run that was interrupted.
+
+    Args:
+        folder: where the answers go.
+        workers: processes, each with one thread; 0 answers in this one; None takes one per core.
+
+    Returns:
+        every prediction, at most `info.limit`.
+
+    Raises:
+        RunError: `folder` holds a run that asked something else.
+        DatasetError: a scene or photograph cannot be used, and `info.skip_bad` is off.
+        InvalidInputError: the split holds nothing to ask; a folder that was made for it is taken away again.
+    """
+    # What is asked wrongly fails here, before anything is written.
+    names = list(build_dataset(info).scenes(info.split))
+    build_method(info)
+    if not names:
+        raise InvalidInputError(f"split '{info.split}' of {info.dataset} is empty")
+    is_new = not folder.exists()
+    done, skipped = _resume(folder, info)
+    limit = math.inf if info.limit is None else info.limit
+    if done:
+        # Scenes without queries leave no line; those before the last answered one are done as well.
+        names = names[names.index(done[-1].scene) + 1 :]
+    if len(done) >= limit:
+        return done
+    with tqdm(total=info.limit, initial=len(done), desc=info.label, unit="query", mininterval=1.0) as bar:
+        for predictions, problems in _answers(info, names, workers):
+            kept = predictions[: int(min(limit - len(done), len(predictions)))]
+            done += kept
+            folder.append(kept)
+            bar.update(len(kept))
+            if problems:
+                skipped = list(dict.fromkeys([*skipped, *map(str, problems)]))
+                folder.write_info(dataclasses.replace(info, skipped=tuple(skipped)))
+            if len(done) >= limit:
+                break
+    if not done and is_new:
+        folder.remove()
+        left_out = f"; {len(skipped)} were left out, the first: {skipped[0]}" if skipped else ""
+        raise InvalidInputError(f"split '{info.split}' of {info.dataset} has no queries{left_out}")
+    return done
+
+
+def _resume(folder: RunFolder, info: RunInfo) -> tuple[list[Prediction], list[str]]:
+    """What an earlier run left: whole scenes only, and what it skipped."""
+    if not folder.exists():
+        folder.write_info(info)
+        folder.replace([])
+        return [], []
+    before = folder.read_info()
+    differing = [
+        field.name
+        for field in dataclasses.fields(RunInfo)
+        if field.name not in _MAY_DIFFER and getattr(before, field.name) != getattr(info, field.name)
+    ]
+    if differing:
+        name = differing[0]
+        raise RunError(
+            f"'{folder.path}' holds a run with {name} {getattr(before, name)!r}, not {getattr(info, name)!r}; "
+            "choose another folder"
+        )
+    done = folder.read_predictions()
+    if done and (info.limit is None or len(done) < info.limit):
+        # The last scene may have been cut, by an interruption or by a limit: it is answered again.
+        done = [prediction for prediction in done if prediction.scene != done[-1].scene]
+    done = done[: info.limit]
+    folder.write_info(dataclasses.replace(info, skipped=before.skipped))
+    folder.replace(done)
+    return done, list(before.skipped)
+
+
+def _answers(
+    info: RunInfo, names: Sequence[str], workers: int | None
+) -> Iterator[tuple[list[Prediction], list[DatasetError]]]:
+    """Answers scene by scene, in order, a few scenes ahead of whoever takes them."""
+    asked = json.dumps(dataclasses.asdict(info))
+    workers = os.cpu_count() or 1 if workers is None else workers
+    if workers == 0:
+        yield from (_answer_scene(asked, name) for name in names)
+        return
+    waiting: deque[Future[tuple[list[Prediction], list[DatasetError]]]] = deque()
+    pool = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
+    try:
+        for name in names:
+            waiting.append(pool.submit(_answer_scene, asked, name))
+            if len(waiting) > 2 * workers:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+@dataclass(frozen=True)
+class _Session:
+    """What a process keeps from one scene to the next."""
+
+    info: RunInfo
+    dataset: Dataset
+    method: Method
+
+
+@lru_cache(maxsize=1)
+def _session(asked: str) -> _Session:
+    torch.set_num_threads(1)
+    info = build_config(RunInfo, json.loads(asked))
+    return _Session(info, build_dataset(info), build_method(info))
+
+
+def _answer_scene(asked: str, name: str) -> tuple[list[Prediction], list[DatasetError]]:
+    """Answer the queries of one scene; what cannot be used is returned beside the answers, or raised."""
+    session = _session(asked)
+    info = session.info
+    problems: list[DatasetError] | None = [] if info.skip_bad else None
+    predictions: list[Prediction] = []
+    for scene in load_scenes(session.dataset, [name], problems):
+        evaluator = _SceneEvaluator(scene, info)
+        for camera in scene.cameras:
+            try:
+                predictions.append(evaluator.ask(camera, session.method))
+            except DatasetError as error:
+                if problems is None:
+                    raise
+                problems.append(error)
+    return predictions, problems or []
+
+
+class _SceneEvaluator:
+    """Asks the queries of one scene and compares what was retrieved with what should have been."""
+
+    def __init__(self, scene: Scene, info: RunInfo) -> None:
+        self._scene, self._info = scene, info
+        self._grid: PoseSet = pose_grid(scene.plan, info.grid_step_m)
+        self._layouts: dict[float, ChamferGrid] = {}
+
+    def ask(self, camera: Camera, method: Method) -> Prediction:
+        """One query and its answer.
+
+        Raises:
+            DatasetError: the query's photograph cannot be used.
+        """
+        info, scene = self._info, self._scene
+        photograph = None
+        if info.kind == "panorama":
+            photograph = scene.photograph(camera, Appearance(info.furniture, info.lighting))
+        question = Question(
+            plan=scene.plan,
+            grid=self._grid,
+            grid_step_m=info.grid_step_m,
+            camera=camera,
+            kind=info.kind,
+            photograph=photograph,
+            heading_known=info.heading_known,
+        )
+        answer = method.answer(question)
+        x_m, y_m = camera.position_m
+        truth = Found(x_m=float(x_m), y_m=float(y_m), room_index=camera.room_index, heading=camera.heading)
+        return Prediction(
+            scene=scene.name,
+            camera=camera.name,
+            room=scene.plan.rooms[camera.room_index].name,
+            camera_height_m=camera.camera_height_m,
+            truth=_pose(truth),
+            stages={stage: _pose(found) for stage, found in answer.stages.items()},
+            layout_hit=self._layout_hit(question, answer),
+            pose_hit=self._pose_hit(camera, answer),
+            room_rank=answer.rank_of_room(camera.room_index),
+            signals=answer.signals,
+            information=None if answer.information is None else tuple(map(tuple, answer.information.tolist())),
+            candidates=tuple(
+                PredictedCandidate(pose=_pose(one.pose), terms=one.terms, probability=one.probability)
+                for one in answer.candidates
+            ),
+            confidence=answer.confidence,
+            heading_confidence=answer.heading_confidence,
+            found_height_m=answer.camera_height_m,
+            timings_ms=answer.timings_ms,
+            facts=tuple(sorted(facts_of_photograph(photograph))),
+        )
+
+    def _layout_hit(self, question: Question, answer: Answer) -> bool | None:
+        """Whether retrieval chose the grid pose with the most similar layout; the first where several are alike."""
+        if answer.retrieved is None:
+            return None
+        height = question.camera.camera_height_m
+        if height not in self._layouts:
+            self._layouts[height] = ChamferGrid(self._scene.plan, self._grid, height)
+        layouts = self._layouts[height]
+        return layouts.nearest(true_layout(question, layouts.columns)) == answer.retrieved
+
+    def _pose_hit(self, camera: Camera, answer: Answer) -> bool | None:
+        if answer.retrieved is None:
+            return None
+        distance = np.linalg.norm(self._grid.position_m - camera.position_m, axis=1)
+        return int(distance.argmin()) == answer.retrieved
+
+
+def _pose(found: Found) -> Pose:
+    return Pose(
+        x_m=found.x_m,
+        y_m=found.y_m,
+        room_index=found.room_index,
+        heading_deg=heading_to_degrees(found.heading),
+        distance=found.distance,
+    )

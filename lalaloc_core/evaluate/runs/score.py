@@ -1,0 +1,293 @@
+"""Scores of predictions: the paper's metrics (section 5), each with a 95 % bootstrap interval. Needs no model.
+
+A query without an answer is a miss in every share and infinitely far in every median. Intervals resample scenes, not
+queries, because the queries of one scene succeed and fail together.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from lalaloc_core.conventions import wrap_angle
+from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.evaluate.runs.predictions import (
+    SCORES_FILE,
+    Prediction,
+    RunFolder,
+    without_infinity,
+)
+from lalaloc_core.files import atomic_write
+
+_RESAMPLES = 1000
+_COVERAGE = 0.95
+RELIABILITY_BINS = 10
+
+
+@dataclass(frozen=True, kw_only=True)
+class Estimate:
+    """A figure and its 95 % bootstrap interval; infinite where half of the queries have no answer."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageScores:
+    """How near the poses after one stage are; shares from 0 to 1, medians over all queries."""
+
+    median_cm: Estimate
+    within_1cm: Estimate
+    within_5cm: Estimate
+    within_10cm: Estimate
+    within_1m: Estimate
+    correct_room: Estimate
+    median_heading_error_deg: Estimate
+    heading_within_2deg: Estimate
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReliabilityBin:
+    """Queries whose confidence lies in [low, high): mean confidence, and the share that is within 1 m."""
+
+    low: float
+    high: float
+    count: int
+    confidence: float
+    frequency: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class SliceScores:
+    """The answers to those `n` queries for which one fact holds; a query counts in the slice of each of its facts."""
+
+    n: int
+    within_1m: Estimate
+    within_10cm: Estimate
+    median_cm: Estimate
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scores:
+    """Figures of one run.
+
+    Attributes:
+        layout_recall: Layout R@1, pose_recall: Pose R@1; None for methods that do not retrieve.
+        stages: by stage in order; `final` is the answer, whichever stage gave it.
+        calibration_error: expected calibration error of "within 1 m"; None without confidences.
+        median_ms: per stage, of the queries that went through it.
+        slices: by fact (`Prediction.facts`), the one with the smallest share within 1 m first; empty where no facts
+            are known.
+    """
+
+    n: int
+    unanswered: int
+    layout_recall: Estimate | None
+    pose_recall: Estimate | None
+    stages: dict[str, StageScores]
+    final: StageScores
+    calibration_error: float | None = None
+    reliability: tuple[ReliabilityBin, ...] = ()
+    median_ms: dict[str, float] = field(default_factory=dict)
+    mean_ms: dict[str, float] = field(default_factory=dict)
+    slices: dict[str, SliceScores] = field(default_factory=dict)
+
+
+def score(predictions: Sequence[Prediction], seed: int = 0) -> Scores:
+    """Score the answers of one run.
+
+    Args:
+        seed: of the bootstrap.
+
+    Raises:
+        InvalidInputError: there is nothing to score.
+    """
+    if not predictions:
+        raise InvalidInputError("there are no predictions to score")
+    bootstrap = _Bootstrap([prediction.scene for prediction in predictions], np.random.default_rng(seed))
+    names = list(dict.fromkeys(name for prediction in predictions for name in prediction.stages))
+    final = position_errors_m(predictions)
+    confident = [p for p in predictions if p.confidence is not None]
+    reliability, calibration_error = (), None
+    if confident:
+        confidence = np.array([prediction.confidence for prediction in confident], dtype=float)
+        right = position_errors_m(confident) < 1.0
+        reliability = reliability_bins(confidence, right)
+        calibration_error = expected_calibration_error(confidence, right)
+    return Scores(
+        n=len(predictions),
+        unanswered=int(np.isnan(final).sum()),
+        layout_recall=_recall(bootstrap, [p.layout_hit for p in predictions]),
+        pose_recall=_recall(bootstrap, [p.pose_hit for p in predictions]),
+        stages={name: _stage_scores(bootstrap, predictions, name) for name in names},
+        final=_stage_scores(bootstrap, predictions, None),
+        calibration_error=calibration_error,
+        reliability=reliability,
+        median_ms=_timings(predictions, np.median),
+        mean_ms=_timings(predictions, np.mean),
+        slices=_slices(bootstrap, predictions),
+    )
+
+
+def score_run(folder: RunFolder) -> dict[str, Any]:
+    """Score a run's answers, write them down in its folder, and return them as plain data.
+
+    Infinite figures become null.
+
+    Raises:
+        RunError: no run there.
+        InvalidInputError: it has no answers.
+    """
+    info = folder.read_info()
+    scores = without_infinity(dataclasses.asdict(score(folder.read_predictions())))
+    report = {"label": info.label, "dataset": info.dataset, "skipped": len(info.skipped), **scores}
+    atomic_write(folder.path / SCORES_FILE, json.dumps(report, indent=2, allow_nan=False) + "\n")
+    return report
+
+
+def position_errors_m(predictions: Sequence[Prediction], stage: str | None = None) -> Float[np.ndarray, "n"]:
+    """Distance (m) of each answer, or of each pose after a stage, to the truth; NaN where there is none."""
+    errors = np.full(len(predictions), np.nan)
+    for index, prediction in enumerate(predictions):
+        found = prediction.answer if stage is None else prediction.stages.get(stage)
+        if found is not None:
+            errors[index] = np.hypot(found.x_m - prediction.truth.x_m, found.y_m - prediction.truth.y_m)
+    return errors
+
+
+def heading_errors_deg(predictions: Sequence[Prediction], stage: str | None = None) -> Float[np.ndarray, "n"]:
+    """Absolute heading error (degrees) of each answer, or of each pose after a stage; NaN where there is none."""
+    errors = np.full(len(predictions), np.nan)
+    for index, prediction in enumerate(predictions):
+        found = prediction.answer if stage is None else prediction.stages.get(stage)
+        if found is not None:
+            turned = np.radians(found.heading_deg - prediction.truth.heading_deg)
+            errors[index] = abs(np.degrees(float(wrap_angle(turned))))
+    return errors
+
+
+def reliability_bins(
+    confidence: Float[np.ndarray, "n"], correct: Bool[np.ndarray, "n"], bins: int = RELIABILITY_BINS
+) -> tuple[ReliabilityBin, ...]:
+    """The reliability diagram: equal-width bins of confidence that hold at least one query."""
+    index: Int[np.ndarray, "n"] = np.minimum((confidence * bins).astype(int), bins - 1)
+    return tuple(
+        ReliabilityBin(
+            low=b / bins,
+            high=(b + 1) / bins,
+            count=int((index == b).sum()),
+            confidence=float(confidence[index == b].mean()),
+            frequency=float(correct[index == b].mean()),
+        )
+        for b in range(bins)
+        if (index == b).any()
+    )
+
+
+def expected_calibration_error(
+    confidence: Float[np.ndarray, "n"], correct: Bool[np.ndarray, "n"], bins: int = RELIABILITY_BINS
+) -> float:
+    """Mean gap between confidence and frequency over the bins of the reliability diagram, weighted by queries."""
+    diagram = reliability_bins(confidence, correct, bins)
+    return sum(one.count * abs(one.confidence - one.frequency) for one in diagram) / len(confidence)
+
+
+class _Bootstrap:
+    """Resamples of scenes, as weights of queries; the same for every figure of a run."""
+
+    def __init__(self, scenes: Sequence[str], rng: np.random.Generator) -> None:
+        names, member = np.unique(np.array(scenes), return_inverse=True)
+        shares = np.full(len(names), 1.0 / len(names))
+        self._weights: Float[np.ndarray, "r n"] = rng.multinomial(len(names), shares, _RESAMPLES)[:, member].astype(
+            float
+        )
+
+    def among(self, chosen: Bool[np.ndarray, "n"]) -> _Bootstrap:
+        """The same resamples of some of the queries, without those resamples that hold none of them."""
+        part = copy.copy(self)
+        weights = self._weights[:, chosen]
+        part._weights = weights[weights.any(axis=1)]
+        return part
+
+    def mean(self, values: Float[np.ndarray, "n"] | Bool[np.ndarray, "n"]) -> Estimate:
+        """Mean, such as a share."""
+        total = self._weights.sum(axis=1)
+        resampled = (self._weights @ values.astype(float))[total > 0.0] / total[total > 0.0]
+        return self._estimate(float(values.mean()), resampled)
+
+    def median(self, values: Float[np.ndarray, "n"]) -> Estimate:
+        """Median; infinite values are ordinary ones."""
+        order = np.argsort(values, kind="stable")
+        cumulated = np.cumsum(self._weights[:, order], axis=1)
+        half = 0.5 * cumulated[:, -1:]
+        # The lower and upper middle of an even number of queries, as np.median takes them.
+        lower = values[order][(cumulated >= half).argmax(axis=1)]
+        upper = values[order][(cumulated > half).argmax(axis=1)]
+        return self._estimate(float(np.median(values)), 0.5 * (lower + upper))
+
+    @staticmethod
+    def _estimate(value: float, resampled: Float[np.ndarray, "r"]) -> Estimate:
+        tail = 0.5 * (1.0 - _COVERAGE)
+        # No interpolation: between a number and infinity there is none.
+        low, high = np.quantile(resampled, [tail, 1.0 - tail], method="nearest")
+        return Estimate(value=value, low=float(low), high=float(high))
+
+
+def _stage_scores(bootstrap: _Bootstrap, predictions: Sequence[Prediction], stage: str | None) -> StageScores:
+    error = _infinite(position_errors_m(predictions, stage))
+    heading = _infinite(heading_errors_deg(predictions, stage))
+    found = [p.answer if stage is None else p.stages.get(stage) for p in predictions]
+    rooms = [f is not None and f.room_index == p.truth.room_index for f, p in zip(found, predictions, strict=True)]
+    return StageScores(
+        median_cm=_centimetres(bootstrap.median(error)),
+        within_1cm=bootstrap.mean(error < 0.01),
+        within_5cm=bootstrap.mean(error < 0.05),
+        within_10cm=bootstrap.mean(error < 0.10),
+        within_1m=bootstrap.mean(error < 1.0),
+        correct_room=bootstrap.mean(np.array(rooms)),
+        median_heading_error_deg=bootstrap.median(heading),
+        heading_within_2deg=bootstrap.mean(heading < 2.0),
+    )
+
+
+def _slices(bootstrap: _Bootstrap, predictions: Sequence[Prediction]) -> dict[str, SliceScores]:
+    error = _infinite(position_errors_m(predictions))
+    slices = {}
+    for fact in sorted({fact for prediction in predictions for fact in prediction.facts}):
+        holds = np.array([fact in prediction.facts for prediction in predictions])
+        part, error_m = bootstrap.among(holds), error[holds]
+        slices[fact] = SliceScores(
+            n=len(error_m),
+            within_1m=part.mean(error_m < 1.0),
+            within_10cm=part.mean(error_m < 0.10),
+            median_cm=_centimetres(part.median(error_m)),
+        )
+    return dict(sorted(slices.items(), key=lambda item: item[1].within_1m.value))
+
+
+def _centimetres(metres: Estimate) -> Estimate:
+    return Estimate(value=100.0 * metres.value, low=100.0 * metres.low, high=100.0 * metres.high)
+
+
+def _infinite(errors: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    return np.where(np.isnan(errors), np.inf, errors)
+
+
+def _recall(bootstrap: _Bootstrap, hits: list[bool | None]) -> Estimate | None:
+    """None where no query went through retrieval; a query that did not counts as a miss where others did."""
+    if all(hit is None for hit in hits):
+        return None
+    return bootstrap.mean(np.array([bool(hit) for hit in hits]))
+
+
+def _timings(predictions: Sequence[Prediction], summary: Callable[[list[float]], Any]) -> dict[str, float]:
+    stages = list(dict.fromkeys(name for prediction in predictions for name in prediction.timings_ms))
+    return {name: float(summary([p.timings_ms[name] for p in predictions if name in p.timings_ms])) for name in stages}

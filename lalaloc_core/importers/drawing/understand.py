@@ -1,0 +1,278 @@
+"""From a drawing to rooms and openings.
+
+Rooms are the areas that are named so. Where none is, they are what the walls enclose; and where nothing says what is
+wall, what all lines enclose.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
+
+import numpy as np
+import shapely
+from shapely.geometry.base import BaseGeometry
+
+from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.importers.drawing.shapes import Area, Drawing, Lettering, Swing
+from lalaloc_core.importers.drawing.walls import DEFAULT_WALLS, Enclosed, Gap, WallConfig, enclose
+from lalaloc_core.importers.model.geometry import opening_line
+from lalaloc_core.importers.model.limits import Budget
+from lalaloc_core.importers.model.report import ReportBuilder
+from lalaloc_core.importers.model.sketch import OpeningKind, Sketch, SketchedOpening, SketchedRoom
+from lalaloc_core.importers.model.words import type_of_room
+
+_MIN_ROOM_M2 = 0.6
+# Leaves of doors; a swing of another size is a corner of a bathtub.
+_LEAF_M = (0.45, 1.6)
+# Parts of one symbol (leaf, frame, panes) lie this near to each other.
+_SYMBOL_M = 0.12
+_OPENING_M = (0.3, 8.0)
+# A hinge lies this near to an end of its gap, and a leaf is that much of the gap's width.
+_HINGE_M, _LEAF_OF_GAP = 0.4, (0.7, 1.35)
+# Sizes that stand behind a room's name.
+_SIZE = re.compile(r"\(?\d+(?:[.,]\d+)?\s*(?:m²|m2|qm|sqm|sq\.? ?ft|sf)(?![a-z])\)?", re.IGNORECASE)
+# Pens as thick as this draw walls.
+_THICK_M = (0.05, 0.6)
+# Lines of walls this near to a room's outline are its own.
+_OFF_WALL_M = 0.03
+_MAX_SEGMENTS = 60_000
+
+
+def understand(drawing: Drawing, builder: ReportBuilder, budget: Budget, config: WallConfig = DEFAULT_WALLS) -> Sketch:
+    """Make a sketch of a drawing in metres, y up.
+
+    Raises:
+        InvalidFloorPlanError: too many lines to look for rooms between them.
+    """
+    sketch = Sketch()
+    rooms = [area for area in drawing.areas if area.role == "room"]
+    sketch.obstacles = [area.shape for area in drawing.areas if area.role == "obstacle"]
+    gaps: Sequence[Gap] = ()
+    if rooms:
+        shapes = _without_containers(rooms, builder)
+        sketch.inner_walls = _free_standing(drawing, shapes)
+        builder.notes.append("rooms are the areas that the file names so")
+    else:
+        enclosed, what = _enclosed(drawing, budget, config)
+        gaps = enclosed.gaps
+        shapes = [Area(shape, "", "room") for shape in enclosed.rooms]
+        builder.notes.append(f"rooms are what {what} enclose; gaps up to {config.widest_gap:g} m were closed")
+    sketch.rooms = named_rooms(shapes, drawing.letterings, builder)
+    sketch.openings = [*_symbols(drawing), *_swings(drawing.swings, gaps, shapes)]
+    taken = shapely.union_all([opening.line.buffer(0.3) for opening in sketch.openings])
+    for gap in gaps:
+        line = shapely.LineString([gap.start, gap.end])
+        if taken.is_empty or shapely.intersection(line, taken).length < 0.3 * line.length:
+            sketch.openings.append(SketchedOpening("passage", gap.start, gap.end))
+            builder.unsure.append(
+                f"the gap of {gap.width:.2f} m at ({gap.start[0]:.2f}, {gap.start[1]:.2f}) has no symbol of a door or "
+                "window; it was taken for a passage"
+            )
+    budget.check_time()
+    return sketch
+
+
+def _free_standing(drawing: Drawing, rooms: Sequence[Area]) -> list[shapely.LineString]:
+    """Lines of walls that run through the inside of a room, away from its own walls."""
+    inner = [room.shape.buffer(-_OFF_WALL_M) for room in rooms]
+    tree = shapely.STRtree(inner)
+    pieces = _pieces(stroke.line for stroke in drawing.strokes if stroke.role == "wall")
+    return [piece for piece in pieces if len(tree.query(piece, predicate="within"))]
+
+
+def _without_containers(rooms: Sequence[Area], builder: ReportBuilder) -> list[Area]:
+    """Rooms without the outlines of flats and storeys around them, and each shape once."""
+    tree = shapely.STRtree([room.shape for room in rooms])
+    kept = []
+    for index, room in enumerate(rooms):
+        inside = [k for k in tree.query(room.shape) if k != index and _covers(room.shape, rooms[k].shape)]
+        same = [k for k in inside if _covers(rooms[k].shape, room.shape)]
+        if any(k < index for k in same):
+            continue
+        smaller = [rooms[k].shape for k in inside if k not in same]
+        if sum(shape.area for shape in smaller) > 0.5 * room.shape.area:
+            builder.notes.append(f"an outline of {room.shape.area:.1f} m² around {len(smaller)} rooms is no room")
+            continue
+        kept.append(room)
+    return kept
+
+
+def _covers(outer: shapely.Polygon, inner: shapely.Polygon) -> bool:
+    return outer.area >= 0.98 * inner.area and shapely.intersection(outer, inner).area > 0.95 * inner.area
+
+
+def _enclosed(drawing: Drawing, budget: Budget, config: WallConfig) -> tuple[Enclosed, str]:
+    """(what walls enclose, what was taken for walls)."""
+    named_bodies = [area.shape for area in drawing.areas if area.role == "wall"]
+    named_lines = [stroke.line for stroke in drawing.strokes if stroke.role == "wall"]
+    closers = _closers(drawing)
+    if named_bodies or named_lines:
+        outlines = [shape.exterior for shape in named_bodies if _is_outline(shape, config)]
+        bodies = [shape for shape in named_bodies if not _is_outline(shape, config)]
+        return enclose(bodies, _pieces([*named_lines, *outlines]), closers, config, budget.check_time), "the walls"
+    dark = [area.shape for area in drawing.areas if area.is_dark and area.role is None]
+    dark = [shape for shape in dark if not _is_outline(shape, config)]
+    thick = [stroke for stroke in drawing.strokes if stroke.role is None and _THICK_M[0] <= stroke.width <= _THICK_M[1]]
+    dark += [stroke.line.buffer(0.5 * stroke.width, cap_style="square", join_style="mitre") for stroke in thick]
+    if dark and (found := enclose(dark, [], closers, config, budget.check_time)).rooms:
+        return found, "the dark areas and thick lines"
+    unnamed = [stroke.line for stroke in drawing.strokes if stroke.role is None]
+    unnamed += [area.shape.exterior for area in drawing.areas if area.role is None]
+    return enclose([], _pieces(unnamed), closers, config, budget.check_time), "all lines"
+
+
+def _is_outline(shape: shapely.Polygon, config: WallConfig) -> bool:
+    """Closed polylines of walls are their bodies, or run along the faces of a whole room."""
+    return not shape.buffer(-0.5 * config.thickest).is_empty
+
+
+def _pieces(lines: Iterable[BaseGeometry]) -> list[shapely.LineString]:
+    pieces = []
+    for line in lines:
+        points = shapely.get_coordinates(line)
+        pieces += [shapely.LineString(pair) for pair in pairwise(points) if (pair[0] != pair[1]).any()]
+    if len(pieces) > _MAX_SEGMENTS:
+        raise InvalidFloorPlanError(
+            f"{len(pieces)} lines could be walls, at most {_MAX_SEGMENTS} are looked at; name the layers of the walls"
+        )
+    return pieces
+
+
+def _closers(drawing: Drawing) -> list[BaseGeometry]:
+    """Doors and windows that are drawn as areas across their wall, or lines in it."""
+    areas = [area.shape for area in drawing.areas if area.role in ("door", "window", "passage")]
+    panes = [stroke.line for stroke in drawing.strokes if stroke.role == "window"]
+    hulls = [shapely.convex_hull(cluster) for cluster in clusters(panes, _SYMBOL_M)]
+    windows: list[BaseGeometry] = [hull if hull.area > 0.0 else hull.buffer(0.002, cap_style="flat") for hull in hulls]
+    return [shape for shape in (*areas, *windows) if _sides(shape)[0] < 0.7]
+
+
+def _sides(shape: BaseGeometry) -> tuple[float, float]:
+    box = shapely.minimum_rotated_rectangle(shape)
+    points = shapely.get_coordinates(box)
+    if len(points) < 4:
+        return 0.0, float(shape.length)
+    first, second = np.linalg.norm(points[1] - points[0]), np.linalg.norm(points[2] - points[1])
+    return float(min(first, second)), float(max(first, second))
+
+
+def named_rooms(shapes: Sequence[Area], letterings: Sequence[Lettering], builder: ReportBuilder) -> list[SketchedRoom]:
+    """Rooms with the lettering that stands in them as their names: the first that has letters and is no size."""
+    tree = shapely.STRtree([area.shape for area in shapes])
+    texts: dict[int, list[str]] = {}
+    for lettering in letterings:
+        inside = tree.query(shapely.Point(lettering.at), predicate="within")
+        if len(inside):
+            smallest = min(inside, key=lambda index: shapes[index].shape.area)
+            texts.setdefault(int(smallest), []).append(lettering.text)
+    rooms = []
+    for index, area in enumerate(shapes):
+        words = [text for raw in texts.get(index, []) if _is_name(text := _without_size(raw))]
+        known = [text for text in words if type_of_room(text) is not None]
+        name = area.name or next(iter(known or words), None)
+        rooms.append(SketchedRoom(area.shape, name, type_of_room(area.kind) or type_of_room(name)))
+    without = sum(room.name is None for room in rooms)
+    if without:
+        builder.notes.append(f"{without} rooms have no name in the file")
+    return rooms
+
+
+def _without_size(text: str) -> str:
+    return _SIZE.sub("", text).strip(" ,;:-\n\t")
+
+
+def _is_name(text: str) -> bool:
+    """Neither a size ("12.5 m²", "3,20 x 4,10") nor a number of a door."""
+    letters = sum(character.isalpha() for character in text)
+    digits = sum(character.isdigit() for character in text)
+    return letters >= 2 and letters > digits
+
+
+def _symbols(drawing: Drawing) -> list[SketchedOpening]:
+    """Openings that are named so: each cluster of shapes that touch is one."""
+    found = []
+    for kind in ("door", "window", "passage"):
+        shapes: list[BaseGeometry] = [area.shape for area in drawing.areas if area.role == kind]
+        swinging = [swing for swing in drawing.swings if kind == "door"]
+        hinges = shapely.MultiPoint([swing.hinge for swing in swinging]) if swinging else None
+        shapes += [stroke.line for stroke in drawing.strokes if stroke.role == kind]
+        for cluster in clusters(shapes, _SYMBOL_M):
+            if hinges is not None and shapely.distance(cluster, hinges) < _SYMBOL_M:
+                continue  # The swing says more exactly where the door is.
+            found += _opening_of(kind, cluster)
+    return found
+
+
+def clusters(shapes: Sequence[BaseGeometry], reach_m: float) -> list[BaseGeometry]:
+    """Shapes that lie near each other, as one geometry each."""
+    if not shapes:
+        return []
+    around = shapely.unary_union([shape.buffer(0.5 * reach_m, quad_segs=2) for shape in shapes])
+    regions = list(shapely.get_parts(around))
+    tree = shapely.STRtree(regions)
+    members: dict[int, list[BaseGeometry]] = {}
+    for shape in shapes:
+        at = tree.query(shape, predicate="intersects")
+        if len(at):
+            members.setdefault(int(at[0]), []).append(shape)
+    return [shapely.GeometryCollection(group) for group in members.values()]
+
+
+def _opening_of(kind: OpeningKind, cluster: BaseGeometry) -> list[SketchedOpening]:
+    # A frame or threshold across the wall says more than the hull around it and the leaf.
+    frames = [part for part in shapely.get_parts(cluster) if part.area > 0.0 and _is_frame(part)]
+    ends = opening_line(max(frames, key=lambda part: part.area) if frames else shapely.convex_hull(cluster))
+    if ends is None or not _OPENING_M[0] <= math.dist(*ends) <= _OPENING_M[1]:
+        return []
+    return [SketchedOpening(kind, *ends)]
+
+
+def _is_frame(part: BaseGeometry) -> bool:
+    short, long = _sides(part)
+    return 0.02 <= short <= 0.6 and long >= max(1.3 * short, _OPENING_M[0])
+
+
+def _swings(swings: Sequence[Swing], gaps: Sequence[Gap], rooms: Sequence[Area]) -> list[SketchedOpening]:
+    """Doors from the quarter circles of leaves: the gap that a leaf closes, else the leaf where it lies in a wall."""
+    walls = shapely.union_all([area.shape.exterior for area in rooms]) if rooms else shapely.LineString()
+    found: list[SketchedOpening] = []
+    closed: set[int] = set()
+    for swing in swings:
+        if not _LEAF_M[0] <= swing.radius <= _LEAF_M[1]:
+            continue
+        index = _gap_of(swing, gaps)
+        if index is not None:
+            if index not in closed:
+                closed.add(index)
+                found.append(SketchedOpening("door", gaps[index].start, gaps[index].end))
+        elif not walls.is_empty:
+            found.append(_shut(swing, walls))
+    return found
+
+
+def _gap_of(swing: Swing, gaps: Sequence[Gap]) -> int | None:
+    """The gap that a leaf closes, one of two leaves included."""
+    best: tuple[float, int] | None = None
+    for index, gap in enumerate(gaps):
+        for near, far in ((gap.start, gap.end), (gap.end, gap.start)):
+            away = math.dist(swing.hinge, near)
+            shares = [leaves * swing.radius / max(gap.width, 1e-6) for leaves in (1, 2)]
+            fits = any(_LEAF_OF_GAP[0] <= share <= _LEAF_OF_GAP[1] for share in shares)
+            towards = min(math.dist(swing.first, far), math.dist(swing.last, far))
+            if away <= _HINGE_M and fits and towards <= gap.width and (best is None or away < best[0]):
+                best = (away, index)
+    return None if best is None else best[1]
+
+
+def _shut(swing: Swing, walls: BaseGeometry) -> SketchedOpening:
+    """The leaf in the position where it lies along a wall."""
+
+    def off(tip: tuple[float, float]) -> float:
+        line = shapely.LineString([swing.hinge, tip])
+        return max(shapely.distance(walls, line.interpolate(share, normalized=True)) for share in (0.2, 0.5, 0.9))
+
+    tip = min((swing.first, swing.last), key=off)
+    return SketchedOpening("door", swing.hinge, tip)

@@ -1,0 +1,202 @@
+"""What is drawn on a page of a PDF: paths, lettering and how much of it is a picture; points, y up."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pypdfium2
+import pypdfium2.raw as pdfium
+import shapely
+from jaxtyping import Float
+from shapely.geometry.base import BaseGeometry
+
+from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.importers.drawing.shapes import (
+    CURVE_STEPS,
+    DARK,
+    Area,
+    Drawing,
+    Lettering,
+    Stroke,
+    luminance,
+    swing_of,
+)
+from lalaloc_core.importers.model.geometry import polygons_of
+from lalaloc_core.importers.model.limits import Budget
+
+_MAX_FORM_DEPTH = 8
+_MAX_TEXTS, _MAX_LENGTH = 5000, 200
+Matrix = Float[np.ndarray, "3 3"]
+
+
+@dataclass
+class PageContent:
+    """A page as far as it is drawn with lines; `picture_share` is how much of it pictures cover."""
+
+    drawing: Drawing = field(default_factory=Drawing)
+    size_pt: tuple[float, float] = (0.0, 0.0)
+    picture_share: float = 0.0
+
+
+@dataclass
+class _Subpath:
+    points: list[tuple[float, float]] = field(default_factory=list)
+    curves: list[list[tuple[float, float]]] = field(default_factory=list)
+    was_curved: bool = False
+    is_closed: bool = False
+
+
+def open_page(content: bytes, number: int) -> tuple[pypdfium2.PdfDocument, pypdfium2.PdfPage]:
+    """A document and one of its pages, counted from 1; the caller closes the document.
+
+    Raises:
+        InvalidFloorPlanError: no PDF that can be read, an encrypted one, or no such page.
+    """
+    try:
+        document = pypdfium2.PdfDocument(content)
+        pages = len(document)
+    except pypdfium2.PdfiumError as error:
+        raise InvalidFloorPlanError(f"the PDF cannot be read, it is damaged or needs a password: {error}") from error
+    if number > pages:
+        document.close()
+        raise InvalidFloorPlanError(f"page is {number}, the PDF has {pages}")
+    try:
+        return document, document[number - 1]
+    except pypdfium2.PdfiumError as error:
+        document.close()
+        raise InvalidFloorPlanError(f"page {number} of the PDF cannot be read: {error}") from error
+
+
+def read_page(page: pypdfium2.PdfPage, budget: Budget) -> PageContent:
+    """Paths, texts and the share of pictures of a page."""
+    width, height = page.get_size()
+    found = PageContent(size_pt=(float(width), float(height)))
+    for item, matrix in _objects(
+        page.raw, pdfium.FPDFPage_CountObjects, pdfium.FPDFPage_GetObject, np.eye(3), budget, 0
+    ):
+        kind = pdfium.FPDFPageObj_GetType(item)
+        if kind == pdfium.FPDF_PAGEOBJ_PATH:
+            _add_path(item, matrix, found.drawing, budget)
+        elif kind == pdfium.FPDF_PAGEOBJ_IMAGE:
+            corners = _applied(matrix, [(0.0, 0.0), (1.0, 0.0), (1.0, 1.0), (0.0, 1.0)])
+            area = shapely.Polygon(corners).area if np.isfinite(corners).all() else 0.0
+            found.picture_share += min(area / max(width * height, 1.0), 1.0)
+    found.drawing.letterings = _letterings(page)
+    return found
+
+
+def _objects(
+    holder: Any, count: Any, get: Any, matrix: Matrix, budget: Budget, depth: int
+) -> Iterator[tuple[Any, Matrix]]:
+    """Objects with the matrix from their own coordinates to the page's; forms are opened."""
+    for index in range(count(holder)):
+        budget.spend()
+        item = get(holder, index)
+        own = pdfium.FS_MATRIX()
+        if not item or not pdfium.FPDFPageObj_GetMatrix(item, own):
+            continue
+        total = matrix @ np.array([[own.a, own.c, own.e], [own.b, own.d, own.f], [0.0, 0.0, 1.0]])
+        if pdfium.FPDFPageObj_GetType(item) != pdfium.FPDF_PAGEOBJ_FORM:
+            yield item, total
+        elif depth < _MAX_FORM_DEPTH:
+            yield from _objects(
+                item, pdfium.FPDFFormObj_CountObjects, pdfium.FPDFFormObj_GetObject, total, budget, depth + 1
+            )
+
+
+def _add_path(item: Any, matrix: Matrix, drawing: Drawing, budget: Budget) -> None:
+    fill, stroke = ctypes.c_int(), ctypes.c_int()
+    if not pdfium.FPDFPath_GetDrawMode(item, fill, stroke):
+        return
+    is_filled, is_stroked = fill.value != pdfium.FPDF_FILLMODE_NONE, bool(stroke.value)
+    is_dark = is_filled and _fill_luminance(item) < DARK
+    width = ctypes.c_float()
+    pdfium.FPDFPageObj_GetStrokeWidth(item, width)
+    pen = float(width.value) * float(np.sqrt(abs(np.linalg.det(matrix[:2, :2])))) if is_stroked else 0.0
+    shells: list[shapely.Polygon] = []
+    for subpath in _subpaths(item, budget):
+        points = _applied(matrix, subpath.points)
+        if not np.isfinite(points).all():
+            continue
+        swings = [swing_of(_applied(matrix, curve), "") for curve in subpath.curves] if len(subpath.curves) <= 2 else []
+        leaves = [swing for swing in swings if swing is not None]
+        if leaves and not is_filled:
+            drawing.swings += leaves
+        elif len(points) >= 3 and (subpath.is_closed or is_filled):
+            shells += polygons_of(shapely.Polygon(points))
+        elif len(points) >= 2 and is_stroked and shapely.LineString(points).length > 0.0:
+            drawing.strokes.append(Stroke(shapely.LineString(points), "", None, pen))
+    shape: BaseGeometry = shapely.Polygon()
+    for shell in shells:
+        shape = shapely.symmetric_difference(shape, shell)
+    if is_filled and not is_dark and not is_stroked:
+        return  # A coloured floor or a white background: its edge is no line that was drawn.
+    drawing.areas += [Area(part, "", None, is_dark=is_dark) for part in polygons_of(shape)]
+
+
+def _subpaths(item: Any, budget: Budget) -> list[_Subpath]:
+    count = pdfium.FPDFPath_CountSegments(item)
+    budget.spend(max(count, 0))
+    paths: list[_Subpath] = []
+    bezier: list[tuple[float, float]] = []
+    x, y = ctypes.c_float(), ctypes.c_float()
+    for index in range(count):
+        segment = pdfium.FPDFPath_GetPathSegment(item, index)
+        if not pdfium.FPDFPathSegment_GetPoint(segment, x, y):
+            continue
+        point = (float(x.value), float(y.value))
+        kind = pdfium.FPDFPathSegment_GetType(segment)
+        if kind == pdfium.FPDF_SEGMENT_MOVETO or not paths:
+            paths.append(_Subpath([point]))
+            bezier = []
+        elif kind == pdfium.FPDF_SEGMENT_BEZIERTO:
+            bezier.append(point)
+            if len(bezier) == 3:
+                _add_curve(paths[-1], bezier)
+                bezier = []
+        else:
+            paths[-1].points.append(point)
+            paths[-1].was_curved = False
+        paths[-1].is_closed |= bool(pdfium.FPDFPathSegment_GetClose(segment))
+    return [path for path in paths if len(path.points) > 1]
+
+
+def _add_curve(path: _Subpath, control: list[tuple[float, float]]) -> None:
+    start, (a, b, end) = np.array(path.points[-1]), (np.array(point) for point in control)
+    t = np.linspace(0.0, 1.0, CURVE_STEPS + 1)[1:, None]
+    points = (1 - t) ** 3 * start + 3 * (1 - t) ** 2 * t * a + 3 * (1 - t) * t**2 * b + t**3 * end
+    piece = [(float(px), float(py)) for px, py in points]
+    if path.was_curved:
+        path.curves[-1] += piece
+    else:
+        path.curves.append([path.points[-1], *piece])
+    path.points += piece
+    path.was_curved = True
+
+
+def _applied(matrix: Matrix, points: list[tuple[float, float]]) -> Float[np.ndarray, "n 2"]:
+    array = np.array(points, dtype=float).reshape(-1, 2)
+    return array @ matrix[:2, :2].T + matrix[:2, 2]
+
+
+def _fill_luminance(item: Any) -> float:
+    red, green, blue, alpha = (ctypes.c_uint() for _ in range(4))
+    if not pdfium.FPDFPageObj_GetFillColor(item, red, green, blue, alpha) or alpha.value < 60:
+        return 255.0
+    return luminance(float(red.value), float(green.value), float(blue.value))
+
+
+def _letterings(page: pypdfium2.PdfPage) -> list[Lettering]:
+    text = page.get_textpage()
+    found = []
+    for index in range(min(text.count_rects(), _MAX_TEXTS)):
+        left, bottom, right, top = text.get_rect(index)
+        words = " ".join(text.get_text_bounded(left, bottom, right, top).split())[:_MAX_LENGTH]
+        if words:
+            found.append(Lettering(words, (0.5 * (left + right), 0.5 * (bottom + top))))
+    text.close()
+    return found

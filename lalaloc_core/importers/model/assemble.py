@@ -1,0 +1,240 @@
+"""From a sketch to a plan in the native format."""
+
+from __future__ import annotations
+
+import math
+import unicodedata
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import shapely
+from shapely import affinity
+from shapely.geometry.base import BaseGeometry
+
+from lalaloc_core.floorplan.earth import Anchor
+from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan import DEFAULT_LIMITS, FloorPlan, PlanLimits, anchor_document
+from lalaloc_core.importers.model.checks import check_document
+from lalaloc_core.importers.model.geometry import polygons_of
+from lalaloc_core.importers.model.options import ImportOptions
+from lalaloc_core.importers.model.report import ImportReport, ReportBuilder
+from lalaloc_core.importers.model.settle import settle_openings
+from lalaloc_core.importers.model.sketch import Level, Sketch, SketchedOpening, SketchedRoom
+from lalaloc_core.importers.model.words import type_of_room
+
+DEFAULT_CEILING_HEIGHT_M = 2.5
+# Rounding of a drawing: vertices this far off a straight wall are not corners, slivers this small are no floor.
+_STRAIGHT_M, _SLIVER_M2 = 0.002, 0.01
+_FAR_M = 10_000.0
+# As far from an anchor directions and lengths are right to a few centimetres.
+_MAX_ANCHOR_SHIFT_M = 20_000.0
+# A tenth of a millimetre is finer than anything that is built.
+_GRID_M, _DECIMALS = 1e-4, 4
+_MAX_NAMED = 5
+
+
+@dataclass(frozen=True, eq=False)
+class ImportedPlan:
+    """One storey of a file, understood.
+
+    Attributes:
+        document: the plan in the native format.
+        report: what was used for what, and what is likely wrong.
+        level: the storey, where the file says.
+        anchor: where on Earth the plan's origin lies, where the file says.
+        checked: the plan, and the limits that it was validated under.
+    """
+
+    document: dict[str, Any]
+    report: ImportReport
+    level: Level | None = None
+    anchor: Anchor | None = None
+    checked: tuple[PlanLimits, FloorPlan] | None = field(default=None, repr=False)
+
+    def plan(self, limits: PlanLimits = DEFAULT_LIMITS) -> FloorPlan:
+        """The validated plan.
+
+        Raises:
+            InvalidFloorPlanError: the document breaks a rule of plans.
+        """
+        if self.checked is not None and self.checked[0] == limits:
+            return self.checked[1]
+        return FloorPlan.from_dict(self.document, limits)
+
+
+def assemble(
+    sketch: Sketch,
+    builder: ReportBuilder,
+    options: ImportOptions,
+    *,
+    format: str,
+    metres_per_unit: float,
+    scale_source: str,
+    is_draft: bool = False,
+) -> ImportedPlan:
+    """Make a plan of a sketch in metres, y up.
+
+    Raises:
+        InvalidFloorPlanError: no rooms, or a plan that breaks the format's rules.
+    """
+    rooms = [room for each in sketch.rooms for room in _clean(each, sketch.obstacles, builder)]
+    if not rooms:
+        raise InvalidFloorPlanError(f"no room was found in the {format} file; {_what_was_there(builder)}")
+    rooms, moved = _near_origin(rooms, builder)
+    openings = [_moved(opening, moved) for opening in sketch.openings]
+    settled = settle_openings(openings, [room.shape for room in rooms])
+    if settled.off_wall:
+        places = ", ".join(f"({o.start[0]:.2f}, {o.start[1]:.2f})" for o in settled.off_wall[:_MAX_NAMED])
+        builder.warnings.append(
+            f"{len(settled.off_wall)} openings lie on no wall and were left out, such as at {places}"
+        )
+    if settled.merged:
+        builder.notes.append(f"{settled.merged} openings that overlap others were left out")
+    document: dict[str, Any] = {"name": options.name or clean_name(sketch.name) or "floor plan"}
+    if sketch.north_deg is not None:
+        document["north_deg"] = round(sketch.north_deg % 360.0, 6)
+    anchor = _anchor_moved(sketch.anchor, moved, builder)
+    if anchor is not None:
+        document["north_deg"] = round(anchor.north_deg % 360.0, 6)
+        document["anchor"] = anchor_document(anchor)
+    document["ceiling_height_m"] = _usual_ceiling(rooms, options, builder)
+    document["rooms"] = [_room(room, document["ceiling_height_m"], sketch, moved) for room in rooms]
+    if settled.openings:
+        document["openings"] = [_opening(opening) for opening in settled.openings]
+    if sketch.opening_kinds is not None:
+        document["opening_kinds"] = list(sketch.opening_kinds)
+    builder.warnings.extend(check_document(document))
+    # Refused here, with what the file says, rather than at whoever uses the plan.
+    checked = (DEFAULT_LIMITS, FloorPlan.from_dict(document))
+    report = builder.build(format, metres_per_unit, scale_source, is_draft=is_draft)
+    return ImportedPlan(document, report, sketch.level, anchor, checked)
+
+
+def clean_name(name: str | None, limit: int = DEFAULT_LIMITS.max_name_length) -> str | None:
+    """A name without control characters, at most as long as the format allows; None where nothing is left."""
+    if name is None:
+        return None
+    spaced = "".join(" " if unicodedata.category(c) in {"Cc", "Cs", "Zl", "Zp"} else c for c in name)
+    return " ".join(spaced.split())[:limit] or None
+
+
+def _clean(room: SketchedRoom, obstacles: list[shapely.Polygon], builder: ReportBuilder) -> list[SketchedRoom]:
+    shape = room.shape
+    for obstacle in obstacles:
+        if obstacle.intersects(shape):
+            shape = shapely.difference(shape, obstacle)
+    floors = [simple for floor in polygons_of(shape) for simple in _simple(floor.simplify(_STRAIGHT_M))]
+    floors = [floor for floor in floors if floor.area >= DEFAULT_LIMITS.min_room_area_m2]
+    label = f"room '{room.name}'" if room.name else "a room without a name"
+    if not floors and room.shape.area < _SLIVER_M2:
+        return []
+    if not floors:
+        builder.notes.append(f"{label} of {room.shape.area:.2g} m² was left out: too small for a room")
+        return []
+    if len(floors) > 1:
+        builder.warnings.append(f"{label} falls into {len(floors)} parts; each became a room")
+    cleaned = []
+    for floor in floors:
+        holes = [ring for ring in floor.interiors if shapely.Polygon(ring).area >= _SLIVER_M2]
+        shape = shapely.Polygon(floor.exterior, holes)
+        name = clean_name(room.name)
+        kind = room.type or type_of_room(name)
+        cleaned.append(SketchedRoom(shape, name, kind, room.ceiling_height_m, room.id))
+    return cleaned
+
+
+def _simple(floor: BaseGeometry) -> list[shapely.Polygon]:
+    """Polygons whose outlines touch themselves nowhere, on the grid that coordinates are written on."""
+    found = []
+    for part in polygons_of(shapely.transform(floor, lambda points: points.round(_DECIMALS))):
+        if shapely.Polygon(part.exterior).is_valid:
+            found.append(part)
+        else:
+            apart = part.buffer(-10.0 * _GRID_M).buffer(10.0 * _GRID_M, join_style="mitre")
+            found += polygons_of(shapely.set_precision(apart, _GRID_M))
+    return found
+
+
+def _near_origin(rooms: list[SketchedRoom], builder: ReportBuilder) -> tuple[list[SketchedRoom], tuple[float, float]]:
+    """Plans far from their origin (national grids) are moved to it; how far, says the report."""
+    x0, y0, x1, y1 = shapely.total_bounds([room.shape for room in rooms])
+    if max(abs(x0), abs(y0), abs(x1), abs(y1)) <= _FAR_M:
+        return rooms, (0.0, 0.0)
+    dx, dy = -math.floor(x0), -math.floor(y0)
+    builder.notes.append(f"the plan was moved by ({dx}, {dy}) m, so that it lies near its origin")
+    moved = [SketchedRoom(affinity.translate(r.shape, dx, dy), r.name, r.type, r.ceiling_height_m, r.id) for r in rooms]
+    return moved, (dx, dy)
+
+
+def _anchor_moved(anchor: Anchor | None, by: tuple[float, float], builder: ReportBuilder) -> Anchor | None:
+    """The anchor of the moved plan; where it was moved far, its place cannot be told any more."""
+    if anchor is None or by == (0.0, 0.0):
+        return anchor
+    if math.hypot(*by) > _MAX_ANCHOR_SHIFT_M:
+        away_km = math.hypot(*by) / 1000.0
+        builder.warnings.append(f"the file's origin lies {away_km:.0f} km away: the place on Earth was left out")
+        return None
+    return anchor.moved((-by[0], -by[1]))
+
+
+def _moved(opening: SketchedOpening, by: tuple[float, float]) -> SketchedOpening:
+    (x0, y0), (x1, y1), (dx, dy) = opening.start, opening.end, by
+    ends = (x0 + dx, y0 + dy), (x1 + dx, y1 + dy)
+    return SketchedOpening(opening.kind, *ends, opening.name, opening.sill_m, opening.head_m)
+
+
+def _usual_ceiling(rooms: list[SketchedRoom], options: ImportOptions, builder: ReportBuilder) -> float:
+    known = [room.ceiling_height_m for room in rooms if room.ceiling_height_m is not None]
+    if options.ceiling_height_m is not None:
+        return options.ceiling_height_m
+    if known:
+        return round(float(np.median(known)), 4)
+    builder.unsure.append(
+        f"the file gives no ceiling height, {DEFAULT_CEILING_HEIGHT_M:g} m was assumed; ceiling_height_m says another"
+    )
+    return DEFAULT_CEILING_HEIGHT_M
+
+
+def _room(room: SketchedRoom, ceiling_m: float, sketch: Sketch, moved: tuple[float, float]) -> dict[str, Any]:
+    said: dict[str, Any] = {"polygon": _ring(room.shape.exterior)}
+    if room.name:
+        said = {"name": room.name} | said
+    if room.type:
+        said["type"] = room.type
+    if room.shape.interiors:
+        said["holes"] = [_ring(ring) for ring in room.shape.interiors]
+    walls = [affinity.translate(wall, *moved) for wall in sketch.inner_walls]
+    inner_walls = [wall for wall in walls if room.shape.contains(wall)]
+    if inner_walls:
+        said["walls"] = [[_xy(point) for point in wall.coords] for wall in inner_walls]
+    if room.ceiling_height_m is not None and abs(room.ceiling_height_m - ceiling_m) > 1e-6:
+        said["ceiling_height_m"] = round(room.ceiling_height_m, 4)
+    return said
+
+
+def _opening(opening: SketchedOpening) -> dict[str, Any]:
+    said: dict[str, Any] = {"kind": opening.kind, "line": [_xy(opening.start), _xy(opening.end)]}
+    name = clean_name(opening.name)
+    if name:
+        said["name"] = name
+    # Both or neither, and only what can be: a sill below its head.
+    sill, head = opening.sill_m, opening.head_m
+    if head is not None and head > max(sill or 0.0, 0.0):
+        said["head_m"] = round(head, 4)
+        if sill is not None and sill >= 0.0:
+            said["sill_m"] = round(sill, 4)
+    return said
+
+
+def _ring(ring: shapely.LinearRing) -> list[list[float]]:
+    return [_xy(point) for point in ring.coords[:-1]]
+
+
+def _xy(point: tuple[float, ...]) -> list[float]:
+    return [round(float(point[0]), _DECIMALS) + 0.0, round(float(point[1]), _DECIMALS) + 0.0]
+
+
+def _what_was_there(builder: ReportBuilder) -> str:
+    used = [f"{count} {use} on '{layer}'" for (layer, use), count in sorted(builder.uses.items())][:_MAX_NAMED]
+    return "it has " + ", ".join(used) if used else "it holds nothing that could be one"

@@ -1,0 +1,205 @@
+"""Which ink is wall: dark and thick, or two lines and what lies between them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import shapely
+from jaxtyping import Bool, Float, Int
+
+from lalaloc_core.importers.model.geometry import cross, polygons_of
+from lalaloc_core.importers.picture.ink import Ink
+
+# Lengths in metres.
+_MIN_THICKNESS_M = 0.055
+# White between the two lines of a wall is no wider; the sector of a door's swing is.
+_MAX_CAVITY_M = 0.42
+_SMALL_M = 1.2
+_STRAIGHT_M, _STRAIGHT_PX = 0.012, 1.3
+# Walls are alike in thickness; a chair, a letter or a basin is not. Thicker pieces that are filled have pillars.
+_ALIKE, _FILLED = (0.6, 2.5), (0.6, 3.0)
+# Where walls meet, the white between their lines is wider than in a wall; of walls it is so on a small part only.
+_WIDE_PART = 0.15
+# A corner that is cut off by less than this is one (m), where the walls turn by about a right angle in all (its sine).
+_CUT_CORNER_M, _SQUARE = 0.07, 0.8
+# The stroke of a pane is as thick as a thin wall, but so much paler (of 255), thinner than its wall, and so long.
+_PALER, _THINNER, _STROKE_M = 45.0, 0.55, 0.3
+
+
+@dataclass(frozen=True, eq=False)
+class WallMask:
+    """Walls as pixels.
+
+    Attributes:
+        mask: True in walls.
+        thickness_m: of the usual wall.
+        cavities: labels of the white areas inside the walls, 0 elsewhere; None where walls are dark.
+    """
+
+    mask: Bool[np.ndarray, "h w"]
+    thickness_m: float
+    cavities: Int[np.ndarray, "h w"] | None
+
+
+def dark_walls(ink: Ink) -> WallMask | None:
+    """Walls that are filled: what stays of the ink when thin lines, and broad ones of another tone, are taken away."""
+    walls = _walls(ink, ink.mask, None)
+    if walls is None:
+        return None
+    strokes = _pale_strokes(ink, walls)
+    return _walls(ink, ink.mask & ~strokes, None) if strokes.any() else walls
+
+
+def _pale_strokes(ink: Ink, walls: WallMask) -> Bool[np.ndarray, "h w"]:
+    """Strokes of doors and windows that are as broad as thin walls: much paler, and thinner than most walls."""
+    tone = float(np.median(ink.gray[cv2.erode(walls.mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0]))
+    pale = (ink.mask & (ink.gray > tone + _PALER)).astype(np.uint8)
+    # The rims of dark walls are pale as well, but only a pixel or two.
+    _, found, stats, _ = cv2.connectedComponentsWithStats(
+        cv2.morphologyEx(pale, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)), connectivity=8
+    )
+    long = stats[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1)
+    # As thick as a strip of that length that has this area.
+    thick = stats[:, cv2.CC_STAT_AREA] / np.maximum(long, 1)
+    pixel = ink.metres_per_pixel
+    is_stroke = (long * pixel >= _STROKE_M) & (thick * pixel <= _THINNER * walls.thickness_m)
+    is_stroke[0] = False
+    strokes = is_stroke[np.asarray(found, dtype=np.int32)].astype(np.uint8)
+    return (cv2.dilate(strokes, np.ones((5, 5), np.uint8)) > 0) & (pale > 0)
+
+
+def outlined_walls(ink: Ink) -> WallMask | None:
+    """Walls that are drawn with two lines, hatched or not: the ink, and the narrow white areas that it encloses."""
+    white = (~ink.mask).astype(np.uint8)
+    count, found = cv2.connectedComponents(white, connectivity=4)
+    labels = np.asarray(found, dtype=np.int32)
+    depth = cv2.distanceTransform(white, cv2.DIST_L2, 5)
+    deepest = np.zeros(count)
+    np.maximum.at(deepest, labels.ravel(), depth.ravel())
+    is_cavity = 2.0 * deepest * ink.metres_per_pixel <= _MAX_CAVITY_M
+    is_cavity |= _is_narrow(labels, depth * ink.metres_per_pixel, count)
+    is_cavity[0] = False
+    return _walls(ink, ink.mask | is_cavity[labels], np.where(is_cavity[labels], labels, 0))
+
+
+def _is_narrow(labels: Int[np.ndarray, "h w"], depth_m: Float[np.ndarray, "h w"], count: int) -> Bool[np.ndarray, "n"]:
+    """Which white areas are as narrow as a wall nearly everywhere, and but a little wider elsewhere."""
+    area = np.bincount(labels.ravel(), minlength=count)
+    reach = 0.5 * _MAX_CAVITY_M
+    middle = labels[depth_m > reach]
+    deepest = np.zeros(count)
+    np.maximum.at(deepest, labels.ravel(), depth_m.ravel())
+    # What a disc as wide as the widest cavity covers is not only its centres.
+    wide = 3.0 * np.bincount(middle, minlength=count)
+    return (wide <= _WIDE_PART * area) & (deepest <= 1.5 * reach)
+
+
+def _walls(ink: Ink, filled: Bool[np.ndarray, "h w"], cavities: Int[np.ndarray, "h w"] | None) -> WallMask | None:
+    size = max(3, round(_MIN_THICKNESS_M / ink.metres_per_pixel))
+    thick = cv2.morphologyEx(filled.astype(np.uint8), cv2.MORPH_OPEN, np.ones((size, size), np.uint8))
+    thickness = _usual_thickness(thick) * ink.metres_per_pixel
+    if thickness < _MIN_THICKNESS_M:
+        return None  # Strokes of a hatch that run together are no walls.
+    alike = _FILLED if cavities is None else _ALIKE
+    kept = _without_furniture(thick, thickness / ink.metres_per_pixel, ink.metres_per_pixel, alike)
+    return WallMask(kept, thickness, cavities) if kept.any() else None
+
+
+def _usual_thickness(mask: np.ndarray) -> float:
+    """Thickness of walls in pixels: the median over the middle lines of what is large; 0 where there is nothing."""
+    depth = cv2.distanceTransform(mask, cv2.DIST_L2, 5)
+    ridge = (depth > 0.0) & (depth >= cv2.dilate(depth, np.ones((3, 3), np.uint8)) - 1e-3)
+    values = depth[ridge].astype(np.float64)
+    return 2.0 * float(np.median(values)) - 1.0 if len(values) and not mask.all() else 0.0
+
+
+def _without_furniture(
+    mask: np.ndarray, thickness: float, metres_per_pixel: float, alike: tuple[float, float]
+) -> Bool[np.ndarray, "h w"]:
+    """Small pieces stay only where they are as thick as a wall, corners between two windows included.
+
+    Args:
+        alike: how thick pieces are at least and at most, in units of the thickness of walls.
+    """
+    count, found, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
+    labels = np.asarray(found, dtype=np.int32)
+    depth = cv2.distanceTransform(mask, cv2.DIST_L2, 5)
+    deepest = np.zeros(count)
+    np.maximum.at(deepest, labels.ravel(), depth.ravel())
+    is_large = stats[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1) * metres_per_pixel >= _SMALL_M
+    # A corner is deeper than its two walls are thick, by the half of a diagonal.
+    thick = 2.0 * deepest - 1.0
+    keep = is_large | ((thick >= alike[0] * thickness) & (thick <= alike[1] * thickness))
+    keep[0] = False
+    return keep[labels]
+
+
+def bodies_of(walls: WallMask, ink: Ink) -> list[shapely.Polygon]:
+    """Walls as polygons in plan metres, straightened."""
+    contours, hierarchy = cv2.findContours(walls.mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    if hierarchy is None:
+        return []
+    straight = max(_STRAIGHT_PX * ink.metres_per_pixel, _STRAIGHT_M)
+    holes: dict[int, list[np.ndarray]] = {}
+    for index, (_, _, _, parent) in enumerate(hierarchy.reshape(-1, 4)):
+        if parent >= 0:
+            holes.setdefault(int(parent), []).append(contours[index])
+    found: list[shapely.Polygon] = []
+    for index, (_, _, _, parent) in enumerate(hierarchy.reshape(-1, 4)):
+        if parent >= 0 or len(contours[index]) < 3:
+            continue
+        inner = [ring for hole in holes.get(index, []) if len(ring := _ring(hole, ink)) >= 3]
+        shell = shapely.Polygon(_ring(contours[index], ink), inner)
+        # Contours run through the centres of a wall's own pixels; the wall reaches half a pixel farther.
+        grown = [part.buffer(0.5 * ink.metres_per_pixel, join_style="mitre") for part in polygons_of(shell)]
+        found += [straightened(part) for shape in grown for part in polygons_of(shape.simplify(straight))]
+    return found
+
+
+def _ring(contour: np.ndarray, ink: Ink) -> np.ndarray:
+    return ink.to_plan(contour.reshape(-1, 2) + 0.5)
+
+
+def straightened(shape: shapely.Polygon, tolerance_deg: float = 6.0, reach_m: float = 0.06) -> shapely.Polygon:
+    """A polygon whose edges that nearly run along the axes do so exactly; the same where that would spoil it."""
+    rings = [
+        _straight_ring(_sharp_ring(np.asarray(ring.coords)[:-1]), tolerance_deg, reach_m)
+        for ring in (shape.exterior, *shape.interiors)
+    ]
+    straight = shapely.Polygon(rings[0], rings[1:])
+    if not straight.is_valid or abs(straight.area - shape.area) > 0.05 * shape.area:
+        return shape
+    return straight
+
+
+def _sharp_ring(points: np.ndarray) -> np.ndarray:
+    """The ring with the corners that pixels round made sharp: edges so short that turn by two obtuse angles."""
+    kept = list(points)
+    index = 0
+    while len(kept) > 4 and index < len(kept):
+        before, a, b, after = (kept[(index + k) % len(kept)] for k in (-1, 0, 1, 2))
+        first, edge, last = a - before, b - a, after - b
+        lengths = [float(np.linalg.norm(step)) for step in (first, edge, last)]
+        turns = cross(first, edge), cross(edge, last), cross(first, last)
+        is_cut = 0.0 < lengths[1] < _CUT_CORNER_M and min(lengths[0], lengths[2]) > lengths[1]
+        if is_cut and turns[0] * turns[1] > 0.0 and abs(turns[2]) > _SQUARE * lengths[0] * lengths[2]:
+            kept[index] = a + first * (cross(edge, last) / turns[2])
+            del kept[(index + 1) % len(kept)]
+        index += 1
+    return np.array(kept)
+
+
+def _straight_ring(points: np.ndarray, tolerance_deg: float, reach_m: float) -> np.ndarray:
+    points = points.copy()
+    steps = np.roll(points, -1, axis=0) - points
+    slope = np.tan(np.radians(tolerance_deg))
+    for axis in (0, 1):
+        along, across = np.abs(steps[:, 1 - axis]), np.abs(steps[:, axis])
+        flat = (across <= slope * along) | ((across < reach_m) & (along > 2.0 * across))
+        for index in np.flatnonzero(flat):
+            other = (index + 1) % len(points)
+            middle = 0.5 * (points[index, axis] + points[other, axis])
+            points[[index, other], axis] = middle
+    return points

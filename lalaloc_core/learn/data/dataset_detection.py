@@ -1,0 +1,54 @@
+"""Which format of data set a folder holds, as its files show, and the reader of it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from lalaloc_core.learn.data.annotated import AnnotatedPhotographs, annotation_files
+from lalaloc_core.learn.data.dataset import DATASET_FORMATS, Dataset
+from lalaloc_core.learn.data.folder import PLAN_FILE, OwnData
+from lalaloc_core.learn.data.structured3d import Structured3D
+from lalaloc_core.learn.data.zind import DATA_FILE, PARTITION_FILE, Zind
+from lalaloc_core.errors import DatasetError
+
+_STRUCTURED3D_SCENES = "scene_" + 5 * "[0-9]"
+
+
+def open_dataset(root: Path, dataset_format: str | None = None) -> Dataset:
+    """The data set that a folder holds.
+
+    Args:
+        dataset_format: which of `dataset.DATASET_FORMATS` to read; None finds it out.
+
+    Raises:
+        DatasetError: there is no such folder, it holds none of the known formats or not the one that is asked for, or
+            it holds more than one and none is asked for.
+    """
+    if not root.exists():
+        raise DatasetError("there is no such folder", path=root)
+    if not root.is_dir():
+        raise DatasetError("a data set is a folder, this is a file", path=root)
+    found: dict[str, Dataset] = {}
+    if any(path.is_dir() and not (path / PLAN_FILE).exists() for path in root.glob(_STRUCTURED3D_SCENES)):
+        found["Structured3D"] = Structured3D(root)
+    if (root / PARTITION_FILE).exists() or next(root.glob(f"*/{DATA_FILE}"), None) is not None:
+        found["ZInD"] = Zind(root)
+    if next(root.glob(f"*/{PLAN_FILE}"), None) is not None:
+        found["own data"] = OwnData(root)
+    if annotation_files(root):
+        found["annotated photographs"] = AnnotatedPhotographs(root)
+    if dataset_format is not None:
+        wanted = DATASET_FORMATS[dataset_format]
+        if wanted not in found:
+            raise DatasetError(f"no {wanted} here; found: {', '.join(found) or 'nothing known'}", path=root)
+        return found[wanted]
+    if len(found) > 1:
+        raise DatasetError(f"the folder holds several data sets: {', '.join(found)}", path=root)
+    if not found:
+        raise DatasetError(
+            "no data set here; looked for folders 'scene_00000' (Structured3D), "
+            f"'{PARTITION_FILE}' or '*/{DATA_FILE}' (ZInD), '*/{PLAN_FILE}' (own data), and "
+            "'*.json' with 'photograph' and 'polygon' (annotated photographs)",
+            path=root,
+        )
+    return next(iter(found.values()))

@@ -1,0 +1,206 @@
+"""A user's own data: plans in the native format, panoramas, and a table of where each was taken.
+
+    ROOT/<scene>/plan.json      the floor plan (docs/conventions.md)
+    ROOT/<scene>/poses.csv      panorama,x_m,y_m,heading_deg,camera_height_m
+    ROOT/<scene>/...            the panoramas, named in poses.csv by their path below the scene's folder
+    ROOT/splits.csv             scene,split; without it every scene is a test scene
+
+The column `camera_height_m`, or any cell of it, may be left out: the plan's camera height then holds.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import shapely
+
+from lalaloc_core.conventions import heading_from_degrees
+from lalaloc_core.learn.data.assembly import inside, pose_fault
+from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene, Split
+from lalaloc_core.learn.data.photographs import FilePhotograph
+from lalaloc_core.errors import DatasetError, InvalidFloorPlanError
+from lalaloc_core.floorplan import FloorPlan
+
+PLAN_FILE = "plan.json"
+POSES_FILE = "poses.csv"
+SPLITS_FILE = "splits.csv"
+
+_REQUIRED = ("panorama", "x_m", "y_m", "heading_deg")
+_OPTIONAL = ("camera_height_m",)
+# Beyond any plan, and far enough to say that a number was meant in another unit.
+_MAX_COORDINATE_M = 100_000.0
+
+
+@dataclass(frozen=True)
+class OwnData:
+    """A folder of a user's own scenes."""
+
+    root: Path
+
+    @property
+    def description(self) -> str:
+        return f"own data ({self.root.resolve().name})"
+
+    @property
+    def appearances(self) -> Sequence[Appearance]:
+        return (Appearance(),)
+
+    def scenes(self, split: Split) -> Sequence[str]:
+        """Scenes of a split by name.
+
+        Raises:
+            DatasetError: the table of splits is damaged, or does not fit the folders.
+        """
+        return [name for name, of in self._splits.items() if of == split]
+
+    def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
+        folder = inside(self.root, name)
+        if folder is None or not (folder / PLAN_FILE).is_file():
+            raise DatasetError(f"no such scene: it has no {PLAN_FILE}", scene=name, path=self.root / PLAN_FILE)
+        plan = _read_plan(folder / PLAN_FILE, name)
+        cameras: dict[str, Camera] = {}
+        for row in _read_table(folder / POSES_FILE, _REQUIRED, _OPTIONAL, scene=name):
+            try:
+                camera = _camera(row, plan, folder)
+                if camera.name in cameras:
+                    raise row.error("panorama", "it stands in an earlier line already")
+                cameras[camera.name] = camera
+            except DatasetError as error:
+                if problems is None:
+                    raise
+                problems.append(error)
+        return Scene(name=name, plan=plan, cameras=tuple(cameras.values()))
+
+    @cached_property
+    def _splits(self) -> dict[str, Split]:
+        """Split of every scene, in the order of names."""
+        here = sorted(path.parent.name for path in self.root.glob(f"*/{PLAN_FILE}"))
+        path = self.root / SPLITS_FILE
+        if not path.exists():
+            return dict.fromkeys(here, "test")
+        found: dict[str, Split] = {}
+        for row in _read_table(path, ("scene", "split"), (), scene=None):
+            scene, split = row.cells["scene"], row.cells["split"]
+            if split not in get_args(Split):
+                raise row.error("split", f"it must be one of {', '.join(get_args(Split))}")
+            if scene not in here:
+                raise row.error("scene", f"there is no {PLAN_FILE} in a folder of this name")
+            if scene in found:
+                raise row.error("scene", "it stands in an earlier line already")
+            found[scene] = split  # type: ignore[assignment]
+        missing = [name for name in here if name not in found]
+        if missing:
+            raise DatasetError("the scene has no line here", scene=missing[0], path=path)
+        return {name: found[name] for name in here}
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Row:
+    """One line of a table."""
+
+    path: Path
+    scene: str | None
+    line: int
+    cells: Mapping[str, str]
+
+    def number(self, column: str, low: float, high: float) -> float:
+        """A cell as a number from `low` to `high`."""
+        try:
+            value = float(self.cells[column])
+        except ValueError:
+            raise self.error(column, "it must be a number") from None
+        if not math.isfinite(value) or not low <= value <= high:
+            raise self.error(column, f"it must lie between {low:g} and {high:g}")
+        return value
+
+    def error(self, column: str, reason: str) -> DatasetError:
+        """An error that names line, column and value, and the panorama where the table has one."""
+        shown = f"line {self.line}, column '{column}' is '{self.cells[column][:80]}': {reason}"
+        return DatasetError(shown, scene=self.scene, room=self.cells.get("panorama") or None, path=self.path)
+
+
+def _camera(row: _Row, plan: FloorPlan, folder: Path) -> Camera:
+    panorama = row.cells["panorama"]
+    path = inside(folder, panorama)
+    if path is None:
+        raise row.error("panorama", "it must be a path below the scene's folder")
+    if not path.is_file():
+        raise row.error("panorama", "there is no such file")
+    x_m = row.number("x_m", -_MAX_COORDINATE_M, _MAX_COORDINATE_M)
+    y_m = row.number("y_m", -_MAX_COORDINATE_M, _MAX_COORDINATE_M)
+    heading_deg = row.number("heading_deg", -360.0, 360.0)
+    height_m = plan.camera_height_m
+    if row.cells.get("camera_height_m"):
+        height_m = row.number("camera_height_m", 0.0, float(plan.ceiling_heights_m.max()))
+    position_m = np.array([x_m, y_m])
+    room_index = int(plan.room_index_at(position_m[None])[0])
+    if room_index < 0:
+        away_m, nearest = min((float(room.shape.distance(shapely.Point(position_m))), room.name) for room in plan.rooms)
+        raise row.error("x_m", f"({x_m:g}, {y_m:g}) m lies in no room; the nearest is '{nearest}', {away_m:.3g} m away")
+    fault = pose_fault(plan, room_index, position_m, height_m)
+    if fault is not None:
+        raise row.error("camera_height_m" if row.cells.get("camera_height_m") else "panorama", fault)
+    return Camera(
+        name=panorama,
+        position_m=position_m,
+        room_index=room_index,
+        heading=heading_from_degrees(heading_deg),
+        camera_height_m=height_m,
+        photographs={Appearance(): FilePhotograph(path=path, scene=row.scene or "", room=panorama)},
+    )
+
+
+def _read_plan(path: Path, scene: str) -> FloorPlan:
+    try:
+        return FloorPlan.from_json(path.read_bytes())
+    except OSError as error:
+        raise DatasetError(f"cannot be read: {error.strerror}", scene=scene, path=path) from error
+    except InvalidFloorPlanError as error:
+        raise DatasetError(error.reason, scene=scene, room=error.room, path=path) from error
+
+
+def _read_table(path: Path, required: Sequence[str], optional: Sequence[str], *, scene: str | None) -> Iterator[_Row]:
+    """Lines of a CSV file with a header; empty lines are passed over.
+
+    Raises:
+        DatasetError: it cannot be read, its columns are others, or a line has too few or too many cells.
+    """
+    try:
+        # Spreadsheets put a mark in front of UTF-8.
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise DatasetError(f"cannot be read: {error.strerror}", scene=scene, path=path) from error
+    except UnicodeDecodeError as error:
+        raise DatasetError(f"not UTF-8 text: {error}", scene=scene, path=path) from error
+    lines = csv.reader(text.splitlines(), strict=True)
+    try:
+        header = [cell.strip() for cell in next(lines, [])]
+        wrong = [name for name in header if name not in (*required, *optional)]
+        missing = [name for name in required if name not in header]
+        if wrong or missing or len(set(header)) < len(header):
+            raise DatasetError(
+                f"line 1 is '{','.join(header)[:200]}', it must name the columns {','.join((*required, *optional))}"
+                + (f" ({', '.join(optional)} may be left out)" if optional else ""),
+                scene=scene,
+                path=path,
+            )
+        for cells in lines:
+            if not any(cell.strip() for cell in cells):
+                continue
+            if len(cells) != len(header):
+                raise DatasetError(
+                    f"line {lines.line_num} has {len(cells)} cells, the header has {len(header)}",
+                    scene=scene,
+                    path=path,
+                )
+            stripped = {name: cell.strip() for name, cell in zip(header, cells, strict=True)}
+            yield _Row(path=path, scene=scene, line=lines.line_num, cells=stripped)
+    except csv.Error as error:
+        raise DatasetError(f"line {lines.line_num} is no CSV: {error}", scene=scene, path=path) from error

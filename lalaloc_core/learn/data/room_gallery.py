@@ -1,0 +1,132 @@
+"""Galleries: one room among others that are like it, side by side in one floor plan.
+
+A stand-in for a building where a room was photographed and nothing is known of its neighbours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from jaxtyping import Float
+
+from lalaloc_core.conventions import wrap_angle
+from lalaloc_core.learn.data.drawn_openings import DrawnOpening
+from lalaloc_core.learn.data.drawn_rooms import DrawnRoom, plan_of_rooms
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.learn.synth.homes.plans import generate_home
+
+GALLERY_ROOMS = 20
+# At most so many of the others are rooms that somebody drew; the rest are generated.
+_MAX_DRAWN = 9
+# How much larger or smaller than drawn, and than the own room where they are generated, the others are made.
+_RESCALED = 0.1
+# Generated rooms that are the most alike; those of a gallery are drawn from them.
+_ALIKE = 30
+_POOL_HOMES = 60
+# Homes of no split: seeds of training, validation and test begin with 0, 1 and 2.
+_POOL = 7
+_PER_ROW = 5
+# Rooms of a plan lie a wall apart; these a good deal more, so that no door belongs to two of them.
+_GAP_M = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class RoomGallery:
+    """A plan of `GALLERY_ROOMS` rooms, and where the own one's origin and its +y have come to lie."""
+
+    plan: FloorPlan
+    room_index: int
+    position_m: Float[np.ndarray, "2"]
+    heading: float
+
+
+def build_gallery(
+    own: DrawnRoom,
+    others: Sequence[DrawnRoom],
+    camera_height_m: float,
+    rng: np.random.Generator,
+    like: DrawnRoom | None = None,
+) -> RoomGallery:
+    """One room among others, all with their walls along the axes, each turned by quarters at random.
+
+    Args:
+        own: with the camera at its origin, looking along +y.
+        others: drawn rooms; those most alike in size and shape are taken, up to `_MAX_DRAWN` of them, and rescaled
+            within `_RESCALED`. The rest are generated rooms of a like shape, scaled to the size within as much.
+        like: what the others are to be like; None: the own room.
+    """
+    like = like or own
+    drawn = sorted(others, key=lambda room: _unlike(like, room))[:_MAX_DRAWN]
+    generated, shapes = _generated()
+    pool = [generated[k] for k in np.argsort(np.abs(shapes - _shape(like)).sum(axis=1), kind="stable")[:_ALIKE]]
+    chosen = rng.choice(len(pool), GALLERY_ROOMS - 1 - len(drawn), replace=False)
+    low, high = 1.0 - _RESCALED, 1.0 + _RESCALED
+    rooms = [room.scaled(rng.uniform(low, high)) for room in drawn]
+    rooms += [pool[k].scaled(like.size_m / pool[k].size_m * rng.uniform(low, high)) for k in chosen]
+    rooms = [room.mirrored() if rng.random() < 0.5 else room for room in rooms]
+    turns = [0.5 * np.pi * int(rng.integers(4)) - room.main_direction for room in (own, *rooms)]
+    turned = [room.turned(turn) for room, turn in zip((own, *rooms), turns, strict=True)]
+    order = rng.permutation(GALLERY_ROOMS)
+    places = _side_by_side([turned[k] for k in order], rng)
+    placed = [turned[k].moved(place) for k, place in zip(order, places, strict=True)]
+    room_index = int(np.flatnonzero(order == 0)[0])
+    plan = plan_of_rooms(f"gallery of {own.name}", placed, camera_height_m)
+    # Azimuth grows clockwise, angles counter-clockwise.
+    return RoomGallery(plan, room_index, places[room_index], float(wrap_angle(-turns[0])))
+
+
+@lru_cache(maxsize=1)
+def _generated() -> tuple[tuple[DrawnRoom, ...], Float[np.ndarray, "n 2"]]:
+    """Rooms of generated homes, their names made unique, and their shapes."""
+    homes = [generate_home(np.random.default_rng([_POOL, number])) for number in range(_POOL_HOMES)]
+    rooms = tuple(
+        _drawn(f"{room.name}, home {number}", home.plan, index)
+        for number, home in enumerate(homes)
+        for index, room in enumerate(home.plan.rooms)
+    )
+    return rooms, np.stack([_shape(room) for room in rooms])
+
+
+def _drawn(name: str, plan: FloorPlan, index: int) -> DrawnRoom:
+    room = plan.rooms[index]
+    openings = []
+    for face in plan.opening_faces:
+        if face.room == index:
+            start, end = room.walls_m[face.wall].reshape(2, 2)
+            line_m = start + np.array([[face.start], [face.end]]) * (end - start)
+            openings.append(DrawnOpening(kind=plan.openings[face.opening].kind, line_m=line_m))
+    return DrawnRoom(
+        name=name,
+        polygon_m=room.polygon_m,
+        ceiling_height_m=room.ceiling_height_m,
+        openings=tuple(openings),
+        room_type=room.type,
+    )
+
+
+def _shape(room: DrawnRoom) -> Float[np.ndarray, "2"]:
+    """Logs of how long a room is for its width, and of how much of the box around it is floor."""
+    extent_m = room.turned(-room.main_direction).extent_m
+    return np.log([extent_m.max() / extent_m.min(), room.size_m**2 / extent_m.prod()])
+
+
+def _unlike(first: DrawnRoom, second: DrawnRoom) -> float:
+    return float(np.abs(_shape(first) - _shape(second)).sum() + abs(np.log(first.size_m / second.size_m)))
+
+
+def _side_by_side(rooms: Sequence[DrawnRoom], rng: np.random.Generator) -> list[Float[np.ndarray, "2"]]:
+    """By how much to move rooms so that they lie in rows, each `_GAP_M` and a little more from the others."""
+    moves, top_m = [], 0.0
+    for first in range(0, len(rooms), _PER_ROW):
+        row = rooms[first : first + _PER_ROW]
+        right_m = 0.0
+        for room in row:
+            # Where poses of the grid come to lie in the room is left to chance.
+            corner = np.array([right_m, top_m]) + rng.uniform(0.0, 0.5, 2)
+            moves.append(corner - room.polygon_m.min(axis=0))
+            right_m = corner[0] + room.extent_m[0] + _GAP_M
+        top_m += max(room.extent_m[1] for room in row) + _GAP_M + 0.5
+    return moves

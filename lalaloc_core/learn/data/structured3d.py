@@ -1,0 +1,197 @@
+"""Structured3D (Zheng et al. 2020), the paper's data set: 3,500 synthetic homes with photo-realistic panoramas.
+
+    ROOT/scene_00000/annotation_3d.json
+    ROOT/scene_00000/2D_rendering/<room>/panorama/camera_xyz.txt
+    ROOT/scene_00000/2D_rendering/<room>/panorama/{empty,simple,full}/rgb_{cold,raw,warm}light.png, depth.png
+
+The centre column of every panorama looks along the world's +y, so all headings are 0.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from lalaloc_core.configuration import build_config
+from lalaloc_core.learn.data.assembly import is_number, pose_fault, read_json
+from lalaloc_core.learn.data.dataset import Appearance, Camera, Photograph, Scene, Split
+from lalaloc_core.learn.data.photographs import FilePhotograph
+from lalaloc_core.learn.data.structured3d_annotation import Annotation, read_annotation
+from lalaloc_core.learn.data.structured3d_splits import scene_numbers
+from lalaloc_core.errors import ConfigError, DatasetError
+
+ANNOTATION_FILE = "annotation_3d.json"
+RENDERING_FOLDER = "2D_rendering"
+SYNTHETIC_FILE = "synthetic.json"
+# (height, width) of the data set's own panoramas.
+PANORAMA_SIZE = (512, 1024)
+FURNITURE = ("full", "simple", "empty")
+LIGHTING = ("warm", "raw", "cold")
+
+_SCENE_NAME = re.compile(r"scene_(\d{5})")
+_MM_PER_M = 1000.0
+
+
+def scene_name(number: int) -> str:
+    """Name of a scene's folder."""
+    return f"scene_{number:05d}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Synthetic:
+    """Content of `synthetic.json`, which marks scenes of this project's generator in Structured3D's layout.
+
+    Attributes:
+        format: of this file.
+        seed: of the generator.
+        height, width: of the panoramas.
+        textures: name of the material pictures; None where all are procedural.
+    """
+
+    format: Literal[1]
+    seed: int
+    height: int
+    width: int
+    textures: str | None = None
+
+
+@dataclass(frozen=True)
+class Structured3D:
+    """A copy of Structured3D, or of a part of it, or synthetic scenes in its layout.
+
+    The paper's exclusions are left out of the splits: see `structured3d_splits`.
+    """
+
+    root: Path
+
+    @cached_property
+    def synthetic(self) -> Synthetic | None:
+        """How the scenes were generated; None for Structured3D itself.
+
+        Raises:
+            DatasetError: the file says something impossible.
+        """
+        path = self.root / SYNTHETIC_FILE
+        if not path.exists():
+            return None
+        try:
+            found: Synthetic = build_config(Synthetic, read_json(path), path=SYNTHETIC_FILE)
+        except ConfigError as error:
+            raise DatasetError(str(error), path=path) from error
+        if found.height < 1 or found.width != 2 * found.height:
+            raise DatasetError(
+                f"panoramas of {found.width} x {found.height}, they must be twice as wide as high", path=path
+            )
+        return found
+
+    @property
+    def description(self) -> str:
+        return "Structured3D" if self.synthetic is None else f"synthetic scenes (seed {self.synthetic.seed})"
+
+    @property
+    def panorama_size(self) -> tuple[int, int]:
+        """(height, width) that every panorama must have."""
+        return PANORAMA_SIZE if self.synthetic is None else (self.synthetic.height, self.synthetic.width)
+
+    @property
+    def appearances(self) -> Sequence[Appearance]:
+        return [Appearance(furniture, lighting) for furniture in FURNITURE for lighting in LIGHTING]
+
+    def scenes(self, split: Split) -> Sequence[str]:
+        here = {path.name for path in _folders(self.root)}
+        return [name for name in map(scene_name, scene_numbers(split)) if name in here]
+
+    def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
+        if not _SCENE_NAME.fullmatch(name):
+            raise DatasetError("no such scene; names are like 'scene_03250'", scene=name, path=self.root)
+        annotation = read_annotation(self.root / name / ANNOTATION_FILE, name)
+        cameras = []
+        for folder in sorted(_folders(self.root / name / RENDERING_FOLDER), key=_by_number):
+            # Rooms may have perspective pictures only.
+            if not (folder / "panorama").is_dir():
+                continue
+            try:
+                cameras.append(self._camera(annotation, name, folder.name, folder / "panorama"))
+            except DatasetError as error:
+                if problems is None:
+                    raise
+                problems.append(error)
+        return Scene(name=name, plan=annotation.plan, cameras=tuple(cameras))
+
+    def _camera(self, annotation: Annotation, scene: str, room: str, folder: Path) -> Camera:
+        path = folder / "camera_xyz.txt"
+        x_m, y_m, z_m = (value / _MM_PER_M for value in _read_three(path, scene, room))
+        position_m = np.array([x_m, y_m])
+        floors = annotation.floors.get(room)
+        if not floors:
+            why = "has no room with this ID" if floors is None else "has this room, but it is too small for a camera"
+            raise DatasetError(f"{ANNOTATION_FILE} {why}", scene=scene, room=room, path=folder)
+        faults = {floor: pose_fault(annotation.plan, floor.room_index, position_m, z_m - floor.z_m) for floor in floors}
+        floor = next((floor for floor in floors if faults[floor] is None), None)
+        if floor is None:
+            raise DatasetError(
+                f"{faults[floors[0]]}; the file's numbers are read as millimetres", scene=scene, room=room, path=path
+            )
+        return Camera(
+            name=room,
+            position_m=position_m,
+            room_index=floor.room_index,
+            heading=0.0,
+            camera_height_m=z_m - floor.z_m,
+            photographs=self._photographs(scene, room, folder),
+        )
+
+    def _photographs(self, scene: str, room: str, folder: Path) -> Mapping[Appearance, Photograph]:
+        found: dict[Appearance, Photograph] = {}
+        for furniture in FURNITURE:
+            level = folder / furniture
+            files, depth_path = _names(level), level / "depth.png"
+            for lighting in LIGHTING:
+                file = f"rgb_{lighting}light.png"
+                if file in files:
+                    found[Appearance(furniture, lighting)] = FilePhotograph(
+                        path=level / file,
+                        scene=scene,
+                        room=room,
+                        depth_path=depth_path,
+                        size=self.panorama_size,
+                    )
+        return found
+
+
+def _read_three(path: Path, scene: str, room: str) -> tuple[float, float, float]:
+    try:
+        text = path.read_text(encoding="ascii")
+    except OSError as error:
+        raise DatasetError(f"cannot be read: {error.strerror}", scene=scene, room=room, path=path) from error
+    except UnicodeDecodeError as error:
+        raise DatasetError(f"not a text file: {error}", scene=scene, room=room, path=path) from error
+    try:
+        values = [float(word) for word in text.split()]
+    except ValueError:
+        values = []
+    if len(values) != 3 or not all(is_number(value) for value in values):
+        raise DatasetError(
+            f"holds '{text.strip()[:80]}', three numbers (millimetres) are needed", scene=scene, room=room, path=path
+        )
+    return values[0], values[1], values[2]
+
+
+def _names(folder: Path) -> list[str]:
+    """Names of what lies in a folder; none where there is no such folder."""
+    return os.listdir(folder) if folder.is_dir() else []
+
+
+def _folders(folder: Path) -> list[Path]:
+    return [folder / name for name in _names(folder) if not name.startswith(".") and (folder / name).is_dir()]
+
+
+def _by_number(folder: Path) -> tuple[int, str]:
+    return (int(folder.name) if folder.name.isdecimal() else -1, folder.name)

@@ -1,0 +1,277 @@
+"""Structured3D's `annotation_3d.json`: rooms as planes, lines and junctions in millimetres.
+
+    semantics    a room, door, window or outer wall: which planes it has
+    planes       floor, ceiling or wall
+    planeLineMatrix     planes x lines, 1 where a line lies on a plane
+    lineJunctionMatrix  lines x junctions, 1 where a junction ends a line
+    junctions    coordinates
+
+Planes, lines and junctions are meant by their place in the lists, as in the data set's own tools.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+from jaxtyping import Float
+
+from lalaloc_core.learn.data.assembly import RoomOutline, assemble_plan, is_number, read_json
+from lalaloc_core.learn.data.drawn_openings import DrawnOpening
+from lalaloc_core.learn.data.polygon_rings import OpenRingError, chain_rings, signed_area
+from lalaloc_core.errors import DatasetError
+from lalaloc_core.floorplan import FloorPlan, room_type_of
+
+_MM_PER_M = 1000.0
+# Every other type is a kind of room.
+_OPENINGS = ("door", "window")
+_NOT_ROOMS = (*_OPENINGS, "outwall")
+# Floors and ceilings that rise or fall by more are not level.
+_LEVEL_TOLERANCE_M = 0.05
+# A door's box ends on the walls of its rooms, but for the rounding of the drawing.
+_BESIDE_M = 0.03
+_LISTS = ("semantics", "planes", "junctions", "planeLineMatrix", "lineJunctionMatrix")
+
+
+@dataclass(frozen=True)
+class Floor:
+    """The floor of a room: which room of the plan, and the height (m) of its floor in the world frame."""
+
+    room_index: int
+    z_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Annotation:
+    """What a scene's annotation says.
+
+    Attributes:
+        floors: by the ID of the room's semantic; a room may have several floors.
+    """
+
+    plan: FloorPlan
+    floors: dict[str, tuple[Floor, ...]]
+
+
+def read_annotation(path: Path, scene: str) -> Annotation:
+    """Read the rooms of a scene.
+
+    Raises:
+        DatasetError: names the room and what is wrong.
+    """
+    return _Reader(read_json(path, scene=scene), scene, path).annotation()
+
+
+class _Reader:
+    def __init__(self, document: dict[str, Any], scene: str, path: Path) -> None:
+        self._document, self._scene, self._path = document, scene, path
+        for key in _LISTS:
+            if not isinstance(document.get(key), list):
+                raise self._error(f"'{key}' must be a list" if key in document else f"'{key}' is missing")
+
+    def annotation(self) -> Annotation:
+        outlines: list[RoomOutline] = []
+        heights: list[tuple[str, float]] = []
+        seen: Counter[str] = Counter()
+        for number, semantic in enumerate(self._document["semantics"]):
+            kind, planes = self._semantic(semantic, number)
+            if kind in _NOT_ROOMS:
+                continue
+            identity = str(semantic.get("ID"))
+            for outline, floor_z_m in self._outlines(f"{kind} {identity}", planes):
+                seen[outline.name] += 1
+                if seen[outline.name] > 1:
+                    outline = dataclasses.replace(outline, name=f"{outline.name} ({seen[outline.name]})")
+                outlines.append(outline)
+                heights.append((identity, floor_z_m))
+        openings, faults = self._openings(outlines, [z_m for _, z_m in heights])
+        plan = assemble_plan(
+            self._scene,
+            outlines,
+            path=self._path,
+            units="coordinates are read as millimetres",
+            openings=openings,
+            opening_kinds=_OPENINGS,
+        )
+        plan = dataclasses.replace(plan, warnings=(*plan.warnings, *faults))
+        # The plan leaves out rooms that are too small.
+        places = {room.name: index for index, room in enumerate(plan.rooms)}
+        floors: dict[str, tuple[Floor, ...]] = {}
+        for outline, (identity, floor_z_m) in zip(outlines, heights, strict=True):
+            kept = (Floor(places[outline.name], floor_z_m),) if outline.name in places else ()
+            floors[identity] = (*floors.get(identity, ()), *kept)
+        return Annotation(plan, floors)
+
+    def _outlines(self, room: str, planes: list[Any]) -> list[tuple[RoomOutline, float]]:
+        """A room's outline with its floor's height, once for each of its floors."""
+        of_kind: dict[str, list[int]] = {"floor": [], "ceiling": []}
+        for plane in planes:
+            entry = self._entry("planes", plane, room)
+            kind = entry.get("type") if isinstance(entry, dict) else None
+            if not isinstance(kind, str):
+                raise self._error(f"plane {plane} has no 'type'", room)
+            of_kind.setdefault(kind, []).append(plane)
+        for kind in ("floor", "ceiling"):
+            if not of_kind[kind]:
+                raise self._error(f"the room has no {kind} among its planes {planes}", room)
+        ceiling_mm = [point for plane in of_kind["ceiling"] for point in self._points_mm(plane, "ceiling", room)]
+        ceiling_z_m, ceiling_warnings = _level(np.array(ceiling_mm)[:, 2] / _MM_PER_M, "ceiling", room)
+        found = []
+        for plane in of_kind["floor"]:
+            corners_m, warnings = self._floor_m(plane, room)
+            floor_z_m, floor_warnings = _level(corners_m[:, 2], "floor", room)
+            outline = RoomOutline(
+                name=room,
+                polygon_m=corners_m[:, :2],
+                ceiling_height_m=ceiling_z_m - floor_z_m,
+                warnings=(*warnings, *floor_warnings, *ceiling_warnings),
+                type=room_type_of(room),
+            )
+            found.append((outline, floor_z_m))
+        return found
+
+    def _openings(
+        self, outlines: list[RoomOutline], floors_z_m: list[float]
+    ) -> tuple[list[DrawnOpening], tuple[str, ...]]:
+        """Doors and windows: boxes between two walls, or single faces; what cannot be read is a warning."""
+        shapes = [shapely.Polygon(outline.polygon_m) for outline in outlines]
+        found, faults = [], []
+        for number, semantic in enumerate(self._document["semantics"]):
+            kind, planes = self._semantic(semantic, number)
+            if kind not in _OPENINGS:
+                continue
+            name = f"{kind} {semantic['ID']}"
+            try:
+                corners_mm = [point for plane in planes for point in self._points_mm(plane, kind, name)]
+            except DatasetError as error:
+                faults.append(f"{name} is left out: {error.reason}")
+                continue
+            if len(corners_mm) < 3:
+                faults.append(f"{name} is left out: it has {len(corners_mm)} corners")
+                continue
+            corners_m = np.array(corners_mm) / _MM_PER_M
+            footprint = shapely.MultiPoint(corners_m[:, :2]).convex_hull
+            beside = [k for k, shape in enumerate(shapes) if shapely.distance(shape, footprint) <= _BESIDE_M]
+            floor_z_m = min((floors_z_m[k] for k in beside), default=min(floors_z_m, default=0.0))
+            found.append(
+                DrawnOpening(
+                    kind=kind,
+                    line_m=_middle_line(footprint),
+                    sill_m=max(0.0, float(corners_m[:, 2].min()) - floor_z_m),
+                    head_m=float(corners_m[:, 2].max()) - floor_z_m,
+                    rooms=tuple(outlines[k].name for k in beside),
+                )
+            )
+        return found, tuple(faults)
+
+    def _floor_m(self, plane: int, room: str) -> tuple[Float[np.ndarray, "n 3"], tuple[str, ...]]:
+        """Corners of a floor, in order, and what was odd about it."""
+        lines = self._lines(plane, "floor", room)
+        rings, fault = self._chained(lines, room)
+        if len(rings) != 1:
+            # Doors and windows may be drawn on the floor too; the data set's own tools leave their lines out.
+            rings = self._chained([line for line in lines if line not in self._lines_of_openings], room)[0] or rings
+        if not rings:
+            raise self._error(f"floor plane {plane}: {fault}", room) from fault
+        corners_m = [np.array([self._junction_mm(junction, room) for junction in ring]) / _MM_PER_M for ring in rings]
+        warnings = ()
+        if len(rings) > 1:
+            warnings = (f"room '{room}': the floor has {len(rings)} rings, only the largest is its outline",)
+        return max(corners_m, key=lambda corners: abs(signed_area(corners[:, :2]))), warnings
+
+    def _chained(self, lines: list[int], room: str) -> tuple[list[list[int]], OpenRingError | None]:
+        try:
+            return chain_rings([self._ends(line, room) for line in lines]), None
+        except OpenRingError as error:
+            return [], error
+
+    @cached_property
+    def _lines_of_openings(self) -> frozenset[int]:
+        found: set[int] = set()
+        for number, semantic in enumerate(self._document["semantics"]):
+            kind, planes = self._semantic(semantic, number)
+            if kind in _OPENINGS:
+                found.update(line for plane in planes for line in _ones(self._entry("planeLineMatrix", plane, kind)))
+        return frozenset(found)
+
+    def _points_mm(self, plane: int, kind: str, room: str) -> list[list[float]]:
+        ends = {junction for line in self._lines(plane, kind, room) for junction in self._ends(line, room)}
+        return [self._junction_mm(junction, room) for junction in sorted(ends)]
+
+    def _semantic(self, semantic: Any, number: int) -> tuple[str, list[Any]]:
+        if not isinstance(semantic, dict) or not isinstance(semantic.get("type"), str):
+            raise self._error(f"semantic {number} has no 'type'")
+        planes = semantic.get("planeID")
+        name = f"{semantic['type']} {semantic.get('ID')}"
+        if not isinstance(semantic.get("ID"), int | str):
+            raise self._error(f"semantic {number} has no 'ID'", name)
+        if not isinstance(planes, list):
+            raise self._error(f"semantic {number} has no list 'planeID'", name)
+        return semantic["type"], planes
+
+    def _lines(self, plane: int, kind: str, room: str) -> list[int]:
+        lines = _ones(self._entry("planeLineMatrix", plane, room))
+        if not lines:
+            raise self._error(f"{kind} plane {plane} has no lines", room)
+        return lines
+
+    def _ends(self, line: int, room: str) -> tuple[int, int]:
+        junctions = _ones(self._entry("lineJunctionMatrix", line, room))
+        if len(junctions) != 2:
+            raise self._error(f"line {line} has {len(junctions)} junctions, exactly two are needed", room)
+        return junctions[0], junctions[1]
+
+    def _junction_mm(self, junction: int, room: str) -> list[float]:
+        entry = self._entry("junctions", junction, room)
+        point = entry.get("coordinate") if isinstance(entry, dict) else None
+        if not isinstance(point, list) or len(point) != 3 or not all(is_number(value) for value in point):
+            raise self._error(f"junction {junction} has coordinate {str(point)[:80]}, three numbers are needed", room)
+        return [float(value) for value in point]
+
+    def _entry(self, key: str, index: Any, room: str) -> Any:
+        entries = self._document[key]
+        if isinstance(index, bool) or not isinstance(index, int) or not 0 <= index < len(entries):
+            raise self._error(f"'{key}' has no entry {index!r}, it has {len(entries)}", room)
+        return entries[index]
+
+    def _error(self, reason: str, room: str | None = None) -> DatasetError:
+        return DatasetError(reason, scene=self._scene, room=room, path=self._path)
+
+
+def _middle_line(footprint: shapely.Geometry) -> Float[np.ndarray, "2 2"]:
+    """The line halfway through a wall's thickness: the middle of the smallest rectangle around, along its long side."""
+    corners = shapely.get_coordinates(shapely.oriented_envelope(footprint))
+    if len(corners) < 5:
+        # A single face is a line from above.
+        return np.stack([corners[0], corners[-1]])
+    sides = np.linalg.norm(np.diff(corners[:3], axis=0), axis=1)
+    one, two, three, four = corners[:4]
+    ends = (
+        ((one + four) / 2.0, (two + three) / 2.0) if sides[0] >= sides[1] else ((one + two) / 2.0, (three + four) / 2.0)
+    )
+    return np.stack(ends)
+
+
+def _level(z_m: Float[np.ndarray, "n"], kind: str, room: str) -> tuple[float, tuple[str, ...]]:
+    """Mean height of a floor or ceiling, and a warning where it is not level."""
+    spread_m = float(np.ptp(z_m))
+    if spread_m <= _LEVEL_TOLERANCE_M:
+        return float(z_m.mean()), ()
+    return float(z_m.mean()), (f"room '{room}': the {kind} is not level, it rises by {spread_m:.2f} m",)
+
+
+def _ones(row: Any) -> list[int]:
+    """Places of the ones in a row of a matrix; rows are long and nearly empty."""
+    if not isinstance(row, list):
+        return []
+    places, place = [], -1
+    for _ in range(row.count(1)):
+        place = row.index(1, place + 1)
+        places.append(place)
+    return places

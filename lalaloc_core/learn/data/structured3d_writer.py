@@ -1,0 +1,242 @@
+"""Writing scenes in Structured3D's layout: the counterpart of `structured3d`, millimetres with z up.
+
+Every room is a prism of planes, every door or window a box between two walls, and the outer walls are a ring around
+the home. A plane's unit normal points into the empty space, and `normal . point + offset = 0` on it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import shapely
+from jaxtyping import Float, UInt8
+from PIL import Image
+
+from lalaloc_core.conventions import TWO_PI
+from lalaloc_core.learn.data.structured3d import ANNOTATION_FILE, PANORAMA_SIZE
+from lalaloc_core.floorplan import FloorPlan, Room
+from lalaloc_core.learn.synth.homes.openings import Opening
+
+_MM_PER_M = 1000.0
+_MAX_DEPTH_MM = 65535.0
+# Higher levels write the same pixels at three times the cost for a tenth less space.
+_PNG_COMPRESSION = 1
+# Thickness of walls that have no room behind them, and the depth of doors that lead nowhere.
+_OUTER_WALL_M = 0.2
+_NICHE_M = 0.05
+# Structured3D's names of the kinds of room that are named differently here.
+_ROOM_TYPES = {"closet": "store room", "storage": "store room"}
+_SAME_ROOM_TYPES = (
+    *("living room", "kitchen", "bedroom", "bathroom", "balcony", "corridor", "dining room", "study", "studio"),
+    *("store room", "garden", "laundry room", "office", "basement", "garage"),
+)
+
+
+def room_id(room_index: int) -> str:
+    """The semantic's ID, and the name of the folder with the room's panoramas."""
+    return str(room_index)
+
+
+def room_type(name: str) -> str:
+    """Structured3D's type of a room that is called "bedroom 2"."""
+    kind = name.rstrip("0123456789 ")
+    kind = _ROOM_TYPES.get(kind, kind)
+    return kind if kind in _SAME_ROOM_TYPES else "undefined"
+
+
+def write_annotation(scene: Path, plan: FloorPlan, openings: Sequence[Opening]) -> None:
+    """Write `annotation_3d.json` into the folder of a scene."""
+    text = json.dumps(build_annotation(plan, openings), separators=(",", ":"), allow_nan=False)
+    (scene / ANNOTATION_FILE).write_text(text, encoding="utf-8")
+
+
+def build_annotation(plan: FloorPlan, openings: Sequence[Opening]) -> dict[str, Any]:
+    """The annotation of a home; the semantic with ID k is room k of the plan."""
+    drawing = _Drawing()
+    rooms = []
+    for room in plan.rooms:
+        prism = drawing.prism(room.polygon_m, 0.0, room.ceiling_height_m)
+        drawing.semantic(room_type(room.name), [prism.floor, prism.ceiling, *prism.walls])
+        rooms.append(prism)
+    for opening in openings:
+        twin = _twin(plan, openings, opening)
+        if twin is not None and twin.room < opening.room:
+            continue
+        near, far = _ends_m(plan, opening), _far_side_m(plan, opening, twin)
+        box = drawing.prism(np.stack([near[0], far[0], far[1], near[1]]), opening.sill_m, opening.head_m)
+        # The wall has a hole where the box begins, and another wall may have one where it ends.
+        drawing.add_hole(rooms[opening.room].walls[opening.wall], box.walls[3])
+        if twin is not None:
+            drawing.add_hole(rooms[twin.room].walls[twin.wall], box.walls[1])
+        kind = "window" if opening.kind == "window" else "door"
+        drawing.semantic(kind, [box.floor, box.ceiling, *box.walls])
+    outside = [room.shape.buffer(_OUTER_WALL_M, join_style="mitre") for room in plan.rooms]
+    walls = []
+    # On a grid of millimetres no edge is so short that it has no direction.
+    for part in shapely.get_parts(shapely.union_all(outside, grid_size=1.0 / _MM_PER_M)):
+        ring_m = np.array(part.exterior.coords)[:-1]
+        # Clockwise, so that the empty space is around it.
+        ring_m = ring_m[::-1] if part.exterior.is_ccw else ring_m
+        walls += drawing.prism(ring_m, 0.0, float(plan.ceiling_heights_m.max()), is_open=True).walls
+    drawing.semantic("outwall", walls)
+    return drawing.document()
+
+
+def write_camera(panorama: Path, room: Room, position_m: Float[np.ndarray, "2"], camera_height_m: float) -> None:
+    """Write where a room's panoramas were taken, and where its corners are in them."""
+    x_mm, y_mm, z_mm = (_MM_PER_M * float(value) for value in (*position_m, camera_height_m))
+    (panorama / "camera_xyz.txt").write_text(f"{x_mm!r} {y_mm!r} {z_mm!r}\n", encoding="ascii")
+    lines = [f"{x:.3f} {y:.3f}\n" for x, y in layout_pixels(room, position_m, camera_height_m).tolist()]
+    (panorama / "layout.txt").write_text("".join(lines), encoding="ascii")
+
+
+def layout_pixels(room: Room, position_m: Float[np.ndarray, "2"], camera_height_m: float) -> Float[np.ndarray, "n 2"]:
+    """Pixels (x, y) of a room's corners that its camera sees, in a panorama of the data set's own size and heading 0.
+
+    Returns:
+        ceiling and floor alternating, from left to right.
+    """
+    height, width = PANORAMA_SIZE
+    # Corners lie on the outline, so that a ray to one may leave the room by rounding.
+    shape = room.shape.buffer(1e-6)
+    rays = shapely.linestrings(np.stack([np.broadcast_to(position_m, room.polygon_m.shape), room.polygon_m], axis=1))
+    offset = room.polygon_m[shapely.covers(shape, rays)] - position_m
+    azimuth, distance = np.arctan2(offset[:, 0], offset[:, 1]), np.hypot(offset[:, 0], offset[:, 1])
+    x = (azimuth / TWO_PI + 0.5) * width - 0.5
+    rises_m = np.array([room.ceiling_height_m - camera_height_m, -camera_height_m])
+    y = (0.5 - np.arctan2(rises_m, distance[:, None]) / np.pi) * height - 0.5
+    pixels = np.stack([np.broadcast_to(x[:, None], y.shape), y], axis=-1)
+    return pixels[np.argsort(x)].reshape(-1, 2)
+
+
+def write_picture(path: Path, pixels: UInt8[np.ndarray, "h w 3"]) -> None:
+    """Write a panorama as PNG."""
+    Image.fromarray(pixels).save(path, compress_level=_PNG_COMPRESSION)
+
+
+def write_depth(path: Path, depth_m: Float[np.ndarray, "h w"]) -> None:
+    """Write ranges as 16-bit PNG; those beyond 65.535 m become 0, "no reading"."""
+    depth_mm = np.rint(depth_m * _MM_PER_M)
+    seen = np.isfinite(depth_mm) & (depth_mm <= _MAX_DEPTH_MM)
+    Image.fromarray(np.where(seen, depth_mm, 0.0).astype(np.uint16)).save(path, compress_level=_PNG_COMPRESSION)
+
+
+class _Prism(NamedTuple):
+    """Numbers of the planes of a prism; wall k belongs to edge k, floor and ceiling are -1 where it has none."""
+
+    floor: int
+    ceiling: int
+    walls: list[int]
+
+
+@dataclass
+class _Drawing:
+    """Junctions, lines and planes as they are drawn; every line and plane knows its parts by number."""
+
+    junctions_mm: list[tuple[float, float, float]] = field(default_factory=list)
+    lines: list[tuple[int, int]] = field(default_factory=list)
+    planes: list[tuple[str, tuple[float, float, float], list[int]]] = field(default_factory=list)
+    semantics: list[dict[str, Any]] = field(default_factory=list)
+
+    def prism(
+        self, polygon_m: Float[np.ndarray, "n 2"], floor_m: float, ceiling_m: float, *, is_open: bool = False
+    ) -> _Prism:
+        """A vertical prism that is empty to the left of its edges; `is_open`: without floor and ceiling."""
+        below, above = ([self._junction(x, y, z) for x, y in polygon_m.tolist()] for z in (floor_m, ceiling_m))
+        floor, ceiling = self._ring(below), self._ring(above)
+        uprights = [self._line(*ends) for ends in zip(below, above, strict=True)]
+        caps = (-1, -1)
+        if not is_open:
+            caps = (
+                self._plane("floor", (0.0, 0.0, 1.0), floor),
+                self._plane("ceiling", (0.0, 0.0, -1.0), ceiling),
+            )
+        walls = []
+        for k, (dx, dy) in enumerate((np.roll(polygon_m, -1, axis=0) - polygon_m).tolist()):
+            length = float(np.hypot(dx, dy))
+            boundary = [floor[k], uprights[(k + 1) % len(uprights)], ceiling[k], uprights[k]]
+            walls.append(self._plane("wall", (-dy / length, dx / length, 0.0), boundary))
+        return _Prism(*caps, walls)
+
+    def add_hole(self, wall: int, face: int) -> None:
+        """Draw the outline of a plane on a wall that it lies in."""
+        self.planes[wall][2].extend(self.planes[face][2][:4])
+
+    def semantic(self, kind: str, planes: list[int]) -> None:
+        self.semantics.append({"ID": len(self.semantics), "type": kind, "planeID": planes})
+
+    def document(self) -> dict[str, Any]:
+        points = np.array(self.junctions_mm)
+        ends = np.array(self.lines)
+        along = points[ends[:, 1]] - points[ends[:, 0]]
+        along /= np.linalg.norm(along, axis=1, keepdims=True)
+        line_junctions = np.zeros((len(ends), len(points)), dtype=int)
+        line_junctions[np.arange(len(ends))[:, None], ends] = 1
+        plane_lines = np.zeros((len(self.planes), len(ends)), dtype=int)
+        planes = []
+        for number, (kind, normal, lines) in enumerate(self.planes):
+            plane_lines[number, lines] = 1
+            offset = -float(np.dot(normal, points[ends[lines[0], 0]]))
+            planes.append({"ID": number, "type": kind, "normal": list(normal), "offset": offset})
+        return {
+            "junctions": [{"ID": number, "coordinate": point} for number, point in enumerate(points.tolist())],
+            "lines": [
+                {"ID": number, "point": point, "direction": direction}
+                for number, (point, direction) in enumerate(
+                    zip(points[ends[:, 0]].tolist(), along.tolist(), strict=True)
+                )
+            ],
+            "planes": planes,
+            "semantics": self.semantics,
+            "planeLineMatrix": plane_lines.tolist(),
+            "lineJunctionMatrix": line_junctions.tolist(),
+            "cuboids": [],
+            "manhattan": [],
+        }
+
+    def _junction(self, x_m: float, y_m: float, z_m: float) -> int:
+        self.junctions_mm.append((_MM_PER_M * x_m, _MM_PER_M * y_m, _MM_PER_M * z_m))
+        return len(self.junctions_mm) - 1
+
+    def _line(self, start: int, end: int) -> int:
+        self.lines.append((start, end))
+        return len(self.lines) - 1
+
+    def _ring(self, corners: list[int]) -> list[int]:
+        return [self._line(corner, corners[(k + 1) % len(corners)]) for k, corner in enumerate(corners)]
+
+    def _plane(self, kind: str, normal: tuple[float, float, float], lines: list[int]) -> int:
+        self.planes.append((kind, normal, lines))
+        return len(self.planes) - 1
+
+
+def _ends_m(plan: FloorPlan, opening: Opening) -> Float[np.ndarray, "2 2"]:
+    """Where an opening begins and ends along its wall."""
+    wall = plan.rooms[opening.room].walls_m[opening.wall]
+    along = (wall[2:] - wall[:2]) / np.hypot(*(wall[2:] - wall[:2]))
+    return wall[:2] + np.array([[opening.start_m], [opening.end_m]]) * along
+
+
+def _twin(plan: FloorPlan, openings: Sequence[Opening], opening: Opening) -> Opening | None:
+    """The same door as the room behind it has it; None where no room of the plan is behind it."""
+    facing = [other for other in openings if (other.room, other.neighbour) == (opening.neighbour, opening.room)]
+    middle = _ends_m(plan, opening).mean(axis=0)
+    return min(facing, key=lambda other: float(np.hypot(*(_ends_m(plan, other).mean(axis=0) - middle))), default=None)
+
+
+def _far_side_m(plan: FloorPlan, opening: Opening, twin: Opening | None) -> Float[np.ndarray, "2 2"]:
+    """The other end of an opening's box, beside each of the opening's own ends."""
+    if twin is not None:
+        return _ends_m(plan, twin)[::-1]
+    near = _ends_m(plan, opening)
+    along = (near[1] - near[0]) / np.hypot(*(near[1] - near[0]))
+    outward = np.array([along[1], -along[0]])
+    far = near + outward * _OUTER_WALL_M
+    box = shapely.Polygon([near[0], far[0], far[1], near[1]]).buffer(-1e-6)
+    is_free = not any(room.shape.intersects(box) for room in plan.rooms)
+    return far if is_free else near + outward * _NICHE_M

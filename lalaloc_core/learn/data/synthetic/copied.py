@@ -1,0 +1,148 @@
+"""Plans of copies of a home that differ in their doors only: which copy a photograph shows, their places alone tell."""
+
+from __future__ import annotations
+
+import dataclasses
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from lalaloc_core.learn.data.dataset import Camera, Scene
+from lalaloc_core.learn.data.synthetic.derived import DerivedScenes
+from lalaloc_core.errors import DatasetError
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.render.layout import layout_view
+
+# Free space between two copies (m): no multiple of a grid's step, so that its lattice lies otherwise in each.
+_APART_M = 3.17
+# Share of the doors in sight of a camera that are elsewhere in the other copies, beside one for each camera.
+_MOVED_SHARE = 0.5
+# A camera sees a door that fills at least so many of so many azimuths, about 6°: it may stand behind a corner.
+_SEEN_COLUMNS, _COLUMNS = 2, 128
+# Doors keep so far (m) from corners and other openings, and are tried every so far along a wall; openings nearer to a
+# wall than its thickness may be are in it.
+_CLEAR_M, _STEP_M, _MAX_THICKNESS_M = 0.15, 0.1, 0.5
+
+
+@dataclass(frozen=True)
+class CopiedScenes(DerivedScenes):
+    """Generated homes as plans of so many copies in a row, of which one, drawn for each home, is photographed.
+
+    In the other copies some of its doors are elsewhere in the room, of those that each camera sees at least one: then
+    every photograph shows which copy it was taken in. All copies have as many doors, unless a room has no wall that is
+    free. Cameras that see no door are left out.
+    """
+
+    copies: int = 4
+
+    @property
+    def description(self) -> str:
+        return f"{self.homes.description}, {self.copies} copies that differ in their doors"
+
+    def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
+        scene = self.homes.load(name, problems)
+        rng = np.random.default_rng([self.homes.seed, zlib.crc32(name.encode())])
+        own = int(rng.integers(self.copies))
+        x_min, _, x_max, _ = scene.plan.bounds_m
+        step_m = x_max - x_min + _APART_M
+        document = scene.plan.to_dict()
+        seen = [(camera, _seen_doors(scene.plan, camera)) for camera in scene.cameras]
+        seen = [(camera, doors) for camera, doors in seen if doors]
+        rooms, openings = [], []
+        for copy in range(self.copies):
+            by_m = copy * step_m
+            rooms += [_moved_room(room, copy, by_m) for room in document["rooms"]]
+            kept = document.get("openings", [])
+            if copy != own:
+                kept = _with_moved_doors(scene.plan, kept, seen, rng)
+            openings += [_moved_opening(opening, copy, by_m) for opening in kept]
+        plan = FloorPlan.from_dict(
+            {**document, "rooms": rooms, "openings": openings, "opening_kinds": sorted(scene.plan.opening_kinds)}
+        )
+        cameras = tuple(_moved_camera(one, own * step_m, own * len(scene.plan.rooms)) for one, _ in seen)
+        return dataclasses.replace(scene, plan=plan, cameras=cameras)
+
+
+def _seen_doors(plan: FloorPlan, camera: Camera) -> list[int]:
+    """Numbers of the plan's openings that are doors and are seen from where a camera stands."""
+    met = _met(plan, camera)
+    document = plan.to_dict()
+    openings = document.get("openings", [])
+    seen = []
+    for index, opening in enumerate(openings):
+        if opening["kind"] == "door":
+            without = FloorPlan.from_dict({**document, "openings": openings[:index] + openings[index + 1 :]})
+            if np.sum(_met(without, camera) != met) >= _SEEN_COLUMNS:
+                seen.append(index)
+    return seen
+
+
+def _met(plan: FloorPlan, camera: Camera) -> Int[np.ndarray, "w"]:
+    """Kind of what is met at each azimuth around a camera."""
+    room, heading = np.array([camera.room_index]), np.zeros(1)
+    here = (camera.position_m[None], heading, room, plan.geometry, _COLUMNS, camera.camera_height_m)
+    return layout_view(*here).kind[0]
+
+
+def _with_moved_doors(
+    plan: FloorPlan, openings: list[dict[str, Any]], seen: Sequence[tuple[Camera, list[int]]], rng: np.random.Generator
+) -> list[dict[str, Any]]:
+    """The openings of a copy: some of the doors that cameras see lie elsewhere in the camera's room."""
+    going: dict[int, int] = {}
+    for camera, doors in seen:
+        one = int(rng.choice(doors))
+        going |= {door: camera.room_index for door in doors if door == one or rng.random() < _MOVED_SHARE}
+    placed = dict(enumerate(openings))
+    for index, room in going.items():
+        line = _free_line(plan.rooms[room].polygon_m, openings[index], list(placed.values()), rng)
+        del placed[index]
+        if line is not None:
+            placed[index] = {**openings[index], "line": line, "rooms": [plan.rooms[room].id]}
+    return [placed[index] for index in sorted(placed)]
+
+
+def _free_line(
+    polygon_m: Float[np.ndarray, "v 2"],
+    door: dict[str, Any],
+    openings: list[dict[str, Any]],
+    rng: np.random.Generator,
+) -> list[list[float]] | None:
+    """A place for a door on a room's walls where no opening is; None if there is none."""
+    width_m = float(np.linalg.norm(np.subtract(*door["line"])))
+    lines = np.array([opening["line"] for opening in openings])
+    free = []
+    for start, end in zip(polygon_m, np.roll(polygon_m, -1, axis=0), strict=True):
+        length_m = float(np.linalg.norm(end - start))
+        along = (end - start) / length_m
+        at = (lines - start) @ along
+        apart = np.abs((lines - start) @ np.array([-along[1], along[0]])).max(axis=1)
+        taken = np.sort(at[apart < _MAX_THICKNESS_M], axis=1)
+        for first in np.arange(_CLEAR_M, length_m - width_m - _CLEAR_M, _STEP_M):
+            last = first + width_m
+            if not np.any((taken[:, 0] < last + _CLEAR_M) & (taken[:, 1] > first - _CLEAR_M)):
+                free.append([(start + first * along).tolist(), (start + last * along).tolist()])
+    return free[int(rng.integers(len(free)))] if free else None
+
+
+def _moved_room(room: dict[str, Any], copy: int, by_m: float) -> dict[str, Any]:
+    lists = {key: [_moved(points, by_m) for points in room[key]] for key in ("holes", "walls") if key in room}
+    return {**room, **lists, "id": f"{room['id']}-copy-{copy}", "polygon": _moved(room["polygon"], by_m)}
+
+
+def _moved_opening(opening: dict[str, Any], copy: int, by_m: float) -> dict[str, Any]:
+    rooms = {"rooms": [f"{room}-copy-{copy}" for room in opening["rooms"]]} if "rooms" in opening else {}
+    return {**opening, **rooms, "line": _moved(opening["line"], by_m)}
+
+
+def _moved(points: list[list[float]], by_m: float) -> list[list[float]]:
+    return [[x + by_m, y] for x, y in points]
+
+
+def _moved_camera(camera: Camera, by_m: float, rooms: int) -> Camera:
+    return dataclasses.replace(
+        camera, position_m=camera.position_m + np.array([by_m, 0.0]), room_index=camera.room_index + rooms
+    )

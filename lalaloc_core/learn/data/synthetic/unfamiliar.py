@@ -1,0 +1,91 @@
+"""Out-of-family scenes: homes and photographs written apart from the training generator, for nothing but reporting."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, UInt8
+
+from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene, Split
+from lalaloc_core.errors import DatasetError, InvalidInputError
+from lalaloc_core.learn.heldout.furnish import LEVELS, Level
+from lalaloc_core.learn.heldout.homes import HomeKey, home_of, stands_of
+from lalaloc_core.learn.heldout.photograph import UnfamiliarShot, depth_m, render
+
+_DEPTH_HEIGHT = 256
+_LEVEL_SHARES = (0.2, 0.25, 0.55)
+# Both are for reporting; there is nothing to train on.
+SPLIT_NUMBERS: dict[Split, int] = {"validation": 1, "test": 2}
+
+
+@dataclass(frozen=True, kw_only=True)
+class UnfamiliarScenes:
+    """Homes of the out-of-family generator with a few cameras each, at every heading and heights of 1.1 to 1.8 m.
+
+    Attributes:
+        homes: how many per split.
+        shots_per_home: cameras per home; they stand where they fit at every furniture level.
+        furniture: every camera's level, or None to draw it for each: then a camera's one photograph has no level.
+    """
+
+    homes: int
+    shots_per_home: int = 4
+    seed: int = 0
+    furniture: Level | None = "full"
+
+    def __post_init__(self) -> None:
+        for name, least in (("homes", 0), ("shots_per_home", 1), ("seed", 0)):
+            if getattr(self, name) < least:
+                raise InvalidInputError(f"{name} is {getattr(self, name)}, it must be at least {least}")
+        if self.furniture not in (None, *LEVELS):
+            raise InvalidInputError(f"furniture is '{self.furniture}', it must be one of {', '.join(LEVELS)}")
+
+    @property
+    def description(self) -> str:
+        return f"out-of-family homes (seed {self.seed})"
+
+    @property
+    def appearances(self) -> Sequence[Appearance]:
+        return (Appearance(self.furniture),)
+
+    def scenes(self, split: Split) -> Sequence[str]:
+        return [f"{split}-{index:05d}" for index in range(self.homes)] if split in SPLIT_NUMBERS else []
+
+    def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
+        split, _, index = name.partition("-")
+        number = next((n for known, n in SPLIT_NUMBERS.items() if known == split), None)
+        if number is None or not index.isdecimal():
+            raise DatasetError("no such out-of-family scene; names are like 'test-00042'", scene=name)
+        key = HomeKey(number, self.seed, int(index))
+        levels = key.rng(5).choice(len(LEVELS), self.shots_per_home, p=_LEVEL_SHARES)
+        cameras = tuple(
+            Camera(
+                name=str(k),
+                position_m=stand.position_m,
+                room_index=stand.room_index,
+                heading=stand.heading,
+                camera_height_m=stand.camera_height_m,
+                photographs={
+                    self.appearances[0]: UnfamiliarPhotograph(
+                        UnfamiliarShot(key, self.furniture or LEVELS[levels[k]], stand, k)
+                    )
+                },
+            )
+            for k, stand in enumerate(stands_of(key, self.shots_per_home))
+        )
+        return Scene(name=name, plan=home_of(key).plan.plan, cameras=cameras)
+
+
+@dataclass(frozen=True, eq=False)
+class UnfamiliarPhotograph:
+    """A photograph that is rendered whenever it is asked for."""
+
+    shot: UnfamiliarShot
+
+    def image(self, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
+        return render(self.shot, height, width)
+
+    def depth_m(self) -> Float[np.ndarray, "h w"]:
+        return depth_m(self.shot, _DEPTH_HEIGHT, 2 * _DEPTH_HEIGHT)

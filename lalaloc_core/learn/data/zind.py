@@ -1,0 +1,290 @@
+"""Zillow Indoor Dataset (ZInD, Cruz et al. 2021): 360° photographs of real, unfurnished homes.
+
+    ROOT/zind_partition.json
+    ROOT/<home>/zind_data.json
+    ROOT/<home>/panos/floor_01_partial_room_01_pano_15.jpg
+
+A scene is one floor of a home, "0000/floor_01". ZInD's frame is mirrored: a point (x, y) is seen at the image azimuth
+atan2(-x, y). Negating every x gives the plan frame, and turns the sense of rotations too: ZInD's counter-clockwise
+`rotation` of a panorama becomes its heading as it stands.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from lalaloc_core.conventions import heading_from_degrees
+from lalaloc_core.learn.data.assembly import RoomOutline, assemble_plan, inside, is_number, pose_fault, read_json
+from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene, Split
+from lalaloc_core.learn.data.drawn_openings import DrawnOpening
+from lalaloc_core.learn.data.photographs import FilePhotograph
+from lalaloc_core.errors import DatasetError
+from lalaloc_core.floorplan import FloorPlan, room_type_of
+
+DATA_FILE = "zind_data.json"
+PARTITION_FILE = "zind_partition.json"
+
+# The lists of a layout, and what their entries are in a plan.
+_OPENING_LISTS = {"doors": "door", "openings": "passage", "windows": "window"}
+_PARTITION_KEYS: dict[Split, str] = {"train": "train", "validation": "val", "test": "test"}
+
+
+@dataclass(frozen=True)
+class Zind:
+    """A copy of ZInD, or of a part of it."""
+
+    root: Path
+
+    @property
+    def description(self) -> str:
+        return "ZInD"
+
+    @property
+    def appearances(self) -> Sequence[Appearance]:
+        return (Appearance(),)
+
+    def scenes(self, split: Split) -> Sequence[str]:
+        """Every floor of a split's homes that are on disk, those without a metric scale included.
+
+        A home whose file cannot be read is listed by its name alone, so that loading it says why.
+
+        Raises:
+            DatasetError: the partition file is missing or damaged.
+        """
+        homes = self._partition.get(_PARTITION_KEYS[split], [])
+        return [name for home in homes if (self.root / home).is_dir() for name in self._floors_of(home)]
+
+    def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
+        home, _, floor = name.partition("/")
+        folder = inside(self.root, home)
+        if folder is None or "/" in floor:
+            raise DatasetError("no such floor; names are like '0000/floor_01'", scene=name, path=self.root)
+        reader = _FloorReader(name, floor, folder, read_json(folder / DATA_FILE, scene=name))
+        return reader.scene(problems)
+
+    @cached_property
+    def _partition(self) -> dict[str, list[str]]:
+        path = self.root / PARTITION_FILE
+        document = read_json(path)
+        for key, homes in document.items():
+            if key not in _PARTITION_KEYS.values():
+                raise DatasetError(f"no split is called '{key}', only {', '.join(_PARTITION_KEYS.values())}", path=path)
+            if not isinstance(homes, list) or not all(isinstance(h, str) and inside(self.root, h) for h in homes):
+                raise DatasetError(f"'{key}' must be a list of the homes' names", path=path)
+        return document
+
+    def _floors_of(self, home: str) -> list[str]:
+        try:
+            merger = read_json(self.root / home / DATA_FILE).get("merger")
+        except DatasetError:
+            return [home]
+        return [f"{home}/{floor}" for floor in sorted(merger)] if isinstance(merger, dict) and merger else [home]
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Panorama:
+    """One panorama of a floor: its place in the file, and what the file says of it."""
+
+    complete_room: str
+    name: str
+    data: Mapping[str, Any]
+
+
+class _FloorReader:
+    """Reads one floor of a home."""
+
+    def __init__(self, scene: str, floor: str, folder: Path, document: dict[str, Any]) -> None:
+        self._scene, self._folder = scene, folder
+        self._path = folder / DATA_FILE
+        merger, scales = document.get("merger"), document.get("scale_meters_per_coordinate")
+        if not isinstance(merger, dict) or not isinstance(scales, dict):
+            raise self._error("'merger' and 'scale_meters_per_coordinate' must be objects")
+        if not isinstance(merger.get(floor), dict):
+            raise self._error(f"no floor '{floor}', there are: {', '.join(sorted(merger)) or 'none'}")
+        scale = scales.get(floor)
+        if scale is None:
+            raise self._error("the floor has no metric scale (scale_meters_per_coordinate is null)")
+        if not is_number(scale) or not scale > 0.0:
+            raise self._error(f"scale_meters_per_coordinate is {scale!r}, it must be a number above 0")
+        self._scale_m = float(scale)
+        self._panoramas = list(self._walk(merger[floor]))
+
+    def scene(self, problems: list[DatasetError] | None) -> Scene:
+        outlines: dict[str, RoomOutline] = {}
+        openings: list[DrawnOpening] = []
+        faults: list[str] = []
+        for panorama in self._panoramas:
+            if panorama.complete_room not in outlines and panorama.data.get("is_primary") is True:
+                layout = panorama.data.get("layout_complete")
+                # Of small rooms seen from outside there may be none.
+                if layout is not None:
+                    outlines[panorama.complete_room] = self._outline(panorama, layout)
+                    openings += self._openings(panorama, layout, faults)
+        plan = assemble_plan(
+            self._scene,
+            list(outlines.values()),
+            path=self._path,
+            units="coordinates are multiplied by scale_meters_per_coordinate",
+            openings=openings,
+            opening_kinds=tuple(_OPENING_LISTS.values()),
+        )
+        plan = dataclasses.replace(plan, warnings=(*plan.warnings, *faults))
+        places = {room.name: index for index, room in enumerate(plan.rooms)}
+        rooms = {room: places[outline.name] for room, outline in outlines.items() if outline.name in places}
+        cameras = []
+        for panorama in self._panoramas:
+            try:
+                cameras.append(self._camera(panorama, plan, rooms.get(panorama.complete_room)))
+            except DatasetError as error:
+                if problems is None:
+                    raise
+                problems.append(error)
+        return Scene(name=self._scene, plan=plan, cameras=tuple(cameras))
+
+    def _walk(self, floor: dict[str, Any]) -> Iterator[_Panorama]:
+        for complete_room, partial_rooms in sorted(floor.items()):
+            for partial_room, panoramas in sorted(self._object(partial_rooms, complete_room).items()):
+                for pano, data in sorted(self._object(panoramas, partial_room).items()):
+                    name = f"{partial_room}_{pano}"
+                    yield _Panorama(complete_room=complete_room, name=name, data=self._object(data, name))
+
+    def _outline(self, panorama: _Panorama, layout: Any) -> RoomOutline:
+        vertices = layout.get("vertices") if isinstance(layout, dict) else None
+        if not isinstance(vertices, list) or len(vertices) < 3:
+            raise self._error("layout_complete has no list of at least three 'vertices'", panorama.name)
+        polygon = np.array([self._pair(vertex, f"vertex {k}", panorama) for k, vertex in enumerate(vertices)])
+        transform = self._transform(panorama)
+        ceiling = self._number(panorama.data, "ceiling_height", panorama)
+        label = str(panorama.data.get("label", "")).strip()
+        return RoomOutline(
+            name=f"{label} {panorama.complete_room}".strip(),
+            polygon_m=transform.to_plan_m(polygon),
+            ceiling_height_m=ceiling * transform.unit_m,
+            type=room_type_of(label),
+        )
+
+    def _openings(self, panorama: _Panorama, layout: Mapping[str, Any], faults: list[str]) -> Iterator[DrawnOpening]:
+        """Doors, passages and windows of a layout: lists of threes, both ends and the heights from the camera."""
+        transform = self._transform(panorama)
+        camera = self._number(panorama.data, "camera_height", panorama)
+        for key, kind in _OPENING_LISTS.items():
+            flat = layout.get(key, [])
+            if not isinstance(flat, list) or len(flat) % 3:
+                faults.append(f"{panorama.name}: '{key}' is left out, it is no list of threes")
+                continue
+            for number in range(0, len(flat), 3):
+                try:
+                    start, end, heights = (
+                        self._pair(flat[number + k], f"{key} {number // 3}", panorama) for k in range(3)
+                    )
+                except DatasetError as error:
+                    faults.append(f"{panorama.name}: an entry of '{key}' is left out, {error.reason}")
+                    continue
+                yield DrawnOpening(
+                    kind=kind,
+                    line_m=transform.to_plan_m(np.array([start, end])),
+                    sill_m=max(0.0, (camera + heights[0]) * transform.unit_m),
+                    head_m=(camera + heights[1]) * transform.unit_m,
+                )
+
+    def _camera(self, panorama: _Panorama, plan: FloorPlan, room_index: int | None) -> Camera:
+        if room_index is None:
+            raise self._error(
+                f"its room '{panorama.complete_room}' has no usable layout_complete in a primary panorama",
+                panorama.name,
+            )
+        transform = self._transform(panorama)
+        position_m = transform.to_plan_m(np.zeros((1, 2)))[0]
+        height_m = self._number(panorama.data, "camera_height", panorama) * transform.unit_m
+        fault = pose_fault(plan, room_index, position_m, height_m)
+        if fault is None and panorama.data.get("is_inside") is False:
+            fault = f"the panorama was taken outside its room '{plan.rooms[room_index].name}' (is_inside is false)"
+        if fault is not None:
+            raise self._error(fault, panorama.name)
+        image_path = panorama.data.get("image_path")
+        path = inside(self._folder, image_path) if isinstance(image_path, str) else None
+        if path is None:
+            raise self._error(f"image_path is {image_path!r}, a path below the home's folder is needed", panorama.name)
+        photograph = FilePhotograph(path=path, scene=self._scene, room=panorama.name)
+        return Camera(
+            name=panorama.name,
+            position_m=position_m,
+            room_index=room_index,
+            heading=transform.heading,
+            camera_height_m=height_m,
+            photographs={Appearance(): photograph},
+        )
+
+    def _transform(self, panorama: _Panorama) -> _Transform:
+        found = panorama.data.get("floor_plan_transformation")
+        if not isinstance(found, dict):
+            raise self._error("has no object 'floor_plan_transformation'", panorama.name)
+        return _Transform(
+            translation=np.array(self._pair(found.get("translation"), "translation", panorama)),
+            rotation_deg=self._number(found, "rotation", panorama, positive=False),
+            scale=self._number(found, "scale", panorama),
+            scale_m=self._scale_m,
+        )
+
+    def _number(self, data: Mapping[str, Any], key: str, panorama: _Panorama, *, positive: bool = True) -> float:
+        value = data.get(key)
+        if not is_number(value) or (positive and not value > 0.0):
+            limit = "a number above 0" if positive else "a number"
+            raise self._error(f"{key} is {value!r}, {limit} is needed", panorama.name)
+        return float(value)
+
+    def _pair(self, value: Any, what: str, panorama: _Panorama) -> tuple[float, float]:
+        if not isinstance(value, list) or len(value) != 2 or not all(is_number(one) for one in value):
+            raise self._error(f"{what} is {str(value)[:80]}, two numbers are needed", panorama.name)
+        return float(value[0]), float(value[1])
+
+    def _object(self, value: Any, what: str) -> dict[str, Any]:
+        if not isinstance(value, dict):
+            raise self._error(f"'{what}' must be an object, not {type(value).__name__}")
+        return value
+
+    def _error(self, reason: str, panorama: str | None = None) -> DatasetError:
+        return DatasetError(reason, scene=self._scene, room=panorama, path=self._path)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class _Transform:
+    """From a panorama's own frame, in units of its camera's height, to the floor's frame and on to the plan's.
+
+    Attributes:
+        translation: of the camera, in the floor's coordinates.
+        rotation_deg: counter-clockwise in the floor's mirrored frame.
+        scale: floor coordinates per camera height.
+        scale_m: metres per floor coordinate.
+    """
+
+    translation: Float[np.ndarray, "2"]
+    rotation_deg: float
+    scale: float
+    scale_m: float
+
+    @property
+    def unit_m(self) -> float:
+        """Metres per unit of the panorama's own frame."""
+        return self.scale * self.scale_m
+
+    @property
+    def heading(self) -> float:
+        """Azimuth of the panorama's centre column in the plan frame, radians."""
+        return heading_from_degrees(self.rotation_deg)
+
+    def to_plan_m(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
+        """Points of the panorama's own frame in the plan frame."""
+        angle = math.radians(self.rotation_deg)
+        turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
+        floor = self.scale * points @ turn.T + self.translation
+        return self.scale_m * floor * np.array([-1.0, 1.0])

@@ -1,0 +1,10 @@
+"""From trained weights to a model bundle.
+
+Begin with `run.py`, which takes the weights of a training run; `bundle_export.py` writes ONNX and safetensors, and
+compares them with torch.
+"""
+
+from lalaloc_core.learn.export.bundle_export import PARITY_TOLERANCE, export_bundle
+from lalaloc_core.learn.export.run import export_run
+
+__all__ = ["PARITY_TOLERANCE", "export_bundle", "export_run"]

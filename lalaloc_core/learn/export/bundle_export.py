@@ -1,0 +1,282 @@
+"""Export trained encoders to a model bundle: ONNX for the service, safetensors for LPO and further training.
+
+What ships is what is checked: weights are rounded to half precision first (storage only, arithmetic stays single),
+then exported, then the exported files are compared with torch on random layouts and panoramas.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import tempfile
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+import safetensors.torch
+import torch
+from torch import Tensor, nn
+
+from lalaloc_core.localise.bundle import (
+    BUNDLE_FILES,
+    DECODER_WEIGHTS,
+    HEAD_ONNX,
+    IMAGE_ONNX,
+    IMAGE_WEIGHTS,
+    LAYOUT_ONNX,
+    LAYOUT_WEIGHTS,
+    MANIFEST_NAME,
+    Bundle,
+    Manifest,
+)
+from lalaloc_core.localise.bundle import write_manifest as _write_manifest
+from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
+from lalaloc_core.errors import ExportError
+from lalaloc_core.nets import ImageEncoder, LayoutEncoder, paper_encoders, ring_image_encoder, trunk
+from lalaloc_core.nets.decoder import LayoutDecoder
+from lalaloc_core.nets.image_encoder import TrunkImageEncoder
+from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
+from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
+from lalaloc_core.learn.training import losses
+from lalaloc_core.learn.training.config import TrainConfig
+
+PARITY_TOLERANCE = 1e-4
+_PARITY_BATCH = 4
+# Smaller tensors (biases, normalisation statistics) keep single precision; they weigh nothing.
+_HALF_FROM_ELEMENTS = 1024
+
+
+def export_bundle(
+    folder: Path,
+    config: TrainConfig,
+    layout_encoder: LayoutEncoder,
+    image_encoder: ImageEncoder | None,
+    decoder: LayoutDecoder | None = None,
+    *,
+    name: str,
+    version: str,
+    training: dict[str, Any] | None = None,
+) -> Bundle:
+    """Write a bundle into `folder`, which is created or whose files of the same names are replaced.
+
+    The networks are put into evaluation mode and their weights rounded in place. Without an image encoder the bundle
+    answers layout queries only.
+
+    Raises:
+        ExportError: an exported network differs from torch by more than `PARITY_TOLERANCE`; `folder` is untouched.
+    """
+    for module in filter(None, (layout_encoder, image_encoder, decoder)):
+        module.cpu().eval().requires_grad_(False)
+        _round_to_half(module)
+    with tempfile.TemporaryDirectory(prefix="lalaloc-export-") as scratch:
+        work = Path(scratch)
+        _save_weights(layout_encoder, work / LAYOUT_WEIGHTS)
+        if image_encoder is not None:
+            _save_weights(image_encoder, work / IMAGE_WEIGHTS)
+        if decoder is not None:
+            _save_weights(decoder, work / DECODER_WEIGHTS)
+        parity = _export_networks(work, config, layout_encoder, image_encoder)
+        told = {**(training or {}), "parity_max_abs_difference": parity}
+        manifest = _manifest(config, image_encoder, name, version, told)
+        folder.mkdir(parents=True, exist_ok=True)
+        # Without its manifest nothing is a bundle, until all files are written.
+        for name in (MANIFEST_NAME, *BUNDLE_FILES):
+            # A bundle of another architecture may have left files that this one does not have.
+            (folder / name).unlink(missing_ok=True)
+        for path in work.iterdir():
+            (folder / path.name).write_bytes(path.read_bytes())
+    return _write_manifest(folder, manifest)
+
+
+def export_again(
+    bundle: Bundle, config: TrainConfig, layout_encoder: LayoutEncoder, image_encoder: ImageEncoder | None
+) -> Bundle:
+    """Write the ONNX networks of a bundle anew, of its own weights; nothing else of it changes but its digest.
+
+    Raises:
+        ExportError: as of `export_bundle`; the bundle is untouched.
+    """
+    with tempfile.TemporaryDirectory(prefix="lalaloc-export-") as scratch:
+        work = Path(scratch)
+        for module in filter(None, (layout_encoder, image_encoder)):
+            module.cpu().eval().requires_grad_(False)
+        parity = _export_networks(work, config, layout_encoder, image_encoder)
+        for path in work.iterdir():
+            (bundle.folder / path.name).write_bytes(path.read_bytes())
+    training = {**bundle.manifest.training, "parity_max_abs_difference": parity}
+    return _write_manifest(bundle.folder, dataclasses.replace(bundle.manifest, training=training))
+
+
+def _export_networks(
+    work: Path, config: TrainConfig, layout_encoder: LayoutEncoder, image_encoder: ImageEncoder | None
+) -> float:
+    """Export and compare every network; returns the largest difference found."""
+    generator = torch.Generator().manual_seed(0)
+
+    def heights(low: float, high: float) -> Tensor:
+        return torch.empty(_PARITY_BATCH).uniform_(low, high, generator=generator)
+
+    profile = torch.empty(_PARITY_BATCH, config.profile_columns).uniform_(0.3, 6.0, generator=generator)
+    layout = {"profile_m": profile, "camera_height_m": heights(1.0, 1.9), "ceiling_height_m": heights(2.2, 3.5)}
+    height, width = config.image_size
+    image = torch.randint(0, 256, (_PARITY_BATCH, height, width, 3), dtype=torch.uint8, generator=generator)
+    differences = [_export(work / LAYOUT_ONNX, layout_encoder, layout, ["latent"])]
+    if isinstance(layout_encoder, RingLayoutEncoder):
+        features = layout_encoder.ring(*layout.values())
+        differences.append(_export(work / HEAD_ONNX, layout_encoder.head, {"ring": features}, ["latent"]))
+    if isinstance(image_encoder, RingImageEncoder | TrunkImageEncoder):
+        inputs = {"image": image, "camera_height_m": heights(1.0, 1.9)}
+        outputs = ["ring", "log_profile", "log_scale"]
+        if isinstance(image_encoder, TrunkImageEncoder):
+            outputs += ["opening_logits", "log_ceiling", "log_ceiling_scale", "room_type_logits"]
+        differences.append(_export(work / IMAGE_ONNX, _RingOutputs(image_encoder), inputs, outputs))
+    elif image_encoder is not None:
+        differences.append(_export(work / IMAGE_ONNX, image_encoder, {"image": image}, ["latent"]))
+    return max(differences)
+
+
+class _RingOutputs(nn.Module):
+    """The image encoder's features as a plain tuple, which is what ONNX knows."""
+
+    def __init__(self, encoder: RingImageEncoder | TrunkImageEncoder) -> None:
+        super().__init__()
+        self.encoder = encoder
+
+    def forward(self, image: Tensor, camera_height_m: Tensor) -> tuple[Tensor, ...]:
+        features = self.encoder(image, camera_height_m)
+        told = (features.ring, features.log_profile, features.log_scale)
+        seen = features.structure
+        if seen is None:
+            return told
+        return (*told, seen.opening_logits, seen.log_ceiling, seen.log_ceiling_scale, seen.room_type_logits)
+
+
+def _export(path: Path, module: nn.Module, inputs: dict[str, Tensor], outputs: list[str]) -> float:
+    """Export one network with a dynamic batch, store it compactly, and compare it with torch."""
+    with warnings.catch_warnings():
+        # The exporter warns of its own internals, which no caller can act upon.
+        warnings.simplefilter("ignore")
+        logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+        program = torch.onnx.export(
+            module.eval(),
+            tuple(inputs.values()),
+            input_names=list(inputs),
+            output_names=outputs,
+            dynamic_shapes=tuple({0: torch.export.Dim("batch", min=1, max=4096)} for _ in inputs),
+            dynamo=True,
+            # onnxruntime optimises when it loads; here weights must stay recognisable for half-precision storage.
+            optimize=False,
+            verbose=False,
+        )
+    assert program is not None
+    model = program.model_proto
+    _drop_traces(model)
+    _settle_types(model)
+    _store_in_half(model)
+    content = model.SerializeToString()
+    path.write_bytes(content)
+    return _parity(path.name, content, module, inputs, outputs)
+
+
+def _parity(name: str, content: bytes, module: nn.Module, inputs: dict[str, Tensor], outputs: list[str]) -> float:
+    """Largest absolute difference between onnxruntime and torch.
+
+    Raises:
+        ExportError: it exceeds `PARITY_TOLERANCE`.
+    """
+    session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
+    actual = session.run(outputs, {key: value.numpy() for key, value in inputs.items()})
+    expected = module(*inputs.values())
+    expected = expected if isinstance(expected, tuple) else (expected,)
+    difference = max(float(np.abs(a - e.numpy()).max()) for a, e in zip(actual, expected, strict=True))
+    if not difference < PARITY_TOLERANCE:
+        raise ExportError(f"{name} differs from torch by {difference:.2e}, at most {PARITY_TOLERANCE:g} is allowed")
+    return difference
+
+
+def _round_to_half(module: nn.Module) -> None:
+    for parameter in module.parameters():
+        if parameter.numel() >= _HALF_FROM_ELEMENTS:
+            parameter.data = parameter.data.half().float()
+
+
+def _save_weights(module: nn.Module, path: Path) -> None:
+    large = {name for name, parameter in module.named_parameters() if parameter.numel() >= _HALF_FROM_ELEMENTS}
+    state = {k: (v.half() if k in large else v).contiguous() for k, v in module.state_dict().items()}
+    path.write_bytes(safetensors.torch.save(state))
+
+
+def _drop_traces(model: onnx.ModelProto) -> None:
+    """Remove the exporter's stack traces: they outweigh small networks and name paths of the exporting machine."""
+    for part in (*model.graph.node, *model.graph.value_info, *model.graph.initializer, *model.graph.input):
+        part.doc_string = ""
+        del part.metadata_props[:]
+    del model.graph.metadata_props[:]
+    del model.metadata_props[:]
+
+
+def _settle_types(model: onnx.ModelProto) -> None:
+    """Say of limits that are cast to the type of a map what that type is: single precision, as everywhere here.
+
+    Otherwise they depend on the map, and onnxruntime cannot clip it while it convolves, but does so afterwards.
+    """
+    for node in model.graph.node:
+        if node.op_type == "CastLike":
+            node.op_type = "Cast"
+            del node.input[1:]
+            node.attribute.append(onnx.helper.make_attribute("to", onnx.TensorProto.FLOAT))
+
+
+def _store_in_half(model: onnx.ModelProto) -> None:
+    """Store large weights as half precision with a cast in front, which onnxruntime folds away when it loads."""
+    casts = []
+    for tensor in model.graph.initializer:
+        values = onnx.numpy_helper.to_array(tensor)
+        if values.dtype != np.float32 or values.size < _HALF_FROM_ELEMENTS:
+            continue
+        half = values.astype(np.float16)
+        if not np.array_equal(half.astype(np.float32), values):
+            # Not one of the rounded parameters but a constant of the graph: leave it exact.
+            continue
+        name = tensor.name
+        tensor.CopyFrom(onnx.numpy_helper.from_array(half, name + ".half"))
+        casts.append(onnx.helper.make_node("Cast", [name + ".half"], [name], to=onnx.TensorProto.FLOAT))
+    nodes = [*casts, *model.graph.node]
+    del model.graph.node[:]
+    model.graph.node.extend(nodes)
+
+
+def _manifest(
+    config: TrainConfig, image_encoder: ImageEncoder | None, name: str, version: str, training: dict[str, Any]
+) -> Manifest:
+    sizes = config.layout_sizes
+    statistics = {"ring": ring_image_encoder, "trunk": trunk, "paper": paper_encoders}[config.architecture]
+    structure: dict[str, Any] = {}
+    if isinstance(image_encoder, TrunkImageEncoder):
+        prior = losses.opening_prior(image_encoder.opening_share, config.image.opening_balance)
+        structure = {
+            "image_config": dataclasses.asdict(config.trunk),
+            "opening_classes": list(OPENING_CLASSES),
+            "opening_prior": prior.tolist(),
+            "room_types": list(ROOM_TYPES),
+            "room_type_prior": image_encoder.room_type_share.tolist(),
+        }
+    height, width = config.image_size
+    return Manifest(
+        name=name,
+        version=version,
+        architecture=config.architecture,
+        layout_config=dataclasses.asdict(sizes),
+        profile_columns=config.profile_columns,
+        image_height=height,
+        image_width=width,
+        image_mean=list(statistics.IMAGE_MEAN),
+        image_std=list(statistics.IMAGE_STD),
+        latent_size=sizes.latent_size,
+        ring_sectors=config.ring.sectors if config.has_ring else 0,
+        **structure,
+        training={**training, "config": config.to_dict()},
+    )

@@ -1,0 +1,271 @@
+"""Furniture to sit, lie, eat and work at, and to keep things in; see `pieces` for the frame."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import numpy as np
+
+from lalaloc_core.learn.synth.furniture.pieces import Finish, Part, Piece, box, cylinder, square_legs
+
+
+def bed(rng: np.random.Generator) -> Piece:
+    """Frame, mattress, duvet, pillows and usually a headboard."""
+    width, depth, height = rng.uniform(0.9, 1.9), rng.uniform(1.95, 2.15), rng.uniform(0.35, 0.6)
+    hx, hy = 0.5 * width, 0.5 * depth
+    linen: Finish = "white" if rng.random() < 0.6 else "fabric"
+    parts = [
+        box(at=(0.0, 0.0), half=(hx, hy), z=(0.08, 0.6 * height), finish="wood"),
+        box(at=(0.0, 0.02), half=(hx - 0.03, hy - 0.03), z=(0.6 * height, height), finish="white"),
+        box(at=(0.0, 0.2 * depth), half=(hx, 0.3 * depth), z=(0.5 * height, height + 0.05), finish=linen),
+    ]
+    pillows = 2 if width > 1.3 else 1
+    for k in range(pillows):
+        x = (k - 0.5 * (pillows - 1)) * width / pillows
+        parts.append(box(at=(x, -hy + 0.3), half=(0.3, 0.2), z=(height, height + 0.12), finish="white"))
+    if rng.random() < 0.7:
+        parts.append(box(at=(0.0, -hy + 0.03), half=(hx, 0.03), z=(0.0, rng.uniform(0.8, 1.3)), finish="wood"))
+    return Piece(width, depth, tuple(parts))
+
+
+def sofa(rng: np.random.Generator) -> Piece:
+    """Seat, back, arms and cushions; an armchair when narrow."""
+    width, depth = rng.uniform(0.75, 2.6), rng.uniform(0.8, 1.0)
+    hx, hy, seat, back = 0.5 * width, 0.5 * depth, rng.uniform(0.38, 0.46), rng.uniform(0.7, 0.95)
+    parts = [
+        box(at=(0.0, 0.08), half=(hx, hy - 0.08), z=(0.06, seat), finish="fabric"),
+        box(at=(0.0, -hy + 0.12), half=(hx, 0.12), z=(0.06, back), finish="fabric"),
+        box(at=(-hx + 0.09, 0.0), half=(0.09, hy), z=(0.06, seat + 0.18), finish="fabric"),
+        box(at=(hx - 0.09, 0.0), half=(0.09, hy), z=(0.06, seat + 0.18), finish="fabric"),
+    ]
+    for x in np.arange(-hx + 0.4, hx - 0.3, 0.7):
+        if rng.random() < 0.5:
+            parts.append(box(at=(float(x), -0.1), half=(0.22, 0.08), z=(seat, seat + 0.35), finish="accent"))
+    return Piece(width, depth, tuple(parts), against_wall=bool(rng.random() < 0.8))
+
+
+def _chair_parts(x: float, y: float, facing: int, finish: Finish) -> list[Part]:
+    """A chair at (x, y) whose back stands on the side of `facing` (+1 or -1 along y)."""
+    legs = [part._replace(x=part.x + x, y=part.y + y) for part in square_legs(0.21, 0.21, 0.04, 0.44, "wood")]
+    seat = box(at=(x, y), half=(0.22, 0.22), z=(0.43, 0.48), finish=finish)
+    back = box(at=(x, y + facing * 0.2), half=(0.21, 0.02), z=(0.48, 0.92), finish=finish)
+    return [*legs, seat, back]
+
+
+def dining_table(rng: np.random.Generator) -> Piece:
+    """A table with chairs on its two long sides."""
+    width, depth, height = rng.uniform(0.8, 2.2), rng.uniform(0.75, 1.0), rng.uniform(0.72, 0.78)
+    hx, hy = 0.5 * width, 0.5 * depth
+    if rng.random() < 0.25:
+        parts = [
+            cylinder(at=(0.0, 0.0), half=(hx, hy), z=(height - 0.04, height), finish="wood"),
+            cylinder(at=(0.0, 0.0), half=(0.06, 0.06), z=(0.0, height - 0.04), finish="metal"),
+        ]
+    else:
+        parts = [
+            box(at=(0.0, 0.0), half=(hx, hy), z=(height - 0.04, height), finish="wood"),
+            *square_legs(hx, hy, 0.07, height - 0.04, "wood"),
+        ]
+    reach = rng.uniform(0.0, 0.3)
+    finish: Finish = "wood" if rng.random() < 0.5 else "accent"
+    for x in np.arange(-hx + 0.35, hx - 0.2, 0.65):
+        for side in (-1, 1):
+            if rng.random() < 0.85:
+                parts += _chair_parts(float(x), side * (hy + reach - 0.1), side, finish)
+    if rng.random() < 0.5:
+        parts.append(
+            cylinder(
+                at=(rng.uniform(-0.3, 0.3), 0.0),
+                half=(0.08, 0.08),
+                z=(height, height + rng.uniform(0.1, 0.35)),
+                finish="accent",
+            )
+        )
+    return Piece(width + 0.1, depth + 2 * reach + 0.3, tuple(parts), against_wall=False)
+
+
+def low_table(rng: np.random.Generator) -> Piece:
+    """A coffee table, round or on four legs, sometimes with something on it."""
+    width, depth, height = rng.uniform(0.5, 1.3), rng.uniform(0.45, 0.7), rng.uniform(0.32, 0.5)
+    hx, hy, is_round = 0.5 * width, 0.5 * depth, bool(rng.random() < 0.3)
+    top = (cylinder if is_round else box)(at=(0.0, 0.0), half=(hx, hy), z=(height - 0.04, height), finish="wood")
+    legs = (
+        [cylinder(at=(0.0, 0.0), half=(0.15, 0.15), z=(0.0, height - 0.04), finish="metal")]
+        if is_round
+        else square_legs(hx, hy, 0.05, height, "wood")
+    )
+    thing = box(
+        at=(rng.uniform(-0.15, 0.15), 0.0),
+        half=(0.12, 0.08),
+        z=(height, height + rng.uniform(0.02, 0.2)),
+        finish="accent",
+    )
+    return Piece(width, depth, (top, *legs, thing), against_wall=False)
+
+
+def desk(rng: np.random.Generator) -> Piece:
+    """A desk with a screen, and a chair before it."""
+    width, depth, height = rng.uniform(0.9, 1.8), rng.uniform(0.55, 0.8), rng.uniform(0.7, 0.78)
+    hx, hy = 0.5 * width, 0.5 * depth
+    back = 0.25
+    parts = [
+        box(at=(0.0, -back), half=(hx, hy), z=(height - 0.03, height), finish="wood"),
+        *(leg._replace(y=leg.y - back) for leg in square_legs(hx, hy, 0.05, height, "metal")),
+        box(at=(0.0, -hy - back + 0.2), half=(0.28, 0.015), z=(height + 0.1, height + 0.45), finish="dark"),
+        box(at=(0.0, -hy - back + 0.2), half=(0.04, 0.04), z=(height, height + 0.12), finish="dark"),
+        *_chair_parts(rng.uniform(-0.2, 0.2), hy - back + 0.1, 1, "dark"),
+    ]
+    if rng.random() < 0.5:
+        parts.append(box(at=(hx - 0.22, -back), half=(0.2, hy - 0.05), z=(0.0, height - 0.03), finish="wood"))
+    return Piece(width, depth + 2 * back, tuple(parts))
+
+
+def wardrobe(rng: np.random.Generator) -> Piece:
+    """A tall box with doors and handles, as high as the ceiling at times."""
+    width = int(rng.integers(1, 6)) * rng.uniform(0.45, 0.62)
+    return wardrobe_run(rng, width, rng.uniform(1.7, 2.6))
+
+
+def wardrobe_run(rng: np.random.Generator, width: float, height: float) -> Piece:
+    """A wardrobe as wide and high (m) as asked for; its doors have handles unless they are sliding ones."""
+    doors = max(1, round(width / rng.uniform(0.45, 0.62)))
+    depth, body = rng.uniform(0.35, 0.65), cast(Finish, "white" if rng.random() < 0.5 else "wood")
+    has_handles, front = rng.random() < 0.75, 0.5 * depth
+    parts = [box(at=(0.0, -0.01), half=(0.5 * width, front - 0.01), z=(0.0, height), finish=body)]
+    pitch = width / doors
+    for k in range(doors):
+        x = -0.5 * width + (k + 0.5) * pitch
+        parts.append(box(at=(x, front - 0.01), half=(0.5 * pitch - 0.008, 0.01), z=(0.06, height - 0.03), finish=body))
+        side = 1 if k % 2 == 0 else -1
+        if has_handles:
+            parts.append(
+                box(
+                    at=(x + side * (0.5 * pitch - 0.06), front + 0.015),
+                    half=(0.01, 0.012),
+                    z=(0.95, 1.15),
+                    finish="metal",
+                )
+            )
+    return Piece(width, depth, tuple(parts))
+
+
+def bookcase(rng: np.random.Generator) -> Piece:
+    """Uprights, boards and books."""
+    width, depth, height = rng.uniform(0.6, 1.8), rng.uniform(0.25, 0.4), rng.uniform(0.8, 2.3)
+    hx, hy = 0.5 * width, 0.5 * depth
+    parts = [box(at=(0.0, -hy + 0.01), half=(hx, 0.01), z=(0.0, height), finish="wood")]
+    parts += [box(at=(sign * (hx - 0.015), 0.0), half=(0.015, hy), z=(0.0, height), finish="wood") for sign in (-1, 1)]
+    levels = max(2, round(height / 0.38))
+    for k in range(levels + 1):
+        z = 0.05 + k * (height - 0.08) / levels
+        parts.append(box(at=(0.0, 0.0), half=(hx - 0.02, hy), z=(z, z + 0.025), finish="wood"))
+        if k < levels and rng.random() < 0.8:
+            span = rng.uniform(0.3, 0.95) * (hx - 0.04)
+            x = rng.uniform(-1, 1) * (hx - 0.04 - span)
+            top = z + 0.025 + rng.uniform(0.4, 0.8) * (height / levels - 0.03)
+            parts.append(
+                box(
+                    at=(x, -0.03),
+                    half=(span, hy - 0.05),
+                    z=(z + 0.025, top),
+                    finish=("accent", "dark", "fabric", "paint")[k % 4],
+                )
+            )
+    return Piece(width, depth, tuple(parts))
+
+
+def sideboard(rng: np.random.Generator) -> Piece:
+    """A low cabinet or chest of drawers, often under a television."""
+    width, depth, height = rng.uniform(0.5, 2.2), rng.uniform(0.35, 0.5), rng.uniform(0.35, 1.0)
+    hy = 0.5 * depth
+    finish: Finish = "white" if rng.random() < 0.4 else "wood"
+    parts = [box(at=(0.0, -0.01), half=(0.5 * width, hy - 0.01), z=(0.0, height), finish=finish)]
+    drawers = int(rng.integers(1, 4))
+    for k in range(drawers):
+        z0, z1 = 0.04 + k * (height - 0.06) / drawers, 0.02 + (k + 1) * (height - 0.06) / drawers
+        parts.append(box(at=(0.0, hy - 0.01), half=(0.5 * width - 0.015, 0.01), z=(z0, z1), finish=finish))
+        parts.append(
+            box(at=(0.0, hy + 0.01), half=(0.06, 0.01), z=(0.5 * (z0 + z1), 0.5 * (z0 + z1) + 0.02), finish="metal")
+        )
+    if height < 0.75 and rng.random() < 0.6:
+        half = min(rng.uniform(0.35, 0.7), 0.5 * width + 0.05)
+        parts.append(
+            box(at=(0.0, -hy + 0.1), half=(half, 0.02), z=(height + 0.06, height + 0.06 + 1.15 * half), finish="dark")
+        )
+    elif rng.random() < 0.7:
+        x = rng.uniform(-0.3, 0.3) * width
+        parts.append(
+            cylinder(at=(x, 0.0), half=(0.08, 0.08), z=(height, height + rng.uniform(0.1, 0.45)), finish="accent")
+        )
+    return Piece(width, depth, tuple(parts))
+
+
+def nightstand(rng: np.random.Generator) -> Piece:
+    """A small chest with a lamp."""
+    width, height = rng.uniform(0.35, 0.55), rng.uniform(0.4, 0.6)
+    half = 0.5 * width
+    parts = (
+        box(at=(0.0, 0.0), half=(half, 0.2), z=(0.0, height), finish="wood"),
+        box(at=(0.0, 0.2), half=(half - 0.02, 0.01), z=(0.1, height - 0.04), finish="wood"),
+        cylinder(at=(0.0, 0.0), half=(0.03, 0.03), z=(height, height + 0.2), finish="metal"),
+        cylinder(at=(0.0, 0.0), half=(0.13, 0.13), z=(height + 0.2, height + 0.42), finish="glow"),
+    )
+    return Piece(width, 0.42, parts)
+
+
+def plant(rng: np.random.Generator) -> Piece:
+    """A pot and a few leafy blobs."""
+    pot, height = rng.uniform(0.1, 0.22), rng.uniform(0.5, 1.9)
+    parts = [
+        cylinder(at=(0.0, 0.0), half=(pot, pot), z=(0.0, 1.6 * pot), finish="accent"),
+        cylinder(at=(0.0, 0.0), half=(0.02, 0.02), z=(1.6 * pot, height - 0.1), finish="wood"),
+    ]
+    for _ in range(int(rng.integers(3, 7))):
+        x, y = rng.uniform(-0.8 * pot, 0.8 * pot, 2)
+        z, radius = rng.uniform(0.35, 1.0) * height, rng.uniform(0.4, 1.0) * pot
+        parts.append(
+            cylinder(at=(float(x), float(y)), half=(radius, 0.7 * radius), z=(z - 0.12, z + 0.06), finish="leaf")
+        )
+    return Piece(3.6 * pot, 3.2 * pot, tuple(parts))
+
+
+def floor_lamp(rng: np.random.Generator) -> Piece:
+    """Foot, pole and shade."""
+    height, radius = rng.uniform(1.3, 1.8), rng.uniform(0.12, 0.25)
+    parts = (
+        cylinder(at=(0.0, 0.0), half=(0.14, 0.14), z=(0.0, 0.03), finish="dark"),
+        cylinder(at=(0.0, 0.0), half=(0.012, 0.012), z=(0.03, height), finish="metal"),
+        cylinder(at=(0.0, 0.0), half=(radius, radius), z=(height - 0.25, height), finish="glow"),
+    )
+    return Piece(2 * radius, 2 * radius, parts)
+
+
+def carton(rng: np.random.Generator) -> Piece:
+    """Boxes, bags and appliances: clutter without a name."""
+    width, depth, height = rng.uniform(0.2, 0.8, 3)
+    finish: Finish = ("wood", "accent", "fabric", "dark", "white", "metal")[int(rng.integers(6))]
+    shape = cylinder if rng.random() < 0.2 else box
+    parts = [shape(at=(0.0, 0.0), half=(0.5 * width, 0.5 * depth), z=(0.0, height), finish=finish)]
+    if rng.random() < 0.4:
+        parts.append(
+            box(
+                at=(0.0, 0.0),
+                half=(0.3 * width, 0.35 * depth),
+                z=(height, height + rng.uniform(0.1, 0.4)),
+                finish="accent",
+            )
+        )
+    return Piece(width, depth, tuple(parts), against_wall=bool(rng.random() < 0.7))
+
+
+def bench(rng: np.random.Generator) -> Piece:
+    """A bench or a shoe rack under a row of hooks."""
+    width = rng.uniform(0.6, 1.4)
+    hx = 0.5 * width
+    parts = (
+        box(at=(0.0, 0.0), half=(hx, 0.17), z=(0.4, 0.45), finish="wood"),
+        *square_legs(hx, 0.17, 0.05, 0.4, "wood"),
+        box(at=(0.0, -0.16), half=(hx, 0.01), z=(1.6, 1.7), finish="wood"),
+        box(at=(rng.uniform(-0.5, 0.5) * hx, -0.1), half=(0.2, 0.07), z=(0.9, 1.65), finish="fabric"),
+    )
+    return Piece(width, 0.36, parts)

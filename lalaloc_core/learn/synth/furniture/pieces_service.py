@@ -1,0 +1,140 @@
+"""Furniture of kitchens and bathrooms; see `pieces` for the frame."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from lalaloc_core.learn.synth.furniture.pieces import Finish, Piece, box, cylinder
+
+COUNTER_DEPTH_M = 0.62
+_UNIT_M = 0.6
+
+
+def counter(rng: np.random.Generator) -> Piece:
+    """A run of kitchen units: base units, worktop, backsplash, hob, sink and wall units."""
+    body: Finish = ("white", "wood", "paint")[int(rng.integers(3))]
+    width = _UNIT_M * int(rng.integers(2, 7))
+    return counter_run(rng, width, rng.uniform(0.85, 0.95), body, wall_units=bool(rng.random() < 0.75))
+
+
+def counter_run(rng: np.random.Generator, width: float, height: float, body: Finish, *, wall_units: bool) -> Piece:
+    """A run of kitchen units, as wide and high (m) as asked for."""
+    units = max(1, round(width / _UNIT_M))
+    unit, depth = width / units, COUNTER_DEPTH_M
+    hx, hy = 0.5 * width, 0.5 * depth
+    parts = [
+        box(at=(0.0, -0.03), half=(hx, hy - 0.06), z=(0.0, 0.1), finish="dark"),
+        box(at=(0.0, -0.01), half=(hx, hy - 0.03), z=(0.1, height - 0.04), finish=body),
+        box(at=(0.0, 0.0), half=(hx, hy), z=(height - 0.04, height), finish="stone"),
+        box(at=(0.0, -hy + 0.01), half=(hx, 0.01), z=(height, height + rng.uniform(0.1, 0.35)), finish="ceramic"),
+    ]
+    if width > 3 * _UNIT_M:
+        parts.append(
+            box(at=(rng.uniform(-0.3, 0.0) * width, 0.0), half=(0.25, 0.22), z=(height, height + 0.01), finish="dark")
+        )
+        parts.append(
+            cylinder(
+                at=(rng.uniform(0.1, 0.3) * width, -0.1), half=(0.02, 0.02), z=(height, height + 0.3), finish="metal"
+            )
+        )
+    for k in range(units):
+        x = -hx + unit * (k + 0.5)
+        oven = rng.random() < 0.15
+        parts.append(
+            box(at=(x, hy - 0.03), half=(0.49 * unit, 0.01), z=(0.11, height - 0.06), finish="dark" if oven else body)
+        )
+        parts.append(box(at=(x, hy - 0.01), half=(0.25 * unit, 0.01), z=(height - 0.14, height - 0.12), finish="metal"))
+    if wall_units:
+        bottom, top = rng.uniform(1.35, 1.5), rng.uniform(1.95, 2.15)
+        for k in range(units):
+            if rng.random() < 0.85:
+                x = -hx + unit * (k + 0.5)
+                parts.append(box(at=(x, -hy + 0.17), half=(0.495 * unit, 0.17), z=(bottom, top), finish=body))
+    return Piece(width, depth, tuple(parts), label="counter")
+
+
+def island(rng: np.random.Generator) -> Piece:
+    """A kitchen island with stools, or half a wall with a worktop."""
+    width, depth, height = rng.uniform(1.0, 2.6), rng.uniform(0.5, 1.1), rng.uniform(0.88, 1.1)
+    body: Finish = ("white", "wood", "paint")[int(rng.integers(3))]
+    hx, hy = 0.5 * width, 0.5 * depth
+    parts = [
+        box(at=(0.0, 0.0), half=(hx - 0.03, hy - 0.05), z=(0.0, height - 0.04), finish=body),
+        box(at=(0.0, 0.0), half=(hx, hy), z=(height - 0.04, height), finish="stone"),
+    ]
+    for x in np.arange(-hx + 0.3, hx - 0.2, 0.6):
+        if rng.random() < 0.5:
+            parts.append(cylinder(at=(float(x), hy + 0.25), half=(0.17, 0.17), z=(0.62, 0.67), finish="wood"))
+            parts.append(cylinder(at=(float(x), hy + 0.25), half=(0.03, 0.03), z=(0.0, 0.62), finish="metal"))
+    return Piece(width, depth + 0.9, tuple(parts), against_wall=False, label="counter")
+
+
+def fridge(rng: np.random.Generator) -> Piece:
+    """A tall box with two doors."""
+    width, height, split = rng.uniform(0.55, 0.9), rng.uniform(1.5, 2.05), rng.uniform(0.5, 1.3)
+    finish: Finish = "white" if rng.random() < 0.5 else "metal"
+    parts = (
+        box(at=(0.0, -0.02), half=(0.5 * width, 0.31), z=(0.02, height), finish=finish),
+        box(at=(0.0, 0.3), half=(0.5 * width - 0.005, 0.02), z=(0.05, split), finish=finish),
+        box(at=(0.0, 0.3), half=(0.5 * width - 0.005, 0.02), z=(split + 0.015, height), finish=finish),
+        box(at=(0.5 * width - 0.05, 0.33), half=(0.012, 0.012), z=(split + 0.05, split + 0.4), finish="dark"),
+    )
+    return Piece(width, 0.7, parts)
+
+
+def bathtub(rng: np.random.Generator) -> Piece:
+    """A tub with a dark-rimmed hollow that reads as one from above."""
+    width, depth, height = rng.uniform(1.4, 1.8), rng.uniform(0.7, 0.8), rng.uniform(0.5, 0.62)
+    hx, hy, rim = 0.5 * width, 0.5 * depth, 0.06
+    parts = [
+        box(at=(0.0, 0.0), half=(hx - rim, hy - rim), z=(0.0, 0.2), finish="ceramic"),
+        box(at=(0.0, -hy + 0.5 * rim), half=(hx, 0.5 * rim), z=(0.0, height), finish="ceramic"),
+        box(at=(0.0, hy - 0.5 * rim), half=(hx, 0.5 * rim), z=(0.0, height), finish="ceramic"),
+        box(at=(-hx + 0.5 * rim, 0.0), half=(0.5 * rim, hy), z=(0.0, height), finish="ceramic"),
+        box(at=(hx - 0.5 * rim, 0.0), half=(0.5 * rim, hy), z=(0.0, height), finish="ceramic"),
+    ]
+    if rng.random() < 0.4:
+        parts.append(box(at=(0.2 * width, hy - 0.02), half=(0.3 * width, 0.02), z=(0.3, 1.95), finish="fabric"))
+    return Piece(width, depth, tuple(parts))
+
+
+def toilet(rng: np.random.Generator) -> Piece:
+    """Bowl, seat and cistern."""
+    parts = (
+        cylinder(at=(0.0, 0.1), half=(0.13, 0.2), z=(0.0, 0.36), finish="ceramic"),
+        cylinder(at=(0.0, 0.08), half=(0.19, 0.25), z=(0.36, 0.41), finish="white"),
+        box(
+            at=(0.0, -0.24), half=(0.19, 0.09), z=(0.36 * rng.integers(0, 2), rng.uniform(0.7, 0.85)), finish="ceramic"
+        ),
+    )
+    return Piece(0.4, 0.66, parts)
+
+
+def washbasin(rng: np.random.Generator) -> Piece:
+    """A basin on a cabinet or a pedestal, with a mirror above."""
+    width = rng.uniform(0.45, 1.3)
+    hx = 0.5 * width
+    below = (
+        box(at=(0.0, 0.0), half=(hx, 0.22), z=(0.25 * rng.random(), 0.78), finish="wood")
+        if rng.random() < 0.6
+        else cylinder(at=(0.0, 0.0), half=(0.09, 0.09), z=(0.0, 0.78), finish="ceramic")
+    )
+    parts = (
+        below,
+        box(at=(0.0, 0.0), half=(hx, 0.24), z=(0.78, 0.86), finish="ceramic"),
+        box(at=(0.0, -0.23), half=(0.9 * hx, 0.01), z=(1.15, rng.uniform(1.7, 2.0)), finish="metal"),
+        cylinder(at=(0.0, -0.15), half=(0.02, 0.02), z=(0.86, 1.0), finish="metal"),
+    )
+    return Piece(width, 0.48, parts)
+
+
+def shower(rng: np.random.Generator) -> Piece:
+    """A tray with one or two screens."""
+    side = rng.uniform(0.75, 1.1)
+    half = 0.5 * side
+    parts = [
+        box(at=(0.0, 0.0), half=(half, half), z=(0.0, rng.uniform(0.02, 0.15)), finish="ceramic"),
+        box(at=(half - 0.01, 0.0), half=(0.01, half), z=(0.1, 2.0), finish="metal"),
+        cylinder(at=(-0.2, -half + 0.03), half=(0.015, 0.015), z=(0.9, 2.05), finish="metal"),
+    ]
+    return Piece(side, side, tuple(parts))

@@ -1,0 +1,10 @@
+"""Procedural homes: rooms, doors, windows, and large buildings made of them.
+
+Begin with `plans.py`, which draws a home: `partition.py` divides it into rooms, `openings.py` joins them. `splits.py`
+numbers homes for training, validation and test. Needs no torch.
+"""
+
+from lalaloc_core.learn.synth.homes.openings import Opening, OpeningKind
+from lalaloc_core.learn.synth.homes.plans import Home, HomeConfig, generate_home
+
+__all__ = ["Home", "HomeConfig", "Opening", "OpeningKind", "generate_home"]

@@ -1,0 +1,335 @@
+"""Casting the rays of panoramas against batches of scenes, column by column.
+
+All tensors are laid out (b, c, h): batch, azimuth column, image row. A column's rays lie in one vertical plane, so
+walls and prisms are intersected once per column in 2-D, and a row only compares heights.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from lalaloc_core.render.profile import cross_walls
+from lalaloc_core.learn.synth.rendering.prisms import PrismHits, cross_prisms, gap_behind, resolve_prisms
+from lalaloc_core.learn.synth.scene.render_scene import Decals, SceneRecords
+
+_TINY = 1e-9
+_MAX_DECALS_PER_COLUMN = 10
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SceneBatch(SceneRecords):
+    """Scenes padded to one size and stacked; see `RenderScene` for the fields, records of rows (b, n)."""
+
+    camera_height_m: Float[Tensor, "b"]
+    heading: Float[Tensor, "b"]
+    walls_m: Float[Tensor, "b n 4"]
+    wall_owner: Int[Tensor, "b n"]
+    wall_surface: Int[Tensor, "b n"]
+
+    def __getitem__(self, index: Tensor) -> SceneBatch:
+        """A batch of some of the scenes."""
+        return SceneBatch(**{name: getattr(self, name)[index] for name in SceneBatch.__dataclass_fields__})
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """What each pixel sees.
+
+    Attributes:
+        distance_m: horizontal distance to it.
+        surface: row of the scene's surfaces.
+        slot: room it lies in (0 for all furniture seen through the own room).
+        normal: unit normal, facing the camera.
+        furniture: whether it is a prism.
+        gap_m: distance in the column's plane to the next piece of furniture behind
+            the hit that stands on the floor, inf if there is none; for contact shadows.
+        wall_gap_m: on floors and ceilings, distance to the wall that the column ends at; large elsewhere.
+        column_end_m: distance of the wall that each column ends at.
+    """
+
+    distance_m: Float[Tensor, "b c h"]
+    surface: Int[Tensor, "b c h"]
+    slot: Int[Tensor, "b c h"]
+    normal: Float[Tensor, "b c h 3"]
+    furniture: Bool[Tensor, "b c h"]
+    gap_m: Float[Tensor, "b c h"]
+    wall_gap_m: Float[Tensor, "b c h"]
+    column_end_m: Float[Tensor, "b c"]
+
+
+@dataclass(frozen=True, eq=False)
+class _Crossings:
+    """Per column and wall: distance (inf: missed), metres along the wall, and whether the ray leaves the room there."""
+
+    distance_m: Float[Tensor, "b c n"]
+    along_m: Float[Tensor, "b c n"]
+    leaving: Bool[Tensor, "b c n"]
+
+
+@dataclass(frozen=True, eq=False)
+class _WallHits:
+    """Per column: distance, wall index, metres along the wall, surface and unit normal."""
+
+    distance_m: Float[Tensor, "b c"]
+    wall: Int[Tensor, "b c"]
+    along_m: Float[Tensor, "b c"]
+    surface: Int[Tensor, "b c"]
+    normal: Float[Tensor, "b c 2"]
+
+
+@dataclass(frozen=True, eq=False)
+class _ShellHits:
+    """What the rays hit of walls, floors and ceilings, before furniture; (b, c, h) unless said otherwise.
+
+    Attributes:
+        vertical: z of the normal, 0 on walls.
+        is_beyond: 1 for what is seen through a hole, whose walls have the normals `beyond_normal`; else 0.
+        own: walls of the own room.
+        beyond_normal: (b, c, 2) of the walls that columns with a hole end at.
+        end_m: (b, c) horizontal distance at which each column ends.
+    """
+
+    distance_m: Tensor
+    surface: Tensor
+    slot: Tensor
+    vertical: Tensor
+    is_beyond: Tensor
+    own: _WallHits
+    beyond_normal: Tensor
+    end_m: Tensor
+
+
+def trace(batch: SceneBatch, direction: Float[Tensor, "b c 2"], slope: Float[Tensor, "h"]) -> Hits:
+    """Cast the camera's rays.
+
+    Args:
+        batch: the scenes.
+        direction: horizontal unit vector of each column.
+        slope: tangent of each row's elevation.
+    """
+    shell = _trace_shell(batch, direction, slope)
+    return _before(batch, shell, cross_prisms(batch.prisms, direction, shell.end_m), direction, slope)
+
+
+def cast_own_walls(
+    walls_m: Float[Tensor, "b n 4"], owner: Int[Tensor, "b n"], direction: Float[Tensor, "b c 2"]
+) -> Float[Tensor, "b c"]:
+    """Horizontal distance to the walls of the camera's own room."""
+    distance = _cross_walls(walls_m, direction).distance_m
+    return torch.where((owner == 0)[:, None], distance, torch.inf).min(dim=2).values
+
+
+def _trace_shell(batch: SceneBatch, direction: Float[Tensor, "b c 2"], slope: Float[Tensor, "h"]) -> _ShellHits:
+    eye, room = batch.camera_height_m, batch.rooms[:, 0]
+    crossings = _cross_walls(batch.walls_m, direction)
+    own = _nearest(batch, crossings, direction, (batch.wall_owner == 0)[:, None])
+    up = slope > 0.0
+    plane = torch.where(up, (room.ceiling_m - eye)[:, None], eye[:, None]) / slope.abs()
+    distance = torch.minimum(own.distance_m[:, :, None], plane[:, None])
+    is_wall = own.distance_m[:, :, None] <= plane[:, None]
+    z = slope * distance + eye[:, None, None]
+    horizontal = torch.where(up, room.ceiling_surface[:, None], room.floor_surface[:, None]).long()
+    surface = torch.where(is_wall, own.surface[:, :, None], horizontal[:, None])
+    vertical = torch.where(is_wall, 0.0, torch.where(up, -1.0, 1.0))
+    surface, hole = _paint(batch, _decals_at(batch, own.wall, own.along_m), z, is_wall, surface)
+    slot, is_beyond = torch.zeros_like(surface), torch.zeros_like(surface)
+    shell = _ShellHits(
+        distance_m=distance,
+        surface=surface,
+        slot=slot,
+        vertical=vertical,
+        is_beyond=is_beyond,
+        own=own,
+        beyond_normal=own.normal.clone(),
+        end_m=own.distance_m.clone(),
+    )
+    item, column = (hole >= 0).any(dim=2).nonzero(as_tuple=True)
+    columns = (item, column)
+    if len(item):
+        _put_beyond(shell, columns, _look_through(batch, columns, crossings, direction, slope, own, hole[columns]))
+    return shell
+
+
+def _put_beyond(shell: _ShellHits, columns: tuple[Tensor, Tensor], beyond: _Beyond) -> None:
+    """Replace what columns hit by what they see through their holes, in place."""
+    for whole, part in (
+        (shell.distance_m, beyond.distance_m),
+        (shell.surface, beyond.surface),
+        (shell.vertical, beyond.vertical),
+        (shell.slot, beyond.slot),
+        (shell.is_beyond, torch.ones_like(beyond.slot)),
+    ):
+        whole[columns] = torch.where(beyond.hole, part.to(whole.dtype), whole[columns])
+    shell.end_m[columns] = torch.maximum(shell.end_m[columns], beyond.wall_m)
+    shell.beyond_normal[columns] = beyond.normal
+
+
+def _before(
+    batch: SceneBatch, shell: _ShellHits, prisms: PrismHits, direction: Float[Tensor, "b c 2"], slope: Tensor
+) -> Hits:
+    """The prisms before what was hit so far."""
+    own_m, own_normal = shell.own.distance_m[:, :, None], shell.own.normal
+    hit_m, nearest = resolve_prisms(prisms, shell.distance_m, slope, batch.camera_height_m)
+    furniture = nearest >= 0
+    # Normals to choose from: of the own walls, of those beyond a hole, of the prisms.
+    normals = torch.cat([own_normal[:, :, None], shell.beyond_normal[:, :, None], prisms.normal], dim=2)
+    chosen = torch.where(furniture, nearest + 2, shell.is_beyond)
+    place = nearest.clamp(min=0)
+    index = prisms.index.gather(2, place)
+    prism_surface = batch.prisms.surface.long()[:, None].expand(-1, index.shape[1], -1).gather(2, index)
+    surface = torch.where(furniture, prism_surface, shell.surface)
+    up = torch.where(slope > 0.0, -1.0, 1.0)
+    is_side = prisms.enter_m.gather(2, place) >= hit_m
+    vertical = torch.where(furniture, torch.where(is_side, 0.0, up), shell.vertical)
+    flat = (vertical != 0.0).float()
+    normal = torch.stack(
+        [
+            normals[..., 0].gather(2, chosen) * (1.0 - flat),
+            normals[..., 1].gather(2, chosen) * (1.0 - flat),
+            vertical,
+        ],
+        dim=-1,
+    )
+    # Furniture in the own room before a hole; beyond the hole it shares the slot of what lies behind it.
+    slot = torch.where(furniture & (hit_m < own_m), 0, shell.slot)
+    incidence = (own_normal * direction).sum(dim=-1).abs()[:, :, None]
+    wall_gap = torch.where(vertical == 0.0, 10.0, (own_m - hit_m).abs() * incidence)
+    return Hits(
+        distance_m=hit_m,
+        surface=surface,
+        slot=slot,
+        normal=normal,
+        furniture=furniture,
+        gap_m=gap_behind(prisms, shell.distance_m),
+        wall_gap_m=wall_gap,
+        column_end_m=shell.end_m,
+    )
+
+
+def _cross_walls(walls_m: Float[Tensor, "b n 4"], direction: Float[Tensor, "b c 2"]) -> _Crossings:
+    x, y = walls_m[:, None, :, 0], walls_m[:, None, :, 1]
+    ex, ey = walls_m[:, None, :, 2] - x, walls_m[:, None, :, 3] - y
+    crossings = cross_walls((direction[:, :, None, 0], direction[:, :, None, 1]), (x, y), (ex, ey))
+    return _Crossings(
+        distance_m=crossings.distance_m,
+        along_m=crossings.share * torch.sqrt(ex**2 + ey**2),
+        leaving=crossings.determinant > 0.0,
+    )
+
+
+def _nearest(batch: SceneBatch, crossings: _Crossings, direction: Tensor, candidate: Tensor) -> _WallHits:
+    distance, wall = torch.where(candidate, crossings.distance_m, torch.inf).min(dim=2)
+    return _WallHits(
+        distance_m=distance,
+        wall=wall,
+        along_m=crossings.along_m.gather(2, wall[:, :, None])[:, :, 0],
+        surface=batch.wall_surface.gather(1, wall),
+        normal=_facing_normal(batch.walls_m, wall, direction),
+    )
+
+
+def _facing_normal(walls_m: Tensor, wall: Tensor, direction: Tensor) -> Tensor:
+    ends = walls_m.gather(1, wall[:, :, None].expand(-1, -1, 4))
+    normal = torch.stack([ends[..., 1] - ends[..., 3], ends[..., 2] - ends[..., 0]], dim=-1)
+    normal = normal / (normal.norm(dim=-1, keepdim=True) + _TINY)
+    toward = (normal * direction).sum(dim=-1, keepdim=True)
+    return torch.where(toward > 0.0, -normal, normal)
+
+
+def _decals_at(batch: SceneBatch, wall: Tensor, along_m: Tensor) -> Int[Tensor, "b c k"]:
+    """Indices of the decals that a column's wall hit may meet, in painting order; -1 pads."""
+    decals = batch.decals[:, None]
+    on = (decals.wall == wall[:, :, None]) & (decals.s0_m <= along_m[:, :, None]) & (decals.s1_m >= along_m[:, :, None])
+    order = torch.where(on, torch.arange(on.shape[2], device=on.device), -1)
+    most = min(int(on.sum(dim=2).max()), _MAX_DECALS_PER_COLUMN)
+    return order.topk(most, dim=2).values.flip(2)
+
+
+def _paint(
+    batch: SceneBatch, decal: Tensor, z: Tensor, is_wall: Tensor, surface: Tensor
+) -> tuple[Int[Tensor, "b c h"], Int[Tensor, "b c h"]]:
+    """Paint decals onto wall pixels; returns the surface and, where the wall has a hole, the decal that makes it."""
+    hole = torch.full_like(surface, -1)
+    for k in range(decal.shape[2]):
+        index = decal[:, :, k]
+        rows = batch.decals.rows.gather(1, index.clamp(min=0)[:, :, None].expand(-1, -1, Decals.WIDTH))
+        met = Decals(torch.where((index >= 0)[:, :, None], rows, torch.tensor(-1.0, device=rows.device)))
+        inside = is_wall & (z >= met.z0_m[:, :, None]) & (z <= met.z1_m[:, :, None])
+        surface = torch.where(inside, met.surface[:, :, None].long(), surface)
+        is_hole = torch.where(met.slot >= 0.0, index, -1)
+        hole = torch.where(inside, is_hole[:, :, None], hole)
+    return surface, hole
+
+
+@dataclass(frozen=True, eq=False)
+class _Beyond:
+    """What the columns with a hole see through it, (m, h) unless said otherwise."""
+
+    hole: Tensor
+    distance_m: Tensor
+    surface: Tensor
+    vertical: Tensor
+    slot: Tensor
+    wall_m: Tensor  # (m,) horizontal distance at which the column ends
+    normal: Tensor  # (m, 2)
+
+
+def _look_through(
+    batch: SceneBatch,
+    columns: tuple[Tensor, Tensor],
+    crossings: _Crossings,
+    direction: Tensor,
+    slope: Tensor,
+    own: _WallHits,
+    hole: Int[Tensor, "m h"],
+) -> _Beyond:
+    item, _ = columns
+    decal = hole.max(dim=1).values
+    opening = batch.decals[item, decal]
+    slot = opening.slot.long()
+    room = batch.rooms[item, slot]
+    eye = batch.camera_height_m[item]
+    near = own.distance_m[columns]
+    incidence = (own.normal[columns] * direction[columns]).sum(dim=-1).abs().clamp(min=1e-3)
+    far = near + opening.depth_m / incidence
+
+    owner = batch.wall_owner[item]
+    wall_t = crossings.distance_m[columns]
+    inner = (owner == slot[:, None]) & crossings.leaving[columns] & (wall_t > near[:, None] + 1e-4)
+    jamb = (owner == -1 - decal[:, None]) & (wall_t <= far[:, None] + 1e-3)
+    distance, wall = torch.where(inner | jamb, wall_t, torch.inf).min(dim=1)
+    is_jamb = jamb.gather(1, wall[:, None])[:, 0]
+    # A ray that slips between jamb and wall by rounding ends where it left.
+    distance = torch.where(distance.isfinite(), distance, far)
+
+    up = slope > 0.0
+    head, ceiling = opening.z1_m - eye, room.ceiling_m - eye
+    soffit = torch.where(up, head[:, None] / slope, torch.inf)
+    plane = torch.where(up, ceiling[:, None], eye[:, None]) / slope.abs()
+    in_soffit = soffit < far[:, None]
+    plane = torch.where(in_soffit, soffit, plane)
+    hit = torch.minimum(distance[:, None], plane)
+    is_wall = distance[:, None] <= plane
+    z = slope * hit + eye[:, None]
+
+    surface = batch.wall_surface[item, wall][:, None].expand_as(hit)
+    trim = opening.surface.long()[:, None]
+    flat = torch.where(up, room.ceiling_surface[:, None], room.floor_surface[:, None]).long()
+    surface = torch.where(is_wall, surface, torch.where(in_soffit, trim, flat))
+    sub = batch[item]
+    along = crossings.along_m[columns].gather(1, wall[:, None])
+    painted = _decals_at(sub, wall[:, None], along)
+    surface, _ = _paint(sub, painted, z[:, None], is_wall[:, None], surface[:, None])
+    return _Beyond(
+        hole=hole >= 0,
+        distance_m=hit,
+        surface=surface[:, 0],
+        vertical=torch.where(is_wall, 0.0, torch.where(up, -1.0, 1.0)),
+        slot=torch.where(is_jamb[:, None] & is_wall, 0, slot[:, None]).expand_as(hit),
+        wall_m=distance,
+        normal=_facing_normal(sub.walls_m, wall[:, None], direction[columns][:, None])[:, 0],
+    )

@@ -1,0 +1,170 @@
+"""Photographs of procedural homes: the panorama renderer."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from lalaloc_core.conventions import column_azimuths, row_elevations
+from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.learn.synth.camera.develop import develop
+from lalaloc_core.learn.synth.records import Row
+from lalaloc_core.learn.synth.rendering.cast import Hits, SceneBatch, trace
+from lalaloc_core.learn.synth.rendering.outdoors import Outdoors
+from lalaloc_core.learn.synth.rendering.shading import Atlas, shade
+from lalaloc_core.learn.synth.scene.build import build_scene
+from lalaloc_core.learn.synth.scene.lighting import Mood, relit
+from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
+from lalaloc_core.learn.synth.scene.render_scene import Decals, Prisms, RenderScene, SceneRecords
+from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
+
+__all__ = ["PanoramaRenderer", "Shot", "sample_shots"]
+
+# Small batches stay in a CPU's caches, large ones fill a GPU.
+_BATCH_PIXELS = {"cpu": 1 << 17}
+_BATCH_PIXELS_ELSEWHERE = 1 << 21
+# What tables are padded with: walls of no room, decals on no wall, and a small box far away.
+_NO_ROOM = -(10**6)
+_PADDING = {
+    "decals": Decals.row(wall=-1.0),
+    "prisms": Prisms.row(x_m=1e6, axis_x=1.0, half_a_m=1.0, half_b_m=1.0),
+}
+
+
+class PanoramaRenderer:
+    """Renders shots as equirectangular panoramas of one size on one device.
+
+    Args:
+        materials: pictures of materials.
+        height: rows of a panorama, even.
+        width: columns.
+        device: where to render.
+        supersample: rays per pixel along a column and along a row, or one number for both. Photographs average over
+            their pixels; (2, 1) smooths the edges of floor and ceiling, 2 those of doors too.
+
+    Raises:
+        InvalidInputError: `height` is odd, or a count of rays is less than one.
+    """
+
+    def __init__(
+        self,
+        materials: MaterialLibrary,
+        *,
+        height: int = 128,
+        width: int = 256,
+        device: str | torch.device = "cpu",
+        supersample: int | tuple[int, int] = 1,
+    ) -> None:
+        if height % 2:
+            raise InvalidInputError(f"a panorama of {height} rows has a row on the horizon; the height must be even")
+        self._materials = materials
+        self._device = torch.device(device)
+        self._atlas = Atlas(materials, self._device)
+        self._outdoors = Outdoors(self._device)
+        rays = (supersample, supersample) if isinstance(supersample, int) else supersample
+        if min(rays) < 1:
+            raise InvalidInputError(f"{rays} rays per pixel along its two axes, at least 1 is needed along each")
+        self._rays_per_pixel = rays
+        rows, columns = height * rays[0], width * rays[1]
+        pixels = _BATCH_PIXELS.get(self._device.type, _BATCH_PIXELS_ELSEWHERE)
+        self._batch_size = max(1, pixels // (rows * columns))
+        self._slope = self._tensor(np.tan(row_elevations(rows)))
+        self._azimuth = self._tensor(column_azimuths(columns))
+        # Pictures take differently rolled parts of one field of noise: drawing new noise would cost more than the rays.
+        self._noise = self._tensor(np.random.default_rng(0).normal(size=(height + 64, width + 64, 3)))
+
+    def render(self, shots: Sequence[Shot]) -> UInt8[Tensor, "b h w 3"]:
+        """Photograph `shots`; each picture depends on its shot and the materials only."""
+        return self.render_scenes([build_scene(shot, self._materials) for shot in shots])
+
+    @torch.no_grad()
+    def render_scenes(self, scenes: Sequence[RenderScene]) -> UInt8[Tensor, "b h w 3"]:
+        """Photograph scenes that were built elsewhere, such as in worker processes, with the same materials."""
+        step = self._batch_size
+        return torch.cat([self._render_batch(scenes[k : k + step]) for k in range(0, len(scenes), step)])
+
+    def _render_batch(self, scenes: Sequence[RenderScene]) -> UInt8[Tensor, "b h w 3"]:
+        batch = stack_scenes(scenes, self._device)
+        direction = self._directions(batch)
+        return self._photograph(batch, trace(batch, direction, self._slope), direction)
+
+    @torch.no_grad()
+    def render_moods(
+        self, shot: Shot, moods: Sequence[Mood]
+    ) -> tuple[UInt8[Tensor, "m h w 3"], Float[Tensor, "h2 w2"]]:
+        """Photograph one staged shot in several lights, casting its rays once.
+
+        Returns:
+            the pictures, and the ranges (m) of `depth_m`.
+        """
+        scene = build_scene(dataclasses.replace(shot, lighting="raw"), self._materials)
+        batch = stack_scenes([scene], self._device)
+        direction = self._directions(batch)
+        hits = trace(batch, direction, self._slope)
+        pictures = [
+            self._photograph(stack_scenes([relit(scene, mood)], self._device), hits, direction) for mood in moods
+        ]
+        return torch.cat(pictures), self._range_m(hits)[0]
+
+    @torch.no_grad()
+    def hits(self, shots: Sequence[Shot]) -> Hits:
+        """What every ray hits, laid out (b, w, h): distances, surfaces, normals."""
+        batch = stack_scenes([build_scene(shot, self._materials) for shot in shots], self._device)
+        return trace(batch, self._directions(batch), self._slope)
+
+    @torch.no_grad()
+    def depth_m(self, shots: Sequence[Shot]) -> Float[Tensor, "b h w"]:
+        """Range (m) along each pixel's ray to whatever it sees, furniture included; at least as large as a panorama."""
+        return self._range_m(self.hits(shots))
+
+    def _photograph(self, batch: SceneBatch, hits: Hits, direction: Float[Tensor, "b c 2"]) -> UInt8[Tensor, "b h w 3"]:
+        radiance = shade(batch, hits, direction, self._slope, self._atlas, self._outdoors).transpose(1, 2)
+        if self._rays_per_pixel != (1, 1):
+            radiance = _shrink(radiance, self._rays_per_pixel)
+        return develop(radiance, batch.exposure, self._noise)
+
+    def _range_m(self, hits: Hits) -> Float[Tensor, "b h w"]:
+        return hits.distance_m.transpose(1, 2) * torch.sqrt(1.0 + self._slope.square())[None, :, None]
+
+    def _directions(self, batch: SceneBatch) -> Float[Tensor, "b c 2"]:
+        azimuth = batch.heading[:, None] + self._azimuth
+        return torch.stack([azimuth.sin(), azimuth.cos()], dim=-1)
+
+    def _tensor(self, array: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.asarray(array, dtype=np.float32)).to(self._device)
+
+
+def _shrink(radiance: Float[Tensor, "b h w 3"], factor: tuple[int, int]) -> Float[Tensor, "b h2 w2 3"]:
+    """Average blocks of rays; what is much brighter than the rest is clipped first, as on a sensor."""
+    planes = radiance.clamp(max=8.0).permute(0, 3, 1, 2)
+    return torch.nn.functional.avg_pool2d(planes, factor).permute(0, 2, 3, 1)
+
+
+def stack_scenes(scenes: Sequence[RenderScene], device: torch.device) -> SceneBatch:
+    """Pad the tables of scenes to one length and stack them."""
+
+    def stack(rows: Sequence[np.ndarray], dtype: torch.dtype = torch.float32, padding: Row | int = 0) -> Tensor:
+        padded = np.zeros((len(rows), max(1, *(len(row) for row in rows)), *rows[0].shape[1:]))
+        padded[:] = padding
+        for target, row in zip(padded, rows, strict=True):
+            target[: len(row)] = row
+        return torch.from_numpy(padded).to(device=device, dtype=dtype)
+
+    def stack_records(name: str) -> Any:
+        records = [getattr(scene, name) for scene in scenes]
+        return type(records[0])(stack([one.rows for one in records], padding=_PADDING.get(name, 0)))
+
+    return SceneBatch(
+        camera_height_m=torch.tensor([scene.camera_height_m for scene in scenes], dtype=torch.float32, device=device),
+        heading=torch.tensor([scene.heading for scene in scenes], dtype=torch.float32, device=device),
+        walls_m=stack([scene.walls_m for scene in scenes]),
+        wall_owner=stack([scene.wall_owner for scene in scenes], torch.long, _NO_ROOM),
+        wall_surface=stack([scene.wall_surface for scene in scenes], torch.long),
+        **{one.name: stack_records(one.name) for one in dataclasses.fields(SceneRecords)},
+    )

@@ -1,0 +1,11 @@
+"""What one camera sees of a home, as arrays to render: walls and what is on them, furniture, materials, light.
+
+Begin with `build.py`, which builds the `RenderScene` (`render_scene.py`) of a `Shot` (`shots.py`); `facts.py` tells
+what makes a shot hard.
+"""
+
+from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
+from lalaloc_core.learn.synth.scene.render_scene import RenderScene
+from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
+
+__all__ = ["MaterialLibrary", "RenderScene", "Shot", "sample_shots"]

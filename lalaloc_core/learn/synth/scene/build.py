@@ -1,0 +1,119 @@
+"""Building a shot's scene: which parts it has, and in which order they are drawn."""
+
+from __future__ import annotations
+
+from lalaloc_core.learn.synth.camera.exposure import sample_exposure, sample_staged_exposure
+from lalaloc_core.learn.synth.furniture.furnish import FurnitureLevel, furnish
+from lalaloc_core.learn.synth.homes.openings import Opening
+from lalaloc_core.learn.synth.scene.doors import add_door
+from lalaloc_core.learn.synth.scene.lighting import Lighting, light_room, relit, sample_backdrop
+from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
+from lalaloc_core.learn.synth.scene.mirrors import add_mirror, sample_mirror
+from lalaloc_core.learn.synth.scene.render_scene import Fact, RenderScene
+from lalaloc_core.learn.synth.scene.shells import Shells
+from lalaloc_core.learn.synth.scene.shots import Shot
+from lalaloc_core.learn.synth.scene.streams import ScenePart, Streams
+from lalaloc_core.learn.synth.scene.style import sample_style
+from lalaloc_core.learn.synth.scene.surfaces import SurfaceTable
+from lalaloc_core.learn.synth.scene.tables import SceneTables
+from lalaloc_core.learn.synth.scene.windows import add_curtains, add_radiator, add_window
+
+
+def build_scene(shot: Shot, materials: MaterialLibrary) -> RenderScene:
+    """The scene that a shot sees, everything that is random about it drawn from the shot's seed."""
+    scene = _Builder(shot, materials).build()
+    return scene if shot.lighting is None else relit(scene, shot.lighting)
+
+
+class _Builder:
+    """Builds one scene, once: what every part draws depends on what was drawn before it."""
+
+    def __init__(self, shot: Shot, materials: MaterialLibrary) -> None:
+        self._shot, self._home = shot, shot.home
+        self._room = shot.home.plan.rooms[shot.room_index]
+        self._openings = self._openings_of(shot.room_index)
+        seen = [opening.neighbour for opening in self._openings if opening.is_see_through]
+        self._slot_rooms = [shot.room_index, *dict.fromkeys(seen)]
+        self._streams = Streams(shot.seed, is_staged=shot.lighting is not None)
+        self._rng = self._streams.shapes
+        self._is_bare = shot.furniture == "empty"
+        # Homes for sale: bare, pale, in daylight.
+        self._is_bright = self._is_bare and not self._streams.is_staged and self._rng.random() < 0.6
+        surfaces = SurfaceTable(materials, materials.mean_colours, self._streams.materials)
+        self._tables = SceneTables(shot.position_m, surfaces)
+        self._style = sample_style(surfaces, self._rng)
+        if shot.is_night:
+            surfaces.darken_outdoors(self._style.outdoors)
+        self._shells = Shells(
+            self._tables, self._style, self._streams, is_bright=self._is_bright, is_bare=self._is_bare
+        )
+        self._facts: set[Fact] = set()
+
+    def build(self) -> RenderScene:
+        streams, tables, rng = self._streams, self._tables, self._rng
+        streams.begin(ScenePart.MOOD)
+        lighting = Lighting(rng, neutral=streams.is_staged, bright=self._is_bright)
+        if self._shot.is_night:
+            lighting.fall_dark()
+        self._add_room(0, self._shot.room_index, lighting)
+        in_room = list(tables.prisms)
+        for slot, room_index in enumerate(self._slot_rooms[1:], start=1):
+            self._add_room(slot, room_index, lighting)
+        streams.begin(ScenePart.LAMPS, self._shot.room_index)
+        lights, lamps, sun = light_room(self._room, self._openings, tables.camera_m, lighting, rng)
+        before_lamps = len(tables.prisms)
+        for lamp in lamps:
+            tables.add_prism(lamp, tables.surfaces.add_finish(lamp.finish), opaque=False)
+        if not streams.is_staged:
+            mirror = sample_mirror(self._room, self._openings, rng, is_bare=self._is_bare)
+            if mirror is not None:
+                self._facts.add("mirror")
+                in_room += tables.prisms[before_lamps:]
+                add_mirror(tables, self._style, mirror, room=self._room, prisms=in_room, lights=lights, rng=rng)
+        tables.add_jambs()
+        if self._is_bright and any(opening.kind == "window" for opening in self._openings):
+            self._facts.add("bare_bright")
+        streams.begin(ScenePart.CAMERA, self._shot.room_index)
+        backdrop = sample_backdrop(rng)
+        exposure = sample_staged_exposure(rng) if streams.is_staged else sample_exposure(rng, bright=self._is_bright)
+        return tables.to_scene(
+            self._shot, lights=lights, sun=sun, backdrop=backdrop, exposure=exposure, facts=self._facts
+        )
+
+    def _openings_of(self, room_index: int) -> list[Opening]:
+        return [opening for opening in self._home.openings if opening.room == room_index]
+
+    def _add_room(self, slot: int, room_index: int, lighting: Lighting) -> None:
+        """Shell, openings and furniture of a room."""
+        first = self._shells.add(slot, room_index, self._home.plan.rooms[room_index], lighting)
+        for opening in self._openings_of(room_index):
+            self._add_opening(first + opening.wall, opening, is_own=slot == 0)
+        self._furnish(room_index, is_own=slot == 0)
+
+    def _add_opening(self, wall: int, opening: Opening, *, is_own: bool) -> None:
+        """A window, or a door, which in the camera's own room one may look through."""
+        tables, style, rng = self._tables, self._style, self._rng
+        number = self._home.openings.index(opening)
+        self._streams.begin(ScenePart.OPENING, number)
+        if opening.kind != "window":
+            slot_behind = self._slot_rooms.index(opening.neighbour) if is_own and opening.is_see_through else None
+            add_door(tables, style, self._home, opening, wall=wall, slot_behind=slot_behind, rng=rng)
+            return
+        add_window(tables, style, wall, opening, rng)
+        if is_own:
+            add_curtains(tables, self._room, opening, rng, is_bare=self._is_bare)
+            self._streams.begin(ScenePart.RADIATOR, number)
+            add_radiator(tables, style, self._room, opening, rng)
+
+    def _furnish(self, room_index: int, *, is_own: bool) -> None:
+        """Furniture, sparse in rooms beyond the camera's own; facts are of the own room only."""
+        self._streams.begin(ScenePart.FURNITURE, room_index)
+        level: FurnitureLevel = self._shot.furniture if is_own or self._is_bare else "simple"
+        camera = self._tables.camera_m if is_own else None
+        # The empty rooms of a staged home are bare; others keep what is built in.
+        built_in = not (self._streams.is_staged and level == "empty")
+        room, openings = self._home.plan.rooms[room_index], self._openings_of(room_index)
+        pieces = furnish(room, openings, level, self._rng, camera, built_in=built_in)
+        if is_own:
+            self._facts |= {prism.label for prism in pieces if prism.label}
+        self._tables.add_pieces(pieces)

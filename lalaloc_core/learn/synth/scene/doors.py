@@ -1,0 +1,131 @@
+"""Doors and wide openings: their frames, what closes them, and the holes through which one sees the next room."""
+
+from __future__ import annotations
+
+import numpy as np
+import shapely
+from jaxtyping import Float
+
+from lalaloc_core.floorplan import Room
+from lalaloc_core.learn.synth.furniture.furnish import wall_frame
+from lalaloc_core.learn.synth.homes.openings import Opening
+from lalaloc_core.learn.synth.homes.plans import Home
+from lalaloc_core.learn.synth.scene.leaves import DOUBLE_FROM_M, boards, hang_leaves
+from lalaloc_core.learn.synth.scene.style import HouseStyle
+from lalaloc_core.learn.synth.scene.tables import SceneTables
+
+# What is no wall's thickness between two rooms is taken for the usual one.
+_USUAL_DEPTH_M, _MAX_DEPTH_M = 0.12, 0.6
+# Leaves and holes begin below the floor: no crack is seen.
+_BELOW_M = -1.0
+_HANDLE_M = 1.0
+
+
+def add_door(
+    tables: SceneTables,
+    style: HouseStyle,
+    home: Home,
+    opening: Opening,
+    *,
+    wall: int,
+    slot_behind: int | None,
+    rng: np.random.Generator,
+) -> None:
+    """Add a door or a wide opening.
+
+    Args:
+        tables: of the scene.
+        style: the house's.
+        home: the home.
+        opening: the opening, not a window.
+        wall: its wall in the tables.
+        slot_behind: slot of the room that one sees through it; with None it is shut or dark.
+        rng: source of randomness.
+    """
+    room = home.plan.rooms[opening.room]
+    s0, s1, head = opening.start_m, opening.end_m, opening.head_m
+    is_framed = opening.kind != "opening" or (head < room.ceiling_height_m - 0.15 and rng.random() < 0.3)
+    if is_framed:
+        border = rng.uniform(0.04, 0.1)
+        tables.add_decal(wall, s_m=(s0 - border, s1 + border), z_m=(0.0, head + border), surface=style.trim)
+    if slot_behind is not None:
+        neighbour = home.plan.rooms[opening.neighbour]
+        depth = _hole_depth(room, neighbour, opening)
+        cheeks = style.trim if is_framed else tables.wall_surfaces[wall]
+        tables.add_decal(wall, s_m=(s0, s1), z_m=(_BELOW_M, head), surface=cheeks, slot=slot_behind, depth_m=depth)
+        _add_threshold(tables, style, room, opening, depth, rng)
+        if opening.kind == "door_open":
+            _add_leaves(tables, style, opening, room=room, neighbour=neighbour, depth_m=depth, rng=rng)
+    elif opening.kind == "door_shut" or (opening.kind == "door_open" and rng.random() < 0.5):
+        _add_shut_door(tables, style, wall, opening, rng)
+    else:
+        tables.add_decal(wall, s_m=(s0, s1), z_m=(_BELOW_M, head), surface=style.gloom)
+
+
+def _hole_depth(room: Room, neighbour: Room, opening: Opening) -> float:
+    """Distance to the facing wall of the room behind."""
+    middle, _, inwards = _frame_of(room, opening)
+    ray = shapely.LineString([middle, middle - inwards])
+    depth = float(shapely.distance(shapely.Point(middle), shapely.intersection(ray, neighbour.shape)))
+    return depth if 0.0 < depth < _MAX_DEPTH_M else _USUAL_DEPTH_M
+
+
+def _frame_of(
+    room: Room, opening: Opening
+) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
+    """(middle of an opening, unit vector along its wall, unit normal into the room)."""
+    start, along, inwards = wall_frame(room, opening.wall)
+    return start + along * 0.5 * (opening.start_m + opening.end_m), along, inwards
+
+
+def _add_shut_door(
+    tables: SceneTables, style: HouseStyle, wall: int, opening: Opening, rng: np.random.Generator
+) -> None:
+    """One leaf or two, with up to three panels or panes and a handle."""
+    s0, s1, head = opening.start_m, opening.end_m, opening.head_m
+    middle, is_double = 0.5 * (s0 + s1), s1 - s0 > DOUBLE_FROM_M
+    tables.add_decal(wall, s_m=(s0, s1), z_m=(_BELOW_M, head), surface=style.door)
+    panels = int(rng.integers(0, 4))
+    panel = style.gloom if style.doors_are_glazed else style.door_panel
+    for start, end in [(s0, middle), (middle, s1)] if is_double else [(s0, s1)]:
+        for k in range(panels):
+            low, high = 0.15 + k * (head - 0.25) / panels, 0.05 + (k + 1) * (head - 0.25) / panels
+            tables.add_decal(wall, s_m=(start + 0.12, end - 0.12), z_m=(low, high), surface=panel)
+    s = middle - 0.08 if is_double else (s1 - 0.08 if rng.random() < 0.5 else s0 + 0.08)
+    tables.add_decal(wall, s_m=(s - 0.05, s + 0.05), z_m=(_HANDLE_M, _HANDLE_M + 0.04), surface=style.handle)
+    if is_double:
+        tables.add_decal(wall, s_m=(middle - 0.006, middle + 0.006), z_m=(0.0, head), surface=style.gloom)
+
+
+def _add_leaves(
+    tables: SceneTables,
+    style: HouseStyle,
+    opening: Opening,
+    *,
+    room: Room,
+    neighbour: Room,
+    depth_m: float,
+    rng: np.random.Generator,
+) -> None:
+    """The leaves of an open door, with their handles."""
+    for leaf in hang_leaves(opening, room, neighbour, depth_m, tables.camera_m, rng):
+        for board in boards(leaf.half_width_m, opening.head_m, glazed=style.doors_are_glazed):
+            centre = leaf.centre_m + leaf.axis * board.along_m
+            tables.add_box(
+                centre, leaf.axis, half_m=(board.half_a, board.half_b), z_m=(board.z0, board.z1), surface=style.door
+            )
+        knob = leaf.centre_m + leaf.axis * 0.8 * leaf.half_width_m
+        tables.add_box(knob, leaf.axis, half_m=(0.06, 0.06), z_m=(_HANDLE_M, _HANDLE_M + 0.03), surface=style.handle)
+
+
+def _add_threshold(
+    tables: SceneTables, style: HouseStyle, room: Room, opening: Opening, depth_m: float, rng: np.random.Generator
+) -> None:
+    """At times a strip in the doorway."""
+    if rng.random() > 0.2:
+        return
+    middle, along, inwards = _frame_of(room, opening)
+    surface = style.trim if rng.random() < 0.5 else style.handle
+    half = 0.5 * (opening.end_m - opening.start_m)
+    centre = middle - inwards * 0.5 * depth_m
+    tables.add_box(centre, along, half_m=(half, 0.5 * depth_m), z_m=(0.0, rng.uniform(0.006, 0.025)), surface=surface)

@@ -1,0 +1,114 @@
+"""What is special about a shot, so that figures can be reported for each hard case by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import get_args
+
+import numpy as np
+import shapely
+import torch
+
+from lalaloc_core.learn.synth.furniture.furnish import wall_frame
+from lalaloc_core.learn.synth.homes.openings import Opening
+from lalaloc_core.learn.synth.scene.build import build_scene
+from lalaloc_core.learn.synth.scene.materials import CATEGORIES, PICTURE_SIZE, MaterialLibrary
+from lalaloc_core.learn.synth.scene.render_scene import Fact, RenderScene, Sun
+from lalaloc_core.learn.synth.scene.shots import Shot
+
+FACTS: tuple[Fact, ...] = get_args(Fact)
+
+_WIDE_M = 1.2
+_STUB_M = (0.08, 0.65)
+_CORRIDOR_WIDTH_M, _CORRIDOR_LENGTH_M = 1.5, 2.5
+_CLOSET_M2, _LARGE_M2 = 3.0, 30.0
+_NEAR_M, _THRESHOLD_M = 0.4, 0.6
+_SUN_SAMPLES = 5
+
+
+def facts_of(shot: Shot) -> frozenset[Fact]:
+    """What holds for a shot's room, its camera's place and the picture.
+
+    `open_door`, `wide_opening` (from 1.2 m) and `wall_stub` (what is left of a wall beside an opening), `corridor` (up
+    to 1.5 m wide), `closet` (below 3 m²) and `large_room` (above 30 m²) are of the own room; `near_wall` (below 0.4 m)
+    and `threshold` (below 0.6 m from an open door or wide opening) of the camera; `counter`, `mirror`, `sun_patch` (in
+    sight of the camera), `nadir_patch` and `bare_bright` (unfurnished, in daylight) of what is drawn.
+    """
+    # What is drawn does not depend on the pictures of materials.
+    scene = build_scene(shot, _blank_materials())
+    return frozenset({*_facts_of_place(shot), *scene.facts, *_facts_of_picture(shot, scene)})
+
+
+def _facts_of_place(shot: Shot) -> set[Fact]:
+    room, here = shot.home.plan.rooms[shot.room_index], shapely.Point(shot.position_m)
+    own = [opening for opening in shot.home.openings if opening.room == shot.room_index]
+    see_through = [opening for opening in own if opening.is_see_through]
+    wide = [
+        opening for opening in see_through if opening.kind == "opening" and opening.end_m - opening.start_m >= _WIDE_M
+    ]
+    inscribed_m = 2.0 * shapely.maximum_inscribed_circle(room.shape, 0.02).length
+    holds: dict[Fact, bool] = {
+        "open_door": any(opening.kind == "door_open" for opening in see_through),
+        "wide_opening": bool(wide),
+        "wall_stub": any(_has_stub(shot, opening) for opening in wide),
+        "corridor": inscribed_m <= _CORRIDOR_WIDTH_M and 0.5 * room.shape.length - inscribed_m >= _CORRIDOR_LENGTH_M,
+        "closet": room.area_m2 < _CLOSET_M2,
+        "large_room": room.area_m2 > _LARGE_M2,
+        "near_wall": room.shape.exterior.distance(here) < _NEAR_M,
+        "threshold": any(_segment(shot, opening).distance(here) < _THRESHOLD_M for opening in see_through),
+    }
+    return {fact for fact, true in holds.items() if true}
+
+
+def _facts_of_picture(shot: Shot, scene: RenderScene) -> set[Fact]:
+    holds: dict[Fact, bool] = {
+        "nadir_patch": bool(scene.exposure.nadir > 0.0),
+        "sun_patch": _sees_sun(shot, scene.sun),
+    }
+    return {fact for fact, true in holds.items() if true}
+
+
+def _has_stub(shot: Shot, opening: Opening) -> bool:
+    x0, y0, x1, y1 = shot.home.plan.rooms[opening.room].walls_m[opening.wall]
+    rest = (opening.start_m, float(np.hypot(x1 - x0, y1 - y0)) - opening.end_m)
+    return any(_STUB_M[0] <= left <= _STUB_M[1] for left in rest)
+
+
+def _segment(shot: Shot, opening: Opening) -> shapely.LineString:
+    start, along, _ = wall_frame(shot.home.plan.rooms[opening.room], opening.wall)
+    return shapely.LineString([start + along * opening.start_m, start + along * opening.end_m])
+
+
+def _sees_sun(shot: Shot, sun: Sun) -> bool:
+    """Whether some of the sunlight that falls through the window lands where the camera sees it, furniture aside."""
+    if not sun.colour.any():
+        return False
+    room = shot.home.plan.rooms[shot.room_index].shape
+    inner, camera = room.buffer(-1e-3), shapely.Point(shot.position_m)
+    middle = (np.arange(_SUN_SAMPLES) + 0.5) / _SUN_SAMPLES
+    toward, rise = sun.direction[:2], sun.direction[2]
+    for s in sun.s0_m + middle * (sun.s1_m - sun.s0_m):
+        foot = sun.wall_start_m + shot.position_m + sun.wall_along * s
+        for z in sun.z0_m + middle * (sun.z1_m - sun.z0_m):
+            landing = _end_inside(room, foot, foot - toward * (z / rise))
+            if inner.buffer(2e-3).covers(shapely.LineString([camera, landing])):
+                return True
+    return False
+
+
+def _end_inside(room: shapely.Polygon, start: np.ndarray, end: np.ndarray) -> shapely.Point:
+    """The end of a segment that starts on a wall, or where it leaves the room before."""
+    along = end - start
+    inside = room.intersection(shapely.LineString([start + 1e-3 * along, end]))
+    parts: Sequence[shapely.Geometry] = [part for part in shapely.get_parts(inside) if part.length > 0.0]
+    nearest = min(parts, key=lambda part: part.distance(shapely.Point(start)), default=None)
+    return shapely.Point(start if nearest is None else shapely.get_coordinates(nearest)[-1])
+
+
+@lru_cache(maxsize=1)
+def _blank_materials() -> MaterialLibrary:
+    """One grey picture for everything."""
+    grey = torch.full((1, PICTURE_SIZE, PICTURE_SIZE, 3), 0.5)
+    first = np.zeros(1, dtype=np.int64)
+    return MaterialLibrary(grey, dict.fromkeys(CATEGORIES, first), dict.fromkeys(CATEGORIES, ()), first)

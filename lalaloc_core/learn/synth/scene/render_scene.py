@@ -1,0 +1,196 @@
+"""One shot's scene as arrays: walls, decals on walls, prisms, surfaces, lights, and how the camera exposes.
+
+Lengths are metres relative to the camera's position in the plan (so that single precision suffices); heights are
+relative to the floor. The camera's own room has slot 0; rooms seen through its doors follow.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from lalaloc_core.learn.synth.camera.exposure import Exposure
+from lalaloc_core.learn.synth.records import Column, Joined, Records
+from lalaloc_core.learn.synth.scene.surfaces import Surfaces
+
+Fact = Literal[
+    "open_door",
+    "wide_opening",
+    "wall_stub",
+    "corridor",
+    "closet",
+    "near_wall",
+    "threshold",
+    "counter",
+    "sun_patch",
+    "nadir_patch",
+    "mirror",
+    "bare_bright",
+    "large_room",
+]
+
+
+class Decals(Records):
+    """Rectangles on walls; later ones cover earlier ones.
+
+    Attributes:
+        wall: index of the wall, -1 for none.
+        s0_m, s1_m: start and end along it.
+        z0_m, z1_m: lower and upper edge over the floor.
+        surface: row of the surfaces; of a hole, what its cheeks are made of.
+        slot: room behind it if it is a hole, else -1.
+        depth_m: of a hole.
+    """
+
+    wall = Column()
+    s0_m = Column()
+    s1_m = Column()
+    z0_m = Column()
+    z1_m = Column()
+    surface = Column()
+    slot = Column()
+    depth_m = Column()
+
+
+class Prisms(Records):
+    """Vertical boxes and elliptic cylinders.
+
+    Attributes:
+        x_m, y_m: centre; both as `centre_m`.
+        axis_x, axis_y: unit vector of the first axis, both as `axis`; the second is that turned by +90°.
+        half_a_m, half_b_m: half extents along the two axes.
+        z0_m, z1_m: lower and upper end over the floor.
+        is_round: 1 for a cylinder.
+        surface: row of the surfaces.
+        is_opaque: 1 for what casts shadows.
+    """
+
+    x_m = Column()
+    y_m = Column()
+    axis_x = Column()
+    axis_y = Column()
+    half_a_m = Column()
+    half_b_m = Column()
+    z0_m = Column()
+    z1_m = Column()
+    is_round = Column()
+    surface = Column()
+    is_opaque = Column()
+    centre_m = Joined(x_m, y_m)
+    axis = Joined(axis_x, axis_y)
+
+
+class VisibleRooms(Records):
+    """Rooms: that of the camera, then those seen through its doors.
+
+    Attributes:
+        ceiling_m: height of the ceiling.
+        floor_surface, ceiling_surface: rows of the surfaces.
+        light_m, light_colour: position, and colour times power, of the one lamp of a room that is seen through a door.
+        ambient: light from everywhere.
+    """
+
+    ceiling_m = Column()
+    floor_surface = Column()
+    ceiling_surface = Column()
+    light_m = Column(3)
+    light_colour = Column(3)
+    ambient = Column(3)
+
+
+class Lights(Records):
+    """Lamps and windows of the own room.
+
+    Attributes:
+        position_m: all three coordinates; `xy_m` and `z_m` are parts of it.
+        colour: times the power.
+        normal: horizontal unit normal of a window; (0, 0) for a lamp, which shines everywhere.
+    """
+
+    xy_m = Column(2)
+    z_m = Column()
+    position_m = Joined(xy_m, z_m)
+    colour = Column(3)
+    normal = Column(2)
+
+
+class Sun(Records):
+    """Sunlight through one window; all 0 for none.
+
+    Attributes:
+        direction: unit vector to the sun.
+        wall_start_m, wall_along: a point of the window's wall and the unit vector along it.
+        s0_m, s1_m: start and end of the window along the wall.
+        z0_m, z1_m: its lower and upper edge.
+        colour: times the power.
+    """
+
+    direction = Column(3)
+    wall_start_m = Column(2)
+    wall_along = Column(2)
+    s0_m = Column()
+    s1_m = Column()
+    z0_m = Column()
+    z1_m = Column()
+    colour = Column(3)
+
+
+class Backdrop(Records):
+    """The outdoors.
+
+    Attributes:
+        sky, ground: colours.
+        horizon: slope (tangent of the elevation) of the mean outline of what stands before the sky.
+        ruggedness: how far the outline rises and falls, as a slope.
+        turn, lift: shares of a full turn by which outline and mottle are shifted.
+    """
+
+    sky = Column(3)
+    ground = Column(3)
+    horizon = Column()
+    ruggedness = Column()
+    turn = Column()
+    lift = Column()
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SceneRecords:
+    """What a scene has as records, and a batch of scenes as records with one axis more.
+
+    Attributes:
+        rooms: that of the camera, then those seen through its doors: the row of a room is its slot.
+        sun, backdrop, exposure: a single row.
+    """
+
+    decals: Decals
+    prisms: Prisms
+    surfaces: Surfaces
+    rooms: VisibleRooms
+    lights: Lights
+    sun: Sun
+    backdrop: Backdrop
+    exposure: Exposure
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class RenderScene(SceneRecords):
+    """Everything that one picture is made of.
+
+    Attributes:
+        camera_height_m: of the camera over the floor.
+        heading: azimuth of the centre column, radians.
+        walls_m: segments (x0, y0, x1, y1), room interior to their left.
+        wall_owner: slot of the room that a wall belongs to; -1 - d for the jambs of the hole that is decal d.
+        wall_surface: row of `surfaces`.
+        facts: what was drawn of what is worth knowing about a picture; `facts` knows more.
+    """
+
+    camera_height_m: float
+    heading: float
+    walls_m: Float[np.ndarray, "n 4"]
+    wall_owner: Int[np.ndarray, "n"]
+    wall_surface: Int[np.ndarray, "n"]
+    facts: frozenset[Fact] = frozenset()

@@ -1,0 +1,208 @@
+"""What surfaces look like: rows of a table that name a picture, its scale and turn, a tint, gloss and glow."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from jaxtyping import Float
+
+from lalaloc_core.learn.synth.furniture.pieces import Finish
+from lalaloc_core.learn.synth.records import Column, Records, Row
+from lalaloc_core.learn.synth.scene.materials import MaterialCategory, MaterialLibrary
+
+Colour = Float[np.ndarray, "3"]
+
+_WOODY: tuple[Finish, ...] = ("wood", "stone")
+_PLAIN_FINISHES: tuple[Finish, ...] = ("white", "metal", "dark", "ceramic", "glow", "paint")
+
+
+class Surfaces(Records):
+    """What the surfaces of a scene look like.
+
+    Attributes:
+        picture: number of the material's picture.
+        scale: pictures per metre.
+        cosine, sine: of the angle by which the picture is turned.
+        tint: factor on its colours.
+        gloss: share of light reflected like a mirror.
+        glow: when positive the surface emits its colour times this instead of reflecting light.
+        is_outdoors: 1 for the view through a window.
+        shift_u, shift_v: by which the picture is moved, as shares of it.
+    """
+
+    picture = Column()
+    scale = Column()
+    cosine = Column()
+    sine = Column()
+    tint = Column(3)
+    gloss = Column()
+    glow = Column()
+    is_outdoors = Column()
+    shift_u = Column()
+    shift_v = Column()
+
+
+class SurfaceTable:
+    """Collects the surfaces of one scene; every method returns the index of the row it added."""
+
+    def __init__(self, materials: MaterialLibrary, mean_colours: Float[np.ndarray, "m 3"], rng: np.random.Generator):
+        self._materials = materials
+        self._means = mean_colours
+        self._rng = rng
+        self.rows: list[Row] = []
+
+    def add(
+        self,
+        category: MaterialCategory,
+        colour: Colour | None = None,
+        *,
+        scale: float = 1.0,
+        angle: float = 0.0,
+        gloss: float = 0.0,
+        glow: float = 0.0,
+    ) -> int:
+        """A surface with a random picture of a category, tinted to a mean `colour` if one is given.
+
+        Args:
+            category: where the picture is taken from.
+            colour: mean linear colour; None keeps the picture's own, varied a little.
+            scale: pictures per metre.
+            angle: turn of the picture, radians.
+            gloss: share of light reflected like a mirror.
+            glow: when positive the surface emits its colour times this instead of reflecting light.
+        """
+        picture = self._materials.sample(category, self._rng)
+        if colour is None:
+            tint = np.exp(self._rng.normal(0.0, 0.2)) * np.exp(self._rng.normal(0.0, 0.04, 3))
+        else:
+            tint = colour / self._means[picture]
+        return self._append(picture, tint, scale=scale, angle=angle, gloss=gloss, glow=glow)
+
+    def add_plain(self, colour: Colour, *, gloss: float = 0.0, glow: float = 0.0) -> int:
+        """A surface of one colour; see `add`."""
+        picture = self._materials.sample_plain(self._rng)
+        return self._append(picture, colour / self._means[picture], scale=0.5, angle=0.0, gloss=gloss, glow=glow)
+
+    def _append(self, picture: int, tint: Colour, *, scale: float, angle: float, gloss: float, glow: float) -> int:
+        shift_u, shift_v = self._rng.random(2)
+        row = Surfaces.row(
+            picture=picture,
+            scale=scale,
+            cosine=math.cos(angle),
+            sine=math.sin(angle),
+            tint=tint,
+            gloss=gloss,
+            glow=glow,
+            shift_u=shift_u,
+            shift_v=shift_v,
+        )
+        self.rows.append(row)
+        return len(self.rows) - 1
+
+    def add_outdoors(self, glow: float) -> int:
+        """The view through a window."""
+        self.rows.append(Surfaces.row(scale=1.0, cosine=1.0, tint=1.0, glow=glow, is_outdoors=1.0))
+        return len(self.rows) - 1
+
+    def darken_outdoors(self, index: int) -> None:
+        """Make the view through a window that of the night."""
+        Surfaces(self.rows[index]).glow = math.exp(self._rng.uniform(math.log(0.004), math.log(0.12)))
+
+    def add_floor(self, walls: Colour, direction: float, *, plain: bool = False) -> int:
+        """A floor: mostly with a picture's own colours, sometimes as the walls; laid along `direction` (radians).
+
+        A `plain` one is wooden, beige or grey.
+        """
+        colour = walls * self._rng.uniform(0.8, 1.1) if self._rng.random() < 0.08 else None
+        if plain and self._rng.random() < 0.7:
+            neutral = pale(self._rng) * self._rng.uniform(0.4, 0.9)
+            colour = neutral if self._rng.random() < 0.5 else 1.5 * wood_tone(self._rng)
+        gloss = self._rng.uniform(0.05, 0.35) if self._rng.random() < 0.5 else 0.0
+        angle = -direction + 0.5 * math.pi * int(self._rng.integers(2))
+        if self._rng.random() < 0.1:
+            angle += self._rng.uniform(0.0, math.pi)
+        return self.add("floor", colour, scale=math.exp(self._rng.uniform(-0.9, 0.6)), angle=angle, gloss=gloss)
+
+    def add_wall(self, colour: Colour) -> int:
+        """A painted wall, or one with a picture's own colours."""
+        kind = self._rng.random()
+        if kind < 0.68:
+            return self.add_plain(colour)
+        return self.add("wall", None if kind > 0.9 else colour, scale=math.exp(self._rng.uniform(-0.7, 0.7)))
+
+    def add_ceiling(self, colour: Colour) -> int:
+        """A ceiling: mostly painted, sometimes panelled."""
+        if self._rng.random() < 0.8:
+            return self.add_plain(colour)
+        return self.add("ceiling", colour, scale=self._rng.uniform(0.4, 1.2))
+
+    def add_finish(self, finish: Finish) -> int:
+        """A surface of furniture."""
+        colour, gloss, glow = _finish(finish, self._rng)
+        if colour is not None and finish in _PLAIN_FINISHES:
+            return self.add_plain(colour, gloss=gloss, glow=glow)
+        angle = 0.5 * math.pi * int(self._rng.integers(2)) if finish in _WOODY else 0.0
+        return self.add(
+            "furniture", colour, scale=math.exp(self._rng.uniform(-0.3, 1.2)), angle=angle, gloss=gloss, glow=glow
+        )
+
+
+def paint(rng: np.random.Generator) -> Colour:
+    """A wall paint: mostly near white, at times coloured or dark."""
+    kind = rng.random()
+    if kind < 0.62:
+        level, strength = rng.uniform(0.5, 0.88), 0.06
+    elif kind < 0.85:
+        level, strength = rng.uniform(0.2, 0.6), 0.18
+    else:
+        level, strength = rng.uniform(0.03, 0.3), 0.45
+    warm, green = rng.normal(0.25, 0.7) * strength, rng.normal(0.0, 0.5) * strength
+    return np.clip(level * np.array([1.0 + warm, 1.0 + green, 1.0 - warm]), 0.01, 0.92)
+
+
+def pale(rng: np.random.Generator) -> Colour:
+    """White, beige, light grey: the walls of a home for sale."""
+    warm = rng.uniform(-0.01, 0.09)
+    return rng.uniform(0.5, 0.88) * np.array([1.0 + 0.5 * warm, 1.0, 1.0 - warm])
+
+
+def bright(rng: np.random.Generator) -> Colour:
+    """Ceilings, trims and doors that are painted white."""
+    return rng.uniform(0.55, 0.9) * np.array([1.0, 1.0 - rng.uniform(0, 0.03), 1.0 - rng.uniform(0, 0.08)])
+
+
+def wood_tone(rng: np.random.Generator) -> Colour:
+    """Brown, from ebony to birch."""
+    level, warmth = math.exp(rng.uniform(math.log(0.03), math.log(0.45))), rng.uniform(0.1, 0.5)
+    return level * np.array([1.0 + warmth, 1.0, 1.0 - warmth])
+
+
+def vivid(rng: np.random.Generator) -> Colour:
+    """Any colour at all."""
+    return math.exp(rng.uniform(math.log(0.05), math.log(0.6))) * np.clip(1.0 + rng.normal(0.0, 0.45, 3), 0.1, 2.0)
+
+
+def _finish(finish: Finish, rng: np.random.Generator) -> tuple[Colour | None, float, float]:
+    """(mean colour, gloss, glow)."""
+    if finish == "wood":
+        return (wood_tone(rng) if rng.random() < 0.6 else None), 0.0, 0.0
+    if finish == "fabric":
+        return (np.clip(paint(rng) * rng.uniform(0.2, 1.0), 0.02, 0.9) if rng.random() < 0.7 else None), 0.0, 0.0
+    if finish == "white":
+        return bright(rng), 0.02, 0.0
+    if finish == "metal":
+        return rng.uniform(0.15, 0.6) * np.array([1.0, 1.0, 1.02]), 0.2, 0.0
+    if finish == "dark":
+        return rng.uniform(0.01, 0.06) * np.ones(3), 0.05, 0.0
+    if finish == "leaf":
+        return rng.uniform(0.04, 0.2) * np.array([rng.uniform(0.4, 0.9), 1.0, rng.uniform(0.1, 0.5)]), 0.0, 0.0
+    if finish == "ceramic":
+        return bright(rng) * (1.0 if rng.random() < 0.85 else 0.3), 0.08, 0.0
+    if finish == "stone":
+        return (paint(rng) if rng.random() < 0.5 else None), 0.08, 0.0
+    if finish == "glow":
+        return np.array([1.0, rng.uniform(0.8, 1.0), rng.uniform(0.55, 1.0)]), 0.0, rng.uniform(0.8, 4.0)
+    if finish == "paint":
+        return paint(rng), 0.02, 0.0
+    return vivid(rng), 0.0, 0.0

@@ -1,0 +1,220 @@
+"""Endless streams of training batches, made in worker processes while the network trains."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, WALL_CODE
+from lalaloc_core.errors import DatasetError
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.render.layout import layout_view
+from lalaloc_core.render.poses import profiles_at
+from lalaloc_core.learn.training.batches import Batch, LoadFailure, Stream, non_empty, stacked, worker_share
+from lalaloc_core.learn.training.config import TrainConfig
+from lalaloc_core.learn.training.deferred import DeferredBatch, DeferredBatcher, DeferredRow, DeferredScene, Row
+from lalaloc_core.learn.training.replay_buffer import ReplayBuffer
+from lalaloc_core.learn.training.rotation import Rotation, sample_heading, sample_rotation
+from lalaloc_core.learn.training.sources import Group, PanoramaSample, Source
+
+# Code of a class that is not known; losses pass over it.
+UNKNOWN = -1
+
+_Drawn = TypeVar("_Drawn")
+_Packed = TypeVar("_Packed")
+
+
+@dataclass
+class LayoutBatches(Stream):
+    """Stage 1: triplets of layouts.
+
+    Each batch holds `profile_m` (anchors, 1 + neighbours, columns) with the anchor first, `camera_height_m` and
+    `ceiling_height_m` of the same leading shape.
+    """
+
+    config: TrainConfig
+    source: Source
+    first: int = 0
+
+    def __iter__(self) -> Iterator[Batch | LoadFailure]:
+        size = self.config.layout.homes_per_step * self.config.layout.anchors_per_home
+        return _batches(self._visit, stacked, self.source, size, self.first)
+
+    def _visit(self, visit: int) -> list[Row] | None:
+        rng = self.source.rng(visit)
+        return [self._row(group, rng) for group in self.source.groups(visit)] or None
+
+    def _row(self, group: Group, rng: np.random.Generator) -> Row:
+        stage, turns = self.config.layout, self.config.turns
+        size = len(group.position_m)
+        # One heading for all turns the whole plan; some negatives stand where positives do, at another heading.
+        chosen, heading = np.arange(size), np.full(size, sample_heading(turns, rng))
+        turned = int(stage.turned_share * stage.triplets.negatives)
+        if turned:
+            chosen[size - turned :] = rng.integers(0, 1 + stage.triplets.positives, turned)
+            heading[size - turned :] = [sample_heading(turns, rng) for _ in range(turned)]
+        room = group.room_index[chosen]
+        profile = profiles_at(
+            group.plan, group.position_m[chosen], room, heading, self.config.profile_columns, np.float32
+        )
+        if turns != "none" and rng.random() < 0.5:
+            profile = profile[:, ::-1].copy()
+        return {
+            "profile_m": profile,
+            "camera_height_m": np.full(size, group.camera_height_m, dtype=np.float32),
+            "ceiling_height_m": group.plan.ceiling_heights_m[room].astype(np.float32),
+        }
+
+
+@dataclass
+class PanoramaBatches(Stream):
+    """Stage 2: panoramas with their layouts, turned and mirrored together.
+
+    Each batch holds `image` (b, h, w, 3) uint8, `profile_m` (b, columns), `camera_height_m` (b) as it is given,
+    `ceiling_height_m` (b), and where a loss compares with neighbours, `neighbour_profile_m` (b, n, columns) and
+    `neighbour_ceiling_height_m` (b, n), which are turned and mirrored as their panorama is. With architecture `trunk`
+    there are `opening_kind` (b, columns) and `room_type` (b), codes of `conventions`, `UNKNOWN` where the plan says
+    nothing of it. From a source
+    whose rendering is deferred come `DeferredBatch`es.
+    """
+
+    config: TrainConfig
+    source: Source
+    neighbours: bool = False
+    first: int = 0
+
+    def __iter__(self) -> Iterator[Batch | DeferredBatch | LoadFailure]:
+        stage, (_, workers) = self.config.image, worker_share()
+        replay: ReplayBuffer[PanoramaSample] = ReplayBuffer(stage.uses_per_panorama, stage.replay_panoramas // workers)
+        batcher = DeferredBatcher(stage.uses_per_panorama)
+
+        def rendered(visit: int) -> list[Row] | None:
+            drawn = self._drawn(visit, replay)
+            return [
+                row | {"image": turn.picture(sample.image)}
+                for sample, turn, row in drawn
+                if row is not None and isinstance(sample.image, np.ndarray)
+            ] or None
+
+        def deferred(visit: int) -> list[DeferredRow] | None:
+            rows = []
+            for sample, turn, row in self._drawn(visit, replay):
+                assert isinstance(sample.image, DeferredScene)
+                if row is None:
+                    batcher.drop(sample.image)
+                else:
+                    rows.append(DeferredRow(sample.image, turn, row))
+            return rows or None
+
+        if self.source.deferred:
+            return _batches(deferred, batcher.pack, self.source, stage.batch, self.first)
+        return _batches(rendered, stacked, self.source, stage.batch, self.first)
+
+    def _drawn(
+        self, visit: int, replay: ReplayBuffer[PanoramaSample]
+    ) -> list[tuple[PanoramaSample, Rotation, Row | None]]:
+        """What a visit shows, how it is turned, and the rest of its rows: None where there are no neighbours."""
+        rng = self.source.rng(visit)
+        drawn = []
+        for new in self.source.samples(visit, *self.config.image_size):
+            for sample in replay.add_and_sample(new, rng):
+                turn = sample_rotation(self.config.turns, sample.heading, self.config.image_size[1], rng)
+                drawn.append((sample, turn, self._row(sample, turn, rng)))
+        return drawn
+
+    def _row(self, sample: PanoramaSample, turn: Rotation, rng: np.random.Generator) -> Row | None:
+        position, room = sample.position_m[None], np.array([sample.room_index])
+        if self.neighbours:
+            group = sample.group(self.config.layout.triplets, rng)
+            if group is None:
+                return None
+            position, room = group.position_m, group.room_index
+        heading = np.full(len(position), turn.heading)
+        columns = self.config.profile_columns
+        profile = turn.profile(profiles_at(sample.plan, position, room, heading, columns, np.float32))
+        ceiling = sample.plan.ceiling_heights_m[room].astype(np.float32)
+        row = {
+            "profile_m": profile[0],
+            "camera_height_m": np.float32(sample.camera_height_m + self._height_error_m(rng)),
+            "ceiling_height_m": ceiling[0],
+        }
+        if self.config.architecture == "trunk":
+            row |= self._structure(sample, turn)
+        if self.neighbours:
+            row |= {"neighbour_profile_m": profile[1:], "neighbour_ceiling_height_m": ceiling[1:]}
+        return row
+
+    def _structure(self, sample: PanoramaSample, turn: Rotation) -> Row:
+        room = sample.plan.rooms[sample.room_index]
+        kind = opening_kinds(
+            sample.plan,
+            sample.position_m,
+            sample.room_index,
+            turn.heading,
+            sample.camera_height_m,
+            self.config.profile_columns,
+        )
+        type_code = ROOM_TYPES.index(room.type)
+        # The first type is that of rooms of which the plan does not say.
+        return {"opening_kind": turn.profile(kind), "room_type": np.array(type_code or UNKNOWN)}
+
+    def _height_error_m(self, rng: np.random.Generator) -> float:
+        spread = self.config.image.camera_height_error_m
+        return float(np.clip(rng.normal(0.0, spread), -3.0 * spread, 3.0 * spread)) if spread else 0.0
+
+
+def opening_kinds(
+    plan: FloorPlan,
+    position_m: Float[np.ndarray, "2"],
+    room_index: int,
+    heading: float,
+    camera_height_m: float,
+    columns: int,
+) -> Int[np.ndarray, "{columns}"]:
+    """Code of what a camera meets at each azimuth at eye height.
+
+    `UNKNOWN` for walls of a plan that does not claim to show all openings: there may be one that it leaves out.
+    """
+    view = layout_view(
+        position_m[None].astype(np.float32),
+        np.array([heading], np.float32),
+        np.array([room_index]),
+        plan.geometry,
+        columns,
+        camera_height_m,
+    )
+    kind = view.kind[0].astype(np.int64)
+    if not plan.opening_kinds.issuperset(OPENING_CLASSES[1:]):
+        kind[kind == WALL_CODE] = UNKNOWN
+    return kind
+
+
+def _batches(
+    visit: Callable[[int], list[_Drawn] | None],
+    pack: Callable[[list[_Drawn]], _Packed],
+    source: Source,
+    size: int,
+    first: int,
+) -> Iterator[_Packed | LoadFailure]:
+    """What the visits from number `first` on draw, `size` to a batch, with what could not be loaded in between."""
+    rows: list[_Drawn] = []
+    try:
+        for drawn in non_empty(visit, first, source.patience):
+            rows += drawn
+            if len(rows) >= size:
+                yield from _failures(source)
+                yield pack(rows[:size])
+                rows = rows[size:]
+    except DatasetError as error:
+        yield from _failures(source)
+        yield LoadFailure(error, fatal=True)
+
+
+def _failures(source: Source) -> Iterator[LoadFailure]:
+    """What could not be loaded since the last time."""
+    yield from [LoadFailure(error, fatal=False) for error in source.problems]
+    source.problems.clear()

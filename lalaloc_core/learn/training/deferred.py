@@ -1,0 +1,135 @@
+"""Deferred rendering: worker processes build scenes and the training device renders them; scenes travel, not pixels.
+
+A worker builds homes and scenes, which is Python, and decides what every row of a batch shows: which scene, how far
+rolled, mirrored or not. The device renders each scene once, when it first comes up, caches the picture until its last
+use, and turns whole batches at once. A scene has some 15 kB, its panorama six times as much.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Int, UInt8
+from torch import Tensor
+
+from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer
+from lalaloc_core.learn.synth.scene.render_scene import RenderScene
+from lalaloc_core.learn.training.batches import Batch, stacked
+from lalaloc_core.learn.training.rotation import Rotation
+
+Row = dict[str, np.ndarray]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DeferredScene:
+    """A scene that is yet to be rendered, under a number of its own among all that are trained on."""
+
+    number: int
+    scene: RenderScene
+
+
+@dataclass(frozen=True, eq=False)
+class DeferredRow:
+    """A row of a batch: the panorama to render, how it is turned, and everything else."""
+
+    deferred: DeferredScene
+    turn: Rotation
+    rest: Row
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class DeferredBatch:
+    """A batch without pixels.
+
+    Attributes:
+        rest: the batch without `image`.
+        number: which scene each row shows.
+        shift: by how many columns it is rolled to the right.
+        mirrored: whether it is mirrored after that.
+        scenes: those that come up for the first time, by number.
+        evicted: numbers that no later batch asks for.
+    """
+
+    rest: Batch
+    number: tuple[int, ...]
+    shift: Int[Tensor, "b"]
+    mirrored: Bool[Tensor, "b"]
+    scenes: dict[int, RenderScene]
+    evicted: tuple[int, ...]
+
+
+class DeferredBatcher:
+    """Packs rows into batches without pixels; every scene is used `uses` times in all."""
+
+    def __init__(self, uses: int) -> None:
+        self._uses = uses
+        self._left: dict[int, int] = {}
+        self._sent: set[int] = set()
+        self._evicted: list[int] = []
+
+    def drop(self, deferred: DeferredScene) -> None:
+        """One use of a scene came to nothing."""
+        self._use(deferred.number)
+
+    def pack(self, rows: list[DeferredRow]) -> DeferredBatch:
+        """A batch of rows; the scenes that it shows first travel with it."""
+        scenes = {row.deferred.number: row.deferred.scene for row in rows if row.deferred.number not in self._sent}
+        self._sent |= scenes.keys()
+        for row in rows:
+            self._use(row.deferred.number)
+        evicted, self._evicted = tuple(self._evicted), []
+        return DeferredBatch(
+            rest=stacked([row.rest for row in rows]),
+            number=tuple(row.deferred.number for row in rows),
+            shift=torch.tensor([row.turn.shift for row in rows]),
+            mirrored=torch.tensor([row.turn.mirrored for row in rows]),
+            scenes=scenes,
+            evicted=evicted,
+        )
+
+    def _use(self, number: int) -> None:
+        left = self._left.pop(number, self._uses) - 1
+        if left:
+            self._left[number] = left
+        elif number in self._sent:
+            self._sent.remove(number)
+            self._evicted.append(number)
+
+
+class DeferredRenderer:
+    """Turns batches without pixels into batches with panoramas, on the renderer's device."""
+
+    def __init__(self, renderer: PanoramaRenderer) -> None:
+        self._renderer = renderer
+        self._images: dict[int, Tensor] = {}
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def rendered(self, batches: Iterable[DeferredBatch]) -> Iterator[Batch]:
+        """Each batch with `image` (b, h, w, 3) uint8 on the device."""
+        for batch in batches:
+            yield self._render(batch)
+
+    def _render(self, batch: DeferredBatch) -> Batch:
+        if batch.scenes:
+            images = self._renderer.render_scenes(list(batch.scenes.values()))
+            self._images.update(zip(batch.scenes, images, strict=True))
+        shown = torch.stack([self._images[number] for number in batch.number])
+        for number in batch.evicted:
+            del self._images[number]
+        return batch.rest | {"image": turned(shown, batch.shift, batch.mirrored)}
+
+
+def turned(
+    images: UInt8[Tensor, "b h w 3"], shift: Int[Tensor, "b"], mirrored: Bool[Tensor, "b"]
+) -> UInt8[Tensor, "b h w 3"]:
+    """Panoramas, each rolled by `shift` columns to the right and then mirrored or not, as `Rotation.picture` does."""
+    width = images.shape[2]
+    column = torch.arange(width, device=images.device)
+    source = torch.where(mirrored.to(images.device)[:, None], width - 1 - column, column)
+    source = (source - shift.to(images.device)[:, None]) % width
+    return torch.take_along_dim(images, source[:, None, :, None], dim=2)

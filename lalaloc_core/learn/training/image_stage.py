@@ -1,0 +1,187 @@
+"""Stage 2: the image encoder against the frozen layout encoder (paper, sections 3.2 and A.1.5)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from lalaloc_core.nets import LayoutEncoder
+from lalaloc_core.nets.image_encoder import TrunkImageEncoder
+from lalaloc_core.nets.image_features import ImageFeatures, StructureFeatures, first_of
+from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
+from lalaloc_core.nets.trunk import StyleMixing
+from lalaloc_core.learn.synth.augmentation.photometric import jittered, optics
+from lalaloc_core.learn.training import losses
+from lalaloc_core.learn.training.batches import Batch
+from lalaloc_core.learn.training.config import ImageStageConfig, TrainConfig
+from lalaloc_core.learn.training.objective import anchors_with_neighbours, chamfer_to_anchors, embed
+from lalaloc_core.learn.training.photographs import Photographs
+from lalaloc_core.learn.training.sources import Source
+from lalaloc_core.learn.training.stages import build_image_encoder, panorama_batches
+
+
+class ImageStage:
+    """Stage 2: the image encoder learns to give a panorama the latent of its bare layout; the teacher is frozen."""
+
+    name = "image"
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        source: Source,
+        layout_encoder: LayoutEncoder,
+        photographs: Photographs | None = None,
+    ) -> None:
+        self.config = config
+        self.photographs = photographs
+        self.source = source
+        self.teacher = layout_encoder.eval().requires_grad_(False)
+        self.encoder = build_image_encoder(config)
+        self.modules: dict[str, nn.Module] = {"image_encoder": self.encoder}
+        self._generators: dict[torch.device, torch.Generator] = {}
+        self._first_step = 0
+
+    @property
+    def settings(self) -> ImageStageConfig:
+        """Settings of this stage."""
+        return self.config.image
+
+    @property
+    def ema_decay(self) -> float:
+        """Decay per step of the averaged weights."""
+        return self.settings.ema_decay
+
+    @property
+    def data(self) -> dict[str, Any]:
+        """What is trained on."""
+        if self.photographs is None:
+            return self.source.data
+        return {**self.source.data, "photographs": len(self.photographs.images)}
+
+    def batches(self, first_step: int, workers: int) -> Iterator[Batch]:
+        """Panorama batches, see `panorama_batches`."""
+        self._first_step, self._generators = first_step, {}
+        return panorama_batches(
+            self.config,
+            self.source,
+            neighbours=bool(self.settings.log_ratio_weight or self.settings.kd_weight),
+            first_step=first_step,
+            workers=workers,
+            device=next(self.encoder.parameters()).device,
+        )
+
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
+        """Weighted losses of a batch by name; their sum is minimised."""
+        layout = (batch["profile_m"], batch["camera_height_m"], batch["ceiling_height_m"])
+        stage, terms = self.settings, {}
+        if isinstance(self.teacher, RingLayoutEncoder):
+            with torch.no_grad():
+                ring = self.teacher.ring(*layout)
+                target = self.teacher.head(ring)
+            seen, photographed = self._encoded(batch)
+            latent = self.teacher.head(seen.ring)
+            if seen.structure is not None:
+                terms |= self._structural(seen.structure, batch)
+            terms |= photographed
+            if stage.ring_weight:
+                terms["ring"] = stage.ring_weight * losses.ring_distillation(seen.ring, ring)
+            if stage.profile_weight:
+                likelihood = losses.laplace(seen.log_profile, seen.log_scale, batch["profile_m"])
+                terms["profile"] = stage.profile_weight * likelihood
+        else:
+            with torch.no_grad():
+                target = self.teacher(*layout)
+            latent = self.encoder(self._seen(batch["image"]))
+        if stage.l2_weight:
+            terms["l2"] = stage.l2_weight * losses.l2(latent, target)
+        if stage.log_ratio_weight or stage.kd_weight:
+            terms |= self._relational(latent.float(), target.float(), batch)
+        return terms
+
+    def _encoded(self, batch: Batch) -> tuple[ImageFeatures, dict[str, Tensor]]:
+        """What the encoder says of a batch's panoramas, and the loss on photographs, which it sees along with them."""
+        stage, image, height = self.settings, batch["image"], batch["camera_height_m"]
+        if self.photographs is None or not (stage.photograph_weight or stage.photograph_profile_weight):
+            return self.encoder(self._seen(image), height), {}
+        count, columns = stage.photographs_per_batch, self.config.profile_columns
+        others = self.photographs.draw(count, columns, self._randomness(torch.device("cpu")))
+        together = self._seen(torch.cat([image, others.images.to(image.device)]))
+        # How high real cameras stood is not known: what is told of photographs is in camera heights.
+        heights = torch.cat([height, height.new_ones(count)])
+        seen = self.encoder(together, heights, self._styles(len(image), count, image.device))
+        assert seen.structure is not None
+        openings, log_distance = (told.to(image.device) for told in (others.openings, others.log_distance))
+        real = slice(len(image), None)
+        logits = seen.structure.opening_logits[real]
+        maps = losses.followed_maps(logits, openings)
+        walls = losses.followed_walls(seen.log_profile[real], seen.log_scale[real], log_distance, logits)
+        followed = stage.photograph_weight * maps + stage.photograph_profile_weight * walls
+        return first_of(seen, len(image)), {"photographs": followed}
+
+    def _styles(self, rendered: int, photographs: int, device: torch.device) -> StyleMixing | None:
+        """Who takes on whose style: every other partner is a photograph, since that is how pictures are to look."""
+        if not self.settings.style_mixing:
+            return None
+        generator = self._randomness(torch.device("cpu"))
+        count = rendered + photographs
+        partner = torch.randint(count, (count,), generator=generator)
+        real = rendered + torch.randint(photographs, (count,), generator=generator)
+        partner = torch.where(torch.rand(count, generator=generator) < 0.5, real, partner)
+        share = torch.rand(count, generator=generator)
+        share[torch.rand(count, generator=generator) >= self.settings.style_mixing] = 0.0
+        return StyleMixing(partner.to(device), share.to(device))
+
+    def _structural(self, seen: StructureFeatures, batch: Batch) -> dict[str, Tensor]:
+        """Losses on what is met at each azimuth, the ceiling and the type of the room."""
+        stage, kind, room_type = self.settings, batch["opening_kind"], batch["room_type"]
+        assert isinstance(self.encoder, TrunkImageEncoder)
+        self.encoder.count(kind, room_type)
+        terms = {}
+        if stage.opening_weight:
+            share = self.encoder.opening_share
+            loss = losses.opening(seen.opening_logits, kind, share, stage.opening_balance)
+            terms["opening"] = stage.opening_weight * loss
+        if stage.ceiling_weight:
+            above_m = batch["ceiling_height_m"] - batch["camera_height_m"]
+            loss = losses.ceiling(seen.log_ceiling, seen.log_ceiling_scale, above_m)
+            terms["ceiling"] = stage.ceiling_weight * loss
+        if stage.room_type_weight:
+            terms["room_type"] = stage.room_type_weight * losses.room_type(seen.room_type_logits, room_type)
+        return terms
+
+    def _seen(self, image: Tensor) -> Tensor:
+        """Pictures with the photometric changes that are asked for; what is drawn depends on seed and first step."""
+        # In full precision, as what a camera does to a picture is: bfloat16 has no 256 grey levels.
+        with torch.autocast(image.device.type, enabled=False):
+            if self.settings.photometric:
+                image = jittered(image, self.settings.photometric, self._randomness(image.device))
+            if self.settings.optics:
+                image = optics(image.float(), self.settings.optics, self._randomness(image.device))
+        return image
+
+    def _randomness(self, device: torch.device) -> torch.Generator:
+        if device not in self._generators:
+            seed = int(np.random.default_rng([9, self.config.seed, self._first_step]).integers(1 << 62))
+            self._generators[device] = torch.Generator(device).manual_seed(seed)
+        return self._generators[device]
+
+    def _relational(self, latent: Tensor, target: Tensor, batch: Batch) -> dict[str, Tensor]:
+        """Losses on the distances of the neighbours' layouts to the panorama."""
+        stage, layout = self.settings, self.config.layout
+        groups = anchors_with_neighbours(batch)
+        with torch.no_grad():
+            neighbours = embed(self.teacher, {key: value[:, 1:] for key, value in groups.items()})
+            taught = torch.linalg.vector_norm(neighbours - target[:, None], dim=2)
+        distance = torch.linalg.vector_norm(neighbours - latent[:, None], dim=2)
+        positives, all_pairs, terms = layout.triplets.positives, layout.all_pairs, {}
+        if stage.log_ratio_weight:
+            chamfer = chamfer_to_anchors(groups, layout)
+            ratio = losses.log_ratio(distance, chamfer, positives, all_pairs=all_pairs)
+            terms["log_ratio"] = stage.log_ratio_weight * ratio
+        if stage.kd_weight:
+            terms["kd"] = stage.kd_weight * losses.log_ratio(distance, taught, positives, all_pairs=all_pairs)
+        return terms

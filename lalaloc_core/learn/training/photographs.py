@@ -1,0 +1,84 @@
+"""Real photographs without labels, with what a segmenter sees in them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from torch import Tensor
+
+from lalaloc_core.errors import DatasetError, InvalidPanoramaError
+from lalaloc_core.panorama.images import read_panorama
+from lalaloc_core.learn.synth.augmentation.stretching import stretched
+from lalaloc_core.learn.training.segmenter import PANORAMA_ROWS, load_segmenter, read_walls_and_openings
+
+# Rooms are drawn out or pushed together along two axes by factors between these, evenly in logs: half of the
+# photographs without labels that there are were taken in halls, which so become rooms.
+_MIN_STRETCH, _MAX_STRETCH = 0.5, 1.6
+
+
+@dataclass(frozen=True, eq=False)
+class Photographs:
+    """Photographs with a segmenter's opinion.
+
+    Attributes:
+        images: (n, h, w, 3) RGB bytes.
+        openings: (n, c, 2) probabilities of door and window by column.
+        log_distance: (n, c) log of the walls' distances in camera heights; nan where they are not seen.
+    """
+
+    images: UInt8[Tensor, "n h w 3"]
+    openings: Float[Tensor, "n c 2"]
+    log_distance: Float[Tensor, "n c"]
+
+    def draw(self, count: int, columns: int, generator: torch.Generator) -> Photographs:
+        """Some photographs, each turned, stretched and mirrored at random, with what is taught of so many columns."""
+        width = self.images.shape[2]
+        chosen = torch.randint(len(self.images), (count,), generator=generator)
+        shifts = torch.randint(width, (count,), generator=generator)
+        mirrored = torch.randint(2, (count,), generator=generator).bool()
+        low, high = np.log(_MIN_STRETCH), np.log(_MAX_STRETCH)
+        factors = torch.exp(low + (high - low) * torch.rand(count, 2, generator=generator))
+        turns = list(zip(chosen.tolist(), shifts.tolist(), strict=True))
+        images, openings, log_distance = (
+            torch.stack([part[index].roll(shift, axis) for index, shift in turns])
+            for part, axis in ((self.images, 1), (self.openings, 0), (self.log_distance, 0))
+        )
+        images, openings, log_distance = stretched(images, openings, log_distance, factors)
+        images[mirrored] = images[mirrored].flip(2)
+        openings[mirrored] = openings[mirrored].flip(1)
+        log_distance[mirrored] = log_distance[mirrored].flip(1)
+        return Photographs(
+            images,
+            openings.unflatten(1, (columns, -1)).mean(dim=2),
+            log_distance.unflatten(1, (columns, -1)).nanmean(dim=2),
+        )
+
+
+def load_photographs(folder: Path, segmenter: Path, height: int, width: int) -> Photographs:
+    """Read the panoramas (`*.jpg`, `*.png`) of a folder and let the segmenter look at each.
+
+    Raises:
+        ConfigError: the segmenter cannot be run.
+        DatasetError: there are none, or one cannot be read.
+    """
+    paths = sorted(path for pattern in ("*.jpg", "*.jpeg", "*.png") for path in folder.glob(pattern))
+    if not paths:
+        raise DatasetError("no photographs (*.jpg, *.jpeg, *.png)", path=folder)
+    segment = load_segmenter(segmenter)
+    images, readings = [], []
+    for path in paths:
+        try:
+            content = path.read_bytes()
+            large = read_panorama(content, height=PANORAMA_ROWS, width=2 * PANORAMA_ROWS)
+            images.append(read_panorama(content, height=height, width=width))
+        except (OSError, InvalidPanoramaError) as error:
+            raise DatasetError(f"cannot be read: {error}", path=path) from error
+        readings.append(read_walls_and_openings(large, segment, width))
+    openings, log_distance = (
+        np.stack([getattr(one, name) for one in readings]) for name in ("openings", "log_distance")
+    )
+    return Photographs(torch.from_numpy(np.stack(images)), torch.from_numpy(openings), torch.from_numpy(log_distance))

@@ -1,0 +1,339 @@
+"""What training looks at: visit number i goes to one scene, the same in every run with the same seed.
+
+`GeneratedSource` draws a new home for every visit; `SceneSource` goes through a data set's training scenes in shuffled
+epochs. Both are small and travel to worker processes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from operator import attrgetter
+from pathlib import Path
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from cachetools import LRUCache, cachedmethod
+from jaxtyping import Float, Int
+
+from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, Scene
+from lalaloc_core.learn.data.synthetic.generated import RendererCache
+from lalaloc_core.errors import DatasetError
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.render.sampling import PoseSet, TripletSampling, sample_neighbours, sample_triplets
+from lalaloc_core.learn.synth.homes.splits import TRAIN, home_of
+from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer
+from lalaloc_core.learn.synth.scene.build import build_scene
+from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
+from lalaloc_core.learn.synth.scene.shots import CEILING_CLEARANCE_M, sample_shots
+from lalaloc_core.learn.training.config import TrainConfig
+from lalaloc_core.learn.training.deferred import DeferredScene
+
+# Cameras stand at least this far below the ceiling of a neighbour's room.
+_HEADROOM_M = 0.1
+_MIN_CAMERA_M, _MAX_CAMERA_M = 1.0, 1.9
+# Of panoramas; lower and higher than photographers usually hold a camera, but they do.
+_CAMERA_HEIGHTS_M = (0.5, 2.2)
+# Share of generated panoramas from thresholds, beside walls, in corridors and closets.
+_HARD_SHARE = 0.25
+# Share of those taken at night.
+_NIGHT_SHARE = 0.12
+_SCENES_CACHED = 256
+_PICTURE_BYTES_CACHED = 1 << 28
+# Visits in a row without any use after which there is something wrong with the generator.
+_GENERATOR_PATIENCE = 1000
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Group:
+    """An anchor, then its positives, then its negatives, all at the anchor's camera height."""
+
+    plan: FloorPlan
+    position_m: Float[np.ndarray, "n 2"]
+    room_index: Int[np.ndarray, "n"]
+    camera_height_m: float
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class PanoramaSample:
+    """A panorama and the pose it was taken from; `image` is (h, w, 3) RGB bytes, or a scene yet to be rendered."""
+
+    plan: FloorPlan
+    position_m: Float[np.ndarray, "2"]
+    room_index: int
+    heading: float
+    camera_height_m: float
+    image: np.ndarray | DeferredScene
+
+    def group(self, sampling: TripletSampling, rng: np.random.Generator) -> Group | None:
+        """Its pose with neighbours; None where the plan is too small for them."""
+        return _group_around(self, self.plan, sampling, rng)
+
+
+@runtime_checkable
+class Source(Protocol):
+    """What training looks at.
+
+    Attributes:
+        data: what checkpoints and manifests say of it.
+        patience: visits in a row that may give nothing.
+        skip_bad: whether files that cannot be used are passed over.
+        problems: errors of what was passed over since this list was last emptied.
+        deferred: whether its panoramas are scenes that are yet to be rendered.
+    """
+
+    @property
+    def deferred(self) -> bool: ...
+
+    @property
+    def data(self) -> dict[str, Any]: ...
+
+    @property
+    def patience(self) -> int: ...
+
+    @property
+    def skip_bad(self) -> bool: ...
+
+    @property
+    def problems(self) -> list[DatasetError]: ...
+
+    def rng(self, visit: int) -> np.random.Generator:
+        """The generator of what is drawn for a visit besides the scene itself."""
+        ...
+
+    def groups(self, visit: int) -> list[Group]:
+        """Anchors of stage 1 with their neighbours; none where the scene is of no use.
+
+        Raises:
+            DatasetError: a file cannot be used and `skip_bad` is off.
+        """
+        ...
+
+    def samples(self, visit: int, height: int, width: int) -> list[PanoramaSample]:
+        """Panoramas of stage 2, `height` x `width`; none where the scene is of no use.
+
+        Raises:
+            DatasetError: a file cannot be used and `skip_bad` is off.
+        """
+        ...
+
+
+@dataclass(eq=False)
+class GeneratedSource:
+    """A new home of the generator for every visit, its anchors and cameras anywhere on the floor.
+
+    Attributes:
+        textures: folder of material pictures; without it all are procedural.
+        deferred: panoramas are scenes, to be rendered by `renderer` elsewhere.
+    """
+
+    config: TrainConfig
+    textures: Path | None = None
+    deferred: bool = False
+    _renderers: RendererCache | None = field(default=None, init=False)
+    patience = _GENERATOR_PATIENCE
+    skip_bad = False
+
+    @property
+    def data(self) -> dict[str, Any]:
+        return {"description": "homes generated while training"}
+
+    @property
+    def problems(self) -> list[DatasetError]:
+        """None: what is generated is never at fault."""
+        return []
+
+    def rng(self, visit: int) -> np.random.Generator:
+        return np.random.default_rng([3, self.config.seed, visit])
+
+    def groups(self, visit: int) -> list[Group]:
+        stage = self.config.layout
+        home, rng = home_of(TRAIN, self.config.seed, visit)
+        drawn = sample_triplets(home.plan, stage.anchors_per_home, stage.triplets, rng)
+        if drawn is None:
+            return []
+        poses, rows = drawn
+        groups = []
+        for row in rows:
+            lowest = float(home.plan.ceiling_heights_m[poses.room_index[row]].min())
+            groups.append(
+                Group(
+                    plan=home.plan,
+                    position_m=poses.position_m[row],
+                    room_index=poses.room_index[row],
+                    camera_height_m=float(rng.uniform(_MIN_CAMERA_M, min(_MAX_CAMERA_M, lowest - CEILING_CLEARANCE_M))),
+                )
+            )
+        return groups
+
+    def samples(self, visit: int, height: int, width: int) -> list[PanoramaSample]:
+        stage = self.config.image
+        home, rng = home_of(TRAIN, self.config.seed, visit)
+        shots = sample_shots(
+            home,
+            stage.shots_per_home,
+            rng,
+            by_room_share=stage.by_room_share,
+            hard_share=_HARD_SHARE,
+            unusual_heights_m=_CAMERA_HEIGHTS_M,
+            night_share=_NIGHT_SHARE,
+        )
+        # Made where it is needed: it does not travel to worker processes.
+        self._renderers = self._renderers or self._renderers_on("cpu")
+        scenes = [build_scene(shot, self._renderers.materials) for shot in shots]
+        images: Sequence[np.ndarray | DeferredScene]
+        if self.deferred:
+            first = visit * stage.shots_per_home
+            images = [DeferredScene(number=first + k, scene=scene) for k, scene in enumerate(scenes)]
+        else:
+            images = list(self._renderers.renderer(height, width, stage.supersample).render_scenes(scenes).numpy())
+        return [
+            PanoramaSample(
+                plan=home.plan,
+                position_m=shot.position_m,
+                room_index=shot.room_index,
+                heading=shot.heading,
+                camera_height_m=shot.camera_height_m,
+                image=image,
+            )
+            for shot, image in zip(shots, images, strict=True)
+        ]
+
+    def renderer(self, device: torch.device) -> PanoramaRenderer:
+        """Renders deferred panoramas as `samples` would have."""
+        return self._renderers_on(device).renderer(*self.config.image_size, self.config.image.supersample)
+
+    def _renderers_on(self, device: torch.device | str) -> RendererCache:
+        return RendererCache(MaterialLibrary.create(np.random.default_rng(self.config.seed), self.textures), device)
+
+
+def _picture_key(
+    _: SceneSource, scene: Scene, camera: Camera, look: Appearance, height: int, width: int
+) -> tuple[Any, ...]:
+    return scene.name, camera.name, look, height, width
+
+
+def _bytes_of(image: np.ndarray) -> int:
+    return image.nbytes
+
+
+@dataclass(eq=False)
+class SceneSource:
+    """The training scenes of a data set in shuffled epochs; each visit draws some of a scene's cameras.
+
+    Stage 1 anchors are the poses of the panoramas; stage 2 draws anew how the room looked (paper, section 5).
+    """
+
+    config: TrainConfig
+    dataset: Dataset
+    skip_bad: bool = False
+    problems: list[DatasetError] = field(default_factory=list, init=False)
+    deferred = False
+
+    def __post_init__(self) -> None:
+        self._names = tuple(self.dataset.scenes("train"))
+        if not self._names:
+            raise DatasetError(f"{self.dataset.description} has no training scenes")
+        self._scenes: LRUCache[str, Scene | None] = LRUCache(_SCENES_CACHED)
+        self._pictures: LRUCache[tuple[Any, ...], np.ndarray] = LRUCache(_PICTURE_BYTES_CACHED, _bytes_of)
+        self._orders: LRUCache[int, np.ndarray] = LRUCache(1)
+
+    @property
+    def data(self) -> dict[str, Any]:
+        return {"description": self.dataset.description, "scenes": len(self._names)}
+
+    @property
+    def patience(self) -> int:
+        """Two epochs."""
+        return 2 * len(self._names)
+
+    def rng(self, visit: int) -> np.random.Generator:
+        return np.random.default_rng([5, self.config.seed, visit])
+
+    def groups(self, visit: int) -> list[Group]:
+        stage, rng = self.config.layout, np.random.default_rng([6, self.config.seed, visit])
+        scene = self._scene(visit)
+        groups: list[Group] = []
+        if scene is not None:
+            for index in rng.permutation(len(scene.cameras)):
+                group = _group_around(scene.cameras[index], scene.plan, stage.triplets, rng)
+                groups += [group] if group is not None else []
+                if len(groups) == stage.anchors_per_home:
+                    break
+        return groups
+
+    def samples(self, visit: int, height: int, width: int) -> list[PanoramaSample]:
+        rng = np.random.default_rng([7, self.config.seed, visit])
+        scene = self._scene(visit)
+        if scene is None:
+            return []
+        samples = []
+        for index in rng.permutation(len(scene.cameras))[: self.config.image.shots_per_home]:
+            camera = scene.cameras[index]
+            image = self._picture(scene, camera, rng, height, width)
+            if image is not None:
+                samples.append(
+                    PanoramaSample(
+                        plan=scene.plan,
+                        position_m=camera.position_m,
+                        room_index=camera.room_index,
+                        heading=camera.heading,
+                        camera_height_m=camera.camera_height_m,
+                        image=image,
+                    )
+                )
+        return samples
+
+    def _scene(self, visit: int) -> Scene | None:
+        epoch, place = divmod(visit, len(self._names))
+        return self._load(self._names[self._shuffled(epoch)[place]])
+
+    @cachedmethod(attrgetter("_orders"))
+    def _shuffled(self, epoch: int) -> np.ndarray:
+        return np.random.default_rng([8, self.config.seed, epoch]).permutation(len(self._names))
+
+    @cachedmethod(attrgetter("_scenes"))
+    def _load(self, name: str) -> Scene | None:
+        if not self.skip_bad:
+            return self.dataset.load(name)
+        try:
+            return self.dataset.load(name, self.problems)
+        except DatasetError as error:
+            self.problems.append(error)
+            return None
+
+    def _picture(
+        self, scene: Scene, camera: Camera, rng: np.random.Generator, height: int, width: int
+    ) -> np.ndarray | None:
+        """One of a camera's photographs; None where it has none that can be read."""
+        looks = sorted(camera.photographs, key=str)
+        if not looks:
+            return None
+        look = looks[rng.integers(len(looks))]
+        try:
+            return self._read(scene, camera, look, height, width)
+        except DatasetError as error:
+            if not self.skip_bad:
+                raise
+            self.problems.append(error)
+            return None
+
+    @cachedmethod(attrgetter("_pictures"), key=_picture_key)
+    def _read(self, scene: Scene, camera: Camera, look: Appearance, height: int, width: int) -> np.ndarray:
+        return camera.photographs[look].image(height, width)
+
+
+def _group_around(
+    anchor: Camera | PanoramaSample, plan: FloorPlan, sampling: TripletSampling, rng: np.random.Generator
+) -> Group | None:
+    pose = PoseSet(np.asarray(anchor.position_m)[None], np.array([anchor.room_index]))
+    near = sample_neighbours(plan, pose, sampling, rng, anchor.camera_height_m + _HEADROOM_M)
+    if near is None:
+        return None
+    return Group(
+        plan=plan,
+        position_m=np.concatenate([pose.position_m, near.position_m]),
+        room_index=np.concatenate([pose.room_index, near.room_index]),
+        camera_height_m=anchor.camera_height_m,
+    )

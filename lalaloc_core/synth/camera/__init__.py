@@ -1,8 +1,0 @@
-"""What a camera makes of the light that falls into it: exposure, lenses, stitching, patches at the poles, compression.
-
-Begin with `develop.py`, which turns radiance into bytes; `exposure.py` has the settings and samples them.
-"""
-
-from lalaloc_core.synth.camera.exposure import Exposure
-
-__all__ = ["Exposure"]
