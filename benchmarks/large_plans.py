@@ -20,20 +20,20 @@ from typing import TypeVar
 import numpy as np
 from jaxtyping import UInt8
 
-from lalaloc_core.localise.bundle import Bundle, default_bundle
-from lalaloc_core.learn.data.synthetic.generated import RendererCache
-from lalaloc_core.floorplan import FloorPlan, PlanLimits
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.evidence import Evidence, EvidenceConfig
-from lalaloc_core.localise.pipeline import localise
-from lalaloc_core.localise.poses import LatentGrid, Query
-from lalaloc_core.localise.retrieval import grid_costs
 from lalaloc_core.evaluate.methods.lalaloc import local_refiner
+from lalaloc_core.floorplan import FloorPlan, PlanLimits
+from lalaloc_core.learn.data.synthetic.generated import RendererCache
 from lalaloc_core.learn.synth.homes.buildings import Building, building_of
 from lalaloc_core.learn.synth.homes.splits import VALIDATION
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
+from lalaloc_core.localise.bundle import Bundle, default_bundle
+from lalaloc_core.localise.camera_height import CameraHeight
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost
+from lalaloc_core.localise.pipeline import localise
+from lalaloc_core.localise.poses import PoseGrid, Query
+from lalaloc_core.localise.retrieval import grid_costs
 from service.grids.embedding import embed, grid_bytes
 
 _AREAS_M2 = (100.0, 1000.0, 5000.0, 10_000.0, 50_000.0, 100_000.0, 200_000.0)
@@ -88,7 +88,7 @@ def _measure(building: Building, bundle: Bundle, renderers: RendererCache, count
     encoders = Encoders(bundle, threads=1)
     document, limits = building.plan.to_dict(), PlanLimits(max_openings=_MAX_OPENINGS)
     read_s, plan = _timed(lambda: FloorPlan.from_dict(document, limits))
-    grids: list[LatentGrid] = []
+    grids: list[PoseGrid] = []
 
     def prepare() -> None:
         grid = embed(
@@ -101,7 +101,7 @@ def _measure(building: Building, bundle: Bundle, renderers: RendererCache, count
     grid, rng = grids[0], np.random.default_rng(5)
     homes = rng.integers(len(building.homes), size=count)
     shots = [sample_shots(building.homes[home], 1, rng)[0] for home in homes]
-    refiner, config, weights = local_refiner(bundle), EvidenceConfig(), encoders.manifest.evidence
+    refiner, config, weights = local_refiner(bundle), MatchingConfig(), encoders.manifest.evidence
     height, width = encoders.manifest.image_height, encoders.manifest.image_width
     images = [renderers.renderer(height, width).render([shot]).cpu().numpy()[0] for shot in shots]
     spent: dict[bool, list[float]] = {True: [], False: []}
@@ -120,7 +120,7 @@ def _measure(building: Building, bundle: Bundle, renderers: RendererCache, count
         seconds, found = _timed(lambda query=query: grid_costs(plan, grid, query, weights, config))
         retrieved.append(seconds)
         if oracle:
-            every, _ = Evidence(plan, query, config.grid_reach * _STEP_M, weights, config).costs(grid.layouts(plan))
+            every, _ = MatchingCost(plan, query, config.grid_reach * _STEP_M, weights, config).costs(grid.layouts(plan))
             best = int(found.cost[: found.compared].argmin())
             hypothesis, pose = np.unravel_index(int(every.argmin()), every.shape)
             same.append((int(found.hypothesis[best]), int(found.pose[best])) == (int(hypothesis), int(pose)))

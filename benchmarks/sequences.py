@@ -18,9 +18,13 @@ from pathlib import Path
 
 import numpy as np
 
-from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.conventions import wrap_angle
+from lalaloc_core.evaluate.methods.lalaloc import local_refiner
 from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, RenderedPhotograph, renderer_cache_of
+from lalaloc_core.learn.synth.homes.plans import Home
+from lalaloc_core.learn.synth.homes.splits import home_of
+from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
+from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.pipeline import Localisation, localise, panorama_heading
@@ -28,10 +32,6 @@ from lalaloc_core.localise.retrieval import build_grid
 from lalaloc_core.localise.sequence import Motion
 from lalaloc_core.localise.sequence.joint import refine_sequence
 from lalaloc_core.localise.sequence.search import localise_sequence
-from lalaloc_core.evaluate.methods.lalaloc import local_refiner
-from lalaloc_core.learn.synth.homes.plans import Home
-from lalaloc_core.learn.synth.homes.splits import home_of
-from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
 
 # Places that a walk may go through, and how far apart neighbours on it are.
 _PLACES, _STRIDE_M = 80, (0.8, 3.5)

@@ -17,18 +17,18 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.venues import queries
-from lalaloc_core.localise.bundle import Bundle
+from lalaloc_core.evaluate.methods.lalaloc import local_refiner
 from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS
+from lalaloc_core.learn.synth.homes.splits import home_of
+from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.evidence import EvidenceConfig
+from lalaloc_core.localise.matching_cost import MatchingConfig
 from lalaloc_core.localise.pipeline import localise
 from lalaloc_core.localise.poses import Query
 from lalaloc_core.localise.venue.merged_plans import MergedPlans
 from lalaloc_core.localise.venue.plan_index import PlanIndex
 from lalaloc_core.localise.venue.prototype_cells import shipped_cells
 from lalaloc_core.localise.venue.prototypes import most_probable, prototypes_of
-from lalaloc_core.evaluate.methods.lalaloc import local_refiner
-from lalaloc_core.learn.synth.homes.splits import home_of
 from scripts.make_prototype_cells import grid_without_latents
 from service.query.venue_localiser import VENUE_CONFIG
 from service.query.venue_plans import MAX_SEARCHED, most_poses
@@ -61,7 +61,7 @@ def main() -> None:
     chosen = np.linspace(0, asked.plans - 1, asked.queries).astype(int).tolist()
     for number, name, query in queries(bundle, chosen, asked.seed):
         tally, begin = told[name], time.process_time()
-        mass = index.log_masses(query, bundle.manifest.evidence, EvidenceConfig())
+        mass = index.log_masses(query, bundle.manifest.evidence, MatchingConfig())
         among = most_probable(mass, poses, most_plans=MAX_SEARCHED, most_poses=most_poses(query, limit)).tolist()
         indexed = time.process_time()
         by_index = found(query, among)

@@ -24,17 +24,17 @@ from pathlib import Path
 
 import numpy as np
 
-from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, RenderedPhotograph, renderer_cache_of
+from lalaloc_core.learn.synth.homes.splits import home_of
+from lalaloc_core.learn.synth.scene.shots import sample_shots
+from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.evidence import EvidenceConfig
+from lalaloc_core.localise.matching_cost import MatchingConfig
 from lalaloc_core.localise.poses import Query
 from lalaloc_core.localise.venue.plan_index import COMPARED, SCANNED, PlanIndex
 from lalaloc_core.localise.venue.prototype_cells import shipped_cells
 from lalaloc_core.localise.venue.prototypes import AZIMUTHS, packed_openings, prototypes_of, unpacked_openings
-from lalaloc_core.learn.synth.homes.splits import home_of
-from lalaloc_core.learn.synth.scene.shots import sample_shots
 from scripts.make_prototype_cells import grid_without_latents
 from service.query.prototype_file import BlockKey, PrototypeFile
 
@@ -135,7 +135,7 @@ def main() -> None:
     blocks = repeated(prototypes(asked.plans, asked.seed), asked.repeat, rng)
     count = np.array([len(block) for block in blocks])
     print(f"{len(blocks)} plans, {count.sum()} prototypes of {blocks[0].itemsize} bytes")
-    weights, config, told = bundle.manifest.evidence, EvidenceConfig(), defaultdict(lambda: defaultdict(list))
+    weights, config, told = bundle.manifest.evidence, MatchingConfig(), defaultdict(lambda: defaultdict(list))
     with tempfile.TemporaryDirectory() as folder:
         path, cells = Path(folder) / "prototypes.bin", shipped_cells()
         keys = [BlockKey(number, "0" * 64) for number in range(len(blocks))]

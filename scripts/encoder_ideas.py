@@ -9,12 +9,12 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from lalaloc_core.conventions import TWO_PI
-from lalaloc_core.nets.image_features import ImageFeatures
-from lalaloc_core.nets.layout_encoder import RingConfig, RingLayoutEncoder
-from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
 from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.image_stage import ImageStage
 from lalaloc_core.learn.training.sources import GeneratedSource
+from lalaloc_core.nets.image_features import ImageFeatures
+from lalaloc_core.nets.layout_encoder import RingConfig, RingLayoutEncoder
+from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
 from scripts.encoder_pool import COLUMNS
 
 

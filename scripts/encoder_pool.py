@@ -15,14 +15,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from lalaloc_core.localise.bundle import LAYOUT_WEIGHTS, Bundle
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes, RenderedPhotograph
+from lalaloc_core.learn.training.presets import PRESETS
+from lalaloc_core.learn.training.sources import GeneratedSource
+from lalaloc_core.localise.bundle import LAYOUT_WEIGHTS, Bundle
 from lalaloc_core.nets import load_layout_encoder
 from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
 from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.render.sampling import pose_grid, random_poses
-from lalaloc_core.learn.training.presets import PRESETS
-from lalaloc_core.learn.training.sources import GeneratedSource
 
 COLUMNS = 128
 FULL_HEIGHT, FULL_WIDTH = 256, 512

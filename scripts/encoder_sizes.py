@@ -26,13 +26,13 @@ import onnxruntime
 import torch
 from torch import Tensor, nn
 
-from lalaloc_core.localise.bundle import Bundle
-from lalaloc_core.nets.layout_encoder import RingConfig, RingLayoutEncoder
 from lalaloc_core.learn.training.averaging import moving_average
 from lalaloc_core.learn.training.config import OptimiserConfig
 from lalaloc_core.learn.training.loop import learning_rate
 from lalaloc_core.learn.training.presets import PRESETS
 from lalaloc_core.learn.training.stages import build_optimiser
+from lalaloc_core.localise.bundle import Bundle
+from lalaloc_core.nets.layout_encoder import RingConfig, RingLayoutEncoder
 from scripts.encoder_ideas import ContrastiveStage, DenseStage, Gru, RingStage
 from scripts.encoder_pool import BUNDLE, FULL_HEIGHT, FULL_WIDTH, PROCESSES, Pool, render_pool, teacher_of
 

@@ -12,19 +12,19 @@ from matplotlib.figure import Figure
 _PANELS = {
     "negative log likelihood of the wall profile": {
         "validation": "val_nll",
-        "out-of-family": "unfamiliar_nll",
+        "out-of-family": "heldout_nll",
     },
     "nearest grid pose within 1 m, by profile": {
         "full": "val_profile_within_1m_full",
         "simple": "val_profile_within_1m_simple",
         "empty": "val_profile_within_1m_empty",
-        "out-of-family, full": "unfamiliar_profile_within_1m",
+        "out-of-family, full": "heldout_profile_within_1m",
     },
     "nearest grid pose within 1 m, by latent": {
         "full": "val_within_1m_full",
         "simple": "val_within_1m_simple",
         "empty": "val_within_1m_empty",
-        "out-of-family, full": "unfamiliar_within_1m",
+        "out-of-family, full": "heldout_within_1m",
     },
 }
 

@@ -16,26 +16,26 @@ import numpy as np
 from jaxtyping import Float
 
 from lalaloc_core.conventions import OPENING_CLASSES
-from lalaloc_core.localise.poses import LatentGrid
+from lalaloc_core.learn.synth.homes.plans import Home
+from lalaloc_core.learn.synth.homes.splits import TRAIN, home_of
+from lalaloc_core.localise.poses import PoseGrid
 from lalaloc_core.localise.venue.prototype_cells import CELLS_FILE, features, nearest
 from lalaloc_core.localise.venue.prototypes import AZIMUTHS, Prototypes, joined, prototypes_of, unpacked_openings
 from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.render.sampling import pose_grid
-from lalaloc_core.learn.synth.homes.plans import Home
-from lalaloc_core.learn.synth.homes.splits import TRAIN, home_of
 
 _STEP_M, _CAMERA_HEIGHT_M = 0.5, 1.5
 # The share of homes that are scaled, and the logs of the factors.
 _SCALED, _LOG_FACTOR = 0.2, (0.2, 1.4)
 
 
-def grid_without_latents(home: Home) -> LatentGrid:
+def grid_without_latents(home: Home) -> PoseGrid:
     """The grid of a home as the renderer has it, without what an encoder makes of it."""
     poses = pose_grid(home.plan, _STEP_M)
     profile_m = profiles_at(
         home.plan, poses.position_m, poses.room_index, np.zeros(len(poses)), 4 * AZIMUTHS, np.float32
     )
-    return LatentGrid(poses, np.zeros((len(poses), 1), np.float32), profile_m, _STEP_M, _CAMERA_HEIGHT_M)
+    return PoseGrid(poses, np.zeros((len(poses), 1), np.float32), profile_m, _STEP_M, _CAMERA_HEIGHT_M)
 
 
 def sample(homes: int, seed: int) -> np.ndarray:

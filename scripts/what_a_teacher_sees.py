@@ -16,15 +16,15 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from lalaloc_core.localise.bundle import Bundle, default_bundle
 from lalaloc_core.conventions import OPENING_CLASSES
+from lalaloc_core.evaluate.runs.photograph_reading import read_azimuths
 from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M, is_annotation, read_annotation
 from lalaloc_core.learn.data.dataset import Photograph
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
-from lalaloc_core.evaluate.runs.photograph_reading import read_azimuths
+from lalaloc_core.learn.training.segmenter import PANORAMA_ROWS, Segment, load_segmenter, read_walls_and_openings
+from lalaloc_core.localise.bundle import Bundle, default_bundle
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.render.layout import layout_view
-from lalaloc_core.learn.training.segmenter import PANORAMA_ROWS, Segment, load_segmenter, read_walls_and_openings
 
 _WALL, _DOOR, _WINDOW, _PASSAGE = (OPENING_CLASSES.index(name) for name in ("wall", "door", "window", "passage"))
 # A line of the teacher's agrees with the truth within this error of log distance.

@@ -15,8 +15,8 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from datetime import datetime
 
-from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.errors import ConfigError, LaLaLocError
+from lalaloc_core.localise.bundle import Bundle
 from service.security import Permission, check_address
 from service.security.keys import hash_of, key_text, new_secret
 from service.settings import Settings

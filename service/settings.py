@@ -10,11 +10,11 @@ from typing import Annotated, Self
 from pydantic import Field, ValidationError, model_validator
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
-from lalaloc_core.localise.bundle import default_bundle
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.floorplan import PlanLimits
-from lalaloc_core.panorama.images import PanoramaLimits
 from lalaloc_core.importers import ImportLimits
+from lalaloc_core.localise.bundle import default_bundle
+from lalaloc_core.panorama.images import PanoramaLimits
 from service.cores import CoreShares, share_cores, usable_cores
 from service.fair_share import with_headroom
 from service.setting_types import Count, HostNames, Metres, Origins, PortMapping, Seconds

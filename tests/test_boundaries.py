@@ -21,53 +21,63 @@ ROOT = Path(__file__).parents[1]
 LAYERS = {
     "lalaloc_core.errors": 0,
     "lalaloc_core.conventions": 0,
-    "lalaloc_core.floorplan.earth": 0,
     "lalaloc_core.file_kinds": 0,
     "lalaloc_core.files": 0,
     "lalaloc_core.configuration": 1,
+    # The query side.
+    "lalaloc_core.floorplan.earth": 0,
     "lalaloc_core.floorplan": 1,
-    "lalaloc_core.render.sampling": 2,
-    "lalaloc_core.learn.metrics": 1,
-    "lalaloc_core.learn.azimuth_metrics": 1,
-    "lalaloc_core.localise.bundle": 1,
+    "lalaloc_core.localise.bundle": 2,
     "lalaloc_core.panorama": 2,
     "lalaloc_core.render": 2,
+    "lalaloc_core.nets": 3,
+    "lalaloc_core.localise": 4,
+    "lalaloc_core.localise.optimise": 5,
+    "lalaloc_core.localise.sequence": 5,
+    "lalaloc_core.localise.venue": 5,
+    "lalaloc_core.draw": 5,
     "lalaloc_core.importers.model": 2,
     "lalaloc_core.importers.drawing": 3,
     "lalaloc_core.importers.picture": 4,
     "lalaloc_core.importers.formats": 5,
     "lalaloc_core.importers.exports": 6,
-    # Chooses among the formats.
     "lalaloc_core.importers": 7,
-    "lalaloc_core.nets": 3,
+    # The wing that learns.
+    "lalaloc_core.learn.metrics": 1,
+    "lalaloc_core.learn.azimuth_metrics": 1,
     "lalaloc_core.learn.synth.records": 2,
     "lalaloc_core.learn.synth.homes": 2,
     "lalaloc_core.learn.synth": 3,
-    "lalaloc_core.learn.synth.augmentation": 4,
     "lalaloc_core.learn.synth.camera": 3,
     "lalaloc_core.learn.synth.furniture": 3,
+    "lalaloc_core.learn.synth.augmentation": 4,
     "lalaloc_core.learn.synth.scene": 4,
     "lalaloc_core.learn.synth.rendering": 5,
-    # Beside synth and apart from it: neither may import the other.
+    # Independent of synth: neither may import the other.
     "lalaloc_core.learn.heldout": 3,
-    "lalaloc_core.localise": 4,
-    "lalaloc_core.localise.optimise": 5,
-    "lalaloc_core.localise.sequence": 5,
-    "lalaloc_core.localise.venue": 5,
     "lalaloc_core.learn.data": 5,
-    "lalaloc_core.draw": 5,
     "lalaloc_core.learn.data.synthetic": 6,
     "lalaloc_core.learn.training": 7,
+    "lalaloc_core.learn.export": 9,
+    "lalaloc_core.learn": 9,
+    # The wing that measures.
     "lalaloc_core.evaluate.methods": 7,
     "lalaloc_core.evaluate.runs": 8,
     "lalaloc_core.evaluate.calibrate": 9,
-    "lalaloc_core.learn.export": 9,
     "lalaloc_core.evaluate.report": 9,
     "lalaloc_core.evaluate.reproduce": 10,
     "lalaloc_core.evaluate.bench": 10,
+    "lalaloc_core.evaluate": 10,
     "lalaloc_core.cli": 11,
     # Below everything: it may import nothing of the rest.
     "lalaloc_client": 0,
+}
+# The seam between the wings: what the modules of a package may not import, whatever their layers.
+QUERY_SIDE = ("floorplan", "importers", "panorama", "render", "nets", "localise", "draw")
+FORBIDDEN = {
+    **{f"lalaloc_core.{package}": ("lalaloc_core.learn", "lalaloc_core.evaluate") for package in QUERY_SIDE},
+    "lalaloc_core.learn": ("lalaloc_core.evaluate",),
+    "service": ("lalaloc_core.learn", "lalaloc_core.evaluate", "lalaloc_core.cli"),
 }
 # The service's layers lie above all of the core's, lowest first.
 SERVICE_LAYERS = (
@@ -92,14 +102,14 @@ LAYERS |= {
 # Importing these loads torch; importing anything else must not.
 TORCH_PACKAGES = (
     "lalaloc_core.nets",
-    "lalaloc_core.learn.synth",
     "lalaloc_core.localise.optimise",
+    "lalaloc_core.learn.synth",
     "lalaloc_core.learn.data.synthetic",
     "lalaloc_core.learn.training",
+    "lalaloc_core.learn.export",
     "lalaloc_core.evaluate.methods",
     "lalaloc_core.evaluate.runs",
     "lalaloc_core.evaluate.report",
-    "lalaloc_core.learn.export",
     "lalaloc_core.evaluate.reproduce",
     "lalaloc_core.evaluate.bench",
 )
@@ -154,7 +164,7 @@ def _folder(module: str) -> str:
 
 
 def _in_torch_package(module: str) -> bool:
-    return any(module == package or module.startswith(package + ".") for package in TORCH_PACKAGES)
+    return any(_is_in(module, package) for package in TORCH_PACKAGES)
 
 
 def _reaches_torch(module: str, seen: set[str]) -> bool:
@@ -178,6 +188,22 @@ def test_every_module_imports_only_from_lower_layers_or_its_own_folder(module: s
         assert target_layer is not None, f"{module} imports {target}, which has no layer"
         neighbour = target_layer == layer and _folder(target) == _folder(module)
         assert target_layer < layer or neighbour, f"{module} (layer {layer}) imports {target} (layer {target_layer})"
+
+
+def _is_in(module: str, package: str) -> bool:
+    return module == package or module.startswith(package + ".")
+
+
+@pytest.mark.parametrize("package", FORBIDDEN)
+def test_wings_are_kept_apart(package: str) -> None:
+    crossing = [
+        (module, target)
+        for module in MODULES
+        if _is_in(module, package)
+        for target in sorted(_imported(module, ast.walk(_tree(module))))
+        if any(_is_in(target, forbidden) for forbidden in FORBIDDEN[package])
+    ]
+    assert crossing == []
 
 
 def test_no_modules_import_each_other_in_a_circle() -> None:

@@ -13,8 +13,8 @@ import pytest
 from PIL import Image
 
 from lalaloc_core.cli import main as lalaloc
-from lalaloc_core.learn.data.annotations import read_annotation
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.learn.data.annotations import read_annotation
 from scripts.write_docs import documents
 from service.schemas import GeoPose, ImportReport, LocaliseAnswer
 from service.schemas.oscp import OscpAnswer

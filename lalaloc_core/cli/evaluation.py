@@ -11,11 +11,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from lalaloc_core.localise.bundle import default_bundle
 from lalaloc_core.cli.arguments import count, positive, processes
 from lalaloc_core.cli.printing import print_json, print_table
-from lalaloc_core.learn.data.dataset import DATASET_FORMATS, SPLITS
 from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.learn.data.dataset import DATASET_FORMATS, SPLITS
+from lalaloc_core.localise.bundle import default_bundle
 
 # So many homes that calibration asks with their own photographs for one that it asks with those of others.
 _PER_MISMATCHED_HOME = 1
@@ -94,7 +94,7 @@ def _data_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--generator",
-        choices=("synth", "unfamiliar"),
+        choices=("synth", "heldout"),
         default="synth",
         help="who draws generated homes: training's generator, or one written apart from it (default: %(default)s)",
     )
@@ -202,12 +202,18 @@ def _worst(arguments: argparse.Namespace) -> None:
 
 
 def _calibrate(arguments: argparse.Namespace) -> None:
-    from lalaloc_core.localise.bundle import Bundle
-    from lalaloc_core.evaluate.calibrate import Answers, calibrate, fit_evidence, store_cohort, store_evidence
-    from lalaloc_core.learn.data.synthetic import training_plans
+    from lalaloc_core.evaluate.calibrate import (
+        Answers,
+        calibrate,
+        fit_matching_weights,
+        store_cohort,
+        store_matching_weights,
+    )
     from lalaloc_core.evaluate.runs.factories import describe_model
     from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
     from lalaloc_core.evaluate.runs.run import run_evaluation
+    from lalaloc_core.learn.data.synthetic import training_plans
+    from lalaloc_core.localise.bundle import Bundle
     from lalaloc_core.localise.cohort import cohort_of
 
     def asked(generated: dict[str, Any], known: bool, whose: str) -> list[Prediction]:
@@ -237,10 +243,10 @@ def _calibrate(arguments: argparse.Namespace) -> None:
     # Weights first: confidence is fitted on answers that were weighed by them.
     evidence = bundle.manifest.evidence
     if not arguments.keep_evidence:
-        evidence = fit_evidence([one for heading in (True, False) for one in asked(own, heading, "unweighed")])
+        evidence = fit_matching_weights([one for heading in (True, False) for one in asked(own, heading, "unweighed")])
     if arguments.openings_weight is not None:
         evidence = dataclasses.replace(evidence, openings=arguments.openings_weight)
-    print_json(dataclasses.asdict(store_evidence(Bundle.open(arguments.bundle), evidence).manifest.evidence))
+    print_json(dataclasses.asdict(store_matching_weights(Bundle.open(arguments.bundle), evidence).manifest.evidence))
     known, searched = (
         Answers(
             own=asked(own, heading, "own"),
@@ -265,7 +271,7 @@ def _asked_homes(arguments: argparse.Namespace) -> dict[str, Any]:
     if arguments.textures is not None:
         raise InvalidInputError("--textures is for --generator synth; the other paints its own materials")
     if arguments.split == "train":
-        raise InvalidInputError("--generator unfamiliar has no split 'train', it is for reporting only")
+        raise InvalidInputError("--generator heldout has no split 'train', it is for reporting only")
     return {"generator": arguments.generator} | {name: generated[name] for name in ("homes", "seed", "furniture")}
 
 

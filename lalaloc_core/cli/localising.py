@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from lalaloc_core.localise.bundle import Bundle, default_bundle
 from lalaloc_core.cli.arguments import heading, positive, tolerance
 from lalaloc_core.cli.plan_files import add_plan_options, check_picture_name, read_plan, write_picture
 from lalaloc_core.cli.printing import print_json, print_table
 from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M
 from lalaloc_core.errors import InvalidInputError, InvalidPanoramaError
+from lalaloc_core.localise.bundle import Bundle, default_bundle
 
 if TYPE_CHECKING:
     from lalaloc_core.draw.answer import DrawnAnswer
@@ -109,11 +109,11 @@ def _answers(arguments: argparse.Namespace, plan: FloorPlan, contents: list[byte
     from tqdm import tqdm
 
     from lalaloc_core.draw.found import drawn_answer
+    from lalaloc_core.evaluate.methods.lalaloc import local_refiner
     from lalaloc_core.localise.encoders import Encoders
     from lalaloc_core.localise.pipeline import localise
     from lalaloc_core.localise.retrieval import build_grid
     from lalaloc_core.localise.stated_camera import known_heading, stated_height
-    from lalaloc_core.evaluate.methods.lalaloc import local_refiner
     from lalaloc_core.panorama.images import open_panorama
 
     bundle = Bundle.open(arguments.bundle)

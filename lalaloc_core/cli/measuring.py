@@ -7,9 +7,9 @@ import json
 from pathlib import Path
 from typing import Any
 
-from lalaloc_core.localise.bundle import default_bundle
 from lalaloc_core.cli.arguments import count
 from lalaloc_core.cli.printing import print_json
+from lalaloc_core.localise.bundle import default_bundle
 
 _GROUPS = (
     "rendering",

@@ -8,9 +8,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from lalaloc_core.localise.bundle import default_bundle
 from lalaloc_core.cli.arguments import count, processes
 from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.localise.bundle import default_bundle
 
 
 def add_commands(commands: Any) -> None:

@@ -11,14 +11,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.cli.printing import print_json
 from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.localise.bundle import Bundle
 
 # Four panoramas each; drawing one takes a third of a second, and validation shows all of them every few minutes.
 _VALIDATION_HOMES = 50
 # So many validation homes for one that is out of the family, which takes longer to draw.
-_PER_UNFAMILIAR_HOME = 3
+_PER_HELDOUT_HOME = 3
 
 
 def add_commands(commands: Any) -> None:
@@ -97,7 +97,7 @@ def _train(arguments: argparse.Namespace) -> None:
     import torch
 
     from lalaloc_core.learn.data.dataset_detection import open_dataset
-    from lalaloc_core.learn.data.synthetic.unfamiliar import UnfamiliarScenes
+    from lalaloc_core.learn.data.synthetic.heldout import HeldoutScenes
     from lalaloc_core.learn.training.data import TrainingData
     from lalaloc_core.learn.training.presets import PRESETS
     from lalaloc_core.learn.training.run import train_end_to_end, train_image, train_layout
@@ -133,14 +133,14 @@ def _train(arguments: argparse.Namespace) -> None:
     if arguments.validation_homes < 1:
         raise InvalidInputError(f"--validation-homes {arguments.validation_homes}: at least 1 is needed")
     render = arguments.render or ("workers" if device.type == "cpu" else "device")
-    unfamiliar_homes = max(arguments.validation_homes // _PER_UNFAMILIAR_HOME, 1)
+    heldout_homes = max(arguments.validation_homes // _PER_HELDOUT_HOME, 1)
     data = TrainingData(
         dataset=None if arguments.data is None else open_dataset(arguments.data),
         skip_bad=arguments.skip_bad,
         textures=arguments.textures,
         deferred=arguments.data is None and render == "device",
         validation_scenes=arguments.validation_homes,
-        unfamiliar=None if arguments.data is not None else UnfamiliarScenes(homes=unfamiliar_homes),
+        heldout=None if arguments.data is not None else HeldoutScenes(homes=heldout_homes),
         photographs=arguments.photographs,
         segmenter=arguments.teacher,
     )

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from lalaloc_core.localise.bundle import ConfidenceModel
 from lalaloc_core.conventions import heading_to_degrees
 from lalaloc_core.draw.answer import DrawnAnswer, DrawnCandidate
 from lalaloc_core.draw.heat import posterior_map
 from lalaloc_core.draw.plan import Marker
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.bundle import ConfidenceModel
 from lalaloc_core.localise.covariance import pose_uncertainty
 from lalaloc_core.localise.pipeline import Localisation, panorama_heading
-from lalaloc_core.localise.poses import Candidate, LatentGrid, Query
+from lalaloc_core.localise.poses import Candidate, PoseGrid, Query
 from lalaloc_core.localise.probability_map import probability_map
 
 
 def drawn_answer(
     plan: FloorPlan,
-    grid: LatentGrid,
+    grid: PoseGrid,
     found: Localisation,
     model: ConfidenceModel | None,
     heading_source: str,

@@ -1,7 +1,7 @@
 """Fit what answers are weighed by, and what they say of themselves, on validation queries.
 
 * How much each term of the evidence may count, and how sharp the posterior is: what makes the right ones of the
-  candidates the most probable (`fit_evidence`).
+  candidates the most probable (`fit_matching_weights`).
 * What fits a picture by chance (`localise.cohort`), from training homes.
 * The probability that a picture fits its plan, with which the posterior makes the probability of "within 1 m", and the
   covariance (`fit_confidence`). Queries are photographs of the plan's home, the same disturbed, since real cameras and
@@ -17,16 +17,16 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import optimize
 
-from lalaloc_core.localise.bundle import COHORT, Bundle, ConfidenceModel, EvidenceModel, LogisticModel, write_manifest
 from lalaloc_core.conventions import heading_from_degrees, wrap_angle
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.evaluate.runs.predictions import Pose, Prediction
 from lalaloc_core.evaluate.runs.score import expected_calibration_error, position_errors_m
 from lalaloc_core.files import atomic_write
+from lalaloc_core.learn.metrics import Accuracy
+from lalaloc_core.localise.bundle import COHORT, Bundle, ConfidenceModel, LogisticModel, MatchingWeights, write_manifest
 from lalaloc_core.localise.cohort import Cohort
 from lalaloc_core.localise.covariance import marginal_information
 from lalaloc_core.localise.posterior import HEADING_SEPARATION, RIGHT_WITHIN_M
-from lalaloc_core.learn.metrics import Accuracy
 
 # Of all that is fitted on, photographs of something else than the plan's home weigh so much: with it they are believed
 # as seldom as by a fit without disturbed ones, and answers about the home itself look about as sure as they are.
@@ -85,14 +85,14 @@ def fit_confidence(known: Answers, searched: Answers) -> ConfidenceModel:
     )
 
 
-def fit_evidence(answers: Sequence[Prediction]) -> EvidenceModel:
+def fit_matching_weights(answers: Sequence[Prediction]) -> MatchingWeights:
     """Weights of the evidence's terms that make the right ones of all candidates the most probable.
 
     The likelihood of a choice model over the candidates of each query: where none of them is right, or all are, a query
     says nothing.
     """
     queries = [one for one in (_choice(prediction) for prediction in answers) if one is not None]
-    default = EvidenceModel()
+    default = MatchingWeights()
     start = default.temperature * np.array([1.0, default.openings, default.ceiling, default.room_type])
     if not queries:
         return default
@@ -110,7 +110,7 @@ def fit_evidence(answers: Sequence[Prediction]) -> EvidenceModel:
     fitted = optimize.minimize(loss, start, method="L-BFGS-B", bounds=bounds).x
     fitted = np.where(used, fitted, start)
     temperature, openings, ceiling, room_type = (float(round(value, 4)) for value in fitted)
-    return EvidenceModel(
+    return MatchingWeights(
         openings=openings / temperature,
         ceiling=ceiling / temperature,
         room_type=room_type / temperature,
@@ -142,7 +142,7 @@ def store_cohort(bundle: Bundle, cohort: Cohort) -> Bundle:
     return write_manifest(bundle.folder, bundle.manifest)
 
 
-def store_evidence(bundle: Bundle, evidence: EvidenceModel) -> Bundle:
+def store_matching_weights(bundle: Bundle, evidence: MatchingWeights) -> Bundle:
     """Store fitted weights in the bundle's manifest."""
     return write_manifest(bundle.folder, dataclasses.replace(bundle.manifest, evidence=evidence))
 

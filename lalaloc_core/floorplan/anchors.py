@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from lalaloc_core.floorplan.earth import Anchor, LocalFrame
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan.earth import Anchor, LocalFrame
 from lalaloc_core.floorplan.rooms import Room
 from lalaloc_core.floorplan.values import check_keys, is_number, json_kind, read_number_between
 

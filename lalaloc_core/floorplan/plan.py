@@ -16,11 +16,11 @@ import shapely
 from jaxtyping import Float, Int
 
 from lalaloc_core.conventions import heading_from_degrees, heading_to_degrees
-from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.anchors import anchor_document, read_anchor
 from lalaloc_core.floorplan.arrays import frozen
 from lalaloc_core.floorplan.checks import check_size, overlap_warnings
+from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.floorplan.geometry import PlanGeometry, build_geometry, pad_walls
 from lalaloc_core.floorplan.heights import (
     DEFAULT_CAMERA_HEIGHT_M,

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 from typing import Any, Literal, get_args
 
-from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.importers.importing import missing_extra
 
 ExportFormat = Literal["native", "geojson", "imdf", "dxf", "svg"]

@@ -2,18 +2,18 @@
 
 Begin with `pipeline.py`, the path of a query: `retrieval.py` compares it with the plan's grid, `vogel.py` samples more
 poses around the best, `optimise/` moves them (LPO, all here that imports torch), `confidence.py` and
-`covariance.py` say how sure the answer is. `evidence.py` is what poses are compared by, `encoders.py` runs the networks
+`covariance.py` say how sure the answer is. `matching_cost.py` is what poses are compared by, `encoders.py` runs the networks
 on onnxruntime. `venue/` searches several plans as one, `sequence/` answers several photographs jointly. Worker
 processes load parts of this, so only plain values are re-exported.
 """
 
-from lalaloc_core.localise.evidence import EvidenceConfig
-from lalaloc_core.localise.poses import Candidate, LatentGrid, PredictedProfile, Query, RefinementJob, RefinementResult
+from lalaloc_core.localise.matching_cost import MatchingConfig
+from lalaloc_core.localise.poses import Candidate, PoseGrid, PredictedProfile, Query, RefinementJob, RefinementResult
 
 __all__ = [
     "Candidate",
-    "EvidenceConfig",
-    "LatentGrid",
+    "MatchingConfig",
+    "PoseGrid",
     "PredictedProfile",
     "Query",
     "RefinementJob",

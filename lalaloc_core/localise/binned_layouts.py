@@ -1,4 +1,4 @@
-"""The poses of a grid as the first look of a search (`first_look.py`) sees them: distances in bins, and openings."""
+"""The poses of a grid as the first look of a search (`coarse_pass.py`) sees them: distances in bins, and openings."""
 
 from __future__ import annotations
 

@@ -75,8 +75,8 @@ class LogisticModel:
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvidenceModel:
-    """How much each term of the evidence may count, fitted on validation queries; see `localise.evidence`.
+class MatchingWeights:
+    """How much each term of the evidence may count, fitted on validation queries; see `localise.matching_cost`.
 
     Attributes:
         openings, ceiling, room_type: weights in units of the walls'.
@@ -158,7 +158,7 @@ class Manifest:
     room_types: list[str] = field(default_factory=list)
     room_type_prior: list[float] = field(default_factory=list)
     confidence: ConfidenceModel | None = None
-    evidence: EvidenceModel = field(default_factory=EvidenceModel)
+    evidence: MatchingWeights = field(default_factory=MatchingWeights)
     training: dict[str, Any] = field(default_factory=dict)
     metrics: dict[str, Any] = field(default_factory=dict)
     files: dict[str, FileEntry] = field(default_factory=dict)

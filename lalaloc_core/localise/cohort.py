@@ -17,13 +17,13 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from lalaloc_core.localise.bundle import COHORT, Bundle, EvidenceModel
 from lalaloc_core.errors import BundleError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.binned_layouts import BinnedLayouts
-from lalaloc_core.localise.evidence import Evidence, EvidenceConfig
-from lalaloc_core.localise.first_look import first_costs
+from lalaloc_core.localise.bundle import COHORT, Bundle, MatchingWeights
+from lalaloc_core.localise.coarse_pass import first_costs
 from lalaloc_core.localise.layouts import Layouts, layouts_at
+from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost
 from lalaloc_core.localise.poses import Query
 from lalaloc_core.render.sampling import pose_grid
 
@@ -104,8 +104,8 @@ def cost_by_chance(
     plan: FloorPlan,
     query: Query,
     reach_m: float,
-    weights: EvidenceModel,
-    config: EvidenceConfig,
+    weights: MatchingWeights,
+    config: MatchingConfig,
 ) -> float | None:
     """What a plan costs that fits a picture by chance.
 
@@ -120,7 +120,7 @@ def cost_by_chance(
         return None
     # What is particular to a room is no matter of chance.
     alone = replace(config, use_ceiling=False, use_room_type=False, use_see_through=False)
-    evidence = Evidence(plan, query, reach_m, weights, alone)
+    evidence = MatchingCost(plan, query, reach_m, weights, alone)
     rough = np.concatenate([part for _, part in first_costs(cohort.binned, evidence, cohort.layouts.room_index)])
     hypothesis = rough.argmin(axis=1)
     pose = np.argsort(rough[np.arange(len(rough)), hypothesis], kind="stable")[:_COMPARED]

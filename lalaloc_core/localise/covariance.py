@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from lalaloc_core.localise.bundle import ConfidenceModel
 from lalaloc_core.floorplan import Room
+from lalaloc_core.localise.bundle import ConfidenceModel
 
 # Curvatures are single precision: what is smaller than this share of the largest is no information.
 _PRECISION = 1e-6

@@ -10,10 +10,10 @@ import numpy as np
 import onnxruntime
 from jaxtyping import Float, Int, UInt8
 
-from lalaloc_core.localise.bundle import HEAD_ONNX, IMAGE_ONNX, LAYOUT_ONNX, Bundle, Manifest
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, TWO_PI, wrap_angle
 from lalaloc_core.errors import BundleError
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.bundle import HEAD_ONNX, IMAGE_ONNX, LAYOUT_ONNX, Bundle, Manifest
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.cohort import Cohort
 from lalaloc_core.localise.layouts import Layouts, layouts_at

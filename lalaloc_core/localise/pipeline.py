@@ -15,15 +15,15 @@ from typing import Literal
 
 import numpy as np
 
-from lalaloc_core.localise.bundle import ConfidenceModel
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.bundle import ConfidenceModel
 from lalaloc_core.localise.cohort import cost_by_chance
 from lalaloc_core.localise.confidence import Signals, signals_of
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.evidence import EvidenceConfig
 from lalaloc_core.localise.hints import NO_HINTS, HintName, Hints
-from lalaloc_core.localise.poses import Candidate, LatentGrid, Query, RefinementJob, RefinementResult
+from lalaloc_core.localise.matching_cost import MatchingConfig
+from lalaloc_core.localise.poses import Candidate, PoseGrid, Query, RefinementJob, RefinementResult
 from lalaloc_core.localise.posterior import Posterior, area_shares, posterior_of
 from lalaloc_core.localise.refinement import refined, refinement_job, with_latents
 from lalaloc_core.localise.retrieval import contradicted, grid_costs, missed_hints, retrieve, suppress
@@ -51,7 +51,7 @@ class LocaliseConfig:
         every_stage: tell what every stage found, even where a later one is reached. Where walls are compared the
             optimiser begins with the grid's candidates; VDR is then worth its time only where LPO has no result.
         by_probability: rank the answers by how probable they are instead of by cost, as places of several plans are.
-        evidence: what poses are compared by.
+        matching: settings of the matching cost.
     """
 
     vdr_samples: int = 200
@@ -65,18 +65,18 @@ class LocaliseConfig:
     separation_m: float = 1.0
     every_stage: bool = False
     by_probability: bool = False
-    evidence: EvidenceConfig = field(default_factory=EvidenceConfig)
+    matching: MatchingConfig = field(default_factory=MatchingConfig)
 
     def least_starts(self, query: Query) -> int:
         """How many candidates of a query are optimised at least."""
-        if not self.evidence.compares_profiles(query):
+        if not self.matching.compares_profiles(query):
             return self.lpo_candidates
         return self.profile_candidates if query.heading_known else self.profile_candidates_turned
 
     def starts(self, query: Query, modes: list[Candidate]) -> int:
         """How many of the modes of a query's posterior, the best first, are optimised."""
         least = self.least_starts(query)
-        if not self.evidence.compares_profiles(query):
+        if not self.matching.compares_profiles(query):
             return least
         alike = sum(mode.total_cost < modes[0].total_cost + self.alike_margin for mode in modes)
         return max(least, min(alike, self.max_candidates))
@@ -156,7 +156,7 @@ class StageClock:
 
 def localise(
     plan: FloorPlan,
-    grid: LatentGrid,
+    grid: PoseGrid,
     encoders: Encoders,
     query: Query,
     *,
@@ -189,7 +189,7 @@ def localise(
 
 def localise_steps(
     plan: FloorPlan,
-    grid: LatentGrid,
+    grid: PoseGrid,
     encoders: Encoders,
     query: Query,
     *,
@@ -231,7 +231,7 @@ class _Search:
     def __init__(
         self,
         plan: FloorPlan,
-        grid: LatentGrid,
+        grid: PoseGrid,
         encoders: Encoders,
         query: Query,
         *,
@@ -243,7 +243,7 @@ class _Search:
         """Retrieve candidates."""
         self._plan, self._grid, self._encoders, self._config = plan, grid, encoders, config
         self._clock, self._hints, self._top_k = clock, hints, top_k
-        weights, evidence = encoders.manifest.evidence, config.evidence
+        weights, evidence = encoders.manifest.evidence, config.matching
         with clock.stage("retrieve"):
             self._doubted = not hints.strict and contradicted(plan, grid, query, weights, evidence)
             self.query = query = query.searched if self._doubted and query.searched is not None else query
@@ -288,7 +288,7 @@ class _Search:
                     camera_height_m=camera_height_m,
                     samples=config.vdr_samples,
                     radius_m=config.vdr_radius_steps * self._grid.step_m,
-                    evidence=config.evidence,
+                    evidence=config.matching,
                     hints=self._hints,
                 )
                 for candidate in candidates[: config.vdr_candidates]
@@ -299,13 +299,13 @@ class _Search:
 
     def job(self, begun: list[Candidate]) -> RefinementJob:
         """What is to be optimised of candidates."""
-        weights, evidence = self._encoders.manifest.evidence, self._config.evidence
+        weights, evidence = self._encoders.manifest.evidence, self._config.matching
         first = begun[: self._starts]
         return refinement_job(self._plan, self.query, first, self._grid.camera_height_m, weights, evidence)
 
     def refined(self, begun: list[Candidate], result: RefinementResult) -> list[Candidate]:
         """The candidates after LPO, the best first."""
-        evidence, first, rest = self._config.evidence, begun[: self._starts], begun[self._starts :]
+        evidence, first, rest = self._config.matching, begun[: self._starts], begun[self._starts :]
         self._ends = refined(self._plan, self._encoders, self.query, first, result, evidence, self._hints)
         self._stage = "lpo"
         return sorted(self._ends, key=attrgetter("total_cost")) + rest

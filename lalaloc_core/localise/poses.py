@@ -17,7 +17,7 @@ from lalaloc_core.render.sampling import PoseSet
 
 
 @dataclass(frozen=True, eq=False)
-class LatentGrid:
+class PoseGrid:
     """Poses, latents and wall profiles of one plan for one model, one camera height and one grid step; heading 0.
 
     Only latents depend on the camera height: wall profiles serve queries of any. Where poses are compared by their wall
@@ -41,14 +41,14 @@ class LatentGrid:
         step_m: float,
         camera_height_m: float,
         layouts: Layouts,
-    ) -> LatentGrid:
+    ) -> PoseGrid:
         """A grid whose layouts are rendered already."""
         grid = cls(poses, latents, profile_m, step_m, camera_height_m)
         grid._layouts.append(layouts)
         return grid
 
     @classmethod
-    def without_latents(cls, poses: PoseSet, layouts: Layouts, step_m: float, camera_height_m: float) -> LatentGrid:
+    def without_latents(cls, poses: PoseSet, layouts: Layouts, step_m: float, camera_height_m: float) -> PoseGrid:
         """A grid of rendered layouts whose poses are compared by these alone; distances in half precision."""
         profile_m = np.exp(layouts.log_profile).astype(np.float16)
         # The logs of what is kept of the profile, so that a grid which is read again answers the same.
@@ -212,7 +212,7 @@ class Candidate:
     Attributes:
         frame_heading: heading (radians) of the layout in the frame of `Query` hypothesis number `hypothesis`;
             the panorama's heading is `query.roll[hypothesis] + frame_heading`.
-        cost: how badly the layout fits, see `localise.evidence`; the latent distance where the model predicts no wall
+        cost: how badly the layout fits, see `localise.matching_cost`; the latent distance where the model predicts no wall
             profile.
         latent_distance: from the latent of its layout to the query's; NaN where nobody has looked, which of answers is
             done in the end.
@@ -247,7 +247,7 @@ class Candidate:
 
 
 def grid_candidate(
-    grid: LatentGrid,
+    grid: PoseGrid,
     pose: int,
     query: Query,
     hypothesis: int,
@@ -304,7 +304,7 @@ class RefinementResult:
     """Where the optimisation ended: poses inside the same rooms, how well they fit, and what it took.
 
     Attributes:
-        cost: (k,) what was minimised: of profiles as in `localise.evidence`, else the distance of the embeddings.
+        cost: (k,) what was minimised: of profiles as in `localise.matching_cost`, else the distance of the embeddings.
         latent_distance: (k,) distance of the embeddings; None where it is no part of the cost.
         information: (k, p, p) curvature of the cost by position and heading, the camera height integrated out.
         height_offset: (k,) log of true over stated camera height; None where it was not solved for.

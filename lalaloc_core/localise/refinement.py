@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool
 
-from lalaloc_core.localise.bundle import EvidenceModel
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.bundle import MatchingWeights
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.evidence import Evidence, EvidenceConfig, precisions
 from lalaloc_core.localise.hints import NO_HINTS, Hints
 from lalaloc_core.localise.layouts import layouts_at
+from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost, precisions
 from lalaloc_core.localise.poses import Candidate, Query, RefinementJob, RefinementResult
 from lalaloc_core.render.sampling import PoseSet
 
@@ -23,8 +23,8 @@ def refinement_job(
     query: Query,
     candidates: list[Candidate],
     camera_height_m: float,
-    weights: EvidenceModel,
-    evidence: EvidenceConfig,
+    weights: MatchingWeights,
+    evidence: MatchingConfig,
 ) -> RefinementJob:
     """What the optimiser needs to refine these candidates, each within its own room.
 
@@ -49,7 +49,7 @@ def refinement_job(
     offsets, height = np.array([candidate.height_offset for candidate in candidates]), query.camera_height
     columns = query.profile.log_m.shape[1]
     layouts = layouts_at(plan, PoseSet(job.position_m, rooms), job.heading, columns)
-    compared = Evidence(plan, query, evidence.fine_reach_m, weights, evidence)
+    compared = MatchingCost(plan, query, evidence.fine_reach_m, weights, evidence)
     shut = [compared.shut_share(layouts, k, one.hypothesis, one.height_offset) for k, one in enumerate(candidates)]
     # The optimiser sums over azimuths what the evidence averages, so the prior is as much stiffer.
     stiffness = 0.0
@@ -71,7 +71,7 @@ def refined(
     query: Query,
     starts: list[Candidate],
     result: RefinementResult,
-    evidence: EvidenceConfig,
+    evidence: MatchingConfig,
     hints: Hints = NO_HINTS,
 ) -> list[Candidate]:
     """Candidates where the optimiser took them, with what all the evidence says of them there.
@@ -92,7 +92,7 @@ def refined(
         hypotheses = np.array([start.hypothesis for start in starts])
         columns, weights = encoders.manifest.profile_columns, encoders.manifest.evidence
         layouts = layouts_at(plan, PoseSet(result.position_m, rooms), result.heading, columns)
-        found = Evidence(plan, query, evidence.fine_reach_m, weights, evidence).terms(layouts, hypotheses, offsets)
+        found = MatchingCost(plan, query, evidence.fine_reach_m, weights, evidence).terms(layouts, hypotheses, offsets)
         cost = found.total(weights)
         if evidence.latent_weight:
             cost = cost + evidence.latent_weight * distance

@@ -8,16 +8,16 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from lalaloc_core.localise.bundle import EvidenceModel
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.errors import InvalidHintError
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.bundle import MatchingWeights
 from lalaloc_core.localise.camera_height import CameraHeight
+from lalaloc_core.localise.coarse_pass import PairLimits, likeliest
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.evidence import Evidence, EvidenceConfig, latent_distances
-from lalaloc_core.localise.first_look import PairLimits, likeliest
 from lalaloc_core.localise.hints import NO_HINTS, HintName, Hints
-from lalaloc_core.localise.poses import Candidate, LatentGrid, Query, grid_candidate
+from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost, latent_distances
+from lalaloc_core.localise.poses import Candidate, PoseGrid, Query, grid_candidate
 from lalaloc_core.localise.posterior import HEADING_SEPARATION, NEGLIGIBLE, GridCosts
 from lalaloc_core.render.sampling import PoseSet, pose_grid
 
@@ -38,26 +38,26 @@ _FIRST_RANKED = 1024
 
 def build_grid(
     plan: FloorPlan, encoders: Encoders, *, step_m: float, camera_height_m: float, latents: bool = True
-) -> LatentGrid:
+) -> PoseGrid:
     """Sample the plan's pose grid, render every layout and, with `latents`, embed it: dear, and often not needed."""
     poses = pose_grid(plan, step_m)
     if not latents:
-        return LatentGrid.without_latents(poses, encoders.rendered(plan, poses), step_m, camera_height_m)
+        return PoseGrid.without_latents(poses, encoders.rendered(plan, poses), step_m, camera_height_m)
     embedded, profile_m = encoders.poses(plan, poses, np.zeros(len(poses)), camera_height_m)
-    return LatentGrid(poses, embedded, profile_m, step_m, camera_height_m)
+    return PoseGrid(poses, embedded, profile_m, step_m, camera_height_m)
 
 
 def grid_costs(
     plan: FloorPlan,
-    grid: LatentGrid,
+    grid: PoseGrid,
     query: Query,
-    weights: EvidenceModel,
-    config: EvidenceConfig,
+    weights: MatchingWeights,
+    config: MatchingConfig,
     hints: Hints = NO_HINTS,
 ) -> GridCosts:
     """Costs of the pairs of a pose of the grid and a hypothesis that may be the best, or are probable.
 
-    All pairs get a first look (`first_look.py`), and those that are the best by that are compared in full.
+    All pairs get a first look (`coarse_pass.py`), and those that are the best by that are compared in full.
 
     Raises:
         InvalidHintError: no pose of the grid is left.
@@ -67,7 +67,7 @@ def grid_costs(
     if not config.compares_profiles(query):
         distance = latent_distances(grid.known_latents, query.latents)
         return GridCosts.of_all(grid.poses, distance, np.zeros_like(distance), against)
-    evidence = Evidence(plan, query, config.grid_reach * grid.step_m, weights, config)
+    evidence = MatchingCost(plan, query, config.grid_reach * grid.step_m, weights, config)
     doubted = _hint_costs(plan, grid, weights, hints.doubted) if hints.strict else None
     chosen = _chosen(plan, grid, evidence, weights.temperature, against, doubted)
     pose, hypothesis = np.divmod(chosen.pair, len(query.roll))
@@ -117,8 +117,8 @@ class _Chosen(NamedTuple):
 
 def _chosen(
     plan: FloorPlan,
-    grid: LatentGrid,
-    evidence: Evidence,
+    grid: PoseGrid,
+    evidence: MatchingCost,
     temperature: float,
     against: Float[np.ndarray, "n"] | None,
     doubted: Float[np.ndarray, "n"] | None,
@@ -148,20 +148,20 @@ def _chosen(
     return _Chosen(np.append(first, others), len(first), seen, estimate)
 
 
-def missed_hints(plan: FloorPlan, costs: GridCosts, weights: EvidenceModel, hints: Hints) -> tuple[HintName, ...]:
+def missed_hints(plan: FloorPlan, costs: GridCosts, weights: MatchingWeights, hints: Hints) -> tuple[HintName, ...]:
     """The hints that would not hold where the picture fits best, if they were no fences."""
     doubted = _penalties(plan, costs.poses, weights, hints.doubted)[costs.pose]
     pose = costs.pose[int((costs.cost + doubted)[: costs.compared].argmin())]
     return hints.missed(costs.poses.position_m[pose], int(costs.poses.room_index[pose]))
 
 
-def _penalties(plan: FloorPlan, poses: PoseSet, weights: EvidenceModel, hints: Hints) -> Float[np.ndarray, "n"]:
+def _penalties(plan: FloorPlan, poses: PoseSet, weights: MatchingWeights, hints: Hints) -> Float[np.ndarray, "n"]:
     """What hints have against poses, in units of the cost."""
     return hints.penalty(plan, poses.position_m, poses.room_index) / weights.temperature
 
 
 def _hint_costs(
-    plan: FloorPlan, grid: LatentGrid, weights: EvidenceModel, hints: Hints
+    plan: FloorPlan, grid: PoseGrid, weights: MatchingWeights, hints: Hints
 ) -> Float[np.ndarray, "n"] | None:
     if hints.are_none:
         return None
@@ -177,7 +177,7 @@ def _hint_costs(
 
 def retrieve(
     costs: GridCosts,
-    grid: LatentGrid,
+    grid: PoseGrid,
     query: Query,
     *,
     top_k: int,
@@ -212,7 +212,7 @@ def retrieve(
     return [_candidate(costs, query, grid, int(pair[index])) for index in kept]
 
 
-def _candidate(costs: GridCosts, query: Query, grid: LatentGrid, pair: int) -> Candidate:
+def _candidate(costs: GridCosts, query: Query, grid: PoseGrid, pair: int) -> Candidate:
     return grid_candidate(
         grid,
         int(costs.pose[pair]),
@@ -225,7 +225,7 @@ def _candidate(costs: GridCosts, query: Query, grid: LatentGrid, pair: int) -> C
 
 
 def contradicted(
-    plan: FloorPlan, grid: LatentGrid, query: Query, weights: EvidenceModel, config: EvidenceConfig
+    plan: FloorPlan, grid: PoseGrid, query: Query, weights: MatchingWeights, config: MatchingConfig
 ) -> bool:
     """Whether the picture fits another heading so much better that the one that was said must be wrong.
 

@@ -11,9 +11,9 @@ from jaxtyping import Float, Int
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.evidence import Evidence, EvidenceConfig, latent_distances
 from lalaloc_core.localise.hints import NO_HINTS, Hints
 from lalaloc_core.localise.layouts import layouts_at
+from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost, latent_distances
 from lalaloc_core.localise.poses import Candidate, Query
 from lalaloc_core.render.sampling import PoseSet
 
@@ -50,14 +50,14 @@ def resample(
     camera_height_m: float,
     samples: int,
     radius_m: float,
-    evidence: EvidenceConfig | None = None,
+    evidence: MatchingConfig | None = None,
     hints: Hints = NO_HINTS,
 ) -> Candidate:
     """The best pose of a Vogel disc around `candidate`, clipped to the rooms; the candidate itself if none is better.
 
     With an unknown heading the samples also cover the sector of headings that the hypothesis stands for.
     """
-    evidence = evidence or EvidenceConfig()
+    evidence = evidence or MatchingConfig()
     disc, number = disc_poses(plan, candidate.position_m, samples=samples, radius_m=radius_m)
     # The candidate first, so that of equals it is kept.
     poses = PoseSet(
@@ -77,7 +77,7 @@ def resample(
     cost = np.zeros(len(poses)) if latents is None else latent_distances(latents, target)[0]
     if evidence.compares_profiles(query):
         layouts = layouts_at(plan, poses, heading, encoders.manifest.profile_columns)
-        compared = Evidence(plan, query, evidence.fine_reach_m, encoders.manifest.evidence, evidence)
+        compared = MatchingCost(plan, query, evidence.fine_reach_m, encoders.manifest.evidence, evidence)
         of_layouts, offsets = compared.costs(layouts, np.array([candidate.hypothesis]))
         cost, offset = of_layouts[0] + evidence.latent_weight * cost, offsets[0]
     against = np.zeros(len(poses))

@@ -9,7 +9,7 @@ from time import monotonic
 from lalaloc_core.errors import LaLaLocError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.poses import LatentGrid
+from lalaloc_core.localise.poses import PoseGrid
 from lalaloc_core.localise.venue.prototype_cells import shipped_cells
 from lalaloc_core.localise.venue.prototypes import prototypes_of
 from service.errors import (
@@ -85,7 +85,7 @@ class GridBuilder:
             self._note_failure(job, error)
         self.jobs.end(job, outcome)
 
-    def _compute(self, job: GridJob) -> LatentGrid:
+    def _compute(self, job: GridJob) -> PoseGrid:
         if job.cancelled.is_set():
             raise self._why_cancelled(job)
         record = self._store.plans.by_revision(job.key.revision_id)
@@ -111,7 +111,7 @@ class GridBuilder:
         self._cache.put(job.key, grid)
         return grid
 
-    def _embed(self, job: GridJob, plan: FloorPlan) -> LatentGrid:
+    def _embed(self, job: GridJob, plan: FloorPlan) -> PoseGrid:
         heartbeat = LeaseHeartbeat(lambda: self._renew(job), self._settings.grid_lease_s / _HEARTBEATS)
 
         def after_chunk(progress: float, worked_s: float) -> None:
@@ -150,7 +150,7 @@ class GridBuilder:
             # Nobody else can take the lease meanwhile either.
             return True
 
-    def _put(self, job: GridJob, grid: LatentGrid, prototypes: SortedPrototypes, *, always_keep_mm: int) -> bool:
+    def _put(self, job: GridJob, grid: PoseGrid, prototypes: SortedPrototypes, *, always_keep_mm: int) -> bool:
         """Store a grid; it may have taken minutes, so a database that is away for a moment is waited for."""
         give_up_at = monotonic() + _KEEP_TRYING_S
         while True:

@@ -11,7 +11,7 @@ from lalaloc_core.errors import InvalidPoseError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.layouts import joined_layouts
-from lalaloc_core.localise.poses import LatentGrid
+from lalaloc_core.localise.poses import PoseGrid
 from lalaloc_core.render.sampling import PoseSet, grid_size, pose_grid
 from service.errors import PlanTooLargeError
 from service.settings import Settings
@@ -30,7 +30,7 @@ def embed(
     step_m: float,
     camera_height_m: float,
     after_chunk: Callable[[float, float], None],
-) -> LatentGrid:
+) -> PoseGrid:
     """Sample and render the grid of a plan, and embed it where the model compares poses by their latents.
 
     Args:
@@ -59,9 +59,9 @@ def embed(
         after_chunk(min(first + chunk, len(poses)) / len(poses), perf_counter() - begin)
     whole = joined_layouts(layouts, poses.room_index)
     if not latents:
-        return LatentGrid.without_latents(poses, whole, step_m, camera_height_m)
+        return PoseGrid.without_latents(poses, whole, step_m, camera_height_m)
     profile_m = np.exp(whole.log_profile)
-    return LatentGrid.with_layouts(poses, np.concatenate(latents), profile_m, step_m, camera_height_m, whole)
+    return PoseGrid.with_layouts(poses, np.concatenate(latents), profile_m, step_m, camera_height_m, whole)
 
 
 def check_size(plan: FloorPlan, settings: Settings) -> None:
@@ -75,7 +75,7 @@ def check_size(plan: FloorPlan, settings: Settings) -> None:
         raise PlanTooLargeError(estimate, settings.max_grid_poses, settings.grid_step_m)
 
 
-def grid_bytes(grid: LatentGrid) -> int:
+def grid_bytes(grid: PoseGrid) -> int:
     """The memory that a grid takes, with what queries make of it."""
     arrays = (grid.latents, grid.profile_m, grid.poses.position_m, grid.poses.room_index)
     stored = sum(array.nbytes for array in arrays if array is not None)

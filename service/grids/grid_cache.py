@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 
-from lalaloc_core.localise.poses import LatentGrid
+from lalaloc_core.localise.poses import PoseGrid
 from service.bounded_cache import BoundedCache
 from service.grids.embedding import grid_bytes
 from service.storage import Store
@@ -12,7 +12,7 @@ from service.storage.records import GridKey
 from service.telemetry import Telemetry
 
 
-class GridCache(BoundedCache[GridKey, LatentGrid]):
+class GridCache(BoundedCache[GridKey, PoseGrid]):
     """Finds grids that were computed before; safe to share between threads."""
 
     def __init__(self, store: Store, limit_bytes: int, telemetry: Telemetry) -> None:
@@ -21,14 +21,14 @@ class GridCache(BoundedCache[GridKey, LatentGrid]):
         self._telemetry = telemetry
         self._loading = threading.Lock()
 
-    def cached(self, key: GridKey) -> LatentGrid | None:
+    def cached(self, key: GridKey) -> PoseGrid | None:
         """A grid that is in memory."""
         grid = self.get(key)
         if grid is not None:
             self._telemetry.grid_cache_hits.inc()
         return grid
 
-    def find(self, key: GridKey) -> LatentGrid | None:
+    def find(self, key: GridKey) -> PoseGrid | None:
         """A grid from memory or from the store.
 
         Raises:
@@ -40,7 +40,7 @@ class GridCache(BoundedCache[GridKey, LatentGrid]):
         self._telemetry.grid_cache_misses.inc()
         return self.load(key)
 
-    def load(self, key: GridKey) -> LatentGrid | None:
+    def load(self, key: GridKey) -> PoseGrid | None:
         """As `find`, without counting; one at a time, so that many queries for one plan read it once."""
         with self._loading:
             grid = self.get(key)
@@ -50,7 +50,7 @@ class GridCache(BoundedCache[GridKey, LatentGrid]):
                     self.put(key, grid)
             return grid
 
-    def put(self, key: GridKey, value: LatentGrid) -> int:
+    def put(self, key: GridKey, value: PoseGrid) -> int:
         """Keep a grid; see `BoundedCache.put`."""
         evicted = super().put(key, value)
         self._telemetry.grid_cache_evictions.inc(evicted)

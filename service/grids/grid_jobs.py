@@ -12,7 +12,7 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 
-from lalaloc_core.localise.poses import LatentGrid
+from lalaloc_core.localise.poses import PoseGrid
 from service.errors import OverloadedError, StoppingError
 from service.storage.records import GridKey
 
@@ -39,7 +39,7 @@ class GridJob:
     plan_id: str
     poses: int
     on_demand: bool
-    future: Future[LatentGrid] = field(default_factory=Future)
+    future: Future[PoseGrid] = field(default_factory=Future)
     cancelled: threading.Event = field(default_factory=threading.Event)
     progress: float = 0.0
     remote: bool = False
@@ -94,7 +94,7 @@ class GridJobs:
             self._changed.notify()
             return job
 
-    def end(self, job: GridJob, outcome: LatentGrid | Exception) -> None:
+    def end(self, job: GridJob, outcome: PoseGrid | Exception) -> None:
         """Forget a job, then give its outcome to those who wait, so that they find the plan in its final state."""
         with self._changed:
             self._jobs.pop(job.key, None)

@@ -9,7 +9,7 @@ from contextlib import suppress
 
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.poses import LatentGrid
+from lalaloc_core.localise.poses import PoseGrid
 from lalaloc_core.localise.venue.prototype_cells import shipped_cells
 from lalaloc_core.localise.venue.prototypes import prototypes_of
 from lalaloc_core.render.sampling import grid_size
@@ -140,7 +140,7 @@ class GridProvider:
         with suppress(StoppingError, OverloadedError):
             self.compute(record, record.plan.camera_height_m)
 
-    def find(self, key: GridKey) -> LatentGrid | None:
+    def find(self, key: GridKey) -> PoseGrid | None:
         """A grid that has been computed before, from memory or from the store.
 
         Raises:
@@ -157,11 +157,11 @@ class GridProvider:
         self._store.grids.put_prototypes(grid_id, prototypes)
         return prototypes
 
-    def cached(self, key: GridKey) -> LatentGrid | None:
+    def cached(self, key: GridKey) -> PoseGrid | None:
         """A grid that is in memory."""
         return self._cache.cached(key)
 
-    def compute(self, record: PlanRecord, camera_height_m: float) -> Future[LatentGrid]:
+    def compute(self, record: PlanRecord, camera_height_m: float) -> Future[PoseGrid]:
         """Compute a grid in the background; asking again while that runs gives the same future.
 
         The future raises UnknownFloorPlanError when the plan is deleted meanwhile, PlanNotReadyError when it gets a

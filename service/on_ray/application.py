@@ -9,8 +9,8 @@ from ray import serve
 from ray.serve.config import AutoscalingConfig, RequestRouterConfig
 from ray.serve.experimental.consistent_hash_router import ConsistentHashRouter
 
-from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.errors import ConfigError
+from lalaloc_core.localise.bundle import Bundle
 from service.fair_share import with_headroom
 from service.on_ray.replicas import EncoderReplica, IngressReplica, LpoReplica, SearchReplica
 from service.settings import Settings

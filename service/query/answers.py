@@ -6,10 +6,10 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.conventions import heading_to_degrees
-from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.floorplan.earth import Anchor
+from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.covariance import pose_uncertainty
 from lalaloc_core.localise.pipeline import Localisation, panorama_heading
 from lalaloc_core.localise.poses import Candidate, Query

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from time import monotonic
 
-from lalaloc_core.localise.bundle import Manifest
 from lalaloc_core.errors import InvalidPanoramaError
+from lalaloc_core.localise.bundle import Manifest
 from lalaloc_core.panorama.images import Panorama
 from service.errors import (
     DeadlineExceededError,

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.floorplan import MAX_FROM_ORIGIN_M, FloorPlan
+from lalaloc_core.floorplan.earth import Anchor
 from service.schemas import GeoPose, GeoPoseAngles, GeoPosePosition, LocaliseAnswer, SequenceAnswer
 
 # Nine decimals of a degree are a tenth of a millimetre.

@@ -9,13 +9,13 @@ from functools import partial
 from time import monotonic
 from typing import TypeVar
 
-from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.draw.answer import PHOTOGRAPH_SIZE, draw_answer
 from lalaloc_core.draw.found import drawn_answer
+from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.pipeline import Localisation, StageClock, Steps, localise_steps
-from lalaloc_core.localise.poses import LatentGrid, Query
+from lalaloc_core.localise.poses import PoseGrid, Query
 from lalaloc_core.localise.sequence.search import SequenceLocalisation, localise_sequence_steps
 from lalaloc_core.localise.steps import next_step
 from lalaloc_core.panorama.images import Panorama
@@ -53,7 +53,7 @@ class _Answered:
 
     answer: LocaliseAnswer
     found: Localisation
-    grid: LatentGrid
+    grid: PoseGrid
 
 
 class Localiser:
@@ -269,7 +269,7 @@ class Localiser:
     def _lpo_timeout_s(self, context: QueryContext) -> float:
         return min(self._settings.lpo_deadline_s, context.left_s - _ANSWER_S)
 
-    async def _grid(self, record: PlanRecord, height: CameraHeight, context: QueryContext) -> LatentGrid:
+    async def _grid(self, record: PlanRecord, height: CameraHeight, context: QueryContext) -> PoseGrid:
         """The plan's grid for a camera height, computed on demand, waited for until the deadline."""
         with context.clock.stage("grid"):
             height_m = grid_height_m(record, height.height_m, latents_alone=not self._encoders.predicts_profile)

@@ -9,8 +9,8 @@ import math
 import numpy as np
 import shapely
 
-from lalaloc_core.floorplan.earth import LocalFrame
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.floorplan.earth import LocalFrame
 from lalaloc_core.localise.hints import RADIUS_RANGE_M
 from lalaloc_core.localise.posterior import HEADING_WITHIN, RIGHT_WITHIN_M
 from service.errors import InvalidRequestError, UnanchoredPlanError

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.poses import LatentGrid
+from lalaloc_core.localise.poses import PoseGrid
 from lalaloc_core.localise.posterior import Posterior
 from lalaloc_core.localise.probability_map import probability_map
 from service.schemas import PosteriorAnswer
@@ -12,7 +12,7 @@ from service.schemas import PosteriorAnswer
 _MIN_PROBABILITY = 5e-7
 
 
-def posterior_answer(plan: FloorPlan, grid: LatentGrid, posterior: Posterior) -> PosteriorAnswer:
+def posterior_answer(plan: FloorPlan, grid: PoseGrid, posterior: Posterior) -> PosteriorAnswer:
     """Places with their probabilities, without those that have next to none."""
     places = probability_map(plan, grid.poses, posterior)
     told = places.probability >= _MIN_PROBABILITY

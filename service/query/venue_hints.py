@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float
 from sqlalchemy import Row
 
-from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.errors import InvalidHintError
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.localise.hints import HintName, Hints, NearInEach, log_factor, rooms_named
 from lalaloc_core.localise.pipeline import Localisation
 from lalaloc_core.localise.venue.merged_plans import MergedPlans

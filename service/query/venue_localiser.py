@@ -14,14 +14,14 @@ import numpy as np
 from jaxtyping import Float
 from sqlalchemy import Row
 
-from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.conventions import heading_from_degrees
-from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.errors import InvalidPoseError
+from lalaloc_core.floorplan.earth import Anchor
+from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.hints import Hints
 from lalaloc_core.localise.pipeline import Localisation, LocaliseConfig, localise_steps
-from lalaloc_core.localise.poses import Candidate, LatentGrid, Query
+from lalaloc_core.localise.poses import Candidate, PoseGrid, Query
 from lalaloc_core.localise.venue.merged_plans import MergedPlans
 from lalaloc_core.localise.venue.prototypes import share_searched
 from service.errors import NoPlanNearbyError, VenueNotReadyError, VenueUnsearchableError
@@ -307,6 +307,6 @@ def _may_stand(record: PlanRecord, form: LocaliseForm) -> bool:
     return True
 
 
-def _laid_out(loaded: Sequence[tuple[Row[Any], PlanRecord, LatentGrid]], query: Query) -> MergedPlans:
+def _laid_out(loaded: Sequence[tuple[Row[Any], PlanRecord, PoseGrid]], query: Query) -> MergedPlans:
     plans, grids = [record.plan for _, record, _ in loaded], [grid for _, _, grid in loaded]
     return MergedPlans.of(plans, grids, query.camera_height.height_m)

@@ -17,11 +17,11 @@ import numpy as np
 from jaxtyping import Float, Int
 from sqlalchemy import Row
 
-from lalaloc_core.localise.bundle import EvidenceModel
 from lalaloc_core.errors import InvalidHintError
+from lalaloc_core.localise.bundle import MatchingWeights
 from lalaloc_core.localise.camera_height import DEFAULT_STD_M, CameraHeight
-from lalaloc_core.localise.evidence import EvidenceConfig
-from lalaloc_core.localise.poses import LatentGrid, Query
+from lalaloc_core.localise.matching_cost import MatchingConfig
+from lalaloc_core.localise.poses import PoseGrid, Query
 from lalaloc_core.localise.venue.plan_index import PlanIndex
 from lalaloc_core.localise.venue.prototype_cells import shipped_cells
 from lalaloc_core.localise.venue.prototypes import most_probable
@@ -175,7 +175,7 @@ class VenuePlans:
         known: Sequence[Row[Any]],
         index: PlanIndex,
         query: Query,
-        weights: EvidenceModel,
+        weights: MatchingWeights,
         log_prior: Float[np.ndarray, "p"],
     ) -> ChosenPlans:
         """The most probable plans of an index.
@@ -183,12 +183,12 @@ class VenuePlans:
         Args:
             log_prior: what is known of plans beforehand.
         """
-        log_mass = index.log_masses(query, weights, EvidenceConfig()) + log_prior
+        log_mass = index.log_masses(query, weights, MatchingConfig()) + log_prior
         poses = np.array([row.poses for row in known])
         chosen = most_probable(log_mass, poses, most_plans=MAX_SEARCHED, most_poses=most_poses(query, self._max_poses))
         return ChosenPlans([known[int(k)] for k in chosen], log_mass, chosen)
 
-    async def load(self, tenant: str, members: Sequence[Row[Any]]) -> list[tuple[Row[Any], PlanRecord, LatentGrid]]:
+    async def load(self, tenant: str, members: Sequence[Row[Any]]) -> list[tuple[Row[Any], PlanRecord, PoseGrid]]:
         """Chosen plans with their grids; those that were deleted or replaced a moment ago are left out."""
         loaded = []
         for row in members:

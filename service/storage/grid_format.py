@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lalaloc_core.localise.poses import LatentGrid
+from lalaloc_core.localise.poses import PoseGrid
 from lalaloc_core.localise.venue.prototype_cells import Cells, shipped_cells
 from lalaloc_core.localise.venue.prototypes import ROW, Prototypes
 from lalaloc_core.render.sampling import PoseSet
@@ -58,7 +58,7 @@ class PackedGrid:
     prototypes: bytes | None
 
 
-def pack(grid: LatentGrid, prototypes: SortedPrototypes | None = None) -> PackedGrid:
+def pack(grid: PoseGrid, prototypes: SortedPrototypes | None = None) -> PackedGrid:
     """The blob of a grid."""
     count, columns = grid.profile_m.shape
     latents = np.empty((count, 0)) if grid.latents is None else grid.latents
@@ -98,7 +98,7 @@ def digest_of(content: bytes | bytearray) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-def unpack(content: bytes | bytearray, *, step_m: float, camera_height_m: float) -> LatentGrid | None:
+def unpack(content: bytes | bytearray, *, step_m: float, camera_height_m: float) -> PoseGrid | None:
     """The grid in a blob, as read-only views of it; None when the blob is not one, or has numbers that are none."""
     if len(content) < _HEADER.size:
         return None
@@ -121,4 +121,4 @@ def unpack(content: bytes | bytearray, *, step_m: float, camera_height_m: float)
     if not all(np.isfinite(array).all() for array in (position_m, latents, profile_m)):
         return None
     poses = PoseSet(position_m, take("<i4", 1)[:, 0])
-    return LatentGrid(poses, latents if latent_size else None, profile_m, step_m, camera_height_m)
+    return PoseGrid(poses, latents if latent_size else None, profile_m, step_m, camera_height_m)

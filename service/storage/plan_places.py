@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float
 from sqlalchemy import ColumnElement, and_, or_
 
-from lalaloc_core.floorplan.earth import Anchor, LocalFrame
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.floorplan.earth import Anchor, LocalFrame
 from service.storage.tables import FLOORPLANS
 
 # Metres of a degree of latitude, where it has the least.

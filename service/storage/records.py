@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from datetime import datetime
 
-from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.poses import LatentGrid
+from lalaloc_core.floorplan.earth import Anchor
+from lalaloc_core.localise.poses import PoseGrid
 from service.storage.grid_format import SortedPrototypes
 
 # Whose plans are whose without API keys.
@@ -36,7 +36,7 @@ class ComputedGrid:
     """A grid that is stored along with its plan; the revision it belongs to is only made then."""
 
     model_sha256: str
-    grid: LatentGrid
+    grid: PoseGrid
     prototypes: SortedPrototypes | None = None
 
     def key(self, revision_id: str) -> GridKey:

@@ -9,7 +9,7 @@ from typing import Any
 from sqlalchemy import ColumnElement, Connection, Table, and_, delete, exists, func, select, update
 from sqlalchemy.exc import IntegrityError
 
-from lalaloc_core.localise.poses import LatentGrid
+from lalaloc_core.localise.poses import PoseGrid
 from service.storage.chunks import read_exactly, write_chunks
 from service.storage.database import Database
 from service.storage.grid_format import (
@@ -35,7 +35,7 @@ class StoredGrids:
     def __init__(self, database: Database) -> None:
         self._database = database
 
-    def get(self, key: GridKey) -> LatentGrid | None:
+    def get(self, key: GridKey) -> PoseGrid | None:
         """A grid, None when it is not stored (or not as it was computed, then it has to be computed again)."""
         columns = LATENT_GRIDS.c
         with self._database.reading() as connection:
@@ -91,7 +91,7 @@ class StoredGrids:
     def put(
         self,
         key: GridKey,
-        grid: LatentGrid,
+        grid: PoseGrid,
         *,
         keep: int,
         always_keep_mm: int,

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import numpy as np
 
-from lalaloc_core.localise.bundle import Bundle, Manifest
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.bundle import Bundle, Manifest
 from lalaloc_core.localise.poses import RefinementJob, RefinementResult
 from lalaloc_core.localise.sequence.joint import SequenceJob, SequenceResult, refine_sequence
 from service.workers.process import serve_jobs
@@ -38,13 +38,13 @@ def load_refiner(
     """
     import torch
 
-    from lalaloc_core.localise.optimise import LatentPoseOptimiser
+    from lalaloc_core.localise.optimise import PoseRefiner
 
     torch.set_num_threads(threads)
     bundle = Bundle.open(bundle_folder)
     if bundle.sha256 != model_sha256:
         raise RuntimeError("the bundle on disk is no longer the one the service runs")
-    optimiser = LatentPoseOptimiser.from_bundle(bundle)
+    optimiser = PoseRefiner.from_bundle(bundle)
     for optimise_heading, by_profile in product((False, True), repeat=2):
         optimiser.refine(warm_up_job(bundle.manifest, optimise_heading=optimise_heading, by_profile=by_profile))
 

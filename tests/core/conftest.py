@@ -10,7 +10,7 @@ from hypothesis import HealthCheck, settings
 
 from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.optimise import LatentPoseOptimiser
+from lalaloc_core.localise.optimise import PoseRefiner
 from lalaloc_core.nets.layout_encoder import RingConfig, RingLayoutEncoder
 
 # Derandomised: the same commit always gives the same verdict.
@@ -52,6 +52,6 @@ def encoders(opened_bundle: Bundle) -> Encoders:
 
 
 @pytest.fixture(scope="session")
-def optimiser(opened_bundle: Bundle) -> LatentPoseOptimiser:
+def optimiser(opened_bundle: Bundle) -> PoseRefiner:
     """Latent pose optimisation with the tiny bundle."""
-    return LatentPoseOptimiser.from_bundle(opened_bundle)
+    return PoseRefiner.from_bundle(opened_bundle)

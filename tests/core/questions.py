@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lalaloc_core.learn.data.dataset import Appearance, Camera, Photograph
 from lalaloc_core.errors import DatasetError
-from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.evaluate.methods.method import Question
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.learn.data.dataset import Appearance, Camera, Photograph
 from lalaloc_core.render.depth import layout_depth
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.render.sampling import PoseSet, pose_grid

@@ -10,18 +10,18 @@ import pytest
 import safetensors.torch
 import torch
 
-from lalaloc_core.localise.bundle import DECODER_WEIGHTS, IMAGE_ONNX, MANIFEST_NAME, Bundle
-from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.errors import BundleError, CheckpointError, ConfigError
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.evaluate.reproduce import ablations
 from lalaloc_core.evaluate.reproduce.ablations import ABLATIONS, BASE, BUDGETS, Budget, train_ablation
-from lalaloc_core.render.sampling import TripletSampling
+from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.training.checkpoint import Checkpoint
 from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.data import TrainingData
 from lalaloc_core.learn.training.run import train_layout
+from lalaloc_core.localise.bundle import DECODER_WEIGHTS, IMAGE_ONNX, MANIFEST_NAME, Bundle
+from lalaloc_core.localise.camera_height import CameraHeight
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.render.sampling import TripletSampling
 
 CPU = torch.device("cpu")
 HOMES = GeneratedScenes(homes=3, shots_per_home=2)

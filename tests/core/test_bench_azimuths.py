@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lalaloc_core.evaluate.bench.azimuths import azimuth_figures
-from lalaloc_core.localise.bundle import Bundle, default_bundle
 from lalaloc_core.conventions import OPENING_CLASSES
+from lalaloc_core.evaluate.bench.azimuths import azimuth_figures
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
+from lalaloc_core.localise.bundle import Bundle, default_bundle
 from lalaloc_core.localise.encoders import Encoders
 
 

@@ -14,6 +14,14 @@ import pytest
 import safetensors.torch
 import torch
 
+from lalaloc_core.errors import BundleError, ExportError
+from lalaloc_core.learn.export import bundle_export as export
+from lalaloc_core.learn.export.bundle_export import PARITY_TOLERANCE, export_bundle
+from lalaloc_core.learn.export.run import export_bundle_again
+from lalaloc_core.learn.training.checkpoint import Checkpoint
+from lalaloc_core.learn.training.config import TrainConfig
+from lalaloc_core.learn.training.presets import PRESETS
+from lalaloc_core.learn.training.stages import build_image_encoder, build_layout_encoder
 from lalaloc_core.localise.bundle import (
     BUNDLE_FILES,
     DECODER_WEIGHTS,
@@ -29,19 +37,11 @@ from lalaloc_core.localise.bundle import (
     Manifest,
     write_manifest,
 )
-from lalaloc_core.errors import BundleError, ExportError
-from lalaloc_core.learn.export import bundle_export as export
-from lalaloc_core.learn.export.bundle_export import PARITY_TOLERANCE, export_bundle
-from lalaloc_core.learn.export.run import export_bundle_again
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.optimise import LatentPoseOptimiser
+from lalaloc_core.localise.optimise import PoseRefiner
 from lalaloc_core.nets import load_decoder
 from lalaloc_core.nets.decoder import LayoutDecoder
-from lalaloc_core.learn.training.checkpoint import Checkpoint
-from lalaloc_core.learn.training.config import TrainConfig
-from lalaloc_core.learn.training.presets import PRESETS
-from lalaloc_core.learn.training.stages import build_image_encoder, build_layout_encoder
 from tests.core.test_training import small_paper
 from tests.strategies import crooked_flat, scene_of
 
@@ -82,7 +82,7 @@ class TestExport:
         assert manifest.training["layout"]["steps"] == TINY.layout.steps
 
     def test_onnx_and_torch_agree_on_the_latents_of_layouts(
-        self, opened_bundle: Bundle, encoders: Encoders, optimiser: LatentPoseOptimiser
+        self, opened_bundle: Bundle, encoders: Encoders, optimiser: PoseRefiner
     ) -> None:
         # More than one batch of the session, so that no dimension is baked in.
         scene = scene_of(crooked_flat(), 300, 0)
@@ -149,7 +149,7 @@ class TestExport:
         bundle = exported(tmp_path, config)
         assert (bundle.manifest.architecture, bundle.manifest.ring_sectors) == ("paper", 0)
         assert HEAD_ONNX not in bundle.manifest.files
-        encoders, optimiser = Encoders(bundle, threads=1), LatentPoseOptimiser.from_bundle(bundle)
+        encoders, optimiser = Encoders(bundle, threads=1), PoseRefiner.from_bundle(bundle)
         image = np.random.default_rng(0).integers(0, 256, (64, 128, 3), dtype=np.uint8)
         known = encoders.query(image, 0.0, CameraHeight(1.5))
         assert known.latents.shape == (1, 128)
@@ -180,7 +180,7 @@ class TestReading:
     def test_altered_weights_are_not_loaded(self, copied: Path) -> None:
         (copied / LAYOUT_WEIGHTS).write_bytes(b"")
         with pytest.raises(BundleError, match="SHA-256"):
-            LatentPoseOptimiser.from_bundle(Bundle.open(copied))
+            PoseRefiner.from_bundle(Bundle.open(copied))
 
     def test_a_missing_file_is_named(self, copied: Path) -> None:
         (copied / IMAGE_ONNX).unlink()

@@ -11,11 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lalaloc_core.localise.bundle import Bundle, ConfidenceModel, EvidenceModel, LogisticModel, write_manifest
-from lalaloc_core.evaluate.calibrate import Answers, calibrate, cross_validate, fit_confidence, fit_evidence
 from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.evaluate.calibrate import Answers, calibrate, cross_validate, fit_confidence, fit_matching_weights
 from lalaloc_core.evaluate.runs.predictions import Pose, PredictedCandidate, Prediction
 from lalaloc_core.evaluate.runs.score import expected_calibration_error, position_errors_m
+from lalaloc_core.localise.bundle import Bundle, ConfidenceModel, LogisticModel, MatchingWeights, write_manifest
 from tests.strategies import seeds
 
 TRUTH = Pose(x_m=0.0, y_m=0.0, room_index=0, heading_deg=0.0)
@@ -275,12 +275,12 @@ class TestEvidence:
     def test_the_weights_that_made_the_right_ones_right_are_found(self) -> None:
         rng = np.random.default_rng(0)
         made = np.array([12.0, 9.0, 1.0, 3.0])
-        model = fit_evidence([self.choice(rng, made) for _ in range(1500)])
+        model = fit_matching_weights([self.choice(rng, made) for _ in range(1500)])
         found = model.temperature * np.array([1.0, model.openings, model.ceiling, model.room_type])
         np.testing.assert_allclose(found, made, atol=1.5)
 
     def test_without_queries_that_teach_anything_they_are_the_usual_ones(self) -> None:
-        assert fit_evidence([result(0.2)]) == fit_evidence([]) == EvidenceModel()
+        assert fit_matching_weights([result(0.2)]) == fit_matching_weights([]) == MatchingWeights()
 
     def test_terms_that_never_differ_keep_their_weights(self) -> None:
         rng = np.random.default_rng(1)
@@ -289,8 +289,8 @@ class TestEvidence:
             one = self.choice(rng, np.array([12.0, 0.0, 0.0, 0.0]))
             rivals = tuple(dataclasses.replace(r, terms={**r.terms, "openings": 0.0}) for r in one.candidates)
             queries.append(dataclasses.replace(one, candidates=rivals))
-        model = fit_evidence(queries)
-        default = EvidenceModel()
+        model = fit_matching_weights(queries)
+        default = MatchingWeights()
         assert model.openings * model.temperature == pytest.approx(default.openings * default.temperature, rel=1e-3)
 
 

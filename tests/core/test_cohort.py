@@ -9,16 +9,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lalaloc_core.localise.bundle import COHORT, Bundle, EvidenceModel, write_manifest
-from lalaloc_core.evaluate.calibrate import store_cohort
-from lalaloc_core.learn.data.synthetic import training_plans
 from lalaloc_core.errors import BundleError
+from lalaloc_core.evaluate.calibrate import store_cohort
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.learn.data.synthetic import training_plans
+from lalaloc_core.localise.bundle import COHORT, Bundle, MatchingWeights, write_manifest
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.cohort import SIZE, Cohort, cohort_of, cost_by_chance, log_cost_to_chance
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.evidence import EvidenceConfig
-from lalaloc_core.localise.optimise import LatentPoseOptimiser
+from lalaloc_core.localise.matching_cost import MatchingConfig
+from lalaloc_core.localise.optimise import PoseRefiner
 from lalaloc_core.localise.pipeline import LocaliseConfig, localise
 from lalaloc_core.localise.poses import PredictedProfile, Query
 from lalaloc_core.localise.retrieval import build_grid, grid_costs
@@ -44,7 +44,7 @@ def picture_of(encoders: Encoders, plan: FloorPlan, at: tuple[float, float], log
 
 
 def in_units_of_chance(encoders: Encoders, cohort: Cohort | None, plan: FloorPlan, query: Query) -> float:
-    weights, config = EvidenceModel(), EvidenceConfig()
+    weights, config = MatchingWeights(), MatchingConfig()
     grid = build_grid(plan, encoders, step_m=0.5, camera_height_m=CAMERA_M)
     cost = float(grid_costs(plan, grid, query, weights, config).cost.min())
     by_chance = cost_by_chance(cohort, plan, query, config.grid_reach * 0.5, weights, config)
@@ -85,7 +85,7 @@ class TestBundles:
         return store_cohort(Bundle.open(folder), cohort)
 
     def test_it_travels_in_the_bundle_and_is_a_signal_of_answers(
-        self, with_cohort: Bundle, cohort: Cohort, optimiser: LatentPoseOptimiser
+        self, with_cohort: Bundle, cohort: Cohort, optimiser: PoseRefiner
     ) -> None:
         found = Cohort.of_bundle(Bundle.open(with_cohort.folder))
         assert found is not None

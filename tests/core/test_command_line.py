@@ -13,9 +13,10 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from lalaloc_core import __version__, bundle
-from lalaloc_core.localise.bundle import Bundle, default_bundle
+from lalaloc_core import __version__
 from lalaloc_core.cli import main
+from lalaloc_core.localise import bundle
+from lalaloc_core.localise.bundle import Bundle, default_bundle
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = ROOT / "examples"
@@ -145,7 +146,7 @@ def test_the_shipped_model_is_relative_in_its_checkout_and_absolute_elsewhere(
     monkeypatch.chdir(ROOT)
     assert default_bundle() == Path("models/default")
     monkeypatch.chdir(tmp_path)
-    assert default_bundle() == Path(bundle.__file__).resolve().parents[1] / "models" / "default"
+    assert default_bundle() == Path(bundle.__file__).resolve().parents[2] / "models" / "default"
     assert Bundle.open(default_bundle()).manifest.name == "default"
 
 

@@ -7,11 +7,11 @@ import dataclasses
 import numpy as np
 
 from lalaloc_core.conventions import OPENING_CLASSES
+from lalaloc_core.errors import DatasetError
+from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Scene
 from lalaloc_core.learn.data.synthetic.copied import CopiedScenes
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
-from lalaloc_core.errors import DatasetError
-from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.render.layout import layout_view
 
 HOMES = GeneratedScenes(homes=3, shots_per_home=2)

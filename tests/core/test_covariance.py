@@ -10,8 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lalaloc_core.localise.bundle import ConfidenceModel
 from lalaloc_core.floorplan import Room
+from lalaloc_core.localise.bundle import ConfidenceModel
 from lalaloc_core.localise.covariance import PoseUncertainty, marginal_information, pose_uncertainty
 from tests.strategies import plan_of, rectangle, seeds
 

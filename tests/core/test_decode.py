@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.evidence import EvidenceConfig
-from lalaloc_core.localise.pipeline import LocaliseConfig
 from lalaloc_core.evaluate.methods.decode import VdrDecode
 from lalaloc_core.evaluate.methods.lalaloc import LaLaLoc
 from lalaloc_core.evaluate.methods.method import Question
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.matching_cost import MatchingConfig
+from lalaloc_core.localise.pipeline import LocaliseConfig
 from lalaloc_core.nets.decoder import DECODED_HEIGHT, DECODED_WIDTH, LayoutDecoder
 from lalaloc_core.render.depth import layout_depth
 from tests.core.questions import CAMERA_M, question_at
@@ -49,7 +49,7 @@ def test_retrieval_and_re_sampling_are_lalaloc_s(encoders: Encoders, heading_kno
     torch.manual_seed(0)
     question = question_at(crooked_flat(), (1.2, 1.1), heading=0.7, heading_known=heading_known)
     answer = VdrDecode(encoders, LayoutDecoder()).answer(question)
-    by_latent = LocaliseConfig(evidence=EvidenceConfig(use_profile=False))
+    by_latent = LocaliseConfig(matching=MatchingConfig(use_profile=False))
     expected = LaLaLoc(encoders, refine="vdr", config=by_latent).answer(question)
     assert list(answer.stages) == ["retrieval", "vdr", "decode"]
     assert {stage: answer.stages[stage] for stage in expected.stages} == expected.stages

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from lalaloc_core.errors import DatasetError
 from lalaloc_core.learn.data.synthetic import disturbed
 from lalaloc_core.learn.data.synthetic.disturbed import DisturbedPhotograph, DisturbedScenes
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
-from lalaloc_core.errors import DatasetError
 
 HOMES = GeneratedScenes(homes=1, shots_per_home=3, furniture=None)
 LOOK = HOMES.appearances[0]

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.drawn_openings import DrawnOpening, opening_entries
 from lalaloc_core.learn.data.structured3d_annotation import read_annotation
 from lalaloc_core.learn.data.structured3d_writer import build_annotation
 from lalaloc_core.learn.data.zind import Zind
-from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.synth.homes.plans import generate_home
 from tests.strategies import crooked_flat
 from tests.zind_home import FLOOR, PANORAMAS, write_home

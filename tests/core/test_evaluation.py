@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 
 from lalaloc_core.cli import main
-from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes, RenderedPhotograph
 from lalaloc_core.errors import InvalidInputError, RunError
 from lalaloc_core.evaluate.runs.factories import build_dataset, choose_appearance
 from lalaloc_core.evaluate.runs.predictions import PREDICTIONS_FILE, Prediction, RunFolder, RunInfo
 from lalaloc_core.evaluate.runs.run import run_evaluation
 from lalaloc_core.evaluate.runs.score import heading_errors_deg, position_errors_m, score
+from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes, RenderedPhotograph
 from lalaloc_core.learn.synth.scene.facts import facts_of
 
 OWN_DATA = Path(__file__).parents[2] / "examples" / "own_data"

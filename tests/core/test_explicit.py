@@ -14,15 +14,15 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.errors import BundleError, ConfigError, InvalidInputError
+from lalaloc_core.evaluate.methods.alignment import DepthAligner
+from lalaloc_core.evaluate.methods.explicit import ExplicitLayout
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.optimise import LpoConfig, PoseOptimiser
 from lalaloc_core.localise.poses import RefinementJob
-from lalaloc_core.evaluate.methods.alignment import DepthAligner
-from lalaloc_core.evaluate.methods.explicit import ExplicitLayout
 from lalaloc_core.render.depth import layout_depth
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.render.sampling import PoseSet

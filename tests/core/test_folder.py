@@ -15,13 +15,13 @@ import pytest
 from PIL import Image
 
 from examples.truth import FOLDER, PLAN_PATH, read_poses
+from lalaloc_core.errors import DatasetError
 from lalaloc_core.learn.data.dataset import Appearance, load_scenes
 from lalaloc_core.learn.data.dataset_detection import open_dataset
 from lalaloc_core.learn.data.folder import OwnData
 from lalaloc_core.learn.data.structured3d import Structured3D
 from lalaloc_core.learn.data.structured3d_splits import bad_scenes
 from lalaloc_core.learn.data.zind import Zind
-from lalaloc_core.errors import DatasetError
 from tests.strategies import plan_document, rectangle
 
 ROOT = Path(__file__).parents[2]

@@ -16,19 +16,19 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.conventions import TWO_PI, wrap_angle
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.learn.training.presets import PRESETS
+from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.optimise import LatentPoseOptimiser
+from lalaloc_core.localise.optimise import PoseRefiner
 from lalaloc_core.localise.pipeline import localise, panorama_heading
 from lalaloc_core.localise.retrieval import build_grid
 from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
 from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.render.sampling import PoseSet
-from lalaloc_core.learn.training.presets import PRESETS
 from tests.strategies import Scene, crooked_flat, scenes
 
 RING = PRESETS["tiny"].ring
@@ -68,7 +68,7 @@ class PaintedSession(onnxruntime.InferenceSession):
 
 
 @pytest.fixture(scope="module")
-def perfect(opened_bundle: Bundle, optimiser: LatentPoseOptimiser) -> Encoders:
+def perfect(opened_bundle: Bundle, optimiser: PoseRefiner) -> Encoders:
     encoders = Encoders(opened_bundle, threads=1)
     assert isinstance(optimiser.encoder, RingLayoutEncoder)
     encoders._image = PaintedSession(optimiser.encoder)
@@ -178,7 +178,7 @@ class TestPerfectEncoder:
     def test_an_inexact_heading_is_searched_within_its_tolerance_and_refined(
         self,
         perfect: Encoders,
-        optimiser: LatentPoseOptimiser,
+        optimiser: PoseRefiner,
         flat: FloorPlan,
         heading: float,
         off: float,
@@ -200,7 +200,7 @@ class TestPerfectEncoder:
     def test_the_search_finds_the_pose_and_the_heading_it_was_photographed_with(
         self,
         perfect: Encoders,
-        optimiser: LatentPoseOptimiser,
+        optimiser: PoseRefiner,
         flat: FloorPlan,
         heading: float,
         known: bool,

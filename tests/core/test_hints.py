@@ -11,16 +11,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.errors import InvalidHintError
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.evidence import EvidenceConfig
 from lalaloc_core.localise.hints import NO_HINTS, Hints, Near, rooms_named
-from lalaloc_core.localise.optimise import LatentPoseOptimiser
+from lalaloc_core.localise.matching_cost import MatchingConfig
+from lalaloc_core.localise.optimise import PoseRefiner
 from lalaloc_core.localise.pipeline import Localisation, Refine, localise
-from lalaloc_core.localise.poses import LatentGrid, PredictedProfile, Query
+from lalaloc_core.localise.poses import PoseGrid, PredictedProfile, Query
 from lalaloc_core.localise.retrieval import build_grid, grid_costs
 from lalaloc_core.render.sampling import PoseSet
 from tests.strategies import plan_of, rectangle, seeds
@@ -48,7 +48,7 @@ def plan() -> FloorPlan:
 
 
 @pytest.fixture(scope="module")
-def grid(plan: FloorPlan, encoders: Encoders) -> LatentGrid:
+def grid(plan: FloorPlan, encoders: Encoders) -> PoseGrid:
     return build_grid(plan, encoders, step_m=0.5, camera_height_m=CAMERA_M)
 
 
@@ -67,7 +67,7 @@ def query(plan: FloorPlan, encoders: Encoders) -> Query:
 
 class TestAnswers:
     @pytest.fixture
-    def ask(self, plan: FloorPlan, grid: LatentGrid, encoders: Encoders, optimiser: LatentPoseOptimiser) -> Ask:
+    def ask(self, plan: FloorPlan, grid: PoseGrid, encoders: Encoders, optimiser: PoseRefiner) -> Ask:
         def asked(query: Query, hints: Hints = NO_HINTS, refine: Refine = "lpo") -> Localisation:
             return localise(plan, grid, encoders, query, refine=refine, refiner=optimiser.refine, hints=hints)
 
@@ -136,14 +136,14 @@ class TestAnswers:
 
 
 def test_of_large_grids_what_hints_allow_is_compared_however_badly_it_fits(
-    plan: FloorPlan, grid: LatentGrid, encoders: Encoders, monkeypatch: pytest.MonkeyPatch
+    plan: FloorPlan, grid: PoseGrid, encoders: Encoders, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("lalaloc_core.localise.retrieval._ALL_COMPARED", 0)
     monkeypatch.setattr("lalaloc_core.localise.retrieval._MIN_COMPARED", 8)
     monkeypatch.setattr("lalaloc_core.localise.retrieval._MAX_COMPARED", 8)
     query = sees(encoders, plan, PoseSet(np.array([[2.1, 5.7]]), np.array([2])))
     hints = Hints(rooms=frozenset({1}), strict=True)
-    costs = grid_costs(plan, grid, query, encoders.manifest.evidence, EvidenceConfig(), hints)
+    costs = grid_costs(plan, grid, query, encoders.manifest.evidence, MatchingConfig(), hints)
     rooms, total = grid.poses.room_index[costs.pose[: costs.compared]], costs.total[: costs.compared]
     assert costs.compared < len(grid.poses)
     assert {1, 2} <= set(rooms.tolist())

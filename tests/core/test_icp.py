@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from scipy.spatial import KDTree
 
 from lalaloc_core.conventions import wrap_angle
-from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.errors import DatasetError, InvalidInputError
 from lalaloc_core.evaluate.methods.icp import Icp, IcpConfig, align, best_motion, merge_cells, scan_of, wall_cloud
 from lalaloc_core.evaluate.methods.method import Question
+from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.render.sampling import PoseSet, pose_grid
 from tests.core.questions import BareRoom, question_at
 from tests.strategies import crooked_flat, l_shape, plan_of, rectangle, scene_of, seeds

@@ -15,7 +15,7 @@ from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.optimise import LatentPoseOptimiser
+from lalaloc_core.localise.optimise import PoseRefiner
 from lalaloc_core.localise.pipeline import Localisation, localise, panorama_heading
 from lalaloc_core.localise.poses import PredictedProfile, Query
 from lalaloc_core.localise.retrieval import build_grid
@@ -37,7 +37,7 @@ def copied(polygons: list[Any], count: int) -> FloorPlan:
 
 
 def found_at(
-    encoders: Encoders, optimiser: LatentPoseOptimiser, plan: FloorPlan, at: tuple[float, float], *, known: bool
+    encoders: Encoders, optimiser: PoseRefiner, plan: FloorPlan, at: tuple[float, float], *, known: bool
 ) -> Localisation:
     """The answer to a perfect picture of a place of the plan."""
     position = np.array([at], dtype=float)
@@ -56,7 +56,7 @@ def found_at(
 class TestShares:
     @pytest.mark.parametrize("at", [(1.37, 1.12), (5.1, 1.3)])
     def test_copies_of_a_flat_get_no_more_than_their_share(
-        self, encoders: Encoders, optimiser: LatentPoseOptimiser, count: int, known: bool, at: tuple[float, float]
+        self, encoders: Encoders, optimiser: PoseRefiner, count: int, known: bool, at: tuple[float, float]
     ) -> None:
         plan = copied([room.polygon_m for room in crooked_flat().rooms], count)
         found = found_at(encoders, optimiser, plan, at, known=known)
@@ -66,7 +66,7 @@ class TestShares:
 
     @pytest.mark.parametrize("width_m", [0.9, 1.15, 1.6, 2.9])
     def test_nor_do_equal_offices_even_narrow_ones(
-        self, encoders: Encoders, optimiser: LatentPoseOptimiser, count: int, known: bool, width_m: float
+        self, encoders: Encoders, optimiser: PoseRefiner, count: int, known: bool, width_m: float
     ) -> None:
         plan = copied([np.array(rectangle(width_m, 4.1))], count)
         found = found_at(encoders, optimiser, plan, (0.4 * width_m, 1.3), known=known)
@@ -77,7 +77,7 @@ class TestHeadings:
     @pytest.mark.parametrize(("depth_m", "ways"), [(4.6, 2), (3.2, 4)], ids=["rectangle", "square"])
     @pytest.mark.parametrize("at", [(0.9, 1.1), (1.6, 0.0)], ids=["in a corner", "in the middle"])
     def test_a_room_without_openings_is_split_between_its_headings(
-        self, encoders: Encoders, optimiser: LatentPoseOptimiser, depth_m: float, ways: int, at: tuple[float, float]
+        self, encoders: Encoders, optimiser: PoseRefiner, depth_m: float, ways: int, at: tuple[float, float]
     ) -> None:
         middle = at[1] == 0.0
         plan = plan_of(rectangle(3.2, depth_m))
@@ -93,7 +93,7 @@ class TestHeadings:
         assert found.posterior.position == pytest.approx(1.0 if middle else 1.0 / ways, abs=0.1)
 
 
-def test_a_corridor_is_known_across_and_not_along(encoders: Encoders, optimiser: LatentPoseOptimiser) -> None:
+def test_a_corridor_is_known_across_and_not_along(encoders: Encoders, optimiser: PoseRefiner) -> None:
     # Longer than the picture tells: its ends are seen at a few azimuths alone.
     plan = plan_of(rectangle(60.0, 1.8))
     position = np.array([[30.0, 0.8]])

@@ -11,11 +11,11 @@ from hypothesis import given, settings
 
 from lalaloc_core.conventions import DOOR_CODE, OPENING_CLASSES, PASSAGE_CODE, WALL_CODE, WINDOW_CODE, column_azimuths
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.learn.synth.homes.plans import generate_home
 from lalaloc_core.render.layout import LayoutView, layout_view
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.render.reference import reference_view
 from lalaloc_core.render.sampling import random_poses
-from lalaloc_core.learn.synth.homes.plans import generate_home
 from tests.strategies import plan_document, plan_of, rectangle, rows_of_rooms, seeds
 
 COLUMNS = 48

@@ -10,12 +10,12 @@ import pytest
 import safetensors.torch
 import torch
 
+from lalaloc_core.learn.training.presets import PRESETS
 from lalaloc_core.nets import load_layout_encoder
 from lalaloc_core.nets.decoder import LayoutDecoder
 from lalaloc_core.nets.layout_encoder import RingConfig, RingLayoutEncoder, pad_around
 from lalaloc_core.nets.paper_encoders import PaperConfig, PaperImageEncoder, PaperLayoutEncoder, ResNet
 from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
-from lalaloc_core.learn.training.presets import PRESETS
 
 TINY = PRESETS["tiny"].ring
 SMALL_PAPER = PaperConfig(layout_height=32, profile_columns=64, image_height=64, image_width=128)

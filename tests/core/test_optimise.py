@@ -11,9 +11,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lalaloc_core.localise.bundle import LAYOUT_WEIGHTS, Bundle
 from lalaloc_core.errors import BundleError
-from lalaloc_core.localise.optimise import LatentPoseOptimiser, LpoConfig
+from lalaloc_core.localise.bundle import LAYOUT_WEIGHTS, Bundle
+from lalaloc_core.localise.optimise import LpoConfig, PoseRefiner
 from lalaloc_core.localise.poses import RefinementJob, RefinementResult
 from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
 from lalaloc_core.render.profile import wall_profile
@@ -93,7 +93,7 @@ class TestConvergence:
     ) -> None:
         scene = scene_of(plan_of(polygon), 4, seed)
         job = job_near(smooth_encoder, scene, seed, heading_known=heading_known)
-        result = LatentPoseOptimiser(smooth_encoder, LM).refine(job)
+        result = PoseRefiner(smooth_encoder, LM).refine(job)
         assert errors_m(result, scene).max() < 1e-3
         assert np.abs(result.heading).max() < 1e-3
         assert latent_distance(result).max() < 1e-3
@@ -106,13 +106,13 @@ class TestConvergence:
     ) -> None:
         scene = scene_of(plan_of(l_shape(5.0, 4.0, 2.0, 2.5)), 24, 0)
         job = job_near(smooth_encoder, scene, 1, heading_known=heading_known)
-        result = LatentPoseOptimiser(smooth_encoder, config).refine(job)
+        result = PoseRefiner(smooth_encoder, config).refine(job)
         assert np.mean(errors_m(result, scene) < 0.01) >= wanted
 
     def test_adam_and_levenberg_marquardt_agree(self, smooth_encoder: RingLayoutEncoder) -> None:
         scene = scene_of(plan_of(l_shape(5.0, 4.0, 2.0, 2.5)), 4, 3)
         job = job_near(smooth_encoder, scene, 3, heading_known=True)
-        first, second = (LatentPoseOptimiser(smooth_encoder, config).refine(job) for config in (LM, ADAM))
+        first, second = (PoseRefiner(smooth_encoder, config).refine(job) for config in (LM, ADAM))
         np.testing.assert_allclose(first.position_m, second.position_m, atol=5e-3)
 
     @pytest.mark.parametrize("config", [LM, ADAM], ids=["lm", "adam"])
@@ -128,7 +128,7 @@ class TestConvergence:
         )
         # Compared at heading 0, so start there.
         job = dataclasses.replace(job, heading=np.zeros(4))
-        result = LatentPoseOptimiser(smooth_encoder, config).refine(job)
+        result = PoseRefiner(smooth_encoder, config).refine(job)
         assert (latent_distance(result) <= np.linalg.norm(at_start - job.targets, axis=1) + 1e-5).all()
 
     def test_a_start_at_the_truth_stays_there_and_says_it_converged(self, smooth_encoder: RingLayoutEncoder) -> None:
@@ -136,7 +136,7 @@ class TestConvergence:
         job = dataclasses.replace(
             job_near(smooth_encoder, scene, 0, heading_known=True), position_m=scene.poses.position_m
         )
-        result = LatentPoseOptimiser(smooth_encoder, LM).refine(job)
+        result = PoseRefiner(smooth_encoder, LM).refine(job)
         assert errors_m(result, scene).max() < 1e-4
         assert result.converged.all()
 
@@ -149,7 +149,7 @@ class TestConvergence:
         near = dataclasses.replace(
             job, position_m=job.position_m - [500.0, -500.0], walls_m=job.walls_m - [500.0, -500.0, 500.0, -500.0]
         )
-        here, there = (LatentPoseOptimiser(smooth_encoder, LM).refine(each) for each in (near, job))
+        here, there = (PoseRefiner(smooth_encoder, LM).refine(each) for each in (near, job))
         np.testing.assert_allclose(there.position_m - [500.0, -500.0], here.position_m, atol=1e-4)
 
 
@@ -163,7 +163,7 @@ class TestProfiles:
         scene = scene_of(plan_of(polygon), 4, seed)
         job = job_near(smooth_encoder, scene, seed, heading_known=heading_known)
         job = by_profile(job, scene, smooth_encoder.config.profile_columns)
-        result = LatentPoseOptimiser(smooth_encoder, LM).refine(job)
+        result = PoseRefiner(smooth_encoder, LM).refine(job)
         assert errors_m(result, scene).max() < 5e-3
         assert np.abs(result.heading).max() < 5e-3
 
@@ -175,7 +175,7 @@ class TestProfiles:
         job = job_near(smooth_encoder, scene, 2, heading_known=False)
         job = by_profile(job, scene, smooth_encoder.config.profile_columns, offset=0.05)
         job = dataclasses.replace(job, latent_weight=latent_weight)
-        result = LatentPoseOptimiser(smooth_encoder, LpoConfig()).refine(job)
+        result = PoseRefiner(smooth_encoder, LpoConfig()).refine(job)
         fit = profile_cost(job, result.position_m, result.heading)
         assert (fit <= profile_cost(job, job.position_m, job.heading) + 1e-5).all()
         if not latent_weight:
@@ -199,7 +199,7 @@ class TestProfiles:
         job = job_near(smooth_encoder, scene, seed, heading_known=False)
         job = by_profile(job, scene, columns)
         job = dataclasses.replace(job, position_m=scene.poses.position_m, heading=np.zeros(1))
-        (information,) = LatentPoseOptimiser(smooth_encoder, LM).refine(job).information
+        (information,) = PoseRefiner(smooth_encoder, LM).refine(job).information
         np.testing.assert_allclose(information, information.T, rtol=1e-5)
         for step in 1e-3 * np.eye(3):
             costs = [profile_cost(job, job.position_m + sign * step[:2], sign * step[2:]) for sign in (1.0, -1.0)]
@@ -230,7 +230,7 @@ class TestStayingInside:
             targets=targets,
             position_m=scene.poses.position_m,
         )
-        result = LatentPoseOptimiser(smooth_encoder, config).refine(job)
+        result = PoseRefiner(smooth_encoder, config).refine(job)
         assert np.isfinite(result.position_m).all()
         assert np.isfinite(result.heading).all()
         assert shapely.contains(scene.plan.rooms[0].shape, shapely.points(result.position_m)).all()
@@ -249,7 +249,7 @@ class TestStayingInside:
             targets=exact_targets(smooth_encoder, target),
             position_m=start.poses.position_m,
         )
-        assert both.room_index_at(LatentPoseOptimiser(smooth_encoder, config).refine(job).position_m).tolist() == [0]
+        assert both.room_index_at(PoseRefiner(smooth_encoder, config).refine(job).position_m).tolist() == [0]
 
 
 class TestBatches:
@@ -259,7 +259,7 @@ class TestBatches:
     def test_a_batch_is_its_poses_one_by_one(
         self, smooth_encoder: RingLayoutEncoder, heading_known: bool, polygon: list, seed: int
     ) -> None:
-        optimiser = LatentPoseOptimiser(smooth_encoder, LM)
+        optimiser = PoseRefiner(smooth_encoder, LM)
         scene = scene_of(plan_of(polygon), 4, seed)
         job = job_near(smooth_encoder, scene, seed, heading_known=heading_known)
         together = optimiser.refine(job)
@@ -274,7 +274,7 @@ class TestBatches:
         poses = PoseSet(np.array([[1.0, 1.0], [7.5, 1.0]]), np.array([0, 1]))
         scene = Scene(plan, poses, np.zeros(2))
         job = job_near(smooth_encoder, scene, 0, heading_known=True)
-        result = LatentPoseOptimiser(smooth_encoder, LM).refine(job)
+        result = PoseRefiner(smooth_encoder, LM).refine(job)
         assert errors_m(result, scene).max() < 1e-3
 
     @given(seeds())
@@ -286,7 +286,7 @@ class TestBatches:
         scene = scene_of(plan_of(l_shape(5.0, 4.0, 2.0, 2.5)), 5, seed)
         job = job_near(smooth_encoder, scene, seed, heading_known=True)
         job = dataclasses.replace(job, targets=job.targets[:1].repeat(5, axis=0))
-        pruned, full = (LatentPoseOptimiser(smooth_encoder, config).refine(job) for config in (LpoConfig(), LM))
+        pruned, full = (PoseRefiner(smooth_encoder, config).refine(job) for config in (LpoConfig(), LM))
         best = int(latent_distance(full).argmin())
         assert latent_distance(pruned).min() <= 1e-3 + latent_distance(full)[best]
         answer = pruned.position_m[int(latent_distance(pruned).argmin())]
@@ -298,14 +298,14 @@ class TestBatches:
         scene = scene_of(plan_of(l_shape(5.0, 4.0, 2.0, 2.5)), 1, seed)
         job = job_near(smooth_encoder, scene, seed, heading_known=False)
         strict = LpoConfig(prune_after=1, prune_ratio=1.0)
-        pruned, full = (LatentPoseOptimiser(smooth_encoder, config).refine(job) for config in (strict, LM))
+        pruned, full = (PoseRefiner(smooth_encoder, config).refine(job) for config in (strict, LM))
         np.testing.assert_allclose(pruned.position_m, full.position_m, atol=1e-6)
 
     def test_a_known_heading_comes_back_as_it_was(self, smooth_encoder: RingLayoutEncoder) -> None:
         scene = scene_of(plan_of(l_shape(5.0, 4.0, 2.0, 2.5)), 3, 1)
         job = job_near(smooth_encoder, scene, 0, heading_known=True)
         job = dataclasses.replace(job, heading=np.array([0.01, -0.02, 0.0]))
-        np.testing.assert_allclose(LatentPoseOptimiser(smooth_encoder).refine(job).heading, job.heading, atol=1e-7)
+        np.testing.assert_allclose(PoseRefiner(smooth_encoder).refine(job).heading, job.heading, atol=1e-7)
 
 
 class TestLoading:
@@ -315,16 +315,16 @@ class TestLoading:
             opened_bundle, manifest=dataclasses.replace(opened_bundle.manifest, layout_config=sizes)
         )
         with pytest.raises(BundleError, match="does not load"):
-            LatentPoseOptimiser.from_bundle(wrong)
+            PoseRefiner.from_bundle(wrong)
 
     @pytest.mark.parametrize("change", [{"architecture": "transformer"}, {"layout_config": {"depth": 3}}])
     def test_a_manifest_of_an_unknown_network_is_a_bundle_error(self, opened_bundle: Bundle, change: dict) -> None:
         wrong = dataclasses.replace(opened_bundle, manifest=dataclasses.replace(opened_bundle.manifest, **change))
         with pytest.raises(BundleError, match="does not load"):
-            LatentPoseOptimiser.from_bundle(wrong)
+            PoseRefiner.from_bundle(wrong)
 
     def test_a_bundle_without_the_weights_is_a_bundle_error(self, opened_bundle: Bundle) -> None:
         files = {k: v for k, v in opened_bundle.manifest.files.items() if k != LAYOUT_WEIGHTS}
         wrong = dataclasses.replace(opened_bundle, manifest=dataclasses.replace(opened_bundle.manifest, files=files))
         with pytest.raises(BundleError, match="lists no file"):
-            LatentPoseOptimiser.from_bundle(wrong)
+            PoseRefiner.from_bundle(wrong)

@@ -15,11 +15,11 @@ from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.optimise import LatentPoseOptimiser
+from lalaloc_core.localise.optimise import PoseRefiner
 from lalaloc_core.localise.pipeline import Localisation, LocaliseConfig, Refine, StageClock, localise, panorama_heading
 from lalaloc_core.localise.poses import (
     Candidate,
-    LatentGrid,
+    PoseGrid,
     PredictedProfile,
     Query,
     RefinementJob,
@@ -40,7 +40,7 @@ def flat() -> FloorPlan:
 
 
 @pytest.fixture(scope="module")
-def grid(flat: FloorPlan, encoders: Encoders) -> LatentGrid:
+def grid(flat: FloorPlan, encoders: Encoders) -> PoseGrid:
     return build_grid(flat, encoders, step_m=0.5, camera_height_m=CAMERA_M)
 
 
@@ -62,7 +62,7 @@ def error_m(found: Localisation, pose: PoseSet) -> float:
 class TestAccuracy:
     @pytest.mark.parametrize("by_profile", [False, True])
     def test_every_stage_comes_nearer_and_optimisation_finds_the_pose(
-        self, flat: FloorPlan, grid: LatentGrid, encoders: Encoders, optimiser: LatentPoseOptimiser, by_profile: bool
+        self, flat: FloorPlan, grid: PoseGrid, encoders: Encoders, optimiser: PoseRefiner, by_profile: bool
     ) -> None:
         errors: dict[Refine, list[float]] = {"none": [], "vdr": [], "lpo": []}
         for seed in range(20):
@@ -76,7 +76,7 @@ class TestAccuracy:
         assert np.mean(np.array(errors["lpo"]) < 0.01) >= 0.8
 
     def test_each_stage_lowers_the_latent_distance_where_that_is_the_cost(
-        self, flat: FloorPlan, grid: LatentGrid, encoders: Encoders, optimiser: LatentPoseOptimiser
+        self, flat: FloorPlan, grid: PoseGrid, encoders: Encoders, optimiser: PoseRefiner
     ) -> None:
         for seed in range(10):
             query = layout_query(encoders, flat, some_pose(flat, seed))
@@ -95,9 +95,9 @@ class TestAnswer:
     def test_candidates_are_apart_best_first_inside_their_rooms_and_not_too_many(
         self,
         flat: FloorPlan,
-        grid: LatentGrid,
+        grid: PoseGrid,
         encoders: Encoders,
-        optimiser: LatentPoseOptimiser,
+        optimiser: PoseRefiner,
         seed: int,
         top_k: int,
         heading_known: bool,
@@ -128,7 +128,7 @@ class TestAnswer:
         assert len(localise(plan, grid, encoders, query, refine="vdr", top_k=5).candidates) == 1
 
     def test_the_same_query_gets_the_same_answer(
-        self, flat: FloorPlan, grid: LatentGrid, encoders: Encoders, optimiser: LatentPoseOptimiser
+        self, flat: FloorPlan, grid: PoseGrid, encoders: Encoders, optimiser: PoseRefiner
     ) -> None:
         query = layout_query(encoders, flat, some_pose(flat, 1))
         first, second = (localise(flat, grid, encoders, query, refiner=optimiser.refine).candidates for _ in range(2))
@@ -148,7 +148,7 @@ class TestStages:
         return layout_query(encoders, flat, some_pose(flat, 3))
 
     def test_the_answer_says_how_far_it_went(
-        self, flat: FloorPlan, grid: LatentGrid, encoders: Encoders, optimiser: LatentPoseOptimiser, query: Query
+        self, flat: FloorPlan, grid: PoseGrid, encoders: Encoders, optimiser: PoseRefiner, query: Query
     ) -> None:
         def stage(**options: Any) -> tuple[str, set[str]]:
             found = localise(flat, grid, encoders, query, **options)
@@ -160,7 +160,7 @@ class TestStages:
         assert stage(refine="lpo", refiner=None) == ("vdr", {"retrieve", "vdr"})
 
     def test_a_refiner_that_cannot_answer_leaves_the_vdr_pose(
-        self, flat: FloorPlan, grid: LatentGrid, encoders: Encoders, query: Query
+        self, flat: FloorPlan, grid: PoseGrid, encoders: Encoders, query: Query
     ) -> None:
         without = localise(flat, grid, encoders, query, refine="vdr")
         late = localise(flat, grid, encoders, query, refiner=lambda job: None)
@@ -168,7 +168,7 @@ class TestStages:
         assert late.candidates == without.candidates
 
     def test_the_answer_is_the_best_of_where_the_optimiser_went(
-        self, flat: FloorPlan, grid: LatentGrid, encoders: Encoders, query: Query
+        self, flat: FloorPlan, grid: PoseGrid, encoders: Encoders, query: Query
     ) -> None:
         jobs: list[RefinementJob] = []
 
@@ -185,7 +185,7 @@ class TestStages:
         assert found.signals["lpo"].cost == 0.9
 
     def test_signals_are_of_the_stage_and_not_of_how_many_candidates_are_asked_for(
-        self, flat: FloorPlan, grid: LatentGrid, encoders: Encoders, optimiser: LatentPoseOptimiser, query: Query
+        self, flat: FloorPlan, grid: PoseGrid, encoders: Encoders, optimiser: PoseRefiner, query: Query
     ) -> None:
         few, many = (localise(flat, grid, encoders, query, top_k=k, refiner=optimiser.refine) for k in (1, 10))
         assert list(few.signals) == list(few.best) == ["retrieval", "vdr", "lpo"]
@@ -193,7 +193,7 @@ class TestStages:
         assert few.signals["lpo"].cost == few.candidates[0].cost
 
     def test_vdr_of_what_is_compared_by_walls_runs_where_it_is_asked_for_or_lpo_has_nothing(
-        self, flat: FloorPlan, grid: LatentGrid, encoders: Encoders, optimiser: LatentPoseOptimiser
+        self, flat: FloorPlan, grid: PoseGrid, encoders: Encoders, optimiser: PoseRefiner
     ) -> None:
         query = layout_query(encoders, flat, some_pose(flat, 3), by_profile=True)
         every = LocaliseConfig(every_stage=True)
@@ -210,7 +210,7 @@ class TestStages:
         assert alone.signals["lpo"] == told.signals["lpo"]
 
     def test_the_refiner_is_given_each_candidate_with_its_own_room_and_target(
-        self, flat: FloorPlan, grid: LatentGrid, encoders: Encoders
+        self, flat: FloorPlan, grid: PoseGrid, encoders: Encoders
     ) -> None:
         jobs: list[RefinementJob] = []
         image = np.random.default_rng(0).integers(0, 256, (32, 64, 3), dtype=np.uint8)
@@ -233,7 +233,7 @@ class TestStages:
                 assert job.camera_height_m[index] == CAMERA_M
 
     def test_only_as_many_candidates_are_optimised_as_configured(
-        self, flat: FloorPlan, grid: LatentGrid, encoders: Encoders, query: Query
+        self, flat: FloorPlan, grid: PoseGrid, encoders: Encoders, query: Query
     ) -> None:
         sizes: list[int] = []
 
@@ -248,7 +248,7 @@ class TestStages:
         assert sizes == [2, 3]
 
     def test_two_candidates_that_meet_become_one(
-        self, flat: FloorPlan, grid: LatentGrid, encoders: Encoders, query: Query
+        self, flat: FloorPlan, grid: PoseGrid, encoders: Encoders, query: Query
     ) -> None:
         def refiner(job: RefinementJob) -> RefinementResult:
             count = len(job.position_m)
@@ -268,7 +268,7 @@ class TestStages:
 
 class TestGrid:
     def test_the_grid_holds_the_latents_of_its_own_poses_at_heading_zero(
-        self, flat: FloorPlan, grid: LatentGrid, encoders: Encoders
+        self, flat: FloorPlan, grid: PoseGrid, encoders: Encoders
     ) -> None:
         assert grid.latents is not None
         assert len(grid.latents) == len(grid.poses)
@@ -278,7 +278,7 @@ class TestGrid:
         np.testing.assert_allclose(latents, grid.latents[index], atol=1e-5)
         np.testing.assert_array_equal(profile_m, grid.profile_m[index])
 
-    def test_another_camera_height_is_another_grid(self, flat: FloorPlan, grid: LatentGrid, encoders: Encoders) -> None:
+    def test_another_camera_height_is_another_grid(self, flat: FloorPlan, grid: PoseGrid, encoders: Encoders) -> None:
         higher = build_grid(flat, encoders, step_m=0.5, camera_height_m=1.8)
         assert dataclasses.replace(higher, latents=grid.latents).camera_height_m == 1.8
         assert higher.latents is not None

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lalaloc_core.localise.bundle import EvidenceModel
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.bundle import MatchingWeights
 from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.evidence import EvidenceConfig
+from lalaloc_core.localise.matching_cost import MatchingConfig
 from lalaloc_core.localise.poses import (
-    LatentGrid,
+    PoseGrid,
     PredictedCeiling,
     PredictedOpenings,
     PredictedProfile,
@@ -38,7 +38,7 @@ from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.render.sampling import pose_grid
 
 COLUMNS, STEP_M = 64, 0.5
-WEIGHTS, CONFIG = EvidenceModel(temperature=40.0, openings=0.4, ceiling=0.1, room_type=0.05), EvidenceConfig()
+WEIGHTS, CONFIG = MatchingWeights(temperature=40.0, openings=0.4, ceiling=0.1, room_type=0.05), MatchingConfig()
 CLASSES = len(OPENING_CLASSES)
 
 
@@ -64,10 +64,10 @@ def plan_of(rng: np.random.Generator, *, kinds: tuple[str, ...] | None = None) -
     return FloorPlan.from_dict(document)
 
 
-def grid_of(plan: FloorPlan) -> LatentGrid:
+def grid_of(plan: FloorPlan) -> PoseGrid:
     poses = pose_grid(plan, STEP_M)
     profile_m = profiles_at(plan, poses.position_m, poses.room_index, np.zeros(len(poses)), COLUMNS, np.float32)
-    return LatentGrid(poses, np.zeros((len(poses), 1), np.float32), profile_m, STEP_M, 1.5)
+    return PoseGrid(poses, np.zeros((len(poses), 1), np.float32), profile_m, STEP_M, 1.5)
 
 
 def query_of(prototypes: Prototypes, number: int, rng: np.random.Generator, *, hypotheses: int = 1) -> Query:

@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_LIMITS, FloorPlan, PlanLimits, room_type_of
-from lalaloc_core.render.sampling import pose_grid, random_poses
-from lalaloc_core.learn.synth.homes.plans import generate_home
 from lalaloc_core.learn.heldout.homes import HomeKey, home_of
+from lalaloc_core.learn.synth.homes.plans import generate_home
+from lalaloc_core.render.sampling import pose_grid, random_poses
 from tests.strategies import plan_document, rectangle, seeds
 
 # Two rooms of 4 x 3 m with a wall of 20 cm between them.

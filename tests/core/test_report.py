@@ -19,19 +19,19 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from lalaloc_core.conventions import heading_to_degrees
-from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.draw.heat import Cells
 from lalaloc_core.errors import RunError
-from lalaloc_core.evaluate.runs.failures import ALIGNMENT_LIMIT_M, Outcome, count_outcomes, outcomes
-from lalaloc_core.evaluate.runs.predictions import Pose, Prediction, RunFolder, RunInfo
-from lalaloc_core.evaluate.runs.score import position_errors_m, score
-from lalaloc_core.render.depth import layout_depth
-from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.evaluate.report import write_report
 from lalaloc_core.evaluate.report.gallery import PER_GROUP, choose_queries
 from lalaloc_core.evaluate.report.pictures import DrawnMap, draw_map, draw_panorama, layout_lines
 from lalaloc_core.evaluate.report.tables import distance, number
 from lalaloc_core.evaluate.report.times import TOTAL, stage_times
+from lalaloc_core.evaluate.runs.failures import ALIGNMENT_LIMIT_M, Outcome, count_outcomes, outcomes
+from lalaloc_core.evaluate.runs.predictions import Pose, Prediction, RunFolder, RunInfo
+from lalaloc_core.evaluate.runs.score import position_errors_m, score
+from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
+from lalaloc_core.render.depth import layout_depth
+from lalaloc_core.render.profile import wall_profile
 from tests.strategies import Scene, crooked_flat, plan_of, rectangle, scenes
 
 VOID = {"meta", "link", "img", "br", "hr", "path", "use", "circle", "rect"}

@@ -9,15 +9,15 @@ import pytest
 
 from lalaloc_core.cli import main
 from lalaloc_core.errors import RunError
-from lalaloc_core.evaluate.runs.factories import build_method
-from lalaloc_core.evaluate.runs.predictions import RunInfo
-from lalaloc_core.evaluate.runs.score import Scores, StageScores
-from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.evaluate.reproduce.ablations import ABLATIONS
 from lalaloc_core.evaluate.reproduce.result import Figure, RowResult, TableResult
 from lalaloc_core.evaluate.reproduce.result_tables import draw_vogel_samples, markdown
 from lalaloc_core.evaluate.reproduce.table import COLUMN_TITLES, PAPER_SETTING, SHIPPED, RowQuery
 from lalaloc_core.evaluate.reproduce.tables import TABLES
+from lalaloc_core.evaluate.runs.factories import build_method
+from lalaloc_core.evaluate.runs.predictions import RunInfo
+from lalaloc_core.evaluate.runs.score import Scores, StageScores
+from lalaloc_core.floorplan import FloorPlan
 from tests.core.questions import question_at
 from tests.strategies import plan_document, rectangle
 

@@ -11,13 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jaxtyping import Float
 
-from lalaloc_core.localise.bundle import EvidenceModel
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.bundle import MatchingWeights
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.evidence import EvidenceConfig, latent_distances, precisions
-from lalaloc_core.localise.poses import Candidate, LatentGrid, PredictedProfile, Query
+from lalaloc_core.localise.matching_cost import MatchingConfig, latent_distances, precisions
+from lalaloc_core.localise.poses import Candidate, PoseGrid, PredictedProfile, Query
 from lalaloc_core.localise.retrieval import contradicted, grid_costs, retrieve, suppress
 from lalaloc_core.localise.vogel import resample, vogel_disc
 from lalaloc_core.render.sampling import PoseSet
@@ -32,16 +32,14 @@ def unit(rng: np.random.Generator, *shape: int) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def random_grid(seed: int, poses: int = 60, columns: int = 16) -> LatentGrid:
+def random_grid(seed: int, poses: int = 60, columns: int = 16) -> PoseGrid:
     rng = np.random.default_rng(seed)
     places = PoseSet(rng.uniform(0, 6, (poses, 2)), np.zeros(poses, dtype=int))
-    return LatentGrid(places, unit(rng, poses, 8), rng.uniform(0.5, 5.0, (poses, columns)), 0.5, 1.5)
+    return PoseGrid(places, unit(rng, poses, 8), rng.uniform(0.5, 5.0, (poses, columns)), 0.5, 1.5)
 
 
-def best_places(
-    grid: LatentGrid, query: Query, *, top_k: int, evidence: EvidenceConfig | None = None
-) -> list[Candidate]:
-    costs = grid_costs(PLAN, grid, query, EvidenceModel(), evidence or EvidenceConfig())
+def best_places(grid: PoseGrid, query: Query, *, top_k: int, evidence: MatchingConfig | None = None) -> list[Candidate]:
+    costs = grid_costs(PLAN, grid, query, MatchingWeights(), evidence or MatchingConfig())
     return retrieve(costs, grid, query, top_k=top_k, separation_m=1.0)
 
 
@@ -133,7 +131,7 @@ class TestRetrieval:
         latents = unit(rng, len(position), 8)
         # One place fits far better than all others, whatever the heading.
         latents[np.linalg.norm(position - 2.0, axis=1) < 1.0] = np.eye(8)[0]
-        grid = LatentGrid(poses, latents, np.ones((len(position), 4)), 0.1, 1.5)
+        grid = PoseGrid(poses, latents, np.ones((len(position), 4)), 0.1, 1.5)
         query = any_heading(np.repeat(np.eye(8)[:1], 64, axis=0))
         assert len(best_places(grid, query, top_k=40)) == 40
 
@@ -164,7 +162,7 @@ class TestRetrieval:
         query = dataclasses.replace(
             any_heading(unit(rng, 3, 8)), profile=PredictedProfile(rng.normal(size=(3, 16)), rng.normal(size=(3, 16)))
         )
-        evidence = EvidenceConfig(latent_weight=0.7)
+        evidence = MatchingConfig(latent_weight=0.7)
         assert query.profile is not None
         assert grid.latents is not None
         residual = np.log(grid.profile_m)[None] - query.profile.log_m[:, None]
@@ -172,7 +170,7 @@ class TestRetrieval:
         costs += 0.7 * latent_distances(grid.latents, query.latents)
         best = best_places(grid, query, top_k=1, evidence=evidence)[0]
         assert best.cost == pytest.approx(costs.min(), rel=1e-4)
-        by_latent = best_places(grid, query, top_k=1, evidence=EvidenceConfig(use_profile=False))[0]
+        by_latent = best_places(grid, query, top_k=1, evidence=MatchingConfig(use_profile=False))[0]
         assert by_latent.cost == pytest.approx(latent_distances(grid.latents, query.latents).min())
 
     def test_of_a_large_grid_the_best_by_some_azimuths_are_compared_in_full(
@@ -187,17 +185,17 @@ class TestRetrieval:
         monkeypatch.setattr("lalaloc_core.localise.retrieval._ALL_COMPARED", 0)
         monkeypatch.setattr("lalaloc_core.localise.retrieval._MIN_COMPARED", 50)
         monkeypatch.setattr("lalaloc_core.localise.retrieval._MAX_COMPARED", 50)
-        costs = grid_costs(PLAN, grid, query, EvidenceModel(), EvidenceConfig())
+        costs = grid_costs(PLAN, grid, query, MatchingWeights(), MatchingConfig())
         assert costs.compared == 50
         assert best_places(grid, query, top_k=3)[:2] == everything[:2]
 
 
 class TestDoubt:
     @pytest.fixture
-    def grid(self) -> LatentGrid:
+    def grid(self) -> PoseGrid:
         return random_grid(0, columns=64)
 
-    def query(self, grid: LatentGrid, turned_by: int) -> Query:
+    def query(self, grid: PoseGrid, turned_by: int) -> Query:
         """A picture of one of the grid's poses, said to look along azimuth 0, that is turned by some sectors of 8."""
         seen = np.roll(np.log(grid.profile_m[17]), 8 * turned_by)
         turned = np.stack([np.roll(seen, 8 * k) for k in range(8)])
@@ -208,15 +206,15 @@ class TestDoubt:
 
     @pytest.mark.parametrize("turned_by", [0, 3])
     def test_a_heading_is_doubted_when_the_picture_fits_another_far_better(
-        self, grid: LatentGrid, turned_by: int
+        self, grid: PoseGrid, turned_by: int
     ) -> None:
         query = self.query(grid, turned_by)
-        assert contradicted(PLAN, grid, query, EvidenceModel(), EvidenceConfig()) == (turned_by != 0)
+        assert contradicted(PLAN, grid, query, MatchingWeights(), MatchingConfig()) == (turned_by != 0)
 
-    def test_it_is_not_where_nothing_may_be_doubted_or_another_is_hardly_better(self, grid: LatentGrid) -> None:
+    def test_it_is_not_where_nothing_may_be_doubted_or_another_is_hardly_better(self, grid: PoseGrid) -> None:
         wrong = self.query(grid, 3)
-        assert not contradicted(PLAN, grid, wrong, EvidenceModel(), EvidenceConfig(heading_doubt=0.0))
-        assert not contradicted(PLAN, grid, wrong, EvidenceModel(temperature=0.5), EvidenceConfig())
+        assert not contradicted(PLAN, grid, wrong, MatchingWeights(), MatchingConfig(heading_doubt=0.0))
+        assert not contradicted(PLAN, grid, wrong, MatchingWeights(temperature=0.5), MatchingConfig())
 
 
 class TestVogelDisc:

@@ -16,7 +16,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.pipeline import localise, panorama_heading
-from lalaloc_core.localise.poses import LatentGrid, PredictedProfile, Query
+from lalaloc_core.localise.poses import PoseGrid, PredictedProfile, Query
 from lalaloc_core.localise.retrieval import build_grid
 from lalaloc_core.localise.sequence.chain import best_paths, forward_backward
 from lalaloc_core.localise.sequence.joint import motion_residuals, refine_sequence
@@ -208,7 +208,7 @@ def plan() -> FloorPlan:
 
 
 @pytest.fixture(scope="module")
-def grid(plan: FloorPlan, encoders: Encoders) -> LatentGrid:
+def grid(plan: FloorPlan, encoders: Encoders) -> PoseGrid:
     return build_grid(plan, encoders, step_m=STEP_M, camera_height_m=CAMERA_M)
 
 
@@ -242,7 +242,7 @@ class TestSearch:
     @pytest.mark.parametrize("directed", [False, True])
     @pytest.mark.parametrize("refiner", [None, refine_sequence])
     def test_neighbours_tell_rooms_apart_that_look_alike(
-        self, plan: FloorPlan, grid: LatentGrid, encoders: Encoders, directed: bool, refiner: SequenceRefiner | None
+        self, plan: FloorPlan, grid: PoseGrid, encoders: Encoders, directed: bool, refiner: SequenceRefiner | None
     ) -> None:
         queries = seen(encoders, plan, WALK, CameraHeight(CAMERA_M, 0.0))
         alone = localise_sequence(plan, grid, encoders, queries, [Motion()] * 2, refiner=refiner)
@@ -268,7 +268,7 @@ class TestSearch:
         assert refiner is None or found.path_probability > 0.98
 
     def test_without_motions_each_is_answered_as_if_it_were_alone(
-        self, plan: FloorPlan, grid: LatentGrid, encoders: Encoders
+        self, plan: FloorPlan, grid: PoseGrid, encoders: Encoders
     ) -> None:
         queries = seen(encoders, plan, WALK, CameraHeight(CAMERA_M, 0.0))
         together = localise_sequence(plan, grid, encoders, queries, [Motion()] * 2)
@@ -278,7 +278,7 @@ class TestSearch:
             assert picture.candidates[0].cost == pytest.approx(alone.candidates[0].cost, abs=1e-5)
 
     def test_a_motion_that_cannot_be_is_told_and_not_believed(
-        self, plan: FloorPlan, grid: LatentGrid, encoders: Encoders
+        self, plan: FloorPlan, grid: PoseGrid, encoders: Encoders
     ) -> None:
         queries = seen(encoders, plan, WALK, CameraHeight(CAMERA_M, 0.0))
         first, second = measured(WALK)
@@ -289,7 +289,7 @@ class TestSearch:
             assert np.linalg.norm(picture.candidates[0].position_m - place) < 0.05
 
     def test_all_pictures_share_one_height_that_is_found(
-        self, plan: FloorPlan, grid: LatentGrid, encoders: Encoders
+        self, plan: FloorPlan, grid: PoseGrid, encoders: Encoders
     ) -> None:
         stated = CameraHeight(CAMERA_M, math.inf)
         # What looks 12 % too near was taken from 12 % higher up.
@@ -301,7 +301,7 @@ class TestSearch:
             assert np.linalg.norm(picture.candidates[0].position_m - place) < 0.05
 
     def test_of_large_grids_the_best_places_are_compared(
-        self, plan: FloorPlan, grid: LatentGrid, encoders: Encoders, monkeypatch: pytest.MonkeyPatch
+        self, plan: FloorPlan, grid: PoseGrid, encoders: Encoders, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr("lalaloc_core.localise.sequence.search._MAX_PLACES", 60)
         queries = seen(encoders, plan, WALK, CameraHeight(CAMERA_M, 0.0))
@@ -309,14 +309,14 @@ class TestSearch:
         assert [picture.candidates[0].room_index for picture in found.pictures] == [1, 2, 2]
 
     def test_a_model_without_a_profile_is_answered_from_the_grid(
-        self, plan: FloorPlan, grid: LatentGrid, encoders: Encoders
+        self, plan: FloorPlan, grid: PoseGrid, encoders: Encoders
     ) -> None:
         queries = [replace(one, profile=None) for one in seen(encoders, plan, WALK, CameraHeight(CAMERA_M, 0.0))]
         found = localise_sequence(plan, grid, encoders, queries, measured(WALK), refiner=refine_sequence)
         assert found.stage == "retrieval"
         assert sum(found.pictures[0].posterior.candidate) <= 1.0 + 1e-9
 
-    def test_motions_are_counted(self, plan: FloorPlan, grid: LatentGrid, encoders: Encoders) -> None:
+    def test_motions_are_counted(self, plan: FloorPlan, grid: PoseGrid, encoders: Encoders) -> None:
         queries = seen(encoders, plan, WALK, CameraHeight(CAMERA_M, 0.0))
         with pytest.raises(InvalidMotionError, match="1 motions are given, 3 pictures have 2"):
             localise_sequence(plan, grid, encoders, queries, [Motion()])

@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given, settings
 
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.evaluate.methods import similarity
 from lalaloc_core.evaluate.methods.oracle import PoseOracle, SimilarityRetrieval
 from lalaloc_core.evaluate.methods.similarity import (
@@ -23,6 +22,7 @@ from lalaloc_core.evaluate.methods.similarity import (
     edge_image,
     layout_grid,
 )
+from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.metrics import chamfer_distance
 from lalaloc_core.render.depth import back_project, layout_depth
 from lalaloc_core.render.profile import wall_profile

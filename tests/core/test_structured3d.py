@@ -15,13 +15,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from lalaloc_core.errors import DatasetError
+from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Appearance, load_scenes
 from lalaloc_core.learn.data.polygon_rings import OpenRingError, chain_rings, signed_area, uncrossed
 from lalaloc_core.learn.data.structured3d import Structured3D
 from lalaloc_core.learn.data.structured3d_annotation import Annotation, read_annotation
 from lalaloc_core.learn.data.structured3d_splits import EXCLUDED_BY_PAPER, OFFICIAL, bad_scenes, scene_numbers
-from lalaloc_core.errors import DatasetError
-from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.render.depth import layout_depth
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.render.sampling import random_poses

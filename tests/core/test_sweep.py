@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.render.layout import layout_view
-from lalaloc_core.render.profile import wall_profile
-from lalaloc_core.render.sweep import SweptViews, swept_profiles, swept_views
-from lalaloc_core.render.sampling import PoseSet, pose_grid, random_poses
 from lalaloc_core.learn.synth.homes.buildings import building_of
 from lalaloc_core.learn.synth.homes.splits import VALIDATION
+from lalaloc_core.render.layout import layout_view
+from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.render.sampling import PoseSet, pose_grid, random_poses
+from lalaloc_core.render.sweep import SweptViews, swept_profiles, swept_views
 from tests.strategies import plan_document, plan_of, rectangle, rows_of_rooms, seeds, spiral
 
 COLUMNS, EYE_M = 64, 1.5

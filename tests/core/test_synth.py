@@ -16,8 +16,6 @@ from PIL import Image
 
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.render.depth import layout_depth
-from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.learn.synth.furniture.catalogue import ROOM_PIECES
 from lalaloc_core.learn.synth.furniture.furnish import CAMERA_CLEARANCE_M, FURNITURE_LEVELS, furnish, rectangle
 from lalaloc_core.learn.synth.homes.plans import Home, generate_home
@@ -28,6 +26,8 @@ from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, sample
 from lalaloc_core.learn.synth.scene.build import build_scene
 from lalaloc_core.learn.synth.scene.facts import facts_of
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
+from lalaloc_core.render.depth import layout_depth
+from lalaloc_core.render.profile import wall_profile
 
 ROWS, COLUMNS = 64, 128
 seeds = st.integers(0, 2**32 - 1)

@@ -25,6 +25,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from lalaloc_core.cli import main
+from lalaloc_core.errors import DatasetError, InvalidInputError
 from lalaloc_core.learn.data.dataset import Split
 from lalaloc_core.learn.data.structured3d import FURNITURE, LIGHTING, Structured3D
 from lalaloc_core.learn.data.structured3d_splits import EXCLUDED_BY_PAPER, OFFICIAL, scene_numbers
@@ -32,9 +33,6 @@ from lalaloc_core.learn.data.structured3d_writer import build_annotation, layout
 from lalaloc_core.learn.data.synthetic import writing as module
 from lalaloc_core.learn.data.synthetic.generated import renderer_cache_of
 from lalaloc_core.learn.data.synthetic.writing import Synthesis, share_out, synthesise
-from lalaloc_core.errors import DatasetError, InvalidInputError
-from lalaloc_core.render.depth import layout_depth
-from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.learn.synth.furniture.furnish import FURNITURE_LEVELS
 from lalaloc_core.learn.synth.homes.plans import Home, generate_home
 from lalaloc_core.learn.synth.homes.splits import TEST, TRAIN, home_of
@@ -43,6 +41,8 @@ from lalaloc_core.learn.synth.scene.lighting import MOODS
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.render_scene import RenderScene
 from lalaloc_core.learn.synth.scene.shots import POSE_MARGIN_M, stage_rooms
+from lalaloc_core.render.depth import layout_depth
+from lalaloc_core.render.profile import wall_profile
 
 # A seed whose first homes have four rooms each.
 HEIGHT, SEED = 32, 267

@@ -18,17 +18,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor, nn
 
-from lalaloc_core.localise.bundle import DECODER_WEIGHTS, IMAGE_ONNX
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.errors import CheckpointError, ConfigError
 from lalaloc_core.learn.export.run import export_run
 from lalaloc_core.learn.metrics import chamfer_distance
-from lalaloc_core.nets import LayoutEncoder
-from lalaloc_core.nets.image_features import ImageFeatures
-from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
-from lalaloc_core.render.depth import back_project, layout_depth
-from lalaloc_core.render.poses import profiles_at
-from lalaloc_core.render.sampling import TripletSampling, random_poses
 from lalaloc_core.learn.synth.homes.splits import TEST, TRAIN, VALIDATION, home_of
 from lalaloc_core.learn.training import batches, objective, sources
 from lalaloc_core.learn.training.batch_streams import LayoutBatches, PanoramaBatches
@@ -44,6 +37,13 @@ from lalaloc_core.learn.training.rotation import sample_rotation
 from lalaloc_core.learn.training.run import train_image
 from lalaloc_core.learn.training.sources import GeneratedSource
 from lalaloc_core.learn.training.stages import TrainingStage, build_layout_encoder
+from lalaloc_core.localise.bundle import DECODER_WEIGHTS, IMAGE_ONNX
+from lalaloc_core.nets import LayoutEncoder
+from lalaloc_core.nets.image_features import ImageFeatures
+from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
+from lalaloc_core.render.depth import back_project, layout_depth
+from lalaloc_core.render.poses import profiles_at
+from lalaloc_core.render.sampling import TripletSampling, random_poses
 from tests.strategies import crooked_flat, seeds
 
 CPU = torch.device("cpu")

@@ -17,11 +17,9 @@ import torch
 from PIL import Image
 
 from lalaloc_core.cli import main
+from lalaloc_core.errors import CheckpointError, DatasetError
 from lalaloc_core.learn.data.folder import OwnData
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
-from lalaloc_core.errors import CheckpointError, DatasetError
-from lalaloc_core.render.poses import profiles_at
-from lalaloc_core.render.sampling import random_poses
 from lalaloc_core.learn.training.batch_streams import LayoutBatches, PanoramaBatches
 from lalaloc_core.learn.training.batches import Batch, load_batches
 from lalaloc_core.learn.training.checkpoint import Checkpoint
@@ -31,6 +29,8 @@ from lalaloc_core.learn.training.presets import PRESETS
 from lalaloc_core.learn.training.run import train_layout
 from lalaloc_core.learn.training.sources import SceneSource
 from lalaloc_core.learn.training.validate import ImageValidation, LayoutValidation
+from lalaloc_core.render.poses import profiles_at
+from lalaloc_core.render.sampling import random_poses
 from tests.strategies import crooked_flat
 
 CPU = torch.device("cpu")

@@ -14,10 +14,12 @@ import pytest
 import torch
 from torch.nn import functional
 
-from lalaloc_core.localise.bundle import IMAGE_ONNX, MANIFEST_NAME, Bundle
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.errors import BundleError, ConfigError
 from lalaloc_core.learn.export.bundle_export import export_bundle
+from lalaloc_core.learn.training.presets import PRESETS
+from lalaloc_core.learn.training.stages import build_image_encoder, build_layout_encoder
+from lalaloc_core.localise.bundle import IMAGE_ONNX, MANIFEST_NAME, Bundle
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.poses import rolled
@@ -32,8 +34,6 @@ from lalaloc_core.nets.trunk import (
     _PadAround,
     load_pretrained,
 )
-from lalaloc_core.learn.training.presets import PRESETS
-from lalaloc_core.learn.training.stages import build_image_encoder, build_layout_encoder
 
 TINY = PRESETS["tiny-trunk"]
 WIDE = TrunkEncoderConfig(

@@ -10,16 +10,11 @@ import numpy as np
 import pytest
 import torch
 
-from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.cli import main
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.errors import CheckpointError, ConfigError
-from lalaloc_core.learn.export.run import export_run
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.nets.image_encoder import TrunkImageEncoder
-from lalaloc_core.nets.trunk import Trunk
+from lalaloc_core.learn.export.run import export_run
 from lalaloc_core.learn.training import losses, run
 from lalaloc_core.learn.training.batch_streams import UNKNOWN, PanoramaBatches, opening_kinds
 from lalaloc_core.learn.training.checkpoint import Checkpoint
@@ -34,6 +29,11 @@ from lalaloc_core.learn.training.rotation import Rotation
 from lalaloc_core.learn.training.sources import GeneratedSource
 from lalaloc_core.learn.training.stages import build_image_encoder, build_layout_encoder, build_optimiser
 from lalaloc_core.learn.training.warm_start import load_warm_start
+from lalaloc_core.localise.bundle import Bundle
+from lalaloc_core.localise.camera_height import CameraHeight
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.nets.image_encoder import TrunkImageEncoder
+from lalaloc_core.nets.trunk import Trunk
 
 TINY = PRESETS["tiny-trunk"]
 SHORT = dataclasses.replace(TINY, image=dataclasses.replace(TINY.image, steps=2))

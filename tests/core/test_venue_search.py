@@ -7,18 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from lalaloc_core.localise.bundle import EvidenceModel
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.bundle import MatchingWeights
 from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.evidence import Evidence, EvidenceConfig
-from lalaloc_core.localise.poses import LatentGrid, PredictedProfile, Query
+from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost
+from lalaloc_core.localise.poses import PoseGrid, PredictedProfile, Query
 from lalaloc_core.localise.venue.merged_plans import MergedPlans
 from lalaloc_core.localise.venue.prototypes import most_probable, share_searched
 from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.render.sampling import pose_grid
 
 COLUMNS, STEP_M = 64, 0.5
-WEIGHTS, CONFIG = EvidenceModel(temperature=40.0), EvidenceConfig()
+WEIGHTS, CONFIG = MatchingWeights(temperature=40.0), MatchingConfig()
 
 
 def plan_of(width_m: float, depth_m: float, *, x_m: float = 0.0, openings: bool = False) -> FloorPlan:
@@ -36,11 +36,11 @@ def plan_of(width_m: float, depth_m: float, *, x_m: float = 0.0, openings: bool 
     return FloorPlan.from_dict(document)
 
 
-def grid_of(plan: FloorPlan) -> LatentGrid:
+def grid_of(plan: FloorPlan) -> PoseGrid:
     poses = pose_grid(plan, STEP_M)
     profile_m = profiles_at(plan, poses.position_m, poses.room_index, np.zeros(len(poses)), COLUMNS, np.float32)
     latents = np.tile(np.eye(1, 8, dtype=np.float32), (len(poses), 1))
-    return LatentGrid(poses, latents, profile_m, STEP_M, 1.5)
+    return PoseGrid(poses, latents, profile_m, STEP_M, 1.5)
 
 
 def query_at(plan: FloorPlan, x_m: float, y_m: float, hypotheses: int = 1) -> Query:
@@ -63,7 +63,7 @@ def merged_plans() -> MergedPlans:
 
 def test_every_pose_costs_what_it_costs_in_its_own_plan(merged_plans: MergedPlans) -> None:
     query = query_at(PLANS[0], 1.3, 1.1)
-    whole, _ = Evidence(merged_plans.plan, query, 0.3, WEIGHTS, CONFIG).costs(
+    whole, _ = MatchingCost(merged_plans.plan, query, 0.3, WEIGHTS, CONFIG).costs(
         merged_plans.grid.layouts(merged_plans.plan)
     )
     parts = []
@@ -71,7 +71,7 @@ def test_every_pose_costs_what_it_costs_in_its_own_plan(merged_plans: MergedPlan
         grid = grid_of(plan)
         # Of the openings only the kinds count that every plan shows; here one shows none.
         compared = replace(plan, opening_kinds=frozenset())
-        parts.append(Evidence(compared, query, 0.3, WEIGHTS, CONFIG).costs(grid.layouts(plan))[0])
+        parts.append(MatchingCost(compared, query, 0.3, WEIGHTS, CONFIG).costs(grid.layouts(plan))[0])
     np.testing.assert_allclose(whole, np.concatenate(parts, axis=1), atol=1e-5)
 
 

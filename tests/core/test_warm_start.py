@@ -12,10 +12,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.cli import main
-from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.errors import CheckpointError
+from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.learn.export.run import export_run
 from lalaloc_core.learn.training.checkpoint import Checkpoint
 from lalaloc_core.learn.training.config import TrainConfig
@@ -28,6 +27,7 @@ from lalaloc_core.learn.training.run import train_image, train_layout
 from lalaloc_core.learn.training.sources import GeneratedSource
 from lalaloc_core.learn.training.stages import build_layout_encoder
 from lalaloc_core.learn.training.warm_start import load_warm_start
+from lalaloc_core.localise.bundle import Bundle
 from tests.core.test_training import LineStage, same_weights
 
 CPU = torch.device("cpu")
@@ -188,7 +188,7 @@ class TestBest:
 class TestValidation:
     def test_it_reports_both_ways_to_retrieve_and_the_unfamiliar_by_level(self, tmp_path: Path) -> None:
         data = TrainingData(
-            validation_scenes=3, unfamiliar=GeneratedScenes(homes=2, shots_per_home=2, seed=5, furniture=None)
+            validation_scenes=3, heldout=GeneratedScenes(homes=2, shots_per_home=2, seed=5, furniture=None)
         )
         teacher = build_layout_encoder(TINY)
         stage = ImageStage(TINY, GeneratedSource(TINY), teacher)
@@ -199,10 +199,10 @@ class TestValidation:
 
         found = scores()
         names = {f"{by}{what}" for by in ("", "profile_") for what in ("within_1m", "median_cm")} | {"nll"}
-        assert {f"{prefix}_{name}" for prefix in ("val", "unfamiliar") for name in names} <= set(found)
+        assert {f"{prefix}_{name}" for prefix in ("val", "heldout") for name in names} <= set(found)
         assert {"val_profile_within_1m_full", "val_median_cm_full"} <= set(found)
         assert all(np.isfinite(value) for value in found.values())
-        assert {path.name for path in tmp_path.iterdir()} == {"validation.npz", "unfamiliar.npz"}
+        assert {path.name for path in tmp_path.iterdir()} == {"validation.npz", "heldout.npz"}
         # The second time the pictures come from the files.
         before = [path.stat().st_mtime_ns for path in sorted(tmp_path.iterdir())]
         assert scores() == found

@@ -13,12 +13,6 @@ from PIL import Image, ImageColor
 from lalaloc_core.cli import main
 from lalaloc_core.draw.canvas import FOUND, TRUE
 from lalaloc_core.errors import RunError
-from lalaloc_core.evaluate.runs.failures import Outcome, is_symmetric, outcomes, symmetric_by_chance
-from lalaloc_core.evaluate.runs.predictions import Pose, Prediction, RunFolder, RunInfo
-from lalaloc_core.evaluate.runs.run import run_evaluation
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.poses import PredictedProfile, Query
-from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.evaluate.report.sheets import PER_SHEET, Thumbnail, draw_sheet
 from lalaloc_core.evaluate.report.worst import (
     SUMMARY_FILE,
@@ -27,6 +21,12 @@ from lalaloc_core.evaluate.report.worst import (
     summarise,
     write_worst,
 )
+from lalaloc_core.evaluate.runs.failures import Outcome, is_symmetric, outcomes, symmetric_by_chance
+from lalaloc_core.evaluate.runs.predictions import Pose, Prediction, RunFolder, RunInfo
+from lalaloc_core.evaluate.runs.run import run_evaluation
+from lalaloc_core.localise.camera_height import CameraHeight
+from lalaloc_core.localise.poses import PredictedProfile, Query
+from lalaloc_core.render.profile import wall_profile
 from tests.strategies import plan_of, rectangle
 
 # A room from (0, 0) to (6, 4) whose camera stands in its lower left corner.

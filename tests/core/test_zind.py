@@ -17,10 +17,10 @@ import shapely
 from hypothesis import given, settings
 
 from lalaloc_core.conventions import column_azimuths, row_elevations, wrap_angle
-from lalaloc_core.learn.data.dataset import Appearance, load_scenes
-from lalaloc_core.learn.data.zind import Zind
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.learn.data.dataset import Appearance, load_scenes
+from lalaloc_core.learn.data.zind import Zind
 from lalaloc_core.render.sampling import random_poses
 from tests.polygons import same_ring
 from tests.strategies import crooked_flat, plans, seeds

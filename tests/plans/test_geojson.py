@@ -10,8 +10,8 @@ import numpy as np
 import pyproj
 import pytest
 
-from lalaloc_core.floorplan.earth import LocalFrame
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan.earth import LocalFrame
 from lalaloc_core.importers import ImportLimits, ImportOptions, import_plan, import_plans
 from tests.plans.conftest import lines, shapes
 

@@ -16,9 +16,9 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from lalaloc_core.localise.bundle import Bundle, write_manifest
 from lalaloc_core.errors import InvalidPoseError
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.bundle import Bundle, write_manifest
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.retrieval import build_grid
 from service.bounded_cache import BoundedCache

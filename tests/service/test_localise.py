@@ -18,9 +18,9 @@ import numpy as np
 import pytest
 from shapely import Point
 
-from lalaloc_core.localise.bundle import Bundle, ConfidenceModel, LogisticModel, write_manifest
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise import pipeline
+from lalaloc_core.localise.bundle import Bundle, ConfidenceModel, LogisticModel, write_manifest
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.retrieval import build_grid

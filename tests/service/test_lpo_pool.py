@@ -72,10 +72,10 @@ def _workers() -> list[int]:
 
 @pytest.mark.parametrize("by_profile", [False, True])
 def test_a_worker_gives_what_the_optimiser_gives(pool: LpoPool, bundle: Bundle, by_profile: bool) -> None:
-    from lalaloc_core.localise.optimise import LatentPoseOptimiser
+    from lalaloc_core.localise.optimise import PoseRefiner
 
     job = warm_up_job(bundle.manifest, optimise_heading=True, by_profile=by_profile)
-    expected = LatentPoseOptimiser.from_bundle(bundle).refine(job)
+    expected = PoseRefiner.from_bundle(bundle).refine(job)
     result = _refine(pool, job, 20.0)
     assert result is not None
     np.testing.assert_allclose(result.position_m, expected.position_m, atol=1e-4)

@@ -25,7 +25,7 @@ from sqlalchemy import delete, event, func, select, update
 
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.poses import LatentGrid
+from lalaloc_core.localise.poses import PoseGrid
 from lalaloc_core.render.sampling import PoseSet
 from service.errors import (
     DamagedDataError,
@@ -111,18 +111,18 @@ def _key(revision_id: str, **changes: object) -> GridKey:
     return GridKey(**values)  # pyright: ignore[reportArgumentType]
 
 
-def _grid(seed: int = 0, count: int = 7) -> LatentGrid:
+def _grid(seed: int = 0, count: int = 7) -> PoseGrid:
     rng = np.random.default_rng(seed)
     poses = PoseSet(rng.normal(size=(count, 2)), rng.integers(0, 2, count))
     latents, profile_m = rng.normal(size=(count, 128)), rng.uniform(0.3, 6.0, (count, 32))
-    return LatentGrid(poses, latents.astype(np.float32), profile_m.astype(np.float32), 0.5, 1.5)
+    return PoseGrid(poses, latents.astype(np.float32), profile_m.astype(np.float32), 0.5, 1.5)
 
 
-def _put(store: Store, key: GridKey, grid: LatentGrid | None = None, keep: int = 8) -> bool:
+def _put(store: Store, key: GridKey, grid: PoseGrid | None = None, keep: int = 8) -> bool:
     return store.grids.put(key, grid or _grid(), keep=keep, always_keep_mm=1500)
 
 
-def _assert_same(found: LatentGrid | None, grid: LatentGrid) -> None:
+def _assert_same(found: PoseGrid | None, grid: PoseGrid) -> None:
     assert found is not None
     assert found.latents is not None
     np.testing.assert_array_equal(found.latents, grid.latents)

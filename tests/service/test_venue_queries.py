@@ -11,7 +11,7 @@ from typing import Any
 import httpx
 import pytest
 
-from lalaloc_core.localise.poses import LatentGrid
+from lalaloc_core.localise.poses import PoseGrid
 from service.grids import builder
 from service.query import venue_plans
 from service.storage.stored_grids import StoredGrids
@@ -250,7 +250,7 @@ def test_plans_that_are_not_ready_are_told(
 ) -> None:
     go_on, embed = threading.Event(), builder.embed
 
-    def held(*arguments: Any, **options: Any) -> LatentGrid:
+    def held(*arguments: Any, **options: Any) -> PoseGrid:
         go_on.wait(60.0)
         return embed(*arguments, **options)
 

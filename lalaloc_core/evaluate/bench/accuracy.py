@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from lalaloc_core.localise.bundle import Bundle
+from lalaloc_core.evaluate.methods.method import QueryKind
 from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
 from lalaloc_core.evaluate.runs.run import run_evaluation
 from lalaloc_core.evaluate.runs.score import StageScores, score
-from lalaloc_core.evaluate.methods.method import QueryKind
+from lalaloc_core.localise.bundle import Bundle
 
 # Homes of what is not among the first figures, and of the comparison of evidence, which asks the same six times.
 _MAX_HOMES_OF_MINOR = 100
@@ -23,7 +23,7 @@ _MAX_HOMES_PER_EVIDENCE = 50
 class Benchmark:
     """What is asked of the model.
 
-    `unfamiliar`: in homes that another generator than training's drew; `copies`: in plans of four copies of a home that
+    `heldout`: in homes that another generator than training's drew; `copies`: in plans of four copies of a home that
     differ in their doors.
 
     Of a `minor` benchmark fewer homes are asked. `settings` are of the method "lalaloc".
@@ -32,7 +32,7 @@ class Benchmark:
     kind: QueryKind = "panorama"
     furniture: str = "full"
     heading_known: bool = True
-    unfamiliar: bool = False
+    heldout: bool = False
     copies: bool = False
     settings: Mapping[str, Any] = field(default_factory=dict)
     minor: bool = False
@@ -43,8 +43,8 @@ _BENCHMARKS = {
     "panorama_full": Benchmark(),
     "panorama_empty": Benchmark(furniture="empty", minor=True),
     "panorama_full_unknown_heading": Benchmark(heading_known=False),
-    "out_of_family_full": Benchmark(unfamiliar=True, minor=True),
-    "out_of_family_empty": Benchmark(unfamiliar=True, furniture="empty", minor=True),
+    "out_of_family_full": Benchmark(heldout=True, minor=True),
+    "out_of_family_empty": Benchmark(heldout=True, furniture="empty", minor=True),
 }
 
 
@@ -76,8 +76,8 @@ def answers_to(bundle: Bundle, benchmark: Benchmark, homes: int, textures: Path 
     """The answers to a benchmark, 4 queries in each of some homes."""
     homes = min(homes, _MAX_HOMES_OF_MINOR) if benchmark.minor else homes
     generated: dict[str, Any] = {"homes": homes, "furniture": benchmark.furniture}
-    if benchmark.unfamiliar:
-        generated["generator"] = "unfamiliar"
+    if benchmark.heldout:
+        generated["generator"] = "heldout"
     else:
         generated["textures"] = None if textures is None else str(textures)
     if benchmark.copies:
@@ -86,7 +86,7 @@ def answers_to(bundle: Bundle, benchmark: Benchmark, homes: int, textures: Path 
         label=f"{benchmark.kind}, {benchmark.furniture}",
         method="lalaloc",
         kind=benchmark.kind,
-        dataset="out-of-family homes" if benchmark.unfamiliar else "generated homes",
+        dataset="out-of-family homes" if benchmark.heldout else "generated homes",
         split="test",
         settings=dict(benchmark.settings),
         generated=generated,

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from lalaloc_core.learn.azimuth_metrics import AzimuthMeasures, measure_azimuths, summarise_azimuths
-from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.conventions import OPENING_CLASSES
-from lalaloc_core.learn.data.dataset import Camera, Dataset
-from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
 from lalaloc_core.evaluate.runs.photograph_reading import read_azimuths
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.learn.azimuth_metrics import AzimuthMeasures, measure_azimuths, summarise_azimuths
+from lalaloc_core.learn.data.dataset import Camera, Dataset
+from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
+from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.render.layout import layout_view
 
@@ -25,11 +25,11 @@ _MAX_HOMES = 100
 def bench_azimuths(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
     """Errors of walls and openings on the furnished test split and out-of-family, 4 panoramas in each of some homes."""
     # Traced by embree, which only the extra `oracle` brings.
-    from lalaloc_core.learn.data.synthetic.unfamiliar import UnfamiliarScenes
+    from lalaloc_core.learn.data.synthetic.heldout import HeldoutScenes
 
     encoders = Encoders(bundle, threads=1)
     homes = min(homes, _MAX_HOMES)
-    datasets = {"test": GeneratedScenes(homes=homes, textures=textures), "out_of_family": UnfamiliarScenes(homes=homes)}
+    datasets = {"test": GeneratedScenes(homes=homes, textures=textures), "out_of_family": HeldoutScenes(homes=homes)}
     return {family: azimuth_figures(encoders, dataset) for family, dataset in datasets.items()}
 
 

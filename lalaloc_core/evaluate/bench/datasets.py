@@ -10,11 +10,11 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from lalaloc_core.localise.bundle import Bundle
-from lalaloc_core.learn.data.structured3d import Structured3D
-from lalaloc_core.learn.data.synthetic.writing import PICTURES_PER_ROOM, Synthesis, share_out, synthesise
 from lalaloc_core.evaluate.runs.predictions import RunFolder, RunInfo
 from lalaloc_core.evaluate.runs.run import run_evaluation
+from lalaloc_core.learn.data.structured3d import Structured3D
+from lalaloc_core.learn.data.synthetic.writing import PICTURES_PER_ROOM, Synthesis, share_out, synthesise
+from lalaloc_core.localise.bundle import Bundle
 
 _SCENES = 48
 _PANORAMA_HEIGHT = 256

@@ -9,16 +9,16 @@ from typing import Any
 import numpy as np
 
 from lalaloc_core.evaluate.bench.homes import home_of_area
-from lalaloc_core.localise.bundle import Bundle
-from lalaloc_core.learn.data.dataset import Camera
-from lalaloc_core.learn.data.synthetic.generated import RenderedPhotograph, RendererCache
-from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.evaluate.methods.icp import Icp
 from lalaloc_core.evaluate.methods.lalaloc import LaLaLoc, local_refiner
 from lalaloc_core.evaluate.methods.method import Method, Question
-from lalaloc_core.render.sampling import pose_grid
+from lalaloc_core.learn.data.dataset import Camera
+from lalaloc_core.learn.data.synthetic.generated import RenderedPhotograph, RendererCache
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.shots import sample_shots
+from lalaloc_core.localise.bundle import Bundle
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.render.sampling import pose_grid
 
 _QUERIES = 5
 _GRID_STEP_M = 0.5

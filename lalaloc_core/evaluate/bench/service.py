@@ -20,10 +20,10 @@ import numpy as np
 from PIL import Image
 
 from lalaloc_core.evaluate.bench.homes import home_of_area
-from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, sample_shots
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
+from lalaloc_core.localise.bundle import Bundle
 
 _REQUESTS = 40
 _STARTUP_SECONDS = 60.0

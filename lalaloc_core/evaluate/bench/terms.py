@@ -30,20 +30,20 @@ _HEADINGS = {"known_heading": True, "unknown_heading": False}
 def bench_terms(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
     """Accuracy with and without each term, heading known and unknown, on the test split and out-of-family."""
     return {
-        family: _rows(bundle, TERMS, homes, textures, unfamiliar=unfamiliar)
-        for family, unfamiliar in (("test", False), ("out_of_family", True))
+        family: _rows(bundle, TERMS, homes, textures, heldout=heldout)
+        for family, heldout in (("test", False), ("out_of_family", True))
     }
 
 
 def bench_heights(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
     """Accuracy on the test split at camera heights that are told right, wrong and not at all."""
-    return {"test": _rows(bundle, HEIGHTS, homes, textures, unfamiliar=False)}
+    return {"test": _rows(bundle, HEIGHTS, homes, textures, heldout=False)}
 
 
 def bench_copies(bundle: Bundle, homes: int, textures: Path | None) -> dict[str, Any]:
     """Which of four copies of a home that differ in where their doors are, with and without openings."""
     rows = {name: TERMS[name] for name in ("all", "without_openings")}
-    return {"test": _rows(bundle, rows, homes, textures, unfamiliar=False, copies=True)}
+    return {"test": _rows(bundle, rows, homes, textures, heldout=False, copies=True)}
 
 
 def _rows(
@@ -52,7 +52,7 @@ def _rows(
     homes: int,
     textures: Path | None,
     *,
-    unfamiliar: bool,
+    heldout: bool,
     copies: bool = False,
 ) -> dict[str, Any]:
     found: dict[str, Any] = {}
@@ -62,9 +62,9 @@ def _rows(
             benchmark = Benchmark(
                 settings=settings,
                 heading_known=known,
-                unfamiliar=unfamiliar,
+                heldout=heldout,
                 copies=copies,
-                minor=unfamiliar or copies,
+                minor=heldout or copies,
             )
             found[heading][name] = summary_of(answers_to(bundle, benchmark, homes, textures))
     return found

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.evaluate.methods.method import Question
+from lalaloc_core.floorplan import FloorPlan
 
 # Queries come scene by scene, and cameras of a scene often share a height: a few are enough.
 GRIDS_CACHED = 4

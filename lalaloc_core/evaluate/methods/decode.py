@@ -13,14 +13,14 @@ import torch
 from jaxtyping import Float
 from torch.nn import functional
 
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.evidence import EvidenceConfig
-from lalaloc_core.localise.optimise import LpoConfig
-from lalaloc_core.localise.pipeline import LocaliseConfig, StageClock, localise
-from lalaloc_core.localise.refinement import refinement_job
 from lalaloc_core.evaluate.methods.alignment import DepthAligner
 from lalaloc_core.evaluate.methods.lalaloc import LaLaLoc, encode, found_pose, grid_index, read_image
 from lalaloc_core.evaluate.methods.method import Answer, Question
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.matching_cost import MatchingConfig
+from lalaloc_core.localise.optimise import LpoConfig
+from lalaloc_core.localise.pipeline import LocaliseConfig, StageClock, localise
+from lalaloc_core.localise.refinement import refinement_job
 from lalaloc_core.nets.decoder import DECODED_HEIGHT, DECODED_WIDTH, LayoutDecoder
 
 
@@ -37,7 +37,7 @@ class VdrDecode:
     ) -> None:
         self._lalaloc = LaLaLoc(encoders, refine="vdr")
         # What the paper compares with is the latent alone.
-        self._config = replace(config or LocaliseConfig(), evidence=EvidenceConfig(use_profile=False))
+        self._config = replace(config or LocaliseConfig(), matching=MatchingConfig(use_profile=False))
         self._decoder = decoder.eval().requires_grad_(False)
         # Training shows the decoder every n-th column of the encoder's wall profile.
         columns = encoders.manifest.profile_columns
@@ -57,7 +57,7 @@ class VdrDecode:
         with clock.stage("decode"):
             start = found.candidates[0]
             job = refinement_job(
-                plan, query, [start], grid.camera_height_m, encoders.manifest.evidence, self._config.evidence
+                plan, query, [start], grid.camera_height_m, encoders.manifest.evidence, self._config.matching
             )
             result = self._aligner.refine(replace(job, targets=self.decode(job.targets)))
         aligned = replace(

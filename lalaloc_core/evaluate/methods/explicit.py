@@ -17,16 +17,16 @@ from cachetools import LRUCache, cachedmethod
 from jaxtyping import Float, UInt8
 
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.optimise import LpoConfig
-from lalaloc_core.localise.pipeline import LocaliseConfig, StageClock
-from lalaloc_core.localise.poses import RefinementJob
-from lalaloc_core.localise.vogel import disc_poses
 from lalaloc_core.evaluate.methods.alignment import DepthAligner
 from lalaloc_core.evaluate.methods.caching import GRIDS_CACHED, grid_key
 from lalaloc_core.evaluate.methods.lalaloc import read_image
 from lalaloc_core.evaluate.methods.method import Answer, Found, Question
 from lalaloc_core.evaluate.methods.similarity import layouts_at
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.optimise import LpoConfig
+from lalaloc_core.localise.pipeline import LocaliseConfig, StageClock
+from lalaloc_core.localise.poses import RefinementJob
+from lalaloc_core.localise.vogel import disc_poses
 from lalaloc_core.render.depth import layout_depth
 from lalaloc_core.render.sampling import PoseSet
 

@@ -24,10 +24,10 @@ from scipy.spatial import KDTree
 
 from lalaloc_core.conventions import column_azimuths, row_elevations, wrap_angle
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.pipeline import StageClock
 from lalaloc_core.evaluate.methods.caching import GRIDS_CACHED, plan_key
 from lalaloc_core.evaluate.methods.method import Answer, Found, Question
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.pipeline import StageClock
 
 
 @dataclass(frozen=True, kw_only=True)

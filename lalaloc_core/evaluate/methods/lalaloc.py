@@ -13,13 +13,15 @@ import torch
 from cachetools import LRUCache, cachedmethod
 from jaxtyping import UInt8
 
-from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M, TWO_PI
+from lalaloc_core.evaluate.methods.caching import GRIDS_CACHED, grid_key
+from lalaloc_core.evaluate.methods.method import Answer, Found, FoundCandidate, Question
 from lalaloc_core.floorplan import DEFAULT_CAMERA_HEIGHT_M
+from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.camera_height import DEFAULT_STD_M, CameraHeight
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.evidence import EvidenceConfig
-from lalaloc_core.localise.optimise import LatentPoseOptimiser, LpoConfig
+from lalaloc_core.localise.matching_cost import MatchingConfig
+from lalaloc_core.localise.optimise import LpoConfig, PoseRefiner
 from lalaloc_core.localise.pipeline import (
     LocaliseConfig,
     Refine,
@@ -28,9 +30,7 @@ from lalaloc_core.localise.pipeline import (
     localise,
     panorama_heading,
 )
-from lalaloc_core.localise.poses import Candidate, LatentGrid, PredictedProfile, Query
-from lalaloc_core.evaluate.methods.caching import GRIDS_CACHED, grid_key
-from lalaloc_core.evaluate.methods.method import Answer, Found, FoundCandidate, Question
+from lalaloc_core.localise.poses import Candidate, PoseGrid, PredictedProfile, Query
 from lalaloc_core.render.sampling import PoseSet
 
 # Hypotheses of a layout query with unknown heading, where no ring says how many there are.
@@ -83,7 +83,7 @@ class LaLaLoc:
         self._refiner = refiner
         # What every stage found is what evaluations report.
         self._config = dataclasses.replace(config or LocaliseConfig(), every_stage=True)
-        self._grids: LRUCache[Any, LatentGrid] = LRUCache(GRIDS_CACHED)
+        self._grids: LRUCache[Any, PoseGrid] = LRUCache(GRIDS_CACHED)
 
     def answer(self, question: Question) -> Answer:
         """Encode the query and run the service's search."""
@@ -105,7 +105,7 @@ class LaLaLoc:
         )
         signals: dict[str, dict[str, float]] = {stage: dataclasses.asdict(one) for stage, one in found.signals.items()}
         # Confidence is fitted on photographs that are compared as the service does.
-        calibrated = question.kind == "panorama" and self._config.evidence == EvidenceConfig()
+        calibrated = question.kind == "panorama" and self._config.matching == MatchingConfig()
         model = self.encoders.manifest.confidence if calibrated else None
         return Answer(
             stages={stage: found_pose(found.query, candidate) for stage, candidate in found.best.items()},
@@ -123,17 +123,17 @@ class LaLaLoc:
         )
 
     @cachedmethod(attrgetter("_grids"), key=grid_key)
-    def grid(self, question: Question) -> LatentGrid:
+    def grid(self, question: Question) -> PoseGrid:
         """Latents of the question's grid at its stated camera height; the last few are cached."""
         height_m, poses = self._stated.of(question).height_m, question.grid
         latents, profile_m = self.encoders.poses(question.plan, poses, np.zeros(len(poses)), height_m)
-        return LatentGrid(poses, latents, profile_m, question.grid_step_m, height_m)
+        return PoseGrid(poses, latents, profile_m, question.grid_step_m, height_m)
 
 
 def local_refiner(bundle: Bundle, config: LpoConfig | None = None) -> Refiner:
     """LPO in this process. Sets torch to one thread: its tensors are too small to share, and waiting costs more."""
     torch.set_num_threads(1)
-    return LatentPoseOptimiser.from_bundle(bundle, config).refine
+    return PoseRefiner.from_bundle(bundle, config).refine
 
 
 def read_image(encoders: Encoders, question: Question) -> UInt8[np.ndarray, "h w 3"] | None:
@@ -181,6 +181,6 @@ def found_pose(query: Query, candidate: Candidate) -> Found:
     )
 
 
-def grid_index(grid: LatentGrid, candidate: Candidate) -> int:
+def grid_index(grid: PoseGrid, candidate: Candidate) -> int:
     """Number of the grid pose that a candidate of retrieval is."""
     return int(np.linalg.norm(grid.poses.position_m - candidate.position_m, axis=1).argmin())

@@ -9,9 +9,9 @@ from typing import Literal, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from lalaloc_core.learn.data.dataset import Camera, Photograph
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.learn.data.dataset import Camera, Photograph
 from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.render.sampling import PoseSet
 

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from cachetools import LRUCache, cachedmethod
 
-from lalaloc_core.localise.pipeline import StageClock
 from lalaloc_core.evaluate.methods.caching import GRIDS_CACHED, grid_key
 from lalaloc_core.evaluate.methods.method import Answer, Found, Question
 from lalaloc_core.evaluate.methods.similarity import LayoutGrid, LayoutMetric, layout_grid, true_layout
+from lalaloc_core.localise.pipeline import StageClock
 
 
 class SimilarityRetrieval:

@@ -17,8 +17,8 @@ from scipy.spatial import KDTree
 
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.evaluate.methods.method import Question
+from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.render.depth import back_project, layout_depth
 from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.render.sampling import PoseSet

@@ -11,8 +11,6 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from lalaloc_core.evaluate.runs.failures import Outcome, count_outcomes
-from lalaloc_core.evaluate.runs.score import position_errors_m
 from lalaloc_core.evaluate.report.figures import (
     MUTED,
     PAPER,
@@ -25,6 +23,8 @@ from lalaloc_core.evaluate.report.figures import (
 )
 from lalaloc_core.evaluate.report.reading import Run
 from lalaloc_core.evaluate.report.times import TOTAL, stage_times
+from lalaloc_core.evaluate.runs.failures import Outcome, count_outcomes
+from lalaloc_core.evaluate.runs.score import position_errors_m
 
 CURVE_LIMITS_M = (0.001, 20.0)
 CONFIDENCE_BINS = 20

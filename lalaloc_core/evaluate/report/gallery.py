@@ -7,15 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lalaloc_core.learn.data.dataset import Camera, Scene
 from lalaloc_core.draw.heat import Cells
 from lalaloc_core.errors import LaLaLocError
-from lalaloc_core.evaluate.runs.factories import build_dataset, choose_appearance
-from lalaloc_core.evaluate.runs.failures import Outcome, outcomes
-from lalaloc_core.evaluate.runs.predictions import Prediction, RunInfo
-from lalaloc_core.evaluate.runs.score import heading_errors_deg, position_errors_m
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.evidence import latent_distances
 from lalaloc_core.evaluate.methods.lalaloc import encode, read_image
 from lalaloc_core.evaluate.methods.method import Question
 from lalaloc_core.evaluate.methods.similarity import ChamferGrid, true_layout
@@ -29,6 +22,13 @@ from lalaloc_core.evaluate.report.pictures import (
 )
 from lalaloc_core.evaluate.report.reading import Run
 from lalaloc_core.evaluate.report.reopening import ask_again, find_camera, open_model
+from lalaloc_core.evaluate.runs.factories import build_dataset, choose_appearance
+from lalaloc_core.evaluate.runs.failures import Outcome, outcomes
+from lalaloc_core.evaluate.runs.predictions import Prediction, RunInfo
+from lalaloc_core.evaluate.runs.score import heading_errors_deg, position_errors_m
+from lalaloc_core.learn.data.dataset import Camera, Scene
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.matching_cost import latent_distances
 
 PER_GROUP = 3
 BEST, MEDIAN, WORST, MISALIGNED = "best", "median", "worst", "wrong alignment"

@@ -8,12 +8,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from lalaloc_core.files import atomic_write
 from lalaloc_core.evaluate.report.charts import draw_charts
 from lalaloc_core.evaluate.report.figures import Chart
 from lalaloc_core.evaluate.report.gallery import Gallery, build_gallery
 from lalaloc_core.evaluate.report.page import render_page
 from lalaloc_core.evaluate.report.reading import Run, open_runs
+from lalaloc_core.files import atomic_write
 
 # Of all galleries together; as text they take a third more, and the page is to stay below 5 MB.
 GALLERY_BYTES = 3_400_000

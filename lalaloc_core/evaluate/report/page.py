@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from lalaloc_core.evaluate.runs.failures import ALIGNMENT_LIMIT_M, Outcome
-from lalaloc_core.evaluate.runs.predictions import RunInfo
 from lalaloc_core.evaluate.report import tables
 from lalaloc_core.evaluate.report.figures import Chart
 from lalaloc_core.evaluate.report.gallery import Gallery
 from lalaloc_core.evaluate.report.reading import Run
+from lalaloc_core.evaluate.runs.failures import ALIGNMENT_LIMIT_M, Outcome
+from lalaloc_core.evaluate.runs.predictions import RunInfo
 
 _GROUPS = {
     "best": "Best",

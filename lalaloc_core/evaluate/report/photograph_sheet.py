@@ -10,12 +10,12 @@ from jaxtyping import Int
 from PIL import Image
 
 from lalaloc_core.conventions import OPENING_CLASSES
-from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M
 from lalaloc_core.draw.photograph import Stroke, draw_strokes, wall_line
-from lalaloc_core.evaluate.runs.galleries import GalleryAnswer, describe_answers
-from lalaloc_core.evaluate.runs.photograph_reading import ReadPhotograph
 from lalaloc_core.evaluate.report.pictures import PREDICTED_COLOUR, TRUE_COLOUR
 from lalaloc_core.evaluate.report.sheets import Thumbnail, draw_sheet
+from lalaloc_core.evaluate.runs.galleries import GalleryAnswer, describe_answers
+from lalaloc_core.evaluate.runs.photograph_reading import ReadPhotograph
+from lalaloc_core.learn.data.annotations import CAMERA_HEIGHT_M
 
 _HEIGHT, _WIDTH = 256, 512
 CLASS_COLOURS = {"door": "#ff9f0a", "window": "#2f7bff", "passage": "#2bd158"}

@@ -13,11 +13,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lalaloc_core.learn.azimuth_metrics import ClassScores, summarise_azimuths
-from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.conventions import OPENING_CLASSES
-from lalaloc_core.learn.data.annotated import AnnotatedPhotographs
 from lalaloc_core.errors import InvalidInputError
+from lalaloc_core.evaluate.report.photograph_sheet import draw_photographs
+from lalaloc_core.evaluate.report.tables import percent
 from lalaloc_core.evaluate.runs.factories import describe_model
 from lalaloc_core.evaluate.runs.galleries import (
     GalleryAnswer,
@@ -29,9 +28,10 @@ from lalaloc_core.evaluate.runs.photograph_reading import ReadPhotograph, read_p
 from lalaloc_core.evaluate.runs.predictions import RunFolder, RunInfo, without_infinity
 from lalaloc_core.evaluate.runs.run import run_evaluation
 from lalaloc_core.files import atomic_write
+from lalaloc_core.learn.azimuth_metrics import ClassScores, summarise_azimuths
+from lalaloc_core.learn.data.annotated import AnnotatedPhotographs
+from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.evaluate.report.photograph_sheet import draw_photographs
-from lalaloc_core.evaluate.report.tables import percent
 
 FIGURES_FILE, SHEET_FILE = "photographs.json", "photographs.png"
 _HEADINGS = {"known": True, "unknown": False}

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lalaloc_core.evaluate.runs.failures import Outcome, count_outcomes
-from lalaloc_core.evaluate.runs.score import Estimate, SliceScores, StageScores
 from lalaloc_core.evaluate.report.charts import curves
 from lalaloc_core.evaluate.report.reading import Run
 from lalaloc_core.evaluate.report.times import stage_times
+from lalaloc_core.evaluate.runs.failures import Outcome, count_outcomes
+from lalaloc_core.evaluate.runs.score import Estimate, SliceScores, StageScores
 
 CURVE_POINTS_M = (0.01, 0.05, 0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 20.0)
 METRICS = ("median", "< 1 cm", "< 5 cm", "< 10 cm", "< 1 m", "right room", "heading")

@@ -17,22 +17,10 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
-from lalaloc_core.localise.bundle import EvidenceModel
 from lalaloc_core.conventions import TWO_PI, column_azimuths, heading_from_degrees
-from lalaloc_core.learn.data.dataset import Camera, Scene
 from lalaloc_core.draw.photograph import Stroke, draw_strokes, wall_line
 from lalaloc_core.errors import LaLaLocError, RunError
-from lalaloc_core.evaluate.runs.factories import build_dataset, choose_appearance
-from lalaloc_core.evaluate.runs.failures import Outcome, is_symmetric, outcomes, symmetric_by_chance
-from lalaloc_core.evaluate.runs.predictions import Pose, Prediction, RunFolder, RunInfo
-from lalaloc_core.evaluate.runs.score import position_errors_m
-from lalaloc_core.files import atomic_write
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.evidence import Evidence, EvidenceConfig
-from lalaloc_core.localise.layouts import layouts_at
-from lalaloc_core.localise.poses import Query
 from lalaloc_core.evaluate.methods.lalaloc import encode, read_image
-from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.evaluate.report.pictures import (
     FOUND_COLOUR,
     PREDICTED_COLOUR,
@@ -48,6 +36,18 @@ from lalaloc_core.evaluate.report.sheets import (
     draw_sheet,
 )
 from lalaloc_core.evaluate.report.tables import distance, percent
+from lalaloc_core.evaluate.runs.factories import build_dataset, choose_appearance
+from lalaloc_core.evaluate.runs.failures import Outcome, is_symmetric, outcomes, symmetric_by_chance
+from lalaloc_core.evaluate.runs.predictions import Pose, Prediction, RunFolder, RunInfo
+from lalaloc_core.evaluate.runs.score import position_errors_m
+from lalaloc_core.files import atomic_write
+from lalaloc_core.learn.data.dataset import Camera, Scene
+from lalaloc_core.localise.bundle import MatchingWeights
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.layouts import layouts_at
+from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost
+from lalaloc_core.localise.poses import Query
+from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.render.sampling import PoseSet
 
 SUMMARY_FILE = "worst.json"
@@ -64,7 +64,7 @@ class WorstQuery:
         symmetric: the right room, taken for its mirror image; see `failures.is_symmetric`.
         symmetric_by_chance: how probable that is for a wrong position anywhere in the room.
         true_cost, found_cost: how badly the layouts of the true and of the found pose fit the predicted wall profile,
-            as in `localise.evidence`, or, for a layout query, the true one; None where the model predicts none. A true
+            as in `localise.matching_cost`, or, for a layout query, the true one; None where the model predicts none. A true
             pose that costs less was missed by the search; one that costs more is no longer to be found by any.
         distance_bias: by how much walls are predicted too far (as a share; negative: too near), in the median azimuth.
     """
@@ -273,14 +273,14 @@ def _layout(scene: Scene, pose: Pose, camera_height_m: float, colour: str, width
     return Stroke(lines, colour, width, width + 1.0)
 
 
-def _cost(query: Query, scene: Scene, pose: Pose, weights: EvidenceModel) -> float:
+def _cost(query: Query, scene: Scene, pose: Pose, weights: MatchingWeights) -> float:
     """How badly the layout of a pose fits what is predicted."""
     assert query.profile is not None
-    config = EvidenceConfig()
+    config = MatchingConfig()
     poses = PoseSet(np.array([[pose.x_m, pose.y_m]]), np.array([pose.room_index]))
     heading = np.array([heading_from_degrees(pose.heading_deg) - query.roll[0]])
     layouts = layouts_at(scene.plan, poses, heading, query.profile.log_m.shape[1])
-    cost, _ = Evidence(scene.plan, query, config.fine_reach_m, weights, config).costs(layouts, np.array([0]))
+    cost, _ = MatchingCost(scene.plan, query, config.fine_reach_m, weights, config).costs(layouts, np.array([0]))
     return float(cost[0, 0])
 
 

@@ -14,17 +14,17 @@ from typing import Any, Literal, get_args
 
 import torch
 
-from lalaloc_core.localise.bundle import MANIFEST_NAME, Bundle
-from lalaloc_core.learn.data.dataset import Dataset
 from lalaloc_core.errors import ConfigError
+from lalaloc_core.learn.data.dataset import Dataset
 from lalaloc_core.learn.export.run import export_run
-from lalaloc_core.nets.paper_encoders import PaperConfig
-from lalaloc_core.render.sampling import TripletSampling
 from lalaloc_core.learn.training.checkpoint import Checkpoint
 from lalaloc_core.learn.training.config import ImageStageConfig, LayoutStageConfig, OptimiserConfig, TrainConfig
 from lalaloc_core.learn.training.data import TrainingData
 from lalaloc_core.learn.training.presets import PRESETS
 from lalaloc_core.learn.training.run import train_end_to_end, train_image, train_layout
+from lalaloc_core.localise.bundle import MANIFEST_NAME, Bundle
+from lalaloc_core.nets.paper_encoders import PaperConfig
+from lalaloc_core.render.sampling import TripletSampling
 
 Budget = Literal["small", "full"]
 BUDGETS: tuple[Budget, ...] = get_args(Budget)

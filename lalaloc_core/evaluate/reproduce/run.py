@@ -19,16 +19,16 @@ from pathlib import Path
 
 import torch
 
-from lalaloc_core.learn.data.dataset_detection import open_dataset
+from lalaloc_core.evaluate.reproduce.ablations import train_ablation
+from lalaloc_core.evaluate.reproduce.result import Budget, Figure, RowResult, TableResult
+from lalaloc_core.evaluate.reproduce.result_tables import draw_vogel_samples, markdown
+from lalaloc_core.evaluate.reproduce.table import SHIPPED, Column, Row, RowQuery, Table
 from lalaloc_core.evaluate.runs.factories import choose_appearance, describe_model
 from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
 from lalaloc_core.evaluate.runs.run import run_evaluation
 from lalaloc_core.evaluate.runs.score import Estimate, Scores, score
 from lalaloc_core.files import atomic_write
-from lalaloc_core.evaluate.reproduce.ablations import train_ablation
-from lalaloc_core.evaluate.reproduce.result import Budget, Figure, RowResult, TableResult
-from lalaloc_core.evaluate.reproduce.result_tables import draw_vogel_samples, markdown
-from lalaloc_core.evaluate.reproduce.table import SHIPPED, Column, Row, RowQuery, Table
+from lalaloc_core.learn.data.dataset_detection import open_dataset
 
 # Queries per row: enough to tell methods apart at a small budget, and few enough that times are taken one at a time.
 _SMALL_LIMIT = 75

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from lalaloc_core.learn.data.dataset import Split
-from lalaloc_core.evaluate.runs.predictions import MethodName
 from lalaloc_core.evaluate.methods.method import QueryKind
+from lalaloc_core.evaluate.runs.predictions import MethodName
+from lalaloc_core.learn.data.dataset import Split
 
 # What the columns of tables are called: fields of `evaluation.score.Scores` and of its `StageScores`, or seconds per
 # query of a stage ("seconds:vdr"), of all together ("seconds").

@@ -8,9 +8,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from lalaloc_core.evaluate.runs.predictions import MethodName
 from lalaloc_core.evaluate.methods.method import QueryKind
 from lalaloc_core.evaluate.reproduce.table import SHIPPED, Column, Row, RowQuery, Table
+from lalaloc_core.evaluate.runs.predictions import MethodName
 
 _ACCURACY = ("median_cm", "within_1cm", "within_5cm", "within_10cm", "within_1m")
 _RECALL = ("layout_recall", "pose_recall")

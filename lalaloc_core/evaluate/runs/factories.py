@@ -8,21 +8,8 @@ from typing import Any, Literal, TypeVar
 
 import torch
 
-from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.configuration import build_config
-from lalaloc_core.learn.data.dataset import Appearance, Dataset
-from lalaloc_core.learn.data.dataset_detection import open_dataset
-from lalaloc_core.learn.data.synthetic.copied import CopiedScenes
-from lalaloc_core.learn.data.synthetic.disturbed import DisturbedScenes
-from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
-from lalaloc_core.learn.data.synthetic.mismatched import MismatchedScenes
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.evaluate.runs.predictions import RunInfo
-from lalaloc_core.localise.camera_height import DEFAULT_STD_M
-from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.evidence import EvidenceConfig
-from lalaloc_core.localise.optimise import LpoConfig
-from lalaloc_core.localise.pipeline import LocaliseConfig, Refine
 from lalaloc_core.evaluate.methods.decode import VdrDecode
 from lalaloc_core.evaluate.methods.explicit import ExplicitLayout
 from lalaloc_core.evaluate.methods.icp import Icp
@@ -30,6 +17,19 @@ from lalaloc_core.evaluate.methods.lalaloc import LaLaLoc, StatedHeight, local_r
 from lalaloc_core.evaluate.methods.method import Method
 from lalaloc_core.evaluate.methods.oracle import PoseOracle, SimilarityRetrieval
 from lalaloc_core.evaluate.methods.similarity import LayoutMetric
+from lalaloc_core.evaluate.runs.predictions import RunInfo
+from lalaloc_core.learn.data.dataset import Appearance, Dataset
+from lalaloc_core.learn.data.dataset_detection import open_dataset
+from lalaloc_core.learn.data.synthetic.copied import CopiedScenes
+from lalaloc_core.learn.data.synthetic.disturbed import DisturbedScenes
+from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
+from lalaloc_core.learn.data.synthetic.mismatched import MismatchedScenes
+from lalaloc_core.localise.bundle import Bundle
+from lalaloc_core.localise.camera_height import DEFAULT_STD_M
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.matching_cost import MatchingConfig
+from lalaloc_core.localise.optimise import LpoConfig
+from lalaloc_core.localise.pipeline import LocaliseConfig, Refine
 from lalaloc_core.nets import load_decoder
 
 
@@ -56,7 +56,7 @@ class LaLaLocSettings:
     ceiling: bool = True
     room_type: bool = True
     see_through: bool = True
-    heading_doubt: float = EvidenceConfig.heading_doubt
+    heading_doubt: float = MatchingConfig.heading_doubt
     camera_height: Literal["stated", "unknown"] = "stated"
     camera_height_std_m: float = DEFAULT_STD_M
     camera_height_error_m: float = 0.0
@@ -87,11 +87,11 @@ def build_dataset(info: RunInfo) -> Dataset:
         return open_dataset(Path(info.data), info.data_format)
     arguments: dict[str, Any] = dict(info.generated or {})
     generator = arguments.pop("generator", "synth")
-    if generator == "unfamiliar":
+    if generator == "heldout":
         # Traced by embree, which only the extra `oracle` brings.
-        from lalaloc_core.learn.data.synthetic.unfamiliar import UnfamiliarScenes
+        from lalaloc_core.learn.data.synthetic.heldout import HeldoutScenes
 
-        return UnfamiliarScenes(**arguments)
+        return HeldoutScenes(**arguments)
     if arguments.get("textures") is not None:
         arguments["textures"] = Path(arguments["textures"])
     homes = GeneratedScenes(**arguments)
@@ -140,7 +140,7 @@ def _lalaloc(bundle: Bundle, encoders: Encoders, settings: LaLaLocSettings) -> L
         vdr_samples=settings.vdr_samples,
         vdr_candidates=settings.vdr_candidates,
         lpo_candidates=settings.lpo_candidates,
-        evidence=EvidenceConfig(
+        matching=MatchingConfig(
             use_profile=settings.evidence != "latent",
             latent_weight=1.0 if settings.evidence == "both" else 0.0,
             use_openings=settings.openings,

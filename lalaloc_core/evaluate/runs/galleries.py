@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lalaloc_core.learn.data.annotated import GalleryKey
-from lalaloc_core.learn.data.annotations import AnnotatedPhotograph
 from lalaloc_core.evaluate.runs.predictions import Prediction
 from lalaloc_core.evaluate.runs.score import expected_calibration_error, heading_errors_deg, position_errors_m
+from lalaloc_core.learn.data.annotated import GalleryKey
+from lalaloc_core.learn.data.annotations import AnnotatedPhotograph
 
 # A position is right within this distance, or within this share of the room's size (the root of its area).
 NEAR_M, NEAR_SHARE = 0.5, 0.1

@@ -20,10 +20,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from lalaloc_core.configuration import build_config
-from lalaloc_core.learn.data.dataset import Split
 from lalaloc_core.errors import ConfigError, RunError
-from lalaloc_core.files import atomic_write
 from lalaloc_core.evaluate.methods.method import QueryKind
+from lalaloc_core.files import atomic_write
+from lalaloc_core.learn.data.dataset import Split
 
 RUN_FILE = "run.json"
 PREDICTIONS_FILE = "predictions.jsonl"

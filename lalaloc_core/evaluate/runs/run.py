@@ -23,12 +23,12 @@ from tqdm import tqdm
 
 from lalaloc_core.configuration import build_config
 from lalaloc_core.conventions import heading_to_degrees
-from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, Scene, facts_of_photograph, load_scenes
 from lalaloc_core.errors import DatasetError, InvalidInputError, RunError
-from lalaloc_core.evaluate.runs.factories import build_dataset, build_method
-from lalaloc_core.evaluate.runs.predictions import Pose, PredictedCandidate, Prediction, RunFolder, RunInfo
 from lalaloc_core.evaluate.methods.method import Answer, Found, Method, Question
 from lalaloc_core.evaluate.methods.similarity import ChamferGrid, true_layout
+from lalaloc_core.evaluate.runs.factories import build_dataset, build_method
+from lalaloc_core.evaluate.runs.predictions import Pose, PredictedCandidate, Prediction, RunFolder, RunInfo
+from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, Scene, facts_of_photograph, load_scenes
 from lalaloc_core.render.sampling import PoseSet, pose_grid
 
 # What may differ when a run goes on: how it was called, how far it goes, and what it found out.

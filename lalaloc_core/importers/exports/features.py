@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from lalaloc_core.floorplan.earth import Anchor, LocalFrame
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan.earth import Anchor, LocalFrame
 
 # Nine decimals of a degree are a tenth of a millimetre.
 _DECIMALS = 9

@@ -17,8 +17,8 @@ from jaxtyping import Float
 from pyproj.exceptions import ProjError
 from shapely.geometry.base import BaseGeometry
 
-from lalaloc_core.floorplan.earth import LocalFrame, to_wgs84
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan.earth import LocalFrame, to_wgs84
 from lalaloc_core.importers.model.assemble import ImportedPlan, assemble, clean_name
 from lalaloc_core.importers.model.geometry import opening_line, polygons_of
 from lalaloc_core.importers.model.levels import chosen_levels

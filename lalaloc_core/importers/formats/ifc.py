@@ -15,8 +15,8 @@ import shapely
 from jaxtyping import Float
 from pyproj.exceptions import ProjError
 
-from lalaloc_core.floorplan.earth import Anchor, LocalFrame, to_wgs84
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan.earth import Anchor, LocalFrame, to_wgs84
 from lalaloc_core.importers.model.assemble import ImportedPlan, assemble
 from lalaloc_core.importers.model.geometry import opening_line, polygons_of
 from lalaloc_core.importers.model.levels import chosen_levels

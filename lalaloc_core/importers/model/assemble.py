@@ -12,9 +12,9 @@ import shapely
 from shapely import affinity
 from shapely.geometry.base import BaseGeometry
 
-from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_LIMITS, FloorPlan, PlanLimits, anchor_document
+from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.importers.model.checks import check_document
 from lalaloc_core.importers.model.geometry import polygons_of
 from lalaloc_core.importers.model.options import ImportOptions

@@ -20,12 +20,12 @@ from jaxtyping import Float, Int
 from PIL import Image, UnidentifiedImageError
 
 from lalaloc_core.conventions import OPENING_CLASSES, TWO_PI, wrap_angle
+from lalaloc_core.errors import DatasetError, InvalidFloorPlanError
+from lalaloc_core.floorplan import FloorPlan, room_type_of
 from lalaloc_core.learn.data.assembly import inside, is_number, read_json
 from lalaloc_core.learn.data.drawn_openings import DrawnOpening
 from lalaloc_core.learn.data.drawn_rooms import DrawnRoom, plan_of_rooms
 from lalaloc_core.learn.data.photographs import FilePhotograph
-from lalaloc_core.errors import DatasetError, InvalidFloorPlanError
-from lalaloc_core.floorplan import FloorPlan, room_type_of
 from lalaloc_core.render.profile import nearest_walls, wall_profile
 
 CAMERA_HEIGHT_M = 1.5

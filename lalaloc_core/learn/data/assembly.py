@@ -14,10 +14,10 @@ import shapely
 from jaxtyping import Float
 
 from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M, ROOM_TYPES
-from lalaloc_core.learn.data.drawn_openings import DrawnOpening, opening_entries
-from lalaloc_core.learn.data.polygon_rings import uncrossed
 from lalaloc_core.errors import DatasetError, InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_CAMERA_HEIGHT_M, DEFAULT_LIMITS, FloorPlan
+from lalaloc_core.learn.data.drawn_openings import DrawnOpening, opening_entries
+from lalaloc_core.learn.data.polygon_rings import uncrossed
 
 # An outline that crosses itself is a slip of the drawing when one simple part of it has nearly all of its floor.
 _MIN_SHARE_UNCROSSED = 0.9

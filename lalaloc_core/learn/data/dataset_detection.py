@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from lalaloc_core.errors import DatasetError
 from lalaloc_core.learn.data.annotated import AnnotatedPhotographs, annotation_files
 from lalaloc_core.learn.data.dataset import DATASET_FORMATS, Dataset
 from lalaloc_core.learn.data.folder import PLAN_FILE, OwnData
 from lalaloc_core.learn.data.structured3d import Structured3D
 from lalaloc_core.learn.data.zind import DATA_FILE, PARTITION_FILE, Zind
-from lalaloc_core.errors import DatasetError
 
 _STRUCTURED3D_SCENES = "scene_" + 5 * "[0-9]"
 

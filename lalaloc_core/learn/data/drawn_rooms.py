@@ -10,8 +10,8 @@ import shapely
 from jaxtyping import Float
 
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
-from lalaloc_core.learn.data.drawn_openings import DrawnOpening
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.learn.data.drawn_openings import DrawnOpening
 
 # Openings are drawn on their walls, but for rounding.
 _ON_THE_WALL_M = 0.01

@@ -22,11 +22,11 @@ import numpy as np
 import shapely
 
 from lalaloc_core.conventions import heading_from_degrees
+from lalaloc_core.errors import DatasetError, InvalidFloorPlanError
+from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.assembly import inside, pose_fault
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene, Split
 from lalaloc_core.learn.data.photographs import FilePhotograph
-from lalaloc_core.errors import DatasetError, InvalidFloorPlanError
-from lalaloc_core.floorplan import FloorPlan
 
 PLAN_FILE = "plan.json"
 POSES_FILE = "poses.csv"

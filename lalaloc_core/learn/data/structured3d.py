@@ -20,12 +20,12 @@ from typing import Literal
 import numpy as np
 
 from lalaloc_core.configuration import build_config
+from lalaloc_core.errors import ConfigError, DatasetError
 from lalaloc_core.learn.data.assembly import is_number, pose_fault, read_json
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Photograph, Scene, Split
 from lalaloc_core.learn.data.photographs import FilePhotograph
 from lalaloc_core.learn.data.structured3d_annotation import Annotation, read_annotation
 from lalaloc_core.learn.data.structured3d_splits import scene_numbers
-from lalaloc_core.errors import ConfigError, DatasetError
 
 ANNOTATION_FILE = "annotation_3d.json"
 RENDERING_FOLDER = "2D_rendering"

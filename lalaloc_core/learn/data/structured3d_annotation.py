@@ -22,11 +22,11 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
+from lalaloc_core.errors import DatasetError
+from lalaloc_core.floorplan import FloorPlan, room_type_of
 from lalaloc_core.learn.data.assembly import RoomOutline, assemble_plan, is_number, read_json
 from lalaloc_core.learn.data.drawn_openings import DrawnOpening
 from lalaloc_core.learn.data.polygon_rings import OpenRingError, chain_rings, signed_area
-from lalaloc_core.errors import DatasetError
-from lalaloc_core.floorplan import FloorPlan, room_type_of
 
 _MM_PER_M = 1000.0
 # Every other type is a kind of room.

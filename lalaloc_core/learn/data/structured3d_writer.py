@@ -18,8 +18,8 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from lalaloc_core.conventions import TWO_PI
-from lalaloc_core.learn.data.structured3d import ANNOTATION_FILE, PANORAMA_SIZE
 from lalaloc_core.floorplan import FloorPlan, Room
+from lalaloc_core.learn.data.structured3d import ANNOTATION_FILE, PANORAMA_SIZE
 from lalaloc_core.learn.synth.homes.openings import Opening
 
 _MM_PER_M = 1000.0

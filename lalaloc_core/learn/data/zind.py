@@ -23,12 +23,12 @@ import numpy as np
 from jaxtyping import Float
 
 from lalaloc_core.conventions import heading_from_degrees
+from lalaloc_core.errors import DatasetError
+from lalaloc_core.floorplan import FloorPlan, room_type_of
 from lalaloc_core.learn.data.assembly import RoomOutline, assemble_plan, inside, is_number, pose_fault, read_json
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene, Split
 from lalaloc_core.learn.data.drawn_openings import DrawnOpening
 from lalaloc_core.learn.data.photographs import FilePhotograph
-from lalaloc_core.errors import DatasetError
-from lalaloc_core.floorplan import FloorPlan, room_type_of
 
 DATA_FILE = "zind_data.json"
 PARTITION_FILE = "zind_partition.json"

@@ -20,6 +20,10 @@ import safetensors.torch
 import torch
 from torch import Tensor, nn
 
+from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
+from lalaloc_core.errors import ExportError
+from lalaloc_core.learn.training import losses
+from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.localise.bundle import (
     BUNDLE_FILES,
     DECODER_WEIGHTS,
@@ -33,15 +37,11 @@ from lalaloc_core.localise.bundle import (
     Manifest,
 )
 from lalaloc_core.localise.bundle import write_manifest as _write_manifest
-from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
-from lalaloc_core.errors import ExportError
 from lalaloc_core.nets import ImageEncoder, LayoutEncoder, paper_encoders, ring_image_encoder, trunk
 from lalaloc_core.nets.decoder import LayoutDecoder
 from lalaloc_core.nets.image_encoder import TrunkImageEncoder
 from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
 from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
-from lalaloc_core.learn.training import losses
-from lalaloc_core.learn.training.config import TrainConfig
 
 PARITY_TOLERANCE = 1e-4
 _PARITY_BATCH = 4

@@ -5,9 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from lalaloc_core.localise.bundle import IMAGE_WEIGHTS, LAYOUT_WEIGHTS, Bundle
 from lalaloc_core.learn.export.bundle_export import export_again, export_bundle
-from lalaloc_core.nets import load_layout_encoder
 from lalaloc_core.learn.training.best import best_path
 from lalaloc_core.learn.training.checkpoint import Checkpoint
 from lalaloc_core.learn.training.stages import build_image_encoder
@@ -20,6 +18,8 @@ from lalaloc_core.learn.training.warm_start import (
     totals,
     weights_of_bundle,
 )
+from lalaloc_core.localise.bundle import IMAGE_WEIGHTS, LAYOUT_WEIGHTS, Bundle
+from lalaloc_core.nets import load_layout_encoder
 
 
 def export_run(

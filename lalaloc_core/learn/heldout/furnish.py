@@ -14,7 +14,7 @@ from lalaloc_core.learn.heldout import fixtures, seats
 from lalaloc_core.learn.heldout.geometry import Part
 from lalaloc_core.learn.heldout.openings import Opening, Wall, span_behind, walls_of
 from lalaloc_core.learn.heldout.outlines import RoomKind
-from lalaloc_core.learn.heldout.plans import UnfamiliarPlan
+from lalaloc_core.learn.heldout.plans import HeldoutPlan
 from lalaloc_core.learn.heldout.seats import Piece
 
 Level = Literal["empty", "simple", "full"]
@@ -87,9 +87,7 @@ _FULLEST_SHARE = 0.5
 class Furnishing:
     """The furniture of a home: `parts` with their rooms, and per room the floor it takes."""
 
-    def __init__(
-        self, plan: UnfamiliarPlan, openings: Sequence[Opening], level: Level, rng: np.random.Generator
-    ) -> None:
+    def __init__(self, plan: HeldoutPlan, openings: Sequence[Opening], level: Level, rng: np.random.Generator) -> None:
         self.parts: list[tuple[int, Part]] = []
         self.taken: list[BaseGeometry] = [shapely.Polygon() for _ in plan.kinds]
         self._doorways = _doorways(openings)
@@ -108,7 +106,7 @@ class Furnishing:
             if level == "full":
                 self._add_more(plan, index, kind, room_rng)
 
-    def _add_more(self, plan: UnfamiliarPlan, index: int, kind: RoomKind, rng: np.random.Generator) -> None:
+    def _add_more(self, plan: HeldoutPlan, index: int, kind: RoomKind, rng: np.random.Generator) -> None:
         more = _MORE[kind]
         clutter = rng.uniform(0.4, 1.0)
         for k in rng.permutation(len(more)):
@@ -158,7 +156,7 @@ class Furnishing:
     def _add(self, index: int, piece: Piece, move: np.ndarray, turn: float) -> None:
         self.parts += [(index, part.turned(turn).moved(float(move[0]), float(move[1]))) for part in piece.parts]
 
-    def _hang_lamp(self, plan: UnfamiliarPlan, index: int, rng: np.random.Generator) -> None:
+    def _hang_lamp(self, plan: HeldoutPlan, index: int, rng: np.random.Generator) -> None:
         """A lamp in the middle of each room, whatever the level."""
         room = plan.plan.rooms[index]
         middle = lamp_place(room.shape)
@@ -166,7 +164,7 @@ class Furnishing:
         parts = fixtures.pendant(rng, room.ceiling_height_m, max(drop, 0.09))
         self.parts += [(index, part.moved(*middle)) for part in parts]
 
-    def _dress_windows(self, plan: UnfamiliarPlan, index: int, rng: np.random.Generator) -> None:
+    def _dress_windows(self, plan: HeldoutPlan, index: int, rng: np.random.Generator) -> None:
         if rng.random() < 0.35:
             return
         for opening in self._openings:

@@ -14,7 +14,7 @@ from lalaloc_core.learn.heldout.furnish import Furnishing, Level
 from lalaloc_core.learn.heldout.geometry import Part
 from lalaloc_core.learn.heldout.openings import Opening, sample_openings, with_openings
 from lalaloc_core.learn.heldout.palette import room_surfaces, thing_surfaces
-from lalaloc_core.learn.heldout.plans import UnfamiliarPlan, sample_plan
+from lalaloc_core.learn.heldout.plans import HeldoutPlan, sample_plan
 from lalaloc_core.learn.heldout.shell import shell_parts
 from lalaloc_core.learn.heldout.surfaces import Materials, Noise
 from lalaloc_core.learn.heldout.tracing import Tracer
@@ -40,10 +40,10 @@ class HomeKey:
 
 
 @dataclass(frozen=True, eq=False)
-class UnfamiliarHome:
+class HeldoutHome:
     """A home as built, without furniture."""
 
-    plan: UnfamiliarPlan
+    plan: HeldoutPlan
     openings: tuple[Opening, ...]
     shell: tuple[tuple[int, Part], ...]
 
@@ -56,7 +56,7 @@ class TracedHome:
         number: per face of the tracer's mesh, its material.
     """
 
-    home: UnfamiliarHome
+    home: HeldoutHome
     tracer: Tracer
     materials: Materials
     number: Int[np.ndarray, "f"]
@@ -73,12 +73,12 @@ class Stand:
 
 
 @lru_cache(maxsize=4)
-def home_of(key: HomeKey) -> UnfamiliarHome:
+def home_of(key: HomeKey) -> HeldoutHome:
     """The home of a key."""
     rng = key.rng(0)
-    plan = sample_plan(rng, f"unfamiliar {key.index}")
+    plan = sample_plan(rng, f"heldout {key.index}")
     openings = sample_openings(plan, rng)
-    return UnfamiliarHome(with_openings(plan, openings), tuple(openings), tuple(shell_parts(plan.plan, openings, rng)))
+    return HeldoutHome(with_openings(plan, openings), tuple(openings), tuple(shell_parts(plan.plan, openings, rng)))
 
 
 @lru_cache(maxsize=4)

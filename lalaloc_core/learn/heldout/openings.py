@@ -11,7 +11,7 @@ import shapely
 from jaxtyping import Float
 
 from lalaloc_core.floorplan import FloorPlan, Room
-from lalaloc_core.learn.heldout.plans import UnfamiliarPlan
+from lalaloc_core.learn.heldout.plans import HeldoutPlan
 
 OpeningKind = Literal["open door", "shut door", "arch", "passage", "front door", "window"]
 # Per room and edge, the stretches where there is an opening already.
@@ -86,7 +86,7 @@ def walls_of(room: Room, index: int) -> list[Wall]:
     ]
 
 
-def sample_openings(plan: UnfamiliarPlan, rng: np.random.Generator) -> list[Opening]:
+def sample_openings(plan: HeldoutPlan, rng: np.random.Generator) -> list[Opening]:
     """Doors that join all rooms, a front door, and windows where nothing stands in front of them."""
     rooms = plan.plan.rooms
     walls = [wall for index, room in enumerate(rooms) for wall in walls_of(room, index)]
@@ -113,7 +113,7 @@ def sample_openings(plan: UnfamiliarPlan, rng: np.random.Generator) -> list[Open
     return openings
 
 
-def with_openings(plan: UnfamiliarPlan, openings: Sequence[Opening]) -> UnfamiliarPlan:
+def with_openings(plan: HeldoutPlan, openings: Sequence[Opening]) -> HeldoutPlan:
     """The plan with its openings drawn in."""
     rooms = plan.plan.rooms
     entries = [
@@ -134,7 +134,7 @@ def with_openings(plan: UnfamiliarPlan, openings: Sequence[Opening]) -> Unfamili
     return replace(plan, plan=FloorPlan.from_dict(document))
 
 
-def _sample_doors(plan: UnfamiliarPlan, walls: list[Wall], taken: _Taken, rng: np.random.Generator) -> list[Opening]:
+def _sample_doors(plan: HeldoutPlan, walls: list[Wall], taken: _Taken, rng: np.random.Generator) -> list[Opening]:
     contacts = [
         contact
         for first in walls
@@ -162,7 +162,7 @@ def _sample_doors(plan: UnfamiliarPlan, walls: list[Wall], taken: _Taken, rng: n
 
 
 def _sample_door(
-    plan: UnfamiliarPlan,
+    plan: HeldoutPlan,
     first: Wall,
     second: Wall,
     span: tuple[float, float],
@@ -198,7 +198,7 @@ def _sample_door(
 
 
 def _sample_windows(
-    wall: Wall, rooms: tuple[Room, ...], plan: UnfamiliarPlan, taken: _Taken, rng: np.random.Generator
+    wall: Wall, rooms: tuple[Room, ...], plan: HeldoutPlan, taken: _Taken, rng: np.random.Generator
 ) -> list[Opening]:
     if plan.kinds[wall.room] == "closet" or rng.random() < (0.55 if plan.kinds[wall.room] == "corridor" else 0.25):
         return []

@@ -20,7 +20,7 @@ _NEIGHBOURS = [(i, j) for i in range(-2, 3) for j in range(-2, 3) if 0 < i * i +
 
 
 @dataclass(frozen=True, eq=False)
-class UnfamiliarShot:
+class HeldoutShot:
     """One photograph: which home, how full, where, and the number that its light and noise come from."""
 
     key: HomeKey
@@ -29,7 +29,7 @@ class UnfamiliarShot:
     number: int
 
 
-def render(shot: UnfamiliarShot, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
+def render(shot: HeldoutShot, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
     """The photograph at a size."""
     rng = shot.key.rng(4, shot.number)
     traced = traced_home(shot.key, shot.furniture)
@@ -40,7 +40,7 @@ def render(shot: UnfamiliarShot, height: int, width: int) -> UInt8[np.ndarray, "
     return film.develop(light, rng)
 
 
-def depth_m(shot: UnfamiliarShot, height: int, width: int) -> Float[np.ndarray, "{height} {width}"]:
+def depth_m(shot: HeldoutShot, height: int, width: int) -> Float[np.ndarray, "{height} {width}"]:
     """Distance (m) along each pixel's ray to what is seen; NaN for the sky."""
     rays = _rays(shot.stand, height, width)
     hits = traced_home(shot.key, shot.furniture).tracer.first(_eye(shot.stand, len(rays)), rays)

@@ -23,7 +23,7 @@ _KIND_SHARES = (0.32, 0.12, 0.18, 0.14, 0.12, 0.12)
 
 
 @dataclass(frozen=True, eq=False)
-class UnfamiliarPlan:
+class HeldoutPlan:
     """A floor plan with what each of its rooms is for.
 
     Attributes:
@@ -37,7 +37,7 @@ class UnfamiliarPlan:
     wall_m: float
 
 
-def sample_plan(rng: np.random.Generator, name: str) -> UnfamiliarPlan:
+def sample_plan(rng: np.random.Generator, name: str) -> HeldoutPlan:
     """Draw a plan of 3 to 9 rooms and 40 to 160 m²."""
     while True:
         kinds: list[RoomKind] = ["living", "kitchen", "bathroom"]
@@ -61,7 +61,7 @@ def sample_plan(rng: np.random.Generator, name: str) -> UnfamiliarPlan:
         }
         for index, (kind, shape) in enumerate(zip(kinds, shapes, strict=True))
     ]
-    return UnfamiliarPlan(FloorPlan.from_dict({"name": name, "rooms": rooms}), tuple(kinds), wall_m)
+    return HeldoutPlan(FloorPlan.from_dict({"name": name, "rooms": rooms}), tuple(kinds), wall_m)
 
 
 def _grow(kinds: list[RoomKind], wall_m: float, rng: np.random.Generator) -> list[shapely.Polygon] | None:

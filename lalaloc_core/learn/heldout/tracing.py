@@ -14,7 +14,7 @@ try:
     from embreex.mesh_construction import TriangleMesh
 except ImportError as error:  # pragma: no cover
     raise ImportError(
-        "unfamiliar homes are traced by embree: install the extra `oracle` (embreex), as `make setup` does"
+        "heldout homes are traced by embree: install the extra `oracle` (embreex), as `make setup` does"
     ) from error
 
 # Rays start this far off the surface they leave, so as not to hit it.

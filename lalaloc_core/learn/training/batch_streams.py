@@ -12,14 +12,14 @@ from jaxtyping import Float, Int
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, WALL_CODE
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.render.layout import layout_view
-from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.learn.training.batches import Batch, LoadFailure, Stream, non_empty, stacked, worker_share
 from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.deferred import DeferredBatch, DeferredBatcher, DeferredRow, DeferredScene, Row
 from lalaloc_core.learn.training.replay_buffer import ReplayBuffer
 from lalaloc_core.learn.training.rotation import Rotation, sample_heading, sample_rotation
 from lalaloc_core.learn.training.sources import Group, PanoramaSample, Source
+from lalaloc_core.render.layout import layout_view
+from lalaloc_core.render.poses import profiles_at
 
 # Code of a class that is not known; losses pass over it.
 UNKNOWN = -1

@@ -11,9 +11,9 @@ from pathlib import Path
 import torch
 from torch import nn
 
+from lalaloc_core.errors import ConfigError, DatasetError
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, Scene, load_scenes
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes, RenderedPhotograph
-from lalaloc_core.errors import ConfigError, DatasetError
 from lalaloc_core.learn.training.best import Validate
 from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.photographs import Photographs, load_photographs
@@ -34,7 +34,7 @@ class TrainingData:
         textures: folder of material pictures for the generator; without it all are procedural.
         validation_scenes: at most this many, spread evenly over the split.
         deferred: the generator's panoramas are rendered on the device that trains, not where homes are made.
-        unfamiliar: scenes that are nothing like those trained on; image validation reports those of their validation
+        heldout: scenes that are nothing like those trained on; image validation reports those of their validation
             split as well, and nothing is chosen by them.
         photographs: folder of panoramas without labels that the image stage learns from as well.
         segmenter: what tells doors and windows in them, see `training.photographs`.
@@ -45,7 +45,7 @@ class TrainingData:
     textures: Path | None = None
     deferred: bool = False
     validation_scenes: int = 50
-    unfamiliar: Dataset | None = None
+    heldout: Dataset | None = None
     photographs: Path | None = None
     segmenter: Path | None = None
 
@@ -116,16 +116,16 @@ class TrainingData:
         cache = folder / "validation.npz" if folder is not None and self.dataset is None else None
         familiar = ImageValidation(config, scenes, layout_encoder, device, usual, problems, cache=cache)
         _log(problems)
-        if self.unfamiliar is None:
+        if self.heldout is None:
             return familiar
         others = ImageValidation(
             config,
-            list(load_scenes(self.unfamiliar, self.unfamiliar.scenes("validation"))),
+            list(load_scenes(self.heldout, self.heldout.scenes("validation"))),
             layout_encoder,
             device,
-            self.unfamiliar.appearances[0],
-            prefix="unfamiliar",
-            cache=None if folder is None else folder / "unfamiliar.npz",
+            self.heldout.appearances[0],
+            prefix="heldout",
+            cache=None if folder is None else folder / "heldout.npz",
         )
         return lambda modules: familiar(modules) | others(modules)
 

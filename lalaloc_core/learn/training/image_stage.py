@@ -9,11 +9,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from lalaloc_core.nets import LayoutEncoder
-from lalaloc_core.nets.image_encoder import TrunkImageEncoder
-from lalaloc_core.nets.image_features import ImageFeatures, StructureFeatures, first_of
-from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
-from lalaloc_core.nets.trunk import StyleMixing
 from lalaloc_core.learn.synth.augmentation.photometric import jittered, optics
 from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.batches import Batch
@@ -22,6 +17,11 @@ from lalaloc_core.learn.training.objective import anchors_with_neighbours, chamf
 from lalaloc_core.learn.training.photographs import Photographs
 from lalaloc_core.learn.training.sources import Source
 from lalaloc_core.learn.training.stages import build_image_encoder, panorama_batches
+from lalaloc_core.nets import LayoutEncoder
+from lalaloc_core.nets.image_encoder import TrunkImageEncoder
+from lalaloc_core.nets.image_features import ImageFeatures, StructureFeatures, first_of
+from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
+from lalaloc_core.nets.trunk import StyleMixing
 
 
 class ImageStage:

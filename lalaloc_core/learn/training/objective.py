@@ -7,12 +7,12 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from lalaloc_core.learn.metrics import chamfer_distance
-from lalaloc_core.nets import LayoutEncoder
-from lalaloc_core.nets.decoder import DECODED_HEIGHT, DECODED_WIDTH, LayoutDecoder
-from lalaloc_core.render.depth import back_project, layout_depth
 from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.batches import Batch
 from lalaloc_core.learn.training.config import LayoutStageConfig
+from lalaloc_core.nets import LayoutEncoder
+from lalaloc_core.nets.decoder import DECODED_HEIGHT, DECODED_WIDTH, LayoutDecoder
+from lalaloc_core.render.depth import back_project, layout_depth
 
 
 class LayoutObjective:

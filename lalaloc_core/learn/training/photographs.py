@@ -11,9 +11,9 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from lalaloc_core.errors import DatasetError, InvalidPanoramaError
-from lalaloc_core.panorama.images import read_panorama
 from lalaloc_core.learn.synth.augmentation.stretching import stretched
 from lalaloc_core.learn.training.segmenter import PANORAMA_ROWS, load_segmenter, read_walls_and_openings
+from lalaloc_core.panorama.images import read_panorama
 
 # Rooms are drawn out or pushed together along two axes by factors between these, evenly in logs: half of the
 # photographs without labels that there are were taken in halls, which so become rooms.

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 
+from lalaloc_core.learn.training.config import ImageStageConfig, LayoutStageConfig, OptimiserConfig, TrainConfig
 from lalaloc_core.nets.image_encoder import TrunkEncoderConfig
 from lalaloc_core.nets.layout_encoder import RingConfig
 from lalaloc_core.nets.trunk import TrunkConfig
 from lalaloc_core.render.sampling import TripletSampling
-from lalaloc_core.learn.training.config import ImageStageConfig, LayoutStageConfig, OptimiserConfig, TrainConfig
 
 PAPER_SGD = OptimiserConfig(kind="sgd", learning_rate=0.01, schedule="steps", warmup=0.0, clip_norm=0.0)
 

@@ -9,8 +9,6 @@ from typing import Any
 import torch
 
 from lalaloc_core.learn.data.dataset import Scene
-from lalaloc_core.nets.image_encoder import TrunkImageEncoder
-from lalaloc_core.nets.trunk import load_pretrained
 from lalaloc_core.learn.training.best import Validate
 from lalaloc_core.learn.training.checkpoint import Checkpoint
 from lalaloc_core.learn.training.config import TrainConfig
@@ -22,6 +20,8 @@ from lalaloc_core.learn.training.loop import run_stage
 from lalaloc_core.learn.training.trained_networks import load_layout_encoder_of
 from lalaloc_core.learn.training.validate import LayoutValidation
 from lalaloc_core.learn.training.warm_start import check_same_networks, checkpoint_with, load_warm_start
+from lalaloc_core.nets.image_encoder import TrunkImageEncoder
+from lalaloc_core.nets.trunk import load_pretrained
 
 ONLINE = TrainingData()
 

@@ -17,11 +17,10 @@ import torch
 from cachetools import LRUCache, cachedmethod
 from jaxtyping import Float, Int
 
-from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, Scene
-from lalaloc_core.learn.data.synthetic.generated import RendererCache
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.render.sampling import PoseSet, TripletSampling, sample_neighbours, sample_triplets
+from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, Scene
+from lalaloc_core.learn.data.synthetic.generated import RendererCache
 from lalaloc_core.learn.synth.homes.splits import TRAIN, home_of
 from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer
 from lalaloc_core.learn.synth.scene.build import build_scene
@@ -29,6 +28,7 @@ from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
 from lalaloc_core.learn.synth.scene.shots import CEILING_CLEARANCE_M, sample_shots
 from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.deferred import DeferredScene
+from lalaloc_core.render.sampling import PoseSet, TripletSampling, sample_neighbours, sample_triplets
 
 # Cameras stand at least this far below the ceiling of a neighbour's room.
 _HEADROOM_M = 0.1

@@ -8,6 +8,11 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 from torch import Tensor, nn
 
+from lalaloc_core.learn.training.batch_streams import PanoramaBatches
+from lalaloc_core.learn.training.batches import Batch, load_batches
+from lalaloc_core.learn.training.config import ImageStageConfig, LayoutStageConfig, OptimiserConfig, TrainConfig
+from lalaloc_core.learn.training.deferred import DeferredRenderer
+from lalaloc_core.learn.training.sources import GeneratedSource, Source
 from lalaloc_core.nets import ImageEncoder, LayoutEncoder
 from lalaloc_core.nets.decoder import LayoutDecoder
 from lalaloc_core.nets.image_encoder import TrunkImageEncoder
@@ -15,11 +20,6 @@ from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
 from lalaloc_core.nets.paper_encoders import PaperImageEncoder, PaperLayoutEncoder
 from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
 from lalaloc_core.nets.trunk import Trunk
-from lalaloc_core.learn.training.batch_streams import PanoramaBatches
-from lalaloc_core.learn.training.batches import Batch, load_batches
-from lalaloc_core.learn.training.config import ImageStageConfig, LayoutStageConfig, OptimiserConfig, TrainConfig
-from lalaloc_core.learn.training.deferred import DeferredRenderer
-from lalaloc_core.learn.training.sources import GeneratedSource, Source
 
 
 @runtime_checkable

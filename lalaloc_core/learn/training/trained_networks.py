@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from lalaloc_core.nets import LayoutEncoder
-from lalaloc_core.nets.decoder import LayoutDecoder
 from lalaloc_core.learn.training.stages import build_layout_encoder
 from lalaloc_core.learn.training.warm_start import checkpoint_with
+from lalaloc_core.nets import LayoutEncoder
+from lalaloc_core.nets.decoder import LayoutDecoder
 
 
 def load_layout_encoder_of(folder: Path, *, last: bool = False) -> LayoutEncoder:

@@ -18,21 +18,21 @@ from cachetools import LRUCache, cachedmethod
 from jaxtyping import Int
 from torch import Tensor, nn
 
-from lalaloc_core.learn.azimuth_metrics import score_classes
 from lalaloc_core.conventions import OPENING_CLASSES
-from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene
 from lalaloc_core.errors import DatasetError
+from lalaloc_core.learn.azimuth_metrics import score_classes
+from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene
 from lalaloc_core.learn.metrics import Accuracy
-from lalaloc_core.nets.image_encoder import TrunkImageEncoder
-from lalaloc_core.nets.image_features import ImageFeatures
-from lalaloc_core.nets.paper_encoders import PaperImageEncoder
-from lalaloc_core.render.poses import profiles_at
-from lalaloc_core.render.sampling import PoseSet, pose_grid
 from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.batch_streams import UNKNOWN, opening_kinds
 from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.picture_cache import cached_pictures
 from lalaloc_core.learn.training.rotation import Rotation, sample_rotation
+from lalaloc_core.nets.image_encoder import TrunkImageEncoder
+from lalaloc_core.nets.image_features import ImageFeatures
+from lalaloc_core.nets.paper_encoders import PaperImageEncoder
+from lalaloc_core.render.poses import profiles_at
+from lalaloc_core.render.sampling import PoseSet, pose_grid
 
 _GRID_STEP_M = 0.5
 _MAX_LOG_ERROR = 0.7

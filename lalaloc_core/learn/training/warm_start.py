@@ -9,12 +9,12 @@ from typing import Any
 import safetensors.torch
 from torch import Tensor, nn
 
-from lalaloc_core.localise.bundle import DECODER_WEIGHTS, IMAGE_WEIGHTS, LAYOUT_WEIGHTS, MANIFEST_NAME, Bundle
 from lalaloc_core.configuration import build_config
 from lalaloc_core.errors import BundleError, CheckpointError
 from lalaloc_core.learn.training.best import best_path
 from lalaloc_core.learn.training.checkpoint import Checkpoint
 from lalaloc_core.learn.training.config import TrainConfig
+from lalaloc_core.localise.bundle import DECODER_WEIGHTS, IMAGE_WEIGHTS, LAYOUT_WEIGHTS, MANIFEST_NAME, Bundle
 
 JOINT = "end-to-end"
 _MODULES = {"layout": {"layout_encoder": LAYOUT_WEIGHTS, "decoder": DECODER_WEIGHTS}}

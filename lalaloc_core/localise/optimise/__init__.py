@@ -1,7 +1,7 @@
 """Pose optimisation (LPO; paper, section 4.2.1): move a pose until its layout fits what the picture says.
 
 In the paper `min over pose of | Φ_layout(Ω(pose, plan)) - f |₂`, latents, with the renderer Ω. Where the model predicts
-a wall profile with its uncertainty, the layout's profile is compared with that, by the cost of `localise.evidence`. Two
+a wall profile with its uncertainty, the layout's profile is compared with that, by the cost of `localise.matching_cost`. Two
 optimisers share one evaluation (residuals and their derivatives by 2 or 3 unknowns; the log of true over stated camera
 height is one more where profiles are compared):
 
@@ -17,6 +17,6 @@ Begin with `optimiser.py`; `problem.py` has the evaluation, `descent.py` the two
 """
 
 from lalaloc_core.localise.optimise.config import LpoConfig
-from lalaloc_core.localise.optimise.optimiser import LatentPoseOptimiser, PoseOptimiser
+from lalaloc_core.localise.optimise.optimiser import PoseOptimiser, PoseRefiner
 
-__all__ = ["LatentPoseOptimiser", "LpoConfig", "PoseOptimiser"]
+__all__ = ["LpoConfig", "PoseOptimiser", "PoseRefiner"]

@@ -9,8 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from lalaloc_core.localise.bundle import LAYOUT_WEIGHTS, Bundle
 from lalaloc_core.errors import BundleError, ConfigError
+from lalaloc_core.localise.bundle import LAYOUT_WEIGHTS, Bundle
 from lalaloc_core.localise.optimise.config import LpoConfig
 from lalaloc_core.localise.optimise.descent import adam, levenberg_marquardt
 from lalaloc_core.localise.optimise.problem import Embedding, Norm, Problem
@@ -73,7 +73,7 @@ class PoseOptimiser:
         )
 
 
-class LatentPoseOptimiser:
+class PoseRefiner:
     """Refines poses with one layout encoder, by predicted wall profiles where a job has them."""
 
     def __init__(self, layout_encoder: LayoutEncoder, config: LpoConfig | None = None) -> None:
@@ -84,7 +84,7 @@ class LatentPoseOptimiser:
         self._columns = self.encoder.config.profile_columns
 
     @classmethod
-    def from_bundle(cls, bundle: Bundle, config: LpoConfig | None = None) -> LatentPoseOptimiser:
+    def from_bundle(cls, bundle: Bundle, config: LpoConfig | None = None) -> PoseRefiner:
         """Load the layout encoder of a bundle.
 
         Raises:

@@ -143,7 +143,7 @@ class Problem:
     def _weighed(
         self, pose: Float[Tensor, "k p"], residual: Float[Tensor, "k d"], jacobian: Float[Tensor, "k p d"]
     ) -> Evaluation:
-        """Costs by the norm; that of Cauchy, which is `localise.evidence`'s, by squares weighted anew everywhere."""
+        """Costs by the norm; that of Cauchy, which is `localise.matching_cost`'s, by squares weighted anew everywhere."""
         held = pose * self._stiffness
         prior = 0.5 * (pose * held).sum(dim=1)
         if self.norm == "cauchy":

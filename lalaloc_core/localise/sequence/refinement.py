@@ -10,13 +10,13 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 
-from lalaloc_core.localise.bundle import EvidenceModel
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.floorplan.geometry import pad_walls
+from lalaloc_core.localise.bundle import MatchingWeights
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.pipeline import LocaliseConfig, panorama_heading
-from lalaloc_core.localise.poses import Candidate, LatentGrid, RefinementJob, RefinementResult
+from lalaloc_core.localise.poses import Candidate, PoseGrid, RefinementJob, RefinementResult
 from lalaloc_core.localise.refinement import refined, refinement_job
 from lalaloc_core.localise.sequence.joint import SequenceJob, SequenceResult, motion_costs
 from lalaloc_core.localise.sequence.motion import FLOOR, Motion, Transition
@@ -45,16 +45,16 @@ def are_alike(
 
 def job_parts(
     plan: FloorPlan,
-    grid: LatentGrid,
+    grid: PoseGrid,
     pictures: list[Observation],
     paths: list[Path],
-    weights: EvidenceModel,
+    weights: MatchingWeights,
     config: LocaliseConfig,
 ) -> list[RefinementJob]:
     """What the optimiser would need of every picture if it were alone."""
     return [
         refinement_job(
-            plan, one.query, [path.starts[t] for path in paths], grid.camera_height_m, weights, config.evidence
+            plan, one.query, [path.starts[t] for path in paths], grid.camera_height_m, weights, config.matching
         )
         for t, one in enumerate(pictures)
     ]
@@ -128,7 +128,7 @@ def ended_paths(
             evaluations=np.zeros(len(paths), int),
             height_offset=result.height_offset,
         )
-        ends.append(refined(plan, encoders, picture.query, starts, alone, config.evidence))
+        ends.append(refined(plan, encoders, picture.query, starts, alone, config.matching))
     moved = [replace(path, ends=tuple(one[m] for one in ends)) for m, path in enumerate(paths)]
     log_motions = np.log(np.exp(-path_motion_costs(pictures, motions, moved)) + FLOOR)
     found = []

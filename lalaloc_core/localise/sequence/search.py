@@ -11,21 +11,21 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float
 
-from lalaloc_core.localise.bundle import EvidenceModel
 from lalaloc_core.errors import InvalidMotionError
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.bundle import MatchingWeights
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.cohort import cost_by_chance
 from lalaloc_core.localise.confidence import Signals, signals_of
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.evidence import Evidence, latent_distances
+from lalaloc_core.localise.matching_cost import MatchingCost, latent_distances
 from lalaloc_core.localise.pipeline import (
     Localisation,
     LocaliseConfig,
     StageClock,
     distinct,
 )
-from lalaloc_core.localise.poses import Candidate, LatentGrid, Query, grid_candidate
+from lalaloc_core.localise.poses import Candidate, PoseGrid, Query, grid_candidate
 from lalaloc_core.localise.posterior import HEADING_SEPARATION, Posterior, area_shares
 from lalaloc_core.localise.refinement import with_latents
 from lalaloc_core.localise.retrieval import contradicted, suppress
@@ -74,7 +74,7 @@ SequenceSteps = Generator[SequenceJob, SequenceResult | None, SequenceLocalisati
 
 def localise_sequence(
     plan: FloorPlan,
-    grid: LatentGrid,
+    grid: PoseGrid,
     encoders: Encoders,
     queries: Sequence[Query],
     motions: Sequence[Motion],
@@ -100,7 +100,7 @@ def localise_sequence(
 
 def localise_sequence_steps(
     plan: FloorPlan,
-    grid: LatentGrid,
+    grid: PoseGrid,
     encoders: Encoders,
     queries: Sequence[Query],
     motions: Sequence[Motion],
@@ -127,7 +127,7 @@ def localise_sequence_steps(
         at = int(whole.height.argmax())
         paths = _paths(grid, pictures, transitions, at, float(log_heights[at]), config)
     stage: Literal["retrieval", "lpo"] = "retrieval"
-    if refine == "lpo" and all(config.evidence.compares_profiles(one.query) for one in pictures):
+    if refine == "lpo" and all(config.matching.compares_profiles(one.query) for one in pictures):
         with clock.stage("lpo"):
             parts = job_parts(plan, grid, pictures, paths, weights, config)
             job = sequence_job(parts, pictures, paths, transitions, motions, weights.temperature)
@@ -149,7 +149,7 @@ def localise_sequence_steps(
         candidates=candidates,
         separation_m=config.separation_m,
     )
-    if stage == "retrieval" and config.evidence.compares_profiles(pictures[0].query):
+    if stage == "retrieval" and config.matching.compares_profiles(pictures[0].query):
         candidates = [
             with_latents(plan, encoders, picture.query, answers, grid.camera_height_m)
             for picture, answers in zip(pictures, candidates, strict=True)
@@ -201,7 +201,7 @@ def _contradicted_motions(
 
 def _signals(
     plan: FloorPlan,
-    grid: LatentGrid,
+    grid: PoseGrid,
     encoders: Encoders,
     picture: Observation,
     answer: Candidate,
@@ -212,35 +212,35 @@ def _signals(
     query, weights = picture.query, encoders.manifest.evidence
     penalty = query.camera_height.penalty(_offsets(query, config)) / weights.temperature
     grid_cost = float((picture.cost.min(axis=(1, 2)) + penalty).min())
-    reach_m = config.evidence.grid_reach * grid.step_m
-    by_chance = cost_by_chance(encoders.cohort, plan, query, reach_m, weights, config.evidence)
+    reach_m = config.matching.grid_reach * grid.step_m
+    by_chance = cost_by_chance(encoders.cohort, plan, query, reach_m, weights, config.matching)
     return signals_of(query, answer, posterior, grid_cost, by_chance)
 
 
 def _offsets(query: Query, config: LocaliseConfig) -> Float[np.ndarray, "j"]:
     """The height offsets that are tried; latents are of the stated height alone."""
-    return query.camera_height.offsets if config.evidence.compares_profiles(query) else np.zeros(1)
+    return query.camera_height.offsets if config.matching.compares_profiles(query) else np.zeros(1)
 
 
 def _picture(
-    plan: FloorPlan, grid: LatentGrid, query: Query, weights: EvidenceModel, config: LocaliseConfig
+    plan: FloorPlan, grid: PoseGrid, query: Query, weights: MatchingWeights, config: LocaliseConfig
 ) -> Observation:
     """Compare a picture with the grid at every height."""
-    evidence = config.evidence
+    evidence = config.matching
     doubted = contradicted(plan, grid, query, weights, evidence)
     query = query.searched if doubted and query.searched is not None else query
     index = np.arange(len(grid.poses))
     if evidence.compares_profiles(query):
         layouts, reach_m = grid.layouts(plan), evidence.grid_reach * grid.step_m
         if len(index) > _MAX_PLACES:
-            coarse, _ = Evidence(plan, query, reach_m, weights, evidence, stride=_STRIDE).costs(layouts)
+            coarse, _ = MatchingCost(plan, query, reach_m, weights, evidence, stride=_STRIDE).costs(layouts)
             index = np.sort(np.argpartition(coarse.min(axis=0), _MAX_PLACES)[:_MAX_PLACES])
             layouts = layouts.rows(index)
         costs = []
         for offset in query.camera_height.offsets:
             height_m = query.camera_height.height_m * math.exp(offset)
             exact = replace(query.scaled(float(offset)), camera_height=CameraHeight(height_m, 0.0))
-            costs.append(Evidence(plan, exact, reach_m, weights, evidence).costs(layouts)[0].T)
+            costs.append(MatchingCost(plan, exact, reach_m, weights, evidence).costs(layouts)[0].T)
         cost = np.stack(costs).astype(np.float64)
     else:
         distance = latent_distances(grid.known_latents, query.latents)
@@ -253,7 +253,7 @@ def _picture(
 
 
 def _paths(
-    grid: LatentGrid,
+    grid: PoseGrid,
     pictures: list[Observation],
     transitions: list[Transition],
     at: int,
@@ -288,7 +288,7 @@ def _paths(
     return kept
 
 
-def _start(grid: LatentGrid, picture: Observation, state: int, at: int) -> Candidate:
+def _start(grid: PoseGrid, picture: Observation, state: int, at: int) -> Candidate:
     """A state of a picture as a candidate."""
     row, hypothesis = divmod(state, len(picture.states.heading))
     pose, query = int(picture.index[row]), picture.query

@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 
 from lalaloc_core.floorplan import FloorPlan, OpeningFace, Room
 from lalaloc_core.localise.layouts import joined_layouts
-from lalaloc_core.localise.poses import Candidate, LatentGrid
+from lalaloc_core.localise.poses import Candidate, PoseGrid
 from lalaloc_core.render.sampling import PoseSet
 
 # Between the boxes around two plans; farther than any two poses that are taken for one place.
@@ -36,12 +36,12 @@ class MergedPlans:
 
     plans: tuple[FloorPlan, ...]
     plan: FloorPlan
-    grid: LatentGrid
+    grid: PoseGrid
     shift_m: Float[np.ndarray, "p 2"]
     _poses: Int[np.ndarray, "p"] = field(repr=False)
 
     @classmethod
-    def of(cls, plans: Sequence[FloorPlan], grids: Sequence[LatentGrid], camera_height_m: float) -> MergedPlans:
+    def of(cls, plans: Sequence[FloorPlan], grids: Sequence[PoseGrid], camera_height_m: float) -> MergedPlans:
         """Lay plans out, in rows and columns: a single row of many would be so long that single precision feels it.
 
         Args:
@@ -124,14 +124,14 @@ def _faces(plans: Sequence[FloorPlan]) -> tuple[OpeningFace, ...]:
 
 
 def _grid(
-    plans: Sequence[FloorPlan], grids: Sequence[LatentGrid], shift_m: Float[np.ndarray, "p 2"], camera_height_m: float
-) -> LatentGrid:
+    plans: Sequence[FloorPlan], grids: Sequence[PoseGrid], shift_m: Float[np.ndarray, "p 2"], camera_height_m: float
+) -> PoseGrid:
     rooms = _starts([len(plan.rooms) for plan in plans])
     poses = PoseSet(
         np.concatenate([grid.poses.position_m + shift for grid, shift in zip(grids, shift_m, strict=True)]),
         np.concatenate([grid.poses.room_index + first for grid, first in zip(grids, rooms, strict=True)]),
     )
-    return LatentGrid.with_layouts(
+    return PoseGrid.with_layouts(
         poses,
         None if any(grid.latents is None for grid in grids) else np.concatenate([grid.known_latents for grid in grids]),
         np.concatenate([grid.profile_m for grid in grids]),

@@ -21,8 +21,8 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt64
 
-from lalaloc_core.localise.bundle import EvidenceModel
-from lalaloc_core.localise.evidence import EvidenceConfig
+from lalaloc_core.localise.bundle import MatchingWeights
+from lalaloc_core.localise.matching_cost import MatchingConfig
 from lalaloc_core.localise.poses import Query
 from lalaloc_core.localise.venue.prototype_cells import FAMILIES, Cells, claims_of
 from lalaloc_core.localise.venue.prototype_codes import BYTES_OF_ONE, CodeScan, codes_of, tables_of
@@ -119,8 +119,8 @@ class PlanIndex:
     def log_masses(
         self,
         query: Query,
-        weights: EvidenceModel,
-        config: EvidenceConfig,
+        weights: MatchingWeights,
+        config: MatchingConfig,
         *,
         compared: int = COMPARED,
         scanned: int = SCANNED,

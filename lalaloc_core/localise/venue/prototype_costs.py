@@ -14,10 +14,10 @@ from functools import cached_property
 import numpy as np
 from jaxtyping import Float, Int
 
-from lalaloc_core.localise.bundle import EvidenceModel
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, WALL_CODE
-from lalaloc_core.localise.evidence import (
-    EvidenceConfig,
+from lalaloc_core.localise.bundle import MatchingWeights
+from lalaloc_core.localise.matching_cost import (
+    MatchingConfig,
     ceiling_costs,
     mean_log,
     precisions,
@@ -47,7 +47,7 @@ class PrototypeCosts:
         penalty: (j,) what each height has against it, in units of the cost.
     """
 
-    def __init__(self, query: Query, step_m: float, weights: EvidenceModel, config: EvidenceConfig) -> None:
+    def __init__(self, query: Query, step_m: float, weights: MatchingWeights, config: MatchingConfig) -> None:
         assert query.profile is not None, "without a predicted profile there is nothing to compare prototypes with"
         self._query, self._weights, self._config = query, weights, config
         self._columns = azimuths(query.profile.log_m.shape[1])

@@ -23,7 +23,7 @@ from jaxtyping import Float, Int, UInt8
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, WALL_CODE
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.layouts import layouts_at
-from lalaloc_core.localise.poses import LatentGrid
+from lalaloc_core.localise.poses import PoseGrid
 from lalaloc_core.render.sampling import PoseSet
 
 AZIMUTHS = 32
@@ -66,7 +66,7 @@ class Prototypes:
         return len(self.rows)
 
 
-def prototypes_of(grid: LatentGrid, plan: FloorPlan) -> Prototypes:
+def prototypes_of(grid: PoseGrid, plan: FloorPlan) -> Prototypes:
     """The prototypes of a plan, in cell 0."""
     place = np.rint(grid.poses.position_m / grid.step_m).astype(np.int64)
     chosen, of_room = place.sum(axis=1) % 2 == 0, grid.poses.room_index

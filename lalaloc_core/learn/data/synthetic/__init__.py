@@ -1,7 +1,7 @@
 """Data sets that are drawn, not read, and writing them to disk.
 
 Begin with `generated.py`, homes of the generator rendered when they are looked at. For calibration `mismatched.py`
-asks them with photographs of others, `disturbed.py` with worse ones; `unfamiliar.py` draws the out-of-family homes,
+asks them with photographs of others, `disturbed.py` with worse ones; `heldout.py` draws the out-of-family homes,
 which need the extra `oracle`; `writing.py` is `lalaloc synth`.
 """
 

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from lalaloc_core.learn.data.dataset import Camera, Scene
-from lalaloc_core.learn.data.synthetic.derived import DerivedScenes
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.learn.data.dataset import Camera, Scene
+from lalaloc_core.learn.data.synthetic.derived import DerivedScenes
 from lalaloc_core.render.layout import layout_view
 
 # Free space between two copies (m): no multiple of a grid's step, so that its lattice lies otherwise in each.

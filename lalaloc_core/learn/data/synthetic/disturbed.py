@@ -14,9 +14,9 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 
+from lalaloc_core.errors import DatasetError
 from lalaloc_core.learn.data.dataset import Camera, Photograph, Scene
 from lalaloc_core.learn.data.synthetic.derived import DerivedScenes, seed_of
-from lalaloc_core.errors import DatasetError
 from lalaloc_core.learn.synth.augmentation.photometric import jittered, optics
 from lalaloc_core.learn.synth.augmentation.stretching import stretched_images
 

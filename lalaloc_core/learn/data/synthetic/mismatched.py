@@ -12,9 +12,9 @@ from typing import ClassVar
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from lalaloc_core.errors import DatasetError
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Photograph, Scene
 from lalaloc_core.learn.data.synthetic.derived import DerivedScenes, seed_of
-from lalaloc_core.errors import DatasetError
 
 # One of so many photographs shows no room, and one is the camera's own upside down; of every other home one is cut out.
 _EVERY = 4

@@ -13,7 +13,14 @@ from jaxtyping import Float
 
 from lalaloc_core.learn.synth.furniture.pieces import Finish, Piece, box
 from lalaloc_core.learn.synth.furniture.pieces_living import wardrobe_run
-from lalaloc_core.learn.synth.furniture.pieces_service import COUNTER_DEPTH_M, bathtub, counter_run, shower, toilet, washbasin
+from lalaloc_core.learn.synth.furniture.pieces_service import (
+    COUNTER_DEPTH_M,
+    bathtub,
+    counter_run,
+    shower,
+    toilet,
+    washbasin,
+)
 
 _MIN_RUN_M = 1.2
 _MAX_RUN_M = 6.0

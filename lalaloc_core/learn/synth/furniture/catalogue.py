@@ -18,7 +18,15 @@ from lalaloc_core.learn.synth.furniture.pieces_living import (
     sofa,
     wardrobe,
 )
-from lalaloc_core.learn.synth.furniture.pieces_service import bathtub, counter, fridge, island, shower, toilet, washbasin
+from lalaloc_core.learn.synth.furniture.pieces_service import (
+    bathtub,
+    counter,
+    fridge,
+    island,
+    shower,
+    toilet,
+    washbasin,
+)
 
 # What stands in a kind of room, most characteristic first, with the chance of each.
 ROOM_PIECES: dict[str, tuple[tuple[Maker, float], ...]] = {

@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from lalaloc_core.render.profile import cross_walls
 from lalaloc_core.learn.synth.rendering.prisms import PrismHits, cross_prisms, gap_behind, resolve_prisms
 from lalaloc_core.learn.synth.scene.render_scene import Decals, SceneRecords
+from lalaloc_core.render.profile import cross_walls
 
 _TINY = 1e-9
 _MAX_DECALS_PER_COLUMN = 10

@@ -10,11 +10,11 @@ from jaxtyping import Float
 
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.floorplan import Room
-from lalaloc_core.render.sampling import random_poses
 from lalaloc_core.learn.synth.furniture.furnish import FURNITURE_LEVELS, FurnitureLevel, wall_frame
 from lalaloc_core.learn.synth.homes.openings import Opening
 from lalaloc_core.learn.synth.homes.plans import Home
 from lalaloc_core.learn.synth.scene.lighting import Mood
+from lalaloc_core.render.sampling import random_poses
 
 POSE_MARGIN_M = 0.2
 # Cameras stand at least this far below the ceiling.

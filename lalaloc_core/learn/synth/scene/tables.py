@@ -11,7 +11,16 @@ from jaxtyping import Float
 from lalaloc_core.learn.synth.camera.exposure import Exposure
 from lalaloc_core.learn.synth.furniture.furnish import Prism
 from lalaloc_core.learn.synth.records import Row
-from lalaloc_core.learn.synth.scene.render_scene import Backdrop, Decals, Fact, Lights, Prisms, RenderScene, Sun, VisibleRooms
+from lalaloc_core.learn.synth.scene.render_scene import (
+    Backdrop,
+    Decals,
+    Fact,
+    Lights,
+    Prisms,
+    RenderScene,
+    Sun,
+    VisibleRooms,
+)
 from lalaloc_core.learn.synth.scene.shots import Shot
 from lalaloc_core.learn.synth.scene.surfaces import Surfaces, SurfaceTable
 

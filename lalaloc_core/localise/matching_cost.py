@@ -28,9 +28,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from lalaloc_core.localise.bundle import EvidenceModel
 from lalaloc_core.conventions import OPENING_CLASSES, PASSAGE_CODE, ROOM_TYPES, TWO_PI, WALL_CODE
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.bundle import MatchingWeights
 from lalaloc_core.localise.layouts import Layouts
 from lalaloc_core.localise.poses import PredictedCeiling, PredictedRoomType, Query
 
@@ -46,7 +46,7 @@ _CHUNK, _PAIRS = 4096, 512
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvidenceConfig:
+class MatchingConfig:
     """What poses are compared by.
 
     Attributes:
@@ -90,7 +90,7 @@ class Terms(NamedTuple):
     room_type: Float[np.ndarray, "n"]
     height: Float[np.ndarray, "n"]
 
-    def total(self, weights: EvidenceModel) -> Float[np.ndarray, "n"]:
+    def total(self, weights: MatchingWeights) -> Float[np.ndarray, "n"]:
         """The cost: terms by their weights."""
         return (
             self.walls
@@ -101,7 +101,7 @@ class Terms(NamedTuple):
         )
 
 
-class Evidence:
+class MatchingCost:
     """Compares poses of one plan with one query.
 
     Args:
@@ -115,8 +115,8 @@ class Evidence:
         plan: FloorPlan,
         query: Query,
         reach_m: float,
-        weights: EvidenceModel,
-        config: EvidenceConfig,
+        weights: MatchingWeights,
+        config: MatchingConfig,
         *,
         stride: int = 1,
     ) -> None:
@@ -340,7 +340,7 @@ class Evidence:
         return ceiling_costs(predicted, clearance_m, offset[:, None], self._config)
 
 
-def precisions(query: Query, reach_m: float, config: EvidenceConfig) -> Float[np.ndarray, "k w"]:
+def precisions(query: Query, reach_m: float, config: MatchingConfig) -> Float[np.ndarray, "k w"]:
     """1 / (κ s), which differences of log distance are multiplied with, for every hypothesis."""
     assert query.profile is not None
     scale = np.maximum(np.exp(query.profile.log_scale), _MIN_SCALE)
@@ -351,7 +351,7 @@ def ceiling_costs(
     predicted: PredictedCeiling,
     clearance_m: Float[np.ndarray, "*#n"],
     offset: Float[np.ndarray, "*#n"],
-    config: EvidenceConfig,
+    config: MatchingConfig,
 ) -> Float[np.ndarray, "*n"]:
     """Cost of ceilings that are so far (m) above the camera, each at a δ."""
     difference = np.log(np.maximum(clearance_m, _MIN_CLEARANCE_M)) - (predicted.log_m + offset)
@@ -359,7 +359,7 @@ def ceiling_costs(
     return np.log1p(np.square(difference / scale))
 
 
-def room_type_losses(predicted: PredictedRoomType, config: EvidenceConfig) -> Float[np.ndarray, "t"]:
+def room_type_losses(predicted: PredictedRoomType, config: MatchingConfig) -> Float[np.ndarray, "t"]:
     """Cost of every type of room; the unknown type costs what says nothing."""
     ratio = config.floor + (1.0 - config.floor) * np.exp(predicted.log_probability) / np.maximum(predicted.prior, 1e-4)
     loss = np.log(ratio[1:].max()) - np.log(np.concatenate([[1.0], ratio[1:]]))

@@ -7,20 +7,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lalaloc_core.localise.bundle import EvidenceModel
-from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.evidence import Evidence, EvidenceConfig
-from lalaloc_core.localise.first_look import LowestCosts, PairLimits, _bounds, _table, first_costs, likeliest
-from lalaloc_core.localise.layouts import layouts_at
-from lalaloc_core.localise.poses import LatentGrid, PredictedOpenings, PredictedProfile, Query, rolled
-from lalaloc_core.localise.retrieval import grid_costs, retrieve
-from lalaloc_core.render.sampling import PoseSet, pose_grid, random_poses
 from lalaloc_core.learn.synth.homes.buildings import Building, building_of
 from lalaloc_core.learn.synth.homes.splits import VALIDATION
+from lalaloc_core.localise.bundle import MatchingWeights
+from lalaloc_core.localise.camera_height import CameraHeight
+from lalaloc_core.localise.coarse_pass import LowestCosts, PairLimits, _bounds, _table, first_costs, likeliest
+from lalaloc_core.localise.layouts import layouts_at
+from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost
+from lalaloc_core.localise.poses import PoseGrid, PredictedOpenings, PredictedProfile, Query, rolled
+from lalaloc_core.localise.retrieval import grid_costs, retrieve
+from lalaloc_core.render.sampling import PoseSet, pose_grid, random_poses
 from tests.strategies import seeds
 
 STEP_M, COLUMNS, HYPOTHESES, QUERIES = 0.7, 64, 32, 24
-WEIGHTS, CONFIG = EvidenceModel(temperature=40.0, openings=0.4), EvidenceConfig()
+WEIGHTS, CONFIG = MatchingWeights(temperature=40.0, openings=0.4), MatchingConfig()
 
 
 @pytest.fixture(scope="module")
@@ -29,10 +29,10 @@ def building() -> Building:
 
 
 @pytest.fixture(scope="module")
-def grid(building: Building) -> LatentGrid:
+def grid(building: Building) -> PoseGrid:
     poses = pose_grid(building.plan, STEP_M)
     layouts = layouts_at(building.plan, poses, np.zeros(len(poses)), COLUMNS)
-    return LatentGrid.without_latents(poses, layouts, STEP_M, 1.5)
+    return PoseGrid.without_latents(poses, layouts, STEP_M, 1.5)
 
 
 @pytest.fixture(scope="module")
@@ -66,12 +66,12 @@ def probabilities(pose: np.ndarray, cost: np.ndarray, poses: int) -> np.ndarray:
 
 
 def test_the_best_place_and_the_posterior_are_those_of_comparing_everything(
-    building: Building, grid: LatentGrid, queries: list[Query]
+    building: Building, grid: PoseGrid, queries: list[Query]
 ) -> None:
     compared = 0
     for query in queries:
         found = grid_costs(building.plan, grid, query, WEIGHTS, CONFIG)
-        every, offset = Evidence(building.plan, query, CONFIG.grid_reach * STEP_M, WEIGHTS, CONFIG).costs(
+        every, offset = MatchingCost(building.plan, query, CONFIG.grid_reach * STEP_M, WEIGHTS, CONFIG).costs(
             grid.layouts(building.plan)
         )
         hypothesis, pose = np.unravel_index(every.argmin(), every.shape)
@@ -92,16 +92,16 @@ def test_the_best_place_and_the_posterior_are_those_of_comparing_everything(
 
 
 def test_what_is_only_estimated_has_its_share_of_the_probability(
-    building: Building, grid: LatentGrid, queries: list[Query], monkeypatch: pytest.MonkeyPatch
+    building: Building, grid: PoseGrid, queries: list[Query], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("lalaloc_core.localise.retrieval._MIN_COMPARED", 64)
     monkeypatch.setattr("lalaloc_core.localise.retrieval._MAX_COMPARED", 64)
     # So little sure of anything that thousands of pairs share what is probable.
-    unsure = EvidenceModel(temperature=8.0, openings=0.4)
+    unsure = MatchingWeights(temperature=8.0, openings=0.4)
     ratios = []
     for query in queries:
         found = grid_costs(building.plan, grid, query, unsure, CONFIG)
-        every, _ = Evidence(building.plan, query, CONFIG.grid_reach * STEP_M, unsure, CONFIG).costs(
+        every, _ = MatchingCost(building.plan, query, CONFIG.grid_reach * STEP_M, unsure, CONFIG).costs(
             grid.layouts(building.plan)
         )
         assert found.compared == 64 < len(found.cost)
@@ -113,11 +113,11 @@ def test_what_is_only_estimated_has_its_share_of_the_probability(
 
 
 def test_openings_and_what_lies_behind_them_count_for_pairs_as_for_all(
-    building: Building, grid: LatentGrid, queries: list[Query]
+    building: Building, grid: PoseGrid, queries: list[Query]
 ) -> None:
     layouts, rng = grid.layouts(building.plan), np.random.default_rng(1)
     assert layouts.seen is not None
-    evidence = Evidence(building.plan, queries[1], 0.3, WEIGHTS, CONFIG)
+    evidence = MatchingCost(building.plan, queries[1], 0.3, WEIGHTS, CONFIG)
     every, offset = evidence.costs(layouts)
     pose, hypothesis = rng.integers(0, len(layouts), 700), rng.integers(0, HYPOTHESES, 700)
     cost, found = evidence.pairs(layouts, pose, hypothesis)
@@ -130,12 +130,12 @@ def test_openings_and_what_lies_behind_them_count_for_pairs_as_for_all(
 )
 @pytest.mark.parametrize("hinted", [False, True])
 def test_the_likeliest_pairs_are_those_of_a_first_look_at_all(
-    building: Building, grid: LatentGrid, queries: list[Query], wanted: PairLimits, hinted: bool
+    building: Building, grid: PoseGrid, queries: list[Query], wanted: PairLimits, hinted: bool
 ) -> None:
     looked_at, rng = 0, np.random.default_rng(2)
     for query in queries[:8]:
         against = np.where(rng.random(len(grid.poses)) < 0.5, np.inf, 0.1) if hinted else None
-        evidence = Evidence(building.plan, query, CONFIG.grid_reach * STEP_M, WEIGHTS, CONFIG)
+        evidence = MatchingCost(building.plan, query, CONFIG.grid_reach * STEP_M, WEIGHTS, CONFIG)
         binned, room_index = grid.binned(building.plan), grid.poses.room_index
         every = np.concatenate([cost for _, cost in first_costs(binned, evidence, room_index)])
         every = every if against is None else every + against[:, None]
@@ -149,10 +149,10 @@ def test_the_likeliest_pairs_are_those_of_a_first_look_at_all(
     assert looked_at < 8 * len(grid.poses)
 
 
-def test_no_pose_costs_less_than_its_bound(building: Building, grid: LatentGrid, queries: list[Query]) -> None:
+def test_no_pose_costs_less_than_its_bound(building: Building, grid: PoseGrid, queries: list[Query]) -> None:
     ranks = []
     for query in queries[:8]:
-        evidence = Evidence(building.plan, query, CONFIG.grid_reach * STEP_M, WEIGHTS, CONFIG)
+        evidence = MatchingCost(building.plan, query, CONFIG.grid_reach * STEP_M, WEIGHTS, CONFIG)
         binned, room_index = grid.binned(building.plan), grid.poses.room_index
         every = np.concatenate([cost for _, cost in first_costs(binned, evidence, room_index)])
         table = _table(binned, evidence).reshape(-1, len(evidence.offsets), evidence.hypotheses)

@@ -13,23 +13,23 @@ import shapely
 
 from lalaloc_core.cli.evaluation import add_commands
 from lalaloc_core.conventions import column_azimuths
-from lalaloc_core.learn.data.dataset import Appearance, Dataset
-from lalaloc_core.learn.data.synthetic.unfamiliar import UnfamiliarPhotograph, UnfamiliarScenes
 from lalaloc_core.errors import DatasetError, InvalidInputError
 from lalaloc_core.evaluate.runs.factories import build_dataset
 from lalaloc_core.evaluate.runs.predictions import RunInfo
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.render.depth import layout_depth
-from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.learn.data.dataset import Appearance, Dataset
+from lalaloc_core.learn.data.synthetic.heldout import HeldoutPhotograph, HeldoutScenes
 from lalaloc_core.learn.heldout.furnish import LEVELS, Furnishing
-from lalaloc_core.learn.heldout.homes import WALL_MARGIN_M, HomeKey, UnfamiliarHome, home_of, traced_home
+from lalaloc_core.learn.heldout.homes import WALL_MARGIN_M, HeldoutHome, HomeKey, home_of, traced_home
 from lalaloc_core.learn.heldout.openings import sample_openings
 from lalaloc_core.learn.heldout.outlines import AREAS_M2, sample_outline
 from lalaloc_core.learn.heldout.plans import MAX_AREA_M2, MAX_ROOMS, MIN_AREA_M2, MIN_ROOMS, sample_plan
 from lalaloc_core.learn.heldout.shell import shell_parts
 from lalaloc_core.learn.heldout.tracing import Tracer
+from lalaloc_core.render.depth import layout_depth
+from lalaloc_core.render.profile import wall_profile
 
-PACKAGE = Path(__file__).parents[2] / "lalaloc_core" / "unfamiliar"
+PACKAGE = Path(__file__).parents[2] / "lalaloc_core" / "heldout"
 HOMES = 4
 
 
@@ -37,9 +37,9 @@ def keys() -> list[HomeKey]:
     return [HomeKey(1, 7, index) for index in range(HOMES)]
 
 
-def photograph(scenes: UnfamiliarScenes, name: str, camera: int) -> UnfamiliarPhotograph:
+def photograph(scenes: HeldoutScenes, name: str, camera: int) -> HeldoutPhotograph:
     (one,) = scenes.load(name).cameras[camera].photographs.values()
-    assert isinstance(one, UnfamiliarPhotograph)
+    assert isinstance(one, HeldoutPhotograph)
     return one
 
 
@@ -125,7 +125,7 @@ class TestTruth:
             np.testing.assert_allclose(traced, profile, atol=0.01)
 
     def test_an_empty_photograph_shows_the_layout_wherever_there_is_no_opening(self) -> None:
-        scenes = UnfamiliarScenes(homes=3, shots_per_home=2, furniture="empty")
+        scenes = HeldoutScenes(homes=3, shots_per_home=2, furniture="empty")
         for name in scenes.scenes("validation"):
             scene = scenes.load(name)
             for camera in scene.cameras:
@@ -139,7 +139,7 @@ class TestTruth:
                 assert np.mean(np.abs(seen - truth) < 0.02) > 0.7
 
     def test_every_camera_stands_in_its_room_clear_of_walls_and_furniture(self) -> None:
-        scenes = UnfamiliarScenes(homes=3, shots_per_home=4)
+        scenes = HeldoutScenes(homes=3, shots_per_home=4)
         for name in scenes.scenes("validation"):
             scene = scenes.load(name)
             for k, camera in enumerate(scene.cameras):
@@ -159,7 +159,7 @@ class TestFurniture:
             assert taken["empty"] == 0.0 < taken["simple"] < taken["full"]
 
     @staticmethod
-    def area(home: UnfamiliarHome, key: HomeKey, level: str) -> float:
+    def area(home: HeldoutHome, key: HomeKey, level: str) -> float:
         furnishing = Furnishing(home.plan, home.openings, level, key.rng(1))  # pyright: ignore[reportArgumentType]
         return sum(float(shapely.area(shape)) for shape in furnishing.taken)
 
@@ -180,7 +180,7 @@ class TestFurniture:
 
 class TestScenes:
     def test_the_same_scene_is_always_the_same_and_splits_differ(self) -> None:
-        scenes = UnfamiliarScenes(homes=2, shots_per_home=1)
+        scenes = HeldoutScenes(homes=2, shots_per_home=1)
         assert isinstance(scenes, Dataset)
         first = scenes.load("test-00001")
         picture = photograph(scenes, "test-00001", 0).image(32, 64)
@@ -193,25 +193,25 @@ class TestScenes:
         assert other.plan.to_dict() != first.plan.to_dict()
 
     def test_the_levels_are_asked_at_the_same_places(self) -> None:
-        places = [UnfamiliarScenes(homes=1, furniture=level).load("test-00000").cameras for level in LEVELS]
+        places = [HeldoutScenes(homes=1, furniture=level).load("test-00000").cameras for level in LEVELS]
         for cameras in zip(*places, strict=True):
             assert len({tuple(camera.position_m) for camera in cameras}) == 1
 
     def test_a_picture_has_the_wanted_size_and_contrast(self) -> None:
-        picture = photograph(UnfamiliarScenes(homes=1), "validation-00000", 0).image(64, 128)
+        picture = photograph(HeldoutScenes(homes=1), "validation-00000", 0).image(64, 128)
         assert picture.shape == (64, 128, 3)
         assert picture.std() > 10
 
     def test_without_a_level_each_camera_has_its_own(self) -> None:
-        scenes = UnfamiliarScenes(homes=2, shots_per_home=6, furniture=None)
+        scenes = HeldoutScenes(homes=2, shots_per_home=6, furniture=None)
         assert scenes.appearances == (Appearance(None),)
         levels = {photograph(scenes, name, k).shot.furniture for name in scenes.scenes("test") for k in range(6)}
         assert len(levels) > 1
 
     def test_there_is_nothing_to_train_on(self) -> None:
-        assert list(UnfamiliarScenes(homes=3).scenes("train")) == []
+        assert list(HeldoutScenes(homes=3).scenes("train")) == []
         with pytest.raises(DatasetError, match="no such out-of-family scene"):
-            UnfamiliarScenes(homes=3).load("train-00000")
+            HeldoutScenes(homes=3).load("train-00000")
 
     @pytest.mark.parametrize(
         ("wrong", "message"),
@@ -233,14 +233,14 @@ def asked(generated: dict) -> RunInfo:
         kind="layout",
         dataset="",
         split="test",
-        generated={"generator": "unfamiliar"} | generated,
+        generated={"generator": "heldout"} | generated,
     )
 
 
 class TestAsking:
     def test_a_run_can_ask_for_them(self) -> None:
         dataset = build_dataset(asked({"homes": 2, "furniture": "empty"}))
-        assert dataset == UnfamiliarScenes(homes=2, furniture="empty")
+        assert dataset == HeldoutScenes(homes=2, furniture="empty")
         assert dataset.description == "out-of-family homes (seed 0)"
 
     @pytest.mark.parametrize(
@@ -254,7 +254,7 @@ class TestAsking:
     def test_options_that_contradict_are_refused(self, options: list[str], message: str) -> None:
         parser = argparse.ArgumentParser()
         add_commands(parser.add_subparsers())
-        arguments = parser.parse_args(["evaluate", "--generator", "unfamiliar", "--method", "oracle", *options])
+        arguments = parser.parse_args(["evaluate", "--generator", "heldout", "--method", "oracle", *options])
         with pytest.raises(InvalidInputError, match=message):
             arguments.run(arguments)
 

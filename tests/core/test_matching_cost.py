@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from lalaloc_core.localise.bundle import EvidenceModel
 from lalaloc_core.conventions import DOOR_CODE, OPENING_CLASSES, PASSAGE_CODE, ROOM_TYPES, WALL_CODE, WINDOW_CODE
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.bundle import MatchingWeights
 from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.evidence import Evidence, EvidenceConfig, precisions
 from lalaloc_core.localise.layouts import Layouts, SeenThrough
+from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost, precisions
 from lalaloc_core.localise.poses import (
     PredictedCeiling,
     PredictedOpenings,
@@ -26,9 +26,9 @@ from lalaloc_core.localise.poses import (
 )
 from tests.strategies import seeds
 
-CONFIG = EvidenceConfig(tail=2.0)
+CONFIG = MatchingConfig(tail=2.0)
 EXACT = CameraHeight(1.5, 0.0)
-WEIGHTS = EvidenceModel(openings=0.5, ceiling=0.25, room_type=0.125, temperature=10.0)
+WEIGHTS = MatchingWeights(openings=0.5, ceiling=0.25, room_type=0.125, temperature=10.0)
 PRIOR = np.array([0.7, 0.15, 0.1, 0.05])
 PLAN = FloorPlan.from_dict(
     {
@@ -55,7 +55,7 @@ def openings(probability: np.ndarray) -> PredictedOpenings:
 
 
 def costs(asked: Query, layouts: Layouts, reach_m: float = 0.1, **changed: Any) -> np.ndarray:
-    return Evidence(PLAN, asked, reach_m, WEIGHTS, dataclasses.replace(CONFIG, **changed)).costs(layouts)[0]
+    return MatchingCost(PLAN, asked, reach_m, WEIGHTS, dataclasses.replace(CONFIG, **changed)).costs(layouts)[0]
 
 
 def in_hall(log_profile: np.ndarray, kind: np.ndarray | None = None, seen: SeenThrough | None = None) -> Layouts:
@@ -108,9 +108,9 @@ class TestWalls:
 
     def test_profiles_are_compared_where_there_are_some_and_they_are_wanted(self) -> None:
         asked = query(np.zeros((1, 4)), np.zeros((1, 4)))
-        assert EvidenceConfig().compares_profiles(asked)
-        assert not EvidenceConfig(use_profile=False).compares_profiles(asked)
-        assert not EvidenceConfig().compares_profiles(dataclasses.replace(asked, profile=None))
+        assert MatchingConfig().compares_profiles(asked)
+        assert not MatchingConfig(use_profile=False).compares_profiles(asked)
+        assert not MatchingConfig().compares_profiles(dataclasses.replace(asked, profile=None))
 
     def test_through_an_opening_one_sees_the_wall_or_what_lies_behind_and_either_fits(self) -> None:
         columns, wall, behind = 16, np.zeros((3, 16)), math.log(4.0)
@@ -159,7 +159,9 @@ class TestOpenings:
         window[..., WINDOW_CODE] = 0.97
         asked = query(np.zeros((1, 8)), np.zeros((1, 8)), openings=openings(window))
         layouts = in_hall(np.zeros((1, 8)), np.full((1, 8), WALL_CODE, np.uint8))
-        claimed, unclaimed = (Evidence(p, asked, 0.0, WEIGHTS, CONFIG).costs(layouts)[0][0, 0] for p in (PLAN, plan))
+        claimed, unclaimed = (
+            MatchingCost(p, asked, 0.0, WEIGHTS, CONFIG).costs(layouts)[0][0, 0] for p in (PLAN, plan)
+        )
         assert claimed > 1.0
         assert unclaimed < 0.02
 
@@ -195,7 +197,7 @@ class TestCeilingAndRoomType:
         # The picture was read at 1.5 m and shows the ceiling 2/3 as far above as the floor is below.
         height = CameraHeight(1.8, math.inf)
         asked = query(np.zeros((1, 4)), np.full((1, 4), 2.0), height, ceiling=PredictedCeiling(math.log(1.2), -3.0))
-        _, offset = Evidence(PLAN, asked, 0.1, WEIGHTS, CONFIG).costs(in_hall(np.zeros((1, 4))))
+        _, offset = MatchingCost(PLAN, asked, 0.1, WEIGHTS, CONFIG).costs(in_hall(np.zeros((1, 4))))
         assert 1.8 * math.exp(offset[0, 0]) == pytest.approx(1.5, rel=0.06)
 
     def test_the_type_of_a_room_counts_where_the_plan_says_it(self) -> None:
@@ -220,7 +222,7 @@ class TestCameraHeight:
         rng = np.random.default_rng(0)
         profile = rng.normal(size=(1, 16))
         asked = query(profile - true, np.full((1, 16), -4.0), height)
-        cost, offset = Evidence(PLAN, asked, 0.05, WEIGHTS, CONFIG).costs(in_hall(profile))
+        cost, offset = MatchingCost(PLAN, asked, 0.05, WEIGHTS, CONFIG).costs(in_hall(profile))
         assert offset[0, 0] == true
         assert cost[0, 0] == pytest.approx(height.penalty(np.array([true]))[0] / WEIGHTS.temperature, abs=1e-5)
 
@@ -267,7 +269,7 @@ def test_every_term_of_some_poses_adds_up_to_their_cost() -> None:
         ceiling=PredictedCeiling(0.2, -2.0),
         room_type=PredictedRoomType(np.log(rng.dirichlet(np.ones(len(ROOM_TYPES)))), types),
     )
-    evidence = Evidence(PLAN, asked, 0.1, WEIGHTS, CONFIG)
+    evidence = MatchingCost(PLAN, asked, 0.1, WEIGHTS, CONFIG)
     cost, offset = evidence.costs(layouts)
     for k in range(2):
         terms = evidence.terms(layouts, np.full(4, k), offset[k])

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene, Split
 from lalaloc_core.errors import DatasetError, InvalidInputError
+from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene, Split
 from lalaloc_core.learn.heldout.furnish import LEVELS, Level
 from lalaloc_core.learn.heldout.homes import HomeKey, home_of, stands_of
-from lalaloc_core.learn.heldout.photograph import UnfamiliarShot, depth_m, render
+from lalaloc_core.learn.heldout.photograph import HeldoutShot, depth_m, render
 
 _DEPTH_HEIGHT = 256
 _LEVEL_SHARES = (0.2, 0.25, 0.55)
@@ -21,7 +21,7 @@ SPLIT_NUMBERS: dict[Split, int] = {"validation": 1, "test": 2}
 
 
 @dataclass(frozen=True, kw_only=True)
-class UnfamiliarScenes:
+class HeldoutScenes:
     """Homes of the out-of-family generator with a few cameras each, at every heading and heights of 1.1 to 1.8 m.
 
     Attributes:
@@ -68,8 +68,8 @@ class UnfamiliarScenes:
                 heading=stand.heading,
                 camera_height_m=stand.camera_height_m,
                 photographs={
-                    self.appearances[0]: UnfamiliarPhotograph(
-                        UnfamiliarShot(key, self.furniture or LEVELS[levels[k]], stand, k)
+                    self.appearances[0]: HeldoutPhotograph(
+                        HeldoutShot(key, self.furniture or LEVELS[levels[k]], stand, k)
                     )
                 },
             )
@@ -79,10 +79,10 @@ class UnfamiliarScenes:
 
 
 @dataclass(frozen=True, eq=False)
-class UnfamiliarPhotograph:
+class HeldoutPhotograph:
     """A photograph that is rendered whenever it is asked for."""
 
-    shot: UnfamiliarShot
+    shot: HeldoutShot
 
     def image(self, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
         return render(self.shot, height, width)

@@ -24,7 +24,7 @@ from jaxtyping import Float, Int
 
 from lalaloc_core.conventions import WALL_CODE
 from lalaloc_core.localise.binned_layouts import OPENING_ROWS, BinnedLayouts
-from lalaloc_core.localise.evidence import Evidence
+from lalaloc_core.localise.matching_cost import MatchingCost
 
 # Poses that are looked at together, so that what is summed up stays in the processor's cache.
 _CHUNK = 512
@@ -94,7 +94,7 @@ class PairLimits:
 
 def likeliest(
     binned: BinnedLayouts,
-    evidence: Evidence,
+    evidence: MatchingCost,
     room_index: Int[np.ndarray, "n"],
     wanted: PairLimits,
     against: Float[np.ndarray, "n"] | None = None,
@@ -160,7 +160,7 @@ def _least(
 
 
 def first_costs(
-    binned: BinnedLayouts, evidence: Evidence, room_index: Int[np.ndarray, "n"]
+    binned: BinnedLayouts, evidence: MatchingCost, room_index: Int[np.ndarray, "n"]
 ) -> Iterator[tuple[int, Float[np.ndarray, "n k"]]]:
     """Rough costs of all poses under all hypotheses, each at its best δ: the first pose of a slice, and its costs."""
     table, by_room = _table(binned, evidence), evidence.by_room()
@@ -170,7 +170,7 @@ def first_costs(
         yield first, _least(binned.rows[part] @ table, by_room[:, room_index[part]], shape)
 
 
-def _table(binned: BinnedLayouts, evidence: Evidence) -> Float[np.ndarray, "r c"]:
+def _table(binned: BinnedLayouts, evidence: MatchingCost) -> Float[np.ndarray, "r c"]:
     """What each row says under every δ and hypothesis, δ by δ."""
     centre, precision, loss = evidence.predicted(binned.columns)
     azimuths, bins = len(binned.columns), len(binned.bins)
