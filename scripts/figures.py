@@ -8,14 +8,11 @@ import json
 from pathlib import Path
 from typing import Any
 
-from lalaloc_core.evaluate.reproduce.result import TableResult
-from lalaloc_core.evaluate.reproduce.result_tables import markdown
+from lalaloc_core.evaluate.reproduce.result import TableResult, markdown
 from lalaloc_core.evaluate.reproduce.tables import TABLES
 
 ROOT = Path(__file__).resolve().parent.parent
 BENCH = ROOT / "docs" / "bench.json"
-SIZES = ROOT / "docs" / "encoder_sizes.json"
-IDEAS = ROOT / "docs" / "encoder_ideas.json"
 PAPER_TABLES = ROOT / "docs" / "tables"
 MANIFEST = ROOT / "models" / "default" / "manifest.json"
 
@@ -68,19 +65,6 @@ def evidence_table() -> str:
             cells = [f"{scores['retrieval']['within_1m']:.1%}", f"{scores['within_1m']:.1%}"]
             cells += [f"{scores['within_10cm']:.1%}", f"{scores['median_cm']:.1f} cm", f"{scores['n']}"]
             rows.append(_row(heading.removesuffix("_heading"), name, *cells))
-    return "\n".join(rows)
-
-
-def variants_table(path: Path) -> str:
-    """Variants of the image encoder that were compared, as a Markdown table."""
-    rows = [
-        "| variant | input | channels | parameters | panoramas | ms | latent | profile | likelihood |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
-    for name, one in json.loads(path.read_text(encoding="utf-8")).items():
-        cells = [name, one["input"], ", ".join(map(str, one["widths"])), f"{one['parameters'] / 1e6:.1f} M"]
-        cells += [f"{one['panoramas']:,}", f"{one['latency_ms']:.0f}"]
-        rows.append(_row(*cells, *(f"{one[by]['within_100']:.1%}" for by in ("latent", "profile", "likelihood"))))
     return "\n".join(rows)
 
 

@@ -1,29 +1,22 @@
-"""Write the generated parts of the documentation: `python -m scripts.write_docs`.
+"""Write the generated tables of README.md and docs/: `python -m scripts.write_docs`.
 
-They stand between `<!-- begin: NAME -->` and `<!-- end: NAME -->`; a stale one fails the tests.
+A table stands between `<!-- begin: NAME -->` and `<!-- end: NAME -->`, where NAME is a key of `TABLES`. The tests fail
+when a table is out of date.
 """
 
 from __future__ import annotations
 
 import ast
 import re
-from collections.abc import Iterator
+from collections.abc import Callable
 from pathlib import Path
 
-from scripts.figures import (
-    IDEAS,
-    SIZES,
-    evidence_table,
-    figures_table,
-    paper_tables,
-    training_table,
-    variants_table,
-)
+from scripts.figures import evidence_table, figures_table, paper_tables, training_table
 from service.settings import PREFIX, Settings
 
 ROOT = Path(__file__).resolve().parent.parent
 _PACKAGES = ("lalaloc_core", "service", "lalaloc_client", "examples", "scripts", "benchmarks")
-# Folders without a docstring: what each is for, and what to begin with.
+# Purpose and first file of the folders without a package docstring.
 _OTHER_FOLDERS = {
     "web": ("The web pages, in TypeScript; `make web` builds `service/web/` of them.", "src/app.ts"),
     "models/default": ("The model that ships, with its card.", "README.md"),
@@ -33,6 +26,7 @@ _OTHER_FOLDERS = {
         "test_boundaries.py",
     ),
 }
+_PART = re.compile(r"<!-- begin: (.+?) -->\n.*?<!-- end: \1 -->", re.DOTALL)
 
 
 def main() -> None:
@@ -42,25 +36,18 @@ def main() -> None:
 
 
 def documents() -> dict[Path, str]:
-    """Every document that has generated parts, as it should read."""
-    parts = {
-        ROOT / "README.md": {"figures": figures_table()},
-        ROOT / "docs" / "operations.md": {"settings": settings_table()},
-        ROOT / "docs" / "results.md": {
-            "figures": figures_table(),
-            "evidence": evidence_table(),
-            "paper": paper_tables(),
-            "training": training_table(),
-            "sizes": variants_table(SIZES),
-            "ideas": variants_table(IDEAS),
-        },
-        ROOT / "docs" / "architecture.md": {"folders": folder_map()},
-    }
-    return {path: _filled(path.read_text(encoding="utf-8"), contents) for path, contents in parts.items()}
+    """Return the up-to-date text of every document that has generated tables."""
+    paths = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    texts = {path: path.read_text(encoding="utf-8") for path in paths}
+    return {path: _PART.sub(_filled, text) for path, text in texts.items() if _PART.search(text)}
+
+
+def _filled(part: re.Match[str]) -> str:
+    return f"<!-- begin: {part[1]} -->\n{TABLES[part[1]]()}\n<!-- end: {part[1]} -->"
 
 
 def settings_table() -> str:
-    """The service's settings as a Markdown table."""
+    """Return the service's settings as a Markdown table."""
     rows = ["| variable | default | meaning |", "|---|---|---|"]
     for name, field in Settings.model_fields.items():
         default = field.default
@@ -72,12 +59,12 @@ def settings_table() -> str:
 
 
 def folder_map() -> str:
-    """Every package, what its docstring says it is for and where to begin, as a Markdown table; then other folders.
+    """Return a Markdown table of all packages, with summary and first file from their docstrings, and other folders.
 
     Raises:
-        FileNotFoundError: what one of those others is to be begun with is gone.
+        FileNotFoundError: the first file of a folder does not exist.
     """
-    rows = ["| folder | what it is for | begin with |", "|---|---|---|"]
+    rows = ["| folder | purpose | begin with |", "|---|---|---|"]
     for package in _PACKAGES:
         for path in sorted((ROOT / package).rglob("__init__.py"), key=lambda path: path.parent):
             docstring = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
@@ -86,30 +73,19 @@ def folder_map() -> str:
             rows.append(f"| `{path.parent.relative_to(ROOT)}/` | {summary} | {f'`{begin[1]}`' if begin else ''} |")
     for folder, (purpose, first) in _OTHER_FOLDERS.items():
         if not (ROOT / folder / first).exists():
-            raise FileNotFoundError(f"the map of folders names '{folder}/{first}', which is gone")
+            raise FileNotFoundError(f"'{folder}/{first}' does not exist; correct _OTHER_FOLDERS")
         rows.append(f"| `{folder}/` | {purpose} | `{first}` |")
     return "\n".join(rows)
 
 
-def _filled(text: str, contents: dict[str, str]) -> str:
-    """The text with each named part replaced.
-
-    Raises:
-        ValueError: a part has no place in the text, or a place no part.
-    """
-    places = list(_places(text))
-    if sorted(places) != sorted(contents):
-        raise ValueError(f"the document has places for {places}, the generated parts are {list(contents)}")
-    for name, content in contents.items():
-        begin, end = f"<!-- begin: {name} -->", f"<!-- end: {name} -->"
-        before, _, rest = text.partition(begin)
-        text = f"{before}{begin}\n{content}\n{end}{rest.partition(end)[2]}"
-    return text
-
-
-def _places(text: str) -> Iterator[str]:
-    for match in re.finditer(r"<!-- begin: (.+?) -->", text):
-        yield match[1]
+TABLES: dict[str, Callable[[], str]] = {
+    "settings": settings_table,
+    "folders": folder_map,
+    "figures": figures_table,
+    "evidence": evidence_table,
+    "paper": paper_tables,
+    "training": training_table,
+}
 
 
 if __name__ == "__main__":

@@ -46,7 +46,7 @@ def _reproduce(arguments: argparse.Namespace) -> None:
     if arguments.data is None:
         raise InvalidInputError("--data is missing: Structured3D, or what `lalaloc synth` writes")
 
-    from lalaloc_core.evaluate.reproduce.result_tables import markdown
+    from lalaloc_core.evaluate.reproduce.result import markdown
     from lalaloc_core.evaluate.reproduce.run import TableMaker
 
     table_maker = TableMaker(

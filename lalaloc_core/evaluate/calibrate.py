@@ -235,7 +235,7 @@ def _covariance_factors(predictions: Sequence[Prediction]) -> tuple[float | None
     """Factors that make half of the right answers' errors fall into the ellipse (interval) that should hold half."""
     position, heading = [], []
     for one in predictions:
-        answer = one.answer
+        answer = one.final_pose
         if answer is None or one.information is None:
             continue
         offset = np.array([answer.x_m - one.truth.x_m, answer.y_m - one.truth.y_m])

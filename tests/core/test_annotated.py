@@ -14,8 +14,14 @@ from PIL import Image, ImageColor
 from lalaloc_core.cli import main
 from lalaloc_core.conventions import OPENING_CLASSES, TWO_PI, column_azimuths
 from lalaloc_core.errors import DatasetError, InvalidInputError
-from lalaloc_core.evaluate.report.photograph_sheet import CLASS_COLOURS, draw_photographs
-from lalaloc_core.evaluate.report.photographs import FIGURES_FILE, SHEET_FILE, PhotographResults, evaluate_photographs
+from lalaloc_core.evaluate.report.photographs import (
+    CLASS_COLOURS,
+    FIGURES_FILE,
+    SHEET_FILE,
+    PhotographResults,
+    draw_photographs,
+    evaluate_photographs,
+)
 from lalaloc_core.evaluate.report.tables import percent
 from lalaloc_core.evaluate.runs.galleries import answers_in_galleries, describe_answers, score_galleries
 from lalaloc_core.evaluate.runs.photograph_reading import ReadPhotograph, read_photographs

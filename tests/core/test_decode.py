@@ -37,7 +37,7 @@ class TrueDecoder(LayoutDecoder):
 @pytest.mark.parametrize("position", [(1.4, 1.3), (2.1, 0.9), (3.1, 1.6)])
 def test_a_decoder_that_is_right_leads_to_the_truth(encoders: Encoders, position: tuple[float, float]) -> None:
     question = question_at(plan_of([[0.0, 0.0], [4.0, 0.0], [4.0, 2.2], [0.0, 3.0]]), position)
-    answer = VdrDecode(encoders, TrueDecoder(question)).answer(question)
+    answer = VdrDecode(encoders, TrueDecoder(question)).locate(question)
     found = answer.stages["decode"]
     assert math.hypot(found.x_m - position[0], found.y_m - position[1]) < 0.02
     assert found.distance == pytest.approx(0.0, abs=0.01)
@@ -48,9 +48,9 @@ def test_a_decoder_that_is_right_leads_to_the_truth(encoders: Encoders, position
 def test_retrieval_and_re_sampling_are_lalaloc_s(encoders: Encoders, heading_known: bool) -> None:
     torch.manual_seed(0)
     question = question_at(crooked_flat(), (1.2, 1.1), heading=0.7, heading_known=heading_known)
-    answer = VdrDecode(encoders, LayoutDecoder()).answer(question)
+    answer = VdrDecode(encoders, LayoutDecoder()).locate(question)
     by_latent = LocaliseConfig(matching=MatchingConfig(use_profile=False))
-    expected = LaLaLoc(encoders, refine="vdr", config=by_latent).answer(question)
+    expected = LaLaLoc(encoders, refine="vdr", config=by_latent).locate(question)
     assert list(answer.stages) == ["retrieval", "vdr", "decode"]
     assert {stage: answer.stages[stage] for stage in expected.stages} == expected.stages
     assert answer.retrieved == expected.retrieved

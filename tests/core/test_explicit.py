@@ -187,7 +187,7 @@ class TestMethod:
         plan = crooked_flat()
         photograph = None if heading is None else PaintedRoom(plan, position, heading)
         question = question_at(plan, position, photograph=photograph, heading=heading or 0.0)
-        answer = ExplicitLayout(painted).answer(question)
+        answer = ExplicitLayout(painted).locate(question)
         errors = [math.hypot(f.x_m - position[0], f.y_m - position[1]) for f in answer.stages.values()]
         assert list(answer.stages) == ["retrieval", "vdr", "align"]
         assert list(answer.timings_ms) == ["encode", "retrieve", "vdr", "align"]
@@ -205,7 +205,7 @@ class TestMethod:
         plan = _two_ceilings()
         scene = scene_of(plan, 1, seed)
         question = question_at(plan, scene.poses.position_m[0])
-        answer = ExplicitLayout(painted).answer(question)
+        answer = ExplicitLayout(painted).locate(question)
         expected = [
             _slow_distance(question.true_profile(COLUMNS), plan, question.grid, k) for k in range(len(question.grid))
         ]
@@ -215,7 +215,7 @@ class TestMethod:
 
     def test_without_the_heading_it_says_so(self, painted: Encoders) -> None:
         with pytest.raises(InvalidInputError, match="heading"):
-            ExplicitLayout(painted).answer(question_at(crooked_flat(), (1.0, 1.0), heading_known=False))
+            ExplicitLayout(painted).locate(question_at(crooked_flat(), (1.0, 1.0), heading_known=False))
 
 
 def _two_ceilings() -> FloorPlan:

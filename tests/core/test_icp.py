@@ -118,7 +118,7 @@ class TestAlign:
 class TestMethod:
     @pytest.mark.parametrize("position", [(1.13, 1.02), (5.21, 1.42), (2.34, 4.81)])
     def test_a_layout_query_is_found_to_a_centimetre_in_any_room(self, position: tuple[float, float]) -> None:
-        answer = Icp().answer(question_at(crooked_flat(), position, heading=1.0, step_m=0.7))
+        answer = Icp().locate(question_at(crooked_flat(), position, heading=1.0, step_m=0.7))
         found = answer.stages["icp"]
         assert math.hypot(found.x_m - position[0], found.y_m - position[1]) < 0.01
         assert found.room_index == crooked_flat().room_index_at(np.array([position]))[0]
@@ -132,21 +132,21 @@ class TestMethod:
         question = question_at(
             plan, position, heading=heading, step_m=0.7, photograph=BareRoom(plan, position, heading, rows=128)
         )
-        found = Icp().answer(question).stages["icp"]
+        found = Icp().locate(question).stages["icp"]
         assert math.hypot(found.x_m - position[0], found.y_m - position[1]) < 0.02
         assert abs(wrap_angle(found.heading - heading)) < 0.01
 
     def test_a_heading_that_is_a_little_off_is_put_right(self) -> None:
         plan, position = crooked_flat(), (1.13, 1.02)
         photograph = BareRoom(plan, position, 1.0, rows=128)
-        found = Icp().answer(question_at(plan, position, heading=1.03, photograph=photograph, step_m=0.7)).stages["icp"]
+        found = Icp().locate(question_at(plan, position, heading=1.03, photograph=photograph, step_m=0.7)).stages["icp"]
         assert abs(wrap_angle(found.heading - 1.0)) < 0.005
 
     @pytest.mark.parametrize("rows", [32, 64])
     def test_the_scan_is_the_horizon_not_the_floor(self, rows: int) -> None:
         plan, position = plan_of(rectangle(9.0, 7.0)), (4.2, 3.1)
         question = question_at(plan, position, step_m=2.0, photograph=BareRoom(plan, position, 0.3, rows), heading=0.3)
-        found = Icp().answer(question).stages["icp"]
+        found = Icp().locate(question).stages["icp"]
         assert math.hypot(found.x_m - position[0], found.y_m - position[1]) < 0.03
 
     def test_an_alignment_outside_all_rooms_belongs_to_the_room_it_started_in(self) -> None:
@@ -158,7 +158,7 @@ class TestMethod:
             photograph=BareRoom(large, (7.5, 7.5), 0.0),
             grid=PoseSet(np.full((1, 2), 0.5), np.zeros(1, int)),
         )
-        found = Icp().answer(question).stages["icp"]
+        found = Icp().locate(question).stages["icp"]
         assert small.room_index_at(np.array([[found.x_m, found.y_m]])).tolist() == [-1]
         assert found.room_index == 0
 
@@ -169,12 +169,12 @@ class TestMethod:
                 return np.full((64, 128), np.nan)
 
         plan = crooked_flat()
-        assert Icp().answer(question_at(plan, (1.0, 1.0), photograph=Dark(plan, (1.0, 1.0), 0.0))).stages == {}
+        assert Icp().locate(question_at(plan, (1.0, 1.0), photograph=Dark(plan, (1.0, 1.0), 0.0))).stages == {}
 
     def test_without_the_heading_or_depth_it_says_so(self) -> None:
         plan = crooked_flat()
         with pytest.raises(InvalidInputError, match="heading"):
-            Icp().answer(question_at(plan, (1.0, 1.0), heading_known=False))
+            Icp().locate(question_at(plan, (1.0, 1.0), heading_known=False))
 
         @dataclass(frozen=True)
         class NotMeasured(BareRoom):
@@ -182,7 +182,7 @@ class TestMethod:
                 raise DatasetError("the data set has no depth")
 
         with pytest.raises(DatasetError, match="no depth"):
-            Icp().answer(question_at(plan, (1.0, 1.0), photograph=NotMeasured(plan, (1.0, 1.0), 0.0)))
+            Icp().locate(question_at(plan, (1.0, 1.0), photograph=NotMeasured(plan, (1.0, 1.0), 0.0)))
 
 
 @pytest.mark.slow
@@ -195,7 +195,7 @@ def test_layout_queries_of_generated_homes_are_found_to_a_centimetre() -> None:
             question = Question(
                 plan=scene.plan, grid=grid, grid_step_m=0.5, camera=camera, kind="layout", photograph=None
             )
-            found = method.answer(question).stages["icp"]
+            found = method.locate(question).stages["icp"]
             errors.append(math.hypot(found.x_m - camera.position_m[0], found.y_m - camera.position_m[1]))
     assert len(errors) == 40
     assert np.median(errors) < 0.005

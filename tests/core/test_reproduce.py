@@ -10,8 +10,7 @@ import pytest
 from lalaloc_core.cli import main
 from lalaloc_core.errors import RunError
 from lalaloc_core.evaluate.reproduce.ablations import ABLATIONS
-from lalaloc_core.evaluate.reproduce.result import Figure, RowResult, TableResult
-from lalaloc_core.evaluate.reproduce.result_tables import draw_vogel_samples, markdown
+from lalaloc_core.evaluate.reproduce.result import Figure, RowResult, TableResult, draw_vogel_samples, markdown
 from lalaloc_core.evaluate.reproduce.table import COLUMN_TITLES, PAPER_SETTING, SHIPPED, RowQuery
 from lalaloc_core.evaluate.reproduce.tables import TABLES
 from lalaloc_core.evaluate.runs.factories import build_method
@@ -123,7 +122,7 @@ class TestPaperSetting:
                 bundle=str(tiny_bundle),
             )
             method = build_method(info)
-            answers = [method.answer(question_at(plan, (1.3, 1.4))) for plan in plans]
+            answers = [method.locate(question_at(plan, (1.3, 1.4))) for plan in plans]
             costs.append([[one.pose.distance for one in answer.candidates] for answer in answers])
         in_the_paper, usual = costs
         assert in_the_paper[0] == in_the_paper[1]

@@ -11,7 +11,6 @@ from hypothesis import given, settings
 
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.evaluate.methods import similarity
-from lalaloc_core.evaluate.methods.oracle import PoseOracle, SimilarityRetrieval
 from lalaloc_core.evaluate.methods.similarity import (
     LAYOUT_METRICS,
     ChamferGrid,
@@ -19,6 +18,8 @@ from lalaloc_core.evaluate.methods.similarity import (
     EdgeGrid,
     Layout,
     LayoutMetric,
+    PoseOracle,
+    SimilarityRetrieval,
     edge_image,
     layout_grid,
 )
@@ -210,7 +211,7 @@ class TestRetrieval:
         method = SimilarityRetrieval(metric)
         for heading in (0.0, 2.0):
             question = question_at(crooked_flat(), (1.02, 1.03), heading=heading)
-            answer = method.answer(question)
+            answer = method.locate(question)
             found = answer.stages["retrieval"]
             assert (found.x_m, found.y_m, found.room_index, found.heading) == (1.0, 1.0, 0, heading)
             assert answer.retrieved is not None
@@ -222,9 +223,9 @@ class TestRetrieval:
         plan = plan_of(rectangle(2.0, 2.0), rectangle(1.0, 1.0, (2.01, 0.5)))
         grid = PoseSet(np.array([[1.5, 1.0], [2.2, 1.0]]), np.array([0, 1]))
         question = question_at(plan, (1.95, 1.0), grid=grid)
-        answer = PoseOracle().answer(question)
+        answer = PoseOracle().locate(question)
         assert (answer.retrieved, answer.stages["retrieval"].room_index) == (1, 1)
-        assert SimilarityRetrieval().answer(question).retrieved == 0
+        assert SimilarityRetrieval().locate(question).retrieved == 0
 
 
 def test_grids_are_cached_by_plan_and_camera_height() -> None:

@@ -9,7 +9,7 @@ from types import CodeType
 
 import numpy as np
 
-from lalaloc_core.evaluate.bench.homes import home_of_area
+from lalaloc_core.evaluate.bench.speed import home_of_area
 from lalaloc_core.evaluate.methods.lalaloc import local_refiner
 from lalaloc_core.learn.data.synthetic.generated import RendererCache
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary

@@ -7,13 +7,16 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from lalaloc_core.evaluate.bench.accuracy import bench_accuracy, bench_evidence
+from lalaloc_core.evaluate.bench.accuracy import (
+    bench_accuracy,
+    bench_copies,
+    bench_evidence,
+    bench_heights,
+    bench_terms,
+)
 from lalaloc_core.evaluate.bench.azimuths import bench_azimuths
-from lalaloc_core.evaluate.bench.datasets import bench_datasets
-from lalaloc_core.evaluate.bench.methods import bench_methods
-from lalaloc_core.evaluate.bench.rendering import bench_rendering
 from lalaloc_core.evaluate.bench.service import bench_service
-from lalaloc_core.evaluate.bench.terms import bench_copies, bench_heights, bench_terms
+from lalaloc_core.evaluate.bench.speed import bench_datasets, bench_methods, bench_rendering
 from lalaloc_core.localise.bundle import Bundle
 
 

@@ -19,7 +19,7 @@ import httpx
 import numpy as np
 from PIL import Image
 
-from lalaloc_core.evaluate.bench.homes import home_of_area
+from lalaloc_core.evaluate.bench.speed import home_of_area
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer, sample_shots
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary

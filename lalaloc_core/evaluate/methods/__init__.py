@@ -4,6 +4,6 @@ Begin with `method.py`, the question and the answer. `lalaloc.py` is this projec
 and `decode.py` are what the paper compares with, `oracle.py` knows the truth.
 """
 
-from lalaloc_core.evaluate.methods.method import Answer, Found, Method, Question
+from lalaloc_core.evaluate.methods.method import Answer, FoundPose, Method, Question
 
-__all__ = ["Answer", "Found", "Method", "Question"]
+__all__ = ["Answer", "FoundPose", "Method", "Question"]

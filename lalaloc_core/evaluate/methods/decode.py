@@ -45,7 +45,7 @@ class VdrDecode:
         self._width = len(range(0, columns, thinning))
         self._aligner = DepthAligner(rows=DECODED_HEIGHT, columns=columns, thinning=thinning, config=schedule)
 
-    def answer(self, question: Question) -> Answer:
+    def locate(self, question: Question) -> Answer:
         """Localise up to the Vogel disc, decode the query's latent, align."""
         encoders, plan, clock = self._lalaloc.encoders, question.plan, StageClock()
         image = read_image(encoders, question)

@@ -18,9 +18,8 @@ from jaxtyping import Float, UInt8
 
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.evaluate.methods.alignment import DepthAligner
-from lalaloc_core.evaluate.methods.caching import GRIDS_CACHED, grid_key
 from lalaloc_core.evaluate.methods.lalaloc import read_image
-from lalaloc_core.evaluate.methods.method import Answer, Found, Question
+from lalaloc_core.evaluate.methods.method import GRIDS_CACHED, Answer, FoundPose, Question, grid_key
 from lalaloc_core.evaluate.methods.similarity import layouts_at
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.optimise import LpoConfig
@@ -45,7 +44,7 @@ class ExplicitLayout:
         self._aligner = DepthAligner(rows=_ROWS, columns=self._columns, config=schedule)
         self._grids: LRUCache[Any, _RenderedPoses] = LRUCache(GRIDS_CACHED)
 
-    def answer(self, question: Question) -> Answer:
+    def locate(self, question: Question) -> Answer:
         """Predict the layout, retrieve, re-sample and align.
 
         Raises:
@@ -93,7 +92,9 @@ class ExplicitLayout:
         depth = layout_depth(profile, camera, ceiling, _ROWS).astype(np.float32)
         return _RenderedPoses(depth, question.camera.camera_height_m, ceiling)
 
-    def _align(self, question: Question, profile_m: Float[np.ndarray, "w"], heading: float, start: Found) -> Found:
+    def _align(
+        self, question: Question, profile_m: Float[np.ndarray, "w"], heading: float, start: FoundPose
+    ) -> FoundPose:
         room = np.array([start.room_index])
         camera, ceiling = np.array([question.camera.camera_height_m]), question.plan.ceiling_heights_m[room]
         job = RefinementJob(
@@ -130,8 +131,8 @@ class _RenderedPoses:
         return index, float(distance[index])
 
 
-def _found(question: Question, poses: PoseSet, index: int, distance: float) -> Found:
-    return Found(
+def _found(question: Question, poses: PoseSet, index: int, distance: float) -> FoundPose:
+    return FoundPose(
         x_m=float(poses.position_m[index, 0]),
         y_m=float(poses.position_m[index, 1]),
         room_index=int(poses.room_index[index]),

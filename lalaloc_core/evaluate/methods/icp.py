@@ -24,8 +24,7 @@ from scipy.spatial import KDTree
 
 from lalaloc_core.conventions import column_azimuths, row_elevations, wrap_angle
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.evaluate.methods.caching import GRIDS_CACHED, plan_key
-from lalaloc_core.evaluate.methods.method import Answer, Found, Question
+from lalaloc_core.evaluate.methods.method import GRIDS_CACHED, Answer, FoundPose, Question, plan_key
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.pipeline import StageClock
 
@@ -78,7 +77,7 @@ class Icp:
     def _tree(self, question: Question) -> KDTree:
         return KDTree(wall_cloud(question.plan, self.config))
 
-    def answer(self, question: Question) -> Answer:
+    def locate(self, question: Question) -> Answer:
         """Align the scan from every pose of the grid.
 
         An alignment that ends outside all rooms belongs to the room that it started in. A photograph without any
@@ -101,7 +100,7 @@ class Icp:
             best = int(aligned.rms_m.argmin())
         position = aligned.shift_m[best]
         room = int(plan.room_index_at(position[None])[0])
-        found = Found(
+        found = FoundPose(
             x_m=float(position[0]),
             y_m=float(position[1]),
             room_index=room if room >= 0 else int(question.grid.room_index[best]),

@@ -14,8 +14,7 @@ from cachetools import LRUCache, cachedmethod
 from jaxtyping import UInt8
 
 from lalaloc_core.conventions import MIN_CAMERA_HEIGHT_M, TWO_PI
-from lalaloc_core.evaluate.methods.caching import GRIDS_CACHED, grid_key
-from lalaloc_core.evaluate.methods.method import Answer, Found, FoundCandidate, Question
+from lalaloc_core.evaluate.methods.method import GRIDS_CACHED, Answer, FoundCandidate, FoundPose, Question, grid_key
 from lalaloc_core.floorplan import DEFAULT_CAMERA_HEIGHT_M
 from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.camera_height import DEFAULT_STD_M, CameraHeight
@@ -85,7 +84,7 @@ class LaLaLoc:
         self._config = dataclasses.replace(config or LocaliseConfig(), every_stage=True)
         self._grids: LRUCache[Any, PoseGrid] = LRUCache(GRIDS_CACHED)
 
-    def answer(self, question: Question) -> Answer:
+    def locate(self, question: Question) -> Answer:
         """Encode the query and run the service's search."""
         clock = StageClock()
         image = read_image(self.encoders, question)
@@ -170,9 +169,9 @@ def encode(
     return Query(latents, rolls, 0.0, heading_known=question.heading_known, camera_height=height, profile=profile)
 
 
-def found_pose(query: Query, candidate: Candidate) -> Found:
+def found_pose(query: Query, candidate: Candidate) -> FoundPose:
     """A candidate as a pose of the panorama."""
-    return Found(
+    return FoundPose(
         x_m=candidate.x_m,
         y_m=candidate.y_m,
         room_index=candidate.room_index,

@@ -1,4 +1,4 @@
-"""What a way to localise is asked and answers; every row of a results table is one `Method`."""
+"""Question to a localisation method, and its answer; every row of a results table is one `Method`."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Question:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Found:
+class FoundPose:
     """A pose that a method found; `heading` in radians, `distance` by the method's own measure."""
 
     x_m: float
@@ -75,7 +75,7 @@ class Found:
 class FoundCandidate:
     """A rival for the answer: its pose, what each term of the evidence says of it, and its posterior probability."""
 
-    pose: Found
+    pose: FoundPose
     terms: dict[str, float]
     probability: float
 
@@ -96,7 +96,7 @@ class Answer:
         timings_ms: wall-clock per stage.
     """
 
-    stages: dict[str, Found] = field(default_factory=dict)
+    stages: dict[str, FoundPose] = field(default_factory=dict)
     candidates: tuple[FoundCandidate, ...] = ()
     retrieved: int | None = None
     signals: dict[str, dict[str, float]] = field(default_factory=dict)
@@ -116,6 +116,20 @@ class Answer:
 class Method(Protocol):
     """A way to localise. Methods keep what belongs to a plan (grids, point clouds) from one question to the next."""
 
-    def answer(self, question: Question) -> Answer:
+    def locate(self, question: Question) -> Answer:
         """Find the camera of a question."""
         ...
+
+
+# Queries come scene by scene, and cameras of a scene often share a height: a few are enough.
+GRIDS_CACHED = 4
+
+
+def grid_key(_: object, question: Question) -> tuple[FloorPlan, float, float]:
+    """Key of what is made of a question's grid; plans are compared by identity, and kept alive by the key."""
+    return question.plan, question.camera.camera_height_m, question.grid_step_m
+
+
+def plan_key(_: object, question: Question) -> FloorPlan:
+    """Key of what is made of a question's plan."""
+    return question.plan

@@ -1,24 +1,27 @@
-"""How alike two layouts are: the four metrics of the paper's table "Layout-similarity metric", against a grid of poses.
+"""Similarity of layouts: the four metrics of the paper's table "Layout-similarity metric", and retrieval by them.
 
-Each class holds what belongs to one plan, one set of poses and one camera height, and compares a query with every pose.
-All layouts are seen at heading 0.
+Each grid class holds the layouts of one plan, one set of poses and one camera height at heading 0, and compares a query
+with every pose. `SimilarityRetrieval` and `PoseOracle` use the true layout or pose: they bound every retrieval.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from operator import attrgetter
+from typing import Any, Literal, get_args
 
 import numpy as np
+from cachetools import LRUCache, cachedmethod
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import KDTree
 
 from lalaloc_core.conventions import TWO_PI
 from lalaloc_core.errors import InvalidInputError
-from lalaloc_core.evaluate.methods.method import Question
+from lalaloc_core.evaluate.methods.method import GRIDS_CACHED, Answer, FoundPose, Question, grid_key
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.pipeline import StageClock
 from lalaloc_core.render.depth import back_project, layout_depth
 from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.render.sampling import PoseSet
@@ -259,3 +262,47 @@ def _corners(profile_m: Float[np.ndarray, "n w"]) -> Bool[np.ndarray, "n w"]:
 def _require_columns(query: Layout, columns: int) -> None:
     if len(query.profile_m) != columns:
         raise InvalidInputError(f"the query's wall profile has {len(query.profile_m)} columns, {columns} are wanted")
+
+
+class SimilarityRetrieval:
+    """The grid pose whose layout is nearest the true layout by one metric (paper, table of layout-similarity metrics).
+
+    By Chamfer distance it is the paper's oracle, and its choice is what Layout R@1 counts as right.
+    """
+
+    def __init__(self, metric: LayoutMetric = "chamfer") -> None:
+        self.metric: LayoutMetric = metric
+        self._grids: LRUCache[Any, LayoutGrid] = LRUCache(GRIDS_CACHED)
+
+    def locate(self, question: Question) -> Answer:
+        """Retrieve with the true layout."""
+        grid = self._grid(question)
+        clock = StageClock()
+        with clock.stage("retrieve"):
+            index = grid.nearest(true_layout(question, grid.columns))
+        return _retrieved(question, index, clock)
+
+    @cachedmethod(attrgetter("_grids"), key=grid_key)
+    def _grid(self, question: Question) -> LayoutGrid:
+        return layout_grid(self.metric, question.plan, question.grid, question.camera.camera_height_m)
+
+
+class PoseOracle:
+    """The grid pose nearest the true position: row "Pose" of the same table, the bound of every retrieval."""
+
+    def locate(self, question: Question) -> Answer:
+        """Look up the nearest grid pose."""
+        clock = StageClock()
+        with clock.stage("retrieve"):
+            index = int(np.linalg.norm(question.grid.position_m - question.camera.position_m, axis=1).argmin())
+        return _retrieved(question, index, clock)
+
+
+def _retrieved(question: Question, index: int, clock: StageClock) -> Answer:
+    found = FoundPose(
+        x_m=float(question.grid.position_m[index, 0]),
+        y_m=float(question.grid.position_m[index, 1]),
+        room_index=int(question.grid.room_index[index]),
+        heading=question.camera.heading,
+    )
+    return Answer(stages={"retrieval": found}, retrieved=index, timings_ms=clock.timings_ms)

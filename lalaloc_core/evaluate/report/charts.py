@@ -21,8 +21,7 @@ from lalaloc_core.evaluate.report.figures import (
     finish,
     line_styles,
 )
-from lalaloc_core.evaluate.report.reading import Run
-from lalaloc_core.evaluate.report.times import TOTAL, stage_times
+from lalaloc_core.evaluate.report.reading import TOTAL, Run, stage_times
 from lalaloc_core.evaluate.runs.failures import Outcome, count_outcomes
 from lalaloc_core.evaluate.runs.score import position_errors_m
 

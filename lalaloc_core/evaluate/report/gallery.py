@@ -144,7 +144,7 @@ class _CardWriter:
         prediction = self._run.predictions[index]
         scene, camera = find_camera(self._dataset, prediction)
         question = ask_again(self._run.info, scene, camera, self._appearance)
-        found = prediction.answer
+        found = prediction.final_pose
         return Card(
             scene=prediction.scene,
             camera=prediction.camera,
@@ -169,7 +169,7 @@ class _CardWriter:
         except (LaLaLocError, OSError) as error:
             self._left_out.append(f"A panorama is left out: {error}.")
             return []
-        return [draw_panorama(image, scene.plan, camera.camera_height_m, prediction.truth, prediction.answer)]
+        return [draw_panorama(image, scene.plan, camera.camera_height_m, prediction.truth, prediction.final_pose)]
 
 
 def _open_encoders(info: RunInfo, left_out: list[str]) -> Encoders | None:

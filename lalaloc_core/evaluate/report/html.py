@@ -1,18 +1,20 @@
-"""The report of an evaluation: one HTML page about one or several runs that needs nothing but itself.
-
-No script and no address: pictures are part of the page, and it reads the same offline.
-"""
+"""Report of evaluation runs: one self-contained HTML page without scripts or external addresses."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from lalaloc_core.evaluate.report import tables
 from lalaloc_core.evaluate.report.charts import draw_charts
 from lalaloc_core.evaluate.report.figures import Chart
 from lalaloc_core.evaluate.report.gallery import Gallery, build_gallery
-from lalaloc_core.evaluate.report.page import render_page
 from lalaloc_core.evaluate.report.reading import Run, open_runs
+from lalaloc_core.evaluate.runs.failures import ALIGNMENT_LIMIT_M, Outcome
+from lalaloc_core.evaluate.runs.predictions import RunInfo
 from lalaloc_core.files import atomic_write
 
 # Of all galleries together; as text they take a third more, and the page is to stay below 5 MB.
@@ -65,3 +67,97 @@ def _write_pictures(folder: Path, charts: Mapping[str, Chart], galleries: Mappin
                 for picture in card.pictures:
                     name = f"run-{number}-{group.replace(' ', '-')}-{place}-{picture.file_name}"
                     atomic_write(folder / name, picture.content)
+
+
+_GROUPS = {
+    "best": "Best",
+    "median": "Median",
+    "worst": "Worst",
+    "wrong alignment": "Worst alignments in the right room",
+}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Part:
+    """One run on the page.
+
+    Attributes:
+        facts: what was asked, by name.
+        gallery: None where it would have made the page too large, or nothing was answered.
+    """
+
+    run: Run
+    facts: dict[str, str]
+    gallery: Gallery | None
+
+
+def render_page(runs: Sequence[Run], charts: Mapping[str, Chart], galleries: Mapping[int, Gallery]) -> str:
+    """The whole page.
+
+    Args:
+        galleries: by number of the run.
+    """
+    environment = Environment(
+        loader=PackageLoader("lalaloc_core.evaluate.report", "template"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["number"] = tables.number
+    environment.filters["percent"] = tables.percent
+    environment.filters["distance"] = tables.distance
+    source, _, _ = PackageLoader("lalaloc_core.evaluate.report", "template").get_source(environment, "style.css")
+    return environment.get_template("page.html").render(
+        title=_title(runs),
+        style=source,
+        parts=[Part(run=run, facts=_facts(run), gallery=galleries.get(run.number)) for run in runs],
+        charts=charts,
+        tables=tables,
+        runs=runs,
+        several=len(runs) > 1,
+        outcomes=[outcome.value for outcome in Outcome],
+        alignment_limit_m=ALIGNMENT_LIMIT_M,
+        group_names=_GROUPS,
+        calibrated=[run for run in runs if run.scores is not None and run.scores.calibration_error is not None],
+        curve_points=[
+            f"{100.0 * limit_m:g} cm" if limit_m < 1.0 else f"{limit_m:g} m" for limit_m in tables.CURVE_POINTS_M
+        ],
+    )
+
+
+def _title(runs: Sequence[Run]) -> str:
+    return f"Localisation: {runs[0].info.label}" if len(runs) == 1 else f"Localisation: {len(runs)} runs"
+
+
+def _facts(run: Run) -> dict[str, str]:
+    """What was asked, as words."""
+    info = run.info
+    facts = {
+        "Method": info.method,
+        "Settings": ", ".join(f"{name} {value}" for name, value in info.settings.items()) or "defaults",
+        "Data": f"{info.dataset}, {info.split} split",
+        "Queries": _queries(run),
+        "Heading": "known" if info.heading_known else "unknown",
+        "Grid": f"{info.grid_step_m:g} m",
+        "Model": _model(info),
+    }
+    if info.generated is not None:
+        facts["Generator"] = ", ".join(f"{name} {value}" for name, value in info.generated.items() if value is not None)
+    return facts
+
+
+def _queries(run: Run) -> str:
+    info = run.info
+    look = "/".join(part for part in (info.furniture, info.lighting) if part is not None)
+    kind = f"{info.kind} queries" + (f" ({look})" if look else "")
+    limit = "" if info.limit is None else f", limited to {info.limit}"
+    unanswered = run.scores.unanswered if run.scores is not None else 0
+    return f"{len(run.predictions)} {kind}{limit}" + (f", {unanswered} without an answer" if unanswered else "")
+
+
+def _model(info: RunInfo) -> str:
+    if info.model is None:
+        return "none"
+    name = " ".join(info.model[key] for key in ("name", "version") if key in info.model)
+    return name + (f", SHA-256 {info.model['sha256'][:12]}…" if "sha256" in info.model else "")

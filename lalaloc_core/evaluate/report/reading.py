@@ -1,10 +1,12 @@
-"""The runs of a report, read and scored."""
+"""Runs of a report: read, scored and timed."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
 
 from lalaloc_core.errors import RunError
 from lalaloc_core.evaluate.runs.predictions import Prediction, RunInfo, read_runs
@@ -65,3 +67,28 @@ def open_runs(folders: Sequence[Path]) -> list[Run]:
 
 def _shortened(label: str) -> str:
     return label if len(label) <= _MAX_LABEL else label[: _MAX_LABEL - 1] + "…"
+
+
+TOTAL = "total"
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageTime:
+    """Milliseconds of one stage over the queries that went through it."""
+
+    count: int
+    median_ms: float
+    p95_ms: float
+
+
+def stage_times(predictions: Sequence[Prediction]) -> dict[str, StageTime]:
+    """Times by stage, and under `TOTAL` of whole queries; empty where nothing was timed."""
+    timed = [prediction.timings_ms for prediction in predictions if prediction.timings_ms]
+    names = list(dict.fromkeys(name for timings in timed for name in timings))
+    times = {name: _summary([timings[name] for timings in timed if name in timings]) for name in names}
+    return {**times, TOTAL: _summary([sum(timings.values()) for timings in timed])} if timed else {}
+
+
+def _summary(milliseconds: list[float]) -> StageTime:
+    median, p95 = np.percentile(milliseconds, [50.0, 95.0])
+    return StageTime(count=len(milliseconds), median_ms=float(median), p95_ms=float(p95))

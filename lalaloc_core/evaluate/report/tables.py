@@ -9,8 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from lalaloc_core.evaluate.report.charts import curves
-from lalaloc_core.evaluate.report.reading import Run
-from lalaloc_core.evaluate.report.times import stage_times
+from lalaloc_core.evaluate.report.reading import Run, stage_times
 from lalaloc_core.evaluate.runs.failures import Outcome, count_outcomes
 from lalaloc_core.evaluate.runs.score import Estimate, SliceScores, StageScores
 

@@ -231,7 +231,7 @@ class _QueryAnalyser:
         """
         scene, camera = find_camera(self._dataset, prediction)
         image = scene.photograph(camera, self._appearance).image(PICTURE_HEIGHT, PICTURE_WIDTH)
-        found, height = prediction.answer, camera.camera_height_m
+        found, height = prediction.final_pose, camera.camera_height_m
         strokes = [_layout(scene, prediction.truth, height, TRUE_COLOUR, 3.0)]
         if found is not None:
             strokes.append(_layout(scene, found, height, FOUND_COLOUR, 1.5))

@@ -1,15 +1,19 @@
-"""A table with our figures beside the paper's, as it is written down."""
+"""Tables with our figures beside the paper's: as JSON, Markdown and drawing."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+import matplotlib.figure
+
 from lalaloc_core.configuration import build_config
 from lalaloc_core.errors import ConfigError, RunError
+from lalaloc_core.evaluate.reproduce.table import COLUMN_TITLES, SHARES
 from lalaloc_core.evaluate.runs.predictions import without_infinity
 
 Budget = Literal["small", "full"]
@@ -66,3 +70,76 @@ class TableResult:
             return build_config(cls, json.loads(path.read_text(encoding="utf-8")), path=path.name)
         except (OSError, ValueError, ConfigError) as error:
             raise RunError(f"'{path}' is no table of results: {error}") from error
+
+
+_PAPER_DATA = "Structured3D"
+
+
+def markdown(table: TableResult) -> str:
+    """A table as Markdown: in each cell our figure, then in italics the paper's."""
+    same = table.dataset == _PAPER_DATA and table.budget == "full"
+    lines = [
+        f"**{table.title}** (`{table.source}`, `lalaloc reproduce --table {table.name}`). Upright: ours, on "
+        f"{table.dataset}, {table.split} split, budget {table.budget}, with 95 % intervals. Italic: the paper's, on "
+        f"{_PAPER_DATA}{'' if same else '; not the same experiment'}.",
+        "",
+        "| | " + " | ".join(COLUMN_TITLES[column] for column in table.columns) + " | n |",
+        "|---|" + "---|" * (len(table.columns) + 1),
+    ]
+    for row in table.rows:
+        name = f"{row.group}: {row.name}" if row.group else row.name
+        cells = [_cell(column, row.figures.get(column), row.paper.get(column)) for column in table.columns]
+        count = f"{row.n} ({row.skipped} skipped)" if row.skipped else str(row.n)
+        lines.append("| " + " | ".join([name, *cells, count]) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def _cell(column: str, ours: Figure | None, paper: float | None) -> str:
+    parts = []
+    if ours is not None:
+        interval = ""
+        if ours.low is not None or ours.high is not None:
+            interval = f" [{_bound(column, ours.low)}, {_bound(column, ours.high)}]"
+        parts.append(_number(column, ours.value) + interval)
+    if paper is not None:
+        parts.append(f"*{_number(column, paper)}*")
+    return " · ".join(parts) or "–"
+
+
+def _number(column: str, value: float | None) -> str:
+    if value is None:
+        return "∞"
+    if column in SHARES:
+        return f"{100.0 * value:.1f} %"
+    if column.startswith("seconds"):
+        return f"{value:.2g}" if value < 10.0 else f"{value:.1f}"
+    # Layout queries end well below a millimetre.
+    return f"{value:.1f}" if value >= 1.0 else f"{value:.2f}" if value >= 0.01 else "< 0.01"
+
+
+def _bound(column: str, value: float | None) -> str:
+    """An end of an interval, as exact as it deserves."""
+    if value is not None and column in SHARES:
+        return f"{100.0 * value:.0f}"
+    return _number(column, value)
+
+
+def _median_cm(row: RowResult) -> float:
+    """Median error; infinite, and then not drawn, where half of the queries have no answer."""
+    value = row.figures["median_cm"].value
+    return math.inf if value is None else value
+
+
+def draw_vogel_samples(table: TableResult, path: Path) -> None:
+    """The paper's figure of Vogel disc samples: median error by number of samples, with and without LPO."""
+    figure = matplotlib.figure.Figure(figsize=(6.0, 3.6), layout="constrained")
+    axes = figure.add_subplot()
+    for name, style in (("VDR", "o-"), ("VDR + LPO", "s-")):
+        rows = [row for row in table.rows if row.name == name]
+        axes.plot([int(row.group.split()[0]) for row in rows], [_median_cm(row) for row in rows], style, label=name)
+    for name, style in (("Retrieval", ":"), ("LPO", "--")):
+        (row,) = (row for row in table.rows if row.name == name and row.group == "without VDR")
+        axes.axhline(_median_cm(row), linestyle=style, color="0.4", label=f"{name}, no VDR")
+    axes.set(xlabel="samples of the Vogel disc", ylabel="median error (cm)", ylim=(0.0, None))
+    axes.legend(frameon=False, loc="center right")
+    figure.savefig(path, dpi=120)

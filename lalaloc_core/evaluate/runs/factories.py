@@ -15,8 +15,7 @@ from lalaloc_core.evaluate.methods.explicit import ExplicitLayout
 from lalaloc_core.evaluate.methods.icp import Icp
 from lalaloc_core.evaluate.methods.lalaloc import LaLaLoc, StatedHeight, local_refiner
 from lalaloc_core.evaluate.methods.method import Method
-from lalaloc_core.evaluate.methods.oracle import PoseOracle, SimilarityRetrieval
-from lalaloc_core.evaluate.methods.similarity import LayoutMetric
+from lalaloc_core.evaluate.methods.similarity import LayoutMetric, PoseOracle, SimilarityRetrieval
 from lalaloc_core.evaluate.runs.predictions import RunInfo
 from lalaloc_core.learn.data.dataset import Appearance, Dataset
 from lalaloc_core.learn.data.dataset_detection import open_dataset
@@ -99,8 +98,7 @@ def build_dataset(info: RunInfo) -> Dataset:
         return CopiedScenes(homes)
     if generator == "disturbed":
         return DisturbedScenes(homes)
-    # Runs of earlier versions say "strangers".
-    return MismatchedScenes(homes) if generator in ("mismatched", "strangers") else homes
+    return MismatchedScenes(homes) if generator == "mismatched" else homes
 
 
 def build_method(info: RunInfo) -> Method:

@@ -56,7 +56,7 @@ def is_symmetric(plan: FloorPlan, prediction: Prediction) -> bool:
 
     That is: it lies within `ALIGNMENT_LIMIT_M` of one of the true position's `symmetric_positions`.
     """
-    found = prediction.answer
+    found = prediction.final_pose
     if found is None or outcomes([prediction]) != [Outcome.WRONG_ALIGNMENT]:
         return False
     return shapely.Point(found.x_m, found.y_m).within(_symmetric_area(plan, prediction))
@@ -77,7 +77,7 @@ def _symmetric_area(plan: FloorPlan, prediction: Prediction) -> shapely.Geometry
 
 
 def _outcome(prediction: Prediction, stage: str | None, error_m: float) -> Outcome:
-    found = prediction.answer if stage is None else prediction.stages.get(stage)
+    found = prediction.final_pose if stage is None else prediction.stages.get(stage)
     if found is None:
         return Outcome.NO_ANSWER
     if found.room_index != prediction.truth.room_index:

@@ -81,7 +81,7 @@ def answers_in_galleries(
         key = GalleryKey.of_scene(prediction.scene)
         assert key is not None, f"'{prediction.scene}' is no gallery"
         size_m = known[key.photograph].outlines[key.outline].size_m
-        found = prediction.answer
+        found = prediction.final_pose
         right_room = found is not None and found.room_index == prediction.truth.room_index
         located = right_room and bool(error_m < max(NEAR_M, NEAR_SHARE * size_m))
         answer = GalleryAnswer(

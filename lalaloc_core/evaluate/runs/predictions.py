@@ -95,7 +95,7 @@ class Prediction:
     facts: tuple[str, ...] = ()
 
     @property
-    def answer(self) -> Pose | None:
+    def final_pose(self) -> Pose | None:
         """The pose after the last stage; None where there is no answer."""
         return next(reversed(self.stages.values()), None)
 

@@ -24,7 +24,7 @@ from tqdm import tqdm
 from lalaloc_core.configuration import build_config
 from lalaloc_core.conventions import heading_to_degrees
 from lalaloc_core.errors import DatasetError, InvalidInputError, RunError
-from lalaloc_core.evaluate.methods.method import Answer, Found, Method, Question
+from lalaloc_core.evaluate.methods.method import Answer, FoundPose, Method, Question
 from lalaloc_core.evaluate.methods.similarity import ChamferGrid, true_layout
 from lalaloc_core.evaluate.runs.factories import build_dataset, build_method
 from lalaloc_core.evaluate.runs.predictions import Pose, PredictedCandidate, Prediction, RunFolder, RunInfo
@@ -192,9 +192,9 @@ class _SceneEvaluator:
             photograph=photograph,
             heading_known=info.heading_known,
         )
-        answer = method.answer(question)
+        answer = method.locate(question)
         x_m, y_m = camera.position_m
-        truth = Found(x_m=float(x_m), y_m=float(y_m), room_index=camera.room_index, heading=camera.heading)
+        truth = FoundPose(x_m=float(x_m), y_m=float(y_m), room_index=camera.room_index, heading=camera.heading)
         return Prediction(
             scene=scene.name,
             camera=camera.name,
@@ -235,7 +235,7 @@ class _SceneEvaluator:
         return int(distance.argmin()) == answer.retrieved
 
 
-def _pose(found: Found) -> Pose:
+def _pose(found: FoundPose) -> Pose:
     return Pose(
         x_m=found.x_m,
         y_m=found.y_m,

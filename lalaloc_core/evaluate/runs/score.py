@@ -157,7 +157,7 @@ def position_errors_m(predictions: Sequence[Prediction], stage: str | None = Non
     """Distance (m) of each answer, or of each pose after a stage, to the truth; NaN where there is none."""
     errors = np.full(len(predictions), np.nan)
     for index, prediction in enumerate(predictions):
-        found = prediction.answer if stage is None else prediction.stages.get(stage)
+        found = prediction.final_pose if stage is None else prediction.stages.get(stage)
         if found is not None:
             errors[index] = np.hypot(found.x_m - prediction.truth.x_m, found.y_m - prediction.truth.y_m)
     return errors
@@ -167,7 +167,7 @@ def heading_errors_deg(predictions: Sequence[Prediction], stage: str | None = No
     """Absolute heading error (degrees) of each answer, or of each pose after a stage; NaN where there is none."""
     errors = np.full(len(predictions), np.nan)
     for index, prediction in enumerate(predictions):
-        found = prediction.answer if stage is None else prediction.stages.get(stage)
+        found = prediction.final_pose if stage is None else prediction.stages.get(stage)
         if found is not None:
             turned = np.radians(found.heading_deg - prediction.truth.heading_deg)
             errors[index] = abs(np.degrees(float(wrap_angle(turned))))
@@ -244,7 +244,7 @@ class _Bootstrap:
 def _stage_scores(bootstrap: _Bootstrap, predictions: Sequence[Prediction], stage: str | None) -> StageScores:
     error = _infinite(position_errors_m(predictions, stage))
     heading = _infinite(heading_errors_deg(predictions, stage))
-    found = [p.answer if stage is None else p.stages.get(stage) for p in predictions]
+    found = [p.final_pose if stage is None else p.stages.get(stage) for p in predictions]
     rooms = [f is not None and f.room_index == p.truth.room_index for f, p in zip(found, predictions, strict=True)]
     return StageScores(
         median_cm=_centimetres(bootstrap.median(error)),

@@ -1,0 +1,199 @@
+"""Speed of rendering, of LaLaLoc against ICP, and of writing, reading and evaluating data sets."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import statistics
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from lalaloc_core.evaluate.methods.icp import Icp
+from lalaloc_core.evaluate.methods.lalaloc import LaLaLoc, local_refiner
+from lalaloc_core.evaluate.methods.method import Method, Question
+from lalaloc_core.evaluate.runs.predictions import RunFolder, RunInfo
+from lalaloc_core.evaluate.runs.run import run_evaluation
+from lalaloc_core.learn.data.dataset import Camera
+from lalaloc_core.learn.data.structured3d import Structured3D
+from lalaloc_core.learn.data.synthetic.generated import RenderedPhotograph, RendererCache
+from lalaloc_core.learn.data.synthetic.writing import PICTURES_PER_ROOM, Synthesis, share_out, synthesise
+from lalaloc_core.learn.synth.homes.plans import Home
+from lalaloc_core.learn.synth.homes.splits import TEST, home_of
+from lalaloc_core.learn.synth.scene.materials import MaterialLibrary
+from lalaloc_core.learn.synth.scene.shots import sample_shots
+from lalaloc_core.localise.bundle import Bundle
+from lalaloc_core.localise.encoders import Encoders
+from lalaloc_core.localise.retrieval import build_grid
+from lalaloc_core.render.depth import layout_depth
+from lalaloc_core.render.profile import wall_profile
+from lalaloc_core.render.reference import reference_depth
+from lalaloc_core.render.sampling import pose_grid, random_poses
+
+
+def home_of_area(area_m2: float) -> Home:
+    """The test home whose area comes nearest, among the first hundred."""
+    homes = (home_of(TEST, 0, index)[0] for index in range(100))
+    return min(homes, key=lambda home: abs(home.plan.area_m2 - area_m2))
+
+
+def median_ms(call: Callable[[], object], repeats: int = 9) -> float:
+    """Median milliseconds of a call, after one that is not counted."""
+    call()
+    times = []
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        call()
+        times.append((time.perf_counter() - begin) * 1e3)
+    return statistics.median(times)
+
+
+_GRID_STEP_M = 0.5
+
+
+def bench_rendering(bundle: Bundle, poses: int = 200) -> dict[str, float]:
+    """Closed-form layout depth against the ray-casting oracle in the same run, and the grid of a 100 m² home."""
+    home = home_of_area(100.0)
+    plan = home.plan
+    drawn = random_poses(plan, poses, np.random.default_rng(0))
+    camera, ceiling = np.full(poses, 1.5), plan.ceiling_heights_m[drawn.room_index]
+    arrays = (drawn.position_m, np.zeros(poses), plan.walls_m[drawn.room_index], camera, ceiling)
+    position, heading, walls, cameras, ceilings = (torch.tensor(a, dtype=torch.float32) for a in arrays)
+
+    def closed_form() -> None:
+        layout_depth(wall_profile(position, heading, walls, 256), cameras, ceilings, 128)
+
+    sample = range(0, poses, poses // 10)
+
+    def oracle() -> None:
+        for index in sample:
+            room = plan.rooms[drawn.room_index[index]]
+            reference_depth(room, drawn.position_m[index], 0.0, 1.5, 128, 256)
+
+    encoders = Encoders(bundle)
+    closed_form_ms = median_ms(closed_form) / poses
+    oracle_ms = median_ms(oracle, repeats=3) / len(sample)
+    grid = build_grid(plan, encoders, step_m=_GRID_STEP_M, camera_height_m=1.5)
+    return {
+        "layout_depth_128x256_ms_per_pose": closed_form_ms,
+        "oracle_128x256_ms_per_pose": oracle_ms,
+        "oracle_to_closed_form_ratio": oracle_ms / closed_form_ms,
+        "grid_area_m2": plan.area_m2,
+        "grid_poses": len(grid.poses),
+        "grid_seconds": median_ms(lambda: build_grid(plan, encoders, step_m=_GRID_STEP_M, camera_height_m=1.5)) / 1e3,
+    }
+
+
+_QUERIES = 5
+_GRID_STEP_M = 0.5
+
+
+def bench_methods(bundle: Bundle) -> dict[str, Any]:
+    """Seconds per query of ICP and of LaLaLoc, in the home nearest 100 m², furnished, heading known.
+
+    What belongs to the plan (ICP's cloud of the walls, LaLaLoc's latent grid) is made before and not counted.
+    """
+    home = home_of_area(100.0)
+    shots = sample_shots(home, _QUERIES + 1, np.random.default_rng(2), "full")
+    renderers = RendererCache(MaterialLibrary.create(np.random.default_rng(2)))
+    grid = pose_grid(home.plan, _GRID_STEP_M)
+    questions = [
+        Question(
+            plan=home.plan,
+            grid=grid,
+            grid_step_m=_GRID_STEP_M,
+            camera=Camera(
+                name=str(index),
+                position_m=shot.position_m,
+                room_index=shot.room_index,
+                heading=shot.heading,
+                # One height, so that one latent grid serves all.
+                camera_height_m=shots[0].camera_height_m,
+                photographs={},
+            ),
+            kind="panorama",
+            photograph=RenderedPhotograph(replace(shot, camera_height_m=shots[0].camera_height_m), renderers),
+        )
+        for index, shot in enumerate(shots)
+    ]
+    icp = _mean_seconds(Icp(), questions)
+    lalaloc = _mean_seconds(LaLaLoc(Encoders(bundle, threads=1), refiner=local_refiner(bundle)), questions)
+    return {
+        "area_m2": home.plan.area_m2,
+        "grid_poses": len(grid),
+        "queries": _QUERIES,
+        "icp_seconds": icp,
+        "lalaloc_seconds": lalaloc,
+        "icp_to_lalaloc_ratio": icp / lalaloc,
+    }
+
+
+def _mean_seconds(method: Method, questions: Sequence[Question]) -> float:
+    """Mean over all questions but the first, which warms up."""
+    answers = [method.locate(question) for question in questions]
+    return float(np.mean([sum(answer.timings_ms.values()) for answer in answers[1:]])) / 1e3
+
+
+_SCENES = 48
+_PANORAMA_HEIGHT = 256
+_QUERIES = 300
+
+
+def bench_datasets(bundle: Bundle, textures: Path | None) -> dict[str, Any]:
+    """Write synthetic test scenes, read their annotations again and again, and localise 300 of their panoramas.
+
+    Each takes a process per core.
+    """
+    cores = os.cpu_count() or 1
+    with tempfile.TemporaryDirectory(prefix="lalaloc-bench-") as scratch:
+        root = Path(scratch) / "scenes"
+        settings = Synthesis(root=root, height=_PANORAMA_HEIGHT, textures=textures)
+        begin = time.perf_counter()
+        synthesise(settings, share_out(_SCENES, "test"), workers=cores)
+        writing = time.perf_counter() - begin
+
+        dataset = Structured3D(root)
+        names = dataset.scenes("test")
+        with ProcessPoolExecutor(cores, multiprocessing.get_context("spawn")) as pool:
+            # Every process reads once before it counts.
+            list(pool.map(_count_cameras, [root] * 4 * cores, names[: 4 * cores]))
+            begin = time.perf_counter()
+            cameras = list(pool.map(_count_cameras, [root] * len(names), names, chunksize=2))
+            reading = time.perf_counter() - begin
+
+        info = RunInfo(
+            label="all stages",
+            method="lalaloc",
+            kind="panorama",
+            dataset=dataset.description,
+            split="test",
+            data=str(root),
+            furniture="full",
+            lighting="warm",
+            limit=_QUERIES,
+            bundle=str(bundle.folder),
+        )
+        begin = time.perf_counter()
+        answered = len(run_evaluation(RunFolder(Path(scratch) / "run"), info))
+        evaluating = time.perf_counter() - begin
+    panoramas = PICTURES_PER_ROOM * sum(cameras)
+    return {
+        "panorama_height": _PANORAMA_HEIGHT,
+        "scenes": len(names),
+        "panoramas_written": panoramas,
+        "panoramas_written_per_second": panoramas / writing,
+        "scenes_read_per_second": len(names) / reading,
+        "queries": answered,
+        "evaluation_seconds": evaluating,
+    }
+
+
+def _count_cameras(root: Path, name: str) -> int:
+    return len(Structured3D(root).load(name).cameras)
