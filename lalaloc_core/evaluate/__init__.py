@@ -1,4 +1,4 @@
-"""The wing that measures models: methods, runs, reports, benchmarks, tables.
+"""Evaluation of models: methods, runs, reports, benchmarks and the paper's tables.
 
 Begin with `runs/run.py`.
 """

@@ -1,6 +1,6 @@
-"""`lalaloc bench`: measure the figures of docs/results.md. Each group prints what it measured, with its n.
+"""Benchmarks behind the figures of docs/results.md: `lalaloc bench`.
 
-Begin with `report.py`, which runs the groups, a module each.
+Begin with `report.py`, which runs the groups of benchmarks.
 """
 
 from lalaloc_core.evaluate.bench.report import run_bench

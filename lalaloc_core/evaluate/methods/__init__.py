@@ -1,7 +1,7 @@
-"""Everything that can be a row of a table: each answers a question with the pose after each of its stages.
+"""Localisation methods, each a row of a results table: a question in, the pose after each stage out.
 
-Begin with `method.py`, the question and the answer. `lalaloc.py` is this project's own search, `icp.py`, `explicit.py`
-and `decode.py` are what the paper compares with, `oracle.py` knows the truth.
+Begin with `method.py`, the question and the answer. `lalaloc.py` is this project's search. `icp.py`, `explicit.py` and
+`decode.py` are the paper's baselines. `similarity.py` retrieves with the true layout or pose.
 """
 
 from lalaloc_core.evaluate.methods.method import Answer, FoundPose, Method, Question

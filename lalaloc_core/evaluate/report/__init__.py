@@ -1,7 +1,7 @@
-"""Evaluations to look at: one HTML page about runs, contact sheets of their worst queries, annotated photographs.
+"""Reports on evaluation runs: an HTML page, contact sheets of the worst queries, annotated photographs.
 
-Begin with `html.py`, the page. `worst.py` draws what fails most, `photographs.py` what a model reads from photographs
-of real rooms; `pictures.py` draws plans and panoramas for all of them, `charts.py` curves.
+Begin with `html.py`, the page. `worst.py` draws the worst queries, `photographs.py` evaluates photographs of real
+rooms; `pictures.py` draws plans and panoramas for all of them, `charts.py` draws the charts.
 """
 
 from lalaloc_core.evaluate.report.html import write_report

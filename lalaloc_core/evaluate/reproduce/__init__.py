@@ -1,7 +1,7 @@
-"""Every table of the paper, run again: `lalaloc reproduce`.
+"""Reproduction of every table of the paper: `lalaloc reproduce`.
 
-Begin with `tables.py`, what each row asks and the paper's figures. `run.py` trains, asks and scores what a table needs,
-`ablations.py` are the trained variants, `result_tables.py` writes the tables as Markdown.
+Begin with `tables.py`, the rows of each table and the paper's figures. `run.py` trains, evaluates and scores a table,
+`ablations.py` has the trained variants, `result.py` writes tables as JSON and Markdown.
 """
 
 from lalaloc_core.evaluate.reproduce.tables import TABLES

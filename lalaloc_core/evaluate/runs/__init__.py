@@ -1,8 +1,8 @@
-"""Asking a method about a data set, writing its answers down, and scoring them.
+"""Evaluation runs: asking a method about a data set, storing the predictions, scoring them.
 
-Begin with `run.py`, which asks; `factories.py` finds data set and method, `predictions.py` is the folder that a run
-leaves, `score.py` scores it without model or data, `failures.py` sorts what went wrong.
-Only what loads no network is re-exported.
+Begin with `run.py`, which asks. `factories.py` builds data set and method, `predictions.py` reads and writes the folder
+of a run, `score.py` scores it without model or data, `failures.py` classifies the failures. Only modules that load no
+network are re-exported.
 """
 
 from lalaloc_core.evaluate.runs.predictions import Prediction, RunFolder, RunInfo
