@@ -34,7 +34,7 @@ from service.settings import Settings
 
 # Uploads of 40 MiB are allowed. A worker may hold the pixels of a picture that it is allowed to decode.
 _MAX_MB = 100.0
-_MAX_DECODING_MB = Settings().decode_memory_bytes / 2**20
+_MAX_DECODING_MB = Settings.load().decode.memory_bytes / 2**20
 # What buffers and allocators keep.
 _LEFT_MB = 150.0
 _GIGABYTE = 1 << 30

@@ -95,7 +95,7 @@ def looks_ms(data: Path, venue_id: str) -> float:
     store, spent_ms = open_store(settings), []
     for _ in range(_LOOKS):
         begin = time.perf_counter()
-        store.venues.state(venue_id, bundle.sha256, settings.grid_step_m)
+        store.venues.state(venue_id, bundle.sha256, settings.grids.grid_step_m)
         spent_ms.append(1e3 * (time.perf_counter() - begin))
     return float(np.median(spent_ms))
 

@@ -30,7 +30,7 @@ _START_S, _STOP_S = 120.0, 40.0
 _CLIENTS = (1, 2, 4, 8, 16)
 # Nobody is refused: what is measured is how requests wait for each other.
 _SHARED = {"LALALOC_LOG_LEVEL": "error", "LALALOC_MAX_QUERIES": "64", "LALALOC_LPO_QUEUE": "64"}
-_SHARES = Settings().cores
+_SHARES = Settings.load().cores
 SETTINGS = {
     "one": (1, {}),
     "two": (

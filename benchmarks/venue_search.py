@@ -43,7 +43,7 @@ def main() -> None:
     parser.add_argument("--queries", type=int, default=24)
     parser.add_argument("--seed", type=int, default=0)
     asked = parser.parse_args()
-    bundle, limit = Bundle.open(asked.bundle), Settings().max_grid_poses
+    bundle, limit = Bundle.open(asked.bundle), Settings.load().grids.max_grid_poses
     encoders, refiner = Encoders(bundle, threads=1), local_refiner(bundle)
     homes = [home_of(SPLIT_NUMBERS["test"], asked.seed, number)[0] for number in range(asked.plans)]
     plans, grids = [home.plan for home in homes], [grid_without_latents(home) for home in homes]

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from scripts.figures import evidence_table, figures_table, paper_tables, training_table
-from service.settings import PREFIX, Settings
+from service.settings import settings_table
 
 ROOT = Path(__file__).resolve().parent.parent
 _PACKAGES = ("lalaloc_core", "service", "lalaloc_client", "examples", "scripts", "benchmarks")
@@ -44,18 +44,6 @@ def documents() -> dict[Path, str]:
 
 def _filled(part: re.Match[str]) -> str:
     return f"<!-- begin: {part[1]} -->\n{TABLES[part[1]]()}\n<!-- end: {part[1]} -->"
-
-
-def settings_table() -> str:
-    """Return the service's settings as a Markdown table."""
-    rows = ["| variable | default | meaning |", "|---|---|---|"]
-    for name, field in Settings.model_fields.items():
-        default = field.default
-        if isinstance(default, Path) and default.is_absolute():
-            default = default.relative_to(ROOT)
-        shown = "" if default is None else f"`{default}`"
-        rows.append(f"| `{PREFIX}{name.upper()}` | {shown} | {field.description} |")
-    return "\n".join(rows)
 
 
 def folder_map() -> str:

@@ -90,7 +90,7 @@ async def _lifespan(
     logger = configure_logging(settings.log_level)
     with ExitStack() as cleanup:
         runtime = app.state.runtime = await asyncio.to_thread(start_runtime, settings, telemetry, cleanup, backends)
-        app.state.cors_origins = settings.cors_origin_set
+        app.state.cors_origins = settings.access.cors_origin_set
         app.state.admission = runtime.admission
         app.state.access_control = runtime.access_control
         yield

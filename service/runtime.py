@@ -47,6 +47,10 @@ _UPLOAD_THREADS = with_headroom(2)
 _VENUE_POSES = 40_000
 # Drawings in memory, and revisions that wait to be drawn.
 _DRAWINGS_BYTES, _MAX_DRAWN = 32 * 2**20, 16
+# Age up to which a plan in memory is used while the database is away.
+_PLAN_CACHE_AGE_S = 600.0
+# Timeout of an event stream; the client then asks again.
+STREAM_DEADLINE_S = 900.0
 # With keys that are not remembered, streams still look no more often.
 _MIN_HEARTBEAT_S = 1.0
 # Share of the time for stopping that LPO jobs may go on in.
@@ -149,10 +153,10 @@ def start_runtime(
     searching = _Searching.start(settings, telemetry, cleanup, backends, bundle, store)
     uploads = _closing(cleanup, Threads("lalaloc-uploads", _UPLOAD_THREADS))
     # As many as may be read at a time, and after the converter in being closed: what waits for it must be let go first.
-    file_uploads = _closing(cleanup, Threads("lalaloc-files", with_headroom(settings.import_workers)))
+    file_uploads = _closing(cleanup, Threads("lalaloc-files", with_headroom(settings.imports.workers)))
     converter = _closing(cleanup, Converter(settings, telemetry))
     grids, localiser = searching.grids, _closing(cleanup, searching.localiser())
-    sweeper = Sweeper(store, grids, sweep_s=settings.sweep_s, keep_answers_s=settings.keep_answers_s)
+    sweeper = Sweeper(store, grids, sweep_s=settings.grids.sweep_s, keep_answers_s=settings.storage.keep_answers_s)
     _closing(cleanup, sweeper).start()
     # One read at a time, which takes no thread from queries while the database is silent.
     event_reads = _closing(cleanup, _reads(settings, threads=1, max_pending=1))
@@ -167,7 +171,7 @@ def start_runtime(
         telemetry=telemetry,
         store=store,
         grids=grids,
-        plan_lookup=PlanLookup(store, max_age_s=settings.plan_cache_age_s),
+        plan_lookup=PlanLookup(store, max_age_s=_PLAN_CACHE_AGE_S),
         optimiser=searching.optimiser,
         decoder=searching.decoder,
         converter=converter,
@@ -211,7 +215,7 @@ class _Searching:
         """Start the worker processes, which warm up in the background, and load the model."""
         # The workers first: loading torch in them overlaps with loading the model here.
         optimiser = backends.optimiser(bundle, settings, telemetry)
-        _closing(cleanup, optimiser, _LPO_DRAIN * settings.stop_deadline_s).start()
+        _closing(cleanup, optimiser, _LPO_DRAIN * settings.requests.stop_deadline_s).start()
         decoder = _closing(cleanup, Decoder(bundle.manifest, settings, telemetry))
         decoder.start()
         encoders = backends.encoders(bundle, settings)
@@ -249,9 +253,9 @@ class _Searching:
             self.grids,
             self.reads,
             path=self.settings.data_dir / "prototypes.bin",
-            file_bytes=self.settings.venue_file_bytes,
-            limit_bytes=self.settings.venue_cache_bytes,
-            max_poses=min(self.settings.max_grid_poses, _VENUE_POSES),
+            file_bytes=self.settings.storage.venue_file_bytes,
+            limit_bytes=self.settings.storage.venue_cache_bytes,
+            max_poses=min(self.settings.grids.max_grid_poses, _VENUE_POSES),
         )
 
     def venue_localiser(self, localiser: Localiser, plans: VenuePlans) -> VenueLocaliser:
@@ -274,7 +278,7 @@ def _closing(cleanup: ExitStack, part: Part, *arguments: float) -> Part:
 
 
 def _reads(settings: Settings, *, threads: int, max_pending: int) -> BoundedReads:
-    return BoundedReads(threads=threads, max_pending=max_pending, wait_s=settings.database_wait_s)
+    return BoundedReads(threads=threads, max_pending=max_pending, wait_s=settings.database.wait_s)
 
 
 async def runtime_of(request: Request) -> Runtime:
@@ -289,8 +293,12 @@ def _plan_events(
     store: Store, grids: GridProvider, admission: Admission, reads: BoundedReads, settings: Settings
 ) -> PlanEvents:
     # Their callers' keys are looked at again as often.
-    heartbeat_s = max(min(settings.key_cache_s, HEARTBEAT_S), _MIN_HEARTBEAT_S) if settings.api_keys else HEARTBEAT_S
-    return PlanEvents(store, grids, admission, reads, max_s=settings.stream_deadline_s, heartbeat_s=heartbeat_s)
+    heartbeat_s = (
+        max(min(settings.access.key_cache_s, HEARTBEAT_S), _MIN_HEARTBEAT_S)
+        if settings.access.api_keys
+        else HEARTBEAT_S
+    )
+    return PlanEvents(store, grids, admission, reads, max_s=STREAM_DEADLINE_S, heartbeat_s=heartbeat_s)
 
 
 def _log_start(bundle: Bundle, grids: GridProvider, telemetry: Telemetry) -> None:

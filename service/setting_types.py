@@ -1,4 +1,4 @@
-"""What the values of settings may be, each type with its check."""
+"""Types of setting values, each with its check."""
 
 from __future__ import annotations
 
@@ -35,6 +35,7 @@ def _port_mapping(value: str) -> str:
 Count = Annotated[int, Field(ge=1)]
 Seconds = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 Metres = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
+Area = Annotated[float, Field(gt=0.0, allow_inf_nan=False)]
 # Lists, separated by commas.
 HostNames = Annotated[str, AfterValidator(_host_names)]
 Origins = Annotated[str, AfterValidator(_origins)]

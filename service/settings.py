@@ -1,14 +1,19 @@
-"""Settings of the service, read once from environment variables that start with `LALALOC_`."""
+"""Settings of the service, read once from environment variables that start with `LALALOC_`.
+
+They are grouped: `LALALOC_LPO_QUEUE` is `settings.lpo.queue`. Units stand in the names: `_s` seconds, `_m` metres,
+`_bytes` bytes.
+"""
 
 from __future__ import annotations
 
+import logging
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Any, ClassVar, Literal, Self
 
-from pydantic import Field, ValidationError, model_validator
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic.fields import FieldInfo
 
 from lalaloc_core.errors import ConfigError
 from lalaloc_core.floorplan import PlanLimits
@@ -17,275 +22,179 @@ from lalaloc_core.localise.bundle import default_bundle
 from lalaloc_core.panorama.images import PanoramaLimits
 from service.cores import CoreShares, share_cores, usable_cores
 from service.fair_share import with_headroom
-from service.setting_types import Count, HostNames, Metres, Origins, PortMapping, Seconds
+from service.setting_types import Area, Count, HostNames, Metres, Origins, PortMapping, Seconds
 
 PREFIX = "LALALOC_"
 _DEFAULT_BUNDLE = default_bundle().resolve()
 
-# Requests that may be uploading, besides queries in work.
+# Requests that may be uploading, in addition to the queries in work.
 _UPLOADS = 38
 
+# Settings of earlier versions that are constants now. A variable that still sets one is ignored with a warning.
+_REMOVED = frozenset(
+    {
+        "decode_queue",
+        "head_deadline_s",
+        "import_deadline_s",
+        "import_queue",
+        "import_stall_s",
+        "max_grids_per_plan",
+        "plan_cache_age_s",
+        "refused_keys_per_minute",
+        "stream_deadline_s",
+    }
+)
 
-class Settings(BaseSettings):
-    """Every field is the variable `LALALOC_<FIELD NAME>`; build with `Settings.load()`.
 
-    Units stand in the names: `_s` seconds, `_m` metres, `_bytes` bytes.
+def _items(text: str) -> frozenset[str]:
+    return frozenset(item.strip().lower() for item in text.split(",")) - {""}
+
+
+class _Group(BaseModel):
+    """Settings of one kind; the first line of the docstring is their heading in the documentation.
+
+    Attributes:
+        prefix: start of the variables' names, after `LALALOC_`; the field's name follows.
     """
 
-    model_config = SettingsConfigDict(env_prefix=PREFIX, env_ignore_empty=True, frozen=True, extra="forbid")
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
-    data_dir: Path = Field(default=Path("data"), description="Folder of the database; created when missing.")
-    database_url: str | None = Field(
+    prefix: ClassVar[str] = ""
+
+
+class DatabaseSettings(_Group):
+    """Database."""
+
+    prefix = "database_"
+
+    url: str | None = Field(
         default=None,
-        description="`postgresql://user:password@host/name` or `sqlite:///file`; by default SQLite in the data folder.",
+        description="`postgresql://user:password@host/name` or `sqlite:///file`. Default: SQLite in the data folder.",
     )
-    database_connections: Annotated[int, Field(ge=1, le=1000)] = Field(
-        default=8, description="Connections to the database that are open at a time."
+    connections: int = Field(default=8, ge=1, le=1000, description="Size of the connection pool.")
+    wait_s: Seconds = Field(
+        default=2.0, description="Timeout for a database connection; the request then fails with 503."
     )
-    database_wait_s: Seconds = Field(
-        default=2.0, description="Longest wait for a connection to the database; then the answer is a 503."
-    )
-    bundle: Path = Field(default=_DEFAULT_BUNDLE, description="Folder of the model bundle.")
-    log_level: str = Field(
-        default="info", pattern="^(debug|info|warning|error)$", description="Least level that is logged."
-    )
-    otlp_endpoint: str | None = Field(
-        default=None,
-        pattern="^https?://[^/]+",
-        description="Full address of an OpenTelemetry collector, `http://collector:4318/v1/traces`; spans of requests "
-        "and their stages go there. Needs the extra `otel`.",
-    )
+
+
+class ComputeSettings(_Group):
+    """Processor cores."""
 
     workers: int | None = Field(
         default=None,
         ge=0,
         le=64,
-        description="LPO worker processes; by default a quarter of the cores that the process may use (affinity and "
-        "control group's quota), at least one. 0 turns LPO off, answers end at VDR.",
+        description="LPO worker processes. Default: a quarter of the usable cores (affinity and cgroup quota), at "
+        "least 1. 0 turns LPO off; answers then end at VDR.",
     )
-    worker_threads: int = Field(default=0, ge=0, le=256, description="Torch threads of each LPO worker; 0: one.")
-    onnx_threads: int = Field(default=0, ge=0, le=256, description="onnxruntime threads per network; 0: one.")
+    worker_threads: int = Field(default=0, ge=0, le=256, description="Torch threads per LPO worker. 0: one.")
+    onnx_threads: int = Field(default=0, ge=0, le=256, description="onnxruntime threads per network. 0: one.")
     compute_threads: int = Field(
         default=0,
         ge=0,
         le=256,
-        description="Queries that the service's own process computes at the same time, besides those in LPO; 0: as "
-        "many as the LPO workers leave cores for; a worker that has more than a quarter of them shares it.",
+        description="Queries that the main process computes at a time, not counting LPO. 0: the cores that the LPO "
+        "workers leave free.",
     )
-    lpo_queue: Count = Field(default=16, description="LPO jobs that may wait for a worker; more are answered by VDR.")
-    lpo_deadline_s: Seconds = Field(default=2.0, description="Longest wait for LPO before the VDR pose is the answer.")
-    lpo_stall_s: Seconds = Field(default=10.0, description="An LPO worker busy with one job for longer is restarted.")
 
-    decode_workers: Annotated[int, Field(ge=1, le=64)] = Field(
+
+class LpoSettings(_Group):
+    """Pose refinement (LPO)."""
+
+    prefix = "lpo_"
+
+    queue: Count = Field(
+        default=16, description="LPO jobs that can wait for a worker. Queries beyond that keep the VDR pose."
+    )
+    deadline_s: Seconds = Field(
+        default=2.0, description="LPO timeout per query; the answer then falls back to the VDR pose."
+    )
+    stall_s: Seconds = Field(
+        default=10.0, description="An LPO worker that is busy with one job for longer is restarted."
+    )
+
+
+class DecodeSettings(_Group):
+    """Decoding panoramas."""
+
+    prefix = "decode_"
+
+    workers: int = Field(
         default=2,
-        description="Processes that decode panoramas, one picture at a time each; one is always left to other tenants "
-        "than those that have others at work.",
+        ge=1,
+        le=64,
+        description="Decoder processes, each with one panorama at a time. One is reserved for idle tenants.",
     )
-    decode_queue: Count = Field(default=32, description="Panoramas that may wait to be decoded; more get a 503.")
-    decode_stall_s: Seconds = Field(
-        default=4.0, description="A process busy with one panorama for longer is replaced, and the query fails."
+    stall_s: Seconds = Field(
+        default=4.0, description="Timeout for decoding one panorama; the process is then replaced and the query fails."
     )
-    decode_memory_bytes: Annotated[int, Field(ge=64 * 2**20)] = Field(
-        default=2**30, description="Memory that decoding one panorama may need; enforced on Linux."
+    memory_bytes: int = Field(
+        default=2**30, ge=64 * 2**20, description="Memory limit for decoding one panorama; enforced on Linux."
     )
-    import_workers: Annotated[int, Field(ge=1, le=64)] = Field(
+
+
+class ImportSettings(_Group):
+    """Reading plan files."""
+
+    prefix = "import_"
+
+    workers: int = Field(
         default=2,
-        description="Processes that read and write files of plans but those in the native format, one at a time each; "
-        "they start with the first such file. One is always left to other tenants than those that have others at work.",
+        ge=1,
+        le=64,
+        description="Processes that read and write plan files (not the native format); started on first use. One is "
+        "reserved for idle tenants.",
     )
-    import_queue: Count = Field(default=16, description="Files of plans that may wait to be read; more get a 503.")
-    import_stall_s: Seconds = Field(
-        default=40.0, description="A process busy with one file of a plan for longer is replaced, and the upload fails."
-    )
-    import_deadline_s: Seconds = Field(
-        default=60.0, description="Longest that reading or writing the file of a plan may take, waiting included."
-    )
-    import_memory_bytes: Annotated[int, Field(ge=256 * 2**20)] = Field(
+    memory_bytes: int = Field(
         default=2 * 2**30,
-        description="Memory that reading the file of a plan may need, with the libraries for it; enforced on Linux.",
+        ge=256 * 2**20,
+        description="Memory limit for reading one plan file, libraries included; enforced on Linux.",
     )
-    compass_tolerance_deg: float = Field(
-        default=20.0,
-        ge=0.0,
-        le=45.0,
-        description="How far off the compass heading in a panorama's metadata may be: it is searched for within that.",
-    )
+
+
+class AccessSettings(_Group):
+    """Access."""
 
     api_keys: bool = Field(
         default=False,
-        description="Every route but health needs an API key; make them with `lalaloc-service keys create`.",
+        description="Require an API key on every route except health and metrics; create keys with `lalaloc-service "
+        "keys create`.",
     )
     allow_anonymous: bool = Field(
         default=False,
-        description="Without API keys, listen to others than this machine as well: where something else decides who "
-        "gets here.",
+        description="Without API keys, also listen on public addresses. Use it behind your own access control.",
     )
     allowed_hosts: HostNames = Field(
         default="",
-        description="Without API keys, names besides this machine's that requests may be for (`Host`) and pages come "
-        "from (`Origin`), separated by commas; `*` for any.",
+        description="Without API keys: host names, separated by commas, that requests can use (`Host`, `Origin`) in "
+        "addition to this machine's; `*` for any.",
     )
     cors_origins: Origins = Field(
         default="",
-        description="Origins whose pages may ask from a browser (CORS), separated by commas, such as "
-        "`https://plans.example`; `*` for any, which needs `api_keys`.",
+        description="CORS: origins, separated by commas, whose pages can call the API from a browser, such as "
+        "`https://plans.example`; `*` for any, which needs `LALALOC_API_KEYS=on`.",
     )
     published_on: PortMapping = Field(
         default="",
-        description="Where the port is published if not where the service listens, as Docker has it: `127.0.0.1:8000`, "
-        "or `8000` for every address. Without API keys, addresses of this machine only, unless `allow_anonymous`.",
+        description="Address on which a container publishes the port, such as `127.0.0.1:8000`; `8000` alone means "
+        "every address. Without API keys it must be an address of this machine, unless `LALALOC_ALLOW_ANONYMOUS=on`.",
     )
-    key_cache_s: Annotated[float, Field(ge=0.0, le=60.0)] = Field(
-        default=5.0, description="How long an API key is remembered: a revoked one is refused at most that much later."
-    )
-    rate_per_minute: Annotated[int, Field(ge=0, le=10**6)] = Field(
-        default=600,
-        description="Requests per minute of an API key that has no rate of its own, counted by each replica; 0: any "
-        "number.",
-    )
-    rate_burst: Annotated[int, Field(ge=0, le=10**6)] = Field(
-        default=60, description="Of these, most within one second; 0: any number."
-    )
-    refused_keys_per_minute: Annotated[int, Field(ge=1, le=10**6)] = Field(
-        default=60,
-        description="Invalid API keys per minute of a client address, counted by each replica; further ones are not "
-        "looked at, those that work go on working.",
-    )
-
-    request_deadline_s: Seconds = Field(default=10.0, description="Longest a query may take once it is uploaded.")
-    upload_deadline_s: Seconds = Field(default=60.0, description="Longest an upload may take.")
-    upload_idle_s: Seconds = Field(default=10.0, description="Longest wait for the next bytes of an upload.")
-    upload_bytes_per_s: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] = Field(
-        default=8192.0, description="Slowest an upload may be, once it is `upload_idle_s` behind."
-    )
-    max_pending_requests: int = Field(
-        default=0,
-        ge=0,
-        description="Uploads and queries in work, from the first byte on; more get a 503 at once. "
-        "0: 38 more than queries may be in work.",
-    )
-    max_queries: int = Field(
-        default=0,
-        ge=0,
-        description="Queries, of these, that are computed at a time; more wait, see `LALALOC_MAX_WAITING_QUERIES`. "
-        "0: enough for a tenant alone to have twice as many as LPO workers and compute threads.",
-    )
-    max_waiting_queries: int = Field(
-        default=16,
-        ge=0,
-        description="Queries that wait for one of those to end; more get a 503 before they are uploaded.",
-    )
-    max_reads: Count = Field(default=64, description="Requests in work that change nothing; more get a 503 at once.")
-    max_streams: Count = Field(default=64, description="Clients that follow events; more get a 503 at once.")
-    stream_deadline_s: Seconds = Field(
-        default=900.0, description="Longest that a client follows events before it has to ask anew."
-    )
-    max_connections: Count = Field(default=1024, description="Open connections, idle ones included; more get a 503.")
-    keep_alive_s: Seconds = Field(default=15.0, description="How long a connection may be idle between requests.")
-    head_deadline_s: Seconds = Field(
-        default=10.0, description="Longest that the head of a request, or the rest of a refused body, may take."
-    )
-    stop_deadline_s: Annotated[float, Field(ge=1.0, le=3600.0)] = Field(
-        default=20.0, description="Longest that stopping may take: what is in work is finished, the rest refused."
-    )
-    stop_notice_s: Annotated[float, Field(ge=0.0, le=3600.0)] = Field(
-        default=0.0, description="How long `/readyz` tells a load balancer that the service stops before it does."
-    )
-
-    grid_step_m: float = Field(default=0.5, ge=0.1, le=5.0, description="Distance of the poses of a latent grid.")
-    max_grid_poses: Count = Field(default=900_000, description="Poses that a plan's latent grid may have.")
-    inline_grid_poses: int = Field(
-        default=1000,
-        ge=0,
-        description="A plan that needs no more grid poses than this is ready when its upload is answered; larger ones "
-        "are prepared in the background.",
-    )
-    grid_lease_s: Annotated[float, Field(ge=0.1, le=3600.0, allow_inf_nan=False)] = Field(
-        default=15.0,
-        description="A replica that is silent for longer loses the latent grid that it computes to another.",
-    )
-    sweep_s: Annotated[float, Field(ge=0.1, le=3600.0, allow_inf_nan=False)] = Field(
+    key_cache_s: float = Field(
         default=5.0,
-        description="How often plans that are gone are dropped from memory, and grids that nobody computes taken up.",
+        ge=0.0,
+        le=60.0,
+        description="Lifetime of an API key in memory: a revoked key is rejected after this delay.",
     )
-    plan_cache_bytes: int = Field(
-        default=64 * 2**20,
+    rate_per_minute: int = Field(
+        default=600,
         ge=0,
-        description="Floor plans kept in memory, so that they are not read anew for every query, and to localise while "
-        "the database is away. 0: none is kept.",
+        le=10**6,
+        description="Rate limit per API key and replica, in requests per minute, for keys without a rate of their own. "
+        "0: no limit.",
     )
-    plan_cache_age_s: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] = Field(
-        default=600.0, description="How long a plan in memory is trusted while the database is away."
+    rate_burst: int = Field(
+        default=60, ge=0, le=10**6, description="Of these, requests within one second. 0: no limit."
     )
-    grid_cache_bytes: int = Field(default=2**30, ge=0, description="Latent grids kept in memory.")
-    venue_cache_bytes: int = Field(
-        default=128 * 2**20,
-        ge=0,
-        description="Memory for indices of large venues: 45 bytes per prototype, some 7.5 kB per plan of a home.",
-    )
-    venue_file_bytes: int = Field(
-        default=2 * 2**30,
-        ge=0,
-        description="Prototypes of floor plans in a file in `LALALOC_DATA_DIR`, which large venues are searched by: 82 "
-        "bytes each, some 14 kB per floor plan of a home. It can be deleted while the service is stopped.",
-    )
-    max_grids_per_plan: Annotated[int, Field(ge=2)] = Field(
-        default=8, description="Stored latent grids (camera heights) per plan; the oldest on-demand one makes room."
-    )
-
-    keep_answers_s: Annotated[float, Field(ge=0.0, le=366 * 86400.0)] = Field(
-        default=0.0,
-        description="How long answers, not their panoramas, are kept so that a link opens them again; 0: not at all.",
-    )
-    max_kept_answers: Count = Field(default=10_000, description="Kept answers per tenant; the oldest makes room.")
-
-    max_revisions: Annotated[int, Field(ge=2)] = Field(
-        default=10, description="Revisions kept per floor plan; the oldest makes room."
-    )
-    max_floorplans: Count = Field(default=10_000, description="Stored floor plans per tenant.")
-    max_plan_bytes: Count = Field(default=40 * 2**20, description="Upload of a floor plan, whatever its format.")
-    max_unpacked_bytes: Count = Field(
-        default=200_000_000,
-        description="What an archive, or a compressed part of a floor plan's file, unpacks to.",
-    )
-    max_entities: Count = Field(
-        default=300_000, description="Lines, polygons, texts and the like in the file of a floor plan, with vertices."
-    )
-    max_plan_pixels: Count = Field(default=40_000_000, description="Pixels of a picture of a floor plan.")
-    max_import_s: Seconds = Field(
-        default=30.0, description="Longest that reading the file of a floor plan may take, once it is begun."
-    )
-    max_rooms: Count = Field(default=10_000, description="Rooms per floor plan.")
-    max_vertices: Annotated[int, Field(ge=3)] = Field(default=200, description="Vertices per room.")
-    max_plan_vertices: Annotated[int, Field(ge=3)] = Field(
-        default=100_000, description="Vertices of all rooms of a floor plan."
-    )
-    max_extent_m: Metres = Field(default=1000.0, description="Width or height of a floor plan.")
-    max_area_m2: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] = Field(
-        default=200_000.0, description="Floor area of all rooms of a floor plan."
-    )
-    max_bounds_area_m2: Annotated[float, Field(gt=0.0, allow_inf_nan=False)] = Field(
-        default=500_000.0,
-        description="Area of the boxes around all rooms of a floor plan, which its latent grid is looked for in.",
-    )
-    max_openings: Annotated[int, Field(ge=0)] = Field(
-        default=20_000, description="Doors, windows and passages of a floor plan."
-    )
-    max_venues: Count = Field(default=1000, description="Stored venues per tenant.")
-    max_venue_plans: Count = Field(default=10_000, description="Floor plans of a venue.")
-    max_venue_bytes: Count = Field(default=4 * 2**20, description="Description of a venue: its list of plans, mostly.")
-    max_panorama_bytes: Count = Field(default=40 * 2**20, description="Upload of a panorama.")
-    max_sequence_panoramas: Annotated[int, Field(ge=2, le=20)] = Field(
-        default=10, description="Panoramas of one query of several."
-    )
-    max_sequence_bytes: Count = Field(
-        default=100 * 2**20, description="Upload of all panoramas of one query of several."
-    )
-    max_pixels: Count = Field(default=100_000_000, description="Pixels of a panorama.")
-    max_scans: Count = Field(
-        default=20, description="Scans of a panorama that is a progressive JPEG; encoders write 3 to 12."
-    )
-    max_top_k: Annotated[int, Field(ge=1, le=100)] = Field(default=10, description="Candidates of an answer.")
 
     @model_validator(mode="after")
     def _any_page_needs_keys(self) -> Self:
@@ -293,68 +202,167 @@ class Settings(BaseSettings):
             raise ValueError("LALALOC_CORS_ORIGINS=* needs LALALOC_API_KEYS=on: any page could change all plans")
         return self
 
-    @classmethod
-    def load(cls) -> Self:
-        """Read the settings from the environment; an empty variable counts as not set.
-
-        Raises:
-            ConfigError: a `LALALOC_` variable that no setting has, or a value outside its limits.
-        """
-        known = {PREFIX + name.upper() for name in cls.model_fields}
-        unknown = sorted(name for name in os.environ if name.upper().startswith(PREFIX) and name.upper() not in known)
-        if unknown:
-            raise ConfigError(f"unknown setting {', '.join(unknown)}; known are {', '.join(sorted(known))}")
-        try:
-            return cls()
-        except ValidationError as error:
-            raise ConfigError("; ".join(_describe(fault) for fault in error.errors())) from error
-
     @property
     def allowed_host_names(self) -> frozenset[str]:
         """The names in `allowed_hosts`, in lower case."""
-        return frozenset(name.strip().lower() for name in self.allowed_hosts.split(",")) - {""}
+        return _items(self.allowed_hosts)
 
     @property
     def cors_origin_set(self) -> frozenset[str]:
         """The origins in `cors_origins`, in lower case."""
-        return frozenset(origin.strip().lower() for origin in self.cors_origins.split(",")) - {""}
+        return _items(self.cors_origins)
 
     @property
     def published_host(self) -> str | None:
-        """The address in `published_on`, `0.0.0.0` where it is a port alone; None where nothing is said."""
+        """The address in `published_on`, `0.0.0.0` if it is a port alone, None if it is empty."""
         if not self.published_on:
             return None
         return self.published_on.rpartition(":")[0].strip("[]") or "0.0.0.0"
 
-    @property
-    def cores(self) -> CoreShares:
-        """How the cores are shared out, with what is left open filled in."""
-        return share_cores(
-            usable_cores(),
-            workers=self.workers,
-            worker_threads=self.worker_threads,
-            compute_threads=self.compute_threads,
-            onnx_threads=self.onnx_threads,
-        )
 
-    @property
-    def pending_limit(self) -> int:
-        """Uploads and queries that may be in work."""
-        return self.max_pending_requests or self.query_limit + _UPLOADS
+class UploadSettings(_Group):
+    """Uploads."""
 
-    @property
-    def query_limit(self) -> int:
-        """Queries that may be computed or wait for it."""
-        return self.max_queries or with_headroom(2 * (self.cores.workers + self.cores.compute_threads))
+    prefix = "upload_"
 
-    @property
-    def resolved_database_url(self) -> str:
-        """The SQLAlchemy URL in use."""
-        return self.database_url or f"sqlite:///{(self.data_dir / 'lalaloc.sqlite3').resolve()}"
+    deadline_s: Seconds = Field(default=60.0, description="Timeout for an upload.")
+    idle_s: Seconds = Field(default=10.0, description="Timeout for the next bytes of an upload.")
+    bytes_per_s: float = Field(
+        default=8192.0,
+        gt=0.0,
+        allow_inf_nan=False,
+        description="Minimum upload rate; an upload can lag behind it by `LALALOC_UPLOAD_IDLE_S`.",
+    )
+
+
+class RequestSettings(_Group):
+    """Requests and connections."""
+
+    request_deadline_s: Seconds = Field(default=10.0, description="Timeout for a query once it is uploaded.")
+    max_pending_requests: int = Field(
+        default=0,
+        ge=0,
+        description="Uploads and queries in work, counted from the first byte; more get a 503. 0: "
+        "`LALALOC_MAX_QUERIES` plus 38.",
+    )
+    max_queries: int = Field(
+        default=0,
+        ge=0,
+        description="Queries computed at a time; more wait, see `LALALOC_MAX_WAITING_QUERIES`. 0: enough for one "
+        "tenant to keep every LPO worker and compute thread busy twice.",
+    )
+    max_waiting_queries: int = Field(
+        default=16, ge=0, description="Queries that can wait for a slot; more get a 503 before their upload is read."
+    )
+    max_reads: Count = Field(default=64, description="Read-only requests in work; more get a 503.")
+    max_streams: Count = Field(default=64, description="Open event streams; more get a 503.")
+    max_connections: Count = Field(default=1024, description="Open connections, idle ones included; more get a 503.")
+    keep_alive_s: Seconds = Field(default=15.0, description="Timeout for an idle connection between requests.")
+    stop_deadline_s: float = Field(
+        default=20.0,
+        ge=1.0,
+        le=3600.0,
+        description="Timeout for stopping: requests in work are finished, new ones refused.",
+    )
+    stop_notice_s: float = Field(
+        default=0.0, ge=0.0, le=3600.0, description="Time for which `/readyz` reports 503 before the service stops."
+    )
+
+
+class GridSettings(_Group):
+    """Pose grids."""
+
+    grid_step_m: float = Field(
+        default=0.5, ge=0.1, le=5.0, description="Distance between neighbouring poses of a pose grid."
+    )
+    max_grid_poses: Count = Field(default=900_000, description="Poses in the pose grid of one plan.")
+    inline_grid_poses: int = Field(
+        default=1000,
+        ge=0,
+        description="Pose grids up to this size are computed during the upload; larger ones in the background.",
+    )
+    grid_lease_s: float = Field(
+        default=15.0,
+        ge=0.1,
+        le=3600.0,
+        allow_inf_nan=False,
+        description="A replica that is silent for longer loses the pose grid that it computes to another replica.",
+    )
+    sweep_s: float = Field(
+        default=5.0,
+        ge=0.1,
+        le=3600.0,
+        allow_inf_nan=False,
+        description="Interval at which deleted plans leave memory and abandoned pose grids are taken over.",
+    )
+
+
+class StorageSettings(_Group):
+    """Caches and kept answers."""
+
+    plan_cache_bytes: int = Field(
+        default=64 * 2**20,
+        ge=0,
+        description="Floor plans kept in memory, for speed and for queries while the database is away. 0: none.",
+    )
+    grid_cache_bytes: int = Field(default=2**30, ge=0, description="Pose grids kept in memory.")
+    venue_cache_bytes: int = Field(
+        default=128 * 2**20,
+        ge=0,
+        description="Search indices of large venues kept in memory: 45 bytes per prototype, about 7.5 kB per home.",
+    )
+    venue_file_bytes: int = Field(
+        default=2 * 2**30,
+        ge=0,
+        description="Prototype file of large venues in `LALALOC_DATA_DIR`: 82 bytes per prototype, 14 kB per home. "
+        "Delete it only while the service is stopped.",
+    )
+    keep_answers_s: float = Field(
+        default=0.0,
+        ge=0.0,
+        le=366 * 86400.0,
+        description="Lifetime of answers that a link can reopen; panoramas are never kept. 0: answers are not kept.",
+    )
+    max_kept_answers: Count = Field(default=10_000, description="Kept answers per tenant; the oldest is dropped first.")
+
+
+class PlanSettings(_Group):
+    """Limits of floor plans and venues."""
+
+    max_floorplans: Count = Field(default=10_000, description="Stored floor plans per tenant.")
+    max_revisions: int = Field(
+        default=10, ge=2, description="Revisions kept per floor plan; the oldest is dropped first."
+    )
+    max_plan_bytes: Count = Field(default=40 * 2**20, description="Upload of a floor plan, in any format.")
+    max_unpacked_bytes: Count = Field(
+        default=200_000_000, description="Size of an archive, or of a compressed part of a plan file, once unpacked."
+    )
+    max_entities: Count = Field(
+        default=300_000, description="Drawing entities (lines, polygons, texts) of a plan file, vertices included."
+    )
+    max_plan_pixels: Count = Field(default=40_000_000, description="Pixels of a floor plan picture.")
+    max_import_s: Seconds = Field(
+        default=30.0,
+        description="Timeout for reading a plan file. The process is replaced 10 s later; waiting included, an upload "
+        "can take twice this time.",
+    )
+    max_rooms: Count = Field(default=10_000, description="Rooms per floor plan.")
+    max_vertices: int = Field(default=200, ge=3, description="Vertices per room.")
+    max_plan_vertices: int = Field(default=100_000, ge=3, description="Vertices of all rooms of a floor plan.")
+    max_extent_m: Metres = Field(default=1000.0, description="Width or height of a floor plan.")
+    max_area_m2: Area = Field(default=200_000.0, description="Floor area of all rooms of a floor plan.")
+    max_bounds_area_m2: Area = Field(
+        default=500_000.0,
+        description="Area of the bounding boxes of all rooms of a floor plan; its pose grid is laid over them.",
+    )
+    max_openings: int = Field(default=20_000, ge=0, description="Doors, windows and passages of a floor plan.")
+    max_venues: Count = Field(default=1000, description="Stored venues per tenant.")
+    max_venue_plans: Count = Field(default=10_000, description="Floor plans of a venue.")
+    max_venue_bytes: Count = Field(default=4 * 2**20, description="Upload of a venue document.")
 
     @property
     def plan_limits(self) -> PlanLimits:
-        """Limits of floor plans in the terms of the core."""
+        """Limits of floor plans, for the core."""
         return PlanLimits(
             max_rooms=self.max_rooms,
             max_vertices_per_room=self.max_vertices,
@@ -367,7 +375,7 @@ class Settings(BaseSettings):
 
     @property
     def import_limits(self) -> ImportLimits:
-        """Limits of the files of floor plans in the terms of the core."""
+        """Limits of plan files, for the core."""
         return ImportLimits(
             max_plan_bytes=self.max_plan_bytes,
             max_unpacked_bytes=self.max_unpacked_bytes,
@@ -378,24 +386,165 @@ class Settings(BaseSettings):
         )
 
     @property
+    def import_deadline_s(self) -> float:
+        """Timeout for reading or writing a plan file, waiting for a process included."""
+        return 2.0 * self.max_import_s
+
+
+class PanoramaSettings(_Group):
+    """Limits of panoramas and queries."""
+
+    max_panorama_bytes: Count = Field(default=40 * 2**20, description="Upload of a panorama.")
+    max_sequence_panoramas: int = Field(default=10, ge=2, le=20, description="Panoramas per sequence query.")
+    max_sequence_bytes: Count = Field(default=100 * 2**20, description="Upload of all panoramas of a sequence query.")
+    max_pixels: Count = Field(default=100_000_000, description="Pixels of a panorama.")
+    max_scans: Count = Field(default=20, description="Scans of a progressive JPEG; encoders write 3 to 12.")
+    max_top_k: int = Field(default=10, ge=1, le=100, description="Candidates per answer.")
+    compass_tolerance_deg: float = Field(
+        default=20.0,
+        ge=0.0,
+        le=45.0,
+        description="Tolerance of the compass heading in a panorama's metadata: headings within it are searched.",
+    )
+
+    @property
     def panorama_limits(self) -> PanoramaLimits:
-        """Limits of panoramas in the terms of the core."""
+        """Limits of panoramas, for the core."""
         return PanoramaLimits(max_pixels=self.max_pixels, max_scans=self.max_scans)
 
 
+class Settings(BaseModel):
+    """Service.
+
+    `Settings.load()` reads the environment; `Settings(lpo_queue=4)` takes values by variable name, without `LALALOC_`
+    and in lower case, and defaults for the rest.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    data_dir: Path = Field(
+        default=Path("data"), description="Data folder, with the SQLite database; created when missing."
+    )
+    bundle: Path = Field(default=_DEFAULT_BUNDLE, description="Folder of the model bundle.")
+    log_level: Literal["debug", "info", "warning", "error"] = Field(default="info", description="Minimum log level.")
+    otlp_endpoint: str | None = Field(
+        default=None,
+        pattern="^https?://[^/]+",
+        description="URL of an OpenTelemetry collector, `http://collector:4318/v1/traces`, for spans of requests and "
+        "their stages. Needs the extra `otel`.",
+    )
+    database: DatabaseSettings = DatabaseSettings()
+    compute: ComputeSettings = ComputeSettings()
+    lpo: LpoSettings = LpoSettings()
+    decode: DecodeSettings = DecodeSettings()
+    imports: ImportSettings = ImportSettings()
+    access: AccessSettings = AccessSettings()
+    uploads: UploadSettings = UploadSettings()
+    requests: RequestSettings = RequestSettings()
+    grids: GridSettings = GridSettings()
+    storage: StorageSettings = StorageSettings()
+    plans: PlanSettings = PlanSettings()
+    panoramas: PanoramaSettings = PanoramaSettings()
+
+    def __init__(self, **values: Any) -> None:
+        """Check the values.
+
+        Raises:
+            ConfigError: an unknown name, or a value outside its limits.
+        """
+        places = {name: path for name, path, _ in _places()}
+        if unknown := sorted(values.keys() - places.keys()):
+            known = ", ".join(sorted(_variable(name) for name in places))
+            raise ConfigError(f"unknown setting {', '.join(map(_variable, unknown))}; known are {known}")
+        nested: dict[str, Any] = {}
+        for name, value in values.items():
+            *group, field = places[name]
+            (nested.setdefault(group[0], {}) if group else nested)[field] = value
+        try:
+            super().__init__(**nested)
+        except ValidationError as error:
+            names: dict[tuple[int | str, ...], str] = {path: name for name, path, _ in _places()}
+            faults = []
+            for fault in error.errors():
+                # A fault of a whole group names the variables itself.
+                message, name = fault["msg"].removeprefix("Value error, "), names.get(fault["loc"])
+                faults.append(message if name is None else f"{_variable(name)} is {fault['input']!r}: {message}")
+            raise ConfigError("; ".join(faults)) from error
+
+    @classmethod
+    def load(cls) -> Self:
+        """Read the settings from the environment; an empty variable counts as not set.
+
+        Raises:
+            ConfigError: an unknown `LALALOC_` variable, or a value outside its limits.
+        """
+        given = {name.upper(): value for name, value in os.environ.items() if name.upper().startswith(PREFIX) and value}
+        values = {name.removeprefix(PREFIX).lower(): value for name, value in given.items()}
+        for name in sorted(values.keys() & _REMOVED):
+            logging.getLogger("lalaloc").warning("%s is ignored: this setting was removed", _variable(name))
+            del values[name]
+        return cls(**values)
+
+    def values(self) -> dict[str, Any]:
+        """Return the value of every setting by variable name, without `LALALOC_` and in lower case."""
+        return {
+            name: getattr(self, path[0]) if len(path) == 1 else getattr(getattr(self, path[0]), path[1])
+            for name, path, _ in _places()
+        }
+
+    def with_values(self, **values: Any) -> Self:
+        """Return a copy with some values changed, by variable name as in the constructor."""
+        return type(self)(**(self.values() | values))
+
+    @property
+    def cores(self) -> CoreShares:
+        """The division of the cores, with every open number resolved."""
+        return share_cores(usable_cores(), **self.compute.model_dump())
+
+    @property
+    def pending_limit(self) -> int:
+        """Limit of uploads and queries in work, resolved."""
+        return self.requests.max_pending_requests or self.query_limit + _UPLOADS
+
+    @property
+    def query_limit(self) -> int:
+        """Limit of queries in work, resolved."""
+        return self.requests.max_queries or with_headroom(2 * (self.cores.workers + self.cores.compute_threads))
+
+    @property
+    def database_url(self) -> str:
+        """The SQLAlchemy URL in use."""
+        return self.database.url or f"sqlite:///{(self.data_dir / 'lalaloc.sqlite3').resolve()}"
+
+
 def settings_table() -> str:
-    """All settings as a Markdown table, for the documentation."""
-    lines = ["| variable | default | meaning |", "|---|---|---|"]
+    """Return all settings as Markdown: a heading and a table per group."""
+    lines: list[str] = []
+    heading = ""
+    for name, path, field in _places():
+        group = Settings if len(path) == 1 else type(Settings.model_fields[path[0]].default)
+        if heading != (heading := (group.__doc__ or "").split("\n")[0].rstrip(".")):
+            lines += ["", f"## {heading}", "", "| variable | default | meaning |", "|---|---|---|"]
+        default = (
+            "`models/default`" if name == "bundle" else "" if field.default in (None, "") else f"`{field.default}`"
+        )
+        lines.append(f"| `{_variable(name)}` | {default} | {field.description} |")
+    return "\n".join(lines[1:])
+
+
+def _places() -> Iterator[tuple[str, tuple[str, ...], FieldInfo]]:
+    """Yield the name, the path of attributes and the field of every setting."""
     for name, field in Settings.model_fields.items():
-        default = "`models/default`" if name == "bundle" else "" if field.default is None else f"`{field.default}`"
-        lines.append(f"| `{PREFIX}{name.upper()}` | {default} | {field.description} |")
-    return "\n".join(lines) + "\n"
+        if isinstance(field.default, _Group):
+            for inner, inner_field in type(field.default).model_fields.items():
+                yield field.default.prefix + inner, (name, inner), inner_field
+        else:
+            yield name, (name,), field
 
 
-def _describe(fault: Mapping[str, object]) -> str:
-    location = fault["loc"]
-    if not location:
-        # About several of them, which it names.
-        return str(fault["msg"]).removeprefix("Value error, ")
-    field = str(location[0]) if isinstance(location, tuple) and location else "?"
-    return f"{PREFIX}{field.upper()} is {fault['input']!r}: {fault['msg']}"
+# Every setting by variable name, without `LALALOC_` and in lower case.
+SETTING_NAMES = frozenset(name for name, _, _ in _places())
+
+
+def _variable(name: str) -> str:
+    return PREFIX + name.upper()

@@ -18,7 +18,7 @@ from fastapi.routing import APIRoute
 from service.cores import share_cores
 from service.http.admission_control import Admission, AdmissionLimits
 from service.routes import ROUTERS
-from service.settings import PREFIX, Settings
+from service.settings import PREFIX, SETTING_NAMES, Settings
 from service.telemetry import Telemetry
 
 FOLDER = Path(__file__).parents[1] / "docker" / "kubernetes"
@@ -86,9 +86,9 @@ def test_all_are_about_the_same_pods() -> None:
 def test_settings_are_those_of_the_service() -> None:
     given = {name: value for name, value in CONFIGURED.items() if name.startswith(PREFIX)}
     values: dict[str, Any] = {name.removeprefix(PREFIX).lower(): value for name, value in given.items()}
-    assert Settings(**values).api_keys
+    assert Settings(**values).access.api_keys
     named = {one["name"] for one in CONTAINER["env"]}
-    assert {name.removeprefix(PREFIX).lower() for name in named} <= Settings.model_fields.keys()
+    assert {name.removeprefix(PREFIX).lower() for name in named} <= SETTING_NAMES
     assert CONFIGURED.keys() - given.keys() == {"FORWARDED_ALLOW_IPS"}
     # What is secret comes from a secret.
     assert all("value" not in one and "secretKeyRef" in one["valueFrom"] for one in CONTAINER["env"])
@@ -96,7 +96,7 @@ def test_settings_are_those_of_the_service() -> None:
 
 
 def test_a_pod_has_time_to_stop_and_is_not_asked_meanwhile() -> None:
-    notice_s, deadline_s = float(CONFIGURED["LALALOC_STOP_NOTICE_S"]), Settings().stop_deadline_s
+    notice_s, deadline_s = float(CONFIGURED["LALALOC_STOP_NOTICE_S"]), Settings().requests.stop_deadline_s
     assert POD["terminationGracePeriodSeconds"] > notice_s + deadline_s
     probe = CONTAINER["readinessProbe"]
     assert notice_s > probe["periodSeconds"] * probe["failureThreshold"]

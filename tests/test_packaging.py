@@ -13,14 +13,14 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 from scripts import install_torch
-from service.settings import PREFIX, Settings
+from service.settings import PREFIX, SETTING_NAMES, Settings
 
 ROOT = Path(__file__).parents[1]
 DOCKERFILE = (ROOT / "docker" / "Dockerfile").read_text(encoding="utf-8")
 REPLICAS = yaml.safe_load((ROOT / "docker" / "compose.replicas.yaml").read_text(encoding="utf-8"))["services"]
 COMPOSE = yaml.safe_load((ROOT / "docker" / "compose.yaml").read_text(encoding="utf-8"))["services"]["service"]
 PYPROJECT = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
-SETTINGS = {PREFIX + name.upper() for name in Settings.model_fields}
+SETTINGS = {PREFIX + name.upper() for name in SETTING_NAMES}
 
 
 def _constraints() -> dict[str, str]:
@@ -140,7 +140,7 @@ def test_the_proxy_and_the_replicas_find_each_other() -> None:
 
 def test_containers_are_given_the_time_that_stopping_takes() -> None:
     for service in (COMPOSE, REPLICAS["replica-1"]):
-        assert float(service["stop_grace_period"].rstrip("s")) > Settings.model_fields["stop_deadline_s"].default
+        assert float(service["stop_grace_period"].rstrip("s")) > Settings().requests.stop_deadline_s
 
 
 def test_the_image_does_not_run_as_root_and_compose_builds_it() -> None:

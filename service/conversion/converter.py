@@ -23,6 +23,11 @@ from service.workers.convert import ConversionRefusal, ExportJob, Imported, Impo
 
 _Pool = WorkerPool[ImportJob | ExportJob, Imported | bytes | ConversionRefusal]
 
+# Files that can wait for a process.
+_QUEUE = 16
+# A process that reads one file for longer than `max_import_s` and this is replaced.
+_STALL_MARGIN_S = 10.0
+
 
 class Converter:
     """Bounded pool of converting workers; may be used from any thread."""
@@ -47,11 +52,11 @@ class Converter:
         """How many workers are wanted and warm; none are before the first file."""
         pool = self._pool
         if pool is None:
-            return PoolState(workers=self._settings.import_workers, ready=0, warmed_up=False, fault=None)
+            return PoolState(workers=self._settings.imports.workers, ready=0, warmed_up=False, fault=None)
         return pool.state
 
     def read(self, content: bytes, options: ImportOptions, client: str) -> Imported:
-        """What there is in the file of a plan; blocks, for `import_deadline_s` at most.
+        """What there is in the file of a plan; blocks, for twice `max_import_s` at most.
 
         Raises:
             InvalidFloorPlanError, SeveralLevelsError: what is wrong with the file, and what to do; or a worker stalled
@@ -62,7 +67,7 @@ class Converter:
             ConverterNotReadyError: no worker is running, nor will be in time.
             StoppingError: the service is shutting down.
         """
-        limit_s = self._settings.import_deadline_s
+        limit_s = self._settings.plans.import_deadline_s
         try:
             future = self._started().submit(ImportJob(content, options), limit_s, client)
             done, _ = wait([future], limit_s)
@@ -89,7 +94,7 @@ class Converter:
         """
         job = ExportJob(json.dumps(plan.to_dict()), format)
         try:
-            answer = await self._started().answer(job, self._settings.import_deadline_s, client)
+            answer = await self._started().answer(job, self._settings.plans.import_deadline_s, client)
         except JobLostError as error:
             self._lost(error)
         if isinstance(answer, ConversionRefusal):
@@ -114,13 +119,13 @@ class Converter:
                 spec = WorkerSpec(
                     "import",
                     run_converter,
-                    (settings.import_limits, settings.import_memory_bytes),
-                    stall_s=settings.import_stall_s,
+                    (settings.plans.import_limits, settings.imports.memory_bytes),
+                    stall_s=settings.plans.max_import_s + _STALL_MARGIN_S,
                 )
                 self._pool = WorkerPool(
                     spec,
-                    workers=settings.import_workers,
-                    queue_limit=settings.import_queue,
+                    workers=settings.imports.workers,
+                    queue_limit=_QUEUE,
                     keep_spare=True,
                     on_restart=lambda _reason: self._telemetry.note_restart("import"),
                 )
@@ -136,25 +141,25 @@ class Converter:
             case "poisoned":
                 raise InvalidFloorPlanError(
                     "the file could not be read: twice that ended the process that tried, perhaps for want of memory "
-                    f"({settings.import_memory_bytes} bytes, import_memory_bytes); save it anew, smaller, or in "
+                    f"({settings.imports.memory_bytes} bytes, import_memory_bytes); save it anew, smaller, or in "
                     "another format"
                 ) from error
             case "stalled":
                 raise InvalidFloorPlanError(
-                    f"reading the file took longer than {settings.import_stall_s:g} s (import_stall_s); export the "
-                    "layers that matter, or one storey, by itself"
+                    f"reading the file took longer than {settings.plans.max_import_s + _STALL_MARGIN_S:g} s (max_import_s is "
+                    f"{settings.plans.max_import_s:g}); export only the layers that matter, or one storey"
                 ) from error
             case "fault":
                 raise InvalidFloorPlanError(
                     "the file is damaged, or drawn in a way that is not understood; save it anew, or in another format"
                 ) from error
             case "queue-full":
-                raise OverloadedError(settings.import_queue) from error
+                raise OverloadedError(_QUEUE) from error
             case "not-ready":
                 raise ConverterNotReadyError from error
             case "closing":
                 raise StoppingError from error
             case "deadline" | "died":
                 raise DeadlineExceededError(
-                    settings.import_deadline_s, "the file of the plan was not read or written"
+                    settings.plans.import_deadline_s, "the plan file was not read or written"
                 ) from error

@@ -52,7 +52,7 @@ def understand(
     """
     if not content.strip():
         raise InvalidFloorPlanError("the body is empty, the file of a floor plan is needed")
-    limits = settings.import_limits
+    limits = settings.plans.import_limits
     if seems_native(content):
         imported = import_if_native(content, options, limits)
         if imported is not None:

@@ -38,6 +38,8 @@ _ABANDONED = (UnknownFloorPlanError, PlanNotReadyError, StoppingError, StoreUnav
 _HEARTBEATS = 8.0
 # So many replicas, or lives of one, may begin a grid without any of them finishing it.
 _MAX_ATTEMPTS = 5
+# Stored pose grids (camera heights) per plan.
+_MAX_GRIDS_PER_PLAN = 8
 
 
 class GridBuilder:
@@ -92,7 +94,7 @@ class GridBuilder:
         if record is None:
             raise UnknownFloorPlanError(job.plan_id)
         check_size(record.plan, self._settings)
-        attempts = self._store.leases.claim(job.key, self._owner, self._settings.grid_lease_s)
+        attempts = self._store.leases.claim(job.key, self._owner, self._settings.grids.grid_lease_s)
         if attempts is None:
             raise LeaseLostError
         # Whoever had the lease until now may have finished.
@@ -112,7 +114,7 @@ class GridBuilder:
         return grid
 
     def _embed(self, job: GridJob, plan: FloorPlan) -> PoseGrid:
-        heartbeat = LeaseHeartbeat(lambda: self._renew(job), self._settings.grid_lease_s / _HEARTBEATS)
+        heartbeat = LeaseHeartbeat(lambda: self._renew(job), self._settings.grids.grid_lease_s / _HEARTBEATS)
 
         def after_chunk(progress: float, worked_s: float) -> None:
             job.progress = progress
@@ -145,7 +147,7 @@ class GridBuilder:
 
     def _renew(self, job: GridJob) -> bool:
         try:
-            return self._store.leases.renew(job.key, self._owner, self._settings.grid_lease_s, job.progress)
+            return self._store.leases.renew(job.key, self._owner, self._settings.grids.grid_lease_s, job.progress)
         except StoreUnavailableError:
             # Nobody else can take the lease meanwhile either.
             return True
@@ -155,9 +157,8 @@ class GridBuilder:
         give_up_at = monotonic() + _KEEP_TRYING_S
         while True:
             try:
-                keep = self._settings.max_grids_per_plan
                 return self._store.grids.put(
-                    job.key, grid, keep=keep, always_keep_mm=always_keep_mm, prototypes=prototypes
+                    job.key, grid, keep=_MAX_GRIDS_PER_PLAN, always_keep_mm=always_keep_mm, prototypes=prototypes
                 )
             except StoreUnavailableError:
                 if monotonic() > give_up_at or job.cancelled.wait(_TRY_EVERY_S):

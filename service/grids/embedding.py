@@ -70,9 +70,9 @@ def check_size(plan: FloorPlan, settings: Settings) -> None:
     Raises:
         PlanTooLargeError: states the estimated number of poses and the limit.
     """
-    estimate = grid_size(plan, settings.grid_step_m)
-    if estimate > settings.max_grid_poses:
-        raise PlanTooLargeError(estimate, settings.max_grid_poses, settings.grid_step_m)
+    estimate = grid_size(plan, settings.grids.grid_step_m)
+    if estimate > settings.grids.max_grid_poses:
+        raise PlanTooLargeError(estimate, settings.grids.max_grid_poses, settings.grids.grid_step_m)
 
 
 def grid_bytes(grid: PoseGrid) -> int:

@@ -52,7 +52,7 @@ class GridProvider:
         self._settings = settings
         self._telemetry = telemetry
         self.throttle = BackgroundThrottle()
-        self._cache = GridCache(store, settings.grid_cache_bytes, telemetry)
+        self._cache = GridCache(store, settings.storage.grid_cache_bytes, telemetry)
         self._inline = threading.Lock()
         self._jobs = GridBuilder(store, encoders, self._cache, self.throttle, settings, telemetry).jobs
         self._unprepared = 0
@@ -73,21 +73,21 @@ class GridProvider:
     @property
     def model(self) -> tuple[str, float]:
         """What grids are kept by beside revision and height: the digest of the model, and the grid step (m)."""
-        return self._model_sha256, self._settings.grid_step_m
+        return self._model_sha256, self._settings.grids.grid_step_m
 
     def key(self, revision_id: str, camera_height_m: float) -> GridKey:
         """The key of a revision's grid for this model and grid step."""
         return GridKey(
             revision_id=revision_id,
             model_sha256=self._model_sha256,
-            step_m=self._settings.grid_step_m,
+            step_m=self._settings.grids.grid_step_m,
             camera_height_mm=millimetres(camera_height_m),
         )
 
     def states(self, plans: list[PlanSummary]) -> list[GridState]:
         """How far each plan's own grid is, whoever computes it."""
         keys = [self.key(summary.revision_id, summary.camera_height_m) for summary in plans]
-        step_m, revision_ids = self._settings.grid_step_m, [summary.revision_id for summary in plans]
+        step_m, revision_ids = self._settings.grids.grid_step_m, [summary.revision_id for summary in plans]
         places = [(key.revision_id, key.camera_height_mm) for key in keys]
         jobs = [self._jobs.get(key) for key in keys]
         stored = self._store.grids.poses(self._model_sha256, step_m, revision_ids)
@@ -111,14 +111,16 @@ class GridProvider:
 
     def prepare(self, plan: FloorPlan) -> ComputedGrid | None:
         """The own grid of a small plan, computed at once; None when that is left to the background."""
-        if self._estimate(plan) > self._settings.inline_grid_poses or not self._inline.acquire(timeout=_INLINE_WAIT_S):
+        if self._estimate(plan) > self._settings.grids.inline_grid_poses or not self._inline.acquire(
+            timeout=_INLINE_WAIT_S
+        ):
             return None
         try:
             with self._telemetry.timed(self._telemetry.grid_seconds):
                 grid = embed(
                     plan,
                     self._encoders,
-                    step_m=self._settings.grid_step_m,
+                    step_m=self._settings.grids.grid_step_m,
                     camera_height_m=millimetres(plan.camera_height_m) / 1000.0,
                     after_chunk=lambda _progress, worked_s: self.throttle.pause(worked_s),
                 )
@@ -199,7 +201,7 @@ class GridProvider:
         """Queue the oldest grids that nobody computes, unless there is enough to do; tells whether more may be left."""
         if len(self._jobs) >= _BATCH:
             return True
-        model = (self._model_sha256, self._settings.grid_step_m)
+        model = (self._model_sha256, self._settings.grids.grid_step_m)
         missing = self._store.grids.missing(*model, _BATCH)
         self._unprepared = self._store.grids.count_unprepared(*model)
         with suppress(StoppingError, OverloadedError):
@@ -215,7 +217,7 @@ class GridProvider:
         if not jobs:
             return
         revision_ids = [job.key.revision_id for job in jobs]
-        leased = self._store.leases.progress(self._model_sha256, self._settings.grid_step_m, revision_ids)
+        leased = self._store.leases.progress(self._model_sha256, self._settings.grids.grid_step_m, revision_ids)
         for job in jobs:
             progress = leased.get((job.key.revision_id, job.key.camera_height_mm))
             if progress is None or job.cancelled.is_set():
@@ -228,4 +230,4 @@ class GridProvider:
         self._jobs.close()
 
     def _estimate(self, plan: FloorPlan) -> int:
-        return grid_size(plan, self._settings.grid_step_m)
+        return grid_size(plan, self._settings.grids.grid_step_m)

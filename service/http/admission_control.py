@@ -185,13 +185,13 @@ class AdmissionLimits:
         return cls(
             requests=settings.pending_limit,
             queries=settings.query_limit,
-            waiting_queries=settings.max_waiting_queries,
-            reads=settings.max_reads,
-            streams=settings.max_streams,
+            waiting_queries=settings.requests.max_waiting_queries,
+            reads=settings.requests.max_reads,
+            streams=settings.requests.max_streams,
             # An upload, its query or its conversion, and a slow reader's time to take the answer.
-            deadline_s=settings.upload_deadline_s
-            + max(settings.request_deadline_s, settings.import_deadline_s)
-            + settings.request_deadline_s,
+            deadline_s=settings.uploads.deadline_s
+            + max(settings.requests.request_deadline_s, settings.plans.import_deadline_s)
+            + settings.requests.request_deadline_s,
         )
 
 

@@ -22,7 +22,7 @@ def max_connections_of(wanted: int, settings: Settings) -> int:
     Raises:
         ConfigError: the system allows so few descriptors that hardly any is left for a connection.
     """
-    others = _OTHERS + _PER_DATABASE_CONNECTION * settings.database_connections
+    others = _OTHERS + _PER_DATABASE_CONNECTION * settings.database.connections
     allowed = _raised_to(wanted + others)
     if allowed - others < _MIN_CONNECTIONS:
         raise ConfigError(

@@ -24,6 +24,8 @@ from service.settings import Settings
 
 # Heads of requests; larger ones get a 400.
 _MAX_HEAD_BYTES = 16 * 1024
+# Timeout for the head of a request, and for the rest of a refused body.
+_HEAD_DEADLINE_S = 10.0
 # Shares of the time for stopping: for requests in work, and then for connections to close. The rest is for workers,
 # background threads and the store.
 _FOR_REQUESTS, _FOR_CONNECTIONS = 0.6, 0.1
@@ -38,10 +40,10 @@ def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
     limits = AdmissionLimits.of(settings)
     # The server's own refusal is plain text; ours comes first.
     least = limits.requests + limits.reads + limits.streams + 1
-    max_connections = max_connections_of(max(settings.max_connections, least), settings)
+    max_connections = max_connections_of(max(settings.requests.max_connections, least), settings)
     return uvicorn.Config(
         app,
-        http=bounded_protocol(settings.head_deadline_s, max_connections),
+        http=bounded_protocol(_HEAD_DEADLINE_S, max_connections),
         # Not another one where it happens to be installed, as with the extra `ray`.
         loop="asyncio",
         ws="none",
@@ -50,8 +52,8 @@ def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
         limit_concurrency=max_connections + 1,
         # uvicorn would believe whoever connects from this machine what address they come from.
         proxy_headers="FORWARDED_ALLOW_IPS" in os.environ,
-        timeout_keep_alive=math.ceil(settings.keep_alive_s),
-        timeout_graceful_shutdown=math.ceil(_FOR_CONNECTIONS * settings.stop_deadline_s),
+        timeout_keep_alive=math.ceil(settings.requests.keep_alive_s),
+        timeout_graceful_shutdown=math.ceil(_FOR_CONNECTIONS * settings.requests.stop_deadline_s),
         h11_max_incomplete_event_size=_MAX_HEAD_BYTES,
     )
 
@@ -71,13 +73,13 @@ class Server(uvicorn.Server):
             os._exit(1)
         self._stopping_since = monotonic()
         # Whatever hangs, a thread or a disk, ends then.
-        last_resort = threading.Timer(self._settings.stop_deadline_s, os._exit, [1])
+        last_resort = threading.Timer(self._settings.requests.stop_deadline_s, os._exit, [1])
         last_resort.daemon = True
         last_resort.start()
         admission = self._admission
         if admission is None:
             self.should_exit = True
-        elif self._settings.stop_notice_s > 0.0:
+        elif self._settings.requests.stop_notice_s > 0.0:
             # Load balancers go on sending until they have noticed.
             admission.drain()
         else:
@@ -89,8 +91,8 @@ class Server(uvicorn.Server):
         if ended or self._stopping_since is None:
             return ended
         waited_s = monotonic() - self._stopping_since
-        max_s = _FOR_REQUESTS * self._settings.stop_deadline_s
-        if waited_s < min(self._settings.stop_notice_s, max_s):
+        max_s = _FOR_REQUESTS * self._settings.requests.stop_deadline_s
+        if waited_s < min(self._settings.requests.stop_notice_s, max_s):
             return False
         admission = self._admission
         if admission is None:

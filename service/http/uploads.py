@@ -66,11 +66,11 @@ class UploadLimits:
     def of(cls, settings: Settings, name: Settable) -> Self:
         """As set for one kind of upload."""
         return cls(
-            max_bytes=getattr(settings, name),
+            max_bytes=settings.values()[name],
             name=name,
-            deadline_s=settings.upload_deadline_s,
-            idle_s=settings.upload_idle_s,
-            bytes_per_s=settings.upload_bytes_per_s,
+            deadline_s=settings.uploads.deadline_s,
+            idle_s=settings.uploads.idle_s,
+            bytes_per_s=settings.uploads.bytes_per_s,
         )
 
 

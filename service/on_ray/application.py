@@ -59,14 +59,14 @@ def app(arguments: dict[str, str]) -> serve.Application:
 def application(settings: Settings, options: RayOptions) -> serve.Application:
     """See `app`; every replica gets the settings, so what they name, such as the bundle, has to be on every machine."""
     sha256 = Bundle.open(settings.bundle).sha256
-    threads = settings.onnx_threads or 1
-    of_search = settings.model_copy(update={"workers": 0, "compute_threads": _SEARCH_THREADS, "onnx_threads": threads})
-    per_search = of_search.query_limit + of_search.max_waiting_queries
+    threads = settings.compute.onnx_threads or 1
+    of_search = settings.with_values(workers=0, compute_threads=_SEARCH_THREADS, onnx_threads=threads)
+    per_search = of_search.query_limit + of_search.requests.max_waiting_queries
     # As many as all replicas that there may be take: else there would never be more of them.
-    most = settings.max_queries or with_headroom(options.search_max * of_search.query_limit)
+    most = settings.requests.max_queries or with_headroom(options.search_max * of_search.query_limit)
     # Panoramas are decoded where they are searched for.
-    of_ingress = settings.model_copy(update={"workers": 0, "decode_workers": 1, "max_queries": most})
-    single = settings.model_copy(update={"onnx_threads": threads})
+    of_ingress = settings.with_values(workers=0, decode_workers=1, max_queries=most)
+    single = settings.with_values(onnx_threads=threads)
 
     encoder = serve.deployment(
         EncoderReplica,
@@ -78,11 +78,11 @@ def application(settings: Settings, options: RayOptions) -> serve.Application:
         LpoReplica,
         name="lpo",
         max_ongoing_requests=1 + _NEXT,
-        max_queued_requests=settings.lpo_queue,
+        max_queued_requests=settings.lpo.queue,
         **_scaled("lpo", options, target=1.0 + _NEXT),
     ).bind(single, sha256)
     # As without Ray, no workers are no LPO; any other number is a matter of replicas.
-    optimiser = None if settings.workers == 0 else lpo
+    optimiser = None if settings.compute.workers == 0 else lpo
     # The class is annotated as what it is not.
     routed: dict[str, Any] = {"request_router_class": ConsistentHashRouter}
     search = serve.deployment(
@@ -90,14 +90,14 @@ def application(settings: Settings, options: RayOptions) -> serve.Application:
         name="search",
         max_ongoing_requests=per_search,
         request_router_config=RequestRouterConfig(**routed),
-        graceful_shutdown_timeout_s=settings.stop_deadline_s,
+        graceful_shutdown_timeout_s=settings.requests.stop_deadline_s,
         **_scaled("search", options, target=float(of_search.query_limit)),
     ).bind(of_search, sha256, encoder, optimiser)
     ingress = serve.deployment(
         IngressReplica,
         name="ingress",
-        max_ongoing_requests=of_ingress.pending_limit + settings.max_reads + settings.max_streams,
-        graceful_shutdown_timeout_s=settings.stop_deadline_s,
+        max_ongoing_requests=of_ingress.pending_limit + settings.requests.max_reads + settings.requests.max_streams,
+        graceful_shutdown_timeout_s=settings.requests.stop_deadline_s,
         **_scaled("ingress", options, target=0.5 * of_ingress.pending_limit),
     )
     return ingress.bind(of_ingress, optimiser, search)

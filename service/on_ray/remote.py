@@ -39,7 +39,7 @@ class RemoteEncoders(Encoders):
 
     def __init__(self, bundle: Bundle, settings: Settings, encoder: DeploymentHandle) -> None:
         super().__init__(bundle, threads=settings.cores.onnx_threads)
-        self._deadline_s = settings.request_deadline_s
+        self._deadline_s = settings.requests.request_deadline_s
         self._encoder = encoder
 
     def query(
@@ -162,7 +162,7 @@ class _SearchCaller:
                 if isinstance(outcome, Failure):
                     raise outcome.error
                 return outcome.value
-        raise DeadlineExceededError(self._settings.request_deadline_s)
+        raise DeadlineExceededError(self._settings.requests.request_deadline_s)
 
     def _observe(self, answer: LocaliseAnswer | SequenceAnswer) -> None:
         """Count an answer here as well, where metrics are asked for."""
@@ -223,5 +223,5 @@ class RemoteVenueLocaliser(_SearchCaller):
 
     async def check_hints(self, venue: VenueRecord, form: LocaliseForm) -> None:
         """See `VenueLocaliser.check_hints`."""
-        context = QueryContext.starting(venue.tenant, self._settings.request_deadline_s)
+        context = QueryContext.starting(venue.tenant, self._settings.requests.request_deadline_s)
         await self._call("check_hints", venue.id, context, venue.tenant, venue.id, form)

@@ -23,6 +23,9 @@ from service.settings import Settings
 from service.telemetry import Telemetry
 from service.workers.decode import DecodeJob, DecodeRefusal, RasteriseJob, run_decoder
 
+# Panoramas that can wait to be decoded.
+_QUEUE = 32
+
 
 class Decoder:
     """Bounded pool of decoding workers."""
@@ -34,11 +37,16 @@ class Decoder:
             WorkerSpec(
                 "decode",
                 run_decoder,
-                (manifest.image_height, manifest.image_width, settings.panorama_limits, settings.decode_memory_bytes),
-                stall_s=settings.decode_stall_s,
+                (
+                    manifest.image_height,
+                    manifest.image_width,
+                    settings.panoramas.panorama_limits,
+                    settings.decode.memory_bytes,
+                ),
+                stall_s=settings.decode.stall_s,
             ),
-            workers=settings.decode_workers,
-            queue_limit=settings.decode_queue,
+            workers=settings.decode.workers,
+            queue_limit=_QUEUE,
             keep_spare=True,
             on_restart=lambda _reason: telemetry.note_restart("decode"),
         )
@@ -113,7 +121,7 @@ class Decoder:
             return DrawingFailedError(error.reason)
         if isinstance(job, RasteriseJob) and error.reason == "stalled":
             # Drawings are of bounded size: it is the machine that is slow.
-            return DeadlineExceededError(self._settings.decode_stall_s)
+            return DeadlineExceededError(self._settings.decode.stall_s)
         match error.reason:
             case "poisoned":
                 return InvalidPanoramaError(
@@ -121,16 +129,16 @@ class Decoder:
                 )
             case "stalled":
                 return InvalidPanoramaError(
-                    f"decoding the panorama took longer than {self._settings.decode_stall_s:g} s (decode_stall_s); a "
+                    f"decoding the panorama took longer than {self._settings.decode.stall_s:g} s (decode_stall_s); a "
                     "smaller one, or one that is saved anew, takes less"
                 )
             case "fault":
                 return InvalidPanoramaError("the panorama is damaged")
             case "queue-full":
-                return OverloadedError(self._settings.decode_queue)
+                return OverloadedError(_QUEUE)
             case "not-ready":
                 return DecoderNotReadyError()
             case "closing":
                 return StoppingError()
             case "deadline" | "died":
-                return DeadlineExceededError(self._settings.request_deadline_s)
+                return DeadlineExceededError(self._settings.requests.request_deadline_s)

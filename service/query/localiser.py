@@ -152,7 +152,7 @@ class Localiser:
         # The picture first: a bad one is refused without waiting for the plan.
         with clock.stage("decode"):
             panorama = await self._decoder.decode(query.content, context.deadline, context.client)
-        known = known_heading(form, record.plan.north, panorama, self._settings.compass_tolerance_deg)
+        known = known_heading(form, record.plan.north, panorama, self._settings.panoramas.compass_tolerance_deg)
         if not hints.are_none:
             # Looking at many rooms takes a while.
             await self.compute(context, partial(hints.check, record.plan))
@@ -185,7 +185,11 @@ class Localiser:
 
     async def _answer_sequence(self, record: PlanRecord, query: SequenceQuery) -> SequenceAnswer:
         form, context, clock = query.form, query.context, query.context.clock
-        height, plan, compass_deg = stated_height(form, record), record.plan, self._settings.compass_tolerance_deg
+        height, plan, compass_deg = (
+            stated_height(form, record),
+            record.plan,
+            self._settings.panoramas.compass_tolerance_deg,
+        )
         # One after another: no query keeps more than one decoder busy.
         with clock.stage("decode"):
             panoramas = [
@@ -238,7 +242,7 @@ class Localiser:
             async with asyncio.timeout(max(context.left_s, 0.0)):
                 return await self._threads.run(context.client, run)
         except TimeoutError as error:
-            raise DeadlineExceededError(self._settings.request_deadline_s) from error
+            raise DeadlineExceededError(self._settings.requests.request_deadline_s) from error
 
     def encode(
         self, panoramas: Sequence[Panorama], known: Sequence[KnownHeading], height: CameraHeight, clock: StageClock
@@ -267,7 +271,7 @@ class Localiser:
         return timings_ms
 
     def _lpo_timeout_s(self, context: QueryContext) -> float:
-        return min(self._settings.lpo_deadline_s, context.left_s - _ANSWER_S)
+        return min(self._settings.lpo.deadline_s, context.left_s - _ANSWER_S)
 
     async def _grid(self, record: PlanRecord, height: CameraHeight, context: QueryContext) -> PoseGrid:
         """The plan's grid for a camera height, computed on demand, waited for until the deadline."""

@@ -26,14 +26,14 @@ class LpoPool:
             name="lpo",
             target=run_worker,
             arguments=(str(bundle.folder.resolve()), bundle.sha256, cores.worker_threads),
-            stall_s=settings.lpo_stall_s,
+            stall_s=settings.lpo.stall_s,
             start_s=_START_S,
             max_start_s=_MAX_START_S,
         )
         self._workers: WorkerPool[RefinementJob | SequenceJob, RefinementResult | SequenceResult] = WorkerPool(
             spec,
             workers=cores.workers,
-            queue_limit=settings.lpo_queue,
+            queue_limit=settings.lpo.queue,
             on_restart=lambda _reason: telemetry.note_restart("lpo"),
         )
         # Shown as 0 from the start, so that the first one is a rise.

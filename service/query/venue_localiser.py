@@ -158,7 +158,7 @@ class VenueLocaliser:
         with clock.stage("decode"):
             panorama = await self._decoder.decode(query.content, context.deadline, context.client)
         north = None if venue.anchor is None else heading_from_degrees(venue.anchor.north_deg)
-        known = known_heading(form, north, panorama, self._settings.compass_tolerance_deg)
+        known = known_heading(form, north, panorama, self._settings.panoramas.compass_tolerance_deg)
         with clock.stage("wait"):
             ready, warnings = await self._ready(venue, members, hints, context)
         height = venue_height(form, ready)

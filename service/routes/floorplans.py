@@ -73,7 +73,7 @@ async def create_floorplan(request: Request, runtime: Running, tenant: Tenant, c
 
     def store(token: str) -> Response:
         plan, original, grid = _prepared(uploaded, runtime, client)
-        limit = runtime.settings.max_floorplans
+        limit = runtime.settings.plans.max_floorplans
         record = runtime.store.plans.add(tenant, token, plan, original=original, limit=limit, grid=grid)
         if record.plan is plan:
             runtime.grids.on_plan_stored(record, grid)
@@ -133,7 +133,7 @@ def get_floorplan(
     if revision is not None and superseded:
         record = plan_at_revision(record, revision, runtime.store.plans)
     add_log_fields(request, plan=record.id, revision=record.revision_id)
-    step_m = runtime.settings.grid_step_m
+    step_m = runtime.settings.grids.grid_step_m
     content, etag = plan_representation(record, plan_state(record, runtime.grids), step_m, superseded=superseded)
     return conditional_answer(request, content, JSON, etag)
 
@@ -158,7 +158,7 @@ async def replace_floorplan(
 
     def store() -> Response:
         plan, original, grid = _prepared(uploaded, runtime, client)
-        keep = runtime.settings.max_revisions
+        keep = runtime.settings.plans.max_revisions
         record = runtime.store.plans.add_revision(
             tenant, current.id, plan, original=original, keep=keep, expected=expected, grid=grid
         )
@@ -202,7 +202,7 @@ def _prepared(uploaded: PlanUpload, runtime: Runtime, client: str) -> tuple[Floo
 
 def _written(request: Request, record: PlanRecord, state: GridState, runtime: Runtime, code: int) -> Response:
     add_log_fields(request, plan=record.id, revision=record.revision_id)
-    content, etag = plan_representation(record, state, runtime.settings.grid_step_m)
+    content, etag = plan_representation(record, state, runtime.settings.grids.grid_step_m)
     path = str(request.app.url_path_for("get_floorplan", floorplan_id=record.id))
     # The tag is that of this answer, which is what a GET from there gives, and not of what was uploaded.
     headers = {"Content-Location": path, "ETag": etag}

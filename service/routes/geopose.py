@@ -76,12 +76,12 @@ async def geopose(
         raise InvalidRequestError([("venue_id", "floorplan_id is given as well, at most one of the two may be")])
     idempotent = IdempotentRequest(runtime.store.idempotency_keys, request, tenant, "POST /geopose")
     media_type(request, (JSON,))
-    clock, most = StageClock(), settings.max_panorama_bytes
+    clock, most = StageClock(), settings.panoramas.max_panorama_bytes
     add_log_fields(request, clock=clock)
     with clock.stage("upload"):
         limits = UploadLimits.of(settings, "max_panorama_bytes")
         body = await read_body(request, replace(limits, max_bytes=4 * -(-most // 3) + _ENVELOPE_BYTES))
-    context = QueryContext.starting(client, settings.request_deadline_s, clock)
+    context = QueryContext.starting(client, settings.requests.request_deadline_s, clock)
 
     def read() -> tuple[OscpRequest, bytes]:
         parsed = parse_document(OscpRequest, body)
@@ -161,7 +161,7 @@ class _Query:
 
     def _form(self, **about: str) -> LocaliseForm:
         form = LocaliseForm.model_validate(about)
-        return form.model_copy(update={"top_k": min(form.top_k, self._runtime.settings.max_top_k)})
+        return form.model_copy(update={"top_k": min(form.top_k, self._runtime.settings.panoramas.max_top_k)})
 
 
 def _contradicted(reason: str) -> str:

@@ -18,7 +18,7 @@ _PROBLEMS = problem_responses(UnknownAnswerError, InvalidRequestError, StoreUnav
 @router.get("/{answer_id}", summary="An answer again", response_model=LocaliseAnswer, responses=_PROBLEMS)
 def get_answer(answer_id: str, runtime: Running, tenant: Tenant) -> Response:
     """What a query was answered, to the byte, while it is kept; its panorama never is."""
-    kept_s = runtime.settings.keep_answers_s
+    kept_s = runtime.settings.storage.keep_answers_s
     content = runtime.store.answers.get(tenant, answer_id, kept_s=kept_s) if is_id(answer_id) else None
     if content is None:
         raise UnknownAnswerError(answer_id)

@@ -23,5 +23,5 @@ async def limits(runtime: Annotated[Runtime, Depends(runtime_of)]) -> LimitsAnsw
         "max_queries_per_tenant": max_per_client(settings.query_limit),
         "max_pending_requests": settings.pending_limit,
     }
-    told = {name: getattr(settings, name) for name in LimitsAnswer.model_fields.keys() - resolved.keys()}
-    return LimitsAnswer(**told, **resolved)
+    values = settings.values() | resolved
+    return LimitsAnswer(**{name: values[name] for name in LimitsAnswer.model_fields})

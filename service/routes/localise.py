@@ -152,7 +152,7 @@ async def _told(answer: LocaliseAnswer, media: str, tenant: str, runtime: Runtim
 
 async def _text(answer: LocaliseAnswer, tenant: str, runtime: Runtime) -> str:
     """An answer as JSON; under its id it is the same, where answers are kept."""
-    if runtime.settings.keep_answers_s == 0.0:
+    if runtime.settings.storage.keep_answers_s == 0.0:
         return answer.model_dump_json()
     told = {"": answer.model_dump_json()}
 
@@ -160,7 +160,7 @@ async def _text(answer: LocaliseAnswer, tenant: str, runtime: Runtime) -> str:
         told[answer_id] = answer.model_copy(update={"answer_id": answer_id}).model_dump_json()
         return told[answer_id]
 
-    keep = partial(runtime.store.answers.add, limit=runtime.settings.max_kept_answers)
+    keep = partial(runtime.store.answers.add, limit=runtime.settings.storage.max_kept_answers)
     try:
         return told[await runtime.reads.run(keep, tenant, answer.floorplan_id, with_id) or ""]
     except StoreUnavailableError:

@@ -55,7 +55,7 @@ async def localise_sequence(request: Request, runtime: Running, tenant: Tenant, 
     check_idempotent_media(request, media)
     idempotent = IdempotentRequest(runtime.store.idempotency_keys, request, tenant, "POST /localise/sequence")
     media_type(request, (MULTIPART,))
-    repeated = {PANORAMA: (_MIN_PANORAMAS, settings.max_sequence_panoramas)}
+    repeated = {PANORAMA: (_MIN_PANORAMAS, settings.panoramas.max_sequence_panoramas)}
     form, parts, context = await read_query(
         request, settings, client, SequenceForm, "max_sequence_bytes", repeated=repeated
     )
@@ -83,8 +83,8 @@ def _panoramas(parts: Parts, form: SequenceForm, settings: Settings) -> list[byt
     """
     contents = parts.repeated(PANORAMA)
     largest = max(len(content) for content in contents)
-    if largest > settings.max_panorama_bytes:
-        raise UploadTooLargeError("max_panorama_bytes", settings.max_panorama_bytes, largest)
+    if largest > settings.panoramas.max_panorama_bytes:
+        raise UploadTooLargeError("max_panorama_bytes", settings.panoramas.max_panorama_bytes, largest)
     if faults := form.faults(len(contents)):
         raise InvalidRequestError(faults)
     return contents

@@ -105,7 +105,7 @@ async def read_query(
     """
     clock = StageClock()
     add_log_fields(request, clock=clock)
-    bounds = {"max_top_k": settings.max_top_k}
+    bounds = {"max_top_k": settings.panoramas.max_top_k}
     with clock.stage("upload"):
         parts = await read_parts(
             request,
@@ -115,8 +115,8 @@ async def read_query(
             check=partial(faults_of, form_type, context=bounds),
             repeated=repeated or {},
         )
-    context = QueryContext.starting(client, settings.request_deadline_s, clock)
+    context = QueryContext.starting(client, settings.requests.request_deadline_s, clock)
     form = validate_fields(form_type, parts.fields, bounds)
     if "top_k" not in form.model_fields_set:
-        form = form.model_copy(update={"top_k": min(form.top_k, settings.max_top_k)})
+        form = form.model_copy(update={"top_k": min(form.top_k, settings.panoramas.max_top_k)})
     return form, parts, context

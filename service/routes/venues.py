@@ -93,7 +93,7 @@ async def create_venue(request: Request, runtime: Running, tenant: Tenant, clien
     def store(token: str) -> Response:
         document = parse_document(VenueDocument, content)
         members = _members(document.plans, runtime)
-        limit = runtime.settings.max_venues
+        limit = runtime.settings.plans.max_venues
         record = runtime.store.venues.add(tenant, token, document.name, _anchor(document.anchor), members, limit=limit)
         return _written(request, record, runtime, status.HTTP_201_CREATED)
 
@@ -183,7 +183,7 @@ async def replace_venue(venue_id: str, request: Request, runtime: Running, tenan
             drop_anchor=document.anchor is None,
             members=_members(document.plans, runtime),
             replace_members=True,
-            max_plans=runtime.settings.max_venue_plans,
+            max_plans=runtime.settings.plans.max_venue_plans,
             expected=expected,
         )
         return _written(request, record, runtime, status.HTTP_200_OK)
@@ -217,7 +217,7 @@ async def change_venue(venue_id: str, request: Request, runtime: Running, tenant
             drop_anchor="anchor" in given and document.anchor is None,
             members=_members(document.plans, runtime),
             removed=_removed(document),
-            max_plans=runtime.settings.max_venue_plans,
+            max_plans=runtime.settings.plans.max_venue_plans,
             expected=expected,
         )
         return _written(request, record, runtime, status.HTTP_200_OK)
@@ -262,7 +262,7 @@ def _members(documents: list[VenuePlanDocument], runtime: Runtime) -> list[Venue
     Raises:
         InvalidRequestError: there are too many, or one of them twice, or ids that are none.
     """
-    limit = runtime.settings.max_venue_plans
+    limit = runtime.settings.plans.max_venue_plans
     if len(documents) > limit:
         raise InvalidRequestError(
             [("plans", f"has {len(documents)} floor plans, at most {limit} are allowed (max_venue_plans)")]

@@ -43,13 +43,13 @@ class AccessControl:
     """Lets the requests of one running app in, or refuses them."""
 
     def __init__(self, keys: ApiKeys, settings: Settings) -> None:
-        self._needs_keys = settings.api_keys
+        self._needs_keys = settings.access.api_keys
         # A port that is published on this machine alone is reached over an address of a container's network.
-        published_here = settings.published_host is not None and is_local((settings.published_host, 0))
-        self._allow_anonymous = settings.allow_anonymous or published_here
-        self._pages = settings.cors_origin_set
-        self._hosts = settings.allowed_host_names
-        self._keys = KeyCache(keys, fresh_s=settings.key_cache_s)
+        published_here = settings.access.published_host is not None and is_local((settings.access.published_host, 0))
+        self._allow_anonymous = settings.access.allow_anonymous or published_here
+        self._pages = settings.access.cors_origin_set
+        self._hosts = settings.access.allowed_host_names
+        self._keys = KeyCache(keys, fresh_s=settings.access.key_cache_s)
         self._rates = RateLimits(settings)
 
     def close(self) -> None:

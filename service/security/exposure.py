@@ -83,8 +83,8 @@ def check_address(host: str, settings: Settings) -> None:
     Raises:
         ConfigError: not a loopback address, while there are neither keys nor leave to do without.
     """
-    reached = settings.published_host or host
-    if not settings.api_keys and not settings.allow_anonymous and not is_local((reached, 0)):
+    reached = settings.access.published_host or host
+    if not settings.access.api_keys and not settings.access.allow_anonymous and not is_local((reached, 0)):
         raise ConfigError(
             f"refusing to listen on {reached} without API keys: others than this machine could read, change and delete "
             "every floor plan. Set LALALOC_API_KEYS=on and make keys with `lalaloc-service keys create`, listen on "

@@ -17,6 +17,8 @@ from service.storage.records import ApiKey
 # Client addresses share this many counters, so that their number does not matter. Only an address with refused keys
 # of its own notices that another one fell on the same counter.
 _ADDRESS_COUNTERS = 1024
+# Invalid API keys per minute of a client address; further ones are rejected without a look-up.
+REFUSED_KEYS_PER_MINUTE = 60
 
 
 class RateLimits:
@@ -24,9 +26,9 @@ class RateLimits:
 
     def __init__(self, settings: Settings) -> None:
         self._limiter = SlidingWindowCounterRateLimiter(MemoryStorage())
-        self._per_minute = settings.rate_per_minute
-        self._burst = settings.rate_burst
-        self._refused = RateLimitItemPerMinute(settings.refused_keys_per_minute, namespace="refused")
+        self._per_minute = settings.access.rate_per_minute
+        self._burst = settings.access.rate_burst
+        self._refused = RateLimitItemPerMinute(REFUSED_KEYS_PER_MINUTE, namespace="refused")
 
     async def count(self, key: ApiKey) -> None:
         """Count a request of a key.

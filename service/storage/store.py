@@ -87,16 +87,16 @@ def open_store(settings: Settings) -> Store:
     Raises:
         ConfigError: the data folder or the database cannot be used.
     """
-    if settings.database_url is None:
+    if settings.database.url is None:
         try:
             settings.data_dir.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise ConfigError(f"cannot create the data folder '{settings.data_dir}': {error.strerror}") from error
     return Store(
-        settings.resolved_database_url,
-        connections=settings.database_connections,
-        wait_s=settings.database_wait_s,
+        settings.database_url,
+        connections=settings.database.connections,
+        wait_s=settings.database.wait_s,
         # A query that is computed still must not be computed once more.
-        claim_s=max(MIN_LEASE_S, settings.request_deadline_s + _CLAIM_MARGIN_S),
-        plan_cache_bytes=settings.plan_cache_bytes,
+        claim_s=max(MIN_LEASE_S, settings.requests.request_deadline_s + _CLAIM_MARGIN_S),
+        plan_cache_bytes=settings.storage.plan_cache_bytes,
     )

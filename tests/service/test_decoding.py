@@ -19,6 +19,7 @@ from PIL import Image
 from PIL.TiffImagePlugin import IFDRational
 from sqlalchemy import select
 
+from service.query import decoding
 from service.storage.database import Database
 from service.storage.tables import METADATA
 from service.telemetry import LOGGER_NAME
@@ -104,8 +105,11 @@ def test_a_picture_over_which_decoders_stall_is_refused_and_the_next_one_is_answ
         assert localise(client, plan_id, panorama, **QUICK).status_code == 200
 
 
-def test_more_panoramas_than_may_wait_are_refused_at_once(start_app: StartApp, tmp_path: Path, panorama: bytes) -> None:
-    with start_app(tmp_path, decode_queue=1) as client, ThreadPoolExecutor(4) as threads:
+def test_more_panoramas_than_may_wait_are_refused_at_once(
+    start_app: StartApp, tmp_path: Path, panorama: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(decoding, "_QUEUE", 1)
+    with start_app(tmp_path) as client, ThreadPoolExecutor(4) as threads:
         plan_id = upload(client)
         ready(client)
         os.kill(decoder(), signal.SIGSTOP)

@@ -13,6 +13,7 @@ from typing import Any
 import httpx
 import pytest
 
+from service import runtime
 from service.app import create_app
 from service.http.events import PlanEvents
 from service.settings import Settings
@@ -135,8 +136,11 @@ def test_streams_are_bounded_in_number_and_a_client_that_goes_frees_its_place(
             assert next(_events(again))[0] == "progress"
 
 
-def test_a_stream_lasts_no_longer_than_it_may(start_app: StartApp, tmp_path: Path) -> None:
-    with start_app(tmp_path, stream_deadline_s=1.0, **SLOW) as client:
+def test_a_stream_lasts_no_longer_than_it_may(
+    start_app: StartApp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(runtime, "STREAM_DEADLINE_S", 1.0)
+    with start_app(tmp_path, **SLOW) as client:
         plan_id = upload(client, HALL, wait=False)
         begin = monotonic()
         assert {name for name, _ in _follow(client, plan_id)} == {"progress"}

@@ -31,6 +31,7 @@ from service.errors import (
     StoreUnavailableError,
     UnknownFloorPlanError,
 )
+from service.grids import builder
 from service.grids.embedding import embed, grid_bytes
 from service.grids.grid_jobs import MAX_ON_DEMAND
 from service.grids.grid_provider import GridProvider
@@ -675,9 +676,14 @@ def test_a_new_model_recomputes_the_grids(
 
 
 def test_a_model_that_predicts_walls_needs_no_grids_of_other_camera_heights(
-    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, panorama: bytes
+    start_app: StartApp,
+    database_of: DatabaseOf,
+    tmp_path: Path,
+    panorama: bytes,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    with start_app(tmp_path, max_grids_per_plan=3) as client:
+    monkeypatch.setattr(builder, "_MAX_GRIDS_PER_PLAN", 3)
+    with start_app(tmp_path) as client:
         plan_id = upload(client)
         for height_m in (1.6, 1.7, 1.8, 1.9):
             _localise_at(client, plan_id, panorama, height_m)

@@ -12,6 +12,7 @@ import httpx
 import pytest
 import yaml
 
+from lalaloc_core.errors import ConfigError
 from service.app import create_app
 from service.http.admission_control import EXEMPT
 from service.openapi import openapi_text
@@ -122,7 +123,7 @@ def test_pages_of_other_sites_are_told_nothing_unless_they_are_named(
 
 @pytest.mark.parametrize("origins", ["plans.example", "https://plans.example/", "https://*.example", "null", "* "])
 def test_origins_that_could_never_match_or_let_everybody_change_plans_are_refused(origins: str) -> None:
-    with pytest.raises(ValueError, match=r"neither an origin such as|needs LALALOC_API_KEYS=on"):
+    with pytest.raises(ConfigError, match=r"neither an origin such as|needs LALALOC_API_KEYS=on"):
         Settings(cors_origins=origins)
     Settings(cors_origins="*", api_keys=True)
 

@@ -314,11 +314,11 @@ def test_confidence_is_that_of_the_stage_s_signals_however_many_are_asked_for(
 def _retrieved(bundle: Path, content: bytes, heading_deg: float | None) -> pipeline.Localisation:
     """What the core says of a query of the flat, as far as the first stage."""
     encoders = Encoders(Bundle.open(bundle), threads=1)
-    manifest, limits = encoders.manifest, Settings().panorama_limits
+    manifest, limits = encoders.manifest, Settings().panoramas.panorama_limits
     image = read_panorama(content, height=manifest.image_height, width=manifest.image_width, limits=limits)
     query = encoders.query(image, None if heading_deg is None else np.radians(heading_deg), CameraHeight(1.5))
     plan = FloorPlan.from_dict(FLAT)
-    grid = build_grid(plan, encoders, step_m=Settings().grid_step_m, camera_height_m=1.5)
+    grid = build_grid(plan, encoders, step_m=Settings().grids.grid_step_m, camera_height_m=1.5)
     return pipeline.localise(plan, grid, encoders, query, refine="none")
 
 

@@ -23,6 +23,7 @@ from PIL import Image
 from benchmarks.plan_drawing import draw_plan
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import Anchor, export_plan
+from service.conversion import converter
 from tests.plans.conftest import FLAT as PLAN
 from tests.plans.test_ifc import DUPLEX, ifc_flat
 from tests.plans.test_pictures import vector_pdf
@@ -319,17 +320,18 @@ class TestHostile:
 
 @pytest.mark.one_replica
 def test_a_file_over_which_the_reader_stalls_is_refused_and_the_next_is_read(
-    start_app: StartApp, tmp_path: Path
+    start_app: StartApp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(converter, "_STALL_MARGIN_S", 2.0)
     others = importers()
-    with start_app(tmp_path, import_stall_s=5.0) as client:
+    with start_app(tmp_path, max_import_s=3.0) as client:
         assert importers() == others, "they start with the first file"
         stored(client, written("svg"))
         # Whatever it is that keeps it busy.
         (pid,) = importers() - others
         os.kill(pid, signal.SIGSTOP)
         problem = assert_problem(send(client, written("dxf")), 422, "invalid-floorplan")
-        assert "longer than 5 s (import_stall_s)" in problem["detail"]
+        assert "longer than 5 s (max_import_s is 3)" in problem["detail"]
         wait_for(lambda: client.get("/readyz").json()["import_pool"]["ready"] == 1)
         # One that is killed costs no upload.
         (pid,) = importers() - others

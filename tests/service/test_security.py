@@ -10,6 +10,7 @@ import socket
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic, sleep
@@ -24,6 +25,7 @@ from starlette.types import Receive, Scope, Send
 from lalaloc_core.errors import ConfigError
 from service.app import create_app
 from service.errors import StoreBusyError, StoreUnavailableError, TooManyRefusedKeysError
+from service.security import rate_limits
 from service.security.exposure import check_address, is_local
 from service.security.key_cache import KeyCache
 from service.security.keys import PresentedKey, hash_of, key_text, new_secret, parse_authorization
@@ -138,8 +140,10 @@ def guarded(
     start_app: StartApp, database_of: DatabaseOf, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Guarded]:
     data_dir = tmp_path_factory.mktemp("data")
-    rates = {"rate_per_minute": 0, "rate_burst": 0, "refused_keys_per_minute": 10**6}
-    with start_app(data_dir, api_keys=True, key_cache_s=0.1, keep_answers_s=600.0, **rates) as client:
+    rates = {"rate_per_minute": 0, "rate_burst": 0}
+    with pytest.MonkeyPatch.context() as patch, ExitStack() as stack:
+        patch.setattr(rate_limits, "REFUSED_KEYS_PER_MINUTE", 10**6)
+        client = stack.enter_context(start_app(data_dir, api_keys=True, key_cache_s=0.1, keep_answers_s=600.0, **rates))
         store = Store(database_of(data_dir))
         key = make_key(store)
         client.headers.update(bearer(key))
@@ -449,9 +453,10 @@ def test_a_burst_is_cut_short(start_app: StartApp, database_of: DatabaseOf, tmp_
 @pytest.mark.one_replica
 @pytest.mark.parametrize("kind", ["unknown", "malformed"])
 def test_a_client_with_many_invalid_keys_is_not_listened_to_but_keys_that_work_are(
-    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, kind: str
+    start_app: StartApp, database_of: DatabaseOf, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:
-    with start_app(tmp_path, api_keys=True, key_cache_s=0.0, refused_keys_per_minute=5) as client:
+    monkeypatch.setattr(rate_limits, "REFUSED_KEYS_PER_MINUTE", 5)
+    with start_app(tmp_path, api_keys=True, key_cache_s=0.0) as client:
         store = Store(database_of(tmp_path))
         key = make_key(store)
         assert client.get("/limits", headers=bearer(key)).status_code == 200
@@ -468,9 +473,13 @@ def test_a_client_with_many_invalid_keys_is_not_listened_to_but_keys_that_work_a
         store.close()
 
 
-def test_counters_of_client_addresses_are_bounded_and_a_network_counts_as_one() -> None:
+def test_counters_of_client_addresses_are_bounded_and_a_network_counts_as_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(rate_limits, "REFUSED_KEYS_PER_MINUTE", 1)
+
     async def count() -> int:
-        rates = RateLimits(Settings(refused_keys_per_minute=1))
+        rates = RateLimits(Settings())
         await rates.count_refused("2001:db8:1:2::1")
         with pytest.raises(TooManyRefusedKeysError):
             await rates.check_refused("2001:db8:1:2:ffff::2")
@@ -674,7 +683,7 @@ def test_other_names_and_pages_will_do_when_they_are_allowed(
 
 @pytest.mark.parametrize("name", ["plans.example:8443", "https://plans.example", "*.example", "[2001:db8::1]", "a b"])
 def test_an_allowed_name_that_could_never_match_is_refused(name: str) -> None:
-    with pytest.raises(ValueError, match="neither a bare name or address nor"):
+    with pytest.raises(ConfigError, match="neither a bare name or address nor"):
         Settings(allowed_hosts=f"localhost,{name}")
     Settings(allowed_hosts="plans.example, 192.0.2.7,2001:db8::1,*")
 

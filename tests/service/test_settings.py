@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import pytest
 from pydantic import ValidationError
 
 from lalaloc_core.errors import ConfigError
-from service.settings import PREFIX, Settings, settings_table
+from service.settings import PREFIX, SETTING_NAMES, Settings, settings_table
 
 
 def test_an_unknown_name_is_an_error_that_names_it_and_the_known_ones(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -38,15 +39,24 @@ def test_values_are_read_and_typed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LALALOC_DATABASE_URL", "")
     settings = Settings.load()
     assert settings.data_dir == Path("/srv/plans")
-    assert settings.workers == 3
-    assert settings.plan_limits.max_rooms == 7
-    assert settings.resolved_database_url == "sqlite:////srv/plans/lalaloc.sqlite3"
+    assert settings.compute.workers == 3
+    assert settings.plans.plan_limits.max_rooms == 7
+    assert settings.database_url == "sqlite:////srv/plans/lalaloc.sqlite3"
+
+
+def test_removed_setting_is_ignored_with_a_warning(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(logging.getLogger("lalaloc"), "propagate", True)
+    monkeypatch.setenv("LALALOC_DECODE_QUEUE", "3")
+    Settings.load()
+    assert "LALALOC_DECODE_QUEUE is ignored" in caplog.text
 
 
 def test_settings_cannot_change_once_read() -> None:
     settings = Settings.load()
     with pytest.raises(ValidationError):
-        settings.workers = 5  # pyright: ignore[reportAttributeAccessIssue]
+        settings.compute.workers = 5  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def test_the_default_bundle_does_not_depend_on_the_working_directory(
@@ -57,6 +67,6 @@ def test_the_default_bundle_does_not_depend_on_the_working_directory(
 
 
 def test_the_table_of_settings_has_every_one_with_its_meaning() -> None:
-    rows = settings_table().splitlines()[2:]
-    assert len(rows) == len(Settings.model_fields)
+    rows = [line for line in settings_table().splitlines() if line.startswith("| `")]
+    assert len(rows) == len(SETTING_NAMES)
     assert all(len(row.split("|")[3].strip()) > 10 for row in rows)
