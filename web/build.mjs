@@ -32,7 +32,7 @@ rmSync(out, { recursive: true, force: true });
 mkdirSync(out, { recursive: true });
 await build({
   absWorkingDir: here,
-  entryPoints: ["src/app.ts", "src/sphere.ts", "src/docs.ts", "src/style.css"],
+  entryPoints: ["src/app.ts", "src/sphere.ts", "src/docs.ts", "src/style.css", "src/docs.css"],
   outdir: out,
   bundle: true,
   minify: true,
@@ -45,6 +45,9 @@ await build({
   logLevel: "warning",
 });
 for (const name of ["index.html", "docs.html", "icon.svg"]) copyFileSync(join(here, "src", name), join(out, name));
+for (const name of ["swagger-ui-bundle.js", "swagger-ui-bundle.js.LICENSE.txt", "swagger-ui.css"]) {
+  copyFileSync(join(here, "node_modules", "swagger-ui-dist", name), join(out, name));
+}
 for (const name of examples) copyFileSync(join(root, "examples", name), join(out, `example-${name}`));
 const built = readdirSync(out).sort();
 const digests = Object.fromEntries(built.map((name) => [name, digest(join(out, name))]));
