@@ -1,5 +1,6 @@
-"""How much load, abuse and failure the service withstands, measured from outside.
+"""Load, fault and abuse tests of a running service, and measurements of single parts of the search.
 
-Each script starts the service, prints what it saw, and fails if it saw what must not be. Run them on a quiet machine,
-from the repository's root: `python -m benchmarks.soak`. Begin with `soak.py`; `load.py` has the clients that all use.
+Each script prints its figures and exits with 1 when a limit is exceeded: `python -m benchmarks.soak`. Run them on a
+quiet machine, from the repository's root. Begin with `harness.py`, which starts the service and the clients of
+`locustfile.py`.
 """

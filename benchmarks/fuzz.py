@@ -1,21 +1,19 @@
-"""Thousands of requests that are wrong in some way: no error of the service's own, no hang, no worker lost.
+"""Fuzzing: thousands of invalid requests must cause no internal error, no hang and no lost worker.
 
     python -m benchmarks.fuzz --requests 10000
 
-Half are made by schemathesis from the API's description, a quarter are panoramas and a quarter floor plans that were
-valid before bytes or values were changed. The seed is fixed; what is found can be found again.
+schemathesis makes half of the requests from the API's description. A quarter are panoramas and a quarter floor plans
+with changed bytes or values. The seed is fixed, so every finding can be reproduced.
 """
 
 from __future__ import annotations
 
-import argparse
 import io
 import itertools
 import json
 import random
 import re
 import sys
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -31,39 +29,42 @@ import numpy as np
 import schemathesis
 from PIL import Image
 
-from benchmarks.load import queries, upload_example_plan
-from examples.launch import running_service
-from examples.truth import PLAN_PATH
+from benchmarks.harness import argument_parser, example_service
+from examples.truth import PLAN_PATH, read_poses
 
 _HANG_S = 5.0
-# A line of a stack trace. Not a word: those that are searched for turn up in requests, and then in answers about them.
+# A line of a stack trace. A single word would also match answers that quote a request.
 _TRACE = re.compile(r"line \d+, in ")
 _CLIENTS = 4
-# Of one operation in a row.
+# Requests to one operation in a row.
 _EXAMPLES = 60
-# Events are an endless answer to a right request.
-_LEFT_OUT = r"/events$"
+# The answer to a valid request for events is endless.
+_EXCLUDED = r"/events$"
 
 
 @dataclass
 class Outcome:
-    """What came back, by kind of request and status, and what must not have."""
+    """Answers by kind of request and status.
+
+    Attributes:
+        bad: answers that show a defect of the service.
+    """
 
     statuses: dict[str, Counter[str]] = field(default_factory=dict)
     bad: list[str] = field(default_factory=list)
     slowest_s: float = 0.0
 
     def sent(self, kind: str) -> int:
-        """How many requests of a kind there were."""
+        """Return the number of requests of a kind."""
         return sum(self.statuses.get(kind, Counter()).values())
 
     @property
-    def looked_at(self) -> bool:
-        """Whether most requests of every kind were, instead of being refused for want of room."""
+    def most_processed(self) -> bool:
+        """Whether the service processed most requests of every kind instead of refusing them as busy."""
         return all(2 * found["503"] < sum(found.values()) for found in self.statuses.values())
 
     def note(self, kind: str, send: Callable[[], httpx.Response]) -> None:
-        """Send a request and look at the answer."""
+        """Send a request and check the answer."""
         begin = time.perf_counter()
         try:
             answer = send()
@@ -82,23 +83,24 @@ class Outcome:
 
 
 def main() -> int:
-    """Run; 1 when the service failed, hung or lost a worker."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    """Run; return 1 when the service failed, hung or lost a worker."""
+    parser = argument_parser(__doc__)
     parser.add_argument("--requests", type=int, default=10_000)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     outcome = Outcome()
-    with tempfile.TemporaryDirectory() as data:
-        settings = {"LALALOC_DATA_DIR": data, "LALALOC_LOG_LEVEL": "error"}
-        with running_service(0, settings) as service, httpx.Client(base_url=service.url, timeout=30.0) as client:
-            plan_id, before = upload_example_plan(service.url), replaced(client)
-            quarter = options.requests // 4
-            with ThreadPoolExecutor(_CLIENTS) as pool:
-                sends = [*_panoramas(client, plan_id, quarter, options.seed), *_plans(client, quarter, options.seed)]
-                list(pool.map(lambda one: outcome.note(*one), sends))
-            _described(service.url, plan_id, options.requests - 2 * quarter, options.seed, outcome)
-            after = replaced(client)
-            well = client.get("/healthz").status_code == httpx.codes.OK and service.process.poll() is None
+    with example_service() as service, httpx.Client(base_url=service.url, timeout=30.0) as client:
+        before, quarter = replaced_workers(client), options.requests // 4
+        with ThreadPoolExecutor(_CLIENTS) as threads:
+            panoramas = _panoramas(client, service.plan_id, quarter, options.seed)
+            list(
+                threads.map(
+                    lambda request: outcome.note(*request), [*panoramas, *_plans(client, quarter, options.seed)]
+                )
+            )
+        _send_described(service.url, service.plan_id, options.requests - 2 * quarter, options.seed, outcome)
+        after = replaced_workers(client)
+        is_healthy = client.get("/healthz").status_code == httpx.codes.OK and service.process.is_running()
     report = {
         "requests": sum(sum(found.values()) for found in outcome.statuses.values()),
         "statuses": {kind: dict(sorted(found.items())) for kind, found in sorted(outcome.statuses.items())},
@@ -107,18 +109,18 @@ def main() -> int:
         "bad": dict(Counter(outcome.bad).most_common(20)),
     }
     print(json.dumps(report, indent=2))
-    return int(bool(outcome.bad) or after > before or not well or not outcome.looked_at)
+    return int(bool(outcome.bad) or after > before or not is_healthy or not outcome.most_processed)
 
 
-def replaced(client: httpx.Client) -> int:
-    """How many workers had to be replaced since the service was started."""
+def replaced_workers(client: httpx.Client) -> int:
+    """Return the number of workers that the service has restarted."""
     found = re.findall(r"^lalaloc_pool_restarts_total{.*} (\S+)$", client.get("/metrics").text, re.MULTILINE)
     return int(sum(map(float, found)))
 
 
-def _described(url: str, plan_id: str, requests: int, seed: int, outcome: Outcome) -> None:
-    """Requests that follow the API's description, and others that just do not; most are about a plan that there is."""
-    schema = schemathesis.openapi.from_url(f"{url}/openapi.json").exclude(path_regex=_LEFT_OUT)
+def _send_described(url: str, plan_id: str, requests: int, seed: int, outcome: Outcome) -> None:
+    """Send requests that follow the API's description and requests that violate it; most name an existing plan."""
+    schema = schemathesis.openapi.from_url(f"{url}/openapi.json").exclude(path_regex=_EXCLUDED)
     operations = [found.ok() for found in schema.get_all_operations()]  # pyright: ignore[reportAttributeAccessIssue]
     before_round = 0
     strategies = [
@@ -127,7 +129,7 @@ def _described(url: str, plan_id: str, requests: int, seed: int, outcome: Outcom
     for round_seed in itertools.count(seed):
         sent = outcome.sent("described")
         if round_seed > seed and sent == before_round:
-            raise RuntimeError("the API's description gives rise to no requests")
+            raise RuntimeError("schemathesis makes no requests from the API's description at /openapi.json")
         before_round = sent
         for strategy in strategies:
             if outcome.sent("described") >= requests:
@@ -143,12 +145,12 @@ def _described(url: str, plan_id: str, requests: int, seed: int, outcome: Outcom
             )
             @hypothesis.given(case=strategy)
             def send(case: Any) -> None:
-                # Ids that there are do not come by chance; and deleting is left to those that do.
+                # Random ids never exist; requests that delete keep them, so that the plan stays.
                 if outcome.sent("described") % 4 and case.method != "DELETE" and "floorplan_id" in case.path_parameters:
                     case.path_parameters["floorplan_id"] = plan_id
                 outcome.note("described", lambda: _sent(case, url))
 
-            # Of an operation without parameters there are no wrong requests.
+            # Operations without parameters have no invalid requests.
             with suppress(hypothesis.errors.Unsatisfiable):
                 send()
 
@@ -156,7 +158,7 @@ def _described(url: str, plan_id: str, requests: int, seed: int, outcome: Outcom
 def _sent(case: Any, url: str) -> httpx.Response:
     answer = case.call(base_url=url, timeout=30.0)
     headers = [(name, value) for name, values in answer.headers.items() for value in values]
-    # Its body is decoded already.
+    # The body is already decoded.
     kept = [(name, value) for name, value in headers if name.lower() != "content-encoding"]
     return httpx.Response(answer.status_code, headers=kept, content=answer.content or b"")
 
@@ -165,7 +167,7 @@ def _panoramas(
     client: httpx.Client, plan_id: str, count: int, seed: int
 ) -> Iterator[tuple[str, Callable[[], httpx.Response]]]:
     rng = random.Random(seed)
-    with Image.open(io.BytesIO(queries()[0].picture)) as opened:
+    with Image.open(io.BytesIO(read_poses()[0].picture.read_bytes())) as opened:
         picture = opened.convert("RGB").resize((256, 128))
     valid = {name: _encoded(picture, name) for name in ("JPEG", "PNG", "WEBP")}
     for _ in range(count):
@@ -185,11 +187,11 @@ def _encoded(picture: Image.Image, name: str) -> bytes:
 
 
 def mutated(content: bytes, rng: random.Random) -> bytes:
-    """Bytes with some changed, cut out, doubled or cut off."""
+    """Return the bytes with some of them changed, removed, doubled or cut off."""
     found = bytearray(content)
     for _ in range(rng.choice((1, 1, 2, 4, 16))):
         place = rng.randrange(len(found)) if len(found) > 1 else 0
-        # Headers decide more than pixels do.
+        # Half of the changes hit the header, which decides more than pixels.
         place = place if rng.random() < 0.5 else min(place, rng.randrange(1, 200))
         kind = rng.randrange(5)
         if kind == 0:
@@ -227,7 +229,7 @@ _ODD: tuple[Any, ...] = (
 
 
 def _bent(value: Any, rng: random.Random) -> Any:
-    """A JSON value with one of its parts replaced, removed or doubled."""
+    """Return the JSON value with one of its parts replaced, removed or doubled."""
     if isinstance(value, dict | list) and value and rng.random() < 0.85:
         keys = list(value) if isinstance(value, dict) else list(range(len(value)))
         key, kind = rng.choice(keys), rng.random()

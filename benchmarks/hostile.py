@@ -1,146 +1,211 @@
-"""What a client sends to keep a service busy: each is answered soon, and health within a second all the while.
+"""Hostile requests: uploads that exhaust memory, and requests that keep the service busy.
 
     python -m benchmarks.hostile
 
-Prints a Markdown table: what was sent, its bytes, the answers, how long they took in all, and the slowest answer of
-`/healthz` meanwhile. `benchmarks.bombs` has what is sent to fill memory.
+Prints a Markdown table: the request, its bytes, the statuses, the duration, the slowest health check meanwhile, and the
+rise of the resident memory of the service and its workers. Every request must be answered soon and without an internal
+error, health checks within a second, and memory must stay within its limit. The picture of the largest allowed size and
+the first frame of an animation are answered; other pictures and bodies are refused.
 """
 
 from __future__ import annotations
 
 import io
+import itertools
 import json
 import math
 import socket
 import struct
 import sys
-import tempfile
-import threading
 import time
-import urllib.request
+import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import httpx
+import numpy as np
 from PIL import Image
 
-from benchmarks.load import upload_example_plan
-from examples.launch import running_service
+from benchmarks.harness import HealthWatch, MemoryWatch, argument_parser, example_service, service_memory_mb
+from service.settings import Settings
 
-_HEALTH_S = 1.0
-# What one request may take; the machine that this runs on has clients to run as well.
-_ANSWER_S = 10.0
-# A health check that takes longer is as good as none.
-_GIVE_UP_S = 20.0
+_MAX_HEALTH_S, _MAX_ANSWER_S, _TIMEOUT_S, _SETTLE_TIMEOUT_S = 1.0, 10.0, 90.0, 20.0
+# Uploads have up to 40 MiB; a worker may hold the pixels of a picture that it decodes.
+_MAX_MB, _MAX_DECODING_MB = 100.0, Settings.load().decode.memory_bytes / 2**20
+# Kept by buffers and allocators after all requests.
+_MAX_LEFT_MB = 150.0
+# The upload limit of 40 MiB, and the bytes in flight when the answer comes.
+_MAX_SENT_BYTES = 50 << 20
+_GIGABYTE = 1 << 30
 _CLIENTS = 60
-# More than a process may have descriptors, by default.
-_IDLE = 1_044
+# More connections than the default limit of file descriptors of a process.
+_IDLE_CONNECTIONS = 1_044
+_JSON = {"Content-Type": "application/json"}
+_FORM = {"Content-Type": "multipart/form-data; boundary=b"}
+_PART = b'--b\r\nContent-Disposition: form-data; name="panorama"; filename="p"\r\n\r\n'
 
 Point = list[float]
 
 
 @dataclass(frozen=True)
 class Attack:
-    """Something to send.
+    """Hostile request.
 
     Attributes:
-        sent: bytes of one request.
-        send: sends it, however often, and gives the statuses of all answers.
+        size_bytes: bytes of one request; 0 for requests without a body.
+        send: sends it and returns the statuses of all answers, 0 for a broken connection.
+        expected: "accepted" for a localisation, "refused" for a status in the 400s, "any" for both.
+        is_slow: whether the client itself takes longer than an answer may take.
     """
 
     name: str
-    sent: int
+    size_bytes: int
     send: Callable[[], list[int]]
+    expected: Literal["accepted", "refused", "any"] = "any"
+    is_slow: bool = False
 
 
 def main() -> int:
-    """Run; 1 when health was slow, or an attack was answered late or by an error of the service."""
+    """Send everything; return 1 when a limit is exceeded or an attack succeeds."""
+    argument_parser(__doc__).parse_args()
     failed = False
-    with tempfile.TemporaryDirectory() as data:
-        settings = {"LALALOC_DATA_DIR": data, "LALALOC_LOG_LEVEL": "error"}
-        with running_service(0, settings) as service:
-            plan_id = upload_example_plan(service.url)
-            print("| sent | bytes | answers | seconds | slowest health |\n|---|---|---|---|---|", flush=True)
-            for attack in _attacks(service.url, plan_id):
-                health = _Health(service.url)
-                begin = time.perf_counter()
+    with example_service() as service:
+        memory_before = service_memory_mb(service.process)
+        print("| request | bytes | statuses | seconds | slowest health check | memory |\n|---|---|---|---|---|---|")
+        for attack in _attacks(service.url, service.plan_id):
+            begin = time.perf_counter()
+            with HealthWatch(service.url) as health, MemoryWatch(service.process) as memory:
                 statuses = Counter(attack.send())
-                seconds, slowest_s = time.perf_counter() - begin, health.end()
-                # Refusals for now are as good as any, as long as they come soon.
-                wrong = any(status == 0 or status in (500, 502, 504) for status in statuses)
-                failed |= wrong or slowest_s > _HEALTH_S or seconds > _ANSWER_S
-                told = ", ".join(f"{count} x {status}" for status, count in sorted(statuses.items()))
-                row = (attack.name, f"{attack.sent:,}", told, f"{seconds:.1f}", f"{slowest_s:.2f} s")
-                print(f"| {' | '.join(row)} |", flush=True)
+            seconds, risen_mb = time.perf_counter() - begin, memory.highest - memory.before
+            failed |= any(status in (0, 500, 502, 504) for status in statuses) or health.slowest_s > _MAX_HEALTH_S
+            accepted = attack.expected == "accepted"
+            failed |= accepted and set(statuses) != {200}
+            failed |= attack.expected == "refused" and any(not 400 <= status < 500 for status in statuses)
+            failed |= seconds > _MAX_ANSWER_S and not (attack.is_slow or accepted)
+            failed |= risen_mb > (_MAX_DECODING_MB if accepted else _MAX_MB)
+            shown = ", ".join(f"{count} x {status}" for status, count in sorted(statuses.items()))
+            row = (attack.name, f"{attack.size_bytes:,}", shown, f"{seconds:.1f}", f"{health.slowest_s:.2f} s")
+            print(f"| {' | '.join(row)} | {risen_mb:+.0f} MB |", flush=True)
+        left_mb = service_memory_mb(service.process) - memory_before
+        failed |= left_mb > _MAX_LEFT_MB
+        print(f"\nMemory after all requests: {left_mb:+.0f} MB against before.")
     return int(failed)
 
 
-class _Health:
-    """Asks for health over and over, each time on a new connection, as a load balancer does."""
-
-    def __init__(self, url: str) -> None:
-        self._url = url
-        self._slowest_s = 0.0
-        self._end = threading.Event()
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
-
-    def end(self) -> float:
-        """How long the slowest answer took."""
-        self._end.set()
-        self._thread.join()
-        return self._slowest_s
-
-    def _run(self) -> None:
-        while True:
-            begin = time.perf_counter()
-            try:
-                with urllib.request.urlopen(f"{self._url}/healthz", timeout=_GIVE_UP_S) as answer:
-                    answer.read()
-            except OSError:
-                self._slowest_s = math.inf
-            self._slowest_s = max(self._slowest_s, time.perf_counter() - begin)
-            if self._end.wait(0.05):
-                return
-
-
 def _attacks(url: str, plan_id: str) -> Iterator[Attack]:
+    def panorama(name: str, content: bytes, *, accepted: bool = False) -> Attack:
+        data, files = {"floorplan_id": plan_id}, {"panorama": ("p", content)}
+        send = lambda: [_post(f"{url}/localise", data=data, files=files)]  # noqa: E731
+        return Attack(name, len(content), send, "accepted" if accepted else "refused")
+
+    def plan(name: str, content: bytes, *, prepare: bool = False, refused: bool = False) -> Attack:
+        def send() -> list[int]:
+            statuses = [_post(f"{url}/floorplans", content=content, headers=_JSON)]
+            return [*statuses, _wait_until_prepared(url)] if prepare else statuses
+
+        return Attack(name, len(content), send, "refused" if refused else "any")
+
+    yield panorama("PNG of 60,000 x 30,000 pixels of one colour", _png(60_000, 30_000, full=True))
+    yield panorama("PNG with a header of 2^31 x 2^30 pixels", _png(1 << 31, 1 << 30, full=False))
+    yield panorama("JPEG with a header of 65,500 x 32,750 pixels", _jpeg_with_size(65_500, 32_750))
+    yield panorama(
+        "WebP of 16,383 x 8,191 pixels of one colour", _encoded(16_383, 8_191, "WEBP", lossless=True, method=0)
+    )
+    yield panorama("PNG of 14,140 x 7,070 pixels, the largest allowed", _encoded(14_140, 7_070, "PNG"), accepted=True)
+    yield panorama("WebP of 9,000 frames", _animation(9_000), accepted=True)
+    yield panorama("PNG with 100 MB of compressed text", _png_with_text(100_000_000))
+    jpeg = _encoded(256, 128, "JPEG")
+    yield panorama("JPEG of 5 million empty comments", jpeg[:2] + _segment(0xFE, b"") * 5_000_000 + jpeg[2:])
+    exif = _segment(0xE1, b"Exif\0\0" + bytes(60_000))
+    yield panorama("JPEG of 640 segments of Exif", jpeg[:2] + exif * 640 + jpeg[2:])
+    yield Attack("body of 1 GB with its length", _GIGABYTE, lambda: _send_gigabyte(url, has_length=True), "refused")
+    yield Attack("body of 1 GB in chunks", _GIGABYTE, lambda: _send_gigabyte(url, has_length=False), "refused")
+    yield Attack("body of one byte a second", 100_000, lambda: _send_slowly(url), "refused", is_slow=True)
+
+    ring = np.linspace(0.0, 2.0 * np.pi, 1_000_000, endpoint=False)
+    yield plan(
+        "plan of a million vertices",
+        _document([np.stack([np.cos(ring), np.sin(ring)], axis=1).tolist()], 2),
+        refused=True,
+    )
+    sparse = 5.0 * np.stack([np.cos(ring[::20]), np.sin(ring[::20])], axis=1)
+    yield plan("plan of 50,000 vertices", _document([sparse.tolist()], 1), refused=True)
+    yield plan("JSON nested a million deep", b"[" * 1_000_000, refused=True)
+    yield plan("JSON nested 900,000 deep, closed", b"[" * 900_000 + b"]" * 900_000, refused=True)
+    yield plan("JSON number of a million digits", b'{"ceiling_height_m": ' + b"9" * 1_000_000 + b"}", refused=True)
     for size in (30_000, 200_000, 2_000_000):
-        text = b'"' + b'\\"' * (size // 2)
-        yield Attack("JSON that is one string without an end", len(text), lambda text=text: [_plan(url, text)])
-    combs = _document([_comb(k) for k in range(24)])
-    yield Attack("24 rooms that are crossing combs", len(combs), lambda: [_plan(url, combs)])
-    yield Attack("... looked at ten times at once", 0, lambda: _together(url, _newest(url), "", 10))
+        yield plan("JSON that is one string without an end", b'"' + b'\\"' * (size // 2))
+    yield plan("24 rooms that are crossing combs", _document([_comb(number) for number in range(24)]))
+    yield Attack("... fetched 10 times at once", 0, lambda: _fetch_newest(url, "", 10))
     for side_m in (290.0, 19.9):
-        slivers = _document([_sliver(k, side_m) for k in range(500)])
-        name = f"500 slivers across squares of {side_m:g} m"
-        yield Attack(name, len(slivers), lambda slivers=slivers: [_plan(url, slivers), _settled(url)])
-    spirals = _document([_spiral(k) for k in range(6)])
-    yield Attack("6 rooms that are spirals", len(spirals), lambda: [_plan(url, spirals)])
-    yield Attack(
-        f"... drawn for {_CLIENTS} clients at once", 0, lambda: _together(url, _newest(url), "/preview.svg", _CLIENTS)
-    )
-    yield Attack(
-        f"... as a mesh for {_CLIENTS} clients at once", 0, lambda: _together(url, _newest(url), "/mesh.glb", _CLIENTS)
-    )
-    for name, picture in _pictures():
-        yield Attack(name, len(picture), lambda picture=picture: [_localise(url, plan_id, picture)])
+        slivers = _document([_sliver(number, side_m) for number in range(500)])
+        yield plan(f"500 slivers across squares of {side_m:g} m", slivers, prepare=True)
+    yield plan("6 rooms that are spirals", _document([_spiral(number) for number in range(6)]))
+    for path, action in (("/preview.svg", "drawn"), ("/mesh.glb", "as a mesh")):
+        name = f"... {action} for {_CLIENTS} clients at once"
+        yield Attack(name, 0, lambda path=path: _fetch_newest(url, path, _CLIENTS))
     form = b'--b\r\nContent-Disposition: form-data; name="file"; filename="p"\r\n\r\n' + b"\r\n--" * 500_000
-    yield Attack("form of 500,000 lines that nearly end it", len(form), lambda: [_form(url, form)])
-    yield Attack(f"{_IDLE:,} connections that say nothing", 0, lambda: _idle(url))
+    send_form = lambda: [_post(f"{url}/floorplans", content=form, headers=_FORM)]  # noqa: E731
+    yield Attack("form of 500,000 lines that nearly end it", len(form), send_form)
+    yield Attack(f"{_IDLE_CONNECTIONS:,} idle connections", 0, lambda: _hold_connections(url))
 
 
-def _document(polygons: list[list[Point]]) -> bytes:
-    rooms = [{"polygon": [[round(x, 3), round(y, 3)] for x, y in polygon]} for polygon in polygons]
+def _png(width: int, height: int, *, full: bool) -> bytes:
+    """Return a greyscale PNG of zeros; without the pixels if it is not `full`."""
+    packer = zlib.compressobj(9)
+    row = b"\0" * (width + 1)
+    packed = b"".join(packer.compress(row) for _ in range(height)) + packer.flush() if full else packer.flush()
+    head = struct.pack(">IIBBBBB", width & 0xFFFFFFFF, height & 0xFFFFFFFF, 8, 0, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + _chunk(b"IHDR", head) + _chunk(b"IDAT", packed) + _chunk(b"IEND", b"")
+
+
+def _png_with_text(size: int) -> bytes:
+    plain = _encoded(256, 128, "PNG")
+    # The header has 8 + 25 bytes.
+    return plain[:33] + _chunk(b"zTXt", b"Comment\0\0" + zlib.compress(b"a" * size, 9)) + plain[33:]
+
+
+def _chunk(kind: bytes, content: bytes) -> bytes:
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+
+def _jpeg_with_size(width: int, height: int) -> bytes:
+    """Return a small JPEG with another size in its header."""
+    content = bytearray(_encoded(256, 128, "JPEG"))
+    place = content.index(b"\xff\xc0") + 5
+    content[place : place + 4] = struct.pack(">HH", height, width)
+    return bytes(content)
+
+
+def _segment(marker: int, content: bytes) -> bytes:
+    return bytes([0xFF, marker]) + struct.pack(">H", len(content) + 2) + content
+
+
+def _animation(frames: int) -> bytes:
+    buffer = io.BytesIO()
+    # Equal frames would be merged.
+    shades = [Image.new("RGB", (128, 64), (k % 256, k // 256, 0)) for k in range(frames)]
+    shades[0].save(buffer, "WEBP", save_all=True, append_images=shades[1:], duration=1, lossless=True, method=0)
+    return buffer.getvalue()
+
+
+def _encoded(width: int, height: int, name: str, **options: Any) -> bytes:
+    buffer = io.BytesIO()
+    Image.new("RGB", (width, height), (90, 90, 90)).save(buffer, name, **options)
+    return buffer.getvalue()
+
+
+def _document(polygons: list[list[Point]], digits: int = 3) -> bytes:
+    rooms = [{"polygon": [[round(x, digits), round(y, digits)] for x, y in polygon]} for polygon in polygons]
     return json.dumps({"ceiling_height_m": 2.5, "rooms": rooms}, separators=(",", ":")).encode()
 
 
 def _comb(number: int) -> list[Point]:
-    """A comb of 48 teeth, every other one turned, so that the teeth of each cross those of half the others."""
+    """Return a comb of 48 teeth; every other comb is transposed, so that its teeth cross those of its neighbours."""
     teeth: list[Point] = []
     for k in range(48):
         teeth += [[k + 0.01, 0.1], [k + 0.01, 48.0], [k + 0.02, 48.0], [k + 0.02, 0.1]]
@@ -150,7 +215,7 @@ def _comb(number: int) -> list[Point]:
 
 
 def _sliver(number: int, side_m: float) -> list[Point]:
-    """A corridor of a few millimetres across a square, whose poses are looked for in all of the square."""
+    """Return a corridor of a few millimetres across a square; its bounding box, searched for poses, is the square."""
     x, width_m = 0.05 * number, 0.25 / side_m
     return [[x, 0.0], [x + width_m, 0.0], [x + side_m, side_m], [x + side_m - width_m, side_m]]
 
@@ -164,73 +229,93 @@ def _spiral(number: int) -> list[Point]:
     return [*arms[0], *reversed(arms[1])]
 
 
-def _pictures() -> Iterator[tuple[str, bytes]]:
-    buffer = io.BytesIO()
-    Image.new("RGB", (256, 128), (90, 90, 90)).save(buffer, "JPEG")
-    plain = buffer.getvalue()
-
-    def segment(marker: int, content: bytes) -> bytes:
-        return bytes([0xFF, marker]) + struct.pack(">H", len(content) + 2) + content
-
-    yield "JPEG of 5 million empty comments", plain[:2] + segment(0xFE, b"") * 5_000_000 + plain[2:]
-    yield "JPEG of 640 segments of Exif", plain[:2] + segment(0xE1, b"Exif\0\0" + bytes(60_000)) * 640 + plain[2:]
-
-
-def _plan(url: str, content: bytes) -> int:
-    headers = {"Content-Type": "application/json"}
-    return _status(lambda: httpx.post(f"{url}/floorplans", content=content, headers=headers, timeout=60.0))
-
-
-def _form(url: str, content: bytes) -> int:
-    headers = {"Content-Type": "multipart/form-data; boundary=b"}
-    return _status(lambda: httpx.post(f"{url}/floorplans", content=content, headers=headers, timeout=60.0))
-
-
-def _localise(url: str, plan_id: str, picture: bytes) -> int:
-    data, files = {"floorplan_id": plan_id}, {"panorama": ("p", picture)}
-    return _status(lambda: httpx.post(f"{url}/localise", data=data, files=files, timeout=60.0))
+def _post(address: str, **request: Any) -> int:
+    return _status(lambda: httpx.post(address, timeout=_TIMEOUT_S, **request))
 
 
 def _status(send: Callable[[], httpx.Response]) -> int:
-    """The status of an answer, 0 for none."""
+    """Return the status of an answer; 0 without one."""
     try:
         return send().status_code
     except httpx.HTTPError:
         return 0
 
 
-def _listed(url: str) -> list[dict[str, Any]]:
+def _stored_plans(url: str) -> list[dict[str, Any]]:
     return httpx.get(f"{url}/floorplans", timeout=60.0).json()["floorplans"]
 
 
-def _newest(url: str) -> str:
-    return _listed(url)[0]["id"]
-
-
-def _settled(url: str) -> int:
-    """Wait until no plan is preparing; 0 when that takes too long."""
-    deadline = time.monotonic() + _GIVE_UP_S
-    while any(plan["status"] == "preparing" for plan in _listed(url)):
+def _wait_until_prepared(url: str) -> int:
+    """Return 200 when no plan is preparing any more, 0 after the timeout."""
+    deadline = time.monotonic() + _SETTLE_TIMEOUT_S
+    while any(plan["status"] == "preparing" for plan in _stored_plans(url)):
         if time.monotonic() > deadline:
             return 0
         time.sleep(0.1)
     return httpx.codes.OK
 
 
-def _together(url: str, plan_id: str, path: str, clients: int) -> list[int]:
-    """The same answer for many clients at once."""
-    address = f"{url}/floorplans/{plan_id}{path}"
+def _fetch_newest(url: str, path: str, clients: int) -> list[int]:
+    """Fetch a resource of the newest plan with many clients at once."""
+    address = f"{url}/floorplans/{_stored_plans(url)[0]['id']}{path}"
     with httpx.Client(timeout=60.0) as client, ThreadPoolExecutor(clients) as threads:
         return list(threads.map(lambda _: _status(lambda: client.get(address)), range(clients)))
 
 
-def _idle(url: str) -> list[int]:
-    """Connections that are opened, and after which somebody asks for the limits."""
+def _hold_connections(url: str) -> list[int]:
+    """Open idle connections, then ask for the limits."""
     host, _, port = url.removeprefix("http://").partition(":")
     with ExitStack() as stack:
-        for _ in range(_IDLE):
+        for _ in range(_IDLE_CONNECTIONS):
             stack.enter_context(socket.create_connection((host, int(port)), timeout=10.0))
         return [_status(lambda: httpx.get(f"{url}/limits", timeout=60.0))]
+
+
+def _send_gigabyte(url: str, *, has_length: bool) -> list[int]:
+    head = f"Content-Length: {_GIGABYTE}" if has_length else "Transfer-Encoding: chunked"
+    block = b"a" * (1 << 16)
+    blocks = itertools.chain([_PART], itertools.repeat(block, _GIGABYTE // len(block)))
+    return _send_parts(url, head, (part if has_length else b"%x\r\n%s\r\n" % (len(part), part) for part in blocks))
+
+
+def _send_slowly(url: str) -> list[int]:
+    def drops() -> Iterator[bytes]:
+        yield _PART
+        while True:
+            time.sleep(1.0)
+            yield b"a"
+
+    return _send_parts(url, "Content-Length: 100000", drops())
+
+
+def _send_parts(url: str, head: str, body: Iterator[bytes]) -> list[int]:
+    """Send a body in parts until the service answers; return its status, 0 for none or too many bytes."""
+    host, _, port = url.removeprefix("http://").partition(":")
+    sent, answer, deadline = 0, b"", time.monotonic() + _TIMEOUT_S
+    with socket.create_connection((host, int(port))) as connection:
+        lines = ["POST /localise HTTP/1.1", f"Host: {host}", "Content-Type: multipart/form-data; boundary=b", head]
+        connection.sendall("\r\n".join([*lines, "", ""]).encode())
+        for part in body:
+            try:
+                connection.settimeout(5.0)
+                connection.sendall(part)
+                sent += len(part)
+                connection.settimeout(0.001)
+                answer = connection.recv(1 << 16)
+            except TimeoutError:
+                if time.monotonic() < deadline and sent <= _MAX_SENT_BYTES:
+                    continue
+            except OSError:
+                # The service closed the connection; its answer, if any, is read below.
+                pass
+            break
+        connection.settimeout(5.0)
+        while b"\r\n" not in answer:
+            try:
+                answer += connection.recv(1 << 16) or b" 0 \r\n"
+            except OSError:
+                break
+    return [int(answer.split(b" ", 2)[1]) if answer.startswith(b"HTTP/") and sent <= _MAX_SENT_BYTES else 0]
 
 
 if __name__ == "__main__":

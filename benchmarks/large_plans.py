@@ -1,15 +1,13 @@
-"""How preparing and searching plans grows with their area: `python -m benchmarks.large_plans`.
+"""Preparing and searching plans by area: `python -m benchmarks.large_plans`.
 
 Buildings are generated homes side by side, with corridors between them and halls full of columns
-(`synth.homes.buildings`), and photographs those of their homes. Times are of one thread's processor, so that a busy
-machine may be measured on; memory is that of the latent grid with all that queries make of it. With `--oracle` every
-query is also compared with all poses, headings and heights at all azimuths, which takes minutes for the larger
-buildings.
+(`learn.synth.homes.buildings`); photographs are of their homes. Times are processor times of one thread, so that the
+machine need not be idle; memory is that of the pose grid with everything that queries derive from it. `--oracle` also
+compares every query with all poses, headings and heights at all azimuths, which takes minutes for large buildings.
 """
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import time
 from collections.abc import Callable
@@ -20,6 +18,7 @@ from typing import TypeVar
 import numpy as np
 from jaxtyping import UInt8
 
+from benchmarks.harness import argument_parser
 from lalaloc_core.evaluate.methods.lalaloc import local_refiner
 from lalaloc_core.floorplan import FloorPlan, PlanLimits
 from lalaloc_core.learn.data.synthetic.generated import RendererCache
@@ -37,7 +36,7 @@ from lalaloc_core.localise.retrieval import grid_costs
 from service.grids.embedding import embed, grid_bytes
 
 _AREAS_M2 = (100.0, 1000.0, 5000.0, 10_000.0, 50_000.0, 100_000.0, 200_000.0)
-# Homes side by side have more doors and windows than plans of this size may have otherwise.
+# Homes side by side have more openings than the default limit.
 _MAX_OPENINGS = 30_000
 _STEP_M = 0.5
 _T = TypeVar("_T")
@@ -45,7 +44,7 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True)
 class _Row:
-    """What was measured of one building; seconds and milliseconds of processor time."""
+    """Figures of one building; seconds and milliseconds of processor time."""
 
     plan: FloorPlan
     poses: int
@@ -67,17 +66,19 @@ class _Row:
 
 
 def main() -> None:
-    """Parse arguments, measure, print a table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    """Measure every building and print the table."""
+    parser = argument_parser(__doc__)
     parser.add_argument("--areas", type=float, nargs="+", default=list(_AREAS_M2), help="m²")
-    parser.add_argument("--queries", type=int, default=8, help="photographs of each building")
+    parser.add_argument("--queries", type=int, default=8, help="photographs per building")
     parser.add_argument("--bundle", type=Path, default=default_bundle())
-    parser.add_argument("--textures", type=Path, help="folder of material pictures")
-    parser.add_argument("--oracle", type=float, default=0.0, help="compare with everything up to this area (m²)")
+    parser.add_argument("--textures", type=Path, help="folder of textures")
+    parser.add_argument("--oracle", type=float, default=0.0, help="compare with brute force up to this area (m²)")
     arguments = parser.parse_args()
     bundle = Bundle.open(arguments.bundle)
     renderers = RendererCache(MaterialLibrary.create(np.random.default_rng(1), arguments.textures))
-    print("| area m² | rooms | poses | read | ready | grid, a pose | known | unknown | retrieval | as brute force |")
+    print(
+        "| area m² | rooms | poses | read | ready | grid, a pose | known | unknown | retrieval | brute force agrees |"
+    )
     print("|---|---|---|---|---|---|---|---|---|---|")
     for area_m2 in arguments.areas:
         building = building_of(VALIDATION, 0, area_m2, hall_share=0.2 if area_m2 > 1000.0 else 0.0)
@@ -107,15 +108,17 @@ def _measure(building: Building, bundle: Bundle, renderers: RendererCache, count
     spent: dict[bool, list[float]] = {True: [], False: []}
     retrieved, same = [], []
 
-    def answer(image: UInt8[np.ndarray, "h w 3"], shot: Shot, *, known: bool) -> None:
+    def localise_shot(image: UInt8[np.ndarray, "h w 3"], shot: Shot, *, known: bool) -> None:
         query = _encoded(encoders, image, shot, known=known)
         localise(plan, grid, encoders, query, refiner=refiner)
 
     for number, (image, shot) in enumerate(zip(images, shots, strict=True)):
         for known in (True, False):
             if not number:
-                answer(image, shot, known=known)
-            spent[known].append(_timed(lambda image=image, shot=shot, known=known: answer(image, shot, known=known))[0])
+                localise_shot(image, shot, known=known)
+            spent[known].append(
+                _timed(lambda image=image, shot=shot, known=known: localise_shot(image, shot, known=known))[0]
+            )
         query = _encoded(encoders, image, shot, known=False)
         seconds, found = _timed(lambda query=query: grid_costs(plan, grid, query, weights, config))
         retrieved.append(seconds)

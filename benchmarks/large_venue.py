@@ -1,20 +1,17 @@
-"""A venue of as many floor plans as one may have, over HTTP: uploaded, paged through, asked about.
+"""Venue with the largest number of floor plans: upload, paging and localisation over HTTP.
 
     python -m benchmarks.large_venue --plans 10000
 
-Small homes of two rooms are drawn at random, and the example flat is one of them: all example panoramas are asked about
-in the venue, which must name it. The pages of the venue must give what was put into it, once and in order. Ends with 1
-where something is wrong. The times of queries, and of the look at whether a venue is still what it was which each of
-them takes, mean something only on a machine that does nothing else.
+The plans are random homes of two rooms and the example flat. All example panoramas are localised in the venue, whose
+answer must name the flat. The pages of the venue must list every plan once and in order. Times of queries, and of the
+state check that each of them makes, are meaningful on an idle machine only.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import random
 import sys
-import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -24,22 +21,18 @@ from typing import Any
 import httpx
 import numpy as np
 
-from benchmarks.load import Query, queries
-from benchmarks.processes import resident_mb
-from examples.launch import running_service
-from examples.truth import PLAN_PATH
+from benchmarks.harness import argument_parser, example_service, query_of, resident_mb
+from examples.truth import TruePose, read_poses
 from lalaloc_core.localise.bundle import Bundle
 from service.settings import Settings
 from service.storage import open_store
 
-_CLIENTS = 4
-_PAGE = 500
-_READY_WITHIN_S = 7200.0
-_LOOKS = 20
+_CLIENTS, _PAGE, _STATE_CHECKS = 4, 500, 20
+_TIMEOUT_S = 7200.0
 
 
-def home(number: int) -> dict[str, Any]:
-    """A plan of two rooms with a door between them; the same for the same number."""
+def random_home(number: int) -> dict[str, Any]:
+    """Return a plan of two rooms with a door between them; the same for the same number."""
     rng = random.Random(number)
     width, depth, split, wall = rng.uniform(3.0, 6.0), rng.uniform(2.2, 4.5), rng.uniform(0.35, 0.65), 0.1
     middle, door = split * width, rng.uniform(0.2, depth - 1.2)
@@ -54,23 +47,18 @@ def home(number: int) -> dict[str, Any]:
 
 
 def upload(client: httpx.Client, documents: Sequence[dict[str, Any]]) -> list[str]:
-    """Ids of the plans, in order."""
-
-    def one(document: dict[str, Any]) -> str:
-        answer = client.post("/floorplans", json=document)
-        answer.raise_for_status()
-        return answer.json()["id"]
-
-    with ThreadPoolExecutor(_CLIENTS) as clients:
-        return list(clients.map(one, documents))
+    """Return the ids of the uploaded plans, in order."""
+    with ThreadPoolExecutor(_CLIENTS) as threads:
+        responses = threads.map(lambda document: client.post("/floorplans", json=document), documents)
+        return [response.raise_for_status().json()["id"] for response in responses]
 
 
 def pages(client: httpx.Client, venue_id: str) -> Iterator[dict[str, Any]]:
-    """All plans of a venue, page by page."""
+    """Yield all plans of a venue, page by page."""
     cursor = None
     while True:
-        given = {"limit": _PAGE} | ({"cursor": cursor} if cursor else {})
-        page = client.get(f"/venues/{venue_id}/plans", params=given).raise_for_status().json()
+        options = {"limit": _PAGE} | ({"cursor": cursor} if cursor else {})
+        page = client.get(f"/venues/{venue_id}/plans", params=options).raise_for_status().json()
         yield from page["plans"]
         cursor = page["next_cursor"]
         if cursor is None:
@@ -78,69 +66,65 @@ def pages(client: httpx.Client, venue_id: str) -> Iterator[dict[str, Any]]:
 
 
 def wait_until_ready(client: httpx.Client, venue_id: str) -> dict[str, Any]:
-    """The venue once all of its plans can be asked about."""
-    deadline = time.monotonic() + _READY_WITHIN_S
+    """Return the venue once all of its plans are ready or failed."""
+    deadline = time.monotonic() + _TIMEOUT_S
     while True:
         venue = client.get(f"/venues/{venue_id}").raise_for_status().json()
         if venue["plans_ready"] + venue["plans_failed"] == venue["plans"]:
             return venue
         if time.monotonic() > deadline:
-            raise TimeoutError(f"{venue['plans_ready']} plans are ready after {_READY_WITHIN_S:g} s")
+            raise TimeoutError(f"{venue['plans_ready']} of {venue['plans']} plans are ready after {_TIMEOUT_S:g} s")
         time.sleep(1.0)
 
 
-def looks_ms(data: Path, venue_id: str) -> float:
-    """Milliseconds that a look at the state of a venue takes in the database, the median."""
+def state_check_ms(data: Path, venue_id: str) -> float:
+    """Return the median duration (ms) of the check whether a venue has changed."""
     settings, bundle = Settings(data_dir=data), Bundle.open(Path("models/default"))
-    store, spent_ms = open_store(settings), []
-    for _ in range(_LOOKS):
+    store, times_ms = open_store(settings), []
+    for _ in range(_STATE_CHECKS):
         begin = time.perf_counter()
         store.venues.state(venue_id, bundle.sha256, settings.grids.grid_step_m)
-        spent_ms.append(1e3 * (time.perf_counter() - begin))
-    return float(np.median(spent_ms))
+        times_ms.append(1e3 * (time.perf_counter() - begin))
+    return float(np.median(times_ms))
 
 
 def main() -> int:
-    """Run; 1 when something is missing or wrong."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    """Measure; return 1 when a plan is missing or an answer names another plan."""
+    parser = argument_parser(__doc__)
     parser.add_argument("--plans", type=int, default=10_000)
-    options = parser.parse_args()
-    documents = [json.loads(PLAN_PATH.read_bytes()), *map(home, range(options.plans - 1))]
-    report: dict[str, Any] = {"plans": len(documents)}
-    with tempfile.TemporaryDirectory() as data:
-        settings = {"LALALOC_DATA_DIR": data, "LALALOC_LOG_LEVEL": "error"}
-        with running_service(0, settings) as service, httpx.Client(base_url=service.url, timeout=120.0) as client:
-            report["resident_mb"] = {"empty": resident_mb(service.process.pid)}
-            begun = time.perf_counter()
-            ids = upload(client, documents)
-            report["uploaded_s"] = round(time.perf_counter() - begun, 1)
-            members = [{"floorplan_id": one, "level": number % 5} for number, one in enumerate(ids)]
-            venue_id = client.post("/venues", json={"plans": members}).raise_for_status().json()["id"]
-            venue = wait_until_ready(client, venue_id)
-            report["ready_s"] = round(time.perf_counter() - begun, 1)
-            report["resident_mb"]["ready"] = resident_mb(service.process.pid)
-            paged = [(one["level"], one["floorplan_id"]) for one in pages(client, venue_id)]
-            report["queries"] = [_asked(client, venue_id, ids[0], query) for query in queries()]
-            report["resident_mb"]["asked"] = resident_mb(service.process.pid)
-        report["look_ms"] = round(looks_ms(Path(data), venue_id), 1)
-    report["holds"] = {
-        "all plans can be asked about": venue["plans_ready"] == len(ids),
-        "pages give every plan once, in order": paged == sorted((one["level"], one["floorplan_id"]) for one in members),
-        "queries name the right plan": all(one["right"] for one in report["queries"]),
+    plans = parser.parse_args().plans
+    report: dict[str, Any] = {"plans": plans}
+    with example_service() as service, httpx.Client(base_url=service.url, timeout=120.0) as client:
+        report["resident_mb"] = {"empty": resident_mb(service.process)}
+        begin = time.perf_counter()
+        ids = [service.plan_id, *upload(client, [random_home(number) for number in range(plans - 1)])]
+        report["uploaded_s"] = round(time.perf_counter() - begin, 1)
+        members = [{"floorplan_id": plan_id, "level": number % 5} for number, plan_id in enumerate(ids)]
+        venue_id = client.post("/venues", json={"plans": members}).raise_for_status().json()["id"]
+        venue = wait_until_ready(client, venue_id)
+        report["ready_s"] = round(time.perf_counter() - begin, 1)
+        report["resident_mb"]["ready"] = resident_mb(service.process)
+        listed = [(plan["level"], plan["floorplan_id"]) for plan in pages(client, venue_id)]
+        report["queries"] = [_localise(client, venue_id, service.plan_id, pose) for pose in read_poses()]
+        report["resident_mb"]["localised"] = resident_mb(service.process)
+        report["state_check_ms"] = round(state_check_ms(service.data, venue_id), 1)
+    report["expected"] = {
+        "all plans are ready": venue["plans_ready"] == len(ids),
+        "pages list every plan once, in order": listed
+        == sorted((plan["level"], plan["floorplan_id"]) for plan in members),
+        "answers name the right plan": all(query["right"] for query in report["queries"]),
     }
     print(json.dumps(report, indent=2))
-    return int(not all(report["holds"].values()))
+    return int(not all(report["expected"].values()))
 
 
-def _asked(client: httpx.Client, venue_id: str, plan_id: str, query: Query) -> dict[str, Any]:
+def _localise(client: httpx.Client, venue_id: str, plan_id: str, pose: TruePose) -> dict[str, Any]:
     begin = time.perf_counter()
-    fields = {"venue_id": venue_id, "heading_deg": str(query.pose.heading_deg)}
-    answer = client.post("/localise", data=fields, files={"panorama": (query.pose.file, query.picture)})
-    told = answer.raise_for_status().json()
+    answer = client.post("/localise", **query_of(pose, venue_id=venue_id)).raise_for_status().json()
     return {
-        "picture": query.pose.file,
-        "right": told["floorplan_id"] == plan_id,
-        "confidence": told["confidence"],
+        "picture": pose.file,
+        "right": answer["floorplan_id"] == plan_id,
+        "confidence": answer["confidence"],
         "ms": round(1e3 * (time.perf_counter() - begin)),
     }
 

@@ -1,4 +1,4 @@
-"""Floor plans drawn as people draw them: generated homes in five styles, with what the drawing shows as the truth."""
+"""Drawings of generated homes in five styles, with the rooms and openings that they show."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from lalaloc_core.learn.synth.homes.plans import Home, HomeConfig, generate_home
 
 Style = Literal["thin", "thick", "hatched", "coloured", "scanned"]
 STYLES: tuple[Style, ...] = get_args(Style)
-# What nobody can tell from a drawing: rooms that are joined by more than this without a symbol are one.
+# Rooms joined by a wider opening without a symbol look like one room.
 WIDEST_BARE_OPENING_M = 1.9
 _MARGIN_M = 1.5
-# Walls between slanted rooms are wedges; an opening leads through one that is no deeper than this.
+# Walls between slanted rooms are wedges; openings lead through wedges up to this depth.
 _MAX_WALL_DEPTH_M = 0.8
 _PIXELS_PER_M = {"thin": 80.0, "thick": 80.0, "hatched": 80.0, "coloured": 80.0, "scanned": 60.0}
 _HOME = HomeConfig(rotated_share=0.0, sheared_share=0.0, rooms=(3, 9), area_m2=(30.0, 140.0))
@@ -31,7 +31,7 @@ _SHIFT = 4
 
 @dataclass(frozen=True)
 class OpeningSymbol:
-    """An opening that a drawing shows: its quadrilateral in the wall, its middle line, and what is cut out of walls."""
+    """Opening of a drawing: its quadrilateral in the wall, its middle line, and the area cut out of walls."""
 
     kind: Literal["door", "window", "passage"]
     shape: shapely.Polygon
@@ -42,7 +42,7 @@ class OpeningSymbol:
 
 @dataclass(frozen=True, eq=False)
 class DrawnPlan:
-    """A picture and the truth, in metres from its lower left corner."""
+    """Picture with its rooms and openings, in metres from its lower left corner."""
 
     picture: UInt8[np.ndarray, "h w 3"]
     metres_per_pixel: float
@@ -50,13 +50,13 @@ class DrawnPlan:
     openings: list[OpeningSymbol]
 
     def png(self) -> bytes:
-        """The picture as a file."""
+        """Return the picture as PNG."""
         stream = io.BytesIO()
         Image.fromarray(self.picture).save(stream, "PNG")
         return stream.getvalue()
 
     def jpeg(self, quality: int = 60) -> bytes:
-        """The picture as a scanner saves it."""
+        """Return the picture as JPEG."""
         stream = io.BytesIO()
         Image.fromarray(self.picture).save(stream, "JPEG", quality=quality)
         return stream.getvalue()
@@ -64,7 +64,7 @@ class DrawnPlan:
 
 @dataclass(frozen=True, eq=False)
 class _Model:
-    """What is drawn, in metres with the origin at the lower left corner of the sheet."""
+    """Home to draw, in metres from the lower left corner of the sheet."""
 
     rooms: list[shapely.Polygon]
     names: list[str]
@@ -74,7 +74,7 @@ class _Model:
 
 
 def draw_plan(style: Style, seed: int) -> DrawnPlan:
-    """A generated home in one of the styles; the same for the same seed."""
+    """Draw a generated home in one of the styles; the same for the same seed."""
     rng = np.random.default_rng([seed, STYLES.index(style)])
     thickness = float(rng.uniform(0.1, 0.25))
     model = _model(generate_home(rng, replace(_HOME, wall_thickness_m=(thickness, thickness))), thickness)
@@ -92,7 +92,7 @@ def draw_plan(style: Style, seed: int) -> DrawnPlan:
     if style == "scanned":
         degrees = float(rng.uniform(1.0, 4.0) * rng.choice([-1.0, 1.0]))
         picture = _scan(picture, degrees, rng)
-        # The importer turns the drawing straight about the sheet's centre; so the truth stays as it was drawn.
+        # The importer turns a skewed drawing back about its centre, so the truth stays as drawn.
     return DrawnPlan(picture, 1.0 / sheet.pixels_per_m, rooms, openings)
 
 
@@ -120,9 +120,9 @@ def _openings(home: Home, origin: np.ndarray, thickness: float, inside: BaseGeom
         end = np.array([x0, y0]) + along * opening.end_m - origin
         shape = shapely.Polygon([start, end, end + thickness * outward, start + thickness * outward])
         kind = {"door_shut": "door", "door_open": "door", "window": "window", "opening": "passage"}[opening.kind]
-        # A door between two rooms is listed by both; and what would cut into a third room is not drawn.
-        seen = any(shapely.intersection(shape, other.shape).area > 0.1 * shape.area for other in found)
-        if seen or shapely.intersection(shape, inside).area > 0.02 * shape.area:
+        # A door between two rooms is listed by both, and an opening into a third room is not drawn.
+        is_drawn = any(shapely.intersection(shape, drawn.shape).area > 0.1 * shape.area for drawn in found)
+        if is_drawn or shapely.intersection(shape, inside).area > 0.02 * shape.area:
             continue
         middle = 0.5 * thickness * outward
         a, b = start + middle, end + middle
@@ -138,7 +138,7 @@ def _cut_through(
     shape: shapely.Polygon,
     inside: BaseGeometry,
 ) -> BaseGeometry:
-    """What an opening takes out of walls: all of the wall up to a room behind it, which may be slanted against it."""
+    """Return the area that an opening cuts out of walls, up to a room behind it that may be slanted against it."""
     deep = []
     for corner in (start, 0.5 * (start + end), end):
         ray = shapely.LineString([corner + 0.01 * outward, corner + _MAX_WALL_DEPTH_M * outward])
@@ -151,7 +151,7 @@ def _cut_through(
 
 
 def _as_seen(model: _Model) -> tuple[list[shapely.Polygon], list[OpeningSymbol]]:
-    """Rooms and openings as a drawing shows them: wide bare openings join rooms."""
+    """Return rooms and openings as a drawing shows them: wide openings without a symbol join rooms."""
     wide = [o for o in model.openings if o.kind == "passage" and math.dist(o.start, o.end) > WIDEST_BARE_OPENING_M]
     joined = shapely.unary_union([*model.rooms, *(o.shape.buffer(1e-3, join_style="mitre") for o in wide)])
     parts = [part for part in shapely.get_parts(joined) if isinstance(part, shapely.Polygon)]
@@ -159,7 +159,7 @@ def _as_seen(model: _Model) -> tuple[list[shapely.Polygon], list[OpeningSymbol]]
 
 
 class _Sheet:
-    """A drawing that comes into being."""
+    """Drawing in progress."""
 
     def __init__(self, model: _Model, pixels_per_m: float) -> None:
         self._model, self.pixels_per_m = model, pixels_per_m
@@ -173,7 +173,7 @@ class _Sheet:
             self._fill(room, _PALE[int(rng.integers(len(_PALE)))])
 
     def furnish(self, rng: np.random.Generator) -> None:
-        """Boxes along walls, tables with chairs, beds; none where a door swings."""
+        """Draw furniture, none of it where a door swings."""
         swings = [o.shape.buffer(math.dist(o.start, o.end)) for o in self._model.openings if o.kind == "door"]
         for room in self._model.rooms:
             taken: list[BaseGeometry] = list(swings)
@@ -186,7 +186,7 @@ class _Sheet:
                 if rng.random() < 0.7:  # Against a wall.
                     x = x0 + 0.06 if rng.random() < 0.5 else x1 - 0.06 - width
                 piece = shapely.box(x, y, x + width, y + depth)
-                if room.buffer(-0.05).contains(piece) and not any(piece.intersects(other) for other in taken):
+                if room.buffer(-0.05).contains(piece) and not any(piece.intersects(area) for area in taken):
                     taken.append(piece.buffer(0.15))
                     self._piece(piece, rng)
 
@@ -205,33 +205,19 @@ class _Sheet:
 
     def letter(self) -> None:
         for room, name in zip(self._model.rooms, self._model.names, strict=True):
-            at = shapely.maximum_inscribed_circle(room, 0.05).coords[0]
+            centre = shapely.maximum_inscribed_circle(room, 0.05).coords[0]
             size = 0.006 * self.pixels_per_m
             (width, height), _ = cv2.getTextSize(name, cv2.FONT_HERSHEY_SIMPLEX, size, 1)
-            x, y = self._pixel((at[0], at[1]))
-            cv2.putText(
-                self.picture,
-                name,
-                (x - width // 2, y + height // 2),
-                cv2.FONT_HERSHEY_SIMPLEX,
-                size,
-                (40, 40, 40),
-                1,
-                cv2.LINE_AA,
-            )
-            cv2.putText(
-                self.picture,
-                f"{room.area:.1f} m2",
-                (x - width // 2, y + 2 * height),
-                cv2.FONT_HERSHEY_SIMPLEX,
-                0.8 * size,
-                (40, 40, 40),
-                1,
-                cv2.LINE_AA,
-            )
+            x, y = self._pixel((centre[0], centre[1]))
+            for text, row, scale in (
+                (name, y + height // 2, size),
+                (f"{room.area:.1f} m2", y + 2 * height, 0.8 * size),
+            ):
+                left, font = (x - width // 2, row), cv2.FONT_HERSHEY_SIMPLEX
+                cv2.putText(self.picture, text, left, font, scale, (40, 40, 40), 1, cv2.LINE_AA)
 
     def dimension(self) -> None:
-        """Dimension lines below and to the left, with ticks and numbers."""
+        """Draw dimension lines below and to the left, with ticks and numbers."""
         x0, y0, x1, y1 = shapely.unary_union(self._model.rooms).bounds
         for (ax, ay), (bx, by), length in (
             ((x0, y0 - 0.9), (x1, y0 - 0.9), x1 - x0),
@@ -240,8 +226,10 @@ class _Sheet:
             self._line((ax, ay), (bx, by), (60, 60, 60), 1)
             for x, y in ((ax, ay), (bx, by)):
                 self._line((x - 0.1, y - 0.1), (x + 0.1, y + 0.1), (60, 60, 60), 1)
-            at = self._pixel((0.5 * (ax + bx) + 0.05, 0.5 * (ay + by) + 0.08))
-            cv2.putText(self.picture, f"{length:.2f}", at, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (60, 60, 60), 1, cv2.LINE_AA)
+            place = self._pixel((0.5 * (ax + bx) + 0.05, 0.5 * (ay + by) + 0.08))
+            cv2.putText(
+                self.picture, f"{length:.2f}", place, cv2.FONT_HERSHEY_SIMPLEX, 0.5, (60, 60, 60), 1, cv2.LINE_AA
+            )
 
     def draw_walls(self, style: Style, rng: np.random.Generator) -> None:
         parts = [part for part in shapely.get_parts(self._model.walls) if part.area > 1e-4]
@@ -273,7 +261,7 @@ class _Sheet:
                 self._door(opening)
 
     def _door(self, opening: OpeningSymbol) -> None:
-        """Leaf and arc, into the room that the opening belongs to; wide doors have two leaves."""
+        """Draw leaf and arc into the room of the opening; wide doors have two leaves."""
         corners = np.asarray(opening.shape.exterior.coords)[:2]
         start, end = corners
         width = float(np.linalg.norm(end - start))
@@ -305,7 +293,7 @@ class _Sheet:
         cv2.polylines(self.picture, [self._fixed(points)], closed, colour, width, cv2.LINE_AA, _SHIFT)
 
     def _fixed(self, points: Float[np.ndarray, "n 2"]) -> np.ndarray:
-        """Pixel centres are whole numbers to OpenCV, with four bits behind the point."""
+        """Return OpenCV's fixed-point coordinates, with pixel centres at integers and `_SHIFT` fractional bits."""
         pixels = (
             np.column_stack([points[:, 0], self._rows / self.pixels_per_m - points[:, 1]]) * self.pixels_per_m - 0.5
         )
@@ -317,7 +305,7 @@ class _Sheet:
 
 
 def _scan(picture: UInt8[np.ndarray, "h w 3"], degrees: float, rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
-    """Skewed, out of focus, unevenly lit, with noise, on paper that is not white."""
+    """Return the picture skewed, blurred and unevenly lit, with noise, on grey paper."""
     rows, columns = picture.shape[:2]
     turn = cv2.getRotationMatrix2D((0.5 * columns - 0.5, 0.5 * rows - 0.5), degrees, 1.0)
     turned = cv2.warpAffine(picture, turn, (columns, rows), flags=cv2.INTER_AREA, borderValue=(255, 255, 255))

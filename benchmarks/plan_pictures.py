@@ -1,4 +1,4 @@
-"""How much of a drawn floor plan is understood: rooms, doors and windows found in pictures, by style of drawing.
+"""Importing drawn floor plans: rooms, doors and windows found in pictures, by style of drawing.
 
 `python -m benchmarks.plan_pictures` prints the table of docs/results.md.
 """
@@ -17,7 +17,7 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers import ImportOptions, import_plan
 
 _IOU = 0.9
-# An opening is found where one of its kind overlaps it by half of the longer.
+# An imported opening matches when it overlaps the true one by half of the longer, at most this far (m) beside it.
 _OVERLAP, _APART_M = 0.5, 0.3
 
 
@@ -27,7 +27,7 @@ class Score:
 
     rooms: int = 0
     rooms_found: int = 0
-    rooms_told: int = 0
+    rooms_imported: int = 0
     seconds: float = 0.0
     plans: int = 0
     door: tuple[int, int, int] = (0, 0, 0)
@@ -35,18 +35,18 @@ class Score:
 
     @property
     def room_share(self) -> float:
-        """Rooms found with an intersection over union of at least 0.9."""
+        """Share of rooms found with an intersection over union of at least 0.9."""
         return self.rooms_found / max(self.rooms, 1)
 
 
 def f1(counts: tuple[int, int, int]) -> float:
-    """From (true, told, found)."""
-    true, told, found = counts
-    return 2.0 * found / max(true + told, 1)
+    """Return the F1 score of (true, imported, found)."""
+    true, imported, found = counts
+    return 2.0 * found / max(true + imported, 1)
 
 
 def score_plan(drawn: DrawnPlan, content: bytes, score: Score) -> None:
-    """Import one picture and count what was found; a refusal finds nothing."""
+    """Import one picture and count the rooms and openings found; none where the import is refused."""
     began = time.process_time()
     try:
         document = import_plan(content, ImportOptions(metres_per_pixel=drawn.metres_per_pixel)).document
@@ -54,10 +54,10 @@ def score_plan(drawn: DrawnPlan, content: bytes, score: Score) -> None:
         document = {"rooms": []}
     score.seconds += time.process_time() - began
     score.plans += 1
-    told = [shapely.Polygon(room["polygon"], room.get("holes")) for room in document["rooms"]]
+    imported = [shapely.Polygon(room["polygon"], room.get("holes")) for room in document["rooms"]]
     score.rooms += len(drawn.rooms)
-    score.rooms_told += len(told)
-    score.rooms_found += sum(any(_iou(room, other) >= _IOU for other in told) for room in drawn.rooms)
+    score.rooms_imported += len(imported)
+    score.rooms_found += sum(any(_iou(room, candidate) >= _IOU for candidate in imported) for room in drawn.rooms)
     openings = document.get("openings", [])
     for kind in ("door", "window"):
         lines = [shapely.LineString(opening["line"]) for opening in openings if opening["kind"] == kind]
@@ -71,23 +71,23 @@ def _iou(a: shapely.Polygon, b: shapely.Polygon) -> float:
     return shared / (a.area + b.area - shared)
 
 
-def _matches(truth: Sequence[OpeningSymbol], told: Sequence[shapely.LineString]) -> int:
-    free = list(told)
+def _matches(truth: Sequence[OpeningSymbol], imported: Sequence[shapely.LineString]) -> int:
+    unmatched = list(imported)
     found = 0
     for opening in truth:
         line = shapely.LineString([opening.start, opening.end])
         around = line.buffer(_APART_M, cap_style="flat")
-        for other in free:
-            shared = shapely.intersection(around, other).length
-            if shared >= _OVERLAP * max(line.length, other.length):
-                free.remove(other)
+        for candidate in unmatched:
+            shared = shapely.intersection(around, candidate).length
+            if shared >= _OVERLAP * max(line.length, candidate.length):
+                unmatched.remove(candidate)
                 found += 1
                 break
     return found
 
 
 def measure(style: Style, plans: int, first_seed: int = 0) -> Score:
-    """Import `plans` generated plans of a style."""
+    """Return the score of a number of generated plans of a style."""
     score = Score()
     for seed in range(first_seed, first_seed + plans):
         drawn = draw_plan(style, seed)
@@ -96,7 +96,7 @@ def measure(style: Style, plans: int, first_seed: int = 0) -> Score:
 
 
 def table(scores: dict[str, Score]) -> str:
-    """The figures as Markdown."""
+    """Return the figures as a Markdown table."""
     lines = [
         "| style | rooms | found, IoU ≥ 0.9 | doors, F1 | windows, F1 | CPU time per picture |",
         "|---|---|---|---|---|---|",
@@ -114,10 +114,10 @@ def main() -> None:
     """Measure every style and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--plans", type=int, default=40, help="generated plans per style")
-    parser.add_argument("--seed", type=int, default=0, help="the first plan's")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the first plan")
     arguments = parser.parse_args()
     if arguments.plans < 1:
-        parser.error(f"--plans is {arguments.plans}, it must be at least 1")
+        parser.error(f"--plans is {arguments.plans}, the minimum is 1")
     print(table({style: measure(style, arguments.plans, arguments.seed) for style in STYLES}))
 
 

@@ -1,94 +1,89 @@
-"""Four clients for minutes while workers are killed: every answer is right, none is lost, memory does not grow.
+"""Soak test: clients for minutes while workers are killed. No answer may be lost or wrong, and memory must not grow.
 
     python -m benchmarks.soak --minutes 5 --every 3
 
-The service's own process is measured at the start, in the middle and at the end. Answers at stage `vdr` are answers:
-it is what is left when a worker dies late in a query.
+Memory is that of the service's own process. Answers at stage `vdr` count: the service falls back to them when a worker
+dies late in a query.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
 import random
 import sys
-import tempfile
 import threading
 import time
-from collections import Counter
 
 import httpx
+import psutil
 
-from benchmarks.load import Load, Reply, ask_for, faults, per_second, percentiles_ms, upload_example_plan
-from benchmarks.processes import kill, resident_mb, workers
-from examples.launch import running_service
+from benchmarks.harness import argument_parser, example_service, resident_mb, run_load, worker_processes
 
-# After warm-up; what is less is noise of the allocator.
-_GROWTH_MB = 40.0
+# Growth after warm-up; less is noise of the allocator.
+_MAX_GROWTH_MB = 40.0
 _WARM_UP_SHARE = 0.2
-_BACK_WITHIN_S = 30.0
+_RESTART_TIMEOUT_S = 30.0
 
 
 def main() -> int:
-    """Run; 1 when something was lost, wrong, or grew."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    """Run; return 1 when an answer was lost or wrong, memory grew, or the test did not test anything."""
+    parser = argument_parser(__doc__)
     parser.add_argument("--minutes", type=float, default=5.0)
     parser.add_argument("--clients", type=int, default=4)
     parser.add_argument("--every", type=float, default=3.0, help="seconds between kills")
     options = parser.parse_args()
-    seconds = 60.0 * options.minutes
-    with tempfile.TemporaryDirectory() as data:
-        settings = {"LALALOC_DATA_DIR": data, "LALALOC_LOG_LEVEL": "error"}
-        with running_service(0, settings) as service:
-            plan_id = upload_example_plan(service.url)
-            memory: list[float] = []
-            killed: Counter[str] = Counter()
-            stop = threading.Event()
+    seconds, memory_mb, killed, stop = 60.0 * options.minutes, list[float](), list[int](), threading.Event()
+    with example_service() as service:
 
-            def reap() -> None:
-                rng = random.Random(0)
-                while not stop.wait(options.every):
-                    alive = workers(service.process.pid)
-                    if alive:
-                        killed[str(kill(rng.choice(alive)))] += 1
+        def kill_workers() -> None:
+            rng = random.Random(0)
+            while not stop.wait(options.every):
+                if workers := worker_processes(service.process):
+                    worker = rng.choice(workers)
+                    try:
+                        worker.kill()
+                    except psutil.NoSuchProcess:
+                        continue
+                    killed.append(worker.pid)
 
-            def watch() -> None:
-                while not stop.wait(seconds / 50.0):
-                    memory.append(resident_mb(service.process.pid))
+        def sample_memory() -> None:
+            while not stop.wait(seconds / 50.0):
+                memory_mb.append(resident_mb(service.process))
 
-            threads = [threading.Thread(target=work) for work in (reap, watch)]
-            for thread in threads:
-                thread.start()
-            replies: list[Reply] = ask_for(service.url, plan_id, Load(options.clients, seconds))
-            stop.set()
-            for thread in threads:
-                thread.join()
-            back = _all_back(service.url)
-    warm = memory[int(_WARM_UP_SHARE * len(memory)) :]
-    lost = [reply for reply in replies if not reply.answered]
+        threads = [threading.Thread(target=work) for work in (kill_workers, sample_memory)]
+        for thread in threads:
+            thread.start()
+        result = run_load(service.url, [service.plan_id], options.clients, seconds)
+        stop.set()
+        for thread in threads:
+            thread.join()
+        restarted = _workers_restart(service.url)
+    warm = memory_mb[int(_WARM_UP_SHARE * len(memory_mb)) :]
+    answered = result.answered
     report = {
-        "requests": len(replies),
-        "per_second": round(per_second(replies), 1),
-        "stages": dict(Counter(reply.stage for reply in replies)),
-        "milliseconds": percentiles_ms(replies),
-        "workers_killed": killed["True"],
-        "without_answer": len(lost),
-        "wrong": dict(faults(replies)),
-        "all_workers_back": back,
+        "answered": answered.count,
+        "per_second": round(answered.per_second, 1),
+        "stages": result.stages,
+        "milliseconds": answered.percentiles_ms(),
+        "refused": result.refused.count,
+        "failed": result.failures,
+        "workers_killed": len(killed),
+        "workers_restarted": restarted,
         "resident_mb": {"start": warm[0], "middle": warm[len(warm) // 2], "end": warm[-1]},
     }
     print(json.dumps(report, indent=2))
-    # It would all be well also if nothing had been killed, or LPO were given up.
-    real = killed["True"] >= seconds / options.every / 2.0 and report["stages"].get("lpo", 0) > 0 and back
-    return int(bool(lost) or bool(report["wrong"]) or not real or warm[-1] > warm[0] + _GROWTH_MB)
+    # Without kills or without LPO the test would pass and show nothing.
+    is_valid = len(killed) >= seconds / options.every / 2.0 and result.stages.get("lpo", 0) > 0
+    lost = result.refused.count + result.failures
+    return int(lost > 0 or not is_valid or not restarted or warm[-1] > warm[0] + _MAX_GROWTH_MB)
 
 
-def _all_back(url: str) -> bool:
-    """Whether all workers are warm again soon after the last was killed."""
-    deadline = time.monotonic() + _BACK_WITHIN_S
+def _workers_restart(url: str) -> bool:
+    """Return whether all workers are ready again within the timeout."""
+    deadline = time.monotonic() + _RESTART_TIMEOUT_S
     while time.monotonic() < deadline:
-        told = httpx.get(f"{url}/readyz").json()
-        if all(told[pool]["ready"] == told[pool]["workers"] for pool in ("lpo_pool", "decode_pool")):
+        pools = httpx.get(f"{url}/readyz").json()
+        if all(pools[pool]["ready"] == pools[pool]["workers"] for pool in ("lpo_pool", "decode_pool")):
             return True
         time.sleep(0.2)
     return False

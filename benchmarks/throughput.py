@@ -1,104 +1,96 @@
-"""Queries per second and how long they take, by number of clients, for two ways of running the service.
+"""Queries per second and their duration by number of clients, for several ways of running the service.
 
-    python -m benchmarks.throughput --seconds 20
+    python -m benchmarks.throughput --seconds 20 --processes 1 2 --clients 1 2 4 8 16
+    python -m benchmarks.throughput --ray-nodes 1 2
 
-Prints a Markdown table. `one` is one process with its workers, `two` is two such replicas on one SQLite database and
-behind the same port: what `uvicorn --workers 2` runs. Where there are more cores than two, each has half the workers.
+Prints a Markdown table. With 2 processes, `uvicorn --workers 2` runs two replicas on one SQLite database and one port;
+each has half of the workers and compute threads where there are more cores than two. On Ray, each node runs one replica
+that searches, one encoder and one LPO optimiser, the first node also runs the ingress, and each client has its own
+plan. All nodes share the cores of this machine: the table shows the cost of distribution, not the gain of more
+machines. `--ray-nodes` needs the extra `ray`.
 """
 
 from __future__ import annotations
 
-import argparse
 import os
-import signal
-import socket
-import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
-import httpx
-
-from benchmarks.load import Load, ask_for, faults, per_second, percentiles_ms, upload_example_plan
+from benchmarks.harness import UNLIMITED, argument_parser, free_port, run_load, upload_example_plan, uvicorn_service
 from service.settings import Settings
 
-ROOT = Path(__file__).resolve().parent.parent
-_START_S, _STOP_S = 120.0, 40.0
 _CLIENTS = (1, 2, 4, 8, 16)
-# Nobody is refused: what is measured is how requests wait for each other.
-_SHARED = {"LALALOC_LOG_LEVEL": "error", "LALALOC_MAX_QUERIES": "64", "LALALOC_LPO_QUEUE": "64"}
-_SHARES = Settings.load().cores
-SETTINGS = {
-    "one": (1, {}),
-    "two": (
-        2,
-        {
-            "LALALOC_WORKERS": str(max(_SHARES.workers // 2, 1)),
-            "LALALOC_COMPUTE_THREADS": str(max(_SHARES.compute_threads // 2, 1)),
-        },
-    ),
-}
+_CPUS_PER_NODE = 4
+_OBJECT_STORE_BYTES = 200 * 2**20
 
 
 def main() -> int:
-    """Run; 1 when an answer was wrong."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=20.0, help="for each number of clients")
+    """Measure; return 1 when an answer was wrong."""
+    parser = argument_parser(__doc__)
+    parser.add_argument("--seconds", type=float, default=20.0, help="duration for each number of clients")
     parser.add_argument("--clients", type=int, nargs="*", default=_CLIENTS)
+    parser.add_argument("--processes", type=int, nargs="*", default=(1, 2), help="processes of uvicorn")
+    parser.add_argument("--ray-nodes", type=int, nargs="*", default=(), help="nodes of a Ray cluster on this machine")
     options = parser.parse_args()
-    print("| processes | clients | queries/s | p50 | p95 | p99 | at `lpo` | refused or wrong |", flush=True)
+    services = {f"{count} processes": _uvicorn(count) for count in options.processes}
+    services |= {f"{count} Ray nodes": _ray_service(count) for count in options.ray_nodes}
+    print("| service | clients | queries/s | p50 | p95 | p99 | stage `lpo` | refused or failed |", flush=True)
     print("|---|---|---|---|---|---|---|---|", flush=True)
-    wrong = 0
-    for name, (processes, settings) in SETTINGS.items():
-        with under_uvicorn(processes, {**_SHARED, **settings}) as url:
-            plan_id = upload_example_plan(url)
-            ask_for(url, plan_id, Load(4, 5.0))
+    failures = 0
+    for name, service in services.items():
+        with service as url:
+            plans = max(options.clients) if name.endswith("nodes") else 1
+            plan_ids = [upload_example_plan(url) for _ in range(plans)]
+            run_load(url, plan_ids, 4, 5.0)
             for clients in options.clients:
-                replies = ask_for(url, plan_id, Load(clients, options.seconds))
-                took = percentiles_ms([reply for reply in replies if reply.answered])
-                bad = sum(not reply.answered or reply.fault is not None for reply in replies)
-                wrong += sum(faults(replies).values())
-                lpo = sum(reply.stage == "lpo" for reply in replies) / len(replies)
-                times = " | ".join(f"{took.get(q, float('nan')):.0f} ms" for q in ("p50", "p95", "p99"))
-                print(f"| {name} | {clients} | {per_second(replies):.1f} | {times} | {lpo:.0%} | {bad} |", flush=True)
-    return int(bool(wrong))
+                result = run_load(url, plan_ids[:clients], clients, options.seconds)
+                failures += result.failures
+                print(result.row(name, clients), flush=True)
+    return int(failures > 0)
 
 
 @contextmanager
-def under_uvicorn(processes: int, settings: dict[str, str]) -> Iterator[str]:
-    """The service under uvicorn with so many processes on one SQLite database; gives its address."""
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        port = probe.getsockname()[1]
-    command = [sys.executable, "-m", "uvicorn", "service.app:app", "--port", str(port), "--log-level", "warning"]
-    command += ["--workers", str(processes)]
-    with tempfile.TemporaryDirectory() as data:
-        environment = {**os.environ, **settings, "LALALOC_DATA_DIR": data}
-        process = subprocess.Popen(command, cwd=ROOT, env=environment, start_new_session=True)
-        url = f"http://127.0.0.1:{port}"
-        try:
-            # Either process may answer: ask until none of them is cold.
-            warm = 0
-            deadline = time.monotonic() + _START_S
-            while warm < 10 * processes:
-                warm = warm + 1 if _ready(url) else 0
-                if time.monotonic() > deadline:
-                    raise TimeoutError("the service did not become ready")
-                time.sleep(0.05)
-            yield url
-        finally:
-            os.killpg(process.pid, signal.SIGTERM)
-            process.wait(_STOP_S)
+def _uvicorn(processes: int) -> Iterator[str]:
+    cores, settings = Settings.load().cores, dict(UNLIMITED)
+    if processes > 1:
+        settings["LALALOC_WORKERS"] = str(max(cores.workers // processes, 1))
+        settings["LALALOC_COMPUTE_THREADS"] = str(max(cores.compute_threads // processes, 1))
+    with uvicorn_service(processes, settings) as url:
+        yield url
 
 
-def _ready(url: str) -> bool:
+@contextmanager
+def _ray_service(nodes: int) -> Iterator[str]:
+    import ray
+    from ray import serve
+    from ray.cluster_utils import Cluster
+
+    from service.on_ray import RayOptions
+    from service.on_ray.application import application
+
+    # By default Ray runs replicas at a lower priority than the clients, which share their cores.
+    os.environ |= {"RAY_USAGE_STATS_ENABLED": "0", "RAY_worker_niceness": "0"}
+    node: dict[str, Any] = {"num_cpus": _CPUS_PER_NODE, "object_store_memory": _OBJECT_STORE_BYTES}
+    cluster = Cluster(initialize_head=True, head_node_args={**node, "include_dashboard": False})
     try:
-        # A connection of its own each time: processes share the port, and each accepts some.
-        return httpx.get(f"{url}/readyz").status_code == httpx.codes.OK
-    except httpx.TransportError:
-        return False
+        for _ in range(nodes - 1):
+            cluster.add_node(**node)
+        ray.init(address=cluster.address, log_to_driver=False)
+        port = free_port()
+        serve.start(http_options={"host": "127.0.0.1", "port": port})
+        with tempfile.TemporaryDirectory() as data:
+            settings = Settings(data_dir=Path(data), log_level="error", max_queries=64, lpo_queue=64)
+            replicas = {f"{name}_{end}": nodes for name in ("encoder", "search", "lpo") for end in ("min", "max")}
+            serve.run(application(settings, RayOptions(ingress_max=1, **replicas)))
+            yield f"http://127.0.0.1:{port}"
+            serve.shutdown()
+    finally:
+        ray.shutdown()
+        cluster.shutdown()
 
 
 if __name__ == "__main__":

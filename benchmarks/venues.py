@@ -1,16 +1,20 @@
-"""Which of very many plans: how fast the index of prototypes answers, and how often it finds what brute force finds.
+"""Search among very many plans: speed and recall of the index of prototypes.
 
-Generated homes stand in for real ones, with variants of each where more plans are asked for: drawn out along each axis
-by up to a tenth, with other ceilings, turned by quarters and mirrored by chance. Their prototypes come from the
-renderer, without latents; those of variants are made of these, which is exact but for what lies between two azimuths.
-Queries are photographs of some of the homes, encoded by the model.
+    python -m benchmarks.venues index --plans 2000 --queries 20 --exact 1e9
+    python -m benchmarks.venues index --plans 2500 --repeat 40 --queries 12 --exact 0
+    python -m benchmarks.venues search --plans 400 --queries 24
 
-Brute force compares all prototypes under all hypotheses, where `--exact` allows for so many pairs: it takes half a
-minute for every 100 million. Where it does not, all of them are compared by codes, and the best million as they are.
-Times are of the processor, in one thread.
+Generated homes take the place of real ones; queries are rendered photographs of some of them, encoded by the model.
+Times are processor times of one thread.
 
-    .venv/bin/python -m benchmarks.venues --plans 2000 --queries 20 --exact 1e9
-    .venv/bin/python -m benchmarks.venues --plans 2500 --repeat 40 --queries 12 --exact 0
+`index` compares the index with brute force. `--repeat` adds variants of each home: stretched along both axes, with
+other ceilings, turned by quarters and mirrored at random. Their prototypes are computed from those of the home, exactly
+up to interpolation between azimuths. Brute force compares all prototypes under all hypotheses where that is at most
+`--exact` pairs (half a minute for every 100 million); beyond, it compares all of them by codes and the best million
+exactly.
+
+`search` localises each query twice with the production search and LPO: among the plans that the index chooses, as the
+service does, and among all plans.
 """
 
 from __future__ import annotations
@@ -21,9 +25,12 @@ import time
 from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from benchmarks.harness import argument_parser
+from lalaloc_core.evaluate.methods.lalaloc import local_refiner
 from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, RenderedPhotograph, renderer_cache_of
 from lalaloc_core.learn.synth.homes.splits import home_of
 from lalaloc_core.learn.synth.scene.shots import sample_shots
@@ -31,24 +38,37 @@ from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.matching_cost import MatchingConfig
+from lalaloc_core.localise.pipeline import localise
 from lalaloc_core.localise.poses import Query
+from lalaloc_core.localise.venue.merged_plans import MergedPlans
 from lalaloc_core.localise.venue.plan_index import COMPARED, SCANNED, PlanIndex
 from lalaloc_core.localise.venue.prototype_cells import shipped_cells
-from lalaloc_core.localise.venue.prototypes import AZIMUTHS, packed_openings, prototypes_of, unpacked_openings
+from lalaloc_core.localise.venue.prototypes import (
+    AZIMUTHS,
+    most_probable,
+    packed_openings,
+    prototypes_of,
+    unpacked_openings,
+)
 from scripts.make_prototype_cells import grid_without_latents
 from service.query.prototype_file import BlockKey, PrototypeFile
+from service.query.venue_localiser import VENUE_CONFIG
+from service.query.venue_plans import MAX_SEARCHED, most_poses
+from service.settings import Settings
 
 _TEST = SPLIT_NUMBERS["test"]
 _FIRST = 20
-# Variants of plans are longer and wider by at most so much.
-_DRAWN_OUT = 0.1
-# Pairs that are compared as they are where brute force compares all by codes.
+# Variants are longer and wider by at most this share.
+_MAX_STRETCH = 0.1
+# Pairs that brute force compares exactly where it compares all pairs by codes.
 _MAX_COMPARED = 1_000_000
 _STEP_M = 0.5
 
+_Figures = defaultdict[str, defaultdict[str, list[Any]]]
+
 
 def prototypes(plans: int, seed: int) -> list[np.ndarray]:
-    """Prototypes of so many homes, sorted into cells."""
+    """Return the prototypes of homes, sorted into cells."""
     blocks = []
     for number in range(plans):
         home, _ = home_of(_TEST, seed, number)
@@ -61,11 +81,11 @@ def prototypes(plans: int, seed: int) -> list[np.ndarray]:
 
 
 def repeated(blocks: list[np.ndarray], times: int, rng: np.random.Generator) -> list[np.ndarray]:
-    """Each of some plans several times: as it is, and variants of it."""
+    """Return each plan and variants of it."""
     found = list(blocks)
     for number in range(1, times):
         variants = [_variant(block, rng) for block in blocks]
-        # Together, which is faster.
+        # One sort of all variants is faster than one per variant.
         cell = shipped_cells().sort(np.concatenate(variants))
         ends = np.cumsum([len(block) for block in variants])
         for block, own in zip(variants, np.split(cell, ends[:-1]), strict=True):
@@ -77,10 +97,10 @@ def repeated(blocks: list[np.ndarray], times: int, rng: np.random.Generator) -> 
 
 
 def _variant(block: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Prototypes of a plan that was drawn out along both axes, turned by quarters and mirrored by chance."""
-    rows, (x, y) = block.copy(), 1.0 + rng.uniform(-_DRAWN_OUT, _DRAWN_OUT, 2)
+    """Return prototypes of a plan stretched along both axes, turned by quarters and mirrored at random."""
+    rows, (x, y) = block.copy(), 1.0 + rng.uniform(-_MAX_STRETCH, _MAX_STRETCH, 2)
     azimuth = 2.0 * np.pi / AZIMUTHS * np.arange(AZIMUTHS)
-    # What is seen at an azimuth was seen at another one before, at another distance.
+    # Stretching moves a point to another azimuth and distance.
     before = np.arctan2(np.sin(azimuth) / y, np.cos(azimuth) / x)
     farther = -0.5 * np.log(np.square(np.cos(azimuth) / x) + np.square(np.sin(azimuth) / y))
     place = before / (2.0 * np.pi) * AZIMUTHS % AZIMUTHS
@@ -98,7 +118,7 @@ def _variant(block: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def queries(bundle: Bundle, homes: list[int], seed: int) -> Iterator[tuple[int, str, Query]]:
-    """A photograph of each home, asked about with what is known of the camera."""
+    """Yield queries with a photograph of each home: its number, the known values, the query."""
     encoders, renderers = Encoders(bundle, threads=1), renderer_cache_of(_TEST, seed, None)
     size = bundle.manifest.image_height, bundle.manifest.image_width
     for number in homes:
@@ -111,31 +131,13 @@ def queries(bundle: Bundle, homes: list[int], seed: int) -> Iterator[tuple[int, 
         yield number, "heading and height unknown", encoders.query(image, None, unknown)
 
 
-def _best(mass: np.ndarray) -> np.ndarray:
-    return np.argsort(-mass, kind="stable")
-
-
-def main() -> None:
-    """Print times and recall."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--bundle", type=Path, default=Path("models/default"))
-    parser.add_argument("--plans", type=int, default=2000)
-    parser.add_argument(
-        "--repeat", type=int, default=1, help="so many variants of each plan, whose homes are generated once"
-    )
-    parser.add_argument("--queries", type=int, default=20)
-    parser.add_argument("--compared", type=int, default=COMPARED, help="pairs that the index compares as they are")
-    parser.add_argument(
-        "--scanned", type=float, nargs="+", default=[SCANNED], help="pairs that the index compares by codes"
-    )
-    parser.add_argument("--exact", type=float, default=1e9, help="most pairs that brute force compares for a query")
-    parser.add_argument("--seed", type=int, default=0)
-    asked = parser.parse_args()
-    bundle, rng = Bundle.open(asked.bundle), np.random.default_rng(asked.seed)
-    blocks = repeated(prototypes(asked.plans, asked.seed), asked.repeat, rng)
+def measure_index(options: argparse.Namespace, bundle: Bundle) -> None:
+    """Print times and recall of the index."""
+    blocks = repeated(prototypes(options.plans, options.seed), options.repeat, np.random.default_rng(options.seed))
     count = np.array([len(block) for block in blocks])
     print(f"{len(blocks)} plans, {count.sum()} prototypes of {blocks[0].itemsize} bytes")
-    weights, config, told = bundle.manifest.evidence, MatchingConfig(), defaultdict(lambda: defaultdict(list))
+    weights, config = bundle.manifest.evidence, MatchingConfig()
+    figures: _Figures = defaultdict(lambda: defaultdict(list))
     with tempfile.TemporaryDirectory() as folder:
         path, cells = Path(folder) / "prototypes.bin", shipped_cells()
         keys = [BlockKey(number, "0" * 64) for number in range(len(blocks))]
@@ -156,32 +158,94 @@ def main() -> None:
             f"its codes in {time.process_time() - built:.2f} s, {index.nbytes / 1e6:.0f} MB",
             flush=True,
         )
-        homes = np.linspace(0, asked.plans - 1, asked.queries).astype(int).tolist()
-        for number, name, query in queries(bundle, homes, asked.seed):
+        homes = np.linspace(0, options.plans - 1, options.queries).astype(int).tolist()
+        for number, name, query in queries(bundle, homes, options.seed):
             pairs = int(count.sum()) * min(len(query.roll), AZIMUTHS) * len(query.camera_height.offsets)
-            how = "brute force" if pairs <= asked.exact else "all codes"
-            compared = 10**15 if pairs <= asked.exact else _MAX_COMPARED
-            brute = _best(index.log_masses(query, weights, config, compared=compared, scanned=10**15))
-            for scanned in asked.scanned:
+            reference, compared = ("brute force", 10**15) if pairs <= options.exact else ("all codes", _MAX_COMPARED)
+            exact = _ranked(index.log_masses(query, weights, config, compared=compared, scanned=10**15))
+            for scanned in options.scanned:
                 begin, began = time.process_time(), time.perf_counter()
-                mass = index.log_masses(query, weights, config, compared=asked.compared, scanned=int(scanned))
-                tally = told[f"{name}, {scanned:,.0f} pairs by codes"]
-                tally["ms"].append(1e3 * (time.process_time() - begin))
-                tally["ms by the clock"].append(1e3 * (time.perf_counter() - began))
-                best = _best(mass)
-                tally["right plan in the first 20"].append(number in best[:_FIRST])
-                tally["right plan in the first 128"].append(number in best[:128])
-                tally[f"{how}: recall of 20"].append(len(np.intersect1d(best[:_FIRST], brute[:_FIRST])) / _FIRST)
-                tally[f"{how}: its first in the first 20"].append(brute[0] in best[:_FIRST])
-                tally[f"{how}: right plan in the first 20"].append(number in brute[:_FIRST])
+                mass = index.log_masses(query, weights, config, compared=options.compared, scanned=int(scanned))
+                columns = figures[f"{name}, {scanned:,.0f} pairs by codes"]
+                columns["ms"].append(1e3 * (time.process_time() - begin))
+                columns["ms of wall clock"].append(1e3 * (time.perf_counter() - began))
+                ranked = _ranked(mass)
+                columns["right plan in the first 20"].append(number in ranked[:_FIRST])
+                columns["right plan in the first 128"].append(number in ranked[:128])
+                shared = np.intersect1d(ranked[:_FIRST], exact[:_FIRST])
+                columns[f"{reference}: recall of 20"].append(len(shared) / _FIRST)
+                columns[f"{reference}: its first in the first 20"].append(exact[0] in ranked[:_FIRST])
+                columns[f"{reference}: right plan in the first 20"].append(number in exact[:_FIRST])
         file.close()
-    for name, tally in told.items():
-        print(f"{name}, n = {asked.queries}")
-        for what, values in tally.items():
-            if what.startswith("ms"):
-                print(f"  {what}: p50 {np.median(values):.0f}, p95 {np.percentile(values, 95):.0f}")
+    for name, columns in figures.items():
+        print(f"{name}, n = {options.queries}")
+        for column, values in columns.items():
+            if column.startswith("ms"):
+                print(f"  {column}: p50 {np.median(values):.0f}, p95 {np.percentile(values, 95):.0f}")
             else:
-                print(f"  {what}: {np.mean(values):.1%} of {len(values)}")
+                print(f"  {column}: {np.mean(values):.1%} of {len(values)}")
+
+
+def measure_search(options: argparse.Namespace, bundle: Bundle) -> None:
+    """Print shares of right plans and times of the full search."""
+    limit, encoders, refiner = Settings.load().grids.max_grid_poses, Encoders(bundle, threads=1), local_refiner(bundle)
+    homes = [home_of(_TEST, options.seed, number)[0] for number in range(options.plans)]
+    plans, grids = [home.plan for home in homes], [grid_without_latents(home) for home in homes]
+    parts = [prototypes_of(grid, plan) for grid, plan in zip(grids, plans, strict=True)]
+    index, poses = PlanIndex.of_parts(parts, shipped_cells()), np.array([len(grid.poses) for grid in grids])
+
+    def best_plan(query: Query, chosen: list[int]) -> int:
+        merged = MergedPlans.of([plans[k] for k in chosen], [grids[k] for k in chosen], query.camera_height.height_m)
+        answer = localise(merged.plan, merged.grid, encoders, query, refiner=refiner, config=VENUE_CONFIG)
+        return chosen[merged.in_own_plan(answer.candidates[0])[0]]
+
+    figures: _Figures = defaultdict(lambda: defaultdict(list))
+    photographed = np.linspace(0, options.plans - 1, options.queries).astype(int).tolist()
+    for number, name, query in queries(bundle, photographed, options.seed):
+        begin = time.process_time()
+        mass = index.log_masses(query, bundle.manifest.evidence, MatchingConfig())
+        chosen = most_probable(mass, poses, most_plans=MAX_SEARCHED, most_poses=most_poses(query, limit)).tolist()
+        indexed = time.process_time()
+        by_index = best_plan(query, chosen)
+        searched = time.process_time()
+        by_all = best_plan(query, list(range(options.plans)))
+        columns = figures[name]
+        columns["plans searched"].append(len(chosen))
+        columns["right plan among them"].append(number in chosen)
+        columns["right plan first by the index alone"].append(number == int(mass.argmax()))
+        columns["right plan first by index and full search"].append(number == by_index)
+        columns["right plan first by full search of all"].append(number == by_all)
+        columns["the same first plan"].append(by_index == by_all)
+        times_s = [indexed - begin, searched - indexed, time.process_time() - searched]
+        columns["s of index, of full search, of full search of all"].append(times_s)
+    for name, columns in figures.items():
+        print(f"{name}, n = {options.queries}")
+        for column, values in columns.items():
+            print(f"  {column}: {np.round(np.mean(values, axis=0), 3)}")
+
+
+def _ranked(mass: np.ndarray) -> np.ndarray:
+    return np.argsort(-mass, kind="stable")
+
+
+def main() -> None:
+    """Measure the index or the search."""
+    parser = argument_parser(__doc__)
+    commands = parser.add_subparsers(dest="command", required=True)
+    index = commands.add_parser("index", help="index of prototypes against brute force")
+    search = commands.add_parser("search", help="index and full search against full search of all plans")
+    for command, plans, count in ((index, 2000, 20), (search, 400, 24)):
+        command.add_argument("--bundle", type=Path, default=Path("models/default"))
+        command.add_argument("--plans", type=int, default=plans, help="generated homes")
+        command.add_argument("--queries", type=int, default=count)
+        command.add_argument("--seed", type=int, default=0)
+    index.add_argument("--repeat", type=int, default=1, help="plans made of each home, itself included")
+    index.add_argument("--compared", type=int, default=COMPARED, help="pairs that the index compares exactly")
+    index.add_argument("--scanned", type=float, nargs="+", default=[SCANNED], help="pairs it compares by codes")
+    index.add_argument("--exact", type=float, default=1e9, help="maximum pairs that brute force compares per query")
+    options = parser.parse_args()
+    measure = measure_index if options.command == "index" else measure_search
+    measure(options, Bundle.open(options.bundle))
 
 
 if __name__ == "__main__":

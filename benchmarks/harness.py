@@ -1,0 +1,322 @@
+"""Set-up that benchmarks share: the service with the example plan, locust's clients, health checks and memory."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import urllib.request
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+import psutil
+
+from examples.launch import ROOT, running_service
+from examples.truth import PLAN_PATH, TruePose
+
+_START_S, _STOP_S, _HEALTH_TIMEOUT_S = 120.0, 40.0, 20.0
+# Settings under which no request of a throughput test is refused.
+UNLIMITED = {"LALALOC_MAX_QUERIES": "64", "LALALOC_LPO_QUEUE": "64"}
+
+
+def argument_parser(doc: str | None) -> argparse.ArgumentParser:
+    """Return a parser that shows a module's docstring as it is written."""
+    return argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+
+
+@dataclass(frozen=True)
+class Service:
+    """Running service.
+
+    Attributes:
+        plan_id: the example plan, ready.
+        data: data folder.
+        process: the server's process.
+    """
+
+    url: str
+    plan_id: str
+    data: Path
+    process: psutil.Process
+
+
+@contextmanager
+def example_service(settings: Mapping[str, str] | None = None) -> Iterator[Service]:
+    """Run the service in one process, with the example plan and a temporary data folder."""
+    with tempfile.TemporaryDirectory() as data:
+        environment = {"LALALOC_DATA_DIR": data, "LALALOC_LOG_LEVEL": "error", **(settings or {})}
+        with running_service(0, environment) as service:
+            yield Service(
+                service.url, upload_example_plan(service.url), Path(data), psutil.Process(service.process.pid)
+            )
+
+
+@contextmanager
+def uvicorn_service(processes: int, settings: Mapping[str, str]) -> Iterator[str]:
+    """Run the service as `uvicorn --workers` on one SQLite database; yield its URL."""
+    port = free_port()
+    command = [sys.executable, "-m", "uvicorn", "service.app:app", "--port", str(port), "--log-level", "warning"]
+    command += ["--workers", str(processes)]
+    with tempfile.TemporaryDirectory() as data:
+        environment = {**os.environ, **settings, "LALALOC_LOG_LEVEL": "error", "LALALOC_DATA_DIR": data}
+        process = subprocess.Popen(command, cwd=ROOT, env=environment, start_new_session=True)
+        url = f"http://127.0.0.1:{port}"
+        try:
+            # The processes share the port, so several answers in a row are needed to have asked all of them.
+            ready, deadline = 0, time.monotonic() + _START_S
+            while ready < 10 * processes:
+                ready = ready + 1 if _is_ready(url) else 0
+                if time.monotonic() > deadline:
+                    raise TimeoutError(f"the service is not ready after {_START_S:g} s")
+                time.sleep(0.05)
+            yield url
+        finally:
+            os.killpg(process.pid, signal.SIGTERM)
+            process.wait(_STOP_S)
+
+
+def free_port() -> int:
+    """Return a port that is free now."""
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        return probe.getsockname()[1]
+
+
+def _is_ready(url: str) -> bool:
+    try:
+        return httpx.get(f"{url}/readyz").status_code == httpx.codes.OK
+    except httpx.TransportError:
+        return False
+
+
+def upload_example_plan(url: str) -> str:
+    """Store the example plan, wait until it is ready, and return its id."""
+    with httpx.Client(base_url=url, timeout=60.0) as client:
+        response = client.post("/floorplans", files={"file": (PLAN_PATH.name, PLAN_PATH.read_bytes())})
+        plan_id: str = response.raise_for_status().json()["id"]
+        while (status := client.get(f"/floorplans/{plan_id}").json()["status"]) == "preparing":
+            time.sleep(0.1)
+    if status != "ready":
+        raise RuntimeError(f"the example plan has status '{status}'; it must be 'ready'")
+    return plan_id
+
+
+def query_of(pose: TruePose, **target: str) -> dict[str, Any]:
+    """Return the form of a query with an example panorama and its heading, as arguments of `httpx.post`."""
+    fields = {**target, "heading_deg": f"{pose.heading_deg}", "camera_height_m": f"{pose.camera_height_m}"}
+    return {"data": fields, "files": {"panorama": (pose.file, pose.picture.read_bytes())}}
+
+
+@dataclass(frozen=True)
+class Requests:
+    """Requests of one kind.
+
+    Attributes:
+        times_ms: number of requests by their duration, which locust rounds to two digits.
+        per_second: mean rate.
+    """
+
+    times_ms: Mapping[float, int]
+    per_second: float
+
+    @property
+    def count(self) -> int:
+        """Number of requests."""
+        return sum(self.times_ms.values())
+
+    def percentile_ms(self, percent: float) -> float:
+        """Return a percentile of the duration; NaN without requests."""
+        rank, seen = percent / 100.0 * self.count, 0
+        for milliseconds, count in sorted(self.times_ms.items()):
+            seen += count
+            if seen >= rank:
+                return milliseconds
+        return math.nan
+
+    def percentiles_ms(self) -> dict[str, float]:
+        """Return median, 95th and 99th percentile."""
+        return {f"p{percent}": self.percentile_ms(percent) for percent in (50, 95, 99)}
+
+
+class LoadResult:
+    """Result of a load test: requests by stage of their answer, refusals and failures."""
+
+    def __init__(self, entries: Sequence[Mapping[str, Any]], seconds: float) -> None:
+        self._entries, self._seconds = entries, seconds
+        self.failures = sum(entry["num_failures"] for entry in entries)
+        self.stages = {entry["name"]: entry["num_requests"] for entry in entries if entry["name"] in ("lpo", "vdr")}
+
+    @property
+    def answered(self) -> Requests:
+        """Requests with an answer."""
+        return self._named(*self.stages)
+
+    @property
+    def refused(self) -> Requests:
+        """Requests refused with `Retry-After`."""
+        return self._named("refused")
+
+    def _named(self, *names: str) -> Requests:
+        times: Counter[float] = Counter()
+        for entry in self._entries:
+            if entry["name"] in names:
+                times.update({float(time_ms): count for time_ms, count in entry["response_times"].items()})
+        return Requests(times, sum(times.values()) / self._seconds)
+
+    def row(self, *cells: object) -> str:
+        """Return a row of a Markdown table: rate, percentiles, share refined by LPO, refused or failed."""
+        answered, lpo = self.answered, self.stages.get("lpo", 0)
+        times = [f"{value:.0f} ms" for value in answered.percentiles_ms().values()]
+        share = f"{lpo / max(answered.count, 1):.0%}"
+        figures = (f"{answered.per_second:.1f}", *times, share, self.refused.count + self.failures)
+        return f"| {' | '.join(map(str, (*cells, *figures)))} |"
+
+
+def run_load(url: str, plan_ids: Sequence[str], clients: int, seconds: float, *, pause_s: float = 1.0) -> LoadResult:
+    """Localise with several clients at once.
+
+    Args:
+        url: the service.
+        plan_ids: plans, which the clients take in turns.
+        clients: number of clients.
+        seconds: duration of the test, rounded up to whole seconds.
+        pause_s: pause of a client after a refusal.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        report = Path(folder) / "report"
+        options = ["--run-time", f"{math.ceil(seconds)}s", "--pause", f"{pause_s}", "--json-file", str(report)]
+        with _locust("TenantUser", url, plan_ids, clients, options) as process:
+            process.wait()
+        return LoadResult(json.loads(report.with_suffix(".json").read_text()), math.ceil(seconds))
+
+
+@contextmanager
+def busy_tenant(url: str, plan_id: str, picture: Path, clients: int, address: str) -> Iterator[None]:
+    """Send a picture with several clients of another tenant until the block ends.
+
+    Args:
+        url: the service.
+        plan_id: the plan to localise in.
+        picture: the file to send.
+        clients: number of clients.
+        address: local address of the clients, their tenant without API keys.
+    """
+    options = ["--picture", str(picture), "--source-address", address]
+    with _locust("BusyUser", url, [plan_id], clients, options):
+        yield
+
+
+@contextmanager
+def _locust(
+    user: str, url: str, plan_ids: Sequence[str], clients: int, options: Sequence[str]
+) -> Iterator[subprocess.Popen[bytes]]:
+    """Run locust in a process of its own, whose clock no other thread delays."""
+    command = [sys.executable, "-m", "locust", "-f", "benchmarks/locustfile.py", "--headless", "--only-summary"]
+    command += ["--host", url, "--plan-ids", ",".join(plan_ids), "--users", str(clients), "--spawn-rate", str(clients)]
+    command += ["--loglevel", "ERROR", "--exit-code-on-error", "0", "--stop-timeout", "30", *options, user]
+    # Failures and percentiles go to standard error; standard output holds the tables of the benchmarks.
+    process = subprocess.Popen(command, cwd=ROOT, stdout=sys.stderr)
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            process.kill()
+            process.wait()
+
+
+class HealthWatch:
+    """Health checks on new connections, as a load balancer sends them, while a block runs.
+
+    Attributes:
+        slowest_s: duration of the slowest check; infinite after a failed one.
+    """
+
+    def __init__(self, url: str, pause_s: float = 0.05) -> None:
+        self.slowest_s = 0.0
+        self._url, self._pause_s = url, pause_s
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+
+    def __enter__(self) -> HealthWatch:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self._end.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while True:
+            begin = time.perf_counter()
+            try:
+                with urllib.request.urlopen(f"{self._url}/healthz", timeout=_HEALTH_TIMEOUT_S) as response:
+                    response.read()
+            except OSError:
+                self.slowest_s = math.inf
+            self.slowest_s = max(self.slowest_s, time.perf_counter() - begin)
+            if self._end.wait(self._pause_s):
+                return
+
+
+class MemoryWatch:
+    """Peak resident memory (MB) of a service and its workers while a block runs.
+
+    Attributes:
+        before: memory when the block began.
+        highest: highest memory so far.
+    """
+
+    def __init__(self, process: psutil.Process) -> None:
+        self._process = process
+        self.before = self.highest = service_memory_mb(process)
+        self._end = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+
+    def __enter__(self) -> MemoryWatch:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self._end.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while not self._end.wait(0.02):
+            self.highest = max(self.highest, service_memory_mb(self._process))
+
+
+def service_memory_mb(process: psutil.Process) -> float:
+    """Return the resident memory (MB) of a service and its workers."""
+    return sum(map(resident_mb, (process, *process.children(recursive=True))))
+
+
+def resident_mb(process: psutil.Process) -> float:
+    """Return the resident memory (MB) of a process; 0 when it has ended."""
+    try:
+        return process.memory_info().rss / 2**20
+    except psutil.NoSuchProcess:
+        return 0.0
+
+
+def worker_processes(process: psutil.Process) -> list[psutil.Process]:
+    """Return the worker processes of a service, without Python's resource tracker."""
+    workers = []
+    for child in process.children(recursive=True):
+        try:
+            if "spawn_main" in " ".join(child.cmdline()):
+                workers.append(child)
+        except psutil.NoSuchProcess:
+            continue
+    return workers
