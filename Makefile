@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo serve test ray lint openapi docs web clean
+.PHONY: help setup demo serve test ray lint openapi docs site web clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -43,8 +43,11 @@ lint: $(STAMP) ## ruff and pyright
 openapi: $(STAMP) ## write openapi.yaml from the application
 	$(BIN)/python -m service.openapi openapi.yaml
 
-docs: $(STAMP) ## write the generated parts of README.md and docs/architecture.md
+docs: $(STAMP) ## write the generated parts of docs/
 	$(BIN)/python -m scripts.write_docs
+
+site: $(STAMP) ## build the documentation site into build/site; warnings are errors
+	$(BIN)/python -m sphinx -q -W --keep-going -j 2 docs build/site
 
 web: ## build the web pages from web/ into service/web (needs node and npm)
 	cd web && npm ci --no-audit --no-fund && npm run check && npm run build

@@ -1,4 +1,4 @@
-"""Draw the pictures of docs/photographs.md from the example panoramas: what an answer needs, and what spoils it.
+"""Draw the pictures of docs/how-to/take-photographs.md from the example panoramas: what an answer needs, and what spoils it.
 
 Run `python -m examples.make_photographs` after a change of the examples.
 """

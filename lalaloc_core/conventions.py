@@ -25,7 +25,7 @@ MIN_CAMERA_HEIGHT_M = 0.1
 OPENING_CLASSES = ("wall", "door", "window", "passage")
 WALL_CODE, DOOR_CODE, WINDOW_CODE, PASSAGE_CODE = range(len(OPENING_CLASSES))
 
-# What a room is for; the place is the code. docs/conventions.md says what each covers.
+# What a room is for; the place is the code. docs/reference/conventions.md says what each covers.
 ROOM_TYPES = (
     "unknown",
     "bedroom",

@@ -1,4 +1,4 @@
-"""Write the generated tables of README.md and docs/: `python -m scripts.write_docs`.
+"""Write the generated parts of docs/: `python -m scripts.write_docs`.
 
 A table stands between `<!-- begin: NAME -->` and `<!-- end: NAME -->`, where NAME is a key of `TABLES`. The tests fail
 when a table is out of date.
@@ -6,12 +6,19 @@ when a table is out of date.
 
 from __future__ import annotations
 
+import argparse
 import ast
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import yaml
+
+from lalaloc_core.cli import entry_point
 from scripts.figures import evidence_table, figures_table, paper_tables, training_table
+from service import cli as service_cli
+from service.openapi import openapi_text
+from service.problem_kinds import HTTP_PROBLEMS, PROBLEMS
 from service.settings import settings_table
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -37,7 +44,7 @@ def main() -> None:
 
 def documents() -> dict[Path, str]:
     """Return the up-to-date text of every document that has generated tables."""
-    paths = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    paths = sorted((ROOT / "docs").rglob("*.md"))
     texts = {path: path.read_text(encoding="utf-8") for path in paths}
     return {path: _PART.sub(_filled, text) for path, text in texts.items() if _PART.search(text)}
 
@@ -66,9 +73,77 @@ def folder_map() -> str:
     return "\n".join(rows)
 
 
+def metrics_table() -> str:
+    """Return the service's metrics as a Markdown table, from the calls that create them."""
+    kinds = {"counter": "counter", "gauge": "gauge", "_gauge": "gauge", "Histogram": "histogram"}
+    metrics = {}
+    for path in sorted((ROOT / "service").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.Call) or len(node.args) < 2:
+                continue
+            kind = kinds.get(getattr(node.func, "attr", getattr(node.func, "id", "")))
+            name, meaning = (
+                argument.value if isinstance(argument, ast.Constant) else None for argument in node.args[:2]
+            )
+            if kind and isinstance(name, str) and isinstance(meaning, str) and name.startswith("lalaloc_"):
+                metrics[f"{name}_total" if kind == "counter" else name] = f"{kind} | {meaning}"
+    rows = ["| metric | type | meaning |", "|---|---|---|"]
+    return "\n".join([*rows, *(f"| `{name}` | {row} |" for name, row in sorted(metrics.items()))])
+
+
+def routes_table() -> str:
+    """Return the routes of the HTTP API as a Markdown table."""
+    rows = ["| route | purpose |", "|---|---|"]
+    for route, operations in yaml.safe_load(openapi_text())["paths"].items():
+        for method, operation in operations.items():
+            rows.append(f"| `{method.upper()} {route}` | {operation['summary']} |")
+    return "\n".join(rows)
+
+
+def problems_table() -> str:
+    """Return the problem kinds of the HTTP API as a Markdown table."""
+    kinds = {kind.slug: kind for kind in (*PROBLEMS.values(), *HTTP_PROBLEMS.values())}
+    rows = ["| kind | status | title |", "|---|---|---|"]
+    ordered = sorted(kinds.values(), key=lambda kind: (kind.status, kind.slug))
+    return "\n".join([*rows, *(f"| `{kind.slug}` | {kind.status} | {kind.title} |" for kind in ordered)])
+
+
+def commands() -> str:
+    """Return every command with its options, as Markdown sections."""
+    parsers = [*_leaves(entry_point.build_parser()), *_leaves(service_cli.build_parser())]
+    return "\n\n".join(_section(parser) for parser in parsers)
+
+
+def _leaves(parser: argparse.ArgumentParser) -> Iterator[argparse.ArgumentParser]:
+    """Yield the parsers of commands that have no commands of their own."""
+    groups = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
+    if not groups:
+        yield parser
+    for group in groups:
+        for command in group.choices.values():
+            yield from _leaves(command)
+
+
+def _section(parser: argparse.ArgumentParser) -> str:
+    rows = []
+    for action in parser._actions:
+        if isinstance(action, argparse._HelpAction | argparse._VersionAction):
+            continue
+        name = ", ".join(action.option_strings) or str(action.metavar or action.dest)
+        choices = f"; one of {', '.join(map(str, action.choices))}" if action.choices else ""
+        meaning = (action.help or "").replace("%(default)s", str(action.default)).replace("%%", "%").replace("|", "\\|")
+        rows.append(f"| `{name}` | {meaning}{choices} |")
+    table = ["| option | meaning |", "|---|---|", *rows] if rows else ["No options."]
+    return "\n".join([f"## {parser.prog}", "", *([parser.description, ""] if parser.description else []), *table])
+
+
 TABLES: dict[str, Callable[[], str]] = {
     "settings": settings_table,
     "folders": folder_map,
+    "metrics": metrics_table,
+    "routes": routes_table,
+    "problems": problems_table,
+    "cli": commands,
     "figures": figures_table,
     "evidence": evidence_table,
     "paper": paper_tables,

@@ -15,7 +15,7 @@ from lalaloc_core.errors import InvalidFloorPlanError
 
 def add_commands(commands: Any) -> None:
     """Add these commands to the parser."""
-    plan = commands.add_parser("plan", help="import, check, draw and export floor plans (docs/floorplans.md)")
+    plan = commands.add_parser("plan", help="import, check, draw and export floor plans (docs/how-to/import-a-plan.md)")
     actions = plan.add_subparsers(required=True, metavar="ACTION")
     bring = actions.add_parser(
         "import", help="make a plan of a file, whatever its format, and say what was used for what"

@@ -26,7 +26,7 @@ def add_commands(commands: Any) -> None:
     synth.set_defaults(run=_synth)
 
     sheet = commands.add_parser("contact-sheet", help="write a sheet of synthetic panoramas to look at")
-    sheet.add_argument("--out", type=Path, default=Path("docs/contact_sheet.jpg"))
+    sheet.add_argument("--out", type=Path, default=Path("contact_sheet.jpg"))
     sheet.add_argument("--seed", type=int, default=0)
     sheet.add_argument("--textures", type=Path)
     sheet.set_defaults(run=_contact_sheet)

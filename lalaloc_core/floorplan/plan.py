@@ -98,7 +98,7 @@ class FloorPlan:
 
     @classmethod
     def from_dict(cls, document: Any, limits: PlanLimits = DEFAULT_LIMITS) -> FloorPlan:
-        """Validate a plan in the native format, whose keys stand in docs/conventions.md; unknown ones are refused.
+        """Validate a plan in the native format, whose keys stand in docs/reference/conventions.md; unknown ones are refused.
 
         Raises:
             InvalidFloorPlanError: names the room and what is wrong.

@@ -1,7 +1,7 @@
 """Floor plans as people have them: read from the files of drawing, building and mapping tools, and written to them.
 
 `import_plan` and `import_plans` take the bytes of a file and find out by its content what it is. Every importer gives a
-document in the native format (docs/conventions.md) and a report of what it used and what is likely wrong.
+document in the native format (docs/reference/conventions.md) and a report of what it used and what is likely wrong.
 
 formats/   an importer for each format; `formats/native.py` is the plainest
 drawing/   vector drawings, whatever the format: which lines are walls, what they enclose

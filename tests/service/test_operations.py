@@ -1,4 +1,4 @@
-"""What docs/operations.md tells operators to do, done: backup and restore, and the upgrade of the model."""
+"""What docs/how-to/operate.md tells operators to do, done: backup and restore, and the upgrade of the model."""
 
 from __future__ import annotations
 

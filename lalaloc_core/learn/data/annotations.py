@@ -3,7 +3,7 @@
     ROOT/<name>.json   the outline of the room around the camera, in camera heights, and what is in its walls
     ROOT/<name>.jpg    the panorama, named in the annotation
 
-docs/datasets.md has the format. A photograph stays the same when room and camera height grow together, so lengths are
+docs/reference/datasets.md has the format. A photograph stays the same when room and camera height grow together, so lengths are
 read for a camera `CAMERA_HEIGHT_M` over the floor.
 """
 

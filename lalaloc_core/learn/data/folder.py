@@ -1,6 +1,6 @@
 """A user's own data: plans in the native format, panoramas, and a table of where each was taken.
 
-    ROOT/<scene>/plan.json      the floor plan (docs/conventions.md)
+    ROOT/<scene>/plan.json      the floor plan (docs/reference/conventions.md)
     ROOT/<scene>/poses.csv      panorama,x_m,y_m,heading_deg,camera_height_m
     ROOT/<scene>/...            the panoramas, named in poses.csv by their path below the scene's folder
     ROOT/splits.csv             scene,split; without it every scene is a test scene
