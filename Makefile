@@ -24,10 +24,13 @@ demo: $(STAMP) ## localise the example panoramas over HTTP, write demo.png
 serve: $(STAMP) ## run the service at http://127.0.0.1:8000 (PORT=8001: there) with the example plan, data in ./data
 	$(BIN)/python -m examples.serve --port $(PORT)
 
-# What computes is shared out to processes with one thread each; what serves needs the machine for itself.
-test: lint ## lint, then the tests
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal --ignore=tests/service --ignore=tests/client --ignore=tests/web
-	$(BIN)/python -m pytest tests/service tests/client tests/web
+# Computation runs in two processes with one thread each; the service's tests need the machine for themselves. The second
+# half runs even if the first fails.
+test: lint site ## lint, build the site, run the tests
+	status=0; \
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal --ignore=tests/service --ignore=tests/client --ignore=tests/web || status=1; \
+	$(BIN)/python -m pytest tests/service tests/client tests/web || status=1; \
+	exit $$status
 
 # A cluster for each file: what one of them leaves behind is not the next one's.
 ON_RAY := floorplans localise resources idempotency events venues venue_queries sequence

@@ -14,10 +14,9 @@ class ConcurrencyLimit:
     """
 
     def __init__(self, max_queries: int | None, ask: Callable[[], int]) -> None:
-        """
-        Args:
-            max_queries: how many may be under way; None: to be asked for.
-            ask: how many the service takes, at least 1.
+        """Args:
+        max_queries: how many may be under way; None: to be asked for.
+        ask: how many the service takes, at least 1.
         """
         self._slots = threading.Semaphore(max_queries or 1)
         self._known = max_queries is not None

@@ -31,14 +31,13 @@ class Sender:
         retry: RetryPolicy | None = None,
         max_queries: int | None = None,
     ) -> None:
-        """
-        Args:
-            base_url: address of the service, with `http://` or `https://`.
-            api_key: sent as `Authorization: Bearer`.
-            timeout_s: longest that connecting, sending or waiting for a part of an answer may take.
-            retry: how often requests are sent again when the service is overloaded or does not answer.
-            max_queries: how many queries are sent at a time, others wait for one of them to be answered; None: as many
-                as the service has room for, by its `/limits`.
+        """Args:
+        base_url: address of the service, with `http://` or `https://`.
+        api_key: sent as `Authorization: Bearer`.
+        timeout_s: longest that connecting, sending or waiting for a part of an answer may take.
+        retry: how often requests are sent again when the service is overloaded or does not answer.
+        max_queries: how many queries are sent at a time, others wait for one of them to be answered; None: as many
+            as the service has room for, by its `/limits`.
         """
         self._http = httpx.Client(**http_options(base_url, api_key, timeout_s))
         self._patience = Patience(retry or RetryPolicy())

@@ -15,7 +15,7 @@ from pathlib import Path
 import yaml
 
 from lalaloc_core.cli import entry_point
-from scripts.figures import evidence_table, figures_table, paper_tables, training_table
+from scripts.figures import accuracy_table, paper_tables, speed_table, terms_table
 from service import cli as service_cli
 from service.openapi import openapi_text
 from service.problem_kinds import HTTP_PROBLEMS, PROBLEMS
@@ -144,10 +144,10 @@ TABLES: dict[str, Callable[[], str]] = {
     "routes": routes_table,
     "problems": problems_table,
     "cli": commands,
-    "figures": figures_table,
-    "evidence": evidence_table,
+    "accuracy": accuracy_table,
+    "terms": terms_table,
+    "speed": speed_table,
     "paper": paper_tables,
-    "training": training_table,
 }
 
 

@@ -36,9 +36,8 @@ class Shares:
     """How much of something each client holds. Not locked: for one event loop, or under the lock of its owner."""
 
     def __init__(self, limit: int) -> None:
-        """
-        Args:
-            limit: how much of it there is.
+        """Args:
+        limit: how much of it there is.
         """
         self.limit = limit
         self.in_use = 0
@@ -118,9 +117,8 @@ class FairSemaphore:
     """A semaphore that is acquired by clients in turn, and shared out between them; for one event loop."""
 
     def __init__(self, limit: int) -> None:
-        """
-        Args:
-            limit: permits in all, of which one client gets the share that `Shares` leaves to it.
+        """Args:
+        limit: permits in all, of which one client gets the share that `Shares` leaves to it.
         """
         self._shares = Shares(limit)
         self._waiting: FairQueue[asyncio.Future[None]] = FairQueue()

@@ -20,9 +20,8 @@ class Threads:
     """Runs blocking calls for one event loop; what waits for a thread is bounded by who is let in."""
 
     def __init__(self, name: str, count: int) -> None:
-        """
-        Args:
-            count: how many there are; `run` shares them out between clients.
+        """Args:
+        count: how many there are; `run` shares them out between clients.
         """
         self._executor = ThreadPoolExecutor(count, thread_name_prefix=name)
         self._semaphore = FairSemaphore(count)
@@ -59,10 +58,9 @@ class BoundedReads:
     """Reads of the store that nobody waits for longer than a while, also when it hangs instead of failing."""
 
     def __init__(self, *, threads: int, max_pending: int, wait_s: float) -> None:
-        """
-        Args:
-            max_pending: reads that may be at work or wait for a thread; no more are lost when the store hangs.
-            wait_s: longest wait for one.
+        """Args:
+        max_pending: reads that may be at work or wait for a thread; no more are lost when the store hangs.
+        wait_s: longest wait for one.
         """
         self._threads = Threads("lalaloc-reads", threads)
         self._max_pending = max_pending

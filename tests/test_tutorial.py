@@ -15,7 +15,7 @@ from PIL import Image
 from lalaloc_core.cli import main
 
 ROOT = Path(__file__).parents[1]
-TUTORIAL = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
+TUTORIAL = (ROOT / "docs" / "getting-started.md").read_text(encoding="utf-8")
 
 
 def test_the_tutorial_ends_in_the_answer_that_it_shows(

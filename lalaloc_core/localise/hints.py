@@ -160,7 +160,7 @@ class Hints:
     def _inside(
         self, position_m: Float[np.ndarray, "n 2"], room_index: Int[np.ndarray, "n"]
     ) -> dict[HintName, Float[np.ndarray, "n"]]:
-        """g of every hint; NaN where it says nothing."""
+        """G of every hint; NaN where it says nothing."""
         found: dict[HintName, Float[np.ndarray, "n"]] = {}
         if self.near is not None:
             beyond = np.maximum(self.near.distance_m(position_m, room_index) / self.near.radius_m - 1.0, 0.0)

@@ -45,10 +45,9 @@ class Slots:
     """How many requests of one kind may be in work, and of these of one client (`Shares`); for one event loop."""
 
     def __init__(self, limit: int, max_waiting: int = 0) -> None:
-        """
-        Args:
-            limit: how many may be in work.
-            max_waiting: how many more may wait for that, in `wait_and_hold`; clients share these places as well.
+        """Args:
+        limit: how many may be in work.
+        max_waiting: how many more may wait for that, in `wait_and_hold`; clients share these places as well.
         """
         self._shares = Shares(limit)
         self._places = Shares(max_waiting)

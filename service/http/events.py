@@ -73,12 +73,11 @@ class PlanEvents:
         max_s: float,
         heartbeat_s: float,
     ) -> None:
-        """
-        Args:
-            reads: where the store is asked how far plans are.
-            max_s: how long a stream lasts at most.
-            heartbeat_s: how often something is sent when there is nothing to tell, so that nobody takes it for dead,
-                and how often it is asked whether a caller is still authorised.
+        """Args:
+        reads: where the store is asked how far plans are.
+        max_s: how long a stream lasts at most.
+        heartbeat_s: how often something is sent when there is nothing to tell, so that nobody takes it for dead,
+            and how often it is asked whether a caller is still authorised.
         """
         self._store = store
         self._grids = grids

@@ -57,8 +57,7 @@ class IdempotentRequest:
     """One request, with a key or without."""
 
     def __init__(self, claims: IdempotencyKeys, request: Request, tenant: str, route: str) -> None:
-        """
-        Args:
+        """Args:
             tenant: whose key it is; the same key of another tenant, or for another route, is another key.
 
         Raises:

@@ -71,9 +71,8 @@ class RemoteOptimiser:
     """LPO elsewhere, whose jobs may fail for any reason: the caller then does without, as with `LpoPool`."""
 
     def __init__(self, lpo: DeploymentHandle | None, telemetry: Telemetry) -> None:
-        """
-        Args:
-            lpo: None: LPO is turned off.
+        """Args:
+        lpo: None: LPO is turned off.
         """
         self._lpo = lpo
         self._telemetry = telemetry
@@ -135,8 +134,7 @@ class _SearchCaller:
         self._telemetry = telemetry
 
     async def _call(self, method: str, of_id: str, context: QueryContext, *arguments: Any) -> Any:
-        """
-        Args:
+        """Args:
             of_id: the plan or venue.
             context: of the query.
 

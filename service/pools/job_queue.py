@@ -64,11 +64,10 @@ class JobQueue:
     """Jobs that wait for a worker, oldest first and clients in turn; may be used from any thread."""
 
     def __init__(self, limit: int, served_by: Callable[[float], bool], workers: Shares | None = None) -> None:
-        """
-        Args:
-            limit: jobs that may wait, besides those at work.
-            served_by: whether a worker is expected to be warm at a time (`monotonic`).
-            workers: those that clients share; None where a client may have all of them.
+        """Args:
+        limit: jobs that may wait, besides those at work.
+        served_by: whether a worker is expected to be warm at a time (`monotonic`).
+        workers: those that clients share; None where a client may have all of them.
         """
         self._served_by = served_by
         self._workers = workers

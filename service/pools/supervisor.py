@@ -55,11 +55,10 @@ class Supervisor:
     """Keeps one worker process alive and feeds it; everything but `stop` happens on its own thread."""
 
     def __init__(self, spec: WorkerSpec, index: int, queue: JobQueue, on_restart: Callable[[str], None]) -> None:
-        """
-        Args:
-            index: tells the workers of a pool apart.
-            queue: where jobs come from; closing it ends the thread once its job is done.
-            on_restart: called with the reason whenever the worker has to be replaced.
+        """Args:
+        index: tells the workers of a pool apart.
+        queue: where jobs come from; closing it ends the thread once its job is done.
+        on_restart: called with the reason whenever the worker has to be replaced.
         """
         self.ready = False
         self.warmed_up = False

@@ -31,10 +31,9 @@ class Drawings:
     """For one event loop. What nobody waits for any more, as its clients hung up, is not begun."""
 
     def __init__(self, *, limit_bytes: int, max_waiting: int) -> None:
-        """
-        Args:
-            limit_bytes: of what is kept.
-            max_waiting: revisions that may be drawn or wait for it.
+        """Args:
+        limit_bytes: of what is kept.
+        max_waiting: revisions that may be drawn or wait for it.
         """
         self._threads = Threads("lalaloc-drawings", 1)
         self._kept: BoundedCache[_Key, bytes] = BoundedCache(limit_bytes, len)

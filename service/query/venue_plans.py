@@ -104,12 +104,11 @@ class VenuePlans:
         limit_bytes: int,
         max_poses: int,
     ) -> None:
-        """
-        Args:
-            path: of the file of prototypes; None for one that is gone with the process.
-            file_bytes: how large that may become.
-            limit_bytes: memory for what is kept of venues.
-            max_poses: that the grids of chosen plans may have in sum.
+        """Args:
+        path: of the file of prototypes; None for one that is gone with the process.
+        file_bytes: how large that may become.
+        limit_bytes: memory for what is kept of venues.
+        max_poses: that the grids of chosen plans may have in sum.
         """
         self._store = store
         self._grids = grids

@@ -41,10 +41,9 @@ class KeyCache:
     """Looks keys up."""
 
     def __init__(self, keys: ApiKeys, *, fresh_s: float, clock: Callable[[], float] = time.monotonic) -> None:
-        """
-        Args:
-            fresh_s: how long an answer of the store is used; a revoked key is refused at most that much later.
-            clock: seconds.
+        """Args:
+        fresh_s: how long an answer of the store is used; a revoked key is refused at most that much later.
+        clock: seconds.
         """
         self._keys = keys
         self._fresh_s = fresh_s

@@ -13,9 +13,8 @@ class CircuitBreaker:
     """Open for a moment after the database failed; safe to share between threads."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        """
-        Args:
-            clock: seconds.
+        """Args:
+        clock: seconds.
         """
         self._clock = clock
         self._open_until_s = -float("inf")

@@ -23,10 +23,9 @@ class IdempotencyKeys:
     """Answers by (tenant, route, key), for a day."""
 
     def __init__(self, database: Database, lease_s: float = MIN_LEASE_S) -> None:
-        """
-        Args:
-            lease_s: how long a request may take; after that its owner counts as dead, and the next one takes over. An
-                owner that lives is overtaken under its own token: work is done twice, and nothing stored twice.
+        """Args:
+        lease_s: how long a request may take; after that its owner counts as dead, and the next one takes over. An
+            owner that lives is overtaken under its own token: work is done twice, and nothing stored twice.
         """
         self._database = database
         self._lease_s = lease_s

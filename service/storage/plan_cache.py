@@ -13,9 +13,8 @@ class PlanCache:
     """Plans by tenant and id, bounded in bytes; safe to share between threads."""
 
     def __init__(self, limit_bytes: int) -> None:
-        """
-        Args:
-            limit_bytes: about how much memory the plans may take; 0: nothing is kept.
+        """Args:
+        limit_bytes: about how much memory the plans may take; 0: nothing is kept.
         """
         self._records: BoundedCache[tuple[str, str], tuple[PlanRecord, float]] = BoundedCache(
             limit_bytes, lambda entry: plan_bytes(entry[0].plan) + len(entry[0].report or "")

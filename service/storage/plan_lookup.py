@@ -15,9 +15,8 @@ class PlanLookup:
     """Finds plans for queries; safe to share between threads."""
 
     def __init__(self, store: Store, *, max_age_s: float) -> None:
-        """
-        Args:
-            max_age_s: how long after it was last read, or stored from here, a plan in memory counts as known.
+        """Args:
+        max_age_s: how long after it was last read, or stored from here, a plan in memory counts as known.
         """
         self._store = store
         self._max_age_s = max_age_s

@@ -59,9 +59,8 @@ class Plans:
     """Plans of all tenants; another tenant's plan is one that does not exist."""
 
     def __init__(self, database: Database, cache: PlanCache) -> None:
-        """
-        Args:
-            cache: is told of every plan that is read or stored at its current revision.
+        """Args:
+        cache: is told of every plan that is read or stored at its current revision.
         """
         self._database = database
         self._cache = cache

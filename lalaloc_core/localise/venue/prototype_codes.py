@@ -61,10 +61,9 @@ class CodeScan:
     """Codes in lists, and the search of some of these for those that fit a query best."""
 
     def __init__(self, code: UInt8[np.ndarray, "n b"], first: Int[np.ndarray, "w"]) -> None:
-        """
-        Args:
-            code: list by list.
-            first: where in `code` each list begins, and where the last one ends.
+        """Args:
+        code: list by list.
+        first: where in `code` each list begins, and where the last one ends.
         """
         dimensions = _PARTS * _VALUES
         lists = len(first) - 1

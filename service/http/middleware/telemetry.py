@@ -35,9 +35,8 @@ class TelemetryMiddleware:
     """
 
     def __init__(self, app: ASGIApp, telemetry: Telemetry, routes: Sequence[Route]) -> None:
-        """
-        Args:
-            routes: name requests that are refused before it is looked at where they lead.
+        """Args:
+        routes: name requests that are refused before it is looked at where they lead.
         """
         self._app = app
         self._telemetry = telemetry
