@@ -16,4 +16,4 @@ units, pixels), `errors.py`, `files.py`, `file_kinds.py` and `configuration.py` 
 Begin with `localise/pipeline.py`, the path of a query. Importing this package loads neither torch nor onnxruntime.
 """
 
-__version__ = "0.1.0"
+__version__ = "0.5.0"
