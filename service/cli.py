@@ -147,7 +147,7 @@ def _create(arguments: argparse.Namespace) -> int:
 
 def _list(arguments: argparse.Namespace) -> int:
     with _store() as store:
-        keys = store.keys.list(arguments.tenant)
+        keys = store.keys.list_keys(arguments.tenant)
     if arguments.json:
         print(json.dumps([asdict(key) | {"scopes": sorted(key.scopes)} for key in keys], default=str, indent=2))
     else:

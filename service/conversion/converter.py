@@ -94,7 +94,7 @@ class Converter:
         """
         job = ExportJob(json.dumps(plan.to_dict()), format)
         try:
-            answer = await self._started().answer(job, self._settings.plans.import_deadline_s, client)
+            answer = await self._started().run_job(job, self._settings.plans.import_deadline_s, client)
         except JobLostError as error:
             self._lost(error)
         if isinstance(answer, ConversionRefusal):

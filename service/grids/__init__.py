@@ -4,9 +4,8 @@ Begin with `grid_provider.py`, which everybody else asks. `builder.py` computes 
 leases; `throttle.py` lets queries go first, and `sweeper.py` looks after what other replicas did.
 """
 
-from service.grids.grid_provider import GridProvider
+from service.grids.grid_provider import GridProvider, GridState
 from service.grids.heights import check_height_m, grid_height_m
-from service.grids.state import GridState
 from service.grids.sweeper import Sweeper
 
 __all__ = ["GridProvider", "GridState", "Sweeper", "check_height_m", "grid_height_m"]

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import logging
 import uuid
+from collections.abc import Callable
 from time import monotonic
 
 from lalaloc_core.errors import LaLaLocError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.poses import PoseGrid
-from lalaloc_core.localise.venue.prototype_cells import shipped_cells
-from lalaloc_core.localise.venue.prototypes import prototypes_of
 from service.errors import (
     PlanFailedError,
     PlanNotReadyError,
@@ -22,7 +21,6 @@ from service.errors import (
 from service.grids.embedding import check_size, embed
 from service.grids.grid_cache import GridCache
 from service.grids.grid_jobs import GridJob, GridJobs
-from service.grids.lease_heartbeat import LeaseHeartbeat, LeaseLostError
 from service.grids.throttle import BackgroundThrottle
 from service.settings import Settings
 from service.storage import Store
@@ -40,6 +38,30 @@ _HEARTBEATS = 8.0
 _MAX_ATTEMPTS = 5
 # Stored pose grids (camera heights) per plan.
 _MAX_GRIDS_PER_PLAN = 8
+
+
+class _LeaseLostError(Exception):
+    """Another replica took over the lease, or the plan was deleted."""
+
+
+class _LeaseHeartbeat:
+    """Periodic renewal of the lease of a job.
+
+    Attributes:
+        lost: the lease belongs to another replica, or its plan was deleted.
+    """
+
+    def __init__(self, renew: Callable[[], bool], every_s: float) -> None:
+        self._renew = renew
+        self._every_s = every_s
+        self._beat_at = monotonic()
+        self.lost = False
+
+    def beat(self) -> None:
+        """Renew the lease if it is due."""
+        if not self.lost and monotonic() >= self._beat_at:
+            self.lost = not self._renew()
+            self._beat_at = monotonic() + self._every_s
 
 
 class GridBuilder:
@@ -72,14 +94,14 @@ class GridBuilder:
         self._telemetry = telemetry
         self._owner = uuid.uuid4().hex
         # Of the jobs that are being computed, all by the one thread of `GridJobs`.
-        self._heartbeats: list[LeaseHeartbeat] = []
+        self._heartbeats: list[_LeaseHeartbeat] = []
         self.jobs = GridJobs(self._work)
 
     def _work(self, job: GridJob) -> None:
         """See a job through; whatever happens ends up in its future, unless another replica is at it."""
         try:
             outcome = self._cache.load(job.key) or self._compute(job)
-        except LeaseLostError:
+        except _LeaseLostError:
             job.remote = True
             return
         except Exception as error:
@@ -90,13 +112,13 @@ class GridBuilder:
     def _compute(self, job: GridJob) -> PoseGrid:
         if job.cancelled.is_set():
             raise self._why_cancelled(job)
-        record = self._store.plans.by_revision(job.key.revision_id)
+        record = self._store.plans.get_by_revision(job.key.revision_id)
         if record is None:
             raise UnknownFloorPlanError(job.plan_id)
         check_size(record.plan, self._settings)
         attempts = self._store.leases.claim(job.key, self._owner, self._settings.grids.grid_lease_s)
         if attempts is None:
-            raise LeaseLostError
+            raise _LeaseLostError
         # Whoever had the lease until now may have finished.
         grid = self._cache.load(job.key)
         if grid is not None:
@@ -107,14 +129,14 @@ class GridBuilder:
             raise PlanFailedError(job.plan_id, reason)
         with self._telemetry.timed(self._telemetry.grid_seconds):
             grid = self._embed(job, record.plan)
-        prototypes = SortedPrototypes.of(prototypes_of(grid, record.plan), shipped_cells())
+        prototypes = SortedPrototypes.of_grid(grid, record.plan)
         if not self._put(job, grid, prototypes, always_keep_mm=millimetres(record.plan.camera_height_m)):
             raise UnknownFloorPlanError(job.plan_id)
         self._cache.put(job.key, grid)
         return grid
 
     def _embed(self, job: GridJob, plan: FloorPlan) -> PoseGrid:
-        heartbeat = LeaseHeartbeat(lambda: self._renew(job), self._settings.grids.grid_lease_s / _HEARTBEATS)
+        heartbeat = _LeaseHeartbeat(lambda: self._renew(job), self._settings.grids.grid_lease_s / _HEARTBEATS)
 
         def after_chunk(progress: float, worked_s: float) -> None:
             job.progress = progress
@@ -123,7 +145,7 @@ class GridBuilder:
                 other.beat()
             if heartbeat.lost:
                 # Leases go with their plans; if this one has, the job fails when it is looked at again.
-                raise LeaseLostError
+                raise _LeaseLostError
             if progress < 1.0:
                 self.jobs.preempt(job)
                 self._throttle.pause(worked_s)
@@ -140,7 +162,7 @@ class GridBuilder:
     def _why_cancelled(self, job: GridJob) -> Exception:
         if self.jobs.closing.is_set():
             return StoppingError()
-        if not self._store.plans.is_kept(job.key.revision_id):
+        if not self._store.plans.has_revision(job.key.revision_id):
             return UnknownFloorPlanError(job.plan_id)
         # The plan has another revision by now, which the next query finds.
         return PlanNotReadyError(job.plan_id, 0.0, 0.0)

@@ -6,19 +6,20 @@ import logging
 import threading
 from concurrent.futures import Future
 from contextlib import suppress
+from dataclasses import dataclass
+from typing import Self
 
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.poses import PoseGrid
-from lalaloc_core.localise.venue.prototype_cells import shipped_cells
-from lalaloc_core.localise.venue.prototypes import prototypes_of
 from lalaloc_core.render.sampling import grid_size
 from service.errors import OverloadedError, StoppingError
 from service.grids.builder import GridBuilder
 from service.grids.embedding import check_size, embed
 from service.grids.grid_cache import GridCache
-from service.grids.state import GridState
+from service.grids.grid_jobs import GridJob
 from service.grids.throttle import BackgroundThrottle
+from service.schemas import PlanStatus
 from service.settings import Settings
 from service.storage import Store
 from service.storage.grid_format import SortedPrototypes
@@ -29,6 +30,37 @@ from service.telemetry import LOGGER_NAME, Telemetry
 _BATCH = 16
 # Uploads compute small grids in turns; one that would wait for longer leaves its grid to the background.
 _INLINE_WAIT_S = 1.0
+
+
+@dataclass(frozen=True)
+class GridState:
+    """Progress of a plan's own pose grid, whichever replica computes it; `poses` is None until it is computed."""
+
+    status: PlanStatus
+    progress: float
+    poses: int | None
+    reason: str | None = None
+
+    @classmethod
+    def after_upload(cls, prepared: ComputedGrid | None) -> Self:
+        """Return the state of a plan that was stored just now, with or without its grid."""
+        return cls("preparing", 0.0, None) if prepared is None else cls("ready", 1.0, len(prepared.grid.poses))
+
+    @classmethod
+    def of_stored(cls, failure: str | None, poses: int | None, remote: float | None, job: GridJob | None) -> Self:
+        """Return the state of a stored plan.
+
+        Args:
+            failure: error of the last computation.
+            poses: number of poses of the stored grid.
+            remote: progress of another replica.
+            job: job of this replica.
+        """
+        if poses is not None:
+            return cls("ready", 1.0, poses)
+        if failure is not None and job is None:
+            return cls("failed", 0.0, None, failure)
+        return cls("preparing", max(remote or 0.0, job.progress if job else 0.0), None)
 
 
 class GridProvider:
@@ -97,7 +129,7 @@ class GridProvider:
             # Leases end as grids are stored, which may have been just now.
             stored = self._store.grids.poses(self._model_sha256, step_m, revision_ids)
         return [
-            GridState.of(summary.failure, stored.get(place), leased.get(place), job)
+            GridState.of_stored(summary.failure, stored.get(place), leased.get(place), job)
             for summary, place, job in zip(plans, places, jobs, strict=True)
         ]
 
@@ -124,7 +156,7 @@ class GridProvider:
                     camera_height_m=millimetres(plan.camera_height_m) / 1000.0,
                     after_chunk=lambda _progress, worked_s: self.throttle.pause(worked_s),
                 )
-            prototypes = SortedPrototypes.of(prototypes_of(grid, plan), shipped_cells())
+            prototypes = SortedPrototypes.of_grid(grid, plan)
             return ComputedGrid(model_sha256=self._model_sha256, grid=grid, prototypes=prototypes)
         except Exception:
             # The background fails at it as well, and records it with the plan.
@@ -152,10 +184,10 @@ class GridProvider:
 
     def make_prototypes(self, key: GridKey, grid_id: int) -> SortedPrototypes | None:
         """Make and store the prototypes of a grid that was stored without; None when it is gone."""
-        grid, record = self.find(key), self._store.plans.by_revision(key.revision_id)
+        grid, record = self.find(key), self._store.plans.get_by_revision(key.revision_id)
         if grid is None or record is None:
             return None
-        prototypes = SortedPrototypes.of(prototypes_of(grid, record.plan), shipped_cells())
+        prototypes = SortedPrototypes.of_grid(grid, record.plan)
         self._store.grids.put_prototypes(grid_id, prototypes)
         return prototypes
 

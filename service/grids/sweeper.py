@@ -48,7 +48,7 @@ class Sweeper:
         in_memory = sorted(self._grids.revisions() | self._store.plan_cache.revisions())
         for first in range(0, len(in_memory), _BATCH_SIZE):
             asked = in_memory[first : first + _BATCH_SIZE]
-            gone = set(asked) - self._store.plans.current(asked)
+            gone = set(asked) - self._store.plans.current_revisions(asked)
             if gone:
                 self._grids.forget(gone)
                 self._store.plan_cache.forget_revisions(gone)

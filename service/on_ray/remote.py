@@ -86,24 +86,10 @@ class RemoteOptimiser:
         workers = 0 if self._lpo is None else 1
         return PoolState(workers=workers, ready=workers, warmed_up=True, fault=None)
 
-    async def refine(self, job: RefinementJob, timeout_s: float, client: str = "") -> RefinementResult | None:
-        """See `LpoPool.refine`; clients do not take turns."""
-        result = await self._answer(job, timeout_s)
-        assert not isinstance(result, SequenceResult)
-        return result
-
-    async def refine_sequence(self, job: SequenceJob, timeout_s: float, client: str = "") -> SequenceResult | None:
-        """As `refine`, of paths."""
-        result = await self._answer(job, timeout_s)
-        assert not isinstance(result, RefinementResult)
-        return result
-
-    def close(self, drain_s: float = 0.0) -> None:
-        """Nothing to do, as for `start`."""
-
-    async def _answer(
-        self, job: RefinementJob | SequenceJob, timeout_s: float
+    async def refine(
+        self, job: RefinementJob | SequenceJob, timeout_s: float, client: str = ""
     ) -> RefinementResult | SequenceResult | None:
+        """See `LpoPool.refine`; clients do not take turns."""
         if self._lpo is None or timeout_s <= 0.0:
             return None
         deadline = monotonic() + timeout_s
@@ -120,6 +106,9 @@ class RemoteOptimiser:
             except RayError:
                 continue
         return self._missed("died")
+
+    def close(self, drain_s: float = 0.0) -> None:
+        """Nothing to do, as for `start`."""
 
     def _missed(self, reason: LostReason) -> None:
         self._telemetry.lpo_missed.labels(reason).inc()
@@ -181,23 +170,25 @@ class RemoteLocaliser(_SearchCaller):
         """See `Localiser.model`."""
         return self._model
 
-    async def answer(self, record: PlanRecord, query: PanoramaQuery) -> LocaliseAnswer:
-        """See `Localiser.answer`, for the errors as well."""
-        found = await self._call("answer", record.id, query.context, record.tenant, record.id, query)
+    async def localise(self, record: PlanRecord, query: PanoramaQuery) -> LocaliseAnswer:
+        """See `Localiser.localise`, for the errors as well."""
+        found = await self._call("localise", record.id, query.context, record.tenant, record.id, query)
         self._observe(found)
         return found
 
-    async def picture(
+    async def localise_and_draw(
         self, record: PlanRecord, query: PanoramaQuery, wanted: PictureRequest
     ) -> tuple[LocaliseAnswer, bytes]:
-        """See `Localiser.picture`."""
-        found, drawn = await self._call("picture", record.id, query.context, record.tenant, record.id, query, wanted)
+        """See `Localiser.localise_and_draw`."""
+        found, drawn = await self._call(
+            "localise_and_draw", record.id, query.context, record.tenant, record.id, query, wanted
+        )
         self._observe(found)
         return found, drawn
 
-    async def answer_sequence(self, record: PlanRecord, query: SequenceQuery) -> SequenceAnswer:
-        """See `Localiser.answer_sequence`."""
-        found = await self._call("answer_sequence", record.id, query.context, record.tenant, record.id, query)
+    async def localise_sequence(self, record: PlanRecord, query: SequenceQuery) -> SequenceAnswer:
+        """See `Localiser.localise_sequence`."""
+        found = await self._call("localise_sequence", record.id, query.context, record.tenant, record.id, query)
         self._observe(found)
         return found
 
@@ -205,17 +196,17 @@ class RemoteLocaliser(_SearchCaller):
 class RemoteVenueLocaliser(_SearchCaller):
     """Answers queries about venues, as `VenueLocaliser` does."""
 
-    async def answer(self, venue: VenueRecord, query: PanoramaQuery) -> LocaliseAnswer:
-        """See `VenueLocaliser.answer`."""
-        found = await self._call("answer_in_venue", venue.id, query.context, venue.tenant, venue.id, query)
+    async def localise(self, venue: VenueRecord, query: PanoramaQuery) -> LocaliseAnswer:
+        """See `VenueLocaliser.localise`."""
+        found = await self._call("localise_in_venue", venue.id, query.context, venue.tenant, venue.id, query)
         self._observe(found)
         return found
 
-    async def answer_near(
+    async def localise_near(
         self, tenant: str, place: EarthPoint, within_m: float, query: PanoramaQuery
     ) -> LocaliseAnswer:
-        """See `VenueLocaliser.answer_near`."""
-        found = await self._call("answer_near", str(place), query.context, tenant, place, within_m, query)
+        """See `VenueLocaliser.localise_near`."""
+        found = await self._call("localise_near", str(place), query.context, tenant, place, within_m, query)
         self._observe(found)
         return found
 

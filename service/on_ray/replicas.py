@@ -77,33 +77,33 @@ class SearchReplica:
         self._runtime = start_runtime(settings, Telemetry(), self._cleanup, backends)
 
     @telling_failures
-    async def answer(self, tenant: str, plan_id: str, query: PanoramaQuery) -> LocaliseAnswer:
-        """See `Localiser.answer`."""
-        return await self._runtime.localiser.answer(await self._plan(tenant, plan_id), query)
+    async def localise(self, tenant: str, plan_id: str, query: PanoramaQuery) -> LocaliseAnswer:
+        """See `Localiser.localise`."""
+        return await self._runtime.localiser.localise(await self._plan(tenant, plan_id), query)
 
     @telling_failures
-    async def picture(
+    async def localise_and_draw(
         self, tenant: str, plan_id: str, query: PanoramaQuery, wanted: PictureRequest
     ) -> tuple[LocaliseAnswer, bytes]:
-        """See `Localiser.picture`."""
-        return await self._runtime.localiser.picture(await self._plan(tenant, plan_id), query, wanted)
+        """See `Localiser.localise_and_draw`."""
+        return await self._runtime.localiser.localise_and_draw(await self._plan(tenant, plan_id), query, wanted)
 
     @telling_failures
-    async def answer_sequence(self, tenant: str, plan_id: str, query: SequenceQuery) -> SequenceAnswer:
-        """See `Localiser.answer_sequence`."""
-        return await self._runtime.localiser.answer_sequence(await self._plan(tenant, plan_id), query)
+    async def localise_sequence(self, tenant: str, plan_id: str, query: SequenceQuery) -> SequenceAnswer:
+        """See `Localiser.localise_sequence`."""
+        return await self._runtime.localiser.localise_sequence(await self._plan(tenant, plan_id), query)
 
     @telling_failures
-    async def answer_in_venue(self, tenant: str, venue_id: str, query: PanoramaQuery) -> LocaliseAnswer:
-        """See `VenueLocaliser.answer`."""
-        return await self._runtime.venue_localiser.answer(await self._venue(tenant, venue_id), query)
+    async def localise_in_venue(self, tenant: str, venue_id: str, query: PanoramaQuery) -> LocaliseAnswer:
+        """See `VenueLocaliser.localise`."""
+        return await self._runtime.venue_localiser.localise(await self._venue(tenant, venue_id), query)
 
     @telling_failures
-    async def answer_near(
+    async def localise_near(
         self, tenant: str, place: EarthPoint, within_m: float, query: PanoramaQuery
     ) -> LocaliseAnswer:
-        """See `VenueLocaliser.answer_near`."""
-        return await self._runtime.venue_localiser.answer_near(tenant, place, within_m, query)
+        """See `VenueLocaliser.localise_near`."""
+        return await self._runtime.venue_localiser.localise_near(tenant, place, within_m, query)
 
     @telling_failures
     async def check_hints(self, tenant: str, venue_id: str, form: LocaliseForm) -> None:

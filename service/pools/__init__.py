@@ -1,14 +1,14 @@
-"""Pools of supervised worker processes, for work that may take long, eat memory, or crash.
+"""Pools of supervised worker processes, for work that is slow, needs much memory, or can crash.
 
-A worker process answers one job at a time over a pipe of its own. A supervising thread starts it, feeds it, kills it
-when it stalls, and replaces it when it dies. What happens to a worker reaches callers only as a `JobLostError`.
+A worker process runs one job at a time and talks over its own pipe. A supervising thread starts it, feeds it, kills it
+when it stalls, and replaces it when it dies. Callers see only the result or a `JobLostError`.
 
     pool = WorkerPool(WorkerSpec("decode", run_decoder, (limits,), stall_s=10.0), workers=2, queue_limit=16)
     pool.start()
-    answer = await pool.answer(job, timeout_s=5.0)      # cancelling it cancels the job
+    result = await pool.run_job(job, timeout_s=5.0)     # cancelling it cancels the job
 
-with `run_decoder(connection, limits)` a function of `service.workers`. Begin with `pool.py`, which is what callers see;
-`job_queue.py` is the queue, and `supervisor.py` the thread over each worker.
+`run_decoder(connection, limits)` is a function of `service.workers`. Begin with `pool.py`, the interface for callers;
+`job_queue.py` is the queue, and `supervisor.py` the thread that keeps one worker alive.
 """
 
 from service.pools.job_queue import JobLostError, LostReason

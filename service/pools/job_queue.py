@@ -1,4 +1,4 @@
-"""Jobs on their way to workers: a bounded queue, and a memory of those that workers died over."""
+"""Bounded queue of jobs, with a memory of the jobs that crashed workers."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from service.fair_share import FairQueue, Shares
 
 LostReason = Literal["not-ready", "queue-full", "deadline", "poisoned", "stalled", "fault", "died", "closing"]
 
-# How soon an idle supervisor notices that its worker was killed.
+# Interval (s) in which an idle supervisor checks that its worker is alive.
 _IDLE_CHECK_S = 0.2
-# So many workers may die over one job: the first may have been killed for another reason.
+# A second try, as the first worker can have been killed for another reason.
 _TRIES_PER_JOB = 2
 _POISON_MEMORY_S, _POISON_MEMORY = 600.0, 256
 
 
 class JobLostError(Exception):
-    """A job has no answer.
+    """Job without a result.
 
     Attributes:
         reason: `not-ready`: no worker is warm, nor will be in time. `queue-full`: too many jobs wait already.
-            `deadline`: no answer in time. `poisoned`: workers died over this job. `stalled`: it took a worker longer
-            than it may. `fault`: the work raised an error, which the log has. `died`: the worker died, and there is no
-            time for another try. `closing`: the pool shuts down.
+            `deadline`: no result in time. `poisoned`: the job crashed workers. `stalled`: the job exceeded its time
+            limit. `fault`: the job raised an error, which is logged. `died`: the worker died, and no time is left
+            for another try. `closing`: the pool shuts down.
     """
 
     def __init__(self, reason: LostReason) -> None:
@@ -37,7 +37,7 @@ class JobLostError(Exception):
 
 
 class PendingJob:
-    """One job on its way through the pool."""
+    """Job that waits or runs."""
 
     def __init__(self, content: bytes, digest: bytes, deadline: float, client: str = "") -> None:
         self.content = content
@@ -50,24 +50,26 @@ class PendingJob:
 
     @property
     def wanted(self) -> bool:
-        """Whether starting it is of use: it has time left, and nobody gave it up."""
+        """Whether the job has time left and was not cancelled."""
         return monotonic() < self.deadline and not self.future.cancelled()
 
     def fail(self, reason: LostReason) -> None:
-        """End it without an answer."""
-        # Whoever waited may have given up at this very moment.
+        """End the job without a result."""
+        # The caller can cancel at this very moment.
         if self.future.running() or self.future.set_running_or_notify_cancel():
             self.future.set_exception(JobLostError(reason))
 
 
 class JobQueue:
-    """Jobs that wait for a worker, oldest first and clients in turn; may be used from any thread."""
+    """Jobs that wait for a worker, oldest first and clients in turn; safe to use from any thread."""
 
     def __init__(self, limit: int, served_by: Callable[[float], bool], workers: Shares | None = None) -> None:
-        """Args:
-        limit: jobs that may wait, besides those at work.
-        served_by: whether a worker is expected to be warm at a time (`monotonic`).
-        workers: those that clients share; None where a client may have all of them.
+        """Create an empty queue.
+
+        Args:
+            limit: maximum number of waiting jobs, besides the running ones.
+            served_by: tells whether a worker is expected to be warm at a time (`monotonic`).
+            workers: shares of the clients in the workers; None lets a client use all of them.
         """
         self._served_by = served_by
         self._workers = workers
@@ -82,14 +84,14 @@ class JobQueue:
 
     @property
     def closed(self) -> bool:
-        """Whether there will be no more jobs."""
+        """Whether the queue takes no more jobs."""
         return self._closed
 
     def put(self, pending: PendingJob) -> None:
-        """Let a job wait.
+        """Add a job.
 
         Raises:
-            JobLostError: there is no use in waiting.
+            JobLostError: the job cannot be run in time.
         """
         with self._changed:
             reason = self._refusal(pending)
@@ -100,7 +102,7 @@ class JobQueue:
             self._changed.notify()
 
     def take(self) -> PendingJob | None:
-        """The next job that is still of use, now running; None when none came in a short while.
+        """Return the next wanted job, marked as running, or None if there was none for a short while.
 
         Its client holds a worker until `release`.
         """
@@ -119,20 +121,20 @@ class JobQueue:
         return None
 
     def release(self, pending: PendingJob) -> None:
-        """The worker that had this job can take another one, or is not coming back."""
+        """Free the worker that had this job, also if the worker died."""
         if self._workers is not None:
             with self._changed:
                 self._workers.give_back(pending.client)
-                # Whichever idle worker looks first: what waits may not have been anybody's to take before.
+                # An idle worker can now take a job that its client's share did not allow before.
                 self._changed.notify()
 
     def give_back(self, pending: PendingJob) -> None:
-        """The worker with this job died or stalled; let another one try, if the job may and has the time."""
+        """Queue a job again whose worker died, if it has tries and time left; fail it otherwise, and if it stalled."""
         reason: LostReason | None = None
         with self._changed:
             if pending.stalled:
-                # Not once more: it would take as long again. But when it is sent again it is tried, as a worker may
-                # also stall because the machine is busy.
+                # Not retried, because it would take as long again. A new submission is tried: the machine may have
+                # been busy.
                 reason = "stalled"
             elif pending.deaths >= _TRIES_PER_JOB:
                 reason = "poisoned"
@@ -142,7 +144,7 @@ class JobQueue:
             elif not pending.wanted or not self._served_by(pending.deadline):
                 reason = "died"
             else:
-                # Past the limit by at most one job per worker, and in front of those that came later.
+                # Exceeds the limit by at most one job per worker, and goes first.
                 self._room.take(pending.client)
                 self._waiting.append_first(pending.client, pending)
                 self._changed.notify()
@@ -150,12 +152,12 @@ class JobQueue:
             pending.fail(reason)
 
     def rest(self, duration_s: float) -> None:
-        """Wait, but not longer than until the queue is closed."""
+        """Wait for `duration_s`, or until the queue is closed."""
         with self._changed:
             self._changed.wait_for(lambda: self._closed, duration_s)
 
     def close(self) -> None:
-        """Lose all jobs that wait, and take no more."""
+        """Fail all waiting jobs, and take no more."""
         with self._changed:
             self._closed = True
             waiting = self._waiting.drop(lambda _ticket: True)

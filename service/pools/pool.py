@@ -1,4 +1,4 @@
-"""What callers see of a pool: jobs go in, answers or a `JobLostError` come out."""
+"""Interface of a pool: jobs go in, results or a `JobLostError` come out."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from service.fair_share import Shares
 from service.pools.job_queue import JobLostError, JobQueue, PendingJob
 from service.pools.supervisor import Supervisor, WorkerSpec
 
-# So that nobody waits while large jobs of others are copied.
+# Several, so that no client waits while large jobs of others are copied.
 _SUBMITTING_THREADS = 8
 
 Job = TypeVar("Job")
-Answer = TypeVar("Answer")
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
 class PoolState:
-    """Workers wanted and warm, whether each has been warm once, and why the last start failed."""
+    """Number of workers, how many are warm, whether each has been warm once, and the error of the last failed start."""
 
     workers: int
     ready: int
@@ -32,8 +32,8 @@ class PoolState:
     fault: str | None
 
 
-class WorkerPool(Generic[Job, Answer]):
-    """Bounded queue before some supervised workers; may be used from any thread."""
+class WorkerPool(Generic[Job, Result]):
+    """Bounded queue in front of supervised workers; safe to use from any thread."""
 
     def __init__(
         self,
@@ -44,25 +44,27 @@ class WorkerPool(Generic[Job, Answer]):
         keep_spare: bool = False,
         on_restart: Callable[[str], None] = lambda _reason: None,
     ) -> None:
-        """A pool that has not been started.
+        """Create a pool, which `start` starts.
 
         Args:
-            queue_limit: jobs that may wait for a worker, besides those at work.
-            keep_spare: keep a worker free of whoever has others at work: for jobs that may take seconds.
-            on_restart: called with the reason whenever a worker has to be replaced.
+            spec: program of the workers.
+            workers: number of workers.
+            queue_limit: maximum number of waiting jobs, besides the running ones.
+            keep_spare: keep one worker free of clients that already have jobs running; for jobs that take seconds.
+            on_restart: called with the reason whenever a worker is replaced.
         """
         self._queue = JobQueue(queue_limit, self._served_by, Shares(workers) if keep_spare else None)
         self._supervisors = [Supervisor(spec, index, self._queue, on_restart) for index in range(workers)]
         self._submitting = ThreadPoolExecutor(_SUBMITTING_THREADS, thread_name_prefix=f"{spec.name}-submit")
 
     def start(self) -> None:
-        """Start all workers; returns at once, see `state` for when they are warm."""
+        """Start all workers and return at once; `state` tells when they are warm."""
         for supervisor in self._supervisors:
             supervisor.start()
 
     @property
     def state(self) -> PoolState:
-        """How many workers are wanted and warm."""
+        """Numbers of workers, all and warm."""
         faults = [supervisor.fault for supervisor in self._supervisors if supervisor.fault is not None]
         return PoolState(
             workers=len(self._supervisors),
@@ -73,7 +75,7 @@ class WorkerPool(Generic[Job, Answer]):
 
     @property
     def waiting(self) -> int:
-        """Jobs that wait for a worker."""
+        """Number of jobs that wait for a worker."""
         return len(self._queue)
 
     @property
@@ -86,29 +88,29 @@ class WorkerPool(Generic[Job, Answer]):
         """Whether the pool shuts down."""
         return self._queue.closed
 
-    def submit(self, job: Job, timeout_s: float, client: str = "") -> Future[Answer]:
-        """Queue a job of a client. Cancelling the future takes it out of the queue again; at work it is finished.
+    def submit(self, job: Job, timeout_s: float, client: str = "") -> Future[Result]:
+        """Queue a job of a client. Cancelling the future removes a waiting job; a running job is finished.
 
         Returns:
-            a future that gives the answer or raises `JobLostError`; it may do so later than the deadline.
+            A future with the result or a `JobLostError`; it can be done later than the deadline.
 
         Raises:
-            JobLostError: there is no use in waiting.
+            JobLostError: the job cannot be run in time.
         """
         content = pickle.dumps(job, protocol=pickle.HIGHEST_PROTOCOL)
         pending = PendingJob(content, hashlib.sha256(content).digest(), monotonic() + timeout_s, client)
         self._queue.put(pending)
         return pending.future
 
-    async def answer(self, job: Job, timeout_s: float, client: str = "") -> Answer:
-        """The answer to a client's job, awaited; a job that is no longer awaited is not started.
+    async def run_job(self, job: Job, timeout_s: float, client: str = "") -> Result:
+        """Run a client's job and return its result; a job that is no longer awaited is not started.
 
         Raises:
-            JobLostError: there is none within `timeout_s`.
+            JobLostError: there is no result within `timeout_s`.
         """
         if self._queue.closed:
             raise JobLostError("closing")
-        # On a thread: copying and hashing a large job would hold up everybody else.
+        # On a thread, because copying and hashing a large job would block the event loop.
         submitted = self._submitting.submit(self.submit, job, timeout_s, client)
         try:
             async with asyncio.timeout(timeout_s):
@@ -121,7 +123,7 @@ class WorkerPool(Generic[Job, Answer]):
             raise
 
     def close(self, drain_s: float = 0.0) -> None:
-        """End all workers and wait for them: jobs at work have `drain_s` to finish, those that wait are lost."""
+        """End all workers and wait for them: running jobs have `drain_s` (s) to finish, waiting jobs are lost."""
         self._queue.close()
         deadline = monotonic() + drain_s
         for supervisor in self._supervisors:
@@ -133,6 +135,6 @@ class WorkerPool(Generic[Job, Answer]):
 
 
 def _take_back(submitted: Future[Future[Any]]) -> None:
-    """Give up a job whose caller left while it was being submitted, or after."""
+    """Cancel a job whose caller left during or after its submission."""
     if not submitted.cancelled() and submitted.exception() is None:
         submitted.result().cancel()

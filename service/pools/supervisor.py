@@ -1,4 +1,4 @@
-"""A thread that keeps one worker process alive and feeds it."""
+"""Thread that keeps one worker process alive and feeds it."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ from service.pools.job_queue import JobQueue, PendingJob
 from service.telemetry import LOGGER_NAME
 from service.workers.process import JobResult, Ready, WorkerFailure
 
-# A worker that dies this soon after it was warm, or before, is replaced more and more slowly; the first time at once.
+# Workers that die sooner than this after they were warm are replaced more and more slowly; the first one at once.
 _HEALTHY_S = 5.0
 _FIRST_BACKOFF_S = 0.25
-# Those that got warm may well do so again, also when one of them was killed while it started.
+# Shorter for workers that were warm before, because they will probably start again.
 _MAX_BACKOFF_S, _MAX_BACKOFF_ONCE_WARM_S, _MAX_WARM_BACKOFF_S = 30.0, 5.0, 1.0
-# After so many failed starts in a row, or none that succeeded, nobody waits for the next one.
+# After this many failed starts in a row, or without any success, jobs do not wait for the next start.
 _HOPELESS_STARTS = 3
-# How long a killed worker may take to be gone, and how often it is looked at.
+# Time limit and poll interval (s) for the end of a killed worker.
 _KILL_S, _JOIN_S = 5.0, 0.2
 
 
 @dataclass(frozen=True)
 class WorkerSpec:
-    """What to run in the processes of a pool.
+    """Program of the processes of a pool.
 
     Attributes:
-        name: of the processes, in the log, and in the process list.
-        target: called in the worker as `target(connection, *arguments)`; has to be importable there.
-        arguments: picklable.
-        stall_s: a worker busy with one job for longer is killed.
-        start_s: what a start usually takes, until one has been measured.
-        max_start_s: a worker not warm after that will not come.
+        name: name in the log and in the process list.
+        target: called in the worker as `target(connection, *arguments)`; must be importable there.
+        arguments: picklable arguments.
+        stall_s: time limit (s) of a job; the worker is killed after it.
+        start_s: usual duration (s) of a start, until one has been measured.
+        max_start_s: time limit (s) of a start.
     """
 
     name: str
@@ -52,13 +52,16 @@ class WorkerSpec:
 
 
 class Supervisor:
-    """Keeps one worker process alive and feeds it; everything but `stop` happens on its own thread."""
+    """Keeper of one worker process; everything but `stop` runs on its own thread."""
 
     def __init__(self, spec: WorkerSpec, index: int, queue: JobQueue, on_restart: Callable[[str], None]) -> None:
-        """Args:
-        index: tells the workers of a pool apart.
-        queue: where jobs come from; closing it ends the thread once its job is done.
-        on_restart: called with the reason whenever the worker has to be replaced.
+        """Create a supervisor, which `start` starts.
+
+        Args:
+            spec: program of the worker.
+            index: number of the worker in its pool.
+            queue: source of jobs; closing it ends the thread after its current job.
+            on_restart: called with the reason whenever the worker is replaced.
         """
         self.ready = False
         self.warmed_up = False
@@ -71,7 +74,7 @@ class Supervisor:
         self._start_s = self._spec.start_s
         self._starts_at = monotonic()
         self._process: BaseProcess | None = None
-        # The job that the worker has, or had when it died: its client waits for the next worker, and no one else.
+        # Job of the worker, also of one that died: until the next worker is ready, only this job's client goes without.
         self._held: PendingJob | None = None
         self._thread = threading.Thread(target=self._run, name=f"{self._spec.name}-supervisor-{index}", daemon=True)
 
@@ -81,19 +84,19 @@ class Supervisor:
 
     @property
     def expected_ready(self) -> float:
-        """When (`monotonic`) the worker will be warm, as far as can be told: as fast as last time, or never."""
+        """Time (`monotonic`) at which the worker is expected to be warm, or infinity if starts keep failing."""
         now = monotonic()
         if self.ready:
             return now
         if self._failed_starts >= _HOPELESS_STARTS or (self._failed_starts and not self.warmed_up):
             return math.inf
         expected = self._starts_at + self._start_s
-        # One that is late may well take as long again.
+        # A late worker will probably take as long again.
         return expected if expected > now else now + (now - self._starts_at)
 
     @property
     def resident_bytes(self) -> int:
-        """Memory of the worker; 0 when there is none, or it cannot be told (it can on Linux)."""
+        """Memory of the worker; 0 without a worker, and on systems other than Linux."""
         pid = self._process.pid if self._process is not None else None
         try:
             pages = Path(f"/proc/{pid}/statm").read_text(encoding="ascii").split()[1]
@@ -102,11 +105,11 @@ class Supervisor:
         return int(pages) * os.sysconf("SC_PAGE_SIZE")
 
     def stop(self, deadline: float) -> None:
-        """End the worker once its job is done, at the deadline (`monotonic`) in any case; the queue must be closed."""
+        """End the worker after its job, or at the deadline (`monotonic`); the queue must be closed."""
         self._thread.join(max(deadline - monotonic(), 0.0))
         give_up = monotonic() + _KILL_S
         while self._thread.is_alive() and monotonic() < give_up:
-            # A supervisor that waits for its worker wakes up when the worker ends; it may just have started another.
+            # The supervisor wakes up when its worker ends; it can just have started another one.
             if self._process is not None:
                 self._process.kill()
             self._thread.join(_JOIN_S)
@@ -132,22 +135,22 @@ class Supervisor:
         logging.getLogger(LOGGER_NAME).warning("worker is replaced", extra={"fields": fields})
 
     def _pause(self, short_lives: int) -> None:
-        """Back off after so many short lives in a row."""
+        """Back off after several short lives in a row."""
         max_s = _MAX_BACKOFF_ONCE_WARM_S if self.warmed_up else _MAX_BACKOFF_S
         if self.fault is None:
             max_s = _MAX_WARM_BACKOFF_S
-        # Bounded before it is raised to a power: worker after worker may die for years.
+        # The exponent is bounded, because workers can die for years.
         pause_s = min(_FIRST_BACKOFF_S * 2.0 ** min(short_lives - 2, 20), max_s) if short_lives > 1 else 0.0
         self._starts_at = monotonic() + pause_s
         self._queue.rest(pause_s)
 
     def _live(self) -> str:
-        """The life of one worker; returns why it ended."""
+        """Run one worker until it ends, and return the reason."""
         self._starts_at = monotonic()
         connection, process = self._launch()
         try:
             self.fault = self._await_ready(connection, process)
-            # Also when the start failed: a worker that never comes must not be held for ever.
+            # Also after a failed start: a worker that never comes must not be held for ever.
             self._release()
             if self.fault is not None:
                 return self.fault
@@ -170,13 +173,13 @@ class Supervisor:
             daemon=True,
         )
         with theirs:
-            # With our copy of its end closed, the pipe breaks when the worker dies.
+            # Closing our copy of its end makes the pipe break when the worker dies.
             process.start()
         self._process = process
         return ours, process
 
     def _await_ready(self, connection: Connection, process: BaseProcess) -> str | None:
-        """Why the worker did not become ready; None when it did."""
+        """Wait for the worker; return the error of a failed start, None after a successful one."""
         with _Watchdog(process, self._spec.max_start_s) as watchdog:
             message = _receive(connection)
         if isinstance(message, Ready):
@@ -187,7 +190,7 @@ class Supervisor:
         return late if watchdog.expired else "the worker died starting"
 
     def _serve(self, connection: Connection, process: BaseProcess) -> str:
-        """Hand out jobs until the worker dies or stalls, or the queue is closed; returns why it ended."""
+        """Hand out jobs until the worker dies or stalls, or the queue is closed; return the reason."""
         while not self._queue.closed:
             if not process.is_alive():
                 return "died idle"
@@ -196,7 +199,7 @@ class Supervisor:
                 continue
             self._held = pending
             with _Watchdog(process, self._spec.stall_s) as watchdog:
-                # A worker that died before it had the whole job did not die over it.
+                # A worker that died before it had the whole job was not crashed by it.
                 sent = process.is_alive() and _send(connection, pending.content)
                 answer = _receive(connection) if sent else None
             if answer is None:
@@ -226,7 +229,7 @@ class Supervisor:
 
 
 class _Watchdog:
-    """Kills a process unless the block ends in time: reads and writes of its pipe then end, even half-way."""
+    """Timer that kills a process unless the block ends in time; reads and writes of its pipe then end as well."""
 
     def __init__(self, process: BaseProcess, limit_s: float) -> None:
         self.expired = False
@@ -247,7 +250,7 @@ class _Watchdog:
 
 
 def _send(connection: Connection, content: bytes) -> bool:
-    """False when the worker died before it had everything."""
+    """Send a job; False if the worker died before it had all of it."""
     try:
         connection.send_bytes(content)
     except OSError:
@@ -256,7 +259,7 @@ def _send(connection: Connection, content: bytes) -> bool:
 
 
 def _receive(connection: Connection) -> object | None:
-    """The worker's next message; None when it died, perhaps in the middle of the message."""
+    """Return the worker's next message; None if it died, even in the middle of the message."""
     try:
         return connection.recv()
     except (EOFError, OSError):

@@ -1,16 +1,24 @@
-"""What answers a panorama: decoding it, and the search with the optimiser in worker processes.
+"""Queries: from a decoded request to the answer, in one plan or in all plans of a venue.
 
-Begin with `localiser.py`. `decoding.py` and `lpo_pool.py` are the pools of worker processes that it asks, and
-`heading.py` decides which heading holds. `venue_localiser.py` asks about all plans of a venue, among which
-`venue_plans.py` chooses, by what `prototype_file.py` keeps. `panorama_query.py` is what all of them are asked, and
-`backends.py` says what may run in other processes instead.
+Begin with `localiser.py`, whose `_localise` shows the steps in order. `stated_camera.py` reads the fields about the
+camera, `answers.py` composes the answer. `venue_localiser.py` does the same for a venue: `venue_plans.py` chooses the
+plans by the prototypes in `prototype_file.py`, and `venue_hints.py` applies the hints to them. `decoding.py` and
+`lpo_pool.py` are pools of worker processes. `queries.py` has the queries and the interfaces of what may run in other
+processes.
 """
 
-from service.query.backends import LocaliserBackend, OptimiserBackend, VenueLocaliserBackend
 from service.query.decoding import Decoder
 from service.query.localiser import Localiser
 from service.query.lpo_pool import LpoPool
-from service.query.panorama_query import PanoramaQuery, PictureRequest, QueryContext, SequenceQuery
+from service.query.queries import (
+    LocaliserBackend,
+    OptimiserBackend,
+    PanoramaQuery,
+    PictureRequest,
+    QueryContext,
+    SequenceQuery,
+    VenueLocaliserBackend,
+)
 from service.query.venue_localiser import VenueLocaliser
 from service.query.venue_plans import VenuePlans
 

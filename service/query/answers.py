@@ -1,31 +1,52 @@
-"""What was found, in the words of the API."""
+"""Answers of the API, composed of search results."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from lalaloc_core.conventions import heading_to_degrees
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.floorplan.earth import Anchor
-from lalaloc_core.localise.bundle import Bundle
+from lalaloc_core.localise.bundle import Bundle, ConfidenceModel
 from lalaloc_core.localise.covariance import pose_uncertainty
 from lalaloc_core.localise.pipeline import Localisation, panorama_heading
-from lalaloc_core.localise.poses import Candidate, Query
-from service.query.geopose import geopose_of
-from service.query.heading import KnownHeading
-from service.schemas import CandidateAnswer, LocaliseAnswer, ModelAnswer, Position, TimingsAnswer
+from lalaloc_core.localise.poses import Candidate, PoseGrid, Query
+from lalaloc_core.localise.posterior import Posterior
+from lalaloc_core.localise.probability_map import probability_map
+from lalaloc_core.localise.sequence import Motion
+from lalaloc_core.localise.sequence.search import SequenceLocalisation
+from lalaloc_core.localise.stated_camera import KnownHeading
+from service.query.geopose import geopose_at
+from service.query.stated_camera import heading_warnings
+from service.schemas import (
+    CandidateAnswer,
+    LocaliseAnswer,
+    ModelAnswer,
+    Position,
+    PosteriorAnswer,
+    SequenceAnswer,
+    SequencePoseAnswer,
+    TimingsAnswer,
+)
 from service.storage.records import PlanRecord
+
+# Smaller probabilities are rounded to 0 in the answer.
+_MIN_PROBABILITY = 5e-7
 
 
 @dataclass(frozen=True)
 class Place:
-    """The plan that a candidate lies in, and the candidate in its frame.
+    """A candidate and the plan that it lies in.
 
     Attributes:
-        anchor: where on Earth the plan lies; None where that is not known.
-        level: of the plan in its venue.
+        plan_id: id of the plan.
+        revision_id: id of the plan's revision.
+        plan: the plan.
+        candidate: the candidate in the plan's frame.
+        anchor: place of the plan on Earth; None where unknown.
+        level: level of the plan in its venue; None outside of venues.
     """
 
     plan_id: str
@@ -36,36 +57,41 @@ class Place:
     level: float | None = None
 
 
-# Tells where a candidate is.
+# Function from a candidate of the search to its place.
 Locate = Callable[[Candidate], Place]
 
 
 def locate_in(record: PlanRecord) -> Locate:
-    """Where the candidates of a search in a single plan are."""
+    """Return the function that places the candidates of a search in a single plan."""
     return lambda candidate: Place(record.id, record.revision_id, record.plan, candidate, record.plan.anchor)
 
 
-def compose(
+def compose_answer(
     found: Localisation,
     *,
     locate: Locate,
     known: KnownHeading,
-    warnings: list[str],
     timings_ms: dict[str, float],
     bundle: Bundle,
+    warnings: Sequence[str] = (),
     share: float = 1.0,
 ) -> LocaliseAnswer:
-    """An answer.
+    """Compose the answer to a query about one panorama.
 
     Args:
-        locate: tells where each candidate is.
-        share: how probable it is that the place is among those that were searched.
+        found: result of the search.
+        locate: places the candidates.
+        known: the heading that was known before the search.
+        timings_ms: durations (ms) by stage.
+        bundle: the model.
+        warnings: warnings besides the one about the heading.
+        share: probability that the place is in the searched plans.
     """
     model = bundle.manifest.confidence
     answer, spread = found.best[found.stage], None
     if model is not None and answer.information is not None:
-        at = locate(answer)
-        spread = pose_uncertainty(answer.information, at.plan.rooms[at.candidate.room_index], model)
+        placed = locate(answer)
+        spread = pose_uncertainty(answer.information, placed.plan.rooms[placed.candidate.room_index], model)
     fits = None if model is None else found.fit_probability(model)
     fits = None if fits is None else fits * share
     candidates = [
@@ -84,7 +110,7 @@ def compose(
         room_id=best.room_id,
         confidence=None if fits is None else fits * found.posterior.position,
         heading_confidence=None if fits is None else fits * min(found.posterior.heading, 1.0),
-        warnings=warnings,
+        warnings=[*heading_warnings(found, known), *warnings],
         covariance_m2=None if spread is None else spread.position_m2.tolist(),
         heading_std_deg=None if spread is None or spread.heading_std is None else math.degrees(spread.heading_std),
         stage=found.stage,
@@ -96,21 +122,6 @@ def compose(
         timings_ms=TimingsAnswer(**{name: timings_ms.get(name, 0.0) for name in TimingsAnswer.model_fields}),
         model=model_answer(bundle),
     )
-
-
-def model_answer(bundle: Bundle) -> ModelAnswer:
-    """Name, version and digest of a bundle."""
-    return ModelAnswer(name=bundle.manifest.name, version=bundle.manifest.version, sha256=bundle.sha256)
-
-
-def heading_warnings(found: Localisation, known: KnownHeading) -> list[str]:
-    """Says that a heading was not followed, where it was not."""
-    if not found.heading_contradicted:
-        return []
-    assert known.heading is not None
-    origin = "heading_deg" if known.source == "given" else "the panorama's compass heading"
-    degrees = heading_to_degrees(known.heading)
-    return [f"{origin} is {degrees:.4g}, which the panorama contradicts: the heading was searched for instead"]
 
 
 def _candidate(place: Place, query: Query, probability: float | None) -> CandidateAnswer:
@@ -128,5 +139,67 @@ def _candidate(place: Place, query: Query, probability: float | None) -> Candida
         probability=None if probability is None else min(probability, 1.0),
         cost=candidate.cost,
         latent_distance=min(max(candidate.latent_distance, 0.0), 2.0),
-        geopose=geopose_of(place.anchor, (candidate.x_m, candidate.y_m), heading_deg, camera_height_m),
+        geopose=geopose_at(place.anchor, (candidate.x_m, candidate.y_m), heading_deg, camera_height_m),
     )
+
+
+def model_answer(bundle: Bundle) -> ModelAnswer:
+    """Return name, version and digest of a bundle."""
+    return ModelAnswer(name=bundle.manifest.name, version=bundle.manifest.version, sha256=bundle.sha256)
+
+
+def posterior_answer(plan: FloorPlan, grid: PoseGrid, posterior: Posterior) -> PosteriorAnswer:
+    """Return the places of the pose grid with a probability above zero."""
+    places = probability_map(plan, grid.poses, posterior)
+    kept = places.probability >= _MIN_PROBABILITY
+    position_m = places.position_m[kept]
+    return PosteriorAnswer(
+        step_m=grid.step_m,
+        x_m=position_m[:, 0].tolist(),
+        y_m=position_m[:, 1].tolist(),
+        probability=places.probability[kept].tolist(),
+    )
+
+
+def compose_sequence_answer(
+    answers: Sequence[LocaliseAnswer],
+    found: SequenceLocalisation,
+    motions: Sequence[Motion],
+    model: ConfidenceModel | None,
+) -> SequenceAnswer:
+    """Compose the answer to a query about several panoramas.
+
+    Args:
+        answers: the answer for each panorama.
+        found: result of the joint search.
+        motions: the stated motions between the panoramas.
+        model: the confidence model; None for a bundle without one.
+    """
+    first = answers[0]
+    fits = [None if model is None else picture.fit_probability(model) for picture in found.pictures]
+    known = [fit for fit in fits if fit is not None]
+    return SequenceAnswer(
+        floorplan_id=first.floorplan_id,
+        floorplan_revision=first.floorplan_revision,
+        poses=[
+            SequencePoseAnswer(**{name: getattr(answer, name) for name in SequencePoseAnswer.model_fields})
+            for answer in answers
+        ],
+        confidence=min(known) * min(found.path_probability, 1.0) if len(known) == len(fits) else None,
+        warnings=[_motion_warning(index, motions[index]) for index in found.motions_contradicted],
+        stage=found.stage,
+        camera_height_m=found.camera_height_m,
+        timings_ms=first.timings_ms,
+        model=first.model,
+    )
+
+
+def _motion_warning(index: int, motion: Motion) -> str:
+    measured = []
+    if motion.distance_m is not None:
+        measured.append(f"distance_m {motion.distance_m:g}")
+    if motion.turn is not None:
+        measured.append(f"turn_deg {math.degrees(motion.turn):.4g}")
+    if motion.direction is not None:
+        measured.append(f"direction_deg {math.degrees(motion.direction):.4g}")
+    return f"motions[{index}] has {', '.join(measured)}, which the panoramas contradict: it was not followed"

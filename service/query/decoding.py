@@ -1,7 +1,7 @@
-"""Decoding panoramas, and making pixels of drawings, in worker processes that are bounded in memory and time.
+"""Pool of worker processes, bounded in memory and time, that decode panoramas and rasterise drawings.
 
-A picture that kills such a process gets a second try, one that takes too long none, and neither harms anything else.
-No client keeps all the processes busy.
+A picture that crashes its worker is tried once more; one that exceeds the time limit is not. Other jobs are not
+affected. No client keeps all workers busy.
 """
 
 from __future__ import annotations
@@ -56,7 +56,6 @@ class Decoder:
         telemetry.gauge(
             "lalaloc_decode_workers_ready", "Decoding workers that are warm.", lambda: self._pool.state.ready
         )
-
         telemetry.gauge(
             "lalaloc_decode_workers_resident_bytes",
             "Memory of all decoding workers.",
@@ -64,76 +63,79 @@ class Decoder:
         )
 
     def start(self) -> None:
-        """Start all workers; returns at once."""
+        """Start all workers and return at once."""
         self._pool.start()
 
     @property
     def state(self) -> PoolState:
-        """How many workers are wanted and warm."""
+        """Numbers of workers, all and warm."""
         return self._pool.state
 
     async def decode(
         self, content: bytes, deadline: float, client: str = "", *, size: tuple[int, int] | None = None
     ) -> Panorama:
-        """The panorama in an uploaded file, by a deadline (`monotonic`).
+        """Decode an uploaded panorama file.
 
         Args:
-            size: height and width of its pixels; by default the encoder's.
+            content: the file.
+            deadline: time limit (`monotonic`).
+            client: fairness group of the job.
+            size: height and width of the result in pixels; None for the encoder's.
 
         Raises:
-            InvalidPanoramaError: see `open_panorama`; or a worker stalled over it, or two died.
+            InvalidPanoramaError: see `open_panorama`; or the file stalled a worker, or crashed two.
             OverloadedError: too many panoramas wait already.
-            DeadlineExceededError: it was not decoded in time.
-            DecoderNotReadyError: no worker is running, nor will be in time.
+            DeadlineExceededError: the deadline passed.
+            DecoderNotReadyError: no worker is running, nor will be by the deadline.
             StoppingError: the service is shutting down.
         """
         height, width = size or self._size
-        answer = await self._answer(DecodeJob(content, height, width), deadline, client)
-        if isinstance(answer, DecodeRefusal):
-            raise InvalidPanoramaError(answer.reason)
-        assert isinstance(answer, Panorama)
-        return answer
+        result = await self._run_job(DecodeJob(content, height, width), deadline, client)
+        if isinstance(result, DecodeRefusal):
+            raise InvalidPanoramaError(result.reason)
+        assert isinstance(result, Panorama)
+        return result
 
     async def rasterise(self, svg: str, deadline: float, client: str = "") -> bytes:
-        """A drawing as PNG, by a deadline (`monotonic`).
+        """Return a drawing as a PNG file, by a deadline (`monotonic`).
 
         Raises:
+            DrawingFailedError: the drawing crashed two workers, or could not be made.
             OverloadedError, DeadlineExceededError, DecoderNotReadyError, StoppingError: as `decode`.
         """
-        answer = await self._answer(RasteriseJob(svg), deadline, client)
-        assert isinstance(answer, bytes)
-        return answer
+        result = await self._run_job(RasteriseJob(svg), deadline, client)
+        assert isinstance(result, bytes)
+        return result
 
-    async def _answer(
+    async def _run_job(
         self, job: DecodeJob | RasteriseJob, deadline: float, client: str
     ) -> Panorama | DecodeRefusal | bytes:
         try:
-            return await self._pool.answer(job, max(deadline - monotonic(), 0.0), client)
+            return await self._pool.run_job(job, max(deadline - monotonic(), 0.0), client)
         except JobLostError as error:
-            raise self._explained(error, job) from error
+            raise self._error(error, job) from error
 
     def close(self) -> None:
         """End all workers and wait for them."""
         self._pool.close()
 
-    def _explained(self, error: JobLostError, job: DecodeJob | RasteriseJob) -> Exception:
-        if isinstance(job, RasteriseJob) and error.reason in ("poisoned", "fault"):
-            return DrawingFailedError(error.reason)
-        if isinstance(job, RasteriseJob) and error.reason == "stalled":
-            # Drawings are of bounded size: it is the machine that is slow.
+    def _error(self, lost: JobLostError, job: DecodeJob | RasteriseJob) -> Exception:
+        """Return the service's error for a lost job."""
+        if isinstance(job, RasteriseJob) and lost.reason in ("poisoned", "fault"):
+            return DrawingFailedError(lost.reason)
+        if isinstance(job, RasteriseJob) and lost.reason == "stalled":
+            # Drawings have a bounded size, so the machine is slow.
             return DeadlineExceededError(self._settings.decode.stall_s)
-        match error.reason:
+        match lost.reason:
             case "poisoned":
-                return InvalidPanoramaError(
-                    "the panorama could not be decoded: twice that ended the process that tried"
-                )
+                return InvalidPanoramaError("the panorama crashed the decoder twice: save it anew, or make it smaller")
             case "stalled":
                 return InvalidPanoramaError(
-                    f"decoding the panorama took longer than {self._settings.decode.stall_s:g} s (decode_stall_s); a "
-                    "smaller one, or one that is saved anew, takes less"
+                    f"decoding the panorama took longer than {self._settings.decode.stall_s:g} s "
+                    "(LALALOC_DECODE_STALL_S): save it anew, or send a smaller one"
                 )
             case "fault":
-                return InvalidPanoramaError("the panorama is damaged")
+                return InvalidPanoramaError("the panorama file is damaged: save it anew")
             case "queue-full":
                 return OverloadedError(_QUEUE)
             case "not-ready":

@@ -1,4 +1,4 @@
-"""Poses on Earth, of plans with an anchor."""
+"""Poses on Earth, for plans with an anchor."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from service.schemas import GeoPose, GeoPoseAngles, GeoPosePosition, LocaliseAns
 _DECIMALS = 9
 
 
-def anchor_of(plan: FloorPlan, of_venue: Anchor | None = None) -> Anchor | None:
-    """Where on Earth a plan lies: its own anchor says so, else that of the venue that was asked about.
+def plan_anchor(plan: FloorPlan, venue_anchor: Anchor | None = None) -> Anchor | None:
+    """Return the plan's own anchor, else the venue's.
 
-    None without either, and for a plan so far from the venue's origin that it would be drawn out.
+    Returns None without either, and for a plan too far from the venue's origin for the projection to hold.
     """
-    if plan.anchor is not None or of_venue is None:
+    if plan.anchor is not None or venue_anchor is None:
         return plan.anchor
-    return of_venue if float(np.abs(plan.bounds_m).max()) <= MAX_FROM_ORIGIN_M else None
+    return venue_anchor if float(np.abs(plan.bounds_m).max()) <= MAX_FROM_ORIGIN_M else None
 
 
-def geopose_of(
+def geopose_at(
     anchor: Anchor | None, position_m: tuple[float, float], heading_deg: float, camera_height_m: float
 ) -> GeoPose | None:
-    """A pose of the frame of a plan with an anchor on Earth; None for one without.
+    """Return a pose of the plan's frame on Earth; None without an anchor.
 
-    The camera's own axes are x to its right, y where its centre column looks, z up: one that looks north is not turned
-    at all. The standard leaves that open; AR clients of the OSCP GeoPose protocol have them so.
+    The camera's axes are x to its right, y towards its centre column and z up, so the angles of a camera that looks
+    north are zero. The standard leaves the axes open; AR clients of the OSCP GeoPose protocol use these.
     """
     if anchor is None:
         return None
@@ -47,21 +47,21 @@ def geopose_of(
     )
 
 
-def features_of(answer: SequenceAnswer) -> dict[str, Any] | None:
-    """An answer as a GeoJSON FeatureCollection (RFC 7946), a Feature for each pose; None without places on Earth.
-
-    What is said of all poses together stands beside the features.
-    """
-    told = answer.model_dump(mode="json", exclude={"poses"})
-    features = [_feature(pose.geopose, pose.model_dump(mode="json")) for pose in answer.poses if pose.geopose]
-    return {"type": "FeatureCollection", "features": features, **told} if features else None
-
-
-def feature_of(answer: LocaliseAnswer) -> dict[str, Any] | None:
-    """An answer as a GeoJSON Feature (RFC 7946) with the answer as its properties; None without a place on Earth."""
+def geojson_feature(answer: LocaliseAnswer) -> dict[str, Any] | None:
+    """Return an answer as a GeoJSON Feature (RFC 7946) with the answer as properties; None without a geopose."""
     if answer.geopose is None:
         return None
     return _feature(answer.geopose, answer.model_dump(mode="json"))
+
+
+def geojson_features(answer: SequenceAnswer) -> dict[str, Any] | None:
+    """Return an answer as a GeoJSON FeatureCollection (RFC 7946), one Feature for each pose; None without geoposes.
+
+    Fields about the whole sequence stand beside `features`.
+    """
+    common = answer.model_dump(mode="json", exclude={"poses"})
+    features = [_feature(pose.geopose, pose.model_dump(mode="json")) for pose in answer.poses if pose.geopose]
+    return {"type": "FeatureCollection", "features": features, **common} if features else None
 
 
 def _feature(geopose: GeoPose, properties: dict[str, Any]) -> dict[str, Any]:

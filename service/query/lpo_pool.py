@@ -1,4 +1,4 @@
-"""Latent pose optimisation in a pool of worker processes, so that the service itself never imports torch."""
+"""Pool of LPO worker processes, so that the service itself never imports torch."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _START_S, _MAX_START_S = 5.0, 120.0
 
 
 class LpoPool:
-    """Bounded pool of LPO workers whose jobs may fail for any reason: the caller then does without."""
+    """Bounded pool of LPO workers; a failed job returns None, and the answer is then not refined."""
 
     def __init__(self, bundle: Bundle, settings: Settings, telemetry: Telemetry) -> None:
         self._telemetry = telemetry
@@ -36,51 +36,39 @@ class LpoPool:
             queue_limit=settings.lpo.queue,
             on_restart=lambda _reason: telemetry.note_restart("lpo"),
         )
-        # Shown as 0 from the start, so that the first one is a rise.
+        # Counters exist with value 0 from the start, so that the first miss shows as a rise.
         for reason in get_args(LostReason):
             telemetry.lpo_missed.labels(reason)
         telemetry.gauge("lalaloc_lpo_queue_depth", "LPO jobs waiting for a worker.", lambda: self._workers.waiting)
         telemetry.gauge("lalaloc_lpo_workers_ready", "LPO workers that are warm.", lambda: self.state.ready)
-
         telemetry.gauge(
             "lalaloc_lpo_workers_resident_bytes", "Memory of all LPO workers.", lambda: self._workers.resident_bytes
         )
 
     def start(self) -> None:
-        """Start all workers; returns at once, see `state` for when they are warm."""
+        """Start all workers and return at once; `state` tells when they are warm."""
         self._workers.start()
 
     @property
     def state(self) -> PoolState:
-        """How many workers are wanted and warm."""
+        """Numbers of workers, all and warm."""
         return self._workers.state
 
-    async def refine(self, job: RefinementJob, timeout_s: float, client: str = "") -> RefinementResult | None:
-        """The result of a job, or None when there is none within `timeout_s`, whatever the reason.
-
-        Cancelling it takes a job that was not started out of the queue. Clients take turns.
-        """
-        result = await self._answer(job, timeout_s, client)
-        assert not isinstance(result, SequenceResult)
-        return result
-
-    async def refine_sequence(self, job: SequenceJob, timeout_s: float, client: str = "") -> SequenceResult | None:
-        """As `refine`, of paths."""
-        result = await self._answer(job, timeout_s, client)
-        assert not isinstance(result, RefinementResult)
-        return result
-
-    async def _answer(
-        self, job: RefinementJob | SequenceJob, timeout_s: float, client: str
+    async def refine(
+        self, job: RefinementJob | SequenceJob, timeout_s: float, client: str = ""
     ) -> RefinementResult | SequenceResult | None:
+        """Return the result of a job, or None if it failed or took longer than `timeout_s`.
+
+        Cancelling removes a job that has not started from the queue. Clients take turns.
+        """
         if self.state.workers == 0 or timeout_s <= 0.0:
             return None
         try:
-            return await self._workers.answer(job, timeout_s, client)
+            return await self._workers.run_job(job, timeout_s, client)
         except JobLostError as error:
             self._telemetry.lpo_missed.labels(error.reason).inc()
             return None
 
     def close(self, drain_s: float = 0.0) -> None:
-        """End all workers: jobs at work have `drain_s` to finish, those that wait are answered None."""
+        """End all workers: running jobs have `drain_s` (s) to finish, waiting jobs return None."""
         self._workers.close(drain_s)

@@ -1,4 +1,4 @@
-"""Requests of the OSCP GeoPose protocol as queries of this service, and its answers as the protocol has them."""
+"""Requests and answers of the OSCP GeoPose protocol, translated to and from this service's own."""
 
 from __future__ import annotations
 
@@ -25,27 +25,27 @@ from service.schemas.oscp import (
     OscpRequest,
 )
 
-# How far off a reading may be that does not say it.
+# Radius (m) for a reading without an accuracy.
 UNKNOWN_ACCURACY_M = 100.0
 _PANORAMAS = {"", "UNKNOWN", "UNKNOWN_CAMERA", "EQUIRECTANGULAR", "SPHERICAL"}
 _READING = "sensorReadings.cameraReadings.0"
 
 
-def picture_of(request: OscpRequest) -> bytes:
-    """The file of the panorama.
+def decode_picture(request: OscpRequest) -> bytes:
+    """Return the panorama file of a request.
 
     Raises:
-        InvalidRequestError: the reading is not of a camera of the request, or not of a panorama, or not in Base64.
+        InvalidRequestError: the reading names no camera of the request, is not a panorama, or is not Base64.
     """
     reading, faults = request.camera_reading, list[tuple[str, str]]()
-    if not any(one.id == reading.sensor_id and one.type == "camera" for one in request.sensors):
+    if not any(sensor.id == reading.sensor_id and sensor.type == "camera" for sensor in request.sensors):
         faults.append((f"{_READING}.sensorId", f"is '{reading.sensor_id[:50]}', sensors has no camera with this id"))
     if reading.image_format.upper() == "DEPTH":
         faults.append((f"{_READING}.imageFormat", "is 'DEPTH', a panorama in colours is needed"))
     model = "" if reading.params is None else (reading.params.model or "").upper()
     if model not in _PANORAMAS:
-        what = "the picture must be a full 360° panorama (EQUIRECTANGULAR)"
-        faults.append((f"{_READING}.params.model", f"is '{model[:50]}': {what}"))
+        fault = f"is '{model[:50]}': the picture must be a full 360° panorama (EQUIRECTANGULAR)"
+        faults.append((f"{_READING}.params.model", fault))
     orientation = reading.image_orientation
     if orientation is not None and (orientation.mirrored or orientation.rotation % 360.0):
         faults.append((f"{_READING}.imageOrientation", "must be neither mirrored nor rotated: send panoramas upright"))
@@ -59,15 +59,15 @@ def picture_of(request: OscpRequest) -> bytes:
     return content
 
 
-def place_of(reading: OscpGeolocationReading) -> tuple[EarthPoint, float]:
-    """Where a reading says that the device is, and how far off that may be (m)."""
+def reading_place(reading: OscpGeolocationReading) -> tuple[EarthPoint, float]:
+    """Return the place of a geolocation reading, and its accuracy as a radius (m)."""
     known = reading.accuracy is not None and reading.accuracy > 0.0
     radius_m = min(max(reading.accuracy or 0.0, RADIUS_RANGE_M[0]), RADIUS_RANGE_M[1]) if known else UNKNOWN_ACCURACY_M
     return EarthPoint(latitude=reading.latitude, longitude=reading.longitude), radius_m
 
 
-def away_m(place: EarthPoint, plan: FloorPlan) -> float:
-    """How far a place on Earth is from the nearest room of a plan with an anchor."""
+def distance_to_plan_m(place: EarthPoint, plan: FloorPlan) -> float:
+    """Return the distance (m) from a place on Earth to the nearest room of an anchored plan."""
     assert plan.anchor is not None
     ((x_m, y_m),) = plan.anchor.to_plan(np.array([[place.longitude, place.latitude]]))
     if not (math.isfinite(x_m) and math.isfinite(y_m)):
@@ -76,16 +76,21 @@ def away_m(place: EarthPoint, plan: FloorPlan) -> float:
 
 
 def unused_warnings(request: OscpRequest) -> list[str]:
-    """Says what was sent and has no say."""
+    """Return a warning for every part of the request that the service does not use."""
     found = [f"{name} are not used" for name in request.sensor_readings.unused]
     return [*found, "priorPoses are not used"] if request.prior_poses else found
 
 
-def answer_of(request: OscpRequest, found: LocaliseAnswer, warnings: list[str]) -> OscpAnswer:
-    """An answer as the protocol has it.
+def compose_oscp_answer(request: OscpRequest, found: LocaliseAnswer, warnings: list[str]) -> OscpAnswer:
+    """Translate an answer into the protocol.
+
+    Args:
+        request: the request.
+        found: the service's own answer.
+        warnings: warnings besides those of the answer.
 
     Raises:
-        UnanchoredPlanError: it is nowhere on Earth.
+        UnanchoredPlanError: the answer has no geopose.
     """
     if found.geopose is None:
         raise UnanchoredPlanError(found.floorplan_id, found.venue_id)
@@ -109,19 +114,20 @@ def answer_of(request: OscpRequest, found: LocaliseAnswer, warnings: list[str]) 
     )
 
 
-def _accuracy(found: LocaliseAnswer, at: GeoPose) -> OscpAccuracy:
-    """By the covariance where there is one, else by what counts as right; and by the rivals, which are elsewhere."""
+def _accuracy(found: LocaliseAnswer, answer: GeoPose) -> OscpAccuracy:
+    """Combine the covariance, or else the tolerances of a right answer, with the spread of the rival candidates."""
     variance_m2 = RIGHT_WITHIN_M**2
     if found.covariance_m2 is not None:
         variance_m2 = found.covariance_m2[0][0] + found.covariance_m2[1][1]
     std_deg = math.degrees(HEADING_WITHIN) if found.heading_std_deg is None else found.heading_std_deg
-    rivals = [(one.geopose, one.probability) for one in found.candidates if one.geopose and one.probability]
+    rivals = [(rival.geopose, rival.probability) for rival in found.candidates if rival.geopose and rival.probability]
     weight = sum(probability for _, probability in rivals)
     squared_m2 = squared_deg2 = 0.0
     if weight > 0.0:
         lon_lat = np.array([[pose.position.lon, pose.position.lat] for pose, _ in rivals])
-        apart_m = np.linalg.norm(LocalFrame(at.position.lon, at.position.lat).to_local(lon_lat), axis=1)
-        turned = np.array([pose.angles.yaw - at.angles.yaw for pose, _ in rivals])
+        frame = LocalFrame(answer.position.lon, answer.position.lat)
+        apart_m = np.linalg.norm(frame.to_local(lon_lat), axis=1)
+        turned = np.array([pose.angles.yaw - answer.angles.yaw for pose, _ in rivals])
         share = np.array([probability for _, probability in rivals]) / weight
         squared_m2 = float(share @ np.square(apart_m))
         squared_deg2 = float(share @ np.square((turned + 180.0) % 360.0 - 180.0))

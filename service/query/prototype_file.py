@@ -1,14 +1,14 @@
-"""Prototypes of many plans in one file, mapped into memory: what a replica need not read of the database again.
+"""Prototypes of many plans in one memory-mapped file, so that a replica need not read them from the database again.
 
-The file is an array of rows of `prototypes.ROW`. A block is a row that holds a header instead, and behind it the
-prototypes of one latent grid:
+The file is an array of rows of `prototypes.ROW`. A block is a header in place of a row, followed by the prototypes of
+one pose grid:
 
     magic (8 bytes), id of the grid (int64), its digest (32 bytes), version of the cells (uint32),
     number of rows (uint32), CRC-32 of the rows (uint32), CRC-32 of all that (uint32), zeros
 
-Blocks are appended and never changed. What the database says decides which are asked for: those of plans that were
-deleted or replaced are never found again, whoever asks. A file that ends in the middle of a block, or was damaged, is
-cut off there when it is opened; one that would grow beyond its limit begins anew.
+Blocks are appended and never changed. Lookups use grid ids and digests from the database, so blocks of deleted or
+replaced plans are never returned. On opening, the file is truncated after its last intact block. A file that would
+exceed its limit is started anew.
 """
 
 from __future__ import annotations
@@ -38,25 +38,25 @@ _MAGIC = b"LLROWS2\0"
 
 @dataclass(frozen=True)
 class BlockKey:
-    """Whose prototypes a block has: the id of the latent grid, and its digest (hexadecimal)."""
+    """Id and digest (hexadecimal) of the pose grid of a block."""
 
     grid_id: int
     sha256: str
 
 
 class PrototypeFile:
-    """One file of one process; safe to share between threads."""
+    """Prototype file of one process; safe to share between threads."""
 
     def __init__(self, path: Path | None, *, cells_version: int, limit_bytes: int) -> None:
-        """Open a file, or make one, and look through it: about a second for each GB.
+        """Open or create a file and scan its blocks, which takes about a second per GB.
 
         Args:
-            path: None, or one that another process has open, is a file that goes when it is closed.
-            cells_version: blocks that were sorted into other cells are not found.
-            limit_bytes: how large it may become.
+            path: path of the file; a temporary file is used for None, or if another process has it open.
+            cells_version: version of the cells; blocks of other versions are ignored.
+            limit_bytes: maximum size of the file.
 
         Raises:
-            OSError: it cannot be read or written.
+            OSError: the file cannot be read or written.
         """
         self._cells_version = cells_version
         self._limit = limit_bytes // ROW.itemsize
@@ -68,21 +68,21 @@ class PrototypeFile:
 
     @property
     def bytes(self) -> int:
-        """How large it is."""
+        """Size of the file."""
         return self._end * ROW.itemsize
 
     def find(self, keys: Iterable[BlockKey]) -> dict[BlockKey, tuple[int, int]]:
-        """Where the blocks of some grids begin in `rows`, and how many rows they have; those that there are."""
+        """Return the first row in `rows` and the number of rows of each block that is in the file."""
         with self._lock:
             return {key: self._places[key] for key in keys if key in self._places}
 
     def add(self, blocks: Mapping[BlockKey, np.ndarray]) -> None:
-        """Append prototypes, sorted into cells; where there is no room for them, in place of all that it had.
+        """Append prototypes that are sorted into cells; a full file is started anew.
 
-        Those that are more than may be in it at all are not added.
+        Prototypes that exceed the limit on their own are not added.
 
         Raises:
-            OSError: they cannot be written; the file is as before.
+            OSError: the prototypes cannot be written; the file is unchanged.
         """
         with self._lock:
             needed = sum(len(rows) + 1 for rows in blocks.values())
@@ -103,16 +103,16 @@ class PrototypeFile:
             self._end = end
 
     def rows(self) -> np.ndarray:
-        """The whole file as it is now; stays as it is when the file begins anew."""
+        """Return the whole file as it is now; the array stays valid when the file is started anew."""
         with self._lock:
             if not self._end:
                 return np.empty(0, ROW)
             return np.memmap(self._file, ROW, "r", shape=(self._end,))
 
     def close(self) -> None:
-        """Let another process have it."""
+        """Release the file for other processes."""
         if not self._file.closed:
-            # Maps that are still there keep the file open, and would keep the lock.
+            # Maps that still exist keep the file open, and would keep the lock.
             fcntl.flock(self._file, fcntl.LOCK_UN)
             self._file.close()
 
@@ -134,8 +134,8 @@ class PrototypeFile:
             self._file.truncate(self._end * ROW.itemsize)
 
     def _begin_anew(self) -> None:
-        """Queries in work keep the file that they have mapped; it goes with the last of them."""
-        logging.getLogger(LOGGER_NAME).info("the file of prototypes is full and begins anew")
+        """Replace the file by an empty one; running queries keep the mapped one until they end."""
+        logging.getLogger(LOGGER_NAME).info("the prototype file is full and is started anew")
         if self._path is not None:
             with contextlib.suppress(FileNotFoundError):
                 self._path.unlink()
@@ -158,14 +158,14 @@ def _opened(path: Path | None) -> IO[bytes]:
 
 
 def _block(content: memoryview, begin: int) -> tuple[BlockKey, int, int] | None:
-    """The block that begins at a row: whose it is, which cells it was sorted into, how many rows; None without one."""
-    at = begin * ROW.itemsize
-    header = content[at : at + ROW.itemsize]
+    """Return key, version of the cells and number of rows of the block at a row; None without an intact block."""
+    offset = begin * ROW.itemsize
+    header = content[offset : offset + ROW.itemsize]
     if len(header) < ROW.itemsize:
         return None
     (crc,) = _CRC.unpack_from(header, _HEADER.size)
     magic, grid_id, digest, version, count, rows_crc = _HEADER.unpack_from(header)
-    rows = content[at + ROW.itemsize : at + (1 + count) * ROW.itemsize]
+    rows = content[offset + ROW.itemsize : offset + (1 + count) * ROW.itemsize]
     whole = magic == _MAGIC and crc == zlib.crc32(header[: _HEADER.size]) and len(rows) == count * ROW.itemsize
     if not whole or zlib.crc32(rows) != rows_crc:
         return None

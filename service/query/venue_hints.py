@@ -1,4 +1,4 @@
-"""What a request about a venue says of where the camera stood: a prior over its plans, and over the places in them."""
+"""Hints of a request about a venue: a prior over the venue's plans, and over the places in them."""
 
 from __future__ import annotations
 
@@ -17,26 +17,29 @@ from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.localise.hints import HintName, Hints, NearInEach, log_factor, rooms_named
 from lalaloc_core.localise.pipeline import Localisation
 from lalaloc_core.localise.venue.merged_plans import MergedPlans
-from service.query.geopose import anchor_of
-from service.query.hints import contradiction, near_missed
+from service.query.geopose import plan_anchor
+from service.query.stated_camera import contradiction, near_missed
 from service.schemas.hint_fields import EarthPoint, HintFields
 from service.storage.plan_places import distances_m
 
-# Levels that an error about an unknown one names.
-_LEVELS_TOLD = 20
+# Maximum number of levels that an error message lists.
+_MAX_LEVELS_LISTED = 20
 _Rows = Sequence[Row[Any]]
 
 
 @dataclass(frozen=True, kw_only=True)
 class VenueHints:
-    """The hints of a request about a venue.
+    """Hints of a request about a venue.
 
-    Rows are of plans, as `Venues.searched` tells them.
+    Methods take rows of plans as returned by `Venues.searchable_plans`.
 
     Attributes:
-        anchor: of the venue.
-        place: where the camera is said to be near; None where nothing is said.
-        rooms: ids or names.
+        anchor: anchor of the venue.
+        place: place that the camera is near; None without that hint.
+        radius_m: radius (m) around `place`.
+        rooms: ids or names of rooms.
+        level: level of the camera; None without that hint.
+        strict: plans and places that contradict the hints are excluded.
     """
 
     anchor: Anchor | None
@@ -47,11 +50,11 @@ class VenueHints:
     strict: bool = False
 
     @classmethod
-    def of(cls, form: HintFields, anchor: Anchor | None) -> Self:
-        """What a form says.
+    def from_form(cls, form: HintFields, anchor: Anchor | None) -> Self:
+        """Return the hints of a form.
 
         Raises:
-            InvalidHintError: a point of a frame that the plans do not share.
+            InvalidHintError: a point in a frame that the plans do not share.
         """
         return cls(
             anchor=anchor,
@@ -63,47 +66,49 @@ class VenueHints:
         )
 
     def check(self, members: _Rows) -> None:
-        """See that the hints can be meant for a venue with these plans, ready or not.
+        """Check the hints against all plans of the venue, ready or not.
 
         Raises:
-            InvalidHintError: a level that none is on, or a place that none is known to be near.
+            InvalidHintError: no plan is on the level, or none is known to be near the place.
         """
         levels = sorted({row.level for row in members})
         if self.level is not None and self.level not in levels:
-            told = ", ".join(f"{level:g}" for level in levels[:_LEVELS_TOLD])
-            more = f" and {len(levels) - _LEVELS_TOLD} more" if len(levels) > _LEVELS_TOLD else ""
+            listed = ", ".join(f"{level:g}" for level in levels[:_MAX_LEVELS_LISTED])
+            more = f" and {len(levels) - _MAX_LEVELS_LISTED} more" if len(levels) > _MAX_LEVELS_LISTED else ""
             raise InvalidHintError(
-                "level", f"no floor plan of the venue is on level {self.level:g}, they are on {told}{more}"
+                "level", f"no floor plan of the venue is on level {self.level:g}; its levels are {listed}{more}"
             )
         if self.place is None:
             return
-        away_m = self._away_m(members)
-        if np.isnan(away_m).all():
+        distance_m = self._distances_m(members)
+        if np.isnan(distance_m).all():
             raise InvalidHintError(
                 "near",
-                f"neither the venue nor a floor plan of it has an anchor, so none is known to be at {self.place}",
+                f"{self.place} cannot be placed, because neither the venue nor any of its floor plans has an "
+                "anchor: add one",
             )
-        if (nearest_m := float(np.nanmin(away_m))) > self.radius_m:
+        if (nearest_m := float(np.nanmin(distance_m))) > self.radius_m:
             raise InvalidHintError(
                 "near",
-                f"{self.place} is {nearest_m:.3g} m from the nearest floor plan of the venue, farther than radius_m, "
-                f"{self.radius_m:g} m",
+                f"{self.place} is {nearest_m:.3g} m from the nearest floor plan of the venue; radius_m is "
+                f"{self.radius_m:g} m: increase it",
             )
 
     def shares(self, rows: _Rows) -> dict[HintName, float]:
-        """How much of the area of plans the hints leave that do not depend on rooms."""
+        """Return the share of the plans' area that the hints `level` and `near` leave."""
         area, found = np.array([row.area_m2 for row in rows]), dict[HintName, float]()
         if self.level is not None:
             found["level"] = float(area[self._on_level(rows)].sum() / area.sum())
         if self.place is not None:
-            known = ~np.isnan(self._away_m(rows))
+            known = ~np.isnan(self._distances_m(rows))
             found["near"] = float((area * self._within(rows))[known].sum() / max(area[known].sum(), 1e-9))
         return found
 
     def log_prior(self, rows: _Rows, shares: Mapping[HintName, float]) -> Float[np.ndarray, "p"]:
-        """Log of what hints make of the prior of plans, before rooms are looked at; -inf for what strict ones exclude.
+        """Return the log prior factors of plans by `level` and `near`; -inf for plans that a strict hint excludes.
 
         Args:
+            rows: rows of the plans.
             shares: see `shares`.
         """
         total = np.zeros(len(rows))
@@ -112,27 +117,31 @@ class VenueHints:
         if self.place is not None:
             factor = log_factor(self._within(rows), shares["near"], strict=self.strict)
             nowhere = -np.inf if self.strict else 0.0
-            total += np.where(np.isnan(self._away_m(rows)), nowhere, factor)
+            total += np.where(np.isnan(self._distances_m(rows)), nowhere, factor)
         return total
 
-    def among(
+    def in_merged_plans(
         self,
         rows: _Rows,
         plans: Sequence[FloorPlan],
-        laid: MergedPlans,
+        merged: MergedPlans,
         shares: Mapping[HintName, float],
         *,
         partly: bool,
     ) -> Hints:
-        """The hints about plans that are laid side by side.
+        """Return the hints about plans that are merged side by side.
 
         Args:
-            partly: whether others were left out, which may have the rooms that none of these has.
+            rows: rows of the plans.
+            plans: the plans.
+            merged: the plans side by side.
+            shares: see `shares`.
+            partly: other plans, which may have the rooms, are not searched.
 
         Raises:
-            InvalidHintError: a room that none of the plans has.
+            InvalidHintError: none of the plans has a room.
         """
-        counts, first = [len(plan.rooms) for plan in plans], laid.first_room
+        counts, first = [len(plan.rooms) for plan in plans], merged.first_room
         level = None
         if self.level is not None:
             on_level = np.repeat(self._on_level(rows), counts)
@@ -144,27 +153,27 @@ class VenueHints:
             )
             if not rooms and self.strict:
                 raise InvalidHintError(
-                    "rooms", f"none of the {len(plans)} floor plans that are searched has one of them"
+                    "rooms", f"none of the {len(plans)} floor plans that are searched has any of the rooms"
                 )
         near = None
         if self.place is not None:
-            point = np.stack([self._in_plan(plan) for plan in plans]) + laid.shift_m
+            point = np.stack([self._in_plan(plan) for plan in plans]) + merged.shift_m
             near = NearInEach(np.repeat(point, counts, axis=0), self.radius_m, str(self.place))
         return Hints(near=near, rooms=rooms or None, level=level, strict=self.strict, shares=shares)
 
-    def unplaced(self, rows: _Rows) -> list[str]:
-        """Says of how many plans `near` says nothing."""
-        if self.place is None or not (count := int(np.isnan(self._away_m(rows)).sum())):
+    def unplaced_warnings(self, rows: _Rows) -> list[str]:
+        """Return a warning with the number of plans whose place on Earth is unknown, if `near` is given."""
+        if self.place is None or not (count := int(np.isnan(self._distances_m(rows)).sum())):
             return []
-        what = "were not searched, near being strict" if self.strict else "near says nothing of them"
-        return [f"{count} of the venue's {len(rows)} floor plans have no anchor: {what}"]
+        effect = "were not searched, because near is strict" if self.strict else "are not affected by near"
+        return [f"{count} of the venue's {len(rows)} floor plans have no anchor and {effect}"]
 
-    def warnings(self, hints: Hints, found: Localisation, rows: _Rows, laid: MergedPlans) -> list[str]:
-        """Says which hints were not followed, or were although the panorama contradicts them."""
+    def warnings(self, hints: Hints, found: Localisation, rows: _Rows, merged: MergedPlans) -> list[str]:
+        """Return a warning for every hint that the panorama contradicts, followed or not."""
         answer = found.candidates[0]
-        row = rows[laid.plan_of(answer.room_index)]
-        room = laid.plan.rooms[answer.room_index]
-        told = {
+        row = rows[merged.plan_of(answer.room_index)]
+        room = merged.plan.rooms[answer.room_index]
+        texts = {
             "near": lambda: near_missed(hints, found),
             "rooms": lambda: (
                 f"rooms is {', '.join(repr(name) for name in self.rooms)}",
@@ -172,24 +181,26 @@ class VenueHints:
             ),
             "level": lambda: (f"level is {self.level:g}", f"the answer is on level {row.level:g}"),
         }
-        return [contradiction(*told[name](), self.strict) for name in found.hints_missed]
+        return [contradiction(*texts[name](), self.strict) for name in found.hints_missed]
 
     def _on_level(self, rows: _Rows) -> np.ndarray:
         return np.array([row.level == self.level for row in rows], bool)
 
-    def _away_m(self, rows: _Rows) -> Float[np.ndarray, "p"]:
-        """How far plans are from the place; NaN where it is not known where they are."""
+    def _distances_m(self, rows: _Rows) -> Float[np.ndarray, "p"]:
+        """Return the distances (m) of plans from the place; NaN where a plan's place is unknown."""
         assert self.place is not None
         return distances_m(rows, self.anchor, self.place.latitude, self.place.longitude)
 
     def _within(self, rows: _Rows) -> Float[np.ndarray, "p"]:
-        """About how much of each plan's area is as near the place as is said; 0 where it is not known."""
+        """Return the approximate share of each plan's area within the radius; 0 where a plan's place is unknown."""
         area = np.array([row.area_m2 for row in rows])
-        return np.where(self._away_m(rows) <= self.radius_m, np.minimum(math.pi * self.radius_m**2 / area, 1.0), 0.0)
+        return np.where(
+            self._distances_m(rows) <= self.radius_m, np.minimum(math.pi * self.radius_m**2 / area, 1.0), 0.0
+        )
 
     def _in_plan(self, plan: FloorPlan) -> Float[np.ndarray, "2"]:
-        """The place in the frame of a plan; NaN where it is not known where the plan lies."""
-        anchor = anchor_of(plan, self.anchor)
+        """Return the place in the frame of a plan; NaN where the plan's place on Earth is unknown."""
+        anchor = plan_anchor(plan, self.anchor)
         if anchor is None or self.place is None:
             return np.full(2, np.nan)
         return anchor.to_plan(np.array([[self.place.longitude, self.place.latitude]]))[0]
@@ -201,17 +212,17 @@ def _on_earth(form: HintFields, anchor: Anchor | None) -> EarthPoint | None:
     if anchor is None:
         raise InvalidHintError(
             "near",
-            "x_m and y_m are of one plan, and the venue has no anchor, which would say that its plans share a frame: "
-            "give latitude and longitude, or floorplan_id",
+            "x_m and y_m need a frame that all plans share, and the venue has no anchor: give latitude and longitude, "
+            "or floorplan_id",
         )
     ((longitude, latitude),) = anchor.to_earth(np.array([[form.near.x_m, form.near.y_m]]))
     if not (math.isfinite(latitude) and math.isfinite(longitude)):
-        raise InvalidHintError("near", f"({form.near.x_m:g}, {form.near.y_m:g}) is nowhere on Earth")
+        raise InvalidHintError("near", f"({form.near.x_m:g}, {form.near.y_m:g}) is not a place on Earth")
     return EarthPoint(latitude=float(latitude), longitude=float(longitude))
 
 
 def _rooms_called(name: str, plans: Sequence[FloorPlan], partly: bool) -> list[tuple[int, int]]:
-    """Numbers of plans, and of rooms in them, that have an id or a name."""
+    """Return (number of the plan, number of the room) for every room with this id or name."""
     found: list[tuple[int, int]] = []
     for index, plan in enumerate(plans):
         try:

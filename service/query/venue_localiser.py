@@ -1,4 +1,4 @@
-"""The query about a venue: in which of its plans was this panorama taken, and where?"""
+"""Localisation in a venue: choose the plans, lay them side by side, search them as one plan."""
 
 from __future__ import annotations
 
@@ -21,43 +21,45 @@ from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.hints import Hints
 from lalaloc_core.localise.pipeline import Localisation, LocaliseConfig, localise_steps
-from lalaloc_core.localise.poses import Candidate, PoseGrid, Query
+from lalaloc_core.localise.poses import Candidate, Query
 from lalaloc_core.localise.venue.merged_plans import MergedPlans
 from lalaloc_core.localise.venue.prototypes import share_searched
 from service.errors import NoPlanNearbyError, VenueNotReadyError, VenueUnsearchableError
 from service.grids import check_height_m
 from service.http.admission_control import Slots
-from service.query.answers import Place, compose, heading_warnings
+from service.query.answers import Place, compose_answer
 from service.query.decoding import Decoder
-from service.query.geopose import anchor_of
-from service.query.heading import known_heading
+from service.query.geopose import plan_anchor
 from service.query.localiser import Localiser
-from service.query.panorama_query import PanoramaQuery, QueryContext
+from service.query.queries import PanoramaQuery, QueryContext
+from service.query.stated_camera import known_heading
 from service.query.venue_hints import VenueHints
 from service.query.venue_plans import VenuePlans, not_excluded, venue_height
 from service.schemas import EarthPoint, LocaliseAnswer, LocaliseForm, PlanProbability
 from service.settings import Settings
 from service.storage.records import PlanRecord, VenueRecord
 
-# The right one of many plans is often not the first by its grid, so more candidates than in a single plan are refined.
+# Among many plans the right one is often not first by its grid, so more candidates are refined than in a single plan.
 VENUE_CONFIG = LocaliseConfig(by_probability=True, profile_candidates=32, profile_candidates_turned=48)
-# How often a venue is looked at none of whose plans is ready.
+# Interval (s) of polling a venue without a plan that is ready.
 _POLL_INTERVAL_S = 0.25
-# Tells the plans that are asked about, as they are at the moment.
-Members = Callable[[], Awaitable[Sequence[Row[Any]]]]
+# Function that reads the current rows of the plans to search.
+ReadPlans = Callable[[], Awaitable[Sequence[Row[Any]]]]
 
 
 @dataclass(frozen=True, eq=False)
 class _Searched:
-    """The plans that are searched in full, and how probable those chosen and those left out seemed before.
+    """Plans that are searched in full, and the prior masses of all plans.
 
     Attributes:
-        rows: as `Venues.searched` tells them.
-        log_mass: of all plans that could be asked about; None where all of them are searched.
-        index: which of those the searched ones are.
-        warnings: what was left out.
-        anchor: of the venue.
-        hints: about the plans as they lie side by side.
+        rows: rows of the searched plans, see `Venues.searchable_plans`.
+        records: the searched plans.
+        merged: the searched plans side by side.
+        log_mass: (p,) log masses of all plans that are ready; None where all of them are searched.
+        index: numbers of the searched plans among these.
+        warnings: warnings about plans that are not searched.
+        anchor: anchor of the venue.
+        hints: hints about the merged plans.
     """
 
     rows: Sequence[Row[Any]]
@@ -70,14 +72,14 @@ class _Searched:
     hints: Hints
 
     def place(self, candidate: Candidate) -> Place:
-        """Where a candidate is."""
+        """Return the plan of a candidate, and the candidate in that plan's frame."""
         number, own = self.merged.in_own_plan(candidate)
         record = self.records[number]
-        anchor, level = anchor_of(record.plan, self.anchor), self.rows[number].level
+        anchor, level = plan_anchor(record.plan, self.anchor), self.rows[number].level
         return Place(record.id, record.revision_id, record.plan, own, anchor, level)
 
     def shares(self, found: Localisation) -> tuple[float, Float[np.ndarray, "m"]]:
-        """How probable it is that the plan is among those searched, and each of these, given that it is."""
+        """Return the probability that the plan is among the searched ones, and that of each, given that it is."""
         probability = self.merged.by_plan(found.posterior.pose)
         if self.log_mass is None:
             return 1.0, probability
@@ -85,7 +87,7 @@ class _Searched:
 
 
 class VenueLocaliser:
-    """Answers queries about venues, on the threads and worker processes of queries about single plans."""
+    """Answers queries about venues, on the threads and worker processes of `Localiser`."""
 
     def __init__(
         self,
@@ -106,61 +108,65 @@ class VenueLocaliser:
         self._decoder = decoder
         self._queries = queries
 
-    async def answer(self, venue: VenueRecord, query: PanoramaQuery) -> LocaliseAnswer:
-        """Localise an encoded panorama in the plans of a venue.
+    async def localise(self, venue: VenueRecord, query: PanoramaQuery) -> LocaliseAnswer:
+        """Localise a panorama in the plans of a venue.
 
         Raises:
-            VenueUnsearchableError: the venue has no plan that is ready or will be.
-            VenueNotReadyError: none of its plans was ready by the deadline.
-            LaLaLocError: see `Localiser.answer`.
+            VenueUnsearchableError: no plan of the venue is ready or will be.
+            VenueNotReadyError: no plan of the venue was ready by the deadline.
+            LaLaLocError: see `Localiser.localise`.
         """
-        return await self._answer(venue, query, partial(self._plans.members, venue.id))
+        return await self._localise(venue, query, partial(self._plans.members, venue.id))
 
-    async def check_hints(self, venue: VenueRecord, form: LocaliseForm) -> None:
-        """Raises:
-        InvalidHintError: what the form says of the place cannot be of the venue.
-        """
-        VenueHints.of(form, venue.anchor).check(await self._plans.members(venue.id))
-
-    async def answer_near(
+    async def localise_near(
         self, tenant: str, place: EarthPoint, within_m: float, query: PanoramaQuery
     ) -> LocaliseAnswer:
-        """As `answer`, in all plans of a tenant with an anchor that lie so near a place on Earth.
+        """Localise a panorama in the tenant's anchored plans within `within_m` of a place on Earth.
 
         Raises:
-            NoPlanNearbyError: there are none.
-            LaLaLocError: see `answer`.
+            NoPlanNearbyError: no such plan exists.
+            LaLaLocError: see `localise`.
         """
-        members = await self._plans.near(tenant, place, within_m)
-        if not members:
+        rows = await self._plans.near(tenant, place, within_m)
+        if not rows:
             raise NoPlanNearbyError(str(place), within_m)
         now = datetime.now(UTC)
-        of_place = VenueRecord(
+        venue = VenueRecord(
             id=f"near {place}",
             tenant=tenant,
             revision_id="",
             revision=1,
             name="",
             anchor=None,
-            plans=len(members),
+            plans=len(rows),
             created_at=now,
             updated_at=now,
         )
-        return await self._answer(of_place, query, partial(self._plans.near, tenant, place, within_m))
+        return await self._localise(venue, query, partial(self._plans.near, tenant, place, within_m))
 
-    async def _answer(self, venue: VenueRecord, query: PanoramaQuery, members: Members) -> LocaliseAnswer:
+    async def check_hints(self, venue: VenueRecord, form: LocaliseForm) -> None:
+        """Check the form's hints against the venue's plans.
+
+        Raises:
+            InvalidHintError: a hint does not match the venue.
+        """
+        VenueHints.from_form(form, venue.anchor).check(await self._plans.members(venue.id))
+
+    async def _localise(self, venue: VenueRecord, query: PanoramaQuery, read_plans: ReadPlans) -> LocaliseAnswer:
         async with self._queries.wait_and_hold(query.context.client, query.context.deadline):
-            return await self._answer_in_slot(venue, query, members)
+            return await self._localise_in_slot(venue, query, read_plans)
 
-    async def _answer_in_slot(self, venue: VenueRecord, query: PanoramaQuery, members: Members) -> LocaliseAnswer:
+    async def _localise_in_slot(
+        self, venue: VenueRecord, query: PanoramaQuery, read_plans: ReadPlans
+    ) -> LocaliseAnswer:
         form, context, clock = query.form, query.context, query.context.clock
-        hints = VenueHints.of(form, venue.anchor)
+        hints = VenueHints.from_form(form, venue.anchor)
         with clock.stage("decode"):
             panorama = await self._decoder.decode(query.content, context.deadline, context.client)
         north = None if venue.anchor is None else heading_from_degrees(venue.anchor.north_deg)
         known = known_heading(form, north, panorama, self._settings.panoramas.compass_tolerance_deg)
         with clock.stage("wait"):
-            ready, warnings = await self._ready(venue, members, hints, context)
+            ready, warnings = await self._ready(venue, read_plans, hints, context)
         height = venue_height(form, ready)
         compute = partial(self._localiser.compute, context)
         encoded = (await compute(lambda: self._localiser.encode([panorama], [known], height, clock)))[0]
@@ -168,10 +174,9 @@ class VenueLocaliser:
             searched = await self._searched(
                 venue, ready, encoded, form=form, hints=hints, warnings=warnings, compute=compute
             )
-        merged = searched.merged
         steps = localise_steps(
-            merged.plan,
-            merged.grid,
+            searched.merged.plan,
+            searched.merged.grid,
             self._encoders,
             encoded,
             refine=form.refine,
@@ -180,19 +185,15 @@ class VenueLocaliser:
             clock=clock,
             hints=searched.hints,
         )
-        found = await self._localiser.finished(steps, context)
+        found = await self._localiser.run_search(steps, context)
         timings_ms = self._localiser.observe(context, found.stage)
-        warnings = [
-            *heading_warnings(found, known),
-            *hints.warnings(searched.hints, found, searched.rows, merged),
-            *searched.warnings,
-        ]
+        hint_warnings = hints.warnings(searched.hints, found, searched.rows, searched.merged)
         share, probability = searched.shares(found)
-        answer = compose(
+        answer = compose_answer(
             found,
             locate=searched.place,
             known=known,
-            warnings=warnings,
+            warnings=[*hint_warnings, *searched.warnings],
             timings_ms=timings_ms,
             bundle=self._bundle,
             share=share,
@@ -201,12 +202,12 @@ class VenueLocaliser:
         return answer.model_copy(update={"venue_id": venue.id, "plans": plans[: form.top_k]})
 
     async def _ready(
-        self, venue: VenueRecord, tell: Members, hints: VenueHints, context: QueryContext
+        self, venue: VenueRecord, read_plans: ReadPlans, hints: VenueHints, context: QueryContext
     ) -> tuple[Sequence[Row[Any]], list[str]]:
-        """The plans that can be asked about, waited for while there is none, and what is to be said of the others."""
+        """Return the plans that are ready, waiting for the first one, and warnings about the other plans."""
         begin = monotonic()
         while True:
-            members = await tell()
+            members = await read_plans()
             if members:
                 hints.check(members)
             ready = [row for row in members if row.grid_id is not None]
@@ -238,9 +239,9 @@ class VenueLocaliser:
         warnings: list[str],
         compute: Callable[..., Any],
     ) -> _Searched:
-        """The plans that are searched in full: all of few, the most probable ones of many."""
+        """Return the plans that are searched in full: all if they are few, else the most probable ones."""
         rows, log_mass, index = ready, None, list(range(len(ready)))
-        shares, warnings = hints.shares(ready), [*warnings, *hints.unplaced(ready)]
+        shares, warnings = hints.shares(ready), [*warnings, *hints.unplaced_warnings(ready)]
         if query.profile is not None and self._plans.needs_choice(ready, query):
             possible = not_excluded(ready, hints.log_prior(ready, shares))
             known, plan_index = await self._plans.index(possible, compute)
@@ -248,10 +249,11 @@ class VenueLocaliser:
             chosen = await compute(partial(self._plans.choose, known, plan_index, query, weights, log_prior))
             rows, log_mass, index = chosen.members, chosen.log_mass, chosen.index.tolist()
             if hints.rooms:
-                told = f"rooms was looked for in the {len(rows)} most probable ones of {len(ready)} floor plans"
-                warnings.append(told)
+                warnings.append(
+                    f"rooms was looked for in the {len(rows)} most probable ones of {len(ready)} floor plans"
+                )
         loaded = await self._plans.load(venue.tenant, rows)
-        kept = [one for one in loaded if _may_stand(one[1], form)]
+        kept = [entry for entry in loaded if _height_is_possible(entry[1], form)]
         if len(kept) < len(loaded):
             left_out = len(loaded) - len(kept)
             warnings = [*warnings, f"{left_out} floor plans have ceilings below camera_height_m and were not searched"]
@@ -259,45 +261,42 @@ class VenueLocaliser:
             if loaded:
                 check_height_m(loaded[0][1], query.camera_height.height_m)
             raise VenueNotReadyError(venue.id, venue.plans, 0.0)
-        place = {row.plan_id: number for row, number in zip(rows, index, strict=True)}
-        merged = await compute(partial(_laid_out, kept, query))
-        searched_rows, plans = [row for row, _, _ in kept], [record.plan for _, record, _ in kept]
+        number = {row.plan_id: position for row, position in zip(rows, index, strict=True)}
+        searched_rows, records = [row for row, _, _ in kept], [record for _, record, _ in kept]
+        plans, grids = [record.plan for record in records], [grid for _, _, grid in kept]
+        merged = await compute(partial(MergedPlans.of, plans, grids, query.camera_height.height_m))
         return _Searched(
             rows=searched_rows,
-            records=[record for _, record, _ in kept],
+            records=records,
             merged=merged,
             log_mass=log_mass,
-            index=[place[row.plan_id] for row, _, _ in kept],
+            index=[number[row.plan_id] for row in searched_rows],
             warnings=warnings,
             anchor=venue.anchor,
             hints=await compute(
-                partial(hints.among, searched_rows, plans, merged, shares, partly=log_mass is not None)
+                partial(hints.in_merged_plans, searched_rows, plans, merged, shares, partly=log_mass is not None)
             ),
         )
 
     def _plan_probabilities(
         self, rows: Sequence[Row[Any]], found: Localisation, share: float, probability: Float[np.ndarray, "m"]
     ) -> list[PlanProbability]:
-        """The plans that were searched, the most probable first.
-
-        Args:
-            share, probability: see `_Searched.shares`.
-        """
+        """Return the searched plans, most probable first; `share` and `probability` as in `_Searched.shares`."""
         model = self._bundle.manifest.confidence
         fits = None if model is None else found.fit_probability(model)
+        ranked = sorted(zip(probability.tolist(), rows, strict=True), key=lambda entry: -entry[0])
         return [
             PlanProbability(
                 floorplan_id=row.plan_id,
                 level=row.level,
                 name=row.name,
-                probability=None if fits is None else min(fits * share * of_plan, 1.0),
+                probability=None if fits is None else min(fits * share * plan_probability, 1.0),
             )
-            for of_plan, row in sorted(zip(probability.tolist(), rows, strict=True), key=lambda one: -one[0])
+            for plan_probability, row in ranked
         ]
 
 
-def _may_stand(record: PlanRecord, form: LocaliseForm) -> bool:
-    """Whether the camera height of a request is possible in a plan."""
+def _height_is_possible(record: PlanRecord, form: LocaliseForm) -> bool:
     if form.camera_height_m is None:
         return True
     try:
@@ -305,8 +304,3 @@ def _may_stand(record: PlanRecord, form: LocaliseForm) -> bool:
     except InvalidPoseError:
         return False
     return True
-
-
-def _laid_out(loaded: Sequence[tuple[Row[Any], PlanRecord, PoseGrid]], query: Query) -> MergedPlans:
-    plans, grids = [record.plan for _, record, _ in loaded], [grid for _, _, grid in loaded]
-    return MergedPlans.of(plans, grids, query.camera_height.height_m)

@@ -1,4 +1,4 @@
-"""Which plans of a venue a query is compared with, and in what form."""
+"""Plans of a venue: the rows of all of them, and the choice of those that a query searches in full."""
 
 from __future__ import annotations
 
@@ -37,26 +37,26 @@ from service.storage.records import PlanRecord, VenueState
 from service.telemetry import LOGGER_NAME
 from service.threads import BoundedReads
 
-# Plans that are searched in full, and what that may come to: poses times hypotheses of the heading times camera
-# heights. How many poses their grids may have besides is an argument of `VenuePlans`.
+# Limits of the plans searched in full: their number, and poses × heading hypotheses × camera heights. `VenuePlans` also
+# limits the poses of their grids.
 MAX_SEARCHED = 128
 _MAX_COMPARISONS = 8_000_000
-# The largest circle around a plan, whose centre may be as far from a place that it covers; and plans near one place.
+# Maximum radius of the circle around a plan, and maximum number of plans near a place.
 _MAX_REACH_M = 1000.0
 _MAX_NEAR = 2000
-# Prototypes that are read at a time, so that one read is short.
+# Prototypes per read, so that a read is short.
 _BATCH_SIZE = 1000
-# About what a plan takes in memory besides its prototypes: its row.
+# Approximate memory of a plan's row.
 _ROW_BYTES = 600
 
 
-# Runs a call on the threads that compute for queries.
+# Function that runs CPU work on the threads of `Localiser`.
 Compute = Callable[[Callable[[], Any]], Awaitable[Any]]
 
 
 @dataclass(frozen=True, eq=False)
 class _Venue:
-    """The plans of a venue, which hold as long as its state stays."""
+    """Rows of a venue's plans, valid for one state of the venue."""
 
     state: VenueState
     rows: Sequence[Row[Any]]
@@ -64,7 +64,7 @@ class _Venue:
 
 @dataclass(frozen=True, eq=False)
 class _Indexed:
-    """The index of some plans: of which of those that were asked for, in their order."""
+    """Index of plans, and the numbers of these plans among the requested ones."""
 
     place: Int[np.ndarray, "p"]
     index: PlanIndex
@@ -72,12 +72,12 @@ class _Indexed:
 
 @dataclass(frozen=True, eq=False)
 class ChosenPlans:
-    """What is searched in full, the most probable first.
+    """Plans that are searched in full, most probable first.
 
     Attributes:
-        members: the plans as `Venues.searched` tells them.
-        log_mass: (p,) of all plans that are ready, chosen or not; see `localise.venue.plan_index`.
-        index: (m,) which of those were chosen.
+        members: rows of the plans, see `Venues.searchable_plans`.
+        log_mass: (p,) log masses of all plans that are ready, see `localise.venue.plan_index`.
+        index: (m,) numbers of the chosen plans among these.
     """
 
     members: Sequence[Row[Any]]
@@ -86,11 +86,10 @@ class ChosenPlans:
 
 
 class VenuePlans:
-    """Finds the plans of a venue, and chooses among them by an index of their prototypes.
+    """Reader of a venue's plans, which chooses among them by an index of their prototypes.
 
-    Prototypes lie in a file of this replica, which is filled from the database with what is asked for. Which plans a
-    venue has, and where their prototypes are, is kept in memory for as long as the database says that nothing of it has
-    changed.
+    Prototypes lie in a file of this replica, filled from the database on demand. The rows of a venue's plans and the
+    places of their prototypes stay in memory until the state of the venue changes.
     """
 
     def __init__(
@@ -104,69 +103,75 @@ class VenuePlans:
         limit_bytes: int,
         max_poses: int,
     ) -> None:
-        """Args:
-        path: of the file of prototypes; None for one that is gone with the process.
-        file_bytes: how large that may become.
-        limit_bytes: memory for what is kept of venues.
-        max_poses: that the grids of chosen plans may have in sum.
+        """Create the reader; files are opened on first use.
+
+        Args:
+            store: the store.
+            grids: provider of pose grids.
+            reads: threads for reads of the store.
+            path: path of the prototype file; None for a temporary one.
+            file_bytes: maximum size of that file.
+            limit_bytes: memory limit for each of the two caches, of rows and of indices.
+            max_poses: maximum number of poses in all grids of the chosen plans.
         """
         self._store = store
         self._grids = grids
         self._reads = reads
         self._path, self._file_bytes = path, file_bytes
         self._max_poses = max_poses
-        self._venues: BoundedCache[str, _Venue] = BoundedCache(limit_bytes, lambda one: _ROW_BYTES * len(one.rows))
-        # By a digest of the plans' grids, in their order.
+        self._venues: BoundedCache[str, _Venue] = BoundedCache(limit_bytes, lambda venue: _ROW_BYTES * len(venue.rows))
+        # Keys are digests of the plans' grids in order.
         self._indices: BoundedCache[bytes, _Indexed] = BoundedCache(
-            limit_bytes, lambda one: one.place.nbytes + one.index.nbytes
+            limit_bytes, lambda indexed: indexed.place.nbytes + indexed.index.nbytes
         )
         self._file: PrototypeFile | None = None
         self._building = threading.Lock()
 
     async def members(self, venue_id: str) -> Sequence[Row[Any]]:
-        """All plans of a venue as they are now, each once."""
+        """Return the current row of every plan of a venue."""
         return await self._reads.run(self._members, venue_id)
 
     async def near(self, tenant: str, place: EarthPoint, within_m: float) -> Sequence[Row[Any]]:
-        """Plans of a tenant with an anchor that lie so near a place, the nearest first."""
+        """Return rows of the tenant's anchored plans within `within_m` of a place, nearest first."""
         latitude, longitude = place.latitude, place.longitude
         reach_m = within_m + _MAX_REACH_M
-        near = self._store.venues.searched_near
+        near = self._store.venues.searchable_plans_near
         rows = await self._reads.run(near, tenant, latitude, longitude, reach_m, *self._grids.model)
-        away_m = distances_m(rows, None, latitude, longitude)
-        order = np.argsort(away_m, kind="stable")
-        unique = {rows[int(k)].plan_id: rows[int(k)] for k in order if away_m[k] <= within_m}
+        distance_m = distances_m(rows, None, latitude, longitude)
+        order = np.argsort(distance_m, kind="stable")
+        unique = {rows[int(k)].plan_id: rows[int(k)] for k in order if distance_m[k] <= within_m}
         return list(unique.values())[:_MAX_NEAR]
 
     def needs_choice(self, ready: Sequence[Row[Any]], query: Query) -> bool:
-        """Whether not all of some plans can be searched in full."""
+        """Tell whether the plans are too many, or too large, to search all of them in full."""
         return len(ready) > MAX_SEARCHED or sum(row.poses for row in ready) > most_poses(query, self._max_poses)
 
     async def index(self, ready: Sequence[Row[Any]], compute: Compute) -> tuple[Sequence[Row[Any]], PlanIndex]:
-        """The index of plans that are ready, with the plans in its order: without those whose grid is gone by now.
+        """Return the index of plans that are ready, and their rows in its order, without plans whose grid was deleted.
 
-        Prototypes of grids that were stored without, or by an earlier version of the service, are made and stored.
+        Prototypes that are missing, or of an earlier format, are made and stored.
 
         Args:
-            compute: what takes the processor is done with it.
+            ready: rows of the plans.
+            compute: runs CPU work.
         """
-        asked = hashlib.sha256("".join(f"{row.grid_id} {row.grid_sha256} " for row in ready).encode()).digest()
-        indexed = self._indices.get(asked)
+        digest = hashlib.sha256("".join(f"{row.grid_id} {row.grid_sha256} " for row in ready).encode()).digest()
+        indexed = self._indices.get(digest)
         if indexed is None:
             found = await compute(partial(self._in_file, ready))
             fresh = await self._fetched([row for row in ready if _key(row) not in found])
             place = np.array([k for k, row in enumerate(ready) if _key(row) in found or _key(row) in fresh], np.intp)
             if not len(place):
-                # Gone since a moment: whoever asks again finds what took their place.
+                # All were deleted or replaced just now; a retry finds the current ones.
                 raise StoreUnavailableError
             there = [ready[int(k)] for k in place]
             index = await compute(partial(self._indexed, there, fresh))
             if index is None:
-                # The file has no room for all of them: this index has them in memory.
+                # The file has no room for all of them, so this index keeps them in memory.
                 fresh |= await self._fetched([row for row in there if _key(row) not in fresh])
                 index = await compute(partial(self._in_memory, there, fresh))
             indexed = _Indexed(place, index)
-            self._indices.put(asked, indexed)
+            self._indices.put(digest, indexed)
         return [ready[int(k)] for k in indexed.place], indexed.index
 
     def choose(
@@ -177,10 +182,14 @@ class VenuePlans:
         weights: MatchingWeights,
         log_prior: Float[np.ndarray, "p"],
     ) -> ChosenPlans:
-        """The most probable plans of an index.
+        """Return the most probable plans of an index.
 
         Args:
-            log_prior: what is known of plans beforehand.
+            known: rows of the index's plans.
+            index: the index.
+            query: the encoded panorama.
+            weights: weights of the matching cost.
+            log_prior: (p,) log prior of the plans.
         """
         log_mass = index.log_masses(query, weights, MatchingConfig()) + log_prior
         poses = np.array([row.poses for row in known])
@@ -188,7 +197,7 @@ class VenuePlans:
         return ChosenPlans([known[int(k)] for k in chosen], log_mass, chosen)
 
     async def load(self, tenant: str, members: Sequence[Row[Any]]) -> list[tuple[Row[Any], PlanRecord, PoseGrid]]:
-        """Chosen plans with their grids; those that were deleted or replaced a moment ago are left out."""
+        """Return chosen plans with their pose grids, without those that were deleted or replaced meanwhile."""
         loaded = []
         for row in members:
             record = await self._reads.run(self._store.plans.get_revision, tenant, row.plan_id, row.revision_id)
@@ -199,16 +208,16 @@ class VenuePlans:
         return loaded
 
     def close(self) -> None:
-        """Let another process have the file."""
+        """Release the prototype file for other processes."""
         if self._file is not None:
             self._file.close()
 
     def _members(self, venue_id: str) -> Sequence[Row[Any]]:
-        # The state first: what changes in between is found out by the next query.
+        # State before rows: a change in between makes the next query read the rows again.
         state = self._store.venues.state(venue_id, *self._grids.model)
         venue = self._venues.get(venue_id)
         if venue is None or venue.state != state:
-            rows = self._store.venues.searched(venue_id, *self._grids.model)
+            rows = self._store.venues.searchable_plans(venue_id, *self._grids.model)
             venue = _Venue(state, list({row.plan_id: row for row in rows}.values()))
             self._venues.put(venue_id, venue)
         return venue.rows
@@ -218,7 +227,7 @@ class VenuePlans:
             return self._opened().find(_key(row) for row in ready)
 
     async def _fetched(self, rows: Sequence[Row[Any]]) -> dict[BlockKey, SortedPrototypes]:
-        """Prototypes of some plans from the database; those that it has not are made, of grids that are still there."""
+        """Return prototypes of plans from the database; missing ones are made from the stored grids."""
         fetched: dict[BlockKey, SortedPrototypes] = {}
         for first in range(0, len(rows), _BATCH_SIZE):
             part = rows[first : first + _BATCH_SIZE]
@@ -233,15 +242,15 @@ class VenuePlans:
         return fetched
 
     def _indexed(self, known: Sequence[Row[Any]], fresh: Mapping[BlockKey, SortedPrototypes]) -> PlanIndex | None:
-        """The index of some plans, of which some are not in the file yet; None where that has no room for them."""
+        """Add prototypes to the file and index it; None if it has no room for all plans."""
         keys = [_key(row) for row in known]
         with self._building:
             file = self._opened()
             there = file.find(fresh)
             try:
-                file.add({key: one.in_shipped_cells() for key, one in fresh.items() if key not in there})
+                file.add({key: prototypes.in_shipped_cells() for key, prototypes in fresh.items() if key not in there})
             except OSError as error:
-                logging.getLogger(LOGGER_NAME).warning("cannot write the file of prototypes: %s", error)
+                logging.getLogger(LOGGER_NAME).warning("cannot write the prototype file: %s", error)
             rows, found = file.rows(), file.find(keys)
         if not all(key in found for key in keys):
             return None
@@ -260,41 +269,40 @@ class VenuePlans:
             try:
                 self._file = PrototypeFile(self._path, cells_version=version, limit_bytes=limit_bytes)
             except OSError as error:
-                logging.getLogger(LOGGER_NAME).warning("cannot open the file of prototypes: %s", error)
+                logging.getLogger(LOGGER_NAME).warning(
+                    "cannot open the prototype file, using a temporary one: %s", error
+                )
                 self._file = PrototypeFile(None, cells_version=version, limit_bytes=limit_bytes)
         return self._file
 
 
 def most_poses(query: Query, max_poses: int) -> int:
-    """How many poses all plans may have that are searched in full: so many comparisons, and at most `max_poses`."""
+    """Return the maximum number of poses in all plans that are searched in full."""
     return min(max_poses, _MAX_COMPARISONS // (len(query.roll) * len(query.camera_height.offsets)))
 
 
 def not_excluded(ready: Sequence[Row[Any]], log_prior: Float[np.ndarray, "p"]) -> Sequence[Row[Any]]:
-    """The plans that are possible at all.
+    """Return the plans with a finite log prior.
 
     Raises:
-        InvalidHintError: none is.
+        InvalidHintError: there is none.
     """
     possible = np.isfinite(log_prior)
     if possible.all():
         return ready
     if not possible.any():
-        raise InvalidHintError("strict", f"all hints hold in none of the {len(ready)} floor plans that are ready")
+        raise InvalidHintError("strict", f"none of the {len(ready)} floor plans that are ready matches all hints")
     return [ready[k] for k in np.flatnonzero(possible).tolist()]
 
 
 def venue_height(form: LocaliseForm, ready: Sequence[Row[Any]]) -> CameraHeight:
-    """What is known of the camera's height before anything is compared, the same for all plans of a venue.
-
-    What the request says, else what all plans say, if they say the same; else nothing: then any height is possible.
-    """
+    """Return the camera height in the request, else the one that all plans of a venue share, else an unknown one."""
     if form.camera_height_m is not None:
         std_m = DEFAULT_STD_M if form.camera_height_std_m is None else form.camera_height_std_m
         return CameraHeight(form.camera_height_m, std_m)
-    said = Counter((row.camera_height_m, row.camera_height_std_m) for row in ready)
-    (height_m, std_m), _ = said.most_common(1)[0]
-    if len(said) > 1 or std_m is None:
+    heights = Counter((row.camera_height_m, row.camera_height_std_m) for row in ready)
+    (height_m, std_m), _ = heights.most_common(1)[0]
+    if len(heights) > 1 or std_m is None:
         std_m = math.inf
     return CameraHeight(height_m, std_m if form.camera_height_std_m is None else form.camera_height_std_m)
 

@@ -106,7 +106,7 @@ def list_floorplans(
     """
     after = None if cursor is None else parse_cursor(cursor)
     # One more than asked for tells whether there is another page.
-    found = runtime.store.plans.list(tenant, limit=limit + 1, after=after, name=name)
+    found = runtime.store.plans.list_plans(tenant, limit=limit + 1, after=after, name=name)
     page = found[:limit]
     more = cursor_text(Cursor(page[-1].created_at, page[-1].id)) if len(found) > limit else None
     return FloorPlanList(floorplans=list_entries(page, runtime.grids), next_cursor=more)

@@ -23,7 +23,7 @@ from service.http.json_body import parse_document
 from service.http.problems import problem_responses
 from service.http.uploads import JSON, Parts, UploadLimits, media_type, read_body
 from service.query import PanoramaQuery, QueryContext
-from service.query.oscp import answer_of, away_m, picture_of, place_of, unused_warnings
+from service.query.oscp import compose_oscp_answer, decode_picture, distance_to_plan_m, reading_place, unused_warnings
 from service.routes.dependencies import IDEMPOTENCY_KEY, Client, Running, Tenant, plan_for_query, venue_for_query
 from service.routes.query_request import QUERY_ERRORS
 from service.runtime import Runtime
@@ -85,7 +85,7 @@ async def geopose(
 
     def read() -> tuple[OscpRequest, bytes]:
         parsed = parse_document(OscpRequest, body)
-        content = picture_of(parsed)
+        content = decode_picture(parsed)
         if len(content) > most:
             raise UploadTooLargeError(limits.name, most, len(content))
         return parsed, content
@@ -95,7 +95,7 @@ async def geopose(
         query = _Query(runtime, tenant, asked, content, context)
         found, warnings = await query.answer(floorplan_id, venue_id)
         add_log_fields(request, plan=found.floorplan_id, revision=found.floorplan_revision, stage=found.stage)
-        told = answer_of(asked, found, [*unused_warnings(asked), *warnings])
+        told = compose_oscp_answer(asked, found, [*unused_warnings(asked), *warnings])
         return Response(told.model_dump_json(), media_type=JSON)
 
     named = {name: value for name, value in (("floorplan_id", floorplan_id), ("venue_id", venue_id)) if value}
@@ -113,7 +113,7 @@ class _Query:
         self._content = content
         self._context = context
         reading = asked.geolocation
-        self._place = None if reading is None else place_of(reading)
+        self._place = None if reading is None else reading_place(reading)
 
     async def answer(self, floorplan_id: str | None, venue_id: str | None) -> tuple[LocaliseAnswer, list[str]]:
         """The answer, and what is to be said of the geolocation reading."""
@@ -127,7 +127,7 @@ class _Query:
         place, radius_m = self._place
         # Plans near a place are asked about as a venue is.
         form = self._form(venue_id="near").model_copy(update={"near": place, "radius_m": radius_m})
-        found = await self._runtime.venue_localiser.answer_near(self._tenant, place, radius_m, self._about(form))
+        found = await self._runtime.venue_localiser.localise_near(self._tenant, place, radius_m, self._about(form))
         return found, []
 
     async def _in_plan(self, floorplan_id: str) -> tuple[LocaliseAnswer, list[str]]:
@@ -137,11 +137,11 @@ class _Query:
         form, warnings = self._form(floorplan_id=record.id), list[str]()
         if self._place is not None:
             place, radius_m = self._place
-            if (off_m := away_m(place, record.plan)) <= radius_m:
+            if (off_m := distance_to_plan_m(place, record.plan)) <= radius_m:
                 form = form.model_copy(update={"near": place, "radius_m": radius_m})
             else:
                 warnings = [_contradicted(f"is {off_m:.3g} m from the floor plan, its accuracy is {radius_m:g} m")]
-        return await self._runtime.localiser.answer(record, self._about(form)), warnings
+        return await self._runtime.localiser.localise(record, self._about(form)), warnings
 
     async def _in_venue(self, venue_id: str) -> tuple[LocaliseAnswer, list[str]]:
         venue, localiser = await venue_for_query(self._tenant, venue_id, self._runtime), self._runtime.venue_localiser
@@ -154,7 +154,7 @@ class _Query:
                 form = near
             except InvalidHintError as error:
                 warnings = [_contradicted(f"has no say: {error.reason}")]
-        return await localiser.answer(venue, self._about(form)), warnings
+        return await localiser.localise(venue, self._about(form)), warnings
 
     def _about(self, form: LocaliseForm) -> PanoramaQuery:
         return PanoramaQuery(form, self._content, self._context)

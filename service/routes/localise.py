@@ -23,7 +23,7 @@ from service.http.accept import preferred
 from service.http.problems import problem_responses
 from service.http.uploads import GEOJSON, JSON, MULTIPART, media_type
 from service.query import PanoramaQuery, PictureRequest
-from service.query.geopose import feature_of
+from service.query.geopose import geojson_feature
 from service.routes.dependencies import Client, Running, Tenant, plan_for_query, venue_for_query
 from service.routes.query_request import PANORAMA, QUERY_ERRORS, body_schema, check_idempotent_media, read_query
 from service.runtime import Runtime
@@ -107,7 +107,7 @@ async def localise(
         if form.venue_id is not None:
             venue = await venue_for_query(tenant, form.venue_id, runtime)
             add_log_fields(request, venue=venue.id)
-            found = await runtime.venue_localiser.answer(venue, query)
+            found = await runtime.venue_localiser.localise(venue, query)
             add_log_fields(request, plan=found.floorplan_id, revision=found.floorplan_revision, stage=found.stage)
             return await _told(found, media, tenant, runtime)
         assert form.floorplan_id is not None
@@ -116,12 +116,12 @@ async def localise(
         if media == GEOJSON and record.plan.anchor is None:
             raise UnanchoredPlanError(record.id)
         if media in (JSON, GEOJSON):
-            found = await runtime.localiser.answer(record, query)
+            found = await runtime.localiser.localise(record, query)
             add_log_fields(request, stage=found.stage)
             return await _told(found, media, tenant, runtime)
         rooms = await runtime.drawings.rooms(record)
-        wanted = PictureRequest(picture=picture or "both", pixels=media == _PNG, rooms=rooms)
-        found, drawn = await runtime.localiser.picture(record, query, wanted)
+        wanted = PictureRequest(picture=picture or "both", as_png=media == _PNG, rooms=rooms)
+        found, drawn = await runtime.localiser.localise_and_draw(record, query, wanted)
         add_log_fields(request, stage=found.stage)
         return Response(drawn, headers=_VARY | _POLICY, media_type=media)
 
@@ -144,7 +144,7 @@ async def _told(answer: LocaliseAnswer, media: str, tenant: str, runtime: Runtim
     """
     if media != GEOJSON:
         return Response(await _text(answer, tenant, runtime), headers=_VARY, media_type=JSON)
-    feature = feature_of(answer)
+    feature = geojson_feature(answer)
     if feature is None:
         raise UnanchoredPlanError(answer.floorplan_id, answer.venue_id)
     return Response(json.dumps(feature), headers=_VARY, media_type=GEOJSON)

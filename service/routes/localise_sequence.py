@@ -14,7 +14,7 @@ from service.http.accept import preferred
 from service.http.problems import problem_responses
 from service.http.uploads import GEOJSON, JSON, MULTIPART, Parts, media_type
 from service.query import SequenceQuery
-from service.query.geopose import features_of
+from service.query.geopose import geojson_features
 from service.routes.dependencies import Client, Running, Tenant, plan_for_query
 from service.routes.query_request import PANORAMA, QUERY_ERRORS, body_schema, check_idempotent_media, read_query
 from service.schemas import SequenceAnswer, SequenceForm
@@ -66,9 +66,9 @@ async def localise_sequence(request: Request, runtime: Running, tenant: Tenant, 
         add_log_fields(request, plan=record.id, revision=record.revision_id)
         if media == GEOJSON and record.plan.anchor is None:
             raise UnanchoredPlanError(record.id)
-        found = await runtime.localiser.answer_sequence(record, query)
+        found = await runtime.localiser.localise_sequence(record, query)
         add_log_fields(request, stage=found.stage)
-        content = found.model_dump_json() if media == JSON else json.dumps(features_of(found))
+        content = found.model_dump_json() if media == JSON else json.dumps(geojson_features(found))
         return Response(content, headers={"Vary": "Accept"}, media_type=media)
 
     return await idempotent.run_async(parts, answer, runtime.reads)

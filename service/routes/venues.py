@@ -113,7 +113,7 @@ def list_venues(
 ) -> VenueList:
     """Stored venues, newest first."""
     after = None if cursor is None else parse_cursor(cursor)
-    found = runtime.store.venues.list(tenant, limit=limit + 1, after=after, name=name)
+    found = runtime.store.venues.list_venues(tenant, limit=limit + 1, after=after, name=name)
     page = found[:limit]
     more = cursor_text(Cursor(page[-1].created_at, page[-1].id)) if len(found) > limit else None
     return VenueList(venues=[venue_summary(record) for record in page], next_cursor=more)

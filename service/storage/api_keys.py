@@ -36,7 +36,7 @@ class ApiKeys:
         with self._database.writing() as connection:
             return _key(connection.execute(API_KEYS.insert().values(**values).returning(API_KEYS)).one())
 
-    def list(self, tenant: str | None = None) -> list[ApiKey]:
+    def list_keys(self, tenant: str | None = None) -> list[ApiKey]:
         """Keys, oldest first; of one tenant or of all."""
         query = select(API_KEYS).order_by(API_KEYS.c.created_at, API_KEYS.c.id)
         if tenant is not None:

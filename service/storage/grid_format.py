@@ -16,9 +16,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.poses import PoseGrid
 from lalaloc_core.localise.venue.prototype_cells import Cells, shipped_cells
-from lalaloc_core.localise.venue.prototypes import ROW, Prototypes
+from lalaloc_core.localise.venue.prototypes import ROW, Prototypes, prototypes_of
 from lalaloc_core.render.sampling import PoseSet
 
 _HEADER = struct.Struct("<4s3I")
@@ -41,6 +42,11 @@ class SortedPrototypes:
         rows = prototypes.rows.copy()
         rows["cell"] = cells.sort(rows)
         return cls(rows, cells.version)
+
+    @classmethod
+    def of_grid(cls, grid: PoseGrid, plan: FloorPlan) -> SortedPrototypes:
+        """Make the prototypes of a plan's pose grid, sorted into the shipped cells."""
+        return cls.of(prototypes_of(grid, plan), shipped_cells())
 
     def in_shipped_cells(self) -> np.ndarray:
         """The rows, sorted anew where that was into other cells."""

@@ -35,7 +35,7 @@ def place_columns(plan: FloorPlan) -> dict[str, float | None]:
     return columns
 
 
-def may_lie_near(latitude: float, longitude: float, within_m: float) -> ColumnElement[bool]:
+def lies_in_box(latitude: float, longitude: float, within_m: float) -> ColumnElement[bool]:
     """Plans whose centres may lie so near a place, and some more: those in a box around it."""
     high = within_m / _DEGREE_M
     near = FLOORPLANS.c.latitude.between(latitude - high, latitude + high)
@@ -49,19 +49,19 @@ def may_lie_near(latitude: float, longitude: float, within_m: float) -> ColumnEl
 
 
 def distances_m(
-    rows: Sequence[Any], of_venue: Anchor | None, latitude: float, longitude: float
+    rows: Sequence[Any], venue_anchor: Anchor | None, latitude: float, longitude: float
 ) -> Float[np.ndarray, "n"]:
     """How far the circles around plans are from a place, 0 within one; NaN for plans whose place is not known.
 
     Args:
         rows: with `centre_x_m`, `centre_y_m`, `reach_m`, `latitude` and `longitude` of plans.
-        of_venue: where plans without an anchor of their own lie.
+        venue_anchor: where plans without an anchor of their own lie.
     """
     lon_lat = np.array([[_number(row.longitude), _number(row.latitude)] for row in rows]).reshape(-1, 2)
     centre = np.array([[_number(row.centre_x_m), _number(row.centre_y_m)] for row in rows]).reshape(-1, 2)
     unknown = np.isnan(lon_lat[:, 0])
-    if of_venue is not None and unknown.any():
-        lon_lat[unknown] = of_venue.to_earth(centre[unknown])
+    if venue_anchor is not None and unknown.any():
+        lon_lat[unknown] = venue_anchor.to_earth(centre[unknown])
     away = LocalFrame(longitude, latitude).to_local(lon_lat)
     reach = np.array([_number(row.reach_m) for row in rows])
     # What cannot be projected is not a number, but infinitely far.

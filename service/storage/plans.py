@@ -3,33 +3,63 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import logging
 import uuid
 from collections.abc import Collection
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from typing import Any
 
 from sqlalchemy import Connection, Row, delete, func, select, text, update
 
+from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import DEFAULT_STD_M
 from service.errors import DamagedDataError, RevisionMismatchError, TooManyFloorPlansError, UnknownFloorPlanError
-from service.storage.chunks import read_chunks, write_chunks
 from service.storage.database import Database
 from service.storage.grid_format import PackedGrid, pack
-from service.storage.pages import newest_first
 from service.storage.plan_cache import PlanCache
-from service.storage.plan_document import PlanDocument
 from service.storage.plan_places import place_columns
 from service.storage.records import JSON, ComputedGrid, Cursor, GridKey, Original, PlanRecord, PlanSummary
-from service.storage.stored_grids import insert_grid, select_summaries
+from service.storage.statements import newest_first, read_chunks, select_summaries, write_chunks
+from service.storage.stored_grids import insert_grid
 from service.storage.tables import FLOORPLANS, LATENT_GRIDS, ORIGINAL_CHUNKS, REVISIONS
-from service.storage.venues import take_out_of_venues
+from service.storage.venues import remove_from_venues
 from service.telemetry import LOGGER_NAME
 
 # Uploads take turns on PostgreSQL, so that the number of plans is exact; differs from the lock of `migration`.
 _COUNT_LOCK = 5_210_002
+
+
+@dataclass(frozen=True)
+class PlanDocument:
+    """Stored form of a plan, which was validated at upload; reading it back checks only its digest.
+
+    Attributes:
+        document: the plan in the native format.
+        document_sha256: its digest; None in a database of an earlier version of the service.
+        warnings: warnings of the validation as a JSON list; None likewise.
+    """
+
+    document: str
+    document_sha256: str | None
+    warnings: str | None
+
+    @classmethod
+    def from_plan(cls, plan: FloorPlan) -> PlanDocument:
+        """Return the stored form of a plan."""
+        document = json.dumps(plan.to_dict())
+        return cls(document, _digest(document), json.dumps(plan.warnings))
+
+    def plan(self) -> FloorPlan | None:
+        """Return the plan; None if the document is damaged."""
+        if self.document_sha256 is not None and _digest(self.document) != self.document_sha256:
+            return None
+        try:
+            return FloorPlan.from_stored(self.document, None if self.warnings is None else json.loads(self.warnings))
+        except (InvalidFloorPlanError, ValueError, TypeError):
+            return None
 
 
 @dataclass(frozen=True)
@@ -44,7 +74,7 @@ class _Content:
     @classmethod
     def of(cls, record: PlanRecord, original: Original, grid: ComputedGrid | None) -> _Content:
         packed = None if grid is None else (grid.key(record.revision_id), pack(grid.grid, grid.prototypes))
-        return cls(PlanDocument.of(record.plan), original, hashlib.sha256(original.content).hexdigest(), packed)
+        return cls(PlanDocument.from_plan(record.plan), original, hashlib.sha256(original.content).hexdigest(), packed)
 
 
 @dataclass(frozen=True)
@@ -92,12 +122,12 @@ class Plans:
         with self._database.writing() as connection:
             if self._database.is_postgresql:
                 connection.execute(text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": _COUNT_LOCK})
-            stored = self._find(connection, _current_head(tenant, plan_id))
+            stored = self._find(connection, _select_current(tenant, plan_id))
             if stored is None:
                 own = select(func.count()).select_from(FLOORPLANS).where(FLOORPLANS.c.tenant == tenant)
                 if (connection.scalar(own) or 0) >= limit:
                     raise TooManyFloorPlansError(limit)
-                values = {"id": plan_id, "tenant": tenant, "created_at": now, **_head(record)}
+                values = {"id": plan_id, "tenant": tenant, "created_at": now, **_revision_values(record)}
                 connection.execute(FLOORPLANS.insert(), values)
                 _insert_revision(connection, record, content)
         if stored is not None:
@@ -141,7 +171,7 @@ class Plans:
             number = (connection.scalar(select(func.max(REVISIONS.c.number)).where(own)) or 0) + 1
             record = replace(record, revision=number, created_at=row.created_at)
             _insert_revision(connection, record, content)
-            connection.execute(update(FLOORPLANS).where(FLOORPLANS.c.id == plan_id).values(**_head(record)))
+            connection.execute(update(FLOORPLANS).where(FLOORPLANS.c.id == plan_id).values(**_revision_values(record)))
             connection.execute(delete(REVISIONS).where(own, REVISIONS.c.number <= number - keep))
             old = select(REVISIONS.c.id).where(own, REVISIONS.c.number < number - 1)
             connection.execute(delete(LATENT_GRIDS).where(LATENT_GRIDS.c.revision_id.in_(old)))
@@ -150,7 +180,7 @@ class Plans:
 
     def get(self, tenant: str, plan_id: str) -> PlanRecord | None:
         """A plan at its current revision."""
-        record = self._one(_current_head(tenant, plan_id))
+        record = self._get(_select_current(tenant, plan_id))
         if record is None:
             self._cache.forget(tenant, plan_id)
         else:
@@ -160,13 +190,13 @@ class Plans:
     def get_revision(self, tenant: str, plan_id: str, revision_id: str) -> PlanRecord | None:
         """A plan at any revision that is kept."""
         query = _select_heads(current=False).where(FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
-        return self._one(query.where(REVISIONS.c.id == revision_id))
+        return self._get(query.where(REVISIONS.c.id == revision_id))
 
-    def by_revision(self, revision_id: str) -> PlanRecord | None:
+    def get_by_revision(self, revision_id: str) -> PlanRecord | None:
         """A plan at some revision, whoever's it is: for work on grids, which knows no tenants."""
-        return self._one(_select_heads(current=False).where(REVISIONS.c.id == revision_id))
+        return self._get(_select_heads(current=False).where(REVISIONS.c.id == revision_id))
 
-    def is_kept(self, revision_id: str) -> bool:
+    def has_revision(self, revision_id: str) -> bool:
         """Whether there is a revision, whosever it is."""
         with self._database.reading() as connection:
             return connection.scalar(select(REVISIONS.c.id).where(REVISIONS.c.id == revision_id)) is not None
@@ -196,7 +226,7 @@ class Plans:
             raise _damaged("original", plan_id, row.id)
         return Original(content, row.original_media_type or JSON, row.report)
 
-    def list(
+    def list_plans(
         self, tenant: str, *, limit: int, after: Cursor | None = None, name: str | None = None
     ) -> list[PlanSummary]:
         """Plans, newest first.
@@ -228,7 +258,7 @@ class Plans:
             if revision_id is not None and expected not in (None, revision_id):
                 raise RevisionMismatchError(plan_id, expected, revision_id)
             if revision_id is not None:
-                take_out_of_venues(connection, plan_id)
+                remove_from_venues(connection, plan_id)
             deleted = connection.execute(delete(FLOORPLANS).where(*own)).rowcount == 1
         self._cache.forget(tenant, plan_id)
         return deleted
@@ -243,7 +273,7 @@ class Plans:
         with self._database.writing() as connection:
             connection.execute(update(REVISIONS).where(REVISIONS.c.failure.is_not(None)).values(failure=None))
 
-    def current(self, revision_ids: Collection[str]) -> set[str]:
+    def current_revisions(self, revision_ids: Collection[str]) -> set[str]:
         """Those among some revisions that are the current ones of their plans."""
         query = select(FLOORPLANS.c.revision_id).where(FLOORPLANS.c.revision_id.in_(revision_ids))
         with self._database.reading() as connection:
@@ -253,7 +283,7 @@ class Plans:
         with self._database.reading() as connection:
             return [PlanSummary(**row._mapping) for row in connection.execute(query)]
 
-    def _one(self, query: Any) -> PlanRecord | None:
+    def _get(self, query: Any) -> PlanRecord | None:
         with self._database.reading() as connection:
             found = self._find(connection, query)
         return None if found is None else self._record(found)
@@ -283,6 +313,10 @@ class Plans:
         return PlanRecord(**row._mapping, plan=plan)
 
 
+def _digest(document: str) -> str:
+    return hashlib.sha256(document.encode("utf-8", "surrogatepass")).hexdigest()
+
+
 def _record(
     plan: FloorPlan,
     original: Original,
@@ -306,7 +340,7 @@ def _record(
     )
 
 
-def _head(record: PlanRecord) -> dict[str, Any]:
+def _revision_values(record: PlanRecord) -> dict[str, Any]:
     """What changes in the table of plans with a revision."""
     name = record.plan.name
     return {
@@ -331,7 +365,7 @@ def _insert_revision(connection: Connection, record: PlanRecord, content: _Conte
         "plan_id": record.id,
         "number": record.revision,
         "created_at": record.updated_at,
-        **content.document.columns(),
+        **asdict(content.document),
         "original_sha256": content.original_sha256,
         "original_media_type": content.original.media_type,
         "report": content.original.report,
@@ -353,7 +387,7 @@ def _height_std_m(plan: FloorPlan) -> float | None:
     return DEFAULT_STD_M if plan.states_camera_height else None
 
 
-def _current_head(tenant: str, plan_id: str) -> Any:
+def _select_current(tenant: str, plan_id: str) -> Any:
     return _select_heads(current=True).where(FLOORPLANS.c.id == plan_id, FLOORPLANS.c.tenant == tenant)
 
 

@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
+from alembic.migration import MigrationContext
+from alembic.operations import Operations
+from alembic.script import ScriptDirectory
 from alembic.script.revision import RevisionError
 from alembic.util import CommandError
+from sqlalchemy import text
 from sqlalchemy.exc import ArgumentError, SQLAlchemyError
 
 from lalaloc_core.errors import ConfigError
@@ -12,13 +18,15 @@ from service.storage.api_keys import ApiKeys
 from service.storage.database import Database
 from service.storage.idempotency_keys import MIN_LEASE_S, IdempotencyKeys
 from service.storage.kept_answers import KeptAnswers
-from service.storage.migration import migrate
 from service.storage.plan_cache import PlanCache
 from service.storage.plans import Plans
 from service.storage.stored_grids import GridLeases, StoredGrids
 from service.storage.venues import Venues
 
 _CLAIM_MARGIN_S = 5.0
+_MIGRATIONS = Path(__file__).parent / "migrations"
+# Advisory lock on PostgreSQL; any number that differs from the other locks, see `plans` and `venues`.
+_MIGRATION_LOCK = 5_210_001
 
 
 class Store:
@@ -59,7 +67,7 @@ class Store:
         """
         try:
             database = Database(url, connections=connections, wait_s=wait_s)
-            migrate(database)
+            _migrate(database)
         except (ArgumentError, CommandError, RevisionError, ImportError, OSError, SQLAlchemyError) as error:
             raise ConfigError(f"cannot open the database: {error}") from error
         self._database = database
@@ -100,3 +108,28 @@ def open_store(settings: Settings) -> Store:
         claim_s=max(MIN_LEASE_S, settings.requests.request_deadline_s + _CLAIM_MARGIN_S),
         plan_cache_bytes=settings.storage.plan_cache_bytes,
     )
+
+
+def _migrate(database: Database) -> None:
+    """Run the missing migrations in one transaction; replicas that start together take turns.
+
+    Raises:
+        CommandError, RevisionError: the database was last used by a newer version of the service.
+        SQLAlchemyError: a migration failed; the database is unchanged.
+    """
+    script = ScriptDirectory(str(_MIGRATIONS))
+    head = script.get_current_head()
+    assert head is not None
+    with database.engine_for_writing.begin() as connection:
+        # On SQLite the transaction is the lock, because it begins as a writer.
+        if database.is_postgresql:
+            connection.execute(text("SET LOCAL statement_timeout = 0"))
+            connection.execute(text("SET LOCAL lock_timeout = '60s'"))
+            connection.execute(text("SELECT pg_advisory_xact_lock(:lock)"), {"lock": _MIGRATION_LOCK})
+        context = MigrationContext.configure(connection)
+        current = context.get_current_revision()
+        steps = reversed(list(script.iterate_revisions(head, current or "base")))
+        with Operations.context(context):
+            for step in steps:
+                step.module.upgrade()
+                context.stamp(script, step.revision)

@@ -10,7 +10,6 @@ from sqlalchemy import ColumnElement, Connection, Table, and_, delete, exists, f
 from sqlalchemy.exc import IntegrityError
 
 from lalaloc_core.localise.poses import PoseGrid
-from service.storage.chunks import read_exactly, write_chunks
 from service.storage.database import Database
 from service.storage.grid_format import (
     PackedGrid,
@@ -22,6 +21,14 @@ from service.storage.grid_format import (
     unpack_prototypes,
 )
 from service.storage.records import GridKey, PlanSummary
+from service.storage.statements import (
+    is_complete_grid,
+    is_own_grid,
+    is_own_height,
+    read_exactly,
+    select_summaries,
+    write_chunks,
+)
 from service.storage.tables import FLOORPLANS, GRID_CHUNKS, GRID_LEASES, LATENT_GRIDS, REVISIONS
 from service.telemetry import LOGGER_NAME
 
@@ -40,7 +47,7 @@ class StoredGrids:
         columns = LATENT_GRIDS.c
         with self._database.reading() as connection:
             query = select(columns.id, columns.size_bytes, columns.sha256).where(
-                *_where(LATENT_GRIDS, key), has_digest()
+                *_where(LATENT_GRIDS, key), is_complete_grid()
             )
             row = connection.execute(query).one_or_none()
             if row is None:
@@ -81,7 +88,7 @@ class StoredGrids:
         """Poses of the stored grids of a model, by revision and camera height (mm); of all revisions, or some."""
         columns = LATENT_GRIDS.c
         query = select(columns.revision_id, columns.camera_height_mm, columns.poses).where(
-            columns.model_sha256 == model_sha256, columns.step_m == step_m, has_digest()
+            columns.model_sha256 == model_sha256, columns.step_m == step_m, is_complete_grid()
         )
         if revision_ids is not None:
             query = query.where(columns.revision_id.in_(revision_ids))
@@ -212,22 +219,6 @@ def insert_grid(connection: Connection, key: GridKey, packed: PackedGrid) -> Non
     write_chunks(connection, GRID_CHUNKS, {"grid_id": grid_id}, memoryview(packed.content))
 
 
-def select_summaries() -> Any:
-    """A query for the columns of `PlanSummary`, of all plans at their current revision."""
-    return select(
-        FLOORPLANS.c.id,
-        FLOORPLANS.c.revision_id,
-        REVISIONS.c.number.label("revision"),
-        FLOORPLANS.c.created_at,
-        FLOORPLANS.c.updated_at,
-        FLOORPLANS.c.name,
-        REVISIONS.c.room_count,
-        REVISIONS.c.area_m2,
-        REVISIONS.c.camera_height_m,
-        REVISIONS.c.failure,
-    ).join_from(FLOORPLANS, REVISIONS, FLOORPLANS.c.revision_id == REVISIONS.c.id)
-
-
 def _columns(key: GridKey) -> dict[str, Any]:
     return {
         "revision_id": key.revision_id,
@@ -239,19 +230,6 @@ def _columns(key: GridKey) -> dict[str, Any]:
 
 def _where(table: Table, key: GridKey) -> list[ColumnElement[bool]]:
     return [table.c[name] == value for name, value in _columns(key).items()]
-
-
-def has_digest() -> ColumnElement[bool]:
-    """Whether a row of the table of grids counts: an earlier version of the service, beside this one, writes none."""
-    return LATENT_GRIDS.c.sha256.is_not(None)
-
-
-def is_own_height(table: Table) -> ColumnElement[bool]:
-    """Whether a row is for the plan's own camera height; half a millimetre more or less is the same one."""
-    return and_(
-        table.c.camera_height_mm >= REVISIONS.c.camera_height_m * 1000.0 - 0.501,
-        table.c.camera_height_mm <= REVISIONS.c.camera_height_m * 1000.0 + 0.501,
-    )
 
 
 def _drop_older_models(connection: Connection, key: GridKey) -> None:
@@ -281,11 +259,4 @@ def _make_room(connection: Connection, key: GridKey, *, keep: int, always_keep_m
 
 
 def _unprepared(model_sha256: str, step_m: float) -> list[ColumnElement[bool]]:
-    own_grid = (
-        LATENT_GRIDS.c.revision_id == REVISIONS.c.id,
-        LATENT_GRIDS.c.model_sha256 == model_sha256,
-        LATENT_GRIDS.c.step_m == step_m,
-        has_digest(),
-        is_own_height(LATENT_GRIDS),
-    )
-    return [REVISIONS.c.failure.is_(None), ~exists().where(*own_grid)]
+    return [REVISIONS.c.failure.is_(None), ~exists().where(is_own_grid(model_sha256, step_m))]

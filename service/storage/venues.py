@@ -30,8 +30,7 @@ from sqlalchemy import (
 from lalaloc_core.floorplan.earth import Anchor
 from service.errors import InvalidRequestError, RevisionMismatchError, TooManyVenuesError, UnknownVenueError
 from service.storage.database import Database
-from service.storage.pages import newest_first
-from service.storage.plan_places import may_lie_near
+from service.storage.plan_places import lies_in_box
 from service.storage.records import (
     Cursor,
     VenueCounts,
@@ -40,7 +39,7 @@ from service.storage.records import (
     VenueRecord,
     VenueState,
 )
-from service.storage.stored_grids import has_digest, is_own_height
+from service.storage.statements import is_own_grid, newest_first
 from service.storage.tables import FLOORPLANS, LATENT_GRIDS, REVISIONS, VENUE_PLANS, VENUES
 
 # Whoever makes venues takes turns on PostgreSQL, so that their number is exact; differs from the other locks.
@@ -50,7 +49,7 @@ _BATCH_SIZE = 1000
 # Ids in one refusal.
 _NAMED = 5
 # What a query needs to know of a plan, but for its level and its name.
-_SEARCHED = (
+_SEARCH_COLUMNS = (
     FLOORPLANS.c.id.label("plan_id"),
     FLOORPLANS.c.revision_id,
     FLOORPLANS.c.centre_x_m,
@@ -166,7 +165,7 @@ class Venues:
             row = _find(connection, tenant, venue_id)
         return None if row is None else _record(row)
 
-    def list(
+    def list_venues(
         self, tenant: str, *, limit: int, after: Cursor | None = None, name: str | None = None
     ) -> list[VenueRecord]:
         """Venues, newest first.
@@ -189,7 +188,7 @@ class Venues:
             level: only plans of this one.
         """
         own_level, plan_id = VENUE_PLANS.c.level, VENUE_PLANS.c.plan_id
-        query = _select_plans(venue_id)
+        query = select(plan_id, own_level, VENUE_PLANS.c.name).where(VENUE_PLANS.c.venue_id == venue_id)
         if level is not None:
             query = query.where(own_level == level)
         if after is not None:
@@ -204,8 +203,7 @@ class Venues:
         ready = case((grid.is_not(None), plan))
         failed = case((and_(grid.is_(None), failure.is_not(None)), plan))
         counts = select(*(func.count(distinct(counted)) for counted in (plan, ready, failed)))
-        joined = VENUE_PLANS.join(FLOORPLANS, FLOORPLANS.c.id == VENUE_PLANS.c.plan_id)
-        query = _with_grids(counts, joined, model_sha256, step_m).where(VENUE_PLANS.c.venue_id == venue_id)
+        query = _in_venue(counts, venue_id, model_sha256, step_m)
         with self._database.reading() as connection:
             return VenueCounts(*connection.execute(query).one())
 
@@ -215,15 +213,14 @@ class Venues:
         failed = case((and_(grid.is_(None), REVISIONS.c.failure.is_not(None)), 1))
         sums = (func.coalesce(func.sum(summed), 0) for summed in (REVISIONS.c.number, grid))
         counts = select(func.count(), func.count(grid), func.count(failed), *sums)
-        joined = VENUE_PLANS.join(FLOORPLANS, FLOORPLANS.c.id == VENUE_PLANS.c.plan_id)
-        query = _with_grids(counts, joined, model_sha256, step_m).where(VENUE_PLANS.c.venue_id == venue_id)
+        query = _in_venue(counts, venue_id, model_sha256, step_m)
         with self._database.reading() as connection:
             revision_id = connection.scalar(select(own_revision).where(VENUES.c.id == venue_id))
             counted = connection.execute(query).one()
         # PostgreSQL sums up to decimals.
         return VenueState(revision_id, *map(int, counted))
 
-    def searched(self, venue_id: str, model_sha256: str, step_m: float) -> Sequence[Row[Any]]:
+    def searchable_plans(self, venue_id: str, model_sha256: str, step_m: float) -> Sequence[Row[Any]]:
         """What a query needs to know of every plan of a venue.
 
         Returns:
@@ -232,18 +229,17 @@ class Venues:
             `grid_sha256` and `poses`, None where it is not stored.
         """
         name = func.coalesce(VENUE_PLANS.c.name, FLOORPLANS.c.name).label("name")
-        columns = (VENUE_PLANS.c.level, name, *_SEARCHED)
-        joined = VENUE_PLANS.join(FLOORPLANS, FLOORPLANS.c.id == VENUE_PLANS.c.plan_id)
-        query = _with_grids(select(*columns), joined, model_sha256, step_m).where(VENUE_PLANS.c.venue_id == venue_id)
+        columns = (VENUE_PLANS.c.level, name, *_SEARCH_COLUMNS)
+        query = _in_venue(select(*columns), venue_id, model_sha256, step_m)
         with self._database.reading() as connection:
             return connection.execute(query.order_by(VENUE_PLANS.c.level, VENUE_PLANS.c.plan_id)).all()
 
-    def searched_near(
+    def searchable_plans_near(
         self, tenant: str, latitude: float, longitude: float, within_m: float, model_sha256: str, step_m: float
     ) -> Sequence[Row[Any]]:
         """As `searched`, of the plans of a tenant that may lie so near a place; all are on level 0."""
-        columns = (literal(0.0).label("level"), FLOORPLANS.c.name, *_SEARCHED)
-        near = may_lie_near(latitude, longitude, within_m)
+        columns = (literal(0.0).label("level"), FLOORPLANS.c.name, *_SEARCH_COLUMNS)
+        near = lies_in_box(latitude, longitude, within_m)
         query = _with_grids(select(*columns), FLOORPLANS, model_sha256, step_m)
         with self._database.reading() as connection:
             return connection.execute(query.where(FLOORPLANS.c.tenant == tenant, near).order_by(FLOORPLANS.c.id)).all()
@@ -262,7 +258,7 @@ class Venues:
             return connection.execute(delete(VENUES).where(VENUES.c.id == venue_id)).rowcount == 1
 
 
-def take_out_of_venues(connection: Connection, plan_id: str) -> None:
+def remove_from_venues(connection: Connection, plan_id: str) -> None:
     """Before a plan is deleted, in the same transaction: every venue that has it gets a revision without it."""
     own = select(VENUE_PLANS.c.venue_id).where(VENUE_PLANS.c.plan_id == plan_id)
     venues = select(VENUES.c.id).where(VENUES.c.id.in_(own)).order_by(VENUES.c.id).with_for_update()
@@ -363,24 +359,16 @@ def _count(connection: Connection, venue_id: str) -> int:
     return connection.scalar(select(func.count()).select_from(VENUE_PLANS).where(own)) or 0
 
 
-def _select_plans(venue_id: str) -> Any:
-    """A query for the columns of `VenueMember`."""
-    return select(VENUE_PLANS.c.plan_id, VENUE_PLANS.c.level, VENUE_PLANS.c.name).where(
-        VENUE_PLANS.c.venue_id == venue_id
-    )
+def _in_venue(query: Any, venue_id: str, model_sha256: str, step_m: float) -> Any:
+    """Return a query about the plans of a venue, joined as in `_with_grids`."""
+    plans = VENUE_PLANS.join(FLOORPLANS, FLOORPLANS.c.id == VENUE_PLANS.c.plan_id)
+    return _with_grids(query, plans, model_sha256, step_m).where(VENUE_PLANS.c.venue_id == venue_id)
 
 
 def _with_grids(query: Any, plans: FromClause, model_sha256: str, step_m: float) -> Any:
     """Plans joined with their current revision, and with their own grids where those are."""
-    own_grid = and_(
-        LATENT_GRIDS.c.revision_id == REVISIONS.c.id,
-        LATENT_GRIDS.c.model_sha256 == model_sha256,
-        LATENT_GRIDS.c.step_m == step_m,
-        has_digest(),
-        is_own_height(LATENT_GRIDS),
-    )
-    joined = plans.join(REVISIONS, REVISIONS.c.id == FLOORPLANS.c.revision_id).outerjoin(LATENT_GRIDS, own_grid)
-    return query.select_from(joined)
+    joined = plans.join(REVISIONS, REVISIONS.c.id == FLOORPLANS.c.revision_id)
+    return query.select_from(joined.outerjoin(LATENT_GRIDS, is_own_grid(model_sha256, step_m)))
 
 
 def _named(ids: Sequence[str]) -> str:

@@ -1,5 +1,5 @@
-"""The programs that run in worker processes: `decode.py` opens pictures, `convert.py` plans, `lpo.py` optimises poses.
+"""Programs of the worker processes: `decode.py` for pictures, `convert.py` for plan files, `lpo.py` for refinement.
 
-Begin with `process.py`, the loop that all run in. `service.pools` starts such processes and watches over them; nothing
-of it is loaded in them, and nothing is re-exported here, as every worker would load it.
+Begin with `process.py`, the loop that all of them run. `service.pools` starts and supervises these processes; it is not
+loaded in them, and this package re-exports nothing, because every worker would load it.
 """

@@ -1,7 +1,7 @@
-"""The body of a conversion worker process: the only place of the service that reads drawings and models.
+"""Program of a conversion worker process, the only part of the service that reads drawings and models.
 
-From `ImportJob` to `Imported`, from `ExportJob` to bytes, or to the `ConversionRefusal` of what cannot be read or
-written. The libraries of a format are loaded with its first file; `service.workers.process` has the rest.
+It turns an `ImportJob` into an `Imported`, an `ExportJob` into a file, and either into a `ConversionRefusal` if the
+file cannot be read or written. The libraries of a format are loaded with its first file.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from lalaloc_core.importers import (
 )
 from service.workers.process import address_space_bytes, limit_memory, serve_jobs
 
-# A worker that has grown by this share of what it may is replaced: what libraries keep must not stand in the way of
-# the next file.
+# A worker that has grown by this share of its limit is replaced, so that memory kept by libraries does not fail the
+# next file.
 _WORN = 0.5
 
 
 @dataclass(frozen=True)
 class ImportJob:
-    """A file of a plan, and what was said about it."""
+    """Uploaded plan file, and the options of its import."""
 
     content: bytes
     options: ImportOptions
@@ -40,7 +40,7 @@ class ImportJob:
 
 @dataclass(frozen=True)
 class ExportJob:
-    """A plan, as the store has it, that is to be written in a format."""
+    """Stored plan document to be written in a format."""
 
     document: str
     format: str
@@ -48,13 +48,13 @@ class ExportJob:
 
 @dataclass(frozen=True)
 class Imported:
-    """What was understood of a file.
+    """Result of an import.
 
     Attributes:
-        document: the plan in the native format, which whoever gets it validates: it comes from a process that read
-            a stranger's file.
-        report: of the import, as JSON has it.
-        media_type: of the file.
+        document: the plan in the native format. The service must validate it, because it comes from a process that read
+            an untrusted file.
+        report: the import report as JSON values.
+        media_type: media type of the file.
     """
 
     document: dict[str, Any]
@@ -64,17 +64,23 @@ class Imported:
 
 @dataclass(frozen=True)
 class ConversionRefusal:
-    """Why a file is no plan, or a plan no such file; `kind` says which error that is."""
+    """Reason why a file cannot be read as a plan, or a plan cannot be written.
+
+    Attributes:
+        reason: text of the error.
+        kind: class of the error.
+        room: room that the error is about.
+        names: names of levels, or purpose and name of a missing extra.
+    """
 
     reason: str
     kind: Literal["invalid", "levels", "extra"] = "invalid"
     room: str | None = None
-    # Names of levels, or the one of an extra with what it is needed for.
     names: tuple[str, ...] = field(default=())
 
     @classmethod
     def of(cls, error: InvalidFloorPlanError | MissingExtraError) -> ConversionRefusal:
-        """The refusal that an error is."""
+        """Return the refusal for an error."""
         if isinstance(error, MissingExtraError):
             return cls(str(error), "extra", names=(error.what, error.extra))
         if isinstance(error, SeveralLevelsError):
@@ -82,7 +88,7 @@ class ConversionRefusal:
         return cls(error.reason, room=error.room)
 
     def error(self) -> InvalidFloorPlanError | MissingExtraError:
-        """The error again."""
+        """Return the error for the refusal."""
         if self.kind == "extra":
             return MissingExtraError(*self.names)
         if self.kind == "levels":
@@ -91,21 +97,23 @@ class ConversionRefusal:
 
 
 def report_of(imported: ImportedPlan) -> dict[str, Any]:
-    """The report of an import, with the storey that the plan is of, as JSON has it."""
+    """Return the report of an import, with the storey of the plan, as JSON values."""
     level = imported.level
-    told = None
+    storey = None
     if level is not None:
-        told = {"name": level.name, "number": level.number, "elevation_m": level.elevation_m}
-    return imported.report.to_dict() | {"level": told}
+        storey = {"name": level.name, "number": level.number, "elevation_m": level.elevation_m}
+    return imported.report.to_dict() | {"level": storey}
 
 
 def run_converter(connection: Connection, limits: ImportLimits, memory_bytes: int) -> None:
-    """Answer files with plans, and plans with files.
+    """Run import and export jobs until the pipe closes.
 
     Args:
-        memory_bytes: what a file may need, the libraries that read it included.
+        connection: the worker's end of the pipe.
+        limits: limits of imported files.
+        memory_bytes: memory limit of a file, including the libraries that read it.
     """
-    # One thread: each has room of its own in what may be used.
+    # One thread, because every thread reserves its own part of the limited memory.
     os.environ["OPENCV_FOR_THREADS_NUM"] = "1"
     begin_bytes = address_space_bytes()
     limit_memory(memory_bytes)
@@ -124,7 +132,8 @@ def _converting(limits: ImportLimits) -> Callable[[ImportJob | ExportJob], Impor
             return ConversionRefusal.of(error)
         except MemoryError:
             return ConversionRefusal(
-                "the file takes more memory than there is for one (import_memory_bytes); make it simpler"
+                "reading the file exceeds the memory limit (LALALOC_IMPORT_MEMORY_BYTES): simplify the file, or "
+                "raise the limit"
             )
 
     return convert
@@ -141,5 +150,5 @@ def _export(job: ExportJob) -> bytes:
 
 
 def _plain(document: Mapping[str, Any]) -> dict[str, Any]:
-    """As JSON has it, without types of any library."""
+    """Return a document as plain JSON values, without types of any library."""
     return json.loads(json.dumps(document))

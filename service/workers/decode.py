@@ -1,7 +1,7 @@
-"""The body of a decoding worker process: the only place of the service that opens pictures it was sent.
+"""Program of a decoding worker process, the only part of the service that opens uploaded pictures.
 
-From the bytes of an upload to a `Panorama`, or to the `DecodeRefusal` of what is none; and, as that keeps the
-interpreter busy for as long, from drawings to pixels. The rest is in `service.workers.process`.
+It turns an uploaded file into a `Panorama` or a `DecodeRefusal`. It also rasterises drawings, which keeps the
+interpreter busy for as long.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from service.workers.process import limit_memory, serve_jobs
 
 @dataclass(frozen=True)
 class DecodeJob:
-    """An uploaded picture, and the size that its pixels are wanted in."""
+    """Uploaded picture, and the size (pixels) of the panorama to return."""
 
     content: bytes
     height: int
@@ -27,24 +27,27 @@ class DecodeJob:
 
 @dataclass(frozen=True)
 class RasteriseJob:
-    """A drawing that is wanted as PNG."""
+    """Drawing to turn into a PNG file."""
 
     svg: str
 
 
 @dataclass(frozen=True)
 class DecodeRefusal:
-    """Why a picture is no usable panorama."""
+    """Reason why a picture is not a usable panorama."""
 
     reason: str
 
 
 def run_decoder(connection: Connection, height: int, width: int, limits: PanoramaLimits, memory_bytes: int) -> None:
-    """Answer uploads with panoramas, and drawings with their pixels.
+    """Run decoding and rasterising jobs until the pipe closes.
 
     Args:
-        height, width: of the usual panorama, to be warm for it.
-        memory_bytes: what decoding may need, besides what the process has before its first picture.
+        connection: the worker's end of the pipe.
+        height: usual height (pixels) of a panorama, for which the worker warms up.
+        width: usual width (pixels).
+        limits: limits of panorama files.
+        memory_bytes: memory limit of decoding, besides what the process uses before its first picture.
     """
     serve_jobs(connection, lambda: _load(height, width, limits, memory_bytes))
 

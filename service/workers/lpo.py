@@ -1,7 +1,6 @@
-"""The body of an LPO worker process: the only place of the service that imports torch.
+"""Program of an LPO worker process, the only part of the service that imports torch.
 
-From `RefinementJob` to `RefinementResult`, and from `SequenceJob` to `SequenceResult`; `service.workers.process` has
-the rest.
+It turns a `RefinementJob` into a `RefinementResult`, and a `SequenceJob` into a `SequenceResult`.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from service.workers.process import serve_jobs
 
 
 def run_worker(connection: Connection, bundle_folder: str, model_sha256: str, threads: int) -> None:
-    """Load the optimiser, warm it up, then answer jobs until the pipe closes."""
+    """Load and warm up the refiner, then run jobs until the pipe closes."""
     for variable in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ[variable] = str(threads)
     serve_jobs(connection, lambda: load_refiner(Path(bundle_folder), model_sha256, threads))
@@ -31,10 +30,10 @@ def run_worker(connection: Connection, bundle_folder: str, model_sha256: str, th
 def load_refiner(
     bundle_folder: Path, model_sha256: str, threads: int
 ) -> Callable[[RefinementJob | SequenceJob], RefinementResult | SequenceResult]:
-    """Load the optimiser and warm it up: what answers jobs.
+    """Load the refiner, warm it up, and return the function from job to result.
 
     Raises:
-        RuntimeError: the bundle is not the one with that digest.
+        RuntimeError: the bundle on disk has another digest.
     """
     import torch
 
@@ -43,19 +42,19 @@ def load_refiner(
     torch.set_num_threads(threads)
     bundle = Bundle.open(bundle_folder)
     if bundle.sha256 != model_sha256:
-        raise RuntimeError("the bundle on disk is no longer the one the service runs")
-    optimiser = PoseRefiner.from_bundle(bundle)
+        raise RuntimeError(f"the bundle in {bundle_folder} changed to {bundle.sha256}: restart the service")
+    refiner = PoseRefiner.from_bundle(bundle)
     for optimise_heading, by_profile in product((False, True), repeat=2):
-        optimiser.refine(warm_up_job(bundle.manifest, optimise_heading=optimise_heading, by_profile=by_profile))
+        refiner.refine(warm_up_job(bundle.manifest, optimise_heading=optimise_heading, by_profile=by_profile))
 
     def refine(job: RefinementJob | SequenceJob) -> RefinementResult | SequenceResult:
-        return refine_sequence(job) if isinstance(job, SequenceJob) else optimiser.refine(job)
+        return refine_sequence(job) if isinstance(job, SequenceJob) else refiner.refine(job)
 
     return refine
 
 
 def warm_up_job(manifest: Manifest, *, optimise_heading: bool, by_profile: bool) -> RefinementJob:
-    """A small job, so that the first real one does not pay for what is built on first use."""
+    """Return a small job that triggers everything that is built on first use."""
     plan = FloorPlan.from_dict(
         {"ceiling_height_m": 2.5, "rooms": [{"polygon": [[0.0, 0.0], [4.0, 0.0], [4.0, 3.0], [0.0, 3.0]]}]}
     )

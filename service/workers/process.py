@@ -1,6 +1,6 @@
-"""The inside of a worker process: announce itself, then answer one job at a time until the parent is gone.
+"""Main loop of a worker process: report readiness, then run one job at a time until the parent is gone.
 
-A `Supervisor` starts such processes and watches over them. Imports little, because every worker imports it.
+`service.pools.supervisor` is the other end. This module imports little, because every worker imports it.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ _PR_SET_PDEATHSIG = 1
 
 @dataclass(frozen=True)
 class Ready:
-    """What a worker says once it is warm."""
+    """Message of a worker that is warm."""
 
 
 @dataclass(frozen=True)
 class JobResult:
-    """A job's answer."""
+    """Message with the result of a job."""
 
     value: Any
 
 
 @dataclass(frozen=True)
 class WorkerFailure:
-    """What a worker says instead of an answer, or instead of being ready."""
+    """Message with the error of a job, or of a failed start."""
 
     reason: str
 
@@ -40,14 +40,15 @@ class WorkerFailure:
 def serve_jobs(
     connection: Connection, load: Callable[[], Callable[[Any], Any]], is_fit: Callable[[], bool] = lambda: True
 ) -> None:
-    """Load what does the work, then answer jobs until the pipe closes.
+    """Load the function that runs jobs, then run jobs until the pipe closes.
 
     Args:
-        load: takes its time and returns the function from job to answer. What either raises is told to the parent; a
-            worker whose function raised goes on with the next job.
-        is_fit: asked after each job; a worker that is not ends, and is replaced.
+        connection: the worker's end of the pipe.
+        load: slow; returns the function from job to result. Errors of either are reported to the parent, and a worker
+            whose function raised an error continues with the next job.
+        is_fit: called after each job; the worker ends, and is replaced, when it returns False.
     """
-    # Ctrl-C and a service manager's signal reach the whole process group; the parent decides when its workers end.
+    # Ctrl-C and a service manager's signal reach the whole process group, but the parent decides when its workers end.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
     _die_with_parent()
@@ -69,7 +70,7 @@ def serve_jobs(
 
 
 def limit_memory(memory_bytes: int) -> None:
-    """Let allocations fail, where the system can, beyond what is in use now and `memory_bytes`."""
+    """Make allocations fail beyond the current use plus `memory_bytes`; on Linux only."""
     if sys.platform != "linux":
         return
     import resource
@@ -80,7 +81,7 @@ def limit_memory(memory_bytes: int) -> None:
 
 
 def address_space_bytes() -> int:
-    """How much this process has asked for; 0 where that cannot be told (it can on Linux)."""
+    """Return the size of this process's address space; 0 on systems other than Linux."""
     if sys.platform != "linux":
         return 0
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
@@ -88,13 +89,13 @@ def address_space_bytes() -> int:
 
 
 def _die_with_parent() -> None:
-    """Also in the middle of a job; an idle worker would notice that the pipe closed."""
+    """Ask the kernel to kill this process with its parent, even in the middle of a job."""
     if sys.platform == "linux":
         ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
 
 
 def _send(connection: Connection, message: Ready | JobResult | WorkerFailure) -> bool:
-    """False when the parent is gone."""
+    """Send a message; False if the parent is gone."""
     try:
         connection.send(message)
     except OSError:

@@ -97,7 +97,7 @@ def test_a_picture_over_which_decoders_stall_is_refused_and_the_next_one_is_answ
         plan_id = upload(client)
         ready(client)
         problem = assert_problem(localise(client, plan_id, slow, **QUICK), 422, "invalid-panorama")
-        assert "longer than 0.2 s (decode_stall_s)" in problem["detail"]
+        assert "longer than 0.2 s (LALALOC_DECODE_STALL_S)" in problem["detail"]
         assert restarts(client) == 1.0
         ready(client)
         assert_problem(localise(client, plan_id, slow, **QUICK), 422, "invalid-panorama")

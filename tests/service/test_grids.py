@@ -229,7 +229,7 @@ def test_replicas_compute_a_grid_once_and_see_how_far_it_is(
     wait_for(lambda: len(second._jobs.remote()) == 1)
     first_encoders.go_on.set()
     wait_for(lambda: first.progress(first.key(record.revision_id, 1.5)) > 0.0 or first_future.done())
-    summary = second_store.plans.list("default", limit=1)[0]
+    summary = second_store.plans.list_plans("default", limit=1)[0]
     assert second.states([summary])[0].status in ("preparing", "ready")
     grid = first_future.result(30.0)
     wait_for(lambda: _looked(second) or second_future.done())
@@ -249,7 +249,7 @@ def test_progress_elsewhere_is_told(open_store: OpenStore, make_grids: MakeGrids
     key = grids.key(record.revision_id, 1.5)
     store.leases.claim(key, "another replica", 60.0)
     store.leases.renew(key, "another replica", 60.0, 0.25)
-    state = grids.states(store.plans.list("default", limit=1))[0]
+    state = grids.states(store.plans.list_plans("default", limit=1))[0]
     assert (state.status, state.progress) == ("preparing", 0.25)
     grids.compute(record, 1.5)
     wait_for(lambda: _looked(grids) or grids.progress(key) == 0.25)
@@ -282,7 +282,7 @@ def test_a_grid_that_nobody_ever_finishes_fails_after_a_few_attempts(
     with pytest.raises(PlanFailedError, match="begun 5 times"):
         grids.compute(record, 1.5).result(30.0)
     assert encoders.embedded == 0
-    state = grids.states(store.plans.list("default", limit=1))[0]
+    state = grids.states(store.plans.list_plans("default", limit=1))[0]
     assert (state.status, state.reason) == ("failed", "its latent grid was begun 5 times and never finished")
     # The next start tries again.
     store.plans.clear_failures()
@@ -301,7 +301,7 @@ def test_a_grid_without_numbers_fails_and_is_not_stored(store: Store, make_grids
     with pytest.raises(InvalidPoseError, match=r"no latents at camera_height_m 1\.5"):
         grids.compute(record, 1.5).result(30.0)
     assert grids.prepare(PLAN) is None
-    state = grids.states(store.plans.list("default", limit=1))[0]
+    state = grids.states(store.plans.list_plans("default", limit=1))[0]
     assert state.status == "failed"
 
 

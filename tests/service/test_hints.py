@@ -16,7 +16,7 @@ from lalaloc_core.localise.hints import Hints, Near
 from lalaloc_core.localise.pipeline import Localisation
 from lalaloc_core.localise.poses import Candidate, Query
 from lalaloc_core.localise.posterior import Posterior, Support
-from service.query.hints import hint_warnings
+from service.query.stated_camera import hint_warnings
 from tests.service.conftest import FLAT, assert_problem, localise, upload
 from tests.strategies import rectangle
 

@@ -280,7 +280,7 @@ def test_an_upload_that_failed_after_it_was_stored_is_found_when_it_is_sent_agai
     with pytest.raises(StoreUnavailableError):
         _idempotent(store).run(NOTHING, work)
     answer = _idempotent(store).run(NOTHING, work)
-    assert [summary.id for summary in store.plans.list("default", limit=10)] == [bytes(answer.body).decode()]
+    assert [summary.id for summary in store.plans.list_plans("default", limit=10)] == [bytes(answer.body).decode()]
 
 
 def _poisoned() -> Exception:

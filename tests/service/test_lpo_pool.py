@@ -20,6 +20,7 @@ import pytest
 
 from lalaloc_core.localise.bundle import LAYOUT_WEIGHTS, Bundle
 from lalaloc_core.localise.poses import RefinementJob, RefinementResult
+from lalaloc_core.localise.sequence import SequenceResult
 from service.query.lpo_pool import LpoPool
 from service.settings import Settings
 from service.telemetry import Telemetry
@@ -63,7 +64,9 @@ def job(bundle: Bundle) -> RefinementJob:
 
 def _refine(pool: LpoPool, job: RefinementJob, timeout_s: float) -> RefinementResult | None:
     """As the service does, but on an event loop of its own."""
-    return asyncio.run(pool.refine(job, timeout_s))
+    result = asyncio.run(pool.refine(job, timeout_s))
+    assert not isinstance(result, SequenceResult)
+    return result
 
 
 def _workers() -> list[int]:

@@ -74,7 +74,7 @@ def _kill(pids: list[int]) -> None:
 
 
 def _run(pool: Pool, job: tuple[str, Any], timeout_s: float) -> Any:
-    return asyncio.run(pool.answer(job, timeout_s))
+    return asyncio.run(pool.run_job(job, timeout_s))
 
 
 def _reason(future: Future[Any]) -> str:
@@ -136,7 +136,7 @@ def test_a_job_over_which_a_worker_stalls_is_given_up_and_tried_anew_when_it_com
 def test_a_job_of_which_its_caller_despairs_while_it_is_submitted_is_not_started(log: Path) -> None:
     async def leave_at_once(pool: Pool) -> None:
         # Large enough that copying and hashing it takes a while.
-        waiting = asyncio.create_task(pool.answer(("echo", bytes(200_000_000)), 20.0))
+        waiting = asyncio.create_task(pool.run_job(("echo", bytes(200_000_000)), 20.0))
         await asyncio.sleep(0.05)
         waiting.cancel()
         with pytest.raises(asyncio.CancelledError):
@@ -209,7 +209,7 @@ def test_jobs_that_nobody_waits_for_are_not_started(log: Path) -> None:
 
 def test_a_wait_that_is_cancelled_on_the_event_loop_cancels_the_job(log: Path) -> None:
     async def give_up(pool: Pool) -> None:
-        waiting = asyncio.create_task(pool.answer(("echo", 1), 20.0))
+        waiting = asyncio.create_task(pool.run_job(("echo", 1), 20.0))
         await asyncio.sleep(0.1)
         waiting.cancel()
         with pytest.raises(asyncio.CancelledError):

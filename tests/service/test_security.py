@@ -340,7 +340,7 @@ def test_when_a_key_was_used_is_written_once_a_minute(guarded: Guarded) -> None:
     key = make_key(guarded.store)
 
     def last_used() -> object:
-        return next(row.last_used_at for row in guarded.store.keys.list() if row.id == id_of(key))
+        return next(row.last_used_at for row in guarded.store.keys.list_keys() if row.id == id_of(key))
 
     assert last_used() is None
     assert guarded.send("GET", "/limits", key).status_code == 200
@@ -531,7 +531,7 @@ def test_a_key_is_trusted_for_ten_minutes_without_the_database_and_not_longer(tm
     try:
         key = asyncio.run(ring.find(presented))
         assert key is not None
-        wait_for(lambda: store.keys.list()[0].last_used_at is not None)
+        wait_for(lambda: store.keys.list_keys()[0].last_used_at is not None)
         # The only connection is taken, so nobody else has one.
         with store._database.reading():
             for clock_s[0] in (1004.0, 1006.0, 1300.0, 1600.0):
@@ -557,7 +557,7 @@ def test_a_database_that_is_busy_is_no_reason_to_trust_a_key(tmp_path: Path) -> 
     try:
         key = asyncio.run(ring.find(presented))
         assert key is not None
-        wait_for(lambda: store.keys.list()[0].last_used_at is not None)
+        wait_for(lambda: store.keys.list_keys()[0].last_used_at is not None)
         with store._database.reading():
             # As if others were answered all the while.
             store._database._answered_s = float("inf")

@@ -36,10 +36,9 @@ from service.errors import (
     TooManyFloorPlansError,
     UnknownFloorPlanError,
 )
-from service.storage.chunks import CHUNK_BYTES
 from service.storage.grid_format import pack
 from service.storage.idempotency_keys import KEPT_FOR, IdempotencyKeys
-from service.storage.plan_document import PlanDocument
+from service.storage.plans import PlanDocument
 from service.storage.records import (
     Claimed,
     ComputedGrid,
@@ -51,6 +50,7 @@ from service.storage.records import (
     StoredAnswer,
     VenueMember,
 )
+from service.storage.statements import CHUNK_BYTES
 from service.storage.store import Store
 from service.storage.tables import (
     FLOORPLANS,
@@ -198,7 +198,7 @@ def test_the_number_of_plans_is_limited_for_each_tenant(store: Store) -> None:
     store.plans.add("two", "b", PLAN, original=Original(b"{}"), limit=1)
     with pytest.raises(TooManyFloorPlansError, match="1 floor plans"):
         store.plans.add("two", "c", PLAN, original=Original(b"{}"), limit=1)
-    assert [summary.id for summary in store.plans.list("two", limit=10)] == ["b"]
+    assert [summary.id for summary in store.plans.list_plans("two", limit=10)] == ["b"]
 
 
 def test_the_limit_holds_when_many_upload_at_once(open_store: OpenStore) -> None:
@@ -213,7 +213,7 @@ def test_the_limit_holds_when_many_upload_at_once(open_store: OpenStore) -> None
 
     with ThreadPoolExecutor(8) as threads:
         assert sum(threads.map(add, range(20))) == 5
-    assert len(stores[0].plans.list("default", limit=10)) == 5
+    assert len(stores[0].plans.list_plans("default", limit=10)) == 5
 
 
 def test_a_tenants_plan_does_not_exist_for_others(store: Store) -> None:
@@ -221,7 +221,7 @@ def test_a_tenants_plan_does_not_exist_for_others(store: Store) -> None:
     assert store.plans.get("two", "p") is None
     assert store.plans.get_revision("two", "p", revision_id) is None
     assert store.plans.original("two", "p") is None
-    assert store.plans.list("two", limit=10) == []
+    assert store.plans.list_plans("two", limit=10) == []
     assert not store.plans.delete("two", "p")
     with pytest.raises(UnknownFloorPlanError):
         store.plans.add_revision("two", "p", PLAN, original=Original(b""), keep=5)
@@ -335,7 +335,7 @@ def test_listing_is_newest_first_and_paged_by_cursor(store: Store) -> None:
         _add(store, plan_id)
     _add(store, "z" * 32, tenant="other")
     found, after = [], None
-    while page := store.plans.list("default", limit=2, after=after):
+    while page := store.plans.list_plans("default", limit=2, after=after):
         found += [summary.id for summary in page]
         after = Cursor(page[-1].created_at, page[-1].id)
     assert found == ids[::-1]
@@ -348,7 +348,7 @@ def test_listing_is_newest_first_and_paged_by_cursor(store: Store) -> None:
 def test_names_are_found_by_any_part_in_any_case(store: Store, asked: str, found: set[str]) -> None:
     for plan_id, name in {"a": "Flat 3", "b": "flat 100%", "c": "Lange Straße 5", "d": "ÄPFEL"}.items():
         _add(store, plan_id, name=name)
-    assert {summary.id for summary in store.plans.list("default", limit=10, name=asked)} == found
+    assert {summary.id for summary in store.plans.list_plans("default", limit=10, name=asked)} == found
 
 
 def test_summaries_are_those_of_the_plans_that_there_are(store: Store) -> None:
@@ -362,7 +362,7 @@ def test_an_upload_that_is_repeated_under_its_id_is_stored_once(store: Store) ->
     first = store.plans.add("default", "p", PLAN, original=Original(b"{}"), limit=1)
     again = store.plans.add("default", "p", PLAN, original=Original(b"{}"), limit=1)
     assert (again.revision_id, again.revision) == (first.revision_id, 1)
-    assert len(store.plans.list("default", limit=10)) == 1
+    assert len(store.plans.list_plans("default", limit=10)) == 1
 
 
 # Revisions
@@ -378,11 +378,11 @@ def test_a_new_revision_replaces_the_plan_and_the_old_one_stays_readable(store: 
     assert (current.plan.name, len(current.plan.rooms)) == ("smaller", 1)
     assert current.updated_at > current.created_at
     assert store.plans.original("default", "p") == Original(b"new")
-    assert store.plans.list("default", limit=5)[0].name == "smaller"
+    assert store.plans.list_plans("default", limit=5)[0].name == "smaller"
     before = store.plans.get_revision("default", "p", old)
     assert before is not None
     assert (before.revision, before.plan.name) == (1, "Flat 3")
-    assert store.plans.current([old, new.revision_id, "nonsense"]) == {new.revision_id}
+    assert store.plans.current_revisions([old, new.revision_id, "nonsense"]) == {new.revision_id}
 
 
 def test_a_revision_that_follows_another_one_than_expected_is_refused(store: Store) -> None:
@@ -707,7 +707,7 @@ def test_keys_are_found_by_hash_until_revoked(store: Store) -> None:
     assert store.keys.find("h1") == made
     assert made.scopes == {"read", "localise"}
     assert store.keys.find("h3") is None
-    assert [key.name for key in store.keys.list("t")] == ["robot"]
+    assert [key.name for key in store.keys.list_keys("t")] == ["robot"]
     store.keys.touch(made.id)
     touched = store.keys.find("h1")
     assert touched is not None
@@ -715,7 +715,7 @@ def test_keys_are_found_by_hash_until_revoked(store: Store) -> None:
     assert store.keys.revoke(made.id)
     assert not store.keys.revoke(made.id)
     assert store.keys.find("h1") is None
-    assert [key.revoked_at is None for key in store.keys.list()] == [False, True]
+    assert [key.revoked_at is None for key in store.keys.list_keys()] == [False, True]
 
 
 def test_a_claim_from_a_clock_that_was_ahead_is_dead(store: Store) -> None:
@@ -741,7 +741,7 @@ def test_processes_that_start_together_make_the_tables_once(url: str) -> None:
     with ThreadPoolExecutor(4) as threads:
         stores = list(threads.map(lambda _: Store(url), range(4)))
     _add(stores[0])
-    assert all(len(store.plans.list("default", limit=10)) == 1 for store in stores)
+    assert all(len(store.plans.list_plans("default", limit=10)) == 1 for store in stores)
     for store in stores:
         store.close()
 
@@ -850,7 +850,7 @@ def test_venues_are_added_to_what_there_is(store: Store, url: str) -> None:
     moved = Store(url)
     assert moved.grids.get(_key(revision_id)) is not None
     moved.venues.add("default", "v", "venue", None, [VenueMember("p", 1.0)], limit=1)
-    [found] = moved.venues.searched("v", "m1", 0.5)
+    [found] = moved.venues.searchable_plans("v", "m1", 0.5)
     assert (found.plan_id, found.camera_height_std_m) == ("p", None)
     assert moved.grids.prototypes([found.grid_id]) == {}
     with moved._database.reading() as connection:
@@ -873,7 +873,7 @@ def test_a_database_of_the_first_version_is_taken_over(tmp_path: Path, grids: st
             raw.execute(f"INSERT INTO {grids} VALUES (?, ?, 'm1', 0.5, 1500, 7, x'00')", (number, plan_id))
     raw.close()
     store = Store(_url(tmp_path))
-    assert [summary.name for summary in store.plans.list("default", limit=10)] == ["Flat 2", "Flat 1"]
+    assert [summary.name for summary in store.plans.list_plans("default", limit=10)] == ["Flat 2", "Flat 1"]
     record = store.plans.get("default", "1" * 32)
     assert record is not None
     assert record.created_at == datetime(2026, 1, 1, 10, 0, 0, 123456, tzinfo=UTC)
@@ -886,7 +886,7 @@ def test_a_database_of_the_first_version_is_taken_over(tmp_path: Path, grids: st
         assert compare_metadata(context, METADATA) == []
     store.close()
     again = Store(_url(tmp_path))
-    assert len(again.plans.list("default", limit=10)) == 2
+    assert len(again.plans.list_plans("default", limit=10)) == 2
     again.close()
 
 
@@ -920,9 +920,9 @@ def test_what_is_open_is_bounded_and_waiting_for_it_as_well(url: str) -> None:
     with store._database.reading(), store._database.reading():
         begin = time.monotonic()
         with pytest.raises(StoreUnavailableError):
-            store.plans.list("default", limit=1)
+            store.plans.list_plans("default", limit=1)
         assert time.monotonic() - begin < 2.0
-    assert store.plans.list("default", limit=1) == []
+    assert store.plans.list_plans("default", limit=1) == []
     store.close()
 
 
@@ -942,7 +942,7 @@ def test_a_database_that_answers_others_meanwhile_is_busy_and_not_away(url: str)
     assert refused
     assert all(isinstance(error, StoreBusyError) for error in refused)
     with store._database.reading(), pytest.raises(StoreUnavailableError) as caught:
-        store.plans.list("default", limit=1)
+        store.plans.list_plans("default", limit=1)
     assert not isinstance(caught.value, StoreBusyError)
     store.close()
 
@@ -951,7 +951,7 @@ def test_an_address_may_say_postgresql_or_name_the_driver(postgres: PostgresServ
     plain = postgres.new_database()
     for url in (plain, plain.replace("postgresql:", "postgresql+psycopg:"), plain.replace("postgresql:", "postgres:")):
         store = Store(url)
-        assert store.plans.list("default", limit=1) == []
+        assert store.plans.list_plans("default", limit=1) == []
         store.close()
 
 

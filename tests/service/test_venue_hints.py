@@ -111,9 +111,12 @@ def test_plans_without_a_place_are_told(client: httpx.Client, storeys: list[str]
     venue_id = venue_of(client, storeys[0], upload(client, STUDIO))
     fields = {"near": json.dumps(at(2.0, 1.5)), "radius_m": 5.0}
     free = answer_to(client, venue_id, panorama, **fields)
-    assert "1 of the venue's 2 floor plans have no anchor: near says nothing of them" in free["warnings"]
+    assert "1 of the venue's 2 floor plans have no anchor and are not affected by near" in free["warnings"]
     strict = answer_to(client, venue_id, panorama, strict="true", **fields)
-    assert "1 of the venue's 2 floor plans have no anchor: were not searched, near being strict" in strict["warnings"]
+    assert (
+        "1 of the venue's 2 floor plans have no anchor and were not searched, because near is strict"
+        in strict["warnings"]
+    )
     assert {candidate["floorplan_id"] for candidate in strict["candidates"]} == {storeys[0]}
 
 
@@ -130,7 +133,7 @@ def test_rooms_that_are_looked_for_in_few_plans_only_are_told(
 @pytest.mark.parametrize(
     ("fields", "detail"),
     [
-        ({"level": 7}, "level: no floor plan of the venue is on level 7, they are on 0, 1, 2, 3"),
+        ({"level": 7}, "level: no floor plan of the venue is on level 7; its levels are 0, 1, 2, 3"),
         ({"near": '{"x_m": 1, "y_m": 1}', "radius_m": 3}, "the venue has no anchor"),
         ({"near": json.dumps(at(50.0)), "radius_m": 10}, "m from the nearest floor plan of the venue"),
         ({"rooms": "attic"}, "rooms: none of the 4 floor plans that are searched has a room 'attic'"),
@@ -145,4 +148,7 @@ def test_what_a_venue_contradicts_is_told(
 
 def test_a_venue_that_is_nowhere_has_no_place_on_earth_to_be_near(client: httpx.Client, panorama: bytes) -> None:
     response = ask(client, venue_of(client, upload(client)), panorama, near=json.dumps(at(0.0)), radius_m=10)
-    assert "nor a floor plan of it has an anchor" in assert_problem(response, 422, "invalid-hint")["detail"]
+    assert (
+        "neither the venue nor any of its floor plans has an anchor"
+        in assert_problem(response, 422, "invalid-hint")["detail"]
+    )

@@ -1,0 +1,181 @@
+"""Queries as they are after the upload, and the interfaces of the components that may run in other processes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from time import monotonic
+from typing import Protocol, Self
+
+from lalaloc_core.draw.answer import Picture
+from lalaloc_core.localise.pipeline import StageClock
+from lalaloc_core.localise.poses import RefinementJob, RefinementResult
+from lalaloc_core.localise.sequence import SequenceJob, SequenceResult
+from service.pools import PoolState
+from service.schemas import (
+    EarthPoint,
+    LocaliseAnswer,
+    LocaliseForm,
+    ModelAnswer,
+    SequenceAnswer,
+    SequenceForm,
+)
+from service.storage.records import PlanRecord, VenueRecord
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class QueryContext:
+    """Client, deadline and clock of a query.
+
+    Pickling keeps the elapsed time and restarts the clock, because machines do not share `monotonic`.
+
+    Attributes:
+        client: fairness group that shares decoders, threads and workers; see `service.fair_share`.
+        begin: end of the upload (`monotonic`).
+        deadline: time limit of the answer (`monotonic`).
+        clock: durations of the stages, failed ones and the wait for the plan's grid included.
+    """
+
+    client: str
+    begin: float
+    deadline: float
+    clock: StageClock
+
+    @classmethod
+    def starting(cls, client: str, limit_s: float, clock: StageClock | None = None, *, spent_s: float = 0.0) -> Self:
+        """Return the context of a query that is complete now.
+
+        Args:
+            client: see the attribute.
+            limit_s: time limit (s) from the end of the upload.
+            clock: the clock that timed the upload; None for a new one.
+            spent_s: time (s) since the end of the upload.
+        """
+        begin = monotonic() - spent_s
+        return cls(client=client, begin=begin, deadline=begin + limit_s, clock=clock or StageClock())
+
+    @property
+    def spent_s(self) -> float:
+        """Time (s) since the end of the upload."""
+        return monotonic() - self.begin
+
+    @property
+    def left_s(self) -> float:
+        """Time (s) until the deadline; negative past it."""
+        return self.deadline - monotonic()
+
+    def __reduce__(self) -> tuple[Callable[..., QueryContext], tuple[str, float, float]]:
+        return _received, (self.client, self.deadline - self.begin, self.spent_s)
+
+
+def _received(client: str, limit_s: float, spent_s: float) -> QueryContext:
+    return QueryContext.starting(client, limit_s, spent_s=spent_s)
+
+
+@dataclass(frozen=True, eq=False)
+class PanoramaQuery:
+    """Query about one panorama.
+
+    Attributes:
+        form: the validated form fields.
+        content: the uploaded picture file.
+        context: client, deadline and clock.
+    """
+
+    form: LocaliseForm
+    content: bytes
+    context: QueryContext
+
+
+@dataclass(frozen=True, eq=False)
+class SequenceQuery:
+    """Query about several panoramas of one visit.
+
+    Attributes:
+        form: the validated form fields.
+        contents: the uploaded picture files, in the order in which they were taken.
+        context: client, deadline and clock.
+    """
+
+    form: SequenceForm
+    contents: list[bytes]
+    context: QueryContext
+
+
+@dataclass(frozen=True, kw_only=True)
+class PictureRequest:
+    """Requested drawing of an answer.
+
+    Attributes:
+        picture: plan, photograph or both.
+        as_png: PNG; else SVG.
+        rooms: the plan's rooms as drawn by `lalaloc_core.draw.plan.draw_rooms`.
+    """
+
+    picture: Picture
+    as_png: bool
+    rooms: str
+
+
+class LocaliserBackend(Protocol):
+    """Localisation in one plan; `Localiser` implements and documents it."""
+
+    @property
+    def model(self) -> ModelAnswer:
+        """See `Localiser.model`."""
+        ...
+
+    async def localise(self, record: PlanRecord, query: PanoramaQuery) -> LocaliseAnswer:
+        """See `Localiser.localise`."""
+        ...
+
+    async def localise_and_draw(
+        self, record: PlanRecord, query: PanoramaQuery, wanted: PictureRequest
+    ) -> tuple[LocaliseAnswer, bytes]:
+        """See `Localiser.localise_and_draw`."""
+        ...
+
+    async def localise_sequence(self, record: PlanRecord, query: SequenceQuery) -> SequenceAnswer:
+        """See `Localiser.localise_sequence`."""
+        ...
+
+
+class VenueLocaliserBackend(Protocol):
+    """Localisation in a venue; `VenueLocaliser` implements and documents it."""
+
+    async def localise(self, venue: VenueRecord, query: PanoramaQuery) -> LocaliseAnswer:
+        """See `VenueLocaliser.localise`."""
+        ...
+
+    async def localise_near(
+        self, tenant: str, place: EarthPoint, within_m: float, query: PanoramaQuery
+    ) -> LocaliseAnswer:
+        """See `VenueLocaliser.localise_near`."""
+        ...
+
+    async def check_hints(self, venue: VenueRecord, form: LocaliseForm) -> None:
+        """See `VenueLocaliser.check_hints`."""
+        ...
+
+
+class OptimiserBackend(Protocol):
+    """Pose refinement (LPO); `LpoPool` implements and documents it."""
+
+    @property
+    def state(self) -> PoolState:
+        """See `LpoPool.state`."""
+        ...
+
+    def start(self) -> None:
+        """See `LpoPool.start`."""
+        ...
+
+    async def refine(
+        self, job: RefinementJob | SequenceJob, timeout_s: float, client: str = ""
+    ) -> RefinementResult | SequenceResult | None:
+        """See `LpoPool.refine`."""
+        ...
+
+    def close(self, drain_s: float = 0.0) -> None:
+        """See `LpoPool.close`."""
+        ...

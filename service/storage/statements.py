@@ -1,0 +1,112 @@
+"""Statements that several tables share: pages of listings, values in chunks, plans with their own pose grids."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, TypeVar
+
+from sqlalchemy import ColumnElement, Connection, Select, Table, and_, or_, select
+
+from service.storage.records import Cursor
+from service.storage.tables import FLOORPLANS, LATENT_GRIDS, REVISIONS
+
+# Large values are stored in pieces, so that neither database nor driver handles one of them whole.
+CHUNK_BYTES = 2**20
+
+Query = TypeVar("Query", bound=Select[Any])
+
+
+def newest_first(query: Query, table: Table, *, limit: int, after: Cursor | None, name: str | None) -> Query:
+    """Return a page of a query about a table with `id`, `created_at` and `folded_name`.
+
+    Args:
+        query: the query.
+        table: the table.
+        limit: maximum number of rows.
+        after: the last row of the previous page.
+        name: part of the name, case-insensitive.
+    """
+    age, own_id = table.c.created_at, table.c.id
+    if name:
+        query = query.where(table.c.folded_name.contains(name.casefold(), autoescape=True))
+    if after is not None:
+        query = query.where(or_(age < after.created_at, and_(age == after.created_at, own_id < after.id)))
+    return query.order_by(age.desc(), own_id.desc()).limit(limit)
+
+
+def write_chunks(connection: Connection, table: Table, owner: dict[str, Any], content: memoryview) -> None:
+    """Write a value, one statement per chunk.
+
+    Args:
+        connection: the transaction.
+        table: the table of chunks.
+        owner: name and value of the column that identifies the value.
+        content: the value.
+    """
+    for number, first in enumerate(range(0, len(content), CHUNK_BYTES)):
+        chunk = bytes(content[first : first + CHUNK_BYTES])
+        connection.execute(table.insert(), {**owner, "number": number, "content": chunk})
+
+
+def read_chunks(connection: Connection, table: Table, owner: dict[str, Any]) -> Iterator[bytes]:
+    """Yield the chunks of a value in order, one statement each."""
+    conditions = [table.c[name] == value for name, value in owner.items()]
+    number = 0
+    while True:
+        query = select(table.c.content).where(*conditions, table.c.number == number)
+        content = connection.scalar(query)
+        if content is None:
+            return
+        yield content
+        number += 1
+
+
+def read_exactly(connection: Connection, table: Table, owner: dict[str, Any], size_bytes: int) -> bytearray | None:
+    """Return a value of known size, assembled in place; None if its size differs."""
+    content, filled = bytearray(size_bytes), 0
+    for chunk in read_chunks(connection, table, owner):
+        if filled + len(chunk) > size_bytes:
+            return None
+        content[filled : filled + len(chunk)] = chunk
+        filled += len(chunk)
+    return content if filled == size_bytes else None
+
+
+def select_summaries() -> Any:
+    """Return a query for the columns of `PlanSummary`, of all plans at their current revision."""
+    return select(
+        FLOORPLANS.c.id,
+        FLOORPLANS.c.revision_id,
+        REVISIONS.c.number.label("revision"),
+        FLOORPLANS.c.created_at,
+        FLOORPLANS.c.updated_at,
+        FLOORPLANS.c.name,
+        REVISIONS.c.room_count,
+        REVISIONS.c.area_m2,
+        REVISIONS.c.camera_height_m,
+        REVISIONS.c.failure,
+    ).join_from(FLOORPLANS, REVISIONS, FLOORPLANS.c.revision_id == REVISIONS.c.id)
+
+
+def is_complete_grid() -> ColumnElement[bool]:
+    """Return the condition that a grid has a digest; earlier versions of the service, running beside, write none."""
+    return LATENT_GRIDS.c.sha256.is_not(None)
+
+
+def is_own_height(table: Table) -> ColumnElement[bool]:
+    """Return the condition that a row is for the plan's own camera height, to half a millimetre."""
+    return and_(
+        table.c.camera_height_mm >= REVISIONS.c.camera_height_m * 1000.0 - 0.501,
+        table.c.camera_height_mm <= REVISIONS.c.camera_height_m * 1000.0 + 0.501,
+    )
+
+
+def is_own_grid(model_sha256: str, step_m: float) -> ColumnElement[bool]:
+    """Return the condition that joins a revision with the grid for its own camera height."""
+    return and_(
+        LATENT_GRIDS.c.revision_id == REVISIONS.c.id,
+        LATENT_GRIDS.c.model_sha256 == model_sha256,
+        LATENT_GRIDS.c.step_m == step_m,
+        is_complete_grid(),
+        is_own_height(LATENT_GRIDS),
+    )
