@@ -28,7 +28,7 @@ _GEOJSON = re.compile(rb'"type"\s{0,20}:\s{0,20}"(FeatureCollection|Feature|Geom
 _HEAD_BYTES = 4096
 
 
-def kind_of(content: bytes) -> str | None:
+def describe_file(content: bytes) -> str | None:
     """What a file is, with its article; None when that cannot be told."""
     for beginning, kind in _BEGINNINGS:
         if content.startswith(beginning):

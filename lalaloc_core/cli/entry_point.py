@@ -1,4 +1,4 @@
-"""The command `lalaloc`: which groups of commands it has, and how it ends."""
+"""The command `lalaloc`: its parser, exit codes, and shell completion."""
 
 from __future__ import annotations
 
@@ -8,32 +8,22 @@ import os
 import sys
 
 from lalaloc_core import __version__
-from lalaloc_core.cli import (
-    completion,
-    evaluation,
-    localising,
-    measuring,
-    photographs,
-    plans,
-    reproduction,
-    synthesis,
-    training,
-)
+from lalaloc_core.cli import evaluation, localising, measuring, plans, synthesis, training
 from lalaloc_core.errors import InvalidInputError, LaLaLocError
 
-# What shells say of a command that Ctrl-C ended.
+# The exit code that shells use for a command ended by Ctrl-C.
 _INTERRUPTED = 130
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run one command; 0 on success, 2 on the caller's mistake, 1 on any other error of this project."""
+    """Run one command; return 0 on success, 2 for invalid input, 1 for any other error of this project."""
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
-    arguments = build_parser().parse_args(argv)
+    arguments = buildbuild_parser().parse_args(argv)
     try:
         arguments.run(arguments)
         sys.stdout.flush()
     except BrokenPipeError:
-        # Whoever reads what is printed has read enough, as `head` does. What is left is not tried again at the end.
+        # The reader closed the pipe, as `head` does. Redirecting keeps Python from flushing to it at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except KeyboardInterrupt:
@@ -48,25 +38,26 @@ def main(argv: list[str] | None = None) -> int:
     except ModuleNotFoundError as error:
         if error.name is None or error.name.startswith("lalaloc"):
             raise
-        print(f"error: '{error.name}' is not installed; the README says which extra brings it", file=sys.stderr)
+        print(f"error: '{error.name}' is not installed; the README lists the extra that brings it", file=sys.stderr)
         return 1
     return 0
 
 
-def build_parser() -> argparse.ArgumentParser:
+def buildbuild_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="lalaloc", description="Localise panoramas in floor plans.")
     parser.add_argument("--version", action="version", version=f"lalaloc {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for group in (
-        localising,
-        plans,
-        evaluation,
-        photographs,
-        synthesis,
-        training,
-        reproduction,
-        measuring,
-    ):
+    for group in (localising, plans, evaluation, measuring, synthesis, training):
         group.add_commands(commands)
-    completion.add_commands(commands, parser)
+    completion = commands.add_parser(
+        "completion", help='print the shell completion script: eval "$(lalaloc completion bash)"'
+    )
+    completion.add_argument("shell", choices=("bash", "zsh"))
+    completion.set_defaults(run=lambda arguments: _complete(parser, arguments.shell))
     return parser
+
+
+def _complete(parser: argparse.ArgumentParser, shell: str) -> None:
+    import shtab
+
+    print(shtab.complete(parser, shell=shell))

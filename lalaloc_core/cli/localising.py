@@ -108,7 +108,7 @@ def _answers(arguments: argparse.Namespace, plan: FloorPlan, contents: list[byte
     """The answers in the order of the photographs, with a progress bar on a terminal."""
     from tqdm import tqdm
 
-    from lalaloc_core.draw.found import drawn_answer
+    from lalaloc_core.draw.answer import drawn_answer
     from lalaloc_core.evaluate.methods.lalaloc import local_refiner
     from lalaloc_core.localise.encoders import Encoders
     from lalaloc_core.localise.pipeline import localise

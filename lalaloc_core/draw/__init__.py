@@ -1,9 +1,9 @@
-"""Pictures of plans and answers: one implementation for the service, the command line, the report and the demo.
+"""Pictures of plans and answers, for the service, the command line and reports.
 
-Everything is drawn as SVG and, where pixels are wanted, rasterised by resvg with the fonts in `fonts/`: the same
-picture on every machine. Begin with `answer.py`, which composes the picture of an answer of a plan (`plan.py`), a heat
-map (`heat.py`) and the photograph with the found layout in it (`outline.py`, `photograph.py`); `found.py` makes what it
-draws of what the search found. Worker processes load `canvas.py` alone, so only that is re-exported.
+All pictures are SVG; resvg rasterises them with the fonts in `fonts/`, so they are the same on every machine. Begin
+with `answer.py`: it turns a localisation into a picture of the plan (`plan.py`), a heat map (`heat.py`) and the
+photograph with the predicted layout (`outline.py`, `photograph.py`). Worker processes load only `canvas.py`, so nothing
+else is re-exported.
 """
 
 from lalaloc_core.draw.canvas import rasterise

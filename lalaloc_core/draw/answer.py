@@ -1,4 +1,4 @@
-"""The picture of an answer: the plan with posterior and answer, the photograph with the found layout, or both."""
+"""The picture of an answer: the plan with the posterior and the pose, the photograph with its layout, or both."""
 
 from __future__ import annotations
 
@@ -11,31 +11,36 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from lalaloc_core.conventions import heading_from_degrees
+from lalaloc_core.conventions import heading_from_degrees, heading_to_degrees
 from lalaloc_core.draw.canvas import FOUND, INK, MUTED, RULE, Number, document, draw_cross, jpeg, shortened, words
-from lalaloc_core.draw.heat import HeatMap, colour_bar, heat_image
-from lalaloc_core.draw.outline import LayoutOutline, outline_of
+from lalaloc_core.draw.heat import HeatMap, colour_bar, heat_image, posterior_map
+from lalaloc_core.draw.outline import LayoutOutline, layout_outline
 from lalaloc_core.draw.photograph import photograph_key, photograph_part
 from lalaloc_core.draw.plan import ELLIPSE_STDS, Marker, draw_camera, extent_m, plan_part, shape_of
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.localise.bundle import ConfidenceModel
+from lalaloc_core.localise.covariance import pose_uncertainty
+from lalaloc_core.localise.pipeline import Localisation, panorama_heading
+from lalaloc_core.localise.poses import Candidate, PoseGrid, Query
+from lalaloc_core.localise.probability_map import probability_map
 
 Picture = Literal["both", "plan", "photograph"]
 PICTURES: tuple[Picture, ...] = get_args(Picture)
 
 _WIDTH, _PAD = 1600.0, 36.0
-# What the photograph is drawn at, and best given in.
+# Size of the drawn photograph; a photograph of this size is not scaled.
 PHOTOGRAPH_SIZE = (1528, 764)
 _HEADER, _KEY, _LEGEND = 104.0, 52.0, 400.0
-# Between them the plan's drawing is as high as its shape asks for.
+# Range of the height of the plan's drawing.
 _MIN_PLAN, _MAX_PLAN = 560.0, 1150.0
-# Less probable rivals say nothing.
+# Less probable rivals are not drawn.
 _MIN_PROBABILITY = 0.001
 _CHARACTERS = 52
 
 
 @dataclass(frozen=True)
 class DrawnCandidate:
-    """Another place that the photograph may have been taken at."""
+    """Another candidate pose, with its probability if known."""
 
     x_m: float
     y_m: float
@@ -46,15 +51,18 @@ class DrawnCandidate:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DrawnAnswer:
-    """What is drawn of an answer.
+    """The contents of an answer's picture.
 
     Attributes:
-        camera: the answer, with its covariance where there is one.
-        room_index: the room that it lies in.
-        heading_source: where the heading came from, in a word or two.
+        plan: the plan.
+        camera: the predicted pose, with its covariance if known.
+        room_index: room of the pose.
+        camera_height_m: height of the camera over the floor.
+        heading_source: origin of the heading, in a word or two.
+        confidence: probability that the position is correct; None if unknown.
         rivals: other candidates, best first.
-        heat: how probable all places are; None leaves the floors white.
-        truth: where the camera really stood, if that is known.
+        heat: map of the posterior; None leaves the floors white.
+        truth: true pose, if known.
     """
 
     plan: FloorPlan
@@ -69,10 +77,62 @@ class DrawnAnswer:
 
     @property
     def outline(self) -> LayoutOutline:
-        """The layout that the answer says the photograph shows."""
+        """The layout as seen from the predicted pose."""
         position_m = np.array([self.camera.x_m, self.camera.y_m])
         heading = heading_from_degrees(self.camera.heading_deg or 0.0)
-        return outline_of(self.plan, position_m, self.room_index, heading, self.camera_height_m)
+        return layout_outline(self.plan, position_m, self.room_index, heading, self.camera_height_m)
+
+
+def drawn_answer(
+    plan: FloorPlan,
+    grid: PoseGrid,
+    found: Localisation,
+    model: ConfidenceModel | None,
+    heading_source: str,
+    truth: Marker | None = None,
+) -> DrawnAnswer:
+    """Collect the contents of the picture of a localisation.
+
+    Args:
+        plan: the plan.
+        grid: pose grid of the plan.
+        found: result of the localisation.
+        model: converts the posterior to probabilities; None leaves them out.
+        heading_source: origin of the heading, in a word or two.
+        truth: true pose, if known.
+    """
+    fits = None if model is None else found.fit_probability(model)
+    best, *others = found.candidates
+    spread = None
+    if model is not None and best.information is not None:
+        spread = pose_uncertainty(best.information, plan.rooms[best.room_index], model)
+    covariance = None
+    if spread is not None:
+        (xx, xy), (_, yy) = spread.position_m2.tolist()
+        covariance = (xx, xy, yy)
+    rivals = [
+        DrawnCandidate(
+            candidate.x_m,
+            candidate.y_m,
+            _heading_deg(found.query, candidate),
+            plan.rooms[candidate.room_index].name,
+            None if fits is None else fits * share,
+        )
+        for candidate, share in zip(others, found.posterior.candidate[1:], strict=True)
+    ]
+    return DrawnAnswer(
+        plan=plan,
+        camera=Marker(
+            x_m=best.x_m, y_m=best.y_m, heading_deg=_heading_deg(found.query, best), covariance_m2=covariance
+        ),
+        room_index=best.room_index,
+        camera_height_m=found.camera_height_m,
+        heading_source="searched for" if found.heading_contradicted else heading_source,
+        confidence=None if model is None else found.confidence(model),
+        rivals=tuple(rivals),
+        heat=posterior_map(plan, probability_map(plan, grid.poses, found.posterior), grid.step_m),
+        truth=truth,
+    )
 
 
 def draw_answer(
@@ -83,27 +143,28 @@ def draw_answer(
     title: str | None = None,
     rooms: str | None = None,
 ) -> str:
-    """An answer as an SVG document, 1600 pixels wide.
+    """Draw an answer as an SVG document, 1600 pixels wide.
 
     Args:
-        photograph: the whole sphere, level, as `panorama.images.open_panorama` gives it; needed unless `picture` is
-            "plan".
-        title: what to say above it; by default the room.
-        rooms: what `draw_rooms` made of the plan before.
+        answer: contents of the picture.
+        photograph: full sphere, level, from `panorama.images.open_panorama`; required unless `picture` is "plan".
+        picture: parts to draw.
+        title: heading of the picture; default: the room.
+        rooms: cached result of `draw_rooms` for the plan.
     """
     room = answer.plan.rooms[answer.room_index].name
     parts = [_header(answer, title or room, None if title is None else room)]
     y = _HEADER
     if picture != "plan":
         if photograph is None:
-            raise ValueError(f"the picture '{picture}' needs the photograph")
+            raise ValueError(f"picture '{picture}' needs the argument photograph")
         (width, height), outline = PHOTOGRAPH_SIZE, answer.outline
         parts.append(photograph_part(jpeg(_sized(photograph)), "jpeg", outline, (_PAD, y, width, height)))
         y += height
         parts.append(photograph_key(outline, _PAD, y + 32))
         y += _KEY
     if picture != "photograph":
-        seen = [(one.x_m, one.y_m) for one in (answer.camera, answer.truth) if one is not None]
+        seen = [(marker.x_m, marker.y_m) for marker in (answer.camera, answer.truth) if marker is not None]
         width = _WIDTH - 3 * _PAD - _LEGEND
         height = min(max(width / shape_of(answer.plan, seen), _MIN_PLAN), _MAX_PLAN)
         heat = "" if answer.heat is None else heat_image(answer.heat, answer.plan)
@@ -116,15 +177,15 @@ def draw_answer(
 
 
 def confidence_words(confidence: float) -> str:
-    """How sure an answer is, for people."""
-    for least, said in ((0.95, "almost certain"), (0.8, "very likely"), (0.5, "likely"), (0.2, "doubtful")):
+    """Describe a confidence in words."""
+    for least, text in ((0.95, "almost certain"), (0.8, "very likely"), (0.5, "likely"), (0.2, "doubtful")):
         if confidence >= least:
-            return said
-    return "hardly more than a guess"
+            return text
+    return "very unlikely"
 
 
 def ellipse_m(covariance_m2: tuple[float, float, float]) -> tuple[float, float]:
-    """Half axes (m), the longer one first, of the ellipse that holds 95 % of a covariance (xx, xy, yy)."""
+    """Return the half axes (m), longer first, of the 95 % ellipse of a covariance (xx, xy, yy; m²)."""
     xx, xy, yy = covariance_m2
     minor, major = ELLIPSE_STDS * np.sqrt(np.maximum(np.linalg.eigvalsh([[xx, xy], [xy, yy]]), 0.0))
     return float(major), float(minor)
@@ -132,19 +193,19 @@ def ellipse_m(covariance_m2: tuple[float, float, float]) -> tuple[float, float]:
 
 def _header(answer: DrawnAnswer, title: str, room: str | None) -> str:
     heading_deg = answer.camera.heading_deg or 0.0
-    said = [] if room is None else [shortened(room, _CHARACTERS)]
-    said += [
+    facts = [] if room is None else [shortened(room, _CHARACTERS)]
+    facts += [
         f"x {answer.camera.x_m:.2f} m, y {answer.camera.y_m:.2f} m",
         f"heading {heading_deg:.1f}° ({answer.heading_source})",
         f"camera {answer.camera_height_m:.2f} m over the floor",
     ]
     return words(_PAD, 54, shortened(title, _CHARACTERS), 36, more='font-weight="bold"') + words(
-        _PAD, 86, "  ·  ".join(said), 20, fill=MUTED
+        _PAD, 86, "  ·  ".join(facts), 20, fill=MUTED
     )
 
 
 def _marks(answer: DrawnAnswer) -> str:
-    """Rivals, the truth and the answer over the plan."""
+    """Draw rivals, true pose and predicted pose over the plan."""
     extent = extent_m(answer.plan)
     size = extent / 60.0
     parts = []
@@ -168,7 +229,7 @@ def _legend(answer: DrawnAnswer, x: Number, y: Number, height: Number) -> str:
         parts.append(words(x, row + 60, f"within 1 m: {confidence_words(answer.confidence)}", 18, fill=MUTED))
         row += 96
     circle = f'<circle cx="{x + 11:.1f}" cy="{row - 6:.1f}" r="9" fill="{FOUND}"/>'
-    parts.append(circle + words(x + 32, row, "found, looking along the wedge", 18))
+    parts.append(circle + words(x + 32, row, "predicted; the wedge shows the heading", 18))
     if answer.camera.covariance_m2 is not None:
         major, minor = ellipse_m(answer.camera.covariance_m2)
         row += 28
@@ -179,7 +240,7 @@ def _legend(answer: DrawnAnswer, x: Number, y: Number, height: Number) -> str:
         parts.append(draw_cross(x + 11, row - 6, 12.0) + words(x + 32, row, f"true, {_length(off_m)} away", 18))
     rivals = _shown(answer.rivals)
     row += 48
-    parts.append(words(x, row, "Rivals" if rivals else "No other place comes near", 18, more='font-weight="bold"'))
+    parts.append(words(x, row, "Other candidates" if rivals else "No other candidate", 18, more='font-weight="bold"'))
     for number, rival in enumerate(rivals, start=2):
         row += 34
         share = "" if rival.probability is None else f"{100 * rival.probability:.1f} %"
@@ -202,8 +263,12 @@ def _sized(photograph: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h2 w2 3
 
 
 def _shown(rivals: Sequence[DrawnCandidate]) -> list[DrawnCandidate]:
-    return [one for one in rivals if one.probability is None or one.probability >= _MIN_PROBABILITY]
+    return [rival for rival in rivals if rival.probability is None or rival.probability >= _MIN_PROBABILITY]
 
 
 def _length(metres: float) -> str:
     return f"{100 * metres:.0f} cm" if metres < 0.995 else f"{metres:.1f} m"
+
+
+def _heading_deg(query: Query, candidate: Candidate) -> float:
+    return heading_to_degrees(panorama_heading(query, candidate))

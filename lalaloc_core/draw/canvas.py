@@ -1,4 +1,4 @@
-"""The parts that every drawing is made of: text, numbers, pictures in pictures, and pixels of it all."""
+"""Basic SVG elements and rasterisation: documents, text, paths, embedded pictures."""
 
 from __future__ import annotations
 
@@ -14,10 +14,9 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 INK, MUTED, RULE, PAPER = "#20242c", "#5a6472", "#d5dbe1", "#ffffff"
-# What is found, and what is true; both are told apart from each other and from the heat map by all who see little
-# colour (vermilion and sky blue of Okabe and Ito's palette).
+# Predicted and true poses: vermilion and sky blue of Okabe and Ito's palette, distinct for colour-blind readers.
 FOUND, TRUE = "#d55e00", "#56b4e9"
-# Pixels of a drawing: whole numbers where they were written down, others where they were computed.
+# A length or coordinate of a drawing.
 Number = int | float
 Box = tuple[Number, Number, Number, Number]
 
@@ -28,7 +27,7 @@ _JPEG_QUALITY = 90
 
 
 def document(width: Number, height: Number, title: str, parts: Iterable[str]) -> str:
-    """A drawing as a document of its own; sizes are pixels."""
+    """Return an SVG document of a size in pixels."""
     return "\n".join(
         [
             f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:.0f}" height="{height:.0f}" '
@@ -42,14 +41,13 @@ def document(width: Number, height: Number, title: str, parts: Iterable[str]) ->
 
 
 def rasterise(svg: str, *, width: int | None = None) -> bytes:
-    """A drawing as PNG.
+    """Rasterise a drawing as PNG.
 
-    Letters are those of the fonts that come along, in Latin, Greek, Cyrillic and a few more scripts; others are drawn
-    as boxes.
+    The bundled fonts cover Latin, Greek, Cyrillic and a few more scripts; other characters are drawn as boxes.
 
     Args:
-        svg: a drawing of this package; nothing that it refers to outside of itself is loaded.
-        width: pixels; by default what the drawing says.
+        svg: a drawing of this package; external references are not loaded.
+        width: pixels; default: the width of the drawing.
     """
     return resvg_py.svg_to_bytes(
         svg_string=svg, width=width, skip_system_fonts=True, font_files=_FONTS, sans_serif_family="DejaVu Sans"
@@ -57,20 +55,20 @@ def rasterise(svg: str, *, width: int | None = None) -> bytes:
 
 
 def pixels(svg: str) -> Image.Image:
-    """A drawing as an RGB picture."""
+    """Rasterise a drawing as an RGB picture."""
     with Image.open(io.BytesIO(rasterise(svg))) as image:
         return image.convert("RGB")
 
 
 def xml_text(text: str) -> str:
-    """Text as XML; the two characters that XML cannot hold, and plans may, are replaced."""
+    """Escape text for XML, and replace the two characters that plans allow and XML does not."""
     return escape(text.replace("\ufffe", "\ufffd").replace("\uffff", "\ufffd"))
 
 
 def words(
     x: Number, y: Number, text: str, size: Number, *, fill: str = INK, anchor: str = "start", more: str = ""
 ) -> str:
-    """A line of text; `y` is that of its base line."""
+    """Draw a line of text; `y` is its base line."""
     return (
         f'<text x="{x:.1f}" y="{y:.1f}" font-size="{size:g}" fill="{fill}" text-anchor="{anchor}" {more}>'
         f"{xml_text(text)}</text>"
@@ -78,7 +76,7 @@ def words(
 
 
 def draw_cross(x: Number, y: Number, reach: Number) -> str:
-    """A cross at a true place, in the units of the drawing."""
+    """Draw a cross at a true position, in the units of the drawing."""
     both = 2.0 * reach
     d = f"M{x - reach:.3f} {y - reach:.3f}l{both:.3f} {both:.3f}m0 {-both:.3f}l{-both:.3f} {both:.3f}"
     return "".join(
@@ -89,12 +87,12 @@ def draw_cross(x: Number, y: Number, reach: Number) -> str:
 
 
 def shortened(text: str, characters: int) -> str:
-    """Text that is no longer than so many characters."""
+    """Shorten text to at most `characters` characters."""
     return text if len(text) <= characters else text[: max(characters - 1, 1)] + "…"
 
 
 def path(lines: Iterable[Float[np.ndarray, "_ 2"]], digits: int = 1) -> str:
-    """Lines of points as the `d` of an SVG path."""
+    """Return lines of points as the `d` of an SVG path."""
     parts = []
     for line in lines:
         first, *others = (f"{x:.{digits}f} {y:.{digits}f}" for x, y in line.tolist())
@@ -103,7 +101,7 @@ def path(lines: Iterable[Float[np.ndarray, "_ 2"]], digits: int = 1) -> str:
 
 
 def image(content: bytes, kind: str, box: Box, more: str = "") -> str:
-    """An encoded picture in a box (x, y, width, height), stretched to fill it."""
+    """Embed an encoded picture, stretched to fill a box (x, y, width, height)."""
     x, y, width, height = box
     return (
         f'<image x="{x:.4f}" y="{y:.4f}" width="{width:.4f}" height="{height:.4f}" preserveAspectRatio="none" '
@@ -112,14 +110,14 @@ def image(content: bytes, kind: str, box: Box, more: str = "") -> str:
 
 
 def png(values: UInt8[np.ndarray, "h w c"]) -> bytes:
-    """Pixels as PNG."""
+    """Encode pixels as PNG."""
     buffer = io.BytesIO()
     Image.fromarray(values).save(buffer, "PNG")
     return buffer.getvalue()
 
 
 def jpeg(values: UInt8[np.ndarray, "h w 3"]) -> bytes:
-    """Pixels as JPEG."""
+    """Encode pixels as JPEG."""
     buffer = io.BytesIO()
     Image.fromarray(values).save(buffer, "JPEG", quality=_JPEG_QUALITY)
     return buffer.getvalue()

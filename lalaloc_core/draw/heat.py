@@ -1,7 +1,6 @@
-"""Heat maps over a plan: a value for every place, in colours that are told apart by all who see little colour.
+"""Heat maps over a plan: probabilities or latent distances per position, in a colour-blind safe scale.
 
-The darker, the nearer to what is looked for. Scales are logarithmic, as in the paper's figure of layout distances: what
-matters is how many times as near, or as probable, a place is.
+Darker is more probable or closer. Scales are logarithmic, as in the paper's figure of layout distances.
 """
 
 from __future__ import annotations
@@ -19,25 +18,25 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.probability_map import ProbabilityMap
 from lalaloc_core.render.sampling import PoseSet
 
-# ColorBrewer's YlGnBu, which is safe for the colour-blind and still a scale when it is printed in grey.
+# ColorBrewer's YlGnBu: safe for colour-blind readers, and monotonic in grey.
 _COLOURS = ["#ffffe5", "#f7fcb9", "#d9f0a3", "#a6dba0", "#5cc2b0", "#2fa4c0", "#2a7ab9", "#27509b", "#132a6b"]
-# So many cells along the longer side of a plan, and none smaller than this.
+# Number of cells along the longer side of a plan, and the smallest cell.
 _CELLS, _MIN_CELL_M = 220, 0.04
-# Places are spread by a normal distribution: its deviation in steps of the grid, and how many of them it reaches.
+# Probabilities are smoothed by a normal distribution: its deviation in grid steps, and its reach in deviations.
 _SPREAD, _REACH = 0.4, 5.0
-# Bilinear, which is fast, where drawn by resvg; browsers do it anyway.
+# Fast bilinear interpolation in resvg; browsers interpolate by default.
 _SMOOTH = 'image-rendering="smooth"'
-# Of probabilities: what is less probable than the best place by this factor has the lightest colour.
+# Positions less probable than the best one by more than 10^_DECADES have the lightest colour.
 _DECADES = 5
 
 
 @dataclass(frozen=True, eq=False)
 class Cells:
-    """A plan cut into square cells.
+    """Square cells over a plan.
 
     Attributes:
-        poses: the middles of the cells that lie in rooms.
-        room: the room of each cell, -1 outside, rows from below.
+        poses: centres of the cells that lie in rooms.
+        room: (rows, columns) room of each cell, -1 outside; the first row is the lowest.
         extent_m: (left, right, bottom, top) of all cells.
     """
 
@@ -46,11 +45,11 @@ class Cells:
     extent_m: tuple[float, float, float, float]
 
     @classmethod
-    def of(cls, plan: FloorPlan, size_m: float | None = None) -> Cells:
-        """Cut a plan; by default into as many cells as are seen."""
+    def cover(cls, plan: FloorPlan, size_m: float | None = None) -> Cells:
+        """Cover a plan with cells; the default size suits a drawing."""
         x_min, y_min, x_max, y_max = plan.bounds_m
         size_m = size_m or max(max(x_max - x_min, y_max - y_min) / _CELLS, _MIN_CELL_M)
-        # One empty cell all around, for the edges to grow into.
+        # One empty cell on each side, which `spread` fills.
         xs = np.arange(x_min - 0.5 * size_m, x_max + size_m, size_m)
         ys = np.arange(y_min - 0.5 * size_m, y_max + size_m, size_m)
         x, y = np.meshgrid(xs, ys)
@@ -61,20 +60,21 @@ class Cells:
         return cls(PoseSet(position_m[room >= 0], room[room >= 0]), room.reshape(x.shape), extent_m)
 
     def spread(self, values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "rows columns"]:
-        """Values of `poses` in their places, grown by a cell into what lies in no room; NaN farther outside."""
-        spread = np.full(self.room.shape, np.nan)
-        spread[self.room >= 0] = values
-        return _grown(spread)
+        """Arrange values of `poses` as a table, extended by one cell outside rooms; NaN farther outside."""
+        table = np.full(self.room.shape, np.nan)
+        table[self.room >= 0] = values
+        return _extended(table)
 
 
 @dataclass(frozen=True, eq=False)
 class HeatMap:
-    """How dark every cell is.
+    """Shades of cells, with the legend of the colour bar.
 
     Attributes:
-        shade: of `cells.poses`, from 0 (lightest) to 1.
-        title: what the colours stand for.
-        ticks: words for some shades, along the bar that explains them.
+        cells: the cells.
+        shade: (n,) shade of each of `cells.poses`, 0 (lightest) to 1.
+        title: quantity that the colours show.
+        ticks: shades and their labels on the colour bar.
     """
 
     cells: Cells
@@ -84,7 +84,7 @@ class HeatMap:
 
 
 def distance_map(cells: Cells, distance: Float[np.ndarray, "n"], title: str) -> HeatMap:
-    """A map of distances, the least the darkest."""
+    """Return a map of distances; the smallest is the darkest."""
     low = max(float(distance.min()), 1e-3)
     high = max(float(distance.max()), 1.001 * low)
     shade = 1.0 - np.log(np.maximum(distance, low) / low) / math.log(high / low)
@@ -93,26 +93,28 @@ def distance_map(cells: Cells, distance: Float[np.ndarray, "n"], title: str) -> 
 
 
 def posterior_map(plan: FloorPlan, places: ProbabilityMap, step_m: float) -> HeatMap:
-    """A map of how probable every place is beside the most probable one.
+    """Return a map of probabilities relative to the most probable position.
 
     Args:
-        step_m: of the grid that was searched: each place stands for a part of its room that is so wide.
+        plan: the plan.
+        places: positions and their probabilities.
+        step_m: step of the pose grid; each position represents a part of its room this wide.
     """
-    cells = Cells.of(plan)
+    cells = Cells.cover(plan)
     left, _, bottom, _ = cells.extent_m
     size_m = (cells.extent_m[1] - left) / cells.room.shape[1]
-    # In cells, from the middle of the first one.
+    # In cells, from the centre of the first one.
     x, y = ((places.position_m - [left, bottom]) / size_m - 0.5).T
     density = np.zeros(cells.room.shape)
     boxes = find_objects(cells.room + 1)
     for room in np.unique(places.room_index):
         box, own = boxes[room] if room < len(boxes) else None, places.room_index == room
-        # A room may be smaller than a cell.
+        # A room smaller than a cell has no box.
         if box is None:
             continue
         inside = cells.room[box] == room
         spread = _splatted(x[own] - box[1].start, y[own] - box[0].start, places.probability[own], inside.shape)
-        # Walls part rooms: what is spread beyond them is of no place.
+        # Smoothing must not cross walls.
         smooth = gaussian_filter(spread, _SPREAD * step_m / size_m, mode="constant", truncate=_REACH)
         density[box][inside] = smooth[inside]
     known = density[cells.room >= 0]
@@ -120,11 +122,11 @@ def posterior_map(plan: FloorPlan, places: ProbabilityMap, step_m: float) -> Hea
         shade = np.maximum(1.0 + np.log10(known / max(float(known.max()), np.finfo(float).tiny)) / _DECADES, 0.0)
     exponents = "⁰¹²³⁴⁵"
     ticks = [(1.0, "1"), *((1.0 - k / _DECADES, f"10⁻{exponents[k]}") for k in range(1, _DECADES + 1))]
-    return HeatMap(cells, shade, "probability beside the best place", tuple(ticks))
+    return HeatMap(cells, shade, "probability relative to the best position", tuple(ticks))
 
 
 def heat_image(heat: HeatMap, plan: FloorPlan) -> str:
-    """The map as a part of a drawing in metres, y pointing down, cut to the plan's floor."""
+    """Draw the map in metres, y pointing down, clipped to the plan's floor."""
     colours = np.full((*heat.cells.room.shape, 4), 0, np.uint8)
     shades = heat.cells.spread(np.clip(heat.shade, 0.0, 1.0))
     known = ~np.isnan(shades)
@@ -139,7 +141,7 @@ def heat_image(heat: HeatMap, plan: FloorPlan) -> str:
 
 
 def colour_bar(heat: HeatMap, x: Number, y: Number, width: Number) -> str:
-    """What the colours stand for: a title, a bar and its ticks, about 62 pixels high; `y` is its upper edge."""
+    """Draw the colour bar with title and ticks, about 62 pixels high; `y` is its upper edge."""
     stops = "".join(
         f'<stop offset="{index / (len(_COLOURS) - 1):.4f}" stop-color="{colour}"/>'
         for index, colour in enumerate(_COLOURS)
@@ -170,7 +172,7 @@ def _colours_of(shade: Float[np.ndarray, "n"]) -> UInt8[np.ndarray, "n 3"]:
 def _splatted(
     x: Float[np.ndarray, "n"], y: Float[np.ndarray, "n"], value: Float[np.ndarray, "n"], shape: tuple[int, int]
 ) -> Float[np.ndarray, "rows columns"]:
-    """Values at places between the middles of cells, shared among the four around each."""
+    """Distribute each value bilinearly among the four cells around its position."""
     spread = np.zeros(shape)
     column, row = np.floor(x).astype(int), np.floor(y).astype(int)
     to_right, up = x - column, y - row
@@ -184,8 +186,8 @@ def _splatted(
     return spread
 
 
-def _grown(table: Float[np.ndarray, "r c"]) -> Float[np.ndarray, "r c"]:
-    """What is known, and the mean of the neighbours that are known where nothing is."""
+def _extended(table: Float[np.ndarray, "r c"]) -> Float[np.ndarray, "r c"]:
+    """Replace each NaN by the mean of its known neighbours."""
     padded = np.pad(table, 1, constant_values=np.nan)
     neighbours = np.stack([padded[1:-1, :-2], padded[1:-1, 2:], padded[:-2, 1:-1], padded[2:, 1:-1]])
     known = ~np.isnan(neighbours)

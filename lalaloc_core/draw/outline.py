@@ -1,6 +1,6 @@
-"""What of a layout is drawn into a photograph: where walls meet floor and ceiling, corners, doors and windows.
+"""Outline of a layout in a panorama: floor and ceiling lines, corners, doors and windows.
 
-In closed form from the plan, like everything that is compared: a pose, a camera height, and the room's walls.
+Computed in closed form from the pose, the camera height and the room's walls.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from lalaloc_core.floorplan import USUAL_HEIGHTS_M, FloorPlan, OpeningFace
 from lalaloc_core.render.profile import nearest_walls
 
 _COLUMNS = 1024
-# Rays this far (radians) to either side of a corner meet the one wall and the other.
+# Extra rays this far (radians) to either side of a corner meet its two walls.
 _BESIDE = 1e-6
-# Rooms of more walls than this have none of them: their corners are as sharp as the columns are fine.
+# Rooms with more walls get no extra rays: their corners are as sharp as the columns.
 _SHARP_WALLS = 256
-# Rays times walls that are crossed at a time.
+# Rays times walls intersected at once, to bound memory.
 _CROSSINGS = 2**20
-# Walls that run on within this angle have no corner between them.
+# Walls within this angle of each other have no corner between them.
 _STRAIGHT = math.radians(8.0)
 _POINTS_PER_OPENING = 33
-# By this share farther away something is hidden.
+# A point farther than the wall by this share is hidden.
 _HIDDEN = 2e-3
 
 Line = Float[np.ndarray, "_ 2"]
@@ -33,7 +33,7 @@ Line = Float[np.ndarray, "_ 2"]
 
 @dataclass(frozen=True, eq=False)
 class OpeningOutline:
-    """An opening, or the part of it that is seen: a closed line around it."""
+    """A closed line around the visible part of an opening."""
 
     kind: str
     line: Line
@@ -44,9 +44,9 @@ class LayoutOutline:
     """Lines of a layout in a panorama, as shares (x, y) of its width and height, y pointing down.
 
     Attributes:
-        floor, ceiling: where the walls end, from the left edge of the panorama to the right one.
-        corners: (k, 2, 2) the edges between walls, from the floor to the ceiling.
-        openings: doors, windows and passages that are seen.
+        floor, ceiling: lower and upper edges of the walls, from the left edge of the panorama to the right.
+        corners: (k, 2, 2) edges between walls, from the floor to the ceiling.
+        openings: visible doors, windows and passages.
     """
 
     floor: Line
@@ -55,14 +55,17 @@ class LayoutOutline:
     openings: tuple[OpeningOutline, ...]
 
 
-def outline_of(
+def layout_outline(
     plan: FloorPlan, position_m: Float[np.ndarray, "2"], room_index: int, heading: float, camera_height_m: float
 ) -> LayoutOutline:
-    """The outline of a room as a camera in it sees it.
+    """Return the outline of a room as seen by a camera in it.
 
     Args:
+        plan: the plan.
+        position_m: (2,) position of the camera.
+        room_index: room of the camera.
         heading: azimuth (radians) of the panorama's centre column.
-        camera_height_m: over the floor; what lies higher than the ceiling is drawn as if it lay just below it.
+        camera_height_m: height over the floor; a camera above the ceiling is drawn just below it.
     """
     walls_m = plan.rooms[room_index].walls_m
     ends = np.concatenate([walls_m[:, :2], walls_m[:, 2:]]) - position_m
@@ -77,8 +80,9 @@ def outline_of(
     above_m = max(float(plan.ceiling_heights_m[room_index]) - camera_height_m, 0.01)
     turns = _turns(walls_m, wall, distance_m)
     near_m = np.minimum(distance_m[:-1], distance_m[1:])[turns]
-    at = azimuth[:-1][turns]
-    corners = np.stack([points_at(at, near_m, -camera_height_m), points_at(at, near_m, above_m)], axis=1)
+    bends = azimuth[:-1][turns]
+    low, high = (project_points(bends, near_m, rise_m) for rise_m in (-camera_height_m, above_m))
+    corners = np.stack([low, high], axis=1)
     openings = [
         drawn
         for face in plan.opening_faces
@@ -86,22 +90,22 @@ def outline_of(
         for drawn in _opening(plan, face, position_m, heading, camera_height_m, walls_m)
     ]
     return LayoutOutline(
-        points_at(azimuth, distance_m, -camera_height_m),
-        points_at(azimuth, distance_m, above_m),
+        project_points(azimuth, distance_m, -camera_height_m),
+        project_points(azimuth, distance_m, above_m),
         corners,
         tuple(openings),
     )
 
 
-def points_at(
+def project_points(
     azimuth: Float[np.ndarray, "n"], distance_m: Float[np.ndarray, "n"], rise_m: Float[np.ndarray, "n"] | float
 ) -> Line:
-    """Where points appear in a panorama, as shares of its width and height.
+    """Project points into a panorama, as shares (x, y) of its width and height.
 
     Args:
-        azimuth: radians, relative to the heading, in [-π, π].
-        distance_m: along the floor.
-        rise_m: above the camera.
+        azimuth: (n,) radians, relative to the heading, in [-π, π].
+        distance_m: (n,) horizontal distances.
+        rise_m: heights above the camera.
     """
     return np.stack([azimuth / TWO_PI + 0.5, 0.5 - np.arctan2(rise_m, distance_m) / math.pi], axis=-1)
 
@@ -109,7 +113,7 @@ def points_at(
 def _met(
     position_m: Float[np.ndarray, "2"], azimuth: Float[np.ndarray, "n"], walls_m: Float[np.ndarray, "w 4"]
 ) -> tuple[Float[np.ndarray, "n"], Int[np.ndarray, "n"]]:
-    """How far off the wall is that each ray meets, and which one; a part of the rays at a time, to bound memory."""
+    """Return distance and index of the wall that each ray meets, in parts to bound memory."""
     parts = np.array_split(azimuth, -(-len(azimuth) * len(walls_m) // _CROSSINGS))
     met = [nearest_walls(position_m[None], part[None], walls_m[None]) for part in parts]
     return np.concatenate([distance[0] for distance, _ in met]), np.concatenate([wall[0] for _, wall in met])
@@ -118,7 +122,7 @@ def _met(
 def _turns(
     walls_m: Float[np.ndarray, "w 4"], wall: Int[np.ndarray, "n"], distance_m: Float[np.ndarray, "n"]
 ) -> Bool[np.ndarray, "n-1"]:
-    """Between which neighbouring rays there is a corner: another wall that is turned, or farther away."""
+    """Return True between neighbouring rays with a corner: another wall, at an angle or at another distance."""
     edge = walls_m[:, 2:] - walls_m[:, :2]
     along = np.arctan2(edge[:, 0], edge[:, 1])
     first, second = wall[:-1], wall[1:]
@@ -149,14 +153,14 @@ def _opening(
     met_m, _ = _met(position_m, azimuth, walls_m)
     visible = (distance_m > 0.0) & (distance_m <= met_m * (1.0 + _HIDDEN) + 1e-3)
     relative = wrap_angle(azimuth - heading)
-    # The panorama's edges part what crosses them.
+    # Split openings that cross the panorama's edge.
     parts = np.split(np.arange(len(relative)), np.flatnonzero(np.abs(np.diff(relative)) > math.pi) + 1)
     drawn = []
     for part in parts:
         for run in np.split(part, np.flatnonzero(~visible[part])):
             run = run[visible[run]]
             if len(run) > 1:
-                lower = points_at(relative[run], distance_m[run], low_m - camera_height_m)
-                upper = points_at(relative[run], distance_m[run], high_m - camera_height_m)
+                lower = project_points(relative[run], distance_m[run], low_m - camera_height_m)
+                upper = project_points(relative[run], distance_m[run], high_m - camera_height_m)
                 drawn.append(OpeningOutline(opening.kind, np.concatenate([lower, upper[::-1], lower[:1]])))
     return drawn

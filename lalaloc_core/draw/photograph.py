@@ -1,4 +1,4 @@
-"""Photographs with lines in them: the outline of a layout, or walls as a network reads them."""
+"""Photographs with lines over them: the outline of a layout, or walls predicted by a network."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from PIL import Image
 from lalaloc_core.draw.canvas import INK, Box, Number, document, image, path, pixels, png, words
 from lalaloc_core.draw.outline import LayoutOutline
 
-# Told apart by all who see little colour, on bright walls and dark furniture alike.
+# Distinct for colour-blind readers, on bright walls and dark furniture.
 WALL_COLOUR = "#ffb000"
 OPENING_COLOURS = {"door": "#dc267f", "window": "#4f7dff", "passage": "#ffffff"}
 
 
 @dataclass(frozen=True, eq=False)
 class Stroke:
-    """Lines of pixels (x, y) in one colour, `width` pixels broad, on a dark edge of `edge_width`."""
+    """Lines of pixels (x, y) in one colour, `width` pixels wide, on a dark edge of `edge_width`."""
 
     lines: Sequence[Float[np.ndarray, "_ 2"]]
     colour: str
@@ -28,14 +28,14 @@ class Stroke:
 
 
 def draw_strokes(photograph: UInt8[np.ndarray, "h w 3"], strokes: Sequence[Stroke]) -> Image.Image:
-    """A picture with lines over it, the last ones on top."""
+    """Draw lines over a photograph, the last ones on top."""
     height, width, _ = photograph.shape
     whole = image(png(photograph), "png", (0.0, 0.0, width, height), 'image-rendering="optimizeSpeed"')
     return pixels(document(width, height, "", [whole, *(_stroke(stroke) for stroke in strokes)]))
 
 
 def wall_line(profile_m: Float[np.ndarray, "w"], rise_m: float, height: int) -> Float[np.ndarray, "w 2"]:
-    """Where the walls of a profile pass a level `rise_m` above the camera, as pixels (x, y) of a panorama."""
+    """Return the line at `rise_m` above the camera on the walls of a profile, as pixels (x, y) of a panorama."""
     x = np.arange(len(profile_m)) + 0.5
     return np.stack([x, (0.5 - np.arctan2(rise_m, profile_m) / np.pi) * height], axis=1)
 
@@ -47,24 +47,26 @@ def wall_stroke(
     width: float = 2.0,
     edge_width: float = 3.0,
 ) -> Stroke:
-    """Floor line, ceiling line and corners of an outline in a picture of a size (width, height)."""
+    """Return floor line, ceiling line and corners of an outline in a picture of a size (width, height)."""
     return Stroke(
         [line * size for line in (outline.floor, outline.ceiling, *outline.corners)], colour, width, edge_width
     )
 
 
 def photograph_part(content: bytes, kind: str, outline: LayoutOutline, box: Box) -> str:
-    """A photograph with a layout in it as a part of a larger drawing.
+    """Draw a photograph with a layout over it as a part of a larger drawing.
 
     Args:
-        content: the encoded picture, and its `kind`: "jpeg" or "png"; as many pixels as the box has.
+        content: the encoded picture, as many pixels as the box.
+        kind: "jpeg" or "png".
+        outline: the layout.
         box: x, y, width and height.
     """
     x, y, width, height = box
     size = np.array([width, height])
-    # Of the width, so that lines look alike in every size.
+    # Proportional to the width, so that lines look alike at every size.
     line = width / 480.0
-    # Pixels that are drawn as they are: smoothing them takes a second.
+    # Unscaled pixels need no smoothing, which takes a second.
     parts = [image(content, kind, (0.0, 0.0, width, height), 'image-rendering="optimizeSpeed"')]
     for opening in outline.openings:
         d, colour = path([opening.line * size]), OPENING_COLOURS[opening.kind]
@@ -78,11 +80,11 @@ def photograph_part(content: bytes, kind: str, outline: LayoutOutline, box: Box)
 
 
 def photograph_key(outline: LayoutOutline, x: Number, y: Number) -> str:
-    """What the lines in a photograph are; `y` is the base line of its words."""
+    """Draw the legend of the lines in a photograph; `y` is the base line of its text."""
     kinds = sorted({opening.kind for opening in outline.openings}, key=list(OPENING_COLOURS).index)
     parts = []
     for name, colour in (
-        ("where the plan has the walls", WALL_COLOUR),
+        ("walls of the plan", WALL_COLOUR),
         *((kind + "s", OPENING_COLOURS[kind]) for kind in kinds),
     ):
         parts.append(

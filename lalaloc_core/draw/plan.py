@@ -1,4 +1,4 @@
-"""A floor plan as an SVG drawing, y up as in the plan frame."""
+"""Floor plans as SVG drawings, y up as in the plan frame."""
 
 from __future__ import annotations
 
@@ -11,22 +11,22 @@ from jaxtyping import Float
 
 from lalaloc_core.draw.canvas import FONT_FAMILY, FOUND, INK, Box, xml_text
 from lalaloc_core.floorplan import FloorPlan, OpeningFace, Room
-from lalaloc_core.floorplan.inmost import inmost_place
+from lalaloc_core.floorplan.rooms import interior_point
 
 _MARGIN_M = 0.5
 _FILLS = ("#eef4fb", "#f7f1e6", "#eef7ee", "#f8eef4", "#f2f0fa", "#f4f6ea")
-# Of the line on the wall, and of the gap through it.
+# Colours of the line on the wall, and of the gap through it.
 _OPENING_COLOURS = {"door": "#b5651d", "window": "#2b7fc9", "passage": "#8c939c"}
 _GAP_COLOURS = {"door": "#f6dfc6", "window": "#cde6fb", "passage": "#ffffff"}
-# Walls are drawn this far outwards from the floors that they enclose: those between rooms meet.
+# Thickness of drawn walls outside each floor; walls between rooms meet.
 _WALL_M = 0.12
-# Where a heat map goes in what `draw_rooms` makes.
+# Placeholder for a heat map in the result of `draw_rooms`.
 _HEAT_PLACE = "<!--heat-->"
-# A scale bar of a round length, about this share of the drawing's width.
+# Largest length of the scale bar, as a share of the drawing's width.
 _BAR_SHARE = 0.2
-# 95 % of a normal distribution in the plane lie within so many standard deviations: the root of -2 log 0.05.
+# Radius, in standard deviations, that holds 95 % of a 2-D normal distribution: sqrt(-2 log 0.05).
 ELLIPSE_STDS = 2.4477
-# Of the drawing's size: room for the scale bar's label; the camera's radius; and how many radii its wedge reaches.
+# Share of the drawing for the scale bar's label, drawing size per camera radius, and reach of the wedge in radii.
 _LABEL_SHARE, _CAMERAS_PER_EXTENT, _CAMERA_REACH = 0.04, 70.0, 5.5
 
 
@@ -41,13 +41,15 @@ class Marker:
 
 
 def plan_svg(plan: FloorPlan, marker: Marker | None = None, *, rooms: str | None = None) -> str:
-    """The plan with the names and areas of its rooms and a scale bar; one SVG unit is one metre.
+    """Draw the plan with names and areas of its rooms and a scale bar; one SVG unit is one metre.
 
-    The view box is the plan's bounds with a margin, and the camera; its y axis points down: plan point (x, y) is drawn
-    at (x, -y).
+    The view box is the plan's bounds with a margin, extended to the camera. Its y axis points down: plan point (x, y)
+    is drawn at (x, -y).
 
     Args:
-        rooms: what `draw_rooms` made of it before.
+        plan: the plan.
+        marker: camera to draw.
+        rooms: cached result of `draw_rooms` for the plan.
     """
     left, top, width, height = _view_box(plan, [] if marker is None else [(marker.x_m, marker.y_m)])
     scale = 1000.0 / max(width, height)
@@ -72,13 +74,15 @@ def plan_part(
     heat: str = "",
     rooms: str | None = None,
 ) -> str:
-    """The plan as a part of a larger drawing, as large as fits into a box (x, y, width, height), in its middle.
+    """Draw the plan as a part of a larger drawing, fitted and centred in a box.
 
     Args:
-        over: what is drawn over it, in metres, y pointing down.
-        seen_m: places that shall be seen even where they lie outside of the plan.
-        heat: a heat map, drawn on the floors.
-        rooms: what `draw_rooms` made of it before.
+        plan: the plan.
+        box: x, y, width and height.
+        over: SVG drawn over the plan, in metres, y pointing down.
+        seen_m: positions to include, even outside the plan.
+        heat: heat map, drawn on the floors.
+        rooms: cached result of `draw_rooms` for the plan.
     """
     x, y, box_width, box_height = box
     left, top, width, height = _view_box(plan, seen_m)
@@ -91,24 +95,24 @@ def plan_part(
 
 
 def shape_of(plan: FloorPlan, seen_m: Sequence[tuple[float, float]] = ()) -> float:
-    """How many times as wide as high a plan is drawn."""
+    """Return the aspect ratio (width / height) of a plan's drawing."""
     _, _, width, height = _view_box(plan, seen_m)
     return width / height
 
 
 def extent_m(plan: FloorPlan) -> float:
-    """The longer side of a plan's drawing, which marks are measured by."""
+    """Return the longer side (m) of a plan's drawing, which scales marks."""
     return max(_size_m(plan))
 
 
 def floor_path(plan: FloorPlan) -> str:
-    """All rooms and their holes as the `d` of an SVG path, in metres, y pointing down."""
+    """Return all rooms and their holes as the `d` of an SVG path, in metres, y pointing down."""
     rings = [ring for room in plan.rooms for ring in (room.polygon_m, *room.holes_m)]
     return "".join("M" + "L".join(f"{x:.3f} {-y:.3f}" for x, y in ring) + "Z" for ring in rings)
 
 
 def draw_rooms(plan: FloorPlan) -> str:
-    """Outlines, openings, names and areas of all rooms: what takes its time, the same wherever a camera stands."""
+    """Draw outlines, openings, names and areas of all rooms: the slow part of a drawing, independent of cameras."""
     extent = max(_size_m(plan))
     wall = 2.0 * max(_WALL_M, extent / 400.0)
     lines = [
@@ -129,11 +133,11 @@ def draw_rooms(plan: FloorPlan) -> str:
 
 
 def draw_camera(marker: Marker, extent: float, colour: str = FOUND) -> str:
-    """A dot, a wedge that opens towards the heading, and the ellipse that holds 95 % of its covariance."""
+    """Draw a dot, a wedge towards the heading, and the 95 % ellipse of the covariance."""
     radius = extent / _CAMERAS_PER_EXTENT
     wedge = ""
     if marker.heading_deg is not None:
-        # SVG turns clockwise, as azimuths do; the wedge is drawn looking up, along the plan's +y.
+        # SVG rotates clockwise, like azimuths; the unrotated wedge points up, along the plan's +y.
         side, reach = 2.2 * radius, 4.6 * radius
         wedge = (
             f'<path d="M0 0L{-side:.4f} {-reach:.4f}Q0 {-1.17 * reach:.4f} {side:.4f} {-reach:.4f}Z" '
@@ -155,15 +159,15 @@ def _rooms_and_scale(plan: FloorPlan, rooms: str | None, heat: str) -> str:
 
 
 def _size_m(plan: FloorPlan) -> tuple[float, float]:
-    """Width and height of the drawing, margins included."""
+    """Return width and height of the drawing, margins included."""
     x_min, y_min, x_max, y_max = plan.bounds_m
     width, height = x_max - x_min + 2 * _MARGIN_M, y_max - y_min + 2 * _MARGIN_M
-    # Below the plan there is the scale bar with its label, which grows with the plan.
+    # The scale bar with its label is below the plan and grows with it.
     return width, height + max(_MARGIN_M, _LABEL_SHARE * max(width, height))
 
 
 def _view_box(plan: FloorPlan, seen_m: Sequence[tuple[float, float]]) -> tuple[float, float, float, float]:
-    """Left, top, width and height of what is seen, y pointing down."""
+    """Return left, top, width and height of the view, y pointing down."""
     width, height = _size_m(plan)
     left, top = plan.bounds_m[0] - _MARGIN_M, -plan.bounds_m[3] - _MARGIN_M
     right, bottom = left + width, top + height
@@ -175,8 +179,8 @@ def _view_box(plan: FloorPlan, seen_m: Sequence[tuple[float, float]]) -> tuple[f
 
 
 def _outline(room: Room, fill: str, extent_m: float) -> str:
-    """The floor, with holes left white, and free-standing walls."""
-    # Half of an outline lies on the floor, which would look smaller by so much.
+    """Draw the floor, with white holes, and free-standing walls."""
+    # Thin: half of an outline covers the floor.
     width = f'stroke-width="{extent_m / 500:.4f}"'
     rings = [(room.polygon_m, fill), *((hole, "#fff") for hole in room.holes_m)]
     lines = [f'<polygon points="{_points(ring)}" fill="{colour}" {width}/>' for ring, colour in rings]
@@ -187,7 +191,7 @@ def _outline(room: Room, fill: str, extent_m: float) -> str:
 
 
 def _opening(plan: FloorPlan, face: OpeningFace, extent_m: float) -> str:
-    """A piece of wall in the colour of what is in it, and once for both rooms the gap through the wall's thickness."""
+    """Draw an opening on its wall and, once for both rooms, the gap through the wall's thickness."""
     own = _piece_m(plan.rooms[face.room], face.wall, face.start, face.end)
     kind = plan.openings[face.opening].kind
     parts = []
@@ -203,7 +207,7 @@ def _opening(plan: FloorPlan, face: OpeningFace, extent_m: float) -> str:
     stroke = f'd="{path}" stroke-width="{extent_m / 220:.4f}"'
     dashes = ""
     if kind == "passage":
-        # Nothing stands there: between the dashes there is no wall either.
+        # A passage has no leaf: the gap shows between the dashes.
         parts.append(f'<path {stroke} stroke="{_GAP_COLOURS[kind]}"/>')
         dashes = f' stroke-dasharray="{extent_m / 75:.4f}"'
     parts.append(f'<path class="{kind}" {stroke} stroke="{_OPENING_COLOURS[kind]}"{dashes}/>')
@@ -211,7 +215,7 @@ def _opening(plan: FloorPlan, face: OpeningFace, extent_m: float) -> str:
 
 
 def _beyond_m(plan: FloorPlan, face: OpeningFace, own_m: Float[np.ndarray, "2 2"]) -> Float[np.ndarray, "2 2"]:
-    """The other side of the wall: where the room behind has its own, else a wall's thickness outwards."""
+    """Return the opening on the other side of the wall: that of the room behind, or a wall's thickness outwards."""
     if face.behind >= 0:
         return _piece_m(plan.rooms[face.behind], face.exit_wall, face.exit_start, face.exit_end)
     (along_x, along_y) = own_m[1] - own_m[0]
@@ -229,8 +233,8 @@ def _points(ring_m: Float[np.ndarray, "n 2"]) -> str:
 
 
 def _label(room: Room, extent_m: float) -> str:
-    """Name and area at the middle of a large circle in the room, small enough to fit."""
-    (x, y), radius_m = inmost_place(room.shape)
+    """Draw name and area at the room's interior point, small enough to fit."""
+    (x, y), radius_m = interior_point(room.shape)
     size = min(extent_m / 40.0, 2.6 * radius_m / max(len(room.name), 6))
     return (
         f'<text x="{x:.3f}" y="{-y:.3f}" font-size="{size:.4f}" stroke-width="{0.18 * size:.4f}">{xml_text(room.name)}'

@@ -1,17 +1,18 @@
 """Floor plans: validated, immutable rooms as closed polygons, with the openings in their walls.
 
-Begin with `plan.py`. `reading.py` makes rooms of a document, `openings.py` puts openings into their walls, `checks.py`
-is what only all rooms together can break, `geometry.py` the arrays that the layout renderer casts its rays against.
+Begin with `plan.py`. `reading.py` reads rooms and openings from a document, `openings.py` places openings on walls,
+`checks.py` validates all rooms together, `geometry.py` builds the arrays for the layout renderer, and `anchors.py` and
+`earth.py` relate a plan to latitude and longitude.
 """
 
 from lalaloc_core.floorplan.anchors import MAX_FROM_ORIGIN_M, anchor_document
 from lalaloc_core.floorplan.geometry import PlanGeometry, pad_walls
-from lalaloc_core.floorplan.heights import MAX_CAMERA_HEIGHT_STD_M
 from lalaloc_core.floorplan.limits import DEFAULT_LIMITS, PlanLimits
 from lalaloc_core.floorplan.openings import DEFAULT_OPENING_TOLERANCE_M, USUAL_HEIGHTS_M, Opening, OpeningFace
 from lalaloc_core.floorplan.plan import DEFAULT_CAMERA_HEIGHT_M, FloorPlan
+from lalaloc_core.floorplan.reading import MAX_CAMERA_HEIGHT_STD_M
 from lalaloc_core.floorplan.rooms import Room
-from lalaloc_core.floorplan.types import room_type_of
+from lalaloc_core.floorplan.types import room_type_from_label
 
 __all__ = [
     "DEFAULT_CAMERA_HEIGHT_M",
@@ -28,5 +29,5 @@ __all__ = [
     "Room",
     "anchor_document",
     "pad_walls",
-    "room_type_of",
+    "room_type_from_label",
 ]

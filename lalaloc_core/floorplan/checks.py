@@ -1,4 +1,4 @@
-"""What only all rooms of a plan together can break: its size, and rooms that overlap."""
+"""Checks of all rooms of a plan together: total size and overlaps."""
 
 from __future__ import annotations
 
@@ -11,44 +11,43 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.limits import PlanLimits
 from lalaloc_core.floorplan.rooms import Room
 
-# Looking for overlaps ends after so many found, or so many pairs looked at: their number grows with the square.
+# The search for overlaps ends after this many found or pairs tested; the number of pairs is quadratic in the rooms.
 _MAX_OVERLAPS, _MAX_PAIRS = 20, 5000
-# Two combs of two hundred corners may cross ten thousand times: what is looked at is bounded by pairs of walls that may
-# cross, over all pairs of rooms. Counting them is not worth it where there are few.
+# Two combs of two hundred vertices can cross ten thousand times, so the number of wall pairs that can cross is limited
+# over all pairs of rooms. Pairs of rooms with fewer wall pairs than `_FEW` are not counted.
 _MAX_WORK, _FEW = 100_000, 400
 
 
 def check_size(rooms: Sequence[Room], limits: PlanLimits) -> None:
-    """Refuse a plan that is too large, as one drawn in millimetres is.
+    """Refuse a plan that is too large, such as one drawn in millimetres.
 
     Raises:
-        InvalidFloorPlanError: it is.
+        InvalidFloorPlanError: extent, floor area or bounding boxes exceed the limits.
     """
     corners = np.concatenate([room.polygon_m for room in rooms])
     extent = float(np.ptp(corners, axis=0).max())
     if extent > limits.max_extent_m:
         raise InvalidFloorPlanError(
-            f"the plan is {extent:.6g} m across, at most {limits.max_extent_m:g} m is allowed (max_extent_m); "
+            f"the plan is {extent:.6g} m across; the limit is {limits.max_extent_m:g} m (LALALOC_MAX_EXTENT_M); "
             "are the coordinates in metres?"
         )
     area_m2 = sum(room.area_m2 for room in rooms)
     if area_m2 > limits.max_area_m2:
         raise InvalidFloorPlanError(
-            f"the floor area is {area_m2:.6g} m², at most {limits.max_area_m2:g} m² is allowed (max_area_m2); "
+            f"the floor area is {area_m2:.6g} m²; the limit is {limits.max_area_m2:g} m² (LALALOC_MAX_AREA_M2); "
             "are the coordinates in metres?"
         )
     boxes_m2 = sum(float(np.prod(np.ptp(room.polygon_m, axis=0))) for room in rooms)
     if boxes_m2 > limits.max_bounds_area_m2:
         raise InvalidFloorPlanError(
-            f"the boxes around all rooms cover {boxes_m2:.6g} m², at most {limits.max_bounds_area_m2:g} m² is allowed "
-            "(max_bounds_area_m2)"
+            f"the bounding boxes of all rooms cover {boxes_m2:.6g} m²; the limit is {limits.max_bounds_area_m2:g} m² "
+            "(LALALOC_MAX_BOUNDS_AREA_M2)"
         )
 
 
 def overlap_warnings(rooms: Sequence[Room], limits: PlanLimits) -> tuple[str, ...]:
-    """Pairs of rooms that share floor, the first twenty of them, and of pairs that are worth their work only."""
+    """Return a warning for each of the first twenty pairs of rooms that overlap, within a bounded amount of work."""
     shapes = [room.shape for room in rooms]
-    # Whose boxes meet; whether the rooms themselves do is asked of each pair, and of not too many.
     first, second = shapely.STRtree(shapes).query(shapes)
     pairs = sorted((int(i), int(j)) for i, j in zip(first, second, strict=True) if i < j)
     crossings = _Crossings(rooms)
@@ -58,9 +57,9 @@ def overlap_warnings(rooms: Sequence[Room], limits: PlanLimits) -> tuple[str, ..
         if len(warnings) == _MAX_OVERLAPS:
             is_complete = False
             break
-        # Pairs of simple rooms are always looked at, whatever stands beside them.
+        # Pairs of simple rooms are always tested.
         if len(rooms[i].walls_m) * len(rooms[j].walls_m) > _FEW:
-            # Counting is work as well: once there was too much of it, it ends.
+            # Counting is work too, so it stops above the limit.
             work += crossings.between(i, j) if work <= _MAX_WORK else 0
             if work > _MAX_WORK:
                 is_complete = False
@@ -69,12 +68,12 @@ def overlap_warnings(rooms: Sequence[Room], limits: PlanLimits) -> tuple[str, ..
         if shared > limits.overlap_tolerance_m2:
             warnings.append(f"rooms '{rooms[i].name}' and '{rooms[j].name}' overlap by {shared:.2f} m²")
     if not is_complete:
-        warnings.append("more rooms may overlap, the rest was not looked at")
+        warnings.append("more rooms may overlap; the remaining pairs were not checked")
     return tuple(warnings)
 
 
 class _Crossings:
-    """Counts pairs of walls whose boxes meet: what the intersection of two rooms costs, without computing it."""
+    """Counter of wall pairs whose bounding boxes meet: an estimate of the cost of intersecting two rooms."""
 
     def __init__(self, rooms: Sequence[Room]) -> None:
         self._rooms = rooms

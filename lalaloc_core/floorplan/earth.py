@@ -1,4 +1,4 @@
-"""Where on Earth a plan lies: anchors, and from latitude and longitude to local metres and back."""
+"""Anchors: conversion between the plan frame and latitude and longitude (WGS84)."""
 
 from __future__ import annotations
 
@@ -13,16 +13,19 @@ from jaxtyping import Float
 if TYPE_CHECKING:
     from pyproj import Transformer
 
-# Frames whose projections are kept.
-_KEPT = 256
+# Number of cached projections.
+_CACHED = 256
 
 
 @dataclass(frozen=True)
 class Anchor:
-    """Where on Earth a plan's origin lies, WGS84; `north_deg` is the azimuth of true north in the plan frame there.
+    """Position of a plan's origin on Earth (WGS84) and its orientation.
 
     Attributes:
-        altitude_m: of the plan's floor, over the ellipsoid; None when it is not known.
+        latitude: degrees.
+        longitude: degrees.
+        altitude_m: height of the plan's floor over the ellipsoid; None if unknown.
+        north_deg: azimuth of true north in the plan frame, at the origin.
     """
 
     latitude: float
@@ -31,20 +34,20 @@ class Anchor:
     north_deg: float = 0.0
 
     def to_earth(self, position_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Longitude and latitude (degrees) of positions in the plan frame."""
+        """Convert positions (m) in the plan frame to longitudes and latitudes (degrees)."""
         return LocalFrame(self.longitude, self.latitude).to_earth(self._turned(position_m))
 
     def to_plan(self, lon_lat: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Positions in the plan frame of longitudes and latitudes (degrees)."""
+        """Convert longitudes and latitudes (degrees) to positions (m) in the plan frame."""
         east_north = LocalFrame(self.longitude, self.latitude).to_local(lon_lat)
         north = math.radians(self.north_deg)
-        # The rows are east and north as the plan has them; turning back is the transpose.
+        # The transpose of the rotation in `_turned`.
         return east_north @ np.array([[math.cos(north), -math.sin(north)], [math.sin(north), math.cos(north)]])
 
     def true_azimuth_deg(self, position_m: tuple[float, float], azimuth_deg: float) -> float:
-        """Degrees clockwise from true north, at a place of the plan, of an azimuth of the plan frame (degrees).
+        """Convert an azimuth of the plan frame (degrees) to degrees clockwise from true north at a position (m).
 
-        North is that of the place, which converges on that of the anchor: 0.01° a kilometre to the east.
+        Meridians converge: true north at the position differs from that at the anchor by some 0.01° per kilometre east.
         """
         place = np.array([position_m], dtype=float)
         frame = LocalFrame(self.longitude, self.latitude)
@@ -52,50 +55,50 @@ class Anchor:
         return (azimuth_deg - self.north_deg + convergence_deg) % 360.0
 
     def moved(self, origin_m: tuple[float, float]) -> Anchor:
-        """The anchor of the plan whose origin is a place of this one, its axes unturned."""
+        """Return the anchor of the same plan with its origin moved to a position (m), its axes unrotated."""
         ((longitude, latitude),) = self.to_earth(np.array([origin_m], dtype=float))
         convergence_deg = LocalFrame(self.longitude, self.latitude).convergence_deg(np.array([longitude, latitude]))
         north_deg = (self.north_deg - convergence_deg) % 360.0
         return Anchor(float(latitude), float(longitude), self.altitude_m, north_deg)
 
     def _turned(self, position_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Metres east and north: north lies `north_deg` clockwise from the plan's +y."""
+        """Rotate positions to metres east and north: north lies `north_deg` clockwise from the plan's +y."""
         north = math.radians(self.north_deg)
         return position_m @ np.array([[math.cos(north), math.sin(north)], [-math.sin(north), math.cos(north)]])
 
 
 @dataclass(frozen=True)
 class LocalFrame:
-    """East and north in metres around a place: a transverse Mercator projection through it, true to scale there.
+    """Metres east and north of a point: a transverse Mercator projection centred there.
 
-    Within a kilometre of the place lengths are right to a hundred-millionth.
+    Lengths within a kilometre of the point are accurate to 1e-8.
     """
 
     longitude: float
     latitude: float
 
     def to_local(self, lon_lat: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Metres east and north of the place."""
+        """Convert longitudes and latitudes (degrees) to metres east and north of the point."""
         return _transform(_projection(self), lon_lat, inverse=False)
 
     def to_earth(self, east_north_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Longitude and latitude (degrees)."""
+        """Convert metres east and north to longitudes and latitudes (degrees)."""
         return _transform(_projection(self), east_north_m, inverse=True)
 
     def convergence_deg(self, lon_lat: Float[np.ndarray, "2"]) -> float:
-        """How far clockwise from true north, at a longitude and latitude (degrees), the frame's north points."""
+        """Return the angle clockwise from true north to the frame's north at a longitude and latitude (degrees)."""
         longitude, latitude = lon_lat
         span = math.radians(float(longitude) - self.longitude)
         return math.degrees(math.atan(math.tan(span) * math.sin(math.radians(float(latitude)))))
 
     @property
     def anchor(self) -> Anchor:
-        """The place as the anchor of a plan whose +y is north."""
+        """The point as the anchor of a plan whose +y is north."""
         return Anchor(latitude=self.latitude, longitude=self.longitude, north_deg=0.0)
 
 
 def to_wgs84(code: str, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-    """Longitude and latitude of points in the reference system of an authority's code, such as "EPSG:25832".
+    """Convert points in the reference system of an authority's code, such as "EPSG:25832", to longitude and latitude.
 
     Raises:
         ProjError: an unknown code.
@@ -105,7 +108,7 @@ def to_wgs84(code: str, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "
     return _transform(Transformer.from_crs(code, "EPSG:4326", always_xy=True), points, inverse=False)
 
 
-@lru_cache(_KEPT)
+@lru_cache(_CACHED)
 def _projection(frame: LocalFrame) -> Transformer:
     from pyproj import Transformer
 

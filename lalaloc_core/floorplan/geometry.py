@@ -1,4 +1,4 @@
-"""A plan's walls and openings as padded arrays, one row per room: what the layout renderer casts its rays against."""
+"""A plan's walls and openings as arrays for the renderer: padded per room, or in one table without padding."""
 
 from __future__ import annotations
 
@@ -7,30 +7,29 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from array_api_compat import array_namespace, device
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
 
 from lalaloc_core.conventions import WALL_CODE, Array
-from lalaloc_core.floorplan.arrays import frozen
 from lalaloc_core.floorplan.openings import Opening, OpeningFace
-from lalaloc_core.floorplan.rooms import Room
+from lalaloc_core.floorplan.rooms import Room, frozen
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PlanGeometry:
-    """Arrays over the rooms of one plan; index them with a pose's room. Lengths in metres.
+    """Padded arrays over the rooms of one plan, indexed by a pose's room. Lengths in metres.
 
-    Rows of `walls_m` are padded by repeating a room's first wall, rows of openings with kind 0, which is none.
+    Rows of `walls_m` are padded by repeating a room's first wall, rows of openings with kind 0 (wall).
 
     Attributes:
         walls_m: (r, n, 4) wall segments (x0, y0, x1, y1).
-        wall_count: (r) how many of them are no padding.
+        wall_count: (r,) number of walls without padding.
         opening_kind: (r, m) codes as in `conventions.OPENING_CLASSES`.
         opening_m: (r, m, 4) the opening on the room's own wall.
-        opening_wall: (r, m) that wall's index, -1 in the padding.
-        opening_share: (r, m, 2) where on it the opening begins and ends, as shares of its length.
-        sill_m, head_m: (r, m) heights of the opening; -inf and inf where the plan does not say.
-        behind: (r, m) index of the room behind, -1 where the plan shows none.
-        exit_m: (r, m, 4) the opening on the wall of the room behind; its own piece where there is none.
+        opening_wall: (r, m) index of that wall, -1 in the padding.
+        opening_share: (r, m, 2) start and end of the opening as shares of the wall's length.
+        sill_m, head_m: (r, m) heights of the opening; -inf and inf if the plan does not give them.
+        behind: (r, m) index of the room behind, -1 for none.
+        exit_m: (r, m, 4) the opening on the wall of the room behind; `opening_m` if there is none.
         opening: (r, m) index in the plan's `openings`, -1 in the padding.
     """
 
@@ -48,26 +47,26 @@ class PlanGeometry:
 
     @property
     def nbytes(self) -> int:
-        """Memory that numpy arrays of it take."""
+        """Memory of the arrays, for numpy."""
         return sum(getattr(self, field.name).nbytes for field in fields(self))
 
     def like(self, array: Array) -> PlanGeometry:
-        """The same geometry in the library, on the device and with the float type of another array."""
-        xp, where = array_namespace(array), device(array)
-        if type(self.walls_m) is type(array) and self.walls_m.dtype == array.dtype and device(self.walls_m) == where:
+        """Convert to the array library, device and float type of another array."""
+        xp, target = array_namespace(array), device(array)
+        if type(self.walls_m) is type(array) and self.walls_m.dtype == array.dtype and device(self.walls_m) == target:
             return self
 
-        def moved(value: Array) -> Array:
+        def convert(value: Array) -> Array:
             is_float = array_namespace(value).isdtype(value.dtype, "real floating")
-            # Torch warns of memory that it may not write to.
+            # Torch warns about read-only memory.
             source = value.copy() if isinstance(value, np.ndarray) else value
-            return xp.asarray(source, dtype=array.dtype if is_float else xp.int64, device=where)
+            return xp.asarray(source, dtype=array.dtype if is_float else xp.int64, device=target)
 
-        return replace(self, **{field.name: moved(getattr(self, field.name)) for field in fields(self)})
+        return replace(self, **{field.name: convert(getattr(self, field.name)) for field in fields(self)})
 
 
 def build_geometry(rooms: Sequence[Room], openings: Sequence[Opening], faces: Sequence[OpeningFace]) -> PlanGeometry:
-    """The arrays of a plan."""
+    """Build the padded arrays of a plan."""
     longest = max(len(room.walls_m) for room in rooms)
     walls_m = np.stack([pad_walls(room.walls_m, longest) for room in rooms])
     by_room: list[list[OpeningFace]] = [[] for _ in rooms]
@@ -80,15 +79,15 @@ def build_geometry(rooms: Sequence[Room], openings: Sequence[Opening], faces: Se
     for room, group in enumerate(by_room):
         for k, face in enumerate(group):
             source = openings[face.opening]
-            at = (room, k)
-            kind[at], wall[at], behind[at], opening[at] = source.code, face.wall, face.behind, face.opening
-            sill_m[at] = -np.inf if source.sill_m is None else source.sill_m
-            head_m[at] = np.inf if source.head_m is None else source.head_m
-            share[at] = face.start, face.end
-            opening_m[at] = _piece(rooms[room].walls_m[face.wall], face.start, face.end)
-            exit_m[at] = opening_m[at]
+            cell = (room, k)
+            kind[cell], wall[cell], behind[cell], opening[cell] = source.code, face.wall, face.behind, face.opening
+            sill_m[cell] = -np.inf if source.sill_m is None else source.sill_m
+            head_m[cell] = np.inf if source.head_m is None else source.head_m
+            share[cell] = face.start, face.end
+            opening_m[cell] = _piece(rooms[room].walls_m[face.wall], face.start, face.end)
+            exit_m[cell] = opening_m[cell]
             if face.behind >= 0:
-                exit_m[at] = _piece(rooms[face.behind].walls_m[face.exit_wall], face.exit_start, face.exit_end)
+                exit_m[cell] = _piece(rooms[face.behind].walls_m[face.exit_wall], face.exit_start, face.exit_end)
     return PlanGeometry(
         walls_m=frozen(walls_m),
         wall_count=frozen(np.array([len(room.walls_m) for room in rooms])),
@@ -105,10 +104,76 @@ def build_geometry(rooms: Sequence[Room], openings: Sequence[Opening], faces: Se
 
 
 def pad_walls(walls_m: Float[np.ndarray, "n 4"], length: int) -> Float[np.ndarray, "length 4"]:
-    """Pad wall segments to `length` rows by repeating the first, which no ray caster can tell from the original."""
+    """Pad wall segments to `length` rows by repeating the first, which changes no ray's distance."""
     return np.concatenate([walls_m, np.repeat(walls_m[:1], length - len(walls_m), axis=0)])
 
 
 def _piece(wall_m: Float[np.ndarray, "4"], start: float, end: float) -> Float[np.ndarray, "4"]:
     edge = wall_m[2:] - wall_m[:2]
     return np.concatenate([wall_m[:2] + start * edge, wall_m[:2] + end * edge])
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class WallTable:
+    """All n walls and m opening faces of a plan, in metres, room after room without padding.
+
+    Attributes:
+        first: (s,) index of each room's first wall, followed by the number of walls.
+        start_m, end_m: (n, 2) ends of the walls. Rooms lie to the left of their walls.
+        is_free: (n,) True for free-standing walls, with the room on both sides.
+        opening_begin: (m,) ascending start of each face: index of its wall plus the share of the wall's length.
+        opening_end: (m,) end of each face, in the same form.
+        opening_kind: (m,) codes as in `conventions.OPENING_CLASSES`.
+        sill_m, head_m: (m,) heights; -inf and inf if the plan does not give them.
+        behind: (m,) index of the room behind; -1 for none.
+        exit_m: (m, 4) the opening on the wall of the room behind; meaningless if there is none.
+    """
+
+    first: Int[np.ndarray, "s"]
+    start_m: Float[np.ndarray, "n 2"]
+    end_m: Float[np.ndarray, "n 2"]
+    is_free: Bool[np.ndarray, "n"]
+    opening_begin: Float[np.ndarray, "m"]
+    opening_end: Float[np.ndarray, "m"]
+    opening_kind: UInt8[np.ndarray, "m"]
+    sill_m: Float[np.ndarray, "m"]
+    head_m: Float[np.ndarray, "m"]
+    behind: Int[np.ndarray, "m"]
+    exit_m: Float[np.ndarray, "m 4"]
+
+    @classmethod
+    def build(cls, rooms: Sequence[Room], openings: Sequence[Opening], faces: Sequence[OpeningFace]) -> WallTable:
+        """Build the table of a plan."""
+        first = np.concatenate([[0], np.cumsum([len(room.walls_m) for room in rooms])])
+        walls_m = np.concatenate([room.walls_m for room in rooms])
+        is_free = np.zeros(len(walls_m), bool)
+        for room, end in zip(rooms, first[1:], strict=True):
+            is_free[end - len(room.inner_walls_m) : end] = True
+        # Sorted stably: the last of several faces with the same start wins, as in `render.layout`.
+        faces = sorted(faces, key=lambda face: first[face.room] + face.wall + face.start)
+        sources = [openings[face.opening] for face in faces]
+        wall = np.array([first[face.room] + face.wall for face in faces], np.float64)
+        # Faces without a room behind need a placeholder: their own wall.
+        exits = [(face.behind, face.exit_wall) if face.behind >= 0 else (face.room, face.wall) for face in faces]
+        ends = np.array([(face.exit_start, face.exit_end) for face in faces]).reshape(-1, 2)
+        through = walls_m[[first[room] + number for room, number in exits]].reshape(-1, 2, 2)
+        edge = through[:, 1] - through[:, 0]
+        leave_m = [through[:, 0] + ends[:, [k]] * edge for k in (0, 1)]
+        return cls(
+            first=frozen(first),
+            start_m=frozen(walls_m[:, :2].copy()),
+            end_m=frozen(walls_m[:, 2:].copy()),
+            is_free=frozen(is_free),
+            opening_begin=frozen(wall + [face.start for face in faces]),
+            opening_end=frozen(wall + [face.end for face in faces]),
+            opening_kind=frozen(np.array([source.code for source in sources], np.uint8)),
+            sill_m=frozen(np.array([-np.inf if source.sill_m is None else source.sill_m for source in sources])),
+            head_m=frozen(np.array([np.inf if source.head_m is None else source.head_m for source in sources])),
+            behind=frozen(np.array([face.behind for face in faces], np.intp)),
+            exit_m=frozen(np.concatenate(leave_m, axis=1)),
+        )
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the arrays."""
+        return sum(getattr(self, field.name).nbytes for field in fields(self))

@@ -1,4 +1,4 @@
-"""Plans as JSON text: strictly, in time that grows with the text and no faster."""
+"""Strict JSON parsing in time linear in the length of the text."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ import numpy as np
 from lalaloc_core.errors import InvalidFloorPlanError
 
 _OPENING, _CLOSING = np.frombuffer(b"[{", np.uint8), np.frombuffer(b"]}", np.uint8)
-# A string that nobody ends reaches to the end of the text. So a match that begins never fails, nothing is looked at
-# twice, and the time is linear; with the closing quote required, each quote of such a string would be tried anew.
+# An unterminated string matches up to the end of the text: a match that begins never fails, so the time is linear. If
+# the closing quote were required, every quote of such a string would be tried again.
 _JSON_STRING = re.compile(r'"[^"\\]*+(?:\\.[^"\\]*+)*+(?:"|\\?\Z)', re.DOTALL)
-# More digits than any finite number of metres has. Python reads thousands, in time that grows with their square.
+# More digits than any finite number of metres has. Python parses thousands, in time quadratic in their number.
 _MAX_DIGITS = 1000
 _DIGITS = re.compile(rf"(?<![0-9])[0-9]{{{_MAX_DIGITS + 1},}}")
 
 
 def read_json(text: str | bytes, max_depth: int) -> Any:
-    """The value of a JSON text.
+    """Parse a JSON text.
 
     Raises:
-        InvalidFloorPlanError: not JSON, nested too deep, a key twice in one object, or a number of too many digits.
+        InvalidFloorPlanError: not JSON, nested too deep, a repeated key in one object, or a number of too many digits.
     """
     try:
         if isinstance(text, bytes):
@@ -44,14 +44,14 @@ def _check_depth(structure: str, max_depth: int) -> None:
     steps = np.isin(characters, _OPENING).astype(np.int64) - np.isin(characters, _CLOSING)
     depth = int(np.cumsum(steps).max(initial=0))
     if depth > max_depth:
-        raise InvalidFloorPlanError(f"the JSON is nested {depth} deep, at most {max_depth} is allowed (max_depth)")
+        raise InvalidFloorPlanError(f"the JSON is nested {depth} levels deep; the limit is {max_depth}")
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found: dict[str, Any] = {}
     for key, value in pairs:
         if key in found:
-            raise InvalidFloorPlanError(f"the key '{key[:50]}' stands twice in one object")
+            raise InvalidFloorPlanError(f"the key '{key[:50]}' occurs twice in one object; remove one of them")
         found[key] = value
     return found
 
@@ -59,4 +59,4 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 def _check_digits(structure: str) -> None:
     found = _DIGITS.search(structure)
     if found is not None:
-        raise InvalidFloorPlanError(f"a number has {len(found[0])} digits, at most {_MAX_DIGITS} are read")
+        raise InvalidFloorPlanError(f"a number has {len(found[0])} digits; the limit is {_MAX_DIGITS}")

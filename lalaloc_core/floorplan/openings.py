@@ -1,14 +1,14 @@
-"""Openings in walls: from one line on the plan to a piece of wall in every room that it serves.
+"""Openings: projection of each opening's line onto the walls of all rooms that it belongs to.
 
-A door between two rooms is one entry of the plan. Rooms are the inner faces of their walls, a wall's thickness apart,
-so an opening is projected at right angles onto every wall that is nearly parallel and near enough. In each room only
-the nearest of several walls, one behind the other, has it.
+A door between two rooms is one entry of the plan. Room polygons are the inner faces of walls, a wall's thickness apart,
+so an opening is projected at right angles onto every wall that is nearly parallel and near enough. If several walls of
+a room lie behind each other, only the nearest gets the opening.
 """
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -22,11 +22,11 @@ from lalaloc_core.floorplan.limits import PlanLimits
 from lalaloc_core.floorplan.rooms import Room
 
 DEFAULT_OPENING_TOLERANCE_M = 0.35
-# Lower and upper edge (m over the floor) of openings whose plan does not say, to draw them.
+# Lower and upper edge (m over the floor) for drawing openings without heights.
 USUAL_HEIGHTS_M = {"door": (0.0, 2.05), "window": (0.9, 2.1), "passage": (0.0, 2.2)}
-# A wall is nearly parallel up to 15 degrees.
+# Walls within 15 degrees of an opening's line are nearly parallel.
 _MIN_COSINE = float(np.cos(np.radians(15.0)))
-# What is shorter on a wall is the end of an opening that lies beside it; half of a narrow opening is never that.
+# A shorter overlap with a wall is the end of an opening beside it, except half of a narrow opening.
 _MIN_PIECE_M = 0.1
 # Openings that share less than this of a wall touch.
 TOUCHING_M = 0.01
@@ -35,14 +35,14 @@ _ROUNDING_M = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Opening:
-    """A door, window or passage, as the plan has it.
+    """A door, window or passage of the plan.
 
     Attributes:
         kind: `door`, `window` or `passage` (an opening without a leaf).
         line_m: (2, 2) its two ends.
-        sill_m, head_m: heights of its lower and upper edge over the floor; None where the plan does not say.
-        name: what the user calls it.
-        rooms: ids of the only rooms that it belongs to; None for all whose wall it lies on.
+        sill_m, head_m: heights of its lower and upper edge over the floor; None if the plan does not give them.
+        name: name for users.
+        rooms: ids of the rooms that it belongs to; None for all rooms whose wall it lies on.
     """
 
     kind: str
@@ -54,22 +54,22 @@ class Opening:
 
     @property
     def code(self) -> int:
-        """The place of its kind in `conventions.OPENING_CLASSES`."""
+        """The index of its kind in `conventions.OPENING_CLASSES`."""
         return OPENING_CLASSES.index(self.kind)
 
 
 @dataclass(frozen=True, kw_only=True)
 class OpeningFace:
-    """The piece of one wall of one room that an opening takes up, with one room behind it.
+    """The part of a room's wall that an opening occupies, with at most one room behind it.
 
     Attributes:
         opening: index of the opening in the plan.
         room: index of the room.
         wall: index of the wall in the room's `walls_m`.
-        start, end: where it begins and ends, as shares of the wall's length.
-        behind: index of the room behind, the room itself at a free-standing wall, -1 where the plan shows none.
-        exit_wall: index of the wall of the room behind that the opening leads through, -1 without one.
-        exit_start, exit_end: the piece of that wall.
+        start, end: ends of the part, as shares of the wall's length.
+        behind: index of the room behind, the room itself at a free-standing wall, -1 for none.
+        exit_wall: index of the wall of the room behind that the opening leads through, -1 for none.
+        exit_start, exit_end: ends of the opening on that wall, as shares of its length.
     """
 
     opening: int
@@ -85,7 +85,7 @@ class OpeningFace:
 
 @dataclass(frozen=True)
 class _Contact:
-    """An opening on a wall: between which shares of the opening's line, how far off, and on which side the room is."""
+    """An opening's overlap with a wall: range along the opening's line, distance, and side of the room."""
 
     room: int
     wall: int
@@ -96,7 +96,7 @@ class _Contact:
 
 
 class _Walls:
-    """The walls of all rooms in one table, found by their place."""
+    """The walls of all rooms in one table with a spatial index."""
 
     def __init__(self, rooms: Sequence[Room]) -> None:
         counts = [len(room.walls_m) for room in rooms]
@@ -112,12 +112,12 @@ class _Walls:
         self._tree = shapely.STRtree([shapely.LineString(wall) for wall in ends.reshape(-1, 2, 2)])
 
     def near(self, line_m: Float[np.ndarray, "2 2"], tolerance_m: float) -> np.ndarray:
-        """Indices of walls whose boxes come near a line."""
+        """Return the indices of walls whose bounding boxes are near a line."""
         low, high = line_m.min(axis=0) - tolerance_m, line_m.max(axis=0) + tolerance_m
         return np.sort(self._tree.query(shapely.box(*low, *high)))
 
     def shares(self, room: int, wall: int, points_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
-        """Where along a wall points lie, as shares of its length, between 0 and 1."""
+        """Project points onto a wall; return shares of its length, clipped to 0 and 1."""
         index = self._first[room] + wall
         along = (points_m - self.start[index]) @ self.edge[index] / self.length_m[index] ** 2
         return np.clip(along, 0.0, 1.0)
@@ -129,13 +129,16 @@ def place_openings(
     """Project openings onto the walls that they lie on.
 
     Args:
-        tolerance_m: how far from a room's wall an opening may be drawn: at least the thickness of a wall.
+        openings: openings of the plan.
+        rooms: rooms of the plan.
+        tolerance_m: largest distance between an opening's line and a wall: at least the thickness of a wall.
+        limits: limits of the plan.
 
     Returns:
-        pieces of walls, and the indices of openings that lie on no wall.
+        faces of the openings, and the indices of openings that lie on no wall.
 
     Raises:
-        InvalidFloorPlanError: openings overlap, or there are too many of them on a wall.
+        InvalidFloorPlanError: openings overlap, or a room or an opening has too many faces.
     """
     if not openings:
         return (), ()
@@ -154,8 +157,8 @@ def place_openings(
     for room, count in Counter(face.room for face in faces).items():
         if count > limits.max_openings_per_room:
             raise InvalidFloorPlanError(
-                f"{count} pieces of openings, at most {limits.max_openings_per_room} are allowed "
-                "(max_openings_per_room)",
+                f"{count} openings on its walls; the limit is {limits.max_openings_per_room} "
+                "(PlanLimits.max_openings_per_room)",
                 room=rooms[room].name,
             )
     _check_overlaps(openings, faces, rooms)
@@ -163,14 +166,14 @@ def place_openings(
 
 
 def label(opening: Opening, index: int) -> str:
-    """What to call an opening in a message."""
+    """Return an opening's name for messages."""
     return f"opening {index} ({opening.kind}{f' {opening.name!r}' if opening.name else ''})"
 
 
 def _contacts(
     index: int, opening: Opening, by_id: dict[str, list[int]], walls: _Walls, tolerance_m: float, limits: PlanLimits
 ) -> list[_Contact]:
-    """Walls that an opening lies on; in each room the nearest one at every place of the opening."""
+    """Return the walls that an opening lies on; at each point of the opening only the nearest wall of a room."""
     start = opening.line_m[0]
     along = opening.line_m[1] - start
     length_m = float(np.hypot(*along))
@@ -181,18 +184,18 @@ def _contacts(
     near = near[np.abs(walls.edge[near] @ direction) >= _MIN_COSINE * walls.length_m[near]]
     first = walls.start[near] - start
     ends = np.stack([first, first + walls.edge[near]], axis=1)
-    at = ends @ direction
-    aside = ends[..., 0] * direction[1] - ends[..., 1] * direction[0]
-    low, high = np.clip(at.min(axis=1), 0.0, length_m), np.clip(at.max(axis=1), 0.0, length_m)
-    # How far off the wall is at both ends of what it shares with the opening.
-    slope = np.divide(aside[:, 1] - aside[:, 0], at[:, 1] - at[:, 0])
-    off_m = aside[:, :1] + slope[:, None] * (np.stack([low, high], axis=1) - at[:, :1])
+    along_m = ends @ direction
+    aside_m = ends[..., 0] * direction[1] - ends[..., 1] * direction[0]
+    low, high = np.clip(along_m.min(axis=1), 0.0, length_m), np.clip(along_m.max(axis=1), 0.0, length_m)
+    # Distance of the wall at both ends of its overlap with the opening.
+    slope = np.divide(aside_m[:, 1] - aside_m[:, 0], along_m[:, 1] - along_m[:, 0])
+    off_m = aside_m[:, :1] + slope[:, None] * (np.stack([low, high], axis=1) - along_m[:, :1])
     least_m = min(_MIN_PIECE_M, 0.5 * length_m)
     on = (np.abs(off_m).max(axis=1) <= tolerance_m + _ROUNDING_M) & (high - low >= least_m)
     if on.sum() > limits.max_walls_per_opening:
         raise InvalidFloorPlanError(
-            f"{label(opening, index)} lies on {on.sum()} walls, at most {limits.max_walls_per_opening} are allowed "
-            "(max_walls_per_opening)"
+            f"{label(opening, index)} lies on {on.sum()} walls; the limit is {limits.max_walls_per_opening} "
+            "(PlanLimits.max_walls_per_opening)"
         )
     away_m = np.abs(off_m).mean(axis=1)
     contacts: list[_Contact] = []
@@ -221,12 +224,12 @@ def _shared(first: _Contact, second: _Contact) -> float:
 def _faces(
     index: int, opening: Opening, contact: _Contact, contacts: Sequence[_Contact], walls: _Walls
 ) -> list[OpeningFace]:
-    """A contact cut where the room behind changes."""
+    """Split a contact wherever the room behind changes."""
     start, along = opening.line_m[0], opening.line_m[1] - opening.line_m[0]
     beyond = [contact] if contact.side == 0 else [other for other in contacts if other.side == -contact.side]
     least = TOUCHING_M / float(np.hypot(*along))
-    ends_beyond = {at for other in beyond for at in (other.low, other.high)}
-    cuts = {at for at in ends_beyond if contact.low + least < at < contact.high - least}
+    ends_beyond = {end for other in beyond for end in (other.low, other.high)}
+    cuts = {end for end in ends_beyond if contact.low + least < end < contact.high - least}
     faces = []
     for low, high in pairwise(sorted({contact.low, contact.high, *cuts})):
         ends = start + np.array([[low], [high]]) * along
@@ -235,7 +238,7 @@ def _faces(
         behind = [other for other in beyond if other.low <= middle <= other.high]
         face = OpeningFace(opening=index, room=contact.room, wall=contact.wall, start=own[0], end=own[1])
         if behind:
-            other = min(behind, key=lambda one: one.away_m)
+            other = min(behind, key=lambda contact: contact.away_m)
             leaving = sorted(walls.shares(other.room, other.wall, ends).tolist())
             face = OpeningFace(
                 opening=index,
@@ -253,7 +256,7 @@ def _faces(
 
 
 def _check_overlaps(openings: Sequence[Opening], faces: Sequence[OpeningFace], rooms: Sequence[Room]) -> None:
-    """Refuse two openings at one place of a wall, unless one is known to stand above the other."""
+    """Refuse openings that overlap on a wall, unless their heights put one above the other."""
     on_wall: dict[tuple[int, int], list[OpeningFace]] = {}
     for face in faces:
         on_wall.setdefault((face.room, face.wall), []).append(face)
@@ -267,7 +270,8 @@ def _check_overlaps(openings: Sequence[Opening], faces: Sequence[OpeningFace], r
                 first, second = openings[face.opening], openings[other.opening]
                 if face.opening != other.opening and not _stacked(first, second):
                     raise InvalidFloorPlanError(
-                        f"{label(first, face.opening)} and {label(second, other.opening)} overlap",
+                        f"{label(first, face.opening)} and {label(second, other.opening)} overlap; move one, or give "
+                        "both sill_m and head_m if one is above the other",
                         room=rooms[room].name,
                     )
 
@@ -277,10 +281,5 @@ def _stacked(first: Opening, second: Opening) -> bool:
 
 
 def is_above(sill_m: float | None, head_m: float | None) -> bool:
-    """Whether an opening with this sill is known to stand above one with this head; None is not known."""
+    """Return True if an opening with this sill is above one with this head; None means unknown."""
     return sill_m is not None and head_m is not None and sill_m >= head_m
-
-
-def kinds_that_occur(openings: Collection[Opening]) -> frozenset[str]:
-    """The kinds of some openings."""
-    return frozenset(opening.kind for opening in openings)

@@ -1,7 +1,6 @@
-"""The floor plan: the only map this project needs.
+"""The floor plan: rooms as simple polygons in the plan frame (metres), each extruded to its own ceiling.
 
-Its rooms are simple polygons in the plan frame (metres), each extruded from the floor to its own ceiling, perhaps with
-holes and free-standing walls. Openings are pieces of their walls: to a ray that looks for walls they are wall.
+Rooms can have holes and free-standing walls. Openings are parts of walls: the wall profile treats them as wall.
 """
 
 from __future__ import annotations
@@ -18,28 +17,29 @@ from jaxtyping import Float, Int
 from lalaloc_core.conventions import heading_from_degrees, heading_to_degrees
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.anchors import anchor_document, read_anchor
-from lalaloc_core.floorplan.arrays import frozen
 from lalaloc_core.floorplan.checks import check_size, overlap_warnings
 from lalaloc_core.floorplan.earth import Anchor
-from lalaloc_core.floorplan.geometry import PlanGeometry, build_geometry, pad_walls
-from lalaloc_core.floorplan.heights import (
+from lalaloc_core.floorplan.geometry import PlanGeometry, WallTable, build_geometry, pad_walls
+from lalaloc_core.floorplan.json_text import read_json
+from lalaloc_core.floorplan.limits import DEFAULT_LIMITS, NO_LIMITS, PlanLimits
+from lalaloc_core.floorplan.openings import DEFAULT_OPENING_TOLERANCE_M, Opening, OpeningFace, label, place_openings
+from lalaloc_core.floorplan.reading import (
     DEFAULT_CAMERA_HEIGHT_M,
     read_camera_height,
     read_camera_height_std,
+    read_ceiling,
     read_north,
+    read_opening_kinds,
+    read_openings,
+    read_rooms,
+    read_tolerance,
 )
-from lalaloc_core.floorplan.json_text import read_json
-from lalaloc_core.floorplan.limits import DEFAULT_LIMITS, NO_LIMITS, PlanLimits
-from lalaloc_core.floorplan.opening_reading import read_opening_kinds, read_openings, read_tolerance
-from lalaloc_core.floorplan.openings import DEFAULT_OPENING_TOLERANCE_M, Opening, OpeningFace, label, place_openings
-from lalaloc_core.floorplan.reading import read_ceiling, read_rooms
-from lalaloc_core.floorplan.rooms import Room
+from lalaloc_core.floorplan.rooms import Room, frozen
 from lalaloc_core.floorplan.values import check_keys, json_kind, read_name
-from lalaloc_core.floorplan.wall_table import WallTable
 
 __all__ = ["DEFAULT_CAMERA_HEIGHT_M", "FloorPlan"]
 
-# Of more, those are found that have a place in their boxes before the rooms themselves are asked.
+# Plans with more rooms use a spatial index to find the room of a position.
 _FEW_ROOMS = 32
 _PLAN_KEYS = {
     "name",
@@ -60,18 +60,18 @@ class FloorPlan:
     """A validated floor plan; build one with `FloorPlan.from_dict` or `FloorPlan.from_json`.
 
     Attributes:
-        name: what the user calls it.
-        rooms: at least one.
+        name: name for users.
+        rooms: at least one room.
         camera_height_m: height of the camera assumed for panoramas of this plan.
-        warnings: what is odd but usable, such as overlapping rooms.
-        north: azimuth of true north (radians), None when it is not known.
+        warnings: problems that do not prevent use, such as overlapping rooms.
+        north: azimuth of true north (radians), None if unknown.
         openings: doors, windows and passages.
-        opening_kinds: the kinds of openings that the plan shows completely.
-        opening_tolerance_m: how far from a room's wall its openings may be drawn.
-        opening_faces: the pieces of walls that openings take up.
-        camera_height_std_m: how far off `camera_height_m` may be, one standard deviation; None when it is not said.
-        states_camera_height: whether the plan says `camera_height_m`; if not, cameras may stand at any height.
-        anchor: where on Earth the plan lies, None when that is not known.
+        opening_kinds: kinds of openings that the plan shows completely.
+        opening_tolerance_m: largest distance between an opening's line and its wall.
+        opening_faces: the parts of walls that openings occupy.
+        camera_height_std_m: standard deviation of `camera_height_m`; None if the plan does not give one.
+        states_camera_height: True if the plan gives `camera_height_m`; otherwise the height is estimated per query.
+        anchor: position on Earth, None if unknown.
     """
 
     name: str
@@ -98,24 +98,23 @@ class FloorPlan:
 
     @classmethod
     def from_dict(cls, document: Any, limits: PlanLimits = DEFAULT_LIMITS) -> FloorPlan:
-        """Validate a plan in the native format, whose keys stand in docs/reference/conventions.md; unknown ones are refused.
+        """Validate a plan in the native format (docs/reference/plan-format.md); unknown keys are refused.
 
         Raises:
-            InvalidFloorPlanError: names the room and what is wrong.
+            InvalidFloorPlanError: the plan is invalid; names the room and the problem.
         """
         return cls._read(document, limits, None)
 
     @classmethod
     def from_stored(cls, text: str, warnings: Sequence[str] | None) -> FloorPlan:
-        """A plan that was valid when its `to_dict` was written, under whatever limits, as JSON.
-
-        What grows faster than the plan is not looked for again.
+        """Read a stored plan, which was valid when its `to_dict` was written as JSON, without size limits.
 
         Args:
-            warnings: what was found when it was validated; None looks for it now.
+            text: JSON of `to_dict`.
+            warnings: warnings of the first validation; None computes them again, which is slow for large plans.
 
         Raises:
-            InvalidFloorPlanError: it is not what `to_dict` wrote.
+            InvalidFloorPlanError: `text` is not the JSON of a plan.
         """
         return cls._read(read_json(text, NO_LIMITS.max_depth), NO_LIMITS, warnings)
 
@@ -134,17 +133,18 @@ class FloorPlan:
         faces, lost = place_openings(openings, rooms, tolerance_m, limits)
         if openings and not faces:
             raise InvalidFloorPlanError(
-                f"no opening lies on a wall: none is within {tolerance_m:g} m of one (opening_tolerance_m)"
+                f"no opening lies on a wall: none is within {tolerance_m:g} m of one (opening_tolerance_m); "
+                "are openings and rooms in the same units?"
             )
         north = read_north(document.get("north_deg"))
-        # Rounded, so that degrees which went through radians are the same again.
+        # Rounding restores degrees that were converted to radians.
         north_deg = None if north is None else round(heading_to_degrees(north), 9)
         anchor = read_anchor(document.get("anchor"), north_deg, rooms)
         if anchor is not None:
             north = heading_from_degrees(anchor.north_deg)
         if warnings is None:
-            astray = [f"{label(openings[k], k)} lies on no wall" for k in lost]
-            warnings = (*overlap_warnings(rooms, limits), *astray)
+            off_wall = [f"{label(openings[k], k)} lies on no wall" for k in lost]
+            warnings = (*overlap_warnings(rooms, limits), *off_wall)
         return cls(
             name=name,
             rooms=rooms,
@@ -161,14 +161,14 @@ class FloorPlan:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """The plan in the native format; `from_dict` of it gives an equal plan."""
+        """Return the plan in the native format; `from_dict` of it gives an equal plan."""
         document: dict[str, Any] = {"name": self.name}
         if self.states_camera_height:
             document["camera_height_m"] = self.camera_height_m
         if self.camera_height_std_m is not None:
             document["camera_height_std_m"] = self.camera_height_std_m
         if self.north is not None:
-            # Rounded, so that degrees which went through radians are the same again.
+            # Rounding restores degrees that were converted to radians.
             document["north_deg"] = round(heading_to_degrees(self.north), 9) % 360.0
         if self.anchor is not None:
             document["anchor"] = anchor_document(self.anchor)
@@ -194,24 +194,24 @@ class FloorPlan:
 
     @cached_property
     def geometry(self) -> PlanGeometry:
-        """Walls and openings as the layout renderer takes them."""
+        """Walls and openings as padded arrays, for the layout renderer."""
         return build_geometry(self.rooms, self.openings, self.opening_faces)
 
     @cached_property
     def wall_table(self) -> WallTable:
-        """The same without padding, for what goes through many poses at once."""
-        return WallTable.of(self.rooms, self.openings, self.opening_faces)
+        """Walls and openings in one table without padding, for rendering many poses."""
+        return WallTable.build(self.rooms, self.openings, self.opening_faces)
 
     @property
     def walls_m(self) -> Float[np.ndarray, "rooms n 4"]:
         """Wall segments of every room, padded to one length by repeating each room's first wall.
 
-        Index with a pose's room to get what `render.profile` wants: `plan.walls_m[room_index]`.
+        `plan.walls_m[room_index]` are the walls of a pose's room, as `render.profile` expects them.
         """
         return self.geometry.walls_m
 
-    def walls_of(self, room_index: Int[np.ndarray, "k"]) -> Float[np.ndarray, "k n 4"]:
-        """As `walls_m[room_index]`, padded to the longest of these rooms alone."""
+    def room_walls(self, room_index: Int[np.ndarray, "k"]) -> Float[np.ndarray, "k n 4"]:
+        """Return `walls_m[room_index]`, padded to the longest of these rooms only."""
         longest = max(len(self.rooms[index].walls_m) for index in room_index)
         return np.stack([pad_walls(self.rooms[index].walls_m, longest) for index in room_index])
 
@@ -230,7 +230,7 @@ class FloorPlan:
         return shapely.STRtree([room.shape for room in self.rooms])
 
     def room_index_at(self, position_m: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, "n"]:
-        """Index of the room each position lies in, -1 outside and in holes; of rooms that overlap, the first."""
+        """Return the index of each position's room, -1 outside rooms and in holes; the first of overlapping rooms."""
         x, y = position_m[:, 0], position_m[:, 1]
         if len(self.rooms) > _FEW_ROOMS:
             point, room = self._room_tree.query(shapely.points(x, y), predicate="within")

@@ -1,4 +1,4 @@
-"""Rooms from the plan's document."""
+"""Readers for the parts of a plan's document: rooms, openings, camera height and north."""
 
 from __future__ import annotations
 
@@ -12,54 +12,63 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
-from lalaloc_core.conventions import ROOM_TYPES
+from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, heading_from_degrees
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.floorplan.arrays import frozen
 from lalaloc_core.floorplan.limits import PlanLimits
-from lalaloc_core.floorplan.rooms import Room
+from lalaloc_core.floorplan.openings import DEFAULT_OPENING_TOLERANCE_M, Opening
+from lalaloc_core.floorplan.rooms import Room, frozen
 from lalaloc_core.floorplan.values import (
     check_keys,
     json_kind,
     read_choice,
     read_list,
     read_name,
+    read_number,
     read_number_between,
     read_points,
     read_segment,
 )
 
+DEFAULT_CAMERA_HEIGHT_M = 1.5
+MAX_CAMERA_HEIGHT_STD_M = 2.0
 _ROOM_KEYS = {"id", "name", "type", "polygon", "holes", "walls", "ceiling_height_m"}
-# A free-standing wall may end this far inside another: drawings let a stub begin on the wall's axis.
+# Free-standing walls can reach this far outside the floor: drawings let a stub begin on the axis of another wall.
 _WALL_OVERSHOOT_M = 0.01
+_KINDS = OPENING_CLASSES[1:]
+_OPENING_KEYS = {"kind", "line", "sill_m", "head_m", "name", "rooms"}
+# From the rounding of drawings to the thickest walls.
+_TOLERANCES_M = (0.01, 1.5)
 
 
 def read_rooms(raw_rooms: Any, default_ceiling_m: float | None, limits: PlanLimits) -> tuple[Room, ...]:
-    """All rooms of a plan, with ids.
+    """Read all rooms of a plan and give ids to rooms without one.
 
     Raises:
-        InvalidFloorPlanError: names the room and what is wrong.
+        InvalidFloorPlanError: a room is invalid, or there are too many rooms or vertices.
     """
     if not isinstance(raw_rooms, list) or not raw_rooms:
         raise InvalidFloorPlanError("'rooms' must be a list of at least one room")
     if len(raw_rooms) > limits.max_rooms:
-        raise InvalidFloorPlanError(f"{len(raw_rooms)} rooms, at most {limits.max_rooms} are allowed (max_rooms)")
+        raise InvalidFloorPlanError(
+            f"the plan has {len(raw_rooms)} rooms; the limit is {limits.max_rooms} (LALALOC_MAX_ROOMS)"
+        )
     vertices = sum(_count_vertices(raw) for raw in raw_rooms if isinstance(raw, Mapping))
     if vertices > limits.max_plan_vertices:
         raise InvalidFloorPlanError(
-            f"{vertices} vertices, at most {limits.max_plan_vertices} are allowed (max_plan_vertices)"
+            f"the plan has {vertices} vertices; the limit is {limits.max_plan_vertices} (LALALOC_MAX_PLAN_VERTICES)"
         )
     rooms = [_read_room(raw, f"room {i + 1}", default_ceiling_m, limits) for i, raw in enumerate(raw_rooms)]
     return tuple(replace(room, id=key) for room, key in zip(rooms, _unique_ids(rooms), strict=True))
 
 
 def read_ceiling(value: Any, room: str | None, limits: PlanLimits) -> float:
-    """A ceiling height (m)."""
+    """Read a ceiling height (m)."""
     low, high = limits.min_ceiling_height_m, limits.max_ceiling_height_m
     return read_number_between(value, "ceiling_height_m", low, high, " m", room)
 
 
 def _count_vertices(raw: Mapping[str, Any]) -> int:
-    """Vertices of outline and holes, and one for each free-standing wall, before any is looked at."""
+    """Count the vertices of outline and holes, and one for each free-standing wall, before reading them."""
     holes = raw.get("holes")
     rings = [raw.get("polygon"), raw.get("walls"), *(holes if isinstance(holes, list | tuple) else ())]
     return sum(len(ring) for ring in rings if isinstance(ring, list | tuple))
@@ -74,18 +83,20 @@ def _read_room(raw: Any, fallback_name: str, default_ceiling_m: float | None, li
     kind = read_choice(raw.get("type", ROOM_TYPES[0]), ROOM_TYPES, "the type", room=name)
     ceiling = raw.get("ceiling_height_m", default_ceiling_m)
     if ceiling is None:
-        raise InvalidFloorPlanError("no ceiling_height_m, neither here nor for the plan", room=name)
+        raise InvalidFloorPlanError("ceiling_height_m is missing; set it for the room or for the plan", room=name)
     height_m = read_ceiling(ceiling, name, limits)
     if (vertices := _count_vertices(raw)) > limits.max_vertices_per_room:
         raise InvalidFloorPlanError(
-            f"{vertices} vertices, at most {limits.max_vertices_per_room} are allowed (max_vertices)", room=name
+            f"{vertices} vertices; the limit is {limits.max_vertices_per_room} (LALALOC_MAX_VERTICES)", room=name
         )
     outline_m = _read_ring(raw.get("polygon"), "polygon", name, limits)
     holes_m = _read_holes(raw.get("holes"), outline_m, name, limits)
     shape = shapely.Polygon(outline_m, holes_m)
     if shape.area < limits.min_room_area_m2:
         raise InvalidFloorPlanError(
-            f"the area is {shape.area:.3g} m², at least {limits.min_room_area_m2:g} m² is needed", room=name
+            f"the area is {shape.area:.3g} m²; the minimum is {limits.min_room_area_m2:g} m² "
+            "(PlanLimits.min_room_area_m2); are the coordinates in metres?",
+            room=name,
         )
     return Room(
         name=name,
@@ -99,11 +110,11 @@ def _read_room(raw: Any, fallback_name: str, default_ceiling_m: float | None, li
 
 
 def _read_ring(raw: Any, what: str, room: str, limits: PlanLimits, *, is_hole: bool = False) -> np.ndarray:
-    """A simple polygon, counter-clockwise, or clockwise if it is a hole; read-only."""
+    """Read a simple polygon: counter-clockwise, or clockwise for a hole; read-only."""
     if not isinstance(raw, list | tuple) or len(raw) < 3:
         raise InvalidFloorPlanError(f"'{what}' must be a list of at least three [x, y] vertices", room=room)
     ring = read_points(raw, limits, room, "vertex" if what == "polygon" else f"{what}: vertex")
-    # Drop repeated vertices, the closing one of a closed ring among them: they would be walls of no length.
+    # Repeated vertices, such as the closing one of a closed ring, would be walls of length zero.
     ring = ring[np.any(ring != np.roll(ring, -1, axis=0), axis=1)]
     subject = "the polygon" if what == "polygon" else what
     if len(ring) < 3:
@@ -117,6 +128,7 @@ def _read_ring(raw: Any, what: str, room: str, limits: PlanLimits, *, is_hole: b
 
 
 def _is_collinear(ring: Float[np.ndarray, "n 2"]) -> bool:
+    # Relative to the first vertex: surveyed coordinates are large.
     away = ring - ring[0]
     length = np.hypot(*away.T)
     direction = away[np.argmax(length)] / length.max()
@@ -127,45 +139,125 @@ def _is_collinear(ring: Float[np.ndarray, "n 2"]) -> bool:
 def _read_holes(
     raw: Any, outline_m: Float[np.ndarray, "n 2"], room: str, limits: PlanLimits
 ) -> tuple[Float[np.ndarray, "_ 2"], ...]:
-    holes = read_list([] if raw is None else raw, "holes", limits.max_vertices_per_room, "max_vertices", room)
+    holes = read_list([] if raw is None else raw, "holes", limits.max_vertices_per_room, "LALALOC_MAX_VERTICES", room)
     rings = tuple(_read_ring(hole, f"hole {i}", room, limits, is_hole=True) for i, hole in enumerate(holes))
     outline = shapely.Polygon(outline_m)
     for index, ring in enumerate(rings):
         if not outline.covers(shapely.Polygon(ring)):
             raise InvalidFloorPlanError(f"hole {index} does not lie inside the polygon", room=room)
-    if rings and not (whole := shapely.Polygon(outline_m, rings)).is_valid:
-        reason = shapely.is_valid_reason(whole)
+    if rings and not (floor := shapely.Polygon(outline_m, rings)).is_valid:
+        reason = shapely.is_valid_reason(floor)
         raise InvalidFloorPlanError(f"the holes cross or cut off parts of the floor ({reason})", room=room)
     return rings
 
 
 def _read_walls(raw: Any, shape: shapely.Polygon, room: str, limits: PlanLimits) -> Float[np.ndarray, "k 4"]:
-    walls = read_list([] if raw is None else raw, "walls", limits.max_vertices_per_room, "max_vertices", room)
+    walls = read_list([] if raw is None else raw, "walls", limits.max_vertices_per_room, "LALALOC_MAX_VERTICES", room)
     if not walls:
         return frozen(np.empty((0, 4)))
     points = np.stack([read_segment(wall, f"wall {index}", limits, room) for index, wall in enumerate(walls)])
     floor = shape.buffer(_WALL_OVERSHOOT_M, join_style="mitre")
     for index, wall in enumerate(points):
         if not floor.covers(shapely.LineString(wall)):
-            raise InvalidFloorPlanError(f"wall {index} leaves the room's floor", room=room)
+            raise InvalidFloorPlanError(
+                f"wall {index} leaves the room's floor; it can reach {_WALL_OVERSHOOT_M:g} m beyond it", room=room
+            )
     return frozen(points.reshape(-1, 4))
 
 
 def _unique_ids(rooms: Sequence[Room]) -> list[str]:
-    """The ids that the document gives, and for other rooms some made from their names: `bedroom`, `bedroom-2`."""
+    """Return the ids of the document, and for rooms without one an id made from the name: `bedroom`, `bedroom-2`."""
     given = Counter(room.id for room in rooms if room.id)
     for key, count in given.items():
         if count > 1:
-            raise InvalidFloorPlanError(f"the id '{key}' is that of {count} rooms, ids are unique")
+            raise InvalidFloorPlanError(f"{count} rooms have the id '{key}'; ids must be unique")
     taken, tried, ids = set(given), Counter[str](), []
     for room in rooms:
         key = room.id
         if not key:
             stem = re.sub(r"[\W_]+", "-", room.name.casefold()).strip("-") or "room"
-            # Counted per name, so that a name that repeats hundreds of times is no search from the beginning each time.
+            # Counted per name: a name that repeats hundreds of times would otherwise be searched from 1 each time.
             while not key or key in taken:
                 tried[stem] += 1
                 key = stem if tried[stem] == 1 else f"{stem}-{tried[stem]}"
             taken.add(key)
         ids.append(key)
     return ids
+
+
+def read_openings(raw: Any, rooms: Sequence[Room], limits: PlanLimits) -> tuple[Opening, ...]:
+    """Read the openings of a plan with these rooms.
+
+    Raises:
+        InvalidFloorPlanError: an opening is invalid, or there are too many.
+    """
+    entries = read_list([] if raw is None else raw, "openings", limits.max_openings, "LALALOC_MAX_OPENINGS")
+    ids = {room.id for room in rooms}
+    return tuple(_read_opening(entry, f"opening {index}", ids, limits) for index, entry in enumerate(entries))
+
+
+def read_opening_kinds(raw: Any, openings: Sequence[Opening]) -> frozenset[str]:
+    """Read the kinds of openings that a plan shows completely; by default the kinds that occur in it."""
+    if raw is None:
+        return frozenset(opening.kind for opening in openings)
+    kinds = read_list(raw, "opening_kinds", len(_KINDS), "one of each kind")
+    return frozenset(read_choice(kind, _KINDS, "an entry of opening_kinds") for kind in kinds)
+
+
+def read_tolerance(raw: Any) -> float:
+    """Read the largest distance (m) between an opening and its wall."""
+    if raw is None:
+        return DEFAULT_OPENING_TOLERANCE_M
+    return read_number_between(raw, "opening_tolerance_m", *_TOLERANCES_M, " m")
+
+
+def _read_opening(raw: Any, where: str, room_ids: set[str], limits: PlanLimits) -> Opening:
+    if not isinstance(raw, Mapping):
+        raise InvalidFloorPlanError(f"{where} must be an object, not {json_kind(raw)}")
+    check_keys(raw, _OPENING_KEYS, where=f"{where}: ")
+    kind = read_choice(raw.get("kind"), _KINDS, f"{where}: the kind")
+    line_m = read_segment(raw.get("line"), f"{where}: the line", limits, None)
+    name = None if raw.get("name") is None else read_name(raw["name"], limits, f"{where}: the name")
+    sill_m, head_m = (
+        None if raw.get(key) is None else read_number_between(raw[key], f"{where}: {key}", 0.0, highest, " m")
+        for key, highest in (("sill_m", limits.max_ceiling_height_m), ("head_m", limits.max_ceiling_height_m))
+    )
+    if sill_m is not None and head_m is not None and sill_m >= head_m:
+        raise InvalidFloorPlanError(f"{where}: sill_m is {sill_m:g} m; it must be below head_m ({head_m:g} m)")
+    rooms = None
+    if raw.get("rooms") is not None:
+        rooms = tuple(read_list(raw["rooms"], f"{where}: rooms", len(room_ids), "one entry for each room"))
+        unknown = [room for room in rooms if not isinstance(room, str) or room not in room_ids]
+        if unknown:
+            shown = f"'{unknown[0][:50]}'" if isinstance(unknown[0], str) else json_kind(unknown[0])
+            raise InvalidFloorPlanError(f"{where}: rooms has {shown}, which is not the id of a room")
+    return Opening(kind, frozen(line_m), sill_m, head_m, name, rooms)
+
+
+def read_camera_height(value: Any, rooms: Sequence[Room], limits: PlanLimits) -> float:
+    """Read the camera height (m), which must be below every ceiling."""
+    lowest_ceiling_m = min(room.ceiling_height_m for room in rooms)
+    height_m = read_number(DEFAULT_CAMERA_HEIGHT_M if value is None else value, "camera_height_m", above=0.0)
+    if height_m < limits.min_camera_height_m:
+        raise InvalidFloorPlanError(
+            f"camera_height_m is {height_m:g} m; it must be at least {limits.min_camera_height_m:g} m"
+        )
+    if height_m >= lowest_ceiling_m:
+        raise InvalidFloorPlanError(
+            f"camera_height_m is {height_m:g} m; it must be below the lowest ceiling ({lowest_ceiling_m:g} m)"
+        )
+    return height_m
+
+
+def read_camera_height_std(value: Any) -> float | None:
+    """Read the standard deviation of the camera height (m), None if the plan does not give one."""
+    if value is None:
+        return None
+    return read_number_between(value, "camera_height_std_m", 0.0, MAX_CAMERA_HEIGHT_STD_M, " m")
+
+
+def read_north(degrees: Any) -> float | None:
+    """Read the azimuth of true north (radians), None if the plan does not give one."""
+    if degrees is None:
+        return None
+    return heading_from_degrees(read_number_between(degrees, "north_deg", -360.0, 360.0, ""))

@@ -1,4 +1,4 @@
-"""One room: its outline, what stands in it, and where a camera may be."""
+"""Rooms: outline, holes, free-standing walls, and the free floor that a camera can stand on."""
 
 from __future__ import annotations
 
@@ -11,11 +11,18 @@ from jaxtyping import Float
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.conventions import ROOM_TYPES
-from lalaloc_core.floorplan.arrays import frozen, ring_edges
-from lalaloc_core.floorplan.inmost import inmost_place
 
-# No camera stands on a free-standing wall, however thin: what is kept of the floor where no margin fits.
+# Margin around free-standing walls in rooms too narrow for any other, so that no camera stands on a wall.
 _WALL_CORE_M = 1e-3
+# `interior_point` tests a lattice over the floor, then finer ones around the best point. The exact answer, the centre
+# of the largest inscribed circle, takes seconds for a spiral of two hundred vertices.
+_LATTICE, _FINER_LATTICE, _ROUNDS = 20, 7, 5
+
+
+def frozen(array: np.ndarray) -> np.ndarray:
+    """Make an array read-only and return it."""
+    array.flags.writeable = False
+    return array
 
 
 def _no_walls() -> Float[np.ndarray, "0 4"]:
@@ -27,13 +34,14 @@ class Room:
     """One room.
 
     Attributes:
-        name: what the user calls it; names may repeat.
-        polygon_m: (n, 2), counter-clockwise, not closed (the last vertex joins the first).
-        ceiling_height_m: over the floor.
-        id: what tells it from the other rooms of its plan.
+        name: name for users; names may repeat.
+        polygon_m: (n, 2) outline, counter-clockwise, not closed (the last vertex joins the first).
+        ceiling_height_m: height over the floor.
+        id: unique within its plan.
         type: one of `conventions.ROOM_TYPES`.
-        holes_m: what is no floor inside the outline, such as columns and shafts: each (k, 2), clockwise, not closed.
-        inner_walls_m: free-standing walls up to the ceiling, segments (x0, y0, x1, y1).
+        holes_m: areas inside the outline that are no floor, such as columns and shafts: each (k, 2), clockwise, not
+            closed.
+        inner_walls_m: (k, 4) free-standing walls up to the ceiling, segments (x0, y0, x1, y1).
     """
 
     name: str
@@ -46,7 +54,7 @@ class Room:
 
     @cached_property
     def shape(self) -> shapely.Polygon:
-        """The floor as a shapely geometry: the outline without the holes."""
+        """The floor as a shapely polygon: the outline without the holes."""
         return shapely.Polygon(self.polygon_m, self.holes_m)
 
     @property
@@ -56,30 +64,65 @@ class Room:
 
     @cached_property
     def walls_m(self) -> Float[np.ndarray, "n 4"]:
-        """Wall segments (x0, y0, x1, y1): edges of the polygon, edges of the holes, free-standing walls.
+        """Wall segments (x0, y0, x1, y1): edges of the outline, edges of the holes, free-standing walls.
 
         The room lies to the left of the edges, and on both sides of the free-standing walls.
         """
-        return frozen(
-            np.concatenate([ring_edges(ring) for ring in (self.polygon_m, *self.holes_m)] + [self.inner_walls_m])
-        )
+        edges = [np.concatenate([ring, np.roll(ring, -1, axis=0)], axis=1) for ring in (self.polygon_m, *self.holes_m)]
+        return frozen(np.concatenate([*edges, self.inner_walls_m]))
 
     def free_floor(self, margin_m: float) -> BaseGeometry:
-        """The floor at least `margin_m` from all walls, free-standing ones included; may be empty."""
+        """Return the floor at least `margin_m` from all walls, free-standing ones included; it can be empty."""
         floor = self.shape.buffer(-margin_m)
         if not len(self.inner_walls_m):
             return floor
         segments = shapely.MultiLineString(self.inner_walls_m.reshape(-1, 2, 2).tolist())
         return floor.difference(segments.buffer(margin_m))
 
-    def inmost_point(self) -> Float[np.ndarray, "2"]:
-        """A place about as far from all walls as any."""
-        floor = self.shape
+    def interior_point(self) -> Float[np.ndarray, "2"]:
+        """Return a point about as far from all walls as possible."""
+        floor: BaseGeometry = self.shape
         if len(self.inner_walls_m):
-            floor = shapely.MultiPolygon(polygons_of(self.free_floor(_WALL_CORE_M)))
-        return inmost_place(floor)[0]
+            parts = shapely.get_parts(self.free_floor(_WALL_CORE_M))
+            floor = shapely.MultiPolygon([part for part in parts if isinstance(part, shapely.Polygon)])
+        return interior_point(floor)[0]
 
 
-def polygons_of(shape: shapely.Geometry) -> list[shapely.Polygon]:
-    """The polygons that a geometry consists of; lines and points are left out."""
-    return [part for part in shapely.get_parts(shape) if isinstance(part, shapely.Polygon)]
+def interior_point(floor: BaseGeometry) -> tuple[Float[np.ndarray, "2"], float]:
+    """Return a point about as far from the edges of a floor as possible, and its distance (m) from them.
+
+    In ordinary rooms this is the centre of the largest inscribed circle, to a centimetre. In a floor narrower than a
+    twentieth of its extent it is any point inside. The time is bounded for any shape.
+
+    Args:
+        floor: polygon or multipolygon, not empty.
+    """
+    shapely.prepare(floor)
+    x_min, y_min, x_max, y_max = floor.bounds
+    middle, half = np.array([x_min + x_max, y_min + y_max]) / 2.0, np.array([x_max - x_min, y_max - y_min]) / 2.0
+    # A start for floors narrower than the lattice spacing.
+    start = floor.representative_point()
+    best, distance_m = _farthest(floor, np.array([[start.x, start.y]]), middle + half * _cell_centres(_LATTICE))
+    half = half / _LATTICE
+    for _ in range(_ROUNDS):
+        # Twice as wide as the cell of the best point: a better one can lie beyond its edge.
+        half = 2.0 * half
+        best, distance_m = _farthest(floor, best[None], best + half * _cell_centres(_FINER_LATTICE))
+        half = half / _FINER_LATTICE
+    return best, distance_m
+
+
+def _cell_centres(count: int) -> Float[np.ndarray, "n 2"]:
+    """Return the cell centres of the square from -1 to 1, cut into `count` x `count` cells."""
+    steps = (2.0 * np.arange(count) + 1.0) / count - 1.0
+    return np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+
+
+def _farthest(
+    floor: BaseGeometry, inside: Float[np.ndarray, "1 2"], points: Float[np.ndarray, "n 2"]
+) -> tuple[Float[np.ndarray, "2"], float]:
+    """Return the point on the floor that is farthest from its edges, and that distance; `inside` is on the floor."""
+    points = np.concatenate([inside, points[shapely.contains_xy(floor, points[:, 0], points[:, 1])]])
+    distance_m = np.asarray(shapely.distance(shapely.points(points), floor.boundary))
+    chosen = int(distance_m.argmax())
+    return points[chosen], float(distance_m[chosen])

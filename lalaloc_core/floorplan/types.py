@@ -1,4 +1,4 @@
-"""What rooms are for: from the words of drawings and data sets to the types of a plan."""
+"""Room types from the labels of drawings and data sets."""
 
 from __future__ import annotations
 
@@ -52,10 +52,10 @@ _WORDS: Mapping[str, str] = {
 } | {name: name for name in ROOM_TYPES}
 
 
-def room_type_of(label: str) -> str:
-    """The type that a label speaks of ("Living room 2": living), `unknown` where it is none of the words known.
+def room_type_from_label(label: str) -> str:
+    """Return the room type of a label ("Living room 2": living), `unknown` if it has no known word.
 
-    The first word that is known decides.
+    The first known word decides.
     """
     words = re.findall(r"[a-z]+", label.casefold())
     return next((_WORDS[word] for word in words if word in _WORDS), ROOM_TYPES[0])

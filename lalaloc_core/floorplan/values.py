@@ -1,4 +1,4 @@
-"""Reading single values of a plan's document; every refusal names the value, in the words of JSON."""
+"""Readers for single values of a plan's document; errors name the value in JSON terms."""
 
 from __future__ import annotations
 
@@ -13,13 +13,16 @@ from jaxtyping import Float
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.limits import PlanLimits
 
-# Unicode categories that neither files nor drawings can hold: control characters and lone surrogates.
+# Unicode categories that files and drawings cannot hold: control characters and lone surrogates.
 _NOT_TEXT = {"Cc", "Cs"}
+# Longest part of a wrong value in a message.
 _SHOWN = 50
+# Shorter than any opening or stub of wall, longer than the rounding of a drawing.
+_MIN_SEGMENT_M = 0.01
 
 
 def json_kind(value: Any) -> str:
-    """What a value is, in the words of JSON."""
+    """Return the JSON type of a value, for messages."""
     if value is None:
         return "null"
     if isinstance(value, bool):
@@ -32,100 +35,96 @@ def json_kind(value: Any) -> str:
 
 
 def is_number(value: Any) -> TypeGuard[int | float]:
-    """Whether a value is a number, which true and false are not."""
+    """Return True for numbers, which booleans are not."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def check_keys(document: Mapping[str, Any], known: Collection[str], room: str | None = None, where: str = "") -> None:
-    """Refuse a key that is not known."""
+    """Refuse unknown keys."""
     unknown = sorted(str(key)[:_SHOWN] for key in document if key not in known)
     if unknown:
         raise InvalidFloorPlanError(
-            f"{where}unknown key '{unknown[0]}', known are {', '.join(sorted(known))}", room=room
+            f"{where}unknown key '{unknown[0]}'; known keys are {', '.join(sorted(known))}", room=room
         )
 
 
 def read_name(value: Any, limits: PlanLimits, what: str, room: str | None = None) -> str:
-    """A text for people."""
+    """Read a non-empty text for users."""
     if not isinstance(value, str) or not value.strip():
         raise InvalidFloorPlanError(f"{what} must be a non-empty string", room=room)
     if len(value) > limits.max_name_length:
         raise InvalidFloorPlanError(
-            f"{what} has {len(value)} characters, at most {limits.max_name_length} are allowed (max_name_length)",
+            f"{what} has {len(value)} characters; the limit is {limits.max_name_length} (PlanLimits.max_name_length)",
             room=room,
         )
     if any(unicodedata.category(character) in _NOT_TEXT for character in value):
-        raise InvalidFloorPlanError(f"{what} has control characters or lone surrogates", room=room)
+        raise InvalidFloorPlanError(f"{what} has control characters or lone surrogates; remove them", room=room)
     return value
 
 
 def read_choice(value: Any, choices: Collection[str], what: str, room: str | None = None) -> str:
-    """One of a few words."""
+    """Read one of the words `choices`."""
     if not isinstance(value, str) or value not in choices:
         shown = f"'{value[:_SHOWN]}'" if isinstance(value, str) else json_kind(value)
-        raise InvalidFloorPlanError(f"{what} is {shown}, it must be one of {', '.join(choices)}", room=room)
+        raise InvalidFloorPlanError(f"{what} is {shown}; it must be one of {', '.join(choices)}", room=room)
     return value
 
 
 def read_number(value: Any, what: str, room: str | None = None, *, above: float) -> float:
-    """A finite number above a bound."""
+    """Read a finite number above a bound."""
     if not is_number(value):
         raise InvalidFloorPlanError(f"{what} must be a number, not {json_kind(value)}", room=room)
     if not _is_finite(value) or value <= above:
         raise InvalidFloorPlanError(
-            f"{what} is {str(value)[:_SHOWN]}, it must be finite and above {above:g}", room=room
+            f"{what} is {str(value)[:_SHOWN]}; it must be finite and above {above:g}", room=room
         )
     return float(value)
 
 
 def read_number_between(value: Any, what: str, low: float, high: float, unit: str, room: str | None = None) -> float:
-    """A number in a closed range."""
+    """Read a number in a closed range."""
     number = read_number(value, what, room, above=-sys.float_info.max)
     if not low <= number <= high:
-        raise InvalidFloorPlanError(f"{what} is {number:g}, it must lie between {low:g} and {high:g}{unit}", room=room)
+        raise InvalidFloorPlanError(f"{what} is {number:g}; it must be between {low:g} and {high:g}{unit}", room=room)
     return number
 
 
-def read_list(value: Any, what: str, most: int, limit: str, room: str | None = None) -> list[Any]:
-    """A list that is not too long."""
+def read_list(value: Any, what: str, limit: int, limit_name: str, room: str | None = None) -> list[Any]:
+    """Read a list of at most `limit` entries."""
     if not isinstance(value, list | tuple):
         raise InvalidFloorPlanError(f"{what} must be a list, not {json_kind(value)}", room=room)
-    if len(value) > most:
-        raise InvalidFloorPlanError(f"{len(value)} {what}, at most {most} are allowed ({limit})", room=room)
+    if len(value) > limit:
+        raise InvalidFloorPlanError(f"{len(value)} {what}; the limit is {limit} ({limit_name})", room=room)
     return list(value)
 
 
 def read_points(
     raw: list[Any] | tuple[Any, ...], limits: PlanLimits, room: str | None, where: str = "vertex"
 ) -> Float[np.ndarray, "n 2"]:
-    """Coordinates in metres; every one is finite and not too far from the origin."""
+    """Read coordinates (m), which must be finite and not too far from the origin."""
     for index, point in enumerate(raw):
         if not (isinstance(point, list | tuple) and len(point) == 2 and all(is_number(value) for value in point)):
             raise InvalidFloorPlanError(f"{where} {index} must be two numbers [x, y]", room=room)
         if not all(_is_finite(value) and abs(value) <= limits.max_coordinate_m for value in point):
             shown = ", ".join(str(value)[:_SHOWN] for value in point)
             raise InvalidFloorPlanError(
-                f"{where} {index} is [{shown}], coordinates must be finite and at most "
-                f"{limits.max_coordinate_m:.0f} m from the origin (max_coordinate_m)",
+                f"{where} {index} is [{shown}]; coordinates must be finite and at most "
+                f"{limits.max_coordinate_m:.0f} m from the origin (PlanLimits.max_coordinate_m)",
                 room=room,
             )
     return np.array(raw, dtype=np.float64).reshape(-1, 2)
 
 
 def read_segment(raw: Any, what: str, limits: PlanLimits, room: str | None) -> Float[np.ndarray, "2 2"]:
-    """Two different points [[x, y], [x, y]]."""
+    """Read two different points [[x, y], [x, y]]."""
     if not isinstance(raw, list | tuple) or len(raw) != 2:
         raise InvalidFloorPlanError(f"{what} must be two points [[x, y], [x, y]]", room=room)
     points = read_points(raw, limits, room, f"{what}: point")
     if float(np.hypot(*(points[1] - points[0]))) < _MIN_SEGMENT_M:
-        raise InvalidFloorPlanError(f"{what} is shorter than {_MIN_SEGMENT_M:g} m", room=room)
+        raise InvalidFloorPlanError(f"{what} is shorter than {_MIN_SEGMENT_M:g} m, the minimum", room=room)
     return points
 
 
-# Shorter than any opening or stub of wall, longer than the rounding of a drawing.
-_MIN_SEGMENT_M = 0.01
-
-
 def _is_finite(value: int | float) -> bool:
-    """Whether a number of any size is finite as a float; JSON integers have no bounds."""
+    """Return True if a number is finite as a float; JSON integers have no bounds."""
     return -sys.float_info.max <= value <= sys.float_info.max

@@ -25,8 +25,8 @@ from lalaloc_core.localise.poses import (
     Query,
     rolled,
 )
-from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.render.sampling import PoseSet
+from lalaloc_core.render.sweep import profiles_at
 
 # Larger batches fall out of the cache and gain nothing.
 _LAYOUT_BATCH = 256

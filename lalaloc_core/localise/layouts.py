@@ -10,9 +10,8 @@ from jaxtyping import Float, Int, UInt8
 
 from lalaloc_core.conventions import WALL_CODE
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.render.sampling import PoseSet
-from lalaloc_core.render.sweep import swept_views
+from lalaloc_core.render.sweep import profiles_at, swept_views
 
 
 @dataclass(frozen=True, eq=False)

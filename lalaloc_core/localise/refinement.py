@@ -37,7 +37,7 @@ def refinement_job(
         targets=query.latents[hypotheses],
         position_m=np.stack([candidate.position_m for candidate in candidates]),
         heading=np.array([candidate.frame_heading for candidate in candidates]),
-        walls_m=plan.walls_of(rooms),
+        walls_m=plan.room_walls(rooms),
         camera_height_m=np.full(len(rooms), camera_height_m),
         ceiling_height_m=plan.ceiling_heights_m[rooms],
         optimise_heading=not query.heading_known,

@@ -41,7 +41,7 @@ class ImageFeatures:
     structure: StructureFeatures | None = None
 
 
-def first_of(seen: ImageFeatures, count: int) -> ImageFeatures:
+def first_rows(seen: ImageFeatures, count: int) -> ImageFeatures:
     """What was said of the first `count` panoramas of a batch."""
     structure = seen.structure
     if structure is not None:

@@ -1,8 +1,8 @@
-"""Reading panoramas: from encoded bytes to the pixels that the image encoder expects.
+"""Reader for panoramas: from encoded bytes to the pixels that the image encoder expects.
 
-The header is checked before any pixel is allocated, and a large picture is scaled down band by band, so that next to it
-only little memory is needed. What the picture says of itself is followed: its EXIF orientation, the part of the sphere
-it shows, and how the camera was held (`photo_sphere`). Nothing else of its metadata is looked at.
+The header is checked before any pixel is allocated, and large pictures are scaled down in bands, so that decoding needs
+little extra memory. Three kinds of metadata are used: the EXIF orientation, the visible part of the sphere, and the
+camera's pitch and roll (`photo_sphere`).
 """
 
 from __future__ import annotations
@@ -19,18 +19,17 @@ from jaxtyping import UInt8
 from PIL import ExifTags, Image, ImageChops, UnidentifiedImageError
 
 from lalaloc_core.errors import InvalidPanoramaError
-from lalaloc_core.file_kinds import kind_of
-from lalaloc_core.panorama.jpeg import count_scans
+from lalaloc_core.file_kinds import describe_file
 from lalaloc_core.panorama.levelling import level
 from lalaloc_core.panorama.photo_sphere import PhotoSphere, SpherePart, read_photo_sphere
-from lalaloc_core.panorama.segments import check_segments
+from lalaloc_core.panorama.segments import check_segments, count_scans
 
 FORMATS = ("JPEG", "PNG", "WEBP")
-# What stands where a picture shows nothing: the mean that encoders subtract.
+# Colour of missing parts of the sphere: the mean that encoders subtract.
 NEUTRAL = (128, 128, 128)
-# Pictures with more pixels are scaled down in bands of about so many.
+# Pictures with more pixels are scaled down in bands of about this size.
 _BAND_PIXELS = 2**22
-# How much finer than the encoder's input a picture is kept until it is in place.
+# Oversampling of pictures that are placed or levelled, relative to the encoder's input.
 _FINER = 2
 _UPRIGHT = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
@@ -41,18 +40,20 @@ _UPRIGHT = {
     7: Image.Transpose.TRANSVERSE,
     8: Image.Transpose.ROTATE_90,
 }
-# Shares of a pixel that are rounding.
+# Rounding error, in pixels.
 _EDGE = 1e-6
 _SIDEWAYS = {5, 6, 7, 8}
 
 
 @dataclass(frozen=True, kw_only=True)
 class PanoramaLimits:
-    """What a panorama may be; checked on the file's header, before its pixels are allocated.
+    """Limits of panoramas, checked on the file's header before its pixels are allocated.
 
     Attributes:
-        max_scans: of a progressive JPEG; encoders write 3 to 12.
-        aspect_tolerance: share by which a full sphere may be off twice as wide as high; stitchers round.
+        max_pixels: width times height.
+        max_scans: scans of a progressive JPEG; encoders write 3 to 12.
+        min_height: pixels of the full sphere's height.
+        aspect_tolerance: relative deviation of a full sphere from twice as wide as high; stitchers round.
     """
 
     max_pixels: int = 100_000_000
@@ -66,8 +67,8 @@ class Panorama:
     """A panorama as the image encoder expects it: the full sphere, level.
 
     Attributes:
-        pixels: RGB.
-        compass_heading: where the centre column looks, clockwise from true north (radians), if the picture says so.
+        pixels: (h, w, 3) RGB.
+        compass_heading: azimuth of the centre column, radians clockwise from true north; None if not in the metadata.
     """
 
     pixels: UInt8[np.ndarray, "h w 3"]
@@ -77,16 +78,16 @@ class Panorama:
 def read_panorama(
     content: bytes, *, height: int, width: int, limits: PanoramaLimits | None = None
 ) -> UInt8[np.ndarray, "{height} {width} 3"]:
-    """The pixels of `open_panorama`, which says what is raised."""
+    """Return the pixels of `open_panorama`; see there for errors."""
     return open_panorama(content, height=height, width=width, limits=limits).pixels
 
 
 def open_panorama(content: bytes, *, height: int, width: int, limits: PanoramaLimits | None = None) -> Panorama:
-    """Decode an equirectangular JPEG, PNG or WebP and scale it to `height` x `width` RGB; the first one of several.
+    """Decode an equirectangular JPEG, PNG or WebP (the first picture of several) and scale it to `height` x `width`.
 
     Raises:
-        InvalidPanoramaError: empty, not one of the formats, damaged, too large, of too many pieces or scans, or neither
-            the full sphere nor a part of it that its metadata tell.
+        InvalidPanoramaError: empty, unsupported format, damaged, too large, too many segments or scans, or neither the
+            full sphere nor a part of it that the metadata describe.
     """
     limits = limits or PanoramaLimits()
     if not content:
@@ -111,7 +112,7 @@ def open_panorama(content: bytes, *, height: int, width: int, limits: PanoramaLi
 
 
 def warm_up(*, height: int, width: int) -> None:
-    """Read a small picture of every format, so that the first real one does not pay for what is loaded on first use."""
+    """Read a small picture of every format, so that codecs are loaded before the first request."""
     picture = Image.new("RGB", (256, 128), NEUTRAL)
     for picture_format in FORMATS:
         buffer = io.BytesIO()
@@ -123,7 +124,7 @@ def warm_up(*, height: int, width: int) -> None:
 def _named_errors(content: bytes, limits: PanoramaLimits) -> Iterator[None]:
     try:
         with warnings.catch_warnings():
-            # Our own pixel limit, checked on the header, replaces Pillow's warning; damaged metadata do not matter.
+            # `_check_pixels` replaces Pillow's size warning; damaged metadata are harmless.
             warnings.simplefilter("ignore")
             yield
     except InvalidPanoramaError:
@@ -131,23 +132,25 @@ def _named_errors(content: bytes, limits: PanoramaLimits) -> Iterator[None]:
     except UnidentifiedImageError as error:
         raise InvalidPanoramaError(_unreadable(content)) from error
     except Image.DecompressionBombError as error:
-        raise InvalidPanoramaError(f"the panorama has more than {limits.max_pixels} pixels (max_pixels)") from error
+        raise InvalidPanoramaError(
+            f"the panorama has too many pixels; the limit is {limits.max_pixels} (LALALOC_MAX_PIXELS)"
+        ) from error
     except MemoryError as error:
-        raise InvalidPanoramaError("the panorama needs more memory than there is to decode it") from error
+        raise InvalidPanoramaError("there is not enough memory to decode the panorama; scale it down") from error
     except (OSError, SyntaxError, ValueError, EOFError) as error:
         raise InvalidPanoramaError(f"the panorama is damaged: {error}") from error
 
 
 def _unreadable(content: bytes) -> str:
     formats = f"{', '.join(FORMATS[:-1])} or {FORMATS[-1]}"
-    kind = kind_of(content)
+    kind = describe_file(content)
     if kind is None or any(name in kind.upper() for name in FORMATS):
         return f"the panorama is not a readable {formats} picture"
-    return f"the panorama is {kind}, which is not read here: save or export it as {formats}"
+    return f"the panorama is {kind}, which is not supported; save or export it as {formats}"
 
 
 def _check_webp_size(content: bytes, limits: PanoramaLimits) -> None:
-    """WebP's decoder allocates its canvas when it is opened, so the header is looked at before."""
+    """Check a WebP's header first: its decoder allocates the canvas when it is opened."""
     if content[:4] != b"RIFF" or content[8:12] != b"WEBP" or len(content) < 30:
         return
     kind, head = content[12:16], content[20:30]
@@ -164,58 +167,56 @@ def _check_webp_size(content: bytes, limits: PanoramaLimits) -> None:
 def _check_pixels(width: int, height: int, limits: PanoramaLimits) -> None:
     if width * height > limits.max_pixels:
         raise InvalidPanoramaError(
-            f"the panorama has {width} x {height} = {width * height} pixels, at most {limits.max_pixels} are allowed "
-            "(max_pixels)"
+            f"the panorama has {width} x {height} = {width * height} pixels; the limit is {limits.max_pixels} "
+            "(LALALOC_MAX_PIXELS)"
         )
 
 
 def _check_scans(content: bytes, limits: PanoramaLimits) -> None:
-    """Each scan of a JPEG goes over all of its pixels once more."""
+    """Refuse JPEGs with many scans; each visits all pixels again."""
     if count_scans(content, limits.max_scans) > limits.max_scans:
         raise InvalidPanoramaError(
-            f"the panorama is a JPEG of more than {limits.max_scans} scans (max_scans); saved anew it has one "
-            "to a dozen"
+            f"the panorama is a JPEG with more than {limits.max_scans} scans, the limit (LALALOC_MAX_SCANS); "
+            "save it again"
         )
 
 
 def _check_shape(width: int, height: int, sphere: PhotoSphere, limits: PanoramaLimits) -> None:
     if sphere.refusal is not None:
-        raise InvalidPanoramaError(f"the panorama cannot be used by its photo sphere metadata: {sphere.refusal}")
+        raise InvalidPanoramaError(f"the panorama's photo sphere metadata rule it out: {sphere.refusal}")
     full_height = height if sphere.part is None else round(height / sphere.part.height)
     if full_height < limits.min_height:
-        raise InvalidPanoramaError(
-            f"the panorama is {full_height} pixels high, at least {limits.min_height} are needed"
-        )
+        raise InvalidPanoramaError(f"the panorama is {full_height} pixels high; the minimum is {limits.min_height}")
     if sphere.part is None and abs(width / height - 2.0) > 2.0 * limits.aspect_tolerance:
-        fault = "" if sphere.fault is None else f"; its photo sphere metadata do not help: {sphere.fault}"
+        fault = "" if sphere.fault is None else f"; its photo sphere metadata are invalid: {sphere.fault}"
         raise InvalidPanoramaError(
-            f"the panorama is {width} x {height}; a full 360° panorama is twice as wide as high, give or take "
+            f"the panorama is {width} x {height}; a full 360° panorama is twice as wide as high, within "
             f"{limits.aspect_tolerance:.0%}{fault}"
         )
 
 
 def _turned(size: tuple[int, int], orientation: int) -> tuple[int, int]:
-    """(width, height) turned as an EXIF orientation says; the same either way."""
+    """Return (width, height) after applying an EXIF orientation, or before it."""
     return (size[1], size[0]) if orientation in _SIDEWAYS else size
 
 
 def _shown_size(part: SpherePart | None, canvas_size: tuple[int, int]) -> tuple[int, int]:
-    """Size that a picture of a part is scaled to, at least as fine as the canvas."""
+    """Return the size to scale a picture of a part of the sphere to, at least as fine as the canvas."""
     width, height = canvas_size
     return (width, height) if part is None else (math.ceil(width * part.width), math.ceil(height * part.height))
 
 
 def _scaled(image: Image.Image, orientation: int, size: tuple[int, int]) -> Image.Image:
-    """The whole picture as RGB of a size, turned upright."""
+    """Scale the whole picture to a size as RGB, and rotate it upright."""
     stored_size = _turned(size, orientation)
-    # A JPEG can be decoded straight to a size near the wanted one.
+    # JPEGs can be decoded directly at a fraction of their size.
     image.draft("RGB", (2 * stored_size[0], 2 * stored_size[1]))
     width, height = image.size
     factor = max(1, min(width // (2 * stored_size[0]), height // (2 * stored_size[1])))
     if width * height <= _BAND_PIXELS or factor == 1:
         scaled = _to_rgb(image).resize(stored_size, Image.Resampling.BOX)
     else:
-        # The last block of a row or column may be cut off, hence the box.
+        # The box accounts for a partial last block in rows and columns.
         box = (0.0, 0.0, width / factor, height / factor)
         scaled = _reduced(image, factor).resize(stored_size, Image.Resampling.BOX, box=box)
     turn = _UPRIGHT.get(orientation)
@@ -223,7 +224,7 @@ def _scaled(image: Image.Image, orientation: int, size: tuple[int, int]) -> Imag
 
 
 def _reduced(image: Image.Image, factor: int) -> Image.Image:
-    """The picture as RGB, `factor` times smaller; converted in bands, a copy of the whole would double its memory."""
+    """Scale the picture down by `factor` as RGB, in bands: a copy of the whole would double its memory."""
     width, height = image.size
     rows = factor * max(1, _BAND_PIXELS // width // factor)
     reduced = Image.new("RGB", (-(-width // factor), -(-height // factor)))
@@ -234,11 +235,11 @@ def _reduced(image: Image.Image, factor: int) -> Image.Image:
 
 
 def _to_rgb(image: Image.Image) -> Image.Image:
-    """8-bit RGB: 16-bit grey scaled, which Pillow would clip; what is transparent becomes neutral."""
+    """Convert to 8-bit RGB; 16-bit grey is scaled (Pillow would clip it), transparent pixels become neutral."""
     if image.mode == "I" or image.mode.startswith("I;16"):
         image = _eight_bit(image)
     if image.mode == "CMYK" and "adobe" not in image.info:
-        # Pillow takes every CMYK picture to be stored inverted, as Adobe's are.
+        # Pillow assumes that CMYK pictures are stored inverted, but only Adobe's are.
         image = ImageChops.invert(image)
     if image.has_transparency_data:
         opaque = Image.new("RGBA", image.size, (*NEUTRAL, 255))
@@ -257,7 +258,7 @@ def _eight_bit(image: Image.Image) -> Image.Image:
 
 
 def _placed(picture: Image.Image, part: SpherePart, size: tuple[int, int]) -> Image.Image:
-    """The full sphere, neutral but for the part that a picture shows; pixels it covers in part stay neutral."""
+    """Place a picture of a part on the neutral full sphere; pixels that it covers partly stay neutral."""
     width, height = size
     edges_x = (part.left * width, (part.left + part.width) * width)
     edges_y = (part.top * height, (part.top + part.height) * height)

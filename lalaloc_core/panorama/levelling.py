@@ -1,4 +1,4 @@
-"""Turning the sphere of a panorama upright, as if the camera had been held level."""
+"""Levelling: rotation of a panorama's sphere as if the camera had been held level."""
 
 from __future__ import annotations
 
@@ -9,16 +9,17 @@ from jaxtyping import Float, UInt8
 
 from lalaloc_core.conventions import column_azimuths, row_elevations
 
-# All rays of a large picture at once would need many times its memory.
+# Rows processed at once: all rays of a large picture would need many times its memory.
 _ROWS = 64
 
 
 def level(pixels: UInt8[np.ndarray, "h w 3"], *, pitch: float, roll: float) -> UInt8[np.ndarray, "h w 3"]:
-    """The panorama as a level camera of the same heading would have taken it; bilinear, across seam and poles.
+    """Resample a panorama as taken by a level camera with the same heading; bilinear, across seam and poles.
 
     Args:
-        pitch: how far above the horizon the centre of the picture looks.
-        roll: how far the camera was turned clockwise about that direction.
+        pixels: (h, w, 3) the panorama.
+        pitch: elevation of the picture's centre, radians above the horizon.
+        roll: rotation of the camera about that direction, radians clockwise.
     """
     height, width = pixels.shape[:2]
     axes = camera_axes(pitch=pitch, roll=roll)
@@ -34,7 +35,7 @@ def level(pixels: UInt8[np.ndarray, "h w 3"], *, pitch: float, roll: float) -> U
 
 
 def camera_axes(*, pitch: float, roll: float) -> Float[np.ndarray, "3 3"]:
-    """Rows: the camera's right, forward and up, in a level frame of the same heading (right, forward, up)."""
+    """Return the camera's right, forward and up as rows, in a level frame with the same heading."""
     forward = [0.0, math.cos(pitch), math.sin(pitch)]
     unrolled_right, unrolled_up = np.array([1.0, 0.0, 0.0]), np.array([0.0, -math.sin(pitch), math.cos(pitch)])
     right = math.cos(roll) * unrolled_right - math.sin(roll) * unrolled_up
@@ -43,14 +44,14 @@ def camera_axes(*, pitch: float, roll: float) -> Float[np.ndarray, "3 3"]:
 
 
 def _sample(pixels: UInt8[np.ndarray, "h w 3"], rays: Float[np.ndarray, "3 r c"]) -> UInt8[np.ndarray, "r c 3"]:
-    """Colours that unit rays of the camera's frame (right, forward, up) meet."""
+    """Return the colours along unit rays in the camera's frame (right, forward, up)."""
     height, width = pixels.shape[:2]
     column = (np.arctan2(rays[0], rays[1]) / (2.0 * np.pi) + 0.5) * width - 0.5
     row = (0.5 - np.arcsin(np.clip(rays[2], -1.0, 1.0)) / np.pi) * height - 0.5
     left, above = np.floor(column).astype(int), np.floor(row).astype(int)
     across, down = (column - left)[..., None], (row - above)[..., None]
     blended = sum(
-        weight * _at(pixels, above + i, left + j)
+        weight * _pixels_around(pixels, above + i, left + j)
         for i, j, weight in (
             (0, 0, (1.0 - down) * (1.0 - across)),
             (0, 1, (1.0 - down) * across),
@@ -61,8 +62,10 @@ def _sample(pixels: UInt8[np.ndarray, "h w 3"], rays: Float[np.ndarray, "3 r c"]
     return np.round(blended).astype(np.uint8)
 
 
-def _at(pixels: UInt8[np.ndarray, "h w 3"], row: np.ndarray, column: np.ndarray) -> UInt8[np.ndarray, "r c 3"]:
-    """Pixels by row and column; a row beyond a pole is the one before it, half a turn away."""
+def _pixels_around(
+    pixels: UInt8[np.ndarray, "h w 3"], row: np.ndarray, column: np.ndarray
+) -> UInt8[np.ndarray, "r c 3"]:
+    """Return pixels by row and column; a row beyond a pole is the row before it, half a turn away."""
     height, width = pixels.shape[:2]
     beyond = (row < 0) | (row >= height)
     column = np.where(beyond, column + width // 2, column)

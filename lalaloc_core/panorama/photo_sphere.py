@@ -1,7 +1,7 @@
-"""What a picture says of itself as a photo sphere: which part of the sphere it shows, and how the camera was held.
+"""Photo Sphere metadata: visible part of the sphere, pitch, roll and compass heading.
 
-Read from the GPano properties of its XMP packet (Google's Photo Sphere XMP metadata). Nothing of it is trusted: values
-out of range are ignored, and a part of the sphere that contradicts itself or the picture is reported, not used.
+Read from the GPano properties of a picture's XMP packet (Google's Photo Sphere XMP metadata). The values are not
+trusted: values out of range are ignored, and a contradictory part of the sphere is reported and not used.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from defusedxml.common import DefusedXmlException
 from defusedxml.ElementTree import fromstring
 
 _NAMESPACE = "{http://ns.google.com/photos/1.0/panorama/}"
-# The packet of a JPEG fits into one segment of 64 KiB; nothing that a camera writes needs more.
+# A packet of a JPEG fits into one segment of 64 KiB.
 _MAX_XMP_BYTES = 256 * 1024
 _MAX_SIDE = 1_000_000
-# Stitchers round; widths, heights and their ratios this close are meant to be equal.
+# Relative difference of equal widths, heights and ratios; stitchers round.
 _TOLERANCE = 0.01
 _MIN_SHARE = 0.1
 _CROP = (
@@ -32,7 +32,7 @@ _CROP = (
 
 @dataclass(frozen=True, kw_only=True)
 class SpherePart:
-    """The part of the full sphere that a picture shows, as shares of the sphere's width (360°) and height (180°)."""
+    """The visible part of the full sphere, as shares of its width (360°) and height (180°)."""
 
     left: float
     top: float
@@ -42,16 +42,15 @@ class SpherePart:
 
 @dataclass(frozen=True, kw_only=True)
 class PhotoSphere:
-    """What a picture says of itself; angles in radians.
+    """Photo Sphere metadata of a picture; angles in radians.
 
     Attributes:
-        part: the part of the sphere it shows, None for all of it, or where that is not known.
-        fault: why `part` is not known although the picture speaks of it.
-        refusal: why the picture is of no use, by its own account.
-        pitch: how far above the horizon its centre looks.
-        roll: how far the camera was turned clockwise about its viewing direction, which turns the horizon in the
-            picture counterclockwise.
-        compass_heading: where its centre looks, clockwise from true north; None when it does not say.
+        part: visible part of the sphere, None for all of it or if unknown.
+        fault: problem with the metadata of `part`, None if they are valid or missing.
+        refusal: reason that the metadata rule the picture out, None if they do not.
+        pitch: elevation of the centre above the horizon.
+        roll: clockwise rotation of the camera about its viewing direction; the horizon rotates counterclockwise.
+        compass_heading: azimuth of the centre, clockwise from true north; None if missing.
     """
 
     part: SpherePart | None = None
@@ -63,20 +62,20 @@ class PhotoSphere:
 
     @property
     def level(self) -> bool:
-        """Whether the camera stood upright."""
+        """True if pitch and roll are zero."""
         return self.pitch == 0.0 and self.roll == 0.0
 
 
 def read_photo_sphere(xmp: bytes | str | None, *, width: int, height: int) -> PhotoSphere:
-    """Read the XMP packet of a picture of `width` x `height` pixels; what cannot be read says nothing."""
+    """Read the XMP packet of a picture of `width` x `height` pixels; unreadable packets count as missing."""
     values = _properties(xmp)
     projection = values.get("ProjectionType", "equirectangular")
     if projection.lower() != "equirectangular":
-        return PhotoSphere(refusal=f"its projection is '{projection[:50]}', only 'equirectangular' is read")
+        return PhotoSphere(refusal=f"the projection is '{projection[:50]}'; only 'equirectangular' is supported")
     part, fault = _part(values, width, height)
     share = 1.0 if part is None else part.width * part.height
     if share < _MIN_SHARE:
-        return PhotoSphere(refusal=f"it shows {share:.1%} of the sphere, at least {_MIN_SHARE:.0%} is needed")
+        return PhotoSphere(refusal=f"it shows {share:.1%} of the sphere; the minimum is {_MIN_SHARE:.0%}")
     return PhotoSphere(
         part=part,
         fault=fault,
@@ -87,7 +86,7 @@ def read_photo_sphere(xmp: bytes | str | None, *, width: int, height: int) -> Ph
 
 
 def _properties(xmp: bytes | str | None) -> dict[str, str]:
-    """The GPano properties of a packet, whether written as attributes or as elements; the first of a name counts."""
+    """Return the GPano properties of a packet, from attributes and elements; the first of each name counts."""
     if not xmp or len(xmp) > _MAX_XMP_BYTES:
         return {}
     packet = xmp.strip("\0 \r\n\t") if isinstance(xmp, str) else xmp.strip(b"\0 \r\n\t")
@@ -104,7 +103,7 @@ def _properties(xmp: bytes | str | None) -> dict[str, str]:
 
 
 def _number(text: str | None) -> float | None:
-    """A finite number, None for anything else."""
+    """Parse a finite number; return None for anything else."""
     try:
         value = float(text or "")
     except ValueError:
@@ -112,33 +111,33 @@ def _number(text: str | None) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _angle(values: dict[str, str], name: str, least: float, most: float) -> float | None:
+def _angle(values: dict[str, str], name: str, low_deg: float, high_deg: float) -> float | None:
     degrees = _number(values.get(name))
-    return math.radians(degrees) if degrees is not None and least <= degrees <= most else None
+    return math.radians(degrees) if degrees is not None and low_deg <= degrees <= high_deg else None
 
 
 def _part(values: dict[str, str], width: int, height: int) -> tuple[SpherePart | None, str | None]:
-    """The part of the sphere that is shown, or what is wrong with the numbers that should tell it."""
+    """Return the visible part of the sphere, or the problem with its metadata."""
     if not any(name in values for name in _CROP):
         return None, None
     numbers = {name: _number(values.get(name)) for name in _CROP}
     for name, number in numbers.items():
         if number is None or not 0.0 <= number <= _MAX_SIDE:
-            return None, f"{name} is '{values.get(name, '')[:50]}', it must lie between 0 and {_MAX_SIDE}"
+            return None, f"{name} is '{values.get(name, '')[:50]}'; it must be between 0 and {_MAX_SIDE}"
     full_width, full_height, part_width, part_height, left, top = (number or 0.0 for number in numbers.values())
     if min(full_width, full_height, part_width, part_height) < 1.0:
-        return None, "it has a width or height of 0"
+        return None, "a width or height is 0"
     if abs(full_width / full_height - 2.0) > 2.0 * _TOLERANCE:
-        return None, f"its full sphere is {full_width:g} x {full_height:g}, not twice as wide as high"
-    # One pixel more is rounding.
+        return None, f"the full sphere is {full_width:g} x {full_height:g}, not twice as wide as high"
+    # One pixel is rounding.
     if left + part_width > full_width + 1.0 or top + part_height > full_height + 1.0:
         return None, (
-            f"the part of {part_width:g} x {part_height:g} at ({left:g}, {top:g}) does not lie within the full sphere "
-            f"of {full_width:g} x {full_height:g}"
+            f"the part of {part_width:g} x {part_height:g} at ({left:g}, {top:g}) is not within the full sphere of "
+            f"{full_width:g} x {full_height:g}"
         )
-    # A picture that was scaled after it was taken keeps its numbers, and their ratio.
+    # A picture that was scaled later keeps its metadata, so only the ratio is compared.
     if abs(width / height / (part_width / part_height) - 1.0) > _TOLERANCE:
-        return None, f"the part is {part_width:g} x {part_height:g}, the picture {width} x {height}"
+        return None, f"the part is {part_width:g} x {part_height:g}, but the picture is {width} x {height}"
     if part_width >= full_width and part_height >= full_height:
         return None, None
     return (

@@ -1,4 +1,4 @@
-"""Layout depth and its back-projection, in closed form from a wall profile (array API: numpy and torch)."""
+"""Layout depth from a wall profile and its back-projection, in closed form, for numpy and torch."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ def layout_depth(
     ceiling_height_m: Float[Array, "b"],
     rows: int,
 ) -> Float[Array, "b {rows} w"]:
-    """Range (m) along each pixel's ray to wall, floor or ceiling, whichever comes first.
+    """Return the range (m) along each pixel's ray to the nearest of wall, floor and ceiling.
 
     `range = min(wall / cos e, camera / -sin e below the horizon, (ceiling - camera) / sin e above it)`.
 
     Args:
-        profile_m: wall profile, see `render.profile`.
-        camera_height_m: height of the camera over the floor.
-        ceiling_height_m: height of the ceiling over the floor, above the camera.
+        profile_m: (b, w) wall profile, see `render.profile`.
+        camera_height_m: (b,) height of the camera over the floor.
+        ceiling_height_m: (b,) height of the ceiling over the floor, above the camera.
         rows: height of the depth image; its rows cover elevation +90° to -90°.
     """
     xp = array_namespace(profile_m, camera_height_m, ceiling_height_m)
@@ -37,7 +37,7 @@ def layout_depth(
 
 
 def back_project(depth_m: Float[Array, "b h w"]) -> Float[Array, "b h*w 3"]:
-    """Point cloud (m) of each depth image in the camera's frame: x right, y forward (centre column), z up."""
+    """Return each depth image as a point cloud (m) in the camera frame: x right, y forward (centre column), z up."""
     xp = array_namespace(depth_m)
     batch, rows, columns = depth_m.shape
     azimuth, elevation = column_azimuths(columns)[None, :], row_elevations(rows)[:, None]

@@ -1,14 +1,14 @@
-"""The wall profile with its derivatives by position and heading, both in closed form.
+"""The wall profile and its derivatives by position and heading, in closed form.
 
-A ray of azimuth a that meets the wall from p to p + e, both counted from the camera, is as long as
+A ray of azimuth a meets the wall from p to p + e, relative to the camera, at the distance
 
     d = (p × e) / (u × e),    u = (sin a, cos a),    v × w = v_x w_y - v_y w_x
 
-Which wall it meets is settled by the forward pass, and the derivatives follow from that wall alone:
+The forward pass finds the nearest wall; the derivatives depend on that wall alone:
 
     ∂ log d / ∂x = -e_y / (p × e)    ∂ log d / ∂y = e_x / (p × e)    ∂ log d / ∂heading = -(u' × e) / (u × e)
 
-with u' = (cos a, -sin a). The same holds for the wall that is seen through an opening, as the ray goes on straight.
+with u' = (cos a, -sin a). A ray through an opening stays straight, so the wall behind has the same derivatives.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from jaxtyping import Float
 from lalaloc_core.conventions import Array, column_azimuths
 from lalaloc_core.render.profile import inverse_crossings
 
-# Rays that meet nothing, of poses outside any room, are as long as this (m), so that nothing becomes infinite.
+# Length (m) of rays that meet no wall, from poses outside every room: keeps all values finite.
 _MAX_DISTANCE_M = 1e6
 
 
 class ProfileJacobian(NamedTuple):
-    """Log wall profiles and what they change by.
+    """Log wall profiles and their derivatives.
 
     Attributes:
-        log_m: (b, c) logs of the distances (m) to the nearest walls.
-        by_pose: (b, 3, c) their derivatives by x and y (m) and by the heading (radians).
+        log_m: (b, c) logarithms of the distances (m) to the nearest walls.
+        by_pose: (b, 3, c) derivatives by x and y (m) and by the heading (radians).
         wall: (b, c) index of the wall that each ray meets.
     """
 
@@ -42,12 +42,12 @@ class ProfileJacobian(NamedTuple):
 def log_profile_gradient(
     position_m: Float[Array, "b 2"], heading: Float[Array, "b"], walls_m: Float[Array, "b n 4"], columns: int
 ) -> ProfileJacobian:
-    """What `log(wall_profile(...))` is and how it changes, for the cost of little more than the profile.
+    """Return `log(wall_profile(...))` with its derivatives, at little more than the cost of the profile.
 
     Args:
-        position_m: camera positions, inside the room that `walls_m` closes.
-        heading: azimuth of the centre column, radians.
-        walls_m: wall segments (x0, y0, x1, y1) of each pose's own room; repeat one to pad.
+        position_m: (b, 2) camera positions, inside the room that `walls_m` closes.
+        heading: (b,) azimuth of the centre column, radians.
+        walls_m: (b, n, 4) wall segments (x0, y0, x1, y1) of each pose's own room; repeat a segment to pad.
         columns: number of azimuth columns.
     """
     xp = array_namespace(position_m, heading, walls_m)
@@ -58,7 +58,7 @@ def log_profile_gradient(
 def log_distance_gradient(
     origin_m: Float[Array, "b 2"], azimuth: Float[Array, "b c"], walls_m: Float[Array, "b n 4"]
 ) -> ProfileJacobian:
-    """As `log_profile_gradient`, along any azimuths (radians)."""
+    """Return log distances and derivatives along any azimuths (radians); see `log_profile_gradient`."""
     xp = array_namespace(origin_m, azimuth, walls_m)
     crossings = inverse_crossings(origin_m, azimuth, walls_m)
     wall = xp.argmax(crossings.inverse_m, axis=1)

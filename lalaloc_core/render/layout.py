@@ -1,7 +1,6 @@
-"""What a camera sees of a plan along the horizon: how far the wall is, what is in it, and how far one sees through it.
+"""The layout view: per azimuth, the distance to the wall, the opening in it, and the distance behind that opening.
 
-Closed form, like the wall profile, and the same lines for numpy and torch. The distance is that to the wall itself:
-doors, windows and passages are pieces of it.
+In closed form, for numpy and torch. The distance is to the wall itself; doors, windows and passages are parts of it.
 """
 
 from __future__ import annotations
@@ -13,19 +12,18 @@ from jaxtyping import Float, Int
 
 from lalaloc_core.conventions import DOOR_CODE, PASSAGE_CODE, Array, column_azimuths
 from lalaloc_core.floorplan import PlanGeometry
-from lalaloc_core.render.profile import cast_rays, nearest_walls
-from lalaloc_core.render.tolerances import BEYOND_M
+from lalaloc_core.render.profile import BEYOND_M, cast_rays, nearest_walls
 
 
 @dataclass(frozen=True, eq=False)
 class LayoutView:
-    """Per pose and azimuth column.
+    """Distances and opening kinds per pose and azimuth column.
 
     Attributes:
-        distance_m: (b, w) to the nearest wall of the pose's room, as `render.profile` has it.
-        kind: (b, w) code in `conventions.OPENING_CLASSES` of what that wall is there at eye height.
-        behind_m: (b, w) along the same ray through an open door or passage to the next wall of the room behind;
-            `distance_m` where nothing can be seen behind.
+        distance_m: (b, w) distance to the nearest wall of the pose's room, the wall profile.
+        kind: (b, w) code in `conventions.OPENING_CLASSES` of that wall at eye height.
+        behind_m: (b, w) distance along the same ray through a door or passage to the next wall of the room behind;
+            equals `distance_m` where no room is visible behind.
     """
 
     distance_m: Float[Array, "b w"]
@@ -41,27 +39,27 @@ def layout_view(
     columns: int,
     camera_height_m: Float[Array, "b"] | float,
 ) -> LayoutView:
-    """What each pose sees, one value per azimuth column of a panorama with that heading.
+    """Render the layout view of each pose, one value per azimuth column of a panorama with that heading.
 
-    Differentiable in position and heading almost everywhere, as far as distances go.
+    The distances are differentiable in position and heading almost everywhere.
 
     Args:
-        position_m: camera positions, inside their rooms; in double precision where the plan lies far from its origin.
-        heading: azimuth of the centre column, radians.
-        room_index: each pose's room.
-        geometry: of the plan, `FloorPlan.geometry`.
+        position_m: (b, 2) camera positions, inside their rooms; use double precision far from the plan's origin.
+        heading: (b,) azimuth of the centre column, radians.
+        room_index: (b,) each pose's room.
+        geometry: `FloorPlan.geometry` of the plan.
         columns: number of azimuth columns.
-        camera_height_m: height of the eye: an opening counts where its sill is below and its head above.
+        camera_height_m: eye height; an opening is visible if its sill is below the eye and its head above.
     """
     xp = array_namespace(position_m, heading)
-    here = {"dtype": position_m.dtype, "device": device(position_m)}
+    like_positions = {"dtype": position_m.dtype, "device": device(position_m)}
     geometry = geometry.like(position_m)
-    azimuth = heading[:, None] + xp.asarray(column_azimuths(columns), **here)[None, :]
+    azimuth = heading[:, None] + xp.asarray(column_azimuths(columns), **like_positions)[None, :]
     walls_m = geometry.walls_m[room_index]
     distance_m, wall = nearest_walls(position_m, azimuth, walls_m)
     # Padding repeats the first wall.
     wall = xp.where(wall < geometry.wall_count[room_index][:, None], wall, xp.zeros_like(wall))
-    eye_m = xp.asarray(camera_height_m, **here) + xp.zeros_like(heading)
+    eye_m = xp.asarray(camera_height_m, **like_positions) + xp.zeros_like(heading)
     opening = _opening_met(position_m, azimuth, distance_m, wall, room_index, geometry, eye_m)
     behind_m = _look_through(position_m, azimuth, distance_m, opening, room_index, geometry)
     return LayoutView(distance_m, _at_opening(geometry.opening_kind, room_index, opening), behind_m)
@@ -76,7 +74,7 @@ def _opening_met(
     geometry: PlanGeometry,
     eye_m: Float[Array, "b"],
 ) -> Int[Array, "b w"]:
-    """Index of the opening of the pose's room that each ray meets at eye height; -1 where it meets none."""
+    """Return the index of the opening that each ray meets at eye height, -1 for none."""
     xp = array_namespace(position_m, azimuth)
     if geometry.opening_wall.shape[1] == 0:
         return xp.full_like(wall, -1)
@@ -94,7 +92,7 @@ def _opening_met(
 
 
 def _at_opening(values: Array, room_index: Int[Array, "b"], opening: Int[Array, "b w"]) -> Int[Array, "b w"]:
-    """The value of the opening that each ray meets, 0 (wall) where it meets none."""
+    """Return the value of the opening that each ray meets, 0 (wall) for none."""
     xp = array_namespace(opening)
     if values.shape[1] == 0:
         return xp.zeros_like(opening)
@@ -110,7 +108,7 @@ def _look_through(
     room_index: Int[Array, "b"],
     geometry: PlanGeometry,
 ) -> Float[Array, "b w"]:
-    """Distance to what lies behind open doors and passages; only rays that meet one are cast on."""
+    """Return distances through doors and passages; only rays that meet one are cast again."""
     xp = array_namespace(position_m, azimuth)
     kind = _at_opening(geometry.opening_kind, room_index, opening)
     row, column = xp.nonzero((kind == DOOR_CODE) | (kind == PASSAGE_CODE))
@@ -121,10 +119,10 @@ def _look_through(
     is_room = behind >= 0
     row, column, room, number, behind = row[is_room], column[is_room], room[is_room], number[is_room], behind[is_room]
     eye_m, ray, wall_m = position_m[row], azimuth[row, column][:, None], distance_m[row, column]
-    # Where the ray leaves the wall's thickness; one that does not meets the reveal.
+    # Distance at which the ray leaves the wall's thickness; a ray that hits the reveal never does.
     exit_m = cast_rays(eye_m, ray, geometry.exit_m[room, number][:, None, :])[:, 0]
     is_through = xp.isfinite(exit_m)
-    # Not going on from infinity keeps NaN out of the gradients.
+    # Replacing infinite distances before arithmetic keeps NaN out of the gradients.
     leave_m = xp.maximum(xp.where(is_through, exit_m, wall_m), wall_m) + BEYOND_M
     direction = xp.concat([xp.sin(ray), xp.cos(ray)], axis=1)
     further_m = cast_rays(eye_m + leave_m[:, None] * direction, ray, geometry.walls_m[behind])[:, 0]

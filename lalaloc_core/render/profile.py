@@ -1,9 +1,8 @@
-"""Wall profile: the horizontal distance from the camera to the nearest wall of its room, in closed form.
+"""Wall profile: horizontal distance from the camera to the nearest wall of its room per azimuth, in closed form.
 
-A floor plan is an extrusion, so all that a camera sees of the bare layout follows from casting one ray per
-azimuth column against the room's wall segments in 2-D. The code is written against the array API: the same
-lines run on numpy arrays (service) and on torch tensors (training and LPO), where the result is differentiable
-in position and heading almost everywhere.
+A floor plan is an extrusion, so one 2-D ray per azimuth column against the room's wall segments determines the whole
+bare layout. The code uses the array API: it runs on numpy arrays (service) and on torch tensors (training and LPO),
+where the result is differentiable in position and heading almost everywhere.
 """
 
 from __future__ import annotations
@@ -14,23 +13,28 @@ from array_api_compat import array_namespace, device
 from jaxtyping import Float, Int
 
 from lalaloc_core.conventions import Array, column_azimuths
-from lalaloc_core.render.tolerances import CORNER_TOLERANCE, EDGE_ON
 
+# A ray may miss both of two adjoining walls at their corner by rounding; each wall is widened by this share.
+CORNER_TOLERANCE = 1e-5
+# A wall whose line passes the camera nearer than this (m, times the wall's length) is edge-on and invisible.
+EDGE_ON = 1e-9
+# A ray through an opening restarts this far (m) beyond it, so that it does not meet the same wall again.
+BEYOND_M = 1e-3
 _PARALLEL = 1e-12
 
 
 def cast_rays(
     origin_m: Float[Array, "b 2"], azimuth: Float[Array, "b c"], walls_m: Float[Array, "b n 4"]
 ) -> Float[Array, "b c"]:
-    """Distance (m) from each origin along each azimuth (radians) to the nearest of its wall segments.
+    """Return the distance (m) from each origin along each azimuth to the nearest of its wall segments.
 
     Args:
-        origin_m: ray origins in the plan frame.
-        azimuth: directions, clockwise from +y.
-        walls_m: per origin, segments (x0, y0, x1, y1); repeat a segment to pad.
+        origin_m: (b, 2) ray origins in the plan frame.
+        azimuth: (b, c) directions, radians clockwise from +y.
+        walls_m: (b, n, 4) segments (x0, y0, x1, y1) of each origin; repeat a segment to pad.
 
     Returns:
-        distances; inf where a ray hits nothing, which happens only outside a closed room.
+        (b, c) distances; inf for a ray that meets no wall, which happens only outside a closed room.
     """
     xp = array_namespace(origin_m, azimuth, walls_m)
     return _distance(xp.max(inverse_crossings(origin_m, azimuth, walls_m).inverse_m, axis=1))
@@ -39,28 +43,27 @@ def cast_rays(
 def nearest_walls(
     origin_m: Float[Array, "b 2"], azimuth: Float[Array, "b c"], walls_m: Float[Array, "b n 4"]
 ) -> tuple[Float[Array, "b c"], Int[Array, "b c"]]:
-    """As `cast_rays`, with the index of the wall that each ray meets; of walls at one distance, any."""
+    """Return the distances of `cast_rays` and the index of the wall that each ray meets (any, for equal distances)."""
     xp = array_namespace(origin_m, azimuth, walls_m)
     inverse_m = inverse_crossings(origin_m, azimuth, walls_m).inverse_m
     return _distance(xp.max(inverse_m, axis=1)), xp.argmax(inverse_m, axis=1)
 
 
 def _distance(inverse_m: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """What the inverse is of; inf of what is not positive."""
+    """Return the reciprocal of positive values, inf for others."""
     xp = array_namespace(inverse_m)
     meets = inverse_m > 0.0
-    # Not dividing by zero in the unused branch keeps NaN out of the gradients.
+    # Avoiding a division by zero in the unused branch keeps NaN out of the gradients.
     distance_m = 1.0 / xp.where(meets, inverse_m, xp.ones_like(inverse_m))
     return xp.where(meets, distance_m, xp.full_like(distance_m, xp.inf))
 
 
 class InverseCrossings(NamedTuple):
-    """Where rays meet walls.
+    """Inverse distances from ray origins to walls.
 
     Attributes:
-        inverse_m: (b, n, c) inverse of the distance (1/m) to every wall along every ray; 0 or less where it misses.
-        edge_x, edge_y: (b, n) of the vectors e / (p × e), by which inverse distances are made; a wall goes from p,
-            counted from the origin, to p + e.
+        inverse_m: (b, n, c) inverse distance (1/m) to every wall along every ray; 0 or less for a miss.
+        edge_x, edge_y: (b, n) components of e / (p × e) for the wall from p to p + e, relative to the origin.
     """
 
     inverse_m: Array
@@ -71,11 +74,11 @@ class InverseCrossings(NamedTuple):
 def inverse_crossings(
     origin_m: Float[Array, "b 2"], azimuth: Float[Array, "b c"], walls_m: Float[Array, "b n 4"]
 ) -> InverseCrossings:
-    """Where every ray meets every wall; see `cast_rays` for the arguments.
+    """Intersect every ray with every wall; see `cast_rays` for the arguments.
 
-    A ray along the unit vector u meets the line from p to p + e after 1 / d = (u × e) / (p × e), with
-    v × w = v_x w_y - v_y w_x, and the wall itself if p and p + e lie on both sides of it. All three cross products are
-    linear in u, so one product of matrices gives them for all rays and walls.
+    A ray along the unit vector u meets the line from p to p + e at the distance d with 1 / d = (u × e) / (p × e), where
+    v × w = v_x w_y - v_y w_x. It meets the wall itself if p and p + e lie on opposite sides of the ray. All three cross
+    products are linear in u, so one matrix product computes them for all rays and walls.
     """
     xp = array_namespace(origin_m, azimuth, walls_m)
     start_x, start_y = walls_m[:, :, 0] - origin_m[:, :1], walls_m[:, :, 1] - origin_m[:, 1:]
@@ -96,12 +99,12 @@ def inverse_crossings(
 
 
 class Crossings(NamedTuple):
-    """Where rays cross the lines through walls.
+    """Intersections of rays with the lines through walls.
 
     Attributes:
-        distance_m: along the ray; inf where it misses the wall itself, or meets it behind its origin.
-        share: how far along the wall, 0 at its start and 1 at its end.
-        determinant: of the linear system that was solved; positive where the ray leaves a room to the wall's left.
+        distance_m: distance along the ray; inf if it misses the wall or meets it behind its origin.
+        share: position along the wall, 0 at its start and 1 at its end.
+        determinant: determinant of the linear system; positive where the ray leaves a room to the wall's left.
     """
 
     distance_m: Array
@@ -110,19 +113,19 @@ class Crossings(NamedTuple):
 
 
 def cross_walls(direction: tuple[Array, Array], start_m: tuple[Array, Array], edge_m: tuple[Array, Array]) -> Crossings:
-    """Cross rays with walls; all arguments are (x, y) components, of shapes that broadcast against each other.
+    """Intersect rays with walls.
 
     Args:
-        direction: unit vectors of the rays.
-        start_m: from the ray's origin to the wall's start.
-        edge_m: from the wall's start to its end.
+        direction: (x, y) components of the rays' unit vectors; all components broadcast against each other.
+        start_m: (x, y) components from the ray's origin to the wall's start.
+        edge_m: (x, y) components from the wall's start to its end.
     """
     (direction_x, direction_y), (start_x, start_y), (edge_x, edge_y) = direction, start_m, edge_m
     xp = array_namespace(direction_x, start_x)
     # Solve t * direction = start + s * edge by Cramer's rule.
     determinant = direction_x * edge_y - direction_y * edge_x
     parallel = xp.abs(determinant) < _PARALLEL
-    # Not dividing by zero in the unused branch keeps NaN out of the gradients.
+    # Avoiding a division by zero in the unused branch keeps NaN out of the gradients.
     inverse = 1.0 / xp.where(parallel, xp.ones_like(determinant), determinant)
     t = (start_x * edge_y - start_y * edge_x) * inverse
     s = (start_x * direction_y - start_y * direction_x) * inverse
@@ -136,12 +139,12 @@ def wall_profile(
     walls_m: Float[Array, "b n 4"],
     columns: int,
 ) -> Float[Array, "b {columns}"]:
-    """Wall profile (m) of each pose, one value per azimuth column of a panorama with that heading.
+    """Return the wall profile (m) of each pose, one value per azimuth column of a panorama with that heading.
 
     Args:
-        position_m: camera positions, inside the room that `walls_m` closes.
-        heading: azimuth of the centre column, radians.
-        walls_m: wall segments of each pose's own room.
+        position_m: (b, 2) camera positions, inside the room that `walls_m` closes.
+        heading: (b,) azimuth of the centre column, radians.
+        walls_m: (b, n, 4) wall segments of each pose's own room.
         columns: number of azimuth columns.
     """
     xp = array_namespace(position_m, heading, walls_m)

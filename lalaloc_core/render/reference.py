@@ -1,7 +1,7 @@
-"""Slow oracles of the closed forms, which share no formula with them.
+"""Slow reference renderers for tests, independent of the closed forms.
 
-Trimesh casts every pixel's ray against the extruded mesh of the room (needs the extra `oracle`, embree); what a ray
-meets and what lies behind it is asked of shapely, one ray at a time, by the plan's own lines.
+Depth: trimesh and embree (extra `oracle`) cast every pixel's ray against the extruded mesh of the room. Openings and
+rooms behind them: shapely intersects one ray at a time with the plan's lines.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _FAR_M = 1e4
 
 
 def room_mesh(room: Room) -> trimesh.Trimesh:
-    """The closed surface of one room: its polygon extruded from the floor (z = 0) to its ceiling, metres."""
+    """Return the closed surface of one room: its polygon extruded from the floor (z = 0) to its ceiling, metres."""
     return trimesh.creation.extrude_polygon(room.shape, room.ceiling_height_m)
 
 
@@ -32,7 +32,7 @@ def reference_depth(
     rows: int,
     columns: int,
 ) -> Float[np.ndarray, "{rows} {columns}"]:
-    """Layout depth (m) of one pose by ray casting; inf where a ray escapes through a seam of the mesh."""
+    """Return the layout depth (m) of one pose by ray casting; inf for rays that escape through a seam of the mesh."""
     j, i = np.meshgrid(np.arange(columns), np.arange(rows))
     azimuth = heading + ((j + 0.5) / columns - 0.5) * 2.0 * np.pi
     elevation = (0.5 - (i + 0.5) / rows) * np.pi
@@ -50,7 +50,7 @@ def reference_depth(
 def reference_view(
     plan: FloorPlan, room_index: int, position_m: Float[np.ndarray, "2"], azimuth: float, camera_height_m: float
 ) -> tuple[float, int, float]:
-    """Distance to the wall (m), code of what is in it, and distance to what lies behind (m), along one ray."""
+    """Return distance to the wall (m), opening code, and distance behind the opening (m) along one ray."""
     direction = np.array([np.sin(azimuth), np.cos(azimuth)])
     room = plan.rooms[room_index]
     distance_m = _crossings(room, position_m, direction)[0]
@@ -75,11 +75,11 @@ def _behind(
     direction: Float[np.ndarray, "2"],
     distance_m: float,
 ) -> float:
-    """Where a ray through an opening ends, `distance_m` where it enters no room through it."""
+    """Return the length of a ray through an opening; `distance_m` if it enters no room."""
     for index, room in enumerate(plan.rooms):
         crossings = [t for t in _crossings(room, position_m, direction) if t > distance_m - 1e-6]
         if index == room_index:
-            # Through a free-standing wall: still on the same floor.
+            # The opening is in a free-standing wall: the ray stays on the same floor.
             probe = shapely.Point(position_m + (distance_m + 1e-4) * direction)
             if room.shape.contains(probe):
                 return next(t for t in crossings if t > distance_m + 1e-6)
@@ -89,7 +89,7 @@ def _behind(
 
 
 def _is_at(line_m: Float[np.ndarray, "2 2"], room: Room, point_m: Float[np.ndarray, "2"], tolerance_m: float) -> bool:
-    """Whether a place on a room's wall lies where an opening is projected onto that wall."""
+    """Return True if a point on a room's wall lies within the opening's projection onto that wall."""
     x0, y0, x1, y1 = min(
         room.walls_m, key=lambda wall: shapely.LineString(wall.reshape(2, 2)).distance(shapely.Point(point_m))
     )
@@ -104,7 +104,7 @@ def _is_at(line_m: Float[np.ndarray, "2 2"], room: Room, point_m: Float[np.ndarr
 
 
 def _crossings(room: Room, position_m: Float[np.ndarray, "2"], direction: Float[np.ndarray, "2"]) -> list[float]:
-    """Distances (m) along a ray at which it meets walls of a room, in order."""
+    """Return the ascending distances (m) along a ray at which it meets walls of a room."""
     ray = shapely.LineString([position_m, position_m + _FAR_M * direction])
     walls = shapely.union_all([shapely.LineString(wall.reshape(2, 2)) for wall in room.walls_m])
     points = shapely.get_coordinates(shapely.intersection(ray, walls))

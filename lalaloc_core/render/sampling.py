@@ -1,4 +1,4 @@
-"""Camera poses in a plan: the regular grid of retrieval, and training triplets (paper, sections 5 and A.1.3)."""
+"""Camera poses in a plan: the regular pose grid of retrieval and training triplets (paper, sections 5 and A.1.3)."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from shapely.geometry.base import BaseGeometry
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.floorplan import FloorPlan
 
-# Cameras do not stand in walls; grid poses keep this distance where the room allows it.
+# Minimum distance of grid poses from walls, if the room is wide enough.
 WALL_MARGIN_M = 0.15
 _MIN_RADIUS_M = 1e-3
-# Points of a lattice that are looked at together: the box around a slanting corridor holds many more than the corridor.
+# Lattice points tested at once, to bound memory: the box around a slanting corridor is much larger than the corridor.
 _LATTICE_POINTS = 65_536
-# Twice the negatives wanted are drawn at a time; where fewer than one in twelve is far enough, the plan is too small.
+# Each round draws twice the wanted negatives; if fewer than one in twelve is far enough, the plan is too small.
 _NEGATIVE_ROUNDS = 6
 
 
 @dataclass(frozen=True, eq=False)
 class PoseSet:
-    """Camera positions of one plan and the room each lies in."""
+    """Camera positions of one plan and the room of each."""
 
     position_m: Float[np.ndarray, "n 2"]
     room_index: Int[np.ndarray, "n"]
@@ -34,25 +34,25 @@ class PoseSet:
 
 
 def grid_size(plan: FloorPlan, step_m: float) -> int:
-    """About how many poses `pose_grid` would return, from areas alone; many narrow rooms may hold twice as many."""
+    """Estimate the number of poses of `pose_grid` from areas alone; many narrow rooms can hold twice as many."""
     return len(plan.rooms) + int(plan.area_m2 / step_m**2)
 
 
 def pose_grid(plan: FloorPlan, step_m: float, after_room: Callable[[], None] = lambda: None) -> PoseSet:
-    """Poses on the lattice of multiples of `step_m`, clipped to the rooms.
+    """Return the poses on the lattice of multiples of `step_m` that lie in rooms.
 
-    A room too small or narrow for any lattice point gets one pose well inside it, so that no room is missing.
+    A room too small or narrow for any lattice point gets one interior pose, so that no room is missing.
 
     Args:
         plan: the plan.
         step_m: distance of neighbouring poses.
-        after_room: called when the poses of a room are found; what it raises ends the work.
+        after_room: called after each room; an exception that it raises ends the computation.
 
     Raises:
         InvalidInputError: `step_m` is not positive.
     """
     if not step_m > 0.0:
-        raise InvalidInputError(f"the grid step is {step_m} m, it must be positive")
+        raise InvalidInputError(f"the grid step is {step_m} m; it must be positive (step_m)")
     positions, rooms = [], []
     for index, room in enumerate(plan.rooms):
         x_min, y_min, x_max, y_max = room.shape.bounds
@@ -66,7 +66,7 @@ def pose_grid(plan: FloorPlan, step_m: float, after_room: Callable[[], None] = l
             + [_lattice_inside(floor, xs[first : first + columns], ys) for first in range(0, len(xs), columns)]
         )
         if len(chosen) == 0:
-            chosen = room.inmost_point()[None]
+            chosen = room.interior_point()[None]
         positions.append(chosen)
         rooms.append(np.full(len(chosen), index))
         after_room()
@@ -76,13 +76,13 @@ def pose_grid(plan: FloorPlan, step_m: float, after_room: Callable[[], None] = l
 def _lattice_inside(
     floor: BaseGeometry, xs: Float[np.ndarray, "c"], ys: Float[np.ndarray, "r"]
 ) -> Float[np.ndarray, "n 2"]:
-    """The points of a lattice that lie on a floor."""
+    """Return the lattice points that lie on a floor."""
     lattice = np.stack(np.meshgrid(xs, ys, indexing="ij"), axis=-1).reshape(-1, 2)
     return lattice[shapely.contains_xy(floor, lattice[:, 0], lattice[:, 1])]
 
 
 def random_poses(plan: FloorPlan, count: int, rng: np.random.Generator, margin_m: float = WALL_MARGIN_M) -> PoseSet:
-    """Poses uniform over the plan's floor, at least `margin_m` from their room's walls.
+    """Draw poses uniformly over the plan's floor, at least `margin_m` from their room's walls.
 
     Raises:
         InvalidInputError: no room is wide enough for the margin.
@@ -90,24 +90,24 @@ def random_poses(plan: FloorPlan, count: int, rng: np.random.Generator, margin_m
     inner = [room.free_floor(margin_m) for room in plan.rooms]
     areas = np.array([shape.area for shape in inner])
     if not areas.sum() > 0.0:
-        raise InvalidInputError(f"no room leaves a margin of {margin_m:g} m to its walls")
+        raise InvalidInputError(f"no room is wide enough for a margin of {margin_m:g} m to its walls (margin_m)")
     shares = rng.multinomial(count, areas / areas.sum())
     positions, rooms = [np.empty((0, 2))], [np.empty(0, dtype=int)]
     for index, (shape, wanted) in enumerate(zip(inner, shares, strict=True)):
         x_min, y_min, x_max, y_max = shape.bounds if wanted else (0.0, 0.0, 1.0, 1.0)
         while wanted > 0:
-            drawn = rng.uniform((x_min, y_min), (x_max, y_max), size=(4 * wanted + 8, 2))
-            drawn = drawn[shapely.contains_xy(shape, drawn[:, 0], drawn[:, 1])][:wanted]
-            positions.append(drawn)
-            rooms.append(np.full(len(drawn), index))
-            wanted -= len(drawn)
+            candidates = rng.uniform((x_min, y_min), (x_max, y_max), size=(4 * wanted + 8, 2))
+            candidates = candidates[shapely.contains_xy(shape, candidates[:, 0], candidates[:, 1])][:wanted]
+            positions.append(candidates)
+            rooms.append(np.full(len(candidates), index))
+            wanted -= len(candidates)
     order = rng.permutation(count)
     return PoseSet(np.concatenate(positions)[order], np.concatenate(rooms)[order])
 
 
 @dataclass(frozen=True, kw_only=True)
 class TripletSampling:
-    """How training draws the neighbours of an anchor (paper, A.1.3: 1 positive to 20 negatives)."""
+    """Numbers and radii of an anchor's neighbours in training (paper, A.1.3: 1 positive to 20 negatives)."""
 
     positives: int = 1
     negatives: int = 20
@@ -122,8 +122,8 @@ def sample_triplets(
 
     Returns:
         the poses, and per anchor a row of indices into them: the anchor, its positives (closer than
-        `positive_radius_m`), its negatives (farther than `negative_radius_m`); None when the plan is too small to
-        hold an anchor's negatives.
+        `positive_radius_m`), its negatives (farther than `negative_radius_m`); None if the plan is too small for
+        negatives.
     """
     pool = random_poses(plan, 4 * (anchors + sampling.negatives), rng)
     distance = np.linalg.norm(pool.position_m[:, None] - pool.position_m[None], axis=-1)
@@ -148,17 +148,17 @@ def sample_triplets(
 def sample_neighbours(
     plan: FloorPlan, anchor: PoseSet, sampling: TripletSampling, rng: np.random.Generator, lowest_ceiling_m: float = 0.0
 ) -> PoseSet | None:
-    """Draw the positives, then the negatives, of one given pose.
+    """Draw the positives, then the negatives, of a given pose.
 
     Args:
         plan: the plan.
-        anchor: one pose.
-        sampling: how many, and how near or far.
+        anchor: the pose.
+        sampling: numbers and radii of positives and negatives.
         rng: source of randomness.
-        lowest_ceiling_m: rooms with a lower ceiling are left out; a camera cannot stand in them.
+        lowest_ceiling_m: rooms with a lower ceiling are excluded, since a camera cannot stand in them.
 
     Returns:
-        `sampling.positives` + `sampling.negatives` poses; None where hardly any of the plan is far enough.
+        `sampling.positives` + `sampling.negatives` poses; None if too little of the plan is far enough.
     """
     open_rooms = plan.ceiling_heights_m >= lowest_ceiling_m
     far_position, far_room = [np.empty((0, 2))], [np.empty(0, dtype=int)]
@@ -185,20 +185,20 @@ def _sample_near(
     rng: np.random.Generator,
     open_rooms: Bool[np.ndarray, "r"] | None = None,
 ) -> PoseSet:
-    """Positions uniform on the disc around each anchor that lie in some room; anchors in tight corners shrink it."""
+    """Draw positions in rooms, uniform on a disc around each anchor; the disc shrinks in tight corners."""
     count = len(anchors) * sampling.positives
     centre = np.repeat(pool.position_m[anchors], sampling.positives, axis=0)
-    # Where rooms overlap, even the smallest disc may lie in another one: then the anchor is its own neighbour.
+    # In overlapping rooms even the smallest disc can lie in another room: then the anchor is its own neighbour.
     result = PoseSet(centre.copy(), np.repeat(pool.room_index[anchors], sampling.positives))
     radius = np.full(count, sampling.positive_radius_m)
     missing = np.arange(count)
     while len(missing):
         angle = rng.uniform(0.0, 2.0 * np.pi, len(missing))
         length = radius[missing] * np.sqrt(rng.uniform(0.0, 1.0, len(missing)))
-        drawn = centre[missing] + length[:, None] * np.stack([np.sin(angle), np.cos(angle)], axis=-1)
-        room = plan.room_index_at(drawn)
+        candidates = centre[missing] + length[:, None] * np.stack([np.sin(angle), np.cos(angle)], axis=-1)
+        room = plan.room_index_at(candidates)
         found = (room >= 0) & (True if open_rooms is None else open_rooms[room])
-        result.position_m[missing[found]] = drawn[found]
+        result.position_m[missing[found]] = candidates[found]
         result.room_index[missing[found]] = room[found]
         missing = missing[~found]
         radius[missing] *= 0.7

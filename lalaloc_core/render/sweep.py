@@ -1,9 +1,8 @@
-"""What many poses of a plan see: every wall is met by the rays between its two ends, and by no others.
+"""Layout views of many poses of a plan at once: each wall fills only the columns between the azimuths of its ends.
 
-`render.layout` casts every ray at every wall, which for large rooms is nearly all in vain. Here the azimuths of a
-wall's ends, as a pose sees them, tell the columns that it may fill, and of the walls of a column the nearest counts.
-What it costs grows with the number of columns, and with that of a room's own walls only by two arctangents each. The
-same picture as `render.layout` draws, for numpy alone and without gradients.
+`render.layout` casts every ray at every wall, and in large rooms most of these pairs miss. Here the azimuths of a
+wall's ends give the columns it can fill, and the nearest wall of each column wins. The cost grows with the number of
+columns, plus two arctangents per wall. The result equals that of `render.layout`, for numpy only, without gradients.
 """
 
 from __future__ import annotations
@@ -15,22 +14,23 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from lalaloc_core.conventions import DOOR_CODE, PASSAGE_CODE, TWO_PI, WALL_CODE, column_azimuths
-from lalaloc_core.floorplan.wall_table import WallTable
-from lalaloc_core.render.tolerances import BEYOND_M, CORNER_TOLERANCE, EDGE_ON
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.floorplan.geometry import WallTable
+from lalaloc_core.render.profile import BEYOND_M, CORNER_TOLERANCE, EDGE_ON
 
-# Pairs of a pose and a wall, or of a ray and a wall, that are looked at together, to bound memory.
+# Pose-wall or ray-wall pairs processed at once, to bound memory.
 _PAIRS = 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
 class SweptViews:
-    """What n poses see in w columns each.
+    """Layout views of n poses in w columns each.
 
     Attributes:
-        distance_m: (n, w) to the nearest wall of the pose's own room; inf where there is none, outside a room.
-        kind: (n, w) codes of what that wall is there at eye height, as in `conventions.OPENING_CLASSES`.
-        row, column: (m,) the rays that go on through an open door or passage, row by row.
-        behind_m: (m,) how far those go on to the next wall of the room behind.
+        distance_m: (n, w) distance to the nearest wall of the pose's own room; inf outside a room.
+        kind: (n, w) code in `conventions.OPENING_CLASSES` of that wall at eye height.
+        row, column: (m,) rays that continue through a door or passage, row by row.
+        behind_m: (m,) distance along these rays to the next wall of the room behind.
     """
 
     distance_m: Float[np.ndarray, "n w"]
@@ -48,19 +48,23 @@ def swept_views(
     columns: int,
     eye_m: float,
 ) -> SweptViews:
-    """What poses of a plan see.
+    """Render the layout views of poses of a plan.
 
     Args:
-        heading: azimuth of the centre column, radians.
+        position_m: (n, 2) camera positions, inside their rooms.
+        heading: (n,) azimuth of the centre column, radians.
+        room_index: (n,) each pose's room.
+        walls: `FloorPlan.wall_table` of the plan.
         columns: number of azimuth columns.
-        eye_m: height of the eye: an opening counts where its sill is below and its head above.
+        eye_m: eye height; an opening is visible if its sill is below the eye and its head above.
     """
     distance_m = np.empty((len(position_m), columns), np.float32)
     kind = np.full((len(position_m), columns), WALL_CODE, np.uint8)
-    rows, at, behind_m = [np.empty(0, np.intp)], [np.empty(0, np.intp)], [np.empty(0, np.float32)]
+    through_rows, through_columns = [np.empty(0, np.intp)], [np.empty(0, np.intp)]
+    behind_m = [np.empty(0, np.float32)]
     at_eye = np.flatnonzero((walls.sill_m < eye_m) & (eye_m < walls.head_m))
     for part in _parts(room_index, walls, columns):
-        rays = _Rays.of(heading[part], columns)
+        rays = _Rays.cast(heading[part], columns)
         distance, wall = _nearest(position_m[part], rays, room_index[part], walls)
         distance_m[part] = distance
         row, column, number = _openings(position_m[part], rays, distance, wall, walls, at_eye)
@@ -70,31 +74,42 @@ def swept_views(
         met_m = distance[row, column]
         seen_m = _behind(position_m[part][row], rays.along(row, column), met_m, number, walls)
         through = seen_m > met_m
-        rows.append(row[through] + part.start)
-        at.append(column[through])
+        through_rows.append(row[through] + part.start)
+        through_columns.append(column[through])
         behind_m.append(seen_m[through].astype(np.float32))
-    return SweptViews(distance_m, kind, np.concatenate(rows), np.concatenate(at), np.concatenate(behind_m))
+    rows, columns_through = np.concatenate(through_rows), np.concatenate(through_columns)
+    return SweptViews(distance_m, kind, rows, columns_through, np.concatenate(behind_m))
 
 
-def swept_profiles(
+def profiles_at(
+    plan: FloorPlan,
     position_m: Float[np.ndarray, "n 2"],
-    heading: Float[np.ndarray, "n"],
     room_index: Int[np.ndarray, "n"],
-    walls: WallTable,
+    heading: Float[np.ndarray, "n"],
     columns: int,
     dtype: type[np.floating] = np.float64,
 ) -> Float[np.ndarray, "n {columns}"]:
-    """The distances (m) of `swept_views` alone."""
+    """Return the wall profiles (m) of poses, each within its own room.
+
+    Args:
+        plan: the plan.
+        position_m: (n, 2) camera positions, inside their rooms.
+        room_index: (n,) each pose's room.
+        heading: (n,) azimuth of the centre column, radians.
+        columns: number of azimuth columns.
+        dtype: float type of the result.
+    """
+    walls = plan.wall_table
     distance_m = np.empty((len(position_m), columns), dtype)
     for part in _parts(room_index, walls, columns):
-        rays = _Rays.of(heading[part], columns)
+        rays = _Rays.cast(heading[part], columns)
         distance_m[part], _ = _nearest(position_m[part], rays, room_index[part], walls)
     return distance_m
 
 
 @dataclass(frozen=True, eq=False)
 class _Rays:
-    """The rays of b poses in w columns: their unit vectors' components, of one pose where all look alike."""
+    """Rays of b poses in w columns: components of their unit vectors, stored once if all headings are equal."""
 
     heading: Float[np.ndarray, "b"]
     columns: int
@@ -102,20 +117,20 @@ class _Rays:
     y: Float[np.ndarray, "k w"]
 
     @classmethod
-    def of(cls, heading: Float[np.ndarray, "b"], columns: int) -> _Rays:
-        told = heading[:1] if (heading == heading[0]).all() else heading
-        azimuth = told[:, None] + column_azimuths(columns)[None]
+    def cast(cls, heading: Float[np.ndarray, "b"], columns: int) -> _Rays:
+        distinct = heading[:1] if (heading == heading[0]).all() else heading
+        azimuth = distinct[:, None] + column_azimuths(columns)[None]
         return cls(heading, columns, np.sin(azimuth), np.cos(azimuth))
 
     def along(self, row: Int[np.ndarray, "m"], column: Int[np.ndarray, "m"]) -> Float[np.ndarray, "m 2"]:
-        """Unit vectors of some of them."""
-        at = column if len(self.x) == 1 else row * self.columns + column
-        return np.stack([self.x.ravel()[at], self.y.ravel()[at]], axis=1)
+        """Return the unit vectors of m rays."""
+        index = column if len(self.x) == 1 else row * self.columns + column
+        return np.stack([self.x.ravel()[index], self.y.ravel()[index]], axis=1)
 
 
 def _parts(room_index: Int[np.ndarray, "n"], walls: WallTable, columns: int) -> Iterator[slice]:
-    """Slices of poses that fit into memory, and into a processor's cache, at once."""
-    # Of rays those that are filled twice and more count as well, if roughly.
+    """Yield slices of poses that fit into memory and into a processor's cache."""
+    # Rays that several walls fill are counted roughly.
     work = np.cumsum(np.maximum(np.diff(walls.first)[room_index], columns))
     begin = 0
     while begin < len(room_index):
@@ -128,47 +143,49 @@ def _parts(room_index: Int[np.ndarray, "n"], walls: WallTable, columns: int) -> 
 def _nearest(
     position_m: Float[np.ndarray, "b 2"], rays: _Rays, room_index: Int[np.ndarray, "b"], walls: WallTable
 ) -> tuple[Float[np.ndarray, "b w"], Int[np.ndarray, "b w"]]:
-    """Distance (m) along every ray to the nearest wall, and that wall's number in the table; -1 where there is none."""
+    """Return the distance (m) along every ray to the nearest wall, and that wall's index in the table, -1 for none."""
     columns = rays.columns
     pose, wall = _each_with(walls, room_index)
     start, end = walls.start_m[wall] - position_m[pose], walls.end_m[wall] - position_m[pose]
     edge = end - start
     area = start[:, 0] * edge[:, 1] - start[:, 1] * edge[:, 0]
-    # Only free-standing walls have a back that can be seen.
+    # Only free-standing walls are visible from both sides.
     faces = np.flatnonzero(np.where(walls.is_free[wall], np.abs(area), area) >= EDGE_ON)
-    pose, wall, start, end, area = (one[faces] for one in (pose, wall, start, end, area))
+    pose, wall, start, end, area = (values[faces] for values in (pose, wall, start, end, area))
     by_x, by_y = edge[faces, 0] / area, edge[faces, 1] / area
-    # Azimuths fall from the start of a wall to its end, as the room lies to its left.
+    # Azimuths decrease from the start of a wall to its end, since the room lies to its left.
     low = np.where(area[:, None] > 0.0, end, start)
     high = np.where(area[:, None] > 0.0, start, end)
-    first, last = (np.ceil(_column_of(one, rays.heading[pose], columns)).astype(np.intp) for one in (low, high))
+    first, last = (
+        np.ceil(_column_towards(point, rays.heading[pose], columns)).astype(np.intp) for point in (low, high)
+    )
     filled = (last - first) % columns
-    # Fewer than half of all columns; more are none at all, but for rounding.
+    # A wall fills fewer than half of all columns; a larger number is zero, wrapped by rounding.
     filled[filled > columns // 2 + 1] = 0
     entry = np.repeat(np.arange(len(pose)), filled)
     column = (np.arange(len(entry)) - (np.cumsum(filled) - filled - first)[entry]) % columns
     ray = pose[entry] * columns + column
-    at = column if len(rays.x) == 1 else ray
-    inverse_m = rays.x.ravel()[at] * by_y[entry] - rays.y.ravel()[at] * by_x[entry]
+    index = column if len(rays.x) == 1 else ray
+    inverse_m = rays.x.ravel()[index] * by_y[entry] - rays.y.ravel()[index] * by_x[entry]
     shape = (len(position_m), columns)
     nearest, met = np.zeros(shape[0] * columns), np.full(shape[0] * columns, -1, np.intp)
     np.maximum.at(nearest, ray, inverse_m)
-    is_it = np.flatnonzero(nearest[ray] == inverse_m)
-    met[ray[is_it]] = wall[entry[is_it]]
+    winner = np.flatnonzero(nearest[ray] == inverse_m)
+    met[ray[winner]] = wall[entry[winner]]
     with np.errstate(divide="ignore"):
         return (1.0 / nearest).reshape(shape), met.reshape(shape)
 
 
-def _column_of(point_m: Float[np.ndarray, "k 2"], heading: Float[np.ndarray, "k"], columns: int) -> np.ndarray:
-    """The column, with its fraction, in whose direction a point lies."""
+def _column_towards(point_m: Float[np.ndarray, "k 2"], heading: Float[np.ndarray, "k"], columns: int) -> np.ndarray:
+    """Return the fractional column in the direction of each point."""
     return (np.arctan2(point_m[:, 0], point_m[:, 1]) - heading) * (columns / TWO_PI) + 0.5 * (columns - 1)
 
 
 def _each_with(walls: WallTable, room_index: Int[np.ndarray, "b"]) -> tuple[np.ndarray, np.ndarray]:
-    """Every wall of every given room: which of them it is of, and its number in the table."""
+    """Pair each given room with its walls: index into `room_index`, and the wall's index in the table."""
     count = np.diff(walls.first)[room_index]
-    of = np.repeat(np.arange(len(room_index)), count)
-    return of, np.arange(len(of)) - np.repeat(np.cumsum(count) - count - walls.first[room_index], count)
+    entry = np.repeat(np.arange(len(room_index)), count)
+    return entry, np.arange(len(entry)) - np.repeat(np.cumsum(count) - count - walls.first[room_index], count)
 
 
 def _openings(
@@ -179,10 +196,9 @@ def _openings(
     walls: WallTable,
     at_eye: Int[np.ndarray, "k"],
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The rays that meet an opening at eye height: row, column, and the opening's number in the table.
+    """Return the rays that meet an opening at eye height: row, column, and the opening's index in the table.
 
-    Args:
-        at_eye: numbers of the openings at eye height.
+    `at_eye` holds the indices of the openings at eye height.
     """
     if not len(at_eye):
         none = np.empty(0, np.intp)
@@ -209,9 +225,9 @@ def _behind(
     number: Int[np.ndarray, "m"],
     walls: WallTable,
 ) -> Float[np.ndarray, "m"]:
-    """How far rays that meet openings go on; as far as the wall where they meet the reveal, or nothing behind."""
+    """Return the distances (m) through openings; that of the wall for rays that hit the reveal or no room behind."""
     exit_m = walls.exit_m[number]
-    # Where the ray leaves the wall's thickness; one that does not meets the reveal.
+    # Distance at which the ray leaves the wall's thickness; 0 for a ray that hits the reveal.
     inverse_m = _inverse_crossings(exit_m[:, :2] - eye_m, exit_m[:, 2:] - eye_m, direction)
     through = np.flatnonzero(inverse_m > 0.0)
     seen_m = distance_m.copy()
@@ -231,15 +247,14 @@ def _behind(
 def _inverse_crossings(
     start_m: Float[np.ndarray, "k 2"], end_m: Float[np.ndarray, "k 2"], direction: Float[np.ndarray, "k 2"]
 ) -> Float[np.ndarray, "k"]:
-    """Inverse distances (1/m) along one ray each to one wall each, counted from the ray's origin; 0 where it misses.
+    """Return the inverse distance (1/m) from each ray's origin to its one wall, 0 for a miss.
 
-    The formula of `profile.inverse_crossings`, which takes all rays with all walls in one product of matrices: for
-    pairs, of which there is one in hundreds, that would be nearly all in vain.
+    The formula of `profile.inverse_crossings`, for k pairs instead of all rays with all walls.
     """
     edge = end_m - start_m
     area = start_m[:, 0] * edge[:, 1] - start_m[:, 1] * edge[:, 0]
     low, high = start_m - CORNER_TOLERANCE * edge, end_m + CORNER_TOLERANCE * edge
-    sides = [one[:, 0] * direction[:, 1] - one[:, 1] * direction[:, 0] for one in (low, high)]
+    sides = [point[:, 0] * direction[:, 1] - point[:, 1] * direction[:, 0] for point in (low, high)]
     inverse_m = direction[:, 0] * edge[:, 1] - direction[:, 1] * edge[:, 0]
     meets = (sides[0] * sides[1] <= 0.0) & (np.abs(area) >= EDGE_ON)
     return np.maximum(np.divide(inverse_m, area, out=np.zeros_like(area), where=meets), 0.0)

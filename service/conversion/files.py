@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.file_kinds import kind_of
+from lalaloc_core.file_kinds import describe_file
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import ImportOptions, detect_format, import_if_native, is_json, media_type_of
 from service.conversion.converter import Converter
@@ -37,7 +37,7 @@ class PlanFile:
 
 def seems_native(content: bytes) -> bool:
     """Whether a file is read here, as far as a glance can tell."""
-    return len(content) <= _MAX_IN_PROCESS_BYTES and is_json(content) and kind_of(content) is None
+    return len(content) <= _MAX_IN_PROCESS_BYTES and is_json(content) and describe_file(content) is None
 
 
 def understand(

@@ -9,8 +9,7 @@ from functools import partial
 from time import monotonic
 from typing import Any, TypeVar
 
-from lalaloc_core.draw.answer import PHOTOGRAPH_SIZE, draw_answer
-from lalaloc_core.draw.found import drawn_answer
+from lalaloc_core.draw.answer import PHOTOGRAPH_SIZE, draw_answer, drawn_answer
 from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders

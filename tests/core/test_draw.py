@@ -15,13 +15,13 @@ from lalaloc_core.conventions import TWO_PI, column_azimuths, wrap_angle
 from lalaloc_core.draw import rasterise
 from lalaloc_core.draw.answer import DrawnAnswer, DrawnCandidate, Picture, confidence_words, draw_answer, ellipse_m
 from lalaloc_core.draw.heat import Cells, HeatMap, distance_map, heat_image, posterior_map
-from lalaloc_core.draw.outline import outline_of
+from lalaloc_core.draw.outline import layout_outline
 from lalaloc_core.draw.photograph import Stroke, draw_strokes, wall_line
 from lalaloc_core.draw.plan import Marker
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.probability_map import ProbabilityMap
-from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.render.sampling import PoseSet, pose_grid
+from lalaloc_core.render.sweep import profiles_at
 
 SVG = "{http://www.w3.org/2000/svg}"
 PLAN = FloorPlan.from_dict(
@@ -63,7 +63,7 @@ def answer(**changes: Any) -> DrawnAnswer:
 @pytest.mark.parametrize("room", [0, 1])
 def test_walls_are_drawn_where_the_renderer_has_them(room: int, heading: float) -> None:
     position_m = np.array([MIDDLE, [5.0, 1.0]][room])
-    outline = outline_of(PLAN, position_m, room, heading, EYE_M)
+    outline = layout_outline(PLAN, position_m, room, heading, EYE_M)
     columns = 512
     profile_m = profiles_at(PLAN, position_m[None], np.array([room]), np.array([heading]), columns)[0]
     for line, rise_m in ((outline.floor, -EYE_M), (outline.ceiling, 1.0)):
@@ -77,7 +77,7 @@ def test_walls_are_drawn_where_the_renderer_has_them(room: int, heading: float) 
 
 def test_corners_stand_where_the_plan_has_them_and_nowhere_else() -> None:
     heading = 0.7
-    outline = outline_of(PLAN, MIDDLE, 0, heading, EYE_M)
+    outline = layout_outline(PLAN, MIDDLE, 0, heading, EYE_M)
     offset = PLAN.rooms[0].polygon_m - MIDDLE
     azimuth = np.sort(wrap_angle(np.arctan2(offset[:, 0], offset[:, 1]) - heading))
     np.testing.assert_allclose(np.sort(outline.corners[:, 0, 0]), azimuth / TWO_PI + 0.5, atol=1e-4)
@@ -87,7 +87,7 @@ def test_corners_stand_where_the_plan_has_them_and_nowhere_else() -> None:
 
 
 def test_openings_are_drawn_at_their_heights_and_those_at_the_pictures_edge_twice() -> None:
-    outline = outline_of(PLAN, MIDDLE, 0, 0.0, EYE_M)
+    outline = layout_outline(PLAN, MIDDLE, 0, 0.0, EYE_M)
     kinds = [opening.kind for opening in outline.openings]
     # The passage lies behind: half of it at either edge.
     assert sorted(kinds) == ["door", "passage", "passage", "window"]
@@ -107,15 +107,15 @@ def test_what_another_wall_hides_is_not_drawn() -> None:
     document["rooms"][1]["walls"] = [[[4.8, 3.6], [4.8, 5.6]]]
     hidden = FloorPlan.from_dict(document)
     position_m = np.array([5.6, 4.6])
-    assert [one.kind for one in outline_of(PLAN, position_m, 1, 0.0, EYE_M).openings] == ["door"]
-    assert outline_of(hidden, position_m, 1, 0.0, EYE_M).openings == ()
+    assert [one.kind for one in layout_outline(PLAN, position_m, 1, 0.0, EYE_M).openings] == ["door"]
+    assert layout_outline(hidden, position_m, 1, 0.0, EYE_M).openings == ()
 
 
 def test_a_round_room_has_no_corners() -> None:
     azimuth = column_azimuths(480)
     ring = np.stack([3.0 * np.sin(azimuth), 3.0 * np.cos(azimuth)], axis=1)[::-1]
     plan = FloorPlan.from_dict({"ceiling_height_m": 2.5, "rooms": [{"name": "round", "polygon": ring.tolist()}]})
-    outline = outline_of(plan, np.zeros(2), 0, 0.0, EYE_M)
+    outline = layout_outline(plan, np.zeros(2), 0, 0.0, EYE_M)
     assert len(outline.corners) == 0
     np.testing.assert_allclose(outline.floor[:, 1], 0.5 + math.atan(0.5) / math.pi, atol=1e-5)
 
@@ -158,7 +158,7 @@ def test_places_that_are_as_probable_are_as_dark() -> None:
 
 
 def test_a_map_of_distances_is_darkest_where_they_are_least() -> None:
-    cells = Cells.of(PLAN, 0.2)
+    cells = Cells.cover(PLAN, 0.2)
     distance_m = 0.1 + np.linalg.norm(cells.poses.position_m - MIDDLE, axis=1)
     heat = distance_map(cells, distance_m, "distance (m)")
     assert heat.shade.argmax() == distance_m.argmin()
@@ -167,7 +167,7 @@ def test_a_map_of_distances_is_darkest_where_they_are_least() -> None:
 
 
 def colours(heat: HeatMap) -> np.ndarray:
-    size = Cells.of(PLAN, 0.05).room.shape
+    size = Cells.cover(PLAN, 0.05).room.shape
     drawn = (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 -6 8 6" width="{size[1]}">{heat_image(heat, PLAN)}</svg>'
     )
@@ -176,7 +176,7 @@ def colours(heat: HeatMap) -> np.ndarray:
 
 
 def test_colours_lie_on_the_floors_alone() -> None:
-    cells = Cells.of(PLAN, 0.1)
+    cells = Cells.cover(PLAN, 0.1)
     shown = colours(HeatMap(cells, np.ones(len(cells.poses)), "", ()))
     height, width = shown.shape[:2]
     rows, columns = np.mgrid[:height, :width]
@@ -219,7 +219,7 @@ def test_an_answer_is_drawn_with_all_that_belongs_to_it(picture: Picture) -> Non
 
 
 def test_a_picture_of_the_photograph_needs_one() -> None:
-    with pytest.raises(ValueError, match="'both' needs the photograph"):
+    with pytest.raises(ValueError, match="'both' needs the argument photograph"):
         draw_answer(answer())
     assert "<image" not in draw_answer(answer(), picture="plan")
 

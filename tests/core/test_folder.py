@@ -179,7 +179,7 @@ class TestBadFiles:
         folder = write_scene(tmp_path, "home")
         document = plan_document(rectangle(4000.0, 3000.0))
         (folder / "plan.json").write_text(json.dumps(document))
-        with pytest.raises(DatasetError, match=r"4000 m across, at most 1000 m .* are the coordinates in met"):
+        with pytest.raises(DatasetError, match=r"4000 m across; the limit is 1000 m .* are the coordinates in met"):
             OwnData(tmp_path).load("home")
 
     @pytest.mark.parametrize("name", ["house", "../home", "", "/"])

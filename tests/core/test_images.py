@@ -16,7 +16,7 @@ from PIL import Image, ImageChops
 
 from lalaloc_core.errors import InvalidPanoramaError
 from lalaloc_core.panorama.images import NEUTRAL, PanoramaLimits, open_panorama, read_panorama
-from lalaloc_core.panorama.jpeg import count_scans
+from lalaloc_core.panorama.segments import count_scans
 
 HEIGHT, WIDTH = 32, 64
 LOSSLESS = {"PNG": {}, "WEBP": {"lossless": True}}
@@ -279,7 +279,7 @@ class TestRefused:
             (b"\x89PNG\r\n\x1a\n", "not a readable|damaged"),
             (
                 encoded(picture(), "GIF"),
-                "is a GIF picture, which is not read here: save or export it as JPEG, PNG or WEBP",
+                "is a GIF picture, which is not supported; save or export it as JPEG, PNG or WEBP",
             ),
             (encoded(picture(), "BMP"), "is a BMP picture"),
             (encoded(picture(), "TIFF"), "is a TIFF picture"),
@@ -288,12 +288,12 @@ class TestRefused:
             (b"\0\0\0\x1cftypisom", "is a video"),
             (b"%PDF-1.7", "is a PDF document"),
             (b' {"name": "x", "type" : "FeatureCollection", "features": []}', "is GeoJSON"),
-            (encoded(Image.new("RGB", (256, 512))), "256 x 512; .* is twice as wide as high, give or take 1%$"),
+            (encoded(Image.new("RGB", (256, 512))), "256 x 512; .* is twice as wide as high, within 1%$"),
             (encoded(Image.new("RGB", (256, 256))), "twice as wide"),
             (encoded(Image.new("RGB", (256, 64))), "twice as wide"),
             (encoded(Image.new("RGB", (530, 256))), "twice as wide"),
-            (encoded(Image.new("RGB", (126, 63))), "63 pixels high, at least 64"),
-            (encoded(Image.new("RGB", (2, 1))), "at least 64"),
+            (encoded(Image.new("RGB", (126, 63))), "63 pixels high; the minimum is 64"),
+            (encoded(Image.new("RGB", (2, 1))), "the minimum is 64"),
         ],
     )
     def test_what_is_no_panorama_is_refused_with_the_reason(self, content: bytes, reason: str) -> None:
@@ -319,7 +319,9 @@ class TestRefused:
         content = of_scans(14_000, 7_000, 400)
         assert len(content) < 700_000
         begin = time.perf_counter()
-        with pytest.raises(InvalidPanoramaError, match=r"a JPEG of more than 20 scans \(max_scans\)"):
+        with pytest.raises(
+            InvalidPanoramaError, match=r"a JPEG with more than 20 scans, the limit \(LALALOC_MAX_SCANS\)"
+        ):
             read(content)
         # Decoding it takes most of a minute.
         assert time.perf_counter() - begin < 1.0
@@ -333,11 +335,13 @@ class TestRefused:
             b"VP8 ": bytes(3) + b"\x9d\x01\x2a" + side.to_bytes(2, "little") * 2,
         }
         content = b"RIFF" + struct.pack("<I", 100) + b"WEBP" + kind + struct.pack("<I", 88) + heads[kind] + bytes(78)
-        with pytest.raises(InvalidPanoramaError, match=r"16383 x 16383 = \d+ pixels, at most 1000 .*\(max_pixels\)"):
+        with pytest.raises(
+            InvalidPanoramaError, match=r"16383 x 16383 = \d+ pixels; the limit is 1000 \(LALALOC_MAX_PIXELS\)"
+        ):
             read(content, PanoramaLimits(max_pixels=1000))
 
     def test_the_limit_on_pixels_is_configurable(self) -> None:
-        with pytest.raises(InvalidPanoramaError, match="at most 1000"):
+        with pytest.raises(InvalidPanoramaError, match="the limit is 1000"):
             read(encoded(picture()), PanoramaLimits(max_pixels=1000))
 
     def test_an_orientation_that_turns_a_panorama_upright_makes_it_a_portrait(self) -> None:

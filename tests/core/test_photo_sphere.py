@@ -150,14 +150,14 @@ class TestParts:
     @pytest.mark.parametrize(
         ("changes", "reason"),
         [
-            ({"CroppedAreaLeftPixels": 500}, "does not lie within the full sphere of 1024 x 512"),
-            ({"CroppedAreaTopPixels": -1}, "CroppedAreaTopPixels is '-1', it must lie between 0 and"),
-            ({"CroppedAreaImageHeightPixels": 400}, "the part is 640 x 400, the picture 640 x 256"),
+            ({"CroppedAreaLeftPixels": 500}, "is not within the full sphere of 1024 x 512"),
+            ({"CroppedAreaTopPixels": -1}, "CroppedAreaTopPixels is '-1'; it must be between 0 and"),
+            ({"CroppedAreaImageHeightPixels": 400}, "the part is 640 x 400, but the picture is 640 x 256"),
             ({"FullPanoHeightPixels": 400}, "not twice as wide as high"),
             ({"FullPanoWidthPixels": "1e300"}, "FullPanoWidthPixels is '1e300'"),
             ({"FullPanoWidthPixels": "nan"}, "FullPanoWidthPixels is 'nan'"),
             ({"FullPanoWidthPixels": ""}, "FullPanoWidthPixels is ''"),
-            ({"CroppedAreaImageWidthPixels": 0}, "width or height of 0"),
+            ({"CroppedAreaImageWidthPixels": 0}, "a width or height is 0"),
         ],
     )
     def test_numbers_that_contradict_are_refused_but_for_a_picture_that_is_full_anyway(
@@ -176,9 +176,9 @@ class TestParts:
         [
             (
                 {"FullPanoWidthPixels": 10240, "FullPanoHeightPixels": 5120},
-                "0.4% of the sphere, at least 10% is needed",
+                "0.4% of the sphere; the minimum is 10%",
             ),
-            ({"ProjectionType": "cylindrical"}, "'cylindrical', only 'equirectangular'"),
+            ({"ProjectionType": "cylindrical"}, "'cylindrical'; only 'equirectangular'"),
         ],
     )
     def test_what_is_no_use_by_its_own_account_is_refused(self, changes: dict[str, object], reason: str) -> None:

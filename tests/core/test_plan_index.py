@@ -34,8 +34,8 @@ from lalaloc_core.localise.venue.prototypes import (
     prototypes_of,
     unpacked_openings,
 )
-from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.render.sampling import pose_grid
+from lalaloc_core.render.sweep import profiles_at
 
 COLUMNS, STEP_M = 64, 0.5
 WEIGHTS, CONFIG = MatchingWeights(temperature=40.0, openings=0.4, ceiling=0.1, room_type=0.05), MatchingConfig()

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.floorplan import DEFAULT_LIMITS, FloorPlan, PlanLimits, room_type_of
+from lalaloc_core.floorplan import DEFAULT_LIMITS, FloorPlan, PlanLimits, room_type_from_label
 from lalaloc_core.learn.heldout.homes import HomeKey, home_of
 from lalaloc_core.learn.synth.homes.plans import generate_home
 from lalaloc_core.render.sampling import pose_grid, random_poses
@@ -108,17 +108,17 @@ def test_openings_across_a_wall_are_on_no_wall() -> None:
     ("opening", "reason"),
     [
         ("door", "opening 0 must be an object, not a string"),
-        ({"kind": "gate", "line": DOOR["line"]}, "opening 0: the kind is 'gate', it must be one of door, window"),
+        ({"kind": "gate", "line": DOOR["line"]}, "opening 0: the kind is 'gate'; it must be one of door, window"),
         ({"kind": "wall", "line": DOOR["line"]}, "the kind is 'wall'"),
         ({"line": DOOR["line"]}, "the kind is null"),
         ({"kind": "door"}, "opening 0: the line must be two points"),
         ({"kind": "door", "line": [[0, 0], [0, 0]]}, "shorter than 0.01 m"),
         ({"kind": "door", "line": [[0, 0], [0, "1"]]}, "two numbers"),
         (DOOR | {"width_m": 1}, "opening 0: unknown key 'width_m'"),
-        (DOOR | {"sill_m": -1}, "sill_m is -1, it must lie between 0 and 20 m"),
-        (DOOR | {"sill_m": 2, "head_m": 1.5}, "sill_m is 2, it must lie below head_m (1.5)"),
+        (DOOR | {"sill_m": -1}, "sill_m is -1; it must be between 0 and 20 m"),
+        (DOOR | {"sill_m": 2, "head_m": 1.5}, "sill_m is 2 m; it must be below head_m (1.5 m)"),
         (DOOR | {"name": ""}, "name must be a non-empty string"),
-        (DOOR | {"rooms": ["attic"]}, "rooms has 'attic', which is no room's id"),
+        (DOOR | {"rooms": ["attic"]}, "rooms has 'attic', which is not the id of a room"),
         (DOOR | {"rooms": "room-1"}, "rooms must be a list, not a string"),
     ],
 )
@@ -145,10 +145,12 @@ def test_a_tolerance_out_of_range_is_refused(value: Any) -> None:
 def test_too_many_openings_are_refused() -> None:
     line = [[0.0, 0.5], [0.0, 0.6]]
     many = {"openings": [{"kind": "window", "line": line}] * 3}
-    assert "3 openings, at most 2" in refused(FloorPlan.from_dict, ROOMS | many, PlanLimits(max_openings=2))
+    assert "3 openings; the limit is 2 (LALALOC_MAX_OPENINGS)" in refused(
+        FloorPlan.from_dict, ROOMS | many, PlanLimits(max_openings=2)
+    )
     windows = [{"kind": "window", "line": [[0.0, 0.5 * k], [0.0, 0.5 * k + 0.4]]} for k in range(6)]
     message = refused(FloorPlan.from_dict, ROOMS | {"openings": windows}, PlanLimits(max_openings_per_room=5))
-    assert "room 'room 1': 6 pieces of openings, at most 5" in message
+    assert "room 'room 1': 6 openings on its walls; the limit is 5" in message
 
 
 def test_a_line_along_a_comb_of_walls_is_refused_soon() -> None:
@@ -159,7 +161,7 @@ def test_a_line_along_a_comb_of_walls_is_refused_soon() -> None:
     ]
     combs = [[[-1, -1], *teeth[2 * k : 2 * k + 60], [-1, 3]] for k in range(3)]
     document = plan_document(*combs) | {"openings": [{"kind": "window", "line": [[1.0, 0.2], [3.0, 0.2]]}]}
-    assert "walls, at most 32 are allowed (max_walls_per_opening)" in refused(FloorPlan.from_dict, document)
+    assert "walls; the limit is 32 (PlanLimits.max_walls_per_opening)" in refused(FloorPlan.from_dict, document)
 
 
 def test_holes_are_no_floor_and_their_edges_are_walls() -> None:
@@ -184,7 +186,7 @@ def test_holes_are_no_floor_and_their_edges_are_walls() -> None:
         ({"walls": [[[1, 1], [1, 1]]]}, "wall 0 is shorter than 0.01 m"),
         ({"walls": [[1, 1]]}, "wall 0: point 0 must be two numbers"),
         ({"holes": [rectangle(1.0, 1.0, at=(1, 1))], "walls": [[[0.5, 1.5], [2.5, 1.5]]]}, "wall 0 leaves"),
-        ({"type": "cave"}, "the type is 'cave', it must be one of unknown, bedroom"),
+        ({"type": "cave"}, "the type is 'cave'; it must be one of unknown, bedroom"),
         ({"type": None}, "the type is null"),
         ({"id": ""}, "the id must be a non-empty string"),
         ({"id": 7}, "the id must be a non-empty string"),
@@ -199,7 +201,7 @@ def test_what_a_room_cannot_have_is_refused_by_its_name(extra: dict[str, Any], r
 def test_edges_of_holes_and_walls_count_as_vertices() -> None:
     extra = {"holes": [rectangle(1.0, 1.0, at=(1.0, 1.0))], "walls": [[[3.0, 1.0], [3.0, 3.0]]]}
     assert len(with_room(PlanLimits(max_vertices_per_room=9), **extra).rooms[0].walls_m) == 9
-    assert "9 vertices, at most 8" in refused(with_room, PlanLimits(max_vertices_per_room=8), **extra)
+    assert "9 vertices; the limit is 8" in refused(with_room, PlanLimits(max_vertices_per_room=8), **extra)
 
 
 def test_poses_keep_off_holes_and_free_standing_walls() -> None:
@@ -227,7 +229,7 @@ def test_ids_are_made_from_names_and_never_twice() -> None:
     ids = [room.id for room in FloorPlan.from_dict(document).rooms]
     assert ids == ["bed-room-2", "bed-room-3", "küche", "bed-room-2-2", "bed-room"]
     document["rooms"][0]["id"] = "bed-room"
-    assert "the id 'bed-room' is that of 2 rooms" in refused(FloorPlan.from_dict, document)
+    assert "2 rooms have the id 'bed-room'; ids must be unique" in refused(FloorPlan.from_dict, document)
 
 
 def test_every_type_is_read_and_written() -> None:
@@ -250,7 +252,7 @@ def test_every_type_is_read_and_written() -> None:
     ],
 )
 def test_labels_of_drawings_have_types(label: str, kind: str) -> None:
-    assert room_type_of(label) == kind
+    assert room_type_from_label(label) == kind
 
 
 def test_everything_survives_being_written_and_read() -> None:
@@ -292,17 +294,17 @@ def test_the_plan_of_an_unfamiliar_home_has_its_openings(index: int) -> None:
     expected += [(o.behind.room, o.behind.edge, o.wall.room) for o in home.openings if o.behind]
     assert sorted((f.room, f.wall, f.behind) for f in plan.opening_faces) == sorted(expected)
     assert plan.warnings == ()
-    assert [room.type for room in plan.rooms] == [room_type_of(kind) for kind in home.plan.kinds]
+    assert [room.type for room in plan.rooms] == [room_type_from_label(kind) for kind in home.plan.kinds]
 
 
 class TestJson:
     def test_a_key_that_stands_twice_is_refused(self) -> None:
         text = json.dumps(ROOMS)[:-1] + ', "name": "other"}'
-        assert "the key 'name' stands twice" in refused(FloorPlan.from_json, text)
+        assert "the key 'name' occurs twice" in refused(FloorPlan.from_json, text)
 
     def test_a_number_of_thousands_of_digits_is_refused_in_plain_words(self) -> None:
         message = refused(FloorPlan.from_json, '{"ceiling_height_m": ' + "9" * 5000 + "}")
-        assert message == "a number has 5000 digits, at most 1000 are read"
+        assert message == "a number has 5000 digits; the limit is 1000"
 
     @pytest.mark.parametrize("pattern", ['"' + '\\"' * 100_000, '"' * 200_001, '"' + '\\"' * 100_000 + "\\"])
     def test_strings_without_an_end_take_time_that_grows_with_the_text(self, pattern: str) -> None:
@@ -319,7 +321,7 @@ class TestJson:
 
     def test_coordinates_too_far_out_are_refused(self) -> None:
         far = plan_document(rectangle(4.0, 3.0, at=(1e8, 0.0)))
-        assert "at most 10000000 m from the origin (max_coordinate_m)" in refused(FloorPlan.from_dict, far)
+        assert "at most 10000000 m from the origin (PlanLimits.max_coordinate_m)" in refused(FloorPlan.from_dict, far)
 
     @pytest.mark.parametrize(
         ("value", "word"), [([], "a list"), ("x", "a string"), (None, "null"), (True, "true"), (1, "a number")]

@@ -12,8 +12,8 @@ import shapely
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan, PlanLimits, checks
-from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.render.sampling import pose_grid
+from lalaloc_core.render.sweep import profiles_at
 from tests.growth import assert_no_worse_than_linear
 from tests.strategies import plan_document, rectangle
 
@@ -56,7 +56,7 @@ def test_combs_that_cross_cost_no_more_than_the_budget(monkeypatch: pytest.Monke
     for rooms in (8, 16):
         asked.clear()
         plan = FloorPlan.from_dict(crossing_combs(rooms))
-        assert plan.warnings[-1] == "more rooms may overlap, the rest was not looked at"
+        assert plan.warnings[-1] == "more rooms may overlap; the remaining pairs were not checked"
         spent.append(sum(asked))
     assert 0 < spent[1] <= 1.5 * spent[0]
 
@@ -95,7 +95,7 @@ def test_limits_of_today_do_not_hold_for_stored_plans() -> None:
 
 
 def test_boxes_around_rooms_are_limited() -> None:
-    message = "the boxes around all rooms cover 120030 m², at most 100000 m² is allowed (max_bounds_area_m2)"
+    message = "the bounding boxes of all rooms cover 120030 m²; the limit is 100000 m² (LALALOC_MAX_BOUNDS_AREA_M2)"
     with pytest.raises(InvalidFloorPlanError) as caught:
         FloorPlan.from_dict(slivers(3), PlanLimits(max_bounds_area_m2=100_000.0))
     assert str(caught.value) == message

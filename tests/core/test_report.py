@@ -500,7 +500,7 @@ class TestDrawing:
 
     def test_cells_keep_to_their_rooms(self) -> None:
         plan = crooked_flat()
-        cells = Cells.of(plan, 0.25)
+        cells = Cells.cover(plan, 0.25)
         assert np.array_equal(plan.room_index_at(cells.poses.position_m), cells.poses.room_index)
         x = cells.spread(cells.poses.position_m[:, 0])
         left, right, _, _ = cells.extent_m
@@ -513,7 +513,7 @@ class TestDrawing:
     def test_names_with_dollar_signs_and_no_answer_can_be_drawn(self) -> None:
         plan = plan_of(rectangle(3.0, 2.0))
         plan = replace(plan, rooms=(replace(plan.rooms[0], name="$x_{$"),))
-        cells = Cells.of(plan, 0.2)
+        cells = Cells.cover(plan, 0.2)
         truth = Pose(x_m=1.0, y_m=1.0, room_index=0, heading_deg=0.0)
         drawn = DrawnMap("distance", "metres", cells, np.linalg.norm(cells.poses.position_m - [1.0, 1.0], axis=1))
         drawing = draw_map(plan, drawn, truth, None)

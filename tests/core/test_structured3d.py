@@ -324,7 +324,7 @@ class TestBadAnnotation:
             (bad_coordinate("origin"), FIRST, ["origin", "three numbers"]),
             (bow_tie, FIRST, ["crosses itself", "50%", "90%"]),
             (scaled(0.001), "bedroom 1033", ["every room is smaller than 0.2 m²", "read as millimetres"]),
-            (spread, None, ["m across, at most 1000 m is allowed", "read as millimetres"]),
+            (spread, None, ["m across; the limit is 1000 m", "read as millimetres"]),
             (scaled(1000.0), FIRST, ["ceiling_height_m is 2500", "read as millimetres"]),
         ],
     )

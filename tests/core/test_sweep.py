@@ -14,7 +14,7 @@ from lalaloc_core.learn.synth.homes.splits import VALIDATION
 from lalaloc_core.render.layout import layout_view
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.render.sampling import PoseSet, pose_grid, random_poses
-from lalaloc_core.render.sweep import SweptViews, swept_profiles, swept_views
+from lalaloc_core.render.sweep import SweptViews, profiles_at, swept_views
 from tests.strategies import plan_document, plan_of, rectangle, rows_of_rooms, seeds, spiral
 
 COLUMNS, EYE_M = 64, 1.5
@@ -72,12 +72,12 @@ def test_profiles_alone_also_far_from_the_origin_and_in_a_wound_up_room(at: tupl
     plan = plan_of((np.array(spiral(80)) + at).tolist())
     poses = pose_grid(plan, 0.5)
     heading = np.linspace(-1.0, 1.0, len(poses))
-    swept = swept_profiles(poses.position_m, heading, poses.room_index, plan.wall_table, COLUMNS)
+    swept = profiles_at(plan, poses.position_m, poses.room_index, heading, COLUMNS)
     cast = wall_profile(poses.position_m, heading, plan.walls_m[poses.room_index], COLUMNS)
     assert (~np.isclose(swept, cast, rtol=1e-6)).mean() < 1e-3
 
 
 def test_nothing_is_seen_outside_a_room() -> None:
     plan = plan_of(rectangle(2.0, 2.0))
-    outside = swept_profiles(np.array([[9.0, 1.0]]), np.zeros(1), np.zeros(1, int), plan.wall_table, 8)
+    outside = profiles_at(plan, np.array([[9.0, 1.0]]), np.zeros(1, int), np.zeros(1), 8)
     assert np.isinf(outside).all()

@@ -42,8 +42,8 @@ from lalaloc_core.nets import LayoutEncoder
 from lalaloc_core.nets.image_features import ImageFeatures
 from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
 from lalaloc_core.render.depth import back_project, layout_depth
-from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.render.sampling import TripletSampling, random_poses
+from lalaloc_core.render.sweep import profiles_at
 from tests.strategies import crooked_flat, seeds
 
 CPU = torch.device("cpu")

@@ -29,8 +29,8 @@ from lalaloc_core.learn.training.presets import PRESETS
 from lalaloc_core.learn.training.run import train_layout
 from lalaloc_core.learn.training.sources import SceneSource
 from lalaloc_core.learn.training.validate import ImageValidation, LayoutValidation
-from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.render.sampling import random_poses
+from lalaloc_core.render.sweep import profiles_at
 from tests.strategies import crooked_flat
 
 CPU = torch.device("cpu")

@@ -14,8 +14,8 @@ from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost
 from lalaloc_core.localise.poses import PoseGrid, PredictedProfile, Query
 from lalaloc_core.localise.venue.merged_plans import MergedPlans
 from lalaloc_core.localise.venue.prototypes import most_probable, share_searched
-from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.render.sampling import pose_grid
+from lalaloc_core.render.sweep import profiles_at
 
 COLUMNS, STEP_M = 64, 0.5
 WEIGHTS, CONFIG = MatchingWeights(temperature=40.0), MatchingConfig()

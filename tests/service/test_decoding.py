@@ -157,7 +157,7 @@ class TestBombs:
             before = most_memory(decoder())
             for kind, bomb in bombs.items():
                 problem = assert_problem(localise(client, plan_id, bomb, **QUICK), 422, "invalid-panorama")
-                assert "4000 x 2000 = 8000000 pixels, at most 1000000 are allowed (max_pixels)" in problem["detail"], (
+                assert "4000 x 2000 = 8000000 pixels; the limit is 1000000 (LALALOC_MAX_PIXELS)" in problem["detail"], (
                     kind
                 )
             assert most_memory(decoder()) < before + 4 * MIB

@@ -206,10 +206,11 @@ def test_an_upload_is_cut_off_at_its_limit_stated_or_streamed(start_app: StartAp
 
 def test_limits_come_from_the_settings(start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path, max_rooms=1, max_vertices=4, max_floorplans=1) as client:
-        assert "at most 1" in assert_problem(client.post("/floorplans", json=FLAT), 422, "invalid-floorplan")["detail"]
+        problem = assert_problem(client.post("/floorplans", json=FLAT), 422, "invalid-floorplan")
+        assert "the limit is 1 (LALALOC_MAX_ROOMS)" in problem["detail"]
         hexagon = _room([[0, 0], [2, 0], [3, 2], [2, 4], [0, 4], [-1, 2]])
         response = client.post("/floorplans", json=hexagon)
-        assert "at most 4" in assert_problem(response, 422, "invalid-floorplan")["detail"]
+        assert "the limit is 4 (LALALOC_MAX_VERTICES)" in assert_problem(response, 422, "invalid-floorplan")["detail"]
         upload(client, _room(SQUARE), wait=False)
         assert_problem(client.post("/floorplans", json=_room(SQUARE)), 507, "too-many-floorplans")
 

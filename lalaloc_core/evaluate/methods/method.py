@@ -12,7 +12,7 @@ from jaxtyping import Float
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Camera, Photograph
-from lalaloc_core.render.poses import profiles_at
+from lalaloc_core.render.sweep import profiles_at
 from lalaloc_core.render.sampling import PoseSet
 
 # "layout": the query is the true layout, as if seen without error; "panorama": a photograph, or its depth for ICP.

@@ -187,7 +187,7 @@ def _open_encoders(info: RunInfo, left_out: list[str]) -> Encoders | None:
 def _maps(question: Question, encoders: Encoders | None, left_out: list[str]) -> list[DrawnMap]:
     """How far the query is from every place of the plan: by latents where there is a model, and by true layouts."""
     plan, camera = question.plan, question.camera
-    cells = Cells.of(plan, max(_CELL_M, math.sqrt(plan.area_m2 / _MAX_CELLS)))
+    cells = Cells.cover(plan, max(_CELL_M, math.sqrt(plan.area_m2 / _MAX_CELLS)))
     maps = []
     if encoders is not None:
         try:

@@ -16,7 +16,7 @@ from lalaloc_core.draw.photograph import Stroke, draw_strokes, wall_line
 from lalaloc_core.draw.plan import Marker, draw_camera, extent_m, plan_part, shape_of
 from lalaloc_core.evaluate.runs.predictions import Pose
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.render.poses import profiles_at
+from lalaloc_core.render.sweep import profiles_at
 
 PANORAMA_HEIGHT, PANORAMA_WIDTH = 384, 768
 TRUE_COLOUR, FOUND_COLOUR, PREDICTED_COLOUR = TRUE, FOUND, "#ffd60a"

@@ -47,7 +47,7 @@ from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.layouts import layouts_at
 from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost
 from lalaloc_core.localise.poses import Query
-from lalaloc_core.render.poses import profiles_at
+from lalaloc_core.render.sweep import profiles_at
 from lalaloc_core.render.sampling import PoseSet
 
 SUMMARY_FILE = "worst.json"

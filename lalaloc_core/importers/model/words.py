@@ -10,7 +10,7 @@ import unicodedata
 from collections.abc import Mapping
 from typing import Literal
 
-from lalaloc_core.floorplan.types import room_type_of
+from lalaloc_core.floorplan.types import room_type_from_label
 
 Role = Literal["door", "window", "passage", "obstacle", "wall", "room", "text", "ignored"]
 
@@ -66,7 +66,7 @@ _ORDER: list[Role] = [role for role, _ in _ROLES]
 # German joins words: "Zimmertür", "Gipskartonwand", "Dachfenster".
 _ENDINGS: Mapping[str, Role] = {"tur": "door", "tuer": "door", "turen": "door", "fenster": "window", "wand": "wall",
                                 "wande": "wall", "waende": "wall", "mauer": "wall", "zimmer": "room"}  # fmt: skip
-# Room words of other languages, as the English ones that `room_type_of` knows.
+# Room words of other languages, as the English ones that `room_type_from_label` knows.
 _ENGLISH: Mapping[str, str] = {
     word: english
     for english, words in {
@@ -111,7 +111,7 @@ def type_of_room(label: str | None) -> str | None:
     words = words_of(label)
     joined = "".join(words)
     english = [_ENGLISH.get(word, word) for word in (*words, joined)]
-    found = room_type_of(" ".join(english))
+    found = room_type_from_label(" ".join(english))
     return None if found == "unknown" else found
 
 

@@ -21,7 +21,7 @@ from PIL import Image, UnidentifiedImageError
 
 from lalaloc_core.conventions import OPENING_CLASSES, TWO_PI, wrap_angle
 from lalaloc_core.errors import DatasetError, InvalidFloorPlanError
-from lalaloc_core.floorplan import FloorPlan, room_type_of
+from lalaloc_core.floorplan import FloorPlan, room_type_from_label
 from lalaloc_core.learn.data.assembly import inside, is_number, read_json
 from lalaloc_core.learn.data.drawn_openings import DrawnOpening
 from lalaloc_core.learn.data.drawn_rooms import DrawnRoom, plan_of_rooms
@@ -112,7 +112,7 @@ def read_annotation(path: Path) -> AnnotatedPhotograph:
         name=path.stem,
         polygon_m=reader.polygon(document["polygon"], "polygon"),
         ceiling_height_m=reader.ceiling_height_m(document["ceiling_above_camera"]),
-        room_type=room_type_of(reader.text(document, "room_type")),
+        room_type=room_type_from_label(reader.text(document, "room_type")),
     )
     polygons = {"polygon": room.polygon_m}
     if document.get("alternative_polygon") is not None:

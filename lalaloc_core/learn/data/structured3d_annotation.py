@@ -23,7 +23,7 @@ import shapely
 from jaxtyping import Float
 
 from lalaloc_core.errors import DatasetError
-from lalaloc_core.floorplan import FloorPlan, room_type_of
+from lalaloc_core.floorplan import FloorPlan, room_type_from_label
 from lalaloc_core.learn.data.assembly import RoomOutline, assemble_plan, is_number, read_json
 from lalaloc_core.learn.data.drawn_openings import DrawnOpening
 from lalaloc_core.learn.data.polygon_rings import OpenRingError, chain_rings, signed_area
@@ -131,7 +131,7 @@ class _Reader:
                 polygon_m=corners_m[:, :2],
                 ceiling_height_m=ceiling_z_m - floor_z_m,
                 warnings=(*warnings, *floor_warnings, *ceiling_warnings),
-                type=room_type_of(room),
+                type=room_type_from_label(room),
             )
             found.append((outline, floor_z_m))
         return found

@@ -24,7 +24,7 @@ from jaxtyping import Float
 
 from lalaloc_core.conventions import heading_from_degrees
 from lalaloc_core.errors import DatasetError
-from lalaloc_core.floorplan import FloorPlan, room_type_of
+from lalaloc_core.floorplan import FloorPlan, room_type_from_label
 from lalaloc_core.learn.data.assembly import RoomOutline, assemble_plan, inside, is_number, pose_fault, read_json
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene, Split
 from lalaloc_core.learn.data.drawn_openings import DrawnOpening
@@ -169,7 +169,7 @@ class _FloorReader:
             name=f"{label} {panorama.complete_room}".strip(),
             polygon_m=transform.to_plan_m(polygon),
             ceiling_height_m=ceiling * transform.unit_m,
-            type=room_type_of(label),
+            type=room_type_from_label(label),
         )
 
     def _openings(self, panorama: _Panorama, layout: Mapping[str, Any], faults: list[str]) -> Iterator[DrawnOpening]:

@@ -10,7 +10,7 @@ import shapely
 from jaxtyping import Float
 from shapely import affinity
 
-from lalaloc_core.floorplan import FloorPlan, room_type_of
+from lalaloc_core.floorplan import FloorPlan, room_type_from_label
 from lalaloc_core.learn.heldout.outlines import RoomKind, sample_outline
 
 MIN_ROOMS, MAX_ROOMS = 3, 9
@@ -55,7 +55,7 @@ def sample_plan(rng: np.random.Generator, name: str) -> HeldoutPlan:
     rooms = [
         {
             "name": f"{kind} {index + 1}",
-            "type": room_type_of(kind),
+            "type": room_type_from_label(kind),
             "polygon": [list(corner) for corner in shape.exterior.coords[:-1]],
             "ceiling_height_m": height_m - (float(rng.uniform(0.1, 0.2)) if rng.random() < 0.2 else 0.0),
         }

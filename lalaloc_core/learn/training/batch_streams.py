@@ -19,7 +19,7 @@ from lalaloc_core.learn.training.replay_buffer import ReplayBuffer
 from lalaloc_core.learn.training.rotation import Rotation, sample_heading, sample_rotation
 from lalaloc_core.learn.training.sources import Group, PanoramaSample, Source
 from lalaloc_core.render.layout import layout_view
-from lalaloc_core.render.poses import profiles_at
+from lalaloc_core.render.sweep import profiles_at
 
 # Code of a class that is not known; losses pass over it.
 UNKNOWN = -1

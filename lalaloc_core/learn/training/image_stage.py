@@ -19,7 +19,7 @@ from lalaloc_core.learn.training.sources import Source
 from lalaloc_core.learn.training.stages import build_image_encoder, panorama_batches
 from lalaloc_core.nets import LayoutEncoder
 from lalaloc_core.nets.image_encoder import TrunkImageEncoder
-from lalaloc_core.nets.image_features import ImageFeatures, StructureFeatures, first_of
+from lalaloc_core.nets.image_features import ImageFeatures, StructureFeatures, first_rows
 from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
 from lalaloc_core.nets.trunk import StyleMixing
 
@@ -120,7 +120,7 @@ class ImageStage:
         maps = losses.followed_maps(logits, openings)
         walls = losses.followed_walls(seen.log_profile[real], seen.log_scale[real], log_distance, logits)
         followed = stage.photograph_weight * maps + stage.photograph_profile_weight * walls
-        return first_of(seen, len(image)), {"photographs": followed}
+        return first_rows(seen, len(image)), {"photographs": followed}
 
     def _styles(self, rendered: int, photographs: int, device: torch.device) -> StyleMixing | None:
         """Who takes on whose style: every other partner is a photograph, since that is how pictures are to look."""

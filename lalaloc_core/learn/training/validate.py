@@ -31,8 +31,8 @@ from lalaloc_core.learn.training.rotation import Rotation, sample_rotation
 from lalaloc_core.nets.image_encoder import TrunkImageEncoder
 from lalaloc_core.nets.image_features import ImageFeatures
 from lalaloc_core.nets.paper_encoders import PaperImageEncoder
-from lalaloc_core.render.poses import profiles_at
 from lalaloc_core.render.sampling import PoseSet, pose_grid
+from lalaloc_core.render.sweep import profiles_at
 
 _GRID_STEP_M = 0.5
 _MAX_LOG_ERROR = 0.7

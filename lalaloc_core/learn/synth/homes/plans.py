@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from lalaloc_core.floorplan import FloorPlan, room_type_of
+from lalaloc_core.floorplan import FloorPlan, room_type_from_label
 from lalaloc_core.learn.synth.homes.openings import Opening, OpeningKind, place_openings
 from lalaloc_core.learn.synth.homes.partition import Cell, inner_outline, partition, reshape_room, with_wing_wall
 
@@ -167,7 +167,7 @@ def _plan(
         {
             "id": key,
             "name": name,
-            "type": room_type_of(name),
+            "type": room_type_from_label(name),
             "polygon": polygon.tolist(),
             "ceiling_height_m": ceiling,
         }
