@@ -18,7 +18,7 @@ _INTERRUPTED = 130
 def main(argv: list[str] | None = None) -> int:
     """Run one command; return 0 on success, 2 for invalid input, 1 for any other error of this project."""
     logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
-    arguments = buildbuild_parser().parse_args(argv)
+    arguments = build_parser().parse_args(argv)
     try:
         arguments.run(arguments)
         sys.stdout.flush()
@@ -43,7 +43,8 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
-def buildbuild_parser() -> argparse.ArgumentParser:
+def build_parser() -> argparse.ArgumentParser:
+    """Build the parser of all commands."""
     parser = argparse.ArgumentParser(prog="lalaloc", description="Localise panoramas in floor plans.")
     parser.add_argument("--version", action="version", version=f"lalaloc {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")

@@ -38,7 +38,9 @@ def add_commands(commands: Any) -> None:
     localise = commands.add_parser(
         "localise", help="say where in a plan 360° photographs were taken, without a service"
     )
-    localise.add_argument("plan", type=Path, metavar="PLAN", help="a floor plan, in any format of docs/how-to/import-a-plan.md")
+    localise.add_argument(
+        "plan", type=Path, metavar="PLAN", help="a floor plan, in any format of docs/how-to/import-a-plan.md"
+    )
     localise.add_argument(
         "photographs", type=Path, nargs="+", metavar="PHOTO", help="full spheres, twice as wide as high"
     )

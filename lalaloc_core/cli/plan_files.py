@@ -28,7 +28,9 @@ _OPTIONS = {
 
 def add_plan_options(parser: argparse.ArgumentParser) -> None:
     """Add what may be said of a plan's file."""
-    group = parser.add_argument_group("of the plan's file, where it does not say so itself (docs/how-to/import-a-plan.md)")
+    group = parser.add_argument_group(
+        "of the plan's file, where it does not say so itself (docs/how-to/import-a-plan.md)"
+    )
     for name, meaning in _OPTIONS.items():
         group.add_argument(f"--{name}", help=meaning)
 
