@@ -1,4 +1,4 @@
-"""Errors of the service; `problem_kinds` says what each means over HTTP.
+"""Errors of the service; `problem_kinds.py` maps each to an HTTP status and a problem type.
 
 LaLaLocError
 └── ServiceError
@@ -7,37 +7,38 @@ LaLaLocError
     ├── UnknownFloorPlanError       no floor plan with this id
     ├── UnknownVenueError           no venue with this id
     ├── UnknownRevisionError        no such revision of the floor plan
-    ├── UnknownAnswerError          no answer is kept under this id
-    ├── UnanchoredPlanError         the floor plan does not say where on Earth it lies
-    ├── NoPlanNearbyError           no floor plan lies near a place on Earth
+    ├── UnknownAnswerError          no kept answer with this id
+    ├── UnanchoredPlanError         the floor plan has no anchor
+    ├── NoPlanNearbyError           no anchored floor plan near the given place
     ├── UploadTooLargeError         more bytes than allowed
-    ├── UploadTimeoutError          the upload took too long
-    ├── UnsupportedMediaError       a body of a type that is not read here
+    ├── UploadTimeoutError          an upload that is too slow
+    ├── UnsupportedMediaError       an unsupported media type
     │   └── UnsupportedEncodingError    a compressed body
-    ├── PlanTooLargeError           the latent grid would have more poses than allowed
-    ├── PlanFailedError             the plan's latent grid could not be computed
-    ├── PlanNotReadyError           still preparing at the request's deadline
-    ├── TooManyFloorPlansError      the tenant has as many as allowed
-    ├── TooManyVenuesError          the tenant has as many as allowed
-    ├── VenueUnsearchableError      the venue has no plan, or none that will ever be ready
-    ├── VenueNotReadyError          no plan of the venue can be asked about yet
-    ├── RevisionMismatchError       the plan or venue has another revision than the one expected
-    ├── IdempotencyKeyReusedError   the key was sent with another body before
-    ├── IdempotencyInProgressError  the same request is being carried out
-    ├── DamagedDataError            what is stored is not what was
+    ├── PlanTooLargeError           the pose grid would exceed its limit
+    ├── PlanFailedError             the plan's pose grid could not be computed
+    ├── PlanNotReadyError           the pose grid was not ready in time
+    ├── TooManyFloorPlansError      the tenant's quota of floor plans is used up
+    ├── TooManyVenuesError          the tenant's quota of venues is used up
+    ├── VenueUnsearchableError      the venue has no usable plan
+    ├── VenueNotReadyError          no plan of the venue is ready yet
+    ├── RevisionMismatchError       the plan or venue is not at the expected revision
+    ├── IdempotencyKeyReusedError   the key was already used with another body
+    ├── IdempotencyInProgressError  the same request is still running
+    ├── DamagedDataError            stored data does not match its digest
     ├── StoreUnavailableError       the database cannot be reached
-    │   ├── StoreBusyError          it answers, but all connections to it are in use
-    │   └── StoreFullError          it has no room left
+    │   ├── StoreBusyError          all database connections are in use
+    │   └── StoreFullError          the database's disk is full
     ├── UnauthenticatedError        no valid API key
-    ├── InsufficientScopeError      the API key is not good for this
-    ├── ExposedWithoutKeysError     asked from elsewhere while there are no API keys
-    ├── RateLimitedError            more requests of an API key than allowed
-    ├── TooManyRefusedKeysError     more invalid API keys from one client than allowed
-    ├── OverloadedError             more requests in flight than allowed
-    │   └── ShareExceededError      more of one tenant than allowed while others may come
-    ├── DecoderNotReadyError        panoramas cannot be decoded at the moment
-    ├── ConverterNotReadyError      files of plans cannot be read or written at the moment
-    ├── DeadlineExceededError       the query could not be computed in time
+    ├── InsufficientScopeError      the API key lacks a scope
+    ├── ExposedWithoutKeysError     a remote request while API keys are off
+    ├── RateLimitedError            the API key exceeded its rate limit
+    ├── TooManyRefusedKeysError     too many invalid API keys from one client
+    ├── OverloadedError             all slots are in use
+    │   └── ShareExceededError      one tenant's share of the slots is in use
+    ├── DrawingFailedError          a drawing could not be rasterised
+    ├── DecoderNotReadyError        no decoder process is running
+    ├── ConverterNotReadyError      no converter process is running
+    ├── DeadlineExceededError       the request missed its deadline
     └── StoppingError               the service is shutting down
 """
 
@@ -52,7 +53,7 @@ class ServiceError(LaLaLocError):
     """Base of the errors that only the service raises.
 
     Attributes:
-        retry_after_s: whole seconds after which trying again makes sense, None when it does not.
+        retry_after_s: whole seconds until a retry makes sense; None if it does not.
     """
 
     retry_after_s: int | None = None
@@ -66,7 +67,7 @@ class InvalidRequestError(ServiceError):
     """A field is missing, unknown, or outside its limits.
 
     Attributes:
-        faults: one (field, message) for each fault.
+        faults: (field, message) pairs.
     """
 
     def __init__(self, faults: list[tuple[str, str]]) -> None:
@@ -89,28 +90,28 @@ class UnknownVenueError(ServiceError):
 
 
 class UnknownRevisionError(ServiceError):
-    """The floor plan has no such revision, or it is no longer kept."""
+    """The floor plan has no such revision, or dropped it."""
 
     def __init__(self, plan_id: str, revision_id: str) -> None:
-        super().__init__(f"floor plan '{plan_id}' has no revision '{revision_id[:64]}', or has it no more")
+        super().__init__(f"floor plan '{plan_id}' has no revision '{revision_id[:64]}'; old revisions are dropped")
 
 
 class UnknownAnswerError(ServiceError):
-    """No answer is kept under this id, or it is no longer."""
+    """No answer is kept under this id."""
 
     def __init__(self, answer_id: str) -> None:
         super().__init__(
-            f"no answer is kept under '{answer_id[:64]}': it was forgotten after a while (keep_answers_s) or with its "
-            "floor plan, or never was"
+            f"no answer is kept under '{answer_id[:64]}'; answers expire (keep_answers_s) and are deleted with their "
+            "floor plan"
         )
 
 
 class UnanchoredPlanError(ServiceError):
-    """The floor plan does not say where on Earth it lies, which the answer that is wanted needs."""
+    """The floor plan has no anchor, and the requested answer needs latitude and longitude."""
 
     def __init__(self, plan_id: str, venue_id: str | None = None) -> None:
         nor = "" if venue_id is None else f", nor has venue '{venue_id}'"
-        super().__init__(f"floor plan '{plan_id}' has no anchor{nor}, so there is no answer in latitude and longitude")
+        super().__init__(f"floor plan '{plan_id}' has no anchor{nor}; add one for answers in latitude and longitude")
 
 
 class NoPlanNearbyError(ServiceError):
@@ -118,7 +119,7 @@ class NoPlanNearbyError(ServiceError):
 
     def __init__(self, place: str, within_m: float) -> None:
         super().__init__(
-            f"no floor plan with an anchor lies within {within_m:g} m of {place}: say which by floorplan_id or venue_id"
+            f"no floor plan with an anchor lies within {within_m:g} m of {place}; set floorplan_id or venue_id"
         )
 
 
@@ -131,29 +132,27 @@ class UploadTooLargeError(ServiceError):
 
 
 class UploadTimeoutError(ServiceError):
-    """The upload did not finish in time, or came too slowly."""
+    """The upload did not finish in time, or was too slow."""
 
 
 class UnsupportedMediaError(ServiceError):
-    """The body is of a type that is not read here."""
+    """The body has an unsupported media type."""
 
     def __init__(self, given: str, accepted: tuple[str, ...]) -> None:
         self.accepted = accepted
         stated = f"content type '{given[:100]}'" if given else "a body without content type"
-        super().__init__(f"{stated} is not read here, send {' or '.join(accepted)}")
+        super().__init__(f"{stated} is not supported; send {' or '.join(accepted)}")
 
 
 class UnsupportedEncodingError(UnsupportedMediaError):
     """The body is compressed."""
 
     def __init__(self, encoding: str) -> None:
-        ServiceError.__init__(
-            self, f"bodies are not read here in Content-Encoding '{encoding[:100]}', send them as they are"
-        )
+        ServiceError.__init__(self, f"Content-Encoding '{encoding[:100]}' is not supported; send the body uncompressed")
 
 
 class PlanTooLargeError(ServiceError):
-    """The plan's latent grid would have more poses than allowed."""
+    """The plan's pose grid would have more poses than allowed."""
 
     def __init__(self, estimate: int, limit: int, step_m: float) -> None:
         super().__init__(
@@ -163,10 +162,10 @@ class PlanTooLargeError(ServiceError):
 
 
 class PlanFailedError(ServiceError):
-    """The plan's latent grid could not be computed.
+    """The plan's pose grid could not be computed.
 
     Attributes:
-        reason: why, as the plan itself tells it.
+        reason: as in the plan's `reason` field.
     """
 
     def __init__(self, plan_id: str, reason: str) -> None:
@@ -175,7 +174,7 @@ class PlanFailedError(ServiceError):
 
 
 class PlanNotReadyError(ServiceError):
-    """The latent grid was not finished within the request's deadline."""
+    """The pose grid was not finished within the request's deadline."""
 
     retry_after_s = 5
 
@@ -186,29 +185,29 @@ class PlanNotReadyError(ServiceError):
 
 
 class TooManyFloorPlansError(ServiceError):
-    """The tenant has as many plans as allowed."""
+    """The tenant's quota of floor plans is used up."""
 
     def __init__(self, limit: int) -> None:
-        super().__init__(f"{limit} floor plans are stored, no more are allowed (max_floorplans); delete some")
+        super().__init__(f"{limit} floor plans are stored; the limit is {limit} (max_floorplans). Delete some first")
 
 
 class TooManyVenuesError(ServiceError):
-    """The tenant has as many venues as allowed."""
+    """The tenant's quota of venues is used up."""
 
     def __init__(self, limit: int) -> None:
-        super().__init__(f"{limit} venues are stored, no more are allowed (max_venues); delete some")
+        super().__init__(f"{limit} venues are stored; the limit is {limit} (max_venues). Delete some first")
 
 
 class VenueUnsearchableError(ServiceError):
-    """The venue has no plans, or the latent grids of all of them failed."""
+    """The venue has no plans, or all of them failed."""
 
     def __init__(self, venue_id: str, plans: int) -> None:
         reason = f"all of its {plans} floor plans failed" if plans else "it has no floor plans"
-        super().__init__(f"nothing can be found in venue '{venue_id}': {reason}")
+        super().__init__(f"venue '{venue_id}' cannot be searched: {reason}")
 
 
 class VenueNotReadyError(ServiceError):
-    """None of the venue's plans has a latent grid yet."""
+    """None of the venue's plans has a pose grid yet."""
 
     retry_after_s = 5
 
@@ -219,35 +218,35 @@ class VenueNotReadyError(ServiceError):
 
 
 class RevisionMismatchError(ServiceError):
-    """The plan or venue has another revision than the one that the caller expects.
+    """The plan or venue is not at the revision that the caller expects.
 
     Attributes:
-        current: id of the revision that it has.
+        current: id of its current revision.
     """
 
-    def __init__(self, of_id: str, expected: str, current: str, *, what: str = "floor plan") -> None:
+    def __init__(self, resource_id: str, expected: str, current: str, *, what: str = "floor plan") -> None:
         self.current = current
-        super().__init__(f"{what} '{of_id}' has revision '{current}', not '{expected[:64]}'")
+        super().__init__(f"{what} '{resource_id}' has revision '{current}', not '{expected[:64]}'")
 
 
 class IdempotencyKeyReusedError(ServiceError):
-    """The idempotency key was sent with another body before."""
+    """The idempotency key was already used with another body."""
 
     def __init__(self, key: str) -> None:
-        super().__init__(f"Idempotency-Key '{key[:64]}' was sent with another body before; take a new one")
+        super().__init__(f"Idempotency-Key '{key[:64]}' was already used with another body; use a new key")
 
 
 class IdempotencyInProgressError(ServiceError):
-    """The same request, under the same idempotency key, is being carried out."""
+    """A request with the same idempotency key is still running."""
 
     retry_after_s = 1
 
     def __init__(self, key: str) -> None:
-        super().__init__(f"the request with Idempotency-Key '{key[:64]}' is being carried out; ask again later")
+        super().__init__(f"the request with Idempotency-Key '{key[:64]}' is still running; retry later")
 
 
 class DamagedDataError(ServiceError):
-    """What is stored is not what was, by its digest. It can be replaced and deleted, not read."""
+    """Stored data does not match its digest. It can be replaced or deleted, but not read."""
 
 
 class StoreUnavailableError(ServiceError):
@@ -255,115 +254,117 @@ class StoreUnavailableError(ServiceError):
 
     retry_after_s = 2
 
-    def __init__(self, reason: str = "the database cannot be reached at the moment") -> None:
+    def __init__(self, reason: str = "the database cannot be reached") -> None:
         super().__init__(reason)
 
 
 class StoreBusyError(StoreUnavailableError):
-    """The database answers others, but no connection to it became free in time.
+    """No database connection became free in time.
 
-    No reason to go by what was read earlier, as while it is away: what it says may be another thing by now.
+    The database is up, so cached data must not be used in its place: it may be out of date.
     """
 
     def __init__(self) -> None:
-        super().__init__("too many requests use the database at the moment")
+        super().__init__("all database connections are in use")
 
 
 class StoreFullError(StoreUnavailableError):
-    """The database answers, but has no room left for what is to be stored."""
+    """The database's disk is full."""
 
     retry_after_s = 60
 
     def __init__(self) -> None:
-        super().__init__("the disk of the database is full, nothing can be stored until there is room")
+        super().__init__("the database's disk is full; nothing can be stored until space is freed")
 
 
 class UnauthenticatedError(ServiceError):
-    """The request has no valid API key. An unknown key and a revoked one are told in the same words."""
+    """The request has no valid API key. Unknown and revoked keys get the same message."""
 
 
 class InsufficientScopeError(ServiceError):
-    """The API key is not good for this."""
+    """The API key lacks the scope that the route needs."""
 
     def __init__(self, needed: str, given: Iterable[str]) -> None:
         scopes = ", ".join(sorted(given))
-        super().__init__(f"this needs an API key with the scope '{needed}', the one given has: {scopes}")
+        super().__init__(f"this request needs an API key with scope '{needed}'; the key has: {scopes}")
 
 
 class ExposedWithoutKeysError(ServiceError):
-    """The request came from elsewhere than this machine, or a page from elsewhere made it, while keys are off."""
+    """A request from another machine, or from a page of another site, while API keys are off."""
 
     def __init__(self, wanted: str) -> None:
         super().__init__(
-            f"API keys are off, so only requests {wanted} are answered; see LALALOC_API_KEYS, LALALOC_ALLOW_ANONYMOUS "
-            "and LALALOC_ALLOWED_HOSTS"
+            f"API keys are off, so only requests {wanted} are answered; set LALALOC_API_KEYS, LALALOC_ALLOW_ANONYMOUS "
+            "or LALALOC_ALLOWED_HOSTS"
         )
 
 
 class RateLimitedError(ServiceError):
-    """The API key sent more requests than allowed."""
+    """The API key exceeded its rate limit."""
 
     def __init__(self, limit: int, period: str, retry_after_s: int) -> None:
         self.retry_after_s = retry_after_s
-        super().__init__(f"this API key may send {limit} requests per {period}, and has")
+        super().__init__(f"Rate limit exceeded: {limit} requests per {period}. Retry after {retry_after_s} s.")
 
 
 class TooManyRefusedKeysError(ServiceError):
-    """The client sent more invalid API keys than allowed."""
+    """The client address sent too many invalid API keys."""
 
     def __init__(self, limit: int, retry_after_s: int) -> None:
         self.retry_after_s = retry_after_s
         super().__init__(
-            f"{limit} invalid API keys came from this address within a minute (refused_keys_per_minute), no more are "
-            "looked at for now"
+            f"Too many invalid API keys from this address: {limit} per minute are allowed. Retry after "
+            f"{retry_after_s} s."
         )
 
 
 class OverloadedError(ServiceError):
-    """More requests are in flight, or more grids asked for, than allowed."""
+    """All slots for requests, or all places in a queue, are in use."""
 
     def __init__(self, limit: int, retry_after_s: int = 1) -> None:
         self.retry_after_s = retry_after_s
-        super().__init__(f"{limit} others are waiting to be answered, no more are taken")
+        super().__init__(f"The service is full: {limit} requests are in work. Retry after {retry_after_s} s.")
 
 
 class ShareExceededError(OverloadedError):
-    """As many requests of one tenant, or without keys of one client address, are in flight as it may have."""
+    """One tenant, or without keys one client address, uses its whole share of the slots."""
 
     def __init__(self, held: int, limit: int, retry_after_s: int = 1) -> None:
         ServiceError.__init__(
-            self, f"{held} of your requests are in work, no more are taken: the rest of {limit} is left to others"
+            self,
+            f"{held} of your requests are in work, and the rest of the {limit} slots is reserved for other tenants. "
+            f"Retry after {retry_after_s} s.",
         )
         self.retry_after_s = retry_after_s
 
 
 class DrawingFailedError(ServiceError):
-    """A drawing of this service's own could not be made into pixels."""
+    """A drawing made by this service could not be rasterised."""
 
     def __init__(self, reason: str) -> None:
-        super().__init__(f"the picture could not be made: {reason}")
+        super().__init__(f"the picture could not be drawn: {reason}")
 
 
 class DecoderNotReadyError(ServiceError):
-    """No process that decodes panoramas is running, nor will be before the request's deadline."""
+    """No decoder process will be running before the request's deadline."""
 
     retry_after_s = 2
 
     def __init__(self) -> None:
-        super().__init__("panoramas cannot be decoded at the moment")
+        super().__init__("no process for decoding panoramas is running yet")
 
 
 class ConverterNotReadyError(ServiceError):
-    """No process that reads and writes files of plans is running, nor will be before the deadline."""
+    """No converter process will be running before the deadline."""
 
     retry_after_s = 2
 
     def __init__(self) -> None:
-        super().__init__("files of plans, but for the native format, cannot be read or written at the moment")
+        super().__init__("no process for reading and writing plan files is running yet; the native format needs none")
 
 
 class DeadlineExceededError(ServiceError):
-    """What was asked for could not be done within its deadline."""
+    """The request missed its deadline."""
 
     retry_after_s = 1
 

@@ -1,4 +1,4 @@
-"""The one table that says what every error means over HTTP."""
+"""Table of errors and the HTTP problems that they become."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ URN = "urn:lalaloc:problem:"
 
 @dataclass(frozen=True)
 class ProblemKind:
-    """What an error means over HTTP: status, stable type, title, and whether its text may leave the service."""
+    """HTTP status, stable type and title of an error; `public` tells if clients see its message."""
 
     status: int
     slug: str
@@ -140,7 +140,7 @@ PROBLEMS: dict[type[Exception], ProblemKind] = {
     RunError: INTERNAL,
 }
 
-# What the framework itself answers: no such route, method not allowed, and so on.
+# Errors of the framework, such as an unknown route.
 HTTP_PROBLEMS: dict[int, ProblemKind] = {
     400: ProblemKind(400, "malformed-request", "Malformed request"),
     404: ProblemKind(404, "not-found", "Not found"),
@@ -149,7 +149,7 @@ HTTP_PROBLEMS: dict[int, ProblemKind] = {
 
 
 def problem_kind(error: Exception) -> ProblemKind:
-    """The table's entry for an error: that of its class, else of its nearest base class."""
+    """Return the entry of the error's class, or of its nearest base class."""
     for cls in type(error).__mro__:
         if cls in PROBLEMS:
             return PROBLEMS[cls]

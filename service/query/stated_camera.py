@@ -15,8 +15,7 @@ from lalaloc_core.localise.stated_camera import KnownHeading
 from lalaloc_core.panorama.images import Panorama
 from service.grids import check_height_m
 from service.schemas import LocaliseForm, StatedHeading
-from service.schemas.camera_fields import CameraFields
-from service.schemas.hint_fields import EarthPoint, HintFields, PlanPoint
+from service.schemas.query_fields import CameraFields, EarthPoint, HintFields, PlanPoint
 from service.storage.records import PlanRecord
 
 

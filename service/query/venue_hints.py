@@ -19,7 +19,7 @@ from lalaloc_core.localise.pipeline import Localisation
 from lalaloc_core.localise.venue.merged_plans import MergedPlans
 from service.query.geopose import plan_anchor
 from service.query.stated_camera import contradiction, near_missed
-from service.schemas.hint_fields import EarthPoint, HintFields
+from service.schemas.query_fields import EarthPoint, HintFields
 from service.storage.plan_places import distances_m
 
 # Maximum number of levels that an error message lists.

@@ -1,19 +1,17 @@
-"""What the HTTP API takes and answers. Units stand in the names: `_m` metres, `_m2` m², `_deg` degrees, `_ms` ms.
+"""Requests and answers of the HTTP API.
 
-fields           the base of all answers, and the types of their numbers: how far each is rounded
-native_plan      a floor plan in the native format
-plan_import      what may be said of the file of a plan, and what is told of reading it
-stored_plans     what is told of stored floor plans
-localise_query   what a query says beside the panorama
-hint_fields      what it says of where the camera stood
-camera_fields    what it says of the camera, and of the answer
-sequence_query   what a query of several panoramas says beside them
-sequence_answer  where they were taken
-localise_answer  where it was taken
-geopose          the same on Earth
-oscp             the same as AR clients ask for it
-venues           floor plans that belong together
-layout           the walls that a camera may see, for who draws them
+Units stand in the names: `_m` metres, `_m2` m², `_deg` degrees, `_ms` milliseconds.
+
+fields           base class of answers, and number types with their rounding
+native_plan      floor plans in the native format
+plan_import      options for reading a plan file, and the report on it
+stored_plans     stored floor plans, their events and walls
+query_fields     form fields that queries share
+localise_query   form of a query
+localise_answer  its answer
+sequence         queries with several panoramas
+oscp             queries of AR clients
+venues           groups of floor plans
 service_state    limits, health, readiness
 problem_details  errors
 
@@ -21,11 +19,11 @@ Begin with `localise_answer.py`.
 """
 
 from service.schemas.fields import ResponseModel
-from service.schemas.geopose import GeoPose, GeoPoseAngles, GeoPosePosition
-from service.schemas.hint_fields import EarthPoint, PlanPoint
-from service.schemas.layout import LayoutAnswer, OpeningFaceAnswer, RoomLayoutAnswer
 from service.schemas.localise_answer import (
     CandidateAnswer,
+    GeoPose,
+    GeoPoseAngles,
+    GeoPosePosition,
     LocaliseAnswer,
     ModelAnswer,
     PlanProbability,
@@ -46,8 +44,8 @@ from service.schemas.native_plan import (
 )
 from service.schemas.plan_import import ImportForm, ImportReport, LayerAnswer, LevelAnswer
 from service.schemas.problem_details import Fault, Problem
-from service.schemas.sequence_answer import SequenceAnswer, SequencePoseAnswer
-from service.schemas.sequence_query import SequenceForm, StatedHeading, StatedMotion
+from service.schemas.query_fields import EarthPoint, PlanPoint
+from service.schemas.sequence import SequenceAnswer, SequenceForm, SequencePoseAnswer, StatedHeading, StatedMotion
 from service.schemas.service_state import HealthAnswer, LimitsAnswer, PoolAnswer, ReadyAnswer
 from service.schemas.stored_plans import (
     BoundsAnswer,
@@ -55,9 +53,12 @@ from service.schemas.stored_plans import (
     FloorPlanList,
     FloorPlanSummary,
     GridAnswer,
+    LayoutAnswer,
+    OpeningFaceAnswer,
     PlanEvent,
     PlanStatus,
     RoomAnswer,
+    RoomLayoutAnswer,
 )
 from service.schemas.venues import (
     VenueAnchorAnswer,

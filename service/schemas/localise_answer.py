@@ -1,4 +1,4 @@
-"""Where a panorama was taken: the answer to a query."""
+"""Answer to a query: the pose of a panorama, in the plan and on Earth."""
 
 from __future__ import annotations
 
@@ -17,44 +17,70 @@ from service.schemas.fields import (
     Share,
     Variance,
 )
-from service.schemas.geopose import GeoPose
 from service.schemas.localise_query import HEADING_MEANING
 
-_LATENT_DISTANCE = Field(ge=0, le=2, description="Distance of the pose's layout to the panorama's latent.")
+
+class GeoPosePosition(ResponseModel):
+    """Position on Earth, WGS84."""
+
+    lat: float = Field(ge=-90, le=90, description="Latitude, degrees.")
+    lon: float = Field(ge=-180, le=180, description="Longitude, degrees.")
+    h: float = Field(
+        description="Height in metres: over the ellipsoid, or over the plan's floor if its anchor has no `altitude_m`. "
+        "With the anchor of a venue: the venue's altitude plus the camera height, on every level."
+    )
+
+
+class GeoPoseAngles(ResponseModel):
+    """Rotations about up, north and east in degrees; all are 0 for a level camera facing north."""
+
+    yaw: float = Field(gt=-180, le=180, description="Counterclockwise from north, seen from above.")
+    pitch: float = Field(description="Always 0: panoramas are level.")
+    roll: float = Field(description="Always 0.")
+
+
+class GeoPose(ResponseModel):
+    """Pose on Earth in OGC GeoPose 1.0 (21-056r11), Basic-YPR."""
+
+    position: GeoPosePosition
+    angles: GeoPoseAngles
+
+
+_LATENT_DISTANCE = Field(
+    ge=0, le=2, description="Distance between the latents of the pose's layout and of the panorama."
+)
 _COST = Field(
     ge=0,
-    description="What candidates are ranked by, together with hints: how badly the walls around the pose fit the "
-    "panorama, without unit, lower is better. Candidates that were not refined as far as the first come after those "
-    "that were, and their costs, which allow for the distance of neighbouring poses, do not compare.",
+    description="Matching cost between the walls around the pose and the panorama, dimensionless; lower is better. "
+    "Candidates are ranked by it and by hints. Candidates that were refined less than the first come last, and their "
+    "costs are not comparable with the others.",
 )
 
-_GEOPOSE = (
-    "The pose on Earth: by the `anchor` of the plan, else by that of the venue that was asked about; null without one."
-)
+_GEOPOSE = "Pose on Earth, from the `anchor` of the plan, else of the venue in the request; null without an anchor."
 
 Pair = Annotated[list[Variance], Field(min_length=2, max_length=2)]
 Covariance = Annotated[list[Pair], Field(min_length=2, max_length=2)]
 
 
 class Position(ResponseModel):
-    """A point of the plan frame."""
+    """Point in the plan frame."""
 
-    x_m: Metres = Field(description="To the right on the drawing.")
-    y_m: Metres = Field(description="Up on the drawing.")
+    x_m: Metres = Field(description="Metres to the right on the drawing.")
+    y_m: Metres = Field(description="Metres up on the drawing.")
 
 
 class CandidateAnswer(ResponseModel):
-    """One possible pose; no two candidates are closer than 1 m and turned alike."""
+    """Possible pose; two candidates differ by at least 1 m or in heading."""
 
-    floorplan_id: str = Field(description="The plan that it lies in.")
-    level: float | None = Field(description="Level of the plan in the venue, null where none was asked about.")
+    floorplan_id: str = Field(description="Plan of the candidate.")
+    level: float | None = Field(description="Level of the plan in the venue; null for a query about one plan.")
     position: Position
     heading_deg: HeadingDeg = Field(ge=0, lt=360, description=f"The {HEADING_MEANING}.")
-    room: str = Field(description="Name of the room the position lies in.")
-    room_id: str = Field(description="Its `id` in the plan, which is unique.")
+    room: str = Field(description="Name of the room.")
+    room_id: str = Field(description="`id` of the room, unique in the plan.")
     probability: Share | None = Field(
-        description="Probability that the position is right within 1 m and the heading within 25°, and no better "
-        "candidate's are; null for a model without confidence.",
+        description="Probability that this candidate, and no better one, is right within 1 m and 25°; null for a model "
+        "without confidence.",
     )
     cost: Score = _COST
     latent_distance: Score = _LATENT_DISTANCE
@@ -62,27 +88,25 @@ class CandidateAnswer(ResponseModel):
 
 
 class PosteriorAnswer(ResponseModel):
-    """How probable places are, given that the panorama is of this plan: lists of one length, a place each."""
+    """Posterior over places, given that the panorama is of this plan; all lists have one entry per place."""
 
-    step_m: float = Field(
-        description="How wide a part of its room each place stands for: the distance of neighbours on the plan's grid."
-    )
+    step_m: float = Field(description="Distance between neighbouring places on the plan's pose grid.")
     x_m: list[Metres]
     y_m: list[Metres]
-    probability: list[Mass] = Field(description="They sum to 1; places of less than 0.0000005 are left out.")
+    probability: list[Mass] = Field(description="Sums to 1; places below 0.0000005 are left out.")
 
 
 class PlanProbability(ResponseModel):
-    """How probable it is that a panorama was taken in one plan of a venue."""
+    """Probability of one plan of a venue."""
 
     floorplan_id: str
-    level: float = Field(description="Number of its level.")
-    name: str = Field(description="What it is called in the venue, else its own name.")
+    level: float = Field(description="Level of the plan.")
+    name: str = Field(description="Name of the plan in the venue, else the plan's own name.")
     probability: Share | None = Field(description="Null for a model without confidence.")
 
 
 class TimingsAnswer(ResponseModel):
-    """Milliseconds per stage, 0 where a stage did not run."""
+    """Milliseconds per stage; 0 for a stage that did not run."""
 
     decode: Milliseconds
     encode: Milliseconds
@@ -90,11 +114,11 @@ class TimingsAnswer(ResponseModel):
     retrieve: Milliseconds
     vdr: Milliseconds
     lpo: Milliseconds
-    total: Milliseconds = Field(description="From the complete upload to the answer, waits included.")
+    total: Milliseconds = Field(description="Time from the complete upload to the answer, waiting included.")
 
 
 class ModelAnswer(ResponseModel):
-    """The model that answered."""
+    """Model that computed the answer."""
 
     name: str
     version: str
@@ -102,57 +126,56 @@ class ModelAnswer(ResponseModel):
 
 
 class LocaliseAnswer(ResponseModel):
-    """Where the panorama was taken."""
+    """Pose of a panorama."""
 
-    floorplan_id: str = Field(description="The plan that the position lies in.")
-    floorplan_revision: str = Field(description="The plan's revision that was searched.")
-    venue_id: str | None = Field(default=None, description="The venue that was asked about; null where it was a plan.")
-    level: float | None = Field(description="Level of the plan in the venue; null where `venue_id` is.")
+    floorplan_id: str = Field(description="Plan of the position.")
+    floorplan_revision: str = Field(description="Revision of the plan that was searched.")
+    venue_id: str | None = Field(default=None, description="Venue in the request; null for a query about one plan.")
+    level: float | None = Field(description="Level of the plan in the venue; null if `venue_id` is null.")
     plans: list[PlanProbability] | None = Field(
         default=None,
-        description="The most probable plans of the venue, the most probable first; null where `venue_id` is.",
+        description="Most probable plans of the venue, best first; null if `venue_id` is null.",
     )
     position: Position
     heading_deg: HeadingDeg = Field(ge=0, lt=360, description=f"The {HEADING_MEANING}.")
     room: str
-    room_id: str = Field(description="`id` of the room in the plan, which is unique.")
+    room_id: str = Field(description="`id` of the room, unique in the plan.")
     confidence: Share | None = Field(
-        description="Probability that the position is right within 1 m: that of the panorama being of this plan, "
-        "times the share that this place has in the posterior over all places, of a venue those of all its plans. Null "
-        "for a model without it.",
+        description="Probability that the position is right within 1 m: the probability that the panorama is of this "
+        "plan, times the share of this place in the posterior over all places (of all plans of a venue). Null for a "
+        "model without confidence.",
     )
     heading_confidence: Share | None = Field(
-        description="Probability that the heading is right within 5°; null where `confidence` is."
+        description="Probability that the heading is right within 5°; null if `confidence` is null."
     )
     warnings: list[str] = Field(
-        description="What was said and not followed, such as a heading or a hint that the panorama contradicts."
+        description="Parts of the request that were not followed, such as a hint that the panorama contradicts."
     )
     heading_source: Literal["given", "panorama", "searched"] = Field(
-        description="Where the heading came from: the request, the panorama's metadata, or the search."
+        description="Source of the heading: the request, the panorama's metadata, or the search."
     )
-    stage: Literal["retrieval", "vdr", "lpo"] = Field(description="The last stage that produced the position.")
+    stage: Literal["retrieval", "vdr", "lpo"] = Field(description="Last stage that ran.")
     covariance_m2: Covariance | None = Field(
-        description="Covariance [[xx, xy], [xy, yy]] of the position in m², given that it is right within 1 m; along "
-        "what the panorama does not tell, as in a corridor, that of a place anywhere in the room. Null unless `stage` "
-        "is `lpo`, and for a model without it."
+        description="Covariance [[xx, xy], [xy, yy]] of the position in m², given that it is right within 1 m. Along a "
+        "direction that the panorama does not constrain, as in a corridor, it is that of the whole room. Null unless "
+        "`stage` is `lpo`, and for a model without confidence."
     )
     heading_std_deg: Degrees | None = Field(
-        description="Standard deviation of the heading where it was searched; null where `covariance_m2` is."
+        description="Standard deviation of a heading that was searched; null if `covariance_m2` is null."
     )
     cost: Score = _COST
     latent_distance: Score = _LATENT_DISTANCE
-    camera_height_m: Metres = Field(description="The camera height that fits best.")
+    camera_height_m: Metres = Field(description="Best-fitting camera height.")
     candidates: list[CandidateAnswer] = Field(
-        description="Best first, of a venue the most probable first; the first one is the answer."
+        description="Candidates, best first (most probable first in a venue); the first is the answer."
     )
     answer_id: str | None = Field(
         default=None,
-        description="Under which `GET /answers/{answer_id}` tells the same again, for `keep_answers_s`; null where "
-        "answers are not kept.",
+        description="Id for `GET /answers/{answer_id}`, valid for `keep_answers_s`; null if answers are not kept.",
     )
     geopose: GeoPose | None = Field(None, description=_GEOPOSE)
     posterior: PosteriorAnswer | None = Field(
-        default=None, description="How probable all places are; null unless asked for with `include`."
+        default=None, description="Posterior over all places; null unless requested with `include`."
     )
     timings_ms: TimingsAnswer
     model: ModelAnswer

@@ -1,4 +1,4 @@
-"""What a query says beside the panorama."""
+"""Form fields of a query."""
 
 from __future__ import annotations
 
@@ -7,57 +7,56 @@ from typing import Annotated, Literal
 from pydantic import Field, ValidationInfo, field_validator
 from pydantic_core import PydanticCustomError
 
-from service.schemas.camera_fields import CameraFields
 from service.schemas.fields import Finite
-from service.schemas.hint_fields import HintFields
+from service.schemas.query_fields import CameraFields, HintFields
 
 HEADING_MEANING = "azimuth of the panorama's centre column, clockwise from the plan's +y seen from above"
 
 
 class LocaliseForm(CameraFields, HintFields):
-    """Fields of a query besides the panorama itself; an empty field counts as left out."""
+    """Form fields of a query, without the panorama; an empty field counts as left out."""
 
-    venue_id: str | None = Field(
-        None, min_length=1, description="Id of the venue in one of whose plans the panorama was taken, not known which."
-    )
+    venue_id: str | None = Field(None, min_length=1, description="Id of a venue, to search all its plans.")
     floorplan_id: str | None = Field(
         None,
         min_length=1,
-        description="Id of the floor plan the panorama was taken in. Either this or `venue_id` is needed.",
+        description="Id of the floor plan. Either this or `venue_id` is required.",
         validate_default=True,
     )
     heading_deg: Annotated[float, Finite] | None = Field(
         None,
         ge=-360,
         le=360,
-        description=f"The {HEADING_MEANING}; left out: what the panorama's metadata say (`GPano:PoseHeadingDegrees`), "
-        "where the plan has `north_deg`, else unknown and searched over.",
+        description=f"The {HEADING_MEANING}. Default: the heading in the panorama's metadata "
+        "(`GPano:PoseHeadingDegrees`) if the plan has `north_deg`; else all headings are searched.",
     )
     heading_tolerance_deg: Annotated[float, Finite] = Field(
         0.0,
         ge=0,
         le=45,
-        description="How far off `heading_deg` may be: it is then searched for within that, to the next sector of the "
-        "model's ring, and refined. 0: it is exact. Needs `heading_deg`.",
+        description="Tolerance of `heading_deg`: headings within it are searched and refined. 0: the heading is exact. "
+        "Needs `heading_deg`.",
     )
     refine: Literal["none", "vdr", "lpo"] = Field(
-        "lpo", description="How far to refine: nearest grid pose, denser poses around it, or optimised pose."
+        "lpo",
+        description="Last stage: nearest pose of the grid (`none`), denser poses around it (`vdr`), or pose refinement "
+        "(`lpo`).",
     )
 
     include: Literal["posterior"] | None = Field(
-        None, description="What else to tell: how probable all places of the plan are."
+        None, description="Extra part of the answer: the posterior over all places of the plan."
     )
 
     @field_validator("include")
     @classmethod
-    def _of_one_plan(cls, value: str | None, given: ValidationInfo) -> str | None:
+    def _check_include(cls, value: str | None, given: ValidationInfo) -> str | None:
         if value is not None and given.data.get("venue_id") is not None:
-            raise ValueError("is about the places of one plan, and not of a venue")
+            raise ValueError("works for one plan, not for a venue")
         return value
 
     @field_validator("heading_deg", "heading_tolerance_deg", mode="before")
     @classmethod
-    def _plain_number(cls, value: object) -> object:
+    def _reject_underscores(cls, value: object) -> object:
         if isinstance(value, str) and "_" in value:
             raise ValueError("not a number")
         return value
@@ -69,14 +68,14 @@ class LocaliseForm(CameraFields, HintFields):
         if value is None and venue_id is None and "venue_id" in given.data:
             raise PydanticCustomError("missing", "missing")
         if venue_id is not None and value is not None:
-            raise ValueError("venue_id is given as well, one of the two is needed")
+            raise ValueError("venue_id is given as well; give one of the two")
         if value is not None and given.data.get("level") is not None:
-            raise ValueError("level is given as well, which is of the plans of a venue: one plan is on one level")
+            raise ValueError("level is given as well; it needs venue_id instead")
         return value
 
     @field_validator("heading_tolerance_deg")
     @classmethod
-    def _of_a_heading(cls, value: float, given: ValidationInfo) -> float:
+    def _check_tolerance(cls, value: float, given: ValidationInfo) -> float:
         if given.data.get("heading_deg", 0.0) is None:
-            raise ValueError("heading_deg, whose tolerance this is, is missing")
+            raise ValueError("needs heading_deg")
         return value

@@ -1,4 +1,4 @@
-"""A floor plan in the native format, as it is uploaded and told."""
+"""Floor plans in the native format."""
 
 from __future__ import annotations
 
@@ -16,55 +16,58 @@ OpeningKind = Annotated[str, WithJsonSchema({"type": "string", "enum": [*OPENING
 
 
 class RoomDocument(BaseModel):
-    """One room of a plan."""
+    """Room of a plan."""
 
-    id: str | None = Field(None, description="Tells rooms of one name apart; unique, by default made from the name.")
-    name: str = Field("", description="Name of the room; by default its number.")
-    type: RoomType = Field("unknown", description="What the room is for.")
+    id: str | None = Field(None, description="Unique id. Default: made from the name.")
+    name: str = Field("", description="Name of the room. Default: its number.")
+    type: RoomType = Field("unknown", description="Use of the room.")
     polygon: Ring = Field(
-        description="Corners [x, y] in metres, in either order, x to the right and y up on the drawing."
+        description="Corners [x, y] in metres, clockwise or counterclockwise; x points right and y up on the drawing."
     )
-    holes: list[Ring] = Field([], description="What is no floor inside the polygon, such as columns and shafts.")
-    walls: list[Segment] = Field([], description="Free-standing walls up to the ceiling.")
+    holes: list[Ring] = Field([], description="Holes in the floor, such as columns and shafts.")
+    walls: list[Segment] = Field([], description="Free-standing walls that reach the ceiling.")
     ceiling_height_m: float | None = Field(None, gt=0, description="Height of this room's ceiling over its floor.")
 
 
 class OpeningDocument(BaseModel):
-    """A door, window or passage; one entry serves both rooms of a wall."""
+    """Door, window or passage; one entry serves both rooms of a wall."""
 
-    kind: OpeningKind = Field(description="A passage is an opening without a leaf.")
-    line: Segment = Field(description="Both ends, along the wall.")
-    sill_m: float | None = Field(None, ge=0, description="Height of its lower edge over the floor.")
-    head_m: float | None = Field(None, ge=0, description="Height of its upper edge over the floor.")
-    name: str | None = Field(None, description="What to call it.")
+    kind: OpeningKind = Field(description="Kind; a passage has no leaf.")
+    line: Segment = Field(description="Both ends, on the wall.")
+    sill_m: float | None = Field(None, ge=0, description="Height of the lower edge over the floor.")
+    head_m: float | None = Field(None, ge=0, description="Height of the upper edge over the floor.")
+    name: str | None = Field(None, description="Name of the opening.")
     rooms: list[str] | None = Field(
-        None, description="Ids of the only rooms that it belongs to; by default all whose wall it lies on."
+        None, description="Ids of the rooms that it belongs to. Default: all rooms whose wall it lies on."
     )
 
 
 class ControlPoint(BaseModel):
-    """A place that is known in the plan and on Earth."""
+    """Point that is known both in the plan and on Earth."""
 
-    x: float = Field(description="In the plan, metres.")
+    x: float = Field(description="Plan coordinate, metres.")
     y: float
     latitude: float = Field(ge=-90, le=90, description="WGS84, degrees.")
     longitude: float = Field(ge=-180, le=180)
 
 
 class AnchorDocument(BaseModel):
-    """Where on Earth a plan lies: `latitude` and `longitude` of its origin, or two control points."""
+    """Place of a plan on Earth: `latitude` and `longitude` of its origin, or two control points."""
 
-    latitude: float | None = Field(None, ge=-90, le=90, description="Of the plan's origin; WGS84, degrees.")
-    longitude: float | None = Field(None, ge=-180, le=180, description="Of the plan's origin.")
-    altitude_m: float | None = Field(None, ge=-1000, le=10_000, description="Of the floor, over the ellipsoid.")
+    latitude: float | None = Field(None, ge=-90, le=90, description="Latitude of the plan's origin, WGS84, degrees.")
+    longitude: float | None = Field(None, ge=-180, le=180, description="Longitude of the plan's origin.")
+    altitude_m: float | None = Field(None, ge=-1000, le=10_000, description="Height of the floor over the ellipsoid.")
     north_deg: float | None = Field(
-        None, ge=-360, le=360, description="Azimuth of true north in the plan, where `north_deg` of the plan says none."
+        None,
+        ge=-360,
+        le=360,
+        description="Azimuth of true north in the plan, if the plan has no `north_deg` of its own.",
     )
     control_points: list[ControlPoint] | None = Field(None, min_length=2, max_length=2)
 
 
 class FloorPlanDocument(BaseModel):
-    """A floor plan in the native format; coordinates in metres."""
+    """Floor plan in the native format; coordinates in metres."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -77,25 +80,23 @@ class FloorPlanDocument(BaseModel):
         }
     )
 
-    name: str = Field("floor plan", description="What to call the plan.")
-    ceiling_height_m: float | None = Field(None, gt=0, description="Ceiling of rooms without their own.")
-    camera_height_m: float = Field(
-        1.5, ge=MIN_CAMERA_HEIGHT_M, description="Height of the camera assumed for panoramas of this plan."
-    )
+    name: str = Field("floor plan", description="Name of the plan.")
+    ceiling_height_m: float | None = Field(None, gt=0, description="Ceiling height of rooms without their own.")
+    camera_height_m: float = Field(1.5, ge=MIN_CAMERA_HEIGHT_M, description="Camera height of panoramas of this plan.")
     north_deg: float | None = Field(
         None, ge=-360, le=360, description="Azimuth of true north: degrees clockwise from the plan's +y."
     )
     anchor: AnchorDocument | None = Field(
-        None, description="Where on Earth the plan lies: by its origin, or by two control points."
+        None, description="Place of the plan on Earth, by its origin or by two control points."
     )
-    camera_height_std_m: float | None = Field(
-        None, ge=0, le=2, description="How far off `camera_height_m` may be: one standard deviation."
+    camera_height_std_m: float | None = Field(None, ge=0, le=2, description="Standard deviation of `camera_height_m`.")
+    rooms: list[RoomDocument] = Field(min_length=1, description="Rooms.")
+    openings: list[OpeningDocument] = Field(
+        [], description="Doors, windows and passages; they can touch but not overlap."
     )
-    rooms: list[RoomDocument] = Field(min_length=1, description="Closed rooms.")
-    openings: list[OpeningDocument] = Field([], description="Doors, windows and passages; they may touch, not overlap.")
     opening_kinds: list[OpeningKind] | None = Field(
-        None, description="The kinds that the plan shows completely; by default those that occur in it."
+        None, description="Kinds of openings that the plan shows completely. Default: the kinds that occur in it."
     )
     opening_tolerance_m: float = Field(
-        0.35, ge=0.01, le=1.5, description="How far from a room's wall an opening may be drawn."
+        0.35, ge=0.01, le=1.5, description="Largest distance between an opening and the wall it belongs to."
     )

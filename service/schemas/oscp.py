@@ -1,7 +1,7 @@
-"""The GeoPose protocol of the Open Spatial Computing Platform (OSCP), version 2: what AR clients ask and are answered.
+"""Requests and answers of the GeoPose protocol, version 2, of the Open Spatial Computing Platform (OSCP).
 
-Names are the protocol's. Members that are not told here are the protocol's as well, or of later versions of it, and are
-not read: privacy (panoramas are never kept), sizes (the picture has its own), sequence numbers, rigs.
+Names are the protocol's. Other members of the protocol, and of later versions of it, are accepted and ignored: privacy
+(panoramas are never kept), sizes (the picture has its own), sequence numbers, rigs.
 """
 
 from __future__ import annotations
@@ -12,8 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from pydantic.alias_generators import to_camel
 
 from service.schemas.fields import Finite, HeadingDeg, ResponseModel, Share
-from service.schemas.geopose import GeoPosePosition
-from service.schemas.localise_answer import Position
+from service.schemas.localise_answer import GeoPosePosition, Position
 
 _Readings = list[dict[str, Any]]
 
@@ -23,47 +22,49 @@ class _Sent(BaseModel):
 
 
 class OscpSensor(_Sent):
-    """A sensor of the device."""
+    """Sensor of the device."""
 
     id: str
     type: str = Field(description="`camera`, `geolocation` and so on.")
 
 
 class OscpImageOrientation(_Sent):
-    """How the picture lies in memory; panoramas are upright, or say otherwise in their EXIF."""
+    """Orientation of the stored picture; a panorama must be upright, or say otherwise in its EXIF data."""
 
     mirrored: bool = False
     rotation: float = 0.0
 
 
 class OscpCameraParam(_Sent):
-    """What is known of the camera."""
+    """Parameters of the camera."""
 
-    model: str | None = Field(None, description="Left out, `UNKNOWN` or `EQUIRECTANGULAR`: others are no panoramas.")
+    model: str | None = Field(None, description="`UNKNOWN`, `EQUIRECTANGULAR` or left out; other models are refused.")
 
 
 class OscpCameraReading(_Sent):
-    """A picture: a full panorama, as of `POST /localise`."""
+    """Panorama, as in `POST /localise`."""
 
     timestamp: Annotated[float, Finite]
     sensor_id: str
-    image_format: str = Field(description="`JPG`, say; the picture itself tells what it is. `DEPTH` is refused.")
-    image_bytes: str = Field(min_length=1, description="The file, JPEG, PNG or WebP, in Base64.")
+    image_format: str = Field(
+        description="Such as `JPG`; the actual format is detected from the picture. `DEPTH` is refused."
+    )
+    image_bytes: str = Field(min_length=1, description="JPEG, PNG or WebP file in Base64.")
     image_orientation: OscpImageOrientation | None = None
     params: OscpCameraParam | None = None
 
 
 class OscpGeolocationReading(_Sent):
-    """A rough place, as of the W3C's geolocation sensor."""
+    """Approximate place, as in the W3C geolocation sensor."""
 
     timestamp: Annotated[float, Finite] = 0.0
     latitude: Annotated[float, Finite] = Field(ge=-90, le=90)
     longitude: Annotated[float, Finite] = Field(ge=-180, le=180)
-    accuracy: Annotated[float, Finite] | None = Field(None, description="Metres; 0 or none: not known.")
+    accuracy: Annotated[float, Finite] | None = Field(None, description="Metres; 0 or null: unknown.")
 
 
 class OscpSensorReadings(_Sent):
-    """What the sensors say."""
+    """Sensor readings."""
 
     camera_readings: Annotated[list[OscpCameraReading], Field(min_length=1, max_length=1)]
     geolocation_readings: list[OscpGeolocationReading] = []
@@ -75,20 +76,20 @@ class OscpSensorReadings(_Sent):
 
     @property
     def unused(self) -> list[str]:
-        """Names of readings that there are, and that nothing is done with."""
+        """Names of the readings that are present but not used."""
         used = {"camera_readings", "geolocation_readings"}
         return [to_camel(name) for name in OscpSensorReadings.model_fields if name not in used and getattr(self, name)]
 
 
 class OscpRequest(_Sent):
-    """Where is this device? A GeoPoseReq of the protocol."""
+    """Query of the protocol (GeoPoseReq)."""
 
-    id: str = Field(description="Comes back in the answer.")
-    timestamp: int | Annotated[float, Finite] = Field(description="Milliseconds since 1970; comes back in the answer.")
+    id: str = Field(description="Returned in the answer.")
+    timestamp: int | Annotated[float, Finite] = Field(description="Milliseconds since 1970; returned in the answer.")
     type: Literal["geopose"]
     sensors: list[OscpSensor]
     sensor_readings: OscpSensorReadings
-    prior_poses: _Readings = Field([], description="Not used, which the answer says.")
+    prior_poses: _Readings = Field([], description="Not used; the answer has a warning.")
 
     @property
     def camera_reading(self) -> OscpCameraReading:
@@ -97,12 +98,12 @@ class OscpRequest(_Sent):
 
     @property
     def geolocation(self) -> OscpGeolocationReading | None:
-        """The latest rough place."""
-        return max(self.sensor_readings.geolocation_readings, key=lambda one: one.timestamp, default=None)
+        """The latest geolocation reading."""
+        return max(self.sensor_readings.geolocation_readings, key=lambda reading: reading.timestamp, default=None)
 
 
 class OscpQuaternion(ResponseModel):
-    """A rotation from the camera (x right, y where the panorama's centre looks, z up) to east, north, up."""
+    """Rotation from the camera (x right, y along the panorama's centre, z up) to east, north, up."""
 
     x: float
     y: float
@@ -111,21 +112,21 @@ class OscpQuaternion(ResponseModel):
 
 
 class OscpGeoPose(ResponseModel):
-    """A pose on Earth: GeoPose Basic-Quaternion."""
+    """Pose on Earth: GeoPose Basic-Quaternion."""
 
     position: GeoPosePosition
     quaternion: OscpQuaternion
 
 
 class OscpAccuracy(ResponseModel):
-    """How far off the pose may be: root of the mean square over its candidates, as probable as they are."""
+    """Accuracy of the pose: root mean square over the candidates, weighted by probability."""
 
     position: float = Field(description="Metres, horizontally.")
     orientation: float = Field(description="Degrees about the vertical.")
 
 
 class OscpFound(ResponseModel):
-    """What the protocol has no place for."""
+    """Parts of the answer that the protocol has no members for."""
 
     floorplan_id: str
     level: float | None
@@ -134,11 +135,11 @@ class OscpFound(ResponseModel):
     room: str
     room_id: str
     confidence: Share | None
-    warnings: list[str] = Field(description="What was sent and not used or not followed.")
+    warnings: list[str] = Field(description="Parts of the request that were not used or not followed.")
 
 
 class OscpAnswer(ResponseModel):
-    """A GeoPoseResp of the protocol, with `lalaloc` beside it."""
+    """Answer of the protocol (GeoPoseResp), extended by `lalaloc`."""
 
     id: str
     timestamp: int | float

@@ -1,4 +1,4 @@
-"""What may be said of the file of a plan, and what is told of reading it."""
+"""Options for reading a plan file, and the report on it."""
 
 from __future__ import annotations
 
@@ -10,36 +10,36 @@ from service.schemas.fields import ResponseModel
 
 
 class ImportForm(BaseModel):
-    """Fields beside the file of a plan; an empty field counts as left out."""
+    """Form fields beside the plan file; an empty field counts as left out."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     units: Literal["m", "cm", "mm", "in", "ft"] | None = Field(None, description="Unit of the file's coordinates.")
     scale: str | None = Field(
-        None, description="Scale of a drawing on paper, such as `1:100`: of a PDF, an SVG with a size, or a scan."
+        None, description="Scale of a drawing on paper, such as `1:100`, for a PDF, an SVG with a size, or a scan."
     )
     metres_per_pixel: float | None = Field(
-        None, gt=0, description="Length of a pixel, of a unit of an SVG, or of a point (1/72 inch) of a PDF."
+        None, gt=0, description="Length of a pixel, of an SVG unit, or of a PDF point (1/72 inch)."
     )
     known_distance: str | None = Field(
-        None, description="Two points of the drawing and how far apart they are: `x0,y0,x1,y1,metres`."
+        None, description="Two points of the drawing and their distance: `x0,y0,x1,y1,metres`."
     )
-    level: str | None = Field(None, description="Name or number of the storey to take, where the file has several.")
+    level: str | None = Field(None, description="Name or number of the storey to read, for files with several.")
     layers: str | None = Field(
-        None, description="Take only these layers, groups or classes; separated by commas, in any case."
+        None, description="Layers, groups or classes to read, separated by commas; case is ignored."
     )
-    page: int | None = Field(None, ge=1, description="Page of a PDF; 1 if left out.")
+    page: int | None = Field(None, ge=1, description="Page of a PDF. Default: 1.")
     y_axis: Literal["up", "down"] | None = Field(
-        None, description="Which way y points in the file, where it is not as its format has it."
+        None, description="Direction of y in the file. Default: that of its format."
     )
     ceiling_height_m: float | None = Field(
-        None, ge=1, le=20, description="Ceiling of rooms whose file gives none; 2.5 m if left out."
+        None, ge=1, le=20, description="Ceiling height of rooms without one in the file. Default: 2.5 m."
     )
-    name: str | None = Field(None, max_length=200, description="What to call the plan.")
+    name: str | None = Field(None, max_length=200, description="Name of the plan.")
 
 
 class LayerAnswer(ResponseModel):
-    """What was made of one layer, group, class or type of entities."""
+    """Use of one layer, group, class or type of entities."""
 
     layer: str
     entities: int
@@ -47,24 +47,22 @@ class LayerAnswer(ResponseModel):
 
 
 class LevelAnswer(ResponseModel):
-    """The storey of the file that the plan is of."""
+    """Storey of the file that was read."""
 
     name: str
-    number: float | None = Field(description="0 is the ground floor; null where the file has no numbers.")
-    elevation_m: float | None = Field(description="Height of its floor in the file; null where that is not known.")
+    number: float | None = Field(description="0 is the ground floor; null if the file has no numbers.")
+    elevation_m: float | None = Field(description="Height of its floor in the file; null if unknown.")
 
 
 class ImportReport(ResponseModel):
-    """How the file of a plan was read."""
+    """Report on reading a plan file."""
 
-    format: str = Field(description="As it was recognised by the content.")
-    level: LevelAnswer | None = Field(description="The storey, where the file has any.")
-    metres_per_unit: float = Field(description="Length of a unit of the file's coordinates.")
-    scale_source: str = Field(description="Where that was read.")
-    is_draft: bool = Field(
-        description="The plan was guessed from a picture or from lines alone: look at it before it is used."
-    )
-    layers: list[LayerAnswer] = Field(description="What was used for what, by layer.")
-    notes: list[str] = Field(description="What was done.")
-    warnings: list[str] = Field(description="What is likely wrong; the plan's `warnings` have these as well.")
-    unsure: list[str] = Field(description="What was guessed or assumed.")
+    format: str = Field(description="Format, detected from the content.")
+    level: LevelAnswer | None = Field(description="Storey, if the file has storeys.")
+    metres_per_unit: float = Field(description="Metres per unit of the file's coordinates.")
+    scale_source: str = Field(description="Source of the scale.")
+    is_draft: bool = Field(description="The plan was guessed from a picture or from plain lines. Check it before use.")
+    layers: list[LayerAnswer] = Field(description="Use of each layer.")
+    notes: list[str] = Field(description="Steps taken.")
+    warnings: list[str] = Field(description="Likely mistakes, also in the plan's `warnings`.")
+    unsure: list[str] = Field(description="Guesses and assumptions.")

@@ -1,4 +1,4 @@
-"""Errors, as of RFC 9457."""
+"""Problem documents of RFC 9457."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from service.schemas.fields import ResponseModel
 
 
 class Fault(ResponseModel):
-    """One field at fault."""
+    """Fault in one field."""
 
     field: str
     message: str
 
 
 class Problem(BaseModel):
-    """An error as of RFC 9457."""
+    """Problem document of RFC 9457."""
 
     type: str = Field(description="Stable identifier of the kind of error.")
     title: str
     status: int
-    detail: str = Field(description="What is wrong with this request, with value and limit.")
-    request_id: str | None = Field(None, description="Names this request in the service's log.")
-    room: str | None = Field(None, description="The room at fault, for an invalid floor plan.")
-    levels: list[str] | None = Field(None, description="The levels of a file with several, to choose one of.")
-    errors: list[Fault] | None = Field(None, description="Every field at fault, for an invalid request.")
+    detail: str = Field(description="Cause of the error, with value and limit.")
+    request_id: str | None = Field(None, description="Id of the request in the service's log.")
+    room: str | None = Field(None, description="Faulty room of an invalid floor plan.")
+    levels: list[str] | None = Field(None, description="Levels to choose from, for a file with several.")
+    errors: list[Fault] | None = Field(None, description="All faulty fields of an invalid request.")

@@ -1,4 +1,4 @@
-"""What is told of stored floor plans."""
+"""Answers about stored floor plans: description, list, events, walls."""
 
 from __future__ import annotations
 
@@ -8,32 +8,32 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, WithJsonSchema
 
 from service.schemas.fields import Metres, ResponseModel, Share, SquareMetres
-from service.schemas.native_plan import RoomType
+from service.schemas.native_plan import OpeningKind, Ring, RoomType
 from service.schemas.plan_import import ImportReport
 
 PlanStatus = Literal["preparing", "ready", "failed"]
 
 
 class RoomAnswer(ResponseModel):
-    """One room of a stored plan."""
+    """Room of a stored plan."""
 
-    id: str = Field(description="Tells rooms of one name apart.")
+    id: str = Field(description="Unique id of the room.")
     name: str
-    type: RoomType = Field(description="What the room is for.")
+    type: RoomType = Field(description="Use of the room.")
     area_m2: SquareMetres = Field(description="Floor area, without holes.")
     ceiling_height_m: float = Field(description="Height of the ceiling over the floor.")
     vertices: int = Field(description="Corners of the polygon.")
 
 
 class GridAnswer(ResponseModel):
-    """The plan's latent grid."""
+    """Pose grid of a plan."""
 
-    step_m: float = Field(description="Distance of neighbouring poses.")
+    step_m: float = Field(description="Distance between neighbouring poses.")
     poses: int = Field(description="Number of poses; an estimate until the plan is ready.")
 
 
 class BoundsAnswer(ResponseModel):
-    """Smallest axis-parallel box around the plan."""
+    """Bounding box of the plan."""
 
     x_min_m: Metres
     y_min_m: Metres
@@ -42,39 +42,39 @@ class BoundsAnswer(ResponseModel):
 
 
 class FloorPlanAnswer(ResponseModel):
-    """A stored floor plan."""
+    """Stored floor plan."""
 
-    id: str = Field(description="Identifier for later requests.")
-    revision: str = Field(description="Identifier of what was uploaded; a replaced plan has another one.")
-    revision_number: int = Field(ge=1, description="How often the plan was uploaded up to this revision.")
+    id: str = Field(description="Id of the plan.")
+    revision: str = Field(description="Id of the revision; it changes when the plan is replaced.")
+    revision_number: int = Field(ge=1, description="Number of the revision, from 1.")
     name: str
     status: PlanStatus | Literal["superseded"] = Field(
-        description="`preparing` while the latent grid is computed, then `ready` or `failed`; `superseded` for a "
-        "revision that is not the current one."
+        description="`preparing` while the pose grid is computed, then `ready` or `failed`; `superseded` for an old "
+        "revision."
     )
-    progress: Share = Field(description="Share of the latent grid that is computed.")
-    reason: str | None = Field(description="Why the plan failed, null unless it did.")
+    progress: Share = Field(description="Fraction of the pose grid that is computed.")
+    reason: str | None = Field(description="Reason of a failure; null if there is none.")
     rooms: list[RoomAnswer]
     area_m2: SquareMetres = Field(description="Sum of the rooms' floor areas.")
     bounds: BoundsAnswer
-    camera_height_m: float = Field(description="Camera height assumed for panoramas of this plan.")
+    camera_height_m: float = Field(description="Camera height of panoramas of this plan.")
     grid: GridAnswer
     warnings: list[str] = Field(
-        description="What is likely wrong with the plan but usable: overlapping rooms, rooms that no door reaches, "
-        "improbable ceilings."
+        description="Likely mistakes in the plan, such as overlapping rooms, rooms without a door or improbable "
+        "ceilings."
     )
     import_report: ImportReport | None = Field(
-        description="How its file was read; null for plans that an earlier version of the service stored."
+        description="Report on reading the file; null for plans stored by an old version of the service."
     )
     plan: Annotated[dict[str, Any], WithJsonSchema({"allOf": [{"$ref": "#/components/schemas/FloorPlanDocument"}]})] = (
-        Field(description="The plan itself in the native format.")
+        Field(description="Plan in the native format.")
     )
-    created_at: datetime = Field(description="When the plan was first uploaded, UTC.")
-    updated_at: datetime = Field(description="When this revision was uploaded, UTC.")
+    created_at: datetime = Field(description="Time of the first upload, UTC.")
+    updated_at: datetime = Field(description="Time of this revision's upload, UTC.")
 
 
 class FloorPlanSummary(ResponseModel):
-    """A stored floor plan in a listing."""
+    """Stored floor plan in a list."""
 
     id: str
     revision: str
@@ -88,18 +88,52 @@ class FloorPlanSummary(ResponseModel):
 
 
 class FloorPlanList(ResponseModel):
-    """A page of stored floor plans, newest first."""
+    """Page of stored floor plans, newest first."""
 
     floorplans: list[FloorPlanSummary]
-    next_cursor: str | None = Field(description="The `cursor` of the next page, null on the last one.")
+    next_cursor: str | None = Field(description="`cursor` of the next page; null on the last page.")
 
 
 class PlanEvent(ResponseModel):
-    """How far a floor plan is; one event of a stream."""
+    """Event of a stream: the state of a floor plan."""
 
     status: PlanStatus | Literal["deleted"]
     progress: Share | None = Field(
-        default=None, description="Share of the latent grid that is computed; not of a deleted plan."
+        default=None, description="Fraction of the pose grid that is computed; absent for a deleted plan."
     )
-    revision: str | None = Field(default=None, description="The current revision; a plan may get another meanwhile.")
-    reason: str | None = Field(default=None, description="Why the plan failed.")
+    revision: str | None = Field(default=None, description="Current revision; it changes when the plan is replaced.")
+    reason: str | None = Field(default=None, description="Reason of a failure.")
+
+
+Wall = Annotated[list[float], Field(min_length=4, max_length=4)]
+
+
+class OpeningFaceAnswer(ResponseModel):
+    """Part of a wall that a door, window or passage takes up."""
+
+    kind: OpeningKind
+    wall: int = Field(ge=0, description="Index of the wall in the room's `walls_m`.")
+    start: float = Field(ge=0, le=1, description="Start, as a fraction of the wall's length.")
+    end: float = Field(ge=0, le=1, description="End, as a fraction of the wall's length.")
+    sill_m: float | None = Field(description="Height of the lower edge over the floor; null if the plan has none.")
+    head_m: float | None = Field(description="Height of the upper edge over the floor; null if the plan has none.")
+
+
+class RoomLayoutAnswer(ResponseModel):
+    """Walls and openings of one room."""
+
+    id: str
+    name: str
+    ceiling_height_m: float
+    polygon: Ring = Field(description="Outline of the floor, counterclockwise.")
+    holes: list[Ring] = Field(description="Holes in the floor.")
+    walls_m: list[Wall] = Field(description="Walls as [x0, y0, x1, y1] in metres, including free-standing walls.")
+    openings: list[OpeningFaceAnswer]
+
+
+class LayoutAnswer(ResponseModel):
+    """Walls of a floor plan at one revision, by room."""
+
+    floorplan_id: str
+    revision: str
+    rooms: list[RoomLayoutAnswer]

@@ -1,4 +1,4 @@
-"""Venues: floor plans that belong together, on levels of their own."""
+"""Venues: groups of floor plans, each on a level."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ def _text(value: str) -> str:
 Name = Annotated[str, Field(max_length=_MAX_NAME), AfterValidator(_text)]
 LevelNumber = Annotated[
     float,
-    Field(ge=-1000, le=1000, description="Number of the level, 0 for the ground; mezzanines have numbers in between."),
+    Field(ge=-1000, le=1000, description="Number of the level, 0 for the ground floor; fractions for mezzanines."),
 ]
 
 
 class Document(BaseModel):
-    """Base of what is sent as JSON: numbers are numbers, and unknown keys are refused."""
+    """Base of JSON request bodies: strict types, unknown keys are refused."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
 
 class VenueAnchorDocument(Document):
-    """Where on Earth the origin of a venue's plans lies, WGS84, for plans that are all drawn in one frame."""
+    """Place on Earth (WGS84) of the plans' common origin, for plans that are all drawn in one frame."""
 
     latitude: float = Field(ge=-90, le=90, description="Degrees north.")
     longitude: float = Field(ge=-180, le=180, description="Degrees east.")
@@ -48,15 +48,15 @@ class VenueAnchorDocument(Document):
 
 
 class VenuePlanDocument(Document):
-    """A plan of a venue."""
+    """Plan of a venue."""
 
     floorplan_id: str = Field(max_length=128, description="Id of a stored floor plan.")
     level: LevelNumber = 0.0
-    name: Name | None = Field(None, description="What to call the plan here; by default its own name.")
+    name: Name | None = Field(None, description="Name of the plan in the venue. Default: the plan's own name.")
 
 
 class VenueDocument(Document):
-    """A venue: a building, a campus, everything that is let in a street."""
+    """Venue, such as a building or a campus."""
 
     model_config = ConfigDict(
         json_schema_extra={
@@ -68,22 +68,22 @@ class VenueDocument(Document):
         }
     )
 
-    name: Name = Field("venue", description="What to call the venue.")
+    name: Name = Field("venue", description="Name of the venue.")
     anchor: VenueAnchorDocument | None = None
-    plans: list[VenuePlanDocument] = Field([], description="Its plans, each once.")
+    plans: list[VenuePlanDocument] = Field([], description="Plans of the venue, without duplicates.")
 
 
 class VenueChangeDocument(Document):
-    """What changes of a venue; what is left out stays as it is."""
+    """Changes to a venue; fields that are left out keep their value."""
 
-    name: Name = Field("", validate_default=False, description="What to call the venue.")
-    anchor: VenueAnchorDocument | None = Field(None, description="Its anchor; null takes it away.")
-    plans: list[VenuePlanDocument] = Field([], description="Plans that come in, or change their level or name.")
-    remove: list[str] = Field([], description="Ids of plans that leave the venue.")
+    name: Name = Field("", validate_default=False, description="Name of the venue.")
+    anchor: VenueAnchorDocument | None = Field(None, description="Anchor of the venue; null removes it.")
+    plans: list[VenuePlanDocument] = Field([], description="Plans to add, or to give another level or name.")
+    remove: list[str] = Field([], description="Ids of plans to remove.")
 
 
 class VenueAnchorAnswer(ResponseModel):
-    """Where on Earth the origin of a venue's plans lies, WGS84."""
+    """Place on Earth (WGS84) of the plans' common origin."""
 
     latitude: float
     longitude: float
@@ -92,10 +92,10 @@ class VenueAnchorAnswer(ResponseModel):
 
 
 class VenueSummary(ResponseModel):
-    """A stored venue in a listing."""
+    """Stored venue in a list."""
 
-    id: str = Field(description="Identifier for later requests.")
-    revision: str = Field(description="Changes with the name, the anchor and the plans that belong to the venue.")
+    id: str = Field(description="Id of the venue.")
+    revision: str = Field(description="Id of the revision; it changes with the name, the anchor and the plans.")
     name: str
     anchor: VenueAnchorAnswer | None
     plans: int = Field(description="Number of floor plans.")
@@ -104,27 +104,27 @@ class VenueSummary(ResponseModel):
 
 
 class VenueAnswer(VenueSummary):
-    """A stored venue."""
+    """Stored venue."""
 
-    revision_number: int = Field(ge=1, description="How many revisions there have been, this one included.")
-    plans_ready: int = Field(description="Plans that can be asked about.")
-    plans_failed: int = Field(description="Plans that never will be, unless they are replaced.")
+    revision_number: int = Field(ge=1, description="Number of the revision, from 1.")
+    plans_ready: int = Field(description="Plans that are ready for queries.")
+    plans_failed: int = Field(description="Plans that failed; replace them.")
 
 
 class VenueList(ResponseModel):
-    """A page of stored venues, newest first."""
+    """Page of stored venues, newest first."""
 
     venues: list[VenueSummary]
-    next_cursor: str | None = Field(description="The `cursor` of the next page, null on the last one.")
+    next_cursor: str | None = Field(description="`cursor` of the next page; null on the last page.")
 
 
 class VenuePlanAnswer(ResponseModel):
-    """A plan of a venue."""
+    """Plan of a venue."""
 
     floorplan_id: str
-    revision: str = Field(description="The plan's current revision.")
-    level: float = Field(description="Number of its level.")
-    name: str = Field(description="What it is called in the venue, else its own name.")
+    revision: str = Field(description="Current revision of the plan.")
+    level: float = Field(description="Level of the plan.")
+    name: str = Field(description="Name of the plan in the venue, else the plan's own name.")
     status: PlanStatus
     progress: Share
     rooms: int = Field(description="Number of rooms.")
@@ -132,7 +132,7 @@ class VenuePlanAnswer(ResponseModel):
 
 
 class VenuePlanList(ResponseModel):
-    """A page of the plans of a venue, by level."""
+    """Page of a venue's plans, by level."""
 
     plans: list[VenuePlanAnswer]
-    next_cursor: str | None = Field(description="The `cursor` of the next page, null on the last one.")
+    next_cursor: str | None = Field(description="`cursor` of the next page; null on the last page.")

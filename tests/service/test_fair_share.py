@@ -192,7 +192,7 @@ def test_bodies_that_do_not_come_leave_room_for_others(start_app: StartApp, tmp_
         with httpx.Client(base_url=client.base_url, transport=httpx.HTTPTransport(local_address=WORST)) as worst:
             problem = assert_problem(worst.post("/floorplans", json=FLAT), 503, "overloaded")
             assert (
-                "6 of your requests are in work, no more are taken: the rest of 8 is left to others"
+                "6 of your requests are in work, and the rest of the 8 slots is reserved for other tenants."
                 in problem["detail"]
             )
 

@@ -78,7 +78,7 @@ def test_a_hint_makes_the_places_that_it_is_of_likelier(client: httpx.Client, pl
         ({"near": '{"x_m": 1}', "radius_m": 3}, "near.y_m", "is missing"),
         ({"near": '{"x_m": 1, "y_m": NaN}', "radius_m": 3}, "near.y_m", "must be finite"),
         ({"near": '{"x_m": 1, "y_m": 2}'}, "radius_m", "is missing"),
-        ({"radius_m": 3}, "radius_m", "near, around which it is, is missing"),
+        ({"radius_m": 3}, "radius_m", "needs near"),
         ({"near": '{"x_m": 1, "y_m": 2}', "radius_m": 0}, "radius_m", "must be at least 0.1"),
         ({"near": '{"x_m": 1, "y_m": 2}', "radius_m": 1001}, "radius_m", "must be at most 1000"),
         ({"rooms": "[]"}, "rooms", "1 are needed"),

@@ -1,0 +1,185 @@
+"""Form fields and answer of a query with several panoramas of one visit."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+
+from lalaloc_core.localise.sequence import Motion
+from lalaloc_core.localise.sequence.motion import MAX_DISTANCE_M, MIN_ANGLE_STD, MIN_DISTANCE_STD_M
+from service.schemas.fields import Degrees, Finite, HeadingDeg, Metres, ResponseModel, Score, Share
+from service.schemas.localise_answer import CandidateAnswer, Covariance, GeoPose, ModelAnswer, Position, TimingsAnswer
+from service.schemas.query_fields import CameraFields
+
+Angle = Annotated[float, Finite, Field(ge=-360, le=360)]
+AngleStd = Annotated[float, Finite, Field(ge=math.degrees(MIN_ANGLE_STD), le=180)]
+_UNKNOWN = Motion()
+
+
+class StatedMotion(BaseModel):
+    """Measured motion from one panorama to the next; leave out what was not measured."""
+
+    model_config = ConfigDict(
+        frozen=True,
+        extra="forbid",
+        json_schema_extra={"example": {"distance_m": 2.4, "distance_std_m": 0.12, "turn_deg": 35, "turn_std_deg": 2}},
+    )
+
+    distance_m: Annotated[float, Finite] | None = Field(
+        None, ge=0, le=MAX_DISTANCE_M, description="Straight-line distance between the two places."
+    )
+    distance_std_m: Annotated[float, Finite] = Field(
+        _UNKNOWN.distance_std_m,
+        ge=MIN_DISTANCE_STD_M,
+        le=MAX_DISTANCE_M,
+        description="Standard deviation of `distance_m`.",
+    )
+    turn_deg: Angle | None = Field(
+        None, description="Heading of the second panorama minus that of the first, clockwise seen from above."
+    )
+    turn_std_deg: AngleStd = Field(
+        round(math.degrees(_UNKNOWN.turn_std), 6), description="Standard deviation of `turn_deg`."
+    )
+    direction_deg: Angle | None = Field(
+        None,
+        description="Azimuth from the first place to the second minus the heading of the first panorama. Needs "
+        "`distance_m`.",
+    )
+    direction_std_deg: AngleStd = Field(
+        round(math.degrees(_UNKNOWN.direction_std), 6), description="Standard deviation of `direction_deg`."
+    )
+
+    @field_validator("direction_deg")
+    @classmethod
+    def _check_direction(cls, value: float | None, given: ValidationInfo) -> float | None:
+        if value is not None and given.data.get("distance_m", 0.0) is None:
+            raise ValueError("needs distance_m")
+        return value
+
+    @property
+    def motion(self) -> Motion:
+        """The motion for the core, in radians."""
+        return Motion(
+            distance_m=self.distance_m,
+            distance_std_m=self.distance_std_m,
+            turn=None if self.turn_deg is None else math.radians(self.turn_deg),
+            turn_std=math.radians(self.turn_std_deg),
+            direction=None if self.direction_deg is None else math.radians(self.direction_deg),
+            direction_std=math.radians(self.direction_std_deg),
+        )
+
+
+class StatedHeading(BaseModel):
+    """Given heading of one panorama."""
+
+    heading_deg: float | None
+    heading_tolerance_deg: float
+
+
+class SequenceForm(CameraFields):
+    """Form fields of a query with several panoramas; an empty field counts as left out."""
+
+    floorplan_id: str = Field(min_length=1, description="Id of the floor plan.")
+    motions: list[StatedMotion | None] | None = Field(
+        None,
+        description="Motions between successive panoramas as a JSON array, one fewer than panoramas; null for a motion "
+        "that was not measured. Without motions, the panoramas share the plan and the camera height only.",
+    )
+    headings_deg: list[Angle | None] | None = Field(
+        None,
+        description="Headings of all panoramas as a JSON array, null for an unknown heading; see `heading_deg` of "
+        "`POST /localise`. Default: the headings in the panoramas' metadata, else unknown.",
+    )
+    heading_tolerance_deg: Annotated[float, Finite] = Field(
+        0.0, ge=0, le=45, description="Tolerance of `headings_deg`. Needs `headings_deg`."
+    )
+    refine: Literal["none", "lpo"] = Field(
+        "lpo", description="Last stage: nearest poses of the grid (`none`), or joint pose refinement (`lpo`)."
+    )
+
+    @field_validator("motions", "headings_deg", mode="before")
+    @classmethod
+    def _parse_array(cls, value: object) -> object:
+        if not isinstance(value, str):
+            return value
+        try:
+            found = json.loads(value)
+        except (ValueError, RecursionError) as error:
+            raise ValueError("not a JSON array") from error
+        if not isinstance(found, list):
+            raise ValueError("not a JSON array")
+        return found
+
+    @field_validator("heading_tolerance_deg", mode="before")
+    @classmethod
+    def _reject_underscores(cls, value: object) -> object:
+        if isinstance(value, str) and "_" in value:
+            raise ValueError("not a number")
+        return value
+
+    @field_validator("heading_tolerance_deg")
+    @classmethod
+    def _check_tolerance(cls, value: float, given: ValidationInfo) -> float:
+        if given.data.get("headings_deg", ()) is None:
+            raise ValueError("needs headings_deg")
+        return value
+
+    def faults(self, panoramas: int) -> list[tuple[str, str]]:
+        """Return (field, message) for fields that do not fit the number of panoramas."""
+        wanted = {"motions": (self.motions, panoramas - 1), "headings_deg": (self.headings_deg, panoramas)}
+        return [
+            (name, f"has {len(given)} items, {panoramas} panoramas need {count}")
+            for name, (given, count) in wanted.items()
+            if given is not None and len(given) != count
+        ]
+
+    def steps(self, panoramas: int) -> list[Motion]:
+        """Return the motions between the panoramas, unknown ones included."""
+        given = self.motions or [None] * (panoramas - 1)
+        return [_UNKNOWN if motion is None else motion.motion for motion in given]
+
+    def heading_of(self, index: int) -> StatedHeading:
+        """Return the given heading of a panorama."""
+        heading_deg = None if self.headings_deg is None else self.headings_deg[index]
+        return StatedHeading(heading_deg=heading_deg, heading_tolerance_deg=self.heading_tolerance_deg)
+
+
+class SequencePoseAnswer(ResponseModel):
+    """Pose of one panorama, from all panoramas together; fields as in the answer of `POST /localise`."""
+
+    position: Position
+    heading_deg: HeadingDeg = Field(ge=0, lt=360)
+    heading_source: Literal["given", "panorama", "searched"]
+    room: str
+    room_id: str
+    confidence: Share | None
+    heading_confidence: Share | None
+    warnings: list[str]
+    covariance_m2: Covariance | None
+    heading_std_deg: Degrees | None
+    cost: Score
+    latent_distance: Score
+    geopose: GeoPose | None = None
+    candidates: list[CandidateAnswer] = Field(
+        description="Poses on the best paths, best path first; the first is the answer."
+    )
+
+
+class SequenceAnswer(ResponseModel):
+    """Poses of the panoramas of one visit."""
+
+    floorplan_id: str
+    floorplan_revision: str = Field(description="Revision of the plan that was searched.")
+    poses: list[SequencePoseAnswer] = Field(description="Poses, one per panorama, in the order sent.")
+    confidence: Share | None = Field(
+        description="Probability that all positions are right within 1 m: that of the path among all paths, times the "
+        "lowest probability that a panorama is of this plan. Null for a model without confidence."
+    )
+    warnings: list[str] = Field(description="Motions in the request that were not followed.")
+    stage: Literal["retrieval", "lpo"] = Field(description="Last stage that ran.")
+    camera_height_m: Metres = Field(description="Camera height that fits all panoramas best.")
+    timings_ms: TimingsAnswer
+    model: ModelAnswer
