@@ -7,7 +7,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo serve test ray lint openapi docs site web clean
+.PHONY: help setup demo serve test ray lint openapi docs site client web clean
 
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-8s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -52,8 +52,11 @@ docs: $(STAMP) ## write the generated parts of docs/
 site: $(STAMP) ## build the documentation site into build/site; warnings are errors
 	$(BIN)/python -m sphinx -q -W --keep-going -j 2 docs build/site
 
+client: $(STAMP) ## generate the blocking client, lalaloc_client/blocking, from the one for asyncio
+	$(BIN)/python -m scripts.generate_client
+
 web: ## build the web pages from web/ into service/web (needs node and npm)
-	cd web && npm ci --no-audit --no-fund && npm run check && npm run build
+	cd web && npm ci --no-audit --no-fund && npm run types && npm run check && npm run build
 
 clean: ## remove the environment and everything that was made; ./data and ./runs stay
 	rm -rf $(VENV) web/node_modules build dist *.egg-info .pytest_cache .ruff_cache .hypothesis demo.png

@@ -1,4 +1,4 @@
-"""Client of the LaLaLoc service: `Client` blocks, `AsyncClient` is for asyncio; both do the same.
+"""Client of the LaLaLoc service: `Client` blocks, `AsyncClient` is for asyncio; their methods are the same.
 
 from lalaloc_client import Client
 
@@ -6,11 +6,9 @@ with Client("http://127.0.0.1:8000") as service:
     plan = service.wait_until_ready(service.upload_floorplan("flat.json").id)
     answer = service.localise(plan.id, "kitchen.jpg", heading_deg=250)
 
-Begin with `client.py`, whose methods stand in `plan_methods.py`, `query_methods.py` and `venue_methods.py`;
-`operations.py` is what both clients do, without doing it.
+Begin with `asynchronous/client.py`; `make client` generates `blocking/` from it.
 """
 
-from lalaloc_client.aio import AsyncClient
 from lalaloc_client.answers import (
     Candidate,
     GeoPoseAnswer,
@@ -23,7 +21,8 @@ from lalaloc_client.answers import (
     SequenceLocalisation,
     SequencePose,
 )
-from lalaloc_client.client import Client
+from lalaloc_client.asynchronous.client import AsyncClient
+from lalaloc_client.blocking.client import Client
 from lalaloc_client.errors import (
     ClientError,
     ConflictError,
@@ -37,19 +36,22 @@ from lalaloc_client.errors import (
     ProblemError,
     UnauthorisedError,
 )
-from lalaloc_client.layout import Layout, OpeningPiece, RoomLayout
 from lalaloc_client.model import (
     Bounds,
     FloorPlan,
     FloorPlanSummary,
     Grid,
+    Layout,
+    OpeningPiece,
     PlanEvent,
     Position,
     Room,
+    RoomLayout,
     Venue,
     VenueAnchor,
     VenuePlan,
 )
+from lalaloc_client.requests import QueryOptions
 from lalaloc_client.retry import RetryPolicy
 
 __all__ = [
@@ -80,6 +82,7 @@ __all__ = [
     "Position",
     "Posterior",
     "ProblemError",
+    "QueryOptions",
     "Readiness",
     "RetryPolicy",
     "Room",

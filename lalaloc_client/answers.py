@@ -1,16 +1,16 @@
-"""What the service answers to queries, as frozen dataclasses, as in `model.py`; `_ms` are milliseconds."""
+"""Answers to queries as frozen dataclasses, as in `model.py`; `_ms` are milliseconds."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from lalaloc_client.model import Position
 
 
 @dataclass(frozen=True)
 class PlanProbability:
-    """How probable it is that a panorama was taken in one plan of a venue."""
+    """Probability that a panorama was taken in one plan of a venue."""
 
     floorplan_id: str
     level: float
@@ -23,11 +23,12 @@ class Candidate:
     """One possible pose; candidates are ranked by `cost`, lower is better.
 
     Attributes:
-        probability: that the camera is within 1 m, turned alike within 25°, and not at a better candidate; None for a
-            model that does not tell.
-        room_id: the room's id in the plan, which is unique as its name need not be.
-        floorplan_id, level: the plan that it lies in, and its level in the venue that was asked about.
-        geopose: the pose on Earth; None where neither plan nor venue have an anchor.
+        probability: probability that the camera is within 1 m and 25° of this pose, and not at a better candidate; None
+            if the model is not calibrated.
+        room_id: the room's id, unique in the plan.
+        floorplan_id: the plan of the pose.
+        level: the plan's level in the searched venue.
+        geopose: the pose on Earth; None without an anchor of plan or venue.
     """
 
     position: Position
@@ -44,7 +45,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Model:
-    """The model that answered."""
+    """The model that computed an answer."""
 
     name: str
     version: str
@@ -53,7 +54,7 @@ class Model:
 
 @dataclass(frozen=True)
 class GeoPosePosition:
-    """A place, WGS84; `h` is metres over the ellipsoid."""
+    """A position in WGS84; `h` is metres over the ellipsoid."""
 
     lat: float
     lon: float
@@ -62,7 +63,7 @@ class GeoPosePosition:
 
 @dataclass(frozen=True)
 class GeoPoseAngles:
-    """Rotations about up, north and east, degrees; a camera that looks north, level, has none."""
+    """Rotations about up, north and east in degrees; all 0 for a level camera that looks north."""
 
     yaw: float
     pitch: float
@@ -79,7 +80,7 @@ class GeoPose:
 
 @dataclass(frozen=True)
 class Posterior:
-    """How probable places are, lists of one length; each stands for a part of its room that is `step_m` wide."""
+    """Probability of each place, as lists of equal length; a place covers `step_m` of its room."""
 
     step_m: float
     x_m: tuple[float, ...]
@@ -89,27 +90,28 @@ class Posterior:
 
 @dataclass(frozen=True)
 class Localisation:
-    """Where a panorama was taken.
+    """Pose of a panorama.
 
     Attributes:
         heading_deg: azimuth of the panorama's centre column, clockwise from the plan's +y.
-        heading_source: `given`, `panorama` (its metadata) or `searched`; None for a service that does not tell.
-        confidence: probability that the position is right within 1 m, None for a model that does not tell.
-        heading_confidence: probability that the heading is right within 5°.
-        warnings: what was said and not followed, such as a heading that the panorama contradicts.
-        camera_height_m: the camera height that fits best.
-        geopose: the pose on Earth; None where neither plan nor venue have an anchor.
-        room_id: the room's id in the plan.
-        stage: the last stage that produced the position: `retrieval`, `vdr` or `lpo`.
-        covariance_m2: of the position, given that it is right within 1 m; None unless `stage` is `lpo`.
-        heading_std_deg: standard deviation of the heading where it was searched.
-        candidates: best first; the first one is the answer.
-        timings_ms: per stage of the service.
-        floorplan_revision: the revision of the plan that was compared with.
-        venue_id, level: the venue that was asked about, and the level of the plan in it.
-        plans: of a venue, the most probable plans, the most probable first.
-        answer_id: under which the service keeps the answer; None where it keeps none.
-        posterior: how probable every place is, where that was asked for.
+        heading_source: `given`, `panorama` (its metadata) or `searched`; None for services without this field.
+        confidence: probability that the position error is below 1 m; None if the model is not calibrated.
+        heading_confidence: probability that the heading error is below 5°.
+        warnings: options that were not followed, such as a heading that the panorama contradicts.
+        camera_height_m: the best camera height.
+        geopose: the pose on Earth; None without an anchor of plan or venue.
+        room_id: the room's id, unique in the plan.
+        stage: the stage that produced the position: `retrieval`, `vdr` or `lpo`.
+        covariance_m2: covariance of the position, given an error below 1 m; None unless `stage` is `lpo`.
+        heading_std_deg: standard deviation of a searched heading.
+        candidates: candidates, best first; the first one is the answer.
+        timings_ms: time per stage of the service.
+        floorplan_revision: the searched revision of the plan.
+        venue_id: the searched venue.
+        level: the plan's level in the venue.
+        plans: the most probable plans of the venue, most probable first.
+        answer_id: id of the answer for `get_answer`; None if the service does not store it.
+        posterior: probability of every place, if requested.
     """
 
     floorplan_id: str
@@ -159,7 +161,7 @@ class QuaternionGeoPose:
 
 @dataclass(frozen=True)
 class GeoPoseAccuracy:
-    """How far off a pose may be: metres, and degrees about the vertical."""
+    """Expected error of a pose: metres, and degrees about the vertical."""
 
     position: float
     orientation: float
@@ -167,7 +169,7 @@ class GeoPoseAccuracy:
 
 @dataclass(frozen=True)
 class PlaceInPlan:
-    """Where a device is, by its floor plan; attributes as of `Localisation`."""
+    """Pose of a device in its floor plan; attributes as in `Localisation`."""
 
     floorplan_id: str
     level: float | None
@@ -184,8 +186,9 @@ class GeoPoseAnswer:
     """An answer of the OSCP GeoPose protocol.
 
     Attributes:
-        id, timestamp: of the request.
-        lalaloc: what the protocol has no place for.
+        id: id of the request.
+        timestamp: timestamp of the request.
+        lalaloc: fields outside the protocol.
     """
 
     id: str
@@ -198,7 +201,7 @@ class GeoPoseAnswer:
 
 @dataclass(frozen=True)
 class SequencePose:
-    """Where one panorama of a sequence was taken, by all of them together; attributes as of `Localisation`."""
+    """Pose of one panorama of a sequence, from all of them jointly; attributes as in `Localisation`."""
 
     position: Position
     heading_deg: float
@@ -218,14 +221,14 @@ class SequencePose:
 
 @dataclass(frozen=True)
 class SequenceLocalisation:
-    """Where the panoramas of one visit were taken.
+    """Poses of the panoramas of one visit.
 
     Attributes:
-        poses: one for each panorama.
-        confidence: probability that all positions are right within 1 m.
-        warnings: motions that were said and not followed.
+        poses: one pose per panorama.
+        confidence: probability that all position errors are below 1 m.
+        warnings: motions that were not followed.
         stage: `retrieval` or `lpo`.
-        camera_height_m: the camera height that fits all panoramas best.
+        camera_height_m: the best common camera height.
     """
 
     floorplan_id: str
@@ -241,7 +244,7 @@ class SequenceLocalisation:
 
 @dataclass(frozen=True)
 class Pool:
-    """The service's LPO workers: wanted, warm now, and whether each has been warm once."""
+    """The service's LPO workers: configured, ready now, and whether all have been ready once."""
 
     workers: int
     ready: int
@@ -251,9 +254,9 @@ class Pool:
 
 @dataclass(frozen=True)
 class Readiness:
-    """Whether the service can answer at full quality."""
+    """Readiness of the service to answer at full quality."""
 
     ready: bool
     model: Model
     lpo_pool: Pool
-    plans_preparing: int = field(default=0)
+    plans_preparing: int = 0

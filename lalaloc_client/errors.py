@@ -1,21 +1,26 @@
 """Errors of the client.
 
 ClientError
-├── ConnectionFailedError     no answer came, also not after the retries
-├── MalformedAnswerError      an answer that this client does not understand
+├── ConnectionFailedError     the service did not answer, retries included
+├── MalformedAnswerError      an answer has another form than the API's
 ├── FloorPlanFailedError      the service could not prepare the plan
-├── NotReadyError             the plan was still preparing when the time was up (a TimeoutError, too)
+├── NotReadyError             the plan was still preparing at the timeout (also a TimeoutError)
 └── ProblemError              the service answered with a problem (RFC 9457)
-    ├── InvalidError          what was sent is wrong: 400, 413, 415, 422
-    ├── UnauthorisedError     no key, one that is not valid, or without the scope: 401, 403
-    ├── NotFoundError         there is no such thing: 404
-    ├── ConflictError         the plan is in another state: 409, 412
-    └── OverloadedError       too much at once, also after the retries: 429, 503
+    ├── InvalidError          the request is wrong: 400, 413, 415, 422
+    ├── UnauthorisedError     the key is missing, invalid, or lacks the scope: 401, 403
+    ├── NotFoundError         the resource does not exist: 404
+    ├── ConflictError         the resource is in another state: 409, 412
+    └── OverloadedError       the service is overloaded or the rate limit exceeded, retries included: 429, 503
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
+
+import httpx
+
+_SHOWN_CHARACTERS = 500
 
 
 class ClientError(Exception):
@@ -23,18 +28,18 @@ class ClientError(Exception):
 
 
 class ConnectionFailedError(ClientError):
-    """No answer came; the cause is httpx's error."""
+    """The service did not answer; the cause is httpx's error."""
 
 
 class MalformedAnswerError(ClientError):
-    """The answer is not what this client understands; says which field."""
+    """The answer has another form than the API's; the message names the field."""
 
 
 class FloorPlanFailedError(ClientError):
     """The service could not prepare the plan.
 
     Attributes:
-        reason: what the service says.
+        reason: the service's explanation.
     """
 
     def __init__(self, floorplan_id: str, reason: str | None) -> None:
@@ -43,7 +48,7 @@ class FloorPlanFailedError(ClientError):
 
 
 class NotReadyError(ClientError, TimeoutError):
-    """The plan was still preparing when the time was up."""
+    """The plan was still preparing at the timeout."""
 
     def __init__(self, floorplan_id: str, waited_s: float, progress: float) -> None:
         super().__init__(f"floor plan '{floorplan_id}' is still preparing after {waited_s:.1f} s ({progress:.0%} done)")
@@ -53,11 +58,11 @@ class ProblemError(ClientError):
     """The service answered with a problem.
 
     Attributes:
-        type: stable identifier of the kind of problem, `about:blank` where the answer has none.
-        status: of HTTP.
-        detail: what is wrong, with value and limit.
-        request_id: names the request in the service's log.
-        faults: (field, message) of every field at fault.
+        type: stable identifier of the kind of problem; `about:blank` if the answer has none.
+        status: HTTP status code.
+        detail: explanation with value and limit.
+        request_id: id of the request in the service's log.
+        faults: (field, message) of every invalid field.
     """
 
     def __init__(
@@ -74,28 +79,28 @@ class ProblemError(ClientError):
         self.detail = detail
         self.request_id = request_id
         self.faults = tuple(faults)
-        named = f" (request {request_id})" if request_id else ""
-        super().__init__(f"{status} {type}: {detail}{named}")
+        suffix = f" (request {request_id})" if request_id else ""
+        super().__init__(f"{status} {type}: {detail}{suffix}")
 
 
 class InvalidError(ProblemError):
-    """What was sent is wrong; sending it again does not help."""
+    """The request is wrong; repeating it does not help."""
 
 
 class UnauthorisedError(ProblemError):
-    """There is no key, it is not valid, or lacks the scope."""
+    """The key is missing, invalid, or lacks the scope."""
 
 
 class NotFoundError(ProblemError):
-    """There is no such thing, or it belongs to somebody else."""
+    """The resource does not exist or belongs to another tenant."""
 
 
 class ConflictError(ProblemError):
-    """The plan is in another state than the request assumes."""
+    """The resource is in another state than the request assumes."""
 
 
 class OverloadedError(ProblemError):
-    """The service has too much to do, or allows this key no more for now."""
+    """The service is overloaded, or the key's rate limit is exceeded."""
 
 
 _BY_STATUS: dict[int, type[ProblemError]] = {
@@ -113,6 +118,24 @@ _BY_STATUS: dict[int, type[ProblemError]] = {
 }
 
 
-def problem_class(status: int) -> type[ProblemError]:
-    """The class of problems with a status of HTTP."""
-    return _BY_STATUS.get(status, ProblemError)
+def problem_of(response: httpx.Response) -> ProblemError:
+    """Return the error for an answer, which a proxy may have sent without a problem document."""
+    try:
+        document = json.loads(response.content)
+    except ValueError:
+        document = None
+    if not isinstance(document, dict):
+        document = {}
+    text = response.text.strip()[:_SHOWN_CHARACTERS] or response.reason_phrase
+    faults = document.get("errors")
+    return _BY_STATUS.get(response.status_code, ProblemError)(
+        str(document.get("type", "about:blank")),
+        response.status_code,
+        str(document.get("detail", text)),
+        request_id=document.get("request_id") or response.headers.get("x-request-id"),
+        faults=[
+            (str(fault.get("field")), str(fault.get("message")))
+            for fault in (faults if isinstance(faults, list) else [])
+            if isinstance(fault, dict)
+        ],
+    )

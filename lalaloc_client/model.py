@@ -1,7 +1,6 @@
-"""Plans and venues as the service tells them, as frozen dataclasses. Units stand in the names: `_m`, `_m2`, `_deg`.
+"""Plans, venues and layouts as frozen dataclasses. Units are in the names: `_m`, `_m2`, `_deg`.
 
-Fields that this client does not know are left out, so that a newer service can be asked; those that it knows must be
-there and of the right type (`parsing.py`). What queries are answered is in `answers.py`.
+Answers may have more fields, so that the client works with newer services; the fields here are checked (`parsing.py`).
 """
 
 from __future__ import annotations
@@ -14,7 +13,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Position:
-    """A point of the plan frame: x to the right, y up on the drawing."""
+    """A point in the plan frame: x to the right, y up on the drawing."""
 
     x_m: float
     y_m: float
@@ -32,7 +31,7 @@ class Bounds:
 
 @dataclass(frozen=True)
 class Room:
-    """One room of a stored plan; `id` tells rooms of one name apart."""
+    """One room of a stored plan; `id` is unique, the name need not be."""
 
     name: str
     area_m2: float
@@ -44,7 +43,7 @@ class Room:
 
 @dataclass(frozen=True)
 class Grid:
-    """A plan's latent grid; the number of poses is an estimate until the plan is ready."""
+    """A plan's pose grid; the number of poses is an estimate until the plan is ready."""
 
     step_m: float
     poses: int
@@ -56,15 +55,16 @@ class FloorPlan:
 
     Attributes:
         status: `preparing`, then `ready` or `failed`.
-        progress: share of its latent grid that is computed, 0 to 1.
-        reason: why it failed, None unless it did.
-        warnings: what is odd about it but usable.
-        revision: names what was uploaded, as `Localisation.floorplan_revision` does.
-        revision_number: how often the plan was uploaded up to this revision.
-        created_at: when it was first uploaded; `updated_at`: when this revision was.
-        etag: names this revision, for `replace_floorplan(..., if_match=...)`.
-        plan: the plan itself in the native format.
-        import_report: how its file was read: what was used for what, what is likely wrong, what was guessed.
+        progress: computed share of its pose grid, 0 to 1.
+        reason: reason of a failure, else None.
+        warnings: oddities that do not prevent its use.
+        revision: id of the uploaded revision, as in `Localisation.floorplan_revision`.
+        revision_number: number of uploads up to this revision.
+        created_at: time of the first upload.
+        updated_at: time of this revision's upload.
+        etag: entity tag of this revision, for `replace_floorplan(..., if_match=...)`.
+        plan: the plan in the native format.
+        import_report: interpretation of its file, with guesses and likely errors.
     """
 
     id: str
@@ -104,7 +104,7 @@ class FloorPlanSummary:
 
 @dataclass(frozen=True)
 class FloorPlanPage:
-    """One page of a listing; `next_cursor` asks for the one after it, None ends the listing."""
+    """One page of a listing; `next_cursor` leads to the next page and is None on the last."""
 
     floorplans: tuple[FloorPlanSummary, ...]
     next_cursor: str | None = None
@@ -112,7 +112,7 @@ class FloorPlanPage:
 
 @dataclass(frozen=True)
 class VenueAnchor:
-    """Where on Earth the origin of a venue's plans lies, WGS84; `north_deg` is the azimuth of true north in them."""
+    """Location of the origin of a venue's plans on Earth, WGS84; `north_deg` is the azimuth of true north in them."""
 
     latitude: float
     longitude: float
@@ -120,7 +120,7 @@ class VenueAnchor:
     north_deg: float = 0.0
 
     def to_dict(self) -> dict[str, Any]:
-        """As it is sent."""
+        """Return the JSON document of the API."""
         return asdict(self)
 
 
@@ -129,9 +129,13 @@ class VenuePlan:
     """A plan of a venue.
 
     Attributes:
-        level: number of its level, 0 for the ground.
-        name: what it is called in the venue; None, when it is sent: by its own name.
-        status, progress, rooms, area_m2, revision: those of the plan, as the service tells them.
+        level: number of its level, 0 for the ground floor.
+        name: its name in the venue. Default when sent: the plan's own name.
+        status: as in `FloorPlan`, filled in by the service like all fields below.
+        progress: as in `FloorPlan`.
+        rooms: number of rooms.
+        area_m2: as in `FloorPlan`.
+        revision: as in `FloorPlan`.
     """
 
     floorplan_id: str
@@ -144,7 +148,7 @@ class VenuePlan:
     revision: str | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """As it is sent."""
+        """Return the JSON document of the API."""
         return {"floorplan_id": self.floorplan_id, "level": self.level, "name": self.name}
 
 
@@ -153,10 +157,11 @@ class Venue:
     """A stored venue.
 
     Attributes:
-        plans: how many floor plans it has; of these `plans_ready` can be asked about, `plans_failed` never will be.
-            Listings do not tell these two.
-        revision: changes with the name, the anchor and the plans that belong to it.
-        etag: names this revision, for `if_match`.
+        revision: id that changes with the name, the anchor and the set of plans.
+        plans: number of floor plans.
+        plans_ready: number of plans that can be searched; None in listings.
+        plans_failed: number of plans that could not be prepared; None in listings.
+        etag: entity tag of this revision, for `if_match`.
     """
 
     id: str
@@ -174,7 +179,7 @@ class Venue:
 
 @dataclass(frozen=True)
 class VenuePage:
-    """One page of a listing of venues; `next_cursor` asks for the one after it, None ends the listing."""
+    """One page of a listing of venues."""
 
     venues: tuple[Venue, ...]
     next_cursor: str | None = None
@@ -190,13 +195,13 @@ class VenuePlanPage:
 
 @dataclass(frozen=True)
 class PlanEvent:
-    """How far a plan is at some moment.
+    """Progress of a plan at one moment.
 
     Attributes:
-        status: `preparing`, then `ready`, `failed` or `deleted`, after which nothing comes.
-        progress: share of its latent grid that is computed, 0 to 1; None of a plan that is deleted.
-        revision: the current one; a plan may get another meanwhile.
-        reason: why it failed.
+        status: `preparing`, then `ready`, `failed` or `deleted`, which is the last event.
+        progress: computed share of its pose grid, 0 to 1; None after deletion.
+        revision: the current revision, which may change in between.
+        reason: reason of a failure.
     """
 
     status: str
@@ -206,5 +211,47 @@ class PlanEvent:
 
     @property
     def final(self) -> bool:
-        """Whether it is the last one."""
+        """True for the last event."""
         return self.status in ("ready", "failed", "deleted")
+
+
+@dataclass(frozen=True)
+class OpeningPiece:
+    """A piece of a wall that is an opening.
+
+    Attributes:
+        wall: index in the room's `walls_m`.
+        start: start of the piece as a share of the wall, 0 to 1.
+        end: end of the piece as a share of the wall, 0 to 1.
+        sill_m: height of the lower edge over the floor, None if unknown.
+        head_m: height of the upper edge over the floor, None if unknown.
+    """
+
+    kind: str
+    wall: int
+    start: float
+    end: float
+    sill_m: float | None = None
+    head_m: float | None = None
+
+
+@dataclass(frozen=True)
+class RoomLayout:
+    """A room for rendering; `walls_m` has (x0, y0, x1, y1) of each wall, with the room to its left."""
+
+    id: str
+    name: str
+    ceiling_height_m: float
+    polygon: tuple[tuple[float, float], ...]
+    holes: tuple[tuple[tuple[float, float], ...], ...]
+    walls_m: tuple[tuple[float, float, float, float], ...]
+    openings: tuple[OpeningPiece, ...]
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Walls and openings of a plan's revision, room by room."""
+
+    floorplan_id: str
+    revision: str
+    rooms: tuple[RoomLayout, ...]

@@ -1,4 +1,4 @@
-"""What is sent: requests as plain data, the same bytes every time they are sent."""
+"""Requests as plain data: repeating one sends the same bytes."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ import re
 import time
 import uuid
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypedDict, Unpack
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypedDict
 
 import httpx
 
@@ -24,20 +24,39 @@ if TYPE_CHECKING:
     from PIL.Image import Image
 
 Document = Mapping[str, Any] | bytes | str | os.PathLike[str]
+Panorama: TypeAlias = "bytes | str | os.PathLike[str] | Image"
 Refine = Literal["none", "vdr", "lpo"]
+SequenceRefine = Literal["none", "lpo"]
 Picture = Literal["both", "plan", "photograph"]
 PictureFormat = Literal["png", "svg"]
-SequenceRefine = Literal["none", "lpo"]
 Covariance = tuple[tuple[float, float], tuple[float, float]]
 
+PICTURE_MEDIA: Mapping[PictureFormat, str] = {"png": "image/png", "svg": "image/svg+xml"}
 _JSON, _FILE = "application/json", "application/octet-stream"
 _JPEG_QUALITY = 95
-_PICTURE_MEDIA: Mapping[PictureFormat, str] = {"png": "image/png", "svg": "image/svg+xml"}
+# Names of the GeoPose protocol for picture files, by the bytes that the files begin with.
+_IMAGE_FORMATS = {b"\xff\xd8\xff": "JPG", b"\x89PNG": "PNG", b"RIFF": "WEBP"}
 _ID = re.compile(r"[A-Za-z0-9_-]{1,128}")
 
 
 class QueryOptions(TypedDict, total=False):
-    """What may be said of a query, as `Client.localise` takes it."""
+    """Options of a query; an option that is left out or None has the default.
+
+    Attributes:
+        heading_deg: azimuth of the panorama's centre column, clockwise from the plan's +y. Default: search for it.
+        heading_tolerance_deg: maximum error of `heading_deg`, up to 45. Default: 0.
+        camera_height_m: camera height over the floor. Default: that of the plan; unknown if the plan has none.
+        camera_height_std_m: standard deviation of the camera height, which is then estimated; 0 means exact. Default:
+            that of the plan, or 0.1.
+        near: approximate camera position, as {"x_m": 3.5, "y_m": 2.0} in the plan, or as {"latitude": 48.1372,
+            "longitude": 11.5757} if the plan has an anchor.
+        radius_m: maximum distance from `near`, which requires it.
+        rooms: ids or names of the rooms in which the camera may have stood.
+        strict: search only the places and headings that the options allow. Default: treat them as hints, which may be
+            wrong.
+        refine: last stage to run: `none`, `vdr` or `lpo`. Default: the last one that the service has.
+        top_k: number of candidates. Default: set by the service.
+    """
 
     heading_deg: float | None
     heading_tolerance_deg: float | None
@@ -56,10 +75,10 @@ class Request:
     """One request to the service.
 
     Attributes:
-        params: of the URL; a list is given once for each of its items.
-        safety: what sending it twice may do.
-        answers: statuses that are an answer, and not a failure.
-        streamed: whether the answer is read as it comes, and may last.
+        params: query parameters; a list is sent as one parameter per item.
+        safety: effect of sending the request twice.
+        answers: status codes of success.
+        streamed: read the answer as it arrives, for as long as it takes.
     """
 
     method: str
@@ -72,308 +91,200 @@ class Request:
     streamed: bool = False
 
 
-def upload_request(document: Document, options: Mapping[str, object] | None, idempotency_key: str | None) -> Request:
-    """Store a plan; the key lets the service see that a second one is the same request."""
-    media, content = _plan_body(document, options)
-    headers = {"Content-Type": media, "Idempotency-Key": idempotency_key or uuid.uuid4().hex}
-    return Request("POST", "/floorplans", headers=headers, content=content)
-
-
-def replace_request(
-    floorplan_id: str, document: Document, options: Mapping[str, object] | None, if_match: str | None
-) -> Request:
-    """Store a new revision of a plan; with `if_match` a second one would be refused, though the first was done."""
-    media, content = _plan_body(document, options)
-    headers = {"Content-Type": media}
-    if if_match is not None:
-        headers["If-Match"] = if_match
-    safety = Safety.ANY if if_match is None else Safety.UNSENT
-    return Request("PUT", _plan_path(floorplan_id), headers=headers, content=content, safety=safety)
-
-
-def export_request(floorplan_id: str, file_format: str) -> Request:
-    """A plan as the file of another tool."""
-    return Request("GET", f"{_plan_path(floorplan_id)}/export", {"format": file_format})
-
-
-def plan_request(floorplan_id: str) -> Request:
-    """Look at a plan."""
-    return Request("GET", _plan_path(floorplan_id))
-
-
-def original_request(floorplan_id: str) -> Request:
-    """The file that a plan was uploaded as."""
-    return Request("GET", f"{_plan_path(floorplan_id)}/original")
-
-
-def preview_request(
-    floorplan_id: str,
-    *,
-    x_m: float | None,
-    y_m: float | None,
-    heading_deg: float | None,
-    covariance_m2: Covariance | None,
-) -> Request:
-    """A drawing of a plan, with a camera in it where its position is given.
+def http_options(base_url: str, api_key: str | None, timeout_s: float) -> dict[str, Any]:
+    """Return the options of an httpx client.
 
     Raises:
-        ValueError: half a position, or a heading or a covariance without one; or a number that is not finite.
+        ValueError: an argument is out of range.
     """
-    if (x_m is None) != (y_m is None):
-        raise ValueError(f"x_m is {x_m} and y_m is {y_m}, they belong together")
-    if x_m is None and not (heading_deg is None and covariance_m2 is None):
-        raise ValueError("heading_deg and covariance_m2 need a position, x_m and y_m")
-    _check_finite({"x_m": x_m, "y_m": y_m, "heading_deg": heading_deg})
-    given = {"x_m": x_m, "y_m": y_m, "heading_deg": heading_deg}
-    params: dict[str, str | list[str]] = {name: str(value) for name, value in given.items() if value is not None}
-    if covariance_m2 is not None:
-        (xx, xy), (_, yy) = covariance_m2
-        _check_finite({"covariance_m2 (xx)": xx, "covariance_m2 (xy)": xy, "covariance_m2 (yy)": yy})
-        params["covariance_m2"] = [str(xx), str(xy), str(yy)]
-    headers = {"Accept": "image/svg+xml"}
-    return Request("GET", f"{_plan_path(floorplan_id)}/preview.svg", params=params, headers=headers)
+    address = httpx.URL(base_url)
+    if address.scheme not in ("http", "https") or not address.host:
+        raise ValueError(f"base_url is '{base_url}'; it must begin with http:// or https:// and name a host")
+    if not timeout_s > 0.0:
+        raise ValueError(f"timeout_s is {timeout_s}; it must be greater than 0")
+    headers = {"Accept": _JSON, "User-Agent": "lalaloc-client"}
+    if api_key is not None:
+        if not (api_key.isascii() and api_key.isprintable()) or not api_key or " " in api_key:
+            # The message leaves the value out: a mistyped key is still mostly the secret.
+            raise ValueError("api_key must be printable ASCII without spaces, and not empty")
+        headers["Authorization"] = f"Bearer {api_key}"
+    return {"base_url": address, "headers": headers, "timeout": timeout_s}
 
 
-def layout_request(floorplan_id: str, revision: str | None) -> Request:
-    """The walls of a plan, room by room."""
-    params = {} if revision is None else {"revision": revision}
-    return Request("GET", f"{_plan_path(floorplan_id)}/layout", params)
+def resource_path(collection: Literal["floorplans", "venues", "answers"], resource_id: str) -> str:
+    """Return the path of a resource.
+
+    Raises:
+        ValueError: `resource_id` cannot be an id.
+    """
+    # Quoting does not keep other characters from naming another route: servers unquote before they route.
+    if not _ID.fullmatch(resource_id):
+        raise ValueError(f"{collection[:-1]}_id is {resource_id!r:.100}; it must be 1 to 128 letters, digits, _ or -")
+    return f"/{collection}/{resource_id}"
 
 
-def answer_request(answer_id: str, method: Literal["GET", "DELETE"] = "GET") -> Request:
-    """An answer that the service keeps, to be told again or forgotten."""
-    return Request(method, resource_path("answers", "answer_id", answer_id))
+def text_values(values: Mapping[str, object]) -> dict[str, Any]:
+    """Return values as texts, lists and mappings as JSON; leave out None.
+
+    Raises:
+        ValueError: a number is not finite.
+    """
+    for name, value in values.items():
+        _check_finite(name, value)
+    return {name: _text(value) for name, value in values.items() if value is not None}
 
 
-def mesh_request(floorplan_id: str) -> Request:
-    """A mesh of a plan."""
-    return Request("GET", f"{_plan_path(floorplan_id)}/mesh.glb", headers={"Accept": "model/gltf-binary"})
-
-
-def events_request(floorplan_id: str) -> Request:
-    """How far a plan is, told as it happens."""
-    headers = {"Accept": "text/event-stream", "Cache-Control": "no-store"}
-    return Request("GET", f"{_plan_path(floorplan_id)}/events", headers=headers, streamed=True)
-
-
-def delete_request(floorplan_id: str) -> Request:
-    """Delete a plan."""
-    return Request("DELETE", _plan_path(floorplan_id))
-
-
-def page_request(name: str | None, limit: int, cursor: str | None) -> Request:
-    """One page of the stored plans."""
-    given = {"name": name, "limit": str(limit), "cursor": cursor}
-    return Request("GET", "/floorplans", {key: value for key, value in given.items() if value is not None})
-
-
-def localise_request(
-    floorplan_id: str | None,
-    panorama: bytes | str | os.PathLike[str] | Image,
+def json_request(
+    method: str,
+    path: str,
+    document: Mapping[str, Any],
     *,
-    heading_deg: float | None = None,
-    heading_tolerance_deg: float | None = None,
-    camera_height_m: float | None = None,
-    camera_height_std_m: float | None = None,
-    refine: Refine | None = None,
-    top_k: int | None = None,
-    near: Mapping[str, float] | None = None,
-    radius_m: float | None = None,
-    rooms: Sequence[str] | None = None,
-    strict: bool | None = None,
-    posterior: bool = False,
-    venue_id: str | None = None,
-    level: float | None = None,
+    if_match: str | None = None,
+    idempotency_key: str | None = None,
+    safety: Safety = Safety.ANY,
 ) -> Request:
-    """A query about a plan or a venue; it stores nothing, so asking twice is as good as once."""
-    given = {
-        "floorplan_id": floorplan_id,
-        "venue_id": venue_id,
-        "heading_deg": heading_deg,
-        "heading_tolerance_deg": heading_tolerance_deg,
-        "camera_height_m": camera_height_m,
-        "camera_height_std_m": camera_height_std_m,
-        "refine": refine,
-        "top_k": top_k,
-        "radius_m": radius_m,
-        "strict": strict,
-        "include": "posterior" if posterior else None,
-        "level": level,
-        "near": None if near is None else json.dumps(dict(near)),
-        # Text alone would be taken for a room by each of its letters.
-        "rooms": None if rooms is None else json.dumps([rooms] if isinstance(rooms, str) else list(rooms)),
-    }
-    _check_finite({**given, **{f"near['{name}']": value for name, value in (near or {}).items()}})
-    return _query("/localise", given, [panorama])
+    """Return a request with a JSON body."""
+    headers = {"Content-Type": _JSON, **_headers(if_match, idempotency_key)}
+    content = json.dumps(document, allow_nan=False).encode()
+    return Request(method, path, headers=headers, content=content, safety=_safety(if_match, safety))
+
+
+def plan_request(
+    method: str,
+    path: str,
+    document: Document,
+    options: Mapping[str, object] | None,
+    *,
+    if_match: str | None = None,
+    idempotency_key: str | None = None,
+) -> Request:
+    """Return a request that stores a plan: as the document alone, or as a form if there are options."""
+    if isinstance(document, bytes):
+        content = document
+    elif isinstance(document, Mapping):
+        content = json.dumps(dict(document), allow_nan=False).encode()
+    else:
+        content = Path(document).read_bytes()
+    if options:
+        media, content = _form("file", [content], options)
+    else:
+        media = _JSON if isinstance(document, Mapping) else _FILE
+    headers = {"Content-Type": media, **_headers(if_match, idempotency_key)}
+    return Request(method, path, headers=headers, content=content, safety=_safety(if_match))
+
+
+def query_request(
+    path: str,
+    panoramas: Sequence[Panorama],
+    values: Mapping[str, object],
+    options: QueryOptions | None = None,
+    *,
+    params: Mapping[str, str] | None = None,
+    accept: str = _JSON,
+) -> Request:
+    """Return a query; repeating it is safe, as it stores nothing.
+
+    Raises:
+        TypeError: an option is unknown.
+        ValueError: a number is not finite.
+    """
+    known = dict(options or {})
+    if unknown := known.keys() - QueryOptions.__annotations__.keys():
+        raise TypeError(f"unknown options: {', '.join(sorted(unknown))}; see QueryOptions")
+    if isinstance(rooms := known.get("rooms"), str):
+        known["rooms"] = [rooms]
+    media, content = _form("panorama", [_picture(panorama) for panorama in panoramas], {**values, **known})
+    return Request("POST", path, params or {}, {"Content-Type": media, "Accept": accept}, content)
 
 
 def geopose_request(
-    panorama: bytes | str | os.PathLike[str] | Image,
-    *,
-    floorplan_id: str | None,
-    venue_id: str | None,
+    panorama: Panorama,
+    params: Mapping[str, Any],
     latitude: float | None,
     longitude: float | None,
     accuracy_m: float | None,
 ) -> Request:
-    """A request of the OSCP GeoPose protocol.
+    """Return a request of the OSCP GeoPose protocol.
 
     Raises:
-        ValueError: half a place, or an accuracy without one; or a number that is not finite.
+        ValueError: only one of latitude and longitude is given, an accuracy is given without them, a number is not
+            finite, or the panorama is not a picture file.
     """
     if (latitude is None) != (longitude is None):
-        raise ValueError(f"latitude is {latitude} and longitude is {longitude}, they belong together")
+        raise ValueError(f"latitude is {latitude} and longitude is {longitude}; give both or neither")
     if latitude is None and accuracy_m is not None:
-        raise ValueError("accuracy_m needs a place, latitude and longitude")
-    _check_finite({"latitude": latitude, "longitude": longitude, "accuracy_m": accuracy_m})
+        raise ValueError(f"accuracy_m is {accuracy_m} without a place; give latitude and longitude as well")
+    _check_finite("latitude", latitude)
+    _check_finite("longitude", longitude)
+    _check_finite("accuracy_m", accuracy_m)
     now_ms = time.time_ns() // 1_000_000
-    privacy = {
-        f"data{what}": [] for what in ("Retention", "AcceptableUse", "SanitizationApplied", "SanitizationRequested")
+    kinds = ("Retention", "AcceptableUse", "SanitizationApplied", "SanitizationRequested")
+    common = {"timestamp": now_ms, "privacy": {f"data{kind}": [] for kind in kinds}}
+    content = _picture(panorama)
+    camera = {
+        "sensorId": "camera",
+        "sequenceNumber": 0,
+        "imageFormat": _image_format(content),
+        # The file itself states its size.
+        "size": [],
+        "imageBytes": base64.b64encode(content).decode("ascii"),
     }
-    common = {"timestamp": now_ms, "privacy": privacy}
-    picture = base64.b64encode(_picture(panorama)).decode("ascii")
-    # The size of a file is in the file.
-    camera = {"sensorId": "camera", "sequenceNumber": 0, "imageFormat": "JPG", "size": [], "imageBytes": picture}
     sensors, readings = [{"id": "camera", "type": "camera"}], {"cameraReadings": [common | camera]}
     if latitude is not None:
         place = {"sensorId": "place", "latitude": latitude, "longitude": longitude, "accuracy": accuracy_m or 0.0}
         sensors.append({"id": "place", "type": "geolocation"})
         readings["geolocationReadings"] = [common | place]
-    asked = {"id": uuid.uuid4().hex, "timestamp": now_ms, "type": "geopose", "sensors": sensors}
-    given = {"floorplan_id": floorplan_id, "venue_id": venue_id}
-    params = {name: value for name, value in given.items() if value is not None}
-    content = json.dumps(asked | {"sensorReadings": readings}).encode()
-    return Request("POST", "/geopose", params, {"Content-Type": _JSON}, content)
+    document = {"id": uuid.uuid4().hex, "timestamp": now_ms, "type": "geopose", "sensors": sensors}
+    body = json.dumps(document | {"sensorReadings": readings}).encode()
+    return Request("POST", "/geopose", params, {"Content-Type": _JSON}, body)
 
 
-def sequence_request(
-    floorplan_id: str,
-    panoramas: Sequence[bytes | str | os.PathLike[str] | Image],
-    *,
-    motions: Sequence[Mapping[str, float] | None] | None,
-    headings_deg: Sequence[float | None] | None,
-    heading_tolerance_deg: float | None,
-    camera_height_m: float | None,
-    camera_height_std_m: float | None,
-    refine: SequenceRefine | None,
-    top_k: int | None,
-) -> Request:
-    """A query of several panoramas."""
-    given = {
-        "floorplan_id": floorplan_id,
-        "heading_tolerance_deg": heading_tolerance_deg,
-        "camera_height_m": camera_height_m,
-        "camera_height_std_m": camera_height_std_m,
-        "refine": refine,
-        "top_k": top_k,
-    }
-    headings = {f"headings_deg[{index}]": one for index, one in enumerate(headings_deg or ())}
-    measured = {
-        f"motions[{index}]['{name}']": value
-        for index, one in enumerate(motions or ())
-        for name, value in (one or {}).items()
-    }
-    _check_finite(given | headings | measured)
-    told = {
-        "motions": None if motions is None else [None if one is None else dict(one) for one in motions],
-        "headings_deg": None if headings_deg is None else list(headings_deg),
-    }
-    known = {name: None if one is None else json.dumps(one) for name, one in told.items()}
-    return _query("/localise/sequence", given | known, panoramas)
-
-
-def _query(
-    path: str, given: Mapping[str, object], panoramas: Sequence[bytes | str | os.PathLike[str] | Image]
-) -> Request:
-    """A form with pictures."""
-    fields = {name: str(value) for name, value in given.items() if value is not None}
-    media, content = _form("panorama", [_picture(panorama) for panorama in panoramas], fields)
-    return Request("POST", path, headers={"Content-Type": media}, content=content)
-
-
-def drawn_request(
-    floorplan_id: str,
-    panorama: bytes | str | os.PathLike[str] | Image,
-    picture: Picture,
-    picture_format: PictureFormat,
-    **asked: Unpack[QueryOptions],
-) -> Request:
-    """A query whose answer is wanted as a picture.
+def preview_params(
+    x_m: float | None, y_m: float | None, heading_deg: float | None, covariance_m2: Covariance | None
+) -> dict[str, Any]:
+    """Return the parameters of a plan's drawing.
 
     Raises:
-        ValueError: no such format.
+        ValueError: only one of x_m and y_m is given, a heading or covariance is given without them, or a number is not
+            finite.
     """
-    if picture_format not in _PICTURE_MEDIA:
-        raise ValueError(f"picture_format is {picture_format!r}, it must be one of {', '.join(_PICTURE_MEDIA)}")
-    query = localise_request(floorplan_id, panorama, **asked)
-    headers = {**query.headers, "Accept": _PICTURE_MEDIA[picture_format]}
-    return replace(query, params={"picture": picture}, headers=headers)
+    if (x_m is None) != (y_m is None):
+        raise ValueError(f"x_m is {x_m} and y_m is {y_m}; give both or neither")
+    if x_m is None and not (heading_deg is None and covariance_m2 is None):
+        raise ValueError("heading_deg and covariance_m2 need a position; give x_m and y_m as well")
+    _check_finite("covariance_m2", covariance_m2)
+    params: dict[str, Any] = text_values({"x_m": x_m, "y_m": y_m, "heading_deg": heading_deg})
+    if covariance_m2 is not None:
+        (xx, xy), (_, yy) = covariance_m2
+        params["covariance_m2"] = [str(xx), str(xy), str(yy)]
+    return params
 
 
-def limits_request() -> Request:
-    """What the service allows."""
-    return Request("GET", "/limits")
+def _headers(if_match: str | None, idempotency_key: str | None) -> dict[str, str]:
+    headers = {"If-Match": if_match, "Idempotency-Key": idempotency_key}
+    return {name: value for name, value in headers.items() if value is not None}
 
 
-def ready_request() -> Request:
-    """Whether the service can answer; 503 says that it cannot yet."""
-    return Request("GET", "/readyz", answers=frozenset({200, 503}))
+def _safety(if_match: str | None, safety: Safety = Safety.ANY) -> Safety:
+    # The service refuses a repeated conditional request even if the first one succeeded.
+    return safety if if_match is None else Safety.UNSENT
 
 
-def _check_finite(given: Mapping[str, object]) -> None:
-    for name, value in given.items():
-        if isinstance(value, float) and not math.isfinite(value):
-            raise ValueError(f"{name} is {value}, it must be a finite number")
-
-
-def _plan_path(floorplan_id: str) -> str:
-    return resource_path("floorplans", "floorplan_id", floorplan_id)
-
-
-def resource_path(collection: str, name: str, given: str) -> str:
-    """Where something with an id is.
-
-    Raises:
-        ValueError: what was given as `name` is no id.
-    """
-    # Anything else could name another route, however it is quoted: servers undo that before they look.
-    if not _ID.fullmatch(given):
-        raise ValueError(f"{name} is {given!r:.100}, it must be 1 to 128 letters, digits, _ or -")
-    return f"/{collection}/{given}"
-
-
-def _plan_body(document: Document, options: Mapping[str, object] | None) -> tuple[str, bytes]:
-    """Media type and content: the file alone, whose format the service finds out, or a form with what is said of it."""
-    content = _document(document)
-    if not options:
-        return _JSON if isinstance(document, Mapping) else _FILE, content
-    _check_finite(options)
-    return _form("file", [content], {name: str(value) for name, value in options.items() if value is not None})
-
-
-def _form(name: str, contents: Sequence[bytes], fields: Mapping[str, str]) -> tuple[str, bytes]:
-    """Media type and content of a form with files, all of one name."""
-    # Made of the content, so that the same request is the same bytes.
+def _form(name: str, contents: Sequence[bytes], values: Mapping[str, object]) -> tuple[str, bytes]:
+    """Return media type and content of a form with files, all in the field `name`."""
+    # Derived from the content, so that the same request has the same bytes.
     boundary = hashlib.sha256(b"".join(contents)).hexdigest()
     encoded = httpx.Request(
         "POST",
         "http://service/",
         headers={"Content-Type": f"multipart/form-data; boundary={boundary}"},
-        data=dict(fields),
+        data=text_values(values),
         files=[(name, (name, content, _FILE)) for content in contents],
     )
     return encoded.headers["content-type"], encoded.read()
 
 
-def _document(document: Document) -> bytes:
-    if isinstance(document, bytes):
-        return document
-    if isinstance(document, Mapping):
-        return json.dumps(dict(document), allow_nan=False).encode()
-    return Path(document).read_bytes()
-
-
-def _picture(panorama: bytes | str | os.PathLike[str] | Image) -> bytes:
+def _picture(panorama: Panorama) -> bytes:
     if isinstance(panorama, bytes):
         return panorama
     if isinstance(panorama, str | os.PathLike):
@@ -381,3 +292,27 @@ def _picture(panorama: bytes | str | os.PathLike[str] | Image) -> bytes:
     buffer = io.BytesIO()
     panorama.convert("RGB").save(buffer, "JPEG", quality=_JPEG_QUALITY)
     return buffer.getvalue()
+
+
+def _image_format(content: bytes) -> str:
+    for prefix, name in _IMAGE_FORMATS.items():
+        if content.startswith(prefix):
+            return name
+    raise ValueError(f"panorama begins with {content[:4]!r}; it must be a JPEG, PNG or WebP file")
+
+
+def _check_finite(name: str, value: object) -> None:
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValueError(f"{name} is {value}; it must be a finite number")
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            _check_finite(f"{name}[{key!r}]", item)
+    elif isinstance(value, Sequence) and not isinstance(value, str | bytes):
+        for index, item in enumerate(value):
+            _check_finite(f"{name}[{index}]", item)
+
+
+def _text(value: object) -> str:
+    if isinstance(value, Mapping) or (isinstance(value, Sequence) and not isinstance(value, str)):
+        return json.dumps(value, default=lambda item: dict(item) if isinstance(item, Mapping) else list(item))
+    return str(value)

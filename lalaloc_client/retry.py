@@ -1,4 +1,4 @@
-"""Whether and when a request is sent again. Clock and chance are passed in."""
+"""Decision whether and when to repeat a request; clock and randomness are arguments."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ _CONFLICT = 409
 
 
 class Safety(Enum):
-    """What sending a request twice may do.
+    """Effect of sending a request twice.
 
     Attributes:
-        ANY: nothing that once does not: it may be sent again after any failure.
-        UNSENT: something else: it is sent again only when the first one surely was not carried out.
+        ANY: the same as sending it once: repeat it after any failure.
+        UNSENT: another effect: repeat it only if the first attempt was certainly not carried out.
     """
 
     ANY = "any"
@@ -26,13 +26,13 @@ class Safety(Enum):
 
 @dataclass(frozen=True, kw_only=True)
 class RetryPolicy:
-    """How patient a client is.
+    """Number of attempts and waits between them.
 
     Attributes:
-        attempts: how often a request is sent at most, the first time included.
-        total_s: no wait begins that would end later than this after the first attempt began.
-        first_s: longest wait before the second attempt; doubles with each one.
-        longest_s: longest wait, unless the service asks for more with Retry-After.
+        attempts: maximum number of attempts, including the first.
+        total_s: time after the start of the first attempt by which every wait must end.
+        first_s: maximum wait before the second attempt; doubles with each attempt.
+        longest_s: maximum wait, unless the service asks for more with Retry-After.
     """
 
     attempts: int = 6
@@ -42,53 +42,55 @@ class RetryPolicy:
 
     def __post_init__(self) -> None:
         if self.attempts < 1:
-            raise ValueError(f"attempts is {self.attempts}, at least 1 is needed")
+            raise ValueError(f"attempts is {self.attempts}; it must be at least 1")
         for name in ("total_s", "first_s", "longest_s"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0.0):
-                raise ValueError(f"{name} is {value}, it must be a finite number of seconds and not negative")
+                raise ValueError(f"{name} is {value}; it must be a finite, non-negative number of seconds")
 
-    def wait_s(self, attempt: int, spent_s: float, asked_s: float | None, chance: float) -> float | None:
-        """How long to wait after an attempt that failed; None when it was the last.
+    def wait_s(self, attempt: int, spent_s: float, after_s: float | None, chance: float) -> float | None:
+        """Return the wait after a failed attempt, None after the last one.
 
         Args:
-            attempt: number of the attempt that failed, from 1.
-            spent_s: time since the first attempt began.
-            asked_s: what the service asked for; never less is waited.
-            chance: 0 to 1, spreads clients that failed together.
+            attempt: number of the failed attempt, from 1.
+            spent_s: time since the start of the first attempt.
+            after_s: wait that the service asks for with Retry-After; the minimum.
+            chance: random number from 0 to 1, which spreads clients that failed together.
         """
         if attempt >= self.attempts:
             return None
         backoff_s = min(self.first_s * 2.0 ** (attempt - 1), self.longest_s)
-        wait_s = backoff_s * (0.5 + 0.5 * chance) if asked_s is None else asked_s + self.first_s * chance
+        wait_s = backoff_s * (0.5 + 0.5 * chance) if after_s is None else after_s + self.first_s * chance
         return wait_s if spent_s + wait_s <= self.total_s else None
 
 
-def may_retry(safety: Safety, status: int | None, *, sent: bool, asked: bool = False) -> bool:
-    """Whether a request may be sent again.
+def may_retry(safety: Safety, status: int | None, *, sent: bool, has_retry_after: bool = False) -> bool:
+    """Return whether repeating a failed request is safe and can help.
 
     Args:
-        status: of the answer; None when there was none.
-        sent: whether any of the request may have reached the service.
-        asked: whether the answer has a Retry-After.
+        safety: effect of sending the request twice.
+        status: status code of the answer, None without an answer.
+        sent: a part of the request may have reached the service.
+        has_retry_after: the answer has a Retry-After header.
     """
     if status is None:
         return safety is Safety.ANY or not sent
-    # A conflict that passes: the same request, whose answer was lost, is still in work.
-    return status in _TRY_LATER or (status == _CONFLICT and asked)
+    # A conflict with Retry-After passes: the service still works on an earlier attempt of the same request.
+    return status in _TRY_LATER or (status == _CONFLICT and has_retry_after)
 
 
 def retry_after_s(value: str | None, date: str | None, now: datetime) -> float | None:
-    """Seconds that a Retry-After asks for: a number of them, or a date of HTTP.
+    """Return the seconds that a Retry-After header asks for, None if it cannot be read.
 
     Args:
-        date: the answer's Date; a date is counted from there, so that clocks need not agree.
-        now: counted from where there is no Date.
+        value: the header: a number of seconds or an HTTP date.
+        date: the answer's Date header, from which a date counts, so that the clocks need not agree.
+        now: start of the wait if there is no Date header.
     """
     if value is None:
         return None
     if value.strip().isdecimal():
-        # More digits than any wait has would not fit a float.
+        # The limit of nine digits keeps the number within the range of a float.
         return float(value.strip()[:9])
     until = _http_date(value)
     if until is None:

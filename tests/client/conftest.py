@@ -1,8 +1,9 @@
-"""Fixtures of the client's tests: both clients behind one face, the production app, and a server that fails."""
+"""Fixtures of the client's tests: both clients with the same interface, the production app, and a failing server."""
 
 from __future__ import annotations
 
 import asyncio
+import inspect
 import json
 import threading
 from collections.abc import Callable, Iterator
@@ -15,8 +16,6 @@ from typing import Any
 import pytest
 
 from lalaloc_client import AsyncClient, Client
-
-# The app's fixtures serve here too.
 from tests.service.conftest import _no_settings_from_outside, database_of, panorama, postgres, start_app
 
 __all__ = ["_no_settings_from_outside", "database_of", "panorama", "postgres", "start_app"]
@@ -26,7 +25,7 @@ MakeClient = Callable[..., AbstractContextManager[Any]]
 
 @dataclass(frozen=True)
 class Planned:
-    """One answer of the failing server; status None: it hangs up without one."""
+    """One answer of the failing server; status None: it closes the connection without an answer."""
 
     status: int | None
     body: Any = None
@@ -34,34 +33,34 @@ class Planned:
 
 
 @dataclass(frozen=True)
-class Seen:
-    """One request that it got."""
+class ReceivedRequest:
+    """One request to the failing server."""
 
     method: str
     path: str
     headers: dict[str, str]
     body: bytes
-    at_s: float
+    received_s: float
 
 
 class FailingServer:
-    """Answers over real HTTP what was planned, in order, and remembers what it was asked."""
+    """HTTP server that sends the planned answers in order and records the requests."""
 
     def __init__(self, url: str) -> None:
         self.url = url
         self.plan: list[Planned] = []
-        self.seen: list[Seen] = []
+        self.requests: list[ReceivedRequest] = []
 
 
 @pytest.fixture
 def failing() -> Iterator[FailingServer]:
-    """A server on a free port; it hangs up on requests that nothing is planned for."""
+    """Return a server on a free port; without a planned answer it closes the connection."""
 
     class Handler(BaseHTTPRequestHandler):
         def _handle(self) -> None:
             body = self.rfile.read(int(self.headers.get("content-length", 0)))
             headers = {name.lower(): value for name, value in self.headers.items()}
-            server.seen.append(Seen(self.command, self.path, headers, body, monotonic()))
+            server.requests.append(ReceivedRequest(self.command, self.path, headers, body, monotonic()))
             planned = server.plan.pop(0) if server.plan else Planned(None)
             self.close_connection = planned.status is None
             if planned.status is None:
@@ -88,51 +87,33 @@ def failing() -> Iterator[FailingServer]:
             thread.join(10.0)
 
 
-class _Blocking:
-    """An `AsyncClient` with the face of a `Client`, so that each test runs with both."""
+class _BlockingAdapter:
+    """An `AsyncClient` with the interface of a `Client`, so that each test runs with both."""
 
     def __init__(self, runner: asyncio.Runner, client: AsyncClient) -> None:
         self._runner = runner
         self._client = client
 
-    def floorplans(self, *arguments: Any, **options: Any) -> list[Any]:
-        async def collect() -> list[Any]:
-            return [summary async for summary in self._client.floorplans(*arguments, **options)]
-
-        return self._runner.run(collect())
-
-    def venues(self, *arguments: Any, **options: Any) -> list[Any]:
-        async def collect() -> list[Any]:
-            return [venue async for venue in self._client.venues(*arguments, **options)]
-
-        return self._runner.run(collect())
-
-    def venue_plans(self, *arguments: Any, **options: Any) -> list[Any]:
-        async def collect() -> list[Any]:
-            return [plan async for plan in self._client.venue_plans(*arguments, **options)]
-
-        return self._runner.run(collect())
-
-    def events(self, *arguments: Any, **options: Any) -> list[Any]:
-        async def collect() -> list[Any]:
-            return [event async for event in self._client.events(*arguments, **options)]
-
-        return self._runner.run(collect())
-
     def __getattr__(self, name: str) -> Callable[..., Any]:
         method = getattr(self._client, name)
-        return lambda *arguments, **options: self._runner.run(method(*arguments, **options))
+
+        async def call(*args: Any, **kwargs: Any) -> Any:
+            if inspect.isasyncgenfunction(method):
+                return [item async for item in method(*args, **kwargs)]
+            return await method(*args, **kwargs)
+
+        return lambda *args, **kwargs: self._runner.run(call(*args, **kwargs))
 
 
 @contextmanager
-def _blocking(*arguments: Any, **options: Any) -> Iterator[_Blocking]:
+def _blocking(*arguments: Any, **options: Any) -> Iterator[_BlockingAdapter]:
     with asyncio.Runner() as runner:
         client = AsyncClient(*arguments, **options)
-        yield _Blocking(runner, client)
+        yield _BlockingAdapter(runner, client)
         runner.run(client.close())
 
 
 @pytest.fixture(params=["sync", "async"])
 def make_client(request: pytest.FixtureRequest) -> MakeClient:
-    """Makes a client of either kind."""
+    """Return a function that creates a client of either kind."""
     return Client if request.param == "sync" else _blocking

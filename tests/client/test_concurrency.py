@@ -1,4 +1,4 @@
-"""Queries that are sent at once wait in the client for as many as the service takes, and all are answered."""
+"""Concurrent queries wait in the client for the service's limit, and all are answered."""
 
 from __future__ import annotations
 
@@ -12,158 +12,152 @@ import httpx
 import pytest
 
 from lalaloc_client import AsyncClient, Client, RetryPolicy
-from lalaloc_client.async_concurrency import AsyncConcurrencyLimit
-from lalaloc_client.concurrency import ConcurrencyLimit
+from lalaloc_client.asynchronous.concurrency import AsyncConcurrencyLimit
+from lalaloc_client.blocking.concurrency import ConcurrencyLimit
 from tests.client.conftest import FailingServer, Planned
 from tests.client.test_retries import LOCALISATION
 from tests.service.conftest import FLAT, StartApp, upload
 
 COUNT = 14
-# Four queries, of which three are for one client, and nowhere to wait.
+# Four concurrent queries, three of them per client, and no queue.
 NARROW = {"max_queries": 4, "max_waiting_queries": 0}
 ONCE = RetryPolicy(attempts=1)
 
 
 @pytest.fixture(scope="module")
 def narrow(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    """A service that takes few queries at a time."""
+    """Return a service with a low limit of concurrent queries."""
     with start_app(tmp_path_factory.mktemp("data"), **NARROW) as started:
         yield started
 
 
 @pytest.fixture(scope="module")
 def plan_id(narrow: httpx.Client) -> str:
-    """A plan to ask about."""
+    """Return the id of a stored plan."""
     return upload(narrow, FLAT)
 
 
-def fourteen_on_threads(client: Client, plan_id: str, panorama: bytes) -> list[Any]:
+def query_on_threads(client: Client, plan_id: str, panorama: bytes) -> list[Any]:
     with ThreadPoolExecutor(COUNT) as threads:
         return list(threads.map(lambda _: client.localise(plan_id, panorama, refine="none"), range(COUNT)))
 
 
-def rejected(service: httpx.Client) -> float:
+def count_rejections(service: httpx.Client) -> float:
     lines = service.get("/metrics").text.splitlines()
-    wanted = 'lalaloc_rejections_total{reason="overloaded"} '
-    return next(float(line.removeprefix(wanted)) for line in lines if line.startswith(wanted))
+    prefix = 'lalaloc_rejections_total{reason="overloaded"} '
+    return next(float(line.removeprefix(prefix)) for line in lines if line.startswith(prefix))
 
 
-def test_what_one_client_sends_at_once_is_answered_and_none_of_it_refused(
-    narrow: httpx.Client, plan_id: str, panorama: bytes
-) -> None:
-    before = rejected(narrow)
-    # Without a second attempt: what is not refused needs none.
+def test_concurrent_queries_are_not_rejected(narrow: httpx.Client, plan_id: str, panorama: bytes) -> None:
+    before = count_rejections(narrow)
     with Client(str(narrow.base_url), retry=ONCE) as client:
-        answers = fourteen_on_threads(client, plan_id, panorama)
+        answers = query_on_threads(client, plan_id, panorama)
     assert len({answer.position for answer in answers}) == 1
-    assert rejected(narrow) == before
+    assert count_rejections(narrow) == before
 
 
-def test_the_same_with_asyncio(narrow: httpx.Client, plan_id: str, panorama: bytes) -> None:
-    async def ask() -> list[Any]:
+def test_concurrent_queries_with_asyncio_are_not_rejected(narrow: httpx.Client, plan_id: str, panorama: bytes) -> None:
+    async def query() -> list[Any]:
         async with AsyncClient(str(narrow.base_url), retry=ONCE) as client:
             return await asyncio.gather(
                 *(client.localise(plan_id, panorama, refine="none") for _ in range(COUNT)),
             )
 
-    before = rejected(narrow)
-    answers = asyncio.run(ask())
+    before = count_rejections(narrow)
+    answers = asyncio.run(query())
     assert len(answers) == COUNT
-    assert rejected(narrow) == before
+    assert count_rejections(narrow) == before
 
 
-def test_more_than_the_service_takes_are_refused_asked_again_and_answered(
-    narrow: httpx.Client, plan_id: str, panorama: bytes
-) -> None:
-    before = rejected(narrow)
+def test_rejected_queries_are_retried(narrow: httpx.Client, plan_id: str, panorama: bytes) -> None:
+    before = count_rejections(narrow)
     patient = RetryPolicy(attempts=40, total_s=60.0)
     with Client(str(narrow.base_url), retry=patient, max_queries=COUNT) as client:
-        answers = fourteen_on_threads(client, plan_id, panorama)
+        answers = query_on_threads(client, plan_id, panorama)
     assert len(answers) == COUNT
-    assert rejected(narrow) > before
+    assert count_rejections(narrow) > before
 
 
-def test_one_query_at_a_time_asks_for_no_limits(failing: FailingServer) -> None:
+def test_sequential_queries_do_not_fetch_limits(failing: FailingServer) -> None:
     failing.plan = [Planned(200, LOCALISATION)] * 3
     with Client(failing.url, retry=ONCE) as client:
         for _ in range(3):
             client.localise("p", b"picture")
-    assert {one.path for one in failing.seen} == {"/localise"}
+    assert {request.path for request in failing.requests} == {"/localise"}
 
 
 @pytest.mark.parametrize(
-    ("told", "at_a_time"),
+    ("limits", "expected"),
     [
         (Planned(200, {"max_queries": 8, "max_queries_per_tenant": 6}), 6),
         (Planned(200, {"max_queries": 8, "max_queries_per_tenant": 1}), 1),
-        # Of a service that does not say, and with a key that may not ask.
+        # The service does not state a limit; the key lacks the scope to read it.
         (Planned(200, {"max_queries": 8}), 3),
         (Planned(403, {"detail": "the key lacks the scope read"}), 3),
     ],
 )
-def test_as_many_are_under_way_as_the_service_says(failing: FailingServer, told: Planned, at_a_time: int) -> None:
-    failing.plan = [told]
-    goes_on = threading.Event()
+def test_concurrency_follows_the_limit_of_the_service(failing: FailingServer, limits: Planned, expected: int) -> None:
+    failing.plan = [limits]
+    released = threading.Event()
     with Client(failing.url, retry=ONCE) as client, ThreadPoolExecutor(COUNT) as threads:
 
         def hold() -> None:
-            nonlocal most, under_way
+            nonlocal highest, running
             with client._concurrency.hold():
                 with lock:
-                    under_way += 1
-                    most = max(most, under_way)
-                    if under_way == at_a_time:
+                    running += 1
+                    highest = max(highest, running)
+                    if running == expected:
                         reached.set()
-                goes_on.wait(30.0)
+                released.wait(30.0)
                 with lock:
-                    under_way -= 1
+                    running -= 1
 
-        lock, reached, under_way, most = threading.Lock(), threading.Event(), 0, 0
-        held = [threads.submit(hold) for _ in range(COUNT)]
+        lock, reached, running, highest = threading.Lock(), threading.Event(), 0, 0
+        futures = [threads.submit(hold) for _ in range(COUNT)]
         assert reached.wait(30.0)
-        goes_on.set()
-        for one in held:
-            one.result()
-    assert most == at_a_time
-    # Only once, however many wait.
-    assert [one.path for one in failing.seen] == ["/limits"]
+        released.set()
+        for future in futures:
+            future.result()
+    assert highest == expected
+    assert [request.path for request in failing.requests] == ["/limits"]
 
 
-def test_who_cannot_ask_fails_and_the_next_asks_again() -> None:
-    answers: list[int | Exception] = [OSError("away"), 2]
+def test_failed_fetch_of_the_limit_is_repeated() -> None:
+    answers: list[int | Exception] = [OSError("unreachable"), 2]
 
-    def ask() -> int:
+    def fetch() -> int:
         answer = answers.pop(0)
         if isinstance(answer, Exception):
             raise answer
         return answer
 
-    limit = ConcurrencyLimit(None, ask)
+    limit = ConcurrencyLimit(None, fetch)
     with limit.hold():
-        with pytest.raises(OSError, match="away"), limit.hold():
+        with pytest.raises(OSError, match="unreachable"), limit.hold():
             pass
         with limit.hold():
             pass
     assert not answers
 
 
-def test_a_task_that_is_cancelled_while_it_waits_takes_no_turn() -> None:
+def test_cancelled_task_takes_no_slot() -> None:
     async def scenario() -> None:
-        async def two() -> int:
+        async def fetch() -> int:
             return 2
 
-        limit, goes_on, held = AsyncConcurrencyLimit(None, two), asyncio.Event(), list[int]()
+        limit, released, held = AsyncConcurrencyLimit(None, fetch), asyncio.Event(), list[int]()
 
         async def hold(number: int) -> None:
             async with limit.hold():
                 held.append(number)
-                await goes_on.wait()
+                await released.wait()
 
         tasks = [asyncio.create_task(hold(number)) for number in range(4)]
         while len(held) < 2:
             await asyncio.sleep(0)
         tasks[2].cancel()
-        goes_on.set()
+        released.set()
         await asyncio.gather(*tasks, return_exceptions=True)
         assert held == [0, 1, 3]
 
@@ -171,6 +165,6 @@ def test_a_task_that_is_cancelled_while_it_waits_takes_no_turn() -> None:
 
 
 @pytest.mark.parametrize("kind", [Client, AsyncClient])
-def test_fewer_than_one_at_a_time_is_refused(kind: type[Client] | type[AsyncClient]) -> None:
-    with pytest.raises(ValueError, match="max_queries is 0, at least 1"):
+def test_limit_below_one_is_rejected(kind: type[Client] | type[AsyncClient]) -> None:
+    with pytest.raises(ValueError, match="max_queries is 0; it must be at least 1"):
         kind("http://127.0.0.1:1", max_queries=0)

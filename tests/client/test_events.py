@@ -1,4 +1,4 @@
-"""Following a plan over streams that end, break off, or are none."""
+"""Progress events of a plan over streams that end, break off, or are something else."""
 
 from __future__ import annotations
 
@@ -14,34 +14,30 @@ _HALF, _DONE = {"status": "preparing", "progress": 0.5}, {"status": "ready", "pr
 
 
 def _stream(*events: dict[str, Any], missing_bytes: int = 0) -> Planned:
-    """A stream of events; with bytes missing it breaks off."""
+    """Return a stream of events; with missing bytes it breaks off."""
     text = "retry: 1\n\n" + "".join(f"event: x\ndata: {json.dumps(event)}\n\n: heartbeat\n\n" for event in events)
     size = {"Content-Length": str(len(text) + missing_bytes)}
     return Planned(200, text.encode(), {"Content-Type": "text/event-stream; charset=utf-8", **size})
 
 
-def _followed(failing: FailingServer, make_client: MakeClient, *planned: Planned) -> list[PlanEvent]:
+def _events(failing: FailingServer, make_client: MakeClient, *planned: Planned) -> list[PlanEvent]:
     failing.plan = list(planned)
     with make_client(failing.url, retry=RetryPolicy(attempts=2, first_s=0.0)) as client:
         return list(client.events("p"))
 
 
 @pytest.mark.parametrize("missing_bytes", [0, 10], ids=["ends", "breaks off"])
-def test_a_stream_that_ends_early_is_asked_for_anew(
-    failing: FailingServer, make_client: MakeClient, missing_bytes: int
-) -> None:
+def test_stream_that_ends_early_is_resumed(failing: FailingServer, make_client: MakeClient, missing_bytes: int) -> None:
     first = _stream(_HALF, missing_bytes=missing_bytes)
-    # A server that closes the connection half-way.
     first.headers["Connection"] = "close"
-    found = _followed(failing, make_client, first, Planned(503, {}, {"Retry-After": "0"}), _stream(_HALF, _DONE))
-    # What was told once is not told again.
-    assert found == [PlanEvent("preparing", 0.5), PlanEvent("ready", 1.0)]
-    assert [seen.path for seen in failing.seen] == ["/floorplans/p/events"] * 3
+    events = _events(failing, make_client, first, Planned(503, {}, {"Retry-After": "0"}), _stream(_HALF, _DONE))
+    assert events == [PlanEvent("preparing", 0.5), PlanEvent("ready", 1.0)]
+    assert [request.path for request in failing.requests] == ["/floorplans/p/events"] * 3
 
 
-def test_a_plan_that_goes_between_two_streams_is_deleted(failing: FailingServer, make_client: MakeClient) -> None:
-    found = _followed(failing, make_client, _stream(_HALF), Planned(404, {}))
-    assert found == [PlanEvent("preparing", 0.5), PlanEvent("deleted")]
+def test_plan_deleted_between_streams(failing: FailingServer, make_client: MakeClient) -> None:
+    events = _events(failing, make_client, _stream(_HALF), Planned(404, {}))
+    assert events == [PlanEvent("preparing", 0.5), PlanEvent("deleted")]
 
 
 @pytest.mark.parametrize(
@@ -49,8 +45,8 @@ def test_a_plan_that_goes_between_two_streams_is_deleted(failing: FailingServer,
     [Planned(200, b"<html>", {"Content-Type": "text/html"}), _stream({"progress": 0.5})],
     ids=["another page", "an event without status"],
 )
-def test_what_is_no_stream_of_events_is_an_error(
+def test_other_content_than_events_is_an_error(
     failing: FailingServer, make_client: MakeClient, planned: Planned
 ) -> None:
     with pytest.raises(MalformedAnswerError):
-        _followed(failing, make_client, planned)
+        _events(failing, make_client, planned)

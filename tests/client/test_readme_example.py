@@ -1,4 +1,4 @@
-"""The README's example runs, as it stands there, against the production app."""
+"""The README's Python example runs against the production app."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from tests.service.conftest import StartApp
 ROOT = Path(__file__).parents[2]
 
 
-def test_the_example_of_the_readme_runs(
+def test_readme_example_runs(
     start_app: StartApp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
     assert blocks
-    # Its paths are those of the repository.
+    # The example's paths are relative to the repository.
     monkeypatch.chdir(ROOT)
     with start_app(tmp_path) as app:
         address = str(app.base_url).rstrip("/")

@@ -1,4 +1,4 @@
-"""Both clients ask about venues of the production app."""
+"""Both clients with venues of the production app."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ ANCHOR = VenueAnchor(51.7546, -1.2545, altitude_m=61.0, north_deg=12.5)
 
 @pytest.fixture(scope="module")
 def app(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    """One app for all tests here."""
+    """Return an app for all tests of this file."""
     with start_app(tmp_path_factory.mktemp("data")) as started:
         yield started
 
 
 @pytest.fixture
 def service(app: httpx.Client, make_client: MakeClient) -> Iterator[Any]:
-    """A client of that app."""
+    """Return a client of that app."""
     with make_client(str(app.base_url)) as client:
         yield client
 
 
-def test_a_venue_is_made_found_changed_and_deleted(service: Any) -> None:
+def test_venue_is_stored_changed_and_deleted(service: Any) -> None:
     plans = [service.upload_floorplan(FLAT | {"name": f"Flat {number}"}).id for number in range(3)]
     members = [VenuePlan(plan, level) for level, plan in enumerate(plans[:2])]
     made = service.make_venue(members, name="12 Mill Lane", anchor=ANCHOR)
@@ -57,7 +57,7 @@ def test_a_venue_is_made_found_changed_and_deleted(service: Any) -> None:
     assert service.floorplan(plans[0]).status == "ready"
 
 
-def test_a_panorama_is_localised_in_a_venue(service: Any, panorama: bytes) -> None:
+def test_panorama_is_localised_in_a_venue(service: Any, panorama: bytes) -> None:
     plans = [service.upload_floorplan(FLAT).id for _ in range(2)]
     venue = service.make_venue([VenuePlan(plan, 3) for plan in plans])
     answer = service.localise_in_venue(venue.id, panorama, refine="none", top_k=3)
@@ -69,7 +69,7 @@ def test_a_panorama_is_localised_in_a_venue(service: Any, panorama: bytes) -> No
     assert (alone.venue_id, alone.level, alone.plans) == (None, None, None)
 
 
-def test_a_venue_takes_hints(service: Any, panorama: bytes) -> None:
+def test_venue_query_takes_options(service: Any, panorama: bytes) -> None:
     plans = [service.upload_floorplan(FLAT).id for _ in range(2)]
     venue = service.make_venue([VenuePlan(plan, level) for level, plan in enumerate(plans)])
     answer = service.localise_in_venue(venue.id, panorama, level=1, rooms=["kitchen"], strict=True, refine="none")
@@ -78,7 +78,7 @@ def test_a_venue_takes_hints(service: Any, panorama: bytes) -> None:
         service.localise_in_venue(venue.id, panorama, level=5)
 
 
-def test_ar_clients_are_told_where_on_earth(service: Any, panorama: bytes) -> None:
+def test_geopose_finds_the_place_on_earth(service: Any, panorama: bytes) -> None:
     anchor = {"latitude": 51.7546, "longitude": -1.2545}
     plan = service.upload_floorplan(FLAT | {"anchor": anchor, "north_deg": 0}).id
     answer = service.geopose(panorama, floorplan_id=plan)
@@ -89,11 +89,11 @@ def test_ar_clients_are_told_where_on_earth(service: Any, panorama: bytes) -> No
     service.delete_floorplan(plan)
     with pytest.raises(NotFoundError, match="no floor plan with an anchor lies within 100 m"):
         service.geopose(panorama, latitude=-51.0, longitude=0.0)
-    with pytest.raises(ValueError, match="they belong together"):
+    with pytest.raises(ValueError, match="give both or neither"):
         service.geopose(panorama, latitude=1.0)
 
 
-def test_what_is_no_id_never_leaves_the_client(service: Any) -> None:
+def test_malformed_venue_id_is_rejected(service: Any) -> None:
     with pytest.raises(ValueError, match=r"venue_id is '\.\./floorplans'"):
         service.delete_venue("../floorplans")
     with pytest.raises(InvalidError, match="changes nothing"):

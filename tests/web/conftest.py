@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -46,6 +47,8 @@ class Visit:
         """The start page, when the example's photographs are there and one is shown."""
         page = self.open()
         expect(page.locator("#photo-strip li")).to_have_count(4)
+        # The viewer sets its shape when it has loaded the photograph.
+        expect(page.locator(".stage")).to_have_attribute("data-shape", re.compile("around|whole"))
         return page
 
     def find(self) -> Page:

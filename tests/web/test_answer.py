@@ -8,9 +8,9 @@ from pathlib import Path
 import httpx
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Browser, Page, Route, expect
 
-from tests.service.conftest import FLAT
+from tests.service.conftest import FLAT, upload
 from tests.web.conftest import EXAMPLES, Visit, visit
 
 
@@ -81,6 +81,7 @@ def test_dragging_the_marker_moves_the_layout_and_candidates_lead_back(desktop: 
     page = desktop.open_example()
     desktop.find()
     # Somewhere inside the living room first, whatever the answer was.
+    expect(page.locator("#fit-state")).to_contain_text("Layout as seen from")
     begin, told = _marker(page), page.locator("#fit-state").inner_text()
     grip = page.locator("#marker .dot").bounding_box()
     assert grip is not None
@@ -99,29 +100,80 @@ def test_dragging_the_marker_moves_the_layout_and_candidates_lead_back(desktop: 
     assert _marker(page) != pytest.approx(begin)
 
 
-def test_everything_up_to_an_answer_works_with_the_keyboard_alone(desktop: Visit) -> None:
+def _expect_marker(page: Page, x_m: float, y_m: float) -> None:
+    """Wait until the marker is at a place."""
+    page.wait_for_function(
+        """([x, y]) => { const found = document.querySelector('#marker').getAttribute('transform').match(/-?[\\d.]+/g);
+        return Math.hypot(found[0] - x, -found[1] - y) < 1e-3; }""",
+        arg=[x_m, y_m],
+    )
+
+
+def test_keyboard_alone_leads_to_an_answer(desktop: Visit) -> None:
     page = desktop.open_example()
     page.locator("#heading").focus()
     for _ in range(3):
         page.keyboard.press("Tab")
-    assert page.evaluate("document.activeElement.id") == "find"
+    expect(page.locator("#find")).to_be_focused()
     page.keyboard.press("Enter")
     expect(page.locator("#answer")).to_be_visible()
+    expect(page.locator("#fit-state")).to_contain_text("Layout as seen from")
     page.locator("#marker").focus()
     x, y = _marker(page)
     page.keyboard.press("ArrowRight")
+    _expect_marker(page, x + 0.05, y)
     page.keyboard.press("Shift+ArrowUp")
-    assert _marker(page) == pytest.approx((x + 0.05, y + 0.5))
+    _expect_marker(page, x + 0.05, y + 0.5)
     page.locator("#stage").focus()
     before = page.locator("#marker .cone").get_attribute("d")
     page.keyboard.press("ArrowRight")
     expect(page.locator("#marker .cone")).not_to_have_attribute("d", before or "")
     page.locator("#compass").focus()
-    for key in ("Home", "PageUp", "ArrowRight"):
+    for key, heading in (("Home", "0"), ("PageUp", "10"), ("ArrowRight", "11"), ("Delete", "")):
         page.keyboard.press(key)
-    expect(page.locator("#heading")).to_have_value("11")
-    page.keyboard.press("Delete")
-    expect(page.locator("#heading")).to_have_value("")
+        expect(page.locator("#heading")).to_have_value(heading)
+
+
+def test_late_layout_keeps_the_moved_marker(desktop: Visit) -> None:
+    page, held = desktop.page, list[Route]()
+    page.route("**/layout*", lambda route: held.append(route))
+    desktop.open_example()
+    desktop.find()
+    page.locator("#marker").focus()
+    x, y = _marker(page)
+    page.keyboard.press("ArrowRight")
+    _expect_marker(page, x + 0.05, y)
+    for route in held:
+        route.continue_()
+    expect(page.locator("#fit-state")).to_contain_text("Layout as seen from")
+    expect(page.locator("#marker")).to_be_focused()
+    _expect_marker(page, x + 0.05, y)
+
+
+def test_choosing_another_plan_aborts_the_query(desktop: Visit) -> None:
+    for name in ("Chosen first", "Chosen second"):
+        upload(desktop.client, FLAT | {"name": name})
+    page = desktop.open()
+    page.locator("#photo-file").set_input_files(EXAMPLES / "kitchen.jpg")
+    page.get_by_text("Plans", exact=True).click()
+    page.get_by_role("button", name="Chosen first").first.click()
+    expect(page.locator("#plan-name")).to_have_text("Chosen first")
+    held = list[Route]()
+    page.route("**/localise", lambda route: held.append(route))
+    with page.expect_request("**/localise"):
+        page.locator("#find").click()
+    page.get_by_role("button", name="Chosen second").first.click()
+    expect(page.locator("#plan-name")).to_have_text("Chosen second")
+    expect(page.locator("#find")).not_to_have_attribute("aria-busy", "true")
+    (route,) = held
+    # Without an abort this answer would switch the page back to the first plan.
+    route.continue_()
+    page.wait_for_load_state("networkidle")
+    expect(page.locator("#plan-name")).to_have_text("Chosen second")
+    expect(page.locator("#answer")).to_be_hidden()
+    page.unroute("**/localise")
+    desktop.find()
+    expect(page.locator("#plan-name")).to_have_text("Chosen second")
 
 
 def test_an_error_is_told_at_its_field_and_the_previous_answer_goes_away(desktop: Visit) -> None:

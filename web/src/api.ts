@@ -1,6 +1,6 @@
 /** The service's API: every request of the pages goes through here, with the key where there is one. */
 
-import type { Answer, Fault, Layout, Plan, PlanDocument, PlanSummary, Venue, VenuePlan } from "./types";
+import type { Answer, Fault, Layout, Plan, PlanDocument, PlanList, Problem, Venue, VenueList, VenuePlanDocument, VenuePlanList } from "./types";
 
 const KEY = "lalaloc-key";
 
@@ -56,7 +56,7 @@ export async function request(path: string, options: RequestInit = {}): Promise<
 async function refusalOf(response: Response): Promise<Refusal> {
   const after = Number(response.headers.get("retry-after"));
   try {
-    const problem = await response.json();
+    const problem: Problem = await response.json();
     const slug = String(problem.type ?? "").split(":").pop() ?? "";
     return new Refusal(response.status, problem.title, problem.detail, problem.errors ?? [], slug, after || null);
   } catch {
@@ -83,7 +83,7 @@ function form(fields: Record<string, string>, name: string, file: File): FormDat
 }
 
 export const api = {
-  async plans(name = "", cursor: string | null = null): Promise<{ floorplans: PlanSummary[]; next_cursor: string | null }> {
+  async plans(name = "", cursor: string | null = null): Promise<PlanList> {
     const query = new URLSearchParams({ limit: "50" });
     if (name) query.set("name", name);
     if (cursor) query.set("cursor", cursor);
@@ -136,13 +136,13 @@ export const api = {
     return response.blob();
   },
 
-  async venues(name = ""): Promise<{ venues: Venue[]; next_cursor: string | null }> {
+  async venues(name = ""): Promise<VenueList> {
     const query = new URLSearchParams({ limit: "50" });
     if (name) query.set("name", name);
     return json(`/venues?${query}`);
   },
 
-  async createVenue(name: string, plans: { floorplan_id: string; level: number }[]): Promise<Venue> {
+  async createVenue(name: string, plans: VenuePlanDocument[]): Promise<Venue> {
     const headers = { "Content-Type": "application/json" };
     return json("/venues", { method: "POST", headers, body: JSON.stringify({ name, plans }) });
   },
@@ -152,7 +152,7 @@ export const api = {
   },
 
   /** The plans of a venue from the lowest level up, as many as fit on a page. */
-  async venuePlans(id: string): Promise<{ plans: VenuePlan[]; next_cursor: string | null }> {
+  async venuePlans(id: string): Promise<VenuePlanList> {
     return json(`/venues/${encodeURIComponent(id)}/plans?limit=500`);
   },
 

@@ -35,7 +35,7 @@ class Page {
   private readonly panorama = new PanoramaView(byId("photo-view"), (yaw, fov) => this.marker.look(yaw, fov));
   private readonly venues = new Venues({ chosen: (venue) => this.onVenue(venue), look: (planId) => void this.plans.choose(planId) });
   private readonly plans = new Plans({
-    chosen: (plan) => this.onPlan(plan), begun: () => { this.isBegun = true; }, picked: () => this.venues.leave(),
+    chosen: (plan) => this.onPlan(plan), begun: () => this.onBegun(), picked: () => this.venues.leave(),
     listed: (plans) => this.venues.offer(plans), searched: (name) => void this.venues.load(name),
   });
   private readonly photos = new Photos((photo, isAnother) => this.onPhoto(photo, isAnother));
@@ -56,6 +56,8 @@ class Page {
   private answer: Answer | null = null;
   /** Which of its candidates is looked at. */
   private looked = 0;
+  /** The marker's pose after the user moved it away from the candidate. */
+  private moved: Pose | null = null;
   private asking: AbortController | null = null;
   /** Whether somebody has begun with a plan of their own, which the example must not take the place of. */
   private isBegun = false;
@@ -84,10 +86,23 @@ class Page {
     } else await this.plans.choose(stored[0]!.id);
   }
 
+  /** The user chose a plan, venue or answer: a running query would replace it. */
+  private onBegun(): void {
+    this.isBegun = true;
+    this.cancelQuery();
+  }
+
+  private cancelQuery(): void {
+    this.asking?.abort();
+    this.asking = null;
+    this.find.removeAttribute("aria-busy");
+  }
+
   /** Show the answer that the address names, if it names one. */
   private async open(): Promise<boolean> {
     const id = new URLSearchParams(location.hash.slice(1)).get("answer");
     if (id === null) return false;
+    this.cancelQuery();
     clearError(byId("plan-error"));
     try {
       const answer = await api.answer(id);
@@ -111,7 +126,8 @@ class Page {
   }
 
   private onVenue(venue: Venue | null): void {
-    if (venue !== null) this.isBegun = true;
+    if (venue === null) this.cancelQuery();
+    else this.onBegun();
     byId("hints").hidden = venue !== null;
     this.photos.forgetHints();
     this.photos.forgetAnswers();
@@ -123,6 +139,7 @@ class Page {
   private onPlan(plan: Plan | null): void {
     const isSame = plan !== null && plan.revision === this.plan?.revision;
     const wasOther = plan === null || (this.plan !== null && this.plan.id !== plan.id);
+    if (plan === null) this.cancelQuery();
     this.plan = plan;
     this.document = plan?.plan ?? null;
     byId("plan-name").textContent = plan?.name ?? "No plan is chosen";
@@ -182,7 +199,7 @@ class Page {
   }
 
   private edit(plan: Plan | null): void {
-    this.isBegun = true;
+    this.onBegun();
     this.plans.stay();
     this.setAnswer(null);
     document.body.classList.add("editing");
@@ -228,6 +245,7 @@ class Page {
     this.answer = answer;
     this.asked = photo;
     this.looked = 0;
+    this.moved = null;
     showAnswer(answer, photo, { look: (index) => this.look(index), save: (one) => this.savePicture(one) });
     this.drawAnswer();
     // The answer to a question about a venue may lie in another of its plans.
@@ -241,6 +259,7 @@ class Page {
     const posterior = isHere ? answer.posterior : null;
     byId("heat-legend").hidden = posterior === null;
     show(this.heat, posterior && drawn && heatMap(posterior, drawn));
+    const hasFocus = this.marker.element.contains(document.activeElement);
     show(this.over);
     const looked = answer?.candidates[this.looked];
     if (answer === null || drawn === null || looked === undefined || looked.floorplan_id !== plan?.id) {
@@ -249,7 +268,9 @@ class Page {
       return;
     }
     show(this.over, isHere && ellipse(answer), rivals(answer, plan.id, this.box, (index) => this.look(index)), this.marker.element);
-    this.look(this.looked);
+    if (hasFocus) this.marker.element.focus({ preventScroll: true });
+    if (this.moved === null) this.look(this.looked);
+    else this.drawLines(this.moved);
   }
 
   /** Move the marker to one of the candidates. */
@@ -257,6 +278,7 @@ class Page {
     const candidate = this.answer?.candidates[index];
     if (candidate === undefined) return;
     this.looked = index;
+    this.moved = null;
     markLooked(index);
     if (candidate.floorplan_id !== this.plan?.id) {
       void this.plans.choose(candidate.floorplan_id);
@@ -270,6 +292,7 @@ class Page {
 
   private onMoved(pose: Pose): void {
     markLooked(null);
+    this.moved = pose;
     this.drawLines(pose);
   }
 
@@ -287,25 +310,28 @@ class Page {
   private async ask(): Promise<void> {
     const photo = this.photos.current;
     if (photo === null) return;
-    this.asking?.abort();
-    const asking = (this.asking = new AbortController());
+    this.cancelQuery();
+    const { signal } = (this.asking = new AbortController());
     photo.answer = null;
     this.setAnswer(null);
     clearError(byId("photo-error"), this.fields);
     this.find.setAttribute("aria-busy", "true");
     try {
       const venue = this.venues.current;
-      photo.fields = fieldsOf(venue, venue === null ? this.plan ?? (await this.storeExample()) : null, photo);
+      photo.fields = fieldsOf(venue, venue === null ? this.plan ?? (await this.storeExample(signal)) : null, photo);
+      if (signal.aborted) return;
       const asked = venue === null ? { ...photo.fields, include: "posterior" } : photo.fields;
-      const answer = await api.localise(asked, photo.file, asking.signal);
+      const answer = await api.localise(asked, photo.file, signal);
       if (answer.floorplan_revision !== this.plan?.revision) await this.plans.choose(answer.floorplan_id, answer.floorplan_revision);
+      // Another plan may have been chosen in the meantime.
+      if (signal.aborted) return;
       photo.answer = answer;
       if (this.photos.current === photo) this.setAnswer(answer, photo);
       this.photos.drawStrip();
     } catch (error) {
-      if (!asking.signal.aborted) showError(byId("photo-error"), error, this.fields);
+      if (!signal.aborted) showError(byId("photo-error"), error, this.fields);
     } finally {
-      if (this.asking === asking) this.find.removeAttribute("aria-busy");
+      if (!signal.aborted) this.cancelQuery();
     }
   }
 
@@ -327,10 +353,10 @@ class Page {
     }
   }
 
-  private async storeExample(): Promise<Plan> {
+  private async storeExample(signal: AbortSignal): Promise<Plan> {
     if (this.document === null) throw new Error("Choose or upload a floor plan first.");
     const plan = await api.createPlan(this.document);
-    this.plans.take(plan);
+    if (!signal.aborted) this.plans.take(plan);
     await this.plans.load();
     return plan;
   }

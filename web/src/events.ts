@@ -1,17 +1,12 @@
 /** Server-sent events over fetch: the browser's own EventSource cannot send a key. */
 
 import { request } from "./api";
-
-export interface PlanProgress {
-  status: "preparing" | "ready" | "failed" | "deleted";
-  progress?: number;
-  reason?: string;
-}
+import type { PlanEvent } from "./types";
 
 const ASK_AGAIN_MS = 2000;
 
 /** Tell how far a plan is until it is in a final state or `signal` ends it. */
-export async function followPlan(id: string, tell: (event: PlanProgress) => void, signal: AbortSignal): Promise<void> {
+export async function followPlan(id: string, tell: (event: PlanEvent) => void, signal: AbortSignal): Promise<void> {
   while (!signal.aborted) {
     const response = await request(`/floorplans/${encodeURIComponent(id)}/events`, { signal });
     for await (const event of eventsOf(response)) {
@@ -23,7 +18,7 @@ export async function followPlan(id: string, tell: (event: PlanProgress) => void
   }
 }
 
-async function* eventsOf(response: Response): AsyncGenerator<PlanProgress> {
+async function* eventsOf(response: Response): AsyncGenerator<PlanEvent> {
   if (response.body === null) return;
   const reader = response.body.pipeThrough(new TextDecoderStream()).getReader();
   let text = "";

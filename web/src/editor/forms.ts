@@ -5,7 +5,9 @@ import type { OpeningDocument, OpeningKind, PlanDocument, RoomDocument } from ".
 import * as change from "./changes";
 import type { Selection } from "./handles";
 
-const ROOM_TYPES = ["unknown", "bedroom", "living", "kitchen", "dining", "bathroom", "corridor", "entrance", "closet",
+type RoomType = NonNullable<RoomDocument["type"]>;
+
+const ROOM_TYPES: RoomType[] = ["unknown", "bedroom", "living", "kitchen", "dining", "bathroom", "corridor", "entrance", "closet",
   "storage", "laundry", "garage", "stairs", "balcony", "office", "meeting"];
 const OPENING_KINDS: OpeningKind[] = ["door", "window", "passage"];
 
@@ -41,7 +43,7 @@ function planForm(plan: PlanDocument, { edit }: FormActions): HTMLElement[] {
     h("h3", {}, "The whole plan"),
     text("plan-form-name", "Name", plan.name ?? "", (name) => set({ name })),
     number("plan-form-ceiling", "Ceiling, m", plan.ceiling_height_m, (value) => set({ ceiling_height_m: value })),
-    number("plan-form-camera", "Camera height, m", plan.camera_height_m, (value) => set({ camera_height_m: value })),
+    number("plan-form-camera", "Camera height, m", plan.camera_height_m, (value) => set({ camera_height_m: value ?? undefined })),
     number("plan-form-north", "North, ° clockwise from up", plan.north_deg, (value) => set({ north_deg: value })),
     claims(plan, edit),
     h("p", { class: "hint" }, `${plan.rooms.length} rooms, ${(plan.openings ?? []).length} openings. Click one to change it.`),
@@ -75,7 +77,7 @@ function openingForm(opening: OpeningDocument, index: number, { edit, select }: 
   const set = (values: Partial<OpeningDocument>): void => edit(change.changeOpening(current, index, values));
   return [
     h("h3", {}, "Opening"),
-    choice("opening-form-kind", "Kind", opening.kind, OPENING_KINDS, (kind) => set({ kind: kind as OpeningKind })),
+    choice("opening-form-kind", "Kind", opening.kind, OPENING_KINDS, (kind) => set({ kind })),
     number("opening-form-width", "Width, m", change.widthOf(opening), (value) => { if (value !== null && value > 0) edit(change.widenOpening(current, index, value)); }),
     number("opening-form-sill", "From, m over the floor", opening.sill_m, (value) => set({ sill_m: value })),
     number("opening-form-head", "To, m over the floor", opening.head_m, (value) => set({ head_m: value })),
@@ -100,8 +102,8 @@ function number(id: string, label: string, value: number | null | undefined, set
   return field(id, label, input);
 }
 
-function choice(id: string, label: string, value: string, options: string[], set: (value: string) => void): HTMLElement {
+function choice<T extends string>(id: string, label: string, value: T, options: T[], set: (value: T) => void): HTMLElement {
   const input = h("select", {}, ...options.map((option) => h("option", { selected: option === value }, option)));
-  input.addEventListener("change", () => set(input.value));
+  input.addEventListener("change", () => set(input.value as T));
   return field(id, label, input);
 }

@@ -1,0 +1,1 @@
+"""`AsyncClient`, from which `make client` generates `blocking/`. Begin with `client.py`."""

@@ -1,0 +1,478 @@
+"""Client for asyncio."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
+from contextlib import aclosing
+from dataclasses import replace
+from time import monotonic
+from typing import Any, Literal, Unpack
+
+import httpx
+from httpx_sse import EventSource
+
+from lalaloc_client.answers import GeoPoseAnswer, Localisation, Readiness, SequenceLocalisation
+from lalaloc_client.asynchronous.backend import run_blocking, sleep
+from lalaloc_client.asynchronous.transport import AsyncTransport
+from lalaloc_client.errors import FloorPlanFailedError, MalformedAnswerError, NotFoundError, NotReadyError
+from lalaloc_client.model import (
+    FloorPlan,
+    FloorPlanPage,
+    FloorPlanSummary,
+    Layout,
+    PlanEvent,
+    Venue,
+    VenueAnchor,
+    VenuePage,
+    VenuePlan,
+    VenuePlanPage,
+)
+from lalaloc_client.parsing import parse
+from lalaloc_client.requests import (
+    PICTURE_MEDIA,
+    Covariance,
+    Document,
+    Panorama,
+    Picture,
+    PictureFormat,
+    QueryOptions,
+    Request,
+    SequenceRefine,
+    geopose_request,
+    json_request,
+    plan_request,
+    preview_params,
+    query_request,
+    resource_path,
+    text_values,
+)
+from lalaloc_client.retry import Safety
+
+_FIRST_POLL_S, _MAX_POLL_S = 0.1, 2.0
+# Pause between two streams of events until the service sends its own, as it does at the start of each stream.
+_RECONNECT_S = 3.0
+
+
+class AsyncClient(AsyncTransport):
+    """Client of a LaLaLoc service; close it, or use it in an `async with` block. One event loop uses a client.
+
+    Every method raises `ProblemError` if the service answers with a problem, `ConnectionFailedError` if it does not
+    answer, and `MalformedAnswerError` if the answer has another form; see `lalaloc_client.errors`. Queries wait in the
+    client while the service already computes as many as it allows.
+    """
+
+    async def __aenter__(self) -> AsyncClient:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
+
+    async def ready(self) -> Readiness:
+        """Return whether the service can answer at full quality."""
+        # 503 means "not ready", which is an answer.
+        return parse(Readiness, await self._content(Request("GET", "/readyz", answers=frozenset({200, 503}))))
+
+    # Floor plans
+
+    async def upload_floorplan(
+        self, document: Document, *, options: Mapping[str, object] | None = None, idempotency_key: str | None = None
+    ) -> FloorPlan:
+        """Store a plan; its pose grid may still be computed afterwards, see `wait_until_ready`.
+
+        Args:
+            document: a mapping in the native format, or the bytes or path of a file in any format that the service
+                reads: native JSON, GeoJSON, IMDF, SVG, DXF, IFC, PDF, PNG or JPEG.
+            options: import options for facts that the file does not state, such as `{"metres_per_pixel": 0.01}` or
+                `{"level": "1"}`.
+            idempotency_key: uploads of the same plan with the same key are one upload. Default: a new key, which the
+                retries of this call share.
+        """
+        key = idempotency_key or uuid.uuid4().hex
+        request = await run_blocking(plan_request, "POST", "/floorplans", document, options, idempotency_key=key)
+        return await self._stored(FloorPlan, request)
+
+    async def replace_floorplan(
+        self,
+        floorplan_id: str,
+        document: Document,
+        *,
+        options: Mapping[str, object] | None = None,
+        if_match: str | None = None,
+    ) -> FloorPlan:
+        """Store a new revision of a plan.
+
+        Args:
+            floorplan_id: id of the plan.
+            document: the new plan, as for `upload_floorplan`.
+            options: import options, as for `upload_floorplan`.
+            if_match: `etag` of the revision to replace. If it is not the latest one: ConflictError.
+        """
+        path = resource_path("floorplans", floorplan_id)
+        request = await run_blocking(plan_request, "PUT", path, document, options, if_match=if_match)
+        return await self._stored(FloorPlan, request)
+
+    async def floorplan(self, floorplan_id: str) -> FloorPlan:
+        """Return a stored plan."""
+        return await self._stored(FloorPlan, Request("GET", resource_path("floorplans", floorplan_id)))
+
+    async def floorplans(self, name: str | None = None, *, page_size: int = 100) -> AsyncIterator[FloorPlanSummary]:
+        """Yield the stored plans, newest first, requested page by page.
+
+        Args:
+            name: yield only plans with this text in their name.
+            page_size: number of plans per request.
+        """
+        async for page in self._pages(FloorPlanPage, "/floorplans", name=name, limit=page_size):
+            for plan in page.floorplans:
+                yield plan
+
+    async def delete_floorplan(self, floorplan_id: str) -> None:
+        """Delete a plan and everything that was derived from it."""
+        await self._send(Request("DELETE", resource_path("floorplans", floorplan_id)))
+
+    async def original(self, floorplan_id: str) -> bytes:
+        """Return the file of a plan's current revision exactly as it was uploaded."""
+        return await self._content(Request("GET", f"{resource_path('floorplans', floorplan_id)}/original"))
+
+    async def preview(
+        self,
+        floorplan_id: str,
+        *,
+        x_m: float | None = None,
+        y_m: float | None = None,
+        heading_deg: float | None = None,
+        covariance_m2: Covariance | None = None,
+    ) -> str:
+        """Return a plan as an SVG drawing in which one unit is one metre.
+
+        Args:
+            floorplan_id: id of the plan.
+            x_m: x of a camera to draw.
+            y_m: y of the camera.
+            heading_deg: heading of the camera, as in `Localisation`.
+            covariance_m2: covariance of its position, as in `Localisation`, drawn as the ellipse that contains 95 %.
+        """
+        params = preview_params(x_m, y_m, heading_deg, covariance_m2)
+        path = f"{resource_path('floorplans', floorplan_id)}/preview.svg"
+        return (await self._content(Request("GET", path, params, {"Accept": "image/svg+xml"}))).decode()
+
+    async def export(self, floorplan_id: str, file_format: str) -> bytes:
+        """Return a plan as a file: `native`, `geojson`, `imdf` (for plans with an anchor), `dxf` or `svg`."""
+        path = f"{resource_path('floorplans', floorplan_id)}/export"
+        return await self._content(Request("GET", path, {"format": file_format}))
+
+    async def layout(self, floorplan_id: str, *, revision: str | None = None) -> Layout:
+        """Return the walls and openings of a plan, room by room, from which a camera's view can be drawn.
+
+        Args:
+            floorplan_id: id of the plan.
+            revision: an older revision, while the service keeps it. Default: the current one.
+        """
+        path = f"{resource_path('floorplans', floorplan_id)}/layout"
+        return parse(Layout, await self._content(Request("GET", path, text_values({"revision": revision}))))
+
+    async def mesh(self, floorplan_id: str) -> bytes:
+        """Return floor, walls and ceilings of a plan as binary glTF (GLB), in metres and y-up."""
+        path = f"{resource_path('floorplans', floorplan_id)}/mesh.glb"
+        return await self._content(Request("GET", path, headers={"Accept": "model/gltf-binary"}))
+
+    async def events(self, floorplan_id: str) -> AsyncIterator[PlanEvent]:
+        """Yield the progress of a plan until it is ready, failed or deleted.
+
+        Reconnects if a stream breaks off or if the service ends it.
+        """
+        headers = {"Accept": "text/event-stream", "Cache-Control": "no-store"}
+        request = Request("GET", f"{resource_path('floorplans', floorplan_id)}/events", headers=headers, streamed=True)
+        last, reconnect_s = None, _RECONNECT_S
+        while last is None or not last.final:
+            try:
+                response = await self._send(request)
+            except NotFoundError:
+                if last is None:
+                    raise
+                yield PlanEvent("deleted")
+                return
+            async with aclosing(response):
+                media = response.headers.get("content-type", "").partition(";")[0].strip()
+                if media != "text/event-stream":
+                    raise MalformedAnswerError(f"the answer is of type '{media[:100]}'; expected a stream of events")
+                try:
+                    async for message in EventSource(response).aiter_sse():
+                        if message.retry is not None:
+                            reconnect_s = message.retry / 1000.0
+                        if message.data:
+                            event = parse(PlanEvent, message.data, "event")
+                            if event != last:
+                                yield event
+                            last = event
+                except httpx.TransportError:
+                    # The next stream begins with the current state, so nothing is missed.
+                    pass
+            if last is None or not last.final:
+                await sleep(reconnect_s)
+
+    async def wait_until_ready(self, floorplan_id: str, *, timeout_s: float = 300.0) -> FloorPlan:
+        """Wait until a plan's pose grid is computed and return the plan.
+
+        Raises:
+            FloorPlanFailedError: the service could not prepare the plan.
+            NotReadyError: the plan is still preparing after `timeout_s`.
+        """
+        request = Request("GET", resource_path("floorplans", floorplan_id))
+        begin_s, pause_s = monotonic(), _FIRST_POLL_S
+        while True:
+            left_s = max(timeout_s - (monotonic() - begin_s), 0.0)
+            retry = replace(self._retry, total_s=min(self._retry.total_s, left_s))
+            plan = await self._stored(FloorPlan, request, retry)
+            if plan.status == "ready":
+                return plan
+            if plan.status == "failed":
+                raise FloorPlanFailedError(floorplan_id, plan.reason)
+            spent_s = monotonic() - begin_s
+            if spent_s >= timeout_s:
+                raise NotReadyError(floorplan_id, spent_s, plan.progress)
+            # The last poll is at the timeout.
+            await sleep(min(pause_s, timeout_s - spent_s))
+            pause_s = min(1.5 * pause_s, _MAX_POLL_S)
+
+    # Venues
+
+    async def make_venue(
+        self,
+        plans: Iterable[VenuePlan],
+        *,
+        name: str | None = None,
+        anchor: VenueAnchor | None = None,
+        idempotency_key: str | None = None,
+    ) -> Venue:
+        """Group stored plans in a venue; `localise_in_venue` searches all of them.
+
+        Args:
+            plans: the plans with their levels.
+            name: name of the venue.
+            anchor: location of the plans' common origin on Earth.
+            idempotency_key: as for `upload_floorplan`.
+        """
+        key = idempotency_key or uuid.uuid4().hex
+        document = _venue_document(plans, name, anchor)
+        return await self._stored(Venue, json_request("POST", "/venues", document, idempotency_key=key))
+
+    async def replace_venue(
+        self,
+        venue_id: str,
+        plans: Iterable[VenuePlan],
+        *,
+        name: str | None = None,
+        anchor: VenueAnchor | None = None,
+        if_match: str | None = None,
+    ) -> Venue:
+        """Replace plans, name and anchor of a venue; what is left out is removed."""
+        document = _venue_document(plans, name, anchor)
+        request = json_request("PUT", resource_path("venues", venue_id), document, if_match=if_match)
+        return await self._stored(Venue, request)
+
+    async def change_venue(
+        self,
+        venue_id: str,
+        *,
+        name: str | None = None,
+        anchor: VenueAnchor | Literal["unchanged"] | None = "unchanged",
+        plans: Iterable[VenuePlan] = (),
+        remove: Sequence[str] = (),
+        if_match: str | None = None,
+    ) -> Venue:
+        """Change parts of a venue.
+
+        Args:
+            venue_id: id of the venue.
+            name: new name. Default: keep the name.
+            anchor: new anchor; None removes it. Default: keep it.
+            plans: plans to add, or to give another level or name.
+            remove: ids of plans to remove.
+            if_match: `etag` of the revision to change. If it is not the latest one: ConflictError.
+        """
+        change: dict[str, Any] = {} if name is None else {"name": name}
+        if anchor != "unchanged":
+            change["anchor"] = None if anchor is None else anchor.to_dict()
+        if added := [plan.to_dict() for plan in plans]:
+            change["plans"] = added
+        if remove:
+            change["remove"] = [remove] if isinstance(remove, str) else list(remove)
+        path = resource_path("venues", venue_id)
+        # A plan can be removed once: the service may refuse a repeated request.
+        request = json_request("PATCH", path, change, if_match=if_match, safety=Safety.UNSENT)
+        return await self._stored(Venue, request)
+
+    async def venue(self, venue_id: str) -> Venue:
+        """Return a stored venue."""
+        return await self._stored(Venue, Request("GET", resource_path("venues", venue_id)))
+
+    async def venues(self, name: str | None = None, *, page_size: int = 100) -> AsyncIterator[Venue]:
+        """Yield the stored venues, newest first, requested page by page.
+
+        Args:
+            name: yield only venues with this text in their name.
+            page_size: number of venues per request.
+        """
+        async for page in self._pages(VenuePage, "/venues", name=name, limit=page_size):
+            for venue in page.venues:
+                yield venue
+
+    async def venue_plans(
+        self, venue_id: str, *, level: float | None = None, page_size: int = 100
+    ) -> AsyncIterator[VenuePlan]:
+        """Yield the plans of a venue from the lowest level up, requested page by page.
+
+        Args:
+            venue_id: id of the venue.
+            level: yield only the plans of this level.
+            page_size: number of plans per request.
+        """
+        path = f"{resource_path('venues', venue_id)}/plans"
+        async for page in self._pages(VenuePlanPage, path, level=level, limit=page_size):
+            for plan in page.plans:
+                yield plan
+
+    async def delete_venue(self, venue_id: str) -> None:
+        """Delete a venue; its plans stay stored."""
+        await self._send(Request("DELETE", resource_path("venues", venue_id)))
+
+    # Queries
+
+    async def localise(
+        self, floorplan_id: str, panorama: Panorama, *, posterior: bool = False, **options: Unpack[QueryOptions]
+    ) -> Localisation:
+        """Localise a panorama in a plan.
+
+        Args:
+            floorplan_id: id of the plan.
+            panorama: the full sphere, twice as wide as high: bytes or path of a JPEG, PNG or WebP file, or a PIL image,
+                which is sent as JPEG.
+            posterior: include the probability of every place of the plan in the answer.
+            **options: see `QueryOptions`.
+        """
+        values = {"floorplan_id": floorplan_id, "include": "posterior" if posterior else None}
+        return parse(Localisation, await self._query(query_request, "/localise", [panorama], values, options))
+
+    async def localise_in_venue(
+        self, venue_id: str, panorama: Panorama, *, level: float | None = None, **options: Unpack[QueryOptions]
+    ) -> Localisation:
+        """Localise a panorama in the plans of a venue.
+
+        Args:
+            venue_id: id of the venue.
+            panorama: as for `localise`.
+            level: level of the camera; a hint unless `strict` is set.
+            **options: see `QueryOptions`; `near` is a latitude and longitude, or, if the venue has an anchor, a point
+                in the common frame of its plans.
+        """
+        values = {"venue_id": venue_id, "level": level}
+        return parse(Localisation, await self._query(query_request, "/localise", [panorama], values, options))
+
+    async def localise_sequence(
+        self,
+        floorplan_id: str,
+        panoramas: Sequence[Panorama],
+        *,
+        motions: Sequence[Mapping[str, float] | None] | None = None,
+        headings_deg: Sequence[float | None] | None = None,
+        heading_tolerance_deg: float | None = None,
+        camera_height_m: float | None = None,
+        camera_height_std_m: float | None = None,
+        refine: SequenceRefine | None = None,
+        top_k: int | None = None,
+    ) -> SequenceLocalisation:
+        """Localise several panoramas of one visit jointly.
+
+        Args:
+            floorplan_id: id of the plan.
+            panoramas: panoramas in the order in which they were taken, each as for `localise`.
+            motions: measurements between consecutive panoramas, any of {"distance_m": 2.4, "distance_std_m": 0.1,
+                "turn_deg": 35, "turn_std_deg": 2, "direction_deg": 10, "direction_std_deg": 2}, or None: the turn of
+                the heading, clockwise, and the direction of the motion relative to the first heading.
+            headings_deg: heading of each panorama, None where unknown.
+            heading_tolerance_deg: maximum error of the headings. Default: 0.
+            camera_height_m: camera height, common to all panoramas, as in `QueryOptions`.
+            camera_height_std_m: its standard deviation, as in `QueryOptions`.
+            refine: last stage to run: `none` or `lpo`. Default: the last one that the service has.
+            top_k: number of candidates per panorama. Default: set by the service.
+        """
+        values = {
+            "floorplan_id": floorplan_id,
+            "motions": motions,
+            "headings_deg": headings_deg,
+            "heading_tolerance_deg": heading_tolerance_deg,
+            "camera_height_m": camera_height_m,
+            "camera_height_std_m": camera_height_std_m,
+            "refine": refine,
+            "top_k": top_k,
+        }
+        content = await self._query(query_request, "/localise/sequence", panoramas, values)
+        return parse(SequenceLocalisation, content)
+
+    async def picture(
+        self,
+        floorplan_id: str,
+        panorama: Panorama,
+        picture: Picture = "both",
+        *,
+        picture_format: PictureFormat = "png",
+        **options: Unpack[QueryOptions],
+    ) -> bytes:
+        """Localise a panorama in a plan and return the answer as a picture 1600 pixels wide.
+
+        Args:
+            floorplan_id: id of the plan.
+            panorama: as for `localise`.
+            picture: `plan` with the posterior as a heat map, the answer and the other candidates, `photograph` with
+                the layout drawn over it, or `both`.
+            picture_format: `png` or `svg`.
+            **options: see `QueryOptions`.
+        """
+        if picture_format not in PICTURE_MEDIA:
+            raise ValueError(f"picture_format is {picture_format!r}; it must be one of {', '.join(PICTURE_MEDIA)}")
+        values = {"floorplan_id": floorplan_id}
+        media, params = PICTURE_MEDIA[picture_format], {"picture": picture}
+        return await self._query(query_request, "/localise", [panorama], values, options, params=params, accept=media)
+
+    async def geopose(
+        self,
+        panorama: Panorama,
+        *,
+        floorplan_id: str | None = None,
+        venue_id: str | None = None,
+        latitude: float | None = None,
+        longitude: float | None = None,
+        accuracy_m: float | None = None,
+    ) -> GeoPoseAnswer:
+        """Localise a panorama on Earth by the OSCP GeoPose protocol.
+
+        Args:
+            panorama: as for `localise`.
+            floorplan_id: plan to search.
+            venue_id: venue to search. Default: the plans near the place, which is then required.
+            latitude: approximate latitude in degrees.
+            longitude: approximate longitude in degrees.
+            accuracy_m: maximum error of that place. Default: unknown.
+        """
+        params = text_values({"floorplan_id": floorplan_id, "venue_id": venue_id})
+        content = await self._query(geopose_request, panorama, params, latitude, longitude, accuracy_m)
+        return parse(GeoPoseAnswer, content)
+
+    async def get_answer(self, answer_id: str) -> Localisation:
+        """Return a stored answer by its `answer_id`."""
+        return parse(Localisation, await self._content(Request("GET", resource_path("answers", answer_id))))
+
+    async def forget_answer(self, answer_id: str) -> None:
+        """Delete a stored answer."""
+        await self._send(Request("DELETE", resource_path("answers", answer_id)))
+
+
+def _venue_document(plans: Iterable[VenuePlan], name: str | None, anchor: VenueAnchor | None) -> dict[str, Any]:
+    document: dict[str, Any] = {"plans": [plan.to_dict() for plan in plans]}
+    if name is not None:
+        document["name"] = name
+    if anchor is not None:
+        document["anchor"] = anchor.to_dict()
+    return document

@@ -1,0 +1,165 @@
+"""Connections, retries and decoding of answers."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Callable, Mapping
+from dataclasses import replace
+from datetime import UTC, datetime
+from random import random
+from time import monotonic
+from typing import Any, ParamSpec, TypeVar
+
+import httpx
+
+from lalaloc_client.asynchronous.backend import run_blocking, sleep
+from lalaloc_client.asynchronous.concurrency import AsyncConcurrencyLimit
+from lalaloc_client.errors import ConnectionFailedError, ProblemError, problem_of
+from lalaloc_client.model import FloorPlan, FloorPlanPage, Venue, VenuePage, VenuePlanPage
+from lalaloc_client.parsing import parse
+from lalaloc_client.requests import Request, http_options, text_values
+from lalaloc_client.retry import RetryPolicy, may_retry, retry_after_s
+
+P = ParamSpec("P")
+StoredT = TypeVar("StoredT", FloorPlan, Venue)
+PageT = TypeVar("PageT", FloorPlanPage, VenuePage, VenuePlanPage)
+
+# Used when the service does not state its limit; every service allows this many.
+_DEFAULT_MAX_QUERIES = 3
+# Failures before any byte of a request was sent.
+_UNSENT = (httpx.ConnectError, httpx.ConnectTimeout, httpx.PoolTimeout)
+# A stream without data for this long is dead: the service sends a heartbeat every 15 s.
+_STREAM_TIMEOUT_S = 30.0
+
+
+class AsyncTransport:
+    """Connection to a service."""
+
+    def __init__(
+        self,
+        base_url: str,
+        *,
+        api_key: str | None = None,
+        timeout_s: float = 60.0,
+        retry: RetryPolicy | None = None,
+        max_queries: int | None = None,
+    ) -> None:
+        """Connect to a service.
+
+        Args:
+            base_url: address of the service, with `http://` or `https://`.
+            api_key: key to send as `Authorization: Bearer`.
+            timeout_s: timeout of connecting, sending, and waiting for each part of an answer.
+            retry: policy for requests that fail because the service is overloaded or unreachable.
+            max_queries: maximum number of concurrent queries, further ones wait; None: the limit in the service's
+                `/limits`.
+
+        Raises:
+            ValueError: an argument is out of range.
+        """
+        if max_queries is not None and max_queries < 1:
+            raise ValueError(f"max_queries is {max_queries}; it must be at least 1")
+        self._http = httpx.AsyncClient(**http_options(base_url, api_key, timeout_s))
+        self._retry = retry or RetryPolicy()
+        self._concurrency = AsyncConcurrencyLimit(max_queries, self._fetch_max_queries)
+
+    async def close(self) -> None:
+        """Close the connections."""
+        await self._http.aclose()
+
+    async def limits(self) -> Mapping[str, Any]:
+        """Return the service's limits by name."""
+        return parse(dict[str, Any], await self._content(Request("GET", "/limits")))
+
+    async def _fetch_max_queries(self) -> int:
+        try:
+            limit = (await self.limits()).get("max_queries_per_tenant")
+        except ProblemError:
+            # A key with the scope to query may lack the scope to read.
+            return _DEFAULT_MAX_QUERIES
+        return limit if isinstance(limit, int) and limit > 0 else _DEFAULT_MAX_QUERIES
+
+    async def _query(self, make: Callable[P, Request], *args: P.args, **kwargs: P.kwargs) -> bytes:
+        """Build a query and send it as soon as the concurrency limit allows both; return the answer's content."""
+        async with self._concurrency.hold():
+            # Reading and encoding pictures blocks.
+            request = await run_blocking(make, *args, **kwargs)
+            return await self._content(request)
+
+    async def _stored(self, kind: type[StoredT], request: Request, retry: RetryPolicy | None = None) -> StoredT:
+        """Send a request and return the stored object in the answer, with its entity tag."""
+        response = await self._send(request, retry)
+        return replace(parse(kind, response.content), etag=response.headers.get("etag"))
+
+    async def _pages(self, kind: type[PageT], path: str, **params: object) -> AsyncIterator[PageT]:
+        """Request a listing page by page."""
+        cursor = None
+        while True:
+            page = parse(kind, await self._content(Request("GET", path, text_values({**params, "cursor": cursor}))))
+            yield page
+            cursor = page.next_cursor
+            if cursor is None:
+                return
+
+    async def _content(self, request: Request) -> bytes:
+        return (await self._send(request)).content
+
+    async def _send(self, request: Request, retry: RetryPolicy | None = None) -> httpx.Response:
+        """Send a request, repeatedly if necessary and safe.
+
+        Args:
+            request: request to send.
+            retry: policy instead of the client's own.
+
+        Returns:
+            The answer, read completely unless the request is streamed.
+
+        Raises:
+            ConnectionFailedError: no attempt was answered.
+            ProblemError: the answer is a problem.
+        """
+        retry = retry or self._retry
+        begin_s, attempt, maybe_done = monotonic(), 0, False
+        while True:
+            attempt += 1
+            response, failure = None, None
+            try:
+                response = await self._send_once(request)
+                if response.status_code in request.answers:
+                    return response
+            except httpx.TransportError as error:
+                failure = error
+            sent = not isinstance(failure, _UNSENT)
+            status = None if response is None else response.status_code
+            after_s = None if response is None else _retry_after_s(response)
+            wait_s = None
+            if may_retry(request.safety, status, sent=sent, has_retry_after=after_s is not None):
+                wait_s = retry.wait_s(attempt, monotonic() - begin_s, after_s, random())
+            if wait_s is not None:
+                maybe_done = maybe_done or (response is None and sent)
+                await sleep(wait_s)
+            elif response is None:
+                raise ConnectionFailedError(
+                    f"{request.method} {request.path} had no answer after {attempt} attempts: "
+                    f"{type(failure).__name__} {failure}".rstrip()
+                ) from failure
+            elif maybe_done and request.method == "DELETE" and status == httpx.codes.NOT_FOUND:
+                # An earlier attempt, whose answer was lost, has deleted it.
+                return response
+            else:
+                raise problem_of(response)
+
+    async def _send_once(self, request: Request) -> httpx.Response:
+        built = self._http.build_request(
+            request.method, request.path, params=request.params, headers=request.headers, content=request.content
+        )
+        if request.streamed:
+            timeout: dict[str, Any] = built.extensions["timeout"]
+            timeout["read"] = max(timeout["read"], _STREAM_TIMEOUT_S)
+        response = await self._http.send(built, stream=request.streamed)
+        if request.streamed and response.status_code not in request.answers:
+            await response.aread()
+        return response
+
+
+def _retry_after_s(response: httpx.Response) -> float | None:
+    return retry_after_s(response.headers.get("retry-after"), response.headers.get("date"), datetime.now(UTC))

@@ -1,0 +1,1 @@
+"""`Client`; `make client` generates all but `backend.py` from `asynchronous/`. Begin with `client.py`."""
