@@ -34,7 +34,7 @@ from benchmarks.harness import HealthWatch, MemoryWatch, argument_parser, exampl
 from service.settings import Settings
 
 _MAX_HEALTH_S, _MAX_ANSWER_S, _TIMEOUT_S, _SETTLE_TIMEOUT_S = 1.0, 10.0, 90.0, 20.0
-# Uploads have up to 40 MiB, and parsed JSON takes some 30 times its bytes. A worker may hold the pixels that it decodes.
+# Uploads have up to 40 MiB; parsed JSON takes some 30 times its bytes. A worker may hold the pixels that it decodes.
 _MAX_MB, _MAX_DECODING_MB = 400.0, Settings.load().decode.memory_bytes / 2**20
 # Kept by buffers and allocators after all requests.
 _MAX_LEFT_MB = 400.0

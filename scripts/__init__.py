@@ -1,4 +1,4 @@
-"""What maintainers run by hand: setting up, documentation, comparing encoders.
+"""Scripts for maintainers: setting up, generated documentation, cells of the venue index.
 
 Begin with `write_docs.py`.
 """

@@ -1,7 +1,7 @@
 """Write the cells of `lalaloc_core.localise.venue.prototype_cells`: k-means over prototypes of generated homes.
 
-The homes are those for training. Some of them are scaled up, so that offices and halls find cells as well. Plans that
-were sorted into other cells are sorted anew where they are read.
+The homes are training homes, some of them scaled up, so that offices and halls find cells as well. The service sorts
+stored plans again when the cells change.
 
     .venv/bin/python -m scripts.make_prototype_cells
 """
@@ -25,12 +25,12 @@ from lalaloc_core.render.sweep import profiles_at
 from lalaloc_core.render.sampling import pose_grid
 
 _STEP_M, _CAMERA_HEIGHT_M = 0.5, 1.5
-# The share of homes that are scaled, and the logs of the factors.
+# Share of scaled homes, and range of the logarithm of their factor.
 _SCALED, _LOG_FACTOR = 0.2, (0.2, 1.4)
 
 
 def grid_without_latents(home: Home) -> PoseGrid:
-    """The grid of a home as the renderer has it, without what an encoder makes of it."""
+    """Return the pose grid of a home with wall profiles and zeros as latents."""
     poses = pose_grid(home.plan, _STEP_M)
     profile_m = profiles_at(
         home.plan, poses.position_m, poses.room_index, np.zeros(len(poses)), 4 * AZIMUTHS, np.float32
@@ -39,7 +39,7 @@ def grid_without_latents(home: Home) -> PoseGrid:
 
 
 def sample(homes: int, seed: int) -> np.ndarray:
-    """Prototypes of so many homes."""
+    """Return the prototypes of a number of homes."""
     parts, rng = list[Prototypes](), np.random.default_rng(seed)
     for index in range(homes):
         home, _ = home_of(TRAIN, seed, index)
@@ -51,40 +51,41 @@ def sample(homes: int, seed: int) -> np.ndarray:
 
 
 def centres(feature: Float[np.ndarray, "n f"], count: int, rounds: int, rng: np.random.Generator) -> np.ndarray:
-    """k-means: the nearest centre of each in the end."""
+    """Return the number of the nearest centre of each row after k-means."""
     centre = feature[rng.choice(len(feature), count, replace=False)]
     chosen = nearest(feature, centre)
     for _ in range(rounds):
         members = np.bincount(chosen, minlength=count)
         total = np.zeros_like(centre)
         np.add.at(total, chosen, feature)
-        # A centre that nothing is nearest to stays where it is.
+        # A centre without members keeps its place.
         centre = np.where(members[:, None] > 0, total / np.maximum(members, 1)[:, None], centre)
         chosen = nearest(feature, centre)
     return chosen
 
 
 def main() -> None:
-    """Write the file."""
+    """Compute the cells and write the file."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--homes", type=int, default=500)
     parser.add_argument("--cells", type=int, default=4096)
     parser.add_argument("--rounds", type=int, default=2)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=CELLS_FILE)
-    asked = parser.parse_args()
-    rows = sample(asked.homes, asked.seed)
-    chosen = centres(features(rows), asked.cells, asked.rounds, np.random.default_rng(asked.seed))
-    there, chosen = np.unique(chosen, return_inverse=True)
+    options = parser.parse_args()
+    rows = sample(options.homes, options.seed)
+    chosen = centres(features(rows), options.cells, options.rounds, np.random.default_rng(options.seed))
+    used, chosen = np.unique(chosen, return_inverse=True)
     members = np.bincount(chosen)[:, None]
-    log_profile = np.zeros((len(there), AZIMUTHS))
+    log_profile = np.zeros((len(used), AZIMUTHS))
     np.add.at(log_profile, chosen, rows["log_profile"].astype(float))
-    share = np.zeros((len(there), AZIMUTHS, len(OPENING_CLASSES)))
+    share = np.zeros((len(used), AZIMUTHS, len(OPENING_CLASSES)))
     np.add.at(share, chosen, unpacked_openings(rows["openings"])[:, :, None] == np.arange(len(OPENING_CLASSES)))
-    told = (log_profile / members).astype(np.float16), np.round(255 * share / members[:, None]).astype(np.uint8)
-    version = zlib.crc32(told[0].tobytes() + told[1].tobytes())
-    np.savez_compressed(asked.out, log_profile=told[0], share=told[1], version=version)
-    print(f"{len(there)} cells of {len(rows)} prototypes of {asked.homes} homes, version {version:08x}: {asked.out}")
+    mean_profile = (log_profile / members).astype(np.float16)
+    mean_share = np.round(255 * share / members[:, None]).astype(np.uint8)
+    version = zlib.crc32(mean_profile.tobytes() + mean_share.tobytes())
+    np.savez_compressed(options.out, log_profile=mean_profile, share=mean_share, version=version)
+    print(f"{len(used)} cells of {len(rows)} prototypes of {options.homes} homes, version {version:08x}: {options.out}")
 
 
 if __name__ == "__main__":

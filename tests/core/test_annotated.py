@@ -344,7 +344,7 @@ class TestGalleryScores:
         assert (scores.located, scores.right_room, scores.among_3) == pytest.approx((1 / 3, 2 / 3, 1.0))
         assert scores.by_photograph == {"hall": pytest.approx(1 / 3)}
         assert describe_answers(answers_in_galleries(predictions, photographs), "hall") == "1 of 3 (ranks 1, 3)"
-        assert describe_answers([], "den") == "not asked"
+        assert describe_answers([], "den") == "not evaluated"
 
     def test_of_two_outlines_the_better_answer_counts(self, photographs: tuple[AnnotatedPhotograph, ...]) -> None:
         predictions = [
@@ -427,7 +427,7 @@ class TestEvaluating:
         # Each was asked once, with the better of two outlines; the poor one was not.
         assert [len(one["galleries"]["unknown"]) for one in figures["photographs"]] == [0, 1, 1]
         assert f"| median of the median error of log distance | {figures['azimuths']['median_error']:.3f} |" in printed
-        assert "not asked" in printed
+        assert "not evaluated" in printed
         with Image.open(out / SHEET_FILE) as sheet:
             assert sheet.width > 4 * 512
         # Whoever asks again goes on with the answers that are there.

@@ -150,7 +150,7 @@ class TestRunning:
     def test_photographs_that_a_data_set_lacks_are_refused(self) -> None:
         scenes = GeneratedScenes(homes=1)
         assert choose_appearance(scenes, None, None).furniture == "full"
-        with pytest.raises(InvalidInputError, match="no photographs 'full/warm', there are: full"):
+        with pytest.raises(InvalidInputError, match="no photographs 'full/warm', choose one of: full"):
             choose_appearance(scenes, "full", "warm")
 
 

@@ -215,7 +215,7 @@ class TestRunFolder:
         folder.append([prediction(0.1)])
         with (tmp_path / PREDICTIONS_FILE).open("a") as file:
             file.write(text)
-        with pytest.raises(RunError, match="line 2 is no prediction"):
+        with pytest.raises(RunError, match="line 2 is not a prediction"):
             folder.read_predictions()
 
     def test_a_folder_without_a_run_is_named(self, tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
-"""Aligning rendered layouts with an explicit one: gradient descent on the mean absolute difference of layout depths.
+"""Alignment of a pose with an explicit layout by gradient descent on the mean absolute difference of layout depths.
 
-The refinement of the paper's baselines that predict a layout: HorizonNet + Loc (section 6.1) and VDR + Decode (section
-6.1.2). It is latent pose optimisation with depth images in place of latents, on the same schedule.
+It refines the paper's baselines HorizonNet + Loc (section 6.1) and VDR + Decode (section 6.1.2): LPO with depth images
+in place of latents, on the same schedule.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from lalaloc_core.render.depth import layout_depth
 
 
 class DepthAligner:
-    """Moves poses, each within its own room, until the depth of their layouts is nearest to target images."""
+    """Optimiser that moves poses within their rooms until their layout depths match target images."""
 
     def __init__(self, *, rows: int, columns: int, thinning: int = 1, config: LpoConfig | None = None) -> None:
-        """Choose the images that are compared.
+        """Set the size of the compared images.
 
         Args:
             rows: rows of the images.
-            columns: columns of the wall profiles that are cast.
-            thinning: the images have every n-th of these columns.
+            columns: columns of the rendered wall profiles.
+            thinning: the images keep every n-th of these columns.
             config: margins and Adam's schedule.
         """
 
@@ -37,9 +37,9 @@ class DepthAligner:
         self._optimiser = PoseOptimiser(depth, columns, norm="l1", config=replace(config or LpoConfig(), method="adam"))
 
     def refine(self, job: RefinementJob) -> RefinementResult:
-        """Align every starting pose of a job whose targets are flattened depth images (m), rows first.
+        """Align the starting poses of a job whose targets are flattened depth images (m), rows first.
 
         Returns:
-            the poses, with mean absolute differences of depth (m) as their distances.
+            poses with mean absolute differences of depth (m) as their distances.
         """
         return self._optimiser.refine(job)

@@ -1,7 +1,7 @@
-"""VDR + Decode: the pose optimised against the layout that the training decoder makes of the query's latent.
+"""VDR + Decode: the pose is aligned with the layout that the training decoder makes of the query's latent.
 
-The paper's comparison of optimising in the latent space with optimising an explicit layout (section 6.1.2): retrieval
-and re-sampling are LaLaLoc's.
+The paper compares optimisation in the latent space with optimisation of an explicit layout in this way (section 6.1.2).
+Retrieval and VDR are LaLaLoc's.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from lalaloc_core.nets.decoder import DECODED_HEIGHT, DECODED_WIDTH, LayoutDecod
 
 
 class VdrDecode:
-    """Answers with a bundle and the decoder that its layout encoder was trained with."""
+    """Method with a bundle and the decoder that its layout encoder was trained with."""
 
     def __init__(
         self,
@@ -36,7 +36,7 @@ class VdrDecode:
         schedule: LpoConfig | None = None,
     ) -> None:
         self._lalaloc = LaLaLoc(encoders, refine="vdr")
-        # What the paper compares with is the latent alone.
+        # The paper compares latents only.
         self._config = replace(config or LocaliseConfig(), matching=MatchingConfig(use_profile=False))
         self._decoder = decoder.eval().requires_grad_(False)
         # Training shows the decoder every n-th column of the encoder's wall profile.
@@ -46,7 +46,7 @@ class VdrDecode:
         self._aligner = DepthAligner(rows=DECODED_HEIGHT, columns=columns, thinning=thinning, config=schedule)
 
     def locate(self, question: Question) -> Answer:
-        """Localise up to the Vogel disc, decode the query's latent, align."""
+        """Retrieve, re-sample with VDR, decode the query's latent and align."""
         encoders, plan, clock = self._lalaloc.encoders, question.plan, StageClock()
         image = read_image(encoders, question)
         with clock.stage("encode"):
@@ -75,9 +75,9 @@ class VdrDecode:
         )
 
     def decode(self, latents: Float[np.ndarray, "k d"]) -> Float[np.ndarray, "k pixels"]:
-        """Flattened layout depths (m) that the decoder makes of latents, as wide as the layouts to compare."""
+        """Return flattened layout depths (m) of latents, as wide as the layouts to compare."""
         with torch.no_grad():
             depth = self._decoder(torch.from_numpy(np.asarray(latents, dtype=np.float32)))
-            # Where profiles are narrower than its images, training compares at their width.
+            # Training compares at the width of the profile where that is narrower than the decoder's images.
             narrowed = functional.interpolate(depth[:, None], (DECODED_HEIGHT, self._width))
         return narrowed.flatten(1).numpy()

@@ -1,9 +1,8 @@
 """Localisation by an explicitly predicted layout: the paper's baseline "HorizonNet + Loc" (section 6.1).
 
-The wall profile that the image encoder predicts takes the place of HorizonNet's. Everything is compared by the mean
-absolute difference of layout depths: the nearest pose of the grid, the nearest of a Vogel disc around it, and then
-gradient descent. A wall profile says nothing of the ceiling, so the prediction takes that of the room it is compared
-with.
+The image encoder's wall profile takes the place of HorizonNet's. All stages compare the mean absolute difference of
+layout depths: retrieval on the grid, VDR on a Vogel disc, then gradient descent. A wall profile has no ceiling, so the
+prediction takes the ceiling of the room that it is compared with.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ _ROWS = 32
 
 
 class ExplicitLayout:
-    """Answers with the wall profile that a bundle of architecture `ring` predicts; layout queries know theirs."""
+    """Method with the wall profile that a `ring` bundle predicts; layout queries use the true one."""
 
     def __init__(
         self, encoders: Encoders, *, config: LocaliseConfig | None = None, schedule: LpoConfig | None = None
@@ -52,7 +51,7 @@ class ExplicitLayout:
             BundleError: the bundle predicts no wall profile.
         """
         if not question.heading_known:
-            raise InvalidInputError("localisation by an explicit layout needs the heading")
+            raise InvalidInputError("method 'explicit' needs the heading; run it with a known heading")
         plan, clock = question.plan, StageClock()
         grid = self._grid(question)
         image = read_image(self._encoders, question)
@@ -60,15 +59,15 @@ class ExplicitLayout:
             profile_m, heading = self._profile(question, image)
         with clock.stage("retrieve"):
             retrieved, distance = grid.nearest(profile_m)
-        stages = {"retrieval": _found(question, question.grid, retrieved, distance)}
+        stages = {"retrieval": _pose(question, question.grid, retrieved, distance)}
         with clock.stage("vdr"):
             config = self._config
             radius_m = config.vdr_radius_steps * question.grid_step_m
             centre = question.grid.position_m[retrieved]
             disc, _ = disc_poses(plan, centre, samples=config.vdr_samples, radius_m=radius_m)
-            # The disc begins at its centre, so the nearest of it is no farther than the pose of the grid.
+            # The disc contains its centre, so its nearest pose is at least as near as the retrieved one.
             nearest, distance = self._rendered(question, disc, heading).nearest(profile_m)
-            stages["vdr"] = _found(question, disc, nearest, distance)
+            stages["vdr"] = _pose(question, disc, nearest, distance)
         with clock.stage("align"):
             stages["align"] = self._align(question, profile_m, heading, stages["vdr"])
         return Answer(stages=stages, retrieved=retrieved, timings_ms=clock.timings_ms)
@@ -76,7 +75,7 @@ class ExplicitLayout:
     def _profile(
         self, question: Question, image: UInt8[np.ndarray, "h w 3"] | None
     ) -> tuple[Float[np.ndarray, "w"], float]:
-        """Wall profile (m) of the query, and the heading that layouts must have to be compared with it."""
+        """Return the query's wall profile (m) and the heading of the layouts to compare with it."""
         if image is None:
             return question.true_profile(self._columns), 0.0
         return self._encoders.profile(image, question.camera.heading, question.camera.camera_height_m)
@@ -108,19 +107,19 @@ class ExplicitLayout:
         )
         aligned = self._aligner.refine(job)
         poses = PoseSet(aligned.position_m, room)
-        return _found(question, poses, 0, float(aligned.cost[0]))
+        return _pose(question, poses, 0, float(aligned.cost[0]))
 
 
 @dataclass(frozen=True, eq=False)
 class _RenderedPoses:
-    """Layout depths (m) of poses of one camera height, with the ceiling over each."""
+    """Layout depths (m) of poses at one camera height, with the ceiling height of each."""
 
     depth_m: Float[np.ndarray, "n h w"]
     camera_height_m: float
     ceiling_height_m: Float[np.ndarray, "n"]
 
     def nearest(self, profile_m: Float[np.ndarray, "w"]) -> tuple[int, float]:
-        """Number of the pose whose depth is nearest to that of a wall profile, and the distance (m)."""
+        """Return the index of the pose with the nearest depth to that of a wall profile, and the distance (m)."""
         distance = np.empty(len(self.depth_m))
         camera = np.array([self.camera_height_m])
         for ceiling in np.unique(self.ceiling_height_m):
@@ -131,7 +130,7 @@ class _RenderedPoses:
         return index, float(distance[index])
 
 
-def _found(question: Question, poses: PoseSet, index: int, distance: float) -> FoundPose:
+def _pose(question: Question, poses: PoseSet, index: int, distance: float) -> FoundPose:
     return FoundPose(
         x_m=float(poses.position_m[index, 0]),
         y_m=float(poses.position_m[index, 1]),

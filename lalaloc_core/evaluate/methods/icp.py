@@ -1,13 +1,13 @@
-"""2-D iterative closest point, the paper's baseline that measures (section A.3, "Iterative Closest Point Baseline").
+"""2-D iterative closest point, the paper's baseline on depth (section A.3, "Iterative Closest Point Baseline").
 
-A scan, what a laser scanner at the camera would see of the horizon, is aligned with points along the walls of the plan,
-from every pose of the grid at once; the alignment with the lowest root mean square distance is the answer. The cloud of
-the plan is merged by finer cells than the paper's 5 cm (`IcpConfig.plan_cell_m`). Where the paper is silent:
+A horizontal laser scan at the camera is aligned with points along the walls of the plan, from every pose of the grid at
+once. The alignment with the lowest root mean square distance is the answer. The plan's cloud is merged by finer cells
+than the paper's 5 cm (`IcpConfig.plan_cell_m`). Choices that the paper leaves open:
 
-* the slice is the rows of the depth image nearest the horizon, which sees over most furniture; projecting all that
-  stands between floor and ceiling would take furniture for walls;
-* the cloud of the plan has the walls of all rooms, so that what a scan sees through an open door finds its wall;
-* only a scan whose heading is known is aligned: the rotation of the alignment refines it.
+* The scan is the rows of the depth image nearest the horizon, above most furniture; projecting all rows between floor
+  and ceiling would take furniture for walls.
+* The plan's cloud has the walls of all rooms, for points seen through open doors.
+* The heading must be known; the alignment refines it.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ class IcpConfig:
     """Settings; the defaults are the paper's where it names them.
 
     Attributes:
-        cell_m: side of the grid cells whose points are merged, in the scan.
-        plan_cell_m: the same in the cloud of the plan. Where it is as coarse as the scan's, points of the scan are
-            drawn to points along the wall that they already lie on, which costs most of a centimetre.
-        still_m, still_iterations: an alignment has converged when so many successive updates move it by less.
-        spacing_m: distance of the points along walls before they are merged.
+        cell_m: side of the cells in which points of the scan are merged.
+        plan_cell_m: the same for the plan's cloud. Cells as coarse as the scan's pull points along their own wall,
+            which costs most of a centimetre.
+        still_m, still_iterations: an alignment converges after this many successive updates of less than `still_m`.
+        spacing_m: distance between points along walls before merging.
         columns: rays of the scan of a layout query.
     """
 
@@ -53,11 +53,11 @@ class IcpConfig:
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Where each start ended: `x_plan = R(turn) x_scan + shift`, turns counter-clockwise.
+    """Alignments by start: `x_plan = R(turn) x_scan + shift`, turns counter-clockwise.
 
     Attributes:
-        rms_m: root mean square distance of the scan's points to their nearest in the plan's cloud.
-        iterations: how many updates each start took.
+        rms_m: root mean square distance of the scan's points to the plan's cloud.
+        iterations: number of updates.
     """
 
     turn: Float[np.ndarray, "k"]
@@ -67,7 +67,7 @@ class Alignment:
 
 
 class Icp:
-    """Answers by aligning the scan of a question; layout queries scan the true layout, others the furnished room."""
+    """Method that aligns the scan of a question: the true layout or the furnished room's depth."""
 
     def __init__(self, config: IcpConfig | None = None) -> None:
         self.config = config or IcpConfig()
@@ -80,15 +80,15 @@ class Icp:
     def locate(self, question: Question) -> Answer:
         """Align the scan from every pose of the grid.
 
-        An alignment that ends outside all rooms belongs to the room that it started in. A photograph without any
-        reading of depth has no answer.
+        An alignment that ends outside all rooms belongs to the room of its start. A photograph without valid depth has
+        no answer.
 
         Raises:
             InvalidInputError: the heading is unknown.
-            DatasetError: a panorama query whose data set has no depth.
+            DatasetError: the data set has no depth.
         """
         if not question.heading_known:
-            raise InvalidInputError("ICP needs the heading of its scan")
+            raise InvalidInputError("method 'icp' needs the heading; run it with a known heading")
         plan, clock = question.plan, StageClock()
         tree = self._tree(question)
         points = self._scan(question)
@@ -104,14 +104,14 @@ class Icp:
             x_m=float(position[0]),
             y_m=float(position[1]),
             room_index=room if room >= 0 else int(question.grid.room_index[best]),
-            # Turning the scan counter-clockwise turns its azimuths, which are clockwise, back.
+            # Turns are counter-clockwise, azimuths clockwise.
             heading=float(wrap_angle(question.camera.heading - aligned.turn[best])),
             distance=float(aligned.rms_m[best]),
         )
         return Answer(stages={"icp": found}, timings_ms=clock.timings_ms)
 
     def _scan(self, question: Question) -> Float[np.ndarray, "n 2"]:
-        """The scan around the camera, turned into the plan frame by the known heading."""
+        """Return the scan around the camera, turned into the plan frame by the known heading."""
         if question.kind == "layout":
             return scan_of(question.true_profile(self.config.columns)[None], 0.0)
         depth = question.require_photograph().depth_m()
@@ -121,14 +121,14 @@ class Icp:
 
 
 def scan_of(distance_m: Float[np.ndarray, "r w"], heading: float) -> Float[np.ndarray, "n 2"]:
-    """Points (m) at horizontal distances from the camera, one column per azimuth; NaN gives none."""
+    """Return points (m) at horizontal distances from the camera, one column per azimuth, without NaN."""
     azimuth = heading + column_azimuths(distance_m.shape[1])
     points = distance_m[..., None] * np.stack([np.sin(azimuth), np.cos(azimuth)], axis=-1)
     return points[np.isfinite(distance_m)]
 
 
 def wall_cloud(plan: FloorPlan, config: IcpConfig) -> Float[np.ndarray, "n 2"]:
-    """Points (m) along the walls of all rooms, merged by cells."""
+    """Return points (m) along the walls of all rooms, merged by cells."""
     walls = np.concatenate([room.walls_m for room in plan.rooms])
     lengths = np.linalg.norm(walls[:, 2:] - walls[:, :2], axis=1)
     parts = []
@@ -140,7 +140,7 @@ def wall_cloud(plan: FloorPlan, config: IcpConfig) -> Float[np.ndarray, "n 2"]:
 
 
 def merge_cells(points_m: Float[np.ndarray, "n 2"], cell_m: float) -> Float[np.ndarray, "m 2"]:
-    """The mean of the points in each cell of a grid."""
+    """Return the mean of the points in each cell of a grid."""
     _, cell, count = np.unique(np.floor(points_m / cell_m), axis=0, return_inverse=True, return_counts=True)
     cell = cell.reshape(-1)
     sums = [np.bincount(cell, weights=points_m[:, axis], minlength=len(count)) for axis in (0, 1)]
@@ -150,10 +150,10 @@ def merge_cells(points_m: Float[np.ndarray, "n 2"], cell_m: float) -> Float[np.n
 def align(
     scan_m: Float[np.ndarray, "n 2"], tree: KDTree, starts_m: Float[np.ndarray, "k 2"], config: IcpConfig
 ) -> Alignment:
-    """Align a scan with a cloud from several starting positions, all without any turn.
+    """Align a scan with a cloud from several starting positions, without an initial turn.
 
-    Each update assigns every point of the scan to its nearest in the cloud and moves the scan to where the sum of
-    squared distances of these pairs is least.
+    Each update pairs every point of the scan with its nearest in the cloud and moves the scan to the minimum of the
+    summed squared distances of the pairs.
     """
     turn, shift = np.zeros(len(starts_m)), starts_m.astype(float)
     still = np.zeros(len(starts_m), dtype=int)
@@ -176,7 +176,7 @@ def align(
 def best_motion(
     scan_m: Float[np.ndarray, "n 2"], targets_m: Float[np.ndarray, "k n 2"]
 ) -> tuple[Float[np.ndarray, "k"], Float[np.ndarray, "k 2"]]:
-    """Turn and shift that bring a scan nearest to its targets, in closed form (the Kabsch algorithm in 2-D)."""
+    """Return the turns and shifts that best align a scan with its targets (the Kabsch algorithm in 2-D)."""
     scan_mean, target_mean = scan_m.mean(axis=0), targets_m.mean(axis=1)
     centred = scan_m - scan_mean
     along = np.einsum("ni,kni->k", centred, targets_m)

@@ -1,4 +1,4 @@
-"""LaLaLoc itself as a method: retrieval, Vogel disc re-sampling, latent pose optimisation, as the service does it."""
+"""LaLaLoc as a method: retrieval, VDR and LPO, as in the service."""
 
 from __future__ import annotations
 
@@ -32,22 +32,22 @@ from lalaloc_core.localise.pipeline import (
 from lalaloc_core.localise.poses import Candidate, PoseGrid, PredictedProfile, Query
 from lalaloc_core.render.sampling import PoseSet
 
-# Hypotheses of a layout query with unknown heading, where no ring says how many there are.
+# Heading hypotheses of a layout query with unknown heading, for models without a ring.
 _HEADINGS = 64
-# Candidates that answers keep: enough to learn from those that were wrong.
+# Candidates per answer: enough to fit weights on wrong ones.
 _CANDIDATES = 20
-# How sure a layout query is of its wall profile: it is the truth, to single precision.
+# Scale of the wall profile of a layout query, which is exact to single precision.
 _TRUE_LAYOUT_LOG_SCALE = -7.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class StatedHeight:
-    """What a method is told of the camera's height.
+    """Camera height as stated to a method.
 
     Attributes:
-        is_known: whether anything is.
-        error_m: by how much it is told wrong.
-        std_m: the standard deviation that is told with it.
+        is_known: whether the height is stated.
+        error_m: error added to the true height.
+        std_m: stated standard deviation.
     """
 
     is_known: bool = True
@@ -55,16 +55,16 @@ class StatedHeight:
     std_m: float = DEFAULT_STD_M
 
     def of(self, question: Question) -> CameraHeight:
-        """What is said of a question's camera."""
+        """Return the stated camera height of a question."""
         if not self.is_known:
             return CameraHeight(DEFAULT_CAMERA_HEIGHT_M, math.inf)
         return CameraHeight(max(question.camera.camera_height_m + self.error_m, MIN_CAMERA_HEIGHT_M), self.std_m)
 
 
 class LaLaLoc:
-    """Answers with one bundle.
+    """Method with one bundle.
 
-    As in the paper's table of times, neither embedding a plan's grid nor reading a photograph is counted.
+    As in the paper's table of times, embedding the grid of a plan and reading a photograph are not timed.
     """
 
     def __init__(
@@ -80,7 +80,7 @@ class LaLaLoc:
         self._stated = stated
         self._refine: Refine = refine
         self._refiner = refiner
-        # What every stage found is what evaluations report.
+        # Evaluations report the pose after every stage.
         self._config = dataclasses.replace(config or LocaliseConfig(), every_stage=True)
         self._grids: LRUCache[Any, PoseGrid] = LRUCache(GRIDS_CACHED)
 
@@ -97,20 +97,22 @@ class LaLaLoc:
             self.encoders,
             query,
             refine=self._refine,
-            # All that are refined; how many are returned changes nothing about the search.
+            # The number of returned candidates does not change the search.
             top_k=_CANDIDATES,
             refiner=self._refiner,
             config=self._config,
         )
-        signals: dict[str, dict[str, float]] = {stage: dataclasses.asdict(one) for stage, one in found.signals.items()}
-        # Confidence is fitted on photographs that are compared as the service does.
+        signals: dict[str, dict[str, float]] = {
+            stage: dataclasses.asdict(values) for stage, values in found.signals.items()
+        }
+        # The confidence model is fitted on photographs and the default matching cost.
         calibrated = question.kind == "panorama" and self._config.matching == MatchingConfig()
         model = self.encoders.manifest.confidence if calibrated else None
         return Answer(
             stages={stage: found_pose(found.query, candidate) for stage, candidate in found.best.items()},
             candidates=tuple(
-                FoundCandidate(pose=found_pose(found.query, one), terms=one.terms, probability=probability)
-                for one, probability in zip(found.candidates, found.posterior.candidate, strict=True)
+                FoundCandidate(pose=found_pose(found.query, candidate), terms=candidate.terms, probability=probability)
+                for candidate, probability in zip(found.candidates, found.posterior.candidate, strict=True)
             ),
             retrieved=grid_index(grid, found.best["retrieval"]),
             signals=signals,
@@ -123,23 +125,23 @@ class LaLaLoc:
 
     @cachedmethod(attrgetter("_grids"), key=grid_key)
     def grid(self, question: Question) -> PoseGrid:
-        """Latents of the question's grid at its stated camera height; the last few are cached."""
+        """Return the pose grid of a question at its stated camera height; the last few are cached."""
         height_m, poses = self._stated.of(question).height_m, question.grid
         latents, profile_m = self.encoders.poses(question.plan, poses, np.zeros(len(poses)), height_m)
         return PoseGrid(poses, latents, profile_m, question.grid_step_m, height_m)
 
 
 def local_refiner(bundle: Bundle, config: LpoConfig | None = None) -> Refiner:
-    """LPO in this process. Sets torch to one thread: its tensors are too small to share, and waiting costs more."""
+    """Return LPO in this process. Sets torch to one thread, because its tensors are too small to share."""
     torch.set_num_threads(1)
     return PoseRefiner.from_bundle(bundle, config).refine
 
 
 def read_image(encoders: Encoders, question: Question) -> UInt8[np.ndarray, "h w 3"] | None:
-    """The photograph of a panorama query at the encoder's size; None for layout queries.
+    """Return the photograph of a panorama query at the encoder's size; None for layout queries.
 
     Raises:
-        DatasetError: it cannot be read.
+        DatasetError: the photograph cannot be read.
     """
     if question.kind == "layout":
         return None
@@ -152,7 +154,7 @@ def encode(
     image: UInt8[np.ndarray, "h w 3"] | None,
     stated: StatedHeight = StatedHeight(),
 ) -> Query:
-    """The query of a question: what the encoder says of a photograph, or the true layout where there is none."""
+    """Return the query of a question: the encoded photograph, or the true layout for layout queries."""
     camera = question.camera
     if image is not None:
         return encoders.query(image, camera.heading if question.heading_known else None, stated.of(question))
@@ -170,7 +172,7 @@ def encode(
 
 
 def found_pose(query: Query, candidate: Candidate) -> FoundPose:
-    """A candidate as a pose of the panorama."""
+    """Return a candidate as a pose of the panorama."""
     return FoundPose(
         x_m=candidate.x_m,
         y_m=candidate.y_m,
@@ -181,5 +183,5 @@ def found_pose(query: Query, candidate: Candidate) -> FoundPose:
 
 
 def grid_index(grid: PoseGrid, candidate: Candidate) -> int:
-    """Number of the grid pose that a candidate of retrieval is."""
+    """Return the index of the grid pose of a retrieval candidate."""
     return int(np.linalg.norm(grid.poses.position_m - candidate.position_m, axis=1).argmin())

@@ -15,19 +15,19 @@ from lalaloc_core.learn.data.dataset import Camera, Photograph
 from lalaloc_core.render.sweep import profiles_at
 from lalaloc_core.render.sampling import PoseSet
 
-# "layout": the query is the true layout, as if seen without error; "panorama": a photograph, or its depth for ICP.
+# "layout": the query is the error-free layout of the true pose; "panorama": a photograph, or its depth for ICP.
 QueryKind = Literal["layout", "panorama"]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Question:
-    """One query.
+    """Query for a localisation method.
 
-    A method may look at the camera's height, at its heading where `heading_known`, at `photograph`, and, for layout
-    queries, at `true_profile`; the rest of the camera is the answer.
+    A method may use the camera's height, its heading if `heading_known`, `photograph`, and, for layout queries,
+    `true_profile`. The rest of the camera is the truth to predict.
 
     Attributes:
-        grid: poses of the plan that retrieval chooses from, `grid_step_m` apart.
+        grid: poses for retrieval, `grid_step_m` apart.
         photograph: None for layout queries.
     """
 
@@ -41,28 +41,28 @@ class Question:
 
     @cached_property
     def ceiling_height_m(self) -> float:
-        """Ceiling of the true room, part of the true layout."""
+        """Ceiling height of the true room, part of the true layout."""
         return float(self.plan.ceiling_heights_m[self.camera.room_index])
 
     def true_profile(self, columns: int) -> Float[np.ndarray, "{columns}"]:
-        """Wall profile (m) of the true pose at heading 0: what a layout query knows, and what the oracle may use."""
+        """Return the wall profile (m) of the true pose at heading 0, for layout queries and oracles."""
         room = np.array([self.camera.room_index])
         return profiles_at(self.plan, self.camera.position_m[None], room, np.zeros(1), columns)[0]
 
     def require_photograph(self) -> Photograph:
-        """The photograph of a panorama query.
+        """Return the photograph of a panorama query.
 
         Raises:
-            InvalidInputError: a layout query has none.
+            InvalidInputError: the question has no photograph.
         """
         if self.photograph is None:
-            raise InvalidInputError(f"a {self.kind} query has no photograph")
+            raise InvalidInputError(f"this {self.kind} query has no photograph; the method needs one")
         return self.photograph
 
 
 @dataclass(frozen=True, kw_only=True)
 class FoundPose:
-    """A pose that a method found; `heading` in radians, `distance` by the method's own measure."""
+    """Predicted pose; `heading` in radians, `distance` by the method's own measure."""
 
     x_m: float
     y_m: float
@@ -73,7 +73,7 @@ class FoundPose:
 
 @dataclass(frozen=True, kw_only=True)
 class FoundCandidate:
-    """A rival for the answer: its pose, what each term of the evidence says of it, and its posterior probability."""
+    """Candidate pose with its terms of the matching cost and its posterior probability."""
 
     pose: FoundPose
     terms: dict[str, float]
@@ -82,17 +82,17 @@ class FoundCandidate:
 
 @dataclass(frozen=True, kw_only=True)
 class Answer:
-    """What a method found.
+    """Result of a method.
 
     Attributes:
-        stages: the best pose after each stage, in order; the last is the answer. Empty: no answer.
-        candidates: the answer and its rivals, best first, where the method has any.
-        retrieved: number of the grid pose that retrieval chose; None for methods that do not retrieve.
-        signals: by stage, what speaks for its pose and against it; see `localise.confidence`.
-        information: curvature of the cost at the answer, see `localise.poses.Candidate`.
-        confidence: probability of being within 1 m, where the method has a model of it.
-        heading_confidence: probability that the heading is right within 5°, likewise.
-        camera_height_m: the height that fits best, where it was solved for.
+        stages: the best pose after each stage, in order; the last is the final pose. Empty without an answer.
+        candidates: the candidate poses, best first, if the method ranks any.
+        retrieved: index of the retrieved grid pose; None for methods without retrieval.
+        signals: inputs of the confidence model by stage; see `localise.confidence`.
+        information: curvature of the cost at the final pose; see `localise.poses.Candidate`.
+        confidence: probability of a position error below 1 m; None without a confidence model.
+        heading_confidence: probability of a heading error below 5°; None without a confidence model.
+        camera_height_m: the estimated camera height, if the method estimates it.
         timings_ms: wall-clock per stage.
     """
 
@@ -107,29 +107,29 @@ class Answer:
     timings_ms: dict[str, float] = field(default_factory=dict)
 
     def rank_of_room(self, room_index: int) -> int | None:
-        """Rank of the best candidate in a room, from 1; None where there is none."""
-        ranks = [rank for rank, one in enumerate(self.candidates, start=1) if one.pose.room_index == room_index]
+        """Return the rank of the best candidate in a room, from 1; None without a candidate there."""
+        ranks = [rank for rank, candidate in enumerate(self.candidates, 1) if candidate.pose.room_index == room_index]
         return ranks[0] if ranks else None
 
 
 @runtime_checkable
 class Method(Protocol):
-    """A way to localise. Methods keep what belongs to a plan (grids, point clouds) from one question to the next."""
+    """Localisation method. It caches what belongs to a plan (grids, point clouds) between questions."""
 
     def locate(self, question: Question) -> Answer:
-        """Find the camera of a question."""
+        """Predict the camera pose of a question."""
         ...
 
 
-# Queries come scene by scene, and cameras of a scene often share a height: a few are enough.
+# Queries arrive scene by scene and often share a camera height, so a small cache is enough.
 GRIDS_CACHED = 4
 
 
 def grid_key(_: object, question: Question) -> tuple[FloorPlan, float, float]:
-    """Key of what is made of a question's grid; plans are compared by identity, and kept alive by the key."""
+    """Return the cache key of a grid. Plans compare by identity; the key keeps them alive."""
     return question.plan, question.camera.camera_height_m, question.grid_step_m
 
 
 def plan_key(_: object, question: Question) -> FloorPlan:
-    """Key of what is made of a question's plan."""
+    """Return the cache key of a plan."""
     return question.plan

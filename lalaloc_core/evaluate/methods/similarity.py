@@ -29,28 +29,28 @@ from lalaloc_core.render.sampling import PoseSet
 LayoutMetric = Literal["edges", "depth", "relative-depth", "chamfer"]
 LAYOUT_METRICS: tuple[LayoutMetric, ...] = get_args(LayoutMetric)
 
-# A wall bends where its profile leaves a straight line by more than this (radians); less is rounding.
+# Deviation of a profile from a straight wall (radians) that counts as a corner; less is rounding.
 _CORNER_BEND = 0.1
-# Parts in which `ChamferGrid.nearest` takes the points of each cloud, to give up on most poses after the first.
+# Parts of a cloud that `ChamferGrid.nearest` adds one by one; most poses are excluded after the first.
 _PARTS = 4
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Layout:
-    """A bare layout as seen from one place at heading 0; `profile_m` is its wall profile."""
+    """Layout seen from one place at heading 0, with its wall profile `profile_m`."""
 
     profile_m: Float[np.ndarray, "w"]
     camera_height_m: float
     ceiling_height_m: float
 
     def depth_m(self, rows: int) -> Float[np.ndarray, "{rows} w"]:
-        """Layout depth (m), one column per entry of the profile."""
+        """Return the layout depth (m), one column per entry of the profile."""
         heights = np.array([self.camera_height_m]), np.array([self.ceiling_height_m])
         return layout_depth(self.profile_m[None], *heights, rows)[0]
 
 
 def true_layout(question: Question, columns: int) -> Layout:
-    """What would be seen at the true pose: what a layout query knows, and what oracles may use."""
+    """Return the layout at the true pose, for layout queries and oracles."""
     return Layout(
         profile_m=question.true_profile(columns),
         camera_height_m=question.camera.camera_height_m,
@@ -61,14 +61,14 @@ def true_layout(question: Question, columns: int) -> Layout:
 def layouts_at(
     plan: FloorPlan, poses: PoseSet, camera_height_m: float, columns: int, heading: float = 0.0
 ) -> tuple[Float[np.ndarray, "n {columns}"], Float[np.ndarray, "n"], Float[np.ndarray, "n"]]:
-    """Wall profiles, camera and ceiling heights (m) of poses, all with one heading."""
+    """Return wall profiles, camera and ceiling heights (m) of poses with one heading."""
     rooms = poses.room_index
     profile = profiles_at(plan, poses.position_m, rooms, np.full(len(poses), heading), columns)
     return profile, np.full(len(poses), camera_height_m), plan.ceiling_heights_m[rooms]
 
 
 class ChamferGrid:
-    """Symmetric Chamfer distance (m) between back-projected point clouds, as `metrics.chamfer_distance` defines it."""
+    """Symmetric Chamfer distance (m) between back-projected point clouds, see `learn.metrics.chamfer_distance`."""
 
     def __init__(
         self, plan: FloorPlan, poses: PoseSet, camera_height_m: float, *, rows: int = 16, columns: int = 32
@@ -78,30 +78,30 @@ class ChamferGrid:
         self._clouds_m = back_project(self._depth_m)
 
     def distances(self, query: Layout) -> Float[np.ndarray, "n"]:
-        """Distance of the query to every pose."""
+        """Return the distance of the query to every pose."""
         pair = self._pair(query)
-        every = np.arange(len(self._clouds_m))
-        return pair.to_query(every, slice(None)) + np.array([pair.from_query(int(index)) for index in every])
+        poses = np.arange(len(self._clouds_m))
+        return pair.to_query(poses, slice(None)) + np.array([pair.from_query(int(index)) for index in poses])
 
     def nearest(self, query: Layout) -> int:
-        """Number of the pose nearest to the query: the least of `distances`, without computing most of them.
+        """Return the index of the pose nearest to the query, without computing most of the distances.
 
-        Every term of a Chamfer distance is at least 0, so a sum over some of them bounds the whole from below; poses
-        whose bound exceeds the best distance so far are left alone. The cheap terms come first: distances to the query
-        need one search tree, distances from it one for every pose.
+        All terms of a Chamfer distance are non-negative, so a partial sum is a lower bound, and poses with a bound
+        above the best distance are skipped. Cheap terms come first: distances to the query need one search tree,
+        distances from it one for every pose.
         """
         pair = self._pair(query)
         bound = np.zeros(len(self._clouds_m))
-        alive = np.arange(len(bound))
+        remaining = np.arange(len(bound))
         best, best_index = math.inf, -1
         for part in range(_PARTS):
-            bound[alive] += pair.to_query(alive, slice(part, None, _PARTS))
+            bound[remaining] += pair.to_query(remaining, slice(part, None, _PARTS))
             if part == 0:
-                # A good guess at the nearest pose makes the first bound to beat.
-                best_index = int(alive[bound[alive].argmin()])
+                # The likely nearest pose gives a low first distance to compare with.
+                best_index = int(remaining[bound[remaining].argmin()])
                 best = pair.distance(best_index)
-            alive = alive[bound[alive] <= best]
-        for index in alive[np.argsort(bound[alive], kind="stable")]:
+            remaining = remaining[bound[remaining] <= best]
+        for index in remaining[np.argsort(bound[remaining], kind="stable")]:
             if bound[index] > best:
                 break
             distance = bound[index] + pair.from_query(int(index))
@@ -115,10 +115,10 @@ class ChamferGrid:
 
 
 class _Comparison:
-    """One query against the clouds of a `ChamferGrid`.
+    """Comparison of one query with the clouds of a `ChamferGrid`.
 
-    Pixels that see the same depth from both places are one point of both clouds: nearest neighbours at distance 0. At
-    equal heights that is true of most of the floor and ceiling, which are left out of the search.
+    Pixels with equal depth in both are the same point of both clouds, with distance 0. At equal heights this holds for
+    most of the floor and ceiling, which are skipped in the search.
     """
 
     def __init__(
@@ -131,24 +131,24 @@ class _Comparison:
         self._differs = (depth_m != query_depth_m).reshape(len(depth_m), -1)
 
     def distance(self, index: int) -> float:
-        """The whole Chamfer distance of one pose."""
+        """Return the Chamfer distance of one pose."""
         return float(self.to_query(np.array([index]), slice(None))[0]) + self.from_query(index)
 
     def to_query(self, poses: Int[np.ndarray, "k"], points: slice) -> Float[np.ndarray, "k"]:
-        """These points' share of the mean distance of each of these poses' clouds to the query's."""
+        """Return the contribution of some points to the mean distance of poses' clouds to the query's."""
         differs = self._differs[poses, points]
         distance = np.zeros(differs.shape)
         distance[differs] = self._tree.query(self._clouds_m[poses, points][differs])[0]
         return distance.sum(axis=1) / self._differs.shape[1]
 
     def from_query(self, index: int) -> float:
-        """Mean distance of the query's cloud to a pose's."""
+        """Return the mean distance of the query's cloud to a pose's."""
         searched = self._query_m[self._differs[index]]
         return float(KDTree(self._clouds_m[index]).query(searched)[0].sum()) / len(self._query_m)
 
 
 class DepthGrid:
-    """Mean absolute difference of layout depth images: in metres, or each scaled to a largest depth of 1."""
+    """Mean absolute difference of layout depth images, in metres or relative to each image's maximum."""
 
     def __init__(
         self,
@@ -165,13 +165,13 @@ class DepthGrid:
         self._depth = self._scaled(layout_depth(*layouts_at(plan, poses, camera_height_m, columns), rows))
 
     def distances(self, query: Layout) -> Float[np.ndarray, "n"]:
-        """Distance of the query to every pose."""
+        """Return the distance of the query to every pose."""
         _require_columns(query, self.columns)
         depth = self._scaled(query.depth_m(self._depth.shape[1])[None])
         return np.abs(self._depth - depth).mean(axis=(1, 2), dtype=np.float64)
 
     def nearest(self, query: Layout) -> int:
-        """Number of the pose nearest to the query."""
+        """Return the index of the pose nearest to the query."""
         return int(self.distances(query).argmin())
 
     def _scaled(self, depth_m: Float[np.ndarray, "n h w"]) -> Float[np.ndarray, "n h w"]:
@@ -180,7 +180,7 @@ class DepthGrid:
 
 
 class EdgeGrid:
-    """2-D Chamfer distance (pixels) between the edges of layouts drawn as panoramas; left and right borders meet."""
+    """2-D Chamfer distance (pixels) between the edges of layouts as panoramas, which wrap around horizontally."""
 
     def __init__(
         self, plan: FloorPlan, poses: PoseSet, camera_height_m: float, *, rows: int = 64, columns: int = 128
@@ -190,10 +190,10 @@ class EdgeGrid:
         edges = edge_image(*layouts_at(plan, poses, camera_height_m, columns), rows).reshape(len(poses), -1)
         self._owner, self._pixel = np.nonzero(edges)
         self._count = edges.sum(axis=1)
-        self._field = np.stack([distance_field(one.reshape(rows, columns)).ravel() for one in edges])
+        self._field = np.stack([distance_field(image.reshape(rows, columns)).ravel() for image in edges])
 
     def distances(self, query: Layout) -> Float[np.ndarray, "n"]:
-        """Distance of the query to every pose."""
+        """Return the distance of the query to every pose."""
         _require_columns(query, self.columns)
         heights = np.array([query.camera_height_m]), np.array([query.ceiling_height_m])
         edges = edge_image(query.profile_m[None], *heights, self._rows)[0]
@@ -202,7 +202,7 @@ class EdgeGrid:
         return to_poses + to_query / self._count
 
     def nearest(self, query: Layout) -> int:
-        """Number of the pose nearest to the query."""
+        """Return the index of the pose nearest to the query."""
         return int(self.distances(query).argmin())
 
 
@@ -210,7 +210,7 @@ LayoutGrid = ChamferGrid | DepthGrid | EdgeGrid
 
 
 def layout_grid(metric: LayoutMetric, plan: FloorPlan, poses: PoseSet, camera_height_m: float) -> LayoutGrid:
-    """The poses of a plan, ready to be compared with queries by a metric."""
+    """Return the grid that compares the poses of a plan with queries by a metric."""
     if metric == "chamfer":
         return ChamferGrid(plan, poses, camera_height_m)
     if metric == "edges":
@@ -224,7 +224,7 @@ def edge_image(
     ceiling_height_m: Float[np.ndarray, "n"],
     rows: int,
 ) -> Bool[np.ndarray, "n {rows} w"]:
-    """Layouts drawn as edges: where walls meet floor and ceiling, and where two walls meet or one hides another."""
+    """Draw the edges of layouts: between walls, floor and ceiling, at corners and at occlusions."""
 
     def row_of(elevation: Float[np.ndarray, "n w"]) -> Int[np.ndarray, "n 1 w"]:
         return np.floor((0.5 - elevation / math.pi) * rows).astype(int)[:, None, :]
@@ -237,9 +237,9 @@ def edge_image(
 
 
 def distance_field(edges: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Distance (pixels) of every pixel to the nearest edge, around the horizon; every column has an edge."""
+    """Return the distance (pixels) of every pixel to the nearest edge, wrapping around; every column has an edge."""
     rows, columns = edges.shape
-    # An edge in its own column is never more than `rows` away, so none beyond that margin can be the nearest.
+    # The edge in a pixel's own column is at most `rows` away, so the margin need not be wider.
     margin = min(rows, columns)
     around = np.pad(edges, ((0, 0), (margin, margin)), mode="wrap")
     distance = distance_transform_edt(~around)
@@ -248,10 +248,10 @@ def distance_field(edges: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
 
 
 def _corners(profile_m: Float[np.ndarray, "n w"]) -> Bool[np.ndarray, "n w"]:
-    """Columns next to a corner.
+    """Return the columns next to a corner or an occlusion.
 
-    Along one straight wall the inverse distance is a cosine of azimuth, u(a + δ) + u(a - δ) = 2 cos δ u(a); where that
-    fails, the wall bends between neighbouring columns or ends in front of another.
+    Along a straight wall the inverse distance is a cosine of azimuth, u(a + δ) + u(a - δ) = 2 cos δ u(a), which fails
+    at corners and occlusions.
     """
     step = TWO_PI / profile_m.shape[1]
     inverse = 1.0 / profile_m
@@ -261,13 +261,15 @@ def _corners(profile_m: Float[np.ndarray, "n w"]) -> Bool[np.ndarray, "n w"]:
 
 def _require_columns(query: Layout, columns: int) -> None:
     if len(query.profile_m) != columns:
-        raise InvalidInputError(f"the query's wall profile has {len(query.profile_m)} columns, {columns} are wanted")
+        raise InvalidInputError(
+            f"the query's wall profile has {len(query.profile_m)} columns; this grid needs {columns}"
+        )
 
 
 class SimilarityRetrieval:
-    """The grid pose whose layout is nearest the true layout by one metric (paper, table of layout-similarity metrics).
+    """Retrieval of the grid pose whose layout is nearest the true layout (table "Layout-similarity metric").
 
-    By Chamfer distance it is the paper's oracle, and its choice is what Layout R@1 counts as right.
+    With Chamfer distance it is the paper's oracle: Layout R@1 counts its choice as right.
     """
 
     def __init__(self, metric: LayoutMetric = "chamfer") -> None:
@@ -275,7 +277,7 @@ class SimilarityRetrieval:
         self._grids: LRUCache[Any, LayoutGrid] = LRUCache(GRIDS_CACHED)
 
     def locate(self, question: Question) -> Answer:
-        """Retrieve with the true layout."""
+        """Return the grid pose with the nearest layout."""
         grid = self._grid(question)
         clock = StageClock()
         with clock.stage("retrieve"):
@@ -288,10 +290,10 @@ class SimilarityRetrieval:
 
 
 class PoseOracle:
-    """The grid pose nearest the true position: row "Pose" of the same table, the bound of every retrieval."""
+    """Retrieval of the grid pose nearest the true position: row "Pose" of the same table."""
 
     def locate(self, question: Question) -> Answer:
-        """Look up the nearest grid pose."""
+        """Return the nearest grid pose."""
         clock = StageClock()
         with clock.stage("retrieve"):
             index = int(np.linalg.norm(question.grid.position_m - question.camera.position_m, axis=1).argmin())

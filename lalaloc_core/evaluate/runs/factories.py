@@ -1,4 +1,4 @@
-"""From what a run asked (`RunInfo`) to the data set and the method that answer it."""
+"""Data set and method of a run, built from its description (`RunInfo`)."""
 
 from __future__ import annotations
 
@@ -37,12 +37,16 @@ class LaLaLocSettings:
     """Settings of method "lalaloc"; the defaults are the service's.
 
     Attributes:
-        evidence: what poses are compared by: the predicted wall profile, where the model predicts one; the latent; or
-            the sum of both.
-        openings, ceiling, room_type, see_through: whether those are compared, where model and plan have them.
-        heading_doubt: probability that a known heading is held to be wrong.
-        camera_height: whether the camera's height is told with a deviation of `camera_height_std_m`, or not at all.
-        camera_height_error_m: by how much it is told wrong.
+        refine: last stage of the search.
+        vdr_samples: poses of the Vogel disc.
+        vdr_candidates, lpo_candidates: number of refined candidates.
+        evidence: term of the matching cost for walls: the predicted wall profile, the latent, or the sum of both.
+        optimiser: method of LPO.
+        openings, ceiling, room_type, see_through: whether the matching cost has these terms, if model and plan do.
+        heading_doubt: assumed probability that a known heading is wrong.
+        camera_height: whether the camera's height is stated, with `camera_height_std_m`, or unknown.
+        camera_height_std_m: stated standard deviation.
+        camera_height_error_m: error added to the stated height.
     """
 
     refine: Refine = "lpo"
@@ -63,31 +67,31 @@ class LaLaLocSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class SimilaritySettings:
-    """Settings of method "similarity": by which metric layouts are compared."""
+    """Settings of method "similarity": the metric of layouts."""
 
     metric: LayoutMetric = "chamfer"
 
 
 @dataclass(frozen=True, kw_only=True)
 class NoSettings:
-    """Methods without settings."""
+    """Settings of methods without settings."""
 
 
 _Settings = TypeVar("_Settings")
 
 
 def build_dataset(info: RunInfo) -> Dataset:
-    """The data set of a run.
+    """Return the data set of a run.
 
     Raises:
-        DatasetError: its folder is gone or holds no data set.
+        DatasetError: its folder does not exist or holds no data set.
     """
     if info.data is not None:
         return open_dataset(Path(info.data), info.data_format)
     arguments: dict[str, Any] = dict(info.generated or {})
     generator = arguments.pop("generator", "synth")
     if generator == "heldout":
-        # Traced by embree, which only the extra `oracle` brings.
+        # Needs embree, from the extra `oracle`.
         from lalaloc_core.learn.data.synthetic.heldout import HeldoutScenes
 
         return HeldoutScenes(**arguments)
@@ -102,12 +106,12 @@ def build_dataset(info: RunInfo) -> Dataset:
 
 
 def build_method(info: RunInfo) -> Method:
-    """The method of a run, ready to answer, on one thread.
+    """Return the method of a run, on one thread.
 
     Raises:
-        BundleError: the model is gone, was altered, or lacks what the method needs.
-        ConfigError: settings that the method does not have.
-        InvalidInputError: the method needs a bundle and none was named.
+        BundleError: the model is missing, changed, or lacks a part that the method needs.
+        ConfigError: the method does not have a setting.
+        InvalidInputError: the method needs a bundle and the run names none.
     """
     if info.method == "similarity":
         return SimilarityRetrieval(_settings(SimilaritySettings, info).metric)
@@ -120,7 +124,7 @@ def build_method(info: RunInfo) -> Method:
         return Icp()
     bundle = require_bundle(info)
     encoders = Encoders(bundle, threads=1)
-    # Tensors of a few poses are too small to share between threads.
+    # Tensors of a few poses are too small for several threads.
     torch.set_num_threads(1)
     if info.method == "explicit":
         return ExplicitLayout(encoders)
@@ -161,27 +165,27 @@ def _settings(kind: type[_Settings], info: RunInfo) -> _Settings:
 
 
 def require_bundle(info: RunInfo) -> Bundle:
-    """The bundle of a run."""
+    """Return the bundle of a run."""
     if info.bundle is None:
-        raise InvalidInputError(f"method '{info.method}' needs a model bundle")
+        raise InvalidInputError(f"method '{info.method}' needs a model bundle; name its folder with --bundle")
     return Bundle.open(Path(info.bundle))
 
 
 def describe_model(folder: Path) -> dict[str, str]:
-    """What a run records of its model."""
+    """Return name, version and SHA-256 of a model."""
     bundle = Bundle.open(folder)
     return {"name": bundle.manifest.name, "version": bundle.manifest.version, "sha256": bundle.sha256}
 
 
 def choose_appearance(dataset: Dataset, furniture: str | None, lighting: str | None) -> Appearance:
-    """How the photographs of a run look: what was asked for, else what the data set is usually asked with.
+    """Return the appearance of a run's photographs; the data set's default for None.
 
     Raises:
         InvalidInputError: the data set has no such photographs.
     """
-    usual = dataset.appearances[0]
-    wanted = Appearance(furniture or usual.furniture, lighting or usual.lighting)
-    if wanted not in dataset.appearances:
-        known = ", ".join(str(one) for one in dataset.appearances)
-        raise InvalidInputError(f"{dataset.description} has no photographs '{wanted}', there are: {known}")
-    return wanted
+    default = dataset.appearances[0]
+    appearance = Appearance(furniture or default.furniture, lighting or default.lighting)
+    if appearance not in dataset.appearances:
+        known = ", ".join(map(str, dataset.appearances))
+        raise InvalidInputError(f"{dataset.description} has no photographs '{appearance}'; choose one of: {known}")
+    return appearance

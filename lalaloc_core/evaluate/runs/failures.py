@@ -1,7 +1,7 @@
-"""Sorting answers into located and failed, by the paper's two kinds of failure (figure of failure cases).
+"""Classification of predictions into located and the paper's two kinds of failure (figure of failure cases).
 
-The paper names the kinds, not where they begin: "an incorrect room is retrieved", or "the correct room is retrieved but
-the alignment is incorrect". Here an alignment is incorrect beyond `ALIGNMENT_LIMIT_M`.
+The paper names "an incorrect room is retrieved" and "the correct room is retrieved but the alignment is incorrect"
+without a threshold. Here an alignment is incorrect beyond `ALIGNMENT_LIMIT_M`.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from lalaloc_core.evaluate.runs.predictions import Prediction
 from lalaloc_core.evaluate.runs.score import position_errors_m
 from lalaloc_core.floorplan import FloorPlan
 
-# One step of the paper's grid: whoever is farther off has not even kept to the poses around the true one.
+# One step of the paper's grid: a larger error is beyond the grid poses around the true one.
 ALIGNMENT_LIMIT_M = 0.5
 
 
 class Outcome(StrEnum):
-    """What became of a query; every query has exactly one."""
+    """Outcome of a query; every query has exactly one."""
 
     LOCATED = "located"
     WRONG_ALIGNMENT = "wrong alignment"
@@ -29,41 +29,38 @@ class Outcome(StrEnum):
 
 
 def outcomes(predictions: Sequence[Prediction], stage: str | None = None) -> list[Outcome]:
-    """What became of each query.
-
-    Args:
-        stage: judge the pose after this stage; None judges the answer.
-    """
+    """Return the outcome of each query, for the final pose or the pose after a stage."""
     errors_m = position_errors_m(predictions, stage)
-    return [_outcome(one, stage, float(error_m)) for one, error_m in zip(predictions, errors_m, strict=True)]
+    pairs = zip(predictions, errors_m, strict=True)
+    return [_outcome(prediction, stage, float(error_m)) for prediction, error_m in pairs]
 
 
 def count_outcomes(predictions: Sequence[Prediction], stage: str | None = None) -> dict[Outcome, int]:
-    """How many queries had each outcome, those with none included; the counts sum to the number of queries."""
+    """Return the number of queries by outcome, for all outcomes."""
     found = outcomes(predictions, stage)
     return {outcome: found.count(outcome) for outcome in Outcome}
 
 
 def symmetric_positions(room: shapely.Polygon, x_m: float, y_m: float) -> list[tuple[float, float]]:
-    """Where a position comes to lie when its room is mirrored along either axis of its bounding box or turned round."""
+    """Return a position mirrored along either axis of its room's bounding box, and turned by 180°."""
     left, bottom, right, top = room.bounds
     across, along = left + right - x_m, bottom + top - y_m
     return [(across, y_m), (x_m, along), (across, along)]
 
 
 def is_symmetric(plan: FloorPlan, prediction: Prediction) -> bool:
-    """Whether an answer in the right room, but wrongly aligned there, took the room for its mirror image.
+    """Return whether a misaligned pose in the right room fits the mirrored room.
 
-    That is: it lies within `ALIGNMENT_LIMIT_M` of one of the true position's `symmetric_positions`.
+    It then lies within `ALIGNMENT_LIMIT_M` of one of the true position's `symmetric_positions`.
     """
-    found = prediction.final_pose
-    if found is None or outcomes([prediction]) != [Outcome.WRONG_ALIGNMENT]:
+    pose = prediction.final_pose
+    if pose is None or outcomes([prediction]) != [Outcome.WRONG_ALIGNMENT]:
         return False
-    return shapely.Point(found.x_m, found.y_m).within(_symmetric_area(plan, prediction))
+    return shapely.Point(pose.x_m, pose.y_m).within(_symmetric_area(plan, prediction))
 
 
 def symmetric_by_chance(plan: FloorPlan, prediction: Prediction) -> float:
-    """Share of the wrong positions in the true room that `is_symmetric` would hold for."""
+    """Return the share of the wrong positions in the true room for which `is_symmetric` holds."""
     truth = prediction.truth
     room = plan.rooms[truth.room_index].shape
     wrong = room.difference(shapely.Point(truth.x_m, truth.y_m).buffer(ALIGNMENT_LIMIT_M))
@@ -77,9 +74,9 @@ def _symmetric_area(plan: FloorPlan, prediction: Prediction) -> shapely.Geometry
 
 
 def _outcome(prediction: Prediction, stage: str | None, error_m: float) -> Outcome:
-    found = prediction.final_pose if stage is None else prediction.stages.get(stage)
-    if found is None:
+    pose = prediction.pose_after(stage)
+    if pose is None:
         return Outcome.NO_ANSWER
-    if found.room_index != prediction.truth.room_index:
+    if pose.room_index != prediction.truth.room_index:
         return Outcome.WRONG_ROOM
     return Outcome.LOCATED if error_m <= ALIGNMENT_LIMIT_M else Outcome.WRONG_ALIGNMENT

@@ -1,4 +1,4 @@
-"""Scores of answers in galleries: how often an annotated photograph's own room is found among others like it."""
+"""Scores in galleries: retrieval of an annotated photograph's own room among similar rooms."""
 
 from __future__ import annotations
 
@@ -12,23 +12,28 @@ from lalaloc_core.evaluate.runs.score import expected_calibration_error, heading
 from lalaloc_core.learn.data.annotated import GalleryKey
 from lalaloc_core.learn.data.annotations import AnnotatedPhotograph
 
-# A position is right within this distance, or within this share of the room's size (the root of its area).
+# A position is right within this distance or this share of the room's size (the root of its area).
 NEAR_M, NEAR_SHARE = 0.5, 0.1
-# A room that is the same when it is turned round has two headings for one position.
-_TURNED_DEG = 10.0
-# Rank of a room that is not among the answer's candidates.
+# A symmetric room has two headings for one position.
+_MAX_HEADING_ERROR_DEG = 10.0
+# Rank of a room without a candidate.
 _NOT_RANKED = 1_000
 
 
 @dataclass(frozen=True, kw_only=True)
 class GalleryAnswer:
-    """One photograph asked for in one gallery; of two outlines, the one that was answered better.
+    """Result of one photograph in one gallery, for the outline with the better result.
 
     Attributes:
-        located: the right room and the right position in it.
-        turned: located, but with a heading that is off by more than 10°.
-        rank: of the best candidate in the right room, from 1; None where no candidate is in it.
-        within_1m: what `confidence` is the probability of.
+        photograph: name of the photograph.
+        gallery, outline: numbers of the gallery and of the outline.
+        located: whether room and position are right.
+        turned: whether it is located with a heading error above 10°.
+        right_room: whether the room is right.
+        rank: rank of the best candidate in the right room, from 1; None without one.
+        error_m: position error; infinite without an answer.
+        within_1m: the event whose probability `confidence` is.
+        confidence: predicted probability of `within_1m`.
     """
 
     photograph: str
@@ -44,7 +49,7 @@ class GalleryAnswer:
 
     @property
     def merit(self) -> tuple[bool, bool, int, float]:
-        """What the better of two answers has more of."""
+        """Sort key: the better of two results is larger."""
         return self.located, self.right_room, -(self.rank or _NOT_RANKED), -self.error_m
 
 
@@ -53,10 +58,13 @@ class GalleryScores:
     """Shares over all galleries of all photographs.
 
     Attributes:
-        turned: share in which the position is right, but the heading is not.
-        among_3: share in which the right room is among the first three candidates.
+        photographs, galleries: numbers of photographs and of galleries.
+        located: share with the right room and position.
+        turned: share with the right position and a wrong heading.
+        right_room: share with the right room.
+        among_3: share with the right room among the first three candidates.
         calibration_error: expected calibration error of "within 1 m"; None without confidences.
-        by_photograph: share of its galleries in which each photograph was located.
+        by_photograph: share of each photograph's galleries in which it is located.
     """
 
     photographs: int
@@ -72,24 +80,24 @@ class GalleryScores:
 def answers_in_galleries(
     predictions: Sequence[Prediction], photographs: Sequence[AnnotatedPhotograph]
 ) -> list[GalleryAnswer]:
-    """One answer for every gallery of every photograph, in order."""
-    known = {one.name: one for one in photographs}
+    """Return one result for every gallery of every photograph, in order."""
+    by_name = {photograph.name: photograph for photograph in photographs}
     errors_m = np.nan_to_num(position_errors_m(predictions), nan=np.inf)
-    turned_deg = heading_errors_deg(predictions)
+    headings_deg = heading_errors_deg(predictions)
     best: dict[tuple[str, int], GalleryAnswer] = {}
-    for prediction, error_m, off_deg in zip(predictions, errors_m, turned_deg, strict=True):
+    for prediction, error_m, heading_deg in zip(predictions, errors_m, headings_deg, strict=True):
         key = GalleryKey.of_scene(prediction.scene)
-        assert key is not None, f"'{prediction.scene}' is no gallery"
-        size_m = known[key.photograph].outlines[key.outline].size_m
-        found = prediction.final_pose
-        right_room = found is not None and found.room_index == prediction.truth.room_index
+        assert key is not None, f"'{prediction.scene}' is not a gallery"
+        size_m = by_name[key.photograph].outlines[key.outline].size_m
+        pose = prediction.final_pose
+        right_room = pose is not None and pose.room_index == prediction.truth.room_index
         located = right_room and bool(error_m < max(NEAR_M, NEAR_SHARE * size_m))
         answer = GalleryAnswer(
             photograph=key.photograph,
             gallery=key.gallery,
             outline=key.outline,
             located=located,
-            turned=located and bool(off_deg > _TURNED_DEG),
+            turned=located and bool(heading_deg > _MAX_HEADING_ERROR_DEG),
             right_room=right_room,
             rank=prediction.room_rank,
             error_m=float(error_m),
@@ -103,31 +111,31 @@ def answers_in_galleries(
 
 
 def score_galleries(answers: Sequence[GalleryAnswer]) -> GalleryScores:
-    """Scores of at least one answer."""
-    confident = [one for one in answers if one.confidence is not None]
+    """Return the scores of at least one result."""
+    confident = [answer for answer in answers if answer.confidence is not None]
     error = None
     if confident:
-        confidence = np.array([one.confidence for one in confident], dtype=float)
-        error = expected_calibration_error(confidence, np.array([one.within_1m for one in confident]))
-    names = list(dict.fromkeys(one.photograph for one in answers))
+        confidence = np.array([answer.confidence for answer in confident], dtype=float)
+        error = expected_calibration_error(confidence, np.array([answer.within_1m for answer in confident]))
+    names = list(dict.fromkeys(answer.photograph for answer in answers))
     return GalleryScores(
         photographs=len(names),
         galleries=len(answers),
-        located=float(np.mean([one.located for one in answers])),
-        turned=float(np.mean([one.turned for one in answers])),
-        right_room=float(np.mean([one.right_room for one in answers])),
-        among_3=float(np.mean([one.rank is not None and one.rank <= 3 for one in answers])),
+        located=float(np.mean([answer.located for answer in answers])),
+        turned=float(np.mean([answer.turned for answer in answers])),
+        right_room=float(np.mean([answer.right_room for answer in answers])),
+        among_3=float(np.mean([answer.rank is not None and answer.rank <= 3 for answer in answers])),
         calibration_error=error,
         by_photograph={
-            name: float(np.mean([one.located for one in answers if one.photograph == name])) for name in names
+            name: float(np.mean([answer.located for answer in answers if answer.photograph == name])) for name in names
         },
     )
 
 
 def describe_answers(answers: Sequence[GalleryAnswer], photograph: str) -> str:
-    """How many of its galleries a photograph was located in, and the ranks of its room in the others."""
-    own = [one for one in answers if one.photograph == photograph]
+    """Describe the number of galleries that locate a photograph, and its room's ranks in the others."""
+    own = [answer for answer in answers if answer.photograph == photograph]
     if not own:
-        return "not asked"
-    missed = [f"{one.rank or 'none'}" for one in own if not one.located]
+        return "not evaluated"
+    missed = [f"{answer.rank or 'none'}" for answer in own if not answer.located]
     return f"{len(own) - len(missed)} of {len(own)}" + (f" (ranks {', '.join(missed)})" if missed else "")

@@ -1,4 +1,4 @@
-"""What a model reads from annotated photographs: walls and openings per azimuth, and how right that is."""
+"""Predictions of a model on annotated photographs, per azimuth: walls and openings, and their errors."""
 
 from __future__ import annotations
 
@@ -17,11 +17,13 @@ from lalaloc_core.localise.encoders import Encoders
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ReadPhotograph:
-    """One photograph and what the model says of it.
+    """Photograph with its predicted walls and openings.
 
     Attributes:
+        photograph: the annotated photograph.
         profile_m: (w,) predicted wall profile.
-        class_scores: (w, classes) predicted log likelihoods but for a constant; None where the model predicts none.
+        class_scores: (w, classes) predicted log likelihoods up to a constant; None if the model predicts none.
+        measures: errors against the annotation.
     """
 
     photograph: AnnotatedPhotograph
@@ -31,7 +33,7 @@ class ReadPhotograph:
 
 
 def read_photographs(encoders: Encoders, photographs: Sequence[AnnotatedPhotograph]) -> list[ReadPhotograph]:
-    """What a model says of each photograph, and how right it is.
+    """Predict walls and openings of each photograph and compare them with the annotation.
 
     Raises:
         BundleError: the model predicts no wall profile.
@@ -39,24 +41,26 @@ def read_photographs(encoders: Encoders, photographs: Sequence[AnnotatedPhotogra
     """
     manifest = encoders.manifest
     read = []
-    for one in photographs:
-        image = one.photograph.image(manifest.image_height, manifest.image_width)
+    for photograph in photographs:
+        image = photograph.photograph.image(manifest.image_height, manifest.image_width)
         log_m, log_scale, scores = read_azimuths(encoders, image, CAMERA_HEIGHT_M)
         measures = measure_azimuths(
-            [one.profile_m(outline, len(log_m)) for outline in range(len(one.outlines))],
+            [photograph.profile_m(outline, len(log_m)) for outline in range(len(photograph.outlines))],
             log_m,
             log_scale,
-            one.classes(len(log_m)),
+            photograph.classes(len(log_m)),
             scores,
         )
-        read.append(ReadPhotograph(photograph=one, profile_m=np.exp(log_m), class_scores=scores, measures=measures))
+        read.append(
+            ReadPhotograph(photograph=photograph, profile_m=np.exp(log_m), class_scores=scores, measures=measures)
+        )
     return read
 
 
 def read_azimuths(
     encoders: Encoders, image: UInt8[np.ndarray, "height width 3"], camera_height_m: float
 ) -> tuple[Float[np.ndarray, "w"], Float[np.ndarray, "w"], Float[np.ndarray, "w c"] | None]:
-    """What a model says of a panorama in its own frame.
+    """Predict walls and openings of a panorama in its own frame.
 
     Returns:
         the log of the predicted wall profile (m), the log of its scale, and `ReadPhotograph.class_scores`.
@@ -66,8 +70,8 @@ def read_azimuths(
     """
     query = encoders.query(image, 0.0, CameraHeight(camera_height_m, 0.0))
     if query.profile is None:
-        raise BundleError(f"model '{encoders.manifest.name}' predicts no wall profile, which is what is measured")
-    # Relative to the shares of the classes, as poses are compared: every class counts alike in what is reported.
+        raise BundleError(f"model '{encoders.manifest.name}' predicts no wall profile; use another bundle")
+    # Relative to the shares of the classes, as in the matching cost, so that every class counts alike.
     openings = query.openings
     scores = None if openings is None else openings.log_probability[0] - np.log(openings.prior)
     return query.profile.log_m[0], query.profile.log_scale[0], scores

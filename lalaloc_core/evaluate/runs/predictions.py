@@ -1,10 +1,10 @@
-"""What an evaluation leaves on disk: one folder per run, with what was asked and every answer.
+"""Files of an evaluation run, one folder per run.
 
-    RUN/run.json            what was asked: method, data, settings, model (`RunInfo`)
+    RUN/run.json            method, data, settings, model (`RunInfo`)
     RUN/predictions.jsonl   one line per query, in order (`Prediction`)
-    RUN/scores.json         written by scoring; can be made again at any time, without model or data
+    RUN/scores.json         scores, which need neither model nor data
 
-Files hold metres, degrees and milliseconds, as the names say.
+Values are in metres, degrees and milliseconds; field names have the unit.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ MethodName = Literal["lalaloc", "oracle", "pose-oracle", "similarity", "icp", "e
 
 @dataclass(frozen=True, kw_only=True)
 class Pose:
-    """A pose in a plan; `distance` is how far the method's own measure says it is from the query (None: none)."""
+    """Pose in a plan; `distance` to the query by the method's own measure, None without one."""
 
     x_m: float
     y_m: float
@@ -45,7 +45,7 @@ class Pose:
 
 @dataclass(frozen=True, kw_only=True)
 class PredictedCandidate:
-    """One candidate for an answer: its pose, what each term of the evidence says of it, and its posterior."""
+    """Candidate pose with its terms of the matching cost and its posterior probability."""
 
     pose: Pose
     terms: dict[str, float]
@@ -54,26 +54,27 @@ class PredictedCandidate:
 
 @dataclass(frozen=True, kw_only=True)
 class Prediction:
-    """One query and its answer.
+    """Query and its predicted pose.
 
     Attributes:
-        scene, camera: which query.
+        scene, camera: names of the query's scene and camera.
         room: name of the true room.
+        camera_height_m: the true camera height.
         truth: the true pose.
-        stages: the best pose after every stage ("retrieval", "vdr", "lpo", ...), in order; the last is the answer.
-            Empty where the method had none: a miss.
-        layout_hit: whether retrieval chose the grid pose whose layout is nearest the truth by Chamfer distance
-            (Layout R@1); None for methods that do not retrieve.
+        stages: the best pose after every stage ("retrieval", "vdr", "lpo", ...), in order; the last is the final
+            pose. Empty without an answer, which counts as a miss.
+        layout_hit: whether retrieval chose the grid pose with the nearest layout by Chamfer distance (Layout R@1);
+            None for methods without retrieval.
         pose_hit: whether it chose the nearest grid pose (Pose R@1).
-        room_rank: of the best candidate in the true room, from 1; None where none is in it, or the method ranks none.
-        signals: by stage, what speaks for its pose and against it; see `localise.confidence`.
-        information: curvature of the cost at the answer, by x and y (m) and, where it was searched, heading (radians).
-        candidates: the answer and its rivals, best first, of methods that have any.
-        confidence: probability, by the model, of being within 1 m.
-        heading_confidence: probability, by the model, of the heading being right within 5°.
-        found_height_m: the camera height that fits best, where it was solved for.
-        timings_ms: per stage.
-        facts: what is known to make the photograph hard, in alphabetical order; see `data.dataset.Described`.
+        room_rank: rank of the best candidate in the true room, from 1; None without one.
+        signals: inputs of the confidence model by stage; see `localise.confidence`.
+        information: curvature of the cost at the final pose, by x and y (m) and, if searched, heading (radians).
+        candidates: candidate poses, best first, if the method ranks any.
+        confidence: predicted probability of a position error below 1 m.
+        heading_confidence: predicted probability of a heading error below 5°.
+        found_height_m: the estimated camera height, if the method estimates it.
+        timings_ms: duration of each stage.
+        facts: known difficulties of the photograph, in alphabetical order; see `learn.data.dataset.Described`.
     """
 
     scene: str
@@ -96,28 +97,32 @@ class Prediction:
 
     @property
     def final_pose(self) -> Pose | None:
-        """The pose after the last stage; None where there is no answer."""
+        """Pose after the last stage; None without an answer."""
         return next(reversed(self.stages.values()), None)
+
+    def pose_after(self, stage: str | None) -> Pose | None:
+        """Return the pose after a stage, or the final pose if the stage is None."""
+        return self.final_pose if stage is None else self.stages.get(stage)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunInfo:
-    """What was asked, enough to ask again.
+    """Description of a run, sufficient to repeat it.
 
     Attributes:
-        label: what tables call the run.
-        settings: the method's own settings, plain data.
-        dataset: what results are to be called, such as "Structured3D".
-        data: folder of the data set as it was given; None for generated homes.
-        data_format: which of `DATASET_FORMATS` that is; None where it is found out.
-        generated: arguments of the generator where `data` is None.
-        furniture, lighting: the appearance of the photographs; None where the data set has none.
-        limit: at most so many queries; None for all.
-        bundle: folder of the model as it was given; None for methods without one.
+        label: name of the run in tables.
+        settings: settings of the method, as plain data.
+        dataset: name of the data set in results, such as "Structured3D".
+        data: folder of the data set; None for generated homes.
+        data_format: one of `DATASET_FORMATS`; None to detect it.
+        generated: arguments of the generator if `data` is None.
+        furniture, lighting: appearance of the photographs; None if the data set has no such choice.
+        limit: maximum number of queries; None for all.
+        bundle: folder of the model; None for methods without one.
         model: name, version and SHA-256 of the bundle.
-        skip_bad: whether scenes and cameras that cannot be used are left out instead of ending the run.
-        command: how to run it again.
-        skipped: scenes and cameras that could not be used, with reasons.
+        skip_bad: whether unusable scenes and cameras are skipped instead of ending the run.
+        command: the command that repeats the run.
+        skipped: skipped scenes and cameras, with reasons.
     """
 
     label: str
@@ -142,16 +147,16 @@ class RunInfo:
 
 
 class RunFolder:
-    """Reads and writes the files of one run."""
+    """Files of one run, read and written."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     def read_info(self) -> RunInfo:
-        """What was asked.
+        """Return the description of the run.
 
         Raises:
-            RunError: no run there, or not one this version reads.
+            RunError: the folder holds no run, or one that this version cannot read.
         """
         path = self.path / RUN_FILE
         try:
@@ -162,36 +167,36 @@ class RunFolder:
             raise RunError(f"'{path}' does not describe a run: {error}") from error
 
     def exists(self) -> bool:
-        """Whether a run was begun here."""
+        """Return whether the folder holds a run."""
         return (self.path / RUN_FILE).exists()
 
     def write_info(self, info: RunInfo) -> None:
-        """Record what is asked."""
+        """Write the description of the run."""
         self.path.mkdir(parents=True, exist_ok=True)
         atomic_write(self.path / RUN_FILE, json.dumps(dataclasses.asdict(info), indent=2) + "\n")
 
     def remove(self) -> None:
-        """Take the run away, and the folder with it unless something else lies there."""
+        """Delete the run, and the folder unless it holds other files."""
         for name in (RUN_FILE, PREDICTIONS_FILE):
             (self.path / name).unlink(missing_ok=True)
         with suppress(OSError):
             self.path.rmdir()
 
     def read_predictions(self) -> list[Prediction]:
-        """Every complete answer; a last line that an interruption cut short is left out.
+        """Return every complete prediction, without a last line that an interruption cut short.
 
         Raises:
-            RunError: a line that is not a prediction.
+            RunError: a line is not a prediction.
         """
         path = self.path / PREDICTIONS_FILE
         if not path.exists():
             return []
         lines = path.read_text(encoding="utf-8").split("\n")
-        # What stands after the last line break was being written when the run was interrupted.
+        # Text after the last line break was cut short by an interruption.
         return [self._parse(line, number) for number, line in enumerate(lines[:-1], start=1)]
 
     def append(self, predictions: Iterable[Prediction]) -> None:
-        """Add answers at the end of the file."""
+        """Append predictions to the file."""
         text = _lines(predictions)
         with (self.path / PREDICTIONS_FILE).open("a", encoding="utf-8") as file:
             file.write(text)
@@ -199,29 +204,29 @@ class RunFolder:
             os.fsync(file.fileno())
 
     def replace(self, predictions: Iterable[Prediction]) -> None:
-        """Replace the file's content, atomically."""
+        """Replace the file atomically."""
         atomic_write(self.path / PREDICTIONS_FILE, _lines(predictions))
 
     def _parse(self, line: str, number: int) -> Prediction:
         try:
             return build_config(Prediction, json.loads(line), path=f"line {number}")
         except (ValueError, ConfigError) as error:
-            raise RunError(f"'{self.path / PREDICTIONS_FILE}' line {number} is no prediction: {error}") from error
+            raise RunError(f"'{self.path / PREDICTIONS_FILE}' line {number} is not a prediction: {error}") from error
 
 
 def read_runs(folders: Iterable[Path]) -> Iterator[tuple[RunInfo, list[Prediction]]]:
-    """What several runs asked and answered."""
+    """Yield the description and the predictions of several runs."""
     for folder in folders:
         run = RunFolder(folder)
         yield run.read_info(), run.read_predictions()
 
 
 def _lines(predictions: Iterable[Prediction]) -> str:
-    return "".join(json.dumps(dataclasses.asdict(one), allow_nan=False) + "\n" for one in predictions)
+    return "".join(json.dumps(dataclasses.asdict(prediction), allow_nan=False) + "\n" for prediction in predictions)
 
 
 def without_infinity(value: Any) -> Any:
-    """Plain data as JSON can hold it: numbers that are not finite become None."""
+    """Return plain data with None in place of numbers that JSON cannot hold."""
     if isinstance(value, dict):
         return {key: without_infinity(item) for key, item in value.items()}
     if isinstance(value, list | tuple):

@@ -1,7 +1,7 @@
-"""Running an evaluation: every query of a split is answered and written down; scoring comes after and apart.
+"""Evaluation runs: every query of a split is localised and its prediction stored; scoring is separate.
 
-Scenes are answered in parallel by processes of one thread each and written in order, so that a run that was
-interrupted goes on where it stopped and ends in the same file.
+Worker processes of one thread each localise scenes in parallel. Predictions are written in order, so that an
+interrupted run resumes where it stopped and ends with the same file.
 """
 
 from __future__ import annotations
@@ -31,26 +31,27 @@ from lalaloc_core.evaluate.runs.predictions import Pose, PredictedCandidate, Pre
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, Scene, facts_of_photograph, load_scenes
 from lalaloc_core.render.sampling import PoseSet, pose_grid
 
-# What may differ when a run goes on: how it was called, how far it goes, and what it found out.
+# Fields of a run that may differ when it resumes.
 _MAY_DIFFER = {"command", "label", "limit", "skipped"}
 
 
 def run_evaluation(folder: RunFolder, info: RunInfo, *, workers: int | None = None) -> list[Prediction]:
-    """Answer every query of a run, or the rest of a run that was interrupted.
+    """Localise every query of a run, or the rest of an interrupted run.
 
     Args:
-        folder: where the answers go.
-        workers: processes, each with one thread; 0 answers in this one; None takes one per core.
+        folder: folder of the predictions.
+        info: description of the run.
+        workers: processes of one thread each; 0 for this process, None for one per core.
 
     Returns:
-        every prediction, at most `info.limit`.
+        all predictions, `info.limit` at most.
 
     Raises:
-        RunError: `folder` holds a run that asked something else.
+        RunError: `folder` holds a run with another description.
         DatasetError: a scene or photograph cannot be used, and `info.skip_bad` is off.
-        InvalidInputError: the split holds nothing to ask; a folder that was made for it is taken away again.
+        InvalidInputError: the split has no queries; a new folder is deleted again.
     """
-    # What is asked wrongly fails here, before anything is written.
+    # Invalid descriptions fail here, before anything is written.
     names = list(build_dataset(info).scenes(info.split))
     build_method(info)
     if not names:
@@ -59,12 +60,12 @@ def run_evaluation(folder: RunFolder, info: RunInfo, *, workers: int | None = No
     done, skipped = _resume(folder, info)
     limit = math.inf if info.limit is None else info.limit
     if done:
-        # Scenes without queries leave no line; those before the last answered one are done as well.
+        # Scenes without queries leave no line, so resume after the last scene that has one.
         names = names[names.index(done[-1].scene) + 1 :]
     if len(done) >= limit:
         return done
     with tqdm(total=info.limit, initial=len(done), desc=info.label, unit="query", mininterval=1.0) as bar:
-        for predictions, problems in _answers(info, names, workers):
+        for predictions, problems in _localise_scenes(info, names, workers):
             kept = predictions[: int(min(limit - len(done), len(predictions)))]
             done += kept
             folder.append(kept)
@@ -76,13 +77,13 @@ def run_evaluation(folder: RunFolder, info: RunInfo, *, workers: int | None = No
                 break
     if not done and is_new:
         folder.remove()
-        left_out = f"; {len(skipped)} were left out, the first: {skipped[0]}" if skipped else ""
-        raise InvalidInputError(f"split '{info.split}' of {info.dataset} has no queries{left_out}")
+        reason = f"; {len(skipped)} scenes or cameras were skipped, the first: {skipped[0]}" if skipped else ""
+        raise InvalidInputError(f"split '{info.split}' of {info.dataset} has no queries{reason}")
     return done
 
 
 def _resume(folder: RunFolder, info: RunInfo) -> tuple[list[Prediction], list[str]]:
-    """What an earlier run left: whole scenes only, and what it skipped."""
+    """Return the predictions of an earlier run for whole scenes, and the skipped scenes and cameras."""
     if not folder.exists():
         folder.write_info(info)
         folder.replace([])
@@ -97,11 +98,11 @@ def _resume(folder: RunFolder, info: RunInfo) -> tuple[list[Prediction], list[st
         name = differing[0]
         raise RunError(
             f"'{folder.path}' holds a run with {name} {getattr(before, name)!r}, not {getattr(info, name)!r}; "
-            "choose another folder"
+            "choose another folder with --out"
         )
     done = folder.read_predictions()
     if done and (info.limit is None or len(done) < info.limit):
-        # The last scene may have been cut, by an interruption or by a limit: it is answered again.
+        # An interruption or a limit can cut the last scene, so it is repeated.
         done = [prediction for prediction in done if prediction.scene != done[-1].scene]
     done = done[: info.limit]
     folder.write_info(dataclasses.replace(info, skipped=before.skipped))
@@ -109,20 +110,20 @@ def _resume(folder: RunFolder, info: RunInfo) -> tuple[list[Prediction], list[st
     return done, list(before.skipped)
 
 
-def _answers(
+def _localise_scenes(
     info: RunInfo, names: Sequence[str], workers: int | None
 ) -> Iterator[tuple[list[Prediction], list[DatasetError]]]:
-    """Answers scene by scene, in order, a few scenes ahead of whoever takes them."""
-    asked = json.dumps(dataclasses.asdict(info))
+    """Yield predictions and problems by scene, in order; workers are a few scenes ahead."""
+    description = json.dumps(dataclasses.asdict(info))
     workers = os.cpu_count() or 1 if workers is None else workers
     if workers == 0:
-        yield from (_answer_scene(asked, name) for name in names)
+        yield from (_localise_scene(description, name) for name in names)
         return
     waiting: deque[Future[tuple[list[Prediction], list[DatasetError]]]] = deque()
     pool = ProcessPoolExecutor(workers, mp_context=multiprocessing.get_context("spawn"))
     try:
         for name in names:
-            waiting.append(pool.submit(_answer_scene, asked, name))
+            waiting.append(pool.submit(_localise_scene, description, name))
             if len(waiting) > 2 * workers:
                 yield waiting.popleft().result()
         while waiting:
@@ -133,7 +134,7 @@ def _answers(
 
 @dataclass(frozen=True)
 class _Session:
-    """What a process keeps from one scene to the next."""
+    """State of a worker process between scenes."""
 
     info: RunInfo
     dataset: Dataset
@@ -141,15 +142,15 @@ class _Session:
 
 
 @lru_cache(maxsize=1)
-def _session(asked: str) -> _Session:
+def _session(description: str) -> _Session:
     torch.set_num_threads(1)
-    info = build_config(RunInfo, json.loads(asked))
+    info = build_config(RunInfo, json.loads(description))
     return _Session(info, build_dataset(info), build_method(info))
 
 
-def _answer_scene(asked: str, name: str) -> tuple[list[Prediction], list[DatasetError]]:
-    """Answer the queries of one scene; what cannot be used is returned beside the answers, or raised."""
-    session = _session(asked)
+def _localise_scene(description: str, name: str) -> tuple[list[Prediction], list[DatasetError]]:
+    """Return the predictions of one scene and, with `skip_bad`, the errors of unusable scenes and cameras."""
+    session = _session(description)
     info = session.info
     problems: list[DatasetError] | None = [] if info.skip_bad else None
     predictions: list[Prediction] = []
@@ -157,7 +158,7 @@ def _answer_scene(asked: str, name: str) -> tuple[list[Prediction], list[Dataset
         evaluator = _SceneEvaluator(scene, info)
         for camera in scene.cameras:
             try:
-                predictions.append(evaluator.ask(camera, session.method))
+                predictions.append(evaluator.predict(camera, session.method))
             except DatasetError as error:
                 if problems is None:
                     raise
@@ -166,18 +167,18 @@ def _answer_scene(asked: str, name: str) -> tuple[list[Prediction], list[Dataset
 
 
 class _SceneEvaluator:
-    """Asks the queries of one scene and compares what was retrieved with what should have been."""
+    """Queries of one scene, with the recall of retrieval."""
 
     def __init__(self, scene: Scene, info: RunInfo) -> None:
         self._scene, self._info = scene, info
         self._grid: PoseSet = pose_grid(scene.plan, info.grid_step_m)
         self._layouts: dict[float, ChamferGrid] = {}
 
-    def ask(self, camera: Camera, method: Method) -> Prediction:
-        """One query and its answer.
+    def predict(self, camera: Camera, method: Method) -> Prediction:
+        """Localise one query.
 
         Raises:
-            DatasetError: the query's photograph cannot be used.
+            DatasetError: the photograph cannot be used.
         """
         info, scene = self._info, self._scene
         photograph = None
@@ -208,8 +209,8 @@ class _SceneEvaluator:
             signals=answer.signals,
             information=None if answer.information is None else tuple(map(tuple, answer.information.tolist())),
             candidates=tuple(
-                PredictedCandidate(pose=_pose(one.pose), terms=one.terms, probability=one.probability)
-                for one in answer.candidates
+                PredictedCandidate(pose=_pose(candidate.pose), terms=candidate.terms, probability=candidate.probability)
+                for candidate in answer.candidates
             ),
             confidence=answer.confidence,
             heading_confidence=answer.heading_confidence,
@@ -219,7 +220,7 @@ class _SceneEvaluator:
         )
 
     def _layout_hit(self, question: Question, answer: Answer) -> bool | None:
-        """Whether retrieval chose the grid pose with the most similar layout; the first where several are alike."""
+        """Return whether retrieval chose the grid pose with the nearest layout, the first of equals."""
         if answer.retrieved is None:
             return None
         height = question.camera.camera_height_m

@@ -1,7 +1,7 @@
-"""Scores of predictions: the paper's metrics (section 5), each with a 95 % bootstrap interval. Needs no model.
+"""Scores of predictions: the paper's metrics (section 5), each with a 95 % bootstrap interval.
 
-A query without an answer is a miss in every share and infinitely far in every median. Intervals resample scenes, not
-queries, because the queries of one scene succeed and fail together.
+A query without an answer is a miss in every share and has an infinite error in every median. The bootstrap resamples
+scenes, not queries, because queries of one scene are correlated.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ RELIABILITY_BINS = 10
 
 @dataclass(frozen=True, kw_only=True)
 class Estimate:
-    """A figure and its 95 % bootstrap interval; infinite where half of the queries have no answer."""
+    """Value and its 95 % bootstrap interval; infinite if half of the queries have no answer."""
 
     value: float
     low: float
@@ -42,7 +42,7 @@ class Estimate:
 
 @dataclass(frozen=True, kw_only=True)
 class StageScores:
-    """How near the poses after one stage are; shares from 0 to 1, medians over all queries."""
+    """Accuracy of the poses after one stage: shares from 0 to 1, medians over all queries."""
 
     median_cm: Estimate
     within_1cm: Estimate
@@ -56,7 +56,7 @@ class StageScores:
 
 @dataclass(frozen=True, kw_only=True)
 class ReliabilityBin:
-    """Queries whose confidence lies in [low, high): mean confidence, and the share that is within 1 m."""
+    """Queries with a confidence in [low, high): mean confidence, and share within 1 m."""
 
     low: float
     high: float
@@ -67,7 +67,7 @@ class ReliabilityBin:
 
 @dataclass(frozen=True, kw_only=True)
 class SliceScores:
-    """The answers to those `n` queries for which one fact holds; a query counts in the slice of each of its facts."""
+    """Accuracy on the `n` queries for which one fact holds; a query counts in the slice of each of its facts."""
 
     n: int
     within_1m: Estimate
@@ -77,15 +77,18 @@ class SliceScores:
 
 @dataclass(frozen=True, kw_only=True)
 class Scores:
-    """Figures of one run.
+    """Scores of one run.
 
     Attributes:
-        layout_recall: Layout R@1, pose_recall: Pose R@1; None for methods that do not retrieve.
-        stages: by stage in order; `final` is the answer, whichever stage gave it.
+        n: number of queries.
+        unanswered: number of queries without an answer.
+        layout_recall, pose_recall: Layout R@1 and Pose R@1; None for methods without retrieval.
+        stages: accuracy by stage, in order.
+        final: accuracy of the final poses.
         calibration_error: expected calibration error of "within 1 m"; None without confidences.
-        median_ms: per stage, of the queries that went through it.
-        slices: by fact (`Prediction.facts`), the one with the smallest share within 1 m first; empty where no facts
-            are known.
+        reliability: bins of the reliability diagram.
+        median_ms, mean_ms: duration by stage, over the queries that passed it.
+        slices: accuracy by fact (`Prediction.facts`), the smallest share within 1 m first.
     """
 
     n: int
@@ -102,16 +105,17 @@ class Scores:
 
 
 def score(predictions: Sequence[Prediction], seed: int = 0) -> Scores:
-    """Score the answers of one run.
+    """Score the predictions of one run.
 
     Args:
-        seed: of the bootstrap.
+        predictions: at least one.
+        seed: seed of the bootstrap.
 
     Raises:
-        InvalidInputError: there is nothing to score.
+        InvalidInputError: there are no predictions.
     """
     if not predictions:
-        raise InvalidInputError("there are no predictions to score")
+        raise InvalidInputError("there are no predictions to score; run `lalaloc evaluate` first")
     bootstrap = _Bootstrap([prediction.scene for prediction in predictions], np.random.default_rng(seed))
     names = list(dict.fromkeys(name for prediction in predictions for name in prediction.stages))
     final = position_errors_m(predictions)
@@ -138,13 +142,11 @@ def score(predictions: Sequence[Prediction], seed: int = 0) -> Scores:
 
 
 def score_run(folder: RunFolder) -> dict[str, Any]:
-    """Score a run's answers, write them down in its folder, and return them as plain data.
-
-    Infinite figures become null.
+    """Score a run, write the scores to its folder, and return them as plain data with null for infinite values.
 
     Raises:
-        RunError: no run there.
-        InvalidInputError: it has no answers.
+        RunError: the folder holds no run.
+        InvalidInputError: the run has no predictions.
     """
     info = folder.read_info()
     scores = without_infinity(dataclasses.asdict(score(folder.read_predictions())))
@@ -154,30 +156,30 @@ def score_run(folder: RunFolder) -> dict[str, Any]:
 
 
 def position_errors_m(predictions: Sequence[Prediction], stage: str | None = None) -> Float[np.ndarray, "n"]:
-    """Distance (m) of each answer, or of each pose after a stage, to the truth; NaN where there is none."""
+    """Return the position errors (m) of the final poses, or of the poses after a stage; NaN without a pose."""
     errors = np.full(len(predictions), np.nan)
     for index, prediction in enumerate(predictions):
-        found = prediction.final_pose if stage is None else prediction.stages.get(stage)
-        if found is not None:
-            errors[index] = np.hypot(found.x_m - prediction.truth.x_m, found.y_m - prediction.truth.y_m)
+        pose = prediction.pose_after(stage)
+        if pose is not None:
+            errors[index] = np.hypot(pose.x_m - prediction.truth.x_m, pose.y_m - prediction.truth.y_m)
     return errors
 
 
 def heading_errors_deg(predictions: Sequence[Prediction], stage: str | None = None) -> Float[np.ndarray, "n"]:
-    """Absolute heading error (degrees) of each answer, or of each pose after a stage; NaN where there is none."""
+    """Return the absolute heading errors (degrees) of the final poses or after a stage; NaN without a pose."""
     errors = np.full(len(predictions), np.nan)
     for index, prediction in enumerate(predictions):
-        found = prediction.final_pose if stage is None else prediction.stages.get(stage)
-        if found is not None:
-            turned = np.radians(found.heading_deg - prediction.truth.heading_deg)
-            errors[index] = abs(np.degrees(float(wrap_angle(turned))))
+        pose = prediction.pose_after(stage)
+        if pose is not None:
+            difference = np.radians(pose.heading_deg - prediction.truth.heading_deg)
+            errors[index] = abs(np.degrees(float(wrap_angle(difference))))
     return errors
 
 
 def reliability_bins(
     confidence: Float[np.ndarray, "n"], correct: Bool[np.ndarray, "n"], bins: int = RELIABILITY_BINS
 ) -> tuple[ReliabilityBin, ...]:
-    """The reliability diagram: equal-width bins of confidence that hold at least one query."""
+    """Return the non-empty bins of the reliability diagram, equally wide in confidence."""
     index: Int[np.ndarray, "n"] = np.minimum((confidence * bins).astype(int), bins - 1)
     return tuple(
         ReliabilityBin(
@@ -195,13 +197,13 @@ def reliability_bins(
 def expected_calibration_error(
     confidence: Float[np.ndarray, "n"], correct: Bool[np.ndarray, "n"], bins: int = RELIABILITY_BINS
 ) -> float:
-    """Mean gap between confidence and frequency over the bins of the reliability diagram, weighted by queries."""
+    """Return the mean gap between confidence and frequency over the bins, weighted by queries."""
     diagram = reliability_bins(confidence, correct, bins)
-    return sum(one.count * abs(one.confidence - one.frequency) for one in diagram) / len(confidence)
+    return sum(part.count * abs(part.confidence - part.frequency) for part in diagram) / len(confidence)
 
 
 class _Bootstrap:
-    """Resamples of scenes, as weights of queries; the same for every figure of a run."""
+    """Resamples of scenes as weights of queries, the same for every score of a run."""
 
     def __init__(self, scenes: Sequence[str], rng: np.random.Generator) -> None:
         names, member = np.unique(np.array(scenes), return_inverse=True)
@@ -211,20 +213,20 @@ class _Bootstrap:
         )
 
     def among(self, chosen: Bool[np.ndarray, "n"]) -> _Bootstrap:
-        """The same resamples of some of the queries, without those resamples that hold none of them."""
+        """Restrict the resamples to some queries, without resamples that hold none of them."""
         part = copy.copy(self)
         weights = self._weights[:, chosen]
         part._weights = weights[weights.any(axis=1)]
         return part
 
     def mean(self, values: Float[np.ndarray, "n"] | Bool[np.ndarray, "n"]) -> Estimate:
-        """Mean, such as a share."""
+        """Return the mean, such as a share."""
         total = self._weights.sum(axis=1)
         resampled = (self._weights @ values.astype(float))[total > 0.0] / total[total > 0.0]
         return self._estimate(float(values.mean()), resampled)
 
     def median(self, values: Float[np.ndarray, "n"]) -> Estimate:
-        """Median; infinite values are ordinary ones."""
+        """Return the median; values can be infinite."""
         order = np.argsort(values, kind="stable")
         cumulated = np.cumsum(self._weights[:, order], axis=1)
         half = 0.5 * cumulated[:, -1:]
@@ -236,7 +238,7 @@ class _Bootstrap:
     @staticmethod
     def _estimate(value: float, resampled: Float[np.ndarray, "r"]) -> Estimate:
         tail = 0.5 * (1.0 - _COVERAGE)
-        # No interpolation: between a number and infinity there is none.
+        # Interpolation between a number and infinity is undefined.
         low, high = np.quantile(resampled, [tail, 1.0 - tail], method="nearest")
         return Estimate(value=value, low=float(low), high=float(high))
 
@@ -244,8 +246,8 @@ class _Bootstrap:
 def _stage_scores(bootstrap: _Bootstrap, predictions: Sequence[Prediction], stage: str | None) -> StageScores:
     error = _infinite(position_errors_m(predictions, stage))
     heading = _infinite(heading_errors_deg(predictions, stage))
-    found = [p.final_pose if stage is None else p.stages.get(stage) for p in predictions]
-    rooms = [f is not None and f.room_index == p.truth.room_index for f, p in zip(found, predictions, strict=True)]
+    pairs = [(prediction.pose_after(stage), prediction.truth) for prediction in predictions]
+    rooms = [pose is not None and pose.room_index == truth.room_index for pose, truth in pairs]
     return StageScores(
         median_cm=_centimetres(bootstrap.median(error)),
         within_1cm=bootstrap.mean(error < 0.01),
@@ -282,7 +284,7 @@ def _infinite(errors: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
 
 
 def _recall(bootstrap: _Bootstrap, hits: list[bool | None]) -> Estimate | None:
-    """None where no query went through retrieval; a query that did not counts as a miss where others did."""
+    """Return the recall, None if no query passed retrieval; otherwise, a query without retrieval is a miss."""
     if all(hit is None for hit in hits):
         return None
     return bootstrap.mean(np.array([bool(hit) for hit in hits]))
