@@ -11,7 +11,7 @@ from starlette.concurrency import run_in_threadpool
 from lalaloc_core.draw.plan import Marker
 from lalaloc_core.errors import MissingExtraError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.importers import ENDINGS, MEDIA_TYPES, ExportFormat
+from lalaloc_core.importers import EXPORT_FORMATS, FORMATS, ExportFormat
 from service.errors import (
     ConverterNotReadyError,
     InvalidRequestError,
@@ -70,7 +70,11 @@ def get_original(floorplan_id: str, request: Request, runtime: Running, tenant: 
     response_class=Response,
     openapi_extra=_CONDITIONAL,
     responses={
-        200: {"content": {media: {"schema": {"type": "string", "format": "binary"}} for media in MEDIA_TYPES.values()}},
+        200: {
+            "content": {
+                FORMATS[name].media_type: {"schema": {"type": "string", "format": "binary"}} for name in EXPORT_FORMATS
+            }
+        },
         **NOT_MODIFIED,
         **problem_responses(
             UnknownFloorPlanError,
@@ -97,8 +101,8 @@ async def get_export(
     if format == "imdf" and record.plan.anchor is None:
         raise UnanchoredPlanError(record.id)
     content = await runtime.converter.write(record.plan, format, client)
-    kept = {"Content-Disposition": f'attachment; filename="plan.{ENDINGS[format]}"'}
-    return conditional_answer(request, content, MEDIA_TYPES[format], content_etag(content), kept)
+    kept = {"Content-Disposition": f'attachment; filename="plan.{FORMATS[format].suffix}"'}
+    return conditional_answer(request, content, FORMATS[format].media_type, content_etag(content), kept)
 
 
 @router.get(

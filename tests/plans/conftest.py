@@ -1,4 +1,4 @@
-"""A small flat of three rooms that the tests of formats draw, each in its own way."""
+"""Small flat of three rooms, used by the tests of all formats."""
 
 from __future__ import annotations
 
@@ -37,31 +37,31 @@ def flat() -> FloorPlan:
 
 
 def shapes(document: dict) -> list[shapely.Polygon]:
-    """The rooms of a document as polygons."""
+    """Return the rooms of a document as polygons."""
     return [shapely.Polygon(room["polygon"], room.get("holes")) for room in document["rooms"]]
 
 
 def lines(document: dict, kind: str) -> list[shapely.LineString]:
-    """The openings of a kind as lines."""
+    """Return the openings of a kind as lines."""
     return [shapely.LineString(opening["line"]) for opening in document.get("openings", []) if opening["kind"] == kind]
 
 
 def assert_same_plan(found: ImportedPlan, expected: dict, *, within_m: float = 2e-3, shift: bool = False) -> None:
-    """Rooms, holes and openings lie where they should, in any order; with `shift`, anywhere as a whole."""
-    ours, theirs = shapes(found.document), shapes(expected)
+    """Compare rooms, holes and openings in any order; with `shift`, after moving the plan as a whole."""
+    found_rooms, expected_rooms = shapes(found.document), shapes(expected)
     move = (0.0, 0.0)
     if shift:
-        a, b = shapely.union_all(ours).bounds, shapely.union_all(theirs).bounds
+        a, b = shapely.union_all(found_rooms).bounds, shapely.union_all(expected_rooms).bounds
         move = (b[0] - a[0], b[1] - a[1])
 
     def moved(shape: BaseGeometry) -> BaseGeometry:
         return shapely.transform(shape, lambda points: points + move)
 
-    assert len(ours) == len(theirs)
-    for room in theirs:
-        assert min(shapely.hausdorff_distance(moved(other), room) for other in ours) <= within_m
+    assert len(found_rooms) == len(expected_rooms)
+    for room in expected_rooms:
+        assert min(shapely.hausdorff_distance(moved(candidate), room) for candidate in found_rooms) <= within_m
     for kind in ("door", "window", "passage"):
-        told, truth = lines(found.document, kind), lines(expected, kind)
-        assert len(told) == len(truth), kind
-        for line in truth:
-            assert min(shapely.hausdorff_distance(moved(other), line) for other in told) <= within_m
+        found_lines, true_lines = lines(found.document, kind), lines(expected, kind)
+        assert len(found_lines) == len(true_lines), kind
+        for line in true_lines:
+            assert min(shapely.hausdorff_distance(moved(candidate), line) for candidate in found_lines) <= within_m

@@ -1,4 +1,4 @@
-"""`lalaloc plan`."""
+"""Command `lalaloc plan`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def file(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_plan_goes_out_and_comes_back(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_plan_is_exported_and_imported(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     drawing, back = tmp_path / "flat.dxf", tmp_path / "back.json"
     assert main(["plan", "export", str(file), "--format", "dxf", "--out", str(drawing)]) == 0
     assert main(["plan", "import", str(drawing), "--out", str(back), "--ceiling-height-m", "2.5"]) == 0
@@ -29,7 +29,7 @@ def test_a_plan_goes_out_and_comes_back(file: Path, tmp_path: Path, capsys: pyte
     assert '"$INSUNITS is 6 (m)"' in capsys.readouterr().err
 
 
-def test_check_tells_what_is_likely_wrong(file: Path, capsys: pytest.CaptureFixture[str]):
+def test_check_prints_warnings(file: Path, capsys: pytest.CaptureFixture[str]):
     file.write_text(json.dumps({**FLAT, "ceiling_height_m": 8}), encoding="utf-8")
     assert main(["plan", "check", str(file)]) == 0
     shown = capsys.readouterr().out
@@ -37,7 +37,7 @@ def test_check_tells_what_is_likely_wrong(file: Path, capsys: pytest.CaptureFixt
     assert "looks like feet" in shown
 
 
-def test_imdf_takes_its_anchor_from_the_command_line(file: Path, tmp_path: Path):
+def test_anchor_option_is_used_for_imdf(file: Path, tmp_path: Path):
     out = tmp_path / "flat.zip"
     arguments = ["plan", "export", str(file), "--format", "imdf", "--out", str(out)]
     assert main(arguments) == 2
@@ -49,11 +49,11 @@ def test_imdf_takes_its_anchor_from_the_command_line(file: Path, tmp_path: Path)
     "arguments",
     [["--anchor", "91,0"], ["--anchor", "here"], ["--anchor", "1,2,3,4"], ["--units", "yd"], ["--scale", "much"]],
 )
-def test_what_cannot_be_is_refused(file: Path, tmp_path: Path, arguments: list[str]):
+def test_invalid_options_are_rejected(file: Path, tmp_path: Path, arguments: list[str]):
     out = str(tmp_path / "x")
     assert main(["plan", "export", str(file), "--format", "imdf", "--out", out, *arguments]) == 2
 
 
-def test_a_file_that_is_not_there_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_missing_file_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     assert main(["plan", "import", str(tmp_path / "none.svg")]) == 2
     assert "none.svg' cannot be read: No such file" in capsys.readouterr().err

@@ -1,4 +1,4 @@
-"""SVG and DXF as real tools write them: CubiCasa's classes, walls only, blocks, layers in three languages."""
+"""SVG and DXF drawings of real tools: classes of CubiCasa, walls only, blocks, layers in three languages."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ from ezdxf.filemanagement import new as new_dxf
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers import ImportOptions, import_plan
-from lalaloc_core.importers.model.words import role_of, type_of_room
+from lalaloc_core.importers.common.limits import Budget
+from lalaloc_core.importers.common.report import ReportBuilder
+from lalaloc_core.importers.common.vocabulary import role_of, type_of_room
+from lalaloc_core.importers.formats import dxf
 from tests.plans.conftest import lines, shapes
 
 CUBICASA = b"""<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1000 600"><g id="Model"><g class="Floor">
@@ -31,21 +34,21 @@ WALLS = b"""<svg xmlns="http://www.w3.org/2000/svg" width="210mm" height="100mm"
 <text x="50" y="80">Schlafzimmer</text><text x="160" y="80">Kitchen</text></g></svg>"""
 
 
-def test_cubicasa_classes_are_understood():
+def test_cubicasa_classes_give_rooms_and_openings():
     plan = import_plan(CUBICASA, ImportOptions(metres_per_pixel=0.01))
     assert [room["type"] for room in plan.document["rooms"]] == ["bedroom", "living"]
     assert [room.area for room in shapes(plan.document)] == pytest.approx([26.32, 26.88])
     (door,), (window,) = lines(plan.document, "door"), lines(plan.document, "window")
-    # Midway in the wall, and on the inner face of the outer wall; y points up.
+    # The door lies midway in its wall, the window on the inner face of the outer wall; y points up.
     assert sorted(door.coords) == [(4.95, -2.9), (4.95, -2.0)]
     assert sorted(window.coords) == [(1.0, -0.2), (2.5, -0.2)]
     used = {(use.layer, use.used_as) for use in plan.report.layers}
     assert ("FixedFurniture BaseCabinet", "ignored") in used
 
 
-def test_walls_enclose_rooms_and_a_swing_is_a_door():
+def test_svg_walls_enclose_rooms_and_swing_is_a_door():
     plan = import_plan(WALLS)
-    assert plan.report.scale_source == "1:100, as is written in the drawing"
+    assert plan.report.scale_source == "1:100, written in the drawing"
     assert {(room["name"], room["type"]) for room in plan.document["rooms"]} == {
         ("Schlafzimmer", "bedroom"),
         ("Kitchen", "kitchen"),
@@ -55,12 +58,12 @@ def test_walls_enclose_rooms_and_a_swing_is_a_door():
     assert door.length == pytest.approx(1.0, abs=0.01)
 
 
-def test_a_svg_without_a_scale_is_asked_for_it():
-    with pytest.raises(InvalidFloorPlanError, match=r"give scale \(1:100\), metres_per_pixel .* or known_distance"):
+def test_svg_without_scale_is_rejected():
+    with pytest.raises(InvalidFloorPlanError, match=r"set scale \(1:100\), metres_per_pixel .* or known_distance"):
         import_plan(CUBICASA)
 
 
-def test_layers_choose_what_is_taken():
+def test_layers_option_selects_layers():
     plan = import_plan(CUBICASA, ImportOptions(metres_per_pixel=0.01, layers=("space bedroom",)))
     assert len(plan.document["rooms"]) == 1
     assert "openings" not in plan.document
@@ -73,7 +76,7 @@ def _dxf(document) -> bytes:
 
 
 def _german_walls(insunits: int = 4):
-    """Walls as single lines of both faces, in millimetres; a door that swings, a window as three lines."""
+    """Draw both faces of walls in millimetres, a door with its swing, and a window of three lines."""
     document = new_dxf()
     document.header["$INSUNITS"] = insunits
     space = document.modelspace()
@@ -106,32 +109,59 @@ def test_german_wall_lines_become_rooms():
     assert door.length == pytest.approx(0.9, abs=0.01)
     assert window.length == pytest.approx(1.5, abs=0.01)
     used = {(use.layer, use.used_as) for use in plan.report.layers}
-    assert {("WAND", "lines: wall"), ("MÖBEL", "ignored"), ("TÜREN", "swings of doors")} <= used
+    assert {("WAND", "lines: wall"), ("MÖBEL", "ignored"), ("TÜREN", "door swings")} <= used
 
 
-def test_layers_that_a_dxf_does_not_have_are_refused_with_those_that_it_has():
-    with pytest.raises(InvalidFloorPlanError, match=r"nothing lies on the layers walls; .*'Fenster', .*'WAND'"):
+def test_unknown_layers_are_rejected_with_the_known_ones():
+    with pytest.raises(
+        InvalidFloorPlanError, match=r"layers is walls, but the drawing has nothing on them; .*'Fenster', .*'WAND'"
+    ):
         import_plan(_dxf(_german_walls()), ImportOptions(layers=("walls",)))
 
 
-def test_a_dxf_without_a_unit_is_refused_with_the_likely_one():
+def test_dxf_without_unit_is_rejected_with_the_likely_one():
     with pytest.raises(InvalidFloorPlanError, match=r"\$INSUNITS is 0.*looks like mm: units=mm"):
         import_plan(_dxf(_german_walls(insunits=0)))
     assert len(import_plan(_dxf(_german_walls(insunits=0)), ImportOptions(units="mm")).document["rooms"]) == 2
 
 
-def test_a_wrong_unit_is_told():
+def test_wrong_unit_gives_a_warning():
     with pytest.raises(InvalidFloorPlanError):
-        import_plan(_dxf(_german_walls(insunits=6)))  # Ten kilometres are no plan.
+        import_plan(_dxf(_german_walls(insunits=6)))  # A plan of ten kilometres.
     document = _german_walls(insunits=5)
     (warning,) = import_plan(_dxf(document)).report.warnings
-    assert "the usual room's side is 7" in warning
+    assert "the side of a typical room is 7" in warning
 
 
 def test_binary_dxf_is_read():
     stream = io.BytesIO()
     _german_walls().write(stream, fmt="bin")
     assert len(import_plan(stream.getvalue()).document["rooms"]) == 2
+
+
+def test_open_polyline_in_surveyed_coordinates_stays_open():
+    document = new_dxf()
+    document.header["$INSUNITS"] = 6
+    space = document.modelspace()
+    east, north = 500_000.0, 5_300_000.0
+    outer = [(0, 0), (10, 0), (10, 8), (0, 8)]
+    # The inner face has a gap of 4 m between its ends, less than 1e-5 of the coordinates.
+    inner = [(0.2, 6.2), (0.2, 7.8), (9.8, 7.8), (9.8, 0.2), (0.2, 0.2), (0.2, 2.2)]
+    for ring, close in ((outer, True), (inner, False)):
+        points = [(east + x, north + y) for x, y in ring]
+        space.add_lwpolyline(points, close=close, dxfattribs={"layer": "WALL"})
+    drawing = dxf._read_drawing(document, ImportOptions(), ReportBuilder(), Budget())
+    assert [stroke.line.length for stroke in drawing.strokes] == pytest.approx([1.6 + 9.6 + 7.6 + 9.6 + 2.0])
+    assert [area.shape.area for area in drawing.areas] == pytest.approx([80.0])
+
+
+def test_polyline_with_equal_ends_is_closed_at_any_coordinates():
+    for origin in (0.0, 5_300_000.0):
+        document = new_dxf()
+        ring = [(0, 0), (4, 0), (4, 3), (0, 3), (0, 1e-6)]
+        document.modelspace().add_lwpolyline([(origin + x, origin + y) for x, y in ring])
+        drawing = dxf._read_drawing(document, ImportOptions(), ReportBuilder(), Budget())
+        assert [area.shape.area for area in drawing.areas] == pytest.approx([12.0])
 
 
 def test_french_polylines_and_blocks_in_feet():
@@ -165,7 +195,7 @@ def test_french_polylines_and_blocks_in_feet():
         ("STÜTZEN", "obstacle"), ("Pièces", "room"), ("MÖBEL", "ignored"), ("DOOR-DIMENSIONS", "ignored"), ("0", None),
     ],
 )  # fmt: skip
-def test_what_layers_are_named_after(layer: str, role: str | None):
+def test_role_of_a_layer(layer: str, role: str | None):
     assert role_of(layer) == role
 
 
@@ -173,5 +203,5 @@ def test_what_layers_are_named_after(layer: str, role: str | None):
     ("name", "kind"),
     [("Küche", "kitchen"), ("Chambre 2", "bedroom"), ("LivingRoom", "living"), ("Bad/WC", "bathroom"), ("X17", None)],
 )
-def test_what_rooms_are_named_after(name: str, kind: str | None):
+def test_type_of_a_room(name: str, kind: str | None):
     assert type_of_room(name) == kind

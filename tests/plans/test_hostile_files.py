@@ -1,4 +1,4 @@
-"""Files that are made to exhaust or to reach out: every one is refused, quickly, with what is wrong."""
+"""Files made to exhaust resources or to read other files are rejected quickly, with a reason."""
 
 from __future__ import annotations
 
@@ -9,90 +9,94 @@ import pickle
 import struct
 import zipfile
 import zlib
+from dataclasses import fields
+from importlib import import_module
 
 import pytest
 from ezdxf.filemanagement import new as new_dxf
 from PIL import Image
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.importers import ImportLimits, ImportOptions, detect_format, import_plans
+from lalaloc_core.importers import EXPORT_FORMATS, FORMATS, ImportLimits, ImportOptions, detect_format, import_plans
 from tests.plans.conftest import FLAT
 
 SVG = '<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink">{}</svg>'
 
 
-def _refused(content: bytes, message: str, **limits: object) -> None:
+def _assert_rejected(content: bytes, message: str, **limits: object) -> None:
     with pytest.raises(InvalidFloorPlanError, match=message):
         import_plans(content, ImportOptions(metres_per_pixel=0.01), ImportLimits(**limits))  # type: ignore[arg-type]
 
 
-def test_entities_that_multiply():
+def test_nested_xml_entities():
     lol = "".join(f'<!ENTITY l{i} "{f"&l{i - 1};" * 10}">' for i in range(1, 10))
-    _refused(f'<!DOCTYPE svg [<!ENTITY l0 "lol">{lol}]>{SVG.format("<text>&l9;</text>")}'.encode(), "declares entities")
+    _assert_rejected(
+        f'<!DOCTYPE svg [<!ENTITY l0 "lol">{lol}]>{SVG.format("<text>&l9;</text>")}'.encode(), "declares entities"
+    )
 
 
-def test_entities_of_other_files():
+def test_external_xml_entities():
     document = f'<!DOCTYPE svg [<!ENTITY x SYSTEM "file:///etc/passwd">]>{SVG.format("<text>&x;</text>")}'
-    _refused(document.encode(), "entities")
+    _assert_rejected(document.encode(), "entities")
 
 
-def test_external_doctypes():
+def test_external_doctype():
     document = f'<!DOCTYPE svg SYSTEM "http://127.0.0.1:1/x.dtd">{SVG.format("")}'
-    _refused(document.encode(), "refers to other files|no room")
+    _assert_rejected(document.encode(), "refers to other files|no room")
 
 
-def test_uses_that_multiply():
+def test_nested_uses():
     uses = [f'<use xlink:href="#g{i - 1}"/>' * 10 for i in range(1, 12)]
     groups = "".join(f'<g id="g{i}">{use}</g>' for i, use in enumerate(uses, 1))
-    _refused(SVG.format(f'<rect id="g0" width="1" height="1"/>{groups}').encode(), "entities")
+    _assert_rejected(SVG.format(f'<rect id="g0" width="1" height="1"/>{groups}').encode(), "entities")
 
 
-def test_a_use_of_itself():
-    _refused(SVG.format('<g id="a"><use href="#a"/></g>').encode(), "draws itself")
+def test_recursive_use():
+    _assert_rejected(SVG.format('<g id="a"><use href="#a"/></g>').encode(), "refers to itself")
 
 
-def test_elements_in_elements():
-    _refused(SVG.format("<g>" * 500 + "</g>" * 500).encode(), "nested more than")
+def test_deeply_nested_elements():
+    _assert_rejected(SVG.format("<g>" * 500 + "</g>" * 500).encode(), "nested more than")
 
 
-def test_deep_json():
-    _refused(("[" * 100_000 + "]" * 100_000).encode(), "nested")
+def test_deeply_nested_json():
+    _assert_rejected(("[" * 100_000 + "]" * 100_000).encode(), "nested")
 
 
-def test_a_zip_that_unpacks_to_more_than_it_may():
+def test_zip_above_the_unpacked_limit():
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("unit.geojson", b" " * 3_000_000)
     assert len(stream.getvalue()) < 10_000
-    _refused(stream.getvalue(), "unpacks to more than", max_unpacked_bytes=1_000_000)
+    _assert_rejected(stream.getvalue(), "unpacks to more than", max_unpacked_bytes=1_000_000)
 
 
-def test_a_zip_that_lies_about_its_sizes():
+def test_zip_with_forged_sizes():
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("unit.geojson", b" " * 3_000_000)
     content = stream.getvalue().replace(struct.pack("<I", 3_000_000), struct.pack("<I", 10))
-    _refused(content, "damaged|unpacks|JSON", max_unpacked_bytes=1_000_000)
+    _assert_rejected(content, "damaged|unpacks|JSON", max_unpacked_bytes=1_000_000)
 
 
-def test_a_zip_of_too_many_files_and_one_with_a_password():
+def test_zip_with_too_many_files_or_a_password():
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w") as archive:
         for number in range(300):
             archive.writestr(f"{number}.geojson", b"{}")
-    _refused(stream.getvalue(), "300 files")
+    _assert_rejected(stream.getvalue(), "300 files")
     content = bytearray()
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w") as archive:
         archive.writestr("unit.geojson", b"{}")
     content += stream.getvalue()
-    # The bit that says "encrypted", in the file's own header and in the directory.
+    # Set the encryption bit in the file's header and in the directory.
     content[6] |= 1
     content[content.index(b"PK\x01\x02") + 8] |= 1
-    _refused(bytes(content), "encrypted")
+    _assert_rejected(bytes(content), "encrypted")
 
 
-def test_blocks_that_multiply():
+def test_nested_blocks():
     document = new_dxf()
     document.blocks.new("B0").add_line((0, 0), (1, 1))
     for level in range(1, 8):
@@ -102,27 +106,27 @@ def test_blocks_that_multiply():
     document.modelspace().add_blockref("B7", (0, 0), dxfattribs={"row_count": 100, "column_count": 100})
     text = io.StringIO()
     document.write(text)
-    _refused(text.getvalue().encode(), "entities")
+    _assert_rejected(text.getvalue().encode(), "entities")
 
 
-def test_a_picture_of_too_many_pixels():
+def test_picture_with_too_many_pixels():
     header = struct.pack(">IIBBBBB", 100_000, 100_000, 8, 0, 0, 0, 0)
     chunk = b"IHDR" + header
     content = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + chunk + struct.pack(">I", zlib.crc32(chunk))
-    _refused(content, "pixels|cannot be read")
+    _assert_rejected(content, "pixels|cannot be read")
 
 
-def test_a_picture_that_is_cut_off():
+def test_truncated_picture():
     stream = io.BytesIO()
     Image.new("L", (200, 200), 255).save(stream, "PNG")
-    _refused(stream.getvalue()[:90], "cannot be read")
+    _assert_rejected(stream.getvalue()[:90], "cannot be read")
 
 
-def test_more_bytes_than_allowed():
-    _refused(b"{" + b" " * 200, "at most 100 are read", max_plan_bytes=100)
+def test_file_above_the_size_limit():
+    _assert_rejected(b"{" + b" " * 200, "the limit is 100 ", max_plan_bytes=100)
 
 
-def test_an_import_that_takes_too_long():
+def test_import_above_the_time_limit():
     ticks = itertools.count(0.0, 10.0)
     with pytest.raises(InvalidFloorPlanError, match="takes more than 30 s"):
         import_plans(json.dumps(FLAT).encode(), clock=lambda: next(ticks) * 10.0)
@@ -132,24 +136,25 @@ def test_an_import_that_takes_too_long():
     ("content", "message"),
     [
         (b"", "empty"),
-        (b"hello there", "no known format"),
-        (b"AC1032 dwg", "DWG: save it as DXF"),
-        (b"GIF89a", "GIF: save it as PNG"),
-        (b"<html></html>", "no SVG"),
+        (b"hello there", "in no known format; supported formats are native JSON, GeoJSON, IMDF, DXF"),
+        (b"AC1032 dwg", "a DWG drawing, which cannot be read: save it as DXF"),
+        (b"GIF89a", "a GIF picture, which cannot be read: save it as PNG"),
+        (b"<html></html>", "XML without an <svg> element"),
+        (b"Rar!....", "a RAR archive, which cannot be read: unpack it"),
         (b"[1, 2]", "the JSON is a list"),
         (b"%PDF-1.7 nothing", "cannot be read"),
-        (b"ISO-10303-21; nothing", "cut off"),
+        (b"ISO-10303-21; nothing", "truncated"),
         (b"ISO-10303-21; nothing END-ISO-10303-21;", "cannot be read|no IfcSpace|schema"),
         (b"  0\nSECTION\n nothing", "cannot be read|no lines"),
         (b"PK\x03\x04 nothing", "damaged"),
         (b"\xff\xd8\xff nothing", "cannot be read"),
     ],
 )
-def test_what_is_no_plan_is_named(content: bytes, message: str):
-    _refused(content, message)
+def test_other_kinds_of_files_are_named(content: bytes, message: str):
+    _assert_rejected(content, message)
 
 
-def test_the_format_is_told_by_content():
+def test_format_is_detected_by_content():
     assert detect_format(b'\xef\xbb\xbf {"rooms": []}') == "native"
     assert detect_format(b'{"type": "Feature"}') == "geojson"
     assert detect_format(b'<?xml version="1.0"?><!-- x --><svg/>') == "svg"
@@ -157,7 +162,15 @@ def test_the_format_is_told_by_content():
     assert detect_format(b"%PDF-1.4") == "pdf"
 
 
-def test_plans_travel_between_processes():
+def test_every_format_has_a_reader_and_every_export_a_writer():
+    for name, format in FORMATS.items():
+        module = import_module(f"lalaloc_core.importers.formats.{name}")
+        assert callable(module.read)
+        assert hasattr(module, "write") == (name in EXPORT_FORMATS)
+        assert format.options <= {field.name for field in fields(ImportOptions)}
+
+
+def test_plans_and_options_can_be_pickled():
     (plan,) = import_plans(json.dumps(FLAT).encode())
     assert pickle.loads(pickle.dumps(plan)).document == plan.document
     assert pickle.loads(pickle.dumps(ImportOptions(scale=100.0))) == ImportOptions(scale=100.0)

@@ -1,4 +1,4 @@
-"""IFC: a model that is made here, and the sample model of buildingSMART where it lies beside the project."""
+"""IFC: a generated model, and buildingSMART's sample model if it is available."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DUPLEX = next((parent / _NAME for parent in Path(__file__).parents if (parent / 
 
 
 class _Model:
-    """An IFC 4 model in millimetres, of one storey."""
+    """IFC 4 model in millimetres, of one storey."""
 
     def __init__(self) -> None:
         self.file: Any = ifcopenshell.file(schema="IFC4")
@@ -32,19 +32,19 @@ class _Model:
         self.storey = make("IfcBuildingStorey", ifcopenshell.guid.new(), Name="EG", Elevation=0.0)
         make("IfcRelAggregates", ifcopenshell.guid.new(), RelatingObject=self.project, RelatedObjects=[self.storey])
 
-    def placement(self, at: tuple[float, float, float]) -> Any:
-        point = self.file.create_entity("IfcCartesianPoint", [float(value) for value in at])
+    def placement(self, origin: tuple[float, float, float]) -> Any:
+        point = self.file.create_entity("IfcCartesianPoint", [float(value) for value in origin])
         return self.file.create_entity("IfcAxis2Placement3D", point)
 
-    def prism(self, kind: str, ring: list[tuple[float, float]], low: float, height: float, **says: object) -> Any:
-        """An element that is an outline, extruded."""
+    def prism(self, kind: str, ring: list[tuple[float, float]], low: float, height: float, **attributes: object) -> Any:
+        """Return an element made by extruding an outline."""
         make = self.file.create_entity
         points = [make("IfcCartesianPoint", [float(x), float(y)]) for x, y in [*ring, ring[0]]]
         profile = make("IfcArbitraryClosedProfileDef", "AREA", None, make("IfcPolyline", points))
         up = make("IfcDirection", [0.0, 0.0, 1.0])
         solid = make("IfcExtrudedAreaSolid", profile, self.placement((0, 0, low)), up, float(height))
         shape = make("IfcShapeRepresentation", self.context, "Body", "SweptSolid", [solid])
-        element = make(kind, ifcopenshell.guid.new(), **says)
+        element = make(kind, ifcopenshell.guid.new(), **attributes)
         element.Representation = make("IfcProductDefinitionShape", None, None, [shape])
         element.ObjectPlacement = make("IfcLocalPlacement", None, self.placement((0, 0, 0)))
         return element
@@ -88,7 +88,7 @@ def ifc_flat() -> _Model:
     return model
 
 
-def test_spaces_doors_windows_columns_and_shafts():
+def test_ifc_elements_give_rooms_openings_and_holes():
     plan = import_plan(ifc_flat().content())
     assert [(room["name"], room["type"]) for room in plan.document["rooms"]] == [
         ("Küche", "kitchen"),
@@ -105,11 +105,11 @@ def test_spaces_doors_windows_columns_and_shafts():
     plan.plan()
 
 
-def test_a_map_conversion_says_where_and_which_way():
+def test_map_conversion_gives_anchor_and_north():
     model = ifc_flat()
     make = model.file.create_entity
     crs = make("IfcProjectedCRS", "EPSG:25832")
-    # Turned by 30° counter-clockwise against the grid.
+    # The model is rotated by 30° counter-clockwise against the grid.
     turn = np.radians(30.0)
     make("IfcMapConversion", model.context, crs, 691000.0, 5334000.0, 510.0, float(np.cos(turn)), float(np.sin(turn)))
     plan = import_plan(model.content())
@@ -117,37 +117,36 @@ def test_a_map_conversion_says_where_and_which_way():
     assert plan.anchor is not None
     assert (plan.anchor.longitude, plan.anchor.latitude) == pytest.approx((lon, lat), abs=1e-9)
     assert plan.anchor.altitude_m == 510.0
-    # East of the zone's meridian grid north lies a little east of true north: meridian convergence.
     convergence = pyproj.Proj("EPSG:25832").get_factors(lon, lat).meridian_convergence
     assert plan.document["north_deg"] == pytest.approx(30.0 - convergence, abs=0.01)
 
 
-def test_a_model_without_spaces_says_what_to_do():
+def test_model_without_spaces_is_rejected_with_a_remedy():
     with pytest.raises(InvalidFloorPlanError, match=r"no IfcSpace .* export it with rooms"):
         import_plan(_Model().content())
 
 
-def test_a_model_that_is_cut_off_is_refused():
+def test_truncated_model_is_rejected():
     content = _Model().content()
-    with pytest.raises(InvalidFloorPlanError, match="cut off: it does not end with END-ISO-10303-21"):
+    with pytest.raises(InvalidFloorPlanError, match="truncated: it does not end with END-ISO-10303-21"):
         import_plan(content[: len(content) - 30])
 
 
 @pytest.fixture(scope="module")
 def duplex() -> tuple[ImportedPlan, ...]:
     if DUPLEX is None:
-        pytest.skip("the sample model is not here")
+        pytest.skip("the sample model is not available")
     return import_plans(DUPLEX.read_bytes())
 
 
-def test_the_duplex_has_a_plan_per_storey(duplex: tuple[ImportedPlan, ...]):
+def test_duplex_has_a_plan_per_storey(duplex: tuple[ImportedPlan, ...]):
     assert [plan.level.name for plan in duplex] == ["Level 1", "Level 2", "Roof"]  # type: ignore[union-attr]
     assert [plan.level.number for plan in duplex] == [0.0, 1.0, 2.0]  # type: ignore[union-attr]
     assert [len(plan.document["rooms"]) for plan in duplex] == [10, 10, 1]
     ground, first = duplex[0], duplex[1]
     assert (len(lines(ground.document, "door")), len(lines(ground.document, "window"))) == (6, 4)
     assert len(lines(first.document, "door")) == 8
-    # Kitchen and living room of both flats have nothing between them.
+    # Kitchen and living room of both flats are open to each other.
     assert sum(line.length > 5.0 for line in lines(ground.document, "passage")) == 2
     assert ground.anchor is not None
     assert (ground.anchor.latitude, ground.anchor.longitude) == pytest.approx((41.8744, -87.6394), abs=1e-4)
@@ -155,7 +154,7 @@ def test_the_duplex_has_a_plan_per_storey(duplex: tuple[ImportedPlan, ...]):
         plan.plan()
 
 
-def test_one_storey_of_the_duplex(duplex: tuple[ImportedPlan, ...]):
+def test_level_option_selects_a_storey_of_the_duplex(duplex: tuple[ImportedPlan, ...]):
     assert DUPLEX is not None
     plan = import_plan(DUPLEX.read_bytes(), ImportOptions(level="Level 2"))
     assert plan.document == duplex[1].document

@@ -1,4 +1,4 @@
-"""The native format with units, and what is said about plans that are likely wrong."""
+"""Native format with units, checks of plans, and import options."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import ImportOptions, KnownDistance, import_plan
-from lalaloc_core.importers.model.checks import check_document, likely_unit
+from lalaloc_core.importers.common.checks import check_document, likely_unit
 from tests.plans.conftest import FLAT, assert_same_plan
 
 FOOT = 0.3048
@@ -38,14 +38,14 @@ def _import(document: dict, **options: object):
     return import_plan(json.dumps(document).encode(), ImportOptions(**options))  # type: ignore[arg-type]
 
 
-def test_a_plan_in_metres_stays_as_it_is():
+def test_plan_in_metres_is_unchanged():
     imported = _import(FLAT)
     assert imported.document == json.loads(json.dumps(FLAT))
     assert imported.report.format == "native"
     assert imported.report.warnings == ()
 
 
-def test_a_plan_in_feet_is_converted():
+def test_plan_in_feet_is_converted():
     imported = _import(_in_feet())
     assert_same_plan(imported, FLAT, within_m=1e-9)
     assert imported.document["ceiling_height_m"] == pytest.approx(2.5)
@@ -53,16 +53,16 @@ def test_a_plan_in_feet_is_converted():
     imported.plan()
 
 
-def test_the_option_wins_over_what_the_file_says():
+def test_units_option_overrides_the_file():
     assert _import({**FLAT, "units": "mm"}, units="m").document["rooms"] == json.loads(json.dumps(FLAT["rooms"]))
 
 
-def test_an_option_that_says_nothing_about_a_format_is_told():
+def test_unused_option_gives_a_warning():
     (warning,) = _import(FLAT, page=3).report.warnings
-    assert warning == "'page' says nothing about a native file and was not used"
+    assert warning == "the option 'page' was ignored: it does not apply to native JSON"
 
 
-def test_y_down_turns_the_plan_over_with_its_north():
+def test_y_down_flips_plan_and_north():
     plan = {**FLAT, "y_axis": "down", "north_deg": 30.0}
     imported = _import(plan)
     assert imported.document["north_deg"] == pytest.approx(150.0)
@@ -72,47 +72,47 @@ def test_y_down_turns_the_plan_over_with_its_north():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"units": "yd"}, "units is 'yd', known are m, cm, mm, in, ft"),
-        ({"units": "ft", "ceiling_height": 8}, "'ceiling_height' and 'ceiling_height_m' say the same"),
-        ({"ceiling_height_m": 2500}, "it looks like mm"),
-        ({"y_axis": "left"}, "known are up, down"),
+        ({"units": "yd"}, "units is 'yd'; set it to one of m, cm, mm, in, ft"),
+        ({"units": "ft", "ceiling_height": 8}, "'ceiling_height' and 'ceiling_height_m' are both set"),
+        ({"ceiling_height_m": 2500}, "It looks like mm"),
+        ({"y_axis": "left"}, "set it to up or down"),
         ({"colour": "red"}, "unknown key 'colour'"),
     ],
 )
-def test_what_cannot_be_is_refused(change: dict, message: str):
+def test_invalid_values_are_rejected(change: dict, message: str):
     with pytest.raises(InvalidFloorPlanError, match=message):
         _import({**FLAT, **change})
 
 
-def test_a_ceiling_of_eight_metres_is_likely_in_feet():
+def test_ceiling_of_eight_metres_suggests_feet():
     (warning,) = _import({**FLAT, "ceiling_height_m": 8.0}).report.warnings
     assert "8 m" in warning
     assert "feet" in warning
     assert "2.44 m" in warning
 
 
-def test_doors_of_three_metres_thirty_are_likely_in_feet():
+def test_doors_wider_than_three_metres_give_a_warning():
     plan = json.loads(json.dumps(FLAT))
     plan["openings"] = [{"kind": "door", "line": [[0.2, 1.95], [3.6, 1.95]]}]
-    assert any("door's width is 3.4 m" in warning for warning in _import(plan).report.warnings)
+    assert any("the median width of doors is 3.4 m" in warning for warning in _import(plan).report.warnings)
 
 
 @pytest.mark.parametrize(("value", "unit"), [(2.5, None), (8.0, "ft"), (250.0, "cm"), (2500.0, "mm"), (96.0, "in")])
-def test_the_likely_unit_of_a_ceiling(value: float, unit: str | None):
+def test_likely_unit_of_a_ceiling(value: float, unit: str | None):
     assert likely_unit(value, (1.9, 6.0)) == unit
 
 
-def test_rooms_that_no_door_reaches_gaps_and_doubled_names_are_told():
+def test_unreachable_isolated_and_duplicate_rooms_are_warned():
     plan = json.loads(json.dumps(FLAT))
     plan["rooms"].append({"name": "bedroom", "polygon": [[20, 0], [24, 0], [24, 4], [20, 4]]})
     warnings = check_document(FloorPlan.from_dict(plan).to_dict())
     assert any(warning == "no door or passage reaches 'bedroom'" for warning in warnings)
-    assert any("farther than a wall's thickness" in warning and "'bedroom'" in warning for warning in warnings)
+    assert any("rooms farther than a wall's thickness" in warning and "'bedroom'" in warning for warning in warnings)
     assert any("share a name: 'bedroom'" in warning for warning in warnings)
     assert check_document(FloorPlan.from_dict(FLAT).to_dict()) == []
 
 
-def test_options_come_from_text():
+def test_options_are_parsed_from_text():
     options = ImportOptions.from_text(
         {"scale": "1:100", "layers": "walls, doors", "page": "2", "level": "", "ceiling_height_m": "2.7"}
     )
@@ -132,6 +132,6 @@ def test_options_come_from_text():
         {"y_axis": "sideways"}, {"name": "a\x00b"}, {"level": "x" * 201},
     ],
 )  # fmt: skip
-def test_options_that_make_no_sense_are_refused(values: dict[str, str]):
+def test_invalid_options_are_rejected(values: dict[str, str]):
     with pytest.raises(InvalidFloorPlanError):
         ImportOptions.from_text(values)

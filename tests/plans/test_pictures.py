@@ -1,4 +1,4 @@
-"""Plans from pictures and PDF pages, in five styles of drawing; `benchmarks/plan_pictures.py` measures many."""
+"""Plans from pictures and PDF pages in five drawing styles; `benchmarks/plan_pictures.py` measures more."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from lalaloc_core.importers.picture.ink import find_skew
 from tests.plans.conftest import lines, shapes
 
 FLAT = Path(__file__).parents[2] / "examples" / "flat.json"
-# Homes that are read well in every style; the benchmark has those that are not.
+# Homes that are read well; the benchmark also contains others.
 SEED = {"thin": 0, "thick": 1, "hatched": 0, "coloured": 3, "scanned": 3}
 
 
@@ -32,7 +32,7 @@ def drawn() -> dict[Style, DrawnPlan]:
 
 
 @pytest.mark.parametrize("style", STYLES)
-def test_rooms_doors_and_windows_are_found(drawn: dict[Style, DrawnPlan], style: Style):
+def test_rooms_and_openings_are_found_in_every_style(drawn: dict[Style, DrawnPlan], style: Style):
     plan = drawn[style]
     score = Score()
     score_plan(plan, plan.jpeg() if style == "scanned" else plan.png(), score)
@@ -43,7 +43,7 @@ def test_rooms_doors_and_windows_are_found(drawn: dict[Style, DrawnPlan], style:
 
 
 @pytest.mark.parametrize("coloured", [True, False])
-def test_the_project_s_own_drawings_are_read_back(coloured: bool):
+def test_drawings_of_plan_svg_are_read_back(coloured: bool):
     flat = FloorPlan.from_json(FLAT.read_bytes())
     svg = plan_svg(flat)
     left, top, width, height = (float(number) for number in re.findall(r'viewBox="([^"]+)"', svg)[0].split())
@@ -51,28 +51,28 @@ def test_the_project_s_own_drawings_are_read_back(coloured: bool):
     stream = io.BytesIO()
     (picture if coloured else picture.convert("LA")).save(stream, "PNG")
     plan = import_plan(stream.getvalue(), ImportOptions(metres_per_pixel=width / picture.width)).document
-    # A picture's origin is its lower left corner.
+    # The origin of a picture is its lower left corner.
     origin = np.array([left, -top - height])
 
     def placed(points: np.ndarray) -> np.ndarray:
         return points + origin
 
     found = [shapely.transform(room, placed) for room in shapes(plan)]
-    shares = [max(_iou(room.shape, other) for other in found) for room in flat.rooms]
+    shares = [max(_iou(room.shape, candidate) for candidate in found) for room in flat.rooms]
     assert min(shares) > 0.95
     for kind in ("door", "window", "passage"):
-        told = [shapely.transform(line, placed) for line in lines(plan, kind)]
+        found_lines = [shapely.transform(line, placed) for line in lines(plan, kind)]
         true = [shapely.LineString(opening.line_m) for opening in flat.openings if opening.kind == kind]
         if not coloured:
-            # The entrance has panes in an outer wall.
+            # Without colours the entrance looks like a window in an outer wall.
             entrance = [line for line in true if line.coords[0][0] == 9.4 and kind == "door"]
             true = [line for line in true if line not in entrance]
-            told = [line for line in told if line.centroid.x < 9.3 or line.centroid.y < 5.0]
-        assert len(told) == len(true)
-        assert all(min(shapely.hausdorff_distance(line, other) for other in told) < 0.2 for line in true)
+            found_lines = [line for line in found_lines if line.centroid.x < 9.3 or line.centroid.y < 5.0]
+        assert len(found_lines) == len(true)
+        assert all(min(shapely.hausdorff_distance(line, near) for near in found_lines) < 0.2 for line in true)
 
 
-def test_a_single_line_in_an_outer_wall_is_a_window_and_in_an_inner_one_a_passage():
+def test_single_line_is_a_window_outside_and_a_passage_inside():
     page = Image.new("L", (900, 500), 255)
     pen = ImageDraw.Draw(page)
     pen.rectangle((100, 100, 800, 400), outline=0, width=20)
@@ -93,29 +93,29 @@ def test_a_single_line_in_an_outer_wall_is_a_window_and_in_an_inner_one_a_passag
     assert sum("a single line" in guess for guess in plan.report.unsure) == 2
 
 
-def test_a_picture_is_a_draft_that_says_what_it_is_unsure_of(drawn: dict[Style, DrawnPlan]):
+def test_picture_is_a_draft_with_its_guesses(drawn: dict[Style, DrawnPlan]):
     plan = import_plan(drawn["thick"].png(), ImportOptions(metres_per_pixel=drawn["thick"].metres_per_pixel))
     assert plan.report.is_draft
     assert plan.report.scale_source == "option metres_per_pixel"
     assert any("ceiling height" in line for line in plan.report.unsure)
-    assert any("lettering is not read" in line for line in plan.report.notes)
+    assert any("text in pictures is not read" in line for line in plan.report.notes)
 
 
-def test_what_a_draft_shows_is_not_held_against_photographs_until_it_is_claimed(drawn: dict[Style, DrawnPlan]):
+def test_draft_claims_no_kind_of_opening(drawn: dict[Style, DrawnPlan]):
     draft = import_plan(drawn["thick"].png(), ImportOptions(metres_per_pixel=drawn["thick"].metres_per_pixel))
     assert draft.plan().openings
     assert draft.plan().opening_kinds == frozenset()
     assert any("opening_kinds" in guess for guess in draft.report.unsure)
 
 
-def test_a_scale_is_never_assumed(drawn: dict[Style, DrawnPlan]):
-    with pytest.raises(InvalidFloorPlanError, match="does not say how long anything is"):
+def test_picture_without_scale_is_rejected(drawn: dict[Style, DrawnPlan]):
+    with pytest.raises(InvalidFloorPlanError, match="the picture gives no scale"):
         import_plan(drawn["thick"].png())
-    with pytest.raises(InvalidFloorPlanError, match="does not say how long anything is"):
+    with pytest.raises(InvalidFloorPlanError, match="the picture gives no scale"):
         import_plan(drawn["thick"].png(), ImportOptions(units="m"))
 
 
-def test_a_known_distance_is_a_scale(drawn: dict[Style, DrawnPlan]):
+def test_known_distance_sets_the_scale(drawn: dict[Style, DrawnPlan]):
     plan = drawn["thick"]
     known = KnownDistance((10.0, 10.0), (10.0, 110.0), 100.0 * plan.metres_per_pixel)
     by_distance = import_plan(plan.png(), ImportOptions(known_distance=known))
@@ -123,7 +123,7 @@ def test_a_known_distance_is_a_scale(drawn: dict[Style, DrawnPlan]):
     assert by_distance.document == by_pixel.document
 
 
-def test_the_resolution_of_a_scan_and_its_scale_on_paper_are_a_scale(drawn: dict[Style, DrawnPlan]):
+def test_scan_resolution_and_paper_scale_set_the_scale(drawn: dict[Style, DrawnPlan]):
     plan = drawn["thick"]
     # 80 pixels to a metre are 1:125 at 254 dots per inch.
     stream = io.BytesIO()
@@ -135,14 +135,14 @@ def test_the_resolution_of_a_scan_and_its_scale_on_paper_are_a_scale(drawn: dict
 
 
 @pytest.mark.parametrize("factor", [0.02, 30.0])
-def test_a_wrong_scale_finds_nothing_or_is_told(drawn: dict[Style, DrawnPlan], factor: float):
+def test_wrong_scale_is_rejected(drawn: dict[Style, DrawnPlan], factor: float):
     plan = drawn["thick"]
     options = ImportOptions(metres_per_pixel=factor * plan.metres_per_pixel)
-    with pytest.raises(InvalidFloorPlanError, match="is the scale right"):
+    with pytest.raises(InvalidFloorPlanError, match="check the scale"):
         import_plan(plan.png(), options)
 
 
-def test_an_empty_page_says_what_was_looked_for():
+def test_empty_picture_is_rejected():
     stream = io.BytesIO()
     Image.new("RGB", (400, 300), "white").save(stream, "PNG")
     with pytest.raises(InvalidFloorPlanError, match="no walls that enclose a room"):
@@ -160,7 +160,7 @@ def test_skew_is_found(degrees: float):
 
 
 def vector_pdf() -> bytes:
-    """Walls as filled outlines, a door and lettering, at 1:100 on a page."""
+    """Return a page with filled walls, a door and texts at 1:100."""
     centimetre = 72 / 2.54
     content = f"{centimetre:.5f} 0 0 {centimetre:.5f} 28 28 cm 0 g\n"
     for x, y, w, h in [
@@ -192,9 +192,9 @@ def vector_pdf() -> bytes:
     return f"{out}trailer << /Size {len(objects) + 1} /Root 1 0 R >>\nstartxref\n{start}\n%%EOF\n".encode()
 
 
-def test_a_pdf_that_is_drawn_is_read_as_a_drawing():
+def test_pdf_with_lines_is_read_as_a_drawing():
     plan = import_plan(vector_pdf())
-    assert plan.report.scale_source == "1:100, as is written in the drawing"
+    assert plan.report.scale_source == "1:100, written in the drawing"
     assert plan.report.is_draft
     assert {(room["name"], room["type"]) for room in plan.document["rooms"]} == {
         ("Kitchen", "kitchen"),
@@ -205,14 +205,14 @@ def test_a_pdf_that_is_drawn_is_read_as_a_drawing():
     assert door.length == pytest.approx(0.9, abs=0.02)
 
 
-def test_a_scanned_pdf_is_read_as_a_picture(drawn: dict[Style, DrawnPlan]):
+def test_scanned_pdf_is_read_as_a_picture(drawn: dict[Style, DrawnPlan]):
     plan = drawn["thick"]
     stream = io.BytesIO()
     Image.fromarray(plan.picture).save(stream, "PDF", resolution=254.0)
     imported = import_plan(stream.getvalue(), ImportOptions(scale=125.0))
     assert len(imported.document["rooms"]) == len(plan.rooms)
     assert "page 1 was read as a picture" in imported.report.notes
-    with pytest.raises(InvalidFloorPlanError, match="page is 2, the PDF has 1"):
+    with pytest.raises(InvalidFloorPlanError, match="page is 2; the PDF has 1 pages"):
         import_plan(stream.getvalue(), ImportOptions(scale=125.0, page=2))
-    with pytest.raises(InvalidFloorPlanError, match="the PDF does not say how long"):
+    with pytest.raises(InvalidFloorPlanError, match="the PDF gives no scale"):
         import_plan(stream.getvalue())

@@ -1,4 +1,4 @@
-"""What is exported is imported again."""
+"""Export and import of the same plan."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ANCHOR = Anchor(latitude=48.1372, longitude=11.5756, north_deg=25.0)
 
 
 @pytest.mark.parametrize("format", ["native", "geojson", "dxf", "svg"])
-def test_rooms_holes_walls_and_openings_come_back(flat: FloorPlan, format):
+def test_exported_plan_is_imported_unchanged(flat: FloorPlan, format):
     back = import_plan(export_plan(flat, format))
     assert_same_plan(back, flat.to_dict())
     assert {room["name"] for room in back.document["rooms"]} == {"bedroom", "living room", "corridor"}
@@ -29,11 +29,11 @@ def test_rooms_holes_walls_and_openings_come_back(flat: FloorPlan, format):
 
 
 @pytest.mark.parametrize("format", ["geojson", "imdf"])
-def test_a_plan_on_earth_comes_back_north_up(flat: FloorPlan, format):
+def test_anchored_plan_is_imported_north_up(flat: FloorPlan, format):
     back = import_plan(export_plan(flat, format, ANCHOR))
     assert back.anchor is not None
     assert abs(back.anchor.latitude - ANCHOR.latitude) < 1e-3
-    # The imported plan has north up; turned back by the anchor's north it is the same.
+    # The imported plan has north up: rotate it back by the anchor's north.
     turn = -ANCHOR.north_deg
     document = json.loads(json.dumps(back.document))
 
@@ -51,7 +51,7 @@ def test_a_plan_on_earth_comes_back_north_up(flat: FloorPlan, format):
     assert document["north_deg"] == 0.0
 
 
-def test_heights_and_types_survive_in_geojson(flat: FloorPlan):
+def test_geojson_keeps_heights_and_types(flat: FloorPlan):
     document = flat.to_dict()
     document["openings"][2] |= {"sill_m": 0.9, "head_m": 2.1}
     back = import_plan(export_plan(FloorPlan.from_dict(document), "geojson")).document
@@ -61,7 +61,7 @@ def test_heights_and_types_survive_in_geojson(flat: FloorPlan):
     assert (window["sill_m"], window["head_m"]) == (0.9, 2.1)
 
 
-def test_an_imdf_archive_has_what_the_standard_asks_for(flat: FloorPlan):
+def test_imdf_archive_conforms_to_the_standard(flat: FloorPlan):
     content = export_plan(flat, "imdf", ANCHOR)
     assert content == export_plan(flat, "imdf", ANCHOR)
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -73,15 +73,15 @@ def test_an_imdf_archive_has_what_the_standard_asks_for(flat: FloorPlan):
     assert all(unit["properties"]["level_id"] == level["id"] and unit["feature_type"] == "unit" for unit in units)
 
 
-def test_what_cannot_be_exported_is_refused(flat: FloorPlan):
+def test_invalid_exports_are_rejected(flat: FloorPlan):
     with pytest.raises(InvalidFloorPlanError, match="anchor"):
         export_plan(flat, "imdf")
-    with pytest.raises(InvalidFloorPlanError, match="known are native, geojson, imdf, dxf, svg"):
+    with pytest.raises(InvalidFloorPlanError, match="set it to one of native, geojson, imdf, dxf, svg"):
         export_plan(flat, "dwg")
     assert set(EXPORT_FORMATS) == {"native", "geojson", "imdf", "dxf", "svg"}
 
 
-def test_scale_of_an_export_is_overruled_by_an_option(flat: FloorPlan):
+def test_scale_option_overrides_an_exported_scale(flat: FloorPlan):
     back = import_plan(export_plan(flat, "svg"), ImportOptions(metres_per_pixel=0.005))
     x0, _, x1, _ = back.plan().bounds_m
     assert x1 - x0 == pytest.approx(4.5)

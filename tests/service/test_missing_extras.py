@@ -1,4 +1,4 @@
-"""Formats whose packages are not installed: the refusal names the extra that brings them."""
+"""Formats whose packages are not installed: the error names the extra to install."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.plans.conftest import FLAT as PLAN
 from tests.plans.test_pictures import vector_pdf
 from tests.service.conftest import StartApp, assert_problem, encode_picture, upload
 
-# Made while this process still finds the packages.
+# Created before the packages are hidden.
 _PLAN = FloorPlan.from_dict(dict(PLAN))
 FILES = {
     "ifc": (b"ISO-10303-21;\nHEADER;\nFILE_SCHEMA(('IFC4'));\nENDSEC;\nDATA;\nENDSEC;\nEND-ISO-10303-21;\n", "ifc"),
@@ -27,22 +27,20 @@ PACKAGES = ("ifcopenshell", "pypdfium2", "ezdxf", "cv2", "svgelements")
 
 @pytest.fixture(scope="module")
 def bare(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    """The app, whose workers find none of the packages: what they import in their place fails as nothing would."""
+    """Start the app with workers that find none of the packages."""
     shadows = tmp_path_factory.mktemp("shadows")
     for name in PACKAGES:
         raising = f"raise ModuleNotFoundError(\"No module named '{name}'\", name={name!r})\n"
         (shadows / f"{name}.py").write_text(raising)
     with pytest.MonkeyPatch.context() as patch:
-        # Workers are started with the search path that their parent has.
+        # Workers inherit the search path of their parent.
         patch.syspath_prepend(str(shadows))
         with start_app(tmp_path_factory.mktemp("data")) as client:
             yield client
 
 
 @pytest.mark.parametrize(("content", "extra"), FILES.values(), ids=FILES.keys())
-def test_a_file_that_nothing_here_reads_is_refused_with_the_extra_that_would(
-    bare: httpx.Client, content: bytes, extra: str
-) -> None:
+def test_import_without_package_names_the_extra(bare: httpx.Client, content: bytes, extra: str) -> None:
     fields = {"metres_per_pixel": "0.01"}
     response = bare.post("/floorplans", files={"file": ("plan", content)}, data=fields)
     problem = assert_problem(response, 501, "missing-extra")
@@ -50,7 +48,7 @@ def test_a_file_that_nothing_here_reads_is_refused_with_the_extra_that_would(
     assert f"pip install 'lalaloc[{extra}]'" in problem["detail"]
 
 
-def test_a_file_that_nothing_here_writes_is_refused_and_the_native_format_goes_on(bare: httpx.Client) -> None:
+def test_export_without_package_names_the_extra(bare: httpx.Client) -> None:
     plan_id = upload(bare)
     problem = assert_problem(bare.get(f"/floorplans/{plan_id}/export?format=dxf"), 501, "missing-extra")
     assert "the extra `plans`" in problem["detail"]

@@ -1,4 +1,4 @@
-"""Floor plans as the files people have, over HTTP: read in processes that may die, told with what was understood."""
+"""Floor plan files over HTTP: formats, options, reports, hostile files, and worker failures."""
 
 from __future__ import annotations
 
@@ -34,48 +34,46 @@ ANCHOR = Anchor(latitude=48.1372, longitude=11.5756, north_deg=25.0)
 SVG = '<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink">{}</svg>'
 
 
-def send(client: httpx.Client, content: bytes, **options: Any) -> httpx.Response:
+def send_plan(client: httpx.Client, content: bytes, **options: Any) -> httpx.Response:
     fields = {name: str(value) for name, value in options.items()}
     return client.post("/floorplans", files={"file": ("plan", content)}, data=fields)
 
 
-def stored(client: httpx.Client, content: bytes, **options: Any) -> dict[str, Any]:
-    response = send(client, content, **options)
+def store_plan(client: httpx.Client, content: bytes, **options: Any) -> dict[str, Any]:
+    response = send_plan(client, content, **options)
     assert response.status_code == 201, response.text
     return response.json()
 
 
-def written(format: str) -> bytes:
-    """The plan of three rooms as a file."""
+def plan_file(format: str) -> bytes:
+    """Return the plan of three rooms as a file."""
     return export_plan(FloorPlan.from_dict(json.loads(json.dumps(PLAN))), format, ANCHOR if format == "imdf" else None)
 
 
-def importers() -> set[int]:
-    """Process ids of the workers that read files, of all apps that run."""
+def import_workers() -> set[int]:
+    """Return the process ids of the import workers of all running apps."""
     children = [child for child in multiprocessing.active_children() if child.name.startswith("lalaloc-import")]
     return {child.pid for child in children if child.pid is not None}
 
 
 @pytest.mark.parametrize(
-    ("format", "media", "named"),
+    ("format", "media"),
     [
-        ("native", "application/json", "native"),
-        ("geojson", "application/geo+json", "geojson"),
-        ("imdf", "application/zip", "imdf"),
-        ("dxf", "image/vnd.dxf", "dxf"),
-        ("svg", "image/svg+xml", "svg"),
+        ("native", "application/json"),
+        ("geojson", "application/geo+json"),
+        ("imdf", "application/zip"),
+        ("dxf", "image/vnd.dxf"),
+        ("svg", "image/svg+xml"),
     ],
 )
-def test_a_file_is_taken_as_it_is_and_says_how_it_was_read(
-    client: httpx.Client, format: str, media: str, named: str
-) -> None:
-    content = written(format)
-    plan = stored(client, content)
+def test_file_is_imported_and_kept(client: httpx.Client, format: str, media: str) -> None:
+    content = plan_file(format)
+    plan = store_plan(client, content)
     assert sorted(room["name"] for room in plan["rooms"]) == ["bedroom", "corridor", "living room"]
     kinds = sorted(opening["kind"] for opening in plan["plan"]["openings"])
     assert kinds == ["door", "door", "passage", "window"]
     report = plan["import_report"]
-    assert report["format"] == named
+    assert report["format"] == format
     assert not report["is_draft"]
     assert report["layers"]
     assert client.get(f"/floorplans/{plan['id']}").json()["import_report"] == report
@@ -86,24 +84,24 @@ def test_a_file_is_taken_as_it_is_and_says_how_it_was_read(
     assert "default-src 'none'" in original.headers["content-security-policy"]
 
 
-def test_an_ifc_model_is_taken(client: httpx.Client) -> None:
-    plan = stored(client, ifc_flat().content())
+def test_ifc_model_is_imported(client: httpx.Client) -> None:
+    plan = store_plan(client, ifc_flat().content())
     assert [(room["name"], room["type"]) for room in plan["rooms"]] == [("Küche", "kitchen"), ("Wohnen", "living")]
     assert plan["import_report"]["level"] == {"name": "EG", "number": 0.0, "elevation_m": 0.0}
 
 
-def test_a_pdf_is_a_draft(client: httpx.Client) -> None:
-    plan = stored(client, vector_pdf())
+def test_pdf_is_a_draft(client: httpx.Client) -> None:
+    plan = store_plan(client, vector_pdf())
     assert plan["import_report"]["is_draft"]
     assert sorted(room["name"] for room in plan["rooms"]) == ["Kitchen", "Wohnzimmer"]
-    assert plan["import_report"]["scale_source"] == "1:100, as is written in the drawing"
+    assert plan["import_report"]["scale_source"] == "1:100, written in the drawing"
 
 
-def test_a_picture_needs_a_scale_and_is_a_draft_that_says_what_it_is_unsure_of(client: httpx.Client) -> None:
+def test_picture_needs_a_scale_and_is_a_draft(client: httpx.Client) -> None:
     drawn = draw_plan("thick", 1)
-    asked = assert_problem(send(client, drawn.png()), 422, "invalid-floorplan")
-    assert "metres_per_pixel" in asked["detail"]
-    plan = stored(client, drawn.png(), metres_per_pixel=drawn.metres_per_pixel, name="Drawn")
+    problem = assert_problem(send_plan(client, drawn.png()), 422, "invalid-floorplan")
+    assert "metres_per_pixel" in problem["detail"]
+    plan = store_plan(client, drawn.png(), metres_per_pixel=drawn.metres_per_pixel, name="Drawn")
     assert plan["name"] == "Drawn"
     assert len(plan["rooms"]) == len(drawn.rooms)
     assert plan["import_report"]["is_draft"]
@@ -111,7 +109,7 @@ def test_a_picture_needs_a_scale_and_is_a_draft_that_says_what_it_is_unsure_of(c
     assert client.get(f"/floorplans/{plan['id']}/original").headers["content-type"] == "image/png"
 
 
-def test_a_plan_in_feet_is_converted(client: httpx.Client) -> None:
+def test_plan_in_feet_is_converted(client: httpx.Client) -> None:
     feet = {"units": "ft", "ceiling_height": 8, "rooms": [{"polygon": [[0, 0], [12, 0], [12, 10], [0, 10]]}]}
     plan = client.post("/floorplans", json=feet).json()
     assert plan["area_m2"] == pytest.approx(120 * 0.3048**2, abs=1e-3)
@@ -119,7 +117,7 @@ def test_a_plan_in_feet_is_converted(client: httpx.Client) -> None:
     assert plan["warnings"] == []
 
 
-def test_what_is_likely_wrong_is_told(client: httpx.Client) -> None:
+def test_likely_mistakes_are_warnings(client: httpx.Client) -> None:
     square = [[0, 0], [4, 0], [4, 3], [0, 3]]
     plan = {
         "ceiling_height_m": 8,
@@ -132,13 +130,13 @@ def test_what_is_likely_wrong_is_told(client: httpx.Client) -> None:
         "openings": [{"kind": "door", "line": [[4.05, 1], [4.05, 1.9]]}],
     }
     answer = client.post("/floorplans", json=plan).json()
-    told = "\n".join(answer["warnings"])
+    warnings = "\n".join(answer["warnings"])
     for words in ("it looks like feet", "share a name: 'hall'", "'shed'", "no door or passage reaches", "overlap"):
-        assert words in told
+        assert words in warnings
     assert client.get(f"/floorplans/{answer['id']}").json()["warnings"] == answer["warnings"]
 
 
-def test_a_y_axis_that_points_down_is_told(client: httpx.Client) -> None:
+def test_y_axis_down_gives_a_warning(client: httpx.Client) -> None:
     document = new_dxf()
     document.header["$INSUNITS"] = 6
     document.header["$UCSYDIR"] = (0, -1, 0)
@@ -146,18 +144,18 @@ def test_a_y_axis_that_points_down_is_told(client: httpx.Client) -> None:
     room.close()
     text = io.StringIO()
     document.write(text)
-    assert any("y" in line and "down" in line for line in stored(client, text.getvalue().encode())["warnings"])
+    assert any("y" in line and "down" in line for line in store_plan(client, text.getvalue().encode())["warnings"])
 
 
-def test_a_file_is_also_taken_as_the_body_whatever_type_it_is_said_to_have(client: httpx.Client) -> None:
+def test_file_as_body_is_detected_by_content(client: httpx.Client) -> None:
     for media in ("image/vnd.dxf", "application/octet-stream", "application/json"):
-        response = client.post("/floorplans", content=written("dxf"), headers={"content-type": media})
+        response = client.post("/floorplans", content=plan_file("dxf"), headers={"content-type": media})
         assert response.status_code == 201, response.text
         assert response.json()["import_report"]["format"] == "dxf"
 
 
-def test_of_several_levels_one_has_to_be_chosen(client: httpx.Client) -> None:
-    collection = json.loads(written("geojson"))
+def test_several_levels_require_the_level_option(client: httpx.Client) -> None:
+    collection = json.loads(plan_file("geojson"))
     upper = json.loads(json.dumps(collection["features"]))
     for feature in collection["features"]:
         feature["properties"]["level"] = "0"
@@ -167,21 +165,21 @@ def test_of_several_levels_one_has_to_be_chosen(client: httpx.Client) -> None:
         feature.pop("id", None)
     collection["features"] += upper
     content = json.dumps(collection).encode()
-    problem = assert_problem(send(client, content), 422, "several-levels")
+    problem = assert_problem(send_plan(client, content), 422, "several-levels")
     assert problem["levels"] == ["0", "1"]
     assert "2 levels: '0', '1'; choose one with `level`" in problem["detail"]
-    assert stored(client, content, level="1")["import_report"]["level"]["name"] == "1"
-    nowhere = assert_problem(send(client, content, level="7"), 422, "invalid-floorplan")
-    assert "has no level '7', it has '0', '1'" in nowhere["detail"]
+    assert store_plan(client, content, level="1")["import_report"]["level"]["name"] == "1"
+    nowhere = assert_problem(send_plan(client, content, level="7"), 422, "invalid-floorplan")
+    assert "has no level '7'; set level to one of '0', '1'" in nowhere["detail"]
 
 
-@pytest.mark.skipif(DUPLEX is None, reason="the sample model does not lie beside the project")
-def test_the_sample_model_of_two_storeys(client: httpx.Client) -> None:
+@pytest.mark.skipif(DUPLEX is None, reason="the sample model is not available")
+def test_sample_model_of_two_storeys(client: httpx.Client) -> None:
     assert DUPLEX is not None
     content = DUPLEX.read_bytes()
-    levels = assert_problem(send(client, content), 422, "several-levels")["levels"]
+    levels = assert_problem(send_plan(client, content), 422, "several-levels")["levels"]
     assert "Level 1" in levels
-    plan = stored(client, content, level="Level 1")
+    plan = store_plan(client, content, level="Level 1")
     assert len(plan["rooms"]) >= 8
     assert plan["import_report"]["level"]["name"] == "Level 1"
     assert client.get(f"/floorplans/{plan['id']}/original").content == content
@@ -190,48 +188,48 @@ def test_the_sample_model_of_two_storeys(client: httpx.Client) -> None:
 @pytest.mark.parametrize(
     ("options", "field", "words"),
     [
-        ({"units": "miles"}, "units", "known are m, cm, mm, in, ft"),
+        ({"units": "miles"}, "units", "set it to one of m, cm, mm, in, ft"),
         ({"scale": "large"}, "scale", "must look like 1:100"),
         ({"metres_per_pixel": "1_0"}, "metres_per_pixel", "must be a number"),
         ({"metres_per_pixel": "99"}, "metres_per_pixel", "between 1e-06 and 10"),
         ({"known_distance": "1,2,3"}, "known_distance", "has 3 numbers"),
         ({"page": "0"}, "page", "between 1 and"),
-        ({"y_axis": "left"}, "y_axis", "known are up, down"),
-        ({"scale": "1:50", "metres_per_pixel": "0.01"}, "scale", "more than once"),
+        ({"y_axis": "left"}, "y_axis", "set it to up or down"),
+        ({"scale": "1:50", "metres_per_pixel": "0.01"}, "scale", "give only one of them"),
         ({"color": "red"}, "color", "unknown part"),
     ],
 )
-def test_an_option_that_cannot_be_is_refused_by_its_name(
+def test_invalid_option_is_rejected_by_name(
     client: httpx.Client, options: dict[str, str], field: str, words: str
 ) -> None:
-    problem = assert_problem(send(client, written("svg"), **options), 422, "invalid-request")
+    problem = assert_problem(send_plan(client, plan_file("svg"), **options), 422, "invalid-request")
     assert [fault["field"] for fault in problem["errors"]] == [field]
     assert words in problem["errors"][0]["message"]
 
 
-def test_an_option_that_says_nothing_about_the_file_is_told(client: httpx.Client) -> None:
-    plan = stored(client, written("native"), level="2")
-    assert any("'level' says nothing about a native file" in line for line in plan["warnings"])
+def test_unused_option_gives_a_warning(client: httpx.Client) -> None:
+    plan = store_plan(client, plan_file("native"), level="2")
+    assert any("the option 'level' was ignored" in line for line in plan["warnings"])
 
 
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        (b"hello there", "no known format; known are"),
-        (b"AC1032 dwg", "DWG: save it as DXF"),
-        (b"GIF89a....", "GIF: save it as PNG"),
+        (b"hello there", "in no known format; supported formats are"),
+        (b"AC1032 dwg", "a DWG drawing, which cannot be read: save it as DXF"),
+        (b"GIF89a....", "a GIF picture, which cannot be read: save it as PNG"),
         (b"%PDF-1.7 nothing", "cannot be read"),
         (b'{"type": "FeatureCollection", "features": []}', "no features"),
         (b"   ", "the body is empty"),
     ],
 )
-def test_a_file_that_is_no_plan_is_refused_with_what_to_do(client: httpx.Client, content: bytes, words: str) -> None:
-    assert words in assert_problem(send(client, content), 422, "invalid-floorplan")["detail"]
+def test_other_files_are_rejected_with_a_remedy(client: httpx.Client, content: bytes, words: str) -> None:
+    assert words in assert_problem(send_plan(client, content), 422, "invalid-floorplan")["detail"]
 
 
-def test_a_file_replaces_a_plan(client: httpx.Client) -> None:
-    plan = stored(client, written("native"))
-    content = written("svg")
+def test_file_replaces_a_plan(client: httpx.Client) -> None:
+    plan = store_plan(client, plan_file("native"))
+    content = plan_file("svg")
     answer = client.put(f"/floorplans/{plan['id']}", files={"file": ("plan.svg", content)}, data={"name": "Anew"})
     assert answer.status_code == 200, answer.text
     assert answer.json()["name"] == "Anew"
@@ -239,21 +237,21 @@ def test_a_file_replaces_a_plan(client: httpx.Client) -> None:
     assert client.get(f"/floorplans/{plan['id']}/original").content == content
 
 
-def test_the_same_file_with_the_same_key_and_other_options_is_another_request(client: httpx.Client) -> None:
-    def ask(**fields: str) -> httpx.Response:
-        file = {"file": ("plan", written("svg"))}
+def test_idempotency_key_covers_the_options(client: httpx.Client) -> None:
+    def upload(**fields: str) -> httpx.Response:
+        file = {"file": ("plan", plan_file("svg"))}
         return client.post("/floorplans", files=file, data=fields, headers={"Idempotency-Key": "a-file"})
 
-    first = ask(name="one")
+    first = upload(name="one")
     assert first.status_code == 201
-    again = ask(name="one")
+    again = upload(name="one")
     assert (again.content, again.headers["idempotency-replayed"]) == (first.content, "true")
-    assert_problem(ask(name="two"), 422, "idempotency-key-reused")
+    assert_problem(upload(name="two"), 422, "idempotency-key-reused")
 
 
 @pytest.fixture(scope="module")
 def strict(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
-    """An app that takes little."""
+    """Start an app with low limits."""
     limits: dict[str, Any] = {
         "max_unpacked_bytes": 1_000_000,
         "max_entities": 3000,
@@ -261,52 +259,52 @@ def strict(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Ite
         "max_plan_bytes": 3_000_000,
     }
     with start_app(tmp_path_factory.mktemp("strict"), **limits) as client:
-        told = client.get("/limits").json()
-        assert {name: told[name] for name in limits} == limits
+        reported = client.get("/limits").json()
+        assert {name: reported[name] for name in limits} == limits
         yield client
 
 
-class TestHostile:
-    """What is made to exhaust or to reach out is refused, and the service answers the next one."""
+class TestHostileFiles:
+    """Files made to exhaust resources are rejected, and the service handles the next request."""
 
-    def refused(self, client: httpx.Client, content: bytes, words: str) -> None:
-        problem = assert_problem(send(client, content, metres_per_pixel=0.01), 422, "invalid-floorplan")
+    def assert_rejected(self, client: httpx.Client, content: bytes, words: str) -> None:
+        problem = assert_problem(send_plan(client, content, metres_per_pixel=0.01), 422, "invalid-floorplan")
         assert words in problem["detail"]
-        assert stored(client, written("svg"))["rooms"]
+        assert store_plan(client, plan_file("svg"))["rooms"]
 
-    def test_a_zip_that_unpacks_to_more_than_it_may(self, strict: httpx.Client) -> None:
+    def test_zip_above_the_unpacked_limit(self, strict: httpx.Client) -> None:
         stream = io.BytesIO()
         with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
             archive.writestr("unit.geojson", b" " * 3_000_000)
-        self.refused(strict, stream.getvalue(), "more than 1000000 bytes (max_unpacked_bytes)")
+        self.assert_rejected(strict, stream.getvalue(), "more than 1000000 bytes (max_unpacked_bytes)")
 
-    def test_entities_that_multiply_and_that_are_elsewhere(self, strict: httpx.Client) -> None:
+    def test_nested_and_external_xml_entities(self, strict: httpx.Client) -> None:
         lol = "".join(f'<!ENTITY l{i} "{f"&l{i - 1};" * 10}">' for i in range(1, 10))
         bomb = f'<!DOCTYPE svg [<!ENTITY l0 "lol">{lol}]>{SVG.format("<text>&l9;</text>")}'
-        self.refused(strict, bomb.encode(), "declares entities")
+        self.assert_rejected(strict, bomb.encode(), "declares entities")
         outside = f'<!DOCTYPE svg [<!ENTITY x SYSTEM "file:///etc/passwd">]>{SVG.format("<text>&x;</text>")}'
-        self.refused(strict, outside.encode(), "entities")
+        self.assert_rejected(strict, outside.encode(), "entities")
 
-    def test_a_drawing_of_too_many_lines(self, strict: httpx.Client) -> None:
+    def test_drawing_with_too_many_lines(self, strict: httpx.Client) -> None:
         document = new_dxf()
         for x in range(4000):
             document.modelspace().add_line((x, 0), (x, 1))
         text = io.StringIO()
         document.write(text)
-        self.refused(strict, text.getvalue().encode(), "more than 3000 entities (max_entities)")
+        self.assert_rejected(strict, text.getvalue().encode(), "more than 3000 entities (max_entities)")
 
-    def test_a_picture_of_too_many_pixels(self, strict: httpx.Client) -> None:
+    def test_picture_with_too_many_pixels(self, strict: httpx.Client) -> None:
         header = b"IHDR" + struct.pack(">IIBBBBB", 30_000, 30_000, 8, 0, 0, 0, 0)
         chunk = struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header))
         picture = b"\x89PNG\r\n\x1a\n" + chunk + struct.pack(">I", 0) + b"IEND" + struct.pack(">I", zlib.crc32(b"IEND"))
-        self.refused(strict, picture, "pixels")
+        self.assert_rejected(strict, picture, "pixels")
 
-    def test_json_that_is_deep_and_large(self, strict: httpx.Client) -> None:
-        self.refused(strict, b'{"type": "FeatureCollection", "features": ' + b"[" * 1_000_000, "nested")
+    def test_deep_and_large_json(self, strict: httpx.Client) -> None:
+        self.assert_rejected(strict, b'{"type": "FeatureCollection", "features": ' + b"[" * 1_000_000, "nested")
         rooms = {"ceiling_height_m": 2.5, "rooms": [{"polygon": [[0, 0]] * 290_000}]}
-        self.refused(strict, json.dumps(rooms).encode(), "vertices")
+        self.assert_rejected(strict, json.dumps(rooms).encode(), "vertices")
 
-    def test_a_file_without_an_end(self, strict: httpx.Client) -> None:
+    def test_endless_file(self, strict: httpx.Client) -> None:
         def endless() -> Iterator[bytes]:
             yield b"0\nSECTION\n"
             for _ in range(200):
@@ -315,53 +313,50 @@ class TestHostile:
         response = strict.post("/floorplans", content=endless(), headers={"content-type": "image/vnd.dxf"})
         problem = assert_problem(response, 413, "upload-too-large")
         assert "at most 3000000 bytes are allowed (max_plan_bytes)" in problem["detail"]
-        assert stored(strict, written("svg"))["rooms"]
+        assert store_plan(strict, plan_file("svg"))["rooms"]
 
 
 @pytest.mark.one_replica
-def test_a_file_over_which_the_reader_stalls_is_refused_and_the_next_is_read(
-    start_app: StartApp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_stalled_worker_is_replaced(start_app: StartApp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(converter, "_STALL_MARGIN_S", 2.0)
-    others = importers()
+    earlier = import_workers()
     with start_app(tmp_path, max_import_s=3.0) as client:
-        assert importers() == others, "they start with the first file"
-        stored(client, written("svg"))
-        # Whatever it is that keeps it busy.
-        (pid,) = importers() - others
+        assert import_workers() == earlier, "workers start with the first file"
+        store_plan(client, plan_file("svg"))
+        (pid,) = import_workers() - earlier
         os.kill(pid, signal.SIGSTOP)
-        problem = assert_problem(send(client, written("dxf")), 422, "invalid-floorplan")
+        problem = assert_problem(send_plan(client, plan_file("dxf")), 422, "invalid-floorplan")
         assert "longer than 5 s (max_import_s is 3)" in problem["detail"]
         wait_for(lambda: client.get("/readyz").json()["import_pool"]["ready"] == 1)
-        # One that is killed costs no upload.
-        (pid,) = importers() - others
+        # A killed worker loses no upload.
+        (pid,) = import_workers() - earlier
         os.kill(pid, signal.SIGKILL)
-        assert stored(client, written("svg"))["rooms"]
-    assert importers() == others, "the pool left a process behind"
+        assert store_plan(client, plan_file("svg"))["rooms"]
+    assert import_workers() == earlier, "the pool left a process behind"
 
 
 @pytest.mark.one_replica
-def test_a_file_that_takes_too_much_memory_is_refused(start_app: StartApp, tmp_path: Path) -> None:
+def test_file_above_the_memory_limit_is_rejected(start_app: StartApp, tmp_path: Path) -> None:
     stream = io.BytesIO()
     Image.new("L", (9_000, 9_000), 255).save(stream, "PNG")
     with start_app(tmp_path, import_memory_bytes=256 * 2**20, max_plan_pixels=10**9) as client:
-        response = send(client, stream.getvalue(), metres_per_pixel=0.001)
+        response = send_plan(client, stream.getvalue(), metres_per_pixel=0.001)
         assert "memory" in assert_problem(response, 422, "invalid-floorplan")["detail"]
-        assert stored(client, written("svg"))["rooms"]
+        assert store_plan(client, plan_file("svg"))["rooms"]
 
 
-def test_an_example_is_answered_in_a_plan_that_came_as_a_drawing(start_app: StartApp, tmp_path: Path) -> None:
+def test_example_is_localised_in_an_imported_drawing(start_app: StartApp, tmp_path: Path) -> None:
     plan = FloorPlan.from_json((EXAMPLES / "flat.json").read_bytes())
     bundle = Path(__file__).parents[2] / "models" / "default"
     truth = next(pose for pose in json.loads((EXAMPLES / "poses.json").read_text()) if pose["room"] == "kitchen")
     picture = (EXAMPLES / truth["file"]).read_bytes()
     with start_app(tmp_path, bundle=bundle) as client:
         for format in ("dxf", "svg", "geojson"):
-            made = stored(client, export_plan(plan, format), ceiling_height_m=2.6)
+            made = store_plan(client, export_plan(plan, format), ceiling_height_m=2.6)
             assert made["status"] == "ready"
             response = localise(client, made["id"], picture, heading_deg=truth["heading_deg"], refine="vdr")
             assert response.status_code == 200, response.text
             answer = response.json()
             assert answer["room"] == "kitchen"
-            place = shapely.Point(answer["position"]["x_m"], answer["position"]["y_m"])
-            assert place.distance(shapely.Point(truth["x_m"], truth["y_m"])) < 0.3
+            position = shapely.Point(answer["position"]["x_m"], answer["position"]["y_m"])
+            assert position.distance(shapely.Point(truth["x_m"], truth["y_m"])) < 0.3

@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw
 from playwright.sync_api import Browser, Page, Route, expect
 
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.importers.exporting import export_plan
+from lalaloc_core.importers import export_plan
 from service.storage.store import Store
 from tests.service.conftest import FLAT, DatabaseOf, StartApp, upload
 from tests.service.test_security import make_key

@@ -1,5 +1,5 @@
-"""Vector drawings, whatever format they came in: which lines are walls, what they enclose, which symbols are doors.
+"""Vector drawings of any format: walls, the rooms they enclose, and the symbols of doors and windows.
 
-Begin with `understand.py`, from a drawing (`shapes.py`) to rooms and openings; `walls.py` finds what walls enclose,
-`scale.py` how long a unit is.
+Begin with `sketching.py`, which turns a drawing (`shapes.py`) into rooms and openings. `walls.py` finds the rooms that
+walls enclose, and `scale.py` the length of a unit.
 """

@@ -1,8 +1,8 @@
-"""Rooms from walls: what walls enclose, once the gaps that doors leave in them are closed.
+"""Rooms enclosed by walls, after the gaps that openings leave in the walls are closed.
 
-Walls come as areas (hatches, filled shapes, what is dark in a picture) or as lines, single or double. Lines are joined
-where they nearly meet; thin areas between them are walls. The end of a wall that faces another wall across a gap no
-wider than a door is the jamb of an opening. All lengths in metres.
+Walls are areas (hatches, filled shapes, dark parts of a picture) or lines, single or double. Lines are joined where
+they nearly meet, and thin areas between them are walls. The end of a wall that faces another wall across a narrow gap
+is the jamb of an opening. All lengths are in metres.
 """
 
 from __future__ import annotations
@@ -16,26 +16,26 @@ import shapely
 from jaxtyping import Float
 from shapely.geometry.base import BaseGeometry
 
-from lalaloc_core.importers.model.geometry import polygons_of
+from lalaloc_core.importers.common.geometry import polygons_of
 
-# Sine of the least angle of a corner at the end of a wall; and how far apart two short ends are jambs of one door (m).
+# Smallest sine of a corner at the end of a wall, and largest gap between two short ends (m).
 _CORNER, _MAX_BETWEEN_NIBS = 0.8, 1.3
-# Jambs that are not in line by more than this are none (m).
+# Largest offset between two jambs (m).
 _OUT_OF_LINE_M = 0.35
 
 
 @dataclass(frozen=True, kw_only=True)
 class WallConfig:
-    """What walls and the openings in them measure (m).
+    """Dimensions of walls and openings (m).
 
     Attributes:
-        thickest: beyond, an area is a room, not a wall.
-        thinnest: shorter ends of walls are corners that a drawing rounds.
-        widest_gap: wider gaps are left open, the rooms beside them are one.
-        narrowest_gap: of an opening.
-        nib: a wall's end must be that long to be the jamb of a gap by itself; shorter ones need one that faces them.
-        snap: ends of lines that are nearer than this to another line are meant to touch it.
-        smallest_room_m2: of what walls enclose, less is a duct.
+        thickest: largest thickness of a wall; thicker areas are rooms.
+        thinnest: smallest thickness of a wall; shorter ends are rounded corners.
+        widest_gap: largest width of an opening; wider gaps stay open and join the rooms beside them.
+        narrowest_gap: smallest width of an opening.
+        nib: smallest length of a wall that forms a jamb alone; shorter walls need a jamb that faces them.
+        snap: ends of lines nearer than this to another line are joined to it.
+        smallest_room_m2: smallest area of a room; smaller areas are ducts.
     """
 
     thickest: float = 0.55
@@ -52,10 +52,13 @@ DEFAULT_WALLS = WallConfig()
 
 @dataclass(frozen=True, eq=False)
 class Gap:
-    """An opening in a wall: the quadrilateral between two jambs, and its middle line along the wall.
+    """Gap in a wall.
 
-    `is_sure` is False where the walls alone do not tell: one end is a short nib, or the two are not quite in line.
-    `is_between_ends` tells that both sides are ends of walls, not an end and the face of another.
+    Attributes:
+        shape: quadrilateral between the two jambs.
+        start, end: middle line along the wall.
+        is_sure: the walls alone identify an opening. False if a jamb is a short nib or the jambs are not in line.
+        is_between_ends: both sides are ends of walls, not an end and the face of another wall.
     """
 
     shape: shapely.Polygon
@@ -70,14 +73,14 @@ class Gap:
         return math.dist(self.start, self.end)
 
 
-def judge_by_walls(gap: Gap) -> int | None:
-    """Where nothing but walls is known: only what they leave no doubt of."""
+def rank_by_walls(gap: Gap) -> int | None:
+    """Rank a gap by the walls alone: accept sure gaps only."""
     return 0 if gap.is_sure else None
 
 
 @dataclass(frozen=True, eq=False)
 class Enclosed:
-    """What walls enclose."""
+    """Rooms, gaps and walls of a drawing."""
 
     rooms: list[shapely.Polygon]
     gaps: list[Gap]
@@ -89,37 +92,38 @@ def enclose(
     lines: Sequence[shapely.LineString],
     closers: Sequence[BaseGeometry] = (),
     config: WallConfig = DEFAULT_WALLS,
-    tick: Callable[[], None] = lambda: None,
-    judge: Callable[[Gap], int | None] = judge_by_walls,
+    check_time: Callable[[], None] = lambda: None,
+    rank: Callable[[Gap], int | None] = rank_by_walls,
 ) -> Enclosed:
-    """The rooms between walls.
+    """Find the rooms between walls.
 
     Args:
-        bodies: walls as areas.
-        lines: walls as lines.
-        closers: doors and windows that are drawn as areas in the walls.
-        tick: called between steps; may raise to end it.
-        judge: how good a gap between two walls is, the least is the best; None: it is no opening, and stays open.
+        bodies: walls drawn as areas.
+        lines: walls drawn as lines.
+        closers: doors and windows drawn as areas in the walls.
+        config: dimensions of walls and openings.
+        check_time: called between steps; raises an exception to stop.
+        rank: rank of a gap, lowest first; None if it is not an opening and stays open.
     """
-    faces, loose = _faces(lines, config, tick) if lines else ([], [])
+    faces, loose = _faces(lines, config, check_time) if lines else ([], [])
     thin = [face for face in faces if _is_thin(face, config)]
     solid = shapely.unary_union([*bodies, *thin]) if bodies or thin else shapely.Polygon()
     if solid.area < 0.05:
-        return _from_single_lines(lines, closers, config, tick)
-    leftovers = [line for line in loose if not solid.buffer(0.02).covers(line) and line.length >= config.nib]
-    blocked = shapely.unary_union([solid, *closers, *(line.buffer(0.01, cap_style="flat") for line in leftovers)])
-    tick()
-    gaps = find_gaps(blocked, config, tick, judge)
+        return _from_single_lines(lines, closers, config, check_time)
+    unpaired = [line for line in loose if not solid.buffer(0.02).covers(line) and line.length >= config.nib]
+    blocked = shapely.unary_union([solid, *closers, *(line.buffer(0.01, cap_style="flat") for line in unpaired)])
+    check_time()
+    gaps = find_gaps(blocked, config, check_time, rank)
     return Enclosed(_insides([blocked, *(gap.shape for gap in gaps)], config), gaps, solid)
 
 
 def find_gaps(
     walls: BaseGeometry,
     config: WallConfig,
-    tick: Callable[[], None] = lambda: None,
-    judge: Callable[[Gap], int | None] = judge_by_walls,
+    check_time: Callable[[], None] = lambda: None,
+    rank: Callable[[Gap], int | None] = rank_by_walls,
 ) -> list[Gap]:
-    """Openings between ends of walls and what they face, the best and then the narrowest first; none overlaps."""
+    """Return gaps between the ends of walls and the walls that they face, by rank and width, without overlaps."""
     parts = [simple for part in polygons_of(walls) for simple in polygons_of(part.simplify(0.004))]
     tree = shapely.STRtree(parts)
     found: list[Gap] = []
@@ -127,21 +131,21 @@ def find_gaps(
         oriented = shapely.geometry.polygon.orient(part)
         for ring in (oriented.exterior, *oriented.interiors):
             for wall in _ends(np.asarray(ring.coords), config):
-                tick()
+                check_time()
                 gap = _gap_before(wall, parts, tree, config)
                 if gap is not None:
                     found.append(gap)
     kept: list[Gap] = []
-    ranked = [(rank, gap.width, gap) for gap in found if (rank := judge(gap)) is not None]
+    ranked = [(priority, gap.width, gap) for gap in found if (priority := rank(gap)) is not None]
     for _, _, gap in sorted(ranked, key=lambda item: item[:2]):
-        if all(shapely.intersection(gap.shape, other.shape).area < 0.25 * gap.shape.area for other in kept):
+        if all(shapely.intersection(gap.shape, better.shape).area < 0.25 * gap.shape.area for better in kept):
             kept.append(gap)
     return kept
 
 
 @dataclass(frozen=True, eq=False)
 class _End:
-    """The end of a wall: its edge, where it looks, and how long the wall behind it is."""
+    """End of a wall: its edge, the outward direction, and the length of the wall behind it (`nib`)."""
 
     start: Float[np.ndarray, "2"]
     end: Float[np.ndarray, "2"]
@@ -150,10 +154,10 @@ class _End:
 
 
 def _ends(ring: Float[np.ndarray, "n 2"], config: WallConfig) -> list[_End]:
-    """Edges that end a wall, of a ring with the wall to its left.
+    """Return the edges of a ring that are ends of walls; the wall lies to the left of the ring.
 
-    Ends are as short as walls are thick, with a right-angled corner at both sides. They look along the longer of their
-    neighbours: of a drawing's edges the short ones are the least exact.
+    An end is as short as walls are thick and has a right-angled corner at both sides. Its outward direction follows the
+    longer neighbouring edge, because short edges are less accurate.
     """
     points = ring[:-1]
     if len(points) < 4:
@@ -167,14 +171,14 @@ def _ends(ring: Float[np.ndarray, "n 2"], config: WallConfig) -> list[_End]:
         following = (i + 1) % len(points)
         if not config.thinnest <= lengths[i] <= config.thickest or min(turns[i - 1], turns[i]) < _CORNER:
             continue
-        behind = max(lengths[i - 1], lengths[following])
+        nib = max(lengths[i - 1], lengths[following])
         outward = directions[i - 1] if lengths[i - 1] >= lengths[following] else -directions[following]
-        found.append(_End(points[i], points[following], outward, float(behind)))
+        found.append(_End(points[i], points[following], outward, float(nib)))
     return found
 
 
 def _gap_before(wall: _End, parts: Sequence[shapely.Polygon], tree: shapely.STRtree, config: WallConfig) -> Gap | None:
-    """The gap between the end of a wall and what it faces; None where that is too near, too far or nothing."""
+    """Return the gap in front of the end of a wall, None if nothing lies within the limits of width."""
     outward = wall.outward
     distances = []
     for share in (0.15, 0.5, 0.85):
@@ -183,7 +187,7 @@ def _gap_before(wall: _End, parts: Sequence[shapely.Polygon], tree: shapely.STRt
         hits = [parts[index].intersection(ray) for index in tree.query(ray, predicate="intersects")]
         reached = [shapely.distance(shapely.Point(origin), hit) for hit in hits if not hit.is_empty]
         distances.append(0.5 * config.thinnest + float(min(reached, default=math.inf)))
-    # One of three may miss, where walls are not quite in line.
+    # One of the three rays can miss if the walls are not quite in line.
     nearest, middle, farthest = sorted(distances)
     width = farthest if farthest - middle <= 0.25 * config.thickest else middle
     if width - nearest > _OUT_OF_LINE_M or not config.narrowest_gap <= width <= config.widest_gap:
@@ -192,7 +196,7 @@ def _gap_before(wall: _End, parts: Sequence[shapely.Polygon], tree: shapely.STRt
     is_sure = width - nearest <= 0.25 * config.thickest and (
         wall.nib >= config.nib or (is_between_ends and width <= _MAX_BETWEEN_NIBS)
     )
-    # A little into both walls, so that nothing is left open beside it.
+    # Overlap both walls slightly, so that no slit stays open.
     near, far = -0.02 * outward, (width + 0.02) * outward
     shape = shapely.Polygon([wall.start + near, wall.end + near, wall.end + far, wall.start + far])
     if not shape.is_valid:
@@ -209,7 +213,7 @@ def _faces_an_end(
     width: float,
     tree: shapely.STRtree,
 ) -> bool:
-    """Whether the other side of a gap is the end of a wall as well, about as thick."""
+    """Return whether the other side of a gap is the end of a wall of similar thickness."""
     a, b = start + (width + 0.02) * outward, end + (width + 0.02) * outward
     side = 0.12 * (b - a) / np.linalg.norm(b - a)
     outside = shapely.LineString([a - side, a - 0.3 * side]), shapely.LineString([b + 0.3 * side, b + side])
@@ -217,21 +221,21 @@ def _faces_an_end(
 
 
 def _faces(
-    lines: Sequence[shapely.LineString], config: WallConfig, tick: Callable[[], None]
+    lines: Sequence[shapely.LineString], config: WallConfig, check_time: Callable[[], None]
 ) -> tuple[list[shapely.Polygon], list[shapely.LineString]]:
-    """(areas between lines, once they are joined; lines that bound none)."""
+    """Return the areas between the joined lines, and the lines that bound no area."""
     network = shapely.unary_union(shapely.set_precision(shapely.multilinestrings(list(lines)), 0.001))
-    tick()
+    check_time()
     segments = [part for part in shapely.get_parts(network) if part.length > 0.0]
     joined = shapely.unary_union([*segments, *_joints(segments, config)])
-    tick()
+    check_time()
     polygons, cuts, dangles, _ = shapely.polygonize_full(list(shapely.get_parts(joined)))
     loose = [*shapely.get_parts(cuts), *shapely.get_parts(dangles)]
     return list(shapely.get_parts(polygons)), [line for line in loose if isinstance(line, shapely.LineString)]
 
 
 def _joints(segments: Sequence[shapely.LineString], config: WallConfig) -> list[shapely.LineString]:
-    """What joins loose ends: to the line that they nearly touch, or, as a jamb, to the other face of their wall."""
+    """Return lines that join loose ends to the line they nearly touch, or to the other face of their wall as a jamb."""
     ends, directions = _loose_ends(segments)
     if not len(ends):
         return []
@@ -254,15 +258,15 @@ def _joints(segments: Sequence[shapely.LineString], config: WallConfig) -> list[
         parallel = np.abs(_cross(directions, directions[index][None])) < 0.1
         partners = np.flatnonzero((apart > config.thinnest) & (apart <= config.thickest) & across & parallel)
         if len(partners):
-            other = partners[np.argmin(apart[partners])]
-            joints.append(shapely.LineString([ends[index], ends[other]]))
+            partner = partners[np.argmin(apart[partners])]
+            joints.append(shapely.LineString([ends[index], ends[partner]]))
     return joints
 
 
 def _loose_ends(
     segments: Sequence[shapely.LineString],
 ) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2"]]:
-    """(ends that no other segment shares, unit vectors that lead out of the line there)."""
+    """Return the ends that no other segment shares, and the outward unit vectors of their lines."""
     tips, outward = [], []
     for segment in segments:
         points = np.asarray(segment.coords)
@@ -281,9 +285,9 @@ def _from_single_lines(
     lines: Sequence[shapely.LineString],
     closers: Sequence[BaseGeometry],
     config: WallConfig,
-    tick: Callable[[], None],
+    check_time: Callable[[], None],
 ) -> Enclosed:
-    """Walls without thickness: gaps lie between loose ends and what lies straight before them."""
+    """Find rooms between walls without thickness; gaps lie in front of loose ends."""
     if not lines:
         return Enclosed([], [], shapely.Polygon())
     network = shapely.unary_union(shapely.set_precision(shapely.multilinestrings(list(lines)), 0.001))
@@ -292,15 +296,15 @@ def _from_single_lines(
     tree = shapely.STRtree(segments)
     gaps: list[Gap] = []
     for end, direction in zip(ends, outward, strict=True):
-        tick()
+        check_time()
         ray = shapely.LineString([end + 1e-4 * direction, end + config.widest_gap * direction])
         hits = [segments[k].intersection(ray) for k in tree.query(ray, predicate="intersects")]
         reached = [shapely.distance(shapely.Point(end), hit) for hit in hits if not hit.is_empty]
         facing = [
-            float(np.linalg.norm(other - end))
-            for other in ends
-            if 1e-6 < np.linalg.norm(other - end) <= config.widest_gap
-            and float((other - end) @ direction) > 0.99 * float(np.linalg.norm(other - end))
+            float(np.linalg.norm(opposite - end))
+            for opposite in ends
+            if 1e-6 < np.linalg.norm(opposite - end) <= config.widest_gap
+            and float((opposite - end) @ direction) > 0.99 * float(np.linalg.norm(opposite - end))
         ]
         width = min([*reached, *facing], default=0.0)
         if width <= 0.0:
@@ -315,7 +319,7 @@ def _from_single_lines(
 
 
 def _insides(pieces: Sequence[BaseGeometry], config: WallConfig) -> list[shapely.Polygon]:
-    """What the union of some areas encloses and is large enough for a room."""
+    """Return the areas enclosed by the union of some pieces that are large enough for a room."""
     union = shapely.unary_union(list(pieces))
     rooms = []
     for part in polygons_of(union):
@@ -328,10 +332,10 @@ def _insides(pieces: Sequence[BaseGeometry], config: WallConfig) -> list[shapely
 
 
 def _distinct(rooms: list[shapely.Polygon]) -> list[shapely.Polygon]:
-    """An island of walls in a room encloses rooms that its own loop found as well."""
+    """Drop duplicates: rooms inside an island of walls are found twice."""
     kept: list[shapely.Polygon] = []
-    for room in sorted(rooms, key=lambda each: -each.area):
-        if all(shapely.intersection(room, other).area < 0.5 * room.area for other in kept):
+    for room in sorted(rooms, key=lambda room: -room.area):
+        if all(shapely.intersection(room, larger).area < 0.5 * room.area for larger in kept):
             kept.append(room)
     return kept
 

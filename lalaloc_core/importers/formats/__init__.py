@@ -1,5 +1,5 @@
-"""Importers, a module for each format of files.
+"""One module per file format, with `read` and, for export formats, `write`.
 
-Begin with `native.py`, the plainest. Drawings (`dxf.py`, `svg.py`, `pdf.py`) leave it to `plans.drawing` to find the
-rooms; in `ifc.py`, `geojson.py` and `imdf.py` they stand in the file.
+Begin with `native.py`, the simplest. The drawings (`dxf.py`, `svg.py`, `pdf.py`) leave finding rooms to
+`lalaloc_core.importers.drawing`; `ifc.py`, `geojson.py` and `imdf.py` take rooms from the file.
 """

@@ -1,14 +1,16 @@
-"""DXF: rooms from closed polylines and hatches on layers named so, else from walls; doors and windows by the names of
-layers and blocks, or by the arcs of leaves.
+"""DXF drawings.
 
-ezdxf reads the file, broken ones as well; what blocks stand for is counted before any is drawn.
+Rooms are closed polylines and hatches on layers named after rooms; without them, the areas that walls enclose. Doors
+and windows are recognised by the names of layers and blocks, or by the arcs of door leaves. ezdxf reads the file and
+repairs damaged ones. Block contents are counted before they are expanded.
 """
 
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import shapely
@@ -18,60 +20,90 @@ from ezdxf.document import Drawing as DxfDocument
 from ezdxf.entities.dxfentity import DXFEntity
 from ezdxf.entities.dxfgfx import DXFGraphic
 from ezdxf.entities.insert import Insert
+from ezdxf.filemanagement import new as new_dxf
 from ezdxf.lldxf.const import DXFError
-from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan.earth import Anchor
+from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
+from lalaloc_core.importers.common.checks import likely_unit
+from lalaloc_core.importers.common.geometry import even_odd_polygons, label_position, polygons_of
+from lalaloc_core.importers.common.limits import Budget
+from lalaloc_core.importers.common.options import ImportOptions
+from lalaloc_core.importers.common.report import ReportBuilder
+from lalaloc_core.importers.common.vocabulary import Role, role_of
 from lalaloc_core.importers.drawing.scale import drawing_scale
-from lalaloc_core.importers.drawing.shapes import Area, Drawing, Lettering, Stroke, swing_of
-from lalaloc_core.importers.drawing.understand import understand
-from lalaloc_core.importers.model.assemble import ImportedPlan, assemble
-from lalaloc_core.importers.model.checks import likely_unit
-from lalaloc_core.importers.model.geometry import polygons_of
-from lalaloc_core.importers.model.limits import Budget
-from lalaloc_core.importers.model.options import ImportOptions
-from lalaloc_core.importers.model.report import ReportBuilder
-from lalaloc_core.importers.model.words import Role, role_of
+from lalaloc_core.importers.drawing.shapes import Area, Drawing, Lettering, Stroke, fit_swing
+from lalaloc_core.importers.drawing.sketching import sketch_drawing
 
-FORMAT = "dxf"
-# $INSUNITS of the format's reference.
+# (metres, option `units`) by $INSUNITS, from the DXF reference.
 _INSUNITS = {1: (0.0254, "in"), 2: (0.3048, "ft"), 4: (1e-3, "mm"), 5: (0.01, "cm"), 6: (1.0, "m"), 14: (0.1, "dm")}
 _LINES = {"LINE", "LWPOLYLINE", "POLYLINE", "ARC", "CIRCLE", "ELLIPSE", "SPLINE"}
 _FILLED = {"HATCH", "MPOLYGON", "SOLID", "TRACE"}
 _TEXTS = {"TEXT", "MTEXT", "ATTRIB"}
 _MAX_NAMED_LAYERS = 20
 _MAX_BLOCK_DEPTH = 16
-# Curves are followed to this share of the drawing's size.
+# Largest distance of a curve from its polyline, as a share of the drawing's size.
 _SAG = 2e-5
 _USUAL_EXTENT_M = (4.0, 120.0)
+# Ends of a polyline this near are the same point, as a share of its length. It must not depend on the distance to the
+# origin: surveyed coordinates are large.
+_CLOSED = 1e-5
+# Layers of exported drawings, with their colours.
+_LAYERS = {"ROOM": 7, "COLUMN": 8, "WALL": 1, "DOOR": 3, "WINDOW": 5, "PASSAGE": 30, "ROOM-TEXT": 2}
+_INSUNITS_METRES = 6
 
 
 @dataclass(frozen=True)
-class _Place:
-    """Where an entity stands: the layer that counts for it, and what layer or block name say it is."""
+class _Context:
+    """Effective layer of an entity, and its role by the name of its layer or block."""
 
     layer: str
     role: Role | None
 
 
-def import_dxf(content: bytes, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
-    """The plan in the model space of a DXF drawing.
+def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
+    """Read the plan in the model space of a DXF drawing.
 
     Raises:
-        InvalidFloorPlanError: what is wrong with the file, or that it does not say its unit.
+        InvalidFloorPlanError: the file is invalid, or neither the file nor the options give its unit.
     """
     document = _open(content)
     _check_blocks(document, budget)
     builder = ReportBuilder()
-    drawing = _read(document, options, builder, budget)
+    drawing = _read_drawing(document, options, builder, budget)
     factor, source = _unit(document, drawing, options, builder)
     if options.y_axis is None and document.header.get("$UCSYDIR", (0.0, 1.0, 0.0))[1] < -0.5:
         builder.warnings.append(
-            "the file's own axes say that y points down ($UCSYDIR); say y_axis=down if it is mirrored"
+            "y points down in the file's coordinate system ($UCSYDIR); set y_axis=down if the plan is mirrored"
         )
-    drawing = drawing.scaled(factor, turn_over=options.y_axis == "down")
-    sketch = understand(drawing, builder, budget)
-    return (assemble(sketch, builder, options, format=FORMAT, metres_per_unit=factor, scale_source=source),)
+    drawing = drawing.scaled(factor, flip_y=options.y_axis == "down")
+    sketch = sketch_drawing(drawing, builder, budget)
+    return (assemble(sketch, builder, options, format="dxf", metres_per_unit=factor, scale_source=source),)
+
+
+def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
+    """Return a DXF drawing in metres. It has no place for heights, ids and the anchor."""
+    drawing = new_dxf("R2010")
+    drawing.header["$INSUNITS"] = _INSUNITS_METRES
+    for layer, colour in _LAYERS.items():
+        drawing.layers.add(layer, color=colour)
+    space = drawing.modelspace()
+    for room in document["rooms"]:
+        space.add_lwpolyline(room["polygon"], close=True, dxfattribs={"layer": "ROOM"})
+        for hole in room.get("holes", ()):
+            space.add_lwpolyline(hole, close=True, dxfattribs={"layer": "COLUMN"})
+        for start, end in room.get("walls", ()):
+            space.add_line(start, end, dxfattribs={"layer": "WALL"})
+        if room.get("name"):
+            position = label_position(shapely.Polygon(room["polygon"], room.get("holes")))
+            space.add_text(room["name"], height=0.2, dxfattribs={"layer": "ROOM-TEXT"}).set_placement(position)
+    for opening in document.get("openings", ()):
+        start, end = opening["line"]
+        space.add_line(start, end, dxfattribs={"layer": opening["kind"].upper()})
+    text = io.StringIO()
+    drawing.write(text)
+    return text.getvalue().encode()
 
 
 def _open(content: bytes) -> DxfDocument:
@@ -83,36 +115,38 @@ def _open(content: bytes) -> DxfDocument:
         document, _ = recover.read(io.BytesIO(content))
     except (DXFError, OSError, ValueError, KeyError, IndexError, TypeError, AttributeError,
             UnicodeError) as error:  # fmt: skip
-        raise InvalidFloorPlanError(f"the DXF cannot be read: {error}") from error
+        raise InvalidFloorPlanError(f"the DXF cannot be read: {error}; save it again, as DXF R2010 or later") from error
     return document
 
 
-def _from_tags(tags: object) -> DxfDocument:
+def _from_tags(tags: Iterable[Any]) -> DxfDocument:
     from ezdxf.lldxf.tagwriter import TagWriter
 
     text = io.StringIO()
     writer = TagWriter(text, dxfversion="AC1032")
-    for tag in tags:  # type: ignore[attr-defined]
+    for tag in tags:
         writer.write_tag(tag)
     document, _ = recover.read(io.BytesIO(text.getvalue().encode()))
     return document
 
 
 def _check_blocks(document: DxfDocument, budget: Budget) -> None:
-    """Count what inserts stand for: blocks of blocks, in rows and columns, grow without end."""
+    """Count the entities after expansion: nested blocks in rows and columns can multiply to billions."""
     sizes: dict[str, int] = {}
 
     def size(name: str, depth: int) -> int:
         if depth > _MAX_BLOCK_DEPTH:
-            raise InvalidFloorPlanError(f"blocks lie more than {_MAX_BLOCK_DEPTH} deep in each other, or in themselves")
+            raise InvalidFloorPlanError(
+                f"blocks are nested more than {_MAX_BLOCK_DEPTH} deep, or contain themselves; explode the blocks"
+            )
         if name not in sizes:
             block = document.blocks.get(name)
             sizes[name] = 0 if block is None else total(block, depth + 1)
         return sizes[name]
 
-    def total(entities: object, depth: int) -> int:
+    def total(entities: Iterable[DXFEntity], depth: int) -> int:
         count = 0
-        for entity in entities:  # type: ignore[attr-defined]
+        for entity in entities:
             count += _weight(entity)
             if isinstance(entity, Insert):
                 rows, columns = max(entity.dxf.row_count, 1), max(entity.dxf.column_count, 1)
@@ -125,7 +159,7 @@ def _check_blocks(document: DxfDocument, budget: Budget) -> None:
 
 
 def _weight(entity: DXFEntity) -> int:
-    """How much there is to an entity: its vertices."""
+    """Return the weight of an entity in the budget: one, plus its vertices."""
     kind = entity.dxftype()
     if kind in ("LWPOLYLINE", "POLYLINE"):
         return 1 + len(entity) // 2  # type: ignore[arg-type]
@@ -134,122 +168,133 @@ def _weight(entity: DXFEntity) -> int:
     return 1
 
 
-def _read(document: DxfDocument, options: ImportOptions, builder: ReportBuilder, budget: Budget) -> Drawing:
+def _read_drawing(document: DxfDocument, options: ImportOptions, builder: ReportBuilder, budget: Budget) -> Drawing:
     drawing = Drawing()
     hidden = {layer.dxf.name.casefold() for layer in document.layers if layer.is_off() or layer.is_frozen()}
     sag = _sag(document)
-    for entity, place in _walk(document.modelspace(), None, 0):
+    for entity, context in _walk(document.modelspace(), None, 0):
         budget.check_time()
-        if place.layer.casefold() in hidden:
-            builder.use(place.layer, "ignored (layer is off)")
-        elif place.role == "ignored" or not options.wants_layer(place.layer):
-            builder.use(place.layer, "ignored")
+        if context.layer.casefold() in hidden:
+            builder.use(context.layer, "ignored (layer is off)")
+        elif context.role == "ignored" or not options.includes_layer(context.layer):
+            builder.use(context.layer, "ignored")
         else:
-            _add(entity, place, drawing, builder, sag)
+            _add(entity, context, drawing, builder, sag)
     if options.layers and not drawing.areas and not drawing.strokes:
-        there = sorted({layer for layer, _ in builder.uses})[:_MAX_NAMED_LAYERS]
+        available = sorted({layer for layer, _ in builder.uses})[:_MAX_NAMED_LAYERS]
         raise InvalidFloorPlanError(
-            f"nothing lies on the layers {', '.join(options.layers)[:200]}; "
-            f"the drawing has {', '.join(repr(layer) for layer in there) or 'nothing on any layer'}"
+            f"layers is {', '.join(options.layers)[:200]}, but the drawing has nothing on them; "
+            f"its layers are {', '.join(repr(layer) for layer in available) or 'empty'}"
         )
     return drawing
 
 
-def _walk(entities: object, around: _Place | None, depth: int) -> Iterator[tuple[DXFGraphic, _Place]]:
-    """Entities with their places; blocks are opened, but for those that are doors and windows themselves."""
-    for entity in entities:  # type: ignore[attr-defined]
+def _walk(entities: Iterable[Any], block: _Context | None, depth: int) -> Iterator[tuple[DXFGraphic, _Context]]:
+    """Yield entities with their contexts. Blocks are expanded, except for windows, passages and obstacles.
+
+    Args:
+        entities: entities of the model space or of a block.
+        block: context of the block that contains them, None for the model space.
+        depth: nesting depth of the block.
+    """
+    for entity in entities:
         if not isinstance(entity, DXFGraphic) or depth > _MAX_BLOCK_DEPTH:
             continue
         layer = entity.dxf.get("layer", "0")
-        # Layer 0 in a block means the layer that the block was put on.
-        on = around.layer if around is not None and layer == "0" else layer
-        role = role_of(on)
-        if around is not None and around.role is not None and role in (None, "text"):
-            role = around.role
+        # Layer 0 in a block stands for the layer of the insert.
+        if block is not None and layer == "0":
+            layer = block.layer
+        role = role_of(layer)
+        if block is not None and block.role is not None and role in (None, "text"):
+            role = block.role
         if isinstance(entity, Insert):
-            named = role_of(entity.dxf.name)
-            role = named if named in ("door", "window", "passage", "obstacle", "ignored") else role
+            block_role = role_of(entity.dxf.name)
+            role = block_role if block_role in ("door", "window", "passage", "obstacle", "ignored") else role
             for attribute in entity.attribs:
-                yield attribute, _Place(on, "text")
+                yield attribute, _Context(layer, "text")
             for copy in entity.multi_insert() if entity.mcount > 1 else (entity,):
-                place = _Place(on, role)
+                context = _Context(layer, role)
                 if role in ("window", "passage", "obstacle"):
-                    yield copy, place
+                    yield copy, context
                 else:
-                    yield from _walk(copy.virtual_entities(), place, depth + 1)
+                    yield from _walk(copy.virtual_entities(), context, depth + 1)
         else:
-            yield entity, _Place(on, role)
+            yield entity, _Context(layer, role)
 
 
-def _add(entity: DXFGraphic, place: _Place, drawing: Drawing, builder: ReportBuilder, sag: float) -> None:
-    kind, role = entity.dxftype(), place.role
+def _add(entity: DXFGraphic, context: _Context, drawing: Drawing, builder: ReportBuilder, sag: float) -> None:
+    kind, role = entity.dxftype(), context.role
     if kind in _TEXTS:
         text = entity.plain_text() if hasattr(entity, "plain_text") else entity.dxf.get("text", "")  # type: ignore[attr-defined]
-        at = entity.dxf.get("insert")
-        if at is not None and text.strip():
-            where = (float(at[0]), float(at[1]))
-            drawing.letterings += [Lettering(line[:200], where, place.layer) for line in text.splitlines()[:20]]
-            builder.use(place.layer, "texts")
+        point = entity.dxf.get("insert")
+        if point is not None and text.strip():
+            position = (float(point[0]), float(point[1]))
+            drawing.letterings += [Lettering(line[:200], position, context.layer) for line in text.splitlines()[:20]]
+            builder.use(context.layer, "texts")
         return
     if role == "text":
-        builder.use(place.layer, "ignored")
+        builder.use(context.layer, "ignored")
         return
     if isinstance(entity, Insert):
-        _add_block(entity, place, drawing, builder, sag)
+        _add_block(entity, context, drawing, builder, sag)
     elif kind in _FILLED:
         shapes = _filled(entity, sag)
         is_solid = kind != "HATCH" or entity.dxf.get("solid_fill", 0) == 1
-        drawing.areas += [Area(shape, place.layer, role, is_dark=is_solid) for shape in shapes]
-        builder.use(place.layer, f"hatches: {role or 'perhaps walls'}", max(len(shapes), 1))
+        drawing.areas += [Area(shape, context.layer, role, is_dark=is_solid) for shape in shapes]
+        builder.use(context.layer, f"hatches: {role or 'possible walls'}", max(len(shapes), 1))
     elif kind in _LINES:
-        _add_line(entity, place, drawing, builder, sag)
+        _add_line(entity, context, drawing, builder, sag)
     else:
-        builder.use(place.layer, f"ignored ({kind})")
+        builder.use(context.layer, f"ignored ({kind})")
 
 
-def _add_block(entity: Insert, place: _Place, drawing: Drawing, builder: ReportBuilder, sag: float) -> None:
-    """A window (column, passage) that is a block: the box around what it draws, along its longer side."""
+def _add_block(entity: Insert, context: _Context, drawing: Drawing, builder: ReportBuilder, sag: float) -> None:
+    """Add a window, passage or column that is a block, as the smallest rectangle around its entities."""
     inner = Drawing()
-    for part, _ in _walk(entity.virtual_entities(), place, 1):
+    for part, _ in _walk(entity.virtual_entities(), context, 1):
         if part.dxftype() in _LINES | _FILLED:
-            _add(part, place, inner, ReportBuilder(), sag)
+            _add(part, context, inner, ReportBuilder(), sag)
     shapes = [*(area.shape for area in inner.areas), *(stroke.line for stroke in inner.strokes)]
     if not shapes:
         return
     box = shapely.minimum_rotated_rectangle(shapely.GeometryCollection(shapes))
-    builder.use(place.layer, f"blocks: {place.role}")
+    builder.use(context.layer, f"blocks: {context.role}")
     if isinstance(box, shapely.Polygon):
-        drawing.areas.append(Area(box, place.layer, place.role))
+        drawing.areas.append(Area(box, context.layer, context.role))
     elif isinstance(box, shapely.LineString):
-        drawing.strokes.append(Stroke(box, place.layer, place.role))
+        drawing.strokes.append(Stroke(box, context.layer, context.role))
 
 
-def _add_line(entity: DXFGraphic, place: _Place, drawing: Drawing, builder: ReportBuilder, sag: float) -> None:
+def _add_line(entity: DXFGraphic, context: _Context, drawing: Drawing, builder: ReportBuilder, sag: float) -> None:
     points = _points(entity, sag)
     if len(points) < 2:
         return
-    role = place.role
+    role = context.role
     if entity.dxftype() == "ARC" and role in (None, "door"):
-        swing = swing_of(points, place.layer)
+        swing = fit_swing(points, context.layer)
         if swing is not None:
             drawing.swings.append(swing)
-            builder.use(place.layer, "swings of doors")
+            builder.use(context.layer, "door swings")
             return
-    closed = bool(getattr(entity, "is_closed", False)) or (len(points) > 3 and bool(np.allclose(points[0], points[-1])))
-    if closed and len(points) >= 3:
+    if len(points) >= 3 and (bool(getattr(entity, "is_closed", False)) or _ends_meet(points)):
         shapes = polygons_of(shapely.Polygon(points))
-        drawing.areas += [Area(shape, place.layer, role) for shape in shapes]
-        builder.use(place.layer, f"closed lines: {role or 'perhaps walls or rooms'}", max(len(shapes), 1))
+        drawing.areas += [Area(shape, context.layer, role) for shape in shapes]
+        builder.use(context.layer, f"closed lines: {role or 'possible walls or rooms'}", max(len(shapes), 1))
     elif shapely.LineString(points).length > 0.0:
-        drawing.strokes.append(Stroke(shapely.LineString(points), place.layer, role))
-        builder.use(place.layer, f"lines: {role or 'perhaps walls'}")
+        drawing.strokes.append(Stroke(shapely.LineString(points), context.layer, role))
+        builder.use(context.layer, f"lines: {role or 'possible walls'}")
+
+
+def _ends_meet(points: np.ndarray) -> bool:
+    length = float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+    return len(points) > 3 and float(np.linalg.norm(points[0] - points[-1])) <= _CLOSED * length
 
 
 def _points(entity: DXFGraphic, sag: float) -> np.ndarray:
-    """Points along a line in world coordinates, seen from above."""
+    """Return the points along a line, in world coordinates seen from above."""
     try:
-        way = dxf_path.make_path(entity)
-        points = np.array([(vertex.x, vertex.y) for vertex in way.flattening(sag, segments=8)])
+        path = dxf_path.make_path(entity)
+        points = np.array([(vertex.x, vertex.y) for vertex in path.flattening(sag, segments=8)])
     except (TypeError, ValueError, ZeroDivisionError, DXFError):
         return np.empty((0, 2))
     if not len(points) or not np.isfinite(points).all():
@@ -258,19 +303,15 @@ def _points(entity: DXFGraphic, sag: float) -> np.ndarray:
 
 
 def _filled(entity: DXFGraphic, sag: float) -> list[shapely.Polygon]:
-    """What a hatch fills: between its outlines."""
+    """Return the filled area of a hatch, between its outlines."""
     try:
         is_hatch = entity.dxftype() in ("HATCH", "MPOLYGON")
-        ways = list(dxf_path.from_hatch(entity)) if is_hatch else [dxf_path.make_path(entity)]  # type: ignore[arg-type]
-        rings = [np.array([(v.x, v.y) for v in way.flattening(sag, segments=8)]) for way in ways]
+        paths = list(dxf_path.from_hatch(entity)) if is_hatch else [dxf_path.make_path(entity)]  # type: ignore[arg-type]
+        rings = [np.array([(v.x, v.y) for v in path.flattening(sag, segments=8)]) for path in paths]
     except (TypeError, ValueError, ZeroDivisionError, DXFError):
         return []
-    shape: BaseGeometry = shapely.Polygon()
-    for ring in rings:
-        if len(ring) >= 4 and np.isfinite(ring).all():
-            for part in polygons_of(shapely.Polygon(ring)):
-                shape = shapely.symmetric_difference(shape, part)
-    return polygons_of(shape)
+    usable = [ring for ring in rings if len(ring) >= 4 and np.isfinite(ring).all()]
+    return even_odd_polygons(part for ring in usable for part in polygons_of(shapely.Polygon(ring)))
 
 
 def _sag(document: DxfDocument) -> float:
@@ -280,26 +321,35 @@ def _sag(document: DxfDocument) -> float:
 
 
 def _unit(document: DxfDocument, drawing: Drawing, options: ImportOptions, builder: ReportBuilder) -> tuple[float, str]:
-    """(metres per unit, where that was read): options, $INSUNITS, or a refusal that names the likely unit."""
+    """Return metres per unit and its source: the options or $INSUNITS; the error names the likely unit."""
     code = document.header.get("$INSUNITS", 0)
-    said = _INSUNITS.get(code)
+    own_unit = _INSUNITS.get(code)
     extent = _extent(drawing)
-    if options.units is None and options.known_distance is None and options.metres_per_pixel is None and said is None:
+    if (
+        options.units is None
+        and options.known_distance is None
+        and options.metres_per_pixel is None
+        and own_unit is None
+    ):
         fitting = likely_unit(extent, _USUAL_EXTENT_M)
         hint = (
-            f"; {extent:g} units across, it looks like {fitting}: units={fitting}"
+            f"; it is {extent:g} units across and looks like {fitting}: units={fitting}"
             if fitting
-            else f" ({extent:g} units)"
+            else f"; it is {extent:g} units across"
         )
         raise InvalidFloorPlanError(
-            f"the DXF does not say its unit ($INSUNITS is {code}){hint}; say units=mm, cm, m, in or ft"
+            f"the DXF gives no unit ($INSUNITS is {code}){hint}; set units to mm, cm, m, in or ft"
         )
     factor, source = drawing_scale(
-        options, "the DXF", said=None if said is None else (said[0], f"$INSUNITS is {code} ({said[1]})")
+        options, "the DXF", own=None if own_unit is None else (own_unit[0], f"$INSUNITS is {code} ({own_unit[1]})")
     )
     if not _USUAL_EXTENT_M[0] <= extent * factor <= 1000.0:
         fitting = likely_unit(extent, _USUAL_EXTENT_M)
-        hint = f"; it looks like {fitting}: units={fitting}" if fitting and said and fitting != said[1] else ""
+        hint = (
+            f"; it looks like {fitting}: set units={fitting}"
+            if fitting and own_unit and fitting != own_unit[1]
+            else "; check units"
+        )
         builder.warnings.append(f"the drawing is {extent * factor:.4g} m across{hint}")
     return factor, source
 
@@ -307,6 +357,8 @@ def _unit(document: DxfDocument, drawing: Drawing, options: ImportOptions, build
 def _extent(drawing: Drawing) -> float:
     shapes = [*(area.shape for area in drawing.areas), *(stroke.line for stroke in drawing.strokes)]
     if not shapes:
-        raise InvalidFloorPlanError("the DXF's model space holds no lines, areas or hatches that could be a plan")
+        raise InvalidFloorPlanError(
+            "the DXF's model space has no lines, areas or hatches; move the plan from the layout to the model space"
+        )
     x0, y0, x1, y1 = shapely.total_bounds(shapes)
     return float(max(x1 - x0, y1 - y0))

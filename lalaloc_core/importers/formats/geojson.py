@@ -1,11 +1,12 @@
-"""GeoJSON: rooms are polygons, doors and windows lines; the features of an IMDF archive are read the same way.
+"""GeoJSON: rooms are polygons, doors and windows are lines. IMDF archives contain the same features.
 
-What a feature is, is read from `feature_type` (IMDF), `indoor` (OpenStreetMap's simple indoor tagging), or the words of
-`type`, `kind`, `category` and `class`; a polygon that says nothing is a room, a line that says nothing a door.
+The kind of a feature is read from `feature_type` (IMDF), `indoor` (OpenStreetMap's simple indoor tagging), or the words
+in `type`, `kind`, `category` and `class`. By default a polygon is a room and a line is a door.
 """
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -18,17 +19,15 @@ from pyproj.exceptions import ProjError
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
-from lalaloc_core.floorplan.earth import LocalFrame, to_wgs84
-from lalaloc_core.importers.model.assemble import ImportedPlan, assemble, clean_name
-from lalaloc_core.importers.model.geometry import opening_line, polygons_of
-from lalaloc_core.importers.model.levels import chosen_levels
-from lalaloc_core.importers.model.limits import Budget
-from lalaloc_core.importers.model.options import METRES_PER_UNIT, ImportOptions
-from lalaloc_core.importers.model.report import ReportBuilder
-from lalaloc_core.importers.model.sketch import Level, Sketch, SketchedOpening, SketchedRoom
-from lalaloc_core.importers.model.words import Role, role_of, type_of_room
+from lalaloc_core.floorplan.earth import Anchor, LocalFrame, to_wgs84
+from lalaloc_core.importers.common.assemble import ImportedPlan, assemble, clean_name
+from lalaloc_core.importers.common.geometry import opening_line, polygons_of
+from lalaloc_core.importers.common.limits import Budget
+from lalaloc_core.importers.common.options import METRES_PER_UNIT, ImportOptions, check_units
+from lalaloc_core.importers.common.report import ReportBuilder
+from lalaloc_core.importers.common.sketch import Level, Sketch, SketchedOpening, SketchedRoom, chosen_levels
+from lalaloc_core.importers.common.vocabulary import Role, role_of, type_of_room
 
-FORMAT = "geojson"
 _FEATURE_TYPES: Mapping[str, Role] = {
     "unit": "room",
     "room": "room",
@@ -43,8 +42,8 @@ _FEATURE_TYPES: Mapping[str, Role] = {
     "window": "window",
     "passage": "passage",
 }
-# Features of an IMDF archive, and units of one, that are no floor to stand on or no part of a plan.
-_NO_PLAN = {
+# Feature types of IMDF that are not part of a plan, and categories of units without a floor.
+_IGNORED_TYPES = {
     "venue",
     "building",
     "footprint",
@@ -58,54 +57,77 @@ _NO_PLAN = {
 }
 _NO_FLOOR = {"opentobelow", "structure", "column", "elevator", "escalator", "movingwalkway"}
 _MAX_REACH_M = 5000.0
+# Decimals of exported degrees; the ninth is a tenth of a millimetre.
+_DECIMALS = 9
 
 
 @dataclass(frozen=True)
-class _Feature:
+class Feature:
+    """Feature with a geometry in the file's coordinates."""
+
     shape: BaseGeometry
-    says: Mapping[str, Any]
+    properties: Mapping[str, Any]
     id: str | None
 
 
-def import_geojson(document: Any, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
-    """One plan for every level of a FeatureCollection, Feature or geometry.
+def read(document: Any, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
+    """Read one plan per level of a FeatureCollection, Feature or geometry.
 
-    Coordinates are WGS84 (or in the legacy `crs`), and become metres around their middle; with `units` they are a
-    drawing's own.
+    Coordinates are WGS84, or in the legacy `crs`, and become metres around their centre. With `units` they are lengths
+    of a drawing.
 
     Raises:
-        InvalidFloorPlanError: what is wrong, and where.
+        InvalidFloorPlanError: the document is invalid, or its coordinates cannot be converted.
     """
-    features = list(_features(document, budget))
-    said = document.get("units") if isinstance(document, Mapping) else None
-    if said is not None and options.units is None:
-        # A foreign member that the exporter writes for plans whose place on Earth is not known.
-        if said not in METRES_PER_UNIT:
-            raise InvalidFloorPlanError(f"units is {str(said)[:50]!r}, known are {', '.join(METRES_PER_UNIT)}")
-        options = replace(options, units=said)
+    features = parse_features(document, budget)
+    units = document.get("units") if isinstance(document, Mapping) else None
+    if units is not None and options.units is None:
+        # `write` adds this member to plans without an anchor.
+        options = replace(options, units=check_units(units))
     if options.name is None and isinstance(document.get("name"), str):
         options = replace(options, name=clean_name(document["name"]))
-    return import_features(features, _crs(document), FORMAT, options, budget)
+    return import_features(features, _crs(document), "geojson", options, budget)
+
+
+def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
+    """Return a FeatureCollection in WGS84 if the plan has an anchor, else in metres with the member `units`."""
+    features = features_of(document, Projector(anchor))
+    collection: dict[str, Any] = {"type": "FeatureCollection", "name": document.get("name", "floor plan")}
+    if anchor is None:
+        collection["units"] = "m"
+    return json.dumps(collection | {"features": features}, ensure_ascii=False).encode()
 
 
 def import_features(
-    features: Sequence[_Feature],
+    features: Sequence[Feature],
     crs: str | None,
     format: str,
     options: ImportOptions,
     budget: Budget,
     levels: Mapping[str, Level] | None = None,
 ) -> tuple[ImportedPlan, ...]:
-    """One plan for every level of these features; `levels` tells what is known of each, by id."""
+    """Make one plan per level.
+
+    Args:
+        features: features of all levels.
+        crs: code of their coordinate reference system, None for WGS84.
+        format: name of the file's format.
+        options: import options.
+        budget: entities and time left.
+        levels: known levels by id.
+
+    Raises:
+        InvalidFloorPlanError: there are no features, or their coordinates cannot be converted.
+    """
     if not features:
-        raise InvalidFloorPlanError(f"the {format} file holds no features with a geometry")
+        raise InvalidFloorPlanError(f"the {format} file has no features with a geometry; export the rooms as polygons")
     project, anchor, metres_per_unit, source = _projection(features, crs, options)
-    by_level: dict[str, tuple[Level, list[_Feature]]] = {}
+    by_level: dict[str, tuple[Level, list[Feature]]] = {}
     for feature in features:
         for key in _levels_of(feature):
             level = (levels or {}).get(key) or _level(key)
             by_level.setdefault(key, (level, []))[1].append(feature)
-    by_level = _with_rooms(by_level)
+    by_level = _levels_with_rooms(by_level)
     plans = []
     for level, members in chosen_levels(by_level, options):
         builder = ReportBuilder()
@@ -114,7 +136,7 @@ def import_features(
             sketch.north_deg = anchor.north_deg
         sketch.name = level.name if len(by_level) > 1 else None
         for feature in members:
-            _sort_in(feature, project(feature.shape), sketch, options, builder)
+            _add_to_sketch(feature, project(feature.shape), sketch, options, builder)
             budget.check_time()
         plans.append(
             assemble(sketch, builder, options, format=format, metres_per_unit=metres_per_unit, scale_source=source)
@@ -122,14 +144,66 @@ def import_features(
     return tuple(plans)
 
 
-def read_features(document: Any, budget: Budget) -> list[_Feature]:
-    """The features of one GeoJSON document that have a geometry."""
+def parse_features(document: Any, budget: Budget) -> list[Feature]:
+    """Return the features of a GeoJSON document that have a geometry.
+
+    Raises:
+        InvalidFloorPlanError: the document or a geometry is invalid.
+    """
     return list(_features(document, budget))
 
 
-def _features(document: Any, budget: Budget) -> Iterator[_Feature]:
+class Projector:
+    """Conversion from plan metres to the coordinates of a file: WGS84 with an anchor, else metres."""
+
+    def __init__(self, anchor: Anchor | None) -> None:
+        self._frame = None if anchor is None else LocalFrame(anchor.longitude, anchor.latitude)
+        turn = math.radians(0.0 if anchor is None else anchor.north_deg)
+        self._east = np.array([math.cos(turn), -math.sin(turn)])
+        self._north = np.array([math.sin(turn), math.cos(turn)])
+
+    def points(self, points_m: Sequence[Sequence[float]]) -> list[list[float]]:
+        """Return points in file coordinates."""
+        array = np.asarray(points_m, dtype=float)
+        if self._frame is None:
+            return array.round(6).tolist()
+        local = np.column_stack([array @ self._east, array @ self._north])
+        return self._frame.to_earth(local).round(_DECIMALS).tolist()
+
+    def polygon(self, rings: Sequence[Sequence[Sequence[float]]]) -> list[list[list[float]]]:
+        """Return closed rings in file coordinates."""
+        return [self.points([*ring, ring[0]]) for ring in rings]
+
+
+def features_of(document: Mapping[str, Any], projector: Projector) -> list[dict[str, Any]]:
+    """Return the rooms, walls and openings of a plan as GeoJSON features with an IMDF `feature_type`."""
+    found: list[dict[str, Any]] = []
+    for number, room in enumerate(document["rooms"]):
+        properties = {"feature_type": "unit", "name": room.get("name", f"room {number + 1}")}
+        properties |= {key: room[key] for key in ("type", "ceiling_height_m") if key in room and room[key] != "unknown"}
+        properties.setdefault("ceiling_height_m", document.get("ceiling_height_m"))
+        rings = projector.polygon([room["polygon"], *room.get("holes", ())])
+        feature = _to_feature("Polygon", rings, properties)
+        if "id" in room:
+            feature["id"] = room["id"]
+        found.append(feature)
+        for wall in room.get("walls", ()):
+            found.append(_to_feature("LineString", projector.points(wall), {"feature_type": "wall"}))
+    for opening in document.get("openings", ()):
+        properties = {"feature_type": "opening"} | {
+            key: opening[key] for key in ("kind", "name", "sill_m", "head_m") if key in opening
+        }
+        found.append(_to_feature("LineString", projector.points(opening["line"]), properties))
+    return found
+
+
+def _to_feature(kind: str, coordinates: Any, properties: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "Feature", "geometry": {"type": kind, "coordinates": coordinates}, "properties": properties}
+
+
+def _features(document: Any, budget: Budget) -> Iterator[Feature]:
     if not isinstance(document, Mapping):
-        raise InvalidFloorPlanError(f"GeoJSON must be an object, not {type(document).__name__}")
+        raise InvalidFloorPlanError(f"the GeoJSON is of type {type(document).__name__}; it must be an object")
     kind = document.get("type")
     if kind == "FeatureCollection":
         features = document.get("features")
@@ -143,15 +217,15 @@ def _features(document: Any, budget: Budget) -> Iterator[_Feature]:
         yield from _feature({"type": "Feature", "geometry": document, "properties": {}}, "the geometry", budget)
 
 
-def _feature(raw: Any, where: str, budget: Budget) -> Iterator[_Feature]:
+def _feature(raw: Any, where: str, budget: Budget) -> Iterator[Feature]:
     if not isinstance(raw, Mapping) or raw.get("type") != "Feature":
-        raise InvalidFloorPlanError(f"{where} is no GeoJSON Feature")
+        raise InvalidFloorPlanError(f"{where} is not a GeoJSON Feature; set its 'type' to 'Feature'")
     geometry = raw.get("geometry")
     if geometry is None:
         return
     budget.spend(1 + _count_numbers(geometry) // 2)
     try:
-        shape = shapely.from_geojson(_dumps(geometry))
+        shape = shapely.from_geojson(json.dumps(geometry, allow_nan=True))
     except (shapely.errors.ShapelyError, ValueError, TypeError) as error:
         raise InvalidFloorPlanError(f"the geometry of {where} cannot be read: {error}") from error
     if shape is None or shape.is_empty:
@@ -159,36 +233,30 @@ def _feature(raw: Any, where: str, budget: Budget) -> Iterator[_Feature]:
     shape = shapely.force_2d(shape)
     if not np.isfinite(shapely.get_coordinates(shape)).all():
         raise InvalidFloorPlanError(f"the geometry of {where} has coordinates that are not finite")
-    says = raw.get("properties")
-    properties = dict(says) if isinstance(says, Mapping) else {}
+    given = raw.get("properties")
+    properties = dict(given) if isinstance(given, Mapping) else {}
     if isinstance(raw.get("feature_type"), str):
         properties["feature_type"] = raw["feature_type"]
     identity = raw.get("id", properties.get("id"))
-    yield _Feature(shape, properties, str(identity)[:200] if isinstance(identity, str | int) else None)
-
-
-def _dumps(geometry: Any) -> str:
-    import json
-
-    return json.dumps(geometry, allow_nan=True)
+    yield Feature(shape, properties, str(identity)[:200] if isinstance(identity, str | int) else None)
 
 
 def _count_numbers(value: Any) -> int:
-    """Numbers in nested lists, without recursion into what the depth check has let through only so deep."""
-    waiting, count = [value], 0
-    while waiting:
-        item = waiting.pop()
+    """Count the numbers in nested lists."""
+    pending, count = [value], 0
+    while pending:
+        item = pending.pop()
         if isinstance(item, Mapping):
-            waiting.extend(item.values())
+            pending.extend(item.values())
         elif isinstance(item, list):
-            waiting.extend(item)
+            pending.extend(item)
         else:
             count += 1
     return count
 
 
 def _crs(document: Any) -> str | None:
-    """The code of the legacy `crs` member ("urn:ogc:def:crs:EPSG::25832"), None for WGS84."""
+    """Return the EPSG code in the legacy member `crs` ("urn:ogc:def:crs:EPSG::25832"), None for WGS84."""
     crs = document.get("crs") if isinstance(document, Mapping) else None
     properties = crs.get("properties") if isinstance(crs, Mapping) else None
     name = properties.get("name") if isinstance(properties, Mapping) else None
@@ -196,14 +264,14 @@ def _crs(document: Any) -> str | None:
         return None
     digits = name.rpartition(":")[2]
     if not digits.isascii() or not digits.isdigit() or len(digits) > 6:
-        raise InvalidFloorPlanError(f"the crs '{name[:100]}' is not known; send WGS84, as GeoJSON has it")
+        raise InvalidFloorPlanError(f"the crs '{name[:100]}' is not an EPSG code; export the file in WGS84")
     return f"EPSG:{digits}"
 
 
-def _projection(features: Sequence[_Feature], crs: str | None, options: ImportOptions) -> Any:
-    """(function from file coordinates to metres, anchor, metres per unit, where the scale was read)."""
-    everything = np.concatenate([shapely.get_coordinates(feature.shape) for feature in features])
-    low, high = everything.min(axis=0), everything.max(axis=0)
+def _projection(features: Sequence[Feature], crs: str | None, options: ImportOptions) -> Any:
+    """Return the function from file coordinates to metres, the anchor, metres per unit, and the source of the scale."""
+    points = np.concatenate([shapely.get_coordinates(feature.shape) for feature in features])
+    low, high = points.min(axis=0), points.max(axis=0)
     if options.units is not None:
         factor = METRES_PER_UNIT[options.units]
         return _scaling(factor, options), None, factor, "option units"
@@ -212,24 +280,24 @@ def _projection(features: Sequence[_Feature], crs: str | None, options: ImportOp
             convert = _checked(lambda points: to_wgs84(crs, points))
             low, high = (convert(np.array([corner]))[0] for corner in (low, high))
         except ProjError as error:
-            raise InvalidFloorPlanError(f"the crs '{crs}' cannot be used: {error}") from error
+            raise InvalidFloorPlanError(f"the crs '{crs}' cannot be used: {error}; export the file in WGS84") from error
     else:
         convert = _checked(lambda points: points)
     if not (-180.0 <= low[0] <= high[0] <= 180.0 and -90.0 <= low[1] <= high[1] <= 90.0):
         raise InvalidFloorPlanError(
-            f"coordinates reach to ({high[0]:g}, {high[1]:g}), which is no longitude and latitude; "
-            "where the file is a drawing in a unit of its own, say so: units=m"
+            f"coordinates reach ({high[0]:g}, {high[1]:g}), outside longitude ±180 and latitude ±90; "
+            "if the file is a drawing in metres, set units=m (or mm, cm, in, ft)"
         )
     frame = LocalFrame(float(round(0.5 * (low[0] + high[0]), 9)), float(round(0.5 * (low[1] + high[1]), 9)))
 
     def project(shape: BaseGeometry) -> BaseGeometry:
         return shapely.transform(shape, lambda points: frame.to_local(convert(points)))
 
-    corners = frame.to_local(convert(everything[[everything[:, 0].argmin(), everything[:, 0].argmax()]]))
+    corners = frame.to_local(convert(points[[points[:, 0].argmin(), points[:, 0].argmax()]]))
     if np.abs(corners).max() > _MAX_REACH_M:
         raise InvalidFloorPlanError(
-            f"the features lie {2.0 * np.abs(corners).max():.0f} m apart, at most {2 * _MAX_REACH_M:g} m can be one "
-            "plan; where the file is a drawing in a unit of its own, say so: units=m"
+            f"the features span {2.0 * np.abs(corners).max():.0f} m; the limit for a plan is {2 * _MAX_REACH_M:g} m; "
+            "if the file is a drawing in metres, set units=m (or mm, cm, in, ft)"
         )
     return project, frame.anchor, 1.0, "longitude and latitude (WGS84)" if crs is None else crs
 
@@ -238,21 +306,23 @@ def _checked(convert: Any) -> Any:
     def checked(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
         converted = convert(points)
         if not np.isfinite(converted).all():
-            raise InvalidFloorPlanError("coordinates lie outside what their reference system covers")
+            raise InvalidFloorPlanError(
+                "coordinates lie outside the area of their reference system; check crs, or set units for a drawing"
+            )
         return converted
 
     return checked
 
 
 def _scaling(factor: float, options: ImportOptions) -> Any:
-    over = -factor if options.y_axis == "down" else factor
-    return lambda shape: shapely.transform(shape, lambda points: points * np.array([factor, over]))
+    y_factor = -factor if options.y_axis == "down" else factor
+    return lambda shape: shapely.transform(shape, lambda points: points * np.array([factor, y_factor]))
 
 
-def _levels_of(feature: _Feature) -> list[str]:
-    """Ids of the levels that a feature is on; OpenStreetMap writes "0;1" for both."""
+def _levels_of(feature: Feature) -> list[str]:
+    """Return the ids of a feature's levels; OpenStreetMap writes "0;1" for two levels."""
     for key in ("level_id", "level", "ordinal", "floor", "storey"):
-        value = feature.says.get(key)
+        value = feature.properties.get(key)
         if isinstance(value, str) and value.strip():
             return [part.strip()[:100] for part in value.split(";")[:20] if part.strip()] or ["0"]
         if isinstance(value, int | float) and not isinstance(value, bool):
@@ -268,62 +338,68 @@ def _level(key: str) -> Level:
     return Level(key, number if math.isfinite(number) else None)
 
 
-def _with_rooms(
-    levels: dict[str, tuple[Level, list[_Feature]]],
-) -> dict[str, tuple[Level, list[_Feature]]]:
-    """Levels that hold a room; features without a level of their own make none beside those that have one."""
+def _levels_with_rooms(
+    levels: dict[str, tuple[Level, list[Feature]]],
+) -> dict[str, tuple[Level, list[Feature]]]:
+    """Drop levels without a room, so that features without a level do not make one."""
     with_rooms = {key: item for key, item in levels.items() if any(_role(feature) == "room" for feature in item[1])}
     return with_rooms or levels
 
 
-def _role(feature: _Feature) -> Role:
-    says = feature.says
-    kind = str(says.get("feature_type") or says.get("indoor") or "").casefold()
-    category = str(says.get("category") or "").casefold()
-    if kind in _NO_PLAN:
+def _role(feature: Feature) -> Role:
+    properties = feature.properties
+    kind = str(properties.get("feature_type") or properties.get("indoor") or "").casefold()
+    category = str(properties.get("category") or "").casefold()
+    if kind in _IGNORED_TYPES:
         return "ignored"
     is_area = shapely.get_dimensions(feature.shape) == 2
     if kind in ("unit", "area", "room") and category in _NO_FLOOR:
         return "obstacle"
     if kind == "opening":
-        return _opening_role(says, category)
+        return _opening_role(properties, category)
     role: Role
     if kind in _FEATURE_TYPES:
         role = _FEATURE_TYPES[kind]
-    elif str(says.get("door") or "no").casefold() != "no":
+    elif str(properties.get("door") or "no").casefold() != "no":
         role = "door"
     else:
         role = "room" if is_area else "door"
         for key in ("layer", "class", "category", "type", "kind"):
-            role = role_of(str(says.get(key) or "")) or role
+            role = role_of(str(properties.get(key) or "")) or role
     return "obstacle" if role == "wall" and is_area else role
 
 
-def _opening_role(says: Mapping[str, Any], category: str) -> Role:
-    """IMDF's openings are doors, or ways without one (`door` is null); of windows it knows nothing."""
-    said = role_of(str(says.get("kind") or category))
-    if said == "door" or said == "window" or said == "passage":
-        return said
-    return "passage" if "door" in says and says["door"] is None else "door"
+def _opening_role(properties: Mapping[str, Any], category: str) -> Role:
+    """Return the role of an IMDF opening: a door, or a passage if `door` is null; windows need a `kind`."""
+    role = role_of(str(properties.get("kind") or category))
+    if role == "door" or role == "window" or role == "passage":
+        return role
+    return "passage" if "door" in properties and properties["door"] is None else "door"
 
 
-def _sort_in(
-    feature: _Feature, shape: BaseGeometry, sketch: Sketch, options: ImportOptions, builder: ReportBuilder
+def _add_to_sketch(
+    feature: Feature, shape: BaseGeometry, sketch: Sketch, options: ImportOptions, builder: ReportBuilder
 ) -> None:
-    """Put one feature where it belongs in the sketch."""
-    says, role = feature.says, _role(feature)
-    layer = str(says.get("feature_type") or says.get("indoor") or says.get("kind") or says.get("type") or "")[:100]
-    name = _name(says)
-    if not options.wants_layer(layer, str(says.get("category") or "")):
-        builder.use(layer, "ignored (not among the layers asked for)")
+    """Add a feature to the sketch by its role."""
+    properties, role = feature.properties, _role(feature)
+    layer = str(
+        properties.get("feature_type")
+        or properties.get("indoor")
+        or properties.get("kind")
+        or properties.get("type")
+        or ""
+    )[:100]
+    name = _name(properties)
+    if not options.includes_layer(layer, str(properties.get("category") or "")):
+        builder.use(layer, "ignored (not in the option layers)")
         return
     if role == "room":
         parts = polygons_of(shape)
         builder.use(layer, "rooms" if parts else "ignored", max(len(parts), 1))
-        kind = _room_type(says, name)
-        ceiling = _number(says, "ceiling_height_m", "ceiling_height", "height")
-        only = feature.id if len(parts) == 1 else None
-        sketch.rooms += [SketchedRoom(part, name, kind, ceiling, only) for part in parts]
+        kind = _room_type(properties, name)
+        ceiling = _number(properties, "ceiling_height_m", "ceiling_height", "height")
+        room_id = feature.id if len(parts) == 1 else None
+        sketch.rooms += [SketchedRoom(part, name, kind, ceiling, room_id) for part in parts]
     elif role == "obstacle":
         parts = polygons_of(shape)
         builder.use(layer, "holes" if parts else "ignored", max(len(parts), 1))
@@ -332,7 +408,7 @@ def _sort_in(
         ends = opening_line(shape)
         builder.use(layer, role if ends is not None else "ignored (a point has no width)")
         if ends is not None:
-            sill, head = _number(says, "sill_m"), _number(says, "head_m")
+            sill, head = _number(properties, "sill_m"), _number(properties, "head_m")
             sketch.openings.append(SketchedOpening(role, *ends, name, sill, head))
     elif role == "wall":
         lines = [part for part in shapely.get_parts(shape) if isinstance(part, shapely.LineString)]
@@ -345,10 +421,10 @@ def _sort_in(
         builder.use(layer, "ignored")
 
 
-def _name(says: Mapping[str, Any]) -> str | None:
-    """IMDF has names by language; English goes first, then whatever there is."""
+def _name(properties: Mapping[str, Any]) -> str | None:
+    """Return the name of a feature; of IMDF's names by language the English one, else the first."""
     for key in ("name", "alt_name", "label", "ref", "title"):
-        value = says.get(key)
+        value = properties.get(key)
         if isinstance(value, Mapping):
             value = value.get("en") or next(iter(value.values()), None)
         if isinstance(value, str) and value.strip():
@@ -358,15 +434,15 @@ def _name(says: Mapping[str, Any]) -> str | None:
     return None
 
 
-def _room_type(says: Mapping[str, Any], name: str | None) -> str | None:
-    words = [says.get(key) for key in ("type", "room", "category", "indoor")]
+def _room_type(properties: Mapping[str, Any], name: str | None) -> str | None:
+    words = [properties.get(key) for key in ("type", "room", "category", "indoor")]
     found = [type_of_room(str(word)) for word in words if isinstance(word, str)]
     return next((kind for kind in found if kind is not None), None) or type_of_room(name)
 
 
-def _number(says: Mapping[str, Any], *keys: str) -> float | None:
+def _number(properties: Mapping[str, Any], *keys: str) -> float | None:
     for key in keys:
-        value = says.get(key)
+        value = properties.get(key)
         if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
             return float(value)
     return None

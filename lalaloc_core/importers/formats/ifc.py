@@ -1,6 +1,6 @@
-"""IFC 2x3 and 4: spaces of every storey as rooms, fillings of voids as doors and windows, columns as holes.
+"""IFC 2x3 and IFC 4 models: spaces become rooms, doors and windows openings, and columns holes, for every storey.
 
-ifcopenshell (the extra `ifc`) reads the model and makes its geometry, in metres whatever the file's unit.
+ifcopenshell (extra `ifc`) reads the model and computes its geometry in metres.
 """
 
 from __future__ import annotations
@@ -17,35 +17,40 @@ from pyproj.exceptions import ProjError
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import Anchor, LocalFrame, to_wgs84
-from lalaloc_core.importers.model.assemble import ImportedPlan, assemble
-from lalaloc_core.importers.model.geometry import opening_line, polygons_of
-from lalaloc_core.importers.model.levels import chosen_levels
-from lalaloc_core.importers.model.limits import Budget
-from lalaloc_core.importers.model.options import ImportOptions
-from lalaloc_core.importers.model.report import ReportBuilder
-from lalaloc_core.importers.model.sketch import Level, OpeningKind, Sketch, SketchedOpening, SketchedRoom
-from lalaloc_core.importers.model.words import role_of
+from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
+from lalaloc_core.importers.common.geometry import opening_line, polygons_of
+from lalaloc_core.importers.common.limits import Budget
+from lalaloc_core.importers.common.options import ImportOptions
+from lalaloc_core.importers.common.report import ReportBuilder
+from lalaloc_core.importers.common.sketch import (
+    Level,
+    OpeningKind,
+    Sketch,
+    SketchedOpening,
+    SketchedRoom,
+    chosen_levels,
+)
+from lalaloc_core.importers.common.vocabulary import role_of
 
-FORMAT = "ifc"
-# Faces this near to the lowest point of a space are its floor.
+# Faces up to this height above the lowest point of a space are its floor.
 _FLOOR_M = 0.05
 _HEIGHT_M = (1.0, 20.0)
-# Triangles of a space are joined across rounding this large.
+# Rounding gaps between the triangles of a space that are closed.
 _SEAM_M = 1e-4
-# Spaces this near have nothing between them; rooms farther apart share no wall.
+# Distance of touching spaces, largest distance of spaces that share a wall, and smallest width of a passage.
 _TOUCHING_M, _THICK_M, _TOUCHING_PASSAGE_M = 2e-3, 0.6, 0.3
-# Where nearly all neighbours touch, spaces are drawn to the middle of their walls.
+# If more than this share of neighbours touch, spaces reach to the centre lines of their walls.
 _MOSTLY = 0.9
-# How a whole file ends, and in how many last bytes that must stand: some tools append spaces or comments.
+# End of a complete file; some tools append white space or comments.
 _END, _TAIL_BYTES = b"END-ISO-10303-21", 4096
 _KINDS = {"IfcDoor": "door", "IfcWindow": "window"}
 
 
-def import_ifc(content: bytes, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
-    """One plan for every storey that has spaces, lowest first.
+def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
+    """Read one plan per storey with spaces, lowest first.
 
     Raises:
-        InvalidFloorPlanError: what is wrong with the model.
+        InvalidFloorPlanError: the model is invalid or has no spaces.
         ModuleNotFoundError: ifcopenshell is not installed.
     """
     budget.spend(content.count(b"=IFC") + content.count(b"= IFC"))
@@ -54,7 +59,7 @@ def import_ifc(content: bytes, options: ImportOptions, budget: Budget) -> tuple[
     storeys = _storeys(model)
     if not storeys:
         raise InvalidFloorPlanError(
-            "the IFC model has no IfcSpace in any storey; export it with rooms (Revit: place rooms; ArchiCAD: zones)"
+            "the IFC model has no IfcSpace in any storey; export it with rooms (Revit: rooms, ArchiCAD: zones)"
         )
     anchor = _anchor(model)
     plans = []
@@ -66,12 +71,14 @@ def import_ifc(content: bytes, options: ImportOptions, budget: Budget) -> tuple[
         _add_elements(storey, floor_m, sketch, builder, budget)
         _join_touching(sketch, builder)
         if not sketch.rooms:
-            raise InvalidFloorPlanError(f"the spaces of level '{level.name}' have no geometry")
+            raise InvalidFloorPlanError(
+                f"the spaces of level '{level.name}' have no geometry; export spaces as solids, or choose another level"
+            )
         kinds = {opening.kind for opening in sketch.openings}
         sketch.opening_kinds = tuple(kind for kind in ("door", "window", "passage") if kind in kinds)
         plans.append(
             assemble(
-                sketch, builder, options, format=FORMAT, metres_per_unit=_unit(model), scale_source="the model's unit"
+                sketch, builder, options, format="ifc", metres_per_unit=_unit(model), scale_source="the model's unit"
             )
         )
     return tuple(plans)
@@ -80,17 +87,19 @@ def import_ifc(content: bytes, options: ImportOptions, budget: Budget) -> tuple[
 def _open(content: bytes) -> Any:
     import ifcopenshell
 
-    # What is cut off would be read as far as it goes, without the storeys or doors that are missing.
+    # ifcopenshell reads a truncated file without an error, and the rest is missing.
     if _END not in content[-_TAIL_BYTES:]:
-        raise InvalidFloorPlanError(f"the IFC file is cut off: it does not end with {_END.decode()}")
+        raise InvalidFloorPlanError(
+            f"the IFC file is truncated: it does not end with {_END.decode()}; export or upload it again"
+        )
     try:
-        # Line by line in Latin-1: what lies beyond ASCII is escaped in the format itself.
+        # The format is ASCII and escapes other characters, so nothing is lost by "replace".
         model = ifcopenshell.file.from_string(content.decode("utf-8", "replace"))
         schema = str(model.schema)
     except (RuntimeError, ValueError, TypeError, AttributeError, OSError) as error:
-        raise InvalidFloorPlanError(f"the IFC model cannot be read: {error}") from error
+        raise InvalidFloorPlanError(f"the IFC model cannot be read: {error}; export it again as IFC4") from error
     if not schema.startswith(("IFC2X3", "IFC4")):
-        raise InvalidFloorPlanError(f"the model's schema is {schema[:50]}, known are IFC2X3 and IFC4")
+        raise InvalidFloorPlanError(f"the model's schema is {schema[:50]}; export it as IFC2X3 or IFC4")
     return model
 
 
@@ -101,7 +110,7 @@ def _unit(model: Any) -> float:
 
 
 def _storeys(model: Any) -> Mapping[str, tuple[Level, tuple[Any, list[Any]]]]:
-    """Storeys with spaces, by their ids."""
+    """Return the storeys that have spaces, by id."""
     spaces: dict[int, list[Any]] = {}
     for space in model.by_type("IfcSpace"):
         storey = _storey_of(space)
@@ -112,7 +121,7 @@ def _storeys(model: Any) -> Mapping[str, tuple[Level, tuple[Any, list[Any]]]]:
         (float(storey.Elevation or 0.0) * unit, storey.id()) for storey in model.by_type("IfcBuildingStorey")
     )
     with_rooms = [(height, key) for height, key in heights if key in spaces]
-    # The ground floor is the one that lies nearest to zero.
+    # The ground floor is the storey nearest to zero.
     ground = min(range(len(with_rooms)), key=lambda i: abs(with_rooms[i][0]), default=0)
     found = {}
     for number, (height, key) in enumerate(with_rooms):
@@ -123,7 +132,7 @@ def _storeys(model: Any) -> Mapping[str, tuple[Level, tuple[Any, list[Any]]]]:
 
 
 def _storey_of(element: Any) -> Any:
-    """The storey that an element belongs to, through spaces that are parts of others; None where there is none."""
+    """Return the storey of an element, also of a space inside another space; None if it has none."""
     for _ in range(16):
         parents = [relation.RelatingObject for relation in getattr(element, "Decomposes", None) or ()]
         if not parents:
@@ -135,7 +144,7 @@ def _storey_of(element: Any) -> Any:
 
 
 def _add_spaces(spaces: Iterable[Any], sketch: Sketch, builder: ReportBuilder, budget: Budget) -> float:
-    """Add rooms; gives the height of the usual floor (m)."""
+    """Add rooms and return the median height of their floors (m)."""
     floors = []
     for space in spaces:
         budget.check_time()
@@ -154,7 +163,10 @@ def _add_spaces(spaces: Iterable[Any], sketch: Sketch, builder: ReportBuilder, b
         height = high - low
         ceiling = height if _HEIGHT_M[0] <= height <= _HEIGHT_M[1] else None
         if ceiling is None:
-            builder.warnings.append(f"space '{name}' is {height:.2f} m high; the usual ceiling was taken instead")
+            builder.warnings.append(
+                f"space '{name}' is {height:.2f} m high, outside {_HEIGHT_M[0]:g} to {_HEIGHT_M[1]:g} m; "
+                "the usual ceiling height is used"
+            )
         sketch.rooms += [SketchedRoom(part, name or None, None, ceiling) for part in parts]
         floors.append(low)
         builder.use("IfcSpace", "rooms")
@@ -162,7 +174,7 @@ def _add_spaces(spaces: Iterable[Any], sketch: Sketch, builder: ReportBuilder, b
 
 
 def _add_elements(storey: Any, floor_m: float, sketch: Sketch, builder: ReportBuilder, budget: Budget) -> None:
-    """Doors, windows and columns that the storey contains."""
+    """Add the doors, windows and columns of a storey."""
     for relation in getattr(storey, "ContainsElements", None) or ():
         for element in relation.RelatedElements:
             budget.check_time()
@@ -180,7 +192,7 @@ def _add_elements(storey: Any, floor_m: float, sketch: Sketch, builder: ReportBu
 
 
 def _join_touching(sketch: Sketch, builder: ReportBuilder) -> None:
-    """Spaces with nothing between them are open to each other; unless all are drawn to the middle of their walls."""
+    """Add passages between touching spaces, unless all spaces reach to the centre lines of their walls."""
     shapes = [room.shape for room in sketch.rooms]
     tree = shapely.STRtree(shapes)
     first, second = tree.query(shapes, predicate="dwithin", distance=_THICK_M)
@@ -198,7 +210,7 @@ def _join_touching(sketch: Sketch, builder: ReportBuilder) -> None:
 
 
 def _opening(element: Any, kind: OpeningKind, floor_m: float) -> SketchedOpening | None:
-    """The void that a door or window fills says where it is; without one, the element itself."""
+    """Locate a door or window by the void that it fills; without a void, by its own shape."""
     voids = [relation.RelatingOpeningElement for relation in getattr(element, "FillsVoids", None) or ()]
     mesh = next((found for void in voids if (found := _mesh(void)) is not None), None) or _mesh(element)
     if mesh is None:
@@ -213,7 +225,7 @@ def _opening(element: Any, kind: OpeningKind, floor_m: float) -> SketchedOpening
 
 
 def _mesh(element: Any) -> tuple[Float[np.ndarray, "n 3"], Any] | None:
-    """(vertices in metres in the model's frame, triangles), None where an element has no shape that can be made."""
+    """Return the vertices (m, model frame) and triangles of an element, None if it has no usable shape."""
     import ifcopenshell.geom
 
     if getattr(element, "Representation", None) is None:
@@ -232,14 +244,14 @@ def _mesh(element: Any) -> tuple[Float[np.ndarray, "n 3"], Any] | None:
 
 
 def _footprint(vertices: Float[np.ndarray, "n 3"], triangles: Any, low: float) -> list[shapely.Polygon]:
-    """The floor of a space: its faces at the bottom, or all of it from above where the bottom is not level."""
+    """Return the floor of a space: its bottom faces, or its whole projection if the bottom is not level."""
     at_bottom = (vertices[triangles][:, :, 2] <= low + _FLOOR_M).all(axis=1)
     floor = _projection(vertices, triangles[at_bottom]) if at_bottom.any() else []
     return floor or _projection(vertices, triangles)
 
 
 def _projection(vertices: Float[np.ndarray, "n 3"], triangles: Any) -> list[shapely.Polygon]:
-    """What triangles cover, from above."""
+    """Return the area that triangles cover, seen from above."""
     corners = vertices[triangles][:, :, :2]
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     flat = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]) > 1e-9
@@ -251,7 +263,7 @@ def _projection(vertices: Float[np.ndarray, "n 3"], triangles: Any) -> list[shap
 
 
 def _anchor(model: Any) -> Anchor | None:
-    """Where the model's origin lies: IfcMapConversion (IFC 4), else the site's latitude and longitude."""
+    """Return the place of the model's origin from IfcMapConversion (IFC 4), else from the site's coordinates."""
     mapped = _map_conversion(model)
     if mapped is not None:
         return mapped
@@ -262,7 +274,7 @@ def _anchor(model: Any) -> Anchor | None:
         latitude, longitude = _degrees(site.RefLatitude), _degrees(site.RefLongitude)
         if abs(latitude) > 90.0 or abs(longitude) > 180.0:
             continue
-        latitude, longitude = _away_from_site(site, latitude, longitude, north_deg, _unit(model))
+        latitude, longitude = _origin_from_site(site, latitude, longitude, north_deg, _unit(model))
         altitude = None if site.RefElevation is None else float(site.RefElevation) * _unit(model)
         return Anchor(latitude, longitude, altitude, north_deg)
     return None
@@ -276,7 +288,7 @@ def _map_conversion(model: Any) -> Anchor | None:
             continue
         east, north = float(conversion.Eastings), float(conversion.Northings)
         try:
-            # A step to the north of the origin tells how far true north lies off the grid's.
+            # A step along grid north gives the angle between grid north and true north.
             lon_lat = to_wgs84(code, np.array([[east, north]]))
             frame = LocalFrame(float(lon_lat[0, 0]), float(lon_lat[0, 1]))
             step = frame.to_local(to_wgs84(code, np.array([[east, north + 100.0]])))[0]
@@ -286,7 +298,7 @@ def _map_conversion(model: Any) -> Anchor | None:
             continue
         grid_north_deg = math.degrees(math.atan2(step[0], step[1]))
         x, y = float(conversion.XAxisAbscissa or 1.0), float(conversion.XAxisOrdinate or 0.0)
-        # The model's x axis points along (x, y) of the grid; so grid north lies that far clockwise from the model's y.
+        # The model's x axis points along (x, y) of the grid: grid north lies this angle clockwise from its y axis.
         turned_deg = math.degrees(math.atan2(y, x))
         height = float(conversion.OrthogonalHeight or 0.0)
         return Anchor(frame.latitude, frame.longitude, height, (turned_deg - grid_north_deg) % 360.0)
@@ -304,21 +316,23 @@ def _true_north_deg(model: Any) -> float:
 
 
 def _degrees(angle: Iterable[int]) -> float:
-    """Degrees of a compound angle: degrees, minutes, seconds, millionths of a second, all of one sign."""
+    """Convert a compound angle (degrees, minutes, seconds, millionths of a second, all of one sign) to degrees."""
     parts = [float(part) for part in angle]
     return sum(part / size for part, size in zip(parts, (1.0, 60.0, 3600.0, 3600e6), strict=False))
 
 
-def _away_from_site(site: Any, latitude: float, longitude: float, north_deg: float, unit: float) -> tuple[float, float]:
-    """Latitude and longitude of the model's origin, where the site stands elsewhere in the model."""
+def _origin_from_site(
+    site: Any, latitude: float, longitude: float, north_deg: float, unit: float
+) -> tuple[float, float]:
+    """Return latitude and longitude of the model's origin if the site is placed elsewhere in the model."""
     from ifcopenshell.util.placement import get_local_placement
 
     if site.ObjectPlacement is None:
         return latitude, longitude
     offset = -np.asarray(get_local_placement(site.ObjectPlacement))[:2, 3] * unit
     turn = math.radians(north_deg)
-    # Plan axes to east and north: north lies `north_deg` clockwise from +y.
+    # North lies `north_deg` clockwise from +y of the plan.
     north = offset @ np.array([math.sin(turn), math.cos(turn)])
     east = offset @ np.array([math.cos(turn), -math.sin(turn)])
-    place = LocalFrame(longitude, latitude).to_earth(np.array([[east, north]]))[0]
-    return float(place[1]), float(place[0])
+    origin = LocalFrame(longitude, latitude).to_earth(np.array([[east, north]]))[0]
+    return float(origin[1]), float(origin[0])

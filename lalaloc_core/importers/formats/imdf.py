@@ -1,50 +1,164 @@
-"""IMDF 1.0 archives (Indoor Mapping Data Format): GeoJSON files by feature type, in a zip archive with a manifest."""
+"""IMDF 1.0 (Indoor Mapping Data Format): a zip archive of GeoJSON files by feature type, with a manifest."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import io
+import json
+import uuid
+import zipfile
+import zlib
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.floorplan.json_text import read_json
-from lalaloc_core.importers.formats.geojson import import_features, read_features
-from lalaloc_core.importers.model.assemble import ImportedPlan
-from lalaloc_core.importers.model.limits import Budget
-from lalaloc_core.importers.model.options import ImportOptions
-from lalaloc_core.importers.model.sketch import Level
+from lalaloc_core.importers.common.assemble import ImportedPlan
+from lalaloc_core.importers.common.limits import Budget, ImportLimits
+from lalaloc_core.importers.common.options import ImportOptions
+from lalaloc_core.importers.common.sketch import Level
+from lalaloc_core.importers.formats.geojson import Projector, features_of, import_features, parse_features
 
-FORMAT = "imdf"
-_TAKEN = ("unit", "opening", "fixture", "kiosk")
+_FEATURE_TYPES = ("unit", "opening", "fixture", "kiosk")
+# Exported archives carry no time, so that equal plans give equal bytes.
+_EPOCH = (2000, 1, 1, 0, 0, 0)
+_NAMESPACE = uuid.UUID("2f6c1d58-2d0e-5c7e-9a41-6b0f6f1e7c11")
+_CATEGORIES = {
+    "corridor": "walkway",
+    "bathroom": "restroom",
+    "stairs": "stairs",
+    "office": "office",
+    "kitchen": "kitchen",
+    "meeting": "conferenceroom",
+    "storage": "storage",
+    "entrance": "lobby",
+}
 
 
-def import_imdf(files: Mapping[str, bytes], options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
-    """One plan for every level of an archive, lowest first.
+def read_archive(content: bytes, limits: ImportLimits, *, suffixes: tuple[str, ...]) -> dict[str, bytes]:
+    """Unpack a zip archive in memory. Archives inside the archive are not opened.
 
     Args:
-        files: the archive's files by name.
+        content: bytes of the archive.
+        limits: limits on the number of files and their total size.
+        suffixes: suffixes of the files to unpack, in lower case.
+
+    Returns:
+        The files by name.
 
     Raises:
-        InvalidFloorPlanError: names the file and what is wrong.
+        InvalidFloorPlanError: the archive is damaged, encrypted or exceeds a limit.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            return _read_members(archive, limits, suffixes)
+    except (zipfile.BadZipFile, zlib.error, NotImplementedError, EOFError, OSError) as error:
+        raise InvalidFloorPlanError(f"the archive is damaged: {error}") from error
+
+
+def read(files: Mapping[str, bytes], options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
+    """Read one plan per level of an archive, lowest first.
+
+    Raises:
+        InvalidFloorPlanError: a file of the archive is missing or invalid.
     """
     by_type = {name.rpartition("/")[2].partition(".")[0].casefold(): name for name in files}
     if "unit" not in by_type:
         found = ", ".join(sorted(files)[:10]) or "no GeoJSON at all"
-        raise InvalidFloorPlanError(f"the archive has no unit.geojson, it has {found}")
+        raise InvalidFloorPlanError(
+            f"the archive has no unit.geojson, it has {found}; send an IMDF archive or one IFC model"
+        )
     features = []
-    for kind in _TAKEN:
+    for kind in _FEATURE_TYPES:
         if kind in by_type:
-            document = _read(files, by_type[kind], budget)
-            # The type stands in every feature by the standard, and in the file's name where a tool left it out.
+            document = _read_member(files, by_type[kind], budget)
+            # The standard requires the type in every feature; some tools give it in the file's name only.
             features += [
-                replace(feature, says={"feature_type": kind} | dict(feature.says))
-                for feature in read_features(document, budget)
+                replace(feature, properties={"feature_type": kind} | dict(feature.properties))
+                for feature in parse_features(document, budget)
             ]
-    levels = _levels(_read(files, by_type["level"], budget)) if "level" in by_type else {}
-    return import_features(features, None, FORMAT, options, budget, levels)
+    levels = _levels(_read_member(files, by_type["level"], budget)) if "level" in by_type else {}
+    return import_features(features, None, "imdf", options, budget, levels)
 
 
-def _read(files: Mapping[str, bytes], name: str, budget: Budget) -> Any:
+def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
+    """Return an IMDF archive of one level with its venue, building, units and openings.
+
+    IMDF has no windows: they are openings with the additional property `kind`, which other readers ignore.
+
+    Raises:
+        InvalidFloorPlanError: the plan has no anchor, so it has no coordinates on Earth.
+    """
+    if anchor is None:
+        raise InvalidFloorPlanError("the plan has no anchor; IMDF requires one: add 'anchor' to the plan")
+    projector = Projector(anchor)
+    name = str(document.get("name", "floor plan"))
+    ids = {kind: str(uuid.uuid5(_NAMESPACE, f"{kind}/{name}")) for kind in ("venue", "building", "level", "footprint")}
+    by_type: dict[str, list[dict[str, Any]]] = {"unit": [], "opening": []}
+    for number, feature in enumerate(features_of(document, projector)):
+        kind = feature["properties"].pop("feature_type")
+        properties = feature["properties"] | {"level_id": ids["level"]}
+        if kind == "unit":
+            properties["category"] = _CATEGORIES.get(properties.get("type", ""), "room")
+            properties["name"] = {"en": properties["name"]}
+        elif kind == "opening":
+            properties["category"] = "pedestrian"
+            properties["door"] = {"type": "door"} if properties["kind"] == "door" else None
+        else:
+            continue  # IMDF has no feature type for free-standing walls.
+        key = feature.get("id") or f"{kind}-{number}"
+        by_type[kind].append(
+            {
+                "id": str(uuid.uuid5(_NAMESPACE, f"{name}/{key}")),
+                "type": "Feature",
+                "feature_type": kind,
+                "geometry": feature["geometry"],
+                "properties": properties,
+            }
+        )
+    outline = projector.polygon([_bounding_box(document)])
+    context = {"venue": {"category": "unspecified", "name": {"en": name}, "address_id": None},
+               "building": {"category": "unspecified", "name": {"en": name}, "address_id": None},
+               "footprint": {"category": "ground", "name": None, "building_ids": [ids["building"]]},
+               "level": {"category": "unspecified", "ordinal": 0, "outdoor": False, "short_name": {"en": "0"},
+                         "name": {"en": name}, "building_ids": [ids["building"]]}}  # fmt: skip
+    for kind, properties in context.items():
+        geometry = None if kind == "building" else {"type": "Polygon", "coordinates": outline}
+        by_type[kind] = [
+            {"id": ids[kind], "type": "Feature", "feature_type": kind, "geometry": geometry, "properties": properties}
+        ]
+    return _write_archive(by_type)
+
+
+def _read_members(archive: zipfile.ZipFile, limits: ImportLimits, suffixes: tuple[str, ...]) -> dict[str, bytes]:
+    members = archive.infolist()
+    if len(members) > limits.max_archive_files:
+        raise InvalidFloorPlanError(
+            f"the archive has {len(members)} files; the limit is {limits.max_archive_files} (max_archive_files)"
+        )
+    found: dict[str, bytes] = {}
+    remaining = limits.max_unpacked_bytes
+    for member in members:
+        if member.is_dir() or not member.filename.casefold().endswith(suffixes):
+            continue
+        if member.flag_bits & 0x1:
+            raise InvalidFloorPlanError(f"'{member.filename[:100]}' is encrypted; send the archive without a password")
+        # The sizes in the archive's directory can be forged, so the read itself is bounded.
+        with archive.open(member) as stream:
+            content = stream.read(remaining + 1)
+        remaining -= len(content)
+        if remaining < 0:
+            raise InvalidFloorPlanError(
+                f"the archive unpacks to more than {limits.max_unpacked_bytes} bytes (max_unpacked_bytes)"
+            )
+        found[member.filename] = content
+    return found
+
+
+def _read_member(files: Mapping[str, bytes], name: str, budget: Budget) -> Any:
     try:
         return read_json(files[name], budget.limits.max_depth)
     except InvalidFloorPlanError as error:
@@ -55,12 +169,13 @@ def _levels(document: Any) -> dict[str, Level]:
     found: dict[str, Level] = {}
     features = document.get("features") if isinstance(document, Mapping) else None
     for feature in features if isinstance(features, list) else []:
-        says = feature.get("properties") if isinstance(feature, Mapping) else None
-        if not isinstance(says, Mapping) or not isinstance(feature.get("id"), str):
+        properties = feature.get("properties") if isinstance(feature, Mapping) else None
+        if not isinstance(properties, Mapping) or not isinstance(feature.get("id"), str):
             continue
-        ordinal = says.get("ordinal")
+        ordinal = properties.get("ordinal")
         number = float(ordinal) if isinstance(ordinal, int | float) and abs(ordinal) < 1e6 else None
-        found[feature["id"]] = Level(_text(says.get("name")) or _text(says.get("short_name")) or f"{ordinal}", number)
+        name = _text(properties.get("name")) or _text(properties.get("short_name")) or f"{ordinal}"
+        found[feature["id"]] = Level(name, number)
     return found
 
 
@@ -68,3 +183,20 @@ def _text(value: Any) -> str | None:
     if isinstance(value, Mapping):
         value = value.get("en") or next(iter(value.values()), None)
     return value[:200] if isinstance(value, str) and value.strip() else None
+
+
+def _write_archive(by_type: Mapping[str, Sequence[Mapping[str, Any]]]) -> bytes:
+    files: dict[str, Any] = {"manifest.json": {"version": "1.0.0", "language": "en", "generated_by": "lalaloc"}}
+    for kind, features in by_type.items():
+        files[f"{kind}.geojson"] = {"type": "FeatureCollection", "features": list(features)}
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in files.items():
+            archive.writestr(zipfile.ZipInfo(name, _EPOCH), json.dumps(content, ensure_ascii=False))
+    return stream.getvalue()
+
+
+def _bounding_box(document: Mapping[str, Any]) -> list[list[float]]:
+    corners = np.concatenate([np.asarray(room["polygon"], dtype=float) for room in document["rooms"]])
+    (x0, y0), (x1, y1) = corners.min(axis=0), corners.max(axis=0)
+    return [[x0, y0], [x1, y0], [x1, y1], [x0, y1]]

@@ -1,43 +1,43 @@
-"""The native format, with `units`: plans that were written in feet or millimetres are converted."""
+"""Native JSON format. Plans with `units` other than metres are converted."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from typing import Any
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.floorplan.values import is_number
-from lalaloc_core.importers.model.assemble import ImportedPlan
-from lalaloc_core.importers.model.checks import USUAL_CEILING_M, check_document, likely_unit
-from lalaloc_core.importers.model.limits import Budget
-from lalaloc_core.importers.model.options import METRES_PER_UNIT, ImportOptions
-from lalaloc_core.importers.model.report import ReportBuilder
+from lalaloc_core.importers.common.assemble import ImportedPlan
+from lalaloc_core.importers.common.checks import USUAL_CEILING_M, check_document, likely_unit
+from lalaloc_core.importers.common.limits import Budget
+from lalaloc_core.importers.common.options import METRES_PER_UNIT, ImportOptions, check_units, check_y_axis
+from lalaloc_core.importers.common.report import ReportBuilder
 
-FORMAT = "native"
-# JSON has numbers of any size.
-_BEYOND = 1e12
-# Lengths of the format. With `units`, a key may stand without its ending and is in that unit.
+# JSON allows numbers of any size; larger ones are left for the validation to refuse.
+_MAX_NUMBER = 1e12
+# Lengths of the format. The same key without "_m" holds a length in `units`.
 _LENGTHS = ("ceiling_height_m", "camera_height_m", "camera_height_std_m", "sill_m", "head_m")
 
 
-def import_native(document: Any, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
-    """A plan in the native format.
+def read(document: Any, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
+    """Read a plan in the native format.
 
-    `units` and `y_axis` ("down") may stand in the document, or come as options, which win. Keys that end in `_m` are
-    always metres; the same keys without it (`ceiling_height`) and all coordinates are in `units`.
+    The document can contain `units` and `y_axis` ("down"); the options take precedence. Keys that end in `_m` are
+    always in metres. The same keys without it (`ceiling_height`) and all coordinates are in `units`.
 
     Raises:
-        InvalidFloorPlanError: names the room and what is wrong.
+        InvalidFloorPlanError: the plan is invalid.
     """
     if not isinstance(document, Mapping):
-        raise InvalidFloorPlanError("a plan must be an object")
+        raise InvalidFloorPlanError(f"the plan is of type {type(document).__name__}; it must be an object with 'rooms'")
     plan = dict(document)
-    units_said, y_axis_said = plan.pop("units", None), plan.pop("y_axis", None)
-    units = _choice(options.units or ("m" if units_said is None else units_said))
-    y_axis = options.y_axis or ("up" if y_axis_said is None else y_axis_said)
-    if y_axis not in ("up", "down"):
-        raise InvalidFloorPlanError(f"y_axis is {str(y_axis)[:50]!r}, known are up, down")
+    own_units, own_y_axis = plan.pop("units", None), plan.pop("y_axis", None)
+    units = check_units(options.units or ("m" if own_units is None else own_units))
+    y_axis = options.y_axis or ("up" if own_y_axis is None else own_y_axis)
+    check_y_axis(y_axis)
     if options.name is not None:
         plan["name"] = options.name
     if options.ceiling_height_m is not None:
@@ -47,8 +47,8 @@ def import_native(document: Any, options: ImportOptions, budget: Budget) -> tupl
     y_factor = -factor if y_axis == "down" else factor
     if factor != 1.0 or y_factor != factor:
         plan = _converted(plan, factor, y_factor)
-        builder.notes.append(f"coordinates were converted from {units}" if factor != 1.0 else "y was turned over")
-    _refuse_other_units(plan)
+        builder.notes.append(f"coordinates were converted from {units}" if factor != 1.0 else "y was flipped")
+    _check_ceiling_units(plan)
     limits = budget.limits.plan
     parsed = FloorPlan.from_dict(plan, limits)
     rooms = plan["rooms"]
@@ -57,18 +57,17 @@ def import_native(document: Any, options: ImportOptions, budget: Budget) -> tupl
     for opening in plan.get("openings") or ():
         builder.use("openings", str(opening["kind"]))
     builder.warnings.extend(check_document(parsed.to_dict()))
-    report = builder.build(FORMAT, factor, "units" if "units" in document or options.units else "the format: metres")
+    report = builder.build("native", factor, "units" if "units" in document or options.units else "the format: metres")
     return (ImportedPlan(plan, report, anchor=parsed.anchor, checked=(limits, parsed)),)
 
 
-def _choice(units: Any) -> str:
-    if not isinstance(units, str) or units not in METRES_PER_UNIT:
-        raise InvalidFloorPlanError(f"units is {str(units)[:50]!r}, known are {', '.join(METRES_PER_UNIT)}")
-    return units
+def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
+    """Return a plan as native JSON; the document contains its own anchor."""
+    return json.dumps(document, ensure_ascii=False, indent=1).encode()
 
 
 def _converted(document: dict[str, Any], factor: float, y_factor: float) -> dict[str, Any]:
-    """The plan in metres. What is no number stays as it is: the format's own checks say what is wrong with it."""
+    """Convert a plan to metres; the validation refuses values of wrong types later."""
     plan = _lengths(document, factor)
     rooms = plan.get("rooms")
     if isinstance(rooms, list):
@@ -81,8 +80,8 @@ def _converted(document: dict[str, Any], factor: float, y_factor: float) -> dict
             else opening
             for opening in openings
         ]
-    if y_factor < 0.0 and is_number(plan.get("north_deg")) and abs(plan["north_deg"]) < _BEYOND:
-        # Turned over, what was clockwise from +y on the drawing is clockwise from its new +y after half a turn.
+    if y_factor < 0.0 and is_number(plan.get("north_deg")) and abs(plan["north_deg"]) < _MAX_NUMBER:
+        # A flip of y mirrors angles and turns +y by half a turn.
         plan["north_deg"] = (180.0 - plan["north_deg"]) % 360.0
     anchor = plan.get("anchor")
     if isinstance(anchor, Mapping):
@@ -95,10 +94,10 @@ def _room(room: Mapping[str, Any], factor: float, y_factor: float) -> dict[str, 
 
 
 def _anchor(anchor: Mapping[str, Any], factor: float, y_factor: float) -> dict[str, Any]:
-    """Control points are places of the drawing; the altitude is metres in any case."""
+    """Convert an anchor: control points are in units of the drawing, the altitude is always in metres."""
     converted = dict(anchor)
     north_deg, points = converted.get("north_deg"), converted.get("control_points")
-    if y_factor < 0.0 and is_number(north_deg) and abs(north_deg) < _BEYOND:
+    if y_factor < 0.0 and is_number(north_deg) and abs(north_deg) < _MAX_NUMBER:
         converted["north_deg"] = (180.0 - north_deg) % 360.0
     if isinstance(points, list):
         scales = {"x": factor, "y": y_factor}
@@ -118,7 +117,7 @@ def _lengths(document: Mapping[str, Any], factor: float) -> dict[str, Any]:
         if short not in plan:
             continue
         if key in plan:
-            raise InvalidFloorPlanError(f"'{short}' and '{key}' say the same, give one of them")
+            raise InvalidFloorPlanError(f"'{short}' and '{key}' are both set; give only one of them")
         value = plan.pop(short)
         plan[key] = _times(value, factor)
     return plan
@@ -137,21 +136,21 @@ def _scaled(value: Any, factor: float, y_factor: float) -> Any:
 
 
 def _times(value: Any, factor: float) -> Any:
-    """A length in metres. What is no number, or none that a float can be, is left for the format's checks to refuse."""
-    return value * factor if is_number(value) and abs(value) < _BEYOND else value
+    """Return a length in metres; other values stay as they are for the validation to refuse."""
+    return value * factor if is_number(value) and abs(value) < _MAX_NUMBER else value
 
 
-def _refuse_other_units(plan: Mapping[str, Any]) -> None:
-    """A ceiling of 2500 "metres" is refused by the format; here the refusal names the unit it was meant in."""
+def _check_ceiling_units(plan: Mapping[str, Any]) -> None:
+    """Refuse a ceiling height of, say, 2500 m with the unit that was probably meant."""
     rooms = plan.get("rooms")
-    places = [plan, *(room for room in rooms if isinstance(room, Mapping))] if isinstance(rooms, list) else [plan]
-    for place in places:
-        height = place.get("ceiling_height_m")
-        if not is_number(height) or not 20.0 < height < _BEYOND:
+    holders = [plan, *(room for room in rooms if isinstance(room, Mapping))] if isinstance(rooms, list) else [plan]
+    for holder in holders:
+        height = holder.get("ceiling_height_m")
+        if not is_number(height) or not 20.0 < height < _MAX_NUMBER:
             continue
         unit = likely_unit(float(height), USUAL_CEILING_M)
         if unit is not None:
             raise InvalidFloorPlanError(
-                f"ceiling_height_m is {height:g}, at most 20 m is allowed; it looks like {unit}: "
-                f'write it as \'ceiling_height\' beside "units": "{unit}"'
+                f"ceiling_height_m is {height:g} m; the limit is 20 m. It looks like {unit}: "
+                f'rename it to \'ceiling_height\' and set "units": "{unit}"'
             )

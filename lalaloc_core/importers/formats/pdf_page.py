@@ -1,4 +1,4 @@
-"""What is drawn on a page of a PDF: paths, lettering and how much of it is a picture; points, y up."""
+"""Contents of a PDF page: paths, text, and the share covered by pictures, in points with y up."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ import pypdfium2
 import pypdfium2.raw as pdfium
 import shapely
 from jaxtyping import Float
-from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.importers.common.geometry import even_odd_polygons, polygons_of
+from lalaloc_core.importers.common.limits import Budget
 from lalaloc_core.importers.drawing.shapes import (
     CURVE_STEPS,
     DARK,
@@ -22,11 +23,9 @@ from lalaloc_core.importers.drawing.shapes import (
     Drawing,
     Lettering,
     Stroke,
+    fit_swing,
     luminance,
-    swing_of,
 )
-from lalaloc_core.importers.model.geometry import polygons_of
-from lalaloc_core.importers.model.limits import Budget
 
 _MAX_FORM_DEPTH = 8
 _MAX_TEXTS, _MAX_LENGTH = 5000, 200
@@ -35,7 +34,7 @@ Matrix = Float[np.ndarray, "3 3"]
 
 @dataclass
 class PageContent:
-    """A page as far as it is drawn with lines; `picture_share` is how much of it pictures cover."""
+    """Drawing on a page, the page's size (points), and the share of it that pictures cover."""
 
     drawing: Drawing = field(default_factory=Drawing)
     size_pt: tuple[float, float] = (0.0, 0.0)
@@ -51,28 +50,32 @@ class _Subpath:
 
 
 def open_page(content: bytes, number: int) -> tuple[pypdfium2.PdfDocument, pypdfium2.PdfPage]:
-    """A document and one of its pages, counted from 1; the caller closes the document.
+    """Open a document and one of its pages, counted from 1. The caller closes the document.
 
     Raises:
-        InvalidFloorPlanError: no PDF that can be read, an encrypted one, or no such page.
+        InvalidFloorPlanError: the file is damaged or encrypted, or has no such page.
     """
     try:
         document = pypdfium2.PdfDocument(content)
         pages = len(document)
     except pypdfium2.PdfiumError as error:
-        raise InvalidFloorPlanError(f"the PDF cannot be read, it is damaged or needs a password: {error}") from error
+        raise InvalidFloorPlanError(
+            f"the PDF cannot be read: {error}; it is damaged or encrypted, save it again without a password"
+        ) from error
     if number > pages:
         document.close()
-        raise InvalidFloorPlanError(f"page is {number}, the PDF has {pages}")
+        raise InvalidFloorPlanError(f"page is {number}; the PDF has {pages} pages")
     try:
         return document, document[number - 1]
     except pypdfium2.PdfiumError as error:
         document.close()
-        raise InvalidFloorPlanError(f"page {number} of the PDF cannot be read: {error}") from error
+        raise InvalidFloorPlanError(
+            f"page {number} of the PDF cannot be read: {error}; save it again or set page"
+        ) from error
 
 
 def read_page(page: pypdfium2.PdfPage, budget: Budget) -> PageContent:
-    """Paths, texts and the share of pictures of a page."""
+    """Return the paths and texts of a page, and the share that pictures cover."""
     width, height = page.get_size()
     found = PageContent(size_pt=(float(width), float(height)))
     for item, matrix in _objects(
@@ -92,7 +95,7 @@ def read_page(page: pypdfium2.PdfPage, budget: Budget) -> PageContent:
 def _objects(
     holder: Any, count: Any, get: Any, matrix: Matrix, budget: Budget, depth: int
 ) -> Iterator[tuple[Any, Matrix]]:
-    """Objects with the matrix from their own coordinates to the page's; forms are opened."""
+    """Yield objects with the matrix to page coordinates; forms are expanded."""
     for index in range(count(holder)):
         budget.spend()
         item = get(holder, index)
@@ -122,7 +125,9 @@ def _add_path(item: Any, matrix: Matrix, drawing: Drawing, budget: Budget) -> No
         points = _applied(matrix, subpath.points)
         if not np.isfinite(points).all():
             continue
-        swings = [swing_of(_applied(matrix, curve), "") for curve in subpath.curves] if len(subpath.curves) <= 2 else []
+        swings = (
+            [fit_swing(_applied(matrix, curve), "") for curve in subpath.curves] if len(subpath.curves) <= 2 else []
+        )
         leaves = [swing for swing in swings if swing is not None]
         if leaves and not is_filled:
             drawing.swings += leaves
@@ -130,12 +135,9 @@ def _add_path(item: Any, matrix: Matrix, drawing: Drawing, budget: Budget) -> No
             shells += polygons_of(shapely.Polygon(points))
         elif len(points) >= 2 and is_stroked and shapely.LineString(points).length > 0.0:
             drawing.strokes.append(Stroke(shapely.LineString(points), "", None, pen))
-    shape: BaseGeometry = shapely.Polygon()
-    for shell in shells:
-        shape = shapely.symmetric_difference(shape, shell)
     if is_filled and not is_dark and not is_stroked:
-        return  # A coloured floor or a white background: its edge is no line that was drawn.
-    drawing.areas += [Area(part, "", None, is_dark=is_dark) for part in polygons_of(shape)]
+        return  # A coloured floor or a white background has no drawn outline.
+    drawing.areas += [Area(part, "", None, is_dark=is_dark) for part in even_odd_polygons(shells)]
 
 
 def _subpaths(item: Any, budget: Budget) -> list[_Subpath]:

@@ -1,24 +1,32 @@
-"""SVG: closed shapes by the words of their layer, id and class; the classes of CubiCasa5K are such words.
+"""SVG drawings. The words in a layer, id or class give a shape its role, as in the data set CubiCasa5K.
 
-svgelements reads shapes, transforms and styles; the document is parsed, bounded and stripped before it sees it.
+svgelements reads shapes, transforms and styles, after this module has parsed, bounded and stripped the XML.
 """
 
 from __future__ import annotations
 
 import io
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 from xml.etree import ElementTree
-from xml.etree.ElementTree import Element
+from xml.etree.ElementTree import Element, ParseError
 
+import defusedxml
 import numpy as np
 import shapely
 import svgelements
-from shapely.geometry.base import BaseGeometry
+from defusedxml import ElementTree as SafeElementTree
 
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan.earth import Anchor
+from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
+from lalaloc_core.importers.common.geometry import even_odd_polygons, label_position, polygons_of
+from lalaloc_core.importers.common.limits import Budget
+from lalaloc_core.importers.common.options import ImportOptions
+from lalaloc_core.importers.common.report import ReportBuilder
+from lalaloc_core.importers.common.vocabulary import Role, role_of
 from lalaloc_core.importers.drawing.scale import drawing_scale
 from lalaloc_core.importers.drawing.shapes import (
     CURVE_STEPS,
@@ -27,79 +35,150 @@ from lalaloc_core.importers.drawing.shapes import (
     Drawing,
     Lettering,
     Stroke,
+    fit_swing,
     luminance,
-    swing_of,
 )
-from lalaloc_core.importers.drawing.understand import understand
-from lalaloc_core.importers.formats.xml_text import read_xml
-from lalaloc_core.importers.model.assemble import ImportedPlan, assemble
-from lalaloc_core.importers.model.geometry import polygons_of
-from lalaloc_core.importers.model.limits import Budget
-from lalaloc_core.importers.model.options import ImportOptions
-from lalaloc_core.importers.model.report import ReportBuilder
-from lalaloc_core.importers.model.words import Role, role_of
+from lalaloc_core.importers.drawing.sketching import sketch_drawing
 
-FORMAT = "svg"
-# What the exporter writes, and the importer believes.
-SCALE_ATTRIBUTE = "data-metres-per-unit"
+# Attribute of the root element with the scale of exported drawings.
+_SCALE_ATTRIBUTE = "data-metres-per-unit"
 _HREF = "{http://www.w3.org/1999/xlink}href"
 _LABEL = "{http://www.inkscape.org/namespaces/inkscape}label"
-# Names that editors give by themselves.
+# Names that editors generate.
 _AUTOMATIC = re.compile(
     r"(?:path|rect|polygon|polyline|line|text|tspan|use|svg|g|group|layer|shape|space|_x)[-_\d.]*", re.I
 )
 _METRES = {"mm": 1e-3, "cm": 1e-2, "in": 0.0254, "pt": 0.0254 / 72.0, "pc": 0.0254 / 6.0, "px": 0.0254 / 96.0}
 _LENGTH = re.compile(r"\s*([0-9.eE+-]+)\s*(mm|cm|in|pt|pc|px|)\s*")
 _BYTES_PER_ENTITY = 12
+# Elements without a shape, and elements that are drawn only where they are used.
+_IGNORED_ELEMENTS = ("image", "script", "foreignObject", "metadata", "pattern", "marker")
+# Export at 1:100: user units per metre, millimetres on paper per metre, and margin.
+_UNITS_PER_M, _MM_PER_M, _MARGIN_M = 100.0, 10.0, 0.5
+_STYLE = (
+    ".Space{fill:#eef3f7;stroke:#222;stroke-width:4}.Column{fill:#888}.Wall{stroke:#222;stroke-width:8}"
+    ".Door{stroke:#2a7;stroke-width:6}.Window{stroke:#26c;stroke-width:6}.Passage{stroke:#d80;stroke-width:6}"
+    "text{font:24px sans-serif;text-anchor:middle}"
+)
 
 
 @dataclass(frozen=True)
-class _Place:
-    """The words around an element, nearest last, and what follows from them."""
+class _Context:
+    """Labels of the elements around a shape, innermost last, and the role and layer that follow from them."""
 
     labels: tuple[str, ...] = ()
     role: Role | None = None
     layer: str = ""
     kind: str | None = None
 
-    def inside(self, element: Any) -> _Place:
-        """The place of an element in this one; the nearest words that say what something is win."""
+    def nested(self, element: Any) -> _Context:
+        """Return the context of a child element; the innermost label with a role decides."""
         own = element.values.get("attributes") or {}
         texts = [str(own[key])[:200] for key in (_LABEL, "id", "class") if own.get(key)]
         labels = (*self.labels, *texts)[-64:]
         for text in (*texts[::-1],):
             role = role_of(text)
             if role is not None:
-                return _Place(labels, role, text, text)
+                return _Context(labels, role, text, text)
         layer = texts[0] if texts and not self.layer else self.layer
-        return _Place(labels, self.role, layer, self.kind)
+        return _Context(labels, self.role, layer, self.kind)
 
 
-def import_svg(content: bytes, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
-    """The plan in a SVG drawing.
+def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
+    """Read the plan in an SVG drawing.
 
     Raises:
-        InvalidFloorPlanError: what is wrong with the file, or that it does not say its scale.
+        InvalidFloorPlanError: the file is invalid, or neither the file nor the options give its scale.
     """
     root = read_xml(content, budget)
     if root.tag.rpartition("}")[2] != "svg":
-        raise InvalidFloorPlanError(f"the root element is <{root.tag.rpartition('}')[2][:50]}>, not <svg>")
+        raise InvalidFloorPlanError(f"the root element is <{root.tag.rpartition('}')[2][:50]}>; it must be <svg>")
     _check_uses(root, budget)
-    paper_m, said = _size_on_paper(root), _own_scale(root)
+    paper_m, own = _size_on_paper(root), _own_scale(root)
     builder = ReportBuilder()
-    drawing = _read(root, options, builder, budget)
+    drawing = _read_drawing(root, options, builder, budget)
     texts = [lettering.text for lettering in drawing.letterings]
-    factor, source = drawing_scale(options, "the SVG", paper_m_per_unit=paper_m, said=said, texts=texts)
+    factor, source = drawing_scale(options, "the SVG", paper_m_per_unit=paper_m, own=own, texts=texts)
     if options.y_axis != "up":
-        builder.notes.append("y points down in SVG and was turned over")
-    drawing = drawing.scaled(factor, turn_over=options.y_axis != "up")
-    sketch = understand(drawing, builder, budget)
-    plan = assemble(sketch, builder, options, format=FORMAT, metres_per_unit=factor, scale_source=source)
+        builder.notes.append("y points down in SVG and was flipped")
+    drawing = drawing.scaled(factor, flip_y=options.y_axis != "up")
+    sketch = sketch_drawing(drawing, builder, budget)
+    plan = assemble(sketch, builder, options, format="svg", metres_per_unit=factor, scale_source=source)
     return (plan,)
 
 
+def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
+    """Return an SVG drawing at 1:100 with the classes of CubiCasa5K. It has no place for heights and the anchor."""
+    corners = np.concatenate([np.asarray(room["polygon"], dtype=float) for room in document["rooms"]])
+    low, high = corners.min(axis=0) - _MARGIN_M, corners.max(axis=0) + _MARGIN_M
+    width, height = (float(size) for size in high - low)
+
+    def points(points_m: Sequence[Sequence[float]]) -> str:
+        return " ".join(f"{_UNITS_PER_M * x:.4f},{-_UNITS_PER_M * y:.4f}" for x, y in points_m)
+
+    view_box = (_UNITS_PER_M * low[0], -_UNITS_PER_M * high[1], _UNITS_PER_M * width, _UNITS_PER_M * height)
+    root = ElementTree.Element(
+        "svg",
+        {
+            "xmlns": "http://www.w3.org/2000/svg",
+            "width": f"{_MM_PER_M * width:.3f}mm",
+            "height": f"{_MM_PER_M * height:.3f}mm",
+            "viewBox": " ".join(f"{value:.4f}" for value in view_box),
+            _SCALE_ATTRIBUTE: repr(1.0 / _UNITS_PER_M),
+        },
+    )
+    ElementTree.SubElement(root, "style").text = _STYLE
+    for room in document["rooms"]:
+        group = ElementTree.SubElement(root, "g", {"class": f"Space {str(room.get('type', '')).capitalize()}".strip()})
+        outline = {"points": points(room["polygon"])}
+        if room.get("name"):
+            outline["data-name"] = room["name"]
+        ElementTree.SubElement(group, "polygon", outline)
+        for hole in room.get("holes", ()):
+            ElementTree.SubElement(root, "polygon", {"class": "Column", "points": points(hole)})
+        for wall in room.get("walls", ()):
+            ElementTree.SubElement(root, "polyline", {"class": "Wall", "fill": "none", "points": points(wall)})
+        x, y = label_position(shapely.Polygon(room["polygon"], room.get("holes")))
+        position = {"x": f"{_UNITS_PER_M * x:.2f}", "y": f"{-_UNITS_PER_M * y:.2f}"}
+        ElementTree.SubElement(root, "text", position).text = room.get("name", "")
+    for opening in document.get("openings", ()):
+        attributes = {"class": opening["kind"].capitalize(), "fill": "none", "points": points(opening["line"])}
+        ElementTree.SubElement(root, "polyline", attributes)
+    return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
+
+
+def read_xml(content: bytes, budget: Budget) -> Element:
+    """Parse XML without entities and external references, and return its root.
+
+    Raises:
+        InvalidFloorPlanError: the XML is invalid, declares entities, or exceeds a limit.
+    """
+    try:
+        root = SafeElementTree.fromstring(content, forbid_dtd=False, forbid_entities=True, forbid_external=True)
+    except defusedxml.EntitiesForbidden as error:
+        raise InvalidFloorPlanError(
+            "the XML declares entities, which are not supported; save the drawing without them (plain SVG)"
+        ) from error
+    except defusedxml.DefusedXmlException as error:
+        raise InvalidFloorPlanError(
+            f"the XML refers to other files, which are not read: {error}; save the drawing as plain SVG"
+        ) from error
+    except (ParseError, ValueError, LookupError) as error:
+        raise InvalidFloorPlanError(f"the XML is not well-formed: {error}; save the drawing again") from error
+    pending = [(root, 1)]
+    while pending:
+        element, depth = pending.pop()
+        if depth > budget.limits.max_depth:
+            raise InvalidFloorPlanError(
+                f"elements are nested more than {budget.limits.max_depth} deep (max_depth); ungroup the drawing"
+            )
+        budget.spend()
+        pending.extend((child, depth + 1) for child in element)
+    return root
+
+
 def _check_uses(root: Element, budget: Budget) -> None:
-    """Count what `<use>` draws again: a few elements that use each other can stand for billions."""
+    """Count the elements after `<use>` is expanded: nested uses can multiply to billions."""
     by_id = {element.get("id"): element for element in root.iter() if element.get("id")}
     sizes: dict[Element, int] = {}
     open_elements: set[Element] = set()
@@ -108,7 +187,7 @@ def _check_uses(root: Element, budget: Budget) -> None:
         if element in sizes:
             return sizes[element]
         if element in open_elements:
-            raise InvalidFloorPlanError("a <use> element draws itself")
+            raise InvalidFloorPlanError("a <use> element refers to itself; remove it or convert it to paths")
         open_elements.add(element)
         total = 1 + len(element.get("d", "")) // _BYTES_PER_ENTITY + len(element.get("points", "")) // _BYTES_PER_ENTITY
         total += sum(size(child) for child in element)
@@ -123,7 +202,7 @@ def _check_uses(root: Element, budget: Budget) -> None:
 
 
 def _size_on_paper(root: Element) -> float | None:
-    """Length of a user unit on paper (m), where the drawing has a width with a unit; pixels are none."""
+    """Return the length of a user unit on paper (m), None if the width has no unit or is in pixels."""
     match = _LENGTH.fullmatch(root.get("width", ""))
     if match is None or match[2] in ("", "px"):
         return None
@@ -138,53 +217,45 @@ def _size_on_paper(root: Element) -> float | None:
 
 def _own_scale(root: Element) -> tuple[float, str] | None:
     try:
-        value = float(root.get(SCALE_ATTRIBUTE, ""))
+        value = float(root.get(_SCALE_ATTRIBUTE, ""))
     except ValueError:
         return None
-    return (value, SCALE_ATTRIBUTE) if 1e-6 <= value <= 1e3 else None
+    return (value, _SCALE_ATTRIBUTE) if 1e-6 <= value <= 1e3 else None
 
 
-def _read(root: Element, options: ImportOptions, builder: ReportBuilder, budget: Budget) -> Drawing:
-    """Everything that is drawn, in user units."""
+def _read_drawing(root: Element, options: ImportOptions, builder: ReportBuilder, budget: Budget) -> Drawing:
+    """Return all visible shapes and texts in user units."""
     for key in ("width", "height", "viewBox", "preserveAspectRatio", "transform"):
         root.attrib.pop(key, None)
     for parent in list(root.iter()):
         for child in list(parent):
-            # Pictures are not looked at, and what stands for nothing by itself is drawn where it is used.
-            if str(child.tag).rpartition("}")[2] in (
-                "image",
-                "script",
-                "foreignObject",
-                "metadata",
-                "pattern",
-                "marker",
-            ):
+            if str(child.tag).rpartition("}")[2] in _IGNORED_ELEMENTS:
                 parent.remove(child)
     try:
         tree = svgelements.SVG.parse(io.BytesIO(ElementTree.tostring(root)), reify=True, ppi=96.0)
     except (ValueError, TypeError, AttributeError, IndexError, KeyError, ZeroDivisionError, OverflowError) as error:
-        raise InvalidFloorPlanError(f"the SVG cannot be read: {error}") from error
+        raise InvalidFloorPlanError(f"the SVG cannot be read: {error}; save it as plain SVG") from error
     drawing = Drawing()
-    for element, place in _walk(tree, _Place()):
+    for element, context in _walk(tree, _Context()):
         budget.spend()
         if _is_hidden(element):
             continue
-        if place.role == "ignored" or not options.wants_layer(*place.labels):
-            builder.use(place.layer, "ignored")
+        if context.role == "ignored" or not options.includes_layer(*context.labels):
+            builder.use(context.layer, "ignored")
         elif isinstance(element, svgelements.Text):
-            _add_text(element, place, drawing)
+            _add_text(element, context, drawing)
         elif isinstance(element, svgelements.Shape):
-            _add_shape(element, place, drawing, builder, budget)
+            _add_shape(element, context, drawing, builder, budget)
     return drawing
 
 
-def _walk(group: svgelements.Group, place: _Place) -> Iterator[tuple[Any, _Place]]:
+def _walk(group: svgelements.Group, context: _Context) -> Iterator[tuple[Any, _Context]]:
     for element in group:
-        here = place.inside(element)
+        nested = context.nested(element)
         if isinstance(element, svgelements.Group):
-            yield from _walk(element, here)
+            yield from _walk(element, nested)
         else:
-            yield element, here
+            yield element, nested
 
 
 def _is_hidden(element: Any) -> bool:
@@ -192,34 +263,34 @@ def _is_hidden(element: Any) -> bool:
     return str(values.get("display")) == "none" or str(values.get("visibility")) == "hidden"
 
 
-def _add_text(element: Any, place: _Place, drawing: Drawing) -> None:
+def _add_text(element: Any, context: _Context, drawing: Drawing) -> None:
     text = " ".join((element.text or "").split())[:200]
-    at = element.transform.point_in_matrix_space((element.x, element.y))
-    if text and np.isfinite([at.x, at.y]).all():
-        drawing.letterings.append(Lettering(text, (float(at.x), float(at.y)), place.layer))
+    point = element.transform.point_in_matrix_space((element.x, element.y))
+    if text and np.isfinite([point.x, point.y]).all():
+        drawing.letterings.append(Lettering(text, (float(point.x), float(point.y)), context.layer))
 
 
-def _add_shape(element: Any, place: _Place, drawing: Drawing, builder: ReportBuilder, budget: Budget) -> None:
-    name = _name_of(element, place)
+def _add_shape(element: Any, context: _Context, drawing: Drawing, builder: ReportBuilder, budget: Budget) -> None:
+    name = _name_of(element, context)
     fill: Any = element.fill
     is_filled = fill is not None and fill.value is not None and fill.opacity > 0.2
     is_dark = is_filled and _luminance_of(fill) < DARK
     width = element.stroke_width if element.stroke is not None and element.stroke.value is not None else 0.0
     shells: list[shapely.Polygon] = []
     for points, closed, curves in _outlines(svgelements.Path(element), budget):
-        swings = [swing_of(curve, place.layer) for curve in curves] if place.role in (None, "door") else []
+        swings = [fit_swing(curve, context.layer) for curve in curves] if context.role in (None, "door") else []
         leaves = [swing for swing in swings if swing is not None] if len(swings) <= 2 else []
         if leaves:
             drawing.swings += leaves
-            builder.use(place.layer, "swings of doors", len(leaves))
-        elif len(points) >= 4 and (closed or (place.role in ("room", "wall", "obstacle") and is_filled)):
+            builder.use(context.layer, "door swings", len(leaves))
+        elif len(points) >= 4 and (closed or (context.role in ("room", "wall", "obstacle") and is_filled)):
             shells += polygons_of(shapely.Polygon(points))
         elif len(points) >= 2 and shapely.LineString(points).length > 0.0:
-            drawing.strokes.append(Stroke(shapely.LineString(points), place.layer, place.role, float(width or 0.0)))
-            builder.use(place.layer, f"lines: {place.role or 'perhaps walls'}")
-    for shape in _with_holes(shells):
-        drawing.areas.append(Area(shape, place.layer, place.role, name, place.kind, is_dark))
-        builder.use(place.layer, f"areas: {place.role or 'perhaps rooms'}")
+            drawing.strokes.append(Stroke(shapely.LineString(points), context.layer, context.role, float(width or 0.0)))
+            builder.use(context.layer, f"lines: {context.role or 'possible walls'}")
+    for shape in even_odd_polygons(shells) if len(shells) > 1 else shells:
+        drawing.areas.append(Area(shape, context.layer, context.role, name, context.kind, is_dark))
+        builder.use(context.layer, f"areas: {context.role or 'possible rooms'}")
 
 
 def _luminance_of(colour: Any) -> float:
@@ -227,7 +298,7 @@ def _luminance_of(colour: Any) -> float:
 
 
 def _outlines(path: svgelements.Path, budget: Budget) -> Iterator[tuple[np.ndarray, bool, list[np.ndarray]]]:
-    """(points, whether closed, its curves: successive curved segments as one) of every subpath."""
+    """Yield the points of every subpath, whether it is closed, and its curves (runs of curved segments)."""
     for subpath in path.as_subpaths():
         segments = [s for s in svgelements.Path(subpath) if not isinstance(s, svgelements.Move)]
         closed = any(isinstance(segment, svgelements.Close) for segment in segments)
@@ -250,32 +321,22 @@ def _outlines(path: svgelements.Path, budget: Budget) -> Iterator[tuple[np.ndarr
         array = _array(points)
         if len(array) and np.isfinite(array).all():
             distinct = array[np.concatenate([[True], np.any(np.diff(array, axis=0) != 0.0, axis=1)])]
-            back = len(distinct) > 3 and bool(np.all(distinct[0] == distinct[-1]))
-            yield distinct, closed or back, [_array(curve) for curve in curves]
+            returns = len(distinct) > 3 and bool(np.all(distinct[0] == distinct[-1]))
+            yield distinct, closed or returns, [_array(curve) for curve in curves]
 
 
 def _array(points: list[complex]) -> np.ndarray:
     return np.array([[point.real, point.imag] for point in points]).reshape(-1, 2)
 
 
-def _with_holes(shells: list[shapely.Polygon]) -> list[shapely.Polygon]:
-    """A path of several outlines is filled between them."""
-    if len(shells) < 2:
-        return shells
-    shape: BaseGeometry = shapely.Polygon()
-    for shell in shells:
-        shape = shapely.symmetric_difference(shape, shell)
-    return polygons_of(shape)
-
-
-def _name_of(element: Any, place: _Place) -> str | None:
-    """The label or id of a room's shape; else what its class says beside "room"."""
+def _name_of(element: Any, context: _Context) -> str | None:
+    """Return the label or id of a room's shape, else the words of its class besides "room"."""
     own = element.values.get("attributes") or {}
     for key in (_LABEL, "data-name", "id"):
         text = str(own.get(key) or "").strip()
         if text and not _AUTOMATIC.fullmatch(text) and (key != "id" or role_of(text) is None):
             return text.replace("_", " ")
-    if place.role != "room" or place.kind is None:
+    if context.role != "room" or context.kind is None:
         return None
-    words = [word for word in re.findall(r"[^\W\d_]+", place.kind) if word.casefold() not in ("space", "room")]
+    words = [word for word in re.findall(r"[^\W\d_]+", context.kind) if word.casefold() not in ("space", "room")]
     return " ".join(words) or None

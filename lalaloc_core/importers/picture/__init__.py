@@ -1,10 +1,5 @@
-"""Plans from pictures: scans, photographs of drawings, screenshots. What comes of them is a draft.
+"""Plans from pictures: scans, photographs of drawings, and screenshots. The result is a draft.
 
-Begin with `sketching.py`: `ink.py` makes ink of grey, `masks.py` finds walls in it, `gaps.py` and `panes.py` doors and
-windows, and `plans.drawing.walls` what the walls enclose.
+Begin with `sketching.py`. `ink.py` separates ink from paper, `wall_mask.py` finds walls in it, and `gaps.py` and
+`windows.py` classify openings. `lalaloc_core.importers.drawing.walls` finds the rooms that the walls enclose.
 """
-
-from lalaloc_core.importers.picture.importing import import_picture
-from lalaloc_core.importers.picture.sketching import sketch_picture
-
-__all__ = ["import_picture", "sketch_picture"]

@@ -1,4 +1,4 @@
-"""What stands in a gap of a wall: the arc of a door, the lines of a window, or nothing."""
+"""Content of gaps in walls: the arc of a door, the lines of a window, or nothing."""
 
 from __future__ import annotations
 
@@ -12,23 +12,25 @@ from jaxtyping import Float
 
 from lalaloc_core.importers.drawing.walls import Gap
 from lalaloc_core.importers.picture.ink import COLOURLESS, Ink
-from lalaloc_core.importers.picture.masks import WallMask
+from lalaloc_core.importers.picture.wall_mask import WallMask
 
-# Shares of an arc, of a leaf, of a pane's line that must be inked; ink this near counts (pixels).
+# Smallest inked shares of an arc, a leaf and the line of a pane; ink counts up to this distance (pixels).
 _ARC, _ARC_WITH_LEAF, _LEAF, _LINE, _ONE_LINE = 0.8, 0.55, 0.8, 0.7, 0.9
 _NEAR_PX = 2
 _DOOR_M = (0.5, 2.4)
 _ARC_POINTS = 28
-# Of 255: how much darker than paper a line's pixels are, its mean is, and how far the paper rises between two lines.
+# Contrast of 255: of a line's pixels, of a line's mean, and of the paper between two lines.
 _FAINT, _DIP, _RISE = 22.0, 30.0, 12.0
 
 
 @dataclass(frozen=True)
 class GapContent:
-    """What was seen in a gap, and how sure that is (0 to 1).
+    """Content of a gap.
 
-    `swing`: the arc of a door; `pane`: two or more lines along the wall; `line`: a single one. `warmth` is that of
-    these lines, of 255: above 0 they are red or brown, below blue.
+    Attributes:
+        kind: "swing" for the arc of a door, "pane" for two or more lines along the wall, "line" for a single line.
+        confidence: 0 to 1.
+        warmth: warmth of the lines, of 255: positive for red or brown, negative for blue.
     """
 
     kind: Literal["swing", "pane", "line", "nothing"]
@@ -37,17 +39,17 @@ class GapContent:
 
 
 class GapReader:
-    """Looks into gaps of one picture."""
+    """Classifier of the gaps of one picture."""
 
     def __init__(self, ink: Ink, walls: WallMask) -> None:
         self._ink = ink
         reach = 2 * _NEAR_PX - 1
-        # Lines of a hatch would make an arc of any.
+        # Exclude walls, because a hatch would match any arc.
         lines = ink.lines & ~walls.mask
         self._near = cv2.dilate(lines.astype(np.uint8), np.ones((reach, reach), np.uint8)) > 0
 
-    def look(self, gap: Gap) -> GapContent:
-        """The most likely content of a gap."""
+    def classify(self, gap: Gap) -> GapContent:
+        """Return the most likely content of a gap."""
         arc = self._arc(gap) if _DOOR_M[0] <= gap.width <= _DOOR_M[1] else 0.0
         if arc >= _ARC:
             return GapContent("swing", arc)
@@ -59,7 +61,7 @@ class GapReader:
         return GapContent("nothing", 1.0 - max(arc, share if lines else 0.0))
 
     def _arc(self, gap: Gap) -> float:
-        """How much of the best quarter circle about an end of the gap is inked, one leaf or two."""
+        """Return the inked share of the best quarter circle about an end of the gap, with one leaf or two."""
         start, end = np.array(gap.start), np.array(gap.end)
         along = (end - start) / gap.width
         across = np.array([-along[1], along[0]])
@@ -69,7 +71,7 @@ class GapReader:
             for side in (1.0, -1.0):
                 hinges = [self._best_swing(start, along, side * across, half, gap.width / leaves)]
                 hinges.append(self._best_swing(end, -along, side * across, half, gap.width / leaves))
-                # Of two leaves, both must be seen.
+                # Both of two leaves must be visible.
                 best = max(best, max(hinges) if leaves == 1 else min(hinges))
         return best
 
@@ -96,9 +98,9 @@ class GapReader:
         return best
 
     def _lines(self, gap: Gap) -> tuple[int, float, float]:
-        """(lines that run from jamb to jamb within the wall, how much of the second best is inked, their warmth).
+        """Return the number of lines from jamb to jamb, the inked share of the second best line, and their warmth.
 
-        Along a pane's line the mean of many pixels stands out of the paper, be it as thin and faint as it may.
+        The mean of the pixels along a line reveals even thin and faint lines.
         """
         start, end = np.array(gap.start), np.array(gap.end)
         along = (end - start) / gap.width
@@ -109,15 +111,15 @@ class GapReader:
         reach = np.linspace(0.08, 0.92, max(8, math.ceil(gap.width / pixel)))
         points = start + (reach * gap.width)[None, :, None] * along + offsets[:, None, None] * across
         columns, rows = (self._ink.to_pixels(points.reshape(-1, 2)) - 0.5).astype(np.float32).T
-        place = columns.reshape(len(offsets), len(reach)), rows.reshape(len(offsets), len(reach))
-        values = cv2.remap(self._ink.gray, *place, cv2.INTER_LINEAR, borderValue=255)
+        maps = columns.reshape(len(offsets), len(reach)), rows.reshape(len(offsets), len(reach))
+        values = cv2.remap(self._ink.gray, *maps, cv2.INTER_LINEAR, borderValue=255)
         profile = values.mean(axis=1)
         shares = (values < 255.0 - _FAINT).mean(axis=1)
         found = [index for index in _dips(profile) if shares[index] >= _LINE]
         best = sorted((float(shares[index]) for index in found), reverse=True)
         warmth = 0.0
         if found and self._ink.warmth is not None:
-            colours = cv2.remap(self._ink.warmth, *place, cv2.INTER_LINEAR, borderValue=COLOURLESS)
+            colours = cv2.remap(self._ink.warmth, *maps, cv2.INTER_LINEAR, borderValue=COLOURLESS)
             warmth = float(colours[found].mean()) - COLOURLESS
         return len(best), best[1] if len(best) > 1 else (best[0] if best else 0.0), warmth
 
@@ -134,7 +136,7 @@ class GapReader:
 
 
 def _dips(profile: Float[np.ndarray, "n"]) -> list[int]:
-    """Where a profile has its minima: each below the paper, and apart from the next by a rise."""
+    """Return the indices of a profile's minima that are darker than paper and separated by a rise."""
     found: list[int] = []
     lowest = highest = 0
     falling = True

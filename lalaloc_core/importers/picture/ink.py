@@ -1,4 +1,4 @@
-"""From a grey picture to ink: even light, straight lines, black and white."""
+"""Separation of ink from paper: even lighting, straightening, and thresholding."""
 
 from __future__ import annotations
 
@@ -9,31 +9,32 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-# Lengths of what is looked at, in metres: finer pictures are made coarser, and light is evened out over so much.
+# Finer pictures are reduced to this resolution (m per pixel).
 FINEST_M = 0.01
-# Warmth of what has no colour.
+# Warmth of grey pixels.
 COLOURLESS = 128.0
+# Lighting is evened out over this length.
 _LIGHT_M = 1.2
 _MAX_SKEW_DEG = 10.0
 _SKEW_PIXELS = 700
-# Lines are thinner than this, and stand out by so much of 255, or so many times the noise.
+# Largest width of lines (m), and their smallest contrast: of 255, and as a multiple of the noise.
 _LINE_M, _FAINTEST, _OVER_NOISE = 0.07, 40.0, 8.0
-# Where Otsu's threshold may lie: pale floors are no ink, pencil is.
+# Range of Otsu's threshold: pencil is ink, pale floors are not.
 _THRESHOLD = (95.0, 205.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Ink:
-    """Black and white: True where something is drawn.
+    """Ink of a picture, straightened.
 
     Attributes:
-        mask: what is dark; rows from the top.
-        gray: what it was made of, lines straight and paper white.
-        warmth: 128 where there is no colour, more towards red, less towards blue; None of a picture in grey.
-        lines: what is dark, and every line that is darker than what is around it, however faint.
-        metres_per_pixel: of this mask, not of the picture it came from.
-        skew_deg: by how much the picture was turned (clockwise as seen) to make its lines straight.
-        size: rows and columns of the picture before it was turned, at this resolution.
+        gray: grey picture with white paper; rows from the top.
+        warmth: 128 without colour, higher towards red, lower towards blue; None for a grey picture.
+        mask: True at dark pixels.
+        lines: `mask`, and faint lines that are darker than their surroundings.
+        metres_per_pixel: length of a pixel of these arrays.
+        skew_deg: clockwise rotation that straightened the picture.
+        size: rows and columns of the picture before the rotation, at this resolution.
     """
 
     gray: UInt8[np.ndarray, "h w"]
@@ -45,14 +46,14 @@ class Ink:
     size: tuple[int, int]
 
     def to_plan(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Metres from pixel coordinates (column, row; of edges, not centres): y up, the centre stays in its place."""
+        """Convert pixel coordinates (column, row; of edges, not centres) to metres with y up."""
         rows, columns = self.mask.shape
         shift = np.array([0.5 * (columns - self.size[1]), 0.5 * (rows - self.size[0])])
         x, y = (np.asarray(points, dtype=float) - shift).T
         return np.column_stack([x, self.size[0] - y]) * self.metres_per_pixel
 
     def to_pixels(self, points_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Pixel coordinates (column, row) of places in the plan; the inverse of `to_plan`."""
+        """Convert plan coordinates (m) to pixel coordinates (column, row); the inverse of `to_plan`."""
         rows, columns = self.mask.shape
         shift = np.array([0.5 * (columns - self.size[1]), 0.5 * (rows - self.size[0])])
         x, y = (np.asarray(points_m, dtype=float) / self.metres_per_pixel).T
@@ -62,12 +63,12 @@ class Ink:
 def read_ink(
     gray: UInt8[np.ndarray, "h w"], metres_per_pixel: float, warmth: UInt8[np.ndarray, "h w"] | None = None
 ) -> Ink:
-    """Even out light, turn lines straight, and threshold.
+    """Even out the lighting, straighten the picture, and threshold it.
 
     Args:
-        gray: rows from the top, 255 is white.
-        metres_per_pixel: of this picture.
-        warmth: as of `Ink`.
+        gray: rows from the top; 255 is white.
+        metres_per_pixel: length of a pixel.
+        warmth: see `Ink`.
     """
     if metres_per_pixel < FINEST_M:
         factor = metres_per_pixel / FINEST_M
@@ -97,7 +98,7 @@ def read_ink(
 
 
 def _faint_lines(even: UInt8[np.ndarray, "h w"], metres_per_pixel: float) -> Bool[np.ndarray, "h w"]:
-    """Thin lines that are darker than what lies beside them by more than the noise of the paper."""
+    """Return thin lines that are darker than their surroundings by more than the noise of the paper."""
     soft = cv2.GaussianBlur(even, (0, 0), 0.6)
     noise = 1.48 * float(np.median(np.abs(soft.astype(np.int16) - cv2.medianBlur(soft, 5))))
     size = max(5, round(_LINE_M / metres_per_pixel) | 1)
@@ -106,7 +107,7 @@ def _faint_lines(even: UInt8[np.ndarray, "h w"], metres_per_pixel: float) -> Boo
 
 
 def _even_light(gray: UInt8[np.ndarray, "h w"], metres_per_pixel: float) -> UInt8[np.ndarray, "h w"]:
-    """The picture over the brightness of its paper: what is brightest around, smoothed."""
+    """Divide the picture by the brightness of its paper, the smoothed local maximum."""
     size = max(3, round(_LIGHT_M / metres_per_pixel)) | 1
     coarse = 8
     small = cv2.resize(gray, None, fx=1.0 / coarse, fy=1.0 / coarse, interpolation=cv2.INTER_AREA)
@@ -118,9 +119,9 @@ def _even_light(gray: UInt8[np.ndarray, "h w"], metres_per_pixel: float) -> UInt
 
 
 def find_skew(ink: Bool[np.ndarray, "h w"]) -> float:
-    """Degrees by which a drawing must be turned so that most of its lines run along rows and columns.
+    """Return the rotation (degrees) that aligns most lines of a drawing with rows and columns.
 
-    Rows and columns are then the most uneven: the angle of the largest energy of differences of their sums.
+    It maximises the energy of the differences between neighbouring row sums and column sums.
     """
     factor = min(1.0, _SKEW_PIXELS / max(ink.shape))
     small = cv2.resize(ink.astype(np.float32), None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
@@ -133,12 +134,12 @@ def find_skew(ink: Bool[np.ndarray, "h w"]) -> float:
     for step, reach in ((1.0, _MAX_SKEW_DEG), (0.25, 1.0), (0.05, 0.25)):
         candidates = best + np.arange(-reach, reach + 0.5 * step, step)
         best = float(max(candidates, key=lambda degrees: energy(float(degrees))))
-    # Less than that is not seen, and a straight drawing stays as sharp as it is.
+    # Skip small rotations, because resampling blurs a straight drawing.
     return best if abs(best) >= 0.15 and energy(best) > 1.02 * energy(0.0) else 0.0
 
 
 def _turned(picture: np.ndarray, degrees: float, fill: float = 255.0) -> np.ndarray:
-    """The picture turned about its centre, on a canvas that holds all of it."""
+    """Rotate the picture about its centre, on a canvas that holds all of it."""
     rows, columns = picture.shape
     angle = math.radians(abs(degrees))
     wide = math.ceil(columns * math.cos(angle) + rows * math.sin(angle))

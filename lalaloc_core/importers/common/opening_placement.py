@@ -1,6 +1,7 @@
-"""Openings as drawings have them (across a wall, along one of its faces) put where a plan has them: along the wall.
+"""Placement of openings on walls.
 
-An opening between two rooms comes to lie midway between their walls, one in an outer wall on the wall's inner face.
+Drawings show openings across a wall or along one of its faces. A plan has them along the wall: midway between the walls
+of two rooms, or on the inner face of an outer wall.
 """
 
 from __future__ import annotations
@@ -13,10 +14,10 @@ import numpy as np
 import shapely
 from jaxtyping import Float
 
-from lalaloc_core.importers.model.geometry import cross
-from lalaloc_core.importers.model.sketch import SketchedOpening
+from lalaloc_core.importers.common.geometry import cross, point_xy
+from lalaloc_core.importers.common.sketch import SketchedOpening
 
-# Of what lies beside an opening: walls are thinner, drawn lines are straighter, and a jamb is no opening.
+# Limits of wall thickness (m), of the sine between opening and wall, and of the length of an opening (m).
 MAX_WALL_THICKNESS_M = 0.7
 _STRAIGHT = math.sin(math.radians(12.0))
 _MIN_LENGTH_M = 0.25
@@ -24,35 +25,41 @@ _KIND_RANK = {"door": 0, "window": 1, "passage": 2}
 
 
 @dataclass(frozen=True)
-class SettledOpenings:
-    """Openings on walls, and those that lie on none."""
+class PlacedOpenings:
+    """Result of the placement.
+
+    Attributes:
+        openings: openings on walls.
+        off_wall: openings that lie on no wall.
+        overlapping: number of openings left out because another takes their place.
+    """
 
     openings: list[SketchedOpening]
     off_wall: list[SketchedOpening]
-    merged: int
+    overlapping: int
 
 
-def settle_openings(openings: Sequence[SketchedOpening], rooms: Sequence[shapely.Polygon]) -> SettledOpenings:
-    """Put every opening on the walls beside it.
+def place_openings(openings: Sequence[SketchedOpening], rooms: Sequence[shapely.Polygon]) -> PlacedOpenings:
+    """Move every opening onto the walls beside it.
 
-    Of two openings that overlap in a wall, the door stays before the window, and the window before the passage.
+    If two openings overlap in a wall, a door is kept before a window and a window before a passage.
     """
     edges = _edges(rooms)
     tree = shapely.STRtree([_segment(edge) for edge in edges])
     kept: list[SketchedOpening] = []
-    off_wall, merged = [], 0
-    for opening in sorted(openings, key=lambda each: (_KIND_RANK[each.kind], -each.line.length)):
+    off_wall, overlapping = [], 0
+    for opening in sorted(openings, key=lambda opening: (_KIND_RANK[opening.kind], -opening.line.length)):
         placed = _place(opening, edges, tree)
         if placed is None:
             off_wall.append(opening)
             continue
-        free = _beside(placed, kept)
+        free = _free_part(placed, kept)
         if free is None:
-            merged += 1
-            _stack(placed, kept)
+            overlapping += 1
+            _stack_window(placed, kept)
         else:
             kept.append(free)
-    return SettledOpenings(kept, off_wall, merged)
+    return PlacedOpenings(kept, off_wall, overlapping)
 
 
 def _edges(rooms: Sequence[shapely.Polygon]) -> Float[np.ndarray, "n 4"]:
@@ -67,7 +74,7 @@ def _segment(edge: Float[np.ndarray, "4"]) -> shapely.LineString:
 
 
 def _place(opening: SketchedOpening, edges: Float[np.ndarray, "n 4"], tree: shapely.STRtree) -> SketchedOpening | None:
-    """The opening on the line of its wall, None where no wall runs along it."""
+    """Return the opening on the line of its wall, None if no wall runs along it."""
     start, end = np.array(opening.start), np.array(opening.end)
     length = float(np.linalg.norm(end - start))
     if length < 1e-6:
@@ -87,23 +94,23 @@ def _place(opening: SketchedOpening, edges: Float[np.ndarray, "n 4"], tree: shap
             continue
         offset = cross(along, 0.5 * (first + second) - start)
         if abs(offset) <= MAX_WALL_THICKNESS_M:
-            # The room lies to the left of its edges.
+            # Rings are counter-clockwise: the room lies to the left of its edges.
             side = 1.0 if direction @ along > 0.0 else -1.0
             beside.append((offset, side))
     shift = _offset_of_wall(beside)
     if shift is None:
         return None
     normal = np.array([-along[1], along[0]])
-    return replace(opening, start=_point(start + shift * normal), end=_point(end + shift * normal))
+    return replace(opening, start=point_xy(start + shift * normal), end=point_xy(end + shift * normal))
 
 
 def _offset_of_wall(beside: list[tuple[float, float]]) -> float | None:
-    """Where between the walls beside it an opening belongs, as an offset to the left of it."""
+    """Return the offset (m, to the left) from an opening to the middle of its wall."""
     if not beside:
         return None
     left = [offset for offset, side in beside if side > 0.0]
     right = [offset for offset, side in beside if side < 0.0]
-    # The wall lies between a room to its right and one to its left, the nearest pair of them.
+    # The wall lies between the nearest pair of a room to its right and a room to its left.
     pairs = [(a, b) for a in left for b in right if -1e-6 <= a - b <= MAX_WALL_THICKNESS_M]
     if pairs:
         a, b = min(pairs, key=lambda pair: abs(pair[0] + pair[1]))
@@ -111,14 +118,14 @@ def _offset_of_wall(beside: list[tuple[float, float]]) -> float | None:
     return min((offset for offset, _ in beside), key=abs)
 
 
-def _beside(opening: SketchedOpening, kept: Sequence[SketchedOpening]) -> SketchedOpening | None:
-    """The part of an opening that no other takes already, None where too little is left."""
+def _free_part(opening: SketchedOpening, kept: Sequence[SketchedOpening]) -> SketchedOpening | None:
+    """Return the longest part of an opening that overlaps no kept opening, None if too little is left."""
     start, end = np.array(opening.start), np.array(opening.end)
     length = float(np.linalg.norm(end - start))
     along = (end - start) / length
     free = [(0.0, length)]
-    for other in kept:
-        a, b = np.array(other.start) - start, np.array(other.end) - start
+    for taken in kept:
+        a, b = np.array(taken.start) - start, np.array(taken.end) - start
         apart = max(abs(cross(along, a)), abs(cross(along, b)))
         if apart > 0.5 * MAX_WALL_THICKNESS_M:
             continue
@@ -128,20 +135,16 @@ def _beside(opening: SketchedOpening, kept: Sequence[SketchedOpening]) -> Sketch
     if longest[1] - longest[0] < max(_MIN_LENGTH_M, 0.5 * length):
         return None
     low, high = longest
-    return replace(opening, start=_point(start + low * along), end=_point(start + high * along))
+    return replace(opening, start=point_xy(start + low * along), end=point_xy(start + high * along))
 
 
-def _stack(opening: SketchedOpening, kept: list[SketchedOpening]) -> None:
-    """Windows above each other are one, from the lowest sill to the highest head."""
+def _stack_window(opening: SketchedOpening, kept: list[SketchedOpening]) -> None:
+    """Merge a window with the window below or above it, from the lowest sill to the highest head."""
     if opening.kind != "window" or opening.head_m is None:
         return
     near = opening.line.buffer(0.5 * MAX_WALL_THICKNESS_M, cap_style="flat")
-    for index, other in enumerate(kept):
-        if other.kind != "window" or other.head_m is None or near.intersection(other.line).length < _MIN_LENGTH_M:
+    for index, window in enumerate(kept):
+        if window.kind != "window" or window.head_m is None or near.intersection(window.line).length < _MIN_LENGTH_M:
             continue
-        sills = [each.sill_m or 0.0 for each in (opening, other)]
-        kept[index] = replace(other, sill_m=min(sills), head_m=max(opening.head_m, other.head_m))
-
-
-def _point(point_m: Float[np.ndarray, "2"]) -> tuple[float, float]:
-    return float(point_m[0]), float(point_m[1])
+        sill_m = min(opening.sill_m or 0.0, window.sill_m or 0.0)
+        kept[index] = replace(window, sill_m=sill_m, head_m=max(opening.head_m, window.head_m))

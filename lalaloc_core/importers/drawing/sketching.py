@@ -1,7 +1,7 @@
-"""From a drawing to rooms and openings.
+"""Conversion of a drawing to rooms and openings.
 
-Rooms are the areas that are named so. Where none is, they are what the walls enclose; and where nothing says what is
-wall, what all lines enclose.
+Rooms are the areas on layers named after rooms. Without them, they are the areas that walls enclose; if no layer names
+walls, the areas that all lines enclose.
 """
 
 from __future__ import annotations
@@ -16,36 +16,38 @@ import shapely
 from shapely.geometry.base import BaseGeometry
 
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.importers.common.geometry import opening_line
+from lalaloc_core.importers.common.limits import Budget
+from lalaloc_core.importers.common.report import ReportBuilder
+from lalaloc_core.importers.common.sketch import OpeningKind, Sketch, SketchedOpening, SketchedRoom
+from lalaloc_core.importers.common.vocabulary import type_of_room
 from lalaloc_core.importers.drawing.shapes import Area, Drawing, Lettering, Swing
 from lalaloc_core.importers.drawing.walls import DEFAULT_WALLS, Enclosed, Gap, WallConfig, enclose
-from lalaloc_core.importers.model.geometry import opening_line
-from lalaloc_core.importers.model.limits import Budget
-from lalaloc_core.importers.model.report import ReportBuilder
-from lalaloc_core.importers.model.sketch import OpeningKind, Sketch, SketchedOpening, SketchedRoom
-from lalaloc_core.importers.model.words import type_of_room
 
 _MIN_ROOM_M2 = 0.6
-# Leaves of doors; a swing of another size is a corner of a bathtub.
+# Width of door leaves; other arcs are furniture, such as the corner of a bathtub.
 _LEAF_M = (0.45, 1.6)
-# Parts of one symbol (leaf, frame, panes) lie this near to each other.
+# Largest distance between parts of one symbol (leaf, frame, panes).
 _SYMBOL_M = 0.12
 _OPENING_M = (0.3, 8.0)
-# A hinge lies this near to an end of its gap, and a leaf is that much of the gap's width.
+# Largest distance of a hinge from an end of its gap, and width of a leaf as a share of the gap.
 _HINGE_M, _LEAF_OF_GAP = 0.4, (0.7, 1.35)
-# Sizes that stand behind a room's name.
+# Area written after a room's name.
 _SIZE = re.compile(r"\(?\d+(?:[.,]\d+)?\s*(?:m²|m2|qm|sqm|sq\.? ?ft|sf)(?![a-z])\)?", re.IGNORECASE)
-# Pens as thick as this draw walls.
+# Width of pens that draw walls.
 _THICK_M = (0.05, 0.6)
-# Lines of walls this near to a room's outline are its own.
+# Lines of walls nearer to a room's outline are its own walls.
 _OFF_WALL_M = 0.03
 _MAX_SEGMENTS = 60_000
 
 
-def understand(drawing: Drawing, builder: ReportBuilder, budget: Budget, config: WallConfig = DEFAULT_WALLS) -> Sketch:
-    """Make a sketch of a drawing in metres, y up.
+def sketch_drawing(
+    drawing: Drawing, builder: ReportBuilder, budget: Budget, config: WallConfig = DEFAULT_WALLS
+) -> Sketch:
+    """Find the rooms and openings of a drawing in metres, y up.
 
     Raises:
-        InvalidFloorPlanError: too many lines to look for rooms between them.
+        InvalidFloorPlanError: the drawing has too many lines that could be walls, or the time is over.
     """
     sketch = Sketch()
     rooms = [area for area in drawing.areas if area.role == "room"]
@@ -54,12 +56,14 @@ def understand(drawing: Drawing, builder: ReportBuilder, budget: Budget, config:
     if rooms:
         shapes = _without_containers(rooms, builder)
         sketch.inner_walls = _free_standing(drawing, shapes)
-        builder.notes.append("rooms are the areas that the file names so")
+        builder.notes.append("rooms are the areas that the file marks as rooms")
     else:
-        enclosed, what = _enclosed(drawing, budget, config)
+        enclosed, source = _enclosed(drawing, budget, config)
         gaps = enclosed.gaps
         shapes = [Area(shape, "", "room") for shape in enclosed.rooms]
-        builder.notes.append(f"rooms are what {what} enclose; gaps up to {config.widest_gap:g} m were closed")
+        builder.notes.append(
+            f"rooms are the areas enclosed by {source}; gaps up to {config.widest_gap:g} m were closed"
+        )
     sketch.rooms = named_rooms(shapes, drawing.letterings, builder)
     sketch.openings = [*_symbols(drawing), *_swings(drawing.swings, gaps, shapes)]
     taken = shapely.union_all([opening.line.buffer(0.3) for opening in sketch.openings])
@@ -69,14 +73,14 @@ def understand(drawing: Drawing, builder: ReportBuilder, budget: Budget, config:
             sketch.openings.append(SketchedOpening("passage", gap.start, gap.end))
             builder.unsure.append(
                 f"the gap of {gap.width:.2f} m at ({gap.start[0]:.2f}, {gap.start[1]:.2f}) has no symbol of a door or "
-                "window; it was taken for a passage"
+                "window; it is taken for a passage"
             )
     budget.check_time()
     return sketch
 
 
 def _free_standing(drawing: Drawing, rooms: Sequence[Area]) -> list[shapely.LineString]:
-    """Lines of walls that run through the inside of a room, away from its own walls."""
+    """Return the lines of walls inside a room, away from its own walls."""
     inner = [room.shape.buffer(-_OFF_WALL_M) for room in rooms]
     tree = shapely.STRtree(inner)
     pieces = _pieces(stroke.line for stroke in drawing.strokes if stroke.role == "wall")
@@ -84,7 +88,7 @@ def _free_standing(drawing: Drawing, rooms: Sequence[Area]) -> list[shapely.Line
 
 
 def _without_containers(rooms: Sequence[Area], builder: ReportBuilder) -> list[Area]:
-    """Rooms without the outlines of flats and storeys around them, and each shape once."""
+    """Drop duplicates and the outlines of flats and storeys around several rooms."""
     tree = shapely.STRtree([room.shape for room in rooms])
     kept = []
     for index, room in enumerate(rooms):
@@ -94,7 +98,7 @@ def _without_containers(rooms: Sequence[Area], builder: ReportBuilder) -> list[A
             continue
         smaller = [rooms[k].shape for k in inside if k not in same]
         if sum(shape.area for shape in smaller) > 0.5 * room.shape.area:
-            builder.notes.append(f"an outline of {room.shape.area:.1f} m² around {len(smaller)} rooms is no room")
+            builder.notes.append(f"an outline of {room.shape.area:.1f} m² around {len(smaller)} rooms was ignored")
             continue
         kept.append(room)
     return kept
@@ -105,7 +109,7 @@ def _covers(outer: shapely.Polygon, inner: shapely.Polygon) -> bool:
 
 
 def _enclosed(drawing: Drawing, budget: Budget, config: WallConfig) -> tuple[Enclosed, str]:
-    """(what walls enclose, what was taken for walls)."""
+    """Return the enclosed areas, and a description of what was taken for walls."""
     named_bodies = [area.shape for area in drawing.areas if area.role == "wall"]
     named_lines = [stroke.line for stroke in drawing.strokes if stroke.role == "wall"]
     closers = _closers(drawing)
@@ -125,7 +129,7 @@ def _enclosed(drawing: Drawing, budget: Budget, config: WallConfig) -> tuple[Enc
 
 
 def _is_outline(shape: shapely.Polygon, config: WallConfig) -> bool:
-    """Closed polylines of walls are their bodies, or run along the faces of a whole room."""
+    """Return whether a closed wall polyline runs along the faces of a room, and is not the body of a wall."""
     return not shape.buffer(-0.5 * config.thickest).is_empty
 
 
@@ -136,13 +140,13 @@ def _pieces(lines: Iterable[BaseGeometry]) -> list[shapely.LineString]:
         pieces += [shapely.LineString(pair) for pair in pairwise(points) if (pair[0] != pair[1]).any()]
     if len(pieces) > _MAX_SEGMENTS:
         raise InvalidFloorPlanError(
-            f"{len(pieces)} lines could be walls, at most {_MAX_SEGMENTS} are looked at; name the layers of the walls"
+            f"{len(pieces)} lines could be walls; the limit is {_MAX_SEGMENTS}; set layers to the layers of the walls"
         )
     return pieces
 
 
 def _closers(drawing: Drawing) -> list[BaseGeometry]:
-    """Doors and windows that are drawn as areas across their wall, or lines in it."""
+    """Return doors and windows drawn as areas across their wall, or as lines in it."""
     areas = [area.shape for area in drawing.areas if area.role in ("door", "window", "passage")]
     panes = [stroke.line for stroke in drawing.strokes if stroke.role == "window"]
     hulls = [shapely.convex_hull(cluster) for cluster in clusters(panes, _SYMBOL_M)]
@@ -160,11 +164,11 @@ def _sides(shape: BaseGeometry) -> tuple[float, float]:
 
 
 def named_rooms(shapes: Sequence[Area], letterings: Sequence[Lettering], builder: ReportBuilder) -> list[SketchedRoom]:
-    """Rooms with the lettering that stands in them as their names: the first that has letters and is no size."""
+    """Name rooms by the first text inside that is a name, preferably a known room type."""
     tree = shapely.STRtree([area.shape for area in shapes])
     texts: dict[int, list[str]] = {}
     for lettering in letterings:
-        inside = tree.query(shapely.Point(lettering.at), predicate="within")
+        inside = tree.query(shapely.Point(lettering.position), predicate="within")
         if len(inside):
             smallest = min(inside, key=lambda index: shapes[index].shape.area)
             texts.setdefault(int(smallest), []).append(lettering.text)
@@ -174,9 +178,9 @@ def named_rooms(shapes: Sequence[Area], letterings: Sequence[Lettering], builder
         known = [text for text in words if type_of_room(text) is not None]
         name = area.name or next(iter(known or words), None)
         rooms.append(SketchedRoom(area.shape, name, type_of_room(area.kind) or type_of_room(name)))
-    without = sum(room.name is None for room in rooms)
-    if without:
-        builder.notes.append(f"{without} rooms have no name in the file")
+    unnamed = sum(room.name is None for room in rooms)
+    if unnamed:
+        builder.notes.append(f"{unnamed} rooms have no name in the file")
     return rooms
 
 
@@ -185,14 +189,14 @@ def _without_size(text: str) -> str:
 
 
 def _is_name(text: str) -> bool:
-    """Neither a size ("12.5 m²", "3,20 x 4,10") nor a number of a door."""
+    """Return whether a text is neither a size ("12.5 m²", "3,20 x 4,10") nor a door number."""
     letters = sum(character.isalpha() for character in text)
     digits = sum(character.isdigit() for character in text)
     return letters >= 2 and letters > digits
 
 
 def _symbols(drawing: Drawing) -> list[SketchedOpening]:
-    """Openings that are named so: each cluster of shapes that touch is one."""
+    """Return the openings on layers named after them, one per cluster of shapes."""
     found = []
     for kind in ("door", "window", "passage"):
         shapes: list[BaseGeometry] = [area.shape for area in drawing.areas if area.role == kind]
@@ -201,13 +205,13 @@ def _symbols(drawing: Drawing) -> list[SketchedOpening]:
         shapes += [stroke.line for stroke in drawing.strokes if stroke.role == kind]
         for cluster in clusters(shapes, _SYMBOL_M):
             if hinges is not None and shapely.distance(cluster, hinges) < _SYMBOL_M:
-                continue  # The swing says more exactly where the door is.
+                continue  # The swing locates the door more precisely.
             found += _opening_of(kind, cluster)
     return found
 
 
 def clusters(shapes: Sequence[BaseGeometry], reach_m: float) -> list[BaseGeometry]:
-    """Shapes that lie near each other, as one geometry each."""
+    """Group shapes that are near each other into one geometry each."""
     if not shapes:
         return []
     around = shapely.unary_union([shape.buffer(0.5 * reach_m, quad_segs=2) for shape in shapes])
@@ -215,14 +219,14 @@ def clusters(shapes: Sequence[BaseGeometry], reach_m: float) -> list[BaseGeometr
     tree = shapely.STRtree(regions)
     members: dict[int, list[BaseGeometry]] = {}
     for shape in shapes:
-        at = tree.query(shape, predicate="intersects")
-        if len(at):
-            members.setdefault(int(at[0]), []).append(shape)
+        indices = tree.query(shape, predicate="intersects")
+        if len(indices):
+            members.setdefault(int(indices[0]), []).append(shape)
     return [shapely.GeometryCollection(group) for group in members.values()]
 
 
 def _opening_of(kind: OpeningKind, cluster: BaseGeometry) -> list[SketchedOpening]:
-    # A frame or threshold across the wall says more than the hull around it and the leaf.
+    # A frame or threshold across the wall is more precise than the hull of frame and leaf.
     frames = [part for part in shapely.get_parts(cluster) if part.area > 0.0 and _is_frame(part)]
     ends = opening_line(max(frames, key=lambda part: part.area) if frames else shapely.convex_hull(cluster))
     if ends is None or not _OPENING_M[0] <= math.dist(*ends) <= _OPENING_M[1]:
@@ -236,7 +240,7 @@ def _is_frame(part: BaseGeometry) -> bool:
 
 
 def _swings(swings: Sequence[Swing], gaps: Sequence[Gap], rooms: Sequence[Area]) -> list[SketchedOpening]:
-    """Doors from the quarter circles of leaves: the gap that a leaf closes, else the leaf where it lies in a wall."""
+    """Return doors from their swings: the gap that a leaf closes, else the leaf in its closed position."""
     walls = shapely.union_all([area.shape.exterior for area in rooms]) if rooms else shapely.LineString()
     found: list[SketchedOpening] = []
     closed: set[int] = set()
@@ -249,30 +253,30 @@ def _swings(swings: Sequence[Swing], gaps: Sequence[Gap], rooms: Sequence[Area])
                 closed.add(index)
                 found.append(SketchedOpening("door", gaps[index].start, gaps[index].end))
         elif not walls.is_empty:
-            found.append(_shut(swing, walls))
+            found.append(_closed_leaf(swing, walls))
     return found
 
 
 def _gap_of(swing: Swing, gaps: Sequence[Gap]) -> int | None:
-    """The gap that a leaf closes, one of two leaves included."""
+    """Return the index of the gap that a leaf closes, alone or as one of two leaves."""
     best: tuple[float, int] | None = None
     for index, gap in enumerate(gaps):
         for near, far in ((gap.start, gap.end), (gap.end, gap.start)):
-            away = math.dist(swing.hinge, near)
+            distance = math.dist(swing.hinge, near)
             shares = [leaves * swing.radius / max(gap.width, 1e-6) for leaves in (1, 2)]
             fits = any(_LEAF_OF_GAP[0] <= share <= _LEAF_OF_GAP[1] for share in shares)
-            towards = min(math.dist(swing.first, far), math.dist(swing.last, far))
-            if away <= _HINGE_M and fits and towards <= gap.width and (best is None or away < best[0]):
-                best = (away, index)
+            tip_distance = min(math.dist(swing.first, far), math.dist(swing.last, far))
+            if distance <= _HINGE_M and fits and tip_distance <= gap.width and (best is None or distance < best[0]):
+                best = (distance, index)
     return None if best is None else best[1]
 
 
-def _shut(swing: Swing, walls: BaseGeometry) -> SketchedOpening:
-    """The leaf in the position where it lies along a wall."""
+def _closed_leaf(swing: Swing, walls: BaseGeometry) -> SketchedOpening:
+    """Return the leaf in the position that lies along a wall."""
 
-    def off(tip: tuple[float, float]) -> float:
+    def distance_to_wall(tip: tuple[float, float]) -> float:
         line = shapely.LineString([swing.hinge, tip])
         return max(shapely.distance(walls, line.interpolate(share, normalized=True)) for share in (0.2, 0.5, 0.9))
 
-    tip = min((swing.first, swing.last), key=off)
+    tip = min((swing.first, swing.last), key=distance_to_wall)
     return SketchedOpening("door", swing.hinge, tip)

@@ -1,4 +1,4 @@
-"""From a sketch to a plan in the native format."""
+"""Conversion of a sketch to a plan in the native format."""
 
 from __future__ import annotations
 
@@ -15,35 +15,35 @@ from shapely.geometry.base import BaseGeometry
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_LIMITS, FloorPlan, PlanLimits, anchor_document
 from lalaloc_core.floorplan.earth import Anchor
-from lalaloc_core.importers.model.checks import check_document
-from lalaloc_core.importers.model.geometry import polygons_of
-from lalaloc_core.importers.model.options import ImportOptions
-from lalaloc_core.importers.model.report import ImportReport, ReportBuilder
-from lalaloc_core.importers.model.settle import settle_openings
-from lalaloc_core.importers.model.sketch import Level, Sketch, SketchedOpening, SketchedRoom
-from lalaloc_core.importers.model.words import type_of_room
+from lalaloc_core.importers.common.checks import check_document
+from lalaloc_core.importers.common.geometry import polygons_of
+from lalaloc_core.importers.common.opening_placement import place_openings
+from lalaloc_core.importers.common.options import ImportOptions
+from lalaloc_core.importers.common.report import ImportReport, ReportBuilder
+from lalaloc_core.importers.common.sketch import Level, Sketch, SketchedOpening, SketchedRoom
+from lalaloc_core.importers.common.vocabulary import type_of_room
 
 DEFAULT_CEILING_HEIGHT_M = 2.5
-# Rounding of a drawing: vertices this far off a straight wall are not corners, slivers this small are no floor.
+# Rounding in drawings: vertices this near to a straight wall (m) and slivers this small (m²) are dropped.
 _STRAIGHT_M, _SLIVER_M2 = 0.002, 0.01
 _FAR_M = 10_000.0
-# As far from an anchor directions and lengths are right to a few centimetres.
+# Up to this distance from an anchor, lengths and directions are accurate to a few centimetres.
 _MAX_ANCHOR_SHIFT_M = 20_000.0
-# A tenth of a millimetre is finer than anything that is built.
+# Resolution of coordinates: a tenth of a millimetre.
 _GRID_M, _DECIMALS = 1e-4, 4
 _MAX_NAMED = 5
 
 
 @dataclass(frozen=True, eq=False)
 class ImportedPlan:
-    """One storey of a file, understood.
+    """Plan of one storey of a file.
 
     Attributes:
-        document: the plan in the native format.
-        report: what was used for what, and what is likely wrong.
-        level: the storey, where the file says.
-        anchor: where on Earth the plan's origin lies, where the file says.
-        checked: the plan, and the limits that it was validated under.
+        document: plan in the native format.
+        report: use of the layers, and likely mistakes.
+        level: storey, if the file gives it.
+        anchor: place of the plan's origin on Earth, if the file gives it.
+        checked: limits and plan of an earlier validation.
     """
 
     document: dict[str, Any]
@@ -53,10 +53,10 @@ class ImportedPlan:
     checked: tuple[PlanLimits, FloorPlan] | None = field(default=None, repr=False)
 
     def plan(self, limits: PlanLimits = DEFAULT_LIMITS) -> FloorPlan:
-        """The validated plan.
+        """Return the validated plan.
 
         Raises:
-            InvalidFloorPlanError: the document breaks a rule of plans.
+            InvalidFloorPlanError: the plan is invalid or exceeds the limits.
         """
         if self.checked is not None and self.checked[0] == limits:
             return self.checked[1]
@@ -73,46 +73,48 @@ def assemble(
     scale_source: str,
     is_draft: bool = False,
 ) -> ImportedPlan:
-    """Make a plan of a sketch in metres, y up.
+    """Make a plan from a sketch in metres, y up.
 
     Raises:
-        InvalidFloorPlanError: no rooms, or a plan that breaks the format's rules.
+        InvalidFloorPlanError: the sketch has no rooms, or the plan is invalid.
     """
-    rooms = [room for each in sketch.rooms for room in _clean(each, sketch.obstacles, builder)]
+    rooms = [room for drawn in sketch.rooms for room in _clean(drawn, sketch.obstacles, builder)]
     if not rooms:
-        raise InvalidFloorPlanError(f"no room was found in the {format} file; {_what_was_there(builder)}")
-    rooms, moved = _near_origin(rooms, builder)
-    openings = [_moved(opening, moved) for opening in sketch.openings]
-    settled = settle_openings(openings, [room.shape for room in rooms])
-    if settled.off_wall:
-        places = ", ".join(f"({o.start[0]:.2f}, {o.start[1]:.2f})" for o in settled.off_wall[:_MAX_NAMED])
-        builder.warnings.append(
-            f"{len(settled.off_wall)} openings lie on no wall and were left out, such as at {places}"
+        raise InvalidFloorPlanError(
+            f"no room was found in the {format} file, which has {_contents(builder)}; check layers, level and the scale"
         )
-    if settled.merged:
-        builder.notes.append(f"{settled.merged} openings that overlap others were left out")
+    rooms, shift = _near_origin(rooms, builder)
+    openings = [_shifted(opening, shift) for opening in sketch.openings]
+    placed = place_openings(openings, [room.shape for room in rooms])
+    if placed.off_wall:
+        places = ", ".join(f"({o.start[0]:.2f}, {o.start[1]:.2f})" for o in placed.off_wall[:_MAX_NAMED])
+        builder.warnings.append(
+            f"{len(placed.off_wall)} openings lie on no wall and were left out, for example at {places}"
+        )
+    if placed.overlapping:
+        builder.notes.append(f"{placed.overlapping} openings that overlap other openings were left out")
     document: dict[str, Any] = {"name": options.name or clean_name(sketch.name) or "floor plan"}
     if sketch.north_deg is not None:
         document["north_deg"] = round(sketch.north_deg % 360.0, 6)
-    anchor = _anchor_moved(sketch.anchor, moved, builder)
+    anchor = _shifted_anchor(sketch.anchor, shift, builder)
     if anchor is not None:
         document["north_deg"] = round(anchor.north_deg % 360.0, 6)
         document["anchor"] = anchor_document(anchor)
     document["ceiling_height_m"] = _usual_ceiling(rooms, options, builder)
-    document["rooms"] = [_room(room, document["ceiling_height_m"], sketch, moved) for room in rooms]
-    if settled.openings:
-        document["openings"] = [_opening(opening) for opening in settled.openings]
+    document["rooms"] = [_room(room, document["ceiling_height_m"], sketch, shift) for room in rooms]
+    if placed.openings:
+        document["openings"] = [_opening(opening) for opening in placed.openings]
     if sketch.opening_kinds is not None:
         document["opening_kinds"] = list(sketch.opening_kinds)
     builder.warnings.extend(check_document(document))
-    # Refused here, with what the file says, rather than at whoever uses the plan.
+    # Validate now, while the error can still refer to the file.
     checked = (DEFAULT_LIMITS, FloorPlan.from_dict(document))
     report = builder.build(format, metres_per_unit, scale_source, is_draft=is_draft)
     return ImportedPlan(document, report, sketch.level, anchor, checked)
 
 
 def clean_name(name: str | None, limit: int = DEFAULT_LIMITS.max_name_length) -> str | None:
-    """A name without control characters, at most as long as the format allows; None where nothing is left."""
+    """Return a name without control characters, cut to `limit`; None if nothing is left."""
     if name is None:
         return None
     spaced = "".join(" " if unicodedata.category(c) in {"Cc", "Cs", "Zl", "Zp"} else c for c in name)
@@ -130,10 +132,13 @@ def _clean(room: SketchedRoom, obstacles: list[shapely.Polygon], builder: Report
     if not floors and room.shape.area < _SLIVER_M2:
         return []
     if not floors:
-        builder.notes.append(f"{label} of {room.shape.area:.2g} m² was left out: too small for a room")
+        builder.notes.append(
+            f"{label} of {room.shape.area:.2g} m² was left out: the smallest room is "
+            f"{DEFAULT_LIMITS.min_room_area_m2:g} m²"
+        )
         return []
     if len(floors) > 1:
-        builder.warnings.append(f"{label} falls into {len(floors)} parts; each became a room")
+        builder.warnings.append(f"{label} has {len(floors)} separate parts; each became a room")
     cleaned = []
     for floor in floors:
         holes = [ring for ring in floor.interiors if shapely.Polygon(ring).area >= _SLIVER_M2]
@@ -145,7 +150,7 @@ def _clean(room: SketchedRoom, obstacles: list[shapely.Polygon], builder: Report
 
 
 def _simple(floor: BaseGeometry) -> list[shapely.Polygon]:
-    """Polygons whose outlines touch themselves nowhere, on the grid that coordinates are written on."""
+    """Return polygons with rounded coordinates whose outlines do not touch themselves."""
     found = []
     for part in polygons_of(shapely.transform(floor, lambda points: points.round(_DECIMALS))):
         if shapely.Polygon(part.exterior).is_valid:
@@ -157,29 +162,32 @@ def _simple(floor: BaseGeometry) -> list[shapely.Polygon]:
 
 
 def _near_origin(rooms: list[SketchedRoom], builder: ReportBuilder) -> tuple[list[SketchedRoom], tuple[float, float]]:
-    """Plans far from their origin (national grids) are moved to it; how far, says the report."""
+    """Move a plan in coordinates of a national grid to the origin; return the rooms and the shift."""
     x0, y0, x1, y1 = shapely.total_bounds([room.shape for room in rooms])
     if max(abs(x0), abs(y0), abs(x1), abs(y1)) <= _FAR_M:
         return rooms, (0.0, 0.0)
     dx, dy = -math.floor(x0), -math.floor(y0)
-    builder.notes.append(f"the plan was moved by ({dx}, {dy}) m, so that it lies near its origin")
+    builder.notes.append(f"the plan was moved by ({dx}, {dy}) m to lie near its origin")
     moved = [SketchedRoom(affinity.translate(r.shape, dx, dy), r.name, r.type, r.ceiling_height_m, r.id) for r in rooms]
     return moved, (dx, dy)
 
 
-def _anchor_moved(anchor: Anchor | None, by: tuple[float, float], builder: ReportBuilder) -> Anchor | None:
-    """The anchor of the moved plan; where it was moved far, its place cannot be told any more."""
-    if anchor is None or by == (0.0, 0.0):
+def _shifted_anchor(anchor: Anchor | None, shift: tuple[float, float], builder: ReportBuilder) -> Anchor | None:
+    """Return the anchor of the moved plan, None if it was moved too far for an accurate place."""
+    if anchor is None or shift == (0.0, 0.0):
         return anchor
-    if math.hypot(*by) > _MAX_ANCHOR_SHIFT_M:
-        away_km = math.hypot(*by) / 1000.0
-        builder.warnings.append(f"the file's origin lies {away_km:.0f} km away: the place on Earth was left out")
+    distance_m = math.hypot(*shift)
+    if distance_m > _MAX_ANCHOR_SHIFT_M:
+        builder.warnings.append(
+            f"the anchor was left out: the file's origin is {distance_m / 1000.0:.0f} km from the plan; the limit is "
+            f"{_MAX_ANCHOR_SHIFT_M / 1000.0:g} km"
+        )
         return None
-    return anchor.moved((-by[0], -by[1]))
+    return anchor.moved((-shift[0], -shift[1]))
 
 
-def _moved(opening: SketchedOpening, by: tuple[float, float]) -> SketchedOpening:
-    (x0, y0), (x1, y1), (dx, dy) = opening.start, opening.end, by
+def _shifted(opening: SketchedOpening, shift: tuple[float, float]) -> SketchedOpening:
+    (x0, y0), (x1, y1), (dx, dy) = opening.start, opening.end, shift
     ends = (x0 + dx, y0 + dy), (x1 + dx, y1 + dy)
     return SketchedOpening(opening.kind, *ends, opening.name, opening.sill_m, opening.head_m)
 
@@ -191,40 +199,40 @@ def _usual_ceiling(rooms: list[SketchedRoom], options: ImportOptions, builder: R
     if known:
         return round(float(np.median(known)), 4)
     builder.unsure.append(
-        f"the file gives no ceiling height, {DEFAULT_CEILING_HEIGHT_M:g} m was assumed; ceiling_height_m says another"
+        f"the file gives no ceiling height; {DEFAULT_CEILING_HEIGHT_M:g} m is assumed (set ceiling_height_m)"
     )
     return DEFAULT_CEILING_HEIGHT_M
 
 
-def _room(room: SketchedRoom, ceiling_m: float, sketch: Sketch, moved: tuple[float, float]) -> dict[str, Any]:
-    said: dict[str, Any] = {"polygon": _ring(room.shape.exterior)}
+def _room(room: SketchedRoom, ceiling_m: float, sketch: Sketch, shift: tuple[float, float]) -> dict[str, Any]:
+    entry: dict[str, Any] = {"polygon": _ring(room.shape.exterior)}
     if room.name:
-        said = {"name": room.name} | said
+        entry = {"name": room.name} | entry
     if room.type:
-        said["type"] = room.type
+        entry["type"] = room.type
     if room.shape.interiors:
-        said["holes"] = [_ring(ring) for ring in room.shape.interiors]
-    walls = [affinity.translate(wall, *moved) for wall in sketch.inner_walls]
+        entry["holes"] = [_ring(ring) for ring in room.shape.interiors]
+    walls = [affinity.translate(wall, *shift) for wall in sketch.inner_walls]
     inner_walls = [wall for wall in walls if room.shape.contains(wall)]
     if inner_walls:
-        said["walls"] = [[_xy(point) for point in wall.coords] for wall in inner_walls]
+        entry["walls"] = [[_xy(point) for point in wall.coords] for wall in inner_walls]
     if room.ceiling_height_m is not None and abs(room.ceiling_height_m - ceiling_m) > 1e-6:
-        said["ceiling_height_m"] = round(room.ceiling_height_m, 4)
-    return said
+        entry["ceiling_height_m"] = round(room.ceiling_height_m, 4)
+    return entry
 
 
 def _opening(opening: SketchedOpening) -> dict[str, Any]:
-    said: dict[str, Any] = {"kind": opening.kind, "line": [_xy(opening.start), _xy(opening.end)]}
+    entry: dict[str, Any] = {"kind": opening.kind, "line": [_xy(opening.start), _xy(opening.end)]}
     name = clean_name(opening.name)
     if name:
-        said["name"] = name
-    # Both or neither, and only what can be: a sill below its head.
+        entry["name"] = name
+    # A sill needs a head above it.
     sill, head = opening.sill_m, opening.head_m
     if head is not None and head > max(sill or 0.0, 0.0):
-        said["head_m"] = round(head, 4)
+        entry["head_m"] = round(head, 4)
         if sill is not None and sill >= 0.0:
-            said["sill_m"] = round(sill, 4)
-    return said
+            entry["sill_m"] = round(sill, 4)
+    return entry
 
 
 def _ring(ring: shapely.LinearRing) -> list[list[float]]:
@@ -235,6 +243,6 @@ def _xy(point: tuple[float, ...]) -> list[float]:
     return [round(float(point[0]), _DECIMALS) + 0.0, round(float(point[1]), _DECIMALS) + 0.0]
 
 
-def _what_was_there(builder: ReportBuilder) -> str:
-    used = [f"{count} {use} on '{layer}'" for (layer, use), count in sorted(builder.uses.items())][:_MAX_NAMED]
-    return "it has " + ", ".join(used) if used else "it holds nothing that could be one"
+def _contents(builder: ReportBuilder) -> str:
+    uses = [f"{count} {use} on '{layer}'" for (layer, use), count in sorted(builder.uses.items())][:_MAX_NAMED]
+    return ", ".join(uses) or "nothing that could be a room"

@@ -1,4 +1,4 @@
-"""Windows that are drawn into walls of two lines: one or more lines along the middle, with an end at both sides."""
+"""Windows drawn into walls of two lines: lines along the middle, closed at both ends."""
 
 from __future__ import annotations
 
@@ -6,18 +6,18 @@ import cv2
 import numpy as np
 import shapely
 
-from lalaloc_core.importers.model.sketch import SketchedOpening
+from lalaloc_core.importers.common.sketch import SketchedOpening
 from lalaloc_core.importers.picture.ink import Ink
-from lalaloc_core.importers.picture.masks import WallMask
+from lalaloc_core.importers.picture.wall_mask import WallMask
 
-# A pane is a white strip between two lines of a window: long, filled like a rectangle, and thinner than its wall.
+# A pane is a white strip between two lines of a window: long (m), thinner than its wall (share), and rectangular.
 _MIN_LENGTH_M, _OF_WALL = 0.4, (0.12, 0.72)
 _FULL, _LONG = 0.8, 3.0
 _SLANTED_DEG = 8.0
 
 
 def windows_in_walls(walls: WallMask, ink: Ink) -> list[SketchedOpening]:
-    """Windows from pairs of panes that lie side by side in a wall."""
+    """Return the windows: groups of panes that lie side by side in a wall."""
     if walls.cavities is None:
         return []
     panes = _panes(walls, ink)
@@ -28,8 +28,8 @@ def windows_in_walls(walls: WallMask, ink: Ink) -> list[SketchedOpening]:
             continue
         group = [first]
         for j in range(i + 1, len(panes)):
-            second, other = panes[j]
-            apart = abs((angle - other + 90.0) % 180.0 - 90.0)
+            second, second_angle = panes[j]
+            apart = abs((angle - second_angle + 90.0) % 180.0 - 90.0)
             if j not in used and apart < _SLANTED_DEG and _side_by_side(group[-1], second, ink, walls):
                 group.append(second)
                 used.add(j)
@@ -39,9 +39,9 @@ def windows_in_walls(walls: WallMask, ink: Ink) -> list[SketchedOpening]:
 
 
 def _panes(walls: WallMask, ink: Ink) -> list[tuple[np.ndarray, float]]:
-    """(corners in pixels, direction in degrees) of every strip that could be a pane."""
+    """Return the corners (pixels) and direction (degrees) of every strip that could be a pane."""
     assert walls.cavities is not None
-    # Cavities outside what was kept as walls are furniture.
+    # Cavities outside the walls are furniture.
     labels = np.where(walls.mask, walls.cavities, 0).astype(np.int32)
     compact = np.unique(labels, return_inverse=True)
     names, index = compact[0], compact[1].reshape(labels.shape)
@@ -66,7 +66,7 @@ def _panes(walls: WallMask, ink: Ink) -> list[tuple[np.ndarray, float]]:
 
 
 def _boxes(index: np.ndarray, count: int) -> list[tuple[int, int, int, int]]:
-    """Bounding boxes of all labels, in one pass each way."""
+    """Return the bounding boxes of all labels."""
     rows, columns = index.shape
     low_x, low_y = np.full(count, columns), np.full(count, rows)
     high_x, high_y = np.zeros(count, int), np.zeros(count, int)
@@ -80,7 +80,7 @@ def _boxes(index: np.ndarray, count: int) -> list[tuple[int, int, int, int]]:
 
 
 def _side_by_side(first: np.ndarray, second: np.ndarray, ink: Ink, walls: WallMask) -> bool:
-    """Whether two strips lie along each other, a line apart."""
+    """Return whether two strips lie along each other, one line apart."""
     a, b = shapely.Polygon(first), shapely.Polygon(second)
     line = 0.5 * walls.thickness_m / ink.metres_per_pixel
     if shapely.distance(a, b) > line:

@@ -1,6 +1,6 @@
-"""What the names of layers, blocks, classes and rooms speak of, in the languages that drawings are named in.
+"""Vocabulary of drawings: roles of layers, blocks and classes, and types of rooms, from their names.
 
-Layer names are whatever an office is used to: AIA codes (`A-DOOR`), English, German, French, Spanish, Italian, Dutch.
+It covers AIA layer codes (`A-DOOR`), English, German, French, Spanish, Italian, Dutch and some Nordic words.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from lalaloc_core.floorplan.types import room_type_from_label
 
 Role = Literal["door", "window", "passage", "obstacle", "wall", "room", "text", "ignored"]
 
-# Looked at in this order: "A-WALL-DOOR" is doors, "window dimensions" none of either.
+# The first match wins: "A-WALL-DOOR" is a door layer, "window dimensions" is ignored.
 _ROLES: tuple[tuple[Role, str], ...] = (
     (
         "ignored",
@@ -63,10 +63,10 @@ _ROLES: tuple[tuple[Role, str], ...] = (
 )
 _ROLE_OF: dict[str, Role] = {word: role for role, words in reversed(_ROLES) for word in words.split()}
 _ORDER: list[Role] = [role for role, _ in _ROLES]
-# German joins words: "Zimmertür", "Gipskartonwand", "Dachfenster".
+# German compounds: "Zimmertür", "Gipskartonwand", "Dachfenster".
 _ENDINGS: Mapping[str, Role] = {"tur": "door", "tuer": "door", "turen": "door", "fenster": "window", "wand": "wall",
                                 "wande": "wall", "waende": "wall", "mauer": "wall", "zimmer": "room"}  # fmt: skip
-# Room words of other languages, as the English ones that `room_type_from_label` knows.
+# Room names in other languages, by the English word that `room_type_from_label` knows.
 _ENGLISH: Mapping[str, str] = {
     word: english
     for english, words in {
@@ -91,23 +91,23 @@ _ENGLISH: Mapping[str, str] = {
 
 
 def words_of(text: str) -> list[str]:
-    """Lower-case words without accents; "A-DOOR_Frame", "LivingRoom" and "Außentür" are split as people read them."""
+    """Split a name such as "A-DOOR_Frame", "LivingRoom" or "Außentür" into lower-case words without accents."""
     spaced = re.sub(r"(?<=[a-zß-öø-ÿ])(?=[A-ZÀ-Þ])", " ", text)
     folded = unicodedata.normalize("NFKD", spaced.replace("ß", "ss")).encode("ascii", "ignore").decode().casefold()
     return re.findall(r"[a-z]+", folded)
 
 
 def role_of(text: str) -> Role | None:
-    """What a layer, block or class of this name holds; None where the name does not say."""
+    """Return the role of a layer, block or class from its name, None if the name gives none."""
     found = {role for word in words_of(text) if (role := _role_of_word(word)) is not None}
     return next((role for role in _ORDER if role in found), None)
 
 
 def type_of_room(label: str | None) -> str | None:
-    """The type of a room of this name or class in the plan's vocabulary, None where it is not known."""
+    """Return the plan's room type for a name or class, None if it is not known."""
     if not label:
         return None
-    # Only whole words: "et" of a Finnish plan is not to be found in "sheet".
+    # Compare whole words only: the Finnish "et" must not match "sheet".
     words = words_of(label)
     joined = "".join(words)
     english = [_ENGLISH.get(word, word) for word in (*words, joined)]

@@ -1,4 +1,4 @@
-"""PNG and JPEG files."""
+"""PNG and JPEG pictures of plans."""
 
 from __future__ import annotations
 
@@ -11,50 +11,51 @@ from jaxtyping import UInt8
 from PIL import Image, ImageOps
 
 from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.importers.common.assemble import ImportedPlan, assemble
+from lalaloc_core.importers.common.limits import Budget
+from lalaloc_core.importers.common.options import ImportOptions
+from lalaloc_core.importers.common.report import ReportBuilder
 from lalaloc_core.importers.drawing.scale import drawing_scale
-from lalaloc_core.importers.model.assemble import ImportedPlan, assemble
-from lalaloc_core.importers.model.limits import Budget
-from lalaloc_core.importers.model.options import ImportOptions
-from lalaloc_core.importers.model.report import ReportBuilder
 from lalaloc_core.importers.picture.sketching import sketch_picture
 
-FORMAT = "picture"
 _MIN_SIDE_PX = 64
-# A picture of more metres than that has a wrong scale, and would be drawn over the heads of all limits.
+# A larger picture has a wrong scale.
 _MAX_EXTENT_M = 1000.0
 
 
-def import_picture(content: bytes, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
-    """The plan that a picture shows, as a draft.
+def read(content: bytes, options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
+    """Read the plan in a picture, as a draft.
 
     Raises:
-        InvalidFloorPlanError: no picture that can be read, or nothing says how long a pixel is.
+        InvalidFloorPlanError: the picture is invalid, or the options give no scale.
     """
     gray, warmth, paper_m_per_pixel = _open(content, budget)
     factor, source = drawing_scale(replace(options, units=None), "the picture", paper_m_per_unit=paper_m_per_pixel)
     rows, columns = gray.shape
     if max(rows, columns) * factor > _MAX_EXTENT_M:
         raise InvalidFloorPlanError(
-            f"the picture is {columns * factor:.0f} m by {rows * factor:.0f} m at {factor:g} m per pixel, at most "
-            f"{_MAX_EXTENT_M:g} m are read; is the scale right?"
+            f"the picture is {columns * factor:.0f} m by {rows * factor:.0f} m at {factor:g} m per pixel; the limit is "
+            f"{_MAX_EXTENT_M:g} m; check the scale (metres_per_pixel, known_distance or scale)"
         )
     builder = ReportBuilder()
     sketch = sketch_picture(gray, factor, builder, budget, warmth)
     if not sketch.rooms:
         raise InvalidFloorPlanError(
             f"no walls that enclose a room were found in the picture, which is {columns * factor:.1f} m by "
-            f"{rows * factor:.1f} m at {factor:g} m per pixel; is the scale right, and are the walls dark or "
-            "drawn with two lines?"
+            f"{rows * factor:.1f} m at {factor:g} m per pixel; check the scale (metres_per_pixel, known_distance or "
+            "scale), and that walls are dark or drawn with two lines"
         )
     return (
-        assemble(sketch, builder, options, format=FORMAT, metres_per_unit=factor, scale_source=source, is_draft=True),
+        assemble(
+            sketch, builder, options, format="picture", metres_per_unit=factor, scale_source=source, is_draft=True
+        ),
     )
 
 
 def _open(
     content: bytes, budget: Budget
 ) -> tuple[UInt8[np.ndarray, "h w"], UInt8[np.ndarray, "h w"] | None, float | None]:
-    """(grey picture on white paper, its warmth, length of a pixel on paper where the file says)."""
+    """Return the grey picture on white, its warmth, and the length of a pixel on paper if the file gives it."""
     limit = budget.limits.max_plan_pixels
     try:
         with warnings.catch_warnings():
@@ -63,11 +64,11 @@ def _open(
                 width, height = picture.size
                 if width * height > limit:
                     raise InvalidFloorPlanError(
-                        f"the picture has {width} x {height} pixels, at most {limit} are read (max_plan_pixels)"
+                        f"the picture has {width} x {height} pixels; the limit is {limit} in total (max_plan_pixels)"
                     )
                 if min(width, height) < _MIN_SIDE_PX:
                     raise InvalidFloorPlanError(
-                        f"the picture has {width} x {height} pixels, at least {_MIN_SIDE_PX} each way are needed"
+                        f"the picture has {width} x {height} pixels; the minimum is {_MIN_SIDE_PX} x {_MIN_SIDE_PX}"
                     )
                 dpi = picture.info.get("dpi")
                 upright = ImageOps.exif_transpose(picture)
@@ -80,19 +81,19 @@ def _open(
         raise
     except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError, Image.DecompressionBombWarning,
             TypeError, ZeroDivisionError) as error:  # fmt: skip
-        raise InvalidFloorPlanError(f"the picture cannot be read: {error}") from error
+        raise InvalidFloorPlanError(f"the picture cannot be read: {error}; save it again as PNG") from error
     return gray, warmth, _paper(dpi)
 
 
 def _warmth(picture: Image.Image) -> UInt8[np.ndarray, "h w"]:
-    """Half of red minus blue, as of `Ink`."""
+    """Return half of red minus blue, plus 128 (see `Ink.warmth`)."""
     red, blue = (np.asarray(picture.getchannel(name)) for name in "RB")
-    # In bytes: of the largest picture that is read, wider numbers would take hundreds of megabytes.
+    # Computed in bytes: wider types take hundreds of megabytes for the largest pictures.
     return (red >> 1) + (127 - (blue >> 1)) + np.uint8(1)
 
 
 def _paper(dpi: object) -> float | None:
-    """Metres of paper per pixel; 72 and 96 are what programs write that do not know."""
+    """Return metres of paper per pixel; 72 and 96 dpi are defaults without meaning."""
     if not isinstance(dpi, tuple) or not dpi:
         return None
     value = float(dpi[0])

@@ -1,4 +1,4 @@
-"""What an import has to say beside the plan: where everything came from, and what is likely wrong with it."""
+"""Report of an import: the use of every layer, the steps taken, and likely mistakes."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
-# Lists of a report end here, so that a file of nothing but mistakes gives no answer of its own size.
+# Limits the size of the report on a file full of mistakes.
 _MAX_LINES = 50
 
 
 @dataclass(frozen=True)
 class LayerUse:
-    """What was made of the entities of one layer (group, class, entity type)."""
+    """Use of the entities of one layer, group, class or entity type."""
 
     layer: str
     entities: int
@@ -21,17 +21,17 @@ class LayerUse:
 
 @dataclass(frozen=True)
 class ImportReport:
-    """The account of one import.
+    """Report of one import.
 
     Attributes:
-        format: of the file, as it was recognised by its content.
-        metres_per_unit: length of a unit of the file's coordinates.
-        scale_source: where that was read.
-        is_draft: the plan was guessed from a picture: have somebody look at it before it is used.
-        layers: what was used, by layer.
-        notes: what was done.
-        warnings: what is likely wrong.
-        unsure: what was guessed, and how sure that is.
+        format: format of the file, detected from its content.
+        metres_per_unit: length of one unit of the file's coordinates.
+        scale_source: source of that length.
+        is_draft: the plan was inferred from a picture or from unnamed lines; review it before use.
+        layers: use of the entities, by layer.
+        notes: steps taken.
+        warnings: likely mistakes in the file.
+        unsure: guesses and their reasons.
     """
 
     format: str
@@ -44,7 +44,7 @@ class ImportReport:
     unsure: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
-        """The report as JSON has it."""
+        """Return the report as plain JSON data."""
         return {
             "format": self.format,
             "metres_per_unit": self.metres_per_unit,
@@ -59,7 +59,7 @@ class ImportReport:
 
 @dataclass
 class ReportBuilder:
-    """What a report is made of while a file is read."""
+    """Report under construction while a file is read."""
 
     notes: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
@@ -67,11 +67,11 @@ class ReportBuilder:
     uses: Counter[tuple[str, str]] = field(default_factory=Counter)
 
     def use(self, layer: str, used_as: str, entities: int = 1) -> None:
-        """Count entities of a layer that were used as something, `ignored` included."""
+        """Count entities of a layer by their use; "ignored" is a use too."""
         self.uses[layer or "(none)", used_as] += entities
 
     def build(self, format: str, metres_per_unit: float, scale_source: str, *, is_draft: bool = False) -> ImportReport:
-        """The report."""
+        """Return the finished report."""
         layers = [LayerUse(layer, count, used_as) for (layer, used_as), count in sorted(self.uses.items())]
         return ImportReport(
             format=format,

@@ -1,4 +1,4 @@
-"""What the file of a plan may cost, and the budget that an import spends from."""
+"""Limits of an import, and the budget that enforces them."""
 
 from __future__ import annotations
 
@@ -9,20 +9,22 @@ from dataclasses import dataclass, field
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import DEFAULT_LIMITS, PlanLimits
 
+_REMEDY = "export a single storey, or only the layers of walls, doors, windows and rooms"
+
 
 @dataclass(frozen=True, kw_only=True)
 class ImportLimits:
-    """Anything beyond is refused with the value and the limit.
+    """Limits on a plan file; larger files are refused with the value and the limit.
 
     Attributes:
-        max_plan_bytes: of the file.
-        max_unpacked_bytes: of what an archive, or a compressed stream in a PDF or picture, unpacks to.
-        max_archive_files: files in an archive.
-        max_entities: lines, polygons, texts, blocks and the like, and vertices of all of them.
-        max_depth: how deep elements, blocks and objects may lie within each other.
-        max_plan_pixels: of a picture, or of a page that is drawn as one.
-        max_import_s: of an import; looked at between entities, so a library's own call may end a little later.
-        plan: of the plan that becomes of it.
+        max_plan_bytes: size of the file.
+        max_unpacked_bytes: total size of the files in an archive, after decompression.
+        max_archive_files: number of files in an archive.
+        max_entities: number of lines, polygons, texts and blocks, plus their vertices.
+        max_depth: nesting depth of elements, blocks and objects.
+        max_plan_pixels: pixels of a picture, or of a page that is rendered.
+        max_import_s: duration of an import. It is checked between entities, so a library call can exceed it.
+        plan: limits of the resulting plan.
     """
 
     max_plan_bytes: int = 50_000_000
@@ -40,7 +42,7 @@ DEFAULT_IMPORT_LIMITS = ImportLimits()
 
 @dataclass
 class Budget:
-    """Counts what an import has spent."""
+    """Counter of the entities and the time that an import has used."""
 
     limits: ImportLimits = DEFAULT_IMPORT_LIMITS
     clock: Callable[[], float] = time.monotonic
@@ -51,28 +53,26 @@ class Budget:
         self.started_s = self.clock()
 
     def spend(self, entities: int = 1) -> None:
-        """Count entities, and look at the clock.
+        """Count entities and check the time.
 
         Raises:
-            InvalidFloorPlanError: more than the limits allow.
+            InvalidFloorPlanError: the number of entities or the time exceeds its limit.
         """
         self.entities += entities
         if self.entities > self.limits.max_entities:
             raise InvalidFloorPlanError(
-                f"the file has more than {self.limits.max_entities} entities (max_entities); "
-                "export the layers that matter, or one storey, by itself"
+                f"the file has more than {self.limits.max_entities} entities (max_entities); {_REMEDY}"
             )
         self.check_time()
 
     def check_time(self) -> None:
-        """Refuse to go on once the time is over.
+        """Check the time.
 
         Raises:
-            InvalidFloorPlanError: the import takes longer than it may.
+            InvalidFloorPlanError: the import takes longer than `max_import_s`.
         """
         elapsed_s = self.clock() - self.started_s
         if elapsed_s > self.limits.max_import_s:
             raise InvalidFloorPlanError(
-                f"reading the file takes more than {self.limits.max_import_s:g} s (max_import_s); "
-                "export the layers that matter, or one storey, by itself"
+                f"reading the file takes more than {self.limits.max_import_s:g} s (max_import_s); {_REMEDY}"
             )

@@ -1,4 +1,4 @@
-"""Small things about shapes that several importers need."""
+"""Geometry helpers that several importers share."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from shapely.geometry.base import BaseGeometry
 
 
 def polygons_of(geometry: BaseGeometry) -> list[shapely.Polygon]:
-    """The polygons of any geometry, made valid, slivers left out."""
+    """Return the polygons of a geometry, made valid, without those of no area."""
     if geometry.is_empty:
         return []
     valid = geometry if geometry.is_valid else shapely.make_valid(geometry)
@@ -26,14 +26,22 @@ def polygons_of(geometry: BaseGeometry) -> list[shapely.Polygon]:
     return found
 
 
+def even_odd_polygons(rings: Iterable[shapely.Polygon]) -> list[shapely.Polygon]:
+    """Return the area between nested outlines, as hatches and paths fill it (even-odd rule)."""
+    shape: BaseGeometry = shapely.Polygon()
+    for ring in rings:
+        shape = shapely.symmetric_difference(shape, ring)
+    return polygons_of(shape)
+
+
 def opening_line(shape: BaseGeometry) -> tuple[tuple[float, float], tuple[float, float]] | None:
-    """The ends of an opening that is drawn as a line, or as an area across its wall: its longer middle line."""
+    """Return the ends of an opening drawn as a line, or as an area across its wall (its longer middle line)."""
     if shapely.get_dimensions(shape) == 1 and not shape.is_empty:
         points = shapely.get_coordinates(shape)
         apart = np.linalg.norm(points[:, None] - points[None], axis=2)
         if len(points) <= 500 and apart.max() > 0.0:
             i, j = np.unravel_index(int(apart.argmax()), apart.shape)
-            return _xy(points[i]), _xy(points[j])
+            return point_xy(points[i]), point_xy(points[j])
         return None
     box = shapely.minimum_rotated_rectangle(shape)
     if not isinstance(box, shapely.Polygon):
@@ -42,13 +50,19 @@ def opening_line(shape: BaseGeometry) -> tuple[tuple[float, float], tuple[float,
     sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
     if sides[0] < sides[1]:
         corners = np.roll(corners, -1, axis=0)
-    return _xy(0.5 * (corners[0] + corners[3])), _xy(0.5 * (corners[1] + corners[2]))
+    return point_xy(0.5 * (corners[0] + corners[3])), point_xy(0.5 * (corners[1] + corners[2]))
+
+
+def label_position(room: shapely.Polygon) -> tuple[float, float]:
+    """Return the centre of the largest circle in a room."""
+    return point_xy(shapely.maximum_inscribed_circle(room, 0.01).coords[0])
 
 
 def cross(a: Float[np.ndarray, "2"], b: Float[np.ndarray, "2"]) -> float:
-    """The third component of a cross product: positive where b points to the left of a."""
+    """Return the third component of the cross product; it is positive where b points to the left of a."""
     return float(a[0] * b[1] - a[1] * b[0])
 
 
-def _xy(point: Float[np.ndarray, "2"]) -> tuple[float, float]:
+def point_xy(point: Float[np.ndarray, "2"] | tuple[float, ...]) -> tuple[float, float]:
+    """Return a point as two floats."""
     return float(point[0]), float(point[1])

@@ -1,4 +1,4 @@
-"""Which ink is wall: dark and thick, or two lines and what lies between them."""
+"""Wall pixels of a picture: dark thick areas, or pairs of lines with the area between them."""
 
 from __future__ import annotations
 
@@ -9,33 +9,32 @@ import numpy as np
 import shapely
 from jaxtyping import Bool, Float, Int
 
-from lalaloc_core.importers.model.geometry import cross, polygons_of
+from lalaloc_core.importers.common.geometry import cross, polygons_of
 from lalaloc_core.importers.picture.ink import Ink
 
-# Lengths in metres.
 _MIN_THICKNESS_M = 0.055
-# White between the two lines of a wall is no wider; the sector of a door's swing is.
+# Largest white gap between the two lines of a wall; the sector of a door swing is wider.
 _MAX_CAVITY_M = 0.42
 _SMALL_M = 1.2
 _STRAIGHT_M, _STRAIGHT_PX = 0.012, 1.3
-# Walls are alike in thickness; a chair, a letter or a basin is not. Thicker pieces that are filled have pillars.
-_ALIKE, _FILLED = (0.6, 2.5), (0.6, 3.0)
-# Where walls meet, the white between their lines is wider than in a wall; of walls it is so on a small part only.
+# Thickness range of walls, relative to the usual wall; filled walls can have pillars.
+_OUTLINED_RANGE, _FILLED_RANGE = (0.6, 2.5), (0.6, 3.0)
+# Largest share of a cavity that can be wider than a wall, at the junctions of walls.
 _WIDE_PART = 0.15
-# A corner that is cut off by less than this is one (m), where the walls turn by about a right angle in all (its sine).
+# Largest cut of a rounded corner (m), and smallest sine of the whole turn.
 _CUT_CORNER_M, _SQUARE = 0.07, 0.8
-# The stroke of a pane is as thick as a thin wall, but so much paler (of 255), thinner than its wall, and so long.
+# Strokes of panes are paler than walls (of 255), thinner than walls (share), and long (m).
 _PALER, _THINNER, _STROKE_M = 45.0, 0.55, 0.3
 
 
 @dataclass(frozen=True, eq=False)
 class WallMask:
-    """Walls as pixels.
+    """Wall pixels.
 
     Attributes:
         mask: True in walls.
-        thickness_m: of the usual wall.
-        cavities: labels of the white areas inside the walls, 0 elsewhere; None where walls are dark.
+        thickness_m: usual thickness of a wall.
+        cavities: labels of the white areas inside walls, 0 elsewhere; None for dark walls.
     """
 
     mask: Bool[np.ndarray, "h w"]
@@ -44,7 +43,7 @@ class WallMask:
 
 
 def dark_walls(ink: Ink) -> WallMask | None:
-    """Walls that are filled: what stays of the ink when thin lines, and broad ones of another tone, are taken away."""
+    """Return filled walls: the ink without thin lines and without broad strokes of a paler tone."""
     walls = _walls(ink, ink.mask, None)
     if walls is None:
         return None
@@ -53,15 +52,15 @@ def dark_walls(ink: Ink) -> WallMask | None:
 
 
 def _pale_strokes(ink: Ink, walls: WallMask) -> Bool[np.ndarray, "h w"]:
-    """Strokes of doors and windows that are as broad as thin walls: much paler, and thinner than most walls."""
+    """Return strokes of doors and windows: as broad as thin walls, but paler and thinner than most walls."""
     tone = float(np.median(ink.gray[cv2.erode(walls.mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0]))
     pale = (ink.mask & (ink.gray > tone + _PALER)).astype(np.uint8)
-    # The rims of dark walls are pale as well, but only a pixel or two.
+    # Opening removes the pale rims of dark walls, which are one or two pixels wide.
     _, found, stats, _ = cv2.connectedComponentsWithStats(
         cv2.morphologyEx(pale, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)), connectivity=8
     )
     long = stats[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1)
-    # As thick as a strip of that length that has this area.
+    # Thickness of a strip of the same length and area.
     thick = stats[:, cv2.CC_STAT_AREA] / np.maximum(long, 1)
     pixel = ink.metres_per_pixel
     is_stroke = (long * pixel >= _STROKE_M) & (thick * pixel <= _THINNER * walls.thickness_m)
@@ -71,7 +70,7 @@ def _pale_strokes(ink: Ink, walls: WallMask) -> Bool[np.ndarray, "h w"]:
 
 
 def outlined_walls(ink: Ink) -> WallMask | None:
-    """Walls that are drawn with two lines, hatched or not: the ink, and the narrow white areas that it encloses."""
+    """Return walls drawn with two lines: the ink and the narrow white areas between its lines."""
     white = (~ink.mask).astype(np.uint8)
     count, found = cv2.connectedComponents(white, connectivity=4)
     labels = np.asarray(found, dtype=np.int32)
@@ -85,13 +84,13 @@ def outlined_walls(ink: Ink) -> WallMask | None:
 
 
 def _is_narrow(labels: Int[np.ndarray, "h w"], depth_m: Float[np.ndarray, "h w"], count: int) -> Bool[np.ndarray, "n"]:
-    """Which white areas are as narrow as a wall nearly everywhere, and but a little wider elsewhere."""
+    """Return the white areas that are as narrow as a wall nearly everywhere, and only slightly wider elsewhere."""
     area = np.bincount(labels.ravel(), minlength=count)
     reach = 0.5 * _MAX_CAVITY_M
     middle = labels[depth_m > reach]
     deepest = np.zeros(count)
     np.maximum.at(deepest, labels.ravel(), depth_m.ravel())
-    # What a disc as wide as the widest cavity covers is not only its centres.
+    # A wide part covers more pixels than the centres of its discs.
     wide = 3.0 * np.bincount(middle, minlength=count)
     return (wide <= _WIDE_PART * area) & (deepest <= 1.5 * reach)
 
@@ -101,14 +100,14 @@ def _walls(ink: Ink, filled: Bool[np.ndarray, "h w"], cavities: Int[np.ndarray, 
     thick = cv2.morphologyEx(filled.astype(np.uint8), cv2.MORPH_OPEN, np.ones((size, size), np.uint8))
     thickness = _usual_thickness(thick) * ink.metres_per_pixel
     if thickness < _MIN_THICKNESS_M:
-        return None  # Strokes of a hatch that run together are no walls.
-    alike = _FILLED if cavities is None else _ALIKE
-    kept = _without_furniture(thick, thickness / ink.metres_per_pixel, ink.metres_per_pixel, alike)
+        return None  # Merged strokes of a hatch are not walls.
+    thickness_range = _FILLED_RANGE if cavities is None else _OUTLINED_RANGE
+    kept = _without_furniture(thick, thickness / ink.metres_per_pixel, ink.metres_per_pixel, thickness_range)
     return WallMask(kept, thickness, cavities) if kept.any() else None
 
 
 def _usual_thickness(mask: np.ndarray) -> float:
-    """Thickness of walls in pixels: the median over the middle lines of what is large; 0 where there is nothing."""
+    """Return the thickness of walls in pixels, the median along their centre lines; 0 without walls."""
     depth = cv2.distanceTransform(mask, cv2.DIST_L2, 5)
     ridge = (depth > 0.0) & (depth >= cv2.dilate(depth, np.ones((3, 3), np.uint8)) - 1e-3)
     values = depth[ridge].astype(np.float64)
@@ -116,12 +115,15 @@ def _usual_thickness(mask: np.ndarray) -> float:
 
 
 def _without_furniture(
-    mask: np.ndarray, thickness: float, metres_per_pixel: float, alike: tuple[float, float]
+    mask: np.ndarray, thickness: float, metres_per_pixel: float, thickness_range: tuple[float, float]
 ) -> Bool[np.ndarray, "h w"]:
-    """Small pieces stay only where they are as thick as a wall, corners between two windows included.
+    """Drop small pieces that are not as thick as a wall. Corners between two windows are kept.
 
     Args:
-        alike: how thick pieces are at least and at most, in units of the thickness of walls.
+        mask: possible walls.
+        thickness: usual thickness of a wall (pixels).
+        metres_per_pixel: length of a pixel.
+        thickness_range: smallest and largest thickness of a piece, relative to `thickness`.
     """
     count, found, stats, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
     labels = np.asarray(found, dtype=np.int32)
@@ -129,15 +131,14 @@ def _without_furniture(
     deepest = np.zeros(count)
     np.maximum.at(deepest, labels.ravel(), depth.ravel())
     is_large = stats[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1) * metres_per_pixel >= _SMALL_M
-    # A corner is deeper than its two walls are thick, by the half of a diagonal.
     thick = 2.0 * deepest - 1.0
-    keep = is_large | ((thick >= alike[0] * thickness) & (thick <= alike[1] * thickness))
+    keep = is_large | ((thick >= thickness_range[0] * thickness) & (thick <= thickness_range[1] * thickness))
     keep[0] = False
     return keep[labels]
 
 
 def bodies_of(walls: WallMask, ink: Ink) -> list[shapely.Polygon]:
-    """Walls as polygons in plan metres, straightened."""
+    """Return walls as straightened polygons in plan metres."""
     contours, hierarchy = cv2.findContours(walls.mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
     if hierarchy is None:
         return []
@@ -152,7 +153,7 @@ def bodies_of(walls: WallMask, ink: Ink) -> list[shapely.Polygon]:
             continue
         inner = [ring for hole in holes.get(index, []) if len(ring := _ring(hole, ink)) >= 3]
         shell = shapely.Polygon(_ring(contours[index], ink), inner)
-        # Contours run through the centres of a wall's own pixels; the wall reaches half a pixel farther.
+        # Contours run through pixel centres, so the wall reaches half a pixel farther.
         grown = [part.buffer(0.5 * ink.metres_per_pixel, join_style="mitre") for part in polygons_of(shell)]
         found += [straightened(part) for shape in grown for part in polygons_of(shape.simplify(straight))]
     return found
@@ -163,7 +164,7 @@ def _ring(contour: np.ndarray, ink: Ink) -> np.ndarray:
 
 
 def straightened(shape: shapely.Polygon, tolerance_deg: float = 6.0, reach_m: float = 0.06) -> shapely.Polygon:
-    """A polygon whose edges that nearly run along the axes do so exactly; the same where that would spoil it."""
+    """Align nearly axis-parallel edges with the axes; return the same polygon if that changes it too much."""
     rings = [
         _straight_ring(_sharp_ring(np.asarray(ring.coords)[:-1]), tolerance_deg, reach_m)
         for ring in (shape.exterior, *shape.interiors)
@@ -175,7 +176,7 @@ def straightened(shape: shapely.Polygon, tolerance_deg: float = 6.0, reach_m: fl
 
 
 def _sharp_ring(points: np.ndarray) -> np.ndarray:
-    """The ring with the corners that pixels round made sharp: edges so short that turn by two obtuse angles."""
+    """Sharpen corners that are rounded by pixels: short edges between two obtuse angles."""
     kept = list(points)
     index = 0
     while len(kept) > 4 and index < len(kept):
@@ -199,7 +200,7 @@ def _straight_ring(points: np.ndarray, tolerance_deg: float, reach_m: float) -> 
         along, across = np.abs(steps[:, 1 - axis]), np.abs(steps[:, axis])
         flat = (across <= slope * along) | ((across < reach_m) & (along > 2.0 * across))
         for index in np.flatnonzero(flat):
-            other = (index + 1) % len(points)
-            middle = 0.5 * (points[index, axis] + points[other, axis])
-            points[[index, other], axis] = middle
+            following = (index + 1) % len(points)
+            middle = 0.5 * (points[index, axis] + points[following, axis])
+            points[[index, following], axis] = middle
     return points

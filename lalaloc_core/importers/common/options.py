@@ -1,0 +1,184 @@
+"""Options of an import, the same in Python, over HTTP and on the command line."""
+
+from __future__ import annotations
+
+import math
+import re
+import unicodedata
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+
+from lalaloc_core.errors import InvalidFloorPlanError
+
+METRES_PER_UNIT: Mapping[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
+_SCALE = re.compile(r"(?:1\s*[:/]\s*)?(\d+(?:\.\d+)?)")
+_MAX_LENGTH, _MAX_LAYERS = 200, 100
+_CEILING_M = (1.0, 20.0)
+
+
+@dataclass(frozen=True)
+class KnownDistance:
+    """Two points of a drawing and their distance.
+
+    Attributes:
+        start, end: (x, y) in the file's coordinates; pixels of a picture.
+        distance_m: distance of the points in metres.
+    """
+
+    start: tuple[float, float]
+    end: tuple[float, float]
+    distance_m: float
+
+    def __post_init__(self) -> None:
+        numbers = (*self.start, *self.end, self.distance_m)
+        if not all(math.isfinite(number) for number in numbers) or self.drawn <= 0.0 or self.distance_m <= 0.0:
+            raise InvalidFloorPlanError(
+                f"known_distance is {numbers}; give x0, y0, x1, y1, metres with two different points and metres above 0"
+            )
+
+    @property
+    def drawn(self) -> float:
+        """Distance of the points in units of the drawing."""
+        return math.dist(self.start, self.end)
+
+    @property
+    def metres_per_unit(self) -> float:
+        """Resulting length of a unit of the drawing."""
+        return self.distance_m / self.drawn
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportOptions:
+    """Facts that the file does not give, or gives wrongly. All are optional.
+
+    Attributes:
+        units: unit of the file's coordinates.
+        scale: denominator of a drawing's scale on paper, 100 for "1:100" (PDF, SVG).
+        metres_per_pixel: length of a pixel, or of a user unit of an SVG.
+        known_distance: two points and their distance; sets the scale.
+        level: name or number of the storey to import, if the file has several.
+        layers: layers, groups or classes to import, ignoring case; empty for all.
+        page: page of a PDF, counted from 1.
+        y_axis: direction of y in the file, "up" or "down", if it differs from the format's.
+        ceiling_height_m: ceiling height of rooms without one in the file.
+        name: name of the plan.
+    """
+
+    units: str | None = None
+    scale: float | None = None
+    metres_per_pixel: float | None = None
+    known_distance: KnownDistance | None = None
+    level: str | None = None
+    layers: tuple[str, ...] = ()
+    page: int = 1
+    y_axis: str | None = None
+    ceiling_height_m: float | None = None
+    name: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.units is not None:
+            check_units(self.units)
+        _check_range("scale", self.scale, 1.0, 10_000.0)
+        _check_range("metres_per_pixel", self.metres_per_pixel, 1e-6, 10.0)
+        _check_range("page", self.page, 1.0, 10_000.0)
+        _check_range("ceiling_height_m", self.ceiling_height_m, *_CEILING_M)
+        if self.y_axis is not None:
+            check_y_axis(self.y_axis)
+        if len(self.layers) > _MAX_LAYERS:
+            raise InvalidFloorPlanError(f"layers has {len(self.layers)} names; the limit is {_MAX_LAYERS}")
+        for text in (*self.layers, *filter(None, (self.level, self.name))):
+            _check_text(text)
+        scales = [name for name in ("scale", "metres_per_pixel", "known_distance") if getattr(self, name) is not None]
+        if len(scales) > 1:
+            raise InvalidFloorPlanError(f"{' and '.join(scales)} each set the scale; give only one of them")
+
+    @classmethod
+    def from_text(cls, values: Mapping[str, str]) -> ImportOptions:
+        """Parse options from form fields or the command line.
+
+        `scale` can be written "1:100", `layers` is separated by commas, `known_distance` is "x0, y0, x1, y1, metres".
+
+        Raises:
+            InvalidFloorPlanError: unknown option or invalid value.
+        """
+        known = {field.name for field in fields(cls)}
+        unknown = sorted(set(values) - known)
+        if unknown:
+            raise InvalidFloorPlanError(f"unknown option '{unknown[0][:50]}'; options are {', '.join(sorted(known))}")
+        given = {name: text.strip() for name, text in values.items() if text.strip()}
+        return cls(**{name: _parse(name, text) for name, text in given.items()})  # type: ignore[arg-type]
+
+    def includes_layer(self, *names: str) -> bool:
+        """Return whether `layers` is empty or holds any of these names."""
+        wanted = {layer.casefold() for layer in self.layers}
+        return not wanted or any(name.casefold() in wanted for name in names)
+
+
+def check_units(units: object) -> str:
+    """Return a known unit.
+
+    Raises:
+        InvalidFloorPlanError: the unit is not in `METRES_PER_UNIT`.
+    """
+    if not isinstance(units, str) or units not in METRES_PER_UNIT:
+        raise InvalidFloorPlanError(f"units is {str(units)[:50]!r}; set it to one of {', '.join(METRES_PER_UNIT)}")
+    return units
+
+
+def check_y_axis(y_axis: object) -> None:
+    """Check a direction of y.
+
+    Raises:
+        InvalidFloorPlanError: it is neither "up" nor "down".
+    """
+    if y_axis not in ("up", "down"):
+        raise InvalidFloorPlanError(f"y_axis is {str(y_axis)[:50]!r}; set it to up or down")
+
+
+def _parse(name: str, text: str) -> object:
+    if name == "scale":
+        match = _SCALE.fullmatch(text)
+        if match is None:
+            raise InvalidFloorPlanError(f"scale is '{text[:50]}'; it must look like 1:100")
+        return float(match[1])
+    if name == "known_distance":
+        numbers = [_number(name, part) for part in re.split(r"[,;\s]+", text)]
+        if len(numbers) != 5:
+            raise InvalidFloorPlanError(f"known_distance has {len(numbers)} numbers; give x0, y0, x1, y1, metres")
+        x0, y0, x1, y1, metres = numbers
+        return KnownDistance((x0, y0), (x1, y1), metres)
+    if name == "layers":
+        return tuple(part.strip() for part in text.split(",") if part.strip())
+    if name == "page":
+        if not text.isascii() or not text.isdigit() or len(text) > 9:
+            raise InvalidFloorPlanError(f"page is '{text[:50]}'; it must be a whole number from 1")
+        return int(text)
+    if name in ("metres_per_pixel", "ceiling_height_m"):
+        return _number(name, text)
+    return text
+
+
+def _number(name: str, text: str) -> float:
+    try:
+        # float() accepts 1_000, which other tools do not.
+        value = math.nan if "_" in text else float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise InvalidFloorPlanError(f"{name} is '{text[:50]}'; it must be a number")
+    return value
+
+
+def _check_range(name: str, value: float | int | None, low: float, high: float) -> None:
+    if value is not None and not low <= value <= high:
+        raise InvalidFloorPlanError(f"{name} is {value:g}; it must be between {low:g} and {high:g}")
+
+
+def _check_text(text: str) -> None:
+    if len(text) > _MAX_LENGTH or any(unicodedata.category(character) in {"Cc", "Cs"} for character in text):
+        raise InvalidFloorPlanError(
+            f"the name {text[:50]!a} is invalid; name, level and layers take up to {_MAX_LENGTH} printable characters"
+        )
+
+
+DEFAULT_OPTIONS = ImportOptions()

@@ -1,0 +1,110 @@
+"""Sketch of a storey, filled in by every importer: rooms and openings in metres, before they become a plan."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal, TypeVar
+
+import shapely
+
+from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan.earth import Anchor
+from lalaloc_core.importers.common.options import ImportOptions
+
+OpeningKind = Literal["door", "window", "passage"]
+Point = tuple[float, float]
+T = TypeVar("T")
+_MAX_NAMED_LEVELS = 12
+
+
+@dataclass(frozen=True, eq=False)
+class SketchedRoom:
+    """Room with its outline and holes in metres."""
+
+    shape: shapely.Polygon
+    name: str | None = None
+    type: str | None = None
+    ceiling_height_m: float | None = None
+    id: str | None = None
+
+
+@dataclass(frozen=True)
+class SketchedOpening:
+    """Door, window or passage from `start` to `end` along its wall, in metres."""
+
+    kind: OpeningKind
+    start: Point
+    end: Point
+    name: str | None = None
+    sill_m: float | None = None
+    head_m: float | None = None
+
+    @property
+    def line(self) -> shapely.LineString:
+        """The opening as a geometry."""
+        return shapely.LineString([self.start, self.end])
+
+
+@dataclass(frozen=True)
+class Level:
+    """Storey of a building."""
+
+    name: str
+    number: float | None = None
+    elevation_m: float | None = None
+
+    def matches(self, wanted: str) -> bool:
+        """Return whether the option `level` names this storey, by name or number."""
+        wanted = wanted.strip().casefold()
+        number = None if self.number is None else f"{self.number:g}"
+        return wanted in (self.name.casefold(), number)
+
+
+@dataclass
+class Sketch:
+    """Contents of one storey.
+
+    Attributes:
+        rooms: rooms.
+        openings: doors, windows and passages.
+        obstacles: areas without floor, such as columns; cut out of the rooms that they lie in.
+        inner_walls: free-standing walls.
+        name: name of the plan.
+        north_deg: direction of north, clockwise from +y.
+        level: the storey.
+        anchor: place of the origin on Earth.
+        opening_kinds: kinds of openings that the source shows completely; None for those that occur.
+    """
+
+    rooms: list[SketchedRoom] = field(default_factory=list)
+    openings: list[SketchedOpening] = field(default_factory=list)
+    obstacles: list[shapely.Polygon] = field(default_factory=list)
+    inner_walls: list[shapely.LineString] = field(default_factory=list)
+    name: str | None = None
+    north_deg: float | None = None
+    level: Level | None = None
+    anchor: Anchor | None = None
+    opening_kinds: tuple[str, ...] | None = None
+
+
+def chosen_levels(levels: Mapping[str, tuple[Level, T]], options: ImportOptions) -> list[tuple[Level, T]]:
+    """Return all storeys, lowest first, or only the one named by the option `level`.
+
+    Raises:
+        InvalidFloorPlanError: no storey has that name or number.
+    """
+    ordered = sorted(levels.values(), key=lambda item: _height(item[0]))
+    if options.level is None:
+        return ordered
+    found = [item for item in ordered if item[0].matches(options.level)]
+    if not found:
+        known = ", ".join(f"'{level.name}'" for level, _ in ordered[:_MAX_NAMED_LEVELS])
+        raise InvalidFloorPlanError(f"the file has no level '{options.level}'; set level to one of {known}")
+    return found
+
+
+def _height(level: Level) -> float:
+    if level.elevation_m is not None:
+        return level.elevation_m
+    return level.number if level.number is not None else 0.0
