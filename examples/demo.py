@@ -1,8 +1,8 @@
-"""`make demo`: localise the example panoramas over HTTP and draw what was found to demo.png.
+"""`make demo`: localise the example panoramas over HTTP and draw the results to demo.png.
 
-Starts the service on a free port with a temporary data folder, uploads the example flat, asks where each panorama was
-taken (once with its heading given, once without), prints the answers beside the truth, draws the service's pictures of
-them, and stops the service. The exit status is 0 only when every stage ran.
+The demo starts the service on a free port with a temporary data folder, uploads the example flat, and localises each
+panorama with and without its heading. It prints the results beside the true poses, draws them, and stops the service.
+The exit status is 0 if every stage ran.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from examples.truth import PLAN_PATH, TruePose, read_poses
 from lalaloc_client import Client, ClientError, Localisation
 
 _PLAN_TIMEOUT_S = 120.0
-# A busy machine shall be slow here, not fall back to a coarser stage; and only warnings shall break the table.
+# Long timeouts prevent a fallback to a coarser stage on a busy machine. Info messages would interrupt the table.
 _DEFAULTS = {
     "LALALOC_LPO_DEADLINE_S": "30",
     "LALALOC_LPO_STALL_S": "60",
@@ -37,11 +37,11 @@ _DEFAULTS = {
 
 
 class StageMissingError(Exception):
-    """A stage of the demo did not run; the message says which."""
+    """A stage did not run; the message names it."""
 
 
 def main() -> int:
-    """Run the demo; 0 when every stage ran, else 1."""
+    """Run the demo and return 0 if every stage ran, else 1."""
     parser = argparse.ArgumentParser(prog="python -m examples.demo", description=__doc__)
     parser.add_argument("--out", type=Path, default=ROOT / "demo.png", help="the picture, PNG or JPEG")
     out: Path = parser.parse_args().out
@@ -51,16 +51,16 @@ def main() -> int:
     except (StageMissingError, ServiceFailedError, ClientError) as error:
         print(f"demo: {error}", file=sys.stderr)
         return 1
-    print(f"\nthe picture is {out}: the plan in every photograph, and on the plan how probable all places are")
+    print(f"\nwrote {out}: the layout over every panorama, and the probability of poses on the plan")
     return 0
 
 
 def localise_examples() -> list[Panel]:
-    """Ask a fresh service for every example panorama; prints a line per answer.
+    """Localise every example panorama with a new service, and print a line per result.
 
     Raises:
-        ClientError: the plan did not get ready, or a query was refused.
-        StageMissingError: an answer is not a full one.
+        ClientError: the plan did not become ready, or a request failed.
+        StageMissingError: a localisation is incomplete.
     """
     with tempfile.TemporaryDirectory(prefix="lalaloc-demo-") as data:
         given = {name: os.environ[name] for name in _DEFAULTS if name in os.environ}
@@ -69,11 +69,11 @@ def localise_examples() -> list[Panel]:
         with running_service(0, environment) as service, Client(service.url) as client:
             plan_id = prepare_plan(client)
             print(_HEADER, flush=True)
-            return [_localise_one(client, plan_id, truth) for truth in read_poses()]
+            return [_localise_panorama(client, plan_id, truth) for truth in read_poses()]
 
 
 def prepare_plan(client: Client) -> str:
-    """Upload the example flat and wait for its latent grid; the plan's id."""
+    """Upload the example flat, wait for its pose grid, and return the plan's id."""
     plan = client.wait_until_ready(client.upload_floorplan(PLAN_PATH).id, timeout_s=_PLAN_TIMEOUT_S)
     print(
         f"plan '{plan.name}' is ready: {len(plan.rooms)} rooms, {plan.area_m2:.1f} m², "
@@ -82,14 +82,14 @@ def prepare_plan(client: Client) -> str:
     return plan.id
 
 
-def _localise_one(client: Client, plan_id: str, truth: TruePose) -> Panel:
+def _localise_panorama(client: Client, plan_id: str, truth: TruePose) -> Panel:
     known = client.localise(
         plan_id, truth.picture, heading_deg=truth.heading_deg, camera_height_m=truth.camera_height_m
     )
     unknown = client.localise(plan_id, truth.picture, camera_height_m=truth.camera_height_m)
-    for label, answer in (("known", known), ("unknown", unknown)):
-        check_answer(answer)
-        print(_line(truth, label, answer), flush=True)
+    for label, localisation in (("known", known), ("unknown", unknown)):
+        check_localisation(localisation)
+        print(_line(truth, label, localisation), flush=True)
     picture = client.picture(
         plan_id, truth.picture, heading_deg=truth.heading_deg, camera_height_m=truth.camera_height_m
     )
@@ -97,23 +97,23 @@ def _localise_one(client: Client, plan_id: str, truth: TruePose) -> Panel:
         return Panel(truth, known, unknown, picture, opened.size)
 
 
-def check_answer(answer: Localisation) -> None:
-    """Make sure that an answer went through every stage and is made of numbers.
+def check_localisation(localisation: Localisation) -> None:
+    """Check that a localisation passed every stage and contains only finite numbers.
 
     Raises:
-        StageMissingError: it is not.
+        StageMissingError: a stage, the candidates or a number is missing.
     """
-    if answer.stage != "lpo":
-        raise StageMissingError(f"the answer ends at stage '{answer.stage}', not at 'lpo'")
-    if not answer.candidates:
-        raise StageMissingError("the answer has no candidates")
-    broken = [path for path, value in _numbers(dataclasses.asdict(answer)) if not math.isfinite(value)]
+    if localisation.stage != "lpo":
+        raise StageMissingError(f"the localisation ends at stage '{localisation.stage}', not at 'lpo'")
+    if not localisation.candidates:
+        raise StageMissingError("the localisation has no candidates")
+    broken = [path for path, value in _numbers(dataclasses.asdict(localisation)) if not math.isfinite(value)]
     if broken:
-        raise StageMissingError(f"the answer has numbers that are not finite: {', '.join(broken)}")
+        raise StageMissingError(f"the localisation has numbers that are not finite: {', '.join(broken)}")
 
 
-def _numbers(value: Any, path: str = "answer") -> Iterator[tuple[str, float]]:
-    """Every number in nested values with the path to it."""
+def _numbers(value: Any, path: str = "localisation") -> Iterator[tuple[str, float]]:
+    """Yield every number in nested values with its path."""
     if isinstance(value, dict):
         for key, inner in value.items():
             yield from _numbers(inner, f"{path}.{key}")
@@ -130,14 +130,14 @@ _HEADER = (
 )
 
 
-def _line(truth: TruePose, label: str, answer: Localisation) -> str:
-    x_m, y_m = answer.position.x_m, answer.position.y_m
+def _line(truth: TruePose, label: str, localisation: Localisation) -> str:
+    x_m, y_m = localisation.position.x_m, localisation.position.y_m
     error_m = math.hypot(x_m - truth.x_m, y_m - truth.y_m)
-    confidence = "-" if answer.confidence is None else f"{answer.confidence:.2f}"
+    confidence = "-" if localisation.confidence is None else f"{localisation.confidence:.2f}"
     return (
         f"{truth.file:<16} {label:<8} {f'{truth.x_m:.2f}, {truth.y_m:.2f}':>12} {f'{x_m:.2f}, {y_m:.2f}':>12} "
-        f"{error_m:>8.3f} {answer.heading_deg:>12.1f} {confidence:>10} {answer.room:<12} "
-        f"{answer.timings_ms['total']:>6.0f}"
+        f"{error_m:>8.3f} {localisation.heading_deg:>12.1f} {confidence:>10} {localisation.room:<12} "
+        f"{localisation.timings_ms['total']:>6.0f}"
     )
 
 

@@ -1,4 +1,4 @@
-"""Start the service as a process of its own, wait until it is ready, and stop it."""
+"""Start the service as a separate process, wait until it is ready, and stop it."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ _STOP_TIMEOUT_S = 20.0
 
 
 class ServiceFailedError(Exception):
-    """The service did not start; its own log says why."""
+    """The service did not start; its log gives the reason."""
 
 
 @dataclass(frozen=True)
 class RunningService:
-    """A service that is ready, at `url`."""
+    """Running service at `url`."""
 
     url: str
     process: subprocess.Popen[str]
@@ -34,14 +34,14 @@ class RunningService:
 
 @contextmanager
 def running_service(port: int, environment: Mapping[str, str]) -> Iterator[RunningService]:
-    """The service at 127.0.0.1, ready; stopped when the block ends. It logs to this process' standard error.
+    """Run the service at 127.0.0.1 until the block ends. It logs to standard error.
 
     Args:
-        port: where to listen, 0 for a free one.
-        environment: variables to set for the service, over those of this process.
+        port: port to listen on, 0 for a free port.
+        environment: environment variables of the service, in addition to those of this process.
 
     Raises:
-        ServiceFailedError: it ended, or was not ready in time.
+        ServiceFailedError: the service ended, or was not ready in time.
     """
     command = [sys.executable, "-m", "service", "--host", "127.0.0.1", "--port", str(port)]
     process = subprocess.Popen(command, cwd=ROOT, env={**os.environ, **environment}, stdout=subprocess.PIPE, text=True)
@@ -54,7 +54,7 @@ def running_service(port: int, environment: Mapping[str, str]) -> Iterator[Runni
 
 
 def _announced_url(process: subprocess.Popen[str]) -> str:
-    """The address that the service prints as its first line, when it has bound its port."""
+    """Return the address that the service prints after it has bound its port."""
     assert process.stdout is not None
     line = process.stdout.readline().strip()
     if not line:
@@ -64,7 +64,7 @@ def _announced_url(process: subprocess.Popen[str]) -> str:
 
 def _wait_until_ready(url: str, process: subprocess.Popen[str]) -> None:
     deadline = time.monotonic() + _READY_TIMEOUT_S
-    # Asked again below, where the process is looked at as well.
+    # This loop retries, because it also checks the process.
     with Client(url, timeout_s=5.0, retry=RetryPolicy(attempts=1)) as client:
         while not _is_ready(client):
             if process.poll() is not None:

@@ -1,7 +1,7 @@
-"""Render the example panoramas and write down where they were taken.
+"""Render the example panoramas and write their true poses.
 
-Run `python -m examples.make_examples` after a change of the flat, the shots or the renderer. The flat was drawn by
-hand: no home that any model was trained on has its plan, its furniture or its light.
+Run `python -m examples.make_examples` after a change of the flat, the views or the renderer. The flat was drawn by
+hand, and no training data contains its plan, furniture or lighting.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ HEIGHT, WIDTH = 512, 1024
 _SUPERSAMPLE = 2
 _JPEG_QUALITY = 90
 _MATERIALS_SEED = 7
-# An opening is drawn on the middle of its wall; both rooms' sides of that wall are nearer than this.
+# Openings are drawn on the centre line of a wall; both faces of the wall are nearer than this.
 _WALL_REACH_M = 0.1
 
 
 @dataclass(frozen=True)
 class Hole:
-    """A door, wide opening or window on the drawing: from one point to another, along a wall's middle (metres)."""
+    """Door, passage or window between two points on the centre line of a wall (m)."""
 
     kind: OpeningKind
     start_m: tuple[float, float]
@@ -41,7 +41,7 @@ class Hole:
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """One photograph: its file, where the camera stood, and the seed of furniture, materials and light."""
+    """Panorama: its file, its camera pose, and the seed of furniture, materials and lighting."""
 
     file: str
     position_m: tuple[float, float]
@@ -78,7 +78,7 @@ VIEWS = (
 
 
 def main() -> None:
-    """Render every view of the flat, and write its true pose beside it."""
+    """Render every view of the flat and write the true poses."""
     home = example_home()
     materials = MaterialLibrary.create(np.random.default_rng(_MATERIALS_SEED))
     renderer = PanoramaRenderer(materials, height=HEIGHT, width=WIDTH, supersample=_SUPERSAMPLE)
@@ -90,20 +90,20 @@ def main() -> None:
 
 
 def example_home() -> Home:
-    """The example flat with its doors and windows."""
+    """Return the example flat with its doors and windows."""
     plan = FloorPlan.from_json(PLAN_PATH.read_bytes())
     return Home(plan, tuple(opening for hole in HOLES for opening in openings_of(plan, hole)))
 
 
 def openings_of(plan: FloorPlan, hole: Hole) -> list[Opening]:
-    """The hole as each of the rooms beside it sees it.
+    """Return the hole as an opening of each room beside it.
 
     Raises:
-        ValueError: no wall of any room runs along the hole.
+        ValueError: no wall runs along the hole.
     """
     sides = list(_walls_beside(plan, hole))
     if not sides:
-        raise ValueError(f"no wall along {hole}")
+        raise ValueError(f"no wall runs along {hole}; the limit is {_WALL_REACH_M:g} m to a wall")
     rooms = [room for room, _, _, _ in sides]
     return [
         Opening(
@@ -114,28 +114,28 @@ def openings_of(plan: FloorPlan, hole: Hole) -> list[Opening]:
             sill_m=hole.sill_m,
             head_m=hole.head_m,
             kind=hole.kind,
-            neighbour=next((other for other in rooms if other != room), -1),
+            neighbour=next((neighbour for neighbour in rooms if neighbour != room), -1),
         )
         for room, wall, start_m, end_m in sides
     ]
 
 
 def _walls_beside(plan: FloorPlan, hole: Hole) -> Iterator[tuple[int, int, float, float]]:
-    """(room, wall, start, end along the wall) for every wall that contains the hole within `_WALL_REACH_M`."""
+    """Yield room, wall, and the start and end along the wall (m) for every wall beside the hole."""
     ends = np.array([hole.start_m, hole.end_m])
     for room_index, room in enumerate(plan.rooms):
         for wall_index, (x0, y0, x1, y1) in enumerate(room.walls_m):
             length = math.hypot(x1 - x0, y1 - y0)
             along = np.array([x1 - x0, y1 - y0]) / length
             offset = ends - (x0, y0)
-            aside = np.abs(offset @ np.array([-along[1], along[0]]))
+            distance = np.abs(offset @ np.array([-along[1], along[0]]))
             start, end = sorted(float(value) for value in offset @ along)
-            if aside.max() < _WALL_REACH_M and start >= 0.0 and end <= length:
+            if distance.max() < _WALL_REACH_M and start >= 0.0 and end <= length:
                 yield room_index, wall_index, start, end
 
 
 def shot_of(home: Home, view: View) -> Shot:
-    """What the renderer needs to take the photograph."""
+    """Return the input of the renderer for a view."""
     position = np.array(view.position_m)
     return Shot(
         home=home,
@@ -149,7 +149,7 @@ def shot_of(home: Home, view: View) -> Shot:
 
 
 def true_pose(plan: FloorPlan, view: View) -> TruePose:
-    """The pose of a photograph as the file of true poses has it."""
+    """Return the true pose of a view."""
     x_m, y_m = view.position_m
     room = plan.rooms[int(plan.room_index_at(np.array([view.position_m]))[0])]
     return TruePose(

@@ -1,4 +1,4 @@
-"""Draw the pictures of docs/how-to/take-photographs.md from the example panoramas: what an answer needs, and what spoils it.
+"""Draw the pictures of docs/how-to/take-photographs.md from an example panorama: usable, tilted, and incomplete.
 
 Run `python -m examples.make_photographs` after a change of the examples.
 """
@@ -13,16 +13,16 @@ from PIL import Image
 from examples.truth import FOLDER
 from lalaloc_core.panorama.levelling import level
 
-OUT = FOLDER.parent / "docs" / "photographs"
+OUT = FOLDER.parent / "docs" / "images"
 _WIDTH, _HEIGHT = 768, 384
 _JPEG_QUALITY = 85
-# A camera that was held askew, and the part of a sphere that a phone's panorama mode shows.
+# Rotation of a tilted camera, and the part of a sphere in a phone's panorama mode.
 _PITCH, _ROLL = math.radians(8.0), math.radians(6.0)
 _PHONE_ROWS = slice(_HEIGHT // 3, 2 * _HEIGHT // 3)
 
 
 def main() -> None:
-    """Write them all."""
+    """Write all pictures."""
     OUT.mkdir(exist_ok=True)
     with Image.open(FOLDER / "kitchen.jpg") as picture:
         sphere = np.asarray(picture.convert("RGB").resize((_WIDTH, _HEIGHT), Image.Resampling.LANCZOS))

@@ -1,4 +1,4 @@
-"""Draw the demo's picture: the service's own picture of every answer, with how far off it is."""
+"""Picture of the demo: the service's picture of every localisation, with its error."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from examples.truth import TruePose
 from lalaloc_client import Localisation
 from lalaloc_core.draw.canvas import MUTED, document, image, pixels, words
 
-# Of one panel: width of the picture in it, and what stands above.
+# Size of a panel: width of its picture, height of its heading, and gap between panels.
 _WIDTH, _HEAD, _GAP = 1000, 96, 30
 _COLUMNS = 2
 _JPEG_QUALITY = 88
@@ -21,9 +21,13 @@ _JPEG_QUALITY = 88
 
 @dataclass(frozen=True)
 class Panel:
-    """One panorama: the truth, the answers with and without its heading, and a picture of the first (PNG).
+    """Results for one panorama.
 
     Attributes:
+        truth: true pose.
+        known: localisation with the heading given.
+        unknown: localisation without the heading.
+        picture: PNG picture of `known`.
         size: width and height of the picture.
     """
 
@@ -35,7 +39,7 @@ class Panel:
 
 
 def draw_demo(panels: Sequence[Panel], path: Path) -> None:
-    """Draw all panels, two beside each other."""
+    """Draw all panels in two columns."""
     height = max(_WIDTH * panel.size[1] / panel.size[0] for panel in panels)
     row_height, rows = _HEAD + height + _GAP, -(-len(panels) // _COLUMNS)
     parts = []
@@ -44,7 +48,7 @@ def draw_demo(panels: Sequence[Panel], path: Path) -> None:
         parts.append(_panel(panel, _GAP + column * (_WIDTH + _GAP), row * row_height))
     whole = document(_COLUMNS * (_WIDTH + _GAP) + _GAP, rows * row_height, "LaLaLoc", parts)
     drawn: Image.Image = pixels(whole)
-    # PNG has no quality and ignores it.
+    # PNG ignores the quality.
     drawn.save(path, quality=_JPEG_QUALITY)
 
 
@@ -63,9 +67,11 @@ def _panel(panel: Panel, x: float, y: float) -> str:
     )
 
 
-def _sentence(label: str, truth: TruePose, answer: Localisation) -> str:
-    x_m, y_m = answer.position.x_m, answer.position.y_m
+def _sentence(label: str, truth: TruePose, localisation: Localisation) -> str:
+    x_m, y_m = localisation.position.x_m, localisation.position.y_m
     error_m = math.hypot(x_m - truth.x_m, y_m - truth.y_m)
-    turned = (answer.heading_deg - truth.heading_deg + 180.0) % 360.0 - 180.0
-    confidence = "" if answer.confidence is None else f", confidence {answer.confidence:.2f}"
-    return f"{label}: {answer.room} ({x_m:.2f}, {y_m:.2f}) m, off by {error_m:.2f} m and {turned:+.1f}°{confidence}"
+    turn_deg = (localisation.heading_deg - truth.heading_deg + 180.0) % 360.0 - 180.0
+    confidence = "" if localisation.confidence is None else f", confidence {localisation.confidence:.2f}"
+    return (
+        f"{label}: {localisation.room} ({x_m:.2f}, {y_m:.2f}) m, error {error_m:.2f} m and {turn_deg:+.1f}°{confidence}"
+    )

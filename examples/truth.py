@@ -1,4 +1,4 @@
-"""Where the example panoramas were taken: `poses.json`, written by `make_examples`, read by the demo."""
+"""True poses of the example panoramas in `poses.json`, written by `make_examples.py`."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ POSES_PATH = FOLDER / "poses.json"
 
 @dataclass(frozen=True, kw_only=True)
 class TruePose:
-    """True pose of one panorama; the fields are those of the file.
+    """True pose of one panorama, with the fields of the file.
 
     Attributes:
-        file: name of the picture in this folder.
-        plan: name of the plan's file in this folder.
+        file: file name of the picture.
+        plan: file name of the plan.
         room: name of the room.
-        x_m, y_m: position in the plan frame.
-        heading_deg: azimuth of the picture's centre column.
-        camera_height_m: over the floor.
+        x_m, y_m: position in plan coordinates.
+        heading_deg: heading of the picture's centre column.
+        camera_height_m: height above the floor.
     """
 
     file: str
@@ -36,16 +36,16 @@ class TruePose:
 
     @property
     def picture(self) -> Path:
-        """The picture's path."""
+        """Path of the picture."""
         return FOLDER / self.file
 
 
 def read_poses() -> list[TruePose]:
-    """The true poses of all example panoramas."""
+    """Return the true poses of all example panoramas."""
     return [TruePose(**record) for record in json.loads(POSES_PATH.read_bytes())]
 
 
 def write_poses(poses: Sequence[TruePose]) -> None:
-    """Replace the file."""
+    """Write all true poses to the file."""
     records = [dataclasses.asdict(pose) for pose in poses]
     POSES_PATH.write_text(json.dumps(records, indent=2) + "\n", encoding="utf-8")

@@ -1,4 +1,4 @@
-"""The example flat, its panoramas and the demo belong together."""
+"""Example flat, its panoramas, and the demo."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from examples.demo import StageMissingError, check_answer
+from examples.demo import StageMissingError, check_localisation
 from examples.make_examples import HEIGHT, HOLES, VIEWS, WIDTH, example_home, openings_of, true_pose
 from examples.truth import FOLDER, PLAN_PATH, read_poses
 from lalaloc_client import Candidate, Localisation, Model, Position
@@ -24,7 +24,7 @@ ROOT = Path(__file__).parents[1]
 PLAN = FloorPlan.from_json(PLAN_PATH.read_bytes())
 
 
-def test_the_flat_has_the_openings_that_its_pictures_show() -> None:
+def test_flat_has_the_openings_in_its_pictures() -> None:
     home, kinds = example_home(), {"door_open": "door", "door_shut": "door", "opening": "passage", "window": "window"}
     drawn = [
         (o.room, o.wall, o.neighbour, kinds[o.kind], round(o.end_m - o.start_m, 6), o.sill_m, o.head_m)
@@ -34,24 +34,24 @@ def test_the_flat_has_the_openings_that_its_pictures_show() -> None:
     for face in home.plan.opening_faces:
         opening, wall = home.plan.openings[face.opening], home.plan.rooms[face.room].walls_m[face.wall]
         length_m = float(np.hypot(*(wall[2:] - wall[:2]))) * (face.end - face.start)
-        where = (face.room, face.wall, face.behind, opening.kind, round(length_m, 6))
-        found.append((*where, opening.sill_m, opening.head_m))
+        location = (face.room, face.wall, face.behind, opening.kind, round(length_m, 6))
+        found.append((*location, opening.sill_m, opening.head_m))
     assert sorted(found) == sorted(drawn)
     assert all(room.type != "unknown" for room in home.plan.rooms)
 
 
-def test_the_flat_is_of_a_usual_size_and_has_no_warnings() -> None:
+def test_flat_has_a_usual_size_and_no_warnings() -> None:
     assert PLAN.warnings == ()
     assert 60.0 < PLAN.area_m2 < 100.0
 
 
 def test_rooms_lie_one_wall_apart() -> None:
     for index, room in enumerate(PLAN.rooms):
-        gaps = [room.shape.distance(other.shape) for other in PLAN.rooms if other is not room]
+        gaps = [room.shape.distance(neighbour.shape) for neighbour in PLAN.rooms if neighbour is not room]
         assert min(gaps) == pytest.approx(0.12), PLAN.rooms[index].name
 
 
-def test_true_poses_are_those_the_pictures_were_taken_from() -> None:
+def test_true_poses_match_the_rendered_views() -> None:
     assert read_poses() == [true_pose(PLAN, view) for view in VIEWS]
 
 
@@ -65,7 +65,7 @@ def test_every_picture_has_a_true_pose_in_its_room() -> None:
             assert picture.size == (WIDTH, HEIGHT)
 
 
-def test_doors_join_two_rooms_and_windows_look_outside() -> None:
+def test_doors_join_two_rooms_and_windows_face_outside() -> None:
     for hole in HOLES:
         openings = openings_of(PLAN, hole)
         assert all(opening.end_m - opening.start_m > 0.5 for opening in openings)
@@ -81,9 +81,9 @@ def test_every_room_has_a_door() -> None:
     assert with_door == set(range(len(PLAN.rooms)))
 
 
-def _answer(**changes: Any) -> Localisation:
+def _localisation(**changes: Any) -> Localisation:
     position = Position(1.0, 2.0)
-    answer = Localisation(
+    localisation = Localisation(
         floorplan_id="p",
         position=position,
         heading_deg=0.0,
@@ -99,27 +99,27 @@ def _answer(**changes: Any) -> Localisation:
         timings_ms={"total": 1.0},
         model=Model("m", "1", "0"),
     )
-    return dataclasses.replace(answer, **changes)
+    return dataclasses.replace(localisation, **changes)
 
 
-def test_a_full_answer_is_accepted() -> None:
-    check_answer(_answer())
+def test_complete_localisation_is_accepted() -> None:
+    check_localisation(_localisation())
 
 
 @pytest.mark.parametrize(
-    ("changes", "complaint"),
+    ("changes", "message"),
     [
         ({"stage": "vdr"}, "'vdr'"),
         ({"candidates": ()}, "no candidates"),
-        ({"position": Position(float("nan"), 0.0)}, r"answer\.position\.x_m"),
+        ({"position": Position(float("nan"), 0.0)}, r"localisation\.position\.x_m"),
     ],
 )
-def test_an_answer_that_is_not_full_is_refused(changes: dict[str, Any], complaint: str) -> None:
-    with pytest.raises(StageMissingError, match=complaint):
-        check_answer(_answer(**changes))
+def test_incomplete_localisation_is_rejected(changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(StageMissingError, match=message):
+        check_localisation(_localisation(**changes))
 
 
-def test_the_demo_runs_through_every_stage(tiny_bundle: Path, tmp_path: Path) -> None:
+def test_demo_runs_every_stage(tiny_bundle: Path, tmp_path: Path) -> None:
     out = tmp_path / "demo.png"
     environment = {**os.environ, "LALALOC_BUNDLE": str(tiny_bundle)}
     command = [sys.executable, "-m", "examples.demo", "--out", str(out)]
@@ -130,7 +130,7 @@ def test_the_demo_runs_through_every_stage(tiny_bundle: Path, tmp_path: Path) ->
         assert picture.width > 1000
 
 
-def test_the_example_is_served_on_another_port_and_begins_in_silence(tmp_path: Path) -> None:
+def test_serve_uses_another_port_and_logs_no_readiness_checks(tmp_path: Path) -> None:
     environment = os.environ | {"LALALOC_DATA_DIR": str(tmp_path / "data"), "LALALOC_WORKERS": "0"}
     command = [sys.executable, "-m", "examples.serve", "--port", "0"]
     with (tmp_path / "log").open("w+") as log:

@@ -1,9 +1,9 @@
-"""Files of floor plans, read into plans and written from them in worker processes that may die.
+"""Import and export of plan files in worker processes.
 
-Begin with `converter.py`, which has the workers. `files.py` says what an upload is, and takes the native format itself.
+Begin with `converter.py`, the pool of workers. `files.py` imports native plans in the service itself.
 """
 
 from service.conversion.converter import Converter
-from service.conversion.files import PlanFile, seems_native, understand
+from service.conversion.files import PlanFile, convert, seems_native
 
-__all__ = ["Converter", "PlanFile", "seems_native", "understand"]
+__all__ = ["Converter", "PlanFile", "convert", "seems_native"]

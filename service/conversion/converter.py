@@ -1,8 +1,7 @@
-"""Reading and writing the files of plans in worker processes, bounded in memory and time.
+"""Pool of worker processes that import and export plan files, limited in memory and time.
 
-Drawings, models and scans are read by large libraries, some of them in C++: a file that kills such a process gets a
-second try, one that takes too long none, and neither harms anything else. The workers start with the first file: a
-service that is sent nothing but the native format does without.
+Large libraries, some of them in C++, read drawings, models and scans. A file that kills its worker is tried once more;
+a file that takes too long is not. The workers start with the first file that is not in the native format.
 """
 
 from __future__ import annotations
@@ -23,14 +22,14 @@ from service.workers.convert import ConversionRefusal, ExportJob, Imported, Impo
 
 _Pool = WorkerPool[ImportJob | ExportJob, Imported | bytes | ConversionRefusal]
 
-# Files that can wait for a process.
+# Largest number of waiting files.
 _QUEUE = 16
-# A process that reads one file for longer than `max_import_s` and this is replaced.
+# A worker that spends longer than `max_import_s` plus this margin on a file is replaced.
 _STALL_MARGIN_S = 10.0
 
 
 class Converter:
-    """Bounded pool of converting workers; may be used from any thread."""
+    """Pool of conversion workers with a bounded queue. Thread-safe."""
 
     def __init__(self, settings: Settings, telemetry: Telemetry) -> None:
         self._settings = settings
@@ -39,78 +38,84 @@ class Converter:
         self._lock = threading.Lock()
         self._closed = False
         telemetry.gauge(
-            "lalaloc_import_queue_depth", "Files of plans waiting for a worker.", lambda: self._count("waiting")
+            "lalaloc_import_queue_depth", "Plan files waiting for a worker.", lambda: self._count("waiting")
         )
         telemetry.gauge(
             "lalaloc_import_workers_resident_bytes",
-            "Memory of all workers that read files of plans.",
+            "Memory of all import workers.",
             lambda: self._count("resident_bytes"),
         )
 
     @property
     def state(self) -> PoolState:
-        """How many workers are wanted and warm; none are before the first file."""
+        """Number of workers wanted and ready; no worker is ready before the first file."""
         pool = self._pool
         if pool is None:
             return PoolState(workers=self._settings.imports.workers, ready=0, warmed_up=False, fault=None)
         return pool.state
 
     def read(self, content: bytes, options: ImportOptions, client: str) -> Imported:
-        """What there is in the file of a plan; blocks, for twice `max_import_s` at most.
+        """Import a plan file. Blocks for up to twice `max_import_s`.
 
         Raises:
-            InvalidFloorPlanError, SeveralLevelsError: what is wrong with the file, and what to do; or a worker stalled
-                over it, or two died.
-            MissingExtraError: what reads its format is not installed.
-            OverloadedError: too many files wait already.
-            DeadlineExceededError: it was not read in time.
-            ConverterNotReadyError: no worker is running, nor will be in time.
+            InvalidFloorPlanError: the file is invalid, a worker stalled on it, or two workers died.
+            SeveralLevelsError: the file has several storeys and no `level` is set.
+            MissingExtraError: a library of its format is not installed.
+            OverloadedError: the queue is full.
+            DeadlineExceededError: the import did not finish in time.
+            ConverterNotReadyError: no worker is running.
             StoppingError: the service is shutting down.
         """
         limit_s = self._settings.plans.import_deadline_s
         try:
-            future = self._started().submit(ImportJob(content, options), limit_s, client)
+            future = self._running_pool().submit(ImportJob(content, options), limit_s, client)
             done, _ = wait([future], limit_s)
             if not done:
                 future.cancel()
                 raise JobLostError("deadline")
-            answer = future.result()
+            result = future.result()
         except JobLostError as error:
-            self._lost(error)
-        if isinstance(answer, ConversionRefusal):
-            raise answer.error()
-        assert isinstance(answer, Imported)
-        return answer
+            self._raise_lost(error)
+        if isinstance(result, ConversionRefusal):
+            raise result.error()
+        assert isinstance(result, Imported)
+        return result
 
     async def write(self, plan: FloorPlan, format: str, client: str) -> bytes:
-        """A plan as the file of another tool.
+        """Export a plan as a file.
 
         Args:
+            plan: plan to export.
             format: one of `lalaloc_core.importers.EXPORT_FORMATS`.
+            client: client that the job counts for.
 
         Raises:
-            InvalidFloorPlanError: the plan has not what the format needs.
-            MissingExtraError, OverloadedError, DeadlineExceededError, ConverterNotReadyError, StoppingError: as `read`.
+            InvalidFloorPlanError: the plan lacks something that the format requires.
+            MissingExtraError: a library of the format is not installed.
+            OverloadedError: the queue is full.
+            DeadlineExceededError: the export did not finish in time.
+            ConverterNotReadyError: no worker is running.
+            StoppingError: the service is shutting down.
         """
         job = ExportJob(json.dumps(plan.to_dict()), format)
         try:
-            answer = await self._started().run_job(job, self._settings.plans.import_deadline_s, client)
+            result = await self._running_pool().run_job(job, self._settings.plans.import_deadline_s, client)
         except JobLostError as error:
-            self._lost(error)
-        if isinstance(answer, ConversionRefusal):
-            raise answer.error()
-        assert isinstance(answer, bytes)
-        return answer
+            self._raise_lost(error)
+        if isinstance(result, ConversionRefusal):
+            raise result.error()
+        assert isinstance(result, bytes)
+        return result
 
     def close(self) -> None:
-        """End all workers and wait for them."""
+        """Stop all workers and wait for them."""
         with self._lock:
             self._closed = True
         if self._pool is not None:
             self._pool.close()
 
-    def _started(self) -> _Pool:
-        """The pool, which the first to ask for it starts."""
+    def _running_pool(self) -> _Pool:
+        """Return the pool; the first call starts it."""
         with self._lock:
             if self._closed:
                 raise JobLostError("closing")
@@ -135,23 +140,23 @@ class Converter:
     def _count(self, name: str) -> float:
         return 0 if self._pool is None else getattr(self._pool, name)
 
-    def _lost(self, error: JobLostError) -> NoReturn:
+    def _raise_lost(self, error: JobLostError) -> NoReturn:
         settings = self._settings
         match error.reason:
             case "poisoned":
                 raise InvalidFloorPlanError(
-                    "the file could not be read: twice that ended the process that tried, perhaps for want of memory "
-                    f"({settings.imports.memory_bytes} bytes, import_memory_bytes); save it anew, smaller, or in "
+                    "the file could not be read: it ended two worker processes, possibly for lack of memory; the "
+                    f"limit is {settings.imports.memory_bytes} bytes (import_memory_bytes); export a smaller part, or "
                     "another format"
                 ) from error
             case "stalled":
                 raise InvalidFloorPlanError(
-                    f"reading the file took longer than {settings.plans.max_import_s + _STALL_MARGIN_S:g} s (max_import_s is "
-                    f"{settings.plans.max_import_s:g}); export only the layers that matter, or one storey"
+                    f"reading the file took longer than {settings.plans.max_import_s + _STALL_MARGIN_S:g} s "
+                    f"(max_import_s is {settings.plans.max_import_s:g}); export a single storey, or fewer layers"
                 ) from error
             case "fault":
                 raise InvalidFloorPlanError(
-                    "the file is damaged, or drawn in a way that is not understood; save it anew, or in another format"
+                    "the file is damaged or has an unsupported structure; save it again, or in another format"
                 ) from error
             case "queue-full":
                 raise OverloadedError(_QUEUE) from error

@@ -1,7 +1,7 @@
-"""What an uploaded file of a plan is: the native format is read here, all others in worker processes.
+"""Conversion of an uploaded plan file.
 
-Small plans in the native format are JSON of bounded depth and size, which nothing can happen over; everything else,
-large JSON included, would hold up everybody else, or may end the process that reads it.
+The service parses small native plans itself, because JSON of bounded depth and size is harmless. Worker processes read
+all other files, which can be slow or crash their reader.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ _MAX_IN_PROCESS_BYTES = 2 * 2**20
 
 @dataclass(frozen=True)
 class PlanFile:
-    """An uploaded file, and what was understood of it.
+    """Plan of an uploaded file.
 
     Attributes:
-        plan: validated under the service's limits.
-        report: of the import, as JSON has it.
-        media_type: of the file, by its content.
+        plan: plan, validated under the service's limits.
+        report: report of the import as JSON data.
+        media_type: media type of the file, detected from its content.
     """
 
     plan: FloorPlan
@@ -36,29 +36,31 @@ class PlanFile:
 
 
 def seems_native(content: bytes) -> bool:
-    """Whether a file is read here, as far as a glance can tell."""
+    """Return whether a file looks like a small native plan, which needs no worker."""
     return len(content) <= _MAX_IN_PROCESS_BYTES and is_json(content) and describe_file(content) is None
 
 
-def understand(
-    content: bytes, options: ImportOptions, converter: Converter, settings: Settings, client: str
-) -> PlanFile:
-    """Read the file of a plan; blocks.
+def convert(content: bytes, options: ImportOptions, converter: Converter, settings: Settings, client: str) -> PlanFile:
+    """Convert an uploaded file to a plan. Blocks.
 
     Raises:
-        InvalidFloorPlanError, SeveralLevelsError: what is wrong with it, and what to do.
-        MissingExtraError, OverloadedError, DeadlineExceededError, ConverterNotReadyError, StoppingError: see
-            `Converter.read`.
+        InvalidFloorPlanError: the file is invalid or exceeds a limit.
+        SeveralLevelsError: the file has several storeys and no `level` is set.
+        MissingExtraError: a library of its format is not installed.
+        OverloadedError: the queue of the workers is full.
+        DeadlineExceededError: the import did not finish in time.
+        ConverterNotReadyError: no worker is running.
+        StoppingError: the service is shutting down.
     """
     if not content.strip():
-        raise InvalidFloorPlanError("the body is empty, the file of a floor plan is needed")
+        raise InvalidFloorPlanError("the body is empty; send a plan file")
     limits = settings.plans.import_limits
     if seems_native(content):
         imported = import_if_native(content, options, limits)
         if imported is not None:
             return PlanFile(imported.plan(limits.plan), report_of(imported), media_type_of(content, "native"))
     elif not is_json(content):
-        # Known at a glance, and refused at once where it is nothing known.
+        # Reject unsupported formats before they take a worker.
         detect_format(content, limits)
-    read = converter.read(content, options, client)
-    return PlanFile(FloorPlan.from_dict(read.document, limits.plan), read.report, read.media_type)
+    result = converter.read(content, options, client)
+    return PlanFile(FloorPlan.from_dict(result.document, limits.plan), result.report, result.media_type)

@@ -1,6 +1,6 @@
-"""Pictures of a stored plan: an SVG drawing and a GLB mesh.
+"""Pictures of stored plans: SVG drawings and GLB meshes.
 
-Begin with `drawings.py`, which keeps them; `lalaloc_core.draw` and `mesh.py` make them.
+Begin with `drawings.py`, which caches them. `lalaloc_core.draw.plan` makes the drawings and `mesh.py` the meshes.
 """
 
 from service.preview.drawings import Drawings

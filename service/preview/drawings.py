@@ -1,4 +1,4 @@
-"""Drawings and meshes of stored plans: made once per revision, on a thread of their own, kept while there is room."""
+"""Cache of drawings and meshes of stored plans, made once per revision on a thread of their own."""
 
 from __future__ import annotations
 
@@ -15,75 +15,78 @@ from service.preview.mesh import plan_glb
 from service.storage.records import PlanRecord
 from service.threads import Threads
 
-# (revision, what is made of it): a revision never changes.
+# (revision, product). A revision never changes.
 _Key = tuple[str, str]
 
 
 @dataclass
-class _Making:
-    """What is being made, or waits for it, and how many requests wait for that."""
+class _PendingJob:
+    """Job that is queued or running, and the number of requests waiting for it."""
 
     future: Future[bytes]
     waiting: int = 0
 
 
 class Drawings:
-    """For one event loop. What nobody waits for any more, as its clients hung up, is not begun."""
+    """Drawings and meshes for one event loop. Queued jobs are cancelled when no request waits for them."""
 
     def __init__(self, *, limit_bytes: int, max_waiting: int) -> None:
-        """Args:
-        limit_bytes: of what is kept.
-        max_waiting: revisions that may be drawn or wait for it.
+        """Start the thread.
+
+        Args:
+            limit_bytes: size of the cache.
+            max_waiting: largest number of revisions being drawn or waiting.
         """
         self._threads = Threads("lalaloc-drawings", 1)
-        self._kept: BoundedCache[_Key, bytes] = BoundedCache(limit_bytes, len)
-        self._making: dict[_Key, _Making] = {}
+        self._cache: BoundedCache[_Key, bytes] = BoundedCache(limit_bytes, len)
+        self._pending: dict[_Key, _PendingJob] = {}
         self._max_waiting = max_waiting
 
     async def svg(self, record: PlanRecord, marker: Marker | None) -> bytes:
-        """The drawing of a plan, with a camera in it or without.
+        """Return the drawing of a plan, optionally with a camera.
 
         Raises:
-            OverloadedError: too many others are waiting to be drawn.
+            OverloadedError: too many plans are waiting to be drawn.
         """
         return plan_svg(record.plan, marker, rooms=await self.rooms(record)).encode()
 
     async def rooms(self, record: PlanRecord) -> str:
-        """What `lalaloc_core.draw.draw_rooms` makes of a plan.
+        """Return the rooms of a plan as SVG elements, from `lalaloc_core.draw.plan.draw_rooms`.
 
         Raises:
-            OverloadedError: too many others are waiting to be drawn.
+            OverloadedError: too many plans are waiting to be drawn.
         """
-        return (await self._made((record.revision_id, "rooms"), lambda: draw_rooms(record.plan).encode())).decode()
+        drawn = await self._get_or_make((record.revision_id, "rooms"), lambda: draw_rooms(record.plan).encode())
+        return drawn.decode()
 
     async def glb(self, record: PlanRecord) -> bytes:
-        """The mesh of a plan.
+        """Return the mesh of a plan.
 
         Raises:
-            OverloadedError: too many others are waiting to be drawn.
+            OverloadedError: too many plans are waiting to be drawn.
         """
-        return await self._made((record.revision_id, "glb"), partial(plan_glb, record.plan))
+        return await self._get_or_make((record.revision_id, "glb"), partial(plan_glb, record.plan))
 
     def close(self) -> None:
-        """Finish what is being drawn, drop the rest."""
+        """Finish the current job and drop the queued jobs."""
         self._threads.close()
 
-    async def _made(self, key: _Key, make: Callable[[], bytes]) -> bytes:
-        if (kept := self._kept.get(key)) is not None:
-            return kept
-        making = self._making.get(key)
-        if making is None:
-            if len(self._making) >= self._max_waiting:
+    async def _get_or_make(self, key: _Key, make: Callable[[], bytes]) -> bytes:
+        if (cached := self._cache.get(key)) is not None:
+            return cached
+        job = self._pending.get(key)
+        if job is None:
+            if len(self._pending) >= self._max_waiting:
                 raise OverloadedError(self._max_waiting)
-            making = self._making[key] = _Making(self._threads.submit(make))
-        making.waiting += 1
+            job = self._pending[key] = _PendingJob(self._threads.submit(make))
+        job.waiting += 1
         try:
-            content = await asyncio.shield(asyncio.wrap_future(making.future))
-            self._kept.put(key, content)
+            content = await asyncio.shield(asyncio.wrap_future(job.future))
+            self._cache.put(key, content)
             return content
         finally:
-            making.waiting -= 1
-            if making.waiting == 0:
-                self._making.pop(key, None)
-                # Without effect on what has begun.
-                making.future.cancel()
+            job.waiting -= 1
+            if job.waiting == 0:
+                self._pending.pop(key, None)
+                # A running job is not affected.
+                job.future.cancel()

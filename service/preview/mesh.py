@@ -1,7 +1,7 @@
-"""A floor plan as a GLB mesh: floor, ceiling and walls of every room, and panels where its walls have openings.
+"""GLB mesh of a floor plan: floor, ceiling and walls of every room, and panels for openings.
 
-glTF is y-up: plan point (x, y, z) becomes (x, z, -y), in metres. All faces look into their room, so a viewer that
-hides back faces shows the inside from wherever one looks.
+glTF is y-up: the plan point (x, y, z) becomes (x, z, -y), in metres. All faces point into their room, so a viewer that
+culls back faces shows the inside from any direction.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ _COLOURS = {
     "window": (150, 200, 235, 255),
     "passage": (90, 90, 95, 255),
 }
-# How far before the wall the panels of openings stand.
-_BEFORE_WALL_M = 0.005
+# Distance between the panels of openings and their wall.
+_PANEL_OFFSET_M = 0.005
 
 
 def plan_glb(plan: FloorPlan) -> bytes:
-    """The plan as binary glTF; one node per surface, named `<number of the room>/<room>/<surface>`."""
+    """Return the plan as binary glTF with one node per surface, named `<room number>/<room>/<surface>`."""
     scene = trimesh.Scene()
     faces: list[list[OpeningFace]] = [[] for _ in plan.rooms]
     for face in plan.opening_faces:
@@ -49,14 +49,14 @@ def _surfaces(room: Room) -> dict[str, trimesh.Trimesh]:
     corners, triangles = trimesh.creation.triangulate_polygon(room.shape, engine="earcut")
     height = room.ceiling_height_m
     return {
-        "floor": _facing(corners, triangles, 0.0, up=True),
-        "ceiling": _facing(corners, triangles, height, up=False),
+        "floor": _horizontal(corners, triangles, 0.0, up=True),
+        "ceiling": _horizontal(corners, triangles, height, up=False),
         "wall": _walls(room, height),
     }
 
 
 def _openings(plan: FloorPlan, room: Room, faces: Sequence[OpeningFace]) -> dict[str, trimesh.Trimesh]:
-    """Panels on the walls of a room, one mesh for each kind of opening."""
+    """Return panels on the walls of a room, one mesh per kind of opening."""
     panels: dict[str, list[np.ndarray]] = {}
     for face in faces:
         opening = plan.openings[face.opening]
@@ -66,37 +66,37 @@ def _openings(plan: FloorPlan, room: Room, faces: Sequence[OpeningFace]) -> dict
         ends = room.walls_m[face.wall].reshape(2, 2)
         edge = ends[1] - ends[0]
         inwards = np.array([-edge[1], edge[0]]) / np.hypot(*edge)
-        start, end = ends[0] + np.array([[face.start], [face.end]]) * edge + _BEFORE_WALL_M * inwards
+        start, end = ends[0] + np.array([[face.start], [face.end]]) * edge + _PANEL_OFFSET_M * inwards
         if low < high:
             panels.setdefault(opening.kind, []).append(np.array([[*start, *end, low, high]]))
-    return {kind: _upright(*_columns(np.concatenate(rows))) for kind, rows in panels.items()}
+    return {kind: _vertical(*_columns(np.concatenate(rows))) for kind, rows in panels.items()}
 
 
 def _columns(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     return rows[:, :2], rows[:, 2:4], rows[:, 4], rows[:, 5]
 
 
-def _facing(corners: np.ndarray, triangles: np.ndarray, z: float, *, up: bool) -> trimesh.Trimesh:
-    """A horizontal surface whose triangles all look up, or all down."""
+def _horizontal(corners: np.ndarray, triangles: np.ndarray, z: float, *, up: bool) -> trimesh.Trimesh:
+    """Return a horizontal surface whose triangles all face up, or all down."""
     a, b, c = (corners[triangles[:, k]] for k in range(3))
     ab, ac = b - a, c - a
-    looks_up = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0] > 0.0
-    turned = np.where((looks_up == up)[:, None], triangles, triangles[:, ::-1])
+    faces_up = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0] > 0.0
+    turned = np.where((faces_up == up)[:, None], triangles, triangles[:, ::-1])
     return _mesh(np.column_stack([corners, np.full(len(corners), z)]), turned)
 
 
 def _walls(room: Room, height: float) -> trimesh.Trimesh:
-    """One rectangle per edge, the room to its left; free-standing walls have one for each side."""
+    """Return one rectangle per edge, with the room to its left; free-standing walls have one per side."""
     walls = np.concatenate([room.walls_m, room.inner_walls_m[:, [2, 3, 0, 1]]])
-    return _upright(walls[:, :2], walls[:, 2:], np.zeros(len(walls)), np.full(len(walls), height))
+    return _vertical(walls[:, :2], walls[:, 2:], np.zeros(len(walls)), np.full(len(walls), height))
 
 
-def _upright(start: np.ndarray, end: np.ndarray, zero: np.ndarray, top: np.ndarray) -> trimesh.Trimesh:
-    """Rectangles from one height to another, seen from their left."""
+def _vertical(start: np.ndarray, end: np.ndarray, bottom: np.ndarray, top: np.ndarray) -> trimesh.Trimesh:
+    """Return rectangles between two heights that face the left of start to end."""
     vertices = np.stack(
         [
-            np.column_stack([start, zero]),
-            np.column_stack([end, zero]),
+            np.column_stack([start, bottom]),
+            np.column_stack([end, bottom]),
             np.column_stack([end, top]),
             np.column_stack([start, top]),
         ],

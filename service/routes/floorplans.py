@@ -8,7 +8,7 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request, Response, status
 
 from lalaloc_core.floorplan import FloorPlan
-from service.conversion import understand
+from service.conversion import convert
 from service.errors import (
     IdempotencyInProgressError,
     IdempotencyKeyReusedError,
@@ -194,7 +194,7 @@ def delete_floorplan(floorplan_id: str, request: Request, runtime: Running, tena
 
 def _prepared(uploaded: PlanUpload, runtime: Runtime, client: str) -> tuple[FloorPlan, Original, ComputedGrid | None]:
     """The plan in an uploaded file, the file as it is stored, and the plan's grid if that is computed at once."""
-    file = understand(uploaded.content, uploaded.options, runtime.converter, runtime.settings, client)
+    file = convert(uploaded.content, uploaded.options, runtime.converter, runtime.settings, client)
     runtime.grids.check_size(file.plan)
     original = Original(uploaded.content, file.media_type, json.dumps(file.report))
     return file.plan, original, runtime.grids.prepare(file.plan)

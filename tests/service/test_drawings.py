@@ -1,4 +1,4 @@
-"""Drawings of stored plans: made once per revision, one at a time, and not for clients that are gone."""
+"""Cache of drawings: one drawing per revision, bounded queue, cancellation."""
 
 from __future__ import annotations
 
@@ -38,24 +38,24 @@ def _record(revision_id: str) -> PlanRecord:
     )
 
 
-class _Pen:
-    """Draws as the service does, once it is let; counts."""
+class _BlockedRenderer:
+    """Renderer that counts its drawings and waits for `release`."""
 
     def __init__(self) -> None:
         self.drawn = 0
-        self.go_on = threading.Event()
+        self.release = threading.Event()
 
     def __call__(self, plan: FloorPlan) -> str:
-        assert self.go_on.wait(30.0)
+        assert self.release.wait(30.0)
         self.drawn += 1
         return draw_rooms(plan)
 
 
 @pytest.fixture
-def pen(monkeypatch: pytest.MonkeyPatch) -> _Pen:
-    pen = _Pen()
-    monkeypatch.setattr(module, "draw_rooms", pen)
-    return pen
+def renderer(monkeypatch: pytest.MonkeyPatch) -> _BlockedRenderer:
+    renderer = _BlockedRenderer()
+    monkeypatch.setattr(module, "draw_rooms", renderer)
+    return renderer
 
 
 @pytest.fixture
@@ -65,59 +65,59 @@ def drawings() -> Iterator[Drawings]:
     made.close()
 
 
-async def _begun(work: Coroutine[Any, Any, bytes]) -> asyncio.Task[bytes]:
+async def _started(work: Coroutine[Any, Any, bytes]) -> asyncio.Task[bytes]:
     task = asyncio.create_task(work)
     await asyncio.sleep(0)
     return task
 
 
-def test_a_revision_is_drawn_once_wherever_the_camera_stands(drawings: Drawings, pen: _Pen) -> None:
+def test_revision_is_drawn_once_for_all_markers(drawings: Drawings, renderer: _BlockedRenderer) -> None:
     record, marker = _record("one"), Marker(x_m=1.0, y_m=2.0, heading_deg=30.0)
 
-    async def ask() -> list[bytes]:
-        tasks = [await _begun(drawings.svg(record, where)) for where in (None, marker, None)]
-        pen.go_on.set()
+    async def request() -> list[bytes]:
+        tasks = [await _started(drawings.svg(record, shown)) for shown in (None, marker, None)]
+        renderer.release.set()
         return [*await asyncio.gather(*tasks), await drawings.svg(record, marker)]
 
-    answers = asyncio.run(ask())
-    assert pen.drawn == 1
+    results = asyncio.run(request())
+    assert renderer.drawn == 1
     plain, marked = plan_svg(record.plan).encode(), plan_svg(record.plan, marker).encode()
-    assert answers == [plain, marked, plain, marked]
+    assert results == [plain, marked, plain, marked]
 
 
-def test_another_revision_is_drawn_anew_and_meshes_are_kept_too(drawings: Drawings, pen: _Pen) -> None:
-    pen.go_on.set()
+def test_new_revision_is_drawn_and_meshes_are_cached(drawings: Drawings, renderer: _BlockedRenderer) -> None:
+    renderer.release.set()
 
-    async def ask() -> bytes:
+    async def request() -> bytes:
         for revision_id in ("one", "two", "one"):
             await drawings.svg(_record(revision_id), None)
         meshes = [await drawings.glb(_record("one")) for _ in range(2)]
         assert meshes[0] is meshes[1]
         return meshes[0]
 
-    assert asyncio.run(ask()) == plan_glb(_record("one").plan)
-    assert pen.drawn == 2
+    assert asyncio.run(request()) == plan_glb(_record("one").plan)
+    assert renderer.drawn == 2
 
 
-def test_what_waits_is_bounded_and_what_nobody_waits_for_is_not_begun(drawings: Drawings, pen: _Pen) -> None:
-    async def ask() -> None:
-        first = await _begun(drawings.svg(_record("one"), None))
-        gone = await _begun(drawings.svg(_record("two"), None))
+def test_queue_is_bounded_and_abandoned_jobs_are_cancelled(drawings: Drawings, renderer: _BlockedRenderer) -> None:
+    async def request() -> None:
+        first = await _started(drawings.svg(_record("one"), None))
+        abandoned = await _started(drawings.svg(_record("two"), None))
         with pytest.raises(OverloadedError, match="2 others"):
             await drawings.svg(_record("three"), None)
-        # Its client hangs up.
-        gone.cancel()
+        # The client disconnects.
+        abandoned.cancel()
         with suppress(asyncio.CancelledError):
-            await gone
-        third = await _begun(drawings.svg(_record("three"), None))
-        pen.go_on.set()
+            await abandoned
+        third = await _started(drawings.svg(_record("three"), None))
+        renderer.release.set()
         await asyncio.gather(first, third)
 
-    asyncio.run(ask())
-    assert pen.drawn == 2
+    asyncio.run(request())
+    assert renderer.drawn == 2
 
 
-def test_the_time_for_a_drawing_grows_with_the_plan_and_no_faster() -> None:
+def test_drawing_time_is_linear_in_the_plan() -> None:
     def draw(corners: int) -> Any:
         return lambda: draw_rooms(plan_of(*[spiral(corners)] * 6))
 

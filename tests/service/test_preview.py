@@ -1,4 +1,4 @@
-"""Drawing and mesh show the plan at scale, whatever its rooms are called."""
+"""Drawing and mesh of a plan: scale, names, marker, openings."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ L_ROOM = {
 }
 
 
-def test_the_drawing_has_every_room_at_its_place_with_y_pointing_up() -> None:
+def test_drawing_has_every_room_with_y_up() -> None:
     plan = FloorPlan.from_dict(FLAT)
     root = ElementTree.fromstring(plan_svg(plan))
     drawn = [
@@ -44,7 +44,7 @@ def test_the_drawing_has_every_room_at_its_place_with_y_pointing_up() -> None:
 @example("<b>&\"'")
 @example("\ufffe \uffff")
 @settings(deadline=None)
-def test_a_name_that_is_accepted_makes_well_formed_svg(name: str) -> None:
+def test_valid_name_gives_well_formed_svg(name: str) -> None:
     document = {"name": name, "ceiling_height_m": 2.5, "rooms": [{"name": name, "polygon": [[0, 0], [3, 0], [0, 3]]}]}
     try:
         plan = FloorPlan.from_dict(document)
@@ -55,7 +55,7 @@ def test_a_name_that_is_accepted_makes_well_formed_svg(name: str) -> None:
     assert drawn == name.replace("\ufffe", "\ufffd").replace("\uffff", "\ufffd")
 
 
-def test_the_camera_is_drawn_at_its_position_and_turned_clockwise() -> None:
+def test_camera_is_drawn_at_its_pose() -> None:
     root = ElementTree.fromstring(plan_svg(FloorPlan.from_dict(FLAT), Marker(x_m=1.5, y_m=2.0, heading_deg=90.0)))
     camera = next(group for group in root.iter(f"{SVG}g") if group.get("class") == "camera")
     assert camera.attrib["transform"] == "translate(1.5000 -2.0000)"
@@ -65,7 +65,7 @@ def test_the_camera_is_drawn_at_its_position_and_turned_clockwise() -> None:
 
 
 @pytest.mark.parametrize("size_m", [(400.0, 3.0), (3.0, 400.0), (400.0, 300.0), (3.0, 2.0)])
-def test_the_scale_and_its_label_lie_within_the_drawing(size_m: tuple[float, float]) -> None:
+def test_scale_bar_lies_within_the_drawing(size_m: tuple[float, float]) -> None:
     (width, height) = size_m
     corners = [[0, 0], [width, 0], [width, height], [0, height]]
     document = {"ceiling_height_m": 2.5, "rooms": [{"name": "hall", "polygon": corners}]}
@@ -74,14 +74,14 @@ def test_the_scale_and_its_label_lie_within_the_drawing(size_m: tuple[float, flo
     (scale,) = [group for group in root.iter(f"{SVG}g") if group.get("class") == "scale"]
     label = next(scale.iter(f"{SVG}text"))
     size = float(label.attrib["font-size"])
-    # Letters reach a quarter of their size below the line, and are at most as wide as high.
+    # Letters reach a quarter of their size below the line and are no wider than high.
     assert top + height < float(label.attrib["y"]) < top + seen_height - size / 4.0
     assert left <= float(label.attrib["x"]) < left + seen_width - size * len(str(label.text))
     assert size >= 0.01 * min(seen_width, seen_height)
 
 
 @given(st.floats(-30.0, 40.0), st.floats(-30.0, 40.0))
-def test_a_camera_outside_of_the_plan_is_seen_as_well(x_m: float, y_m: float) -> None:
+def test_camera_outside_the_plan_is_visible(x_m: float, y_m: float) -> None:
     plan = FloorPlan.from_dict(FLAT)
     root = ElementTree.fromstring(plan_svg(plan, Marker(x_m=x_m, y_m=y_m, heading_deg=0.0)))
     left, top, width, height = (float(value) for value in root.attrib["viewBox"].split())
@@ -93,20 +93,20 @@ def test_a_camera_outside_of_the_plan_is_seen_as_well(x_m: float, y_m: float) ->
 
 
 @pytest.mark.parametrize("document", [FLAT, L_ROOM], ids=["flat", "concave"])
-def test_the_mesh_encloses_the_plans_volume_seen_from_inside(document: dict) -> None:
+def test_mesh_encloses_the_volume_of_the_plan(document: dict) -> None:
     plan = FloorPlan.from_dict(document)
     scene = trimesh.load(io.BytesIO(plan_glb(plan)), file_type="glb")
     assert isinstance(scene, trimesh.Scene)
     merged = scene.to_mesh()
     expected = sum(room.area_m2 * room.ceiling_height_m for room in plan.rooms)
-    # Faces look inwards, so the signed volume is negative.
+    # Faces point inwards, so the signed volume is negative.
     assert math.isclose(-merged.volume, expected, rel_tol=1e-5)
     x_min, y_min, x_max, y_max = plan.bounds_m
     top = float(plan.ceiling_heights_m.max())
     np.testing.assert_allclose(merged.bounds, [[x_min, 0.0, -y_max], [x_max, top, -y_min]], atol=1e-5)
 
 
-def test_floor_ceiling_and_walls_are_separate_and_named() -> None:
+def test_mesh_surfaces_are_separate_and_named() -> None:
     plan = FloorPlan.from_dict(FLAT)
     scene = trimesh.load(io.BytesIO(plan_glb(plan)), file_type="glb")
     assert isinstance(scene, trimesh.Scene)
@@ -117,14 +117,14 @@ def test_floor_ceiling_and_walls_are_separate_and_named() -> None:
     assert len(areas) == 6
 
 
-def test_the_ellipse_of_a_covariance_is_drawn_along_its_axes_with_y_pointing_up() -> None:
-    # Long by 0.4 m (one standard deviation) along 30° from +x towards +y, and 0.1 m across.
+def test_covariance_ellipse_follows_its_axes() -> None:
+    # Standard deviation 0.4 m along 30° from +x towards +y, and 0.1 m across.
     along = np.array([math.cos(math.radians(30.0)), math.sin(math.radians(30.0))])
     covariance = 0.01 * np.eye(2) + (0.16 - 0.01) * np.outer(along, along)
     marker = Marker(x_m=1.5, y_m=2.0, covariance_m2=(covariance[0, 0], covariance[0, 1], covariance[1, 1]))
     root = ElementTree.fromstring(plan_svg(FloorPlan.from_dict(FLAT), marker))
     ellipse = next(root.iter(f"{SVG}ellipse"))
-    # 95 % of a normal distribution in the plane lie within √5.991 standard deviations.
+    # √5.991 standard deviations contain 95 % of a bivariate normal distribution.
     assert float(ellipse.attrib["rx"]) == pytest.approx(math.sqrt(5.991) * 0.4, abs=1e-3)
     assert float(ellipse.attrib["ry"]) == pytest.approx(math.sqrt(5.991) * 0.1, abs=1e-3)
     turn = float(ellipse.attrib["transform"].removeprefix("rotate(").removesuffix(")"))
@@ -144,24 +144,24 @@ OPEN_FLAT = {
 }
 
 
-def test_openings_holes_and_free_standing_walls_are_drawn() -> None:
+def test_openings_holes_and_inner_walls_are_drawn() -> None:
     root = ElementTree.fromstring(plan_svg(FloorPlan.from_dict(OPEN_FLAT)))
     paths = [(path.get("class"), path.get("d")) for path in root.iter(f"{SVG}path")]
     assert ("walls", "M3.000 -3.000L3.000 -2.000") in paths
     assert [kind for kind, _ in paths if kind in ("door", "window")] == ["door", "door", "window"]
-    # At both faces of the outer wall.
+    # The window is drawn at both faces of the outer wall.
     assert ("window", "M1.000 -0.000L2.000 -0.000M2.000 0.120L1.000 0.120") in paths
     polygons = [polygon.attrib for polygon in root.iter(f"{SVG}polygon")]
     assert any(polygon["points"].count(" ") == 2 and polygon["fill"] == "#fff" for polygon in polygons)
-    # The doorway through the wall's thickness.
+    # The doorway passes through the wall.
     assert any("4.000,-1.000" in polygon["points"] and "4.200,-1.000" in polygon["points"] for polygon in polygons)
 
 
-def test_the_mesh_has_a_hole_in_the_floor_walls_from_both_sides_and_panels_at_openings() -> None:
+def test_mesh_has_holes_inner_walls_and_opening_panels() -> None:
     plan = FloorPlan.from_dict(OPEN_FLAT)
     scene = trimesh.load_scene(io.BytesIO(plan_glb(plan)), file_type="glb")
     assert scene.geometry["1/room 1/floor"].area == pytest.approx(11.5, abs=1e-4)
-    # Outline 14 m, hole 2 + root of 2 m, the stub from both sides 2 m; 2.5 m high.
+    # Outline 14 m, hole 2 + √2 m, both sides of the inner wall 2 m; 2.5 m high.
     assert scene.geometry["1/room 1/wall"].area == pytest.approx(2.5 * (16.0 + 2.0 + math.sqrt(2.0)), abs=1e-3)
     assert scene.geometry["1/room 1/window"].area == pytest.approx(1.0, abs=1e-4)
     assert scene.geometry["2/room 2/door"].area == pytest.approx(0.9 * 2.05, abs=1e-4)
