@@ -88,7 +88,7 @@ class PlanEvents:
         self._subscribers: set[_Subscriber] = set()
         self._watch: asyncio.Task[None] | None = None
 
-    def answer(self, plan_id: str, still_authorised: StillAuthorised = _always) -> EventStream:
+    def event_stream(self, plan_id: str, still_authorised: StillAuthorised = _always) -> EventStream:
         """The stream of a plan that there is.
 
         Args:

@@ -1,7 +1,7 @@
-"""The HTTP routes: each module makes one router.
+"""HTTP routes, one router per module.
 
-Begin with `localise.py`, the query. `dependencies.py` has what routes about plans share, `plan_answers.py` says plans
-in the words of the API.
+Begin with `localise.py`, the query. `dependencies.py` has the dependencies and look-ups that routes share,
+`plan_answers.py` turns stored plans into answers.
 """
 
 from service.routes import (
@@ -19,7 +19,7 @@ from service.routes import (
     venues,
 )
 
-# In the order in which the API description has them.
+# In the order of the API description.
 ROUTERS = tuple(
     module.router
     for module in (

@@ -1,4 +1,4 @@
-"""What routes about plans have in common: the running service, whose plans it is about, and the one in the path."""
+"""Dependencies of routes: the running service, the tenant, and the plan or venue in the path."""
 
 from __future__ import annotations
 
@@ -27,15 +27,15 @@ async def _client_of(request: Request) -> str:
 
 Running = Annotated[Runtime, Depends(runtime_of)]
 Tenant = Annotated[str, Depends(_tenant_of)]
-# With whom the request shares what the service can do at a time; see `service.fair_share`.
+# Tenant or client address that the request's share of slots counts for; see `service.fair_share`.
 Client = Annotated[str, Depends(_client_of)]
 
 
 def stored_plan(tenant: str, floorplan_id: str, plans: Plans) -> PlanRecord:
-    """A stored plan of a tenant.
+    """Return a stored plan of a tenant.
 
     Raises:
-        UnknownFloorPlanError: there is none.
+        UnknownFloorPlanError: no such plan.
         StoreUnavailableError: the database is away.
     """
     record = plans.get(tenant, floorplan_id) if is_id(floorplan_id) else None
@@ -45,10 +45,10 @@ def stored_plan(tenant: str, floorplan_id: str, plans: Plans) -> PlanRecord:
 
 
 def plan_at_revision(current: PlanRecord, revision_id: str, plans: Plans) -> PlanRecord:
-    """A stored plan at any of its revisions.
+    """Return a stored plan at one of its revisions.
 
     Raises:
-        UnknownRevisionError: it is not kept, or never was.
+        UnknownRevisionError: no such revision is kept.
         StoreUnavailableError: the database is away.
     """
     if revision_id == current.revision_id:
@@ -60,10 +60,10 @@ def plan_at_revision(current: PlanRecord, revision_id: str, plans: Plans) -> Pla
 
 
 def plan_summary(tenant: str, floorplan_id: str, plans: Plans) -> PlanSummary:
-    """A stored plan of a tenant without its rooms: whoever replaces or deletes it need not be able to read it.
+    """Return a stored plan without its rooms, so that damaged plans can be replaced or deleted.
 
     Raises:
-        UnknownFloorPlanError: there is none.
+        UnknownFloorPlanError: no such plan.
         StoreUnavailableError: the database is away.
     """
     summary = plans.summary(tenant, floorplan_id) if is_id(floorplan_id) else None
@@ -73,11 +73,11 @@ def plan_summary(tenant: str, floorplan_id: str, plans: Plans) -> PlanSummary:
 
 
 async def plan_for_query(tenant: str, floorplan_id: str, runtime: Runtime) -> PlanRecord:
-    """A plan for a query: as the database has it, or as it was read lately when the database is away or silent.
+    """Return a plan for a query: from the database, or from memory while the database is away.
 
     Raises:
-        UnknownFloorPlanError: there is none.
-        StoreUnavailableError: the database is away, and the plan was not read lately; or too many use it.
+        UnknownFloorPlanError: no such plan.
+        StoreUnavailableError: the database is away and the plan is not in memory, or the database is busy.
     """
     record = await runtime.plan_lookup.find(tenant, floorplan_id, runtime.reads) if is_id(floorplan_id) else None
     if record is None:
@@ -86,11 +86,11 @@ async def plan_for_query(tenant: str, floorplan_id: str, runtime: Runtime) -> Pl
 
 
 async def venue_for_query(tenant: str, venue_id: str, runtime: Runtime) -> VenueRecord:
-    """A venue for a query, as the database has it.
+    """Return a venue for a query.
 
     Raises:
-        UnknownVenueError: there is none.
-        StoreUnavailableError: the database is away, or too many use it.
+        UnknownVenueError: no such venue.
+        StoreUnavailableError: the database is away or busy.
     """
     record = await runtime.reads.run(runtime.store.venues.get, tenant, venue_id) if is_id(venue_id) else None
     if record is None:
@@ -99,25 +99,25 @@ async def venue_for_query(tenant: str, venue_id: str, runtime: Runtime) -> Venue
 
 
 def is_id(text: str) -> bool:
-    """Whether a text looks like an id; they are made here, and whatever looks different need not reach the database."""
+    """Return True for 32 hexadecimal digits; other texts are never looked up in the database."""
     return _ID.fullmatch(text) is not None
 
 
 def header(name: str, description: str) -> dict[str, Any]:
-    """An optional header of a request in the API description."""
+    """Describe an optional request header for the API description."""
     return {"name": name, "in": "header", "required": False, "description": description, "schema": {"type": "string"}}
 
 
 IDEMPOTENCY_KEY = header(
     HEADER,
-    f"1 to {MAX_KEY_CHARACTERS} visible ASCII characters. The same key with the same content within 24 hours is the "
-    "same request, and answered alike, with `Idempotency-Replayed: true`.",
+    f"1 to {MAX_KEY_CHARACTERS} visible ASCII characters. A second request with the same key and content within 24 "
+    "hours is not executed again; it gets the first answer with `Idempotency-Replayed: true`.",
 )
-IF_NONE_MATCH = header("If-None-Match", "Entity tags that the caller has, or `*`; with one of them the answer is 304.")
-NOT_MODIFIED: dict[int | str, dict[str, Any]] = {304: {"description": "The caller has this representation."}}
+IF_NONE_MATCH = header("If-None-Match", "Entity tags that the client has, or `*`; if one matches, the answer is 304.")
+NOT_MODIFIED: dict[int | str, dict[str, Any]] = {304: {"description": "The client has this representation already."}}
 UNLESS_CHANGED = [
-    header("If-Match", "Entity tags of the revision that it must still have, or `*`; 412 when it has another."),
-    header("If-None-Match", "Entity tags of revisions that it must not have; 412 when it has one of them."),
+    header("If-Match", "Entity tags of the expected revision, or `*`; 412 if none matches."),
+    header("If-None-Match", "Entity tags of revisions; 412 if one matches."),
 ]
-# What a filter by name may be.
+# Pattern of filters by name.
 NO_CONTROLS = r"^[^\x00-\x1f\x7f]*$"

@@ -1,4 +1,4 @@
-"""Floor plans: upload, list, look at, replace, delete."""
+"""Floor plans: upload, list, read, replace, delete."""
 
 from __future__ import annotations
 
@@ -61,12 +61,12 @@ _MAX_LISTED = 500
     ),
 )
 async def create_floorplan(request: Request, runtime: Running, tenant: Tenant, client: Client) -> Response:
-    """Store a floor plan, from whatever file there is of it.
+    """Store a floor plan from a plan file.
 
-    Its format is found out by its content: JSON in the native format, GeoJSON, an IMDF archive, SVG, DXF, IFC, PDF, or
-    a picture. What was made of it stands in `import_report`; a plan that was read from a picture is a draft, to be
-    looked at before it is used. A small plan is `ready` with the answer; the latent grid of a larger one is computed in
-    the background (see `status` and `progress`, and `/events`).
+    The format is detected from the content: JSON in the native format, GeoJSON, an IMDF archive, SVG, DXF, IFC, PDF, or
+    a picture. `import_report` tells how the file was read; a plan read from a picture is a draft, so check it before
+    use. A small plan is `ready` at once; the pose grid of a larger plan is computed in the background (see `status`,
+    `progress` and `/events`).
     """
     idempotent = IdempotentRequest(runtime.store.idempotency_keys, request, tenant, "POST /floorplans")
     uploaded = await read_upload(request, runtime)
@@ -77,15 +77,15 @@ async def create_floorplan(request: Request, runtime: Running, tenant: Tenant, c
         record = runtime.store.plans.add(tenant, token, plan, original=original, limit=limit, grid=grid)
         if record.plan is plan:
             runtime.grids.on_plan_stored(record, grid)
-            # Not asked for: what is stored is answered for, whatever becomes of the database.
+            # Not read back, so that a stored plan is confirmed even if the database fails now.
             state = GridState.after_upload(grid)
         else:
-            # It was stored before, and may have been replaced since, and then has another grid.
+            # Stored by an earlier attempt, and possibly replaced since.
             runtime.grids.on_plan_stored(record, None)
             state = plan_state(record, runtime.grids)
         return _written(request, record, state, runtime, status.HTTP_201_CREATED)
 
-    # One call from the claim to the answer: a client that hangs up meanwhile does not leave it half-way.
+    # One call from claim to answer, so that a disconnect does not interrupt it.
     return await uploaded.threads(runtime).run(client, idempotent.run, uploaded.parts, store)
 
 
@@ -95,17 +95,17 @@ def list_floorplans(
     tenant: Tenant,
     name: Annotated[
         str | None,
-        Query(max_length=200, pattern=NO_CONTROLS, description="Only plans with this in their name, in any case."),
+        Query(max_length=200, pattern=NO_CONTROLS, description="Part of the name; case is ignored."),
     ] = None,
-    limit: Annotated[int, Query(ge=1, le=_MAX_LISTED, description="How many to return.")] = 100,
-    cursor: Annotated[str | None, Query(description="The `next_cursor` of the page before.")] = None,
+    limit: Annotated[int, Query(ge=1, le=_MAX_LISTED, description="Maximum number of items.")] = 100,
+    cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page.")] = None,
 ) -> FloorPlanList:
-    """Stored floor plans, newest first.
+    """List stored floor plans, newest first.
 
-    Going from page to page gives every plan once that is there all the while, whatever is uploaded or deleted.
+    Paging returns every plan that exists throughout exactly once, even if others are uploaded or deleted meanwhile.
     """
     after = None if cursor is None else parse_cursor(cursor)
-    # One more than asked for tells whether there is another page.
+    # One extra item shows that there is another page.
     found = runtime.store.plans.list_plans(tenant, limit=limit + 1, after=after, name=name)
     page = found[:limit]
     more = cursor_text(Cursor(page[-1].created_at, page[-1].id)) if len(found) > limit else None
@@ -114,7 +114,7 @@ def list_floorplans(
 
 @router.get(
     "/{floorplan_id}",
-    summary="A floor plan",
+    summary="Get a floor plan",
     response_model=FloorPlanAnswer,
     openapi_extra={"parameters": [IF_NONE_MATCH]},
     responses=NOT_MODIFIED
@@ -125,9 +125,9 @@ def get_floorplan(
     request: Request,
     runtime: Running,
     tenant: Tenant,
-    revision: Annotated[str | None, Query(description="An older revision, while it is kept.")] = None,
+    revision: Annotated[str | None, Query(description="Id of an older revision.")] = None,
 ) -> Response:
-    """A stored floor plan with the status and progress of its latent grid."""
+    """Return a stored floor plan with the status and progress of its pose grid."""
     record = stored_plan(tenant, floorplan_id, runtime.store.plans)
     superseded = revision is not None and revision != record.revision_id
     if revision is not None and superseded:
@@ -148,9 +148,9 @@ def get_floorplan(
 async def replace_floorplan(
     floorplan_id: str, request: Request, runtime: Running, tenant: Tenant, client: Client
 ) -> Response:
-    """Store a new revision of a plan that there is, from a file of any format that `POST /floorplans` takes.
+    """Store a new revision of a floor plan, from a file of any format that `POST /floorplans` accepts.
 
-    Queries in work are answered by the revision that they began with, and say which (`floorplan_revision`).
+    Queries in work use the revision that they began with, and return it as `floorplan_revision`.
     """
     current = await runtime.uploads.run(client, plan_summary, tenant, floorplan_id, runtime.store.plans)
     expected = expected_revision(request, current.id, current.revision_id)
@@ -162,7 +162,7 @@ async def replace_floorplan(
         record = runtime.store.plans.add_revision(
             tenant, current.id, plan, original=original, keep=keep, expected=expected, grid=grid
         )
-        # First, so that it is not in the way of the new grid; queries in work may still need the one in memory.
+        # Before the new grid starts. The old grid stays in memory for queries in work.
         runtime.grids.cancel(current.revision_id)
         runtime.grids.on_plan_stored(record, grid)
         return _written(request, record, GridState.after_upload(grid), runtime, status.HTTP_200_OK)
@@ -180,9 +180,9 @@ async def replace_floorplan(
     ),
 )
 def delete_floorplan(floorplan_id: str, request: Request, runtime: Running, tenant: Tenant) -> None:
-    """Delete a floor plan with all its revisions, the files they were uploaded as, and their latent grids, for good.
+    """Delete a floor plan with all its revisions, uploaded files and pose grids.
 
-    A latent grid that is being computed is not any more. The venues that the plan belongs to get a revision without it.
+    The computation of its pose grid is cancelled. Venues with this plan get a new revision without it.
     """
     current = plan_summary(tenant, floorplan_id, runtime.store.plans)
     add_log_fields(request, plan=current.id, revision=current.revision_id)
@@ -193,7 +193,7 @@ def delete_floorplan(floorplan_id: str, request: Request, runtime: Running, tena
 
 
 def _prepared(uploaded: PlanUpload, runtime: Runtime, client: str) -> tuple[FloorPlan, Original, ComputedGrid | None]:
-    """The plan in an uploaded file, the file as it is stored, and the plan's grid if that is computed at once."""
+    """Return the plan in an uploaded file, the file as stored, and the pose grid if it is computed at once."""
     file = convert(uploaded.content, uploaded.options, runtime.converter, runtime.settings, client)
     runtime.grids.check_size(file.plan)
     original = Original(uploaded.content, file.media_type, json.dumps(file.report))
@@ -204,7 +204,7 @@ def _written(request: Request, record: PlanRecord, state: GridState, runtime: Ru
     add_log_fields(request, plan=record.id, revision=record.revision_id)
     content, etag = plan_representation(record, state, runtime.settings.grids.grid_step_m)
     path = str(request.app.url_path_for("get_floorplan", floorplan_id=record.id))
-    # The tag is that of this answer, which is what a GET from there gives, and not of what was uploaded.
+    # The tag of this answer, which is also that of a GET from this location.
     headers = {"Content-Location": path, "ETag": etag}
     if code == status.HTTP_201_CREATED:
         headers["Location"] = path

@@ -1,4 +1,4 @@
-"""The query of AR clients: the GeoPose protocol of the Open Spatial Computing Platform, version 2."""
+"""Queries of AR clients: GeoPose protocol of the Open Spatial Computing Platform (OSCP), version 2."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from service.schemas.oscp import OscpAnswer, OscpRequest
 from service.telemetry import add_log_fields
 
 router = APIRouter(tags=["localisation"])
-# What a request has beside its picture.
+# Size of a request without its picture.
 _ENVELOPE_BYTES = 64 * 1024
 
 
@@ -62,70 +62,70 @@ async def geopose(
     runtime: Running,
     tenant: Tenant,
     client: Client,
-    floorplan_id: Annotated[str | None, Query(description="The floor plan that the device is in.")] = None,
-    venue_id: Annotated[str | None, Query(description="The venue that it is in.")] = None,
+    floorplan_id: Annotated[str | None, Query(description="Id of the floor plan to search.")] = None,
+    venue_id: Annotated[str | None, Query(description="Id of the venue to search.")] = None,
 ) -> Response:
-    """Where on Earth is this device? For AR clients of the GeoPose protocol, version 2 (`GeoPoseReq`, `GeoPoseResp`).
+    """Localise a device on Earth, for AR clients of the GeoPose protocol, version 2 (`GeoPoseReq`, `GeoPoseResp`).
 
-    The one camera reading is a panorama. Without `floorplan_id` and `venue_id` in the address, all floor plans with an
-    `anchor` are searched that are as near the geolocation reading as its accuracy says, or within 100 m where it says
-    none. With them the reading is a hint. Plans have to have an `anchor`, or be of a venue that has one.
+    The single camera reading is a panorama. Without `floorplan_id` and `venue_id`, all floor plans with an `anchor`
+    within the accuracy of the geolocation reading (100 m if it has none) are searched. With one of them, the reading is
+    a hint. The plan, or its venue, needs an `anchor`.
     """
     settings = runtime.settings
     if floorplan_id is not None and venue_id is not None:
-        raise InvalidRequestError([("venue_id", "floorplan_id is given as well, at most one of the two may be")])
+        raise InvalidRequestError([("venue_id", "floorplan_id is given as well; give at most one of the two")])
     idempotent = IdempotentRequest(runtime.store.idempotency_keys, request, tenant, "POST /geopose")
     media_type(request, (JSON,))
-    clock, most = StageClock(), settings.panoramas.max_panorama_bytes
+    clock, max_bytes = StageClock(), settings.panoramas.max_panorama_bytes
     add_log_fields(request, clock=clock)
     with clock.stage("upload"):
         limits = UploadLimits.of(settings, "max_panorama_bytes")
-        body = await read_body(request, replace(limits, max_bytes=4 * -(-most // 3) + _ENVELOPE_BYTES))
+        body = await read_body(request, replace(limits, max_bytes=4 * -(-max_bytes // 3) + _ENVELOPE_BYTES))
     context = QueryContext.starting(client, settings.requests.request_deadline_s, clock)
 
     def read() -> tuple[OscpRequest, bytes]:
         parsed = parse_document(OscpRequest, body)
         content = decode_picture(parsed)
-        if len(content) > most:
-            raise UploadTooLargeError(limits.name, most, len(content))
+        if len(content) > max_bytes:
+            raise UploadTooLargeError(limits.name, max_bytes, len(content))
         return parsed, content
 
-    async def answer() -> Response:
-        asked, content = await runtime.uploads.run(client, read)
-        query = _Query(runtime, tenant, asked, content, context)
-        found, warnings = await query.answer(floorplan_id, venue_id)
+    async def respond() -> Response:
+        parsed, content = await runtime.uploads.run(client, read)
+        query = _Query(runtime, tenant, parsed, content, context)
+        found, warnings = await query.localise(floorplan_id, venue_id)
         add_log_fields(request, plan=found.floorplan_id, revision=found.floorplan_revision, stage=found.stage)
-        told = compose_oscp_answer(asked, found, [*unused_warnings(asked), *warnings])
-        return Response(told.model_dump_json(), media_type=JSON)
+        answer = compose_oscp_answer(parsed, found, [*unused_warnings(parsed), *warnings])
+        return Response(answer.model_dump_json(), media_type=JSON)
 
     named = {name: value for name, value in (("floorplan_id", floorplan_id), ("venue_id", venue_id)) if value}
-    return await idempotent.run_async(Parts(named, {"body": body}), answer, runtime.reads)
+    return await idempotent.run_async(Parts(named, {"body": body}), respond, runtime.reads)
 
 
 class _Query:
-    """One request, once it is read."""
+    """Query of one request."""
 
     def __init__(
-        self, runtime: Runtime, tenant: str, asked: OscpRequest, content: bytes, context: QueryContext
+        self, runtime: Runtime, tenant: str, parsed: OscpRequest, content: bytes, context: QueryContext
     ) -> None:
         self._runtime = runtime
         self._tenant = tenant
         self._content = content
         self._context = context
-        reading = asked.geolocation
+        reading = parsed.geolocation
         self._place = None if reading is None else reading_place(reading)
 
-    async def answer(self, floorplan_id: str | None, venue_id: str | None) -> tuple[LocaliseAnswer, list[str]]:
-        """The answer, and what is to be said of the geolocation reading."""
+    async def localise(self, floorplan_id: str | None, venue_id: str | None) -> tuple[LocaliseAnswer, list[str]]:
+        """Return the answer, and warnings about the geolocation reading."""
         if floorplan_id is not None:
             return await self._in_plan(floorplan_id)
         if venue_id is not None:
             return await self._in_venue(venue_id)
         if self._place is None:
-            fault = "is missing: it tells which floor plan, where the address has neither floorplan_id nor venue_id"
+            fault = "is missing; without floorplan_id and venue_id it selects the floor plans"
             raise InvalidRequestError([("sensorReadings.geolocationReadings", fault)])
         place, radius_m = self._place
-        # Plans near a place are asked about as a venue is.
+        # Plans near a place are searched like a venue.
         form = self._form(venue_id="near").model_copy(update={"near": place, "radius_m": radius_m})
         found = await self._runtime.venue_localiser.localise_near(self._tenant, place, radius_m, self._about(form))
         return found, []

@@ -14,26 +14,26 @@ from service.schemas import HealthAnswer, PoolAnswer, ReadyAnswer
 router = APIRouter(tags=["operations"])
 
 
-@router.get("/healthz", summary="Is the process alive?")
+@router.get("/healthz", summary="Check liveness")
 async def healthz() -> HealthAnswer:
-    """Always `ok` while the service runs."""
+    """Return `ok` while the process runs."""
     return HealthAnswer(status="ok")
 
 
 @router.get(
     "/readyz",
-    summary="Can it answer at full quality?",
+    summary="Check readiness",
     responses={
         503: {
             "model": ReadyAnswer,
-            "description": "Not yet: LPO or decoding processes are still warming up. Or no longer: the service stops.",
+            "description": "LPO or decoder processes are still starting, or the service is stopping.",
         }
     },
 )
 async def readyz(runtime: Annotated[Runtime, Depends(runtime_of)], response: Response) -> ReadyAnswer:
-    """200 once the model and every worker have been warm, 503 before, and from when the service is told to stop.
+    """Return 200 once the model and all workers are ready, and 503 before that and while the service stops.
 
-    A worker that is replaced later does not make the service unready: queries are answered by VDR, or wait.
+    Replacing a worker later does not make the service unready: queries wait, or keep the VDR pose.
     """
     if not runtime.ready:
         response.status_code = status.HTTP_503_SERVICE_UNAVAILABLE
@@ -50,13 +50,13 @@ async def readyz(runtime: Annotated[Runtime, Depends(runtime_of)], response: Res
 
 @router.get(
     "/metrics",
-    summary="Prometheus metrics",
+    summary="Get Prometheus metrics",
     response_class=Response,
     responses={200: {"content": {"text/plain": {"schema": {"type": "string"}}}}},
 )
 async def metrics(runtime: Annotated[Runtime, Depends(runtime_of)]) -> Response:
-    """All metrics in Prometheus' text format."""
-    # From memory in milliseconds, and told also when every thread is busy.
+    """Return all metrics in Prometheus' text format."""
+    # A coroutine, because it takes milliseconds and must work when every thread is busy.
     return Response(runtime.telemetry.render(), media_type=CONTENT_TYPE_LATEST)
 
 

@@ -1,4 +1,4 @@
-"""Answers that are kept for a while: told again, or forgotten at once."""
+"""Kept answers: read and delete."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ router = APIRouter(prefix="/answers", tags=["localisation"])
 _PROBLEMS = problem_responses(UnknownAnswerError, InvalidRequestError, StoreUnavailableError)
 
 
-@router.get("/{answer_id}", summary="An answer again", response_model=LocaliseAnswer, responses=_PROBLEMS)
+@router.get("/{answer_id}", summary="Get a kept answer", response_model=LocaliseAnswer, responses=_PROBLEMS)
 def get_answer(answer_id: str, runtime: Running, tenant: Tenant) -> Response:
-    """What a query was answered, to the byte, while it is kept; its panorama never is."""
+    """Return the answer to an earlier query, byte for byte, while it is kept. Panoramas are never kept."""
     kept_s = runtime.settings.storage.keep_answers_s
     content = runtime.store.answers.get(tenant, answer_id, kept_s=kept_s) if is_id(answer_id) else None
     if content is None:
@@ -25,8 +25,10 @@ def get_answer(answer_id: str, runtime: Running, tenant: Tenant) -> Response:
     return Response(content, media_type=JSON)
 
 
-@router.delete("/{answer_id}", status_code=status.HTTP_204_NO_CONTENT, summary="Forget an answer", responses=_PROBLEMS)
+@router.delete(
+    "/{answer_id}", status_code=status.HTTP_204_NO_CONTENT, summary="Delete a kept answer", responses=_PROBLEMS
+)
 def delete_answer(answer_id: str, runtime: Running, tenant: Tenant) -> None:
-    """Forget an answer before its time."""
+    """Delete a kept answer before it expires."""
     if not is_id(answer_id) or not runtime.store.answers.delete(tenant, answer_id):
         raise UnknownAnswerError(answer_id)

@@ -1,4 +1,4 @@
-"""What requests may be."""
+"""Limits of requests."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from service.schemas import LimitsAnswer
 router = APIRouter(tags=["operations"])
 
 
-@router.get("/limits", summary="What may requests be?")
+@router.get("/limits", summary="Get the limits")
 async def limits(runtime: Annotated[Runtime, Depends(runtime_of)]) -> LimitsAnswer:
-    """The limits this service was started with; the error about one names it."""
+    """Return the limits of this service; an error about a limit names it."""
     settings = runtime.settings
-    # As they are in effect: the settings may leave these numbers to the service.
+    # Resolved, because 0 leaves these numbers to the service.
     resolved = {
         "max_queries": settings.query_limit,
         "max_queries_per_tenant": max_per_client(settings.query_limit),

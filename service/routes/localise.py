@@ -1,4 +1,4 @@
-"""The query: where was this panorama taken?"""
+"""Queries: localise a panorama in a floor plan or a venue."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from service.telemetry import add_log_fields
 
 router = APIRouter(tags=["localisation"])
 _PNG, _SVG = "image/png", "image/svg+xml"
-# The photograph in an SVG is a part of it; nothing else may load, and nothing run.
+# The photograph in an SVG is a data URL; nothing else can load or run.
 _POLICY = {"Content-Security-Policy": "default-src 'none'; img-src data:; frame-ancestors 'none'"}
 _VARY = {"Vary": "Accept"}
 
@@ -41,7 +41,7 @@ _PANORAMA_SCHEMA = {
     "type": "string",
     "format": "binary",
     "description": "Equirectangular panorama as JPEG, PNG or WebP: the full 360°, twice as wide as high, or the "
-    "part of it that its photo sphere metadata (GPano in XMP) tell.",
+    "part of it that its photo sphere metadata (GPano in XMP) describe.",
 }
 
 
@@ -76,20 +76,20 @@ async def localise(
     picture: Annotated[
         Picture | None,
         Query(
-            description="What a picture shows: the `plan` with the posterior as a heat map, the answer, its covariance "
-            "ellipse and its rivals; the `photograph` with the found layout drawn in; or `both`, as when it is left "
-            "out. Needs `Accept: image/png` or `Accept: image/svg+xml`."
+            description="Content of the picture: the `plan` with the posterior as a heat map, the answer, its "
+            "covariance ellipse and the other candidates; the `photograph` with the layout drawn in; or `both` (default). "
+            "Needs `Accept: image/png` or `Accept: image/svg+xml`."
         ),
     ] = None,
 ) -> Response:
-    """Find where in a stored floor plan, or in which plan of a venue and where in it, a panorama was taken.
+    """Localise a panorama in a stored floor plan, or in the plans of a venue.
 
     With `Accept: image/png` or `Accept: image/svg+xml` the answer is a picture, 1600 pixels wide; with `Accept:
-    application/geo+json` a GeoJSON Feature at the place on Earth, for plans and venues with an `anchor`.
+    application/geo+json` it is a GeoJSON Feature on Earth, for plans and venues with an `anchor`.
 
-    A plan that is still preparing is waited for. Of a venue the plans that are ready are searched, and the answer warns
-    of others; while none is, the venue is waited for. When optimisation (`lpo`) cannot answer in time, the answer is
-    the one before it, with `"stage": "vdr"`.
+    The query waits for a plan that is still preparing. In a venue it searches the plans that are ready, warns about the
+    others, and waits if none is ready. If pose refinement (`lpo`) is not done in time, the answer falls back to the VDR
+    pose, with `"stage": "vdr"`.
     """
     media = preferred(request, (JSON, _PNG, _SVG, GEOJSON))
     _check_picture(media, picture)
@@ -100,16 +100,18 @@ async def localise(
         request, runtime.settings, client, LocaliseForm, "max_panorama_bytes", files={PANORAMA}
     )
     if form.venue_id is not None and media in (_PNG, _SVG):
-        raise InvalidRequestError([("venue_id", f"is not answered in {media}: a picture is of one plan")])
+        raise InvalidRequestError(
+            [("venue_id", f"cannot be answered in {media}: pictures show one plan; give floorplan_id")]
+        )
 
-    async def answer() -> Response:
+    async def respond() -> Response:
         query = PanoramaQuery(form, parts.files[PANORAMA], context)
         if form.venue_id is not None:
             venue = await venue_for_query(tenant, form.venue_id, runtime)
             add_log_fields(request, venue=venue.id)
             found = await runtime.venue_localiser.localise(venue, query)
             add_log_fields(request, plan=found.floorplan_id, revision=found.floorplan_revision, stage=found.stage)
-            return await _told(found, media, tenant, runtime)
+            return await _response(found, media, tenant, runtime)
         assert form.floorplan_id is not None
         record = await plan_for_query(tenant, form.floorplan_id, runtime)
         add_log_fields(request, plan=record.id, revision=record.revision_id)
@@ -118,29 +120,31 @@ async def localise(
         if media in (JSON, GEOJSON):
             found = await runtime.localiser.localise(record, query)
             add_log_fields(request, stage=found.stage)
-            return await _told(found, media, tenant, runtime)
+            return await _response(found, media, tenant, runtime)
         rooms = await runtime.drawings.rooms(record)
         wanted = PictureRequest(picture=picture or "both", as_png=media == _PNG, rooms=rooms)
         found, drawn = await runtime.localiser.localise_and_draw(record, query, wanted)
         add_log_fields(request, stage=found.stage)
         return Response(drawn, headers=_VARY | _POLICY, media_type=media)
 
-    return await idempotent.run_async(parts, answer, runtime.reads)
+    return await idempotent.run_async(parts, respond, runtime.reads)
 
 
 def _check_picture(media: str, picture: Picture | None) -> None:
-    """Raises:
-    InvalidRequestError: what is said of a picture and none is wanted.
+    """Refuse the parameter `picture` for an answer that is no picture.
+
+    Raises:
+        InvalidRequestError: the answer is JSON or GeoJSON.
     """
     if media in (JSON, GEOJSON) and picture is not None:
         raise InvalidRequestError([("picture", f"needs the header Accept: {_PNG} or Accept: {_SVG}")])
 
 
-async def _told(answer: LocaliseAnswer, media: str, tenant: str, runtime: Runtime) -> Response:
-    """An answer as JSON or as GeoJSON.
+async def _response(answer: LocaliseAnswer, media: str, tenant: str, runtime: Runtime) -> Response:
+    """Return an answer as JSON or GeoJSON.
 
     Raises:
-        UnanchoredPlanError: GeoJSON is wanted of an answer that is nowhere on Earth.
+        UnanchoredPlanError: GeoJSON is requested, and the answer has no place on Earth.
     """
     if media != GEOJSON:
         return Response(await _text(answer, tenant, runtime), headers=_VARY, media_type=JSON)
@@ -151,18 +155,18 @@ async def _told(answer: LocaliseAnswer, media: str, tenant: str, runtime: Runtim
 
 
 async def _text(answer: LocaliseAnswer, tenant: str, runtime: Runtime) -> str:
-    """An answer as JSON; under its id it is the same, where answers are kept."""
+    """Return an answer as JSON, and keep it if the settings say so."""
     if runtime.settings.storage.keep_answers_s == 0.0:
         return answer.model_dump_json()
-    told = {"": answer.model_dump_json()}
+    texts = {"": answer.model_dump_json()}
 
     def with_id(answer_id: str) -> str:
-        told[answer_id] = answer.model_copy(update={"answer_id": answer_id}).model_dump_json()
-        return told[answer_id]
+        texts[answer_id] = answer.model_copy(update={"answer_id": answer_id}).model_dump_json()
+        return texts[answer_id]
 
     keep = partial(runtime.store.answers.add, limit=runtime.settings.storage.max_kept_answers)
     try:
-        return told[await runtime.reads.run(keep, tenant, answer.floorplan_id, with_id) or ""]
+        return texts[await runtime.reads.run(keep, tenant, answer.floorplan_id, with_id) or ""]
     except StoreUnavailableError:
-        # It was found all the same.
-        return told[""]
+        # The answer is valid although it could not be kept.
+        return texts[""]

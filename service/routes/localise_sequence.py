@@ -1,4 +1,4 @@
-"""The query of several panoramas: where were they taken, on one visit?"""
+"""Queries with several panoramas of one visit."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ _PANORAMAS_SCHEMA: dict[str, Any] = {
     "type": "array",
     "items": {"type": "string", "format": "binary"},
     "minItems": _MIN_PANORAMAS,
-    "description": "The panoramas in the order in which they were taken, a part named `panorama` for each, as for "
-    "`POST /localise`; at most `max_sequence_panoramas`, and `max_sequence_bytes` together.",
+    "description": "Panoramas in the order in which they were taken, one part named `panorama` each, as for "
+    "`POST /localise`; limits: `max_sequence_panoramas`, and `max_sequence_bytes` together.",
 }
 
 
@@ -43,12 +43,12 @@ _PANORAMAS_SCHEMA: dict[str, Any] = {
     | problem_responses(InvalidMotionError, UnanchoredPlanError, *QUERY_ERRORS),
 )
 async def localise_sequence(request: Request, runtime: Running, tenant: Tenant, client: Client) -> Response:
-    """Find where in a stored floor plan several panoramas of one visit were taken, all of them together.
+    """Localise several panoramas of one visit together in a stored floor plan.
 
-    What was measured of the motions between them tells places apart that look alike. With `Accept:
-    application/geo+json` the answer is a GeoJSON FeatureCollection, a Feature for each panorama, for plans with an
-    `anchor`. A plan that is still preparing is waited for. When optimisation (`lpo`) cannot answer in time, the answer
-    is the one before it, with `"stage": "retrieval"`.
+    Measured motions between them resolve places that look alike. With `Accept: application/geo+json` the answer is a
+    GeoJSON FeatureCollection with one Feature per panorama, for plans with an `anchor`. The query waits for a plan that
+    is still preparing. If pose refinement (`lpo`) is not done in time, the answer falls back to the best path on the
+    pose grid, with `"stage": "retrieval"`.
     """
     settings = runtime.settings
     media = preferred(request, (JSON, GEOJSON))
@@ -61,7 +61,7 @@ async def localise_sequence(request: Request, runtime: Running, tenant: Tenant, 
     )
     query = SequenceQuery(form, _panoramas(parts, form, settings), context)
 
-    async def answer() -> Response:
+    async def respond() -> Response:
         record = await plan_for_query(tenant, form.floorplan_id, runtime)
         add_log_fields(request, plan=record.id, revision=record.revision_id)
         if media == GEOJSON and record.plan.anchor is None:
@@ -71,15 +71,15 @@ async def localise_sequence(request: Request, runtime: Running, tenant: Tenant, 
         content = found.model_dump_json() if media == JSON else json.dumps(geojson_features(found))
         return Response(content, headers={"Vary": "Accept"}, media_type=media)
 
-    return await idempotent.run_async(parts, answer, runtime.reads)
+    return await idempotent.run_async(parts, respond, runtime.reads)
 
 
 def _panoramas(parts: Parts, form: SequenceForm, settings: Settings) -> list[bytes]:
-    """The panoramas, in order.
+    """Return the panoramas in order.
 
     Raises:
-        UploadTooLargeError: one of them has more bytes than a panorama may have.
-        InvalidRequestError: fields that do not go with their number.
+        UploadTooLargeError: a panorama is larger than allowed.
+        InvalidRequestError: fields that do not fit the number of panoramas.
     """
     contents = parts.repeated(PANORAMA)
     largest = max(len(content) for content in contents)

@@ -1,7 +1,6 @@
-"""The web pages: one to use the service, one about its API. What they are made of is built from `web/` by `make web`.
+"""Web pages: the application at `/` and the API documentation at `/docs`, built from `web/` by `make web`.
 
-Nothing is loaded from elsewhere, nothing is inline, and with API keys on they are the only routes without: they ask for
-a key themselves.
+Nothing is inline or loaded from elsewhere. The pages need no API key; they ask for one before they call the API.
 """
 
 from __future__ import annotations
@@ -18,12 +17,12 @@ from service.http.conditional import conditional_answer, content_etag
 router = APIRouter(include_in_schema=False)
 
 _HEADERS = {
-    # Pictures that are chosen on the page are shown from memory: `blob:`.
+    # `blob:` is for pictures that were chosen on the page.
     "Content-Security-Policy": (
         "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob: data:; "
         "connect-src 'self' blob:; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
     ),
-    # A browser asks each time whether its copy is still good: another version may answer next.
+    # Browsers revalidate each time, because another version can answer next.
     "Cache-Control": "no-cache",
 }
 _NAME = re.compile(r"[A-Za-z0-9_-]+(?:\.[a-z0-9]+)+")
@@ -31,31 +30,33 @@ _NAME = re.compile(r"[A-Za-z0-9_-]+(?:\.[a-z0-9]+)+")
 
 @router.get("/")
 def index(request: Request) -> Response:
-    """The page that shows where photographs were taken."""
+    """Return the start page."""
     return _file(request, "index.html")
 
 
 @router.get("/docs")
 def docs(request: Request) -> Response:
-    """The API's documentation."""
+    """Return the API documentation."""
     return _file(request, "docs.html")
 
 
 @router.get("/web/{name}")
 def part(request: Request, name: str) -> Response:
-    """Scripts, styles and examples of the pages."""
+    """Return a script, style or example of the pages."""
     return _file(request, name)
 
 
 @router.get("/favicon.ico")
 def icon(request: Request) -> Response:
-    """What browsers show beside the title, and ask for also where no page names it."""
+    """Return the icon."""
     return _file(request, "icon.svg")
 
 
 def _file(request: Request, name: str) -> Response:
-    """Raises:
-    HTTPException: there is no such file.
+    """Return a built file.
+
+    Raises:
+        HTTPException: no such file.
     """
     path = files("service") / "web" / name
     if not _NAME.fullmatch(name) or not path.is_file():

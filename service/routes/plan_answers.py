@@ -1,4 +1,4 @@
-"""Stored plans in the words of the API."""
+"""Stored plans as answers of the API."""
 
 from __future__ import annotations
 
@@ -10,25 +10,20 @@ from service.storage.records import PlanRecord, PlanSummary
 
 
 def plan_state(record: PlanRecord, grids: GridProvider) -> GridState:
-    """How far a plan's own grid is at this moment."""
+    """Return the current state of a plan's pose grid."""
     return grids.states([_summary(record)])[0]
 
 
 def plan_representation(
     record: PlanRecord, state: GridState, step_m: float, *, superseded: bool = False
 ) -> tuple[bytes, str]:
-    """A plan as JSON, and the entity tag of that.
-
-    Args:
-        step_m: grid step of the service.
-        superseded: whether the plan has another revision by now.
-    """
+    """Return a plan as JSON, and its entity tag; `superseded` marks an old revision."""
     content = _answer(record, state, step_m, superseded=superseded).model_dump_json().encode()
     return content, plan_etag(record.revision_id, content)
 
 
 def list_entries(summaries: list[PlanSummary], grids: GridProvider) -> list[FloorPlanSummary]:
-    """Plans as a listing has them."""
+    """Return plans as items of a list."""
     return [
         FloorPlanSummary(
             id=summary.id,
@@ -72,7 +67,7 @@ def _answer(record: PlanRecord, state: GridState, step_m: float, *, superseded: 
         bounds=BoundsAnswer(x_min_m=x_min, y_min_m=y_min, x_max_m=x_max, y_max_m=y_max),
         camera_height_m=plan.camera_height_m,
         grid=GridAnswer(step_m=step_m, poses=grid_size(plan, step_m) if state.poses is None else state.poses),
-        # Those of the import first: what it checks, and what it had to leave out.
+        # Warnings of the import come first.
         warnings=list(dict.fromkeys([*(() if report is None else report.warnings), *plan.warnings])),
         import_report=report,
         plan=plan.to_dict(),

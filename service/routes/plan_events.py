@@ -1,4 +1,4 @@
-"""How far a plan is, told as it happens."""
+"""Event streams about floor plans."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ router = APIRouter(prefix="/floorplans", tags=["floor plans"])
     },
 )
 async def follow_floorplan(floorplan_id: str, request: Request, runtime: Running, tenant: Tenant) -> Response:
-    """Server-sent events about the plan's latent grid, whichever replica computes it.
+    """Stream server-sent events about the plan's pose grid.
 
-    `progress` comes at once and whenever something changed, at most four times a second; `ready`, `failed` or
-    `deleted` is the last one. A comment comes at least every 15 s when there is nothing to tell. The stream also ends
-    after `stream_deadline_s`, soon after the caller's API key was revoked, and when the service stops: ask anew.
+    `progress` comes at once and after each change, up to four times a second; `ready`, `failed` or `deleted` is the
+    last event. A comment is sent at least every 15 s. The stream also ends after 15 minutes, soon after the API key is
+    revoked, and when the service stops; reconnect then.
     """
     record = await asyncio.to_thread(stored_plan, tenant, floorplan_id, runtime.store.plans)
     add_log_fields(request, plan=record.id, revision=record.revision_id)
-    return runtime.events.answer(record.id, partial(runtime.access_control.still_authorised, request))
+    return runtime.events.event_stream(record.id, partial(runtime.access_control.still_authorised, request))

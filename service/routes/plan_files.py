@@ -1,4 +1,4 @@
-"""What there is of a stored plan to download: the original, a drawing, a mesh."""
+"""Downloads of a stored plan: original file, export, drawing, mesh."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from service.telemetry import add_log_fields
 router = APIRouter(prefix="/floorplans", tags=["floor plans"])
 
 _SVG, _GLB = "image/svg+xml", "model/gltf-binary"
-# Three rounded numbers may be a covariance by so much less.
+# Tolerance for a covariance whose three numbers were rounded.
 _ROUNDED = 1e-3
 _PROBLEMS = problem_responses(UnknownFloorPlanError, InvalidRequestError, StoreUnavailableError)
 _CONDITIONAL = {"parameters": [IF_NONE_MATCH]}
@@ -37,7 +37,7 @@ _CONDITIONAL = {"parameters": [IF_NONE_MATCH]}
 
 @router.get(
     "/{floorplan_id}/original",
-    summary="The file as it was uploaded",
+    summary="Get the uploaded file",
     response_class=Response,
     openapi_extra=_CONDITIONAL,
     responses={
@@ -52,13 +52,13 @@ _CONDITIONAL = {"parameters": [IF_NONE_MATCH]}
     },
 )
 def get_original(floorplan_id: str, request: Request, runtime: Running, tenant: Tenant) -> Response:
-    """The bytes that were uploaded, unchanged, with the media type that their content has; of the current revision."""
+    """Return the uploaded file of the current revision, unchanged, with the media type of its content."""
     current = plan_summary(tenant, floorplan_id, runtime.store.plans)
     add_log_fields(request, plan=current.id, revision=current.revision_id)
     original = runtime.store.plans.original(tenant, current.id)
     if original is None:
         raise UnknownFloorPlanError(floorplan_id)
-    # A stranger's drawing may hold scripts: it is a file to keep, and no page of this service.
+    # An uploaded drawing can contain scripts, so browsers must not open it as a page of this service.
     kept = {"Content-Disposition": "attachment"} if original.media_type != JSON else None
     etag = content_etag(original.content)
     return conditional_answer(request, original.content, original.media_type, etag, kept)
@@ -66,7 +66,7 @@ def get_original(floorplan_id: str, request: Request, runtime: Running, tenant: 
 
 @router.get(
     "/{floorplan_id}/export",
-    summary="The plan as a file of another tool",
+    summary="Export a floor plan",
     response_class=Response,
     openapi_extra=_CONDITIONAL,
     responses={
@@ -93,10 +93,11 @@ async def get_export(
     tenant: Tenant,
     client: Client,
     format: Annotated[
-        ExportFormat, Query(description="IMDF needs a plan with an `anchor`; GeoJSON uses it.")
+        ExportFormat,
+        Query(description="Format of the file. IMDF needs a plan with an `anchor`; GeoJSON uses it if present."),
     ] = "native",
 ) -> Response:
-    """What was understood of the plan, to be opened elsewhere, or uploaded again."""
+    """Return the plan in another file format."""
     record = _noted(request, await run_in_threadpool(stored_plan, tenant, floorplan_id, runtime.store.plans))
     if format == "imdf" and record.plan.anchor is None:
         raise UnanchoredPlanError(record.id)
@@ -107,7 +108,7 @@ async def get_export(
 
 @router.get(
     "/{floorplan_id}/preview.svg",
-    summary="A drawing",
+    summary="Get a drawing",
     response_class=Response,
     openapi_extra=_CONDITIONAL,
     responses={200: {"content": {_SVG: {"schema": {"type": "string"}}}}, **NOT_MODIFIED, **_PROBLEMS},
@@ -117,8 +118,8 @@ async def get_preview(
     request: Request,
     runtime: Running,
     tenant: Tenant,
-    x_m: Annotated[float | None, Query(allow_inf_nan=False, description="Mark a camera at this x.")] = None,
-    y_m: Annotated[float | None, Query(allow_inf_nan=False, description="Mark a camera at this y.")] = None,
+    x_m: Annotated[float | None, Query(allow_inf_nan=False, description="x of a camera to mark.")] = None,
+    y_m: Annotated[float | None, Query(allow_inf_nan=False, description="y of a camera to mark.")] = None,
     heading_deg: Annotated[
         float | None, Query(ge=-360, le=360, allow_inf_nan=False, description="Heading of the marked camera.")
     ] = None,
@@ -127,17 +128,17 @@ async def get_preview(
         Query(
             min_length=3,
             max_length=3,
-            description="Covariance of the marked position in m², given three times as xx, xy and yy: the ellipse that "
-            "holds 95 % is drawn.",
+            description="Covariance of the marked position in m²: the parameter three times, for xx, xy and yy. The "
+            "95 % ellipse is drawn.",
         ),
     ] = None,
 ) -> Response:
-    """The plan with the names of its rooms, optionally with a camera drawn in; one SVG unit is one metre."""
+    """Return a drawing of the plan with room names, and optionally a camera; one SVG unit is one metre."""
     if (x_m is None) != (y_m is None):
-        raise InvalidRequestError([("y_m" if y_m is None else "x_m", "is missing; x_m and y_m belong together")])
+        raise InvalidRequestError([("y_m" if y_m is None else "x_m", "is missing; give both x_m and y_m")])
     if x_m is None:
-        of_marker = {"heading_deg": heading_deg, "covariance_m2": covariance_m2}
-        faults = [(name, "needs x_m and y_m") for name, value in of_marker.items() if value is not None]
+        marker_fields = {"heading_deg": heading_deg, "covariance_m2": covariance_m2}
+        faults = [(name, "needs x_m and y_m") for name, value in marker_fields.items() if value is not None]
         if faults:
             raise InvalidRequestError(faults)
     marker = None
@@ -147,14 +148,14 @@ async def get_preview(
     if marker is not None:
         _check_near(marker, record.plan)
     content = await runtime.drawings.svg(record, marker)
-    # An SVG can carry scripts; ours never does, and must not be talked into it.
+    # Defence in depth: the drawing has no scripts.
     policy = {"Content-Security-Policy": "default-src 'none'"}
     return conditional_answer(request, content, _SVG, content_etag(content), policy)
 
 
 @router.get(
     "/{floorplan_id}/mesh.glb",
-    summary="A mesh",
+    summary="Get a mesh",
     response_class=Response,
     openapi_extra=_CONDITIONAL,
     responses={
@@ -164,7 +165,7 @@ async def get_preview(
     },
 )
 async def get_mesh(floorplan_id: str, request: Request, runtime: Running, tenant: Tenant) -> Response:
-    """Floor, walls and ceiling of every room as binary glTF, in metres and y-up."""
+    """Return floor, walls and ceiling of every room as binary glTF, in metres and y-up."""
     record = _noted(request, await run_in_threadpool(stored_plan, tenant, floorplan_id, runtime.store.plans))
     content = await runtime.drawings.glb(record)
     return conditional_answer(request, content, _GLB, content_etag(content))
@@ -176,32 +177,34 @@ def _noted(request: Request, record: PlanRecord) -> PlanRecord:
 
 
 def _check_near(marker: Marker, plan: FloorPlan) -> None:
-    """Raises:
-    InvalidRequestError: a camera so far from the plan that nothing would be seen of either.
+    """Refuse a camera that is too far from the plan to be drawn with it.
+
+    Raises:
+        InvalidRequestError: the camera is further away than the plan's larger side.
     """
     x_min, y_min, x_max, y_max = plan.bounds_m
-    beyond_m = max(x_max - x_min, y_max - y_min)
+    margin_m = max(x_max - x_min, y_max - y_min)
     ranges = (("x_m", marker.x_m, x_min, x_max), ("y_m", marker.y_m, y_min, y_max))
     faults = [
-        (name, f"is {value:g}, it must lie from {least - beyond_m:g} to {most + beyond_m:g}: near the plan")
-        for name, value, least, most in ranges
-        if not least - beyond_m <= value <= most + beyond_m
+        (name, f"is {value:g}; it must lie between {low - margin_m:g} and {high + margin_m:g}, near the plan")
+        for name, value, low, high in ranges
+        if not low - margin_m <= value <= high + margin_m
     ]
     if faults:
         raise InvalidRequestError(faults)
 
 
 def _covariance(given: list[float] | None) -> tuple[float, float, float] | None:
-    """Three numbers as (xx, xy, yy).
+    """Return (xx, xy, yy).
 
     Raises:
-        InvalidRequestError: no covariance has these.
+        InvalidRequestError: not a covariance.
     """
     if given is None:
         return None
     xx, xy, yy = given
     if xx < 0.0 or yy < 0.0 or xy * xy > xx * yy * (1.0 + _ROUNDED):
         raise InvalidRequestError(
-            [("covariance_m2", f"is {xx:g}, {xy:g}, {yy:g}: xx and yy must not be negative, nor xy² above xx·yy")]
+            [("covariance_m2", f"is {xx:g}, {xy:g}, {yy:g}; xx and yy must be at least 0, and xy² at most xx·yy")]
         )
     return xx, xy, yy

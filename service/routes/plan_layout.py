@@ -1,4 +1,4 @@
-"""The walls of a plan with the openings in them, for whoever draws what a camera sees."""
+"""Walls and openings of a plan, for clients that draw layouts."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ router = APIRouter(prefix="/floorplans", tags=["floor plans"])
 
 @router.get(
     "/{floorplan_id}/layout",
-    summary="Its walls, room by room",
+    summary="Get the walls of a floor plan",
     response_model=LayoutAnswer,
     openapi_extra={"parameters": [IF_NONE_MATCH]},
     responses=NOT_MODIFIED
@@ -39,12 +39,12 @@ def get_layout(
     request: Request,
     runtime: Running,
     tenant: Tenant,
-    revision: Annotated[str | None, Query(description="An older revision, while it is kept.")] = None,
+    revision: Annotated[str | None, Query(description="Id of an older revision.")] = None,
 ) -> Response:
-    """All walls of each room, and which piece of which wall each opening takes up.
+    """Return the walls of each room, and the part of a wall that each opening takes up.
 
-    With these a client computes what a camera sees from any place, as the service does: the distance to the nearest
-    wall of its room in every direction, and from that where floor, ceiling and openings appear in a panorama.
+    A client can compute from them the layout that a camera sees: the distance to the nearest wall of its room in every
+    direction, and hence where floor, ceiling and openings appear in a panorama.
     """
     record = stored_plan(tenant, floorplan_id, runtime.store.plans)
     if revision is not None:

@@ -1,4 +1,4 @@
-"""The body of a request that uploads a plan: a file of any format, alone or in a form with what to know about it."""
+"""Body of a plan upload: a plan file, alone or in a form with options."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from service.schemas import ImportForm
 from service.threads import Threads
 
 _FILE = "file"
-# What tools say of such files; which of them it is, says the file.
+# Media types that clients send; the actual format is detected from the content.
 _FILES = (
     JSON,
     "application/geo+json",
@@ -65,13 +65,13 @@ def _form_schema() -> dict[str, Any]:
         "type": "string",
         "format": "binary",
         "description": "GeoJSON, an IMDF archive, SVG, DXF, IFC (also zipped), PDF, PNG, JPEG, or JSON in the native "
-        "format (FloorPlanDocument); which of them it is, is found out by its content.",
+        "format (FloorPlanDocument). The format is detected from the content.",
     }
     schema["required"] = [_FILE]
     return schema
 
 
-# How both operations that take a plan describe their body.
+# Request body of both operations that take a plan.
 UPLOAD_BODY: dict[str, Any] = {
     "required": True,
     "content": {
@@ -84,7 +84,7 @@ UPLOAD_BODY: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class PlanUpload:
-    """What was sent: the bytes of a file, and what was said of it."""
+    """Uploaded file with its options."""
 
     content: bytes
     options: ImportOptions
@@ -92,21 +92,21 @@ class PlanUpload:
 
     @property
     def parts(self) -> Parts:
-        """What makes a request the same as another."""
+        """The parts that identify the request for idempotency."""
         return Parts(dict(self.fields), {_FILE: self.content})
 
     def threads(self, runtime: Runtime) -> Threads:
-        """Where it is read and stored: what waits for a worker is not in the way of what does not."""
+        """Return the threads to read and store it on; files that wait for a worker have threads of their own."""
         return runtime.uploads if seems_native(self.content) else runtime.file_uploads
 
 
 async def read_upload(request: Request, runtime: Runtime) -> PlanUpload:
-    """The file in a request, with its options.
+    """Read the file in a request, with its options.
 
     Raises:
-        UnsupportedMediaError: a body that says it is something else.
+        UnsupportedMediaError: the media type is not that of a plan file.
         UploadTooLargeError, UploadTimeoutError, MalformedRequestError: see `read_body` and `read_parts`.
-        InvalidRequestError: a part or an option that is missing, unknown, or has a value that it cannot have.
+        InvalidRequestError: a part or option is missing, unknown or invalid.
     """
     limits = UploadLimits.of(runtime.settings, "max_plan_bytes")
     if media_type(request, (MULTIPART, *_FILES)) != MULTIPART:
@@ -117,7 +117,7 @@ async def read_upload(request: Request, runtime: Runtime) -> PlanUpload:
 
 
 def _faults(fields: Mapping[str, str]) -> list[tuple[str, str]]:
-    """What is wrong with options, each by its name; those that contradict each other, by the names of all."""
+    """Return (name, message) of invalid options, and of options that contradict each other."""
     faults = []
     for name, text in fields.items():
         try:

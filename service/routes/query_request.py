@@ -1,4 +1,4 @@
-"""What the requests that ask about panoramas have in common: a form with pictures, and what it may be refused with."""
+"""Common parts of queries: the multipart form with its panoramas, and the errors."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from service.telemetry import add_log_fields
 
 PANORAMA = "panorama"
 Form = TypeVar("Form", LocaliseForm, SequenceForm)
-# What a query may be refused with.
+# Errors of a query.
 QUERY_ERRORS: tuple[type[Exception], ...] = (
     InvalidPanoramaError,
     InvalidPoseError,
@@ -61,13 +61,9 @@ QUERY_ERRORS: tuple[type[Exception], ...] = (
 
 
 def body_schema(form: type[BaseModel], panorama: Mapping[str, Any]) -> dict[str, Any]:
-    """How an operation describes its body.
-
-    Args:
-        panorama: the schema of the picture, or of the pictures.
-    """
+    """Return the description of a query's body, given its form and the schema of its panoramas."""
     schema = form.model_json_schema(ref_template="#/components/schemas/{model}")
-    # Told with the others, see `http.api_description`.
+    # `http.api_description` adds these schemas.
     schema.pop("$defs", None)
     schema["properties"][PANORAMA] = dict(panorama)
     schema["required"] = [*schema.get("required", []), PANORAMA]
@@ -76,11 +72,13 @@ def body_schema(form: type[BaseModel], panorama: Mapping[str, Any]) -> dict[str,
 
 
 def check_idempotent_media(request: Request, media: str) -> None:
-    """Raises:
-    InvalidRequestError: an idempotency key where another answer than JSON is wanted.
+    """Refuse an idempotency key for an answer that is not JSON.
+
+    Raises:
+        InvalidRequestError: the request has such a key.
     """
     if media != JSON and IDEMPOTENCY_HEADER in request.headers:
-        raise InvalidRequestError([(IDEMPOTENCY_HEADER, "is for answers in application/json, others are not kept")])
+        raise InvalidRequestError([(IDEMPOTENCY_HEADER, "works for answers in application/json only")])
 
 
 async def read_query(
@@ -93,15 +91,23 @@ async def read_query(
     files: Collection[str] = (),
     repeated: Mapping[str, tuple[int, int]] | None = None,
 ) -> tuple[Form, Parts, QueryContext]:
-    """The form in a request, all its parts, and the context of the query that begins as it is there as a whole.
+    """Read the form of a query and start the clock of its deadline.
 
     Args:
-        limit: the setting of how large the body may be.
-        files, repeated: see `read_parts`.
+        request: the request.
+        settings: settings of the service.
+        client: tenant or client address that the query counts for.
+        form_type: model of the form.
+        limit: name of the setting that limits the body.
+        files: see `read_parts`.
+        repeated: see `read_parts`.
+
+    Returns:
+        the form, all parts, and the context of the query.
 
     Raises:
         UploadTooLargeError, UploadTimeoutError, MalformedRequestError: see `read_parts`.
-        InvalidRequestError: a part or a field that is missing, unknown, or has a value that it cannot have.
+        InvalidRequestError: a part or field is missing, unknown or invalid.
     """
     clock = StageClock()
     add_log_fields(request, clock=clock)

@@ -1,4 +1,4 @@
-"""Stored venues in the words of the API."""
+"""Stored venues as answers of the API."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from service.storage.records import VenueMember, VenueRecord
 
 
 def venue_summary(record: VenueRecord) -> VenueSummary:
-    """A venue as a listing has it."""
+    """Return a venue as an item of a list."""
     return VenueSummary(
         id=record.id,
         revision=record.revision_id,
@@ -24,7 +24,7 @@ def venue_summary(record: VenueRecord) -> VenueSummary:
 
 
 def venue_representation(record: VenueRecord, runtime: Runtime) -> tuple[bytes, str]:
-    """A venue as JSON, and the entity tag of that."""
+    """Return a venue as JSON, and its entity tag."""
     counts = runtime.store.venues.counts(record.id, *runtime.grids.model)
     answer = VenueAnswer(
         **venue_summary(record).model_dump(),
@@ -37,21 +37,21 @@ def venue_representation(record: VenueRecord, runtime: Runtime) -> tuple[bytes, 
 
 
 def plan_entries(members: list[VenueMember], runtime: Runtime) -> list[VenuePlanAnswer]:
-    """Plans of a venue; one that is deleted at this moment is left out."""
+    """Return the plans of a venue; a plan that was just deleted is left out."""
     summaries = runtime.store.plans.summaries([member.plan_id for member in members])
     states = dict(zip([summary.id for summary in summaries], runtime.grids.states(summaries), strict=True))
-    of_plan = {summary.id: summary for summary in summaries}
+    by_id = {summary.id: summary for summary in summaries}
     return [
         VenuePlanAnswer(
             floorplan_id=member.plan_id,
-            revision=of_plan[member.plan_id].revision_id,
+            revision=by_id[member.plan_id].revision_id,
             level=member.level,
-            name=member.name or of_plan[member.plan_id].name,
+            name=member.name or by_id[member.plan_id].name,
             status=states[member.plan_id].status,
             progress=states[member.plan_id].progress,
-            rooms=of_plan[member.plan_id].room_count,
-            area_m2=of_plan[member.plan_id].area_m2,
+            rooms=by_id[member.plan_id].room_count,
+            area_m2=by_id[member.plan_id].area_m2,
         )
         for member in members
-        if member.plan_id in of_plan
+        if member.plan_id in by_id
     ]

@@ -1,4 +1,4 @@
-"""Venues: floor plans that belong together, to be searched at once."""
+"""Venues: groups of floor plans that are searched together."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def _body(model: type[BaseModel]) -> dict[str, Any]:
 @router.post(
     "",
     status_code=status.HTTP_201_CREATED,
-    summary="Make a venue",
+    summary="Create a venue",
     response_model=VenueAnswer,
     openapi_extra={"requestBody": _body(VenueDocument), "parameters": [IDEMPOTENCY_KEY]},
     responses=problem_responses(
@@ -83,9 +83,9 @@ def _body(model: type[BaseModel]) -> dict[str, Any]:
     ),
 )
 async def create_venue(request: Request, runtime: Running, tenant: Tenant, client: Client) -> Response:
-    """Group stored floor plans, each with the number of its level, so that a panorama is searched for in all of them.
+    """Group stored floor plans, each on a level, so that one query searches all of them.
 
-    A plan may belong to several venues. One that is deleted leaves them.
+    A plan can belong to several venues. Deleting a plan removes it from its venues.
     """
     idempotent = IdempotentRequest(runtime.store.idempotency_keys, request, tenant, "POST /venues")
     content = await _read(request, runtime)
@@ -106,12 +106,12 @@ def list_venues(
     tenant: Tenant,
     name: Annotated[
         str | None,
-        Query(max_length=200, pattern=NO_CONTROLS, description="Only venues with this in their name, in any case."),
+        Query(max_length=200, pattern=NO_CONTROLS, description="Part of the name; case is ignored."),
     ] = None,
-    limit: Annotated[int, Query(ge=1, le=_MAX_LISTED, description="How many to return.")] = 100,
-    cursor: Annotated[str | None, Query(description="The `next_cursor` of the page before.")] = None,
+    limit: Annotated[int, Query(ge=1, le=_MAX_LISTED, description="Maximum number of items.")] = 100,
+    cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page.")] = None,
 ) -> VenueList:
-    """Stored venues, newest first."""
+    """List stored venues, newest first."""
     after = None if cursor is None else parse_cursor(cursor)
     found = runtime.store.venues.list_venues(tenant, limit=limit + 1, after=after, name=name)
     page = found[:limit]
@@ -121,13 +121,13 @@ def list_venues(
 
 @router.get(
     "/{venue_id}",
-    summary="A venue",
+    summary="Get a venue",
     response_model=VenueAnswer,
     openapi_extra={"parameters": [IF_NONE_MATCH]},
     responses=NOT_MODIFIED | problem_responses(UnknownVenueError, InvalidRequestError, StoreUnavailableError),
 )
 def get_venue(venue_id: str, request: Request, runtime: Running, tenant: Tenant) -> Response:
-    """A stored venue, and how many of its plans can be asked about."""
+    """Return a stored venue with the number of plans that are ready."""
     record = _stored(tenant, venue_id, runtime)
     content, etag = venue_representation(record, runtime)
     return conditional_answer(request, content, JSON, etag)
@@ -135,7 +135,7 @@ def get_venue(venue_id: str, request: Request, runtime: Running, tenant: Tenant)
 
 @router.get(
     "/{venue_id}/plans",
-    summary="The plans of a venue",
+    summary="List the plans of a venue",
     responses=problem_responses(UnknownVenueError, InvalidRequestError, StoreUnavailableError),
 )
 def list_venue_plans(
@@ -143,14 +143,14 @@ def list_venue_plans(
     runtime: Running,
     tenant: Tenant,
     level: Annotated[
-        float | None, Query(ge=-1000, le=1000, allow_inf_nan=False, description="Only plans of this level.")
+        float | None, Query(ge=-1000, le=1000, allow_inf_nan=False, description="Level of the plans.")
     ] = None,
-    limit: Annotated[int, Query(ge=1, le=_MAX_LISTED, description="How many to return.")] = 100,
-    cursor: Annotated[str | None, Query(description="The `next_cursor` of the page before.")] = None,
+    limit: Annotated[int, Query(ge=1, le=_MAX_LISTED, description="Maximum number of items.")] = 100,
+    cursor: Annotated[str | None, Query(description="`next_cursor` of the previous page.")] = None,
 ) -> VenuePlanList:
-    """The plans of a venue from the lowest level up, and how far the latent grid of each is.
+    """List the plans of a venue from the lowest level up, with the state of their pose grids.
 
-    Going from page to page gives every plan once that belongs to the venue, on the same level, all the while.
+    Paging returns every plan that stays in the venue on the same level exactly once.
     """
     record = _stored(tenant, venue_id, runtime)
     after = None if cursor is None else parse_venue_cursor(cursor)
@@ -168,7 +168,7 @@ def list_venue_plans(
     responses=problem_responses(*_REFUSED_BODIES, UnknownVenueError, RevisionMismatchError),
 )
 async def replace_venue(venue_id: str, request: Request, runtime: Running, tenant: Tenant, client: Client) -> Response:
-    """Give a venue another name, anchor and plans: what is left out, it has no more."""
+    """Replace the name, anchor and plans of a venue; fields that are left out are reset."""
     content = await _read(request, runtime)
 
     def store() -> Response:
@@ -199,7 +199,7 @@ async def replace_venue(venue_id: str, request: Request, runtime: Running, tenan
     responses=problem_responses(*_REFUSED_BODIES, UnknownVenueError, RevisionMismatchError),
 )
 async def change_venue(venue_id: str, request: Request, runtime: Running, tenant: Tenant, client: Client) -> Response:
-    """Change the name or the anchor of a venue, or some of its plans."""
+    """Change the name, the anchor or some plans of a venue."""
     content = await _read(request, runtime)
 
     def store() -> Response:
@@ -208,7 +208,7 @@ async def change_venue(venue_id: str, request: Request, runtime: Running, tenant
         document = parse_document(VenueChangeDocument, content)
         given = document.model_fields_set
         if not given:
-            raise InvalidRequestError([("body", "changes nothing: name, anchor, plans or remove are needed")])
+            raise InvalidRequestError([("body", "changes nothing; give name, anchor, plans or remove")])
         record = runtime.store.venues.change(
             tenant,
             current.id,
@@ -233,7 +233,7 @@ async def change_venue(venue_id: str, request: Request, runtime: Running, tenant
     responses=problem_responses(UnknownVenueError, RevisionMismatchError, InvalidRequestError, StoreUnavailableError),
 )
 def delete_venue(venue_id: str, request: Request, runtime: Running, tenant: Tenant) -> None:
-    """Delete a venue; its floor plans stay."""
+    """Delete a venue; its floor plans are kept."""
     current = _stored(tenant, venue_id, runtime)
     expected = expected_revision(request, current.id, current.revision_id, what="venue")
     if not runtime.store.venues.delete(tenant, current.id, expected=expected):
@@ -257,10 +257,10 @@ def _anchor(document: VenueAnchorDocument | None) -> Anchor | None:
 
 
 def _members(documents: list[VenuePlanDocument], runtime: Runtime) -> list[VenueMember]:
-    """Plans of a venue as they were sent.
+    """Return the plans of a venue in a request.
 
     Raises:
-        InvalidRequestError: there are too many, or one of them twice, or ids that are none.
+        InvalidRequestError: too many plans, duplicates, or invalid ids.
     """
     limit = runtime.settings.plans.max_venue_plans
     if len(documents) > limit:
@@ -270,7 +270,7 @@ def _members(documents: list[VenuePlanDocument], runtime: Runtime) -> list[Venue
     counted = Counter(document.floorplan_id for document in documents)
     twice = [plan_id for plan_id, count in counted.items() if count > 1]
     if twice:
-        raise InvalidRequestError([("plans", f"has floor plan '{twice[0]}' {counted[twice[0]]} times")])
+        raise InvalidRequestError([("plans", f"has floor plan '{twice[0]}' {counted[twice[0]]} times; give it once")])
     if wrong := [plan_id for plan_id in counted if not is_id(plan_id)]:
         raise InvalidRequestError([("plans", f"there is no floor plan '{wrong[0]}'")])
     return [VenueMember(document.floorplan_id, document.level, document.name) for document in documents]
@@ -279,7 +279,9 @@ def _members(documents: list[VenuePlanDocument], runtime: Runtime) -> list[Venue
 def _removed(document: VenueChangeDocument) -> set[str]:
     removed = set(document.remove)
     if both := removed & {plan.floorplan_id for plan in document.plans}:
-        raise InvalidRequestError([("remove", f"has floor plan '{min(both)[:64]}', and so has plans")])
+        raise InvalidRequestError(
+            [("remove", f"has floor plan '{min(both)[:64]}', which is also in plans; give it in one of them")]
+        )
     return removed
 
 

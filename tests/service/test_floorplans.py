@@ -179,7 +179,7 @@ def test_preview_and_mesh_are_served_as_what_they_are(client: httpx.Client) -> N
     assert_problem(half, 422, "invalid-request")
     far = client.get(f"/floorplans/{plan_id}/preview.svg", params={"x_m": 1, "y_m": 1e6})
     (fault,) = assert_problem(far, 422, "invalid-request")["errors"]
-    assert (fault["field"], "is 1e+06, it must lie from " in fault["message"]) == ("y_m", True)
+    assert (fault["field"], "is 1e+06; it must lie between " in fault["message"]) == ("y_m", True)
 
 
 def test_a_plan_whose_grid_would_be_too_large_is_refused_by_estimate_and_limit(

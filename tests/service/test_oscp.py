@@ -155,7 +155,7 @@ WRONG: dict[str, tuple[Callable[[dict[str, Any]], None], str, str]] = {
         "upright",
     ),
     "no sensor": (_asked(sensors=[]), "sensorReadings.cameraReadings.0.sensorId", "no camera with this id"),
-    "no place": (lambda _: None, "sensorReadings.geolocationReadings", "neither floorplan_id nor venue_id"),
+    "no place": (lambda _: None, "sensorReadings.geolocationReadings", "without floorplan_id and venue_id"),
 }
 
 
