@@ -41,7 +41,8 @@ def import_plans(
     """
     if len(content) > limits.max_plan_bytes:
         raise InvalidFloorPlanError(
-            f"the file has {len(content)} bytes; the limit is {limits.max_plan_bytes} (max_plan_bytes)"
+            f"the file has {len(content)} bytes; the limit is {limits.max_plan_bytes} (max_plan_bytes); "
+            "export a single storey"
         )
     budget = Budget(limits, clock)
     try:
@@ -172,7 +173,7 @@ def _format_by_magic(content: bytes) -> Format:
             return format
     start = head.removeprefix(codecs.BOM_UTF8).lstrip()
     if not start:
-        raise InvalidFloorPlanError("the file is empty")
+        raise InvalidFloorPlanError("the file is empty; export it again")
     kind = describe_file(content)
     if kind is not None:
         found = f"{kind}, which cannot be read: {_ADVICE.get(kind.rpartition(' ')[2], 'convert it')}"

@@ -15,8 +15,8 @@ from lalaloc_client import Client
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import Anchor, ImportOptions, import_plan
-from tests.plans.conftest import FLAT as PLAN
-from tests.plans.conftest import assert_same_plan
+from tests.importers.conftest import FLAT as PLAN
+from tests.importers.conftest import assert_same_plan
 from tests.service.conftest import FLAT, assert_problem, localise, upload
 
 ANCHOR = {"latitude": 48.1372, "longitude": 11.5756, "altitude_m": 519.5}

@@ -9,8 +9,8 @@ import pytest
 
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import export_plan
-from tests.plans.conftest import FLAT as PLAN
-from tests.plans.test_pictures import vector_pdf
+from tests.importers.conftest import FLAT as PLAN
+from tests.importers.test_pictures import vector_pdf
 from tests.service.conftest import StartApp, assert_problem, encode_picture, upload
 
 # Created before the packages are hidden.

@@ -24,9 +24,9 @@ from benchmarks.plan_drawing import draw_plan
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import Anchor, export_plan
 from service.conversion import converter
-from tests.plans.conftest import FLAT as PLAN
-from tests.plans.test_ifc import DUPLEX, ifc_flat
-from tests.plans.test_pictures import vector_pdf
+from tests.importers.conftest import FLAT as PLAN
+from tests.importers.test_ifc import DUPLEX, ifc_flat
+from tests.importers.test_pictures import vector_pdf
 from tests.service.conftest import StartApp, assert_problem, localise, wait_for
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

@@ -208,7 +208,9 @@ def _features(document: Any, budget: Budget) -> Iterator[Feature]:
     if kind == "FeatureCollection":
         features = document.get("features")
         if not isinstance(features, list):
-            raise InvalidFloorPlanError("'features' of the FeatureCollection must be a list")
+            raise InvalidFloorPlanError(
+                f"'features' of the FeatureCollection is of type {type(features).__name__}; it must be a list"
+            )
         for index, feature in enumerate(features):
             yield from _feature(feature, f"feature {index}", budget)
     elif kind == "Feature":
@@ -227,12 +229,12 @@ def _feature(raw: Any, where: str, budget: Budget) -> Iterator[Feature]:
     try:
         shape = shapely.from_geojson(json.dumps(geometry, allow_nan=True))
     except (shapely.errors.ShapelyError, ValueError, TypeError) as error:
-        raise InvalidFloorPlanError(f"the geometry of {where} cannot be read: {error}") from error
+        raise InvalidFloorPlanError(f"the geometry of {where} is not a GeoJSON geometry: {error}") from error
     if shape is None or shape.is_empty:
         return
     shape = shapely.force_2d(shape)
     if not np.isfinite(shapely.get_coordinates(shape)).all():
-        raise InvalidFloorPlanError(f"the geometry of {where} has coordinates that are not finite")
+        raise InvalidFloorPlanError(f"the geometry of {where} has coordinates that are not finite; remove it")
     given = raw.get("properties")
     properties = dict(given) if isinstance(given, Mapping) else {}
     if isinstance(raw.get("feature_type"), str):

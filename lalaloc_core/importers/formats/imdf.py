@@ -56,7 +56,7 @@ def read_archive(content: bytes, limits: ImportLimits, *, suffixes: tuple[str, .
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             return _read_members(archive, limits, suffixes)
     except (zipfile.BadZipFile, zlib.error, NotImplementedError, EOFError, OSError) as error:
-        raise InvalidFloorPlanError(f"the archive is damaged: {error}") from error
+        raise InvalidFloorPlanError(f"the archive is damaged: {error}; pack it again") from error
 
 
 def read(files: Mapping[str, bytes], options: ImportOptions, budget: Budget) -> tuple[ImportedPlan, ...]:
@@ -93,7 +93,7 @@ def write(document: Mapping[str, Any], anchor: Anchor | None) -> bytes:
         InvalidFloorPlanError: the plan has no anchor, so it has no coordinates on Earth.
     """
     if anchor is None:
-        raise InvalidFloorPlanError("the plan has no anchor; IMDF requires one: add 'anchor' to the plan")
+        raise InvalidFloorPlanError("IMDF requires the place of the plan on Earth; set its anchor")
     projector = Projector(anchor)
     name = str(document.get("name", "floor plan"))
     ids = {kind: str(uuid.uuid5(_NAMESPACE, f"{kind}/{name}")) for kind in ("venue", "building", "level", "footprint")}
@@ -137,7 +137,8 @@ def _read_members(archive: zipfile.ZipFile, limits: ImportLimits, suffixes: tupl
     members = archive.infolist()
     if len(members) > limits.max_archive_files:
         raise InvalidFloorPlanError(
-            f"the archive has {len(members)} files; the limit is {limits.max_archive_files} (max_archive_files)"
+            f"the archive has {len(members)} files; the limit is {limits.max_archive_files} (max_archive_files); "
+            "pack only the files of the plan"
         )
     found: dict[str, bytes] = {}
     remaining = limits.max_unpacked_bytes
@@ -152,7 +153,8 @@ def _read_members(archive: zipfile.ZipFile, limits: ImportLimits, suffixes: tupl
         remaining -= len(content)
         if remaining < 0:
             raise InvalidFloorPlanError(
-                f"the archive unpacks to more than {limits.max_unpacked_bytes} bytes (max_unpacked_bytes)"
+                f"the archive unpacks to more than {limits.max_unpacked_bytes} bytes (max_unpacked_bytes); "
+                "pack only the files of the plan"
             )
         found[member.filename] = content
     return found

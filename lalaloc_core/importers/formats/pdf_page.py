@@ -64,7 +64,7 @@ def open_page(content: bytes, number: int) -> tuple[pypdfium2.PdfDocument, pypdf
         ) from error
     if number > pages:
         document.close()
-        raise InvalidFloorPlanError(f"page is {number}; the PDF has {pages} pages")
+        raise InvalidFloorPlanError(f"page is {number}; the PDF has {pages} pages, set page to one of them")
     try:
         return document, document[number - 1]
     except pypdfium2.PdfiumError as error:

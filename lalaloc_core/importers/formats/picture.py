@@ -64,11 +64,13 @@ def _open(
                 width, height = picture.size
                 if width * height > limit:
                     raise InvalidFloorPlanError(
-                        f"the picture has {width} x {height} pixels; the limit is {limit} in total (max_plan_pixels)"
+                        f"the picture has {width} x {height} pixels; the limit is {limit} in total (max_plan_pixels); "
+                        "reduce its resolution"
                     )
                 if min(width, height) < _MIN_SIDE_PX:
                     raise InvalidFloorPlanError(
-                        f"the picture has {width} x {height} pixels; the minimum is {_MIN_SIDE_PX} x {_MIN_SIDE_PX}"
+                        f"the picture has {width} x {height} pixels; the minimum is {_MIN_SIDE_PX} x {_MIN_SIDE_PX}; "
+                        "use a larger picture"
                     )
                 dpi = picture.info.get("dpi")
                 upright = ImageOps.exif_transpose(picture)

@@ -18,7 +18,7 @@ from PIL import Image
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers import EXPORT_FORMATS, FORMATS, ImportLimits, ImportOptions, detect_format, import_plans
-from tests.plans.conftest import FLAT
+from tests.importers.conftest import FLAT
 
 SVG = '<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink">{}</svg>'
 

@@ -14,7 +14,7 @@ from lalaloc_core.importers.common.limits import Budget
 from lalaloc_core.importers.common.report import ReportBuilder
 from lalaloc_core.importers.common.vocabulary import role_of, type_of_room
 from lalaloc_core.importers.formats import dxf
-from tests.plans.conftest import lines, shapes
+from tests.importers.conftest import lines, shapes
 
 CUBICASA = b"""<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1000 600"><g id="Model"><g class="Floor">
 <g id="Wall" class="Wall External"><polygon points="0,0 1000,0 1000,20 0,20"/>

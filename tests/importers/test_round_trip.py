@@ -12,7 +12,7 @@ import shapely
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import EXPORT_FORMATS, Anchor, ImportOptions, export_plan, import_plan
-from tests.plans.conftest import assert_same_plan
+from tests.importers.conftest import assert_same_plan
 
 ANCHOR = Anchor(latitude=48.1372, longitude=11.5756, north_deg=25.0)
 

@@ -13,7 +13,7 @@ import pytest
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import LocalFrame
 from lalaloc_core.importers import ImportLimits, ImportOptions, import_plan, import_plans
-from tests.plans.conftest import lines, shapes
+from tests.importers.conftest import lines, shapes
 
 PLACE = LocalFrame(longitude=-0.1276, latitude=51.5072)
 
@@ -107,13 +107,13 @@ def test_imdf_kiosks_are_holes_and_windows_are_kept():
 @pytest.mark.parametrize(
     ("document", "message"),
     [
-        ({"type": "FeatureCollection", "features": 3}, "'features' of the FeatureCollection must be a list"),
+        ({"type": "FeatureCollection", "features": 3}, "is of type int; it must be a list"),
         ({"type": "FeatureCollection", "features": []}, "no features with a geometry"),
         ({"type": "FeatureCollection", "features": [{"type": "Thing"}]}, "feature 0 is not a GeoJSON Feature"),
         ({"type": "Feature", "geometry": {"type": "Polygon", "coordinates": "x"}}, "geometry of the feature"),
         ({"type": "Point", "coordinates": [1, 2]}, "no room was found"),
         ({"type": "Polygon", "coordinates": [[[0, 0], [1, 0], [1, 1], [0, 0]]]}, "the limit for a plan"),
-        ({"type": "Polygon", "coordinates": [[[0, 0], [1e400, 0], [1, 1], [0, 0]]]}, "cannot be read"),
+        ({"type": "Polygon", "coordinates": [[[0, 0], [1e400, 0], [1, 1], [0, 0]]]}, "is not a GeoJSON geometry"),
     ],
 )
 def test_invalid_documents_are_rejected(document: dict, message: str):

@@ -9,7 +9,7 @@ import pytest
 
 from lalaloc_core.cli import main
 from lalaloc_core.floorplan import FloorPlan
-from tests.plans.conftest import FLAT
+from tests.importers.conftest import FLAT
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import ImportOptions, KnownDistance, import_plan
 from lalaloc_core.importers.picture.ink import find_skew
-from tests.plans.conftest import lines, shapes
+from tests.importers.conftest import lines, shapes
 
 FLAT = Path(__file__).parents[2] / "examples" / "flat.json"
 # Homes that are read well; the benchmark also contains others.

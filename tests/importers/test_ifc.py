@@ -11,7 +11,7 @@ import pytest
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers import ImportedPlan, ImportOptions, import_plan, import_plans
-from tests.plans.conftest import lines, shapes
+from tests.importers.conftest import lines, shapes
 
 ifcopenshell = pytest.importorskip("ifcopenshell")
 

@@ -10,7 +10,7 @@ from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import ImportOptions, KnownDistance, import_plan
 from lalaloc_core.importers.common.checks import check_document, likely_unit
-from tests.plans.conftest import FLAT, assert_same_plan
+from tests.importers.conftest import FLAT, assert_same_plan
 
 FOOT = 0.3048
 
