@@ -1,16 +1,16 @@
 """Localise a photograph in a floor plan.
 
-Everything that a query needs:
+The query side:
 
     floorplan/   plans: rooms, openings, anchors, validation
-    importers/   plan files of other tools, read and written
+    importers/   import and export of plan files of other tools
     panorama/    photographs as files: decoding, metadata, levelling
     render/      the layout renderer
     nets/        the networks in torch
     localise/    encoders, matching cost, retrieval, VDR, LPO, posterior
     draw/        pictures of plans and answers
 
-`learn/` makes models, `evaluate/` measures them, `cli/` is the command line. The ground floor is `conventions.py` (axes,
+`learn/` trains models, `evaluate/` measures them, `cli/` is the command line. All of them use `conventions.py` (axes,
 units, pixels), `errors.py`, `files.py`, `file_kinds.py` and `configuration.py` (dataclasses from plain data).
 
 Begin with `localise/pipeline.py`, the path of a query. Importing this package loads neither torch nor onnxruntime.

@@ -1,9 +1,9 @@
-"""Axes, units and the pixel contract. Every other module relies on this page.
+"""Axes, units and pixel coordinates used by all other modules.
 
 Plan frame: right-handed, metres, x to the right, y up on the drawing, z up from the floor.
-Azimuth: clockwise from the plan's +y seen from above, so azimuth 0 looks along +y and π/2 along +x.
-Heading of a panorama: the azimuth that its centre column looks along.
-Inside the code angles are radians; degrees exist at the HTTP API, on the command line and in files only.
+Azimuth: clockwise from the plan's +y seen from above; azimuth 0 is +y and π/2 is +x.
+Heading of a panorama: azimuth of its centre column.
+Angles are radians inside the code; degrees are used only in the HTTP API, on the command line and in files.
 """
 
 from __future__ import annotations
@@ -14,18 +14,18 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-# Any array that array-api-compat understands: numpy in the service, torch in training and LPO.
+# Arrays that array-api-compat supports: numpy in the service, torch in training and LPO.
 Array = Any
 
 TWO_PI = 2.0 * math.pi
-# A camera nearer to the floor is one whose height was given in another unit.
+# A lower camera height was probably given in another unit.
 MIN_CAMERA_HEIGHT_M = 0.1
 
-# What a horizontal ray meets at eye height; its place is its code, in plans, layouts, networks and search alike.
+# Classes of what a horizontal ray meets at eye height; the index is the code in plans, layouts, networks and search.
 OPENING_CLASSES = ("wall", "door", "window", "passage")
 WALL_CODE, DOOR_CODE, WINDOW_CODE, PASSAGE_CODE = range(len(OPENING_CLASSES))
 
-# What a room is for; the place is the code. docs/reference/conventions.md says what each covers.
+# Room types; the index is the code. docs/reference/conventions.md describes each.
 ROOM_TYPES = (
     "unknown",
     "bedroom",
@@ -47,26 +47,26 @@ ROOM_TYPES = (
 
 
 def column_azimuths(columns: int) -> Float[np.ndarray, "columns"]:
-    """Azimuth (radians, relative to the heading) of each pixel column's centre: ((j + 0.5) / W - 0.5) 2π."""
+    """Return the azimuth (radians, relative to the heading) of column centres: ((j + 0.5) / W - 0.5) 2π."""
     return ((np.arange(columns) + 0.5) / columns - 0.5) * TWO_PI
 
 
 def row_elevations(rows: int) -> Float[np.ndarray, "rows"]:
-    """Elevation (radians, up is positive) of each pixel row's centre: (0.5 - (i + 0.5) / H) π."""
+    """Return the elevation (radians, up is positive) of row centres: (0.5 - (i + 0.5) / H) π."""
     return (0.5 - (np.arange(rows) + 0.5) / rows) * math.pi
 
 
 def wrap_angle(angle: Array) -> Array:
-    """The same angle (radians) in [-π, π)."""
+    """Wrap an angle (radians) to [-π, π)."""
     return (angle + math.pi) % TWO_PI - math.pi
 
 
 def heading_from_degrees(degrees: float) -> float:
-    """Radians in [0, 2π) of a heading in degrees."""
+    """Convert a heading in degrees to radians in [0, 2π)."""
     return math.radians(degrees % 360.0)
 
 
 def heading_to_degrees(radians: float) -> float:
-    """Degrees in [0, 360) of a heading in radians."""
+    """Convert a heading in radians to degrees in [0, 360)."""
     degrees = math.degrees(radians) % 360.0
     return 0.0 if degrees >= 360.0 else degrees

@@ -1,20 +1,20 @@
-"""The exception tree. Every error carries the values it speaks of.
+"""Exceptions of the core. Messages name the wrong value and the limit; `service.errors` adds those of the service.
 
 LaLaLocError
-├── InvalidInputError            the caller's data is wrong (a 4xx over HTTP, exit code 2 on the command line)
-│   ├── InvalidFloorPlanError    a plan cannot be what it says; names the room
-│   │   └── SeveralLevelsError   a file has several storeys, and none was chosen; names them
-│   ├── MissingExtraError        a format that needs a package which is not installed; names the extra
-│   ├── InvalidPanoramaError     a picture that is not a usable 360° panorama
-│   ├── InvalidPoseError         a position, heading or height outside its limits
-│   ├── InvalidHintError         what is said to be known of a place cannot be; names the hint
-│   ├── InvalidMotionError       a motion between two pictures that cannot have been measured
-│   └── DatasetError             a data set's file is missing, damaged or impossible; names scene, room and path
+├── InvalidInputError            the caller's data are wrong (a 4xx over HTTP, exit code 2 on the command line)
+│   ├── InvalidFloorPlanError    a floor plan is invalid; names the room
+│   │   └── SeveralLevelsError   a file has several levels and none was chosen; names them
+│   ├── MissingExtraError        a format needs a package that is not installed; names the extra
+│   ├── InvalidPanoramaError     a picture is not a usable 360° panorama
+│   ├── InvalidPoseError         a position, heading or height is outside its limits
+│   ├── InvalidHintError         a hint is invalid; names the hint
+│   ├── InvalidMotionError       a motion between two photographs is invalid
+│   └── DatasetError             a file of a data set is missing, damaged or invalid; names scene, room and path
 ├── ConfigError                  unknown key or value of a wrong type in a configuration
-├── BundleError                  a model bundle is missing, incomplete or was altered
+├── BundleError                  a model bundle is missing, incomplete or altered
 ├── CheckpointError              a checkpoint is missing or belongs to another configuration
-├── ExportError                  an exported network disagrees with the one it was exported from
-└── RunError                     an evaluation run is missing, damaged, or was made with other settings
+├── ExportError                  an exported network disagrees with its source
+└── RunError                     an evaluation run is missing, damaged, or has other settings
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-# Of the storeys of a tower, so many are named in a sentence.
+# Largest number of levels named in a message.
 _SHOWN_LEVELS = 12
 
 
@@ -31,15 +31,15 @@ class LaLaLocError(Exception):
 
 
 class InvalidInputError(LaLaLocError, ValueError):
-    """The caller's data is wrong; the message names the value and the limit."""
+    """The caller's data are wrong; the message names the value and the limit."""
 
 
 class InvalidFloorPlanError(InvalidInputError):
     """A floor plan breaks a rule.
 
     Attributes:
-        room: name of the room at fault, None when the fault lies in the plan as a whole.
-        reason: what is wrong, with value and limit.
+        room: name of the invalid room, None if the plan as a whole is invalid.
+        reason: problem, with value and limit.
     """
 
     def __init__(self, reason: str, *, room: str | None = None) -> None:
@@ -49,10 +49,10 @@ class InvalidFloorPlanError(InvalidInputError):
 
 
 class SeveralLevelsError(InvalidFloorPlanError):
-    """A file has several storeys where one plan is wanted.
+    """A file has several levels and none was chosen.
 
     Attributes:
-        levels: their names, lowest first.
+        levels: names of the levels, lowest first.
     """
 
     def __init__(self, levels: Sequence[str]) -> None:
@@ -63,34 +63,34 @@ class SeveralLevelsError(InvalidFloorPlanError):
 
 
 class MissingExtraError(InvalidInputError):
-    """A format cannot be read or written here: the package that does is not installed.
+    """A format cannot be read or written because its package is not installed.
 
     Attributes:
-        what: was to be done.
-        extra: of this project, which brings the package.
+        action: the attempted action, for the message.
+        extra: extra of this project that brings the package.
     """
 
-    def __init__(self, what: str, extra: str) -> None:
-        self.what, self.extra = what, extra
+    def __init__(self, action: str, extra: str) -> None:
+        self.action, self.extra = action, extra
         super().__init__(
-            f"{what} needs the extra `{extra}`, which is not installed here: pip install 'lalaloc[{extra}]'"
+            f"{action} needs the extra `{extra}`, which is not installed; run pip install 'lalaloc[{extra}]'"
         )
 
 
 class InvalidPanoramaError(InvalidInputError):
-    """A picture is not a full equirectangular panorama this project can read."""
+    """A picture is not a readable equirectangular panorama."""
 
 
 class InvalidPoseError(InvalidInputError):
-    """A position, heading or height lies outside its limits."""
+    """A position, heading or height is outside its limits."""
 
 
 class InvalidHintError(InvalidInputError):
-    """What is said to be known of a place beforehand cannot be meant.
+    """A hint about the pose is invalid.
 
     Attributes:
-        hint: name of the hint at fault.
-        reason: what is wrong, with value and limit.
+        hint: name of the invalid hint.
+        reason: problem, with value and limit.
     """
 
     def __init__(self, hint: str, reason: str) -> None:
@@ -99,29 +99,29 @@ class InvalidHintError(InvalidInputError):
 
 
 class InvalidMotionError(InvalidInputError):
-    """A motion between two pictures lies outside its limits, or misses a part."""
+    """A motion between two photographs is outside its limits or incomplete."""
 
 
 class DatasetError(InvalidInputError):
-    """A file of a data set is missing, damaged, or says what cannot be.
+    """A file of a data set is missing, damaged or invalid.
 
     Attributes:
-        reason: what is wrong, with value and limit.
-        scene, room: where; None when the fault lies above them.
-        path: the file at fault, None when there is no single one.
+        reason: problem, with value and limit.
+        scene, room: location of the problem; None if it concerns more than one.
+        path: the file, None if there is no single one.
     """
 
     def __init__(
         self, reason: str, *, scene: str | None = None, room: str | None = None, path: Path | None = None
     ) -> None:
         self.reason, self.scene, self.room, self.path = reason, scene, room, path
-        where = [f"scene '{scene}'"] if scene is not None else []
-        where += [f"room '{room}'"] if room is not None else []
-        where += [f"'{path}'"] if path is not None else []
-        super().__init__(f"{', '.join(where)}: {reason}" if where else reason)
+        location = [f"scene '{scene}'"] if scene is not None else []
+        location += [f"room '{room}'"] if room is not None else []
+        location += [f"'{path}'"] if path is not None else []
+        super().__init__(f"{', '.join(location)}: {reason}" if location else reason)
 
     def __reduce__(self) -> tuple[Callable[..., DatasetError], tuple[object, ...]]:
-        """Errors of worker processes arrive whole."""
+        """Support pickling, so that errors of worker processes keep their attributes."""
         return _dataset_error, (self.reason, self.scene, self.room, self.path)
 
 
@@ -142,8 +142,8 @@ class CheckpointError(LaLaLocError):
 
 
 class ExportError(LaLaLocError):
-    """An exported network disagrees with the one it was exported from."""
+    """An exported network disagrees with its source."""
 
 
 class RunError(LaLaLocError):
-    """An evaluation run is missing, damaged, or was made with other settings."""
+    """An evaluation run is missing, damaged, or has other settings."""

@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all."""
+"""Atomic writing of files."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ PART_SUFFIX = ".part"
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A temporary path beside `path` to write to, which takes its place at the end; after an error nothing changes.
+    """Yield a temporary path beside `path` that replaces it at the end; after an error `path` is unchanged.
 
-    A process that is killed meanwhile leaves the previous file, and the part that it had written beside it.
+    A process killed meanwhile leaves the previous file, and the temporary file beside it.
     """
     part = path.with_name(path.name + PART_SUFFIX)
     try:
@@ -25,6 +25,6 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def atomic_write(path: Path, content: str | bytes) -> None:
-    """Write a file, text as UTF-8, so that a crash leaves the previous one."""
+    """Write a file atomically, text as UTF-8."""
     with replacing(path) as part:
         part.write_bytes(content.encode() if isinstance(content, str) else content)

@@ -1,7 +1,7 @@
-"""The command line, `lalaloc`; each module here adds one group of commands.
+"""The command line, `lalaloc`; each module adds one group of commands.
 
-Begin with `localising.py`, which answers, and `evaluation.py`, which has the most of them; `entry_point.py` puts the
-groups together. Commands import what they run when they run it, so that `lalaloc --help` loads no network.
+Begin with `entry_point.py`, which assembles the groups; `localising.py` has the main command. Commands import their
+implementation when they run, so `lalaloc --help` loads no network.
 """
 
 from lalaloc_core.cli.entry_point import main

@@ -17,9 +17,9 @@ from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.learn.data.dataset import DATASET_FORMATS, SPLITS
 from lalaloc_core.localise.bundle import default_bundle
 
-# So many homes that calibration asks with their own photographs for one that it asks with those of others.
+# Ratio of calibration homes to homes that get photographs of other homes.
 _PER_MISMATCHED_HOME = 1
-# Homes that the cohort is drawn from.
+# Homes of the cohort.
 _COHORT_HOMES = 60
 # Columns of the printed table.
 _SHARES = ("within_1cm", "within_10cm", "within_1m", "correct_room", "heading_within_2deg")
@@ -28,83 +28,105 @@ _SHARES = ("within_1cm", "within_10cm", "within_1m", "correct_room", "heading_wi
 def add_commands(commands: Any) -> None:
     """Add these commands to the parser."""
     evaluate = commands.add_parser(
-        "evaluate", help="answer the queries of a data set, or of generated homes, and score the answers"
+        "evaluate", help="localise the queries of a data set or of generated homes, and score the answers"
     )
-    evaluate.add_argument("--bundle", type=Path, default=default_bundle(), help="model (default: %(default)s)")
+    evaluate.add_argument("--bundle", type=Path, default=default_bundle(), help="model bundle (default: %(default)s)")
     evaluate.add_argument(
         "--method",
         default="lalaloc",
         choices=("lalaloc", "oracle", "icp", "explicit", "decode"),
-        help="who answers (default: %(default)s)",
+        help="localisation method (default: %(default)s)",
     )
     evaluate.add_argument(
-        "--kind", choices=("layout", "panorama"), default="panorama", help="what is asked (default: %(default)s)"
+        "--kind", choices=("layout", "panorama"), default="panorama", help="kind of query (default: %(default)s)"
     )
     _data_arguments(evaluate)
-    evaluate.add_argument("--split", choices=SPLITS, default="test")
-    evaluate.add_argument("--furniture", choices=("empty", "simple", "full"), help="default: the data set's usual")
-    evaluate.add_argument("--lighting", choices=("cold", "raw", "warm"), help="default: the data set's usual")
-    evaluate.add_argument("--heading", choices=("known", "unknown"), default="known")
-    evaluate.add_argument("--grid-step", type=positive, default=0.5, metavar="M", help="metres (default: %(default)s)")
-    evaluate.add_argument("--refine", choices=("none", "vdr", "lpo"), help="how far to go; default: lpo")
-    evaluate.add_argument("--limit", type=count, metavar="N", help="at most N queries")
-    evaluate.add_argument("--skip-bad", action="store_true", help="leave out and list what cannot be used")
-    evaluate.add_argument("--workers", type=processes, metavar="N", help="processes; default: one per core")
-    evaluate.add_argument("--out", type=Path, metavar="RUN", help="folder of the run; one that exists goes on")
-    evaluate.add_argument("--json", action="store_true", help="print every figure as JSON")
+    evaluate.add_argument("--split", choices=SPLITS, default="test", help="split (default: %(default)s)")
+    evaluate.add_argument(
+        "--furniture", choices=("empty", "simple", "full"), help="furniture level (default: by data set)"
+    )
+    evaluate.add_argument("--lighting", choices=("cold", "raw", "warm"), help="lighting (default: by data set)")
+    evaluate.add_argument(
+        "--heading", choices=("known", "unknown"), default="known", help="heading of queries (default: %(default)s)"
+    )
+    evaluate.add_argument(
+        "--grid-step",
+        type=positive,
+        default=0.5,
+        metavar="M",
+        help="step of the pose grid, metres (default: %(default)s)",
+    )
+    evaluate.add_argument("--refine", choices=("none", "vdr", "lpo"), help="last stage of refinement (default: lpo)")
+    evaluate.add_argument("--limit", type=count, metavar="N", help="largest number of queries (default: all)")
+    evaluate.add_argument("--skip-bad", action="store_true", help="skip and list unusable samples")
+    evaluate.add_argument("--workers", type=processes, metavar="N", help="worker processes (default: one per core)")
+    evaluate.add_argument("--out", type=Path, metavar="RUN", help="folder of the run; an existing run is continued")
+    evaluate.add_argument("--json", action="store_true", help="print all figures as JSON")
     evaluate.set_defaults(run=_evaluate)
 
-    score = commands.add_parser("score", help="score the answers of runs again, without model or data")
-    score.add_argument("runs", type=Path, nargs="+", metavar="RUN")
-    score.add_argument("--json", action="store_true", help="print every figure as JSON")
+    score = commands.add_parser("score", help="score the stored predictions of runs again, without model or data")
+    score.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="folder of a run")
+    score.add_argument("--json", action="store_true", help="print all figures as JSON")
     score.set_defaults(run=_score)
 
-    report = commands.add_parser("report", help="write one self-contained HTML page about runs")
-    report.add_argument("runs", type=Path, nargs="+", metavar="RUN")
-    report.add_argument("--out", type=Path, default=Path("report.html"))
-    report.add_argument("--pictures", type=Path, metavar="DIR", help="also write the page's pictures as files")
+    report = commands.add_parser("report", help="write a self-contained HTML report about runs")
+    report.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="folder of a run")
+    report.add_argument(
+        "--out", type=Path, default=Path("report.html"), metavar="FILE", help="page to write (default: %(default)s)"
+    )
+    report.add_argument("--pictures", type=Path, metavar="DIR", help="folder to write the page's pictures to as well")
     report.set_defaults(run=_report)
 
-    worst = commands.add_parser("worst", help="draw the worst queries of a run and count what they have in common")
-    worst.add_argument("folder", type=Path, metavar="RUN")
-    worst.add_argument("--count", type=count, default=100, metavar="N", help="how many (default: %(default)s)")
-    worst.add_argument("--out", type=Path, default=Path("worst"), metavar="FOLDER", help="default: %(default)s")
+    worst = commands.add_parser("worst", help="draw the worst queries of a run and count their properties")
+    worst.add_argument("folder", type=Path, metavar="RUN", help="folder of the run")
+    worst.add_argument("--count", type=count, default=100, metavar="N", help="number of queries (default: %(default)s)")
+    worst.add_argument(
+        "--out", type=Path, default=Path("worst"), metavar="DIR", help="folder of results (default: %(default)s)"
+    )
     worst.set_defaults(run=_worst)
 
-    calibrate = commands.add_parser("calibrate", help="fit a bundle's confidence on generated validation homes")
-    calibrate.add_argument("--bundle", type=Path, default=default_bundle())
+    calibrate = commands.add_parser(
+        "calibrate", help="fit a bundle's matching weights and confidence on generated validation homes"
+    )
+    calibrate.add_argument("--bundle", type=Path, default=default_bundle(), help="model bundle (default: %(default)s)")
     _generator_arguments(calibrate)
     calibrate.add_argument(
         "--openings-weight",
         type=positive,
         metavar="WEIGHT",
-        help="weight of openings in units of the walls', such as photographs ask for; default: what is fitted",
+        help="weight of openings relative to walls, such as one tuned on photographs (default: fitted)",
     )
     calibrate.add_argument(
-        "--keep-evidence", action="store_true", help="keep the bundle's weights of the evidence; fit confidence alone"
+        "--keep-evidence", action="store_true", help="keep the bundle's matching weights and fit only confidence"
     )
-    calibrate.add_argument("--out", type=Path, metavar="DIR", help="keep the answers there, and go on with those there")
+    calibrate.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder to store predictions in and to continue from"
+    )
     calibrate.set_defaults(run=_calibrate)
 
 
 def _data_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--data", type=Path, metavar="DIR", help="a data set; default: generated homes")
+    parser.add_argument("--data", type=Path, metavar="DIR", help="data set (default: generated homes)")
     parser.add_argument(
-        "--dataset", choices=tuple(DATASET_FORMATS), help="format of the data set; default: found out by its files"
+        "--dataset", choices=tuple(DATASET_FORMATS), help="format of the data set (default: detected from its files)"
     )
     parser.add_argument(
         "--generator",
         choices=("synth", "heldout"),
         default="synth",
-        help="who draws generated homes: training's generator, or one written apart from it (default: %(default)s)",
+        help="generator of homes: the one used in training, or out-of-distribution homes (default: %(default)s)",
     )
     _generator_arguments(parser)
 
 
 def _generator_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--homes", type=count, default=100, help="generated homes, 4 queries each")
-    parser.add_argument("--seed", type=int, default=0, help="of the generated homes")
-    parser.add_argument("--textures", type=Path, help="folder of material pictures for generated homes")
+    parser.add_argument(
+        "--homes", type=count, default=100, help="number of generated homes, 4 queries each (default: %(default)s)"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="random seed of generated homes (default: %(default)s)")
+    parser.add_argument(
+        "--textures", type=Path, metavar="DIR", help="material pictures for generated homes (default: procedural)"
+    )
 
 
 def _evaluate(arguments: argparse.Namespace) -> None:
@@ -116,7 +138,7 @@ def _evaluate(arguments: argparse.Namespace) -> None:
     method, panorama = arguments.method, arguments.kind == "panorama"
     bundle = None if method in ("oracle", "icp") else arguments.bundle
     if arguments.data is None and arguments.dataset is not None:
-        raise InvalidInputError(f"--dataset {arguments.dataset} is the format of --data, which is missing")
+        raise InvalidInputError(f"--dataset {arguments.dataset} needs --data, which is missing")
     if arguments.data is not None and arguments.generator != "synth":
         raise InvalidInputError(f"--generator {arguments.generator} is for generated homes, not for --data")
     if arguments.refine is not None and method != "lalaloc":
@@ -130,7 +152,7 @@ def _evaluate(arguments: argparse.Namespace) -> None:
         settings={} if arguments.refine is None else {"refine": arguments.refine},
         data=None if arguments.data is None else str(arguments.data),
         data_format=arguments.dataset,
-        generated=_asked_homes(arguments) if arguments.data is None else None,
+        generated=_generated_homes(arguments) if arguments.data is None else None,
         heading_known=arguments.heading == "known",
         grid_step_m=arguments.grid_step,
         limit=arguments.limit,
@@ -167,7 +189,7 @@ def _score(arguments: argparse.Namespace) -> None:
 
 
 def _print_scores(report: dict[str, Any]) -> None:
-    """The figures that everybody asks for first, as a table; the rest is in the run's folder and in its report."""
+    """Print the main figures as a table; the run's folder and its report have all of them."""
     skipped = f", {report['skipped']} left out" if report["skipped"] else ""
     print(f"{report['label']}, {report['dataset']}: {report['n']} queries, {report['unanswered']} unanswered{skipped}")
     stages = {**report["stages"], "answer": report["final"]}
@@ -216,10 +238,10 @@ def _calibrate(arguments: argparse.Namespace) -> None:
     from lalaloc_core.localise.bundle import Bundle
     from lalaloc_core.localise.cohort import cohort_of
 
-    def asked(generated: dict[str, Any], known: bool, whose: str) -> list[Prediction]:
+    def predictions(generated: dict[str, Any], known: bool, source: str) -> list[Prediction]:
         heading = "known" if known else "searched"
         info = RunInfo(
-            label=f"calibration, {whose} homes, heading {heading}",
+            label=f"calibration, {source} homes, heading {heading}",
             method="lalaloc",
             kind="panorama",
             dataset="generated homes",
@@ -230,28 +252,30 @@ def _calibrate(arguments: argparse.Namespace) -> None:
             model=describe_model(arguments.bundle),
         )
         if arguments.out is not None:
-            return run_evaluation(RunFolder(arguments.out / f"{whose}-{heading}"), info)
+            return run_evaluation(RunFolder(arguments.out / f"{source}-{heading}"), info)
         with tempfile.TemporaryDirectory(prefix="lalaloc-run-") as folder:
             return run_evaluation(RunFolder(Path(folder)), info)
 
     bundle = Bundle.open(arguments.bundle)
-    strangers = training_plans(_COHORT_HOMES, arguments.seed)
-    store_cohort(bundle, cohort_of(strangers, bundle.manifest.profile_columns, arguments.seed))
+    cohort_plans = training_plans(_COHORT_HOMES, arguments.seed)
+    store_cohort(bundle, cohort_of(cohort_plans, bundle.manifest.profile_columns, arguments.seed))
     own = _generated(arguments, None)
     disturbed = own | {"generator": "disturbed"}
     mismatched = own | {"generator": "mismatched", "homes": max(arguments.homes // _PER_MISMATCHED_HOME, 1)}
-    # Weights first: confidence is fitted on answers that were weighed by them.
-    evidence = bundle.manifest.evidence
+    # Weights first: confidence is fitted on predictions made with them.
+    weights = bundle.manifest.evidence
     if not arguments.keep_evidence:
-        evidence = fit_matching_weights([one for heading in (True, False) for one in asked(own, heading, "unweighed")])
+        weights = fit_matching_weights(
+            [prediction for heading in (True, False) for prediction in predictions(own, heading, "unweighed")]
+        )
     if arguments.openings_weight is not None:
-        evidence = dataclasses.replace(evidence, openings=arguments.openings_weight)
-    print_json(dataclasses.asdict(store_matching_weights(Bundle.open(arguments.bundle), evidence).manifest.evidence))
+        weights = dataclasses.replace(weights, openings=arguments.openings_weight)
+    print_json(dataclasses.asdict(store_matching_weights(Bundle.open(arguments.bundle), weights).manifest.evidence))
     known, searched = (
         Answers(
-            own=asked(own, heading, "own"),
-            disturbed=asked(disturbed, heading, "disturbed"),
-            mismatched=asked(mismatched, heading, "mismatched"),
+            own=predictions(own, heading, "own"),
+            disturbed=predictions(disturbed, heading, "disturbed"),
+            mismatched=predictions(mismatched, heading, "mismatched"),
         )
         for heading in (True, False)
     )
@@ -263,20 +287,20 @@ def _calibrate(arguments: argparse.Namespace) -> None:
     print_json(bundle.manifest.metrics)
 
 
-def _asked_homes(arguments: argparse.Namespace) -> dict[str, Any]:
-    """Arguments of the generator that was asked for, as plain data."""
+def _generated_homes(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return the arguments of the chosen generator as plain data."""
     generated = _generated(arguments, arguments.furniture or "full")
     if arguments.generator == "synth":
         return generated
     if arguments.textures is not None:
-        raise InvalidInputError("--textures is for --generator synth; the other paints its own materials")
+        raise InvalidInputError("--textures is for --generator synth; 'heldout' has materials of its own")
     if arguments.split == "train":
-        raise InvalidInputError("--generator heldout has no split 'train', it is for reporting only")
+        raise InvalidInputError("--generator heldout has no split 'train'; choose --split validation or test")
     return {"generator": arguments.generator} | {name: generated[name] for name in ("homes", "seed", "furniture")}
 
 
 def _generated(arguments: argparse.Namespace, furniture: str | None) -> dict[str, Any]:
-    """Arguments of `GeneratedScenes`, as plain data."""
+    """Return arguments of `GeneratedScenes` as plain data."""
     return {
         "homes": arguments.homes,
         "seed": arguments.seed,

@@ -1,4 +1,4 @@
-"""`lalaloc localise`: where in a plan photographs were taken, without a service."""
+"""`lalaloc localise`: localise photographs in a plan, without a service."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _GRID_STEP_M = 0.5
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """An answer about one photograph."""
+    """The answer for one photograph."""
 
     photograph: Path
     drawn: DrawnAnswer
@@ -35,47 +35,46 @@ class _Found:
 
 def add_commands(commands: Any) -> None:
     """Add this command to the parser."""
-    localise = commands.add_parser(
-        "localise", help="say where in a plan 360° photographs were taken, without a service"
-    )
+    localise = commands.add_parser("localise", help="localise 360° photographs in a plan, without a service")
     localise.add_argument(
         "plan", type=Path, metavar="PLAN", help="a floor plan, in any format of docs/how-to/import-a-plan.md"
     )
     localise.add_argument(
-        "photographs", type=Path, nargs="+", metavar="PHOTO", help="full spheres, twice as wide as high"
+        "photographs", type=Path, nargs="+", metavar="PHOTO", help="panoramas of the full sphere, twice as wide as high"
     )
     localise.add_argument(
         "--heading",
         type=heading,
         metavar="DEG",
-        help="azimuth of the photographs' centre columns, clockwise from the plan's +y; default: by their compass "
-        "where the plan knows north, else it is found",
+        help="azimuth of the photographs' centre columns, clockwise from the plan's +y (default: the photographs' "
+        "compass if the plan has north_deg, otherwise estimated)",
     )
     localise.add_argument(
-        "--heading-tolerance", type=tolerance, metavar="DEG", help="how far off --heading may be (default: 0)"
+        "--heading-tolerance", type=tolerance, metavar="DEG", help="largest error of --heading (default: 0)"
     )
     localise.add_argument(
         "--camera-height",
         type=positive,
         metavar="M",
-        help="metres over the floor; default: the plan's, else it is found",
+        help="metres over the floor (default: the plan's, otherwise estimated)",
     )
     localise.add_argument(
         "--out",
         type=Path,
         metavar="FILE",
-        help="a picture of the answer, .png or .svg; of several "
-        "photographs each has the number of its photograph in its name",
+        help="picture of the answer to write, .png or .svg; with several photographs their number is appended",
     )
     localise.add_argument(
         "--picture",
         choices=("both", "plan", "photograph"),
         default="both",
-        help="what --out shows: the plan with the posterior, the photograph with the found layout, or both "
+        help="content of --out: the plan with the posterior, the photograph with the predicted layout, or both "
         "(default: %(default)s)",
     )
-    localise.add_argument("--json", action="store_true", help="print JSON, a list with an answer for each photograph")
-    localise.add_argument("--bundle", type=Path, default=default_bundle(), help="model (default: the one that ships)")
+    localise.add_argument("--json", action="store_true", help="print JSON: a list with one answer per photograph")
+    localise.add_argument(
+        "--bundle", type=Path, default=default_bundle(), help="model bundle (default: the shipped one)"
+    )
     add_plan_options(localise)
     localise.set_defaults(run=_localise)
 
@@ -84,7 +83,7 @@ def _localise(arguments: argparse.Namespace) -> None:
     from lalaloc_core.draw.answer import draw_answer
 
     if arguments.heading_tolerance is not None and arguments.heading is None:
-        raise InvalidInputError("--heading-tolerance is of --heading, which is missing")
+        raise InvalidInputError("--heading-tolerance needs --heading, which is missing")
     if arguments.out is not None:
         check_picture_name(arguments.out)
     plan = read_plan(arguments.plan, arguments).plan()
@@ -101,13 +100,13 @@ def _localise(arguments: argparse.Namespace) -> None:
             title = answer.photograph.name if len(contents) > 1 else None
             write_picture(draw_answer(answer.drawn, shown, arguments.picture, title=title), out)
     if arguments.json:
-        print_json([one.document for one in found])
+        print_json([answer.document for answer in found])
     else:
-        print_table(_HEAD, [_row(one) for one in found])
+        print_table(_HEAD, [_row(answer) for answer in found])
 
 
 def _answers(arguments: argparse.Namespace, plan: FloorPlan, contents: list[bytes]) -> Iterator[_Found]:
-    """The answers in the order of the photographs, with a progress bar on a terminal."""
+    """Yield the answers in the order of the photographs, with a progress bar on a terminal."""
     from tqdm import tqdm
 
     from lalaloc_core.draw.answer import drawn_answer
@@ -121,7 +120,7 @@ def _answers(arguments: argparse.Namespace, plan: FloorPlan, contents: list[byte
     bundle = Bundle.open(arguments.bundle)
     encoders, refiner = Encoders(bundle, threads=1), local_refiner(bundle)
     height, model = stated_height(plan, arguments.camera_height), bundle.manifest.confidence
-    # Models that compare latents alone have a grid for every height.
+    # Models that compare only latents need a pose grid per camera height.
     grid_height_m = plan.camera_height_m if encoders.predicts_profile else height.height_m
     grid = build_grid(
         plan, encoders, step_m=_GRID_STEP_M, camera_height_m=grid_height_m, latents=not encoders.predicts_profile
@@ -137,19 +136,19 @@ def _answers(arguments: argparse.Namespace, plan: FloorPlan, contents: list[byte
         found = localise(plan, grid, encoders, query, refiner=refiner)
         drawn = drawn_answer(plan, grid, found, model, _SOURCES[known.source])
         source = "searched" if found.heading_contradicted else known.source
-        warnings = ["the photograph contradicts the heading, which was searched for instead"]
-        told = {
+        warnings = ["the photograph contradicts the heading, which was estimated instead"]
+        details = {
             "stage": found.stage,
             "heading_source": source,
             "heading_confidence": None if model is None else found.heading_confidence(model),
             "warnings": warnings if found.heading_contradicted else [],
             "model": {"name": bundle.manifest.name, "version": bundle.manifest.version, "sha256": bundle.sha256},
         }
-        yield _Found(path, drawn, _document(path, drawn) | told)
+        yield _Found(path, drawn, _document(path, drawn) | details)
 
 
 def _document(path: Path, drawn: DrawnAnswer) -> dict[str, Any]:
-    """An answer as JSON, with the names of the API."""
+    """Return an answer as JSON, with the field names of the API."""
     room, camera = drawn.plan.rooms[drawn.room_index], drawn.camera
     covariance = None
     if camera.covariance_m2 is not None:
@@ -157,12 +156,12 @@ def _document(path: Path, drawn: DrawnAnswer) -> dict[str, Any]:
         covariance = [[xx, xy], [xy, yy]]
     rivals = [
         {
-            "position": {"x_m": one.x_m, "y_m": one.y_m},
-            "heading_deg": one.heading_deg,
-            "room": one.room,
-            "probability": one.probability,
+            "position": {"x_m": rival.x_m, "y_m": rival.y_m},
+            "heading_deg": rival.heading_deg,
+            "room": rival.room,
+            "probability": rival.probability,
         }
-        for one in drawn.rivals
+        for rival in drawn.rivals
     ]
     best = {"position": {"x_m": camera.x_m, "y_m": camera.y_m}, "heading_deg": camera.heading_deg, "room": room.name}
     return {
@@ -177,7 +176,7 @@ def _document(path: Path, drawn: DrawnAnswer) -> dict[str, Any]:
 
 
 _HEAD = ("photograph", "room", "x m", "y m", "heading °", "95 % within", "camera m", "confidence")
-_SOURCES = {"given": "given", "panorama": "by the compass", "searched": "searched for"}
+_SOURCES = {"given": "given", "panorama": "from the compass", "searched": "estimated"}
 
 
 def _row(found: _Found) -> tuple[str, ...]:
@@ -205,7 +204,7 @@ def _content(path: Path) -> bytes:
 
 
 def _pixels(path: Path, content: bytes) -> Any:
-    """The photograph in the size that it is drawn in."""
+    """Read the photograph in the size of the picture."""
     from lalaloc_core.draw.answer import PHOTOGRAPH_SIZE
     from lalaloc_core.panorama.images import read_panorama
 
@@ -216,7 +215,7 @@ def _pixels(path: Path, content: bytes) -> Any:
 
 @contextmanager
 def _named(path: Path) -> Iterator[None]:
-    """Says of which photograph an error is."""
+    """Name the photograph in errors."""
     try:
         yield
     except InvalidPanoramaError as error:
@@ -227,6 +226,6 @@ def _check_height(height_m: float | None, plan: FloorPlan) -> None:
     lowest_m = float(plan.ceiling_heights_m.min())
     if height_m is not None and not MIN_CAMERA_HEIGHT_M <= height_m < lowest_m:
         raise InvalidInputError(
-            f"--camera-height is {height_m:g}, it must be at least {MIN_CAMERA_HEIGHT_M:g} and below the plan's lowest "
-            f"ceiling ({lowest_m:g} m)"
+            f"--camera-height is {height_m:g} m; it must be at least {MIN_CAMERA_HEIGHT_M:g} m and below the plan's "
+            f"lowest ceiling ({lowest_m:g} m)"
         )

@@ -1,4 +1,4 @@
-"""Plans as commands take them: a file of any format that is read, and what to make of it."""
+"""Input and output of plans for commands: import options, reading, and writing pictures."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from lalaloc_core.errors import InvalidFloorPlanError, InvalidInputError
 if TYPE_CHECKING:
     from lalaloc_core.importers import ImportedPlan
 
-# The options of an import, as `plans.ImportOptions.from_text` takes them.
+# Options of an import, as `importers.ImportOptions.from_text` expects them.
 _OPTIONS = {
     "units": "unit of the file's coordinates: m, cm, mm, in or ft",
-    "scale": "scale of a drawing on paper, 1:100",
-    "metres-per-pixel": "length of a pixel, or of a unit of an SVG",
-    "known-distance": "two points of the drawing and how far apart they are: x0,y0,x1,y1,metres",
-    "level": "name or number of the storey to take",
-    "layers": "take only these layers, groups or classes; separated by commas",
+    "scale": "scale of a drawing on paper, such as 1:100",
+    "metres-per-pixel": "metres per pixel, or per unit of an SVG",
+    "known-distance": "two points of the drawing and their distance: x0,y0,x1,y1,metres",
+    "level": "name or number of the level to import",
+    "layers": "import only these layers, groups or classes, separated by commas",
     "page": "page of a PDF, from 1",
-    "y-axis": "which way y points in the file: up or down",
-    "ceiling-height-m": "ceiling of rooms whose file gives none",
-    "name": "what to call the plan",
+    "y-axis": "direction of y in the file: up or down",
+    "ceiling-height-m": "ceiling height of rooms without one, in metres",
+    "name": "name of the plan",
 }
 
 
 def add_plan_options(parser: argparse.ArgumentParser) -> None:
-    """Add what may be said of a plan's file."""
+    """Add the options of an import."""
     group = parser.add_argument_group(
         "of the plan's file, where it does not say so itself (docs/how-to/import-a-plan.md)"
     )
@@ -36,15 +36,15 @@ def add_plan_options(parser: argparse.ArgumentParser) -> None:
 
 
 def read_plans(file: Path, arguments: argparse.Namespace) -> tuple[ImportedPlan, ...]:
-    """The plans in a file, one for each level.
+    """Read the plans in a file, one for each level.
 
     Raises:
-        InvalidFloorPlanError: the file cannot be read, or is no plan.
+        InvalidFloorPlanError: the file cannot be read or is not a plan.
     """
     from lalaloc_core.importers import ImportOptions, import_plans
 
-    said = {name.replace("-", "_"): getattr(arguments, name.replace("-", "_")) for name in _OPTIONS}
-    options = ImportOptions.from_text({name: value for name, value in said.items() if value is not None})
+    values = {name.replace("-", "_"): getattr(arguments, name.replace("-", "_")) for name in _OPTIONS}
+    options = ImportOptions.from_text({name: value for name, value in values.items() if value is not None})
     try:
         content = file.read_bytes()
     except OSError as error:
@@ -53,22 +53,22 @@ def read_plans(file: Path, arguments: argparse.Namespace) -> tuple[ImportedPlan,
 
 
 def read_plan(file: Path, arguments: argparse.Namespace) -> ImportedPlan:
-    """The one plan in a file.
+    """Read the only plan in a file.
 
     Raises:
-        InvalidFloorPlanError: there are several, or none.
+        InvalidFloorPlanError: the file cannot be read, or has several levels.
     """
     plan, *others = read_plans(file, arguments)
     if others:
-        raise InvalidFloorPlanError(f"the file has {1 + len(others)} levels, choose one with --level")
+        raise InvalidFloorPlanError(f"the file has {1 + len(others)} levels; choose one with --level")
     return plan
 
 
 def write_picture(svg: str, out: Path) -> None:
-    """Write a drawing as the name of its file says.
+    """Write a drawing as SVG or PNG, by the file's suffix.
 
     Raises:
-        InvalidInputError: neither .svg nor .png, or it cannot be written.
+        InvalidInputError: another suffix, or the file cannot be written.
     """
     from lalaloc_core.draw import rasterise
 
@@ -80,8 +80,10 @@ def write_picture(svg: str, out: Path) -> None:
 
 
 def check_picture_name(out: Path) -> None:
-    """Raises:
-    InvalidInputError: a picture's file is called neither .svg nor .png.
+    """Refuse a picture file with another suffix than .svg or .png.
+
+    Raises:
+        InvalidInputError: another suffix.
     """
     if out.suffix.lower() not in (".svg", ".png"):
-        raise InvalidInputError(f"the picture is called '{out.name}', it must end in .png or .svg")
+        raise InvalidInputError(f"the picture's file is '{out.name}'; it must end in .png or .svg (--out)")

@@ -17,28 +17,20 @@ def add_commands(commands: Any) -> None:
     """Add these commands to the parser."""
     plan = commands.add_parser("plan", help="import, check, draw and export floor plans (docs/how-to/import-a-plan.md)")
     actions = plan.add_subparsers(required=True, metavar="ACTION")
-    bring = actions.add_parser(
-        "import", help="make a plan of a file, whatever its format, and say what was used for what"
-    )
-    bring.add_argument("file", type=Path)
-    bring.add_argument("--out", type=Path, help="write the plan in the native format here; else to standard output")
-    check = actions.add_parser("check", help="say what is likely wrong with a plan")
-    check.add_argument("file", type=Path)
+    importing = actions.add_parser("import", help="convert a file of any supported format to a plan, with a report")
+    importing.add_argument("--out", type=Path, metavar="FILE", help="file to write (default: standard output)")
+    check = actions.add_parser("check", help="print the warnings of a plan")
     check.add_argument("--json", action="store_true", help="print JSON")
     draw = actions.add_parser("draw", help="draw a plan as PNG or SVG")
-    draw.add_argument("file", type=Path)
-    draw.add_argument("--out", type=Path, required=True, help="the picture, .png or .svg")
-    send = actions.add_parser("export", help="write a plan in another format")
-    send.add_argument("file", type=Path)
-    send.add_argument("--format", required=True, help="native, geojson, imdf, dxf or svg")
-    send.add_argument("--out", type=Path, required=True)
-    send.add_argument("--anchor", help="latitude,longitude[,north_deg] of the plan's origin, for geojson and imdf")
-    for action in (bring, check, draw, send):
+    draw.add_argument("--out", type=Path, required=True, metavar="FILE", help="picture to write, .png or .svg")
+    export = actions.add_parser("export", help="write a plan in another format")
+    export.add_argument("--format", required=True, help="native, geojson, imdf, dxf or svg")
+    export.add_argument("--out", type=Path, required=True, metavar="FILE", help="file to write")
+    export.add_argument("--anchor", help="latitude,longitude[,north_deg] of the plan's origin, for geojson and imdf")
+    for action, run in ((importing, _import), (check, _check), (draw, _draw), (export, _export)):
+        action.add_argument("file", type=Path, help="floor plan, in any supported format")
         add_plan_options(action)
-    bring.set_defaults(run=_import)
-    check.set_defaults(run=_check)
-    draw.set_defaults(run=_draw)
-    send.set_defaults(run=_export)
+        action.set_defaults(run=run)
 
 
 def _import(arguments: argparse.Namespace) -> None:
@@ -56,11 +48,11 @@ def _import(arguments: argparse.Namespace) -> None:
 
 
 def _check(arguments: argparse.Namespace) -> None:
-    said, plans = [], []
+    messages, plans = [], []
     for imported in read_plans(arguments.file, arguments):
         plan = imported.plan()
         warnings = [*imported.report.warnings, *imported.report.unsure, *plan.warnings]
-        said += warnings
+        messages += warnings
         summary = {"rooms": len(plan.rooms), "area_m2": round(plan.area_m2, 2), "openings": len(plan.openings)}
         plans.append({"name": plan.name, **summary, "warnings": warnings})
         if not arguments.json:
@@ -68,8 +60,8 @@ def _check(arguments: argparse.Namespace) -> None:
     if arguments.json:
         print_json(plans)
         return
-    for line in said:
-        print(f"- {line}")
+    for message in messages:
+        print(f"- {message}")
 
 
 def _draw(arguments: argparse.Namespace) -> None:
@@ -97,7 +89,9 @@ def _anchor(text: str) -> Any:
         latitude, longitude = numbers[:2]
         north_deg = numbers[2] if len(numbers) > 2 else 0.0
     except (ValueError, IndexError) as error:
-        raise InvalidFloorPlanError(f"anchor is '{text[:50]}', it must be latitude,longitude[,north_deg]") from error
+        raise InvalidFloorPlanError(f"--anchor is '{text[:50]}'; it must be latitude,longitude[,north_deg]") from error
     if not (abs(latitude) <= 90.0 and abs(longitude) <= 180.0 and abs(north_deg) <= 360.0) or len(numbers) > 3:
-        raise InvalidFloorPlanError(f"anchor is '{text[:50]}', latitude lies within ±90, longitude within ±180")
+        raise InvalidFloorPlanError(
+            f"--anchor is '{text[:50]}'; latitude must be within ±90, longitude within ±180, north_deg within ±360"
+        )
     return Anchor(latitude, longitude, north_deg=north_deg)

@@ -9,20 +9,22 @@ from typing import Any
 
 from lalaloc_core.learn.data.dataset import SPLITS
 
-# What shells say of a command that Ctrl-C ended.
+# The exit code that shells use for a command ended by Ctrl-C.
 _INTERRUPTED = 130
 
 
 def add_commands(commands: Any) -> None:
     """Add these commands to the parser."""
     synth = commands.add_parser("synth", help="write synthetic scenes in Structured3D's layout")
-    synth.add_argument("--scenes", type=int, required=True, help="how many there shall be; those that are stay")
-    synth.add_argument("--out", type=Path, required=True, help="folder of the data set")
-    synth.add_argument("--split", choices=("all", *SPLITS), default="all")
-    synth.add_argument("--seed", type=int, default=0)
-    synth.add_argument("--height", type=int, default=256, help="rows of a panorama, which is twice as wide")
-    synth.add_argument("--textures", type=Path, help="folder of material pictures")
-    synth.add_argument("--workers", type=int, default=1, help="processes that render")
+    synth.add_argument("--scenes", type=int, required=True, help="number of scenes in total; existing ones are kept")
+    synth.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the data set")
+    synth.add_argument("--split", choices=("all", *SPLITS), default="all", help="split (default: %(default)s)")
+    synth.add_argument("--seed", type=int, default=0, help="random seed (default: %(default)s)")
+    synth.add_argument(
+        "--height", type=int, default=256, help="pixels of a panorama's height, half its width (default: %(default)s)"
+    )
+    synth.add_argument("--textures", type=Path, metavar="DIR", help="material pictures (default: procedural materials)")
+    synth.add_argument("--workers", type=int, default=1, help="rendering processes (default: %(default)s)")
     synth.set_defaults(run=_synth)
 
     sheet = commands.add_parser("contact-sheet", help="write a sheet of synthetic panoramas to look at")
@@ -40,9 +42,9 @@ def _synth(arguments: argparse.Namespace) -> None:
     try:
         written = synthesise(settings, numbers, workers=arguments.workers)
     except KeyboardInterrupt:
-        print("interrupted; the same command goes on where it stopped", file=sys.stderr)
+        print("interrupted; run the same command again to continue", file=sys.stderr)
         raise SystemExit(_INTERRUPTED) from None
-    counts = ", ".join(f"{len(of_split)} {split}" for split, of_split in numbers.items())
+    counts = ", ".join(f"{len(scenes)} {split}" for split, scenes in numbers.items())
     print(f"{arguments.out}: {counts}; {written} of them new")
 
 

@@ -15,80 +15,86 @@ from lalaloc_core.cli.printing import print_json
 from lalaloc_core.errors import InvalidInputError
 from lalaloc_core.localise.bundle import Bundle
 
-# Four panoramas each; drawing one takes a third of a second, and validation shows all of them every few minutes.
+# Four panoramas each; rendering one takes a third of a second, and validation uses all of them every few minutes.
 _VALIDATION_HOMES = 50
-# So many validation homes for one that is out of the family, which takes longer to draw.
+# Ratio of validation homes to out-of-distribution homes, which take longer to render.
 _PER_HELDOUT_HOME = 3
 
 
 def add_commands(commands: Any) -> None:
     """Add these commands to the parser."""
     train = commands.add_parser("train", help="train a stage: the layout encoder, then the image encoder")
-    train.add_argument("stage", choices=("layout", "image", "end-to-end"), help="end-to-end is both stages at once")
+    train.add_argument(
+        "stage", choices=("layout", "image", "end-to-end"), help="stage to train; end-to-end trains both at once"
+    )
     train.add_argument("--preset", default="ring", choices=("ring", "trunk", "paper", "tiny", "tiny-trunk"))
-    train.add_argument("--out", type=Path, required=True, help="folder of the run, shared by both stages")
-    train.add_argument("--data", type=Path, metavar="DIR", help="a data set; default: homes drawn while training")
-    train.add_argument("--skip-bad", action="store_true", help="pass over files that cannot be used, naming each once")
-    train.add_argument("--minutes", type=float, help="wall-clock budget; sets the pace of the schedule")
-    train.add_argument("--steps", type=int, help="number of updates, instead of the preset's")
-    train.add_argument("--seed", type=int, help="instead of the preset's")
+    train.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="folder of the run, shared by both stages"
+    )
+    train.add_argument("--data", type=Path, metavar="DIR", help="data set (default: homes generated during training)")
+    train.add_argument("--skip-bad", action="store_true", help="skip unusable files and log each once")
+    train.add_argument("--minutes", type=float, help="wall-clock budget; replaces --steps in the schedule")
+    train.add_argument("--steps", type=int, help="number of updates (default: the preset's)")
+    train.add_argument("--seed", type=int, help="random seed (default: the preset's)")
     train.add_argument(
         "--set",
         action="append",
         default=[],
         metavar="KEY=VALUE",
         dest="settings",
-        help="replace one setting of the preset, such as image.uses_per_panorama=4 or image.supersample=[2,1]",
+        help="change a setting of the preset, such as image.uses_per_panorama=4 or image.supersample=[2,1]",
     )
     train.add_argument(
         "--from",
         type=Path,
         metavar="DIR",
         dest="init_from",
-        help="begin with the weights of a bundle or of another run, instead of fresh ones",
+        help="start from the weights of a bundle or of another run (default: random weights)",
     )
     train.add_argument(
         "--layout-from",
         type=Path,
         metavar="DIR",
-        help="image stage: a bundle or another run whose layout encoder to follow, where --out has none",
+        help="image stage: bundle or run with the layout encoder to use if --out has none",
     )
     train.add_argument(
         "--photographs",
         type=Path,
         metavar="DIR",
-        help="image stage: panoramas without labels, whose walls and openings --teacher tells (preset trunk)",
+        help="image stage: panoramas without labels; --teacher predicts their walls and openings (preset trunk)",
     )
-    train.add_argument("--teacher", type=Path, metavar="FILE", help="TensorFlow Lite segmenter of ADE20K's classes")
-    train.add_argument("--resume", action="store_true", help="go on from the checkpoint in --out")
-    train.add_argument("--device", help="cpu or cuda; default: cuda where there is one")
-    train.add_argument("--workers", type=int, default=1, help="processes that make batches; 0: none")
+    train.add_argument("--teacher", type=Path, metavar="FILE", help="TensorFlow Lite segmenter with ADE20K's classes")
+    train.add_argument("--resume", action="store_true", help="continue from the checkpoint in --out")
+    train.add_argument("--device", help="cpu or cuda (default: cuda if available)")
+    train.add_argument(
+        "--workers", type=int, default=1, help="processes that make batches; 0 uses none (default: %(default)s)"
+    )
     train.add_argument(
         "--render",
         choices=("workers", "device"),
-        help="where generated homes are photographed: by the processes that make batches, or on --device, which they "
-        "then send scenes instead of pixels; default: on the device if it is a GPU",
+        help="renderer of generated homes: the worker processes, or --device, which then receives scenes instead of "
+        "pixels (default: device if it is a GPU)",
     )
     train.add_argument(
         "--validation-homes",
         type=int,
         default=_VALIDATION_HOMES,
         metavar="N",
-        help="validate on at most so many homes or scenes (default: %(default)s)",
+        help="largest number of homes or scenes for validation (default: %(default)s)",
     )
-    train.add_argument("--textures", type=Path, help="folder of material pictures; without it all are procedural")
+    train.add_argument("--textures", type=Path, metavar="DIR", help="material pictures (default: procedural materials)")
     train.set_defaults(run=_train)
 
     export = commands.add_parser("export", help="export a trained run to a model bundle")
-    export.add_argument("--run", type=Path, required=True, dest="folder")
-    export.add_argument("--out", type=Path, required=True)
-    export.add_argument("--name", help="of the model; default: the name of the folder --out")
-    export.add_argument("--version", required=True, dest="model_version")
-    export.add_argument("--note", action="append", default=[], metavar="KEY=VALUE", help="recorded in the manifest")
-    export.add_argument("--last", action="store_true", help="the last weights, instead of the best by validation")
+    export.add_argument("--run", type=Path, required=True, dest="folder", metavar="DIR", help="folder of the run")
+    export.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the bundle")
+    export.add_argument("--name", help="name of the model (default: name of the folder --out)")
+    export.add_argument("--version", required=True, dest="model_version", help="version of the model")
+    export.add_argument("--note", action="append", default=[], metavar="KEY=VALUE", help="note for the manifest")
+    export.add_argument("--last", action="store_true", help="export the last weights instead of the best by validation")
     export.set_defaults(run=_export)
 
-    again = commands.add_parser("export-again", help="write the networks of a model bundle anew, of its own weights")
+    again = commands.add_parser("export-again", help="export the networks of a model bundle again from its own weights")
     again.add_argument("bundle", type=Path, help="folder of the bundle")
     again.set_defaults(run=_export_again)
 
@@ -109,7 +115,7 @@ def _train(arguments: argparse.Namespace) -> None:
     if arguments.data is not None and arguments.render is not None:
         raise InvalidInputError("--render is for generated homes, not for --data")
     if arguments.init_from is not None and (arguments.resume or arguments.stage == "end-to-end"):
-        raise InvalidInputError("--from is for a run of one stage that begins, neither for --resume nor for end-to-end")
+        raise InvalidInputError("--from starts a new run of one stage; it excludes --resume and end-to-end")
     image_only = {"--layout-from": "layout_from", "--photographs": "photographs", "--teacher": "teacher"}
     for option, name in image_only.items():
         if arguments.stage != "image" and getattr(arguments, name) is not None:
@@ -126,12 +132,12 @@ def _train(arguments: argparse.Namespace) -> None:
         config = dataclasses.replace(config, seed=arguments.seed)
     device = torch.device(arguments.device or ("cuda" if torch.cuda.is_available() else "cpu"))
     if device.type == "cpu":
-        # The workers need cores of their own: threads that wait for each other on shared ones are slower than fewer.
+        # Workers need cores of their own: threads that share cores are slower than fewer threads.
         torch.set_num_threads(max((os.cpu_count() or 1) - arguments.workers, 1))
     if arguments.workers < 0:
-        raise InvalidInputError(f"--workers {arguments.workers}: at least 0 is needed")
+        raise InvalidInputError(f"--workers is {arguments.workers}; it must be at least 0")
     if arguments.validation_homes < 1:
-        raise InvalidInputError(f"--validation-homes {arguments.validation_homes}: at least 1 is needed")
+        raise InvalidInputError(f"--validation-homes is {arguments.validation_homes}; it must be at least 1")
     render = arguments.render or ("workers" if device.type == "cpu" else "device")
     heldout_homes = max(arguments.validation_homes // _PER_HELDOUT_HOME, 1)
     data = TrainingData(
@@ -153,12 +159,12 @@ def _train(arguments: argparse.Namespace) -> None:
 
 
 def _settings(pairs: list[str]) -> dict[str, Any]:
-    """Settings by path; values are JSON, and plain words are text."""
+    """Parse settings by path; values are JSON, other words are text."""
     settings = {}
     for pair in pairs:
         path, equals, value = pair.partition("=")
         if not equals:
-            raise InvalidInputError(f"--set {pair}: KEY=VALUE is wanted")
+            raise InvalidInputError(f"--set is '{pair}'; it must be KEY=VALUE")
         try:
             settings[path] = json.loads(value)
         except ValueError:

@@ -127,7 +127,7 @@ def drawn_answer(
         ),
         room_index=best.room_index,
         camera_height_m=found.camera_height_m,
-        heading_source="searched for" if found.heading_contradicted else heading_source,
+        heading_source="estimated" if found.heading_contradicted else heading_source,
         confidence=None if model is None else found.confidence(model),
         rivals=tuple(rivals),
         heat=posterior_map(plan, probability_map(plan, grid.poses, found.posterior), grid.step_m),

@@ -1,10 +1,10 @@
-"""The networks, in torch: encoders of layouts and of panoramas, and the decoder of latents.
+"""The networks, in torch: layout encoders, image encoders, and the decoder of latents.
 
-Begin with `layout_encoder.py` and `image_encoder.py`, the two that ship; the latter stands on a trunk that was
-pretrained on photographs (`trunk.py`). `ring_image_encoder.py` is an image encoder without a trunk,
-`paper_encoders.py` has the encoders of the paper; `horizon_attention.py` is the attention around the horizon that image
-encoders share, `image_features.py` what they say of a panorama, `decoder.py` draws the layout of a latent. `loading.py`
-rebuilds networks from a bundle; `lalaloc_core.localise.encoders` runs the exported ones without torch.
+Begin with `image_encoder.py` and `layout_encoder.py`, the two of the shipped model. The image encoder extends a trunk
+pretrained on photographs (`trunk.py`), predicts `image_features.py`, and uses the attention of `horizon_attention.py`.
+`ring_image_encoder.py` is an image encoder without a trunk, `paper_encoders.py` has the encoders of the paper, and
+`decoder.py` reconstructs layout depth from a latent. `loading.py` rebuilds networks from a bundle. The exported
+networks run in `localise/encoders.py`, without torch.
 """
 
 from lalaloc_core.nets.decoder import LayoutDecoder

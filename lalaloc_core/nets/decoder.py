@@ -1,4 +1,4 @@
-"""Layout decoder: a latent back to layout depth, an aid to training only (paper, section A.1.2)."""
+"""Layout decoder: from a latent to layout depth, for training only (paper, section A.1.2)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _WIDTHS = (256, 128, 64, 32, 32)
 
 
 class LayoutDecoder(nn.Module):
-    """Latent to 2x4x256, four times (bilinear x2, 3x3 conv, ReLU, batch norm), point-wise conv to 32x64 depth (m)."""
+    """Decoder: latent to 2x4x256, four times (bilinear x2, 3x3 conv, ReLU, batch norm), 1x1 conv to 32x64 depth (m)."""
 
     def __init__(self, latent_size: int = 128) -> None:
         super().__init__()
@@ -30,5 +30,6 @@ class LayoutDecoder(nn.Module):
         self.to_depth = nn.Conv2d(_WIDTHS[-1], 1, 1)
 
     def forward(self, latent: Float[Tensor, "b d"]) -> Float[Tensor, "b 32 64"]:
+        """Decode latents to layout depth (m)."""
         features = self.expand(latent).reshape(-1, _WIDTHS[0], 2, 4)
         return self.to_depth(self.blocks(features))[:, 0]

@@ -1,4 +1,4 @@
-"""Attention around the horizon, with which image encoders infer what furniture hides."""
+"""Attention around the horizon: image encoders infer from it the walls that furniture hides."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ from torch import Tensor, nn
 
 
 class HorizonAttention(nn.Module):
-    """Attention over the sectors, with a learnt bias by their circular offset, and a feed-forward layer.
+    """Attention over the sectors with a learnt bias by circular offset, and a feed-forward layer.
 
-    What furniture hides is inferred from the rest of the room. Offsets, not positions, keep it true that rolling
-    the panorama rolls the ring.
+    The bias depends on offsets, not on positions, so rolling the panorama rolls the ring.
     """
 
     def __init__(self, width: int, heads: int, sectors: int) -> None:
@@ -28,6 +27,7 @@ class HorizonAttention(nn.Module):
         self.offset: Tensor
 
     def forward(self, x: Float[Tensor, "b s c"]) -> Float[Tensor, "b s c"]:
+        """Mix the features of all sectors."""
         batch, sectors, width = x.shape
         qkv = self.qkv(self.norm1(x)).reshape(batch, sectors, 3, self.heads, width // self.heads)
         query, key, value = qkv.permute(2, 0, 3, 1, 4).unbind(0)

@@ -1,10 +1,10 @@
-"""Architecture `trunk`: the image encoder on a trunk that was pretrained on photographs.
+"""Architecture `trunk`: the image encoder of the shipped model, on a trunk pretrained on photographs.
 
-The layout encoder and the shared head are those of `ring`. The trunk's maps of four strides are each flattened over
-height, brought to the ring's sectors, and mixed around the horizon. What an image shows is known up to a factor: the
-camera height is no input of the features that profile, openings, ceiling and type of the room are read from, but the
-unit of their lengths. An error of the stated height is therefore one offset of the log profile, exactly. Only the ring,
-which is compared with layouts in metres, is told the height.
+Layout encoder and head are those of `ring`. The trunk's feature maps of four strides are flattened over height,
+interpolated to the ring's sectors, and mixed around the horizon. An image shows lengths only relative to the camera
+height, so profile, openings, ceiling and room type are predicted without it, and lengths are then multiplied by it: an
+error of the stated height is exactly one offset of the log profile. Only the ring, which is compared with layouts in
+metres, takes the height as an input.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ from lalaloc_core.nets.image_features import ImageFeatures, StructureFeatures
 from lalaloc_core.nets.layout_encoder import RingConfig
 from lalaloc_core.nets.trunk import IMAGE_MEAN, IMAGE_STD, TAP_STRIDES, StyleMixing, Trunk, TrunkConfig
 
-# How fast the classes' shares are followed once many batches were seen.
+# Smallest update rate of the running class shares.
 _SHARE_RATE = 1e-3
 _MIN_LOG_SCALE, _MAX_LOG_SCALE = -6.0, 2.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrunkEncoderConfig:
-    """Sizes of the image encoder; sectors, channels, profile columns and latent are those of `RingConfig`.
+    """Sizes of the image encoder; sectors, channels, profile columns and latent size are those of `RingConfig`.
 
     Attributes:
         image_height, image_width: pixels; both multiples of the largest stride.
         trunk: sizes of the trunk.
-        squeezed: features per sector that each of the trunk's maps is squeezed to.
-        mixer_width, mixer_blocks, mixer_heads: of the attention around the horizon.
+        squeezed: features per sector from each of the trunk's maps.
+        mixer_width, mixer_blocks, mixer_heads: sizes of the attention around the horizon.
     """
 
     image_height: int = 128
@@ -48,20 +48,20 @@ class TrunkEncoderConfig:
     mixer_heads: int = 4
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be built.
+        """Check the sizes.
 
         Raises:
-            ConfigError: names the value and the limit.
+            ConfigError: a size is invalid.
         """
         for name in ("image_height", "image_width"):
             if getattr(self, name) % TAP_STRIDES[-1] or getattr(self, name) < TAP_STRIDES[-1]:
-                raise ConfigError(f"trunk.{name} is {getattr(self, name)}, a multiple of {TAP_STRIDES[-1]} is needed")
+                raise ConfigError(f"trunk.{name} is {getattr(self, name)}; it must be a multiple of {TAP_STRIDES[-1]}")
         if len(self.squeezed) != len(TAP_STRIDES):
-            raise ConfigError(f"trunk.squeezed has {len(self.squeezed)} values, {len(TAP_STRIDES)} are needed")
+            raise ConfigError(f"trunk.squeezed has {len(self.squeezed)} values; it must have {len(TAP_STRIDES)}")
 
 
 class TrunkImageEncoder(nn.Module):
-    """Panorama and camera height to a ring, a wall profile, and what else the picture says of the layout."""
+    """Image encoder: panorama and camera height to ring, wall profile, openings, ceiling height and room type."""
 
     def __init__(self, config: TrunkEncoderConfig, ring: RingConfig) -> None:
         super().__init__()
@@ -86,7 +86,7 @@ class TrunkImageEncoder(nn.Module):
         self.to_ceiling = nn.Sequential(nn.Linear(width, width), nn.GELU(), nn.Linear(width, 2))
         self.to_room_type = nn.Sequential(nn.Linear(2 * width, width), nn.GELU(), nn.Linear(width, len(ROOM_TYPES)))
         self.to_ring = nn.Sequential(nn.Linear(width + 1, width), nn.GELU(), nn.Linear(width, ring.channels))
-        # Of what was seen in training, which says what the predicted probabilities are to be compared with.
+        # Class shares of the training data: the prior that predicted probabilities are divided by.
         for name, classes in (("opening", OPENING_CLASSES), ("room_type", ROOM_TYPES)):
             self.register_buffer(f"{name}_share", torch.full((len(classes),), 1.0 / len(classes)))
         self.register_buffer("counted", torch.zeros((), dtype=torch.long))
@@ -101,16 +101,16 @@ class TrunkImageEncoder(nn.Module):
     def forward(
         self, image: Tensor, camera_height_m: Float[Tensor, "b"], styles: StyleMixing | None = None
     ) -> ImageFeatures:
-        """Encode `image`, (b, h, w, 3), values 0 to 255 of any type; `styles` is for training."""
+        """Encode `image`, (b, h, w, 3), values 0 to 255 of any type; `styles` is for training only."""
         mixed = self._mixed(image, styles)
         log_height = torch.log(camera_height_m)
-        told = log_height[:, None, None].expand(-1, mixed.shape[1], -1)
+        height_input = log_height[:, None, None].expand(-1, mixed.shape[1], -1)
         profile = self.to_profile(mixed).unflatten(2, (self.per_sector, 2)).flatten(1, 2)
         openings = self.to_openings(mixed).unflatten(2, (self.per_sector, len(OPENING_CLASSES))).flatten(1, 2)
         ceiling = self.to_ceiling(mixed).mean(dim=1)
         overall = torch.cat([mixed.mean(dim=1), mixed.amax(dim=1)], dim=1)
         return ImageFeatures(
-            ring=self.to_ring(torch.cat([mixed, told], dim=2)).transpose(1, 2),
+            ring=self.to_ring(torch.cat([mixed, height_input], dim=2)).transpose(1, 2),
             log_profile=profile[..., 0] + log_height[:, None],
             log_scale=profile[..., 1].clamp(_MIN_LOG_SCALE, _MAX_LOG_SCALE),
             structure=StructureFeatures(
@@ -123,7 +123,7 @@ class TrunkImageEncoder(nn.Module):
 
     @torch.no_grad()
     def count(self, opening_kind: Int[Tensor, "b w"], room_type: Int[Tensor, "b"]) -> None:
-        """Follow the classes' shares in what is trained on; codes below 0 are not known."""
+        """Update the class shares with the labels of a batch; codes below 0 are unknown."""
         self.counted += 1
         rate = max(1.0 / int(self.counted), _SHARE_RATE)
         for share, kind in ((self.opening_share, opening_kind), (self.room_type_share, room_type)):
@@ -132,7 +132,7 @@ class TrunkImageEncoder(nn.Module):
                 share.lerp_(torch.bincount(known.long(), minlength=len(share)).to(share) / len(known), rate)
 
     def _mixed(self, image: Tensor, styles: StyleMixing | None) -> Float[Tensor, "b s c"]:
-        """Features of the sectors, which know nothing of the camera height."""
+        """Return the features of the sectors, which are independent of the camera height."""
         pixels = (image.permute(0, 3, 1, 2).to(self.mean.dtype) - self.mean) / self.std
         squeezed = []
         for number, (tap, squeeze) in enumerate(zip(self.trunk(pixels, styles), self.squeezes, strict=True)):
@@ -142,10 +142,10 @@ class TrunkImageEncoder(nn.Module):
 
 
 def _interpolation(width: int, stride: int, sectors: int) -> Float[Tensor, "s v"]:
-    """Weights that take a map's columns to the sectors' centres, linearly and around the horizon.
+    """Return weights of linear interpolation from a map's columns to the sectors' centres, around the horizon.
 
-    Column i of a map of some stride is centred on pixel `stride (i + 1) - 1`: "same" padding of an even picture is
-    uneven, and each halving looks half a pixel of its own to the right.
+    Column i of a map is centred on pixel `stride (i + 1) - 1`: "same" padding of an even picture is uneven, so each
+    halving shifts by half a pixel to the right.
     """
     columns = width // stride
     weights = torch.zeros(sectors, columns)

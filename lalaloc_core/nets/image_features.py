@@ -1,4 +1,4 @@
-"""What image encoders say of a panorama."""
+"""Outputs of image encoders."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class StructureFeatures:
-    """What an image encoder says of a panorama besides the distance of the walls.
+    """Predictions besides the wall profile: openings, ceiling height and room type.
 
     Attributes:
-        opening_logits: (b, w, classes) of what is met at each azimuth, in the order of `conventions.OPENING_CLASSES`.
+        opening_logits: (b, w, classes) class of each azimuth, in the order of `conventions.OPENING_CLASSES`.
         log_ceiling: (b) log of the ceiling's height above the camera (m).
         log_ceiling_scale: (b) log of the scale of the Laplace distribution of `log_ceiling`'s error.
         room_type_logits: (b, types) in the order of `conventions.ROOM_TYPES`.
@@ -26,13 +26,13 @@ class StructureFeatures:
 
 @dataclass(frozen=True)
 class ImageFeatures:
-    """What the image encoder says of a panorama.
+    """Predictions of an image encoder for a batch of panoramas.
 
     Attributes:
-        ring: (b, c, s) features to be compared with the layout encoder's.
+        ring: (b, c, s) features to compare with the layout encoder's.
         log_profile: (b, w) log of the predicted wall profile (m).
         log_scale: (b, w) log of the scale of the Laplace distribution of `log_profile`'s error.
-        structure: what an encoder that tells openings, ceiling and type of the room says of them.
+        structure: openings, ceiling height and room type, if the encoder predicts them.
     """
 
     ring: Tensor
@@ -41,9 +41,9 @@ class ImageFeatures:
     structure: StructureFeatures | None = None
 
 
-def first_rows(seen: ImageFeatures, count: int) -> ImageFeatures:
-    """What was said of the first `count` panoramas of a batch."""
-    structure = seen.structure
+def first_rows(features: ImageFeatures, count: int) -> ImageFeatures:
+    """Return the predictions for the first `count` panoramas of a batch."""
+    structure = features.structure
     if structure is not None:
         structure = StructureFeatures(**{name: value[:count] for name, value in vars(structure).items()})
-    return ImageFeatures(seen.ring[:count], seen.log_profile[:count], seen.log_scale[:count], structure)
+    return ImageFeatures(features.ring[:count], features.log_profile[:count], features.log_scale[:count], structure)

@@ -1,8 +1,8 @@
-"""The layout encoder of the architectures `ring` and `trunk`: features around the horizon, one per azimuth sector.
+"""Layout encoder of the architectures `ring` and `trunk`: wall profile to a ring of features, one per azimuth sector.
 
-Both branches meet in such a ring. Rolling it is turning the camera, so an unknown heading costs one forward of the
-image. The layout encoder is a 1-D circular CNN on the wall profile; one head that image encoders share (flatten, fully
-connected, L2 norm) turns a ring into a latent.
+Image encoders predict the same kind of ring. Rolling it rotates the camera, so an unknown heading needs only one
+forward pass of the image. The layout encoder is a 1-D circular CNN on the wall profile; a head shared with the image
+encoders (flatten, fully connected, L2 norm) converts a ring to a latent.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-# Distances outside are clamped before they become features: no camera stands nearer, no room is larger.
+# Distances are clamped to the range of real rooms before they become features.
 _MIN_DISTANCE_M = 0.05
 _MAX_DISTANCE_M = 50.0
 
@@ -42,7 +42,7 @@ class RingConfig:
 
 
 def pad_around(x: Float[Tensor, "*batch w"], padding: int) -> Float[Tensor, "*batch w+2*{padding}"]:
-    """Pad the last axis, azimuth, with what lies on its other end: a panorama has no border there."""
+    """Pad the last axis, azimuth, circularly."""
     return torch.cat([x[..., -padding:], x, x[..., :padding]], dim=-1) if padding else x
 
 
@@ -56,6 +56,7 @@ class RingConv1d(nn.Module):
         self.norm: nn.BatchNorm1d | nn.Identity = nn.BatchNorm1d(outputs)
 
     def forward(self, x: Float[Tensor, "b i w"]) -> Float[Tensor, "b o v"]:
+        """Convolve and normalise."""
         return self.norm(self.conv(pad_around(x, self.padding)))
 
     def fuse(self) -> None:
@@ -66,13 +67,14 @@ class RingConv1d(nn.Module):
 
 
 class RingHead(nn.Module):
-    """Ring to latent: flatten, one fully connected layer, L2 norm. Shared by both branches."""
+    """Head from ring to latent: flatten, one fully connected layer, L2 norm. Shared by both encoders."""
 
     def __init__(self, config: RingConfig) -> None:
         super().__init__()
         self.fc = nn.Linear(config.channels * config.sectors, config.latent_size)
 
     def forward(self, ring: Float[Tensor, "b c s"]) -> Float[Tensor, "b d"]:
+        """Convert rings to latents."""
         return functional.normalize(self.fc(ring.flatten(1)), dim=1)
 
 
@@ -83,17 +85,19 @@ class _LayoutBlock(nn.Module):
         self.conv2 = RingConv1d(width, width, 5, dilation=dilation)
 
     def forward(self, x: Float[Tensor, "b c s"]) -> Float[Tensor, "b c s"]:
-        # SiLU, not ReLU: pose optimisation differentiates this network and likes smooth derivatives.
+        # SiLU, not ReLU: pose refinement differentiates this network and needs smooth derivatives.
         return functional.silu(x + self.conv2(functional.silu(self.conv1(x))))
 
 
 class RingLayoutEncoder(nn.Module):
-    """Wall profile and heights to a latent."""
+    """Layout encoder: wall profile, camera height and ceiling height to a latent."""
 
     def __init__(self, config: RingConfig) -> None:
         super().__init__()
         if config.profile_columns % config.sectors:
-            raise ValueError(f"{config.profile_columns} columns do not divide into {config.sectors} sectors")
+            raise ValueError(
+                f"profile_columns is {config.profile_columns}; it must be a multiple of sectors ({config.sectors})"
+            )
         self.config = config
         stride = config.profile_columns // config.sectors
         self.stem = RingConv1d(4, config.layout_width, 7, stride=stride)
@@ -107,7 +111,7 @@ class RingLayoutEncoder(nn.Module):
         camera_height_m: Float[Tensor, "b"],
         ceiling_height_m: Float[Tensor, "b"],
     ) -> Float[Tensor, "b c s"]:
-        """Features of the bare layout around the horizon."""
+        """Return the ring of the bare layout."""
         distance = profile_m.clamp(_MIN_DISTANCE_M, _MAX_DISTANCE_M)
         foot = torch.atan(camera_height_m[:, None] / distance)
         top = torch.atan((ceiling_height_m - camera_height_m)[:, None] / distance)
@@ -120,10 +124,11 @@ class RingLayoutEncoder(nn.Module):
         camera_height_m: Float[Tensor, "b"],
         ceiling_height_m: Float[Tensor, "b"],
     ) -> Float[Tensor, "b d"]:
+        """Encode layouts as latents."""
         return self.head(self.ring(profile_m, camera_height_m, ceiling_height_m))
 
     def fused(self) -> RingLayoutEncoder:
-        """A copy for evaluation with every normalisation folded away: the same function in half the time."""
+        """Return a copy for evaluation with every normalisation folded into its convolution, in half the time."""
         copied = copy.deepcopy(self).eval()
         for module in copied.modules():
             if isinstance(module, RingConv1d):

@@ -1,4 +1,4 @@
-"""Loading a layout encoder or a decoder from a bundle's weights."""
+"""Loaders for layout encoders and decoders from a bundle's weights."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def load_layout_encoder(architecture: str, config: dict[str, Any], weights: byte
     """Rebuild a layout encoder from the configuration and the safetensors of a bundle.
 
     Raises:
-        ValueError: unknown architecture, or a configuration that is not one (`ConfigError`).
+        ValueError: unknown architecture, or an invalid configuration (`ConfigError`).
         RuntimeError: the weights do not fit.
     """
     if architecture in ("ring", "trunk"):
@@ -29,26 +29,26 @@ def load_layout_encoder(architecture: str, config: dict[str, Any], weights: byte
     elif architecture == "paper":
         encoder = PaperLayoutEncoder(build_config(PaperConfig, config))
     else:
-        raise ValueError(f"unknown architecture '{architecture}', known are 'ring', 'trunk' and 'paper'")
+        raise ValueError(f"unknown architecture '{architecture}'; it must be 'ring', 'trunk' or 'paper'")
     _load_weights(encoder, weights)
     return encoder
 
 
 def load_decoder(bundle: Bundle) -> LayoutDecoder:
-    """The decoder that a bundle's layout encoder was trained with.
+    """Load the decoder that a bundle's layout encoder was trained with.
 
     Raises:
-        BundleError: the bundle has none, or it was altered or does not fit.
+        BundleError: the bundle has no decoder, or it is altered or does not fit.
     """
     decoder = LayoutDecoder(bundle.manifest.latent_size)
     try:
         _load_weights(decoder, bundle.read(DECODER_WEIGHTS))
     except RuntimeError as error:
-        raise BundleError(f"bundle '{bundle.folder}': decoder does not load: {error}") from error
+        raise BundleError(f"bundle '{bundle.folder}': the decoder's weights do not fit: {error}") from error
     return decoder.eval()
 
 
 def _load_weights(module: nn.Module, weights: bytes) -> None:
-    """Half precision is a storage format here; arithmetic is single precision."""
+    """Load weights as single precision; half precision is only a storage format."""
     state = safetensors.torch.load(weights)
     module.load_state_dict({k: v.float() if v.is_floating_point() else v for k, v in state.items()}, strict=True)

@@ -1,7 +1,7 @@
 """Architecture `paper`: ResNet-18 on layout depth, ResNet-50 on RGB, average pool, one FC to 128 (section A.1.1).
 
-The alternatives that the paper compares are options: ResNet-50 and a two-layer predictor on the layout's side.
-Parameter names are torchvision's, so that its ImageNet weights load into `backbone` as they are.
+The paper's alternatives are options: ResNet-50 and a two-layer predictor for layouts. Parameter names are
+torchvision's, so its ImageNet weights load into `backbone` unchanged.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from torch.nn import functional
 
 from lalaloc_core.render.depth import layout_depth
 
-# ImageNet statistics, for users who start from its weights.
+# ImageNet statistics, for training from its weights.
 IMAGE_MEAN = (0.485, 0.456, 0.406)
 IMAGE_STD = (0.229, 0.224, 0.225)
 
@@ -26,9 +26,12 @@ class PaperConfig:
     """Sizes of the `paper` architecture.
 
     Attributes:
-        layout_depth, image_depth: layers of either ResNet.
-        layout_predictor: from pooled features to the latent: one fully connected layer, or two with a ReLU between.
-        width: channels of the first stage, which the later ones double; ResNets have 64.
+        layout_depth, image_depth: layers of the two ResNets.
+        layout_predictor: layers from pooled features to the latent: one fully connected, or two with a ReLU between.
+        width: channels of the first stage; each later stage doubles them. ResNets have 64.
+        latent_size: features of a latent.
+        layout_height, profile_columns: size of the layout depth, pixels.
+        image_height, image_width: size of the panorama, pixels.
     """
 
     layout_depth: Literal[18, 50] = 18
@@ -43,7 +46,7 @@ class PaperConfig:
 
 
 class BasicBlock(nn.Module):
-    """Two 3x3 convolutions with a shortcut (ResNet-18)."""
+    """Residual block of two 3x3 convolutions (ResNet-18)."""
 
     expansion = 1
 
@@ -56,13 +59,14 @@ class BasicBlock(nn.Module):
         self.downsample = _shortcut(inputs, width, stride)
 
     def forward(self, x: Float[Tensor, "b i h w"]) -> Float[Tensor, "b o g v"]:
+        """Apply the block."""
         y = functional.relu(self.bn1(self.conv1(x)))
         y = self.bn2(self.conv2(y))
         return functional.relu(y + (x if self.downsample is None else self.downsample(x)))
 
 
 class Bottleneck(nn.Module):
-    """1x1, 3x3, 1x1 convolutions with a shortcut (ResNet-50)."""
+    """Residual block of 1x1, 3x3 and 1x1 convolutions (ResNet-50)."""
 
     expansion = 4
 
@@ -77,6 +81,7 @@ class Bottleneck(nn.Module):
         self.downsample = _shortcut(inputs, 4 * width, stride)
 
     def forward(self, x: Float[Tensor, "b i h w"]) -> Float[Tensor, "b o g v"]:
+        """Apply the block."""
         y = functional.relu(self.bn1(self.conv1(x)))
         y = functional.relu(self.bn2(self.conv2(y)))
         y = self.bn3(self.conv3(y))
@@ -90,7 +95,7 @@ def _shortcut(inputs: int, outputs: int, stride: int) -> nn.Sequential | None:
 
 
 class ResNet(nn.Module):
-    """ResNet-18 or ResNet-50 up to and with its pooled features; `channels` of them."""
+    """ResNet-18 or ResNet-50 up to its `channels` pooled features."""
 
     def __init__(self, depth: int, *, inputs: int = 3, width: int = 64) -> None:
         super().__init__()
@@ -112,13 +117,14 @@ class ResNet(nn.Module):
         return nn.Sequential(*layers)
 
     def forward(self, x: Float[Tensor, "b i h w"]) -> Float[Tensor, "b c"]:
+        """Return the pooled features."""
         x = self.maxpool(functional.relu(self.bn1(self.conv1(x))))
         x = self.layer4(self.layer3(self.layer2(self.layer1(x))))
         return x.mean(dim=(2, 3))
 
 
 class PaperLayoutEncoder(nn.Module):
-    """Layout depth, rendered from the wall profile, to a latent."""
+    """Layout encoder: layout depth, rendered from the wall profile, to a latent."""
 
     def __init__(self, config: PaperConfig) -> None:
         super().__init__()
@@ -135,19 +141,20 @@ class PaperLayoutEncoder(nn.Module):
         camera_height_m: Float[Tensor, "b"],
         ceiling_height_m: Float[Tensor, "b"],
     ) -> Float[Tensor, "b d"]:
+        """Encode layouts as latents."""
         depth = layout_depth(profile_m, camera_height_m, ceiling_height_m, self.config.layout_height)
         return functional.normalize(self.fc(self.backbone(depth[:, None])), dim=1)
 
 
 class PaperImageEncoder(nn.Module):
-    """RGB panorama to a latent."""
+    """Image encoder: RGB panorama to a latent."""
 
     def __init__(self, config: PaperConfig) -> None:
         super().__init__()
         self.config = config
         self.backbone = ResNet(config.image_depth, width=config.width)
         self.fc = nn.Linear(self.backbone.channels, config.latent_size)
-        # Not "mean": ONNX would take it for the output of the pooling.
+        # Not "mean": ONNX would confuse it with the output of the pooling.
         self.register_buffer("pixel_mean", 255.0 * torch.tensor(IMAGE_MEAN)[None, :, None, None], persistent=False)
         self.register_buffer("pixel_std", 255.0 * torch.tensor(IMAGE_STD)[None, :, None, None], persistent=False)
         self.pixel_mean: Tensor

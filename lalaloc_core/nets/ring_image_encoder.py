@@ -1,4 +1,4 @@
-"""The image encoder of the architecture `ring`: a small 2-D ResNet whose map is squeezed over height into a ring."""
+"""Image encoder of the architecture `ring`: a small 2-D ResNet whose feature map is flattened over height to a ring."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class _ImageBlock(nn.Module):
 
 
 class RingImageEncoder(nn.Module):
-    """Panorama and camera height to a ring and a predicted wall profile.
+    """Image encoder: panorama and camera height to a ring and a wall profile.
 
     The camera height gives the metric scale that a single panorama lacks.
     """
@@ -57,7 +57,9 @@ class RingImageEncoder(nn.Module):
             stages += [_ImageBlock(outputs, outputs, (1, 1)) for _ in range(count - 1)]
             inputs, height, width = outputs, height // 2, width // stride[1]
         if width != config.sectors:
-            raise ValueError(f"the image encoder ends at {width} sectors, {config.sectors} are wanted")
+            raise ValueError(
+                f"the image encoder ends at {width} sectors instead of {config.sectors}; change image_width or sectors"
+            )
         self.stages = nn.Sequential(*stages)
         self.squeeze = nn.Linear(inputs * height + 1, config.mixer_width)
         mixers = (
@@ -89,7 +91,7 @@ class RingImageEncoder(nn.Module):
         profile = self.to_profile(mixed).reshape(batch, -1, self.per_sector, 2).flatten(1, 2)
         return ImageFeatures(
             ring=self.to_ring(mixed).transpose(1, 2),
-            # Distances come in units of the camera height, as the image shows them.
+            # The network predicts distances in units of the camera height.
             log_profile=profile[..., 0] + scale[:, :, 0],
             log_scale=profile[..., 1].clamp(-6.0, 2.0),
         )

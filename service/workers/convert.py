@@ -82,7 +82,7 @@ class ConversionRefusal:
     def of(cls, error: InvalidFloorPlanError | MissingExtraError) -> ConversionRefusal:
         """Return the refusal for an error."""
         if isinstance(error, MissingExtraError):
-            return cls(str(error), "extra", names=(error.what, error.extra))
+            return cls(str(error), "extra", names=(error.action, error.extra))
         if isinstance(error, SeveralLevelsError):
             return cls(error.reason, "levels", names=error.levels)
         return cls(error.reason, room=error.room)

@@ -69,9 +69,9 @@ def test_several_photographs_are_rows_of_a_table_and_pictures_with_numbers(
         (["gone.json", KITCHEN], "'gone.json' cannot be read"),
         ([PLAN, "gone.jpg"], "'gone.jpg' cannot be read"),
         ([PLAN, PLAN], "flat.json': the panorama is"),
-        ([PLAN, KITCHEN, "--out", "answer.gif"], "'answer.gif', it must end in .png or .svg"),
+        ([PLAN, KITCHEN, "--out", "answer.gif"], "'answer.gif'; it must end in .png or .svg"),
         ([PLAN, KITCHEN, "--out", "/gone/answer.svg", "--picture", "plan"], "cannot be written"),
-        ([PLAN, KITCHEN, "--camera-height", "3"], "--camera-height is 3, it must be at least 0.1 and below"),
+        ([PLAN, KITCHEN, "--camera-height", "3"], "--camera-height is 3 m; it must be at least 0.1 m and below"),
         ([PLAN, KITCHEN, "--heading-tolerance", "3"], "--heading, which is missing"),
     ],
 )

@@ -162,7 +162,7 @@ class TestRing:
         assert padded.tolist() == [float(i % 6) for i in range(-padding, 6 + padding)]
 
     def test_sizes_that_do_not_meet_are_refused(self) -> None:
-        with pytest.raises(ValueError, match="33 columns"):
+        with pytest.raises(ValueError, match="profile_columns is 33"):
             RingLayoutEncoder(dataclasses.replace(TINY, profile_columns=33))
         with pytest.raises(ValueError, match="sectors"):
             RingImageEncoder(dataclasses.replace(TINY, sectors=24, profile_columns=48))

@@ -163,7 +163,7 @@ class TestCommand:
     @pytest.mark.parametrize(
         ("arguments", "complaint"),
         [
-            (["--table", "roof"], "no table 'roof', there are: localisation"),
+            (["--table", "roof"], "unknown table 'roof'; --table is one of localisation"),
             ([], "name a table"),
             (["--table", "similarity"], "--data is missing"),
         ],
