@@ -164,7 +164,7 @@ class TestCommand:
         ("arguments", "complaint"),
         [
             (["--table", "roof"], "unknown table 'roof'; --table is one of localisation"),
-            ([], "name a table"),
+            ([], "no table is chosen"),
             (["--table", "similarity"], "--data is missing"),
         ],
     )
