@@ -20,7 +20,7 @@ import numpy as np
 from benchmarks.harness import argument_parser
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.evaluate.methods.lalaloc import local_refiner
-from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, RenderedPhotograph, renderer_cache_of
+from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, RenderedPhotograph, split_renderer_cache
 from lalaloc_core.learn.synth.homes.plans import Home
 from lalaloc_core.learn.synth.homes.splits import home_of
 from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
@@ -122,7 +122,7 @@ def main() -> None:
     options = parser.parse_args()
     bundle = Bundle.open(options.bundle)
     encoders, refiner = Encoders(bundle, threads=1), local_refiner(bundle)
-    model, renderers = bundle.manifest.confidence, renderer_cache_of(SPLIT_NUMBERS["test"], options.seed, None)
+    model, renderers = bundle.manifest.confidence, split_renderer_cache(SPLIT_NUMBERS["test"], options.seed, None)
     ways = {"alone": None, "distance and turn": False, "distance, turn and direction": True}
     tallies = {name: Tally([], [], [], []) for name in ways}
     index = done = 0

@@ -31,7 +31,7 @@ import numpy as np
 
 from benchmarks.harness import argument_parser
 from lalaloc_core.evaluate.methods.lalaloc import local_refiner
-from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, RenderedPhotograph, renderer_cache_of
+from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, RenderedPhotograph, split_renderer_cache
 from lalaloc_core.learn.synth.homes.splits import home_of
 from lalaloc_core.learn.synth.scene.shots import sample_shots
 from lalaloc_core.localise.bundle import Bundle
@@ -119,7 +119,7 @@ def _variant(block: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 def queries(bundle: Bundle, homes: list[int], seed: int) -> Iterator[tuple[int, str, Query]]:
     """Yield queries with a photograph of each home: its number, the known values, the query."""
-    encoders, renderers = Encoders(bundle, threads=1), renderer_cache_of(_TEST, seed, None)
+    encoders, renderers = Encoders(bundle, threads=1), split_renderer_cache(_TEST, seed, None)
     size = bundle.manifest.image_height, bundle.manifest.image_width
     for number in homes:
         home, rng = home_of(_TEST, seed, number)

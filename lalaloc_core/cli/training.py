@@ -185,8 +185,8 @@ def _export(arguments: argparse.Namespace) -> None:
 
 
 def _export_again(arguments: argparse.Namespace) -> None:
-    from lalaloc_core.learn.export.run import export_bundle_again
+    from lalaloc_core.learn.export.run import reexport_bundle
 
     before = Bundle.open(arguments.bundle)
-    after = export_bundle_again(arguments.bundle)
+    after = reexport_bundle(arguments.bundle)
     print_json({"before": before.sha256, "after": after.sha256})

@@ -151,7 +151,7 @@ def calibrate(bundle: Bundle, known: Answers, searched: Answers, description: st
     """Store the fitted confidence and the validation figures in the bundle's manifest."""
     metrics = {**bundle.manifest.metrics, "validation_queries": description}
     for name, answers in (("validation", known), ("validation_heading_searched", searched)):
-        metrics[name] = Accuracy.of(position_errors_m(answers.own)).to_dict()
+        metrics[name] = Accuracy.from_errors(position_errors_m(answers.own)).to_dict()
         metrics[f"{name}_confidence"] = cross_validate(answers)
     manifest = dataclasses.replace(bundle.manifest, confidence=fit_confidence(known, searched), metrics=metrics)
     return write_manifest(bundle.folder, manifest)

@@ -1,1 +1,1 @@
-"""The wing that makes models: data sets, synthetic homes, training and export. Begin with `training/loop.py`."""
+"""Learning side: data sets, synthetic homes, training and export. Begin with `training/loop.py`."""

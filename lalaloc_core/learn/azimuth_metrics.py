@@ -1,6 +1,6 @@
-"""What is said of a photograph azimuth by azimuth, against the truth: walls, how sure one is of them, what is in them.
+"""Metrics of predictions by azimuth: wall distances, their scales, and opening classes.
 
-Formulas alone, so that training can validate with them.
+The module holds formulas only, so that training can validate with them.
 """
 
 from __future__ import annotations
@@ -11,19 +11,19 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-# Shares of the errors that a predicted Laplace distribution promises to hold within its quantiles.
+# Quantiles of the predicted Laplace distributions at which the share of errors is reported.
 QUANTILES = (0.5, 0.8, 0.9, 0.95)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AzimuthMeasures:
-    """One photograph; of several outlines that can be defended, the one that the prediction is nearer to.
+    """Measures of one photograph, against the annotated outline nearest to the prediction.
 
     Attributes:
         outline: number of that outline.
-        log_error: (w,) predicted less true log distance of the wall; infinite where the prediction is not a number.
+        log_error: (w,) predicted minus true log distance of the wall; infinite where the prediction is NaN.
         log_scale: (w,) predicted log scale of `log_error`, of a Laplace distribution.
-        confusion: azimuths by true (row) and predicted class; None where no classes were predicted.
+        confusion: azimuths by true (row) and predicted class; None if no classes were predicted.
     """
 
     outline: int
@@ -38,7 +38,7 @@ class AzimuthMeasures:
 
     @property
     def error_90(self) -> float:
-        """|Δ log d| that nine in ten azimuths are below."""
+        """90 % quantile of |Δ log d|."""
         return float(np.quantile(np.abs(self.log_error), 0.9, method="higher"))
 
     @property
@@ -48,12 +48,12 @@ class AzimuthMeasures:
 
     @property
     def scale_ratio(self) -> float:
-        """How many times larger errors are than their predicted scale says, in the median."""
+        """Median ratio of errors to their predicted scale; 1 for a calibrated prediction."""
         return float(np.median(self._normalised) / np.log(2.0))
 
     @property
     def within(self) -> Float[np.ndarray, "q"]:
-        """Share of the errors within each of `QUANTILES` of what was predicted; they are right if they are equal."""
+        """Share of the errors within each predicted quantile of `QUANTILES`; equal to it if calibrated."""
         limits = -np.log1p(-np.array(QUANTILES))
         return (self._normalised[:, None] <= limits).mean(axis=0)
 
@@ -64,10 +64,12 @@ class AzimuthMeasures:
 
 @dataclass(frozen=True, kw_only=True)
 class ClassScores:
-    """Classes per azimuth; None where a class never occurs, or is never predicted.
+    """Scores of predicted classes.
 
     Attributes:
         balanced_accuracy: mean recall of the classes that occur.
+        recall: by class; None if the class never occurs.
+        precision: by class; None if the class is never predicted.
     """
 
     balanced_accuracy: float
@@ -77,14 +79,15 @@ class ClassScores:
 
 @dataclass(frozen=True, kw_only=True)
 class AzimuthSummary:
-    """Several photographs.
+    """Measures over several photographs.
 
     Attributes:
-        median_error: median over the photographs of their medians of |Δ log d|.
-        error_90: median over the photographs of what nine in ten of their azimuths are below.
+        n: number of photographs.
+        median_error: median over the photographs of their median |Δ log d|.
+        error_90: median over the photographs of their 90 % quantile of |Δ log d|.
         scale_ratio: median over the photographs.
-        within: by quantile, the share of all azimuths whose error lies within it.
-        classes: over all azimuths; None where none were predicted.
+        within: share of all azimuths within each predicted quantile.
+        classes: over all azimuths; None if no classes were predicted.
     """
 
     n: int
@@ -105,13 +108,13 @@ def measure_azimuths(
     """Compare a prediction with an annotation.
 
     Args:
-        profiles_m: the true wall profile (m), of each outline that can be defended.
-        log_profile: predicted log wall profile (m), as wide.
+        profiles_m: true wall profile (m) of each annotated outline.
+        log_profile: predicted log wall profile (m).
         log_scale: predicted log scale.
-        true_classes: code of every azimuth; wanted with `class_scores`.
+        true_classes: code of every azimuth; required with `class_scores`.
         class_scores: predicted log probabilities, or any score that is largest for the likeliest class.
     """
-    errors = [np.nan_to_num(log_profile - np.log(one), nan=np.inf) for one in profiles_m]
+    errors = [np.nan_to_num(log_profile - np.log(profile), nan=np.inf) for profile in profiles_m]
     outline = int(np.argmin([np.median(np.abs(error)) for error in errors]))
     confusion = None
     if class_scores is not None:
@@ -122,35 +125,35 @@ def measure_azimuths(
 
 
 def summarise_azimuths(measures: Sequence[AzimuthMeasures], classes: Sequence[str]) -> AzimuthSummary:
-    """Figures over photographs, all of which count the same, but for `within` and `classes`.
+    """Summarise photographs with equal weight.
 
     Args:
-        measures: at least one.
+        measures: one per photograph, at least one.
         classes: names of the classes by code.
     """
-    within = np.mean([one.within for one in measures], axis=0)
-    confusions = [one.confusion for one in measures if one.confusion is not None]
+    within = np.mean([measure.within for measure in measures], axis=0)
+    confusions = [measure.confusion for measure in measures if measure.confusion is not None]
     return AzimuthSummary(
         n=len(measures),
-        median_error=float(np.median([one.median_error for one in measures])),
-        error_90=float(np.median([one.error_90 for one in measures])),
-        scale_ratio=float(np.median([one.scale_ratio for one in measures])),
+        median_error=float(np.median([measure.median_error for measure in measures])),
+        error_90=float(np.median([measure.error_90 for measure in measures])),
+        scale_ratio=float(np.median([measure.scale_ratio for measure in measures])),
         within={f"{quantile:g}": float(share) for quantile, share in zip(QUANTILES, within, strict=True)},
         classes=score_classes(np.sum(confusions, axis=0), classes) if confusions else None,
     )
 
 
 def score_classes(confusion: Int[np.ndarray, "c c"], classes: Sequence[str]) -> ClassScores:
-    """Scores of a table of counts by true (row) and predicted class."""
-    right, occurs, predicted = (
+    """Compute the scores of a table of counts by true (row) and predicted class."""
+    correct, occurring, predicted = (
         counts.tolist() for counts in (np.diag(confusion), confusion.sum(axis=1), confusion.sum(axis=0))
     )
-    recall = {name: _share(right[k], occurs[k]) for k, name in enumerate(classes)}
+    recall = {name: _share(correct[k], occurring[k]) for k, name in enumerate(classes)}
     known = [share for share in recall.values() if share is not None]
     return ClassScores(
         balanced_accuracy=float(np.mean(known)) if known else float("nan"),
         recall=recall,
-        precision={name: _share(right[k], predicted[k]) for k, name in enumerate(classes)},
+        precision={name: _share(correct[k], predicted[k]) for k, name in enumerate(classes)},
     )
 
 

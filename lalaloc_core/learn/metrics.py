@@ -1,4 +1,4 @@
-"""Distances between layouts and scores of localisation (array API where a formula is used in training too)."""
+"""Chamfer distance of layouts and accuracy of localisation; the distance works on numpy and torch arrays."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from lalaloc_core.conventions import Array
 
 
 def chamfer_distance(first: Float[Array, "b n 3"], second: Float[Array, "b m 3"]) -> Float[Array, "b"]:
-    """Symmetric Chamfer distance (m): mean nearest-neighbour distance from each cloud to the other, summed."""
+    """Return the symmetric Chamfer distance (m): the sum of both mean nearest-neighbour distances."""
     xp = array_namespace(first, second)
     square_first = xp.sum(first * first, axis=-1)[:, :, None]
     square_second = xp.sum(second * second, axis=-1)[:, None, :]
@@ -35,8 +35,8 @@ class Accuracy:
     within_1m: float
 
     @classmethod
-    def of(cls, error_m: Float[np.ndarray, "n"]) -> Accuracy:
-        """Score position errors (m); NaN stands for a query without an answer."""
+    def from_errors(cls, error_m: Float[np.ndarray, "n"]) -> Accuracy:
+        """Compute the accuracy of position errors (m); NaN marks a query without an answer."""
         error = np.where(np.isnan(error_m), np.inf, error_m)
         return cls(
             n=len(error),
@@ -48,5 +48,5 @@ class Accuracy:
         )
 
     def to_dict(self) -> dict[str, int | float]:
-        """The figures by name."""
+        """Return the metrics by name."""
         return asdict(self)

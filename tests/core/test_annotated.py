@@ -201,7 +201,7 @@ class TestGalleries:
     def test_the_camera_sees_in_the_plan_what_was_drawn_on_the_photograph(self, root: Path) -> None:
         dataset = AnnotatedPhotographs(root)
         for name in dataset.scenes("test"):
-            key = GalleryKey.of_scene(name)
+            key = GalleryKey.from_scene(name)
             assert key is not None
             one = next(p for p in dataset.photographs if p.name == key.photograph)
             scene = dataset.load(name)

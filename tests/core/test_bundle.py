@@ -17,7 +17,7 @@ import torch
 from lalaloc_core.errors import BundleError, ExportError
 from lalaloc_core.learn.export import bundle_export as export
 from lalaloc_core.learn.export.bundle_export import PARITY_TOLERANCE, export_bundle
-from lalaloc_core.learn.export.run import export_bundle_again
+from lalaloc_core.learn.export.run import reexport_bundle
 from lalaloc_core.learn.training.checkpoint import Checkpoint
 from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.presets import PRESETS
@@ -289,7 +289,7 @@ class TestIdentity:
             model.producer_name = "older"
             (tmp_path / name).write_bytes(model.SerializeToString())
         older = write_manifest(tmp_path, manifest)
-        after = export_bundle_again(tmp_path)
+        after = reexport_bundle(tmp_path)
         assert after.sha256 == Bundle.open(tmp_path).sha256 != older.sha256
         again = Encoders(after, threads=1).query(image, None, CameraHeight(1.5))
         np.testing.assert_allclose(again.latents, told.latents, atol=1e-6)
@@ -301,7 +301,7 @@ class TestIdentity:
     def test_networks_are_not_written_anew_of_damaged_weights(self, copied: Path) -> None:
         (copied / LAYOUT_WEIGHTS).write_bytes(b"damaged")
         with pytest.raises(BundleError, match=LAYOUT_WEIGHTS):
-            export_bundle_again(copied)
+            reexport_bundle(copied)
 
 
 class TestConfidence:

@@ -16,7 +16,7 @@ from lalaloc_core.learn.training.batch_streams import PanoramaBatches
 from lalaloc_core.learn.training.batches import Batch, load_batches
 from lalaloc_core.learn.training.checkpoint import Checkpoint
 from lalaloc_core.learn.training.config import TrainConfig
-from lalaloc_core.learn.training.deferred import DeferredRenderer, turned
+from lalaloc_core.learn.training.deferred import DeferredRenderer, rotate_images
 from lalaloc_core.learn.training.presets import PRESETS
 from lalaloc_core.learn.training.rotation import Rotation
 from lalaloc_core.learn.training.sources import GeneratedSource
@@ -60,7 +60,7 @@ def test_pictures_are_developed_once_and_forgotten_after_their_last_use() -> Non
     source = GeneratedSource(config(3), deferred=True)
     renderer, shown, seen = DeferredRenderer(source.renderer(CPU)), set(), 0
     deferred = list(itertools.islice(load_batches(PanoramaBatches(source.config, source), 0), 40))
-    for batch, _ in zip(deferred, renderer.rendered(deferred), strict=True):
+    for batch, _ in zip(deferred, renderer.render_batches(deferred), strict=True):
         assert not shown & batch.scenes.keys()
         shown |= batch.scenes.keys()
         seen += len(batch.number)
@@ -72,7 +72,7 @@ def test_pictures_are_developed_once_and_forgotten_after_their_last_use() -> Non
 @given(shift=st.integers(-40, 40), mirrored=st.booleans())
 def test_whole_batches_turn_as_single_pictures_do(shift: int, mirrored: bool) -> None:
     images = np.random.default_rng(0).integers(0, 256, (2, 3, 16, 3), dtype=np.uint8)
-    found = turned(torch.from_numpy(images), torch.tensor([shift, 1]), torch.tensor([mirrored, True]))
+    found = rotate_images(torch.from_numpy(images), torch.tensor([shift, 1]), torch.tensor([mirrored, True]))
     expected = [
         Rotation(shift=shift, heading=0.0, mirrored=mirrored).picture(images[0]),
         Rotation(shift=1, heading=0.0, mirrored=True).picture(images[1]),

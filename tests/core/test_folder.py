@@ -20,7 +20,7 @@ from lalaloc_core.learn.data.dataset import Appearance, load_scenes
 from lalaloc_core.learn.data.dataset_detection import open_dataset
 from lalaloc_core.learn.data.folder import OwnData
 from lalaloc_core.learn.data.structured3d import Structured3D
-from lalaloc_core.learn.data.structured3d_splits import bad_scenes
+from lalaloc_core.learn.data.structured3d_splits import ERRATA, EXCLUDED_BY_PAPER, OFFICIAL
 from lalaloc_core.learn.data.zind import Zind
 from tests.strategies import plan_document, rectangle
 
@@ -115,7 +115,7 @@ class TestBadFiles:
             ("hall.png,1,2,0,140", ["column 'camera_height_m' is '140'", "between 0 and 2.5"]),
             ("hall.png,1,2,0,0", ["column 'camera_height_m' is '0'", "at least 0.1 m"]),
             ("rooms/study.png,5,1,0,2.3", ["column 'camera_height_m' is '2.3'", "below the ceiling (2.1 m)"]),
-            ("hall.png,3.5,1.5,0,1.4", ["(3.5, 1.5) m lies in no room", "nearest is 'room 1', 0.5 m away"]),
+            ("hall.png,3.5,1.5,0,1.4", ["(3.5, 1.5) m is in no room", "nearest is 'room 1', 0.5 m away"]),
             ("attic.png,1,2,0,1.4", ["column 'panorama' is 'attic.png'", "no such file"]),
             ("rooms,1,2,0,1.4", ["column 'panorama' is 'rooms'", "no such file"]),
             (",1,2,0,1.4", ["column 'panorama' is ''", "below the scene's folder"]),
@@ -270,10 +270,12 @@ class TestDocumentation:
     page = (ROOT / "docs" / "datasets.md").read_text(encoding="utf-8")
 
     def test_lists_every_bad_scene_with_its_reasons(self) -> None:
-        expected = [
-            f"| {bad.number} | {bad.split} | {', '.join(bad.sources)} | {'left out' if bad.excluded else 'kept'} |"
-            for bad in bad_scenes()
-        ]
+        expected = []
+        for split, excluded in EXCLUDED_BY_PAPER.items():
+            for number in sorted(set(excluded) | {number for number in ERRATA if number in OFFICIAL[split]}):
+                sources = ["paper"] * (number in excluded) + ["errata"] * (number in ERRATA)
+                effect = "left out" if number in excluded else "kept"
+                expected.append(f"| {number} | {split} | {', '.join(sources)} | {effect} |")
         assert [line for line in self.page.splitlines() if re.match(r"\| \d", line)] == expected
 
     def test_shows_an_error_as_it_is(self, tmp_path: Path) -> None:

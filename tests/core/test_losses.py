@@ -162,10 +162,10 @@ class TestStructure:
         for passage in (0.0, 0.05):
             probability = torch.tensor([[[0.1 - passage, 0.8, 0.1, passage]]])
             logits = (probability + 1e-12).log().requires_grad_()
-            (gradient,) = torch.autograd.grad(losses.followed_maps(logits, taught), logits)
+            (gradient,) = torch.autograd.grad(losses.teacher_openings(logits, taught), logits)
             torch.testing.assert_close(gradient, torch.zeros_like(gradient), atol=1e-6, rtol=0.0)
         without_door = torch.tensor([[[0.8, 0.1, 0.1, 1e-6]]]).log().requires_grad_()
-        (gradient,) = torch.autograd.grad(losses.followed_maps(without_door, taught), without_door)
+        (gradient,) = torch.autograd.grad(losses.teacher_openings(without_door, taught), without_door)
         assert gradient[0, 0, 1] < 0.0 < gradient[0, 0, 0]
 
     def test_following_walls_goes_on_where_they_are_seen_and_stops_at_passages(self) -> None:
@@ -176,7 +176,7 @@ class TestStructure:
             [[[0.9, 0.0, 0.0, 0.1], [0.9, 0.0, 0.0, 0.1], [0.1, 0.0, 0.0, 0.9], [0, 0.6, 0, 0.4]]]
         )
         logits = (probability + 1e-9).log().requires_grad_()
-        loss = losses.followed_walls(log_profile, torch.zeros(1, 4), taught, logits)
+        loss = losses.teacher_walls(log_profile, torch.zeros(1, 4), taught, logits)
         gradient, of_logits = torch.autograd.grad(loss, [log_profile, logits], allow_unused=True)
         assert torch.equal(gradient.sign(), torch.tensor([[-1.0, 0.0, 0.0, 1.0]]))
         # A student must not escape from a wall by calling it a passage.
@@ -207,16 +207,16 @@ class TestChamfer:
 class TestAccuracy:
     def test_a_query_without_an_answer_is_a_miss_in_every_figure(self) -> None:
         nan = float("nan")
-        accuracy = Accuracy.of(np.array([0.005, nan, 0.03, nan, 0.5]))
+        accuracy = Accuracy.from_errors(np.array([0.005, nan, 0.03, nan, 0.5]))
         assert accuracy.n == 5
         assert accuracy.within_1cm == pytest.approx(1 / 5)
         assert accuracy.within_5cm == accuracy.within_10cm == pytest.approx(2 / 5)
         assert accuracy.within_1m == pytest.approx(3 / 5)
         assert accuracy.median_cm == pytest.approx(50.0)
-        assert Accuracy.of(np.array([0.1, nan, nan])).median_cm == math.inf
+        assert Accuracy.from_errors(np.array([0.1, nan, nan])).median_cm == math.inf
 
     def test_shares_are_strictly_below_their_limits(self) -> None:
-        accuracy = Accuracy.of(np.array([0.01, 0.05, 0.10, 1.0]))
+        accuracy = Accuracy.from_errors(np.array([0.01, 0.05, 0.10, 1.0]))
         assert [accuracy.within_1cm, accuracy.within_5cm, accuracy.within_10cm, accuracy.within_1m] == [
             0.0,
             0.25,
@@ -226,7 +226,7 @@ class TestAccuracy:
 
     @given(st.lists(st.floats(0.0, 10.0) | st.just(float("nan")), min_size=1, max_size=30))
     def test_wider_limits_hold_more(self, errors: list[float]) -> None:
-        figures = Accuracy.of(np.array(errors)).to_dict()
+        figures = Accuracy.from_errors(np.array(errors)).to_dict()
         shares = [figures[f"within_{limit}"] for limit in ("1cm", "5cm", "10cm", "1m")]
         assert shares == sorted(shares)
         assert shares[0] >= 0.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes
-from lalaloc_core.learn.data.synthetic.mismatched import CutOut, MismatchedScenes, OutdoorPhotograph, TurnedOver
+from lalaloc_core.learn.data.synthetic.mismatched import Cropped, MismatchedScenes, OutdoorPhotograph, UpsideDown
 
 HOMES = GeneratedScenes(homes=2, shots_per_home=4, furniture=None)
 LOOK = HOMES.appearances[0]
@@ -23,10 +23,10 @@ def test_cameras_are_the_homes_own_and_see_the_next_home() -> None:
             assert isinstance(camera.photographs[LOOK], OutdoorPhotograph)
         elif k == 2:
             shown = camera.photographs[LOOK]
-            assert isinstance(shown, TurnedOver)
+            assert isinstance(shown, UpsideDown)
             assert np.array_equal(shown.image(16, 32)[::-1, ::-1], mine.photographs[LOOK].image(16, 32))
         elif k == 1:
-            assert isinstance(camera.photographs[LOOK], CutOut)
+            assert isinstance(camera.photographs[LOOK], Cropped)
         else:
             pictures = [one.photographs[LOOK].image(16, 32) for one in (camera, mine, theirs)]
             assert np.array_equal(pictures[0], pictures[2])
@@ -35,12 +35,12 @@ def test_cameras_are_the_homes_own_and_see_the_next_home() -> None:
 
 def test_every_other_home_is_shown_nothing_that_is_cut_out() -> None:
     shown = [camera.photographs[LOOK] for camera in MismatchedScenes(HOMES).load("validation-00000").cameras]
-    assert not any(isinstance(one, CutOut) for one in shown)
+    assert not any(isinstance(one, Cropped) for one in shown)
 
 
 def test_what_is_cut_out_is_a_part_drawn_out_to_the_whole() -> None:
     whole = HOMES.load("validation-00000").cameras[0].photographs[LOOK]
-    picture, part = whole.image(40, 80), CutOut(whole).image(40, 80)
+    picture, part = whole.image(40, 80), Cropped(whole).image(40, 80)
     assert part.shape == picture.shape
     assert np.array_equal(part[0, 0], picture[12, 20])
     assert np.array_equal(part[-1, -1], picture[27, 39])

@@ -18,10 +18,10 @@ from PIL import Image
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Appearance, load_scenes
-from lalaloc_core.learn.data.polygon_rings import OpenRingError, chain_rings, signed_area, uncrossed
+from lalaloc_core.learn.data.polygon_rings import OpenRingError, chain_rings, largest_simple_part, signed_area
 from lalaloc_core.learn.data.structured3d import Structured3D
 from lalaloc_core.learn.data.structured3d_annotation import Annotation, read_annotation
-from lalaloc_core.learn.data.structured3d_splits import EXCLUDED_BY_PAPER, OFFICIAL, bad_scenes, scene_numbers
+from lalaloc_core.learn.data.structured3d_splits import ERRATA, EXCLUDED_BY_PAPER, OFFICIAL, scene_numbers
 from lalaloc_core.render.depth import layout_depth
 from lalaloc_core.render.profile import wall_profile
 from lalaloc_core.render.sampling import random_poses
@@ -112,15 +112,15 @@ class TestRings:
 
     def test_a_spike_is_cut_off_and_a_bow_tie_is_half_lost(self) -> None:
         square = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 3.0], [0.0, 3.0]])
-        assert uncrossed(square)[1] == 1.0
+        assert largest_simple_part(square)[1] == 1.0
         spike = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 3.0], [4.0, 5.0], [4.0, 3.0], [0.0, 3.0]])
-        polygon, share = uncrossed(spike)
+        polygon, share = largest_simple_part(spike)
         assert share == pytest.approx(1.0)
         assert same_ring(polygon[::-1], square, 1e-9) or same_ring(polygon, square, 1e-9)
         bow_tie = np.array([[0.0, 0.0], [2.0, 2.0], [2.0, 0.0], [0.0, 2.0]])
-        assert uncrossed(bow_tie)[1] == pytest.approx(0.5)
+        assert largest_simple_part(bow_tie)[1] == pytest.approx(0.5)
         flat = np.array([[0.0, 0.0], [1.0, 0.0], [2.0, 0.0]])
-        assert uncrossed(flat)[1] == 0.0
+        assert largest_simple_part(flat)[1] == 0.0
 
 
 class TestPlan:
@@ -545,13 +545,10 @@ class TestDataset:
         for split, numbers in EXCLUDED_BY_PAPER.items():
             assert set(numbers) <= set(OFFICIAL[split])
 
-    def test_every_bad_scene_has_a_source_and_only_the_papers_are_excluded(self) -> None:
-        found = bad_scenes()
-        assert len(found) == 26 + 4
-        assert all(bad.sources and bad.number in OFFICIAL[bad.split] for bad in found)
-        kept = [bad.number for bad in found if not bad.excluded]
-        assert kept == [1155, 1714, 1816, 3398]
-        assert [bad.number for bad in found if len(bad.sources) == 2] == [1192, 1852]
+    def test_errata_alone_exclude_no_scene(self) -> None:
+        excluded = {number for numbers in EXCLUDED_BY_PAPER.values() for number in numbers}
+        assert len(excluded) == 26
+        assert sorted(set(ERRATA) - excluded) == [1155, 1714, 1816, 3398]
 
     def test_lists_the_scenes_on_disk_by_split(self, tmp_path: Path) -> None:
         for name in ("scene_02999", "scene_00278", "scene_00002", "scene_03249", "scene_03307", "scene_03499", "other"):

@@ -31,7 +31,7 @@ from lalaloc_core.learn.data.structured3d import FURNITURE, LIGHTING, Structured
 from lalaloc_core.learn.data.structured3d_splits import EXCLUDED_BY_PAPER, OFFICIAL, scene_numbers
 from lalaloc_core.learn.data.structured3d_writer import build_annotation, layout_pixels, room_type, write_depth
 from lalaloc_core.learn.data.synthetic import writing as module
-from lalaloc_core.learn.data.synthetic.generated import renderer_cache_of
+from lalaloc_core.learn.data.synthetic.generated import split_renderer_cache
 from lalaloc_core.learn.data.synthetic.writing import Synthesis, share_out, synthesise
 from lalaloc_core.learn.synth.furniture.furnish import FURNITURE_LEVELS
 from lalaloc_core.learn.synth.homes.plans import Home, generate_home
@@ -367,7 +367,7 @@ def test_light_changes_colours(root: Path) -> None:
 def test_pictures_in_several_lights_are_the_same_as_one_by_one() -> None:
     home, rng = home_of(TEST, SEED, 3250)
     shot = stage_rooms(home, rng)[0]
-    renderer = renderer_cache_of(TEST, SEED, None).renderer(HEIGHT, 2 * HEIGHT)
+    renderer = split_renderer_cache(TEST, SEED, None).renderer(HEIGHT, 2 * HEIGHT)
     pictures, depth_m = renderer.render_moods(shot, MOODS)
     for mood, picture in zip(MOODS, pictures, strict=True):
         alone = dataclasses.replace(shot, lighting=mood)

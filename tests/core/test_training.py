@@ -23,7 +23,8 @@ from lalaloc_core.errors import CheckpointError, ConfigError
 from lalaloc_core.learn.export.run import export_run
 from lalaloc_core.learn.metrics import chamfer_distance
 from lalaloc_core.learn.synth.homes.splits import TEST, TRAIN, VALIDATION, home_of
-from lalaloc_core.learn.training import batches, objective, sources
+from lalaloc_core.learn.training import batches, sources
+from lalaloc_core.learn.training import layout_stage as layout_module
 from lalaloc_core.learn.training.batch_streams import LayoutBatches, PanoramaBatches
 from lalaloc_core.learn.training.batches import Batch, load_batches
 from lalaloc_core.learn.training.checkpoint import Checkpoint
@@ -68,11 +69,10 @@ def image_stage(config: TrainConfig, teacher: LayoutEncoder) -> ImageStage:
     return ImageStage(config, GeneratedSource(config), teacher)
 
 
-class LineStage:
-    """The smallest stage there is: a line through points, its batches a function of the step."""
+class LineStage(TrainingStage):
+    """Smallest possible stage: a line through points; batches are a function of the step."""
 
     name = "line"
-    teacher = None
 
     def __init__(self, steps: int = 12, **settings: Any) -> None:
         torch.manual_seed(3)
@@ -83,10 +83,6 @@ class LineStage:
     @property
     def settings(self) -> ImageStageConfig:
         return self.config.image
-
-    @property
-    def ema_decay(self) -> float:
-        return self.settings.ema_decay
 
     @property
     def data(self) -> dict[str, Any]:
@@ -497,7 +493,7 @@ class TestStages:
         def refused(*_: object) -> None:
             raise AssertionError("the Chamfer distance was asked for")
 
-        monkeypatch.setattr(objective, "chamfer_to_anchors", refused)
+        monkeypatch.setattr(layout_module, "chamfer_to_anchors", refused)
         layout = dataclasses.replace(TINY.layout, log_ratio_weight=0.0, scale_weight=0.0, decode_weight=1.0)
         stage = layout_stage(dataclasses.replace(TINY, layout=layout))
         assert set(stage.losses(next(layout_batches()))) == {"decode"}

@@ -21,11 +21,11 @@ from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.data import TrainingData
 from lalaloc_core.learn.training.image_stage import ImageStage
 from lalaloc_core.learn.training.loop import run_stage
-from lalaloc_core.learn.training.picture_cache import cached_pictures
 from lalaloc_core.learn.training.presets import PRESETS
 from lalaloc_core.learn.training.run import train_image, train_layout
 from lalaloc_core.learn.training.sources import GeneratedSource
 from lalaloc_core.learn.training.stages import build_layout_encoder
+from lalaloc_core.learn.training.validate import cached_pictures
 from lalaloc_core.learn.training.warm_start import load_warm_start
 from lalaloc_core.localise.bundle import Bundle
 from tests.core.test_training import LineStage, same_weights

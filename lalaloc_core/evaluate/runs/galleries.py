@@ -86,7 +86,7 @@ def answers_in_galleries(
     headings_deg = heading_errors_deg(predictions)
     best: dict[tuple[str, int], GalleryAnswer] = {}
     for prediction, error_m, heading_deg in zip(predictions, errors_m, headings_deg, strict=True):
-        key = GalleryKey.of_scene(prediction.scene)
+        key = GalleryKey.from_scene(prediction.scene)
         assert key is not None, f"'{prediction.scene}' is not a gallery"
         size_m = by_name[key.photograph].outlines[key.outline].size_m
         pose = prediction.final_pose

@@ -28,7 +28,7 @@ from lalaloc_core.evaluate.methods.method import Answer, FoundPose, Method, Ques
 from lalaloc_core.evaluate.methods.similarity import ChamferGrid, true_layout
 from lalaloc_core.evaluate.runs.factories import build_dataset, build_method
 from lalaloc_core.evaluate.runs.predictions import Pose, PredictedCandidate, Prediction, RunFolder, RunInfo
-from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, Scene, facts_of_photograph, load_scenes
+from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, Scene, load_scenes, photograph_facts
 from lalaloc_core.render.sampling import PoseSet, pose_grid
 
 # Fields of a run that may differ when it resumes.
@@ -216,7 +216,7 @@ class _SceneEvaluator:
             heading_confidence=answer.heading_confidence,
             found_height_m=answer.camera_height_m,
             timings_ms=answer.timings_ms,
-            facts=tuple(sorted(facts_of_photograph(photograph))),
+            facts=tuple(sorted(photograph_facts(photograph))),
         )
 
     def _layout_hit(self, question: Question, answer: Answer) -> bool | None:

@@ -1,8 +1,8 @@
-"""Data sets: scenes with cameras and their photographs, whatever the files are.
+"""Data sets: scenes with cameras and photographs, in any file format.
 
-Begin with `dataset.py`, what every data set looks like. `dataset_detection.py` tells the formats of a folder apart,
-each of which has a reader: `structured3d.py`, `zind.py`, `folder.py` (a user's own) and `annotated.py` (photographs of
-real rooms). `assembly.py` makes validated plans of what readers find. Data sets that are drawn lie in `synthetic/`.
+Begin with `dataset.py`, the interface of every data set. `dataset_detection.py` detects the format of a folder and opens
+its reader: `structured3d.py`, `zind.py`, `folder.py` (a user's own data) or `annotated.py` (annotated photographs of
+real rooms). `assembly.py` builds validated plans for the readers. Generated data sets are in `synthetic/`.
 """
 
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, Photograph, Scene, Split, load_scenes

@@ -1,4 +1,4 @@
-"""Annotated photographs as a data set: each is asked for in galleries, plans of its own room among others like it."""
+"""Annotated photographs as a data set: each is localised in galleries, plans of its own room among similar ones."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _SCENE = re.compile(r"(?P<photograph>.+)-(?P<gallery>\d+)(?P<alternative>-altern
 
 @dataclass(frozen=True)
 class GalleryKey:
-    """Which question a scene is: the photograph, the number of its gallery, and which outline is its own room's."""
+    """Key of a scene: the photograph, the number of its gallery, and the outline used for its own room."""
 
     photograph: str
     gallery: int
@@ -34,76 +34,84 @@ class GalleryKey:
         return f"{self.photograph}-{self.gallery}" + ("-alternative" if self.outline else "")
 
     @classmethod
-    def of_scene(cls, name: str) -> GalleryKey | None:
-        """The key that a scene's name stands for; None where it is none."""
-        found = _SCENE.fullmatch(name)
-        if found is None:
+    def from_scene(cls, name: str) -> GalleryKey | None:
+        """Parse a scene's name; return None if it is not the name of a gallery."""
+        match = _SCENE.fullmatch(name)
+        if match is None:
             return None
-        return cls(found["photograph"], int(found["gallery"]), int(found["alternative"] is not None))
+        return cls(match["photograph"], int(match["gallery"]), int(match["alternative"] is not None))
 
 
 @dataclass(frozen=True)
 class AnnotatedPhotographs:
-    """A folder of annotated photographs; all are test scenes, for nothing but measuring.
+    """Folder of annotated photographs; all are test scenes.
 
-    A photograph with an alternative outline has each gallery twice, once with either; the others are the same.
-    Photographs of poor quality are not asked for, but their rooms are among the others.
+    A photograph with an alternative outline has each gallery twice, once per outline, with the same other rooms.
+    Photographs of poor quality have no gallery, but their rooms occur in galleries of others.
+
+    Attributes:
+        root: the folder.
     """
 
     root: Path
 
     @property
     def description(self) -> str:
+        """Name of the data set in results."""
         return f"annotated photographs in galleries ({self.root.resolve().name})"
 
     @property
     def appearances(self) -> Sequence[Appearance]:
+        """The only appearance, without furniture level."""
         return (Appearance(),)
 
     @cached_property
     def photographs(self) -> tuple[AnnotatedPhotograph, ...]:
-        """All of them, in the order of names.
+        """All photographs, sorted by name.
 
         Raises:
-            DatasetError: one cannot be read, or there are none.
+            DatasetError: an annotation cannot be read, or there are none.
         """
-        found = tuple(read_annotation(path) for path in annotation_files(self.root))
-        if not found:
+        photographs = tuple(read_annotation(path) for path in annotation_files(self.root))
+        if not photographs:
             raise DatasetError("there are no annotated photographs", path=self.root)
-        return found
+        return photographs
 
     def keys(self, galleries: int = GALLERIES) -> list[GalleryKey]:
-        """The questions: the first gallery of every photograph, then the second ones, and so on."""
+        """Return the keys of the scenes: the first gallery of every photograph, then the second ones, and so on."""
         return [
-            GalleryKey(one.name, gallery, outline)
+            GalleryKey(photograph.name, gallery, outline)
             for gallery in range(galleries)
-            for one in self.photographs
-            if one.counts
-            for outline in range(len(one.outlines))
+            for photograph in self.photographs
+            if photograph.counts
+            for outline in range(len(photograph.outlines))
         ]
 
     def scenes(self, split: Split) -> Sequence[str]:
+        """Return the names of the galleries; only the test split has some."""
         return [key.scene for key in self.keys()] if split == "test" else []
 
     def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
-        key = GalleryKey.of_scene(name)
-        one = next((p for p in self.photographs if key is not None and p.name == key.photograph), None)
-        if key is None or one is None or key.outline >= len(one.outlines):
+        """Build the gallery of a scene's name."""
+        key = GalleryKey.from_scene(name)
+        photograph = next((p for p in self.photographs if key is not None and p.name == key.photograph), None)
+        if key is None or photograph is None or key.outline >= len(photograph.outlines):
             raise DatasetError("no such gallery of an annotated photograph", scene=name, path=self.root)
-        others = [other.outlines[0] for other in self.photographs if other is not one]
-        rng = np.random.default_rng([zlib.crc32(one.name.encode()), key.gallery])
-        gallery = build_gallery(one.outlines[key.outline], others, CAMERA_HEIGHT_M, rng, like=one.outlines[0])
+        others = [other.outlines[0] for other in self.photographs if other is not photograph]
+        rng = np.random.default_rng([zlib.crc32(photograph.name.encode()), key.gallery])
+        own = photograph.outlines[key.outline]
+        gallery = build_gallery(own, others, CAMERA_HEIGHT_M, rng, like=photograph.outlines[0])
         camera = Camera(
-            name=one.name,
+            name=photograph.name,
             position_m=gallery.position_m,
             room_index=gallery.room_index,
             heading=gallery.heading,
             camera_height_m=CAMERA_HEIGHT_M,
-            photographs={Appearance(): one.photograph},
+            photographs={Appearance(): photograph.photograph},
         )
         return Scene(name=name, plan=gallery.plan, cameras=(camera,))
 
 
 def annotation_files(root: Path) -> list[Path]:
-    """The annotations in a folder, in the order of names."""
+    """Return the annotation files of a folder, sorted by name."""
     return [path for path in sorted(root.glob("*.json")) if is_annotation(path)]

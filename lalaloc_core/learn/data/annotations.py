@@ -1,10 +1,10 @@
-"""Annotated photographs of real rooms: what can be measured of a camera whose place in a building nobody knows.
+"""Annotated photographs of real rooms whose place in a building is unknown.
 
-    ROOT/<name>.json   the outline of the room around the camera, in camera heights, and what is in its walls
+    ROOT/<name>.json   outline of the room around the camera, in camera heights, and its openings
     ROOT/<name>.jpg    the panorama, named in the annotation
 
-docs/reference/datasets.md has the format. A photograph stays the same when room and camera height grow together, so lengths are
-read for a camera `CAMERA_HEIGHT_M` over the floor.
+docs/reference/datasets.md describes the format. A photograph does not change when room and camera height are scaled together, so
+lengths are converted for a camera `CAMERA_HEIGHT_M` above the floor.
 """
 
 from __future__ import annotations
@@ -22,41 +22,45 @@ from PIL import Image, UnidentifiedImageError
 from lalaloc_core.conventions import OPENING_CLASSES, TWO_PI, wrap_angle
 from lalaloc_core.errors import DatasetError, InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan, room_type_from_label
-from lalaloc_core.learn.data.assembly import inside, is_number, read_json
+from lalaloc_core.learn.data.assembly import is_number, path_below, read_json
 from lalaloc_core.learn.data.drawn_openings import DrawnOpening
 from lalaloc_core.learn.data.drawn_rooms import DrawnRoom, plan_of_rooms
 from lalaloc_core.learn.data.photographs import FilePhotograph
 from lalaloc_core.render.profile import nearest_walls, wall_profile
 
 CAMERA_HEIGHT_M = 1.5
-# Where a ceiling is not flat: how far over the camera it is taken to be, in camera heights.
-_USUAL_CEILING = 1.2
+# Assumed height of a ceiling that is not flat, above the camera in camera heights.
+_DEFAULT_CEILING = 1.2
 Quality = Literal["good", "fair", "poor"]
-# A kind of opening, and the columns of its left and right edge as shares of the picture's width; the left one is the
-# larger where the picture's border lies between.
+# Kind of an opening, and the columns of its left and right edge as shares of the picture's width; left is larger than
+# right if the opening crosses the picture's border.
 ClassSpan = tuple[str, float, float]
 
 _REQUIRED = {"photograph", "quality", "polygon", "ceiling_above_camera", "openings"}
 _OPTIONAL = {"alternative_polygon", "room_type", "notes"}
 _OPENING_KEYS = {"kind", "columns", "line"}
 _MAX_VERTICES, _MAX_OPENINGS = 200, 100
-# In camera heights: the largest coordinate, and how far off the outline the ends of an opening may be drawn.
-_MAX_REACH, _OFF_THE_WALL = 60.0, 0.1
-# An opening's columns and its line say the same twice; they may differ by this share of the picture's width.
+# In camera heights: maximum coordinate, and maximum distance between the ends of an opening and the outline.
+_MAX_REACH, _MAX_OFFSET = 60.0, 0.1
+# Maximum difference between an opening's columns and its line, as a share of the picture's width.
 _COLUMN_TOLERANCE = 0.01
-# An opening is looked for with so many rays between its edges. It is on a wall that at least so many of them meet, and
-# it is that of another outline where it is met within this (m) of the same place.
+# Rays cast between the edges of an opening, minimum share of them on each of its walls, and maximum distance (m)
+# between the points where a ray meets two outlines that share the opening.
 _RAYS, _MIN_SHARE, _SAME_PLACE_M = 64, 0.2, 0.05
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AnnotatedPhotograph:
-    """One photograph and what was drawn on it; metres, camera at (0, 0), +y along the picture's centre column.
+    """Photograph with its annotation; metres, camera at (0, 0), +y along the picture's centre column.
 
     Attributes:
-        outlines: the room, and, where another outline can be defended as well, that one.
-        has_flat_ceiling: whether the outlines' ceiling height was seen; else it is a usual one.
-        class_spans: the openings as they are seen.
+        name: of the annotation file, without suffix.
+        photograph: the panorama.
+        quality: of the photograph; poor ones have no galleries.
+        outlines: the room, and an alternative outline if the annotation has one.
+        has_flat_ceiling: the ceiling height is annotated; otherwise it is the default.
+        class_spans: the openings by column.
+        notes: remarks of the annotator.
     """
 
     name: str
@@ -69,24 +73,24 @@ class AnnotatedPhotograph:
 
     @property
     def counts(self) -> bool:
-        """Whether it is good enough for figures."""
+        """True if the quality suffices for metrics."""
         return self.quality != "poor"
 
     def profile_m(self, outline: int, columns: int) -> Float[np.ndarray, "{columns}"]:
-        """Wall profile (m) of an outline, by column of the picture."""
+        """Return the wall profile (m) of an outline by column of the picture."""
         return wall_profile(np.zeros((1, 2)), np.zeros(1), self.outlines[outline].walls_m[None], columns)[0]
 
     def classes(self, columns: int) -> Int[np.ndarray, "{columns}"]:
-        """Code in `conventions.OPENING_CLASSES` of what each column of the picture shows; of the first outline."""
-        at = (np.arange(columns) + 0.5) / columns
+        """Return the code in `conventions.OPENING_CLASSES` of each column of the picture, for the first outline."""
+        share = (np.arange(columns) + 0.5) / columns
         classes = np.zeros(columns, dtype=int)
         for kind, left, right in self.class_spans:
-            classes[(at - left) % 1.0 < (right - left) % 1.0] = OPENING_CLASSES.index(kind)
+            classes[(share - left) % 1.0 < (right - left) % 1.0] = OPENING_CLASSES.index(kind)
         return classes
 
 
 def is_annotation(path: Path) -> bool:
-    """Whether a JSON file is an annotation, by its keys; not whether it is a right one."""
+    """Return whether a JSON file has the keys of an annotation; its values are not checked."""
     try:
         document = read_json(path)
     except DatasetError:
@@ -95,10 +99,10 @@ def is_annotation(path: Path) -> bool:
 
 
 def read_annotation(path: Path) -> AnnotatedPhotograph:
-    """Read one annotation; of the photograph itself only the size.
+    """Read an annotation, and the size of its photograph.
 
     Raises:
-        DatasetError: it is damaged or says what cannot be, or its photograph is missing.
+        DatasetError: the annotation is damaged or impossible, or its photograph is missing.
     """
     document = read_json(path, scene=path.stem)
     reader = _Reader(path)
@@ -106,7 +110,7 @@ def read_annotation(path: Path) -> AnnotatedPhotograph:
     photograph, width = reader.photograph(document["photograph"])
     quality = document["quality"]
     if quality not in get_args(Quality):
-        raise reader.error(f"quality is {quality!r}, it must be one of {', '.join(get_args(Quality))}")
+        raise reader.error(f"quality is {quality!r}; it must be one of {', '.join(get_args(Quality))}")
     spans = reader.openings(document["openings"], width)
     room = DrawnRoom(
         name=path.stem,
@@ -131,7 +135,7 @@ def read_annotation(path: Path) -> AnnotatedPhotograph:
 
 
 class _Reader:
-    """Reads the parts of one annotation; errors name its file."""
+    """Reader of one annotation; errors name its file."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -143,15 +147,17 @@ class _Reader:
         unknown = sorted(set(document) - _REQUIRED - _OPTIONAL)
         missing = sorted(_REQUIRED - set(document))
         if unknown:
-            raise self.error(f"unknown key '{unknown[0][:50]}', known are {', '.join(sorted(_REQUIRED | _OPTIONAL))}")
+            raise self.error(
+                f"unknown key '{unknown[0][:50]}'; known keys are {', '.join(sorted(_REQUIRED | _OPTIONAL))}"
+            )
         if missing:
             raise self.error(f"the key '{missing[0]}' is missing")
 
     def ceiling_height_m(self, raw: Any) -> float:
-        """Height of the ceiling over the floor; a usual one where none is given."""
+        """Return the height of the ceiling above the floor, or the default if none is given."""
         if raw is not None and not (is_number(raw) and 0.0 < raw <= _MAX_REACH):
-            raise self.error(f"ceiling_above_camera is {raw!r}, it must be null or above 0 and at most {_MAX_REACH:g}")
-        return CAMERA_HEIGHT_M * (1.0 + (_USUAL_CEILING if raw is None else float(raw)))
+            raise self.error(f"ceiling_above_camera is {raw!r}; it must be null, or above 0 and at most {_MAX_REACH:g}")
+        return CAMERA_HEIGHT_M * (1.0 + (_DEFAULT_CEILING if raw is None else float(raw)))
 
     def text(self, document: Mapping[str, Any], key: str) -> str:
         text = document.get(key, "")
@@ -159,67 +165,68 @@ class _Reader:
             raise self.error(f"{key} must be text, not {type(text).__name__}")
         return text
 
-    def photograph(self, named: Any) -> tuple[FilePhotograph, int]:
-        """The photograph, and its width in pixels."""
-        path = inside(self._path.parent, named) if isinstance(named, str) else None
+    def photograph(self, value: Any) -> tuple[FilePhotograph, int]:
+        """Return the photograph and its width in pixels."""
+        path = path_below(self._path.parent, value) if isinstance(value, str) else None
         if path is None:
-            raise self.error(f"photograph is {named!r}, it must be a path below the annotation's folder")
+            raise self.error(f"photograph is {value!r}; it must be a path below the annotation's folder")
         try:
             with Image.open(path) as image:
                 width = image.width
         except UnidentifiedImageError as error:
-            raise self.error(f"photograph '{named}' is not a readable picture") from error
+            raise self.error(f"photograph '{value}' is not a readable picture") from error
         except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-            raise self.error(f"photograph '{named}' cannot be read: {error}") from error
-        return FilePhotograph(path=path, scene=self._path.stem, room=named), width
+            raise self.error(f"photograph '{value}' cannot be read: {error}") from error
+        return FilePhotograph(path=path, scene=self._path.stem, room=value), width
 
     def polygon(self, raw: Any, key: str) -> Float[np.ndarray, "n 2"]:
-        """An outline (m), validated as rooms of floor plans are, with the camera inside."""
+        """Return an outline (m), validated like a room of a floor plan, with the camera inside."""
         polygon_m = self._points(raw, key, 3, _MAX_VERTICES) * CAMERA_HEIGHT_M
         shape = {"name": self._path.stem, "polygon": polygon_m.tolist(), "ceiling_height_m": 2.0 * CAMERA_HEIGHT_M}
         try:
             (room,) = FloorPlan.from_dict({"rooms": [shape]}).rooms
         except InvalidFloorPlanError as error:
-            raise self.error(f"{key}: {error.reason} (for a camera {CAMERA_HEIGHT_M:g} m over the floor)") from error
+            raise self.error(f"{key}: {error.reason} (for a camera {CAMERA_HEIGHT_M:g} m above the floor)") from error
         if not room.shape.contains(shapely.Point(0.0, 0.0)):
-            raise self.error(f"{key}: the camera at (0, 0) stands outside of it")
+            raise self.error(f"{key}: the camera at (0, 0) is outside the outline")
         return room.polygon_m
 
-    def outline(self, room: DrawnRoom, seen: DrawnRoom, spans: Sequence[ClassSpan], key: str) -> DrawnRoom:
-        """A room with those openings, seen in the outline of another, that lie in both outlines."""
-        drawn = replace(room, openings=tuple(piece for span in spans for piece in _pieces(room, seen, span)))
+    def outline(self, room: DrawnRoom, annotated: DrawnRoom, spans: Sequence[ClassSpan], key: str) -> DrawnRoom:
+        """Add to a room the openings, annotated for another outline, that lie on both outlines."""
+        drawn = replace(room, openings=tuple(piece for span in spans for piece in _pieces(room, annotated, span)))
         try:
             plan_of_rooms(self._path.stem, [drawn], CAMERA_HEIGHT_M)
         except InvalidFloorPlanError as error:
-            raise self.error(f"{key}: {error.reason} (for a camera {CAMERA_HEIGHT_M:g} m over the floor)") from error
+            raise self.error(f"{key}: {error.reason} (for a camera {CAMERA_HEIGHT_M:g} m above the floor)") from error
         return drawn
 
     def openings(self, raw: Any, width: int) -> tuple[ClassSpan, ...]:
-        """Kinds of openings with the columns that they take up, as shares of the width."""
+        """Return the kinds of the openings with their columns as shares of the width."""
         if not isinstance(raw, list) or len(raw) > _MAX_OPENINGS:
-            raise self.error(f"openings must be a list of at most {_MAX_OPENINGS}")
+            raise self.error(f"openings must be a list of at most {_MAX_OPENINGS} entries")
         spans = []
-        for number, one in enumerate(raw):
+        for number, entry in enumerate(raw):
             what = f"opening {number}"
-            if not isinstance(one, Mapping) or set(one) != _OPENING_KEYS:
+            if not isinstance(entry, Mapping) or set(entry) != _OPENING_KEYS:
                 raise self.error(f"{what} must be an object with the keys {', '.join(sorted(_OPENING_KEYS))}")
-            if one["kind"] not in OPENING_CLASSES[1:]:
-                raise self.error(f"{what}: kind is {one['kind']!r}, it must be one of {', '.join(OPENING_CLASSES[1:])}")
-            left, right = self._columns(one["columns"], what, width)
-            line = self._points(one["line"], f"{what}: line", 2, 2)
+            kind = entry["kind"]
+            if kind not in OPENING_CLASSES[1:]:
+                raise self.error(f"{what}: kind is {kind!r}; it must be one of {', '.join(OPENING_CLASSES[1:])}")
+            left, right = self._columns(entry["columns"], what, width)
+            line = self._points(entry["line"], f"{what}: line", 2, 2)
             self._check_sides(line, (left, right), what, width)
-            spans.append((one["kind"], left, right))
+            spans.append((kind, left, right))
         return tuple(spans)
 
     def check_lines(self, raw: list[Any], outline: DrawnRoom) -> None:
-        """Check that openings which were read begin and end on the outline."""
+        """Check that the openings begin and end on the outline."""
         ring = shapely.LinearRing(outline.polygon_m / CAMERA_HEIGHT_M)
-        for number, one in enumerate(raw):
-            away = float(shapely.distance(ring, shapely.points(np.array(one["line"]))).max())
-            if away > _OFF_THE_WALL:
+        for number, entry in enumerate(raw):
+            away = float(shapely.distance(ring, shapely.points(np.array(entry["line"]))).max())
+            if away > _MAX_OFFSET:
                 raise self.error(
-                    f"opening {number}: an end of its line is {away:.2g} off the outline, at most {_OFF_THE_WALL:g} is "
-                    "allowed"
+                    f"opening {number}: an end of its line is {away:.2g} camera heights from the outline; the limit is "
+                    f"{_MAX_OFFSET:g}"
                 )
 
     def _columns(self, raw: Any, what: str, width: int) -> tuple[float, float]:
@@ -228,52 +235,52 @@ class _Reader:
             or len(raw) != 2
             or not all(is_number(column) and 0.0 <= column <= width for column in raw)
         ):
-            raise self.error(f"{what}: columns are {raw!r}, they must be two numbers from 0 to the width, {width}")
+            raise self.error(f"{what}: columns are {raw!r}; they must be two numbers from 0 to the width, {width}")
         return raw[0] / width, raw[1] / width
 
     def _check_sides(self, line: Float[np.ndarray, "2 2"], sides: tuple[float, float], what: str, width: int) -> None:
-        seen = np.arctan2(line[:, 0], line[:, 1]) / TWO_PI + 0.5
-        away = np.abs(wrap_angle(TWO_PI * (seen - np.array(sides)))) / TWO_PI
+        ends = np.arctan2(line[:, 0], line[:, 1]) / TWO_PI + 0.5
+        away = np.abs(wrap_angle(TWO_PI * (ends - np.array(sides)))) / TWO_PI
         if away.max() > _COLUMN_TOLERANCE:
-            shown, said = (", ".join(f"{share * width:.0f}" for share in pair) for pair in (seen, sides))
+            line_columns, columns = (", ".join(f"{share * width:.0f}" for share in pair) for pair in (ends, sides))
             raise self.error(
-                f"{what}: the ends of its line are seen at the columns {shown}, but its columns are {said}; they may "
-                f"differ by {_COLUMN_TOLERANCE * width:.0f}"
+                f"{what}: the ends of its line are at the columns {line_columns}, but its columns are {columns}; the "
+                f"maximum difference is {_COLUMN_TOLERANCE * width:.0f}"
             )
 
-    def _points(self, raw: Any, what: str, least: int, most: int) -> Float[np.ndarray, "n 2"]:
-        if not isinstance(raw, list) or not least <= len(raw) <= most:
-            raise self.error(f"{what} must be a list of {least} to {most} points [x, y]")
+    def _points(self, raw: Any, what: str, low: int, high: int) -> Float[np.ndarray, "n 2"]:
+        if not isinstance(raw, list) or not low <= len(raw) <= high:
+            raise self.error(f"{what} must be a list of {low} to {high} points [x, y]")
         for point in raw:
             if not isinstance(point, list) or len(point) != 2 or not all(map(is_number, point)):
-                raise self.error(f"{what}: a point is {str(point)[:50]}, it must be two numbers [x, y]")
+                raise self.error(f"{what}: a point is {str(point)[:50]}; it must be two numbers [x, y]")
             if max(map(abs, point)) > _MAX_REACH:
                 raise self.error(
-                    f"{what}: a point is {str(point)[:50]}, more than {_MAX_REACH:g} camera heights away; "
-                    "are lengths in camera heights?"
+                    f"{what}: a point is {str(point)[:50]}; the limit is {_MAX_REACH:g}, and lengths are in camera "
+                    "heights"
                 )
         return np.array(raw, dtype=np.float64)
 
 
-def _pieces(room: DrawnRoom, seen: DrawnRoom, span: ClassSpan) -> list[DrawnOpening]:
-    """The pieces of a room's walls that an opening takes up, as far as they are seen.
+def _pieces(room: DrawnRoom, annotated: DrawnRoom, span: ClassSpan) -> list[DrawnOpening]:
+    """Return the visible pieces of a room's walls that an opening covers.
 
-    Its edges may be those of something before it, so its line is no piece of a wall.
+    An opening may be partly occluded, so its line need not be a piece of a wall.
     """
     kind, left, right = span
     share = left + (right - left) % 1.0 * (np.arange(_RAYS) + 0.5) / _RAYS
     azimuth = TWO_PI * (share - 0.5)
-    place, wall = _met(room, azimuth)
-    same = np.linalg.norm(place - _met(seen, azimuth)[0], axis=1) <= _SAME_PLACE_M
+    place, wall = _cast(room, azimuth)
+    same = np.linalg.norm(place - _cast(annotated, azimuth)[0], axis=1) <= _SAME_PLACE_M
     pieces = []
     for number in np.unique(wall[same]):
-        met = place[same & (wall == number)]
-        if len(met) >= _MIN_SHARE * _RAYS:
-            pieces.append(DrawnOpening(kind=kind, line_m=met[[0, -1]]))
+        hits = place[same & (wall == number)]
+        if len(hits) >= _MIN_SHARE * _RAYS:
+            pieces.append(DrawnOpening(kind=kind, line_m=hits[[0, -1]]))
     return pieces
 
 
-def _met(room: DrawnRoom, azimuth: Float[np.ndarray, "n"]) -> tuple[Float[np.ndarray, "n 2"], Int[np.ndarray, "n"]]:
-    """Where rays from the camera meet a room's walls, and which."""
+def _cast(room: DrawnRoom, azimuth: Float[np.ndarray, "n"]) -> tuple[Float[np.ndarray, "n 2"], Int[np.ndarray, "n"]]:
+    """Return the points and the walls where rays from the camera meet a room."""
     distance_m, wall = nearest_walls(np.zeros((1, 2)), azimuth[None], room.walls_m[None])
     return distance_m[0, :, None] * np.stack([np.sin(azimuth), np.cos(azimuth)], axis=1), wall[0]

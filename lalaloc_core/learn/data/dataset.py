@@ -1,7 +1,7 @@
-"""What every data set looks like to training and evaluation, whatever its files are.
+"""Interface of all data sets for training and evaluation.
 
-A `Dataset` lists scenes by split and loads one at a time; a `Scene` is a floor plan with the cameras that stood in it;
-a `Camera` is a true pose with its photographs. Nothing is decoded before it is asked for.
+A `Dataset` lists scenes by split and loads one at a time; a `Scene` is a floor plan with its cameras; a `Camera` is a
+true pose with its photographs. Photographs are decoded on demand.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from lalaloc_core.floorplan import FloorPlan
 
 Split = Literal["train", "validation", "test"]
 SPLITS: tuple[Split, ...] = get_args(Split)
-# What each format is called on the command line and in words.
+# Formats by their name on the command line.
 DATASET_FORMATS = {
     "structured3d": "Structured3D",
     "zind": "ZInD",
@@ -29,11 +29,11 @@ DATASET_FORMATS = {
 
 @dataclass(frozen=True, order=True)
 class Appearance:
-    """How a room looked when it was photographed; None where a data set does not tell.
+    """Appearance of a room in a photograph.
 
     Attributes:
-        furniture: "empty", "simple" or "full".
-        lighting: "cold", "raw" or "warm".
+        furniture: "empty", "simple" or "full"; None if unknown.
+        lighting: "cold", "raw" or "warm"; None if unknown.
     """
 
     furniture: str | None = None
@@ -45,14 +45,14 @@ class Appearance:
 
 @runtime_checkable
 class Photograph(Protocol):
-    """A panorama that can be read."""
+    """Panorama that is read on demand."""
 
     def image(self, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
-        """RGB pixels at the wanted size."""
+        """Return RGB pixels at the given size."""
         ...
 
     def depth_m(self) -> Float[np.ndarray, "h w"]:
-        """Distance (m) along each pixel's ray to what was seen, furniture included; NaN where there is no reading.
+        """Return the distance (m) along each pixel's ray, furniture included; NaN without a reading.
 
         Raises:
             DatasetError: the data set has no depth.
@@ -62,31 +62,30 @@ class Photograph(Protocol):
 
 @runtime_checkable
 class Described(Protocol):
-    """A photograph of which it is known what makes it hard, beyond what its appearance tells.
-
-    Attributes:
-        facts: names of what holds for it, such as "open_door" or "near_wall"; worked out when asked for.
-    """
+    """Photograph with known facts that make it hard to localise, besides its appearance."""
 
     @property
-    def facts(self) -> frozenset[str]: ...
+    def facts(self) -> frozenset[str]:
+        """Names of the facts, such as "open_door" or "near_wall"; computed on demand."""
+        ...
 
 
-def facts_of_photograph(photograph: Photograph | None) -> frozenset[str]:
-    """What holds for a photograph; nothing where its data set does not tell, or where there is none."""
+def photograph_facts(photograph: Photograph | None) -> frozenset[str]:
+    """Return the facts of a photograph; empty if they are unknown."""
     return photograph.facts if isinstance(photograph, Described) else frozenset()
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Camera:
-    """A place where photographs were taken.
+    """True pose with its photographs.
 
     Attributes:
         name: unique within its scene.
-        position_m: (x, y) in the plan frame, inside room number `room_index`.
+        position_m: (x, y) in the plan frame.
+        room_index: room of the plan that contains the position.
         heading: azimuth of the photographs' centre column, radians.
-        camera_height_m: over the floor.
-        photographs: by how the room looked.
+        camera_height_m: above the floor.
+        photographs: by appearance of the room.
     """
 
     name: str
@@ -99,53 +98,53 @@ class Camera:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Scene:
-    """A floor plan and the cameras that stood in it."""
+    """Floor plan with its cameras."""
 
     name: str
     plan: FloorPlan
     cameras: tuple[Camera, ...]
 
     def photograph(self, camera: Camera, appearance: Appearance) -> Photograph:
-        """One photograph of a camera.
+        """Return a photograph of a camera.
 
         Raises:
-            DatasetError: this camera took none like that.
+            DatasetError: the camera has no photograph of this appearance.
         """
         found = camera.photographs.get(appearance)
         if found is None:
-            known = ", ".join(str(one) for one in sorted(camera.photographs, key=str)) or "none"
-            raise DatasetError(f"no photograph '{appearance}', there are: {known}", scene=self.name, room=camera.name)
+            known = ", ".join(str(look) for look in sorted(camera.photographs, key=str)) or "none"
+            raise DatasetError(f"no photograph '{appearance}'; available: {known}", scene=self.name, room=camera.name)
         return found
 
 
 @runtime_checkable
 class Dataset(Protocol):
-    """Scenes by split; small enough to be sent to worker processes.
-
-    Attributes:
-        description: what results on it are to be called, such as "Structured3D".
-        appearances: every appearance that its cameras were photographed in, the usual query first.
-    """
+    """Scenes by split; small enough to be sent to worker processes."""
 
     @property
-    def description(self) -> str: ...
+    def description(self) -> str:
+        """Name of the data set in results, such as "Structured3D"."""
+        ...
 
     @property
-    def appearances(self) -> Sequence[Appearance]: ...
+    def appearances(self) -> Sequence[Appearance]:
+        """All appearances of its photographs, the usual one of queries first."""
+        ...
 
     def scenes(self, split: Split) -> Sequence[str]:
-        """Names of the scenes of a split, in order."""
+        """Return the names of a split's scenes in order."""
         ...
 
     def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
         """Read one scene.
 
         Args:
-            problems: cameras that cannot be used are left out and their errors appended here; without it the first
-                such error is raised.
+            name: of the scene.
+            problems: receives the errors of cameras that cannot be used, which are left out; None raises the first
+                error.
 
         Raises:
-            DatasetError: the floor plan cannot be read, or a camera where `problems` is None.
+            DatasetError: the floor plan cannot be read, or a camera if `problems` is None.
         """
         ...
 
@@ -154,10 +153,13 @@ def load_scenes(dataset: Dataset, names: Iterable[str], problems: list[DatasetEr
     """Load scenes one after another.
 
     Args:
-        problems: scenes and cameras that cannot be used are left out and their errors appended here.
+        dataset: to read from.
+        names: of the scenes.
+        problems: receives the errors of scenes and cameras that cannot be used, which are left out; None raises the
+            first error.
 
     Raises:
-        DatasetError: the first of them, where `problems` is None.
+        DatasetError: a scene or camera cannot be used and `problems` is None.
     """
     for name in names:
         try:

@@ -1,4 +1,4 @@
-"""Which format of data set a folder holds, as its files show, and the reader of it."""
+"""Detection of a data set's format by its files."""
 
 from __future__ import annotations
 
@@ -15,19 +15,20 @@ _STRUCTURED3D_SCENES = "scene_" + 5 * "[0-9]"
 
 
 def open_dataset(root: Path, dataset_format: str | None = None) -> Dataset:
-    """The data set that a folder holds.
+    """Open the data set in a folder.
 
     Args:
-        dataset_format: which of `dataset.DATASET_FORMATS` to read; None finds it out.
+        root: the folder.
+        dataset_format: a key of `dataset.DATASET_FORMATS`; None detects the format.
 
     Raises:
-        DatasetError: there is no such folder, it holds none of the known formats or not the one that is asked for, or
-            it holds more than one and none is asked for.
+        DatasetError: the folder does not exist, holds no data set of the given or of any known format, or holds
+            several and no format is given.
     """
     if not root.exists():
         raise DatasetError("there is no such folder", path=root)
     if not root.is_dir():
-        raise DatasetError("a data set is a folder, this is a file", path=root)
+        raise DatasetError("a data set must be a folder; this is a file", path=root)
     found: dict[str, Dataset] = {}
     if any(path.is_dir() and not (path / PLAN_FILE).exists() for path in root.glob(_STRUCTURED3D_SCENES)):
         found["Structured3D"] = Structured3D(root)
@@ -40,13 +41,13 @@ def open_dataset(root: Path, dataset_format: str | None = None) -> Dataset:
     if dataset_format is not None:
         wanted = DATASET_FORMATS[dataset_format]
         if wanted not in found:
-            raise DatasetError(f"no {wanted} here; found: {', '.join(found) or 'nothing known'}", path=root)
+            raise DatasetError(f"no {wanted} in this folder; found: {', '.join(found) or 'nothing known'}", path=root)
         return found[wanted]
     if len(found) > 1:
-        raise DatasetError(f"the folder holds several data sets: {', '.join(found)}", path=root)
+        raise DatasetError(f"the folder holds several data sets ({', '.join(found)}); set the format", path=root)
     if not found:
         raise DatasetError(
-            "no data set here; looked for folders 'scene_00000' (Structured3D), "
+            "no data set in this folder; looked for folders 'scene_00000' (Structured3D), "
             f"'{PARTITION_FILE}' or '*/{DATA_FILE}' (ZInD), '*/{PLAN_FILE}' (own data), and "
             "'*.json' with 'photograph' and 'polygon' (annotated photographs)",
             path=root,

@@ -1,11 +1,11 @@
-"""A user's own data: plans in the native format, panoramas, and a table of where each was taken.
+"""A user's own data: plans in the native format, panoramas, and a table of their poses.
 
-    ROOT/<scene>/plan.json      the floor plan (docs/reference/conventions.md)
+    ROOT/<scene>/plan.json      floor plan (docs/reference/conventions.md)
     ROOT/<scene>/poses.csv      panorama,x_m,y_m,heading_deg,camera_height_m
-    ROOT/<scene>/...            the panoramas, named in poses.csv by their path below the scene's folder
+    ROOT/<scene>/...            panoramas, named in poses.csv by their path below the scene's folder
     ROOT/splits.csv             scene,split; without it every scene is a test scene
 
-The column `camera_height_m`, or any cell of it, may be left out: the plan's camera height then holds.
+The column `camera_height_m` and its cells are optional; the default is the plan's camera height.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import shapely
 from lalaloc_core.conventions import heading_from_degrees
 from lalaloc_core.errors import DatasetError, InvalidFloorPlanError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.learn.data.assembly import inside, pose_fault
+from lalaloc_core.learn.data.assembly import path_below, pose_fault
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene, Split
 from lalaloc_core.learn.data.photographs import FilePhotograph
 
@@ -34,43 +34,50 @@ SPLITS_FILE = "splits.csv"
 
 _REQUIRED = ("panorama", "x_m", "y_m", "heading_deg")
 _OPTIONAL = ("camera_height_m",)
-# Beyond any plan, and far enough to say that a number was meant in another unit.
+# Larger coordinates indicate another unit.
 _MAX_COORDINATE_M = 100_000.0
 
 
 @dataclass(frozen=True)
 class OwnData:
-    """A folder of a user's own scenes."""
+    """Folder of a user's own scenes.
+
+    Attributes:
+        root: the folder.
+    """
 
     root: Path
 
     @property
     def description(self) -> str:
+        """Name of the data set in results."""
         return f"own data ({self.root.resolve().name})"
 
     @property
     def appearances(self) -> Sequence[Appearance]:
+        """The only appearance, without furniture level."""
         return (Appearance(),)
 
     def scenes(self, split: Split) -> Sequence[str]:
-        """Scenes of a split by name.
+        """Return the names of a split's scenes in order.
 
         Raises:
-            DatasetError: the table of splits is damaged, or does not fit the folders.
+            DatasetError: the table of splits is damaged or does not match the folders.
         """
-        return [name for name, of in self._splits.items() if of == split]
+        return [name for name, scene_split in self._splits.items() if scene_split == split]
 
     def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
-        folder = inside(self.root, name)
+        """Read a scene; see `Dataset.load`."""
+        folder = path_below(self.root, name)
         if folder is None or not (folder / PLAN_FILE).is_file():
-            raise DatasetError(f"no such scene: it has no {PLAN_FILE}", scene=name, path=self.root / PLAN_FILE)
+            raise DatasetError(f"no such scene: {PLAN_FILE} is missing", scene=name, path=self.root / PLAN_FILE)
         plan = _read_plan(folder / PLAN_FILE, name)
         cameras: dict[str, Camera] = {}
         for row in _read_table(folder / POSES_FILE, _REQUIRED, _OPTIONAL, scene=name):
             try:
                 camera = _camera(row, plan, folder)
                 if camera.name in cameras:
-                    raise row.error("panorama", "it stands in an earlier line already")
+                    raise row.error("panorama", "it is a duplicate of an earlier line")
                 cameras[camera.name] = camera
             except DatasetError as error:
                 if problems is None:
@@ -80,25 +87,25 @@ class OwnData:
 
     @cached_property
     def _splits(self) -> dict[str, Split]:
-        """Split of every scene, in the order of names."""
-        here = sorted(path.parent.name for path in self.root.glob(f"*/{PLAN_FILE}"))
+        """Split of every scene, sorted by name."""
+        names = sorted(path.parent.name for path in self.root.glob(f"*/{PLAN_FILE}"))
         path = self.root / SPLITS_FILE
         if not path.exists():
-            return dict.fromkeys(here, "test")
+            return dict.fromkeys(names, "test")
         found: dict[str, Split] = {}
         for row in _read_table(path, ("scene", "split"), (), scene=None):
             scene, split = row.cells["scene"], row.cells["split"]
             if split not in get_args(Split):
                 raise row.error("split", f"it must be one of {', '.join(get_args(Split))}")
-            if scene not in here:
-                raise row.error("scene", f"there is no {PLAN_FILE} in a folder of this name")
+            if scene not in names:
+                raise row.error("scene", f"there is no folder of this name with a {PLAN_FILE}")
             if scene in found:
-                raise row.error("scene", "it stands in an earlier line already")
+                raise row.error("scene", "it is a duplicate of an earlier line")
             found[scene] = split  # type: ignore[assignment]
-        missing = [name for name in here if name not in found]
+        missing = [name for name in names if name not in found]
         if missing:
-            raise DatasetError("the scene has no line here", scene=missing[0], path=path)
-        return {name: found[name] for name in here}
+            raise DatasetError("the scene has no line in this table", scene=missing[0], path=path)
+        return {name: found[name] for name in names}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -111,7 +118,7 @@ class _Row:
     cells: Mapping[str, str]
 
     def number(self, column: str, low: float, high: float) -> float:
-        """A cell as a number from `low` to `high`."""
+        """Return a cell as a number from `low` to `high`."""
         try:
             value = float(self.cells[column])
         except ValueError:
@@ -121,14 +128,14 @@ class _Row:
         return value
 
     def error(self, column: str, reason: str) -> DatasetError:
-        """An error that names line, column and value, and the panorama where the table has one."""
+        """Create an error with the line, column and value, and the panorama if the table has one."""
         shown = f"line {self.line}, column '{column}' is '{self.cells[column][:80]}': {reason}"
         return DatasetError(shown, scene=self.scene, room=self.cells.get("panorama") or None, path=self.path)
 
 
 def _camera(row: _Row, plan: FloorPlan, folder: Path) -> Camera:
     panorama = row.cells["panorama"]
-    path = inside(folder, panorama)
+    path = path_below(folder, panorama)
     if path is None:
         raise row.error("panorama", "it must be a path below the scene's folder")
     if not path.is_file():
@@ -143,7 +150,7 @@ def _camera(row: _Row, plan: FloorPlan, folder: Path) -> Camera:
     room_index = int(plan.room_index_at(position_m[None])[0])
     if room_index < 0:
         away_m, nearest = min((float(room.shape.distance(shapely.Point(position_m))), room.name) for room in plan.rooms)
-        raise row.error("x_m", f"({x_m:g}, {y_m:g}) m lies in no room; the nearest is '{nearest}', {away_m:.3g} m away")
+        raise row.error("x_m", f"({x_m:g}, {y_m:g}) m is in no room; the nearest is '{nearest}', {away_m:.3g} m away")
     fault = pose_fault(plan, room_index, position_m, height_m)
     if fault is not None:
         raise row.error("camera_height_m" if row.cells.get("camera_height_m") else "panorama", fault)
@@ -167,13 +174,13 @@ def _read_plan(path: Path, scene: str) -> FloorPlan:
 
 
 def _read_table(path: Path, required: Sequence[str], optional: Sequence[str], *, scene: str | None) -> Iterator[_Row]:
-    """Lines of a CSV file with a header; empty lines are passed over.
+    """Yield the lines of a CSV file with a header, without empty lines.
 
     Raises:
-        DatasetError: it cannot be read, its columns are others, or a line has too few or too many cells.
+        DatasetError: the file cannot be read, has wrong columns, or a line has too few or too many cells.
     """
     try:
-        # Spreadsheets put a mark in front of UTF-8.
+        # Spreadsheets write a byte order mark.
         text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
         raise DatasetError(f"cannot be read: {error.strerror}", scene=scene, path=path) from error
@@ -186,8 +193,8 @@ def _read_table(path: Path, required: Sequence[str], optional: Sequence[str], *,
         missing = [name for name in required if name not in header]
         if wrong or missing or len(set(header)) < len(header):
             raise DatasetError(
-                f"line 1 is '{','.join(header)[:200]}', it must name the columns {','.join((*required, *optional))}"
-                + (f" ({', '.join(optional)} may be left out)" if optional else ""),
+                f"line 1 is '{','.join(header)[:200]}'; it must name the columns {','.join((*required, *optional))}"
+                + (f" ({', '.join(optional)} is optional)" if optional else ""),
                 scene=scene,
                 path=path,
             )
@@ -196,11 +203,11 @@ def _read_table(path: Path, required: Sequence[str], optional: Sequence[str], *,
                 continue
             if len(cells) != len(header):
                 raise DatasetError(
-                    f"line {lines.line_num} has {len(cells)} cells, the header has {len(header)}",
+                    f"line {lines.line_num} has {len(cells)} cells; the header has {len(header)}",
                     scene=scene,
                     path=path,
                 )
             stripped = {name: cell.strip() for name, cell in zip(header, cells, strict=True)}
             yield _Row(path=path, scene=scene, line=lines.line_num, cells=stripped)
     except csv.Error as error:
-        raise DatasetError(f"line {lines.line_num} is no CSV: {error}", scene=scene, path=path) from error
+        raise DatasetError(f"line {lines.line_num} is not valid CSV: {error}", scene=scene, path=path) from error

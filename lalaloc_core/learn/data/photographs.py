@@ -1,4 +1,4 @@
-"""Photographs in files: nothing is opened before it is asked for."""
+"""Photographs in files, opened on demand."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ _MM_PER_M = 1000.0
 
 @dataclass(frozen=True, kw_only=True)
 class FilePhotograph:
-    """A panorama in a file.
+    """Panorama in a file.
 
     Attributes:
-        path: the picture.
-        scene, room: where it was taken, for errors.
-        depth_path: 16-bit PNG with millimetres along each pixel's ray, 0 where there is no reading; None: no depth.
-        size: (height, width) that both must have; None: any that is a whole panorama.
+        path: of the picture.
+        scene, room: place of the photograph, for errors.
+        depth_path: 16-bit PNG with millimetres along each pixel's ray, 0 without a reading; None for no depth.
+        size: required (height, width) of both files; None accepts any whole panorama.
     """
 
     path: Path
@@ -34,10 +34,10 @@ class FilePhotograph:
     size: tuple[int, int] | None = None
 
     def image(self, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
-        """RGB pixels at the wanted size.
+        """Return RGB pixels at the given size.
 
         Raises:
-            DatasetError: missing, damaged, no panorama, or of another size than the data set's.
+            DatasetError: the file is missing, damaged, not a panorama, or not of the data set's size.
         """
         content = self._read(self.path)
         limits = PanoramaLimits()
@@ -50,10 +50,10 @@ class FilePhotograph:
             raise self._error(str(error), self.path) from error
 
     def depth_m(self) -> Float[np.ndarray, "h w"]:
-        """Distance (m) along each pixel's ray to what was seen; NaN where there is no reading.
+        """Return the distance (m) along each pixel's ray; NaN without a reading.
 
         Raises:
-            DatasetError: there is none, or it is missing or damaged.
+            DatasetError: the data set has no depth, or the file is missing or damaged.
         """
         if self.depth_path is None:
             raise self._error("the data set has no depth", self.path)
@@ -63,7 +63,7 @@ class FilePhotograph:
         try:
             with Image.open(io.BytesIO(content), formats=("PNG",)) as image:
                 if not image.mode.startswith("I"):
-                    raise self._error(f"depth has mode {image.mode}, a 16-bit grey PNG is needed", self.depth_path)
+                    raise self._error(f"depth has mode {image.mode}; a 16-bit grey PNG is required", self.depth_path)
                 depth_mm = np.asarray(image)
         except UnidentifiedImageError as error:
             raise self._error("depth is not a PNG picture", self.depth_path) from error
@@ -78,7 +78,7 @@ class FilePhotograph:
             raise self._error(f"cannot be read: {error.strerror}", path) from error
 
     def _check_size(self, path: Path, content: bytes) -> None:
-        """Compare the size in the file's header, before any pixel is decoded."""
+        """Check the size in the file's header before any pixel is decoded."""
         try:
             with Image.open(io.BytesIO(content)) as image:
                 width, height = image.size
@@ -88,7 +88,7 @@ class FilePhotograph:
             raise self._error(f"damaged: {error}", path) from error
         if (height, width) != self.size and self.size is not None:
             raise self._error(
-                f"the picture is {width} x {height}, this data set's are {self.size[1]} x {self.size[0]}", path
+                f"the picture is {width} x {height}; this data set requires {self.size[1]} x {self.size[0]}", path
             )
 
     def _error(self, reason: str, path: Path) -> DatasetError:

@@ -1,4 +1,4 @@
-"""Closed rings: chaining unordered lines into the outline of a floor, and outlines that cross themselves."""
+"""Closed rings: chaining unordered lines into outlines, and repair of outlines that cross themselves."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ from jaxtyping import Float
 
 
 class OpenRingError(ValueError):
-    """Lines that do not close; the message names the junction."""
+    """Lines that do not form closed rings; the message names the junction."""
 
 
 def chain_rings(lines: Sequence[tuple[int, int]]) -> list[list[int]]:
-    """Chain lines, each given by the junctions at its ends, into closed rings.
+    """Chain lines into closed rings.
 
     Args:
-        lines: in any order and direction.
+        lines: junctions at both ends of each line, in any order and direction.
 
     Returns:
-        junctions of every ring, in walking order, the first not repeated at the end.
+        Junctions of every ring in order, the first not repeated at the end.
 
     Raises:
-        OpenRingError: a junction that does not join exactly two lines, or a ring of fewer than three junctions.
+        OpenRingError: a junction does not join exactly two lines, or a ring has fewer than three junctions.
     """
     at_junction: dict[int, list[int]] = defaultdict(list)
     for number, ends in enumerate(lines):
@@ -33,7 +33,7 @@ def chain_rings(lines: Sequence[tuple[int, int]]) -> list[list[int]]:
     for junction, joined in at_junction.items():
         if len(joined) != 2:
             raise OpenRingError(
-                f"the ring does not close: junction {junction} joins {len(joined)} of its lines, not exactly two"
+                f"the ring does not close: junction {junction} joins {len(joined)} of its lines, not two"
             )
     rings, used = [], [False] * len(lines)
     for first, (start, junction) in enumerate(lines):
@@ -43,33 +43,33 @@ def chain_rings(lines: Sequence[tuple[int, int]]) -> list[list[int]]:
         used[first] = True
         while junction != start:
             ring.append(junction)
-            one, other = at_junction[junction]
-            line = other if line == one else one
+            first_line, second_line = at_junction[junction]
+            line = second_line if line == first_line else first_line
             used[line] = True
             near, far = lines[line]
             junction = far if near == junction else near
         if len(ring) < 3:
-            raise OpenRingError(f"a ring has {len(ring)} junctions {sorted(ring)}, at least three are needed")
+            raise OpenRingError(f"a ring has {len(ring)} junctions {sorted(ring)}; the minimum is three")
         rings.append(ring)
     return rings
 
 
 def signed_area(polygon: Float[np.ndarray, "n 2"]) -> float:
-    """Area inside a ring, positive when it runs counter-clockwise."""
+    """Return the area inside a ring; positive for counter-clockwise rings."""
     following = np.roll(polygon, -1, axis=0)
     return float(polygon[:, 0] @ following[:, 1] - polygon[:, 1] @ following[:, 0]) / 2.0
 
 
-def uncrossed(polygon: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "m 2"], float]:
-    """The largest simple polygon within a ring that may cross or touch itself.
+def largest_simple_part(polygon: Float[np.ndarray, "n 2"]) -> tuple[Float[np.ndarray, "m 2"], float]:
+    """Return the largest simple polygon within a ring that may cross or touch itself.
 
     Returns:
-        it, and its share of all the area that the ring encloses; the ring itself and 1 where it is simple already.
+        The polygon and its share of the enclosed area; a simple ring returns itself and 1.
     """
     shape = shapely.Polygon(polygon)
     if shape.is_valid:
         return polygon, 1.0
-    # A collection may hold multi-polygons, so parts are taken twice.
+    # A collection may hold multi-polygons, so it is split twice.
     parts = shapely.get_parts(shapely.get_parts(shapely.make_valid(shape)))
     areas = [part.area for part in parts]
     if not sum(areas) > 0.0:

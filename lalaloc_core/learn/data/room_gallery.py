@@ -1,6 +1,6 @@
-"""Galleries: one room among others that are like it, side by side in one floor plan.
+"""Galleries: one room among similar ones, side by side in one floor plan.
 
-A stand-in for a building where a room was photographed and nothing is known of its neighbours.
+A gallery replaces the unknown building around a photographed room.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from lalaloc_core.learn.data.drawn_rooms import DrawnRoom, plan_of_rooms
 from lalaloc_core.learn.synth.homes.plans import generate_home
 
 GALLERY_ROOMS = 20
-# At most so many of the others are rooms that somebody drew; the rest are generated.
+# Maximum number of annotated rooms among the others; the rest are generated.
 _MAX_DRAWN = 9
-# How much larger or smaller than drawn, and than the own room where they are generated, the others are made.
+# Maximum relative change of size: of annotated rooms to their drawing, of generated rooms to the own room.
 _RESCALED = 0.1
-# Generated rooms that are the most alike; those of a gallery are drawn from them.
-_ALIKE = 30
+# Number of most similar generated rooms from which a gallery draws.
+_SIMILAR = 30
 _POOL_HOMES = 60
-# Homes of no split: seeds of training, validation and test begin with 0, 1 and 2.
+# Seed of homes outside all splits: training, validation and test seeds begin with 0, 1 and 2.
 _POOL = 7
 _PER_ROW = 5
-# Rooms of a plan lie a wall apart; these a good deal more, so that no door belongs to two of them.
+# Gap between rooms, wider than a wall, so that no door belongs to two rooms.
 _GAP_M = 1.0
 
 
 @dataclass(frozen=True, eq=False)
 class RoomGallery:
-    """A plan of `GALLERY_ROOMS` rooms, and where the own one's origin and its +y have come to lie."""
+    """Plan of `GALLERY_ROOMS` rooms, and the pose of the own room's frame in it: origin, and heading of its +y."""
 
     plan: FloorPlan
     room_index: int
@@ -50,18 +50,20 @@ def build_gallery(
     rng: np.random.Generator,
     like: DrawnRoom | None = None,
 ) -> RoomGallery:
-    """One room among others, all with their walls along the axes, each turned by quarters at random.
+    """Place a room among similar ones, all aligned with the axes and randomly rotated by quarter turns.
 
     Args:
-        own: with the camera at its origin, looking along +y.
-        others: drawn rooms; those most alike in size and shape are taken, up to `_MAX_DRAWN` of them, and rescaled
-            within `_RESCALED`. The rest are generated rooms of a like shape, scaled to the size within as much.
-        like: what the others are to be like; None: the own room.
+        own: room with the camera at its origin, looking along +y.
+        others: annotated rooms; the most similar in size and shape are used, up to `_MAX_DRAWN`, rescaled within
+            `_RESCALED`. The rest are generated rooms of similar shape, scaled to the size within the same range.
+        camera_height_m: of the plan.
+        rng: of all random draws.
+        like: room that the others must resemble; None uses `own`.
     """
     like = like or own
-    drawn = sorted(others, key=lambda room: _unlike(like, room))[:_MAX_DRAWN]
+    drawn = sorted(others, key=lambda room: _dissimilarity(like, room))[:_MAX_DRAWN]
     generated, shapes = _generated()
-    pool = [generated[k] for k in np.argsort(np.abs(shapes - _shape(like)).sum(axis=1), kind="stable")[:_ALIKE]]
+    pool = [generated[k] for k in np.argsort(np.abs(shapes - _shape(like)).sum(axis=1), kind="stable")[:_SIMILAR]]
     chosen = rng.choice(len(pool), GALLERY_ROOMS - 1 - len(drawn), replace=False)
     low, high = 1.0 - _RESCALED, 1.0 + _RESCALED
     rooms = [room.scaled(rng.uniform(low, high)) for room in drawn]
@@ -80,7 +82,7 @@ def build_gallery(
 
 @lru_cache(maxsize=1)
 def _generated() -> tuple[tuple[DrawnRoom, ...], Float[np.ndarray, "n 2"]]:
-    """Rooms of generated homes, their names made unique, and their shapes."""
+    """Return rooms of generated homes with unique names, and their shapes."""
     homes = [generate_home(np.random.default_rng([_POOL, number])) for number in range(_POOL_HOMES)]
     rooms = tuple(
         _drawn(f"{room.name}, home {number}", home.plan, index)
@@ -108,23 +110,23 @@ def _drawn(name: str, plan: FloorPlan, index: int) -> DrawnRoom:
 
 
 def _shape(room: DrawnRoom) -> Float[np.ndarray, "2"]:
-    """Logs of how long a room is for its width, and of how much of the box around it is floor."""
+    """Return the logs of a room's aspect ratio and of the floor's share of its bounding box."""
     extent_m = room.turned(-room.main_direction).extent_m
     return np.log([extent_m.max() / extent_m.min(), room.size_m**2 / extent_m.prod()])
 
 
-def _unlike(first: DrawnRoom, second: DrawnRoom) -> float:
+def _dissimilarity(first: DrawnRoom, second: DrawnRoom) -> float:
     return float(np.abs(_shape(first) - _shape(second)).sum() + abs(np.log(first.size_m / second.size_m)))
 
 
 def _side_by_side(rooms: Sequence[DrawnRoom], rng: np.random.Generator) -> list[Float[np.ndarray, "2"]]:
-    """By how much to move rooms so that they lie in rows, each `_GAP_M` and a little more from the others."""
+    """Return the translations that arrange rooms in rows, with gaps of `_GAP_M` and a little more."""
     moves, top_m = [], 0.0
     for first in range(0, len(rooms), _PER_ROW):
         row = rooms[first : first + _PER_ROW]
         right_m = 0.0
         for room in row:
-            # Where poses of the grid come to lie in the room is left to chance.
+            # A random offset varies the position of the pose grid in the room.
             corner = np.array([right_m, top_m]) + rng.uniform(0.0, 0.5, 2)
             moves.append(corner - room.polygon_m.min(axis=0))
             right_m = corner[0] + room.extent_m[0] + _GAP_M

@@ -1,4 +1,4 @@
-"""Structured3D (Zheng et al. 2020), the paper's data set: 3,500 synthetic homes with photo-realistic panoramas.
+"""Structured3D (Zheng et al. 2020), the paper's data set: 3,500 synthetic homes with photorealistic panoramas.
 
     ROOT/scene_00000/annotation_3d.json
     ROOT/scene_00000/2D_rendering/<room>/panorama/camera_xyz.txt
@@ -40,19 +40,19 @@ _MM_PER_M = 1000.0
 
 
 def scene_name(number: int) -> str:
-    """Name of a scene's folder."""
+    """Return the name of a scene's folder."""
     return f"scene_{number:05d}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Synthetic:
-    """Content of `synthetic.json`, which marks scenes of this project's generator in Structured3D's layout.
+    """Content of `synthetic.json`, which marks generated scenes in Structured3D's layout.
 
     Attributes:
-        format: of this file.
+        format: version of this file.
         seed: of the generator.
         height, width: of the panoramas.
-        textures: name of the material pictures; None where all are procedural.
+        textures: name of the material pictures; None if all materials are procedural.
     """
 
     format: Literal[1]
@@ -64,19 +64,22 @@ class Synthetic:
 
 @dataclass(frozen=True)
 class Structured3D:
-    """A copy of Structured3D, or of a part of it, or synthetic scenes in its layout.
+    """Copy of Structured3D or a part of it, or generated scenes in its layout.
 
-    The paper's exclusions are left out of the splits: see `structured3d_splits`.
+    Scenes excluded by the paper are not in the splits, see `structured3d_splits`.
+
+    Attributes:
+        root: folder of the scenes.
     """
 
     root: Path
 
     @cached_property
     def synthetic(self) -> Synthetic | None:
-        """How the scenes were generated; None for Structured3D itself.
+        """Settings of generated scenes; None for Structured3D itself.
 
         Raises:
-            DatasetError: the file says something impossible.
+            DatasetError: the file has invalid values.
         """
         path = self.root / SYNTHETIC_FILE
         if not path.exists():
@@ -87,34 +90,38 @@ class Structured3D:
             raise DatasetError(str(error), path=path) from error
         if found.height < 1 or found.width != 2 * found.height:
             raise DatasetError(
-                f"panoramas of {found.width} x {found.height}, they must be twice as wide as high", path=path
+                f"panoramas of {found.width} x {found.height}; they must be twice as wide as high", path=path
             )
         return found
 
     @property
     def description(self) -> str:
+        """Name of the data set in results."""
         return "Structured3D" if self.synthetic is None else f"synthetic scenes (seed {self.synthetic.seed})"
 
     @property
     def panorama_size(self) -> tuple[int, int]:
-        """(height, width) that every panorama must have."""
+        """Required (height, width) of every panorama."""
         return PANORAMA_SIZE if self.synthetic is None else (self.synthetic.height, self.synthetic.width)
 
     @property
     def appearances(self) -> Sequence[Appearance]:
+        """All combinations of furniture and lighting."""
         return [Appearance(furniture, lighting) for furniture in FURNITURE for lighting in LIGHTING]
 
     def scenes(self, split: Split) -> Sequence[str]:
-        here = {path.name for path in _folders(self.root)}
-        return [name for name in map(scene_name, scene_numbers(split)) if name in here]
+        """Return the names of a split's scenes on disk."""
+        names = {path.name for path in _folders(self.root)}
+        return [name for name in map(scene_name, scene_numbers(split)) if name in names]
 
     def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
+        """Read a scene; see `Dataset.load`."""
         if not _SCENE_NAME.fullmatch(name):
             raise DatasetError("no such scene; names are like 'scene_03250'", scene=name, path=self.root)
         annotation = read_annotation(self.root / name / ANNOTATION_FILE, name)
         cameras = []
         for folder in sorted(_folders(self.root / name / RENDERING_FOLDER), key=_by_number):
-            # Rooms may have perspective pictures only.
+            # Some rooms have perspective pictures only.
             if not (folder / "panorama").is_dir():
                 continue
             try:
@@ -131,13 +138,13 @@ class Structured3D:
         position_m = np.array([x_m, y_m])
         floors = annotation.floors.get(room)
         if not floors:
-            why = "has no room with this ID" if floors is None else "has this room, but it is too small for a camera"
+            why = "has no room with this ID" if floors is None else "has this room, but it is below the minimum area"
             raise DatasetError(f"{ANNOTATION_FILE} {why}", scene=scene, room=room, path=folder)
         faults = {floor: pose_fault(annotation.plan, floor.room_index, position_m, z_m - floor.z_m) for floor in floors}
         floor = next((floor for floor in floors if faults[floor] is None), None)
         if floor is None:
             raise DatasetError(
-                f"{faults[floors[0]]}; the file's numbers are read as millimetres", scene=scene, room=room, path=path
+                f"{faults[floors[0]]} (the file's numbers are read as millimetres)", scene=scene, room=room, path=path
             )
         return Camera(
             name=room,
@@ -179,13 +186,13 @@ def _read_three(path: Path, scene: str, room: str) -> tuple[float, float, float]
         values = []
     if len(values) != 3 or not all(is_number(value) for value in values):
         raise DatasetError(
-            f"holds '{text.strip()[:80]}', three numbers (millimetres) are needed", scene=scene, room=room, path=path
+            f"holds '{text.strip()[:80]}'; three numbers (millimetres) are required", scene=scene, room=room, path=path
         )
     return values[0], values[1], values[2]
 
 
 def _names(folder: Path) -> list[str]:
-    """Names of what lies in a folder; none where there is no such folder."""
+    """Return the names of a folder's entries; empty if it does not exist."""
     return os.listdir(folder) if folder.is_dir() else []
 
 

@@ -1,12 +1,12 @@
 """Structured3D's `annotation_3d.json`: rooms as planes, lines and junctions in millimetres.
 
-    semantics    a room, door, window or outer wall: which planes it has
+    semantics    rooms, doors, windows and outer walls with their planes
     planes       floor, ceiling or wall
     planeLineMatrix     planes x lines, 1 where a line lies on a plane
     lineJunctionMatrix  lines x junctions, 1 where a junction ends a line
     junctions    coordinates
 
-Planes, lines and junctions are meant by their place in the lists, as in the data set's own tools.
+Planes, lines and junctions are referenced by their index in the lists, as in the data set's own tools.
 """
 
 from __future__ import annotations
@@ -29,19 +29,19 @@ from lalaloc_core.learn.data.drawn_openings import DrawnOpening
 from lalaloc_core.learn.data.polygon_rings import OpenRingError, chain_rings, signed_area
 
 _MM_PER_M = 1000.0
-# Every other type is a kind of room.
+# All other types are rooms.
 _OPENINGS = ("door", "window")
 _NOT_ROOMS = (*_OPENINGS, "outwall")
-# Floors and ceilings that rise or fall by more are not level.
+# Maximum height difference of a level floor or ceiling.
 _LEVEL_TOLERANCE_M = 0.05
-# A door's box ends on the walls of its rooms, but for the rounding of the drawing.
+# Maximum distance between a door's box and the walls of its rooms, because of rounding.
 _BESIDE_M = 0.03
 _LISTS = ("semantics", "planes", "junctions", "planeLineMatrix", "lineJunctionMatrix")
 
 
 @dataclass(frozen=True)
 class Floor:
-    """The floor of a room: which room of the plan, and the height (m) of its floor in the world frame."""
+    """Floor of a room: index of the room in the plan, and height (m) of the floor in the world frame."""
 
     room_index: int
     z_m: float
@@ -49,10 +49,11 @@ class Floor:
 
 @dataclass(frozen=True, eq=False)
 class Annotation:
-    """What a scene's annotation says.
+    """Content of a scene's annotation.
 
     Attributes:
-        floors: by the ID of the room's semantic; a room may have several floors.
+        plan: floor plan of the scene.
+        floors: by the ID of the room's semantic; a room can have several floors.
     """
 
     plan: FloorPlan
@@ -63,12 +64,14 @@ def read_annotation(path: Path, scene: str) -> Annotation:
     """Read the rooms of a scene.
 
     Raises:
-        DatasetError: names the room and what is wrong.
+        DatasetError: the annotation is damaged; names the room.
     """
     return _Reader(read_json(path, scene=scene), scene, path).annotation()
 
 
 class _Reader:
+    """Reader of one annotation; errors name its scene and file."""
+
     def __init__(self, document: dict[str, Any], scene: str, path: Path) -> None:
         self._document, self._scene, self._path = document, scene, path
         for key in _LISTS:
@@ -109,21 +112,21 @@ class _Reader:
         return Annotation(plan, floors)
 
     def _outlines(self, room: str, planes: list[Any]) -> list[tuple[RoomOutline, float]]:
-        """A room's outline with its floor's height, once for each of its floors."""
-        of_kind: dict[str, list[int]] = {"floor": [], "ceiling": []}
+        """Return the outline and floor height of each of a room's floors."""
+        by_kind: dict[str, list[int]] = {"floor": [], "ceiling": []}
         for plane in planes:
             entry = self._entry("planes", plane, room)
             kind = entry.get("type") if isinstance(entry, dict) else None
             if not isinstance(kind, str):
                 raise self._error(f"plane {plane} has no 'type'", room)
-            of_kind.setdefault(kind, []).append(plane)
+            by_kind.setdefault(kind, []).append(plane)
         for kind in ("floor", "ceiling"):
-            if not of_kind[kind]:
+            if not by_kind[kind]:
                 raise self._error(f"the room has no {kind} among its planes {planes}", room)
-        ceiling_mm = [point for plane in of_kind["ceiling"] for point in self._points_mm(plane, "ceiling", room)]
+        ceiling_mm = [point for plane in by_kind["ceiling"] for point in self._points_mm(plane, "ceiling", room)]
         ceiling_z_m, ceiling_warnings = _level(np.array(ceiling_mm)[:, 2] / _MM_PER_M, "ceiling", room)
         found = []
-        for plane in of_kind["floor"]:
+        for plane in by_kind["floor"]:
             corners_m, warnings = self._floor_m(plane, room)
             floor_z_m, floor_warnings = _level(corners_m[:, 2], "floor", room)
             outline = RoomOutline(
@@ -139,7 +142,7 @@ class _Reader:
     def _openings(
         self, outlines: list[RoomOutline], floors_z_m: list[float]
     ) -> tuple[list[DrawnOpening], tuple[str, ...]]:
-        """Doors and windows: boxes between two walls, or single faces; what cannot be read is a warning."""
+        """Return doors and windows (boxes between two walls, or single faces), and warnings about unreadable ones."""
         shapes = [shapely.Polygon(outline.polygon_m) for outline in outlines]
         found, faults = [], []
         for number, semantic in enumerate(self._document["semantics"]):
@@ -171,18 +174,18 @@ class _Reader:
         return found, tuple(faults)
 
     def _floor_m(self, plane: int, room: str) -> tuple[Float[np.ndarray, "n 3"], tuple[str, ...]]:
-        """Corners of a floor, in order, and what was odd about it."""
+        """Return the corners of a floor in order, and warnings."""
         lines = self._lines(plane, "floor", room)
         rings, fault = self._chained(lines, room)
         if len(rings) != 1:
-            # Doors and windows may be drawn on the floor too; the data set's own tools leave their lines out.
+            # Doors and windows may also be drawn on the floor; the data set's own tools ignore their lines.
             rings = self._chained([line for line in lines if line not in self._lines_of_openings], room)[0] or rings
         if not rings:
             raise self._error(f"floor plane {plane}: {fault}", room) from fault
         corners_m = [np.array([self._junction_mm(junction, room) for junction in ring]) / _MM_PER_M for ring in rings]
         warnings = ()
         if len(rings) > 1:
-            warnings = (f"room '{room}': the floor has {len(rings)} rings, only the largest is its outline",)
+            warnings = (f"room '{room}': the floor has {len(rings)} rings; only the largest is used",)
         return max(corners_m, key=lambda corners: abs(signed_area(corners[:, :2]))), warnings
 
     def _chained(self, lines: list[int], room: str) -> tuple[list[list[int]], OpenRingError | None]:
@@ -224,20 +227,20 @@ class _Reader:
     def _ends(self, line: int, room: str) -> tuple[int, int]:
         junctions = _ones(self._entry("lineJunctionMatrix", line, room))
         if len(junctions) != 2:
-            raise self._error(f"line {line} has {len(junctions)} junctions, exactly two are needed", room)
+            raise self._error(f"line {line} has {len(junctions)} junctions; two are required", room)
         return junctions[0], junctions[1]
 
     def _junction_mm(self, junction: int, room: str) -> list[float]:
         entry = self._entry("junctions", junction, room)
         point = entry.get("coordinate") if isinstance(entry, dict) else None
         if not isinstance(point, list) or len(point) != 3 or not all(is_number(value) for value in point):
-            raise self._error(f"junction {junction} has coordinate {str(point)[:80]}, three numbers are needed", room)
+            raise self._error(f"junction {junction} has coordinate {str(point)[:80]}; three numbers are required", room)
         return [float(value) for value in point]
 
     def _entry(self, key: str, index: Any, room: str) -> Any:
         entries = self._document[key]
         if isinstance(index, bool) or not isinstance(index, int) or not 0 <= index < len(entries):
-            raise self._error(f"'{key}' has no entry {index!r}, it has {len(entries)}", room)
+            raise self._error(f"'{key}' has no entry {index!r}; it has {len(entries)} entries", room)
         return entries[index]
 
     def _error(self, reason: str, room: str | None = None) -> DatasetError:
@@ -245,29 +248,26 @@ class _Reader:
 
 
 def _middle_line(footprint: shapely.Geometry) -> Float[np.ndarray, "2 2"]:
-    """The line halfway through a wall's thickness: the middle of the smallest rectangle around, along its long side."""
+    """Return the centre line of a wall opening: the long axis of its smallest enclosing rectangle."""
     corners = shapely.get_coordinates(shapely.oriented_envelope(footprint))
     if len(corners) < 5:
-        # A single face is a line from above.
+        # A single face is a line in plan view.
         return np.stack([corners[0], corners[-1]])
     sides = np.linalg.norm(np.diff(corners[:3], axis=0), axis=1)
-    one, two, three, four = corners[:4]
-    ends = (
-        ((one + four) / 2.0, (two + three) / 2.0) if sides[0] >= sides[1] else ((one + two) / 2.0, (three + four) / 2.0)
-    )
-    return np.stack(ends)
+    a, b, c, d = corners[:4]
+    return np.stack([(a + d) / 2.0, (b + c) / 2.0] if sides[0] >= sides[1] else [(a + b) / 2.0, (c + d) / 2.0])
 
 
 def _level(z_m: Float[np.ndarray, "n"], kind: str, room: str) -> tuple[float, tuple[str, ...]]:
-    """Mean height of a floor or ceiling, and a warning where it is not level."""
+    """Return the mean height of a floor or ceiling, and a warning if it is not level."""
     spread_m = float(np.ptp(z_m))
     if spread_m <= _LEVEL_TOLERANCE_M:
         return float(z_m.mean()), ()
-    return float(z_m.mean()), (f"room '{room}': the {kind} is not level, it rises by {spread_m:.2f} m",)
+    return float(z_m.mean()), (f"room '{room}': the {kind} is not level; its height varies by {spread_m:.2f} m",)
 
 
 def _ones(row: Any) -> list[int]:
-    """Places of the ones in a row of a matrix; rows are long and nearly empty."""
+    """Return the indices of the ones in a row of a matrix; rows are long and sparse."""
     if not isinstance(row, list):
         return []
     places, place = [], -1

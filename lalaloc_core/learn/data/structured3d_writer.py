@@ -1,7 +1,7 @@
-"""Writing scenes in Structured3D's layout: the counterpart of `structured3d`, millimetres with z up.
+"""Writer of scenes in Structured3D's layout, the counterpart of `structured3d`: millimetres, z up.
 
-Every room is a prism of planes, every door or window a box between two walls, and the outer walls are a ring around
-the home. A plane's unit normal points into the empty space, and `normal . point + offset = 0` on it.
+Every room is a prism of planes, every door or window a box between two walls, and the outer walls form a ring around
+the home. A plane's unit normal points into the empty space, and `normal . point + offset = 0` on the plane.
 """
 
 from __future__ import annotations
@@ -24,12 +24,12 @@ from lalaloc_core.learn.synth.homes.openings import Opening
 
 _MM_PER_M = 1000.0
 _MAX_DEPTH_MM = 65535.0
-# Higher levels write the same pixels at three times the cost for a tenth less space.
+# Higher levels take three times as long and save 10 % of space.
 _PNG_COMPRESSION = 1
-# Thickness of walls that have no room behind them, and the depth of doors that lead nowhere.
+# Thickness of walls without a room behind them, and depth of doors that lead nowhere.
 _OUTER_WALL_M = 0.2
 _NICHE_M = 0.05
-# Structured3D's names of the kinds of room that are named differently here.
+# Structured3D's names of room types that have other names in this project.
 _ROOM_TYPES = {"closet": "store room", "storage": "store room"}
 _SAME_ROOM_TYPES = (
     *("living room", "kitchen", "bedroom", "bathroom", "balcony", "corridor", "dining room", "study", "studio"),
@@ -38,12 +38,12 @@ _SAME_ROOM_TYPES = (
 
 
 def room_id(room_index: int) -> str:
-    """The semantic's ID, and the name of the folder with the room's panoramas."""
+    """Return the semantic's ID, which is also the name of the room's panorama folder."""
     return str(room_index)
 
 
 def room_type(name: str) -> str:
-    """Structured3D's type of a room that is called "bedroom 2"."""
+    """Return Structured3D's type of a room from its name, such as "bedroom 2"."""
     kind = name.rstrip("0123456789 ")
     kind = _ROOM_TYPES.get(kind, kind)
     return kind if kind in _SAME_ROOM_TYPES else "undefined"
@@ -56,7 +56,7 @@ def write_annotation(scene: Path, plan: FloorPlan, openings: Sequence[Opening]) 
 
 
 def build_annotation(plan: FloorPlan, openings: Sequence[Opening]) -> dict[str, Any]:
-    """The annotation of a home; the semantic with ID k is room k of the plan."""
+    """Build the annotation of a home; the semantic with ID k is room k of the plan."""
     drawing = _Drawing()
     rooms = []
     for room in plan.rooms:
@@ -69,7 +69,7 @@ def build_annotation(plan: FloorPlan, openings: Sequence[Opening]) -> dict[str, 
             continue
         near, far = _ends_m(plan, opening), _far_side_m(plan, opening, twin)
         box = drawing.prism(np.stack([near[0], far[0], far[1], near[1]]), opening.sill_m, opening.head_m)
-        # The wall has a hole where the box begins, and another wall may have one where it ends.
+        # The box makes a hole in its wall, and one in the wall of the room behind it.
         drawing.add_hole(rooms[opening.room].walls[opening.wall], box.walls[3])
         if twin is not None:
             drawing.add_hole(rooms[twin.room].walls[twin.wall], box.walls[1])
@@ -77,10 +77,10 @@ def build_annotation(plan: FloorPlan, openings: Sequence[Opening]) -> dict[str, 
         drawing.semantic(kind, [box.floor, box.ceiling, *box.walls])
     outside = [room.shape.buffer(_OUTER_WALL_M, join_style="mitre") for room in plan.rooms]
     walls = []
-    # On a grid of millimetres no edge is so short that it has no direction.
+    # A grid of millimetres avoids edges too short to have a direction.
     for part in shapely.get_parts(shapely.union_all(outside, grid_size=1.0 / _MM_PER_M)):
         ring_m = np.array(part.exterior.coords)[:-1]
-        # Clockwise, so that the empty space is around it.
+        # Clockwise, because the empty space is outside.
         ring_m = ring_m[::-1] if part.exterior.is_ccw else ring_m
         walls += drawing.prism(ring_m, 0.0, float(plan.ceiling_heights_m.max()), is_open=True).walls
     drawing.semantic("outwall", walls)
@@ -88,7 +88,7 @@ def build_annotation(plan: FloorPlan, openings: Sequence[Opening]) -> dict[str, 
 
 
 def write_camera(panorama: Path, room: Room, position_m: Float[np.ndarray, "2"], camera_height_m: float) -> None:
-    """Write where a room's panoramas were taken, and where its corners are in them."""
+    """Write the camera position of a room's panoramas, and the pixels of the room's corners."""
     x_mm, y_mm, z_mm = (_MM_PER_M * float(value) for value in (*position_m, camera_height_m))
     (panorama / "camera_xyz.txt").write_text(f"{x_mm!r} {y_mm!r} {z_mm!r}\n", encoding="ascii")
     lines = [f"{x:.3f} {y:.3f}\n" for x, y in layout_pixels(room, position_m, camera_height_m).tolist()]
@@ -96,13 +96,13 @@ def write_camera(panorama: Path, room: Room, position_m: Float[np.ndarray, "2"],
 
 
 def layout_pixels(room: Room, position_m: Float[np.ndarray, "2"], camera_height_m: float) -> Float[np.ndarray, "n 2"]:
-    """Pixels (x, y) of a room's corners that its camera sees, in a panorama of the data set's own size and heading 0.
+    """Return the pixels (x, y) of a room's visible corners in a panorama of `PANORAMA_SIZE` with heading 0.
 
     Returns:
-        ceiling and floor alternating, from left to right.
+        Ceiling and floor corners alternating, from left to right.
     """
     height, width = PANORAMA_SIZE
-    # Corners lie on the outline, so that a ray to one may leave the room by rounding.
+    # Corners lie on the outline, so a ray to a corner may leave the room by rounding.
     shape = room.shape.buffer(1e-6)
     rays = shapely.linestrings(np.stack([np.broadcast_to(position_m, room.polygon_m.shape), room.polygon_m], axis=1))
     offset = room.polygon_m[shapely.covers(shape, rays)] - position_m
@@ -120,14 +120,14 @@ def write_picture(path: Path, pixels: UInt8[np.ndarray, "h w 3"]) -> None:
 
 
 def write_depth(path: Path, depth_m: Float[np.ndarray, "h w"]) -> None:
-    """Write ranges as 16-bit PNG; those beyond 65.535 m become 0, "no reading"."""
+    """Write ranges as 16-bit PNG; ranges above 65.535 m become 0, "no reading"."""
     depth_mm = np.rint(depth_m * _MM_PER_M)
     seen = np.isfinite(depth_mm) & (depth_mm <= _MAX_DEPTH_MM)
     Image.fromarray(np.where(seen, depth_mm, 0.0).astype(np.uint16)).save(path, compress_level=_PNG_COMPRESSION)
 
 
 class _Prism(NamedTuple):
-    """Numbers of the planes of a prism; wall k belongs to edge k, floor and ceiling are -1 where it has none."""
+    """Indices of a prism's planes; wall k belongs to edge k, and a missing floor or ceiling is -1."""
 
     floor: int
     ceiling: int
@@ -136,7 +136,7 @@ class _Prism(NamedTuple):
 
 @dataclass
 class _Drawing:
-    """Junctions, lines and planes as they are drawn; every line and plane knows its parts by number."""
+    """Junctions, lines, planes and semantics; lines and planes reference their parts by index."""
 
     junctions_mm: list[tuple[float, float, float]] = field(default_factory=list)
     lines: list[tuple[int, int]] = field(default_factory=list)
@@ -146,7 +146,7 @@ class _Drawing:
     def prism(
         self, polygon_m: Float[np.ndarray, "n 2"], floor_m: float, ceiling_m: float, *, is_open: bool = False
     ) -> _Prism:
-        """A vertical prism that is empty to the left of its edges; `is_open`: without floor and ceiling."""
+        """Add a vertical prism, empty to the left of its edges; an open one has no floor and ceiling."""
         below, above = ([self._junction(x, y, z) for x, y in polygon_m.tolist()] for z in (floor_m, ceiling_m))
         floor, ceiling = self._ring(below), self._ring(above)
         uprights = [self._line(*ends) for ends in zip(below, above, strict=True)]
@@ -164,7 +164,7 @@ class _Drawing:
         return _Prism(*caps, walls)
 
     def add_hole(self, wall: int, face: int) -> None:
-        """Draw the outline of a plane on a wall that it lies in."""
+        """Add the outline of a plane to the wall that contains it."""
         self.planes[wall][2].extend(self.planes[face][2][:4])
 
     def semantic(self, kind: str, planes: list[int]) -> None:
@@ -216,21 +216,21 @@ class _Drawing:
 
 
 def _ends_m(plan: FloorPlan, opening: Opening) -> Float[np.ndarray, "2 2"]:
-    """Where an opening begins and ends along its wall."""
+    """Return both ends of an opening on its wall."""
     wall = plan.rooms[opening.room].walls_m[opening.wall]
     along = (wall[2:] - wall[:2]) / np.hypot(*(wall[2:] - wall[:2]))
     return wall[:2] + np.array([[opening.start_m], [opening.end_m]]) * along
 
 
 def _twin(plan: FloorPlan, openings: Sequence[Opening], opening: Opening) -> Opening | None:
-    """The same door as the room behind it has it; None where no room of the plan is behind it."""
-    facing = [other for other in openings if (other.room, other.neighbour) == (opening.neighbour, opening.room)]
+    """Return the same door in the room behind it; None if there is no room behind it."""
+    facing = [twin for twin in openings if (twin.room, twin.neighbour) == (opening.neighbour, opening.room)]
     middle = _ends_m(plan, opening).mean(axis=0)
-    return min(facing, key=lambda other: float(np.hypot(*(_ends_m(plan, other).mean(axis=0) - middle))), default=None)
+    return min(facing, key=lambda twin: float(np.hypot(*(_ends_m(plan, twin).mean(axis=0) - middle))), default=None)
 
 
 def _far_side_m(plan: FloorPlan, opening: Opening, twin: Opening | None) -> Float[np.ndarray, "2 2"]:
-    """The other end of an opening's box, beside each of the opening's own ends."""
+    """Return the far ends of an opening's box, in the order of the near ends."""
     if twin is not None:
         return _ends_m(plan, twin)[::-1]
     near = _ends_m(plan, opening)

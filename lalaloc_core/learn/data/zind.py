@@ -4,9 +4,9 @@
     ROOT/<home>/zind_data.json
     ROOT/<home>/panos/floor_01_partial_room_01_pano_15.jpg
 
-A scene is one floor of a home, "0000/floor_01". ZInD's frame is mirrored: a point (x, y) is seen at the image azimuth
-atan2(-x, y). Negating every x gives the plan frame, and turns the sense of rotations too: ZInD's counter-clockwise
-`rotation` of a panorama becomes its heading as it stands.
+A scene is one floor of a home, "0000/floor_01". ZInD's frame is mirrored: a point (x, y) appears at the image azimuth
+atan2(-x, y). Negating x gives the plan frame and reverses rotations, so ZInD's counter-clockwise `rotation` of a
+panorama equals its heading.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from jaxtyping import Float
 from lalaloc_core.conventions import heading_from_degrees
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan, room_type_from_label
-from lalaloc_core.learn.data.assembly import RoomOutline, assemble_plan, inside, is_number, pose_fault, read_json
+from lalaloc_core.learn.data.assembly import RoomOutline, assemble_plan, is_number, path_below, pose_fault, read_json
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene, Split
 from lalaloc_core.learn.data.drawn_openings import DrawnOpening
 from lalaloc_core.learn.data.photographs import FilePhotograph
@@ -33,29 +33,35 @@ from lalaloc_core.learn.data.photographs import FilePhotograph
 DATA_FILE = "zind_data.json"
 PARTITION_FILE = "zind_partition.json"
 
-# The lists of a layout, and what their entries are in a plan.
+# Lists of a layout, and the kinds of their entries in a plan.
 _OPENING_LISTS = {"doors": "door", "openings": "passage", "windows": "window"}
 _PARTITION_KEYS: dict[Split, str] = {"train": "train", "validation": "val", "test": "test"}
 
 
 @dataclass(frozen=True)
 class Zind:
-    """A copy of ZInD, or of a part of it."""
+    """Copy of ZInD or a part of it.
+
+    Attributes:
+        root: folder of the homes.
+    """
 
     root: Path
 
     @property
     def description(self) -> str:
+        """Name of the data set in results."""
         return "ZInD"
 
     @property
     def appearances(self) -> Sequence[Appearance]:
+        """The only appearance, without furniture level."""
         return (Appearance(),)
 
     def scenes(self, split: Split) -> Sequence[str]:
-        """Every floor of a split's homes that are on disk, those without a metric scale included.
+        """Return all floors of a split's homes on disk, including those without a metric scale.
 
-        A home whose file cannot be read is listed by its name alone, so that loading it says why.
+        A home whose file cannot be read is listed by its name alone, so that loading it raises the error.
 
         Raises:
             DatasetError: the partition file is missing or damaged.
@@ -64,8 +70,9 @@ class Zind:
         return [name for home in homes if (self.root / home).is_dir() for name in self._floors_of(home)]
 
     def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
+        """Read a scene; see `Dataset.load`."""
         home, _, floor = name.partition("/")
-        folder = inside(self.root, home)
+        folder = path_below(self.root, home)
         if folder is None or "/" in floor:
             raise DatasetError("no such floor; names are like '0000/floor_01'", scene=name, path=self.root)
         reader = _FloorReader(name, floor, folder, read_json(folder / DATA_FILE, scene=name))
@@ -77,8 +84,8 @@ class Zind:
         document = read_json(path)
         for key, homes in document.items():
             if key not in _PARTITION_KEYS.values():
-                raise DatasetError(f"no split is called '{key}', only {', '.join(_PARTITION_KEYS.values())}", path=path)
-            if not isinstance(homes, list) or not all(isinstance(h, str) and inside(self.root, h) for h in homes):
+                raise DatasetError(f"unknown split '{key}'; known are {', '.join(_PARTITION_KEYS.values())}", path=path)
+            if not isinstance(homes, list) or not all(isinstance(h, str) and path_below(self.root, h) for h in homes):
                 raise DatasetError(f"'{key}' must be a list of the homes' names", path=path)
         return document
 
@@ -92,7 +99,7 @@ class Zind:
 
 @dataclass(frozen=True, kw_only=True)
 class _Panorama:
-    """One panorama of a floor: its place in the file, and what the file says of it."""
+    """Panorama of a floor: its room and name in the file, and its data."""
 
     complete_room: str
     name: str
@@ -100,7 +107,7 @@ class _Panorama:
 
 
 class _FloorReader:
-    """Reads one floor of a home."""
+    """Reader of one floor of a home."""
 
     def __init__(self, scene: str, floor: str, folder: Path, document: dict[str, Any]) -> None:
         self._scene, self._folder = scene, folder
@@ -109,12 +116,12 @@ class _FloorReader:
         if not isinstance(merger, dict) or not isinstance(scales, dict):
             raise self._error("'merger' and 'scale_meters_per_coordinate' must be objects")
         if not isinstance(merger.get(floor), dict):
-            raise self._error(f"no floor '{floor}', there are: {', '.join(sorted(merger)) or 'none'}")
+            raise self._error(f"no floor '{floor}'; available: {', '.join(sorted(merger)) or 'none'}")
         scale = scales.get(floor)
         if scale is None:
             raise self._error("the floor has no metric scale (scale_meters_per_coordinate is null)")
         if not is_number(scale) or not scale > 0.0:
-            raise self._error(f"scale_meters_per_coordinate is {scale!r}, it must be a number above 0")
+            raise self._error(f"scale_meters_per_coordinate is {scale!r}; it must be a number above 0")
         self._scale_m = float(scale)
         self._panoramas = list(self._walk(merger[floor]))
 
@@ -125,7 +132,7 @@ class _FloorReader:
         for panorama in self._panoramas:
             if panorama.complete_room not in outlines and panorama.data.get("is_primary") is True:
                 layout = panorama.data.get("layout_complete")
-                # Of small rooms seen from outside there may be none.
+                # Small rooms photographed from outside may have no layout.
                 if layout is not None:
                     outlines[panorama.complete_room] = self._outline(panorama, layout)
                     openings += self._openings(panorama, layout, faults)
@@ -160,7 +167,7 @@ class _FloorReader:
     def _outline(self, panorama: _Panorama, layout: Any) -> RoomOutline:
         vertices = layout.get("vertices") if isinstance(layout, dict) else None
         if not isinstance(vertices, list) or len(vertices) < 3:
-            raise self._error("layout_complete has no list of at least three 'vertices'", panorama.name)
+            raise self._error("layout_complete has no list 'vertices' of at least three points", panorama.name)
         polygon = np.array([self._pair(vertex, f"vertex {k}", panorama) for k, vertex in enumerate(vertices)])
         transform = self._transform(panorama)
         ceiling = self._number(panorama.data, "ceiling_height", panorama)
@@ -173,13 +180,13 @@ class _FloorReader:
         )
 
     def _openings(self, panorama: _Panorama, layout: Mapping[str, Any], faults: list[str]) -> Iterator[DrawnOpening]:
-        """Doors, passages and windows of a layout: lists of threes, both ends and the heights from the camera."""
+        """Yield doors, passages and windows of a layout: triples of both ends and the heights from the camera."""
         transform = self._transform(panorama)
         camera = self._number(panorama.data, "camera_height", panorama)
         for key, kind in _OPENING_LISTS.items():
             flat = layout.get(key, [])
             if not isinstance(flat, list) or len(flat) % 3:
-                faults.append(f"{panorama.name}: '{key}' is left out, it is no list of threes")
+                faults.append(f"{panorama.name}: '{key}' is left out; it is not a list of triples")
                 continue
             for number in range(0, len(flat), 3):
                 try:
@@ -187,7 +194,7 @@ class _FloorReader:
                         self._pair(flat[number + k], f"{key} {number // 3}", panorama) for k in range(3)
                     )
                 except DatasetError as error:
-                    faults.append(f"{panorama.name}: an entry of '{key}' is left out, {error.reason}")
+                    faults.append(f"{panorama.name}: an entry of '{key}' is left out; {error.reason}")
                     continue
                 yield DrawnOpening(
                     kind=kind,
@@ -211,9 +218,11 @@ class _FloorReader:
         if fault is not None:
             raise self._error(fault, panorama.name)
         image_path = panorama.data.get("image_path")
-        path = inside(self._folder, image_path) if isinstance(image_path, str) else None
+        path = path_below(self._folder, image_path) if isinstance(image_path, str) else None
         if path is None:
-            raise self._error(f"image_path is {image_path!r}, a path below the home's folder is needed", panorama.name)
+            raise self._error(
+                f"image_path is {image_path!r}; a path below the home's folder is required", panorama.name
+            )
         photograph = FilePhotograph(path=path, scene=self._scene, room=panorama.name)
         return Camera(
             name=panorama.name,
@@ -239,12 +248,12 @@ class _FloorReader:
         value = data.get(key)
         if not is_number(value) or (positive and not value > 0.0):
             limit = "a number above 0" if positive else "a number"
-            raise self._error(f"{key} is {value!r}, {limit} is needed", panorama.name)
+            raise self._error(f"{key} is {value!r}; it must be {limit}", panorama.name)
         return float(value)
 
     def _pair(self, value: Any, what: str, panorama: _Panorama) -> tuple[float, float]:
-        if not isinstance(value, list) or len(value) != 2 or not all(is_number(one) for one in value):
-            raise self._error(f"{what} is {str(value)[:80]}, two numbers are needed", panorama.name)
+        if not isinstance(value, list) or len(value) != 2 or not all(map(is_number, value)):
+            raise self._error(f"{what} is {str(value)[:80]}; it must be two numbers", panorama.name)
         return float(value[0]), float(value[1])
 
     def _object(self, value: Any, what: str) -> dict[str, Any]:
@@ -258,10 +267,10 @@ class _FloorReader:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class _Transform:
-    """From a panorama's own frame, in units of its camera's height, to the floor's frame and on to the plan's.
+    """Transform of a panorama's frame, in camera heights, to the floor's frame and the plan's.
 
     Attributes:
-        translation: of the camera, in the floor's coordinates.
+        translation: of the camera in floor coordinates.
         rotation_deg: counter-clockwise in the floor's mirrored frame.
         scale: floor coordinates per camera height.
         scale_m: metres per floor coordinate.
@@ -283,7 +292,7 @@ class _Transform:
         return heading_from_degrees(self.rotation_deg)
 
     def to_plan_m(self, points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-        """Points of the panorama's own frame in the plan frame."""
+        """Convert points of the panorama's frame to the plan frame."""
         angle = math.radians(self.rotation_deg)
         turn = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
         floor = self.scale * points @ turn.T + self.translation

@@ -1,7 +1,7 @@
-"""From trained weights to a model bundle.
+"""Export of trained weights to a model bundle.
 
-Begin with `run.py`, which takes the weights of a training run; `bundle_export.py` writes ONNX and safetensors, and
-compares them with torch.
+Begin with `run.py`, which exports a training run; `bundle_export.py` writes ONNX and safetensors files and compares
+them with torch.
 """
 
 from lalaloc_core.learn.export.bundle_export import PARITY_TOLERANCE, export_bundle

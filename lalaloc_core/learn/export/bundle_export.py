@@ -1,7 +1,7 @@
-"""Export trained encoders to a model bundle: ONNX for the service, safetensors for LPO and further training.
+"""Export of trained encoders to a model bundle: ONNX for the service, safetensors for LPO and further training.
 
-What ships is what is checked: weights are rounded to half precision first (storage only, arithmetic stays single),
-then exported, then the exported files are compared with torch on random layouts and panoramas.
+Weights are first rounded to half precision (storage only; arithmetic stays single), then exported. The exported files
+are compared with torch on random layouts and panoramas.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ from lalaloc_core.localise.bundle import (
     MANIFEST_NAME,
     Bundle,
     Manifest,
+    write_manifest,
 )
-from lalaloc_core.localise.bundle import write_manifest as _write_manifest
 from lalaloc_core.nets import ImageEncoder, LayoutEncoder, paper_encoders, ring_image_encoder, trunk
 from lalaloc_core.nets.decoder import LayoutDecoder
 from lalaloc_core.nets.image_encoder import TrunkImageEncoder
@@ -45,7 +45,7 @@ from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
 
 PARITY_TOLERANCE = 1e-4
 _PARITY_BATCH = 4
-# Smaller tensors (biases, normalisation statistics) keep single precision; they weigh nothing.
+# Smaller tensors (biases, normalisation statistics) keep single precision at negligible size.
 _HALF_FROM_ELEMENTS = 1024
 
 
@@ -60,13 +60,20 @@ def export_bundle(
     version: str,
     training: dict[str, Any] | None = None,
 ) -> Bundle:
-    """Write a bundle into `folder`, which is created or whose files of the same names are replaced.
+    """Write a bundle; networks are put into evaluation mode and their weights are rounded in place.
 
-    The networks are put into evaluation mode and their weights rounded in place. Without an image encoder the bundle
-    answers layout queries only.
+    Args:
+        folder: of the bundle; created, or its bundle files are replaced.
+        config: configuration of the run.
+        layout_encoder: trained layout encoder.
+        image_encoder: trained image encoder; without it the bundle answers layout queries only.
+        decoder: trained decoder, if any.
+        name: of the model.
+        version: of the model.
+        training: entries of the manifest's `training`.
 
     Raises:
-        ExportError: an exported network differs from torch by more than `PARITY_TOLERANCE`; `folder` is untouched.
+        ExportError: an exported network differs from torch by more than `PARITY_TOLERANCE`; `folder` is unchanged.
     """
     for module in filter(None, (layout_encoder, image_encoder, decoder)):
         module.cpu().eval().requires_grad_(False)
@@ -79,25 +86,25 @@ def export_bundle(
         if decoder is not None:
             _save_weights(decoder, work / DECODER_WEIGHTS)
         parity = _export_networks(work, config, layout_encoder, image_encoder)
-        told = {**(training or {}), "parity_max_abs_difference": parity}
-        manifest = _manifest(config, image_encoder, name, version, told)
+        training = {**(training or {}), "parity_max_abs_difference": parity}
+        manifest = _manifest(config, image_encoder, name, version, training)
         folder.mkdir(parents=True, exist_ok=True)
-        # Without its manifest nothing is a bundle, until all files are written.
-        for name in (MANIFEST_NAME, *BUNDLE_FILES):
-            # A bundle of another architecture may have left files that this one does not have.
-            (folder / name).unlink(missing_ok=True)
+        # The manifest goes first, so that an interrupted export leaves no valid bundle; files of another architecture
+        # go too.
+        for file in (MANIFEST_NAME, *BUNDLE_FILES):
+            (folder / file).unlink(missing_ok=True)
         for path in work.iterdir():
             (folder / path.name).write_bytes(path.read_bytes())
-    return _write_manifest(folder, manifest)
+    return write_manifest(folder, manifest)
 
 
-def export_again(
+def reexport_networks(
     bundle: Bundle, config: TrainConfig, layout_encoder: LayoutEncoder, image_encoder: ImageEncoder | None
 ) -> Bundle:
-    """Write the ONNX networks of a bundle anew, of its own weights; nothing else of it changes but its digest.
+    """Export the ONNX networks of a bundle again from its own weights; only they and the digests change.
 
     Raises:
-        ExportError: as of `export_bundle`; the bundle is untouched.
+        ExportError: an exported network differs from torch by more than `PARITY_TOLERANCE`; the bundle is unchanged.
     """
     with tempfile.TemporaryDirectory(prefix="lalaloc-export-") as scratch:
         work = Path(scratch)
@@ -107,13 +114,13 @@ def export_again(
         for path in work.iterdir():
             (bundle.folder / path.name).write_bytes(path.read_bytes())
     training = {**bundle.manifest.training, "parity_max_abs_difference": parity}
-    return _write_manifest(bundle.folder, dataclasses.replace(bundle.manifest, training=training))
+    return write_manifest(bundle.folder, dataclasses.replace(bundle.manifest, training=training))
 
 
 def _export_networks(
     work: Path, config: TrainConfig, layout_encoder: LayoutEncoder, image_encoder: ImageEncoder | None
 ) -> float:
-    """Export and compare every network; returns the largest difference found."""
+    """Export every network and compare it with torch; return the largest difference."""
     generator = torch.Generator().manual_seed(0)
 
     def heights(low: float, high: float) -> Tensor:
@@ -139,7 +146,7 @@ def _export_networks(
 
 
 class _RingOutputs(nn.Module):
-    """The image encoder's features as a plain tuple, which is what ONNX knows."""
+    """Image encoder with its features as a plain tuple, as ONNX requires."""
 
     def __init__(self, encoder: RingImageEncoder | TrunkImageEncoder) -> None:
         super().__init__()
@@ -147,17 +154,17 @@ class _RingOutputs(nn.Module):
 
     def forward(self, image: Tensor, camera_height_m: Tensor) -> tuple[Tensor, ...]:
         features = self.encoder(image, camera_height_m)
-        told = (features.ring, features.log_profile, features.log_scale)
-        seen = features.structure
-        if seen is None:
-            return told
-        return (*told, seen.opening_logits, seen.log_ceiling, seen.log_ceiling_scale, seen.room_type_logits)
+        outputs = (features.ring, features.log_profile, features.log_scale)
+        extra = features.structure
+        if extra is None:
+            return outputs
+        return (*outputs, extra.opening_logits, extra.log_ceiling, extra.log_ceiling_scale, extra.room_type_logits)
 
 
 def _export(path: Path, module: nn.Module, inputs: dict[str, Tensor], outputs: list[str]) -> float:
-    """Export one network with a dynamic batch, store it compactly, and compare it with torch."""
+    """Export one network with a dynamic batch, store it compactly, and return its largest difference from torch."""
     with warnings.catch_warnings():
-        # The exporter warns of its own internals, which no caller can act upon.
+        # The exporter warns about its own internals.
         warnings.simplefilter("ignore")
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)
         program = torch.onnx.export(
@@ -167,14 +174,14 @@ def _export(path: Path, module: nn.Module, inputs: dict[str, Tensor], outputs: l
             output_names=outputs,
             dynamic_shapes=tuple({0: torch.export.Dim("batch", min=1, max=4096)} for _ in inputs),
             dynamo=True,
-            # onnxruntime optimises when it loads; here weights must stay recognisable for half-precision storage.
+            # onnxruntime optimises on loading; unoptimised weights remain recognisable for half-precision storage.
             optimize=False,
             verbose=False,
         )
     assert program is not None
     model = program.model_proto
     _drop_traces(model)
-    _settle_types(model)
+    _resolve_cast_types(model)
     _store_in_half(model)
     content = model.SerializeToString()
     path.write_bytes(content)
@@ -182,10 +189,10 @@ def _export(path: Path, module: nn.Module, inputs: dict[str, Tensor], outputs: l
 
 
 def _parity(name: str, content: bytes, module: nn.Module, inputs: dict[str, Tensor], outputs: list[str]) -> float:
-    """Largest absolute difference between onnxruntime and torch.
+    """Return the largest absolute difference between onnxruntime and torch.
 
     Raises:
-        ExportError: it exceeds `PARITY_TOLERANCE`.
+        ExportError: the difference is not below `PARITY_TOLERANCE`.
     """
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
     actual = session.run(outputs, {key: value.numpy() for key, value in inputs.items()})
@@ -193,7 +200,7 @@ def _parity(name: str, content: bytes, module: nn.Module, inputs: dict[str, Tens
     expected = expected if isinstance(expected, tuple) else (expected,)
     difference = max(float(np.abs(a - e.numpy()).max()) for a, e in zip(actual, expected, strict=True))
     if not difference < PARITY_TOLERANCE:
-        raise ExportError(f"{name} differs from torch by {difference:.2e}, at most {PARITY_TOLERANCE:g} is allowed")
+        raise ExportError(f"{name} differs from torch by {difference:.2e}; the limit is {PARITY_TOLERANCE:g}")
     return difference
 
 
@@ -210,7 +217,7 @@ def _save_weights(module: nn.Module, path: Path) -> None:
 
 
 def _drop_traces(model: onnx.ModelProto) -> None:
-    """Remove the exporter's stack traces: they outweigh small networks and name paths of the exporting machine."""
+    """Remove the exporter's stack traces, which are large and contain paths of the exporting machine."""
     for part in (*model.graph.node, *model.graph.value_info, *model.graph.initializer, *model.graph.input):
         part.doc_string = ""
         del part.metadata_props[:]
@@ -218,10 +225,10 @@ def _drop_traces(model: onnx.ModelProto) -> None:
     del model.metadata_props[:]
 
 
-def _settle_types(model: onnx.ModelProto) -> None:
-    """Say of limits that are cast to the type of a map what that type is: single precision, as everywhere here.
+def _resolve_cast_types(model: onnx.ModelProto) -> None:
+    """Replace casts to another tensor's type with casts to single precision, the only type in these networks.
 
-    Otherwise they depend on the map, and onnxruntime cannot clip it while it convolves, but does so afterwards.
+    Otherwise clipping limits depend on the clipped tensor, and onnxruntime cannot fuse clipping with convolution.
     """
     for node in model.graph.node:
         if node.op_type == "CastLike":
@@ -231,7 +238,7 @@ def _settle_types(model: onnx.ModelProto) -> None:
 
 
 def _store_in_half(model: onnx.ModelProto) -> None:
-    """Store large weights as half precision with a cast in front, which onnxruntime folds away when it loads."""
+    """Store large weights in half precision, each with a cast that onnxruntime folds on loading."""
     casts = []
     for tensor in model.graph.initializer:
         values = onnx.numpy_helper.to_array(tensor)
@@ -239,7 +246,7 @@ def _store_in_half(model: onnx.ModelProto) -> None:
             continue
         half = values.astype(np.float16)
         if not np.array_equal(half.astype(np.float32), values):
-            # Not one of the rounded parameters but a constant of the graph: leave it exact.
+            # A constant of the graph, not a rounded parameter, stays exact.
             continue
         name = tensor.name
         tensor.CopyFrom(onnx.numpy_helper.from_array(half, name + ".half"))

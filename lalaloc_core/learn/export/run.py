@@ -1,22 +1,22 @@
-"""The export of a training run: the weights that its stages left, as one model bundle."""
+"""Export of a training run, or of an existing bundle's weights, to a model bundle."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
-from lalaloc_core.learn.export.bundle_export import export_again, export_bundle
-from lalaloc_core.learn.training.best import best_path
-from lalaloc_core.learn.training.checkpoint import Checkpoint
+from lalaloc_core.learn.export.bundle_export import export_bundle, reexport_networks
+from lalaloc_core.learn.training.checkpoint import Checkpoint, best_path
 from lalaloc_core.learn.training.stages import build_image_encoder
-from lalaloc_core.learn.training.trained_networks import load_decoder_of, load_layout_encoder_of
 from lalaloc_core.learn.training.warm_start import (
     JOINT,
+    bundle_weights,
     check_same_networks,
-    checkpoint_with,
-    panoramas,
-    totals,
-    weights_of_bundle,
+    find_checkpoint,
+    load_trained_decoder,
+    load_trained_layout_encoder,
+    panorama_count,
+    training_totals,
 )
 from lalaloc_core.localise.bundle import IMAGE_WEIGHTS, LAYOUT_WEIGHTS, Bundle
 from lalaloc_core.nets import load_layout_encoder
@@ -33,63 +33,68 @@ def export_run(
     layout_only: bool = False,
     last: bool = False,
 ) -> Bundle:
-    """Export what training left in `folder` to a bundle at `out`, with the decoder where one was trained.
+    """Export a training run to a bundle, with its decoder if it has one.
 
     Args:
-        layout_from: folder of the run whose layout encoder the image encoder was trained against; default: `folder`.
-        layout_only: there is no image encoder, and the bundle answers layout queries only.
-        last: take the last weights of the run, not the best by validation. Of two stages this is the second: it has
-            learnt to follow the best layout encoder.
+        folder: of the run.
+        out: folder of the bundle.
+        name: of the model.
+        version: of the model.
+        notes: additional entries of the manifest's `training`.
+        layout_from: run folder of the layout encoder used as teacher; default: `folder`.
+        layout_only: export no image encoder; the bundle answers layout queries only.
+        last: export the last weights instead of the best by validation. With two stages this applies to the image
+            encoder, because its teacher was the best layout encoder.
 
     Raises:
-        CheckpointError: a stage has not run there, or the branches do not belong together.
+        CheckpointError: a stage has no checkpoint, or the branches have different networks.
         ExportError: the exported networks differ from torch.
     """
     teacher = layout_from or folder
-    # Branches that were trained together are taken from one moment.
+    # Branches trained together are exported from the same step.
     last_layout = last and (layout_only or (teacher / f"{JOINT}.pt").exists())
-    layout = checkpoint_with("layout", teacher, last=last_layout)
-    image = None if layout_only else checkpoint_with("image", folder, last=last)
+    layout = find_checkpoint("layout", teacher, last=last_layout)
+    image = None if layout_only else find_checkpoint("image", folder, last=last)
     training: dict[str, Any] = {layout.stage: _summary(layout, teacher, last=last_layout)}
     image_encoder = None
     if image is not None:
         check_same_networks("layout", image.config, layout.config, str(teacher))
         image_encoder = build_image_encoder(image.config)
         image_encoder.load_state_dict(image.inference_weights["image_encoder"])
-        training[image.stage] = {**_summary(image, folder, last=last), "panoramas": panoramas(image)}
+        training[image.stage] = {**_summary(image, folder, last=last), "panoramas": panorama_count(image)}
     return export_bundle(
         out,
         (image or layout).config,
-        load_layout_encoder_of(teacher, last=last_layout),
+        load_trained_layout_encoder(teacher, last=last_layout),
         image_encoder,
-        load_decoder_of(teacher, last=last_layout),
+        load_trained_decoder(teacher, last=last_layout),
         name=name,
         version=version,
         training={**training, **(notes or {})},
     )
 
 
-def export_bundle_again(folder: Path) -> Bundle:
-    """Write the ONNX networks of the bundle in `folder` anew, where the exporter has learnt something since.
+def reexport_bundle(folder: Path) -> Bundle:
+    """Export the ONNX networks of the bundle in `folder` again, for example after the exporter has improved.
 
     Raises:
-        BundleError: there is none, or it is damaged.
+        BundleError: there is no bundle, or it is damaged.
         ExportError: the exported networks differ from torch; the bundle is untouched.
     """
     bundle = Bundle.open(folder)
     bundle.check()
     manifest, image_encoder = bundle.manifest, None
     stage = "image" if IMAGE_WEIGHTS in manifest.files else "layout"
-    found = weights_of_bundle(bundle, stage)
+    start = bundle_weights(bundle, stage)
     if stage == "image":
-        image_encoder = build_image_encoder(found.checkpoint.config)
-        found.load_into({"image_encoder": image_encoder})
+        image_encoder = build_image_encoder(start.checkpoint.config)
+        start.load_into({"image_encoder": image_encoder})
     layout_encoder = load_layout_encoder(manifest.architecture, manifest.layout_config, bundle.read(LAYOUT_WEIGHTS))
-    return export_again(bundle, found.checkpoint.config, layout_encoder, image_encoder)
+    return reexport_networks(bundle, start.checkpoint.config, layout_encoder, image_encoder)
 
 
 def _summary(checkpoint: Checkpoint, folder: Path, *, last: bool) -> dict[str, Any]:
-    """What a manifest says of a stage; steps and minutes are those until the chosen checkpoint."""
+    """Return the manifest entry of a stage; steps and minutes are those of the exported checkpoint."""
     summary: dict[str, Any] = {"steps": checkpoint.step, "minutes": round(checkpoint.seconds / 60.0, 1)}
     summary |= checkpoint.metrics
     path = folder / f"{checkpoint.stage}.pt"
@@ -99,5 +104,5 @@ def _summary(checkpoint: Checkpoint, folder: Path, *, last: bool) -> dict[str, A
     if checkpoint.data:
         summary["data"] = checkpoint.data
     if checkpoint.begun_from:
-        summary |= {"begun_from": checkpoint.begun_from, **totals(checkpoint)}
+        summary |= {"begun_from": checkpoint.begun_from, **training_totals(checkpoint)}
     return summary

@@ -1,4 +1,4 @@
-"""Endless streams of training batches, made in worker processes while the network trains."""
+"""Endless streams of training batches, built in worker processes while the network trains."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from lalaloc_core.conventions import OPENING_CLASSES, ROOM_TYPES, WALL_CODE
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.learn.training.batches import Batch, LoadFailure, Stream, non_empty, stacked, worker_share
+from lalaloc_core.learn.training.batches import Batch, LoadFailure, Stream, draw_visits, stack_rows, worker_share
 from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.deferred import DeferredBatch, DeferredBatcher, DeferredRow, DeferredScene, Row
 from lalaloc_core.learn.training.replay_buffer import ReplayBuffer
@@ -21,16 +21,16 @@ from lalaloc_core.learn.training.sources import Group, PanoramaSample, Source
 from lalaloc_core.render.layout import layout_view
 from lalaloc_core.render.sweep import profiles_at
 
-# Code of a class that is not known; losses pass over it.
+# Code of an unknown class; losses ignore it.
 UNKNOWN = -1
 
-_Drawn = TypeVar("_Drawn")
+_Item = TypeVar("_Item")
 _Packed = TypeVar("_Packed")
 
 
 @dataclass
 class LayoutBatches(Stream):
-    """Stage 1: triplets of layouts.
+    """Stage 1: stream of layout triplets.
 
     Each batch holds `profile_m` (anchors, 1 + neighbours, columns) with the anchor first, `camera_height_m` and
     `ceiling_height_m` of the same leading shape.
@@ -42,7 +42,7 @@ class LayoutBatches(Stream):
 
     def __iter__(self) -> Iterator[Batch | LoadFailure]:
         size = self.config.layout.homes_per_step * self.config.layout.anchors_per_home
-        return _batches(self._visit, stacked, self.source, size, self.first)
+        return _batches(self._visit, stack_rows, self.source, size, self.first)
 
     def _visit(self, visit: int) -> list[Row] | None:
         rng = self.source.rng(visit)
@@ -51,7 +51,7 @@ class LayoutBatches(Stream):
     def _row(self, group: Group, rng: np.random.Generator) -> Row:
         stage, turns = self.config.layout, self.config.turns
         size = len(group.position_m)
-        # One heading for all turns the whole plan; some negatives stand where positives do, at another heading.
+        # A common heading rotates the whole plan; some negatives are positions of positives at another heading.
         chosen, heading = np.arange(size), np.full(size, sample_heading(turns, rng))
         turned = int(stage.turned_share * stage.triplets.negatives)
         if turned:
@@ -72,14 +72,13 @@ class LayoutBatches(Stream):
 
 @dataclass
 class PanoramaBatches(Stream):
-    """Stage 2: panoramas with their layouts, turned and mirrored together.
+    """Stage 2: stream of panoramas with their layouts, rotated and mirrored together.
 
-    Each batch holds `image` (b, h, w, 3) uint8, `profile_m` (b, columns), `camera_height_m` (b) as it is given,
-    `ceiling_height_m` (b), and where a loss compares with neighbours, `neighbour_profile_m` (b, n, columns) and
-    `neighbour_ceiling_height_m` (b, n), which are turned and mirrored as their panorama is. With architecture `trunk`
-    there are `opening_kind` (b, columns) and `room_type` (b), codes of `conventions`, `UNKNOWN` where the plan says
-    nothing of it. From a source
-    whose rendering is deferred come `DeferredBatch`es.
+    Each batch holds `image` (b, h, w, 3) uint8, `profile_m` (b, columns), `camera_height_m` (b) with the configured
+    error, and `ceiling_height_m` (b). Batches with neighbours hold `neighbour_profile_m` (b, n, columns) and
+    `neighbour_ceiling_height_m` (b, n), rotated and mirrored like their panorama. With architecture `trunk` there are
+    `opening_kind` (b, columns) and `room_type` (b): codes of `conventions`, or `UNKNOWN`. Sources with deferred
+    rendering yield `DeferredBatch` instead.
     """
 
     config: TrainConfig
@@ -93,7 +92,7 @@ class PanoramaBatches(Stream):
         batcher = DeferredBatcher(stage.uses_per_panorama)
 
         def rendered(visit: int) -> list[Row] | None:
-            drawn = self._drawn(visit, replay)
+            drawn = self._draw(visit, replay)
             return [
                 row | {"image": turn.picture(sample.image)}
                 for sample, turn, row in drawn
@@ -102,7 +101,7 @@ class PanoramaBatches(Stream):
 
         def deferred(visit: int) -> list[DeferredRow] | None:
             rows = []
-            for sample, turn, row in self._drawn(visit, replay):
+            for sample, turn, row in self._draw(visit, replay):
                 assert isinstance(sample.image, DeferredScene)
                 if row is None:
                     batcher.drop(sample.image)
@@ -112,12 +111,12 @@ class PanoramaBatches(Stream):
 
         if self.source.deferred:
             return _batches(deferred, batcher.pack, self.source, stage.batch, self.first)
-        return _batches(rendered, stacked, self.source, stage.batch, self.first)
+        return _batches(rendered, stack_rows, self.source, stage.batch, self.first)
 
-    def _drawn(
+    def _draw(
         self, visit: int, replay: ReplayBuffer[PanoramaSample]
     ) -> list[tuple[PanoramaSample, Rotation, Row | None]]:
-        """What a visit shows, how it is turned, and the rest of its rows: None where there are no neighbours."""
+        """Draw the samples of a visit, their rotations and the rest of their rows; a row without neighbours is None."""
         rng = self.source.rng(visit)
         drawn = []
         for new in self.source.samples(visit, *self.config.image_size):
@@ -143,12 +142,12 @@ class PanoramaBatches(Stream):
             "ceiling_height_m": ceiling[0],
         }
         if self.config.architecture == "trunk":
-            row |= self._structure(sample, turn)
+            row |= self._classes(sample, turn)
         if self.neighbours:
             row |= {"neighbour_profile_m": profile[1:], "neighbour_ceiling_height_m": ceiling[1:]}
         return row
 
-    def _structure(self, sample: PanoramaSample, turn: Rotation) -> Row:
+    def _classes(self, sample: PanoramaSample, turn: Rotation) -> Row:
         room = sample.plan.rooms[sample.room_index]
         kind = opening_kinds(
             sample.plan,
@@ -159,7 +158,7 @@ class PanoramaBatches(Stream):
             self.config.profile_columns,
         )
         type_code = ROOM_TYPES.index(room.type)
-        # The first type is that of rooms of which the plan does not say.
+        # Code 0 stands for rooms without a type in the plan.
         return {"opening_kind": turn.profile(kind), "room_type": np.array(type_code or UNKNOWN)}
 
     def _height_error_m(self, rng: np.random.Generator) -> float:
@@ -175,9 +174,9 @@ def opening_kinds(
     camera_height_m: float,
     columns: int,
 ) -> Int[np.ndarray, "{columns}"]:
-    """Code of what a camera meets at each azimuth at eye height.
+    """Return the code of the wall or opening that a camera sees at each azimuth at eye height.
 
-    `UNKNOWN` for walls of a plan that does not claim to show all openings: there may be one that it leaves out.
+    Walls are `UNKNOWN` in a plan that does not claim to show all openings.
     """
     view = layout_view(
         position_m[None].astype(np.float32),
@@ -194,16 +193,16 @@ def opening_kinds(
 
 
 def _batches(
-    visit: Callable[[int], list[_Drawn] | None],
-    pack: Callable[[list[_Drawn]], _Packed],
+    visit: Callable[[int], list[_Item] | None],
+    pack: Callable[[list[_Item]], _Packed],
     source: Source,
     size: int,
     first: int,
 ) -> Iterator[_Packed | LoadFailure]:
-    """What the visits from number `first` on draw, `size` to a batch, with what could not be loaded in between."""
-    rows: list[_Drawn] = []
+    """Yield batches of `size` rows from the visits from number `first` on, and load failures in between."""
+    rows: list[_Item] = []
     try:
-        for drawn in non_empty(visit, first, source.patience):
+        for drawn in draw_visits(visit, first, source.patience):
             rows += drawn
             if len(rows) >= size:
                 yield from _failures(source)
@@ -215,6 +214,6 @@ def _batches(
 
 
 def _failures(source: Source) -> Iterator[LoadFailure]:
-    """What could not be loaded since the last time."""
+    """Yield the load failures since the last call."""
     yield from [LoadFailure(error, fatal=False) for error in source.problems]
     source.problems.clear()

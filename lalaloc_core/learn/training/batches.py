@@ -1,4 +1,4 @@
-"""Batches on their way from worker processes to the training loop, and what was left out on the way."""
+"""Loading of batches in worker processes, and reporting of files that could not be used."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ Batch = dict[str, torch.Tensor]
 
 @dataclass(frozen=True)
 class LoadFailure:
-    """A file that could not be used; `fatal` when training cannot go on without it."""
+    """A file that could not be used; `fatal` if training cannot continue without it."""
 
     error: DatasetError
     fatal: bool
 
 
-# Of batches, with pixels or without, and of trouble.
+# Yields batches, with or without pixels, and load failures.
 Stream = IterableDataset[Any]
 
 
 def worker_share() -> tuple[int, int]:
-    """(number, count) of the worker process this runs in."""
+    """Return (number, count) of the worker process that calls this."""
     info = get_worker_info()
     return (0, 1) if info is None else (info.id, info.num_workers)
 
 
-def non_empty(draw: Callable[[int], _Drawn | None], first: int, patience: int) -> Iterator[_Drawn]:
-    """What `draw` makes of this worker's share of the visits from number `first` on, without those that give nothing.
+def draw_visits(draw: Callable[[int], _Drawn | None], first: int, patience: int) -> Iterator[_Drawn]:
+    """Yield the results of `draw` for this worker's share of the visits from number `first` on, without None.
 
     Raises:
-        DatasetError: `patience` visits in a row gave nothing.
+        DatasetError: `patience` visits in a row returned None.
     """
     worker, workers = worker_share()
     empty = 0
@@ -54,38 +54,38 @@ def non_empty(draw: Callable[[int], _Drawn | None], first: int, patience: int) -
             continue
         empty += 1
         if empty >= patience:
-            raise DatasetError(f"{empty} scenes in a row gave nothing to train on: none is usable and large enough")
+            raise DatasetError(f"{empty} scenes in a row have no training sample: all are unusable or too small")
 
 
-def stacked(rows: list[dict[str, np.ndarray]]) -> Batch:
-    """Rows of a batch as tensors with a leading dimension."""
+def stack_rows(rows: list[dict[str, np.ndarray]]) -> Batch:
+    """Stack rows to a batch of tensors with a leading dimension."""
     return {key: torch.from_numpy(np.stack([row[key] for row in rows])) for key in rows[0]}
 
 
 def load_batches(stream: Stream, workers: int) -> Iterator[Any]:
-    """Batches from `workers` processes with one thread each; 0 makes them in this process.
+    """Yield batches from `workers` processes with one thread each; 0 makes them in this process.
 
-    What could not be used is logged with its number, once.
+    Each file that cannot be used is logged once, with a running number.
 
     Raises:
-        DatasetError: the data set has a fault that training may not pass over.
+        DatasetError: a file cannot be used and training must not skip it.
     """
     options: dict[str, Any] = {}
     if workers:
         options = {"multiprocessing_context": "spawn", "worker_init_fn": _single_thread, "prefetch_factor": 6}
-    yield from _loaded(DataLoader(stream, batch_size=None, num_workers=workers, **options))
+    yield from _without_failures(DataLoader(stream, batch_size=None, num_workers=workers, **options))
 
 
-def _loaded(items: Iterable[Any]) -> Iterator[Any]:
-    left_out: set[str] = set()
+def _without_failures(items: Iterable[Any]) -> Iterator[Any]:
+    skipped: set[str] = set()
     for item in items:
         if not isinstance(item, LoadFailure):
             yield item
         elif item.fatal:
             raise item.error
-        elif str(item.error) not in left_out:
-            left_out.add(str(item.error))
-            _LOG.warning("left out, number %d: %s", len(left_out), item.error)
+        elif str(item.error) not in skipped:
+            skipped.add(str(item.error))
+            _LOG.warning("skipped, number %d: %s", len(skipped), item.error)
 
 
 def _single_thread(_: int) -> None:

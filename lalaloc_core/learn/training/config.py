@@ -1,4 +1,4 @@
-"""Training configuration: frozen, typed, strict about unknown keys; it travels inside every checkpoint."""
+"""Training configuration: frozen, typed, strict about unknown keys; stored in every checkpoint."""
 
 from __future__ import annotations
 
@@ -17,22 +17,28 @@ from lalaloc_core.render.sampling import TripletSampling
 Architecture = Literal["ring", "trunk", "paper"]
 Turns = Literal["any", "quarters", "none"]
 _MAX_RAYS = 8
-_OF_TRUNK = ("pretrained", "opening_weight", "ceiling_weight", "room_type_weight", "photograph_weight")
-# Of the spread; errors are cut off at three times that, and no camera stands lower than a metre or so.
+_TRUNK_ONLY = ("pretrained", "opening_weight", "ceiling_weight", "room_type_weight", "photograph_weight")
+# Limit of the spread; errors are clipped at three times the spread, and cameras stand about 1 m high or more.
 _MAX_HEIGHT_ERROR_M = 0.2
 
 
 @dataclass(frozen=True, kw_only=True)
 class OptimiserConfig:
-    """Optimiser and learning-rate schedule; fractions are of the whole stage.
+    """Optimiser and learning-rate schedule; shares are of the whole stage.
 
     Attributes:
-        schedule: "cosine" falls to 1 % all the way; "steps" multiplies by `gamma` at each milestone; "trapezoid" stays
-            at the full rate and falls to 1 % at the end, as 1 - √, so that a run may be prolonged before it falls.
-        warmup: share in which the rate rises, from 5 %.
-        decay: share in which a trapezoid falls.
-        trunk_factor: the rate of a pretrained trunk in units of everything else's; the lower, the nearer it stays to
-            what it knew.
+        kind: AdamW, or SGD with momentum.
+        learning_rate: full rate.
+        weight_decay: L2 penalty; AdamW applies it to matrices only.
+        momentum: of SGD.
+        schedule: "cosine" decays to 1 % over the whole stage; "steps" multiplies by `gamma` at each milestone;
+            "trapezoid" keeps the full rate and decays to 1 % as 1 - √ at the end, so a run can be extended before.
+        warmup: share in which the rate rises from 5 %.
+        decay: share in which a trapezoid decays.
+        milestones: shares at which "steps" lowers the rate.
+        gamma: factor of "steps".
+        clip_norm: maximum norm of the gradient; 0 turns clipping off.
+        trunk_factor: factor on the learning rate of a pretrained trunk; lower values keep it closer to its weights.
     """
 
     kind: Literal["adamw", "sgd"] = "adamw"
@@ -53,16 +59,20 @@ class LayoutStageConfig:
     """Stage 1: the layout encoder alone, log-ratio and decoding losses (paper, section 3.1).
 
     Attributes:
-        minutes: wall-clock budget; when given, it and not `steps` sets the pace of the schedule.
-        all_pairs: compare every two neighbours of an anchor instead of positives with negatives only.
-        turned_share: share of the negatives replaced by positives' places seen at another heading.
-        log_ratio_weight: weight of the log-ratio loss; 0 leaves it out.
-        decode_weight: weight of the decoding loss; 0 leaves it, and the decoder, out.
-        decode_anchors_only: decode the anchors' latents alone; the decoder costs more than a small encoder.
-        cloud_rows, cloud_columns: sub-sampling of the layouts whose Chamfer distances are taken.
-        scale_weight: weight of the loss that fixes the global scale of latent distances, which the log-ratio
+        steps: number of updates.
+        minutes: wall-clock budget; replaces `steps` as the length of the schedule.
+        homes_per_step, anchors_per_home: size of a batch.
+        triplets: sampling of positives and negatives around an anchor.
+        all_pairs: compare all pairs of an anchor's neighbours instead of positives with negatives only.
+        turned_share: share of the negatives replaced by positions of positives at another heading.
+        log_ratio_weight: weight of the log-ratio loss; 0 turns it off.
+        decode_weight: weight of the decoding loss; 0 turns it off and removes the decoder.
+        decode_anchors_only: decode the anchors' latents only, because the decoder costs more than a small encoder.
+        scale_weight: weight of the loss that fixes the global scale of latent distances, which the log-ratio loss
             leaves free and which otherwise shrinks.
-        latent_per_metre: the latent distance that one metre of Chamfer distance should be worth.
+        latent_per_metre: target latent distance per metre of Chamfer distance.
+        cloud_rows, cloud_columns: resolution of the layouts compared by Chamfer distance.
+        optimiser: optimiser and schedule.
     """
 
     steps: int = 6000
@@ -86,40 +96,42 @@ class LayoutStageConfig:
 class ImageStageConfig:
     """Stage 2: the image encoder against the frozen layout encoder (paper, sections 3.2 and A.1.5).
 
-    End-to-end training, which is both stages at once, takes its schedule and the weight of its latent distance from
-    here as well, and everything else from `LayoutStageConfig`.
+    End-to-end training takes its schedule, batch and latent distance weight from here, and the rest from
+    `LayoutStageConfig`.
 
     Attributes:
-        minutes: wall-clock budget; when given, it and not `steps` sets the pace of the schedule.
-        by_room_share: share of the panoramas drawn evenly over rooms instead of over the floor, so that closets and
-            corridors are seen often enough.
-        supersample: rays per pixel along (rows, columns) of generated panoramas; may be changed when a run resumes.
-        uses_per_panorama: how often a panorama is learnt from, each time turned and mirrored anew; 1 never repeats.
-        replay_panoramas: how many wait for their next use, over all worker processes; the more, the farther apart
-            are the uses of one.
+        steps: number of updates.
+        minutes: wall-clock budget; replaces `steps` as the length of the schedule.
+        batch: panoramas per update.
+        shots_per_home: panoramas drawn from one home.
+        by_room_share: share of the panoramas drawn uniformly over rooms instead of over the floor area, so that small
+            rooms occur often enough.
+        supersample: rays per pixel along (rows, columns) of generated panoramas; may change when a run resumes.
+        uses_per_panorama: number of times a panorama is used, each time with a new rotation and mirroring.
+        replay_panoramas: panoramas waiting for their next use, over all workers; more of them separate repeated uses.
         photometric: strength, 0 to 1, of random changes of exposure, contrast and colours.
-        camera_height_error_m: spread (normal) of the error of the camera heights that the networks are told. Targets
-            are the true walls at the told height, because that is what a query is compared with: the grid is embedded
-            at the told height as well.
-        l2_weight: weight of the latent distance, the paper's choice; 0 leaves it out.
+        camera_height_error_m: standard deviation of the error of the camera heights given to the networks. Targets are
+            the true walls at the given height, because the pose grid of a query is embedded at that height too.
+        l2_weight: weight of the latent distance, the paper's choice; 0 turns it off.
         log_ratio_weight: weight of the log-ratio loss with the panorama as anchor and layouts as neighbours, drawn as
             in stage 1.
         kd_weight: weight of the same loss with the layout encoder's distances in place of the Chamfer distances.
-        ring_weight: weight of distilling ring features (architectures `ring` and `trunk`).
+        ring_weight: weight of ring feature distillation (architectures `ring` and `trunk`).
         profile_weight: weight of the Laplace likelihood of the wall profile (architectures `ring` and `trunk`).
-        optics: strength, 0 to 1, of random changes by lens and file: blur, vignetting, seams, tone curves, JPEG.
-        pretrained: begin with the trunk's weights of ImageNet (architecture `trunk`).
-        opening_weight: weight of the cross entropy of what is met at each azimuth (architecture `trunk`, like the
-            following).
-        opening_balance: 0 lets every azimuth count alike in it, 1 every class, whatever its share of the azimuths.
-        ceiling_weight: weight of the Laplace likelihood of the ceiling's height.
-        room_type_weight: weight of the cross entropy of the room's type.
-        photograph_weight: weight of following a teacher's maps on photographs without labels, where there are any.
-        photograph_profile_weight: weight of following its lines of floor and ceiling on them.
-        photographs_per_batch: how many of them are added to each batch.
-        style_mixing: where there are photographs, share of a batch's pictures whose early features take on another's
-            style, every other time that of a photograph.
-        ema_decay: decay per step of the averaged weights that are validated and shipped; 0 turns it off.
+        optics: strength, 0 to 1, of random lens and file effects: blur, vignetting, seams, tone curves, JPEG.
+        pretrained: start with ImageNet weights of the trunk (architecture `trunk`).
+        opening_weight: weight of the cross entropy of the opening class at each azimuth (architecture `trunk`, like
+            all following settings but the last two).
+        opening_balance: 0 gives all azimuths the same weight in it, 1 all classes regardless of their share.
+        ceiling_weight: weight of the Laplace likelihood of the ceiling height.
+        room_type_weight: weight of the cross entropy of the room type.
+        photograph_weight: weight of a teacher's openings on unlabelled photographs.
+        photograph_profile_weight: weight of the teacher's walls on them.
+        photographs_per_batch: photographs added to each batch.
+        style_mixing: share of a batch whose early features take on another picture's style, every other time that of a
+            photograph; needs photographs.
+        ema_decay: decay per step of the averaged weights, which are validated and shipped; 0 turns averaging off.
+        optimiser: optimiser and schedule.
     """
 
     steps: int = 20000
@@ -153,11 +165,16 @@ class ImageStageConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainConfig:
-    """Everything that decides what is trained, but the data.
+    """All settings of a training run except its data.
 
     Attributes:
-        turns: the headings that layouts and panoramas are turned to: any, and mirrored or not; a multiple of a quarter
-            turn, and mirrored or not; or none but heading 0, which is enough for queries whose heading is known.
+        name: of the run.
+        architecture: `ring`, `trunk`, or the networks of the `paper`.
+        seed: of all random draws.
+        turns: headings of training layouts and panoramas: "any" and "quarters" (multiples of 90°) with random
+            mirroring, or "none", heading 0 only, which suffices for queries with known heading.
+        ring, trunk, paper: sizes of the networks; an architecture ignores the sizes of others.
+        layout, image: settings of the stages.
     """
 
     name: str
@@ -171,70 +188,72 @@ class TrainConfig:
     image: ImageStageConfig = field(default_factory=ImageStageConfig)
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be trained.
+        """Check the values that types cannot.
 
         Raises:
             ConfigError: names the key, its value and the limit.
         """
         for name, wanted in (("layout.cloud_columns", self.layout.cloud_columns), ("the decoder", DECODED_WIDTH)):
             if self.profile_columns % min(wanted, self.profile_columns):
-                raise ConfigError(f"{self.profile_columns} profile columns cannot be thinned to {wanted} ({name})")
+                raise ConfigError(
+                    f"profile_columns is {self.profile_columns}; it must be a multiple of {wanted} ({name})"
+                )
         if not self.layout.log_ratio_weight and not self.layout.decode_weight:
-            raise ConfigError("config.layout: log_ratio_weight and decode_weight are both 0, nothing is learnt")
+            raise ConfigError("config.layout: log_ratio_weight and decode_weight are both 0; set one above 0")
         image = self.image
         if not any((image.l2_weight, image.log_ratio_weight, image.kd_weight, image.ring_weight)):
-            raise ConfigError("config.image: the weights of all losses on the latent are 0, nothing is learnt")
+            raise ConfigError(
+                "config.image: l2_weight, log_ratio_weight, kd_weight and ring_weight are all 0; set one above 0"
+            )
         if len(image.supersample) != 2 or not all(1 <= rays <= _MAX_RAYS for rays in image.supersample):
-            raise ConfigError(f"config.image.supersample is {image.supersample}, it must be two of 1 to {_MAX_RAYS}")
-        for name in ("uses_per_panorama", "replay_panoramas"):
+            raise ConfigError(
+                f"config.image.supersample is {image.supersample}; it must be two numbers from 1 to {_MAX_RAYS}"
+            )
+        for name in ("uses_per_panorama", "replay_panoramas", "photographs_per_batch"):
             if getattr(image, name) < 1:
-                raise ConfigError(f"config.image.{name} is {getattr(image, name)}, it must be at least 1")
+                raise ConfigError(f"config.image.{name} is {getattr(image, name)}; the minimum is 1")
         for name in ("photometric", "optics", "opening_balance"):
             if not 0.0 <= getattr(image, name) <= 1.0:
-                raise ConfigError(f"config.image.{name} is {getattr(image, name):g}, it must lie within 0 and 1")
+                raise ConfigError(f"config.image.{name} is {getattr(image, name):g}; it must lie between 0 and 1")
         if self.architecture != "trunk":
-            for name in _OF_TRUNK:
+            for name in _TRUNK_ONLY:
                 if getattr(image, name):
                     raise ConfigError(
-                        f"config.image.{name} is {getattr(image, name)}, but only architecture 'trunk' has what it is "
-                        f"for, and this is '{self.architecture}'"
+                        f"config.image.{name} is {getattr(image, name)}; architecture '{self.architecture}' needs "
+                        f"{False if name == 'pretrained' else 0}, only 'trunk' has this output"
                     )
-        if image.photographs_per_batch < 1:
-            raise ConfigError(
-                f"config.image.photographs_per_batch is {image.photographs_per_batch}, at least 1 is needed"
-            )
         if not 0.0 <= image.camera_height_error_m <= _MAX_HEIGHT_ERROR_M:
             raise ConfigError(
-                f"config.image.camera_height_error_m is {image.camera_height_error_m:g}, "
-                f"it must lie within 0 and {_MAX_HEIGHT_ERROR_M:g} m"
+                f"config.image.camera_height_error_m is {image.camera_height_error_m:g}; "
+                f"it must lie between 0 and {_MAX_HEIGHT_ERROR_M:g} m"
             )
         for part in ("layout", "image"):
             optimiser = getattr(self, part).optimiser
             if not 0.0 < optimiser.decay <= 1.0 - optimiser.warmup:
                 raise ConfigError(
-                    f"config.{part}.optimiser.decay is {optimiser.decay:g}, it must lie within 0 "
-                    f"and what the warm-up leaves, {1.0 - optimiser.warmup:g}"
+                    f"config.{part}.optimiser.decay is {optimiser.decay:g}; it must be above 0 and at most "
+                    f"1 - warmup, {1.0 - optimiser.warmup:g}"
                 )
         if self.layout.turned_share and self.turns != "any":
             raise ConfigError(
-                f"config.layout.turned_share is {self.layout.turned_share:g}, with turns other than 'any'"
+                f"config.layout.turned_share is {self.layout.turned_share:g}; it must be 0 unless turns is 'any'"
             )
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data, for checkpoints and manifests."""
+        """Return plain data for checkpoints and manifests."""
         return dataclasses.asdict(self)
 
     @classmethod
     def from_dict(cls, raw: dict[str, Any]) -> TrainConfig:
-        """Rebuild strictly.
+        """Build a configuration from plain data, refusing unknown keys.
 
         Raises:
-            ConfigError: an unknown key or a value of the wrong type, named with its path.
+            ConfigError: an unknown key or a value of the wrong type; names its path.
         """
         return build_config(cls, raw, path="config")
 
     def with_settings(self, settings: dict[str, Any]) -> TrainConfig:
-        """Replace single settings, each by its path such as "image.optimiser.learning_rate".
+        """Return a copy with some settings replaced, each by its path such as "image.optimiser.learning_rate".
 
         Raises:
             ConfigError: no such setting, or a value of the wrong type.
@@ -250,13 +269,13 @@ class TrainConfig:
         return self.from_dict(raw)
 
     def with_networks(self, *sizes: RingConfig | TrunkEncoderConfig | PaperConfig) -> TrainConfig:
-        """The same with other sizes of the networks that they are sizes of."""
+        """Return a copy with other network sizes, each assigned by its type."""
         names = {RingConfig: "ring", TrunkEncoderConfig: "trunk", PaperConfig: "paper"}
         return dataclasses.replace(self, **{names[type(part)]: part for part in sizes})
 
     @property
     def has_ring(self) -> bool:
-        """Whether both branches meet in features around the horizon."""
+        """True if both branches share features around the horizon."""
         return self.architecture != "paper"
 
     @property

@@ -1,4 +1,4 @@
-"""Where training and its validation get their scenes from: a data set, or the generator."""
+"""Scenes of training and validation, from a data set or the generator."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torch import nn
 from lalaloc_core.errors import ConfigError, DatasetError
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Dataset, Scene, load_scenes
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes, RenderedPhotograph
-from lalaloc_core.learn.training.best import Validate
+from lalaloc_core.learn.training.checkpoint import Validate
 from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.photographs import Photographs, load_photographs
 from lalaloc_core.learn.training.sources import GeneratedSource, SceneSource, Source
@@ -26,18 +26,18 @@ _SHOTS_PER_HOME = 4
 
 @dataclass(frozen=True, kw_only=True)
 class TrainingData:
-    """What to train on.
+    """Data of a training run.
 
     Attributes:
-        dataset: None draws homes with the generator, without touching disk.
-        skip_bad: pass over files of the data set that cannot be used, naming each once.
-        textures: folder of material pictures for the generator; without it all are procedural.
-        validation_scenes: at most this many, spread evenly over the split.
-        deferred: the generator's panoramas are rendered on the device that trains, not where homes are made.
-        heldout: scenes that are nothing like those trained on; image validation reports those of their validation
-            split as well, and nothing is chosen by them.
-        photographs: folder of panoramas without labels that the image stage learns from as well.
-        segmenter: what tells doors and windows in them, see `training.photographs`.
+        dataset: data set; None draws homes with the generator, without touching disk.
+        skip_bad: skip files of the data set that cannot be used, logging each once.
+        textures: folder of material pictures for the generator; None makes all materials procedural.
+        deferred: render the generator's panoramas on the training device instead of in the workers.
+        validation_scenes: maximum number of validation scenes, spread evenly over the split.
+        heldout: out-of-distribution scenes; image validation reports their validation split too, but no choice depends
+            on it.
+        photographs: folder of unlabelled panoramas for the image stage.
+        segmenter: TensorFlow Lite file that predicts their walls and openings, see `training.segmenter`.
     """
 
     dataset: Dataset | None = None
@@ -50,31 +50,31 @@ class TrainingData:
     segmenter: Path | None = None
 
     def source(self, config: TrainConfig) -> Source:
-        """What training looks at."""
+        """Create the source of training scenes."""
         if self.dataset is None:
             return GeneratedSource(config, self.textures, self.deferred)
         return SceneSource(config, self.dataset, self.skip_bad)
 
     def load_photographs(self, config: TrainConfig) -> Photographs | None:
-        """The photographs with what the segmenter sees in them; None where none are to be learnt from.
+        """Load the photographs with the segmenter's predictions; None if there are no photographs.
 
         Raises:
-            ConfigError: photographs without a segmenter or the reverse, an architecture that tells no openings, or a
+            ConfigError: photographs without a segmenter or the reverse, an architecture without openings, or a
                 segmenter that cannot be run.
             DatasetError: a photograph cannot be read.
         """
         if self.photographs is None and self.segmenter is None:
             return None
         if self.photographs is None or self.segmenter is None:
-            raise ConfigError("photographs and their teacher are given together or not at all")
+            raise ConfigError("--photographs and --teacher must be given together")
         if config.architecture != "trunk":
             raise ConfigError(
-                f"architecture '{config.architecture}' tells no openings, it cannot learn from photographs"
+                f"architecture '{config.architecture}' predicts no openings; --photographs needs architecture 'trunk'"
             )
         return load_photographs(self.photographs, self.segmenter, *config.image_size)
 
     def validation(self, config: TrainConfig) -> list[Scene]:
-        """Validation scenes, none where the data set has none.
+        """Load the validation scenes; empty if the data set has none.
 
         Raises:
             DatasetError: a scene cannot be used and `skip_bad` is off.
@@ -103,10 +103,14 @@ class TrainingData:
         device: torch.device,
         folder: Path | None = None,
     ) -> Validate:
-        """Panorama queries in those scenes, asked in the data set's usual look; see `ImageValidation`.
+        """Create the validation with panorama queries, in the data set's usual appearance.
 
         Args:
-            folder: where to keep pictures that were rendered.
+            config: of the run.
+            scenes: validation scenes.
+            layout_encoder: frozen teacher; None uses the one being trained.
+            device: to run on.
+            folder: caches rendered panoramas; None caches nothing.
 
         Raises:
             DatasetError: a photograph cannot be read and `skip_bad` is off.
@@ -114,11 +118,11 @@ class TrainingData:
         usual = None if self.dataset is None else self.dataset.appearances[0]
         problems: list[DatasetError] | None = [] if self.skip_bad else None
         cache = folder / "validation.npz" if folder is not None and self.dataset is None else None
-        familiar = ImageValidation(config, scenes, layout_encoder, device, usual, problems, cache=cache)
+        validation = ImageValidation(config, scenes, layout_encoder, device, usual, problems, cache=cache)
         _log(problems)
         if self.heldout is None:
-            return familiar
-        others = ImageValidation(
+            return validation
+        heldout = ImageValidation(
             config,
             list(load_scenes(self.heldout, self.heldout.scenes("validation"))),
             layout_encoder,
@@ -127,16 +131,16 @@ class TrainingData:
             prefix="heldout",
             cache=None if folder is None else folder / "heldout.npz",
         )
-        return lambda modules: familiar(modules) | others(modules)
+        return lambda modules: validation(modules) | heldout(modules)
 
 
 def _log(problems: list[DatasetError] | None) -> None:
     for number, problem in enumerate(problems or [], start=1):
-        _LOG.warning("left out of validation, number %d: %s", number, problem)
+        _LOG.warning("skipped in validation, number %d: %s", number, problem)
 
 
 def _with_levels(scene: Scene) -> Scene:
-    """A generated scene whose photographs say how full the rooms were drawn."""
+    """Add the drawn furniture level to the appearances of a generated scene."""
 
     def with_level(camera: Camera) -> Camera:
         photographs = {

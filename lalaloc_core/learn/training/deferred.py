@@ -1,8 +1,8 @@
-"""Deferred rendering: worker processes build scenes and the training device renders them; scenes travel, not pixels.
+"""Deferred rendering: worker processes send scenes instead of pixels, and the training device renders them.
 
-A worker builds homes and scenes, which is Python, and decides what every row of a batch shows: which scene, how far
-rolled, mirrored or not. The device renders each scene once, when it first comes up, caches the picture until its last
-use, and turns whole batches at once. A scene has some 15 kB, its panorama six times as much.
+A worker builds homes and scenes in Python and decides for every row of a batch which scene it shows, its rotation and
+its mirroring. The device renders each scene at its first use, caches the panorama until its last use, and rotates whole
+batches at once. A scene has about 15 kB, its panorama six times as much.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer
 from lalaloc_core.learn.synth.scene.render_scene import RenderScene
-from lalaloc_core.learn.training.batches import Batch, stacked
+from lalaloc_core.learn.training.batches import Batch, stack_rows
 from lalaloc_core.learn.training.rotation import Rotation
 
 Row = dict[str, np.ndarray]
@@ -25,7 +25,7 @@ Row = dict[str, np.ndarray]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class DeferredScene:
-    """A scene that is yet to be rendered, under a number of its own among all that are trained on."""
+    """A scene to be rendered later, with a number that is unique within the run."""
 
     number: int
     scene: RenderScene
@@ -33,7 +33,7 @@ class DeferredScene:
 
 @dataclass(frozen=True, eq=False)
 class DeferredRow:
-    """A row of a batch: the panorama to render, how it is turned, and everything else."""
+    """A row of a batch: the panorama to render, its rotation, and the other values."""
 
     deferred: DeferredScene
     turn: Rotation
@@ -46,11 +46,11 @@ class DeferredBatch:
 
     Attributes:
         rest: the batch without `image`.
-        number: which scene each row shows.
-        shift: by how many columns it is rolled to the right.
-        mirrored: whether it is mirrored after that.
-        scenes: those that come up for the first time, by number.
-        evicted: numbers that no later batch asks for.
+        number: scene of each row.
+        shift: columns by which each panorama is rolled to the right.
+        mirrored: panoramas mirrored after that.
+        scenes: scenes used for the first time, by number.
+        evicted: numbers of scenes that no later batch uses.
     """
 
     rest: Batch
@@ -62,7 +62,7 @@ class DeferredBatch:
 
 
 class DeferredBatcher:
-    """Packs rows into batches without pixels; every scene is used `uses` times in all."""
+    """Packer of rows into batches without pixels; every scene is used `uses` times in total."""
 
     def __init__(self, uses: int) -> None:
         self._uses = uses
@@ -71,18 +71,18 @@ class DeferredBatcher:
         self._evicted: list[int] = []
 
     def drop(self, deferred: DeferredScene) -> None:
-        """One use of a scene came to nothing."""
+        """Count one use of a scene that yields no row."""
         self._use(deferred.number)
 
     def pack(self, rows: list[DeferredRow]) -> DeferredBatch:
-        """A batch of rows; the scenes that it shows first travel with it."""
+        """Pack rows into a batch, with the scenes that it uses for the first time."""
         scenes = {row.deferred.number: row.deferred.scene for row in rows if row.deferred.number not in self._sent}
         self._sent |= scenes.keys()
         for row in rows:
             self._use(row.deferred.number)
         evicted, self._evicted = tuple(self._evicted), []
         return DeferredBatch(
-            rest=stacked([row.rest for row in rows]),
+            rest=stack_rows([row.rest for row in rows]),
             number=tuple(row.deferred.number for row in rows),
             shift=torch.tensor([row.turn.shift for row in rows]),
             mirrored=torch.tensor([row.turn.mirrored for row in rows]),
@@ -100,7 +100,7 @@ class DeferredBatcher:
 
 
 class DeferredRenderer:
-    """Turns batches without pixels into batches with panoramas, on the renderer's device."""
+    """Renderer of batches without pixels, on its own device."""
 
     def __init__(self, renderer: PanoramaRenderer) -> None:
         self._renderer = renderer
@@ -109,8 +109,8 @@ class DeferredRenderer:
     def __len__(self) -> int:
         return len(self._images)
 
-    def rendered(self, batches: Iterable[DeferredBatch]) -> Iterator[Batch]:
-        """Each batch with `image` (b, h, w, 3) uint8 on the device."""
+    def render_batches(self, batches: Iterable[DeferredBatch]) -> Iterator[Batch]:
+        """Yield each batch with `image` (b, h, w, 3) uint8 on the device."""
         for batch in batches:
             yield self._render(batch)
 
@@ -121,13 +121,13 @@ class DeferredRenderer:
         shown = torch.stack([self._images[number] for number in batch.number])
         for number in batch.evicted:
             del self._images[number]
-        return batch.rest | {"image": turned(shown, batch.shift, batch.mirrored)}
+        return batch.rest | {"image": rotate_images(shown, batch.shift, batch.mirrored)}
 
 
-def turned(
+def rotate_images(
     images: UInt8[Tensor, "b h w 3"], shift: Int[Tensor, "b"], mirrored: Bool[Tensor, "b"]
 ) -> UInt8[Tensor, "b h w 3"]:
-    """Panoramas, each rolled by `shift` columns to the right and then mirrored or not, as `Rotation.picture` does."""
+    """Roll each panorama by `shift` columns to the right, then mirror it if asked, like `Rotation.picture`."""
     width = images.shape[2]
     column = torch.arange(width, device=images.device)
     source = torch.where(mirrored.to(images.device)[:, None], width - 1 - column, column)

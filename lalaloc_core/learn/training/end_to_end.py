@@ -1,9 +1,8 @@
-"""Both branches at once, which the paper compares with its two stages (section 6, "End-to-End Training")."""
+"""End-to-end training of both branches, the paper's alternative to two stages (section 6, "End-to-End Training")."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
 
 from torch import Tensor, nn
 
@@ -11,9 +10,10 @@ from lalaloc_core.errors import ConfigError
 from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.batches import Batch
 from lalaloc_core.learn.training.config import ImageStageConfig, TrainConfig
-from lalaloc_core.learn.training.objective import LayoutObjective, anchors_with_neighbours
+from lalaloc_core.learn.training.layout_stage import LayoutObjective, anchors_with_neighbours
 from lalaloc_core.learn.training.sources import Source
 from lalaloc_core.learn.training.stages import (
+    TrainingStage,
     build_decoder,
     build_image_encoder,
     build_layout_encoder,
@@ -21,23 +21,24 @@ from lalaloc_core.learn.training.stages import (
 )
 
 
-class EndToEndStage:
-    """The layout branch learns as in stage 1; the image branch follows its latents, which get no gradient from that.
+class EndToEndStage(TrainingStage):
+    """Both branches at once: layouts as in stage 1, images against the layout latents, which get no image gradient.
 
     Raises:
-        ConfigError: an architecture whose branches share their head, or changed exposures, cannot be trained like that.
+        ConfigError: the architecture shares a head between its branches, or the configuration changes exposures.
     """
 
     name = "end-to-end"
-    teacher = None
 
     def __init__(self, config: TrainConfig, source: Source) -> None:
         if config.architecture != "paper":
-            raise ConfigError(f"config.architecture is '{config.architecture}', end-to-end training knows 'paper' only")
+            raise ConfigError(
+                f"config.architecture is '{config.architecture}'; end-to-end training supports 'paper' only"
+            )
         for name in ("photometric", "optics"):
             if getattr(config.image, name):
                 raise ConfigError(
-                    f"config.image.{name} is {getattr(config.image, name):g}, end-to-end training has none"
+                    f"config.image.{name} is {getattr(config.image, name):g}; end-to-end training needs 0"
                 )
         self.config = config
         self.source = source
@@ -50,21 +51,11 @@ class EndToEndStage:
 
     @property
     def settings(self) -> ImageStageConfig:
-        """Schedule, batch and the weight of the latent distance; the rest is in `config.layout`."""
+        """Schedule, batch and weight of the latent distance; `config.layout` has the rest."""
         return self.config.image
 
-    @property
-    def ema_decay(self) -> float:
-        """Decay per step of the averaged weights."""
-        return self.settings.ema_decay
-
-    @property
-    def data(self) -> dict[str, Any]:
-        """What is trained on."""
-        return self.source.data
-
     def batches(self, first_step: int, workers: int) -> Iterator[Batch]:
-        """Panorama batches with neighbours."""
+        """Yield panorama batches with neighbours."""
         return panorama_batches(
             self.config,
             self.source,
@@ -75,7 +66,7 @@ class EndToEndStage:
         )
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
-        """Weighted losses of a batch by name; their sum is minimised."""
+        """Return the weighted losses of a batch by name."""
         terms, latent = self.objective(anchors_with_neighbours(batch))
         distance = losses.l2(self.encoder(batch["image"]).float(), latent[:, 0].detach())
         return {**terms, "l2": self.settings.l2_weight * distance}

@@ -13,10 +13,10 @@ from lalaloc_core.learn.synth.augmentation.photometric import jittered, optics
 from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.batches import Batch
 from lalaloc_core.learn.training.config import ImageStageConfig, TrainConfig
-from lalaloc_core.learn.training.objective import anchors_with_neighbours, chamfer_to_anchors, embed
+from lalaloc_core.learn.training.layout_stage import anchors_with_neighbours, chamfer_to_anchors, embed
 from lalaloc_core.learn.training.photographs import Photographs
 from lalaloc_core.learn.training.sources import Source
-from lalaloc_core.learn.training.stages import build_image_encoder, panorama_batches
+from lalaloc_core.learn.training.stages import TrainingStage, build_image_encoder, panorama_batches
 from lalaloc_core.nets import LayoutEncoder
 from lalaloc_core.nets.image_encoder import TrunkImageEncoder
 from lalaloc_core.nets.image_features import ImageFeatures, StructureFeatures, first_rows
@@ -24,8 +24,8 @@ from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
 from lalaloc_core.nets.trunk import StyleMixing
 
 
-class ImageStage:
-    """Stage 2: the image encoder learns to give a panorama the latent of its bare layout; the teacher is frozen."""
+class ImageStage(TrainingStage):
+    """Stage 2: the image encoder learns to map a panorama to the latent of its bare layout; the teacher is frozen."""
 
     name = "image"
 
@@ -39,11 +39,16 @@ class ImageStage:
         self.config = config
         self.photographs = photographs
         self.source = source
-        self.teacher = layout_encoder.eval().requires_grad_(False)
+        self._layout_encoder = layout_encoder.eval().requires_grad_(False)
         self.encoder = build_image_encoder(config)
         self.modules: dict[str, nn.Module] = {"image_encoder": self.encoder}
         self._generators: dict[torch.device, torch.Generator] = {}
         self._first_step = 0
+
+    @property
+    def teacher(self) -> LayoutEncoder:
+        """Frozen layout encoder."""
+        return self._layout_encoder
 
     @property
     def settings(self) -> ImageStageConfig:
@@ -51,19 +56,14 @@ class ImageStage:
         return self.config.image
 
     @property
-    def ema_decay(self) -> float:
-        """Decay per step of the averaged weights."""
-        return self.settings.ema_decay
-
-    @property
     def data(self) -> dict[str, Any]:
-        """What is trained on."""
+        """Description of the training data."""
         if self.photographs is None:
             return self.source.data
         return {**self.source.data, "photographs": len(self.photographs.images)}
 
     def batches(self, first_step: int, workers: int) -> Iterator[Batch]:
-        """Panorama batches, see `panorama_batches`."""
+        """Yield panorama batches."""
         self._first_step, self._generators = first_step, {}
         return panorama_batches(
             self.config,
@@ -75,58 +75,60 @@ class ImageStage:
         )
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
-        """Weighted losses of a batch by name; their sum is minimised."""
+        """Return the weighted losses of a batch by name."""
         layout = (batch["profile_m"], batch["camera_height_m"], batch["ceiling_height_m"])
         stage, terms = self.settings, {}
         if isinstance(self.teacher, RingLayoutEncoder):
             with torch.no_grad():
                 ring = self.teacher.ring(*layout)
                 target = self.teacher.head(ring)
-            seen, photographed = self._encoded(batch)
-            latent = self.teacher.head(seen.ring)
-            if seen.structure is not None:
-                terms |= self._structural(seen.structure, batch)
-            terms |= photographed
+            features, photograph_terms = self._encode(batch)
+            latent = self.teacher.head(features.ring)
+            if features.structure is not None:
+                terms |= self._structure_losses(features.structure, batch)
+            terms |= photograph_terms
             if stage.ring_weight:
-                terms["ring"] = stage.ring_weight * losses.ring_distillation(seen.ring, ring)
+                terms["ring"] = stage.ring_weight * losses.ring_distillation(features.ring, ring)
             if stage.profile_weight:
-                likelihood = losses.laplace(seen.log_profile, seen.log_scale, batch["profile_m"])
+                likelihood = losses.laplace(features.log_profile, features.log_scale, batch["profile_m"])
                 terms["profile"] = stage.profile_weight * likelihood
         else:
             with torch.no_grad():
                 target = self.teacher(*layout)
-            latent = self.encoder(self._seen(batch["image"]))
+            latent = self.encoder(self._augment(batch["image"]))
         if stage.l2_weight:
             terms["l2"] = stage.l2_weight * losses.l2(latent, target)
         if stage.log_ratio_weight or stage.kd_weight:
-            terms |= self._relational(latent.float(), target.float(), batch)
+            terms |= self._distance_losses(latent.float(), target.float(), batch)
         return terms
 
-    def _encoded(self, batch: Batch) -> tuple[ImageFeatures, dict[str, Tensor]]:
-        """What the encoder says of a batch's panoramas, and the loss on photographs, which it sees along with them."""
+    def _encode(self, batch: Batch) -> tuple[ImageFeatures, dict[str, Tensor]]:
+        """Return the features of a batch's panoramas, and the loss on photographs encoded along with them."""
         stage, image, height = self.settings, batch["image"], batch["camera_height_m"]
         if self.photographs is None or not (stage.photograph_weight or stage.photograph_profile_weight):
-            return self.encoder(self._seen(image), height), {}
+            return self.encoder(self._augment(image), height), {}
         count, columns = stage.photographs_per_batch, self.config.profile_columns
-        others = self.photographs.draw(count, columns, self._randomness(torch.device("cpu")))
-        together = self._seen(torch.cat([image, others.images.to(image.device)]))
-        # How high real cameras stood is not known: what is told of photographs is in camera heights.
+        photographs = self.photographs.draw(count, columns, self._generator(torch.device("cpu")))
+        images = self._augment(torch.cat([image, photographs.images.to(image.device)]))
+        # The camera height of photographs is unknown, so their targets are in camera heights.
         heights = torch.cat([height, height.new_ones(count)])
-        seen = self.encoder(together, heights, self._styles(len(image), count, image.device))
-        assert seen.structure is not None
-        openings, log_distance = (told.to(image.device) for told in (others.openings, others.log_distance))
+        features = self.encoder(images, heights, self._styles(len(image), count, image.device))
+        assert features.structure is not None
+        openings, log_distance = (
+            target.to(image.device) for target in (photographs.openings, photographs.log_distance)
+        )
         real = slice(len(image), None)
-        logits = seen.structure.opening_logits[real]
-        maps = losses.followed_maps(logits, openings)
-        walls = losses.followed_walls(seen.log_profile[real], seen.log_scale[real], log_distance, logits)
-        followed = stage.photograph_weight * maps + stage.photograph_profile_weight * walls
-        return first_rows(seen, len(image)), {"photographs": followed}
+        logits = features.structure.opening_logits[real]
+        openings_loss = losses.teacher_openings(logits, openings)
+        walls_loss = losses.teacher_walls(features.log_profile[real], features.log_scale[real], log_distance, logits)
+        total = stage.photograph_weight * openings_loss + stage.photograph_profile_weight * walls_loss
+        return first_of(features, len(image)), {"photographs": total}
 
     def _styles(self, rendered: int, photographs: int, device: torch.device) -> StyleMixing | None:
-        """Who takes on whose style: every other partner is a photograph, since that is how pictures are to look."""
+        """Draw style partners; every other partner is a photograph, because queries look like photographs."""
         if not self.settings.style_mixing:
             return None
-        generator = self._randomness(torch.device("cpu"))
+        generator = self._generator(torch.device("cpu"))
         count = rendered + photographs
         partner = torch.randint(count, (count,), generator=generator)
         real = rendered + torch.randint(photographs, (count,), generator=generator)
@@ -135,47 +137,47 @@ class ImageStage:
         share[torch.rand(count, generator=generator) >= self.settings.style_mixing] = 0.0
         return StyleMixing(partner.to(device), share.to(device))
 
-    def _structural(self, seen: StructureFeatures, batch: Batch) -> dict[str, Tensor]:
-        """Losses on what is met at each azimuth, the ceiling and the type of the room."""
+    def _structure_losses(self, features: StructureFeatures, batch: Batch) -> dict[str, Tensor]:
+        """Return the losses on openings, ceiling height and room type."""
         stage, kind, room_type = self.settings, batch["opening_kind"], batch["room_type"]
         assert isinstance(self.encoder, TrunkImageEncoder)
         self.encoder.count(kind, room_type)
         terms = {}
         if stage.opening_weight:
             share = self.encoder.opening_share
-            loss = losses.opening(seen.opening_logits, kind, share, stage.opening_balance)
+            loss = losses.opening(features.opening_logits, kind, share, stage.opening_balance)
             terms["opening"] = stage.opening_weight * loss
         if stage.ceiling_weight:
             above_m = batch["ceiling_height_m"] - batch["camera_height_m"]
-            loss = losses.ceiling(seen.log_ceiling, seen.log_ceiling_scale, above_m)
+            loss = losses.ceiling(features.log_ceiling, features.log_ceiling_scale, above_m)
             terms["ceiling"] = stage.ceiling_weight * loss
         if stage.room_type_weight:
-            terms["room_type"] = stage.room_type_weight * losses.room_type(seen.room_type_logits, room_type)
+            terms["room_type"] = stage.room_type_weight * losses.room_type(features.room_type_logits, room_type)
         return terms
 
-    def _seen(self, image: Tensor) -> Tensor:
-        """Pictures with the photometric changes that are asked for; what is drawn depends on seed and first step."""
-        # In full precision, as what a camera does to a picture is: bfloat16 has no 256 grey levels.
+    def _augment(self, image: Tensor) -> Tensor:
+        """Apply the configured photometric changes; the random draws depend on the seed and the first step."""
+        # Single precision, because bfloat16 cannot represent 256 grey levels.
         with torch.autocast(image.device.type, enabled=False):
             if self.settings.photometric:
-                image = jittered(image, self.settings.photometric, self._randomness(image.device))
+                image = jittered(image, self.settings.photometric, self._generator(image.device))
             if self.settings.optics:
-                image = optics(image.float(), self.settings.optics, self._randomness(image.device))
+                image = optics(image.float(), self.settings.optics, self._generator(image.device))
         return image
 
-    def _randomness(self, device: torch.device) -> torch.Generator:
+    def _generator(self, device: torch.device) -> torch.Generator:
         if device not in self._generators:
             seed = int(np.random.default_rng([9, self.config.seed, self._first_step]).integers(1 << 62))
             self._generators[device] = torch.Generator(device).manual_seed(seed)
         return self._generators[device]
 
-    def _relational(self, latent: Tensor, target: Tensor, batch: Batch) -> dict[str, Tensor]:
-        """Losses on the distances of the neighbours' layouts to the panorama."""
+    def _distance_losses(self, latent: Tensor, target: Tensor, batch: Batch) -> dict[str, Tensor]:
+        """Return the losses on the latent distances between a panorama and its neighbours' layouts."""
         stage, layout = self.settings, self.config.layout
         groups = anchors_with_neighbours(batch)
         with torch.no_grad():
             neighbours = embed(self.teacher, {key: value[:, 1:] for key, value in groups.items()})
-            taught = torch.linalg.vector_norm(neighbours - target[:, None], dim=2)
+            teacher_distance = torch.linalg.vector_norm(neighbours - target[:, None], dim=2)
         distance = torch.linalg.vector_norm(neighbours - latent[:, None], dim=2)
         positives, all_pairs, terms = layout.triplets.positives, layout.all_pairs, {}
         if stage.log_ratio_weight:
@@ -183,5 +185,5 @@ class ImageStage:
             ratio = losses.log_ratio(distance, chamfer, positives, all_pairs=all_pairs)
             terms["log_ratio"] = stage.log_ratio_weight * ratio
         if stage.kd_weight:
-            terms["kd"] = stage.kd_weight * losses.log_ratio(distance, taught, positives, all_pairs=all_pairs)
+            terms["kd"] = stage.kd_weight * losses.log_ratio(distance, teacher_distance, positives, all_pairs=all_pairs)
         return terms

@@ -1,4 +1,4 @@
-"""The training loop both stages share: schedule, mixed precision, averaging, log, checkpoints, resuming."""
+"""The training loop of all stages: schedule, mixed precision, averaging, log, checkpoints, resuming."""
 
 from __future__ import annotations
 
@@ -7,23 +7,24 @@ import dataclasses
 import logging
 import math
 import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.optim.swa_utils import AveragedModel
 from tqdm import tqdm
 
 from lalaloc_core.errors import CheckpointError
-from lalaloc_core.learn.training.averaging import moving_average, resume_average
 from lalaloc_core.learn.training.batches import Batch
-from lalaloc_core.learn.training.best import BestCheckpoint, Validate, best_path
-from lalaloc_core.learn.training.checkpoint import Checkpoint
+from lalaloc_core.learn.training.checkpoint import BestCheckpoint, Checkpoint, Validate, best_path
 from lalaloc_core.learn.training.config import OptimiserConfig, TrainConfig
 from lalaloc_core.learn.training.stages import TrainingStage, build_optimiser
 
 _LOG = logging.getLogger(__name__)
 _LOG_EVERY = 20
+_MINUTES_BAR = "{desc}: {percentage:3.0f}%|{bar}| {n:.2f}/{total:g} min [{elapsed}{postfix}]"
 
 
 def run_stage(
@@ -37,19 +38,23 @@ def run_stage(
     validate: Validate | None = None,
     begun_from: dict[str, Any] | None = None,
 ) -> Checkpoint:
-    """Train a stage to the end of its schedule, or resume one that was interrupted.
+    """Train a stage to the end of its schedule, or resume an interrupted run.
 
-    Writes `<stage>.pt` (the last checkpoint), `<stage>.best.pt` (the best by validation, where that tells accuracies)
-    and `<stage>.csv` (losses and validation by step) into `folder`.
+    Writes `<stage>.pt` (the last checkpoint), `<stage>.best.pt` (the best by validation, if metrics rank it) and
+    `<stage>.csv` (losses and validation by step) into `folder`.
 
     Args:
+        stage: networks, data and losses.
+        folder: of the run.
+        device: to train on.
         workers: processes that make batches.
-        begun_from: what checkpoints say of the origin of the weights that the stage's modules have now; a resumed run
-            keeps what its checkpoint says.
-        validate: called with the modules (averaged where averaging is on) whenever a checkpoint is written.
+        resume: continue from `<stage>.pt`.
+        checkpoint_minutes: interval between checkpoints.
+        validate: called with the modules (averaged if averaging is on) before each checkpoint is written.
+        begun_from: origin of the initial weights, stored in checkpoints; a resumed run keeps its checkpoint's value.
 
     Raises:
-        CheckpointError: `resume` without a checkpoint, or of another configuration or data.
+        CheckpointError: `resume` without a checkpoint, or with one of another configuration or other data.
     """
     path = folder / f"{stage.name}.pt"
     trainer = _Trainer(stage, device)
@@ -59,15 +64,12 @@ def run_stage(
     best = BestCheckpoint(best_path(path), stage, validate, resume=resume)
     batches = stage.batches(trainer.step, workers)
     last_saved = time.monotonic()
-    with (
-        _CsvLog(folder / f"{stage.name}.csv", append=resume) as log,
-        tqdm(total=stage.settings.steps, initial=trainer.step, desc=stage.name, mininterval=10.0) as bar,
-    ):
+    with _CsvLog(folder / f"{stage.name}.csv", append=resume) as log, _progress_bar(trainer) as bar:
         while trainer.progress < 1.0:
             begin = time.monotonic()
             terms = trainer.train_step(next(batches))
             trainer.seconds += time.monotonic() - begin
-            bar.update()
+            bar.update(min(trainer.spent, trainer.budget) - bar.n)
             if trainer.step % _LOG_EVERY == 0:
                 log.write(trainer.step, trainer.seconds, terms)
                 bar.set_postfix({name: f"{value:.3f}" for name, value in terms.items()}, refresh=False)
@@ -106,21 +108,29 @@ class _Trainer:
 
     @property
     def inference_modules(self) -> dict[str, nn.Module]:
-        """What to validate: the modules with averaged weights where averaging is on."""
+        """Modules to validate: those with averaged weights if averaging is on."""
         return self.stage.modules if self._averaged is None else dict(self._averaged.module.named_children())
 
     @property
+    def budget(self) -> int | float:
+        """Length of the schedule: minutes if a time budget is set, else steps."""
+        return self.settings.steps if self.settings.minutes is None else self.settings.minutes
+
+    @property
+    def spent(self) -> int | float:
+        """Part of `budget` that is done, in the same unit."""
+        return self.step if self.settings.minutes is None else self.seconds / 60.0
+
+    @property
     def progress(self) -> float:
-        """Share of the schedule done, by time where a time budget is set, else by steps."""
-        if self.settings.minutes is not None:
-            return self.seconds / (60.0 * self.settings.minutes)
-        return self.step / self.settings.steps
+        """Share of the schedule that is done."""
+        return self.spent / self.budget
 
     def train_step(self, batch: Batch) -> dict[str, float]:
-        """One update; returns the losses by name.
+        """Update the networks once and return the losses by name.
 
         Raises:
-            FloatingPointError: the loss is not finite; the last checkpoint is still good.
+            FloatingPointError: the loss is not finite; the last checkpoint remains valid.
         """
         for group in self.optimiser.param_groups:
             group["lr"] = group.get("factor", 1.0) * learning_rate(self.settings.optimiser, min(self.progress, 1.0))
@@ -142,7 +152,7 @@ class _Trainer:
         return {name: term.item() for name, term in terms.items()}
 
     def checkpoint(self) -> Checkpoint:
-        """The present state."""
+        """Return the present state."""
         return Checkpoint(
             stage=self.stage.name,
             config=self.stage.config,
@@ -157,9 +167,12 @@ class _Trainer:
         )
 
     def restore(self, checkpoint: Checkpoint) -> None:
-        """Go on from a checkpoint of the same configuration; only budgets and the rays per pixel may change."""
-        if _lasting(checkpoint.config) != _lasting(self.stage.config):
-            raise CheckpointError(f"the checkpoint of stage '{checkpoint.stage}' has another configuration")
+        """Continue from a checkpoint of the same configuration; only budgets and rays per pixel may differ."""
+        if _without_budgets(checkpoint.config) != _without_budgets(self.stage.config):
+            raise CheckpointError(
+                f"the checkpoint of stage '{checkpoint.stage}' has another configuration; resume with the preset, seed "
+                "and settings of the run"
+            )
         if checkpoint.data and checkpoint.data != self.stage.data:
             raise CheckpointError(f"the checkpoint was trained on {checkpoint.data}, not on {self.stage.data}")
         for name, module in self.stage.modules.items():
@@ -167,14 +180,27 @@ class _Trainer:
         if self._averaged is not None:
             for name, module in self.inference_modules.items():
                 module.load_state_dict(checkpoint.averaged[name])
-            resume_average(self._averaged, checkpoint.step)
+            _set_average_steps(self._averaged, checkpoint.step)
         self.optimiser.load_state_dict(checkpoint.optimiser)
         self.step, self.seconds, self.metrics = checkpoint.step, checkpoint.seconds, checkpoint.metrics
         self.begun_from = checkpoint.begun_from
 
 
+def _progress_bar(trainer: _Trainer) -> tqdm[Any]:
+    """Create a progress bar in the unit of the budget: minutes or steps."""
+    timed = trainer.settings.minutes is not None
+    return tqdm(
+        total=trainer.budget,
+        initial=min(trainer.spent, trainer.budget),
+        desc=trainer.stage.name,
+        unit="step",
+        bar_format=_MINUTES_BAR if timed else None,
+        mininterval=10.0,
+    )
+
+
 def _multiplies_bfloat16() -> bool:
-    """Whether the processor multiplies matrices in bfloat16 itself; where it does not, autocast only costs time."""
+    """Return whether the processor multiplies bfloat16 matrices natively; otherwise autocast only costs time."""
     return bool(torch.cpu.get_capabilities().get("amx_bf16", False))
 
 
@@ -182,8 +208,8 @@ def _states(modules: dict[str, nn.Module]) -> dict[str, dict[str, Tensor]]:
     return {name: module.state_dict() for name, module in modules.items()}
 
 
-def _lasting(config: TrainConfig) -> TrainConfig:
-    """A configuration without what may change when a run resumes."""
+def _without_budgets(config: TrainConfig) -> TrainConfig:
+    """Reset the settings that may change when a run resumes."""
     return dataclasses.replace(
         config,
         layout=dataclasses.replace(config.layout, steps=0, minutes=None),
@@ -192,7 +218,7 @@ def _lasting(config: TrainConfig) -> TrainConfig:
 
 
 def learning_rate(config: OptimiserConfig, progress: float) -> float:
-    """Learning rate at a share (0 to 1) of the schedule."""
+    """Return the learning rate at a share (0 to 1) of the schedule."""
     if config.warmup and progress < config.warmup:
         return config.learning_rate * (0.05 + 0.95 * progress / config.warmup)
     if config.schedule == "steps":
@@ -203,8 +229,37 @@ def learning_rate(config: OptimiserConfig, progress: float) -> float:
     return config.learning_rate * (0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * progress)))
 
 
+def moving_average(module: nn.Module, decay: float) -> AveragedModel:
+    """Create an exponential moving average of a module's weights and statistics, in evaluation mode.
+
+    The average starts with the module's present weights; call `update_parameters` after every step.
+
+    Args:
+        module: averaged module.
+        decay: per step; early steps use a smaller decay.
+    """
+
+    def update(averaged: Iterable[Tensor], current: Iterable[Tensor], count: Tensor | int) -> None:
+        # At full decay, early steps would keep their weight for too long.
+        share = 1.0 - min(decay, (1.0 + int(count)) / (10.0 + int(count)))
+        for average, value in zip(averaged, current, strict=True):
+            if average.is_floating_point():
+                average.lerp_(value, share)
+            else:
+                average.copy_(value)
+
+    average = AveragedModel(module, multi_avg_fn=update, use_buffers=True).eval()
+    _set_average_steps(average, 0)
+    return average
+
+
+def _set_average_steps(average: AveragedModel, step: int) -> None:
+    """Set the number of steps in an average; the initial weights count as one."""
+    average.n_averaged.fill_(1 + step)
+
+
 class _CsvLog:
-    """Long-format log: one row per step and value, so that any tool can plot it."""
+    """Long-format log: one row per step and value, which any tool can plot."""
 
     def __init__(self, path: Path, *, append: bool) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -11,25 +11,27 @@ from lalaloc_core.conventions import OPENING_CLASSES
 
 # Keeps log and its gradient finite when two latents coincide.
 _MIN_DISTANCE = 1e-4
-# A class that is hardly ever seen does not get all the weight.
+# Limits the weight of very rare classes.
 _MIN_SHARE = 1e-3
-# Cameras touch no ceiling.
+# Lower bound of the ceiling's height above the camera (m).
 _MIN_ABOVE_M = 0.05
 
 
 def log_ratio(
     latent_distance: Float[Tensor, "a n"], reference: Float[Tensor, "a n"], positives: int, *, all_pairs: bool
 ) -> Tensor:
-    """Log-ratio loss (equation 1), averaged over anchors and pairs of neighbours.
+    """Return the log-ratio loss (equation 1), averaged over anchors and pairs of neighbours.
 
-    `(log D_i / D_j - log R_i / R_j)²` for each anchor and pair (i, j) of its neighbours. Between layouts, D is their
-    latents' distance and R their Chamfer distance. The panorama's variants (section A.1.5) measure D from the
-    panorama's latent; R stays (log-ratio') or is the distance of the teacher's latents (knowledge distillation).
+    `(log D_i / D_j - log R_i / R_j)²` for each anchor and pair (i, j) of its neighbours. Between layouts, D is the
+    distance of latents and R the Chamfer distance. The panorama's variants (section A.1.5) measure D from the
+    panorama's latent; R is again the Chamfer distance (log-ratio') or the distance of the teacher's latents (knowledge
+    distillation).
 
     Args:
         latent_distance: D of each neighbour to its anchor; the first `positives` columns are the positives.
         reference: R of the same pairs, in any unit.
-        all_pairs: use every pair of neighbours, else each positive with each negative, as in the paper.
+        positives: number of positives per anchor.
+        all_pairs: use every pair of neighbours instead of each positive with each negative (the paper).
     """
     excess = _safe_log(latent_distance) - _safe_log(reference)
     if all_pairs:
@@ -40,23 +42,23 @@ def log_ratio(
 def distance_scale(
     latent_distance: Float[Tensor, "a n"], chamfer: Float[Tensor, "a n"], latent_per_metre: float
 ) -> Tensor:
-    """Fixes what the log-ratio leaves free: the mean ratio of latent to Chamfer distance."""
+    """Penalise the mean ratio of latent to Chamfer distance, which the log-ratio loss leaves free."""
     excess = _safe_log(latent_distance) - _safe_log(chamfer)
     return (excess.mean() - torch.log(torch.tensor(latent_per_metre, device=excess.device))).square()
 
 
 def decode(decoded: Float[Tensor, "b h w"], depth_m: Float[Tensor, "b h w"]) -> Tensor:
-    """Decoding loss (equation 2): mean |L' - L| in metres."""
+    """Return the decoding loss (equation 2): mean |L' - L| in metres."""
     return (decoded - depth_m).abs().mean()
 
 
 def l2(image_latent: Float[Tensor, "b d"], layout_latent: Float[Tensor, "b d"]) -> Tensor:
-    """Latent distance (equation 3), averaged: |f - g|₂."""
+    """Return the mean latent distance (equation 3): |f - g|₂."""
     return torch.linalg.vector_norm(image_latent - layout_latent, dim=1).mean()
 
 
 def ring_distillation(student: Float[Tensor, "b c s"], teacher: Float[Tensor, "b c s"]) -> Tensor:
-    """Mean |difference| of ring features in units of each channel's spread over the batch."""
+    """Return the mean |difference| of ring features, in units of each channel's spread over the batch."""
     spread = teacher.std(dim=(0, 2), keepdim=True).clamp_min(1e-3)
     return ((student - teacher) / spread).abs().mean()
 
@@ -64,21 +66,21 @@ def ring_distillation(student: Float[Tensor, "b c s"], teacher: Float[Tensor, "b
 def laplace(
     log_profile: Float[Tensor, "b w"], log_scale: Float[Tensor, "b w"], profile_m: Float[Tensor, "b w"]
 ) -> Tensor:
-    """Negative log likelihood of the true log wall profile under the predicted Laplace distributions."""
+    """Return the negative log likelihood of the true log wall profile under the predicted Laplace distributions."""
     error = (log_profile - torch.log(profile_m)).abs()
     return (error * torch.exp(-log_scale) + log_scale).mean()
 
 
-def followed_walls(
+def teacher_walls(
     log_profile: Float[Tensor, "b w"],
     log_scale: Float[Tensor, "b w"],
     log_distance: Float[Tensor, "b w"],
     opening_logits: Float[Tensor, "b w c"],
 ) -> Tensor:
-    """`laplace` of a teacher's walls, whose log distances are nan where it sees none.
+    """Return the `laplace` loss of a teacher's walls, whose log distances are NaN where it sees none.
 
-    Where the student sees a passage the teacher is not followed: it sees the wall of the room behind, and a room ends
-    in the plane of its own wall.
+    Azimuths where the student predicts a passage are left out: the teacher sees the wall of the next room, but a room
+    ends in the plane of its own wall.
     """
     passage = torch.softmax(opening_logits.detach(), dim=2)[..., OPENING_CLASSES.index("passage")]
     known = torch.isfinite(log_distance) & (passage < 0.5)
@@ -90,50 +92,50 @@ def followed_walls(
 def opening(
     logits: Float[Tensor, "b w c"], kind: Int[Tensor, "b w"], share: Float[Tensor, "c"], balance: float
 ) -> Tensor:
-    """Cross entropy of what is met at each azimuth; kinds below 0 are not known and do not count.
+    """Return the cross entropy of the opening class at each azimuth; negative kinds are unknown and ignored.
 
-    Classes weigh `share ** -balance`. The distributions that are learnt so are those of a world in which the classes'
-    shares are `opening_prior`.
+    Classes are weighted by `share ** -balance`, so the network learns distributions whose class shares are
+    `opening_prior`.
     """
     weight = share.clamp_min(_MIN_SHARE) ** -balance
-    return _weighted(logits.flatten(0, 1), kind.flatten(), weight)
+    return _cross_entropy(logits.flatten(0, 1), kind.flatten(), weight)
 
 
 def opening_prior(share: Float[Tensor, "c"], balance: float) -> Float[Tensor, "c"]:
-    """The classes' shares in the world that `opening` pretends to be in."""
+    """Return the class shares implied by the weights of `opening`."""
     weighted = share.clamp_min(_MIN_SHARE) ** (1.0 - balance)
     return weighted / weighted.sum()
 
 
 def room_type(logits: Float[Tensor, "b c"], kind: Int[Tensor, "b"]) -> Tensor:
-    """Cross entropy of the rooms' types; those below 0 are not known and do not count."""
-    return _weighted(logits, kind, None)
+    """Return the cross entropy of room types; negative kinds are unknown and ignored."""
+    return _cross_entropy(logits, kind, None)
 
 
-def _weighted(logits: Float[Tensor, "n c"], kind: Int[Tensor, "n"], weight: Tensor | None) -> Tensor:
+def _cross_entropy(logits: Float[Tensor, "n c"], kind: Int[Tensor, "n"], weight: Tensor | None) -> Tensor:
     if not bool((kind >= 0).any()):
         return 0.0 * logits.sum()
     return functional.cross_entropy(logits, kind.long(), weight, ignore_index=-1)
 
 
 def ceiling(log_ceiling: Float[Tensor, "b"], log_scale: Float[Tensor, "b"], above_m: Float[Tensor, "b"]) -> Tensor:
-    """Negative log likelihood of the ceiling's true height above the camera (m)."""
+    """Return the negative log likelihood of the ceiling's true height above the camera (m)."""
     error = (log_ceiling - torch.log(above_m.clamp_min(_MIN_ABOVE_M))).abs()
     return (error * torch.exp(-log_scale) + log_scale).mean()
 
 
-def followed_maps(logits: Float[Tensor, "b w c"], taught: Float[Tensor, "b w 2"]) -> Tensor:
-    """Cross entropy to a teacher's shares of (door, window) in each column.
+def teacher_openings(logits: Float[Tensor, "b w c"], shares: Float[Tensor, "b w 2"]) -> Tensor:
+    """Return the cross entropy to a teacher's shares of (door, window) in each column.
 
-    The teacher knows no passages: the rest may be wall or passage as the student likes.
+    The teacher knows no passages, so the remaining share is free to be wall or passage.
     """
     log_probability = torch.log_softmax(logits, dim=2)
     door, window = (OPENING_CLASSES.index(kind) for kind in ("door", "window"))
     others = [code for code in range(len(OPENING_CLASSES)) if code not in (door, window)]
     rest = torch.logsumexp(log_probability[..., others], dim=2)
-    left = (1.0 - taught.sum(dim=2)).clamp_min(0.0)
-    seen = taught[..., 0] * log_probability[..., door] + taught[..., 1] * log_probability[..., window] + left * rest
-    return -seen.mean()
+    left = (1.0 - shares.sum(dim=2)).clamp_min(0.0)
+    agreement = shares[..., 0] * log_probability[..., door] + shares[..., 1] * log_probability[..., window]
+    return -(agreement + left * rest).mean()
 
 
 def _safe_log(distance: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Real photographs without labels, with what a segmenter sees in them."""
+"""Unlabelled real photographs with the predictions of a segmenter."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from lalaloc_core.learn.synth.augmentation.stretching import stretched
 from lalaloc_core.learn.training.segmenter import PANORAMA_ROWS, load_segmenter, read_walls_and_openings
 from lalaloc_core.panorama.images import read_panorama
 
-# Rooms are drawn out or pushed together along two axes by factors between these, evenly in logs: half of the
-# photographs without labels that there are were taken in halls, which so become rooms.
+# Rooms are stretched along two axes by log-uniform factors between these limits, because half of the available
+# unlabelled photographs show halls.
 _MIN_STRETCH, _MAX_STRETCH = 0.5, 1.6
 
 
 @dataclass(frozen=True, eq=False)
 class Photographs:
-    """Photographs with a segmenter's opinion.
+    """Photographs with a segmenter's predictions.
 
     Attributes:
         images: (n, h, w, 3) RGB bytes.
         openings: (n, c, 2) probabilities of door and window by column.
-        log_distance: (n, c) log of the walls' distances in camera heights; nan where they are not seen.
+        log_distance: (n, c) log distance of the walls in camera heights; NaN where they are not visible.
     """
 
     images: UInt8[Tensor, "n h w 3"]
@@ -35,7 +35,7 @@ class Photographs:
     log_distance: Float[Tensor, "n c"]
 
     def draw(self, count: int, columns: int, generator: torch.Generator) -> Photographs:
-        """Some photographs, each turned, stretched and mirrored at random, with what is taught of so many columns."""
+        """Draw photographs, each randomly rotated, stretched and mirrored, with targets of `columns` columns."""
         width = self.images.shape[2]
         chosen = torch.randint(len(self.images), (count,), generator=generator)
         shifts = torch.randint(width, (count,), generator=generator)
@@ -59,11 +59,17 @@ class Photographs:
 
 
 def load_photographs(folder: Path, segmenter: Path, height: int, width: int) -> Photographs:
-    """Read the panoramas (`*.jpg`, `*.png`) of a folder and let the segmenter look at each.
+    """Read the panoramas (`*.jpg`, `*.jpeg`, `*.png`) of a folder and segment each.
+
+    Args:
+        folder: of the panoramas.
+        segmenter: TensorFlow Lite file, see `segmenter`.
+        height: rows of the returned panoramas.
+        width: columns of the returned panoramas and predictions.
 
     Raises:
         ConfigError: the segmenter cannot be run.
-        DatasetError: there are none, or one cannot be read.
+        DatasetError: the folder has no panorama, or one that cannot be read.
     """
     paths = sorted(path for pattern in ("*.jpg", "*.jpeg", "*.png") for path in folder.glob(pattern))
     if not paths:
@@ -79,6 +85,6 @@ def load_photographs(folder: Path, segmenter: Path, height: int, width: int) -> 
             raise DatasetError(f"cannot be read: {error}", path=path) from error
         readings.append(read_walls_and_openings(large, segment, width))
     openings, log_distance = (
-        np.stack([getattr(one, name) for one in readings]) for name in ("openings", "log_distance")
+        np.stack([getattr(reading, name) for reading in readings]) for name in ("openings", "log_distance")
     )
     return Photographs(torch.from_numpy(np.stack(images)), torch.from_numpy(openings), torch.from_numpy(log_distance))

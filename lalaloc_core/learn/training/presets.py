@@ -1,4 +1,4 @@
-"""The configurations that `lalaloc train --preset` knows, and a tiny one of each kind for tests."""
+"""Presets of `lalaloc train --preset`, including tiny ones for tests."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ _TINY = TrainConfig(
     image=ImageStageConfig(steps=12, batch=8, ring_weight=1.0, profile_weight=0.5, ema_decay=0.9),
 )
 
-# The paper counts epochs over Structured3D; its 18,000 or so training panoramas give these numbers of steps.
+# The paper counts epochs over Structured3D, whose training split has about 18,000 panoramas.
 PRESETS: dict[str, TrainConfig] = {
     "paper": TrainConfig(
         name="paper",
@@ -88,7 +88,7 @@ PRESETS: dict[str, TrainConfig] = {
             optimiser=OptimiserConfig(learning_rate=1.5e-3),
         ),
     ),
-    # The layout branch is that of `ring`.
+    # Same layout branch as `ring`.
     "trunk": TrainConfig(
         name="trunk",
         architecture="trunk",

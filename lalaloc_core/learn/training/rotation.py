@@ -1,4 +1,4 @@
-"""Turning and mirroring what is trained on, exactly: pictures by whole pixels, layouts by the heading that is left."""
+"""Exact rotation and mirroring: panoramas by whole pixels, layouts by the remaining heading."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ _QUARTER = TWO_PI / 4.0
 
 @dataclass(frozen=True, kw_only=True)
 class Rotation:
-    """How a panorama is turned.
+    """Rotation and mirroring of a panorama.
 
     Attributes:
-        shift: pixels that its columns move to the right.
-        heading: azimuth of its centre column after that, radians; layouts are cast at this heading.
-        mirrored: swap left and right of pictures and profiles, last.
+        shift: pixels by which its columns move to the right.
+        heading: azimuth of the centre column after the shift, radians; layouts are cast at this heading.
+        mirrored: swap left and right of panoramas and profiles after the shift.
     """
 
     shift: int
@@ -28,17 +28,17 @@ class Rotation:
     mirrored: bool
 
     def picture(self, image: Shaped[np.ndarray, "h w 3"]) -> Shaped[np.ndarray, "h w 3"]:
-        """Turn and mirror a panorama."""
+        """Rotate and mirror a panorama."""
         turned = np.roll(image, self.shift, axis=1)
         return turned[:, ::-1] if self.mirrored else turned
 
     def profile(self, profile_m: Shaped[np.ndarray, "*n columns"]) -> Shaped[np.ndarray, "*n columns"]:
-        """Mirror wall profiles, or what else has azimuth columns, that were cast at `heading`."""
+        """Mirror wall profiles, or other values by azimuth column, that were cast at `heading`."""
         return profile_m[..., ::-1] if self.mirrored else profile_m
 
 
 def sample_rotation(turns: Turns, heading: float, width: int, rng: np.random.Generator) -> Rotation:
-    """Draw how to turn a panorama of `width` columns whose centre column looks along `heading` (radians)."""
+    """Draw the rotation of a panorama of `width` columns whose centre column looks along `heading` (radians)."""
     pixel = TWO_PI / width
     shift = int(rng.integers(width)) if turns == "any" else round((heading - _target(turns, rng)) / pixel)
     mirrored = turns != "none" and bool(rng.random() < 0.5)
@@ -46,7 +46,7 @@ def sample_rotation(turns: Turns, heading: float, width: int, rng: np.random.Gen
 
 
 def sample_heading(turns: Turns, rng: np.random.Generator) -> float:
-    """Draw the heading (radians) of a layout that has none of its own."""
+    """Draw the heading (radians) of a layout."""
     return float(rng.uniform(0.0, TWO_PI)) if turns == "any" else _target(turns, rng)
 
 

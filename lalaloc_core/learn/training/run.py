@@ -9,17 +9,21 @@ from typing import Any
 import torch
 
 from lalaloc_core.learn.data.dataset import Scene
-from lalaloc_core.learn.training.best import Validate
-from lalaloc_core.learn.training.checkpoint import Checkpoint
+from lalaloc_core.learn.training.checkpoint import Checkpoint, Validate
 from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.data import TrainingData
 from lalaloc_core.learn.training.end_to_end import EndToEndStage
 from lalaloc_core.learn.training.image_stage import ImageStage
 from lalaloc_core.learn.training.layout_stage import LayoutStage
 from lalaloc_core.learn.training.loop import run_stage
-from lalaloc_core.learn.training.trained_networks import load_layout_encoder_of
+from lalaloc_core.learn.training.stages import TrainingStage
 from lalaloc_core.learn.training.validate import LayoutValidation
-from lalaloc_core.learn.training.warm_start import check_same_networks, checkpoint_with, load_warm_start
+from lalaloc_core.learn.training.warm_start import (
+    check_same_networks,
+    find_checkpoint,
+    load_trained_layout_encoder,
+    load_warm_start,
+)
 from lalaloc_core.nets.image_encoder import TrunkImageEncoder
 from lalaloc_core.nets.trunk import load_pretrained
 
@@ -36,18 +40,24 @@ def train_layout(
     resume: bool = False,
     init_from: Path | None = None,
 ) -> Checkpoint:
-    """Stage 1 into `folder`.
+    """Run stage 1.
 
     Args:
-        init_from: a bundle or a run's folder whose weights training begins with; not for a run that resumes.
+        config: of the run.
+        folder: of the run.
+        device: to train on.
+        data: training and validation scenes.
+        workers: processes that make batches.
+        resume: continue from the checkpoint in `folder`.
+        init_from: bundle or run folder that provides the first weights; not with `resume`.
 
     Raises:
-        CheckpointError: what to begin or to go on with is missing, or has other networks.
+        CheckpointError: initial weights or the checkpoint are missing, or have other networks.
         DatasetError: a file of the data set cannot be used.
     """
     torch.manual_seed(config.seed)
     stage = LayoutStage(config, data.source(config))
-    begun_from = None if init_from is None else _warm_start(stage, init_from, "layout")
+    begun_from = None if init_from is None else _warm_start(stage, init_from)
     scenes = data.validation(config)
     validate = LayoutValidation(config, scenes, device) if scenes else None
     return run_stage(
@@ -55,11 +65,11 @@ def train_layout(
     )
 
 
-def _warm_start(stage: LayoutStage | ImageStage, folder: Path, name: str) -> dict[str, Any]:
-    """Initialise a stage with trained weights; returns what checkpoints say of their origin."""
-    found = load_warm_start(folder, name, stage.config)
-    found.load_into(stage.modules)
-    return found.origin
+def _warm_start(stage: TrainingStage, folder: Path) -> dict[str, Any]:
+    """Load trained weights into a stage; return their origin for checkpoints."""
+    start = load_warm_start(folder, stage.name, stage.config)
+    start.load_into(stage.modules)
+    return start.origin
 
 
 def train_image(
@@ -74,30 +84,37 @@ def train_image(
     init_from: Path | None = None,
     layout_from: Path | None = None,
 ) -> Checkpoint:
-    """Stage 2 into `folder`, against the layout encoder that stage 1 left there, or in the folder `teacher`.
+    """Run stage 2 against a trained layout encoder.
 
     Args:
-        init_from: a bundle or a run's folder whose image encoder training begins with; not for a run that resumes.
-            Where `folder` has no layout encoder and no other teacher is named, it gets the one from there.
-        layout_from: a bundle or a run's folder whose layout encoder `folder` gets where it has none.
+        config: of the run.
+        folder: of the run.
+        device: to train on.
+        data: training and validation scenes, and photographs.
+        teacher: run folder with the layout encoder; default: `folder`.
+        workers: processes that make batches.
+        resume: continue from the checkpoint in `folder`.
+        init_from: bundle or run folder that provides the first image encoder, and the layout encoder if `folder` has
+            none and `teacher` is not given; not with `resume`.
+        layout_from: bundle or run folder that provides the layout encoder if `folder` has none.
 
     Raises:
-        CheckpointError: stage 1 has not run there, or for other networks.
+        CheckpointError: the layout encoder is missing or has other networks.
         DatasetError: a file of the data set cannot be used.
     """
     torch.manual_seed(config.seed + 1)
     origin = layout_from or init_from
     if origin is not None and teacher is None and not (folder / "layout.pt").exists():
-        found = load_warm_start(origin, "layout", config).checkpoint
-        dataclasses.replace(found, stage="layout").save(folder / "layout.pt")
+        start = load_warm_start(origin, "layout", config)
+        dataclasses.replace(start.checkpoint, stage="layout").save(folder / "layout.pt")
     teacher = teacher or folder
-    check_same_networks("layout", config, checkpoint_with("layout", teacher).config, str(teacher))
-    layout_encoder = load_layout_encoder_of(teacher)
+    check_same_networks("layout", config, find_checkpoint("layout", teacher).config, str(teacher))
+    layout_encoder = load_trained_layout_encoder(teacher)
     stage = ImageStage(config, data.source(config), layout_encoder, data.load_photographs(config))
     fresh = init_from is None and not resume
     if fresh and isinstance(stage.encoder, TrunkImageEncoder) and config.image.pretrained:
         load_pretrained(stage.encoder.trunk)
-    begun_from = None if init_from is None else _warm_start(stage, init_from, "image")
+    begun_from = None if init_from is None else _warm_start(stage, init_from)
     scenes = data.validation(config)
     validate = data.image_validation(config, scenes, layout_encoder, device, folder) if scenes else None
     return run_stage(
@@ -114,20 +131,30 @@ def train_end_to_end(
     workers: int = 1,
     resume: bool = False,
 ) -> Checkpoint:
-    """Both branches at once into `folder`.
+    """Train both branches at once.
+
+    Args:
+        config: of the run.
+        folder: of the run.
+        device: to train on.
+        data: training and validation scenes.
+        workers: processes that make batches.
+        resume: continue from the checkpoint in `folder`.
 
     Raises:
-        ConfigError: the architecture cannot be trained like that.
+        ConfigError: the architecture does not support end-to-end training.
         DatasetError: a file of the data set cannot be used.
     """
     torch.manual_seed(config.seed)
     stage = EndToEndStage(config, data.source(config))
     scenes = data.validation(config)
-    validate = _both(config, data, scenes, device, folder) if scenes else None
+    validate = _joint_validation(config, data, scenes, device, folder) if scenes else None
     return run_stage(stage, folder, device=device, workers=workers, resume=resume, validate=validate)
 
 
-def _both(config: TrainConfig, data: TrainingData, scenes: list[Scene], device: torch.device, folder: Path) -> Validate:
+def _joint_validation(
+    config: TrainConfig, data: TrainingData, scenes: list[Scene], device: torch.device, folder: Path
+) -> Validate:
     layout = LayoutValidation(config, scenes, device)
     image = data.image_validation(config, scenes, None, device, folder)
     return lambda modules: {**{f"layout_{key}": value for key, value in layout(modules).items()}, **image(modules)}

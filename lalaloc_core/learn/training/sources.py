@@ -1,7 +1,7 @@
-"""What training looks at: visit number i goes to one scene, the same in every run with the same seed.
+"""Sources of training scenes: visit number i uses one scene, the same in every run with the same seed.
 
-`GeneratedSource` draws a new home for every visit; `SceneSource` goes through a data set's training scenes in shuffled
-epochs. Both are small and travel to worker processes.
+`GeneratedSource` draws a new home for every visit; `SceneSource` visits a data set's training scenes in shuffled
+epochs. Both are small enough to be sent to worker processes.
 """
 
 from __future__ import annotations
@@ -30,24 +30,24 @@ from lalaloc_core.learn.training.config import TrainConfig
 from lalaloc_core.learn.training.deferred import DeferredScene
 from lalaloc_core.render.sampling import PoseSet, TripletSampling, sample_neighbours, sample_triplets
 
-# Cameras stand at least this far below the ceiling of a neighbour's room.
+# Minimum distance (m) of a camera below the ceiling of a neighbour's room.
 _HEADROOM_M = 0.1
 _MIN_CAMERA_M, _MAX_CAMERA_M = 1.0, 1.9
-# Of panoramas; lower and higher than photographers usually hold a camera, but they do.
+# Camera heights of panoramas, including unusually low and high ones.
 _CAMERA_HEIGHTS_M = (0.5, 2.2)
-# Share of generated panoramas from thresholds, beside walls, in corridors and closets.
+# Share of generated panoramas on thresholds, beside walls, in corridors and closets.
 _HARD_SHARE = 0.25
-# Share of those taken at night.
+# Share of generated panoramas at night.
 _NIGHT_SHARE = 0.12
 _SCENES_CACHED = 256
 _PICTURE_BYTES_CACHED = 1 << 28
-# Visits in a row without any use after which there is something wrong with the generator.
+# Consecutive visits without a sample that indicate a fault of the generator.
 _GENERATOR_PATIENCE = 1000
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Group:
-    """An anchor, then its positives, then its negatives, all at the anchor's camera height."""
+    """Poses in the order anchor, positives, negatives, all at the anchor's camera height."""
 
     plan: FloorPlan
     position_m: Float[np.ndarray, "n 2"]
@@ -57,7 +57,7 @@ class Group:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class PanoramaSample:
-    """A panorama and the pose it was taken from; `image` is (h, w, 3) RGB bytes, or a scene yet to be rendered."""
+    """A panorama and its pose; `image` is (h, w, 3) RGB bytes, or a scene to be rendered later."""
 
     plan: FloorPlan
     position_m: Float[np.ndarray, "2"]
@@ -67,65 +67,63 @@ class PanoramaSample:
     image: np.ndarray | DeferredScene
 
     def group(self, sampling: TripletSampling, rng: np.random.Generator) -> Group | None:
-        """Its pose with neighbours; None where the plan is too small for them."""
+        """Return the pose with sampled neighbours; None if the plan is too small for them."""
         return _group_around(self, self.plan, sampling, rng)
 
 
 @runtime_checkable
 class Source(Protocol):
-    """What training looks at.
-
-    Attributes:
-        data: what checkpoints and manifests say of it.
-        patience: visits in a row that may give nothing.
-        skip_bad: whether files that cannot be used are passed over.
-        problems: errors of what was passed over since this list was last emptied.
-        deferred: whether its panoramas are scenes that are yet to be rendered.
-    """
+    """Source of training scenes."""
 
     @property
-    def deferred(self) -> bool: ...
+    def deferred(self) -> bool:
+        """Panoramas are scenes to be rendered later."""
+        ...
 
     @property
-    def data(self) -> dict[str, Any]: ...
+    def data(self) -> dict[str, Any]:
+        """Description for checkpoints and manifests."""
+        ...
 
     @property
-    def patience(self) -> int: ...
+    def patience(self) -> int:
+        """Maximum number of consecutive visits without a sample."""
+        ...
 
     @property
-    def skip_bad(self) -> bool: ...
-
-    @property
-    def problems(self) -> list[DatasetError]: ...
+    def problems(self) -> list[DatasetError]:
+        """Errors of skipped files since this list was last emptied."""
+        ...
 
     def rng(self, visit: int) -> np.random.Generator:
-        """The generator of what is drawn for a visit besides the scene itself."""
+        """Return the random generator of a visit, for everything but the scene itself."""
         ...
 
     def groups(self, visit: int) -> list[Group]:
-        """Anchors of stage 1 with their neighbours; none where the scene is of no use.
+        """Return stage 1's anchors with their neighbours; empty if the scene cannot be used.
 
         Raises:
-            DatasetError: a file cannot be used and `skip_bad` is off.
+            DatasetError: a file cannot be used and must not be skipped.
         """
         ...
 
     def samples(self, visit: int, height: int, width: int) -> list[PanoramaSample]:
-        """Panoramas of stage 2, `height` x `width`; none where the scene is of no use.
+        """Return stage 2's panoramas, `height` x `width`; empty if the scene cannot be used.
 
         Raises:
-            DatasetError: a file cannot be used and `skip_bad` is off.
+            DatasetError: a file cannot be used and must not be skipped.
         """
         ...
 
 
 @dataclass(eq=False)
 class GeneratedSource:
-    """A new home of the generator for every visit, its anchors and cameras anywhere on the floor.
+    """Source of generated homes: a new one for every visit, with anchors and cameras anywhere on the floor.
 
     Attributes:
-        textures: folder of material pictures; without it all are procedural.
-        deferred: panoramas are scenes, to be rendered by `renderer` elsewhere.
+        config: of the run.
+        textures: folder of material pictures; None makes all materials procedural.
+        deferred: panoramas are scenes, to be rendered by `renderer` in another process.
     """
 
     config: TrainConfig
@@ -133,21 +131,23 @@ class GeneratedSource:
     deferred: bool = False
     _renderers: RendererCache | None = field(default=None, init=False)
     patience = _GENERATOR_PATIENCE
-    skip_bad = False
 
     @property
     def data(self) -> dict[str, Any]:
+        """Description for checkpoints and manifests."""
         return {"description": "homes generated while training"}
 
     @property
     def problems(self) -> list[DatasetError]:
-        """None: what is generated is never at fault."""
+        """Empty list; generated homes have no faults."""
         return []
 
     def rng(self, visit: int) -> np.random.Generator:
+        """Return the random generator of a visit, for everything but the scene itself."""
         return np.random.default_rng([3, self.config.seed, visit])
 
     def groups(self, visit: int) -> list[Group]:
+        """Return stage 1's anchors with their neighbours."""
         stage = self.config.layout
         home, rng = home_of(TRAIN, self.config.seed, visit)
         drawn = sample_triplets(home.plan, stage.anchors_per_home, stage.triplets, rng)
@@ -168,6 +168,7 @@ class GeneratedSource:
         return groups
 
     def samples(self, visit: int, height: int, width: int) -> list[PanoramaSample]:
+        """Return stage 2's panoramas, `height` x `width`."""
         stage = self.config.image
         home, rng = home_of(TRAIN, self.config.seed, visit)
         shots = sample_shots(
@@ -179,7 +180,7 @@ class GeneratedSource:
             unusual_heights_m=_CAMERA_HEIGHTS_M,
             night_share=_NIGHT_SHARE,
         )
-        # Made where it is needed: it does not travel to worker processes.
+        # Created on first use, so that it is not sent to worker processes.
         self._renderers = self._renderers or self._renderers_on("cpu")
         scenes = [build_scene(shot, self._renderers.materials) for shot in shots]
         images: Sequence[np.ndarray | DeferredScene]
@@ -201,7 +202,7 @@ class GeneratedSource:
         ]
 
     def renderer(self, device: torch.device) -> PanoramaRenderer:
-        """Renders deferred panoramas as `samples` would have."""
+        """Create the renderer of deferred panoramas; its pixels are those of `samples`."""
         return self._renderers_on(device).renderer(*self.config.image_size, self.config.image.supersample)
 
     def _renderers_on(self, device: torch.device | str) -> RendererCache:
@@ -220,9 +221,15 @@ def _bytes_of(image: np.ndarray) -> int:
 
 @dataclass(eq=False)
 class SceneSource:
-    """The training scenes of a data set in shuffled epochs; each visit draws some of a scene's cameras.
+    """Source of a data set's training scenes in shuffled epochs; each visit draws some of a scene's cameras.
 
-    Stage 1 anchors are the poses of the panoramas; stage 2 draws anew how the room looked (paper, section 5).
+    Anchors of stage 1 are the poses of the panoramas; stage 2 draws the appearance for each visit (paper, section 5).
+
+    Attributes:
+        config: of the run.
+        dataset: with training scenes.
+        skip_bad: skip files that cannot be used, and append their errors to `problems`.
+        problems: errors of skipped files.
     """
 
     config: TrainConfig
@@ -234,24 +241,27 @@ class SceneSource:
     def __post_init__(self) -> None:
         self._names = tuple(self.dataset.scenes("train"))
         if not self._names:
-            raise DatasetError(f"{self.dataset.description} has no training scenes")
+            raise DatasetError(f"{self.dataset.description}: there are no training scenes")
         self._scenes: LRUCache[str, Scene | None] = LRUCache(_SCENES_CACHED)
         self._pictures: LRUCache[tuple[Any, ...], np.ndarray] = LRUCache(_PICTURE_BYTES_CACHED, _bytes_of)
         self._orders: LRUCache[int, np.ndarray] = LRUCache(1)
 
     @property
     def data(self) -> dict[str, Any]:
+        """Description for checkpoints and manifests."""
         return {"description": self.dataset.description, "scenes": len(self._names)}
 
     @property
     def patience(self) -> int:
-        """Two epochs."""
+        """Two epochs of visits."""
         return 2 * len(self._names)
 
     def rng(self, visit: int) -> np.random.Generator:
+        """Return the random generator of a visit, for everything but the scene itself."""
         return np.random.default_rng([5, self.config.seed, visit])
 
     def groups(self, visit: int) -> list[Group]:
+        """Return stage 1's anchors with their neighbours."""
         stage, rng = self.config.layout, np.random.default_rng([6, self.config.seed, visit])
         scene = self._scene(visit)
         groups: list[Group] = []
@@ -264,6 +274,7 @@ class SceneSource:
         return groups
 
     def samples(self, visit: int, height: int, width: int) -> list[PanoramaSample]:
+        """Return stage 2's panoramas, `height` x `width`."""
         rng = np.random.default_rng([7, self.config.seed, visit])
         scene = self._scene(visit)
         if scene is None:
@@ -306,7 +317,7 @@ class SceneSource:
     def _picture(
         self, scene: Scene, camera: Camera, rng: np.random.Generator, height: int, width: int
     ) -> np.ndarray | None:
-        """One of a camera's photographs; None where it has none that can be read."""
+        """Draw one of a camera's photographs; None if it has none that can be read."""
         looks = sorted(camera.photographs, key=str)
         if not looks:
             return None

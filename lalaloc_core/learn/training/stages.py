@@ -1,9 +1,10 @@
-"""What the training loop needs to know of a stage, and what the two stages share."""
+"""Base class of the training stages, and the networks, batches and optimiser they build."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -22,92 +23,108 @@ from lalaloc_core.nets.ring_image_encoder import RingImageEncoder
 from lalaloc_core.nets.trunk import Trunk
 
 
-@runtime_checkable
-class TrainingStage(Protocol):
-    """What the training loop needs to know of a stage.
+class TrainingStage(ABC):
+    """Networks, data and losses of one stage, run by the training loop.
 
     Attributes:
-        modules: the networks that are trained, by name.
-        teacher: a frozen network that the losses ask, on the device of the others; None for none.
-        ema_decay: decay per step of the averaged weights; 0 turns averaging off.
-        data: what checkpoints and manifests say of what it is trained on.
+        name: names the stage's checkpoints and log.
+        config: of the run.
+        source: training scenes.
+        modules: trained networks by name.
     """
 
-    name: str
+    name: ClassVar[str]
     config: TrainConfig
+    source: Source
     modules: dict[str, nn.Module]
 
     @property
-    def teacher(self) -> nn.Module | None: ...
+    def teacher(self) -> nn.Module | None:
+        """Frozen network used by the losses; the loop moves it to the training device."""
+        return None
 
     @property
-    def ema_decay(self) -> float: ...
+    @abstractmethod
+    def settings(self) -> LayoutStageConfig | ImageStageConfig:
+        """Budget and optimiser of this stage."""
 
     @property
-    def settings(self) -> LayoutStageConfig | ImageStageConfig: ...
+    def ema_decay(self) -> float:
+        """Decay per step of the averaged weights; 0 turns averaging off."""
+        return self.settings.ema_decay if isinstance(self.settings, ImageStageConfig) else 0.0
 
     @property
-    def data(self) -> dict[str, Any]: ...
+    def data(self) -> dict[str, Any]:
+        """Description of the training data, stored in checkpoints and manifests."""
+        return self.source.data
 
-    def batches(self, first_step: int, workers: int) -> Iterator[Batch]: ...
+    @abstractmethod
+    def batches(self, first_step: int, workers: int) -> Iterator[Batch]:
+        """Yield batches from a step on; earlier steps used other homes, or other parts of the epoch."""
 
-    def losses(self, batch: Batch) -> dict[str, Tensor]: ...
+    @abstractmethod
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
+        """Return the weighted losses of a batch by name; the loop minimises their sum."""
 
 
 def build_layout_encoder(config: TrainConfig) -> LayoutEncoder:
-    """A fresh layout encoder of the configured architecture."""
+    """Build an untrained layout encoder of the configured architecture."""
     return RingLayoutEncoder(config.ring) if config.has_ring else PaperLayoutEncoder(config.paper)
 
 
 def build_image_encoder(config: TrainConfig) -> ImageEncoder:
-    """A fresh image encoder of the configured architecture."""
+    """Build an untrained image encoder of the configured architecture."""
     if config.architecture == "trunk":
         return TrunkImageEncoder(config.trunk, config.ring)
     return RingImageEncoder(config.ring) if config.has_ring else PaperImageEncoder(config.paper)
 
 
 def build_decoder(config: TrainConfig) -> LayoutDecoder | None:
-    """A fresh layout decoder, where one is trained."""
+    """Build an untrained layout decoder; None if the decoding loss is off."""
     return LayoutDecoder(config.latent_size) if config.layout.decode_weight else None
 
 
 def panorama_batches(
     config: TrainConfig, source: Source, *, neighbours: bool, first_step: int, workers: int, device: torch.device
 ) -> Iterator[Batch]:
-    """Panorama batches from a step on: with homes, or parts of the epoch, that earlier steps have not seen.
+    """Yield panorama batches from a step on, with homes or parts of the epoch that earlier steps have not used.
 
     Args:
-        neighbours: whether rows have the layouts of neighbours.
-        device: where deferred panoramas are rendered.
+        config: of the run.
+        source: of the scenes.
+        neighbours: add the layouts of neighbouring poses to each row.
+        first_step: number of the first step.
+        workers: processes that make batches; 0 makes them in this process.
+        device: renders deferred panoramas.
     """
-    first = first_step * (config.image.batch // config.image.shots_per_home + 1)
-    batches = load_batches(PanoramaBatches(config, source, neighbours, first), workers)
+    first_visit = first_step * (config.image.batch // config.image.shots_per_home + 1)
+    batches = load_batches(PanoramaBatches(config, source, neighbours, first_visit), workers)
     if isinstance(source, GeneratedSource) and source.deferred:
-        return DeferredRenderer(source.renderer(device)).rendered(batches)
+        return DeferredRenderer(source.renderer(device)).render_batches(batches)
     return batches
 
 
 def build_optimiser(modules: dict[str, nn.Module], config: OptimiserConfig) -> torch.optim.Optimizer:
-    """The optimiser over all parameters; AdamW decays matrices only."""
+    """Build the optimiser of all parameters; AdamW decays matrices only."""
     trunks = [part for module in modules.values() for part in module.modules() if isinstance(part, Trunk)]
     slow = {id(p) for trunk in trunks for p in trunk.parameters()}
     parameters = [p for module in modules.values() for p in module.parameters() if p.requires_grad]
     if config.kind == "sgd":
-        groups = _by_rate(parameters, slow, config, weight_decay=config.weight_decay)
+        groups = _groups_by_rate(parameters, slow, config, weight_decay=config.weight_decay)
         return torch.optim.SGD(groups, config.learning_rate, momentum=config.momentum)
-    groups = _by_rate([p for p in parameters if p.ndim > 1], slow, config, weight_decay=config.weight_decay)
-    groups += _by_rate([p for p in parameters if p.ndim <= 1], slow, config, weight_decay=0.0)
+    groups = _groups_by_rate([p for p in parameters if p.ndim > 1], slow, config, weight_decay=config.weight_decay)
+    groups += _groups_by_rate([p for p in parameters if p.ndim <= 1], slow, config, weight_decay=0.0)
     return torch.optim.AdamW(groups, config.learning_rate)
 
 
-def _by_rate(
+def _groups_by_rate(
     parameters: list[nn.Parameter], slow: set[int], config: OptimiserConfig, *, weight_decay: float
 ) -> list[dict[str, Any]]:
-    """Groups of parameters with the factor on the learning rate that each keeps all along."""
+    """Split parameters by the factor that multiplies their learning rate."""
     groups = []
-    for factor, chosen in (
+    for factor, members in (
         (1.0, [p for p in parameters if id(p) not in slow]),
         (config.trunk_factor, [p for p in parameters if id(p) in slow]),
     ):
-        groups += [{"params": chosen, "weight_decay": weight_decay, "factor": factor}] if chosen else []
+        groups += [{"params": members, "weight_decay": weight_decay, "factor": factor}] if members else []
     return groups

@@ -1,32 +1,31 @@
-"""Validation while training: retrieval in scenes that training never sees.
+"""Validation during training: retrieval in scenes that are not trained on.
 
-Cheap by design: known heading, the nearest grid latent, no refinement. `lalaloc evaluate` runs the full path on the
+Validation is fast: known heading, nearest grid latent, no refinement. `lalaloc evaluate` runs the full pipeline on the
 exported bundle.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+import zipfile
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from operator import attrgetter
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from cachetools import LRUCache, cachedmethod
-from jaxtyping import Int
+from jaxtyping import Int, UInt8
 from torch import Tensor, nn
 
 from lalaloc_core.conventions import OPENING_CLASSES
 from lalaloc_core.errors import DatasetError
+from lalaloc_core.files import replacing
 from lalaloc_core.learn.azimuth_metrics import score_classes
 from lalaloc_core.learn.data.dataset import Appearance, Camera, Scene
 from lalaloc_core.learn.metrics import Accuracy
 from lalaloc_core.learn.training import losses
 from lalaloc_core.learn.training.batch_streams import UNKNOWN, opening_kinds
 from lalaloc_core.learn.training.config import TrainConfig
-from lalaloc_core.learn.training.picture_cache import cached_pictures
 from lalaloc_core.learn.training.rotation import Rotation, sample_rotation
 from lalaloc_core.nets.image_encoder import TrunkImageEncoder
 from lalaloc_core.nets.image_features import ImageFeatures
@@ -40,43 +39,6 @@ _BATCH = 16
 _LAYOUT_BATCH = 256
 
 
-@dataclass(frozen=True, eq=False)
-class _Query:
-    """A camera, and the turn that brings its photograph to heading 0 but for less than a pixel."""
-
-    scene: Scene
-    grid: PoseSet
-    camera: Camera
-    turn: Rotation
-
-    @property
-    def pose(self) -> PoseSet:
-        return PoseSet(np.asarray(self.camera.position_m)[None], np.array([self.camera.room_index]))
-
-    @property
-    def fingerprint(self) -> bytes:
-        """Distinguishes this query from others of its kind."""
-        camera, plan = self.camera, self.scene.plan
-        numbers = [*camera.position_m, camera.heading, camera.camera_height_m, self.turn.shift]
-        return np.array(numbers).tobytes() + plan.walls_m.tobytes() + plan.ceiling_heights_m.tobytes()
-
-    def opening_kinds(self, columns: int) -> Int[np.ndarray, "{columns}"]:
-        """What the turned photograph shows at each azimuth, see `stream.opening_kinds`."""
-        camera = self.camera
-        return opening_kinds(
-            self.scene.plan,
-            np.asarray(camera.position_m),
-            camera.room_index,
-            self.turn.heading,
-            camera.camera_height_m,
-            columns,
-        )
-
-    def distance_m(self) -> np.ndarray:
-        """From every grid pose to the camera."""
-        return np.linalg.norm(self.grid.position_m - self.camera.position_m, axis=1)
-
-
 class LayoutValidation:
     """Layout queries at the cameras' poses: the nearest grid latent against the nearest grid pose."""
 
@@ -87,47 +49,50 @@ class LayoutValidation:
 
     @torch.no_grad()
     def __call__(self, modules: dict[str, nn.Module]) -> dict[str, float]:
+        """Return the metrics of the module `layout_encoder` by name."""
         encoder = modules["layout_encoder"]
-        training = encoder.training
+        was_training = encoder.training
         encoder.eval()
-        grids = _Grids(encoder, self.columns, self.device)
         errors, oracle, targets = [], [], []
+        view, grid = None, torch.empty(0)
         for query in self.queries:
-            target = grids.embed(query, query.pose)
+            if query.view != view:
+                view, grid = query.view, query.layouts(query.grid, self.columns, self.device).embed(encoder)
+            target = query.layouts(query.pose, self.columns, self.device).embed(encoder)
             distance = query.distance_m()
-            errors.append(distance[grids.nearest(query, target)])
+            errors.append(distance[int(torch.cdist(target, grid).argmin())])
             oracle.append(distance.min())
             targets.append(target)
-        encoder.train(training)
-        accuracy = Accuracy.of(np.array(errors))
+        encoder.train(was_training)
+        accuracy = Accuracy.from_errors(np.array(errors))
         return {
             "val_median_cm": accuracy.median_cm,
             "val_within_1m": accuracy.within_1m,
-            "val_oracle_median_cm": Accuracy.of(np.array(oracle)).median_cm,
+            "val_oracle_median_cm": Accuracy.from_errors(np.array(oracle)).median_cm,
             "val_latent_spread": float(torch.cat(targets).std(dim=0).square().sum().sqrt()),
         }
 
 
 class ImageValidation:
-    """Panorama queries, each camera in its usual look, read once: accuracy of the nearest grid pose.
+    """Panorama queries, one per camera in its usual appearance: accuracy of the nearest grid pose.
 
-    Nearest by latent, and with architecture `ring` also by the predicted wall profile: the mean |Δ log distance|, each
-    at most `_MAX_LOG_ERROR`, against the layouts of the grid. Reported over all queries and by furniture level. Beside
-    it the median over the queries of the median |Δ log distance| of the true wall, and with architecture `trunk` the
-    balanced accuracy of the openings.
+    The nearest pose is found by latent, and for networks with a wall profile also by that profile: the mean
+    |Δ log distance|, each clipped at `_MAX_LOG_ERROR`, to the layouts of the grid. Metrics cover all queries and each
+    furniture level. Further metrics are the median over the queries of the median |Δ log distance| to the true wall,
+    and for architecture `trunk` the balanced accuracy of the openings.
 
     Args:
-        config: sizes.
+        config: provides the sizes.
         scenes: with cameras whose photographs can be read.
-        layout_encoder: the frozen teacher; None takes the one that is being trained.
-        device: where to run.
-        usual: the look to ask with, where a camera was photographed so; else its first.
-        problems: photographs that cannot be read are left out and their errors appended here.
-        prefix: what the names of all figures begin with.
-        cache: file that caches the pictures, for photographs that take long to make.
+        layout_encoder: frozen teacher; None uses the one being trained.
+        device: to run on.
+        usual: preferred appearance of the photographs; cameras without it use their first.
+        problems: receives the errors of unreadable photographs, which are left out; None raises the first error.
+        prefix: of the names of all metrics.
+        cache: file that caches the photographs, because rendering them is slow.
 
     Raises:
-        DatasetError: the first of them where `problems` is None; or none can be read.
+        DatasetError: a photograph cannot be read and `problems` is None, or no photograph can be read.
     """
 
     def __init__(
@@ -148,11 +113,11 @@ class ImageValidation:
         self.layout_encoder = layout_encoder
         self.prefix = prefix
         self.queries = _queries(config, scenes)
-        looks = [_look(query.camera, usual) for query in self.queries]
-        read: list[bool] = [True] * len(looks)
+        looks = [_appearance(query.camera, usual) for query in self.queries]
+        readable: list[bool] = [True] * len(looks)
 
-        def pictures() -> np.ndarray:
-            found = []
+        def read_pictures() -> np.ndarray:
+            pictures = []
             for k, (query, look) in enumerate(zip(self.queries, looks, strict=True)):
                 try:
                     image = query.scene.photograph(query.camera, look).image(*config.image_size)
@@ -160,91 +125,91 @@ class ImageValidation:
                     if problems is None:
                         raise
                     problems.append(error)
-                    read[k] = False
+                    readable[k] = False
                     continue
-                found.append(query.turn.picture(image))
-            if not found:
-                raise DatasetError("no validation scene has a photograph that can be read")
-            return np.stack(found)
+                pictures.append(query.turn.picture(image))
+            if not pictures:
+                raise DatasetError("no photograph of the validation scenes can be read")
+            return np.stack(pictures)
 
-        about = [str(config.image_size).encode()]
-        about += [query.fingerprint + str(look).encode() for query, look in zip(self.queries, looks, strict=True)]
-        self.images = torch.from_numpy(cached_pictures(cache, about, pictures))
-        self.queries = [query for query, good in zip(self.queries, read, strict=True) if good]
-        self.levels = np.array([str(look.furniture) for look, good in zip(looks, read, strict=True) if good])
+        identity = [str(config.image_size).encode()]
+        identity += [query.fingerprint + str(look).encode() for query, look in zip(self.queries, looks, strict=True)]
+        self.images = torch.from_numpy(cached_pictures(cache, identity, read_pictures))
+        self.queries = [query for query, good in zip(self.queries, readable, strict=True) if good]
+        self.levels = np.array([str(look.furniture) for look, good in zip(looks, readable, strict=True) if good])
         self._grid_latents: list[Tensor] | None = None
         self._layouts: list[_Layouts] = []
 
     @torch.no_grad()
     def __call__(self, modules: dict[str, nn.Module]) -> dict[str, float]:
+        """Return the metrics of the module `image_encoder` by name."""
         encoder = modules["image_encoder"]
         layout_encoder = self.layout_encoder or modules["layout_encoder"]
-        training = [(module, module.training) for module in (encoder, layout_encoder)]
+        modes = [(module, module.training) for module in (encoder, layout_encoder)]
         encoder.eval()
         layout_encoder.to(self.device).eval()
         if not self._layouts:
-            self._layouts = [_Layouts.of(query, query.grid, self.columns, self.device) for query in self.queries]
+            self._layouts = [query.layouts(query.grid, self.columns, self.device) for query in self.queries]
         if self._grid_latents is None or self.layout_encoder is None:
-            self._grid_latents = [layouts.embedded(layout_encoder) for layouts in self._layouts]
+            self._grid_latents = [layouts.embed(layout_encoder) for layouts in self._layouts]
         parts = range(0, len(self.queries), _BATCH)
-        seen = [self._see(encoder, layout_encoder, slice(k, k + _BATCH)) for k in parts]
-        latents = torch.cat([answer.latent for answer in seen])
+        predictions = [self._predict(encoder, layout_encoder, slice(k, k + _BATCH)) for k in parts]
+        latents = torch.cat([prediction.latent for prediction in predictions])
         nearest = [
             int(torch.cdist(latent[None], grid).argmin())
             for latent, grid in zip(latents, self._grid_latents, strict=True)
         ]
-        scores = self._scores("", nearest)
-        profiles = [answer.log_profile for answer in seen if answer.log_profile is not None]
+        metrics = self._accuracies("", nearest)
+        profiles = [prediction.log_profile for prediction in predictions if prediction.log_profile is not None]
         if profiles:
-            scores |= self._scores(
-                "profile_",
-                [
-                    int((profile - layouts.profile_m.log()).abs().clamp_max(_MAX_LOG_ERROR).mean(dim=1).argmin())
-                    for profile, layouts in zip(torch.cat(profiles), self._layouts, strict=True)
-                ],
-            )
-            scores[f"{self.prefix}_nll"] = sum(answer.nll for answer in seen) / len(self.queries)
-            true = torch.cat([answer.true_profile_m for answer in seen if answer.true_profile_m is not None])
+            nearest = [
+                int((profile - layouts.profile_m.log()).abs().clamp_max(_MAX_LOG_ERROR).mean(dim=1).argmin())
+                for profile, layouts in zip(torch.cat(profiles), self._layouts, strict=True)
+            ]
+            metrics |= self._accuracies("profile_", nearest)
+            metrics[f"{self.prefix}_nll"] = sum(prediction.nll for prediction in predictions) / len(self.queries)
+            true = torch.cat([part.true_profile_m for part in predictions if part.true_profile_m is not None])
             error = (torch.cat(profiles) - true.log()).abs().median(dim=1).values
-            scores[f"{self.prefix}_log_error"] = float(error.median())
-        confusions = [answer.confusion for answer in seen if answer.confusion is not None]
+            metrics[f"{self.prefix}_log_error"] = float(error.median())
+        confusions = [prediction.confusion for prediction in predictions if prediction.confusion is not None]
         if confusions:
             accuracy = score_classes(np.sum(confusions, axis=0), OPENING_CLASSES).balanced_accuracy
-            scores[f"{self.prefix}_opening_accuracy"] = accuracy
-        for module, was_training in training:
+            metrics[f"{self.prefix}_opening_accuracy"] = accuracy
+        for module, was_training in modes:
             module.train(was_training)
-        return scores
+        return metrics
 
-    def _scores(self, by: str, nearest: list[int]) -> dict[str, float]:
+    def _accuracies(self, method: str, nearest: list[int]) -> dict[str, float]:
+        """Return the metrics of one retrieval method over all queries and by furniture level."""
         errors = np.array([query.distance_m()[k] for query, k in zip(self.queries, nearest, strict=True)])
         levels = sorted(set(self.levels))
         slices = {"": np.full(len(errors), True)}
         slices |= {f"_{level}": self.levels == level for level in levels} if len(levels) > 1 else {}
-        scores = {}
-        for name, chosen in slices.items():
-            accuracy = Accuracy.of(errors[chosen])
-            scores[f"{self.prefix}_{by}within_1m{name}"] = accuracy.within_1m
-            scores[f"{self.prefix}_{by}median_cm{name}"] = accuracy.median_cm
-        return scores
+        metrics = {}
+        for name, members in slices.items():
+            accuracy = Accuracy.from_errors(errors[members])
+            metrics[f"{self.prefix}_{method}within_1m{name}"] = accuracy.within_1m
+            metrics[f"{self.prefix}_{method}median_cm{name}"] = accuracy.median_cm
+        return metrics
 
-    def _see(self, encoder: nn.Module, layout_encoder: nn.Module, part: slice) -> _Answer:
+    def _predict(self, encoder: nn.Module, layout_encoder: nn.Module, part: slice) -> _Prediction:
         images = self.images[part].to(self.device)
         if isinstance(encoder, PaperImageEncoder):
-            return _Answer(encoder(images))
+            return _Prediction(encoder(images))
         queries = self.queries[part]
         heights = torch.tensor([query.camera.camera_height_m for query in queries], dtype=torch.float32)
         features = encoder(images, heights.to(self.device))
-        true = torch.cat([_Layouts.of(query, query.pose, self.columns, self.device).profile_m for query in queries])
+        true = torch.cat([query.layouts(query.pose, self.columns, self.device).profile_m for query in queries])
         nll = float(losses.laplace(features.log_profile, features.log_scale, true))
         latent = layout_encoder.get_submodule("head")(features.ring)
-        return _Answer(
+        return _Prediction(
             latent, features.log_profile, nll * len(queries), true, self._confusion(encoder, features, queries)
         )
 
     def _confusion(
         self, encoder: nn.Module, features: ImageFeatures, queries: list[_Query]
     ) -> Int[np.ndarray, "c c"] | None:
-        """Azimuths by true and by likeliest class, relative to the classes' shares."""
+        """Count azimuths by true and by predicted class; predictions are relative to the classes' shares."""
         if features.structure is None or not isinstance(encoder, TrunkImageEncoder):
             return None
         logits = features.structure.opening_logits
@@ -258,8 +223,59 @@ class ImageValidation:
 
 
 @dataclass(frozen=True, eq=False)
-class _Answer:
-    """What an image encoder says of some queries; `nll` is the sum of their profiles' negative log likelihoods."""
+class _Query:
+    """A camera, and the rotation that brings its photograph to heading 0 within a pixel."""
+
+    scene: Scene
+    grid: PoseSet
+    camera: Camera
+    turn: Rotation
+
+    @property
+    def pose(self) -> PoseSet:
+        return PoseSet(np.asarray(self.camera.position_m)[None], np.array([self.camera.room_index]))
+
+    @property
+    def view(self) -> tuple[int, float, float]:
+        """Key of the layouts of the grid: grid, camera height and heading."""
+        return id(self.grid), self.camera.camera_height_m, self.turn.heading
+
+    @property
+    def fingerprint(self) -> bytes:
+        """Identity of this query among others of its kind."""
+        camera, plan = self.camera, self.scene.plan
+        numbers = [*camera.position_m, camera.heading, camera.camera_height_m, self.turn.shift]
+        return np.array(numbers).tobytes() + plan.walls_m.tobytes() + plan.ceiling_heights_m.tobytes()
+
+    def opening_kinds(self, columns: int) -> Int[np.ndarray, "{columns}"]:
+        """Return the true opening classes of the rotated photograph, see `batch_streams.opening_kinds`."""
+        camera = self.camera
+        return opening_kinds(
+            self.scene.plan,
+            np.asarray(camera.position_m),
+            camera.room_index,
+            self.turn.heading,
+            camera.camera_height_m,
+            columns,
+        )
+
+    def layouts(self, poses: PoseSet, columns: int, device: torch.device) -> _Layouts:
+        """Return the layouts at poses of the plan, seen at the heading of the rotated photograph."""
+        plan = self.scene.plan
+        heading = np.full(len(poses), self.turn.heading)
+        profile = torch.from_numpy(profiles_at(plan, poses.position_m, poses.room_index, heading, columns, np.float32))
+        ceiling = torch.tensor(plan.ceiling_heights_m[poses.room_index], dtype=torch.float32)
+        camera = torch.full((len(poses),), self.camera.camera_height_m)
+        return _Layouts(profile.to(device), camera.to(device), ceiling.to(device))
+
+    def distance_m(self) -> np.ndarray:
+        """Return the distance of every grid pose to the camera."""
+        return np.linalg.norm(self.grid.position_m - self.camera.position_m, axis=1)
+
+
+@dataclass(frozen=True, eq=False)
+class _Prediction:
+    """Output of an image encoder for some queries; `nll` is the sum of their negative log likelihoods."""
 
     latent: Tensor
     log_profile: Tensor | None = None
@@ -270,48 +286,17 @@ class _Answer:
 
 @dataclass(frozen=True, eq=False)
 class _Layouts:
-    """Layouts at some poses of a query's plan, seen as its camera is turned."""
+    """Inputs of a layout encoder."""
 
     profile_m: Tensor
     camera_height_m: Tensor
     ceiling_height_m: Tensor
 
-    @classmethod
-    def of(cls, query: _Query, poses: PoseSet, columns: int, device: torch.device) -> _Layouts:
-        plan = query.scene.plan
-        heading = np.full(len(poses), query.turn.heading)
-        profile = torch.from_numpy(profiles_at(plan, poses.position_m, poses.room_index, heading, columns, np.float32))
-        ceiling = torch.tensor(plan.ceiling_heights_m[poses.room_index], dtype=torch.float32)
-        camera = torch.full((len(poses),), query.camera.camera_height_m)
-        return cls(profile.to(device), camera.to(device), ceiling.to(device))
-
-    def embedded(self, encoder: nn.Module) -> Tensor:
-        """Latents (n, d)."""
+    def embed(self, encoder: nn.Module) -> Tensor:
+        """Return the latents (n, d)."""
         inputs = (self.profile_m, self.camera_height_m, self.ceiling_height_m)
         parts = zip(*(tensor.split(_LAYOUT_BATCH) for tensor in inputs), strict=True)
         return torch.cat([encoder(*part) for part in parts])
-
-
-class _Grids:
-    """Latents of the grids of one encoder; the last is cached, because queries come scene by scene."""
-
-    def __init__(self, encoder: nn.Module, columns: int, device: torch.device) -> None:
-        self.encoder, self.columns, self.device = encoder, columns, device
-        self._latents: LRUCache[tuple[Any, ...], Tensor] = LRUCache(1)
-
-    def nearest(self, query: _Query, latent: Tensor) -> int:
-        """Number of the query's grid pose whose latent is nearest to `latent` (1, d)."""
-        return int(torch.cdist(latent, self._of_grid(query)).argmin())
-
-    @cachedmethod(
-        attrgetter("_latents"), lambda _, query: (id(query.grid), query.camera.camera_height_m, query.turn.heading)
-    )
-    def _of_grid(self, query: _Query) -> Tensor:
-        return self.embed(query, query.grid)
-
-    def embed(self, query: _Query, poses: PoseSet) -> Tensor:
-        """Latents (n, d) of the layouts at some poses, seen as the query's camera is turned."""
-        return _Layouts.of(query, poses, self.columns, self.device).embedded(self.encoder)
 
 
 def _queries(config: TrainConfig, scenes: Sequence[Scene]) -> list[_Query]:
@@ -324,7 +309,35 @@ def _queries(config: TrainConfig, scenes: Sequence[Scene]) -> list[_Query]:
     return queries
 
 
-def _look(camera: Camera, usual: Appearance | None) -> Appearance:
+def _appearance(camera: Camera, usual: Appearance | None) -> Appearance:
     if usual is not None and (usual in camera.photographs or not camera.photographs):
         return usual
     return min(camera.photographs, key=str, default=Appearance())
+
+
+def cached_pictures(
+    path: Path | None, identity: list[bytes], make: Callable[[], UInt8[np.ndarray, "n h w 3"]]
+) -> UInt8[np.ndarray, "n h w 3"]:
+    """Return pictures from a file; make and write them if it is missing, damaged or holds other pictures.
+
+    Args:
+        path: npz file; None caches nothing.
+        identity: distinguishes these pictures from others, such as their poses. It does not cover the renderer: delete
+            the file after changing that.
+        make: makes the pictures.
+    """
+    if path is None:
+        return make()
+    digest = hashlib.sha256(b"\n".join(identity)).hexdigest()
+    try:
+        with np.load(path) as kept:
+            if str(kept["digest"]) == digest:
+                return kept["pictures"]
+    except (OSError, KeyError, ValueError, EOFError, zipfile.BadZipFile):
+        # A missing or damaged file is written again.
+        pass
+    pictures = make()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as part, part.open("wb") as file:
+        np.savez(file, digest=np.array(digest), pictures=pictures)
+    return pictures

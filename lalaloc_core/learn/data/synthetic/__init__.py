@@ -1,8 +1,8 @@
-"""Data sets that are drawn, not read, and writing them to disk.
+"""Generated data sets, and writing them to disk.
 
-Begin with `generated.py`, homes of the generator rendered when they are looked at. For calibration `mismatched.py`
-asks them with photographs of others, `disturbed.py` with worse ones; `heldout.py` draws the out-of-family homes,
-which need the extra `oracle`; `writing.py` is `lalaloc synth`.
+Begin with `generated.py`: homes of the generator, rendered on demand. For calibration, `mismatched.py` replaces their
+photographs by those of other places, `disturbed.py` degrades them, and `copied.py` puts copies of a home into one plan.
+`heldout.py` generates the out-of-distribution homes (extra `oracle`); `writing.py` implements `lalaloc synth`.
 """
 
 from lalaloc_core.learn.data.synthetic.generated import GeneratedScenes, training_plans

@@ -1,4 +1,4 @@
-"""Plans of copies of a home that differ in their doors only: which copy a photograph shows, their places alone tell."""
+"""Plans with several copies of a home that differ only in the positions of their doors."""
 
 from __future__ import annotations
 
@@ -14,36 +14,41 @@ from jaxtyping import Float, Int
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.learn.data.dataset import Camera, Scene
-from lalaloc_core.learn.data.synthetic.derived import DerivedScenes
+from lalaloc_core.learn.data.synthetic.generated import DerivedScenes
 from lalaloc_core.render.layout import layout_view
 
-# Free space between two copies (m): no multiple of a grid's step, so that its lattice lies otherwise in each.
+# Gap between two copies (m), not a multiple of the grid step, so that the grid has another offset in each copy.
 _APART_M = 3.17
-# Share of the doors in sight of a camera that are elsewhere in the other copies, beside one for each camera.
+# Share of the doors seen by a camera that are moved in the other copies, besides one per camera.
 _MOVED_SHARE = 0.5
-# A camera sees a door that fills at least so many of so many azimuths, about 6°: it may stand behind a corner.
+# Minimum number of azimuths, of all azimuths, of a visible door: about 6°.
 _SEEN_COLUMNS, _COLUMNS = 2, 128
-# Doors keep so far (m) from corners and other openings, and are tried every so far along a wall; openings nearer to a
-# wall than its thickness may be are in it.
+# Distance (m) of doors from corners and other openings, step of positions along a wall, and maximum distance of an
+# opening from the wall that contains it.
 _CLEAR_M, _STEP_M, _MAX_THICKNESS_M = 0.15, 0.1, 0.5
 
 
 @dataclass(frozen=True)
 class CopiedScenes(DerivedScenes):
-    """Generated homes as plans of so many copies in a row, of which one, drawn for each home, is photographed.
+    """Generated homes as plans of several copies in a row; one random copy per home is photographed.
 
-    In the other copies some of its doors are elsewhere in the room, of those that each camera sees at least one: then
-    every photograph shows which copy it was taken in. All copies have as many doors, unless a room has no wall that is
-    free. Cameras that see no door are left out.
+    In the other copies some doors are moved within their room, at least one of those that each camera sees, so every
+    photograph identifies its copy. Doors without a free position are removed. Cameras that see no door are left out.
+
+    Attributes:
+        homes: the generated homes.
+        copies: number of copies per home.
     """
 
     copies: int = 4
 
     @property
     def description(self) -> str:
+        """Name of the data set in results."""
         return f"{self.homes.description}, {self.copies} copies that differ in their doors"
 
     def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
+        """Generate a scene and copy it."""
         scene = self.homes.load(name, problems)
         rng = np.random.default_rng([self.homes.seed, zlib.crc32(name.encode())])
         own = int(rng.integers(self.copies))
@@ -63,41 +68,41 @@ class CopiedScenes(DerivedScenes):
         plan = FloorPlan.from_dict(
             {**document, "rooms": rooms, "openings": openings, "opening_kinds": sorted(scene.plan.opening_kinds)}
         )
-        cameras = tuple(_moved_camera(one, own * step_m, own * len(scene.plan.rooms)) for one, _ in seen)
+        cameras = tuple(_moved_camera(camera, own * step_m, own * len(scene.plan.rooms)) for camera, _ in seen)
         return dataclasses.replace(scene, plan=plan, cameras=cameras)
 
 
 def _seen_doors(plan: FloorPlan, camera: Camera) -> list[int]:
-    """Numbers of the plan's openings that are doors and are seen from where a camera stands."""
-    met = _met(plan, camera)
+    """Return the indices of the doors that a camera sees."""
+    kinds = _visible_kinds(plan, camera)
     document = plan.to_dict()
     openings = document.get("openings", [])
     seen = []
     for index, opening in enumerate(openings):
         if opening["kind"] == "door":
             without = FloorPlan.from_dict({**document, "openings": openings[:index] + openings[index + 1 :]})
-            if np.sum(_met(without, camera) != met) >= _SEEN_COLUMNS:
+            if np.sum(_visible_kinds(without, camera) != kinds) >= _SEEN_COLUMNS:
                 seen.append(index)
     return seen
 
 
-def _met(plan: FloorPlan, camera: Camera) -> Int[np.ndarray, "w"]:
-    """Kind of what is met at each azimuth around a camera."""
+def _visible_kinds(plan: FloorPlan, camera: Camera) -> Int[np.ndarray, "w"]:
+    """Return the opening class at each azimuth around a camera."""
     room, heading = np.array([camera.room_index]), np.zeros(1)
-    here = (camera.position_m[None], heading, room, plan.geometry, _COLUMNS, camera.camera_height_m)
-    return layout_view(*here).kind[0]
+    view = layout_view(camera.position_m[None], heading, room, plan.geometry, _COLUMNS, camera.camera_height_m)
+    return view.kind[0]
 
 
 def _with_moved_doors(
     plan: FloorPlan, openings: list[dict[str, Any]], seen: Sequence[tuple[Camera, list[int]]], rng: np.random.Generator
 ) -> list[dict[str, Any]]:
-    """The openings of a copy: some of the doors that cameras see lie elsewhere in the camera's room."""
-    going: dict[int, int] = {}
+    """Return the openings of a copy: some doors seen by cameras are moved within the camera's room."""
+    moving: dict[int, int] = {}
     for camera, doors in seen:
-        one = int(rng.choice(doors))
-        going |= {door: camera.room_index for door in doors if door == one or rng.random() < _MOVED_SHARE}
+        chosen = int(rng.choice(doors))
+        moving |= {door: camera.room_index for door in doors if door == chosen or rng.random() < _MOVED_SHARE}
     placed = dict(enumerate(openings))
-    for index, room in going.items():
+    for index, room in moving.items():
         line = _free_line(plan.rooms[room].polygon_m, openings[index], list(placed.values()), rng)
         del placed[index]
         if line is not None:
@@ -111,16 +116,16 @@ def _free_line(
     openings: list[dict[str, Any]],
     rng: np.random.Generator,
 ) -> list[list[float]] | None:
-    """A place for a door on a room's walls where no opening is; None if there is none."""
+    """Draw a free position for a door on a room's walls; None if there is none."""
     width_m = float(np.linalg.norm(np.subtract(*door["line"])))
     lines = np.array([opening["line"] for opening in openings])
     free = []
     for start, end in zip(polygon_m, np.roll(polygon_m, -1, axis=0), strict=True):
         length_m = float(np.linalg.norm(end - start))
         along = (end - start) / length_m
-        at = (lines - start) @ along
+        positions = (lines - start) @ along
         apart = np.abs((lines - start) @ np.array([-along[1], along[0]])).max(axis=1)
-        taken = np.sort(at[apart < _MAX_THICKNESS_M], axis=1)
+        taken = np.sort(positions[apart < _MAX_THICKNESS_M], axis=1)
         for first in np.arange(_CLEAR_M, length_m - width_m - _CLEAR_M, _STEP_M):
             last = first + width_m
             if not np.any((taken[:, 0] < last + _CLEAR_M) & (taken[:, 1] > first - _CLEAR_M)):

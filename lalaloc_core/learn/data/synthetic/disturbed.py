@@ -1,7 +1,7 @@
-"""Questions as they are asked with real cameras and plans: worse pictures, and lengths that are a little off.
+"""Generated homes with degraded photographs and small length errors, as with real cameras and plans.
 
-Confidence learns from them how badly a right answer may fit (`lalaloc_core.evaluate.calibrate`): renderings of exact plans alone
-fit better than any photograph does.
+Calibration needs them (`lalaloc_core.evaluate.calibrate`), because renderings of exact plans fit better than
+photographs do.
 """
 
 from __future__ import annotations
@@ -16,41 +16,43 @@ from jaxtyping import Float, UInt8
 
 from lalaloc_core.errors import DatasetError
 from lalaloc_core.learn.data.dataset import Camera, Photograph, Scene
-from lalaloc_core.learn.data.synthetic.derived import DerivedScenes, seed_of
+from lalaloc_core.learn.data.synthetic.generated import DerivedScenes, camera_seed
 from lalaloc_core.learn.synth.augmentation.photometric import jittered, optics
 from lalaloc_core.learn.synth.augmentation.stretching import stretched_images
 
-# Standard deviation of the logarithm of how much longer rooms look than their plan says, along two axes.
+# Standard deviation of the log ratio between photographed and planned lengths, along two axes.
 _LENGTH_ERROR = 0.1
-# Of what training does to pictures.
+# Strength of the photometric changes, 1 as in training.
 _STRENGTH = 1.0
 
 
 @dataclass(frozen=True)
 class DisturbedScenes(DerivedScenes):
-    """Generated homes whose photographs are drawn out a little, and exposed, blurred and compressed anew."""
+    """Generated homes whose photographs are slightly stretched, and changed in exposure, blur and compression."""
 
-    asked: ClassVar[str] = "disturbed"
+    variant: ClassVar[str] = "disturbed"
 
     def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
+        """Generate a scene and disturb its photographs."""
         scene = self.homes.load(name, problems)
         return dataclasses.replace(scene, cameras=tuple(_disturbed(camera) for camera in scene.cameras))
 
 
 def _disturbed(camera: Camera) -> Camera:
-    seed = seed_of(camera)
+    seed = camera_seed(camera)
     photographs = {look: DisturbedPhotograph(photograph, seed) for look, photograph in camera.photographs.items()}
     return dataclasses.replace(camera, photographs=photographs)
 
 
 @dataclass(frozen=True, eq=False)
 class DisturbedPhotograph:
-    """A photograph of a room whose lengths are a little off, by a camera that is not the renderer's."""
+    """Photograph with small length errors and the effects of a real camera."""
 
     photograph: Photograph
     seed: int
 
     def image(self, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
+        """Return RGB pixels at the given size."""
         generator = torch.Generator().manual_seed(self.seed)
         factors = torch.exp(_LENGTH_ERROR * torch.randn(1, 2, generator=generator))
         image = stretched_images(torch.from_numpy(self.photograph.image(height, width))[None], factors)
@@ -58,4 +60,5 @@ class DisturbedPhotograph:
         return image[0].round().to(torch.uint8).numpy()
 
     def depth_m(self) -> Float[np.ndarray, "h w"]:
-        raise DatasetError("a photograph that is drawn out has no depth")
+        """Raise an error: there is no depth."""
+        raise DatasetError("disturbed photographs have no depth")

@@ -1,4 +1,4 @@
-"""Synthetic scenes from the generator, without touching disk: homes by seed, rendered when they are looked at."""
+"""Scenes of the generator, without touching disk: homes by seed, rendered on demand."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -28,13 +29,14 @@ SPLIT_NUMBERS: dict[Split, int] = {"train": TRAIN, "validation": VALIDATION, "te
 
 @dataclass(frozen=True, kw_only=True)
 class GeneratedScenes:
-    """Homes of the generator with a few cameras each, at every heading and camera heights of 1.0 to 1.9 m.
+    """Homes of the generator with a few cameras each, at any heading and camera heights of 1.0 to 1.9 m.
 
     Attributes:
-        homes: how many per split.
+        homes: number of homes per split.
         shots_per_home: cameras per home.
-        furniture: every camera's level, or None to draw it for each: then a camera's one photograph has no level.
-        textures: folder of material pictures; without it all are procedural.
+        seed: of the homes.
+        furniture: level of all cameras; None draws a level per camera, and its photograph has no level.
+        textures: folder of material pictures; None makes all materials procedural.
     """
 
     homes: int
@@ -45,22 +47,26 @@ class GeneratedScenes:
 
     @property
     def description(self) -> str:
+        """Name of the data set in results."""
         return f"generated homes (seed {self.seed})"
 
     @property
     def appearances(self) -> Sequence[Appearance]:
+        """The only appearance, with the configured furniture level."""
         return (Appearance(self.furniture),)
 
     def scenes(self, split: Split) -> Sequence[str]:
+        """Return the names of a split's scenes."""
         return [f"{split}-{index:05d}" for index in range(self.homes)]
 
     def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
+        """Generate a scene from its name."""
         split, _, index = name.partition("-")
         number = next((n for known, n in SPLIT_NUMBERS.items() if known == split), None)
         if number is None or not index.isdecimal():
             raise DatasetError("no such generated scene; names are like 'test-00042'", scene=name)
         home, rng = home_of(number, self.seed, int(index))
-        renderers = renderer_cache_of(number, self.seed, self.textures)
+        renderers = split_renderer_cache(number, self.seed, self.textures)
         shots = sample_shots(home, self.shots_per_home, rng, self.furniture)
         cameras = tuple(
             Camera(
@@ -77,12 +83,39 @@ class GeneratedScenes:
 
 
 def training_plans(homes: int, seed: int) -> list[FloorPlan]:
-    """The plans of the first training homes."""
+    """Return the plans of the first training homes."""
     return [home_of(TRAIN, seed, index)[0].plan for index in range(homes)]
 
 
+@dataclass(frozen=True)
+class DerivedScenes:
+    """Base of data sets that change the scenes of generated homes; `load` makes the change, `variant` describes it."""
+
+    homes: GeneratedScenes
+    variant: ClassVar[str]
+
+    @property
+    def description(self) -> str:
+        """Name of the data set in results."""
+        return f"{self.homes.description}, {self.variant}"
+
+    @property
+    def appearances(self) -> Sequence[Appearance]:
+        """Appearances of the generated homes."""
+        return self.homes.appearances
+
+    def scenes(self, split: Split) -> Sequence[str]:
+        """Return the names of a split's scenes."""
+        return self.homes.scenes(split)
+
+
+def camera_seed(camera: Camera) -> int:
+    """Derive a seed for a camera's photograph from its position."""
+    return int(1e3 * abs(camera.position_m).sum())
+
+
 class RendererCache:
-    """The materials of a split, and its renderers by picture: both take a second to build and are kept."""
+    """Materials of a split and its renderers by picture size, cached because each takes a second to build."""
 
     def __init__(self, materials: MaterialLibrary, device: torch.device | str = "cpu") -> None:
         self.materials = materials
@@ -90,7 +123,7 @@ class RendererCache:
         self._renderers: dict[tuple[int, int, tuple[int, int]], PanoramaRenderer] = {}
 
     def renderer(self, height: int, width: int, supersample: tuple[int, int] = (1, 1)) -> PanoramaRenderer:
-        """The renderer of a picture size with `supersample` rays per pixel along (rows, columns)."""
+        """Return the renderer of a picture size with `supersample` rays per pixel along (rows, columns)."""
         key = height, width, supersample
         if key not in self._renderers:
             self._renderers[key] = PanoramaRenderer(
@@ -100,25 +133,27 @@ class RendererCache:
 
 
 @lru_cache(maxsize=4)
-def renderer_cache_of(split: int, seed: int, textures: Path | None) -> RendererCache:
-    """The renderers of a split: materials are sampled anew for each."""
+def split_renderer_cache(split: int, seed: int, textures: Path | None) -> RendererCache:
+    """Return the renderers of a split, each with its own sample of materials."""
     return RendererCache(MaterialLibrary.create(np.random.default_rng([split, seed]), textures))
 
 
 @dataclass(frozen=True, eq=False)
 class RenderedPhotograph:
-    """A photograph that is rendered whenever it is asked for; like a real one it averages over each pixel's area."""
+    """Photograph rendered on demand; like a real one it averages over each pixel's area."""
 
     shot: Shot
     renderers: RendererCache
 
     @cached_property
     def facts(self) -> frozenset[str]:
-        """What makes the shot hard, see `synth.scene.facts`."""
+        """Facts that make the shot hard, see `synth.scene.facts`."""
         return frozenset(facts_of(self.shot))
 
     def image(self, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
+        """Render RGB pixels at the given size."""
         return self.renderers.renderer(height, width, _PHOTOGRAPH_RAYS).render([self.shot])[0].cpu().numpy()
 
     def depth_m(self) -> Float[np.ndarray, "h w"]:
+        """Render the distance (m) along each pixel's ray."""
         return self.renderers.renderer(_DEPTH_HEIGHT, 2 * _DEPTH_HEIGHT).depth_m([self.shot])[0].cpu().numpy()

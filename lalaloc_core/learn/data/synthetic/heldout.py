@@ -1,4 +1,4 @@
-"""Out-of-family scenes: homes and photographs written apart from the training generator, for nothing but reporting."""
+"""Out-of-distribution scenes for reporting only; their generator shares no code with the training generator."""
 
 from __future__ import annotations
 
@@ -16,18 +16,19 @@ from lalaloc_core.learn.heldout.photograph import HeldoutShot, depth_m, render
 
 _DEPTH_HEIGHT = 256
 _LEVEL_SHARES = (0.2, 0.25, 0.55)
-# Both are for reporting; there is nothing to train on.
+# There is no training split.
 SPLIT_NUMBERS: dict[Split, int] = {"validation": 1, "test": 2}
 
 
 @dataclass(frozen=True, kw_only=True)
 class HeldoutScenes:
-    """Homes of the out-of-family generator with a few cameras each, at every heading and heights of 1.1 to 1.8 m.
+    """Homes of the out-of-distribution generator with a few cameras each, at any heading, 1.1 to 1.8 m high.
 
     Attributes:
-        homes: how many per split.
-        shots_per_home: cameras per home; they stand where they fit at every furniture level.
-        furniture: every camera's level, or None to draw it for each: then a camera's one photograph has no level.
+        homes: number of homes per split.
+        shots_per_home: cameras per home, at positions that are free at every furniture level.
+        seed: of the homes.
+        furniture: level of all cameras; None draws a level per camera, and its photograph has no level.
     """
 
     homes: int
@@ -36,28 +37,32 @@ class HeldoutScenes:
     furniture: Level | None = "full"
 
     def __post_init__(self) -> None:
-        for name, least in (("homes", 0), ("shots_per_home", 1), ("seed", 0)):
-            if getattr(self, name) < least:
-                raise InvalidInputError(f"{name} is {getattr(self, name)}, it must be at least {least}")
+        for name, minimum in (("homes", 0), ("shots_per_home", 1), ("seed", 0)):
+            if getattr(self, name) < minimum:
+                raise InvalidInputError(f"{name} is {getattr(self, name)}; the minimum is {minimum}")
         if self.furniture not in (None, *LEVELS):
-            raise InvalidInputError(f"furniture is '{self.furniture}', it must be one of {', '.join(LEVELS)}")
+            raise InvalidInputError(f"furniture is '{self.furniture}'; it must be one of {', '.join(LEVELS)}")
 
     @property
     def description(self) -> str:
+        """Name of the data set in results."""
         return f"out-of-family homes (seed {self.seed})"
 
     @property
     def appearances(self) -> Sequence[Appearance]:
+        """The only appearance, with the configured furniture level."""
         return (Appearance(self.furniture),)
 
     def scenes(self, split: Split) -> Sequence[str]:
+        """Return the names of a split's scenes; the training split has none."""
         return [f"{split}-{index:05d}" for index in range(self.homes)] if split in SPLIT_NUMBERS else []
 
     def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
+        """Generate a scene from its name."""
         split, _, index = name.partition("-")
         number = next((n for known, n in SPLIT_NUMBERS.items() if known == split), None)
         if number is None or not index.isdecimal():
-            raise DatasetError("no such out-of-family scene; names are like 'test-00042'", scene=name)
+            raise DatasetError("no such out-of-distribution scene; names are like 'test-00042'", scene=name)
         key = HomeKey(number, self.seed, int(index))
         levels = key.rng(5).choice(len(LEVELS), self.shots_per_home, p=_LEVEL_SHARES)
         cameras = tuple(
@@ -80,12 +85,14 @@ class HeldoutScenes:
 
 @dataclass(frozen=True, eq=False)
 class HeldoutPhotograph:
-    """A photograph that is rendered whenever it is asked for."""
+    """Photograph rendered on demand."""
 
     shot: HeldoutShot
 
     def image(self, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
+        """Render RGB pixels at the given size."""
         return render(self.shot, height, width)
 
     def depth_m(self) -> Float[np.ndarray, "h w"]:
+        """Render the distance (m) along each pixel's ray."""
         return depth_m(self.shot, _DEPTH_HEIGHT, 2 * _DEPTH_HEIGHT)

@@ -1,7 +1,7 @@
-"""Synthetic scenes on disk, in Structured3D's layout: `lalaloc synth`.
+"""Generated scenes on disk in Structured3D's layout: `lalaloc synth`.
 
-A scene appears under its own name only when it is complete, so an interrupted run goes on where it stopped. What a
-scene looks like depends on its number and the settings alone, not on the run or the process that renders it.
+A scene gets its final name when it is complete, so an interrupted run can continue. A scene depends on its number and
+the settings only, not on the run or the process that renders it.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from lalaloc_core.learn.data.structured3d_writer import (
     write_depth,
     write_picture,
 )
-from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, renderer_cache_of
+from lalaloc_core.learn.data.synthetic.generated import SPLIT_NUMBERS, split_renderer_cache
 from lalaloc_core.learn.synth.furniture.furnish import FURNITURE_LEVELS
 from lalaloc_core.learn.synth.homes.splits import home_of
 from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer
@@ -55,13 +55,13 @@ _SCENE = re.compile(r"scene_\d+")
 
 @dataclass(frozen=True, kw_only=True)
 class Synthesis:
-    """What decides how scenes look, and where they are written.
+    """Settings of generated scenes on disk.
 
     Attributes:
         root: folder of the data set.
-        seed: of the homes and everything in them.
-        height: rows of a panorama, even; it is twice as wide.
-        textures: folder of material pictures; without it all are procedural.
+        seed: of the homes and their contents.
+        height: rows of a panorama, even; the width is twice the height.
+        textures: folder of material pictures; None makes all materials procedural.
     """
 
     root: Path
@@ -71,72 +71,75 @@ class Synthesis:
 
     def __post_init__(self) -> None:
         if self.seed < 0:
-            raise InvalidInputError(f"the seed is {self.seed}, it must not be negative")
+            raise InvalidInputError(f"seed is {self.seed}; the minimum is 0")
         if self.height % 2 or not _MIN_HEIGHT <= self.height <= _MAX_HEIGHT:
             raise InvalidInputError(
-                f"panoramas of {self.height} rows, an even number from {_MIN_HEIGHT} to {_MAX_HEIGHT} is needed"
+                f"height is {self.height}; it must be an even number from {_MIN_HEIGHT} to {_MAX_HEIGHT}"
             )
         folder = self.textures
         if folder is not None and not any(any((folder / kind).glob("*/*.jpg")) for kind in CATEGORIES):
-            raise InvalidInputError(f"no <category>/<material>/*.jpg below '{folder}'")
+            raise InvalidInputError(f"no <category>/<material>/*.jpg below '{folder}' (--textures)")
 
     @property
     def marker(self) -> Synthetic:
-        """What the data set says of itself."""
+        """Content of the data set's `synthetic.json`."""
         name = None if self.textures is None else self.textures.resolve().name
         return Synthetic(format=1, seed=self.seed, height=self.height, width=2 * self.height, textures=name)
 
 
 def share_out(scenes: int, split: Split | Literal["all"]) -> dict[Split, tuple[int, ...]]:
-    """Numbers of the scenes to write, by split: each split's first ones that the paper does not exclude.
+    """Choose the numbers of the scenes to write by split: each split's first ones that the paper does not exclude.
 
     Args:
-        scenes: how many.
-        split: which split, or "all": then shared out like the official ones, and from three on each has some.
+        scenes: number of scenes.
+        split: a split, or "all" for the proportions of the official splits; each then gets at least one of three or
+            more scenes.
 
     Raises:
-        InvalidInputError: more scenes than there are numbers, or none.
+        InvalidInputError: the number of scenes is below 1 or above the size of the splits.
     """
-    numbers: dict[Split, tuple[int, ...]] = {one: scene_numbers(one) for one in SPLITS if split in ("all", one)}
-    total = sum(len(found) for found in numbers.values())
+    numbers: dict[Split, tuple[int, ...]] = {name: scene_numbers(name) for name in SPLITS if split in ("all", name)}
+    total = sum(len(available) for available in numbers.values())
     if not 1 <= scenes <= total:
-        where = "the splits have" if split == "all" else f"split '{split}' has"
-        raise InvalidInputError(f"{scenes} scenes asked for, from 1 to {total} are possible: that many numbers {where}")
-    exact = {one: scenes * len(found) / total for one, found in numbers.items()}
-    counts = {one: math.floor(share) for one, share in exact.items()}
-    by_remainder = sorted(exact, key=lambda one: counts[one] - exact[one])
-    for one in by_remainder[: scenes - sum(counts.values())]:
-        counts[one] += 1
-    for one in numbers:
-        if counts[one] == 0 and scenes >= len(numbers):
-            counts[one] = 1
-            counts[max(counts, key=lambda other: counts[other])] -= 1
-    return {one: found[: counts[one]] for one, found in numbers.items()}
+        where = "the splits" if split == "all" else f"split '{split}'"
+        raise InvalidInputError(f"scenes is {scenes}; the limits of {where} are 1 to {total}")
+    exact = {name: scenes * len(available) / total for name, available in numbers.items()}
+    counts = {name: math.floor(share) for name, share in exact.items()}
+    by_remainder = sorted(exact, key=lambda name: counts[name] - exact[name])
+    for name in by_remainder[: scenes - sum(counts.values())]:
+        counts[name] += 1
+    for name in numbers:
+        if counts[name] == 0 and scenes >= len(numbers):
+            counts[name] = 1
+            counts[max(counts, key=lambda largest: counts[largest])] -= 1
+    return {name: available[: counts[name]] for name, available in numbers.items()}
 
 
 def synthesise(settings: Synthesis, numbers: dict[Split, tuple[int, ...]], *, workers: int = 1) -> int:
-    """Write the scenes that are not there yet; a progress bar goes to standard error.
+    """Write the missing scenes, with a progress bar on standard error.
 
     Args:
+        settings: of the scenes.
         numbers: of the scenes, by split.
-        workers: processes; with 1 this process does the work.
+        workers: processes; 1 renders in this process.
 
     Returns:
-        how many scenes were written.
+        Number of scenes written.
 
     Raises:
-        InvalidInputError: the settings, or the folder has scenes of other settings, or cannot be written to.
+        InvalidInputError: the number of workers is below 1.
+        DatasetError: the folder has scenes of other settings, or cannot be written to.
     """
     if workers < 1:
-        raise InvalidInputError(f"{workers} worker processes, at least 1 is needed")
-    wanted = [_Job(settings, split, number) for split, of_split in numbers.items() for number in of_split]
-    with _named_errors(settings.root):
+        raise InvalidInputError(f"workers is {workers}; the minimum is 1")
+    wanted = [_Job(settings, split, number) for split, chosen in numbers.items() for number in chosen]
+    with _write_errors(settings.root):
         _claim(settings)
         for job in wanted:
             shutil.rmtree(job.part, ignore_errors=True)
         missing = [job for job in wanted if not job.folder.is_dir()]
     with (
-        closing(_written_here(missing) if workers == 1 else _written_by(workers, missing)) as finished,
+        closing(_write_serially(missing) if workers == 1 else _write_in_processes(workers, missing)) as finished,
         tqdm(total=len(wanted), initial=len(wanted) - len(missing), desc="synth", unit="scene") as bar,
     ):
         panoramas = 0
@@ -149,7 +152,7 @@ def synthesise(settings: Synthesis, numbers: dict[Split, tuple[int, ...]], *, wo
 
 @dataclass(frozen=True)
 class _Job:
-    """One scene to write."""
+    """A scene to write."""
 
     settings: Synthesis
     split: Split
@@ -161,28 +164,31 @@ class _Job:
 
     @property
     def part(self) -> Path:
-        """The scene while it is incomplete."""
+        """Folder of the incomplete scene."""
         return self.settings.root / (scene_name(self.number) + PART_SUFFIX)
 
 
 def _write_scene(job: _Job, stop: Event | None = None) -> int:
-    """Render and write one scene; nothing is left of one that fails.
+    """Render and write one scene; a failure leaves no files.
 
     Args:
-        stop: looked at between rooms; once set, the scene is given up.
+        job: the scene.
+        stop: checked between rooms; when set, the scene is abandoned.
 
     Returns:
-        how many panoramas were written.
+        Number of panoramas written.
 
     Raises:
-        DatasetError: it cannot be written.
+        DatasetError: the scene cannot be written.
     """
     settings, split = job.settings, SPLIT_NUMBERS[job.split]
     home, rng = home_of(split, settings.seed, job.number)
-    renderer = renderer_cache_of(split, settings.seed, settings.textures).renderer(settings.height, 2 * settings.height)
+    renderer = split_renderer_cache(split, settings.seed, settings.textures).renderer(
+        settings.height, 2 * settings.height
+    )
     shots = stage_rooms(home, rng)
     try:
-        with _named_errors(job.part):
+        with _write_errors(job.part):
             job.part.mkdir()
             write_annotation(job.part, home.plan, home.openings)
             for shot in shots:
@@ -191,7 +197,7 @@ def _write_scene(job: _Job, stop: Event | None = None) -> int:
                 _write_room(job.part / RENDERING_FOLDER / room_id(shot.room_index) / "panorama", shot, renderer)
             job.part.rename(job.folder)
     finally:
-        # Gone already when it was renamed.
+        # No effect after the rename.
         shutil.rmtree(job.part, ignore_errors=True)
     return PICTURES_PER_ROOM * len(shots)
 
@@ -208,7 +214,7 @@ def _write_room(folder: Path, shot: Shot, renderer: PanoramaRenderer) -> None:
 
 
 def _claim(settings: Synthesis) -> None:
-    """Mark a new folder with the settings, or check that it has scenes of the same."""
+    """Mark a new folder with the settings, or check that an existing one has the same settings."""
     root, marker = settings.root, settings.marker
     path = root / SYNTHETIC_FILE
     root.mkdir(parents=True, exist_ok=True)
@@ -216,17 +222,20 @@ def _claim(settings: Synthesis) -> None:
     if found is None:
         foreign = next((entry.name for entry in root.iterdir() if _SCENE.fullmatch(entry.name)), None)
         if foreign is not None:
-            raise DatasetError(f"holds '{foreign}' but no {SYNTHETIC_FILE}: its scenes are not synthetic", path=root)
+            raise DatasetError(
+                f"holds '{foreign}' but no {SYNTHETIC_FILE}: its scenes are not generated; choose another folder",
+                path=root,
+            )
         atomic_write(path, json.dumps(dataclasses.asdict(marker)) + "\n")
     elif found != marker:
         before, now = dataclasses.asdict(found), dataclasses.asdict(marker)
         differences = [f"{key} {before[key]!r}, not {now[key]!r}" for key in before if before[key] != now[key]]
-        raise DatasetError(f"its scenes were made with {'; '.join(differences)}", path=root)
+        raise DatasetError(f"its scenes were generated with {'; '.join(differences)}", path=root)
 
 
 @contextmanager
-def _named_errors(path: Path) -> Iterator[None]:
-    """A full disk, or a folder that may not be written to, is an error of the caller's."""
+def _write_errors(path: Path) -> Iterator[None]:
+    """Convert a full disk or a read-only folder to a DatasetError."""
     try:
         yield
     except OSError as error:
@@ -234,10 +243,10 @@ def _named_errors(path: Path) -> Iterator[None]:
         raise DatasetError(f"cannot be written: {error.strerror or error}", path=where) from error
 
 
-def _written_here(jobs: Sequence[_Job]) -> Generator[int]:
-    """Write scenes in this process; yields their numbers of panoramas."""
+def _write_serially(jobs: Sequence[_Job]) -> Generator[int]:
+    """Write scenes in this process and yield their numbers of panoramas."""
     threads = torch.get_num_threads()
-    # As in worker processes: how sums are split over threads would show in the last bit.
+    # As in worker processes, because the number of threads changes the last bit of sums.
     torch.set_num_threads(1)
     try:
         yield from map(_write_scene, jobs)
@@ -245,8 +254,8 @@ def _written_here(jobs: Sequence[_Job]) -> Generator[int]:
         torch.set_num_threads(threads)
 
 
-def _written_by(workers: int, jobs: Sequence[_Job]) -> Generator[int]:
-    """Write scenes in worker processes; yields their numbers of panoramas, in order."""
+def _write_in_processes(workers: int, jobs: Sequence[_Job]) -> Generator[int]:
+    """Write scenes in worker processes and yield their numbers of panoramas in order."""
     context = multiprocessing.get_context("spawn")
     stop = context.Event()
     pool = ProcessPoolExecutor(workers, context, _start_worker, (stop,))
@@ -259,14 +268,16 @@ def _written_by(workers: int, jobs: Sequence[_Job]) -> Generator[int]:
         while waiting:
             yield waiting.popleft().result()
     except BrokenProcessPool as error:
-        raise DatasetError("a worker process died; fewer may fit into memory", path=jobs[0].settings.root) from error
+        raise DatasetError(
+            "a worker process died; use fewer --workers if memory is short", path=jobs[0].settings.root
+        ) from error
     finally:
-        # After an interruption or an error the workers give up the scenes in the making.
+        # After an interruption or an error the workers abandon their scenes.
         stop.set()
         pool.shutdown(cancel_futures=True)
 
 
-# Set once, when a worker process starts: an event can be handed over at no other time.
+# Set when a worker process starts, because an event can be passed at no other time.
 _stop: Event | None = None
 
 
@@ -274,7 +285,7 @@ def _start_worker(stop: Event) -> None:
     global _stop
     _stop = stop
     torch.set_num_threads(1)
-    # Ctrl-C reaches the whole group of processes; the parent tells its workers what to do.
+    # Ctrl-C reaches the whole process group; the parent stops its workers itself.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_die_with_parent, daemon=True).start()
 
