@@ -1,4 +1,4 @@
-"""Tiny scenes in Structured3D's layout, written by hand so that the reader is tested against something else's idea."""
+"""Tiny scenes in Structured3D's layout, written independently of the reader under test."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ROOM_TYPES = ("living room", "kitchen", "bedroom", "undefined")
 
 @dataclass
 class Drawing:
-    """Planes, lines and junctions while they are drawn; everything in millimetres."""
+    """Planes, lines and junctions of an annotation; millimetres."""
 
     junctions: list[list[float]] = field(default_factory=list)
     lines: list[tuple[int, int]] = field(default_factory=list)
@@ -37,25 +37,25 @@ class Drawing:
         return len(self.lines) - 1
 
     def ring(self, corners: Sequence[int]) -> list[int]:
-        return [self.line(one, corners[(k + 1) % len(corners)]) for k, one in enumerate(corners)]
+        return [self.line(corner, corners[(k + 1) % len(corners)]) for k, corner in enumerate(corners)]
 
     def plane(self, kind: str, lines: Sequence[int]) -> int:
         self.planes.append((kind, list(lines)))
         return len(self.planes) - 1
 
     def prism(self, polygon_mm: np.ndarray, floor_mm: float, ceiling_mm: float) -> list[int]:
-        """Floor, ceiling and walls of a room; returns their planes."""
+        """Add the floor, ceiling and walls of a room; return their planes."""
         below = [self.junction(x, y, floor_mm) for x, y in polygon_mm.tolist()]
         above = [self.junction(x, y, ceiling_mm) for x, y in polygon_mm.tolist()]
         floor, ceiling = self.ring(below), self.ring(above)
-        uprights = [self.line(one, other) for one, other in zip(below, above, strict=True)]
+        uprights = [self.line(*ends) for ends in zip(below, above, strict=True)]
         planes = [self.plane("floor", floor), self.plane("ceiling", ceiling)]
         for k in range(len(below)):
             planes.append(self.plane("wall", [floor[k], uprights[(k + 1) % len(below)], ceiling[k], uprights[k]]))
         return planes
 
     def opening(self, wall: int, start_mm: np.ndarray, end_mm: np.ndarray, sill_mm: float, head_mm: float) -> int:
-        """A door or window: a hole in a wall and a plane of its own; returns that plane."""
+        """Add a door or window, a hole in a wall with its own plane; return that plane."""
         corners = [
             self.junction(float(at[0]), float(at[1]), z)
             for at, z in ((start_mm, sill_mm), (end_mm, sill_mm), (end_mm, head_mm), (start_mm, head_mm))
@@ -65,7 +65,7 @@ class Drawing:
         return self.plane("wall", ring)
 
     def to_document(self, rng: np.random.Generator) -> dict[str, Any]:
-        """The annotation, with lines and junctions in any order."""
+        """Return the annotation with shuffled lines and junctions."""
         line_order = rng.permutation(len(self.lines)).tolist()
         junction_order = rng.permutation(len(self.junctions)).tolist()
         line_place = {line: place for place, line in enumerate(line_order)}
@@ -97,12 +97,12 @@ class Drawing:
 
 
 def room_id(index: int) -> str:
-    """ID that the drawing gives to a room of the plan."""
+    """Return the ID of a room of the plan in the annotation."""
     return str(1007 + 13 * index)
 
 
 def drawing_of(plan: FloorPlan, rng: np.random.Generator, floor_m: float = 0.0) -> Drawing:
-    """A plan as the data set draws it: every room from any corner and in any sense, a door and a window in each."""
+    """Draw a plan as an annotation: rooms start at any corner in any sense, each with a door and a window."""
     drawing = Drawing()
     for index, room in enumerate(plan.rooms):
         polygon_mm = 1000.0 * np.roll(room.polygon_m, int(rng.integers(len(room.polygon_m))), axis=0)
@@ -125,7 +125,7 @@ def drawing_of(plan: FloorPlan, rng: np.random.Generator, floor_m: float = 0.0) 
 
 @dataclass(frozen=True, kw_only=True)
 class Stand:
-    """Where a camera stands: position and height over the floor in metres."""
+    """Camera position and height above the floor in metres."""
 
     room_index: int
     x_m: float
@@ -165,18 +165,18 @@ def write_annotation(folder: Path, document: dict[str, Any]) -> None:
 
 
 def write_camera(panorama: Path, x_mm: float, y_mm: float, z_mm: float) -> None:
-    """Replace a camera's place."""
+    """Replace a camera's position."""
     (panorama / "camera_xyz.txt").write_text(f"{x_mm} {y_mm} {z_mm}\n", encoding="ascii")
 
 
 def write_synthetic(root: Path, **changes: Any) -> None:
-    """Mark a folder as scenes of the generator with small panoramas."""
+    """Mark a folder as generated scenes with small panoramas."""
     document = {"format": 1, "seed": 5, "height": HEIGHT, "width": WIDTH, "textures": None, **changes}
     (root / "synthetic.json").write_text(json.dumps(document), encoding="utf-8")
 
 
 def depth_mm(room: Room, stand: Stand, size: tuple[int, int]) -> np.ndarray:
-    """Depth of the bare room, ray by ray, in the frame that the data set's own tools use: x = r sin, y = r cos."""
+    """Cast the depth of the bare room ray by ray in the frame of the data set's tools: x = r sin, y = r cos."""
     height, width = size
     depth = np.zeros(size, dtype=np.uint16)
     outline = shapely.Polygon(room.polygon_m).exterior

@@ -1,4 +1,4 @@
-"""Small homes in ZInD's own structure with a known answer: `python -m tests.zind_home OUT`.
+"""Small homes in ZInD's structure with known poses: `python -m tests.zind_home OUT`.
 
 A right-handed plan with true poses is mirrored into ZInD's frame, and every panorama gets a frame of its own with a
 random turn, scale and place. Its picture is painted from that frame alone, by ZInD's rule that a point (x, y) is seen
@@ -30,7 +30,7 @@ FLOOR_GREY, CEILING_GREY = 60, 200
 
 @dataclass(frozen=True, kw_only=True)
 class TruePanorama:
-    """A panorama as it truly was, in the plan frame: metres, radians clockwise from +y."""
+    """True pose of a panorama in the plan frame: metres, radians clockwise from +y."""
 
     room_index: int
     x_m: float
@@ -40,7 +40,7 @@ class TruePanorama:
     primary: bool = True
 
     def name(self, number: int) -> str:
-        """Name of its camera when it is panorama `number` of its floor."""
+        """Return the camera's name of panorama `number` of its floor."""
         return f"partial_room_{self.room_index + 1:02d}_pano_{number}"
 
 
@@ -54,7 +54,7 @@ PANORAMAS = (
 
 
 def wall_colour(wall: int) -> tuple[int, int, int]:
-    """Colour of a room's wall by its number."""
+    """Return the colour of a room's wall by its number."""
     return 255 - 40 * (wall % 5), 30 + 45 * wall % 200, 20 + 90 * (wall % 3)
 
 
@@ -92,14 +92,14 @@ def write_homes(root: Path, rng: np.random.Generator, size: tuple[int, int] = (H
 def _panorama_data(
     plan: FloorPlan, panorama: TruePanorama, scale_m: float, rng: np.random.Generator
 ) -> tuple[dict[str, Any], np.ndarray]:
-    """What the file says of a panorama, and its room's vertices in its own frame."""
+    """Return the file's entry of a panorama, and its room's vertices in the panorama's frame."""
     room = plan.rooms[panorama.room_index]
     mirror = np.array([-1.0, 1.0])
-    # A panorama's own frame has the camera's height as its unit, and its image's centre column along +y.
+    # The panorama's frame has the camera height as its unit, and the centre column along +y.
     scale = panorama.height_m / scale_m
     translation = np.array([panorama.x_m, panorama.y_m]) * mirror / scale_m
     turns = 360.0 * int(rng.integers(-1, 2))
-    # Seen from below, as in a mirror, clockwise is counter-clockwise.
+    # In the mirrored frame, clockwise becomes counter-clockwise.
     angle = panorama.heading
     cosine, sine = math.cos(angle), math.sin(angle)
     offset = room.polygon_m * mirror / scale_m - translation
@@ -126,14 +126,14 @@ def _panorama_data(
 
 
 def _painted(vertices: np.ndarray, ceiling_height: float, size: tuple[int, int]) -> np.ndarray:
-    """The panorama of a room in the panorama's own frame, the camera at its origin, one unit over the floor."""
+    """Paint the panorama of a room in the panorama's frame, the camera at its origin, one unit above the floor."""
     height, width = size
     pixels = np.zeros((height, width, 3), dtype=np.uint8)
-    walls = [shapely.LineString([one, vertices[(k + 1) % len(vertices)]]) for k, one in enumerate(vertices)]
+    walls = [shapely.LineString([vertex, vertices[(k + 1) % len(vertices)]]) for k, vertex in enumerate(vertices)]
     elevation = math.pi * (0.5 - (np.arange(height) + 0.5) / height)
     for column in range(width):
         image_azimuth = 2.0 * math.pi * ((column + 0.5) / width - 0.5)
-        # The direction whose atan2(-x, y) is this azimuth.
+        # Direction whose atan2(-x, y) is this azimuth.
         x, y = -math.sin(image_azimuth), math.cos(image_azimuth)
         ray = shapely.LineString([(0.0, 0.0), (999.0 * x, 999.0 * y)])
         crossings = [wall.intersection(ray) for wall in walls]

@@ -1,4 +1,4 @@
-"""Annotated photographs: reading them, galleries of rooms like theirs, and what is measured on both."""
+"""Annotated photographs: reading, galleries of similar rooms, and metrics on both."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ from lalaloc_core.render.profile import wall_profile
 
 REAL = Path(__file__).parents[3] / "shared" / "real" / "annotated"
 WIDTH = 256
-# A room 4 wide and 3 deep in camera heights; the camera stands 1 from its left wall, 1 from the wall behind it.
+# Room of 4 x 3 camera heights; the camera is 1 from its left wall and 1 from the wall behind it.
 POLYGON = [[-1.0, -1.0], [3.0, -1.0], [3.0, 2.0], [-1.0, 2.0]]
 
 
@@ -60,7 +60,7 @@ def annotation(name: str, **changes: Any) -> dict[str, Any]:
         "ceiling_above_camera": 0.8,
         "openings": [
             opening("window", [0.0, 2.0], [2.0, 2.0]),
-            # Behind the camera, so that it goes over the picture's border.
+            # Behind the camera, across the picture's border.
             opening("door", [0.5, -1.0], [-0.5, -1.0]),
         ],
         "notes": "",
@@ -78,7 +78,7 @@ def write(root: Path, name: str, **changes: Any) -> Path:
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """Three photographs, one of them with two outlines and one too poor to count."""
+    """Write three photographs, one with two outlines and one of poor quality."""
     write(tmp_path, "hall", alternative_polygon=[[-1.0, -1.0], [5.0, -1.0], [5.0, 2.0], [-1.0, 2.0]])
     write(tmp_path, "den", quality="poor", openings=[], ceiling_above_camera=None)
     write(
@@ -91,18 +91,18 @@ def root(tmp_path: Path) -> Path:
 
 
 class TestReading:
-    def test_lengths_are_those_for_the_camera_height_that_is_assumed(self, root: Path) -> None:
-        one = read_annotation(root / "hall.json")
-        assert np.allclose(one.outlines[0].polygon_m, CAMERA_HEIGHT_M * np.array(POLYGON))
-        assert one.outlines[0].ceiling_height_m == pytest.approx(1.8 * CAMERA_HEIGHT_M)
-        assert one.has_flat_ceiling
+    def test_lengths_use_the_assumed_camera_height(self, root: Path) -> None:
+        hall = read_annotation(root / "hall.json")
+        assert np.allclose(hall.outlines[0].polygon_m, CAMERA_HEIGHT_M * np.array(POLYGON))
+        assert hall.outlines[0].ceiling_height_m == pytest.approx(1.8 * CAMERA_HEIGHT_M)
+        assert hall.has_flat_ceiling
         assert not read_annotation(root / "den.json").has_flat_ceiling
         # The centre column looks along +y, columns further right clockwise of it.
-        profile_m = one.profile_m(0, 64)
+        profile_m = hall.profile_m(0, 64)
         ahead, right = profile_m[31:33].mean(), profile_m[47:49].mean()
         assert (ahead, right) == (pytest.approx(2.0 * 1.5, rel=0.01), pytest.approx(3.0 * 1.5, rel=0.01))
 
-    def test_classes_follow_the_columns_also_over_the_border(self, root: Path) -> None:
+    def test_classes_wrap_around_the_border(self, root: Path) -> None:
         classes = read_annotation(root / "hall.json").classes(WIDTH)
         door, window = OPENING_CLASSES.index("door"), OPENING_CLASSES.index("window")
         assert classes[WIDTH // 2 + 5] == window
@@ -111,41 +111,42 @@ class TestReading:
         assert np.count_nonzero(classes == door) == pytest.approx(2 * np.arctan(0.5) / TWO_PI * WIDTH, abs=2)
         assert np.count_nonzero(classes == window) == pytest.approx(np.pi / 4 / TWO_PI * WIDTH, abs=2)
 
-    def test_an_alternative_outline_keeps_the_openings_that_lie_on_it(self, tmp_path: Path) -> None:
+    def test_alternative_outline_keeps_its_openings(self, tmp_path: Path) -> None:
         alternative = [[-1.0, -1.0], [3.0, -1.0], [3.0, 2.5], [-1.0, 2.5]]
         first, second = read_annotation(write(tmp_path, "hall", alternative_polygon=alternative)).outlines
-        assert [one.kind for one in first.openings] == ["window", "door"]
-        assert [one.kind for one in second.openings] == ["door"]
+        assert [opening.kind for opening in first.openings] == ["window", "door"]
+        assert [opening.kind for opening in second.openings] == ["door"]
 
-    def test_an_opening_lies_on_its_wall_also_where_its_edge_is_that_of_a_corner_before_it(
-        self, tmp_path: Path
-    ) -> None:
-        # A pier before the wall ahead, whose corner at (1/2, 3/2) is where the window is seen to end.
+    def test_occluded_opening_lies_on_its_wall(self, tmp_path: Path) -> None:
+        # A pier in front of the wall hides the window beyond its corner at (1/2, 3/2).
         polygon = [[-2.0, -1.0], [2.0, -1.0], [2.0, 2.0], [1.0, 2.0], [1.0, 1.5], [0.5, 1.5], [0.5, 2.0], [-2.0, 2.0]]
         line = [-1.0, 2.0], [0.5, 1.5]
-        one = read_annotation(write(tmp_path, "corner", polygon=polygon, openings=[opening("window", *line)]))
-        (piece,) = one.outlines[0].openings
+        corner = read_annotation(write(tmp_path, "corner", polygon=polygon, openings=[opening("window", *line)]))
+        (piece,) = corner.outlines[0].openings
         assert piece.line_m / CAMERA_HEIGHT_M == pytest.approx(np.array([[-1.0, 2.0], [0.5, 2.0]]), abs=0.05)
 
     @pytest.mark.parametrize(
         ("changes", "reason"),
         [
             ({"colour": "red"}, "unknown key 'colour'"),
-            ({"quality": "superb"}, "quality is 'superb', it must be one of good, fair, poor"),
+            ({"quality": "superb"}, "quality is 'superb'; it must be one of good, fair, poor"),
             ({"photograph": "../hall.png"}, "it must be a path below"),
             ({"photograph": "lost.png"}, "photograph 'lost.png' cannot be read"),
             ({"photograph": "hall.json"}, "not a readable picture"),
             ({"ceiling_above_camera": -1.0}, "ceiling_above_camera is -1.0"),
-            ({"polygon": [[1.0, 1.0], [2.0, 1.0], [2.0, 2.0]]}, "the camera at (0, 0) stands outside"),
+            ({"polygon": [[1.0, 1.0], [2.0, 1.0], [2.0, 2.0]]}, "the camera at (0, 0) is outside"),
             ({"polygon": [[-1, -1], [1, 1], [1, -1], [-1, 1.5]]}, "crosses itself"),
-            ({"polygon": [[-1, -1], [400, -1], [1, 1]]}, "more than 60 camera heights away"),
+            ({"polygon": [[-1, -1], [400, -1], [1, 1]]}, "the limit is 60, and lengths are in camera heights"),
             ({"polygon": [[-1, -1], [1, -1], ["1", 1]]}, "it must be two numbers"),
             ({"openings": [{"kind": "door", "columns": [0, 9]}]}, "keys columns, kind, line"),
             ({"openings": [opening("hatch", [0.0, 2.0], [1.0, 2.0])]}, "kind is 'hatch'"),
-            ({"openings": [opening("door", [0.0, 1.5], [1.0, 1.5])]}, "is 0.5 off the outline, at most 0.1 is allowed"),
+            (
+                {"openings": [opening("door", [0.0, 1.5], [1.0, 1.5])]},
+                "is 0.5 camera heights from the outline; the limit is 0.1",
+            ),
             (
                 {"openings": [opening("door", [0.0, 2.0], [1.0, 2.0]) | {"columns": [128, 170]}]},
-                "seen at the columns 128, 147, but its columns are 128, 170; they may differ by 3",
+                "are at the columns 128, 147, but its columns are 128, 170; the maximum difference is 3",
             ),
             ({"openings": [opening("door", [0.0, 2.0], [1.0, 2.0]) | {"columns": [128, 257]}]}, "to the width, 256"),
             (
@@ -155,7 +156,9 @@ class TestReading:
             ({"notes": 7}, "notes must be text"),
         ],
     )
-    def test_what_cannot_be_is_refused_with_the_value(self, root: Path, changes: dict[str, Any], reason: str) -> None:
+    def test_invalid_annotation_is_refused_with_the_value(
+        self, root: Path, changes: dict[str, Any], reason: str
+    ) -> None:
         document = annotation("hall", **changes)
         (root / "hall.json").write_text(json.dumps(document))
         with pytest.raises(DatasetError) as caught:
@@ -163,7 +166,7 @@ class TestReading:
         assert reason in str(caught.value)
         assert "hall" in str(caught.value)
 
-    def test_a_missing_key_is_named(self, root: Path) -> None:
+    def test_missing_key_is_named(self, root: Path) -> None:
         document = annotation("hall")
         del document["quality"]
         (root / "hall.json").write_text(json.dumps(document))
@@ -180,11 +183,11 @@ class TestDrawnRooms:
     )
 
     @pytest.mark.parametrize("angle", [0.3, -0.5, 0.7])
-    def test_the_main_direction_undoes_a_turn(self, angle: float) -> None:
+    def test_main_direction_follows_rotation(self, angle: float) -> None:
         assert self.ROOM.turned(angle).main_direction == pytest.approx(angle)
 
     @pytest.mark.parametrize("change", ["turned", "scaled", "mirrored", "moved"])
-    def test_openings_stay_on_the_outline_which_stays_counter_clockwise(self, change: str) -> None:
+    def test_transformed_openings_stay_on_the_outline(self, change: str) -> None:
         room = {
             "turned": self.ROOM.turned(0.4),
             "scaled": self.ROOM.scaled(1.3),
@@ -198,34 +201,34 @@ class TestDrawnRooms:
 
 
 class TestGalleries:
-    def test_the_camera_sees_in_the_plan_what_was_drawn_on_the_photograph(self, root: Path) -> None:
+    def test_gallery_profile_matches_the_annotation(self, root: Path) -> None:
         dataset = AnnotatedPhotographs(root)
         for name in dataset.scenes("test"):
             key = GalleryKey.from_scene(name)
             assert key is not None
-            one = next(p for p in dataset.photographs if p.name == key.photograph)
+            photograph = next(p for p in dataset.photographs if p.name == key.photograph)
             scene = dataset.load(name)
             (camera,) = scene.cameras
             seen_m = wall_profile(
                 camera.position_m[None], np.array([camera.heading]), scene.plan.walls_m[[camera.room_index]], 64
             )[0]
-            assert np.allclose(seen_m, one.profile_m(key.outline, 64), rtol=1e-6)
+            assert np.allclose(seen_m, photograph.profile_m(key.outline, 64), rtol=1e-6)
 
-    def test_the_camera_meets_in_the_plan_what_the_photograph_shows(self, root: Path) -> None:
+    def test_gallery_openings_match_the_annotation(self, root: Path) -> None:
         dataset = AnnotatedPhotographs(root)
-        scene, one = dataset.load("hall-0"), read_annotation(root / "hall.json")
+        scene, hall = dataset.load("hall-0"), read_annotation(root / "hall.json")
         (camera,) = scene.cameras
         plan, rooms = scene.plan, np.array([camera.room_index])
         view = layout_view(
             camera.position_m[None], np.array([camera.heading]), rooms, plan.geometry, WIDTH, camera.camera_height_m
         )
-        assert np.count_nonzero(view.kind[0] != one.classes(WIDTH)) <= 6
+        assert np.count_nonzero(view.kind[0] != hall.classes(WIDTH)) <= 6
         assert plan.opening_kinds == {"door", "window", "passage"}
         assert plan.rooms[camera.room_index].type == "bedroom"
         # The others have openings of their own.
         assert {face.room for face in plan.opening_faces} > set(rooms)
 
-    def test_rooms_lie_apart_along_the_axes_and_are_alike(self, root: Path) -> None:
+    def test_gallery_rooms_are_similar_and_apart(self, root: Path) -> None:
         scene = AnnotatedPhotographs(root).load("hall-0")
         rooms = scene.plan.rooms
         own = rooms[scene.cameras[0].room_index]
@@ -239,12 +242,12 @@ class TestGalleries:
         edges = np.roll(own.polygon_m, -1, axis=0) - own.polygon_m
         assert np.abs(edges).min(axis=1).max() < 1e-9
 
-    def test_the_same_question_is_the_same_plan_and_another_is_another(self, root: Path) -> None:
+    def test_gallery_key_determines_the_plan(self, root: Path) -> None:
         first, again = (AnnotatedPhotographs(root).load("hall-1") for _ in range(2))
         assert first.plan.to_dict() == again.plan.to_dict()
         assert first.plan.to_dict() != AnnotatedPhotographs(root).load("hall-2").plan.to_dict()
 
-    def test_both_outlines_are_asked_for_among_the_same_others(self, root: Path) -> None:
+    def test_both_outlines_share_the_other_rooms(self, root: Path) -> None:
         dataset = AnnotatedPhotographs(root)
         first, second = dataset.load("hall-0"), dataset.load("hall-0-alternative")
         own = first.cameras[0].room_index
@@ -252,33 +255,33 @@ class TestGalleries:
         for index, (a, b) in enumerate(zip(first.plan.rooms, second.plan.rooms, strict=True)):
             assert a.area_m2 == pytest.approx(b.area_m2) or index == own
 
-    def test_own_size_of_generated_rooms_follows_the_room_that_they_are_to_be_like(self) -> None:
+    def test_generated_rooms_follow_the_given_size(self) -> None:
         small, large = TestDrawnRooms.ROOM, TestDrawnRooms.ROOM.scaled(2.0)
         gallery = build_gallery(large, [], 1.5, np.random.default_rng(0), like=small)
         areas = np.array([room.area_m2 for room in gallery.plan.rooms])
         assert areas[gallery.room_index] == pytest.approx(4.0 * small.size_m**2)
         assert np.delete(areas, gallery.room_index).max() < 1.3 * small.size_m**2
 
-    def test_a_folder_of_them_opens_as_a_data_set_of_test_scenes(self, root: Path) -> None:
+    def test_folder_opens_as_a_data_set(self, root: Path) -> None:
         dataset = open_dataset(root)
         assert isinstance(dataset, AnnotatedPhotographs)
         assert dataset.scenes("train") == dataset.scenes("validation") == []
-        # One photograph has two outlines, and one is too poor to be asked for.
+        # One photograph has two outlines, and one of poor quality has no gallery.
         assert len(dataset.scenes("test")) == 3 * GALLERIES
         assert list(dataset.scenes("test"))[:3] == ["hall-0", "hall-0-alternative", "nook-0"]
 
     @pytest.mark.parametrize("name", ["hall", "hall-x", "cellar-0", "nook-0-alternative"])
-    def test_there_are_no_other_scenes(self, root: Path, name: str) -> None:
+    def test_unknown_gallery_is_refused(self, root: Path, name: str) -> None:
         with pytest.raises(DatasetError, match="no such gallery"):
             AnnotatedPhotographs(root).load(name)
 
-    def test_an_empty_folder_is_refused(self, tmp_path: Path) -> None:
+    def test_empty_folder_is_refused(self, tmp_path: Path) -> None:
         with pytest.raises(DatasetError, match="no annotated photographs"):
             AnnotatedPhotographs(tmp_path).scenes("test")
 
 
 class TestAzimuths:
-    def test_errors_that_are_laplace_distributed_as_predicted_are_calibrated(self) -> None:
+    def test_laplace_errors_are_calibrated(self) -> None:
         rng = np.random.default_rng(0)
         scale = rng.uniform(0.05, 0.5, 20_000)
         measures = measure_azimuths([np.ones(20_000)], rng.laplace(0.0, scale), np.log(scale))
@@ -286,13 +289,13 @@ class TestAzimuths:
         assert measures.scale_ratio == pytest.approx(1.0, abs=0.03)
         assert measure_azimuths([np.ones(20_000)], rng.laplace(0.0, 3.0 * scale), np.log(scale)).scale_ratio > 2.8
 
-    def test_the_better_of_two_outlines_counts(self) -> None:
+    def test_better_of_two_outlines_counts(self) -> None:
         near, far = np.full(8, 2.0), np.full(8, 5.0)
         measures = measure_azimuths([far, near], np.log(np.full(8, 2.2)), np.zeros(8))
         assert measures.outline == 1
         assert measures.median_error == measures.bias == pytest.approx(np.log(1.1))
 
-    def test_no_number_is_an_infinite_error(self) -> None:
+    def test_nan_prediction_is_an_infinite_error(self) -> None:
         log_profile = np.where(np.arange(8) < 5, np.nan, 0.0)
         measures = measure_azimuths([np.ones(8)], log_profile, np.zeros(8))
         assert np.isinf(measures.median_error)
@@ -300,14 +303,14 @@ class TestAzimuths:
 
     def test_classes_are_scored_by_class(self) -> None:
         truth = np.array([0, 0, 0, 0, 1, 1, 2, 2])
-        said = np.array([0, 0, 0, 1, 1, 0, 2, 2])
-        scores = np.eye(4)[said]
+        predicted = np.array([0, 0, 0, 1, 1, 0, 2, 2])
+        scores = np.eye(4)[predicted]
         measures = measure_azimuths([np.ones(8)], np.zeros(8), np.zeros(8), truth, scores)
         assert measures.confusion is not None
         classes = score_classes(measures.confusion, OPENING_CLASSES)
         assert classes.recall == {"wall": 0.75, "door": 0.5, "window": 1.0, "passage": None}
         assert classes.precision == {"wall": 0.75, "door": 0.5, "window": 1.0, "passage": None}
-        # A class that never occurs is not asked for.
+        # A class that never occurs has no recall.
         assert classes.balanced_accuracy == pytest.approx(0.75)
         assert summarise_azimuths([measures, measures], OPENING_CLASSES).classes == classes
 
@@ -332,7 +335,7 @@ class TestGalleryScores:
     def photographs(self, root: Path) -> tuple[AnnotatedPhotograph, ...]:
         return AnnotatedPhotographs(root).photographs
 
-    def test_located_is_the_right_room_and_near(self, photographs: tuple[AnnotatedPhotograph, ...]) -> None:
+    def test_located_needs_the_right_room_and_distance(self, photographs: tuple[AnnotatedPhotograph, ...]) -> None:
         # The hall is 6 m by 4.5 m, so a tenth of its size is more than half a metre.
         near, far, elsewhere = 0.51, 0.53, 0.1
         predictions = [
@@ -346,7 +349,7 @@ class TestGalleryScores:
         assert describe_answers(answers_in_galleries(predictions, photographs), "hall") == "1 of 3 (ranks 1, 3)"
         assert describe_answers([], "den") == "not evaluated"
 
-    def test_of_two_outlines_the_better_answer_counts(self, photographs: tuple[AnnotatedPhotograph, ...]) -> None:
+    def test_better_answer_of_two_outlines_counts(self, photographs: tuple[AnnotatedPhotograph, ...]) -> None:
         predictions = [
             answer("hall-0", room=4, x_m=9.0, rank=None),
             answer("hall-0-alternative", room=3, x_m=0.1, rank=1, confidence=0.9),
@@ -355,7 +358,7 @@ class TestGalleryScores:
         assert (only.located, only.outline, only.confidence) == (True, 1, 0.9)
         assert score_galleries([only]).calibration_error == pytest.approx(0.1)
 
-    def test_a_room_taken_the_wrong_way_round_is_told(self, photographs: tuple[AnnotatedPhotograph, ...]) -> None:
+    def test_reversed_heading_is_reported(self, photographs: tuple[AnnotatedPhotograph, ...]) -> None:
         predictions = [
             answer("hall-0", room=3, x_m=0.1, rank=1, heading_deg=178.0),
             answer("hall-1", room=3, x_m=0.1, rank=1, heading_deg=355.0),
@@ -364,7 +367,7 @@ class TestGalleryScores:
         scores = score_galleries(answers_in_galleries(predictions, photographs))
         assert (scores.located, scores.turned) == pytest.approx((2 / 3, 1 / 3))
 
-    def test_no_answer_is_a_miss(self, photographs: tuple[AnnotatedPhotograph, ...]) -> None:
+    def test_missing_answer_is_a_miss(self, photographs: tuple[AnnotatedPhotograph, ...]) -> None:
         missing = Prediction(
             scene="nook-0",
             camera="nook",
@@ -378,42 +381,43 @@ class TestGalleryScores:
 
 
 class TestEvaluating:
-    def test_reading_compares_with_what_the_encoder_says(self, root: Path, encoders: Encoders) -> None:
+    def test_reading_compares_encoder_predictions(self, root: Path, encoders: Encoders) -> None:
         photographs = AnnotatedPhotographs(root).photographs
-        for read, one in zip(read_photographs(encoders, photographs), photographs, strict=True):
-            image = one.photograph.image(encoders.manifest.image_height, encoders.manifest.image_width)
+        for read, photograph in zip(read_photographs(encoders, photographs), photographs, strict=True):
+            image = photograph.photograph.image(encoders.manifest.image_height, encoders.manifest.image_width)
             profile_m, left_over = encoders.profile(image, 0.0, CAMERA_HEIGHT_M)
             assert left_over == 0.0
             azimuth = column_azimuths(len(profile_m))
-            polygon = one.outlines[read.measures.outline].polygon_m
+            polygon = photograph.outlines[read.measures.outline].polygon_m
             walls = np.concatenate([polygon, np.roll(polygon, -1, axis=0)], axis=1)[None]
-            # One ray at a time, by turning a camera of one column.
+            # One ray at a time, by rotating a camera of one column.
             true_m = [wall_profile(np.zeros((1, 2)), np.array([a]), walls, 1)[0, 0] for a in azimuth]
             assert np.allclose(read.measures.log_error, np.log(profile_m) - np.log(true_m), atol=1e-5)
 
-    def test_predicted_openings_are_told_and_drawn_below_the_annotated_ones(self, root: Path) -> None:
-        one = read_annotation(root / "hall.json")
-        truth = one.classes(128)
-        # What is annotated as a door is predicted as a window.
+    def test_predicted_openings_are_reported_and_drawn(self, root: Path) -> None:
+        hall = read_annotation(root / "hall.json")
+        truth = hall.classes(128)
+        # The annotated door is predicted as a window.
         scores = np.eye(len(OPENING_CLASSES))[np.where(truth == OPENING_CLASSES.index("door"), 2, truth)]
-        profile_m = one.profile_m(0, 128)
+        profile_m = hall.profile_m(0, 128)
         measures = measure_azimuths([profile_m], np.log(profile_m), np.full(128, -3.0), truth, scores)
-        read = ReadPhotograph(photograph=one, profile_m=profile_m, class_scores=scores, measures=measures)
-        told = PhotographResults(read=[read], answers={}).markdown()
+        read = ReadPhotograph(photograph=hall, profile_m=profile_m, class_scores=scores, measures=measures)
+        markdown = PhotographResults(read=[read], answers={}).markdown()
         assert (
-            f"{percent(2 / 3)} (walls {percent(1.0)} found, {percent(1.0)} right; doors {percent(0.0)} found, –" in told
+            f"{percent(2 / 3)} (walls {percent(1.0)} found, {percent(1.0)} right; doors {percent(0.0)} found, –"
+            in markdown
         )
         sheet = np.asarray(draw_photographs("one", [read], {}))
         colours = {kind: np.array(ImageColor.getrgb(colour)) for kind, colour in CLASS_COLOURS.items()}
         picture = sheet[26 : 26 + 256, 8 : 8 + 512].astype(int)
-        # The door is seen behind the camera, at the picture's border; the window from its middle on.
+        # The door is behind the camera, at the picture's border; the window starts at its middle.
         annotated, predicted = picture[4], picture[13]
         assert np.abs(annotated[3] - colours["door"]).max() < 30
         assert np.abs(predicted[3] - colours["window"]).max() < 30
         assert np.abs(annotated[290] - colours["window"]).max() < 30
         assert np.abs(predicted[290] - colours["window"]).max() < 30
 
-    def test_one_command_prints_measures_and_draws(
+    def test_command_prints_measures_and_draws(
         self, root: Path, tiny_bundle: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         out = tmp_path / "out"
@@ -423,18 +427,18 @@ class TestEvaluating:
         figures = json.loads((out / FIGURES_FILE).read_text())
         assert figures["azimuths"]["n"] == 2
         assert figures["galleries"]["known"]["galleries"] == 2
-        assert [one["name"] for one in figures["photographs"]] == ["den", "hall", "nook"]
-        # Each was asked once, with the better of two outlines; the poor one was not.
-        assert [len(one["galleries"]["unknown"]) for one in figures["photographs"]] == [0, 1, 1]
+        assert [entry["name"] for entry in figures["photographs"]] == ["den", "hall", "nook"]
+        # One gallery per photograph, with the better of two outlines; poor photographs have none.
+        assert [len(entry["galleries"]["unknown"]) for entry in figures["photographs"]] == [0, 1, 1]
         assert f"| median of the median error of log distance | {figures['azimuths']['median_error']:.3f} |" in printed
         assert "not evaluated" in printed
         with Image.open(out / SHEET_FILE) as sheet:
             assert sheet.width > 4 * 512
-        # Whoever asks again goes on with the answers that are there.
+        # A second run reuses the stored answers.
         assert main([*command, "--workers", "0", "--out", str(out)]) == 0
         assert json.loads((out / FIGURES_FILE).read_text()) == figures
 
-    def test_poor_photographs_alone_are_no_figures(self, tmp_path: Path, tiny_bundle: Path) -> None:
+    def test_poor_photographs_alone_are_refused(self, tmp_path: Path, tiny_bundle: Path) -> None:
         write(tmp_path, "den", quality="poor")
         with pytest.raises(InvalidInputError, match="all 1 photographs"):
             evaluate_photographs(tmp_path, tiny_bundle, tmp_path / "out", galleries=1, workers=0)
@@ -442,18 +446,18 @@ class TestEvaluating:
 
 @pytest.mark.skipif(not REAL.exists(), reason="the annotated photographs are not here")
 class TestRealPhotographs:
-    def test_all_can_be_read_and_asked_for(self) -> None:
+    def test_real_photographs_can_be_read(self) -> None:
         dataset = AnnotatedPhotographs(REAL)
         assert len(dataset.photographs) == 22
-        assert sum(one.counts for one in dataset.photographs) == 19
+        assert sum(photograph.counts for photograph in dataset.photographs) == 19
         for key in dataset.keys(galleries=1):
             scene = dataset.load(key.scene)
             assert scene.plan.warnings == ()
             (camera,) = scene.cameras
             assert scene.plan.room_index_at(camera.position_m[None])[0] == camera.room_index
 
-    def test_openings_and_outlines_agree(self) -> None:
-        for one in AnnotatedPhotographs(REAL).photographs:
-            shown = {kind for kind, _, _ in one.class_spans}
-            assert {OPENING_CLASSES[code] for code in one.classes(1024)} == shown | {"wall"}
-            assert {piece.kind for piece in one.outlines[0].openings} == shown
+    def test_real_openings_lie_on_outlines(self) -> None:
+        for photograph in AnnotatedPhotographs(REAL).photographs:
+            shown = {kind for kind, _, _ in photograph.class_spans}
+            assert {OPENING_CLASSES[code] for code in photograph.classes(1024)} == shown | {"wall"}
+            assert {piece.kind for piece in photograph.outlines[0].openings} == shown

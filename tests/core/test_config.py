@@ -1,4 +1,4 @@
-"""Training configuration: it survives plain data, and refuses what it does not know."""
+"""Training configuration: round trips and refusal of invalid values."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from lalaloc_core.learn.training.presets import PRESETS
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_a_configuration_survives_plain_data_and_json(name: str) -> None:
+def test_configuration_round_trip(name: str) -> None:
     config = PRESETS[name]
     assert TrainConfig.from_dict(config.to_dict()) == config
     assert TrainConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
     assert config.name == name
 
 
-def test_minutes_survive_as_number_and_as_none() -> None:
+def test_minutes_round_trip() -> None:
     config = PRESETS["tiny"]
     timed = dataclasses.replace(config, image=dataclasses.replace(config.image, minutes=2.5))
     assert TrainConfig.from_dict(timed.to_dict()).image.minutes == 2.5
     assert TrainConfig.from_dict(config.to_dict()).image.minutes is None
 
 
-def test_whole_numbers_are_fine_where_a_float_is_wanted() -> None:
+def test_integers_are_accepted_as_floats() -> None:
     raw = PRESETS["tiny"].to_dict()
     raw["image"]["minutes"] = 3
     raw["layout"]["optimiser"]["learning_rate"] = 1
@@ -62,7 +62,7 @@ def test_whole_numbers_are_fine_where_a_float_is_wanted() -> None:
         (["layout", "triplets", "positives"], 1.5, r"config\.layout\.triplets\.positives"),
     ],
 )
-def test_what_is_unknown_or_of_a_wrong_type_is_refused_by_its_path(path: list[str], value: Any, message: str) -> None:
+def test_unknown_key_or_wrong_type_is_refused(path: list[str], value: Any, message: str) -> None:
     raw = PRESETS["tiny"].to_dict()
     inner = raw
     for key in path[:-1]:
@@ -74,33 +74,33 @@ def test_what_is_unknown_or_of_a_wrong_type_is_refused_by_its_path(path: list[st
 
 @dataclasses.dataclass(frozen=True)
 class Sized:
-    """A size as one number, as (rows, columns), or by name."""
+    """Size as one number, as (rows, columns), or by name."""
 
     size: int | tuple[int, int] | str | None
 
 
 @pytest.mark.parametrize("size", [3, (2, 4), "small", None])
-def test_every_arm_of_a_union_is_tried(size: Any) -> None:
+def test_union_members_are_accepted(size: Any) -> None:
     assert build_config(Sized, {"size": size}) == Sized(size)
 
 
 @pytest.mark.parametrize("size", [1.5, (2, 4, 6), (2,), True, {"rows": 2}])
-def test_what_no_arm_of_a_union_takes_is_refused(size: Any) -> None:
+def test_values_outside_a_union_are_refused(size: Any) -> None:
     with pytest.raises(ConfigError, match=r"config\.size"):
         build_config(Sized, {"size": size})
 
 
-def test_a_missing_key_without_default_is_refused() -> None:
+def test_missing_key_without_default_is_refused() -> None:
     with pytest.raises(ConfigError, match="name"):
         TrainConfig.from_dict({"seed": 1})
 
 
-def test_a_configuration_cannot_be_changed() -> None:
+def test_configuration_is_immutable() -> None:
     with pytest.raises(dataclasses.FrozenInstanceError):
         PRESETS["tiny"].seed = 1  # type: ignore[misc]
 
 
-def test_the_paper_preset_says_what_the_paper_says() -> None:
+def test_paper_preset_matches_the_paper() -> None:
     config = PRESETS["paper"]
     assert (config.paper.layout_depth, config.paper.image_depth, config.paper.latent_size) == (18, 50, 128)
     assert (config.layout.triplets.positives, config.layout.triplets.negatives) == (1, 20)
@@ -119,16 +119,20 @@ def test_sizes_follow_the_architecture() -> None:
 @pytest.mark.parametrize(
     ("path", "value", "message"),
     [
-        (["layout", "cloud_columns"], 24, r"32 profile columns cannot be thinned to 24 \(layout\.cloud_columns\)"),
-        (["ring", "profile_columns"], 80, r"80 profile columns cannot be thinned to \d+"),
-        (["layout"], {"log_ratio_weight": 0.0, "decode_weight": 0.0}, "nothing is learnt"),
-        (["image"], {"l2_weight": 0.0, "profile_weight": 1.0}, "nothing is learnt"),
+        (
+            ["layout", "cloud_columns"],
+            24,
+            r"profile_columns is 32; it must be a multiple of 24 \(layout\.cloud_columns\)",
+        ),
+        (["ring", "profile_columns"], 80, r"profile_columns is 80; it must be a multiple of \d+"),
+        (["layout"], {"log_ratio_weight": 0.0, "decode_weight": 0.0}, "are both 0; set one above 0"),
+        (["image"], {"l2_weight": 0.0, "profile_weight": 1.0}, "are all 0; set one above 0"),
         (["turns"], "halves", r"config\.turns is 'halves'"),
         (["paper", "layout_depth"], 34, r"config\.paper\.layout_depth is 34"),
         (["paper", "layout_predictor"], "linear", r"config\.paper\.layout_predictor is 'linear'"),
     ],
 )
-def test_what_cannot_be_trained_is_refused(path: list[str], value: Any, message: str) -> None:
+def test_invalid_configuration_is_refused(path: list[str], value: Any, message: str) -> None:
     raw = PRESETS["tiny"].to_dict()
     inner = raw
     for key in path[:-1]:
@@ -138,14 +142,14 @@ def test_what_cannot_be_trained_is_refused(path: list[str], value: Any, message:
         TrainConfig.from_dict(raw)
 
 
-def test_other_headings_are_no_negatives_where_nothing_is_turned() -> None:
+def test_turned_negatives_need_turned_layouts() -> None:
     config = PRESETS["ring"]
     assert config.layout.turned_share > 0.0
     with pytest.raises(ConfigError, match=r"turned_share is 0\.25"):
         dataclasses.replace(config, turns="none")
 
 
-def test_configurations_from_before_the_comparisons_still_load() -> None:
+def test_old_configuration_loads() -> None:
     raw = PRESETS["paper"].to_dict()
     del raw["turns"], raw["layout"]["log_ratio_weight"], raw["image"]["log_ratio_weight"], raw["image"]["kd_weight"]
     del raw["paper"]["layout_predictor"], raw["paper"]["width"]
@@ -153,7 +157,7 @@ def test_configurations_from_before_the_comparisons_still_load() -> None:
 
 
 class TestLearningRate:
-    def test_cosine_warms_up_then_falls_to_a_hundredth(self) -> None:
+    def test_cosine_schedule(self) -> None:
         config = OptimiserConfig(learning_rate=1.0, warmup=0.1)
         rates = [learning_rate(config, step / 200) for step in range(201)]
         assert rates[0] == pytest.approx(0.05)
@@ -163,12 +167,12 @@ class TestLearningRate:
         assert rates[100] == pytest.approx(0.505)
         assert rates[-1] == pytest.approx(0.01)
 
-    def test_a_trapezoid_stays_up_and_falls_at_the_end(self) -> None:
+    def test_trapezoid_schedule(self) -> None:
         config = OptimiserConfig(learning_rate=2.0, schedule="trapezoid", warmup=0.1, decay=0.2)
         rates = [learning_rate(config, progress) for progress in (0.0, 0.05, 0.1, 0.5, 0.8, 0.85, 1.0)]
         assert rates == pytest.approx([0.1, 1.05, 2.0, 2.0, 2.0, 2.0 * (0.01 + 0.99 * 0.5), 0.02])
 
-    def test_steps_fall_by_gamma_at_each_milestone(self) -> None:
+    def test_step_schedule(self) -> None:
         config = OptimiserConfig(learning_rate=0.1, schedule="steps", warmup=0.0, milestones=(0.5, 0.75), gamma=0.1)
         rates = [learning_rate(config, progress) for progress in (0.0, 0.49, 0.5, 0.74, 0.75, 1.0)]
         assert rates == pytest.approx([0.1, 0.1, 0.01, 0.01, 0.001, 0.001])

@@ -1,4 +1,4 @@
-"""Copies of a home that differ in their doors: one of them is the home, in the others doors are elsewhere."""
+"""Plans with copies of a home: one equals the home, in the others doors are moved."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from lalaloc_core.render.layout import layout_view
 HOMES = GeneratedScenes(homes=3, shots_per_home=2)
 
 
-def test_copies_differ_in_their_doors_only_and_the_camera_stands_in_the_whole_one() -> None:
+def test_copies_differ_in_their_doors_only() -> None:
     for name in CopiedScenes(HOMES).scenes("validation"):
         home, scene = HOMES.load(name), CopiedScenes(HOMES).load(name)
         rooms, plan = len(home.plan.rooms), scene.plan
@@ -33,7 +33,7 @@ def test_copies_differ_in_their_doors_only_and_the_camera_stands_in_the_whole_on
             counts[opening.kind][int(x_m // step_m)] += 1
         doors = counts["door"]
         (whole,) = own
-        assert doors[whole] == sum(one.kind == "door" for one in home.plan.openings) > 0
+        assert doors[whole] == sum(opening.kind == "door" for opening in home.plan.openings) > 0
         assert all(doors[whole] - 1 <= count <= doors[whole] for count in doors)
         for kind in ("window", "passage"):
             assert len(set(counts[kind].tolist())) == 1
@@ -45,7 +45,7 @@ def test_copies_differ_in_their_doors_only_and_the_camera_stands_in_the_whole_on
             assert moved.photographs.keys() == camera.photographs.keys()
 
 
-def test_every_photograph_shows_a_door_that_is_elsewhere_in_each_other_copy() -> None:
+def test_every_photograph_identifies_its_copy() -> None:
     photographs = 0
     for name in CopiedScenes(HOMES).scenes("validation"):
         home, scene = HOMES.load(name), CopiedScenes(HOMES).load(name)
@@ -69,14 +69,14 @@ def test_every_photograph_shows_a_door_that_is_elsewhere_in_each_other_copy() ->
 
 
 class _Doorless(GeneratedScenes):
-    """Homes whose doors are windows."""
+    """Generated homes with windows instead of doors."""
 
     def load(self, name: str, problems: list[DatasetError] | None = None) -> Scene:
         home = super().load(name, problems)
         document = home.plan.to_dict()
-        openings = [{**one, "kind": "window"} for one in document["openings"]]
+        openings = [{**opening, "kind": "window"} for opening in document["openings"]]
         return dataclasses.replace(home, plan=FloorPlan.from_dict({**document, "openings": openings}))
 
 
-def test_a_camera_that_sees_no_door_is_left_out() -> None:
+def test_camera_without_door_in_view_is_left_out() -> None:
     assert CopiedScenes(_Doorless(homes=1)).load("validation-00000").cameras == ()

@@ -1,4 +1,4 @@
-"""Deferred rendering: what the training device renders is what the workers would have, none is kept too long."""
+"""Deferred rendering: the training device renders the same panoramas as the workers and evicts them."""
 
 from __future__ import annotations
 
@@ -45,18 +45,18 @@ def batches(
 
 
 @pytest.mark.parametrize(("uses", "neighbours", "workers"), [(1, False, 0), (3, False, 1), (3, True, 0)])
-def test_deferred_batches_are_the_same_as_rendered_ones(uses: int, neighbours: bool, workers: int) -> None:
+def test_deferred_batches_equal_rendered_ones(uses: int, neighbours: bool, workers: int) -> None:
     rendered = batches(uses, deferred=False, neighbours=neighbours, workers=workers)
     deferred = batches(uses, deferred=True, neighbours=neighbours, workers=workers)
     for a, b in zip(rendered, deferred, strict=True):
         assert a.keys() == b.keys()
         for key in a.keys() - {"image"}:
             assert torch.equal(a[key], b[key])
-        # The same rays in batches of other sizes may round differently.
+        # Batch sizes affect rounding.
         assert (a["image"].int() - b["image"].int()).abs().max() <= 1
 
 
-def test_pictures_are_developed_once_and_forgotten_after_their_last_use() -> None:
+def test_scenes_are_rendered_once_and_evicted() -> None:
     source = GeneratedSource(config(3), deferred=True)
     renderer, shown, seen = DeferredRenderer(source.renderer(CPU)), set(), 0
     deferred = list(itertools.islice(load_batches(PanoramaBatches(source.config, source), 0), 40))
@@ -64,13 +64,13 @@ def test_pictures_are_developed_once_and_forgotten_after_their_last_use() -> Non
         assert not shown & batch.scenes.keys()
         shown |= batch.scenes.keys()
         seen += len(batch.number)
-        # Those that wait for their next use, and those that the next batch has begun with.
+        # Scenes waiting for their next use, and scenes of the unfinished next batch.
         assert len(renderer) <= source.config.image.replay_panoramas + source.config.image.batch
     assert len(shown) < seen / 2
 
 
 @given(shift=st.integers(-40, 40), mirrored=st.booleans())
-def test_whole_batches_turn_as_single_pictures_do(shift: int, mirrored: bool) -> None:
+def test_batches_rotate_like_single_pictures(shift: int, mirrored: bool) -> None:
     images = np.random.default_rng(0).integers(0, 256, (2, 3, 16, 3), dtype=np.uint8)
     found = rotate_images(torch.from_numpy(images), torch.tensor([shift, 1]), torch.tensor([mirrored, True]))
     expected = [
@@ -80,7 +80,7 @@ def test_whole_batches_turn_as_single_pictures_do(shift: int, mirrored: bool) ->
     assert np.array_equal(found.numpy(), np.stack(expected))
 
 
-def test_training_learns_the_same_wherever_panoramas_are_rendered(tmp_path: Path) -> None:
+def test_training_does_not_depend_on_the_rendering_place(tmp_path: Path) -> None:
     common = ["--preset", "tiny", "--workers", "0", "--steps", "3", "--validation-homes", "1"]
     weights = []
     for place in ("workers", "device"):
@@ -92,8 +92,6 @@ def test_training_learns_the_same_wherever_panoramas_are_rendered(tmp_path: Path
         assert torch.allclose(value.float(), weights[1][name].float(), atol=1e-3), name
 
 
-def test_where_to_render_is_a_question_of_generated_homes_only(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_render_option_needs_generated_homes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["train", "image", "--out", str(tmp_path), "--data", "somewhere", "--render", "device"]) != 0
     assert "--render is for generated homes" in capsys.readouterr().err

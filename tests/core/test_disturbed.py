@@ -1,4 +1,4 @@
-"""Homes asked with worse pictures of rooms of other lengths: the plan and the poses are the home's own."""
+"""Homes with disturbed photographs and unchanged plans and poses."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LOOK = HOMES.appearances[0]
 
 
 class _Shaded:
-    """A picture whose columns tell their azimuth: dark in front, brighter all the way around."""
+    """Photograph whose brightness encodes the azimuth: dark in front, brighter towards the back."""
 
     def image(self, height: int, width: int) -> np.ndarray:
         away = np.abs(np.arange(width) + 0.5 - 0.5 * width) / (0.5 * width)
@@ -25,10 +25,10 @@ class _Shaded:
         return np.ones((8, 16))
 
 
-def test_all_but_the_picture_is_the_homes_own() -> None:
-    asked, own = DisturbedScenes(HOMES).load("validation-00000"), HOMES.load("validation-00000")
-    assert asked.plan.to_dict() == own.plan.to_dict()
-    for camera, mine in zip(asked.cameras, own.cameras, strict=True):
+def test_only_the_picture_is_disturbed() -> None:
+    scene, own = DisturbedScenes(HOMES).load("validation-00000"), HOMES.load("validation-00000")
+    assert scene.plan.to_dict() == own.plan.to_dict()
+    for camera, mine in zip(scene.cameras, own.cameras, strict=True):
         assert np.array_equal(camera.position_m, mine.position_m)
         assert (camera.room_index, camera.heading) == (mine.room_index, mine.heading)
         assert camera.camera_height_m == mine.camera_height_m
@@ -38,26 +38,26 @@ def test_all_but_the_picture_is_the_homes_own() -> None:
         assert not np.array_equal(picture, plain)
 
 
-def test_a_photograph_is_disturbed_alike_each_time_and_each_otherwise() -> None:
-    first, again, other = (DisturbedPhotograph(_Shaded(), seed).image(16, 32) for seed in (1, 1, 2))
+def test_disturbance_depends_on_the_photograph_only() -> None:
+    first, again, different = (DisturbedPhotograph(_Shaded(), seed).image(16, 32) for seed in (1, 1, 2))
     assert np.array_equal(first, again)
-    assert not np.array_equal(first, other)
+    assert not np.array_equal(first, different)
 
 
-def test_lengths_differ_by_a_tenth(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is seen at 45 degrees tells how much wider a room became than it became deeper."""
+def test_length_error_is_ten_percent(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The direction at 45 degrees gives the ratio of the factors of width and depth."""
     monkeypatch.setattr(disturbed, "_STRENGTH", 0.0)
     width, ratios = 256, []
     plain = _Shaded().image(1, width)[0, :, 0].astype(float)
     right = slice(width // 2, width)
     for seed in range(200):
         picture = DisturbedPhotograph(_Shaded(), seed).image(16, width)[8, :, 0].astype(float)
-        at = np.interp(picture[5 * width // 8], plain[right], np.arange(width)[right]) - 5 * width // 8
-        ratios.append(np.tan(np.pi / 4 + at / width * 2.0 * np.pi))
+        shift = np.interp(picture[5 * width // 8], plain[right], np.arange(width)[right]) - 5 * width // 8
+        ratios.append(np.tan(np.pi / 4 + shift / width * 2.0 * np.pi))
     assert np.std(np.log(ratios)) == pytest.approx(0.1 * np.sqrt(2.0), rel=0.2)
     assert np.mean(np.log(ratios)) == pytest.approx(0.0, abs=0.04)
 
 
-def test_what_is_drawn_out_has_no_depth() -> None:
+def test_disturbed_photograph_has_no_depth() -> None:
     with pytest.raises(DatasetError, match="no depth"):
         DisturbedPhotograph(_Shaded(), 0).depth_m()

@@ -1,4 +1,4 @@
-"""Openings of data sets: a plan that was written has them again, and what cannot be read is said."""
+"""Openings of data sets: round trips, and warnings about unreadable ones."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.zind_home import FLOOR, PANORAMAS, write_home
 
 
 def faces_of(plan: FloorPlan) -> list[tuple[int, int, int, str]]:
-    """Where openings are; Structured3D knows no passages, they are doors there."""
+    """Return the positions of openings; passages count as doors, because Structured3D has no passages."""
     kinds = {"passage": "door"}
     return sorted(
         (face.room, face.wall, face.behind, kinds.get(kind := plan.openings[face.opening].kind, kind))
@@ -28,7 +28,7 @@ def faces_of(plan: FloorPlan) -> list[tuple[int, int, int, str]]:
 
 
 @pytest.mark.parametrize("seed", [0, 4, 9])
-def test_openings_written_in_the_layout_of_structured3d_are_read_again(seed: int, tmp_path: Path) -> None:
+def test_structured3d_openings_round_trip(seed: int, tmp_path: Path) -> None:
     home = generate_home(np.random.default_rng(seed))
     path = tmp_path / "annotation_3d.json"
     path.write_text(json.dumps(build_annotation(home.plan, home.openings)))
@@ -43,7 +43,7 @@ def test_openings_written_in_the_layout_of_structured3d_are_read_again(seed: int
     assert heights == sorted((round(o.sill_m or 0.0, 6), round(o.head_m or 0.0, 6)) for o in home.plan.openings)
 
 
-def test_a_door_that_cannot_be_read_is_a_warning_and_the_rooms_stay(tmp_path: Path) -> None:
+def test_unreadable_door_is_a_warning(tmp_path: Path) -> None:
     home = generate_home(np.random.default_rng(0))
     annotation = build_annotation(home.plan, home.openings)
     doors = [semantic for semantic in annotation["semantics"] if semantic["type"] == "door"]
@@ -60,18 +60,18 @@ def test_a_door_that_cannot_be_read_is_a_warning_and_the_rooms_stay(tmp_path: Pa
 
 @pytest.fixture
 def zind(tmp_path: Path) -> Path:
-    """A ZInD home whose first two rooms show the door between them, the first a window as well."""
+    """Write a ZInD home with a door between two rooms, drawn in both, and a window in the first."""
     write_home(tmp_path / "0000", crooked_flat(), PANORAMAS, np.random.default_rng(0))
     path = tmp_path / "0000" / "zind_data.json"
     document = json.loads(path.read_text())
     merger = document["merger"][FLOOR]
 
     def between(room: int, wall: int, begin: float, end: float) -> list[list[float]]:
-        """A piece of a room's wall in the frame of the room's panorama, whose vertices are those of the plan."""
+        """Return a piece of a room's wall in the frame of the room's panorama."""
         (partial,) = merger[f"complete_room_{room + 1:02d}"].values()
         layout = next(iter(partial.values()))["layout_complete"]
-        one, two = (np.array(layout["vertices"][(wall + k) % len(layout["vertices"])]) for k in (0, 1))
-        return [(one + at * (two - one)).tolist() for at in (begin, end)]
+        start, stop = (np.array(layout["vertices"][(wall + k) % len(layout["vertices"])]) for k in (0, 1))
+        return [(start + share * (stop - start)).tolist() for share in (begin, end)]
 
     def layout_of(room: int) -> dict[str, list]:
         (partial,) = merger[f"complete_room_{room + 1:02d}"].values()
@@ -85,7 +85,7 @@ def zind(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_openings_of_zind_are_in_the_plan_once(zind: Path) -> None:
+def test_zind_openings_are_in_the_plan_once(zind: Path) -> None:
     plan = Zind(zind).load(f"0000/{FLOOR}").plan
     assert [opening.kind for opening in plan.openings] == ["door", "window"]
     assert sorted((face.room, face.wall, face.behind) for face in plan.opening_faces) == [
@@ -100,7 +100,7 @@ def test_openings_of_zind_are_in_the_plan_once(zind: Path) -> None:
     assert plan.warnings == ()
 
 
-def test_damaged_lists_of_zind_are_warnings(zind: Path) -> None:
+def test_damaged_zind_lists_are_warnings(zind: Path) -> None:
     path = zind / "0000" / "zind_data.json"
     document = json.loads(path.read_text())
     (partial,) = document["merger"][FLOOR]["complete_room_01"].values()
@@ -109,11 +109,11 @@ def test_damaged_lists_of_zind_are_warnings(zind: Path) -> None:
     path.write_text(json.dumps(document))
     plan = Zind(zind).load(f"0000/{FLOOR}").plan
     assert [opening.kind for opening in plan.openings] == ["door"]
-    assert any("'doors' is left out, it is no list of threes" in warning for warning in plan.warnings)
+    assert any("'doors' is left out; it is not a list of triples" in warning for warning in plan.warnings)
     assert any("an entry of 'windows' is left out" in warning for warning in plan.warnings)
 
 
-def test_of_openings_that_overlap_the_first_stays() -> None:
+def test_first_of_overlapping_openings_is_kept() -> None:
     def drawn(y0: float, y1: float, x: float = 0.0) -> DrawnOpening:
         return DrawnOpening(kind="door", line_m=np.array([[x, y0], [x, y1]]))
 
@@ -121,5 +121,5 @@ def test_of_openings_that_overlap_the_first_stays() -> None:
     assert [entry["line"] for entry in entries] == [[[0.0, 0.0], [0.0, 1.0]]]
     assert [warning.split(" is left out")[1][:20] for warning in warnings] == [
         ": it overlaps anothe",
-        ": it is shorter than",
+        ": the minimum is 0.0",
     ]

@@ -32,7 +32,7 @@ POSES = f"{HEADER}\nhall.png,1,2,90,1.4\nrooms/study.png,5.5,1,-45,\n"
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """One scene of two rooms and two panoramas."""
+    """Write one scene with two rooms and two panoramas."""
     write_scene(tmp_path, "home")
     return tmp_path
 
@@ -64,17 +64,17 @@ class TestReading:
         assert scene.photograph(study, dataset.appearances[0]).image(64, 128).mean() == 200
         assert pickle.loads(pickle.dumps(dataset)) == dataset
 
-    def test_the_column_of_heights_may_be_left_out(self, tmp_path: Path) -> None:
+    def test_height_column_is_optional(self, tmp_path: Path) -> None:
         write_scene(tmp_path, "home", "panorama,x_m,y_m,heading_deg\nhall.png,1,2,0\n")
         assert OwnData(tmp_path).load("home").cameras[0].camera_height_m == 1.3
 
-    def test_tables_of_spreadsheets_are_read(self, tmp_path: Path) -> None:
+    def test_spreadsheet_tables_are_read(self, tmp_path: Path) -> None:
         rows = '\ufeffheading_deg, y_m,x_m,panorama\r\n90,2,1,"hall.png"\r\n\r\n,,,\r\n'
         write_scene(tmp_path, "home", rows)
         (camera,) = OwnData(tmp_path).load("home").cameras
         assert camera.position_m.tolist() == [1.0, 2.0]
 
-    def test_splits_are_those_of_the_table(self, root: Path) -> None:
+    def test_splits_match_the_table(self, root: Path) -> None:
         write_scene(root, "barn")
         write_scene(root, "cottage")
         (root / "splits.csv").write_text("scene,split\nhome,train\ncottage,test\nbarn,test\n")
@@ -87,13 +87,13 @@ class TestReading:
         ("lines", "reason"),
         [
             ("home,dev", "line 2, column 'split' is 'dev': it must be one of train, validation, test"),
-            ("house,test", "line 2, column 'scene' is 'house': there is no plan.json in a folder of this name"),
-            ("home,test\nhome,train", "line 3, column 'scene' is 'home': it stands in an earlier line already"),
-            ("", "scene 'home'.*the scene has no line here"),
-            ("home", "line 2 has 1 cells, the header has 2"),
+            ("house,test", "line 2, column 'scene' is 'house': there is no folder of this name with a plan.json"),
+            ("home,test\nhome,train", "line 3, column 'scene' is 'home': it is a duplicate of an earlier line"),
+            ("", "scene 'home'.*the scene has no line in this table"),
+            ("home", "line 2 has 1 cells; the header has 2"),
         ],
     )
-    def test_a_bad_table_of_splits_is_refused(self, root: Path, lines: str, reason: str) -> None:
+    def test_bad_split_table_is_refused(self, root: Path, lines: str, reason: str) -> None:
         (root / "splits.csv").write_text(f"scene,split\n{lines}\n")
         with pytest.raises(DatasetError, match=reason) as caught:
             OwnData(root).scenes("test")
@@ -113,7 +113,7 @@ class TestBadFiles:
             ("hall.png,1,2,nan,1.4", ["column 'heading_deg' is 'nan'", "between"]),
             ("hall.png,1,2,0,-1", ["column 'camera_height_m' is '-1'", "between 0 and 2.5"]),
             ("hall.png,1,2,0,140", ["column 'camera_height_m' is '140'", "between 0 and 2.5"]),
-            ("hall.png,1,2,0,0", ["column 'camera_height_m' is '0'", "at least 0.1 m"]),
+            ("hall.png,1,2,0,0", ["column 'camera_height_m' is '0'", "the minimum is 0.1 m"]),
             ("rooms/study.png,5,1,0,2.3", ["column 'camera_height_m' is '2.3'", "below the ceiling (2.1 m)"]),
             ("hall.png,3.5,1.5,0,1.4", ["(3.5, 1.5) m is in no room", "nearest is 'room 1', 0.5 m away"]),
             ("attic.png,1,2,0,1.4", ["column 'panorama' is 'attic.png'", "no such file"]),
@@ -123,7 +123,7 @@ class TestBadFiles:
             ("/etc/passwd,1,2,0,1.4", ["column 'panorama'", "below the scene's folder"]),
         ],
     )
-    def test_a_bad_cell_is_refused_by_name_or_left_out(self, tmp_path: Path, line: str, reasons: list[str]) -> None:
+    def test_bad_cell_is_refused_or_left_out(self, tmp_path: Path, line: str, reasons: list[str]) -> None:
         folder = write_scene(tmp_path, "home", f"{HEADER}\nhall.png,2,2,0,\n{line}\n")
         panorama = line.split(",")[0]
         with pytest.raises(DatasetError) as caught:
@@ -136,26 +136,26 @@ class TestBadFiles:
         assert len(OwnData(tmp_path).load("home", problems).cameras) == 1
         assert [str(problem) for problem in problems] == [str(error)]
 
-    def test_a_panorama_stands_in_one_line(self, tmp_path: Path) -> None:
+    def test_duplicate_panorama_is_refused(self, tmp_path: Path) -> None:
         write_scene(tmp_path, "home", f"{HEADER}\nhall.png,1,2,0,\nhall.png,2,2,0,\n")
-        with pytest.raises(DatasetError, match=r"line 3, column 'panorama' is 'hall\.png': it stands in an"):
+        with pytest.raises(DatasetError, match=r"line 3, column 'panorama' is 'hall\.png': it is a dup"):
             OwnData(tmp_path).load("home")
 
     @pytest.mark.parametrize(
         ("content", "reason"),
         [
             (None, "cannot be read: No such file"),
-            (b"", "line 1 is '', it must name the columns panorama,x_m"),
-            (b"panorama,x_m,y_m\n", "line 1 is 'panorama,x_m,y_m', it must name the columns"),
+            (b"", "line 1 is ''; it must name the columns panorama,x_m"),
+            (b"panorama,x_m,y_m\n", "line 1 is 'panorama,x_m,y_m'; it must name the columns"),
             (b"panorama;x_m;y_m;heading_deg\n", "it must name the columns"),
             (b"panorama,x_m,y_m,heading_deg,height\n", "it must name the columns"),
             (b"panorama,x_m,x_m,y_m,heading_deg\n", "it must name the columns"),
-            (b"panorama,x_m,y_m,heading_deg\nhall.png,1,2\n", "line 2 has 3 cells, the header has 4"),
-            (b'panorama,x_m,y_m,heading_deg\n"hall.png,1,2,3\n', "line 2 is no CSV"),
+            (b"panorama,x_m,y_m,heading_deg\nhall.png,1,2\n", "line 2 has 3 cells; the header has 4"),
+            (b'panorama,x_m,y_m,heading_deg\n"hall.png,1,2,3\n', "line 2 is not valid CSV"),
             (b"\xff\xfe\x00", "not UTF-8"),
         ],
     )
-    def test_a_bad_table_is_refused(self, root: Path, content: bytes | None, reason: str) -> None:
+    def test_bad_pose_table_is_refused(self, root: Path, content: bytes | None, reason: str) -> None:
         path = root / "home" / "poses.csv"
         path.unlink()
         if content is not None:
@@ -165,7 +165,7 @@ class TestBadFiles:
             OwnData(root).load("home", problems)
         assert (caught.value.scene, caught.value.path) == ("home", path)
 
-    def test_a_bad_plan_is_refused_by_the_name_of_its_room(self, tmp_path: Path) -> None:
+    def test_bad_plan_error_names_the_room(self, tmp_path: Path) -> None:
         folder = write_scene(tmp_path, "home")
         document = json.loads((folder / "plan.json").read_text())
         document["rooms"][1]["polygon"] = [[0, 0], [2, 2], [2, 0], [0, 2]]
@@ -175,7 +175,7 @@ class TestBadFiles:
         assert (caught.value.scene, caught.value.room, caught.value.path) == ("home", "room 2", folder / "plan.json")
         assert caught.value.__cause__ is not None
 
-    def test_a_plan_in_millimetres_is_refused(self, tmp_path: Path) -> None:
+    def test_plan_in_millimetres_is_refused(self, tmp_path: Path) -> None:
         folder = write_scene(tmp_path, "home")
         document = plan_document(rectangle(4000.0, 3000.0))
         (folder / "plan.json").write_text(json.dumps(document))
@@ -183,11 +183,11 @@ class TestBadFiles:
             OwnData(tmp_path).load("home")
 
     @pytest.mark.parametrize("name", ["house", "../home", "", "/"])
-    def test_another_name_is_no_scene(self, root: Path, name: str) -> None:
+    def test_unknown_scene_name_is_refused(self, root: Path, name: str) -> None:
         with pytest.raises(DatasetError, match="no such scene"):
             OwnData(root).load(name)
 
-    def test_a_picture_that_is_no_panorama_is_refused_when_read(self, root: Path) -> None:
+    def test_picture_of_wrong_shape_is_refused_when_read(self, root: Path) -> None:
         path = root / "home" / "hall.png"
         Image.fromarray(np.zeros((64, 64, 3), np.uint8)).save(path)
         scene = OwnData(root).load("home")
@@ -197,7 +197,7 @@ class TestBadFiles:
 
 
 class TestOpening:
-    def test_each_format_is_recognised(self, tmp_path: Path, root: Path) -> None:
+    def test_each_format_is_detected(self, tmp_path: Path, root: Path) -> None:
         for folder in ("s3d/scene_00017", "zind/0000", "partition"):
             (tmp_path / "sets" / folder).mkdir(parents=True)
         (tmp_path / "sets" / "zind" / "0000" / "zind_data.json").write_text("{}")
@@ -207,17 +207,17 @@ class TestOpening:
         assert isinstance(open_dataset(tmp_path / "sets" / "partition"), Zind)
         assert isinstance(open_dataset(root), OwnData)
 
-    def test_of_several_the_one_that_is_named_is_read(self, tmp_path: Path) -> None:
+    def test_format_option_selects_one_of_several(self, tmp_path: Path) -> None:
         write_scene(tmp_path, "home")
         (tmp_path / "zind_partition.json").write_text("{}")
         with pytest.raises(DatasetError, match="several data sets: ZInD, own data"):
             open_dataset(tmp_path)
         assert isinstance(open_dataset(tmp_path, "zind"), Zind)
         assert isinstance(open_dataset(tmp_path, "own"), OwnData)
-        with pytest.raises(DatasetError, match="no Structured3D here; found: ZInD, own data"):
+        with pytest.raises(DatasetError, match="no Structured3D in this folder; found: ZInD, own data"):
             open_dataset(tmp_path, "structured3d")
 
-    def test_own_scenes_may_have_any_name(self, tmp_path: Path) -> None:
+    def test_own_scenes_can_have_any_name(self, tmp_path: Path) -> None:
         write_scene(tmp_path, "scene_00000")
         assert isinstance(open_dataset(tmp_path), OwnData)
 
@@ -226,11 +226,11 @@ class TestOpening:
         [
             (lambda path: None, "there is no such folder"),
             (lambda path: path.write_text(""), "this is a file"),
-            (lambda path: path.mkdir(), "no data set here; looked for folders 'scene_00000'"),
+            (lambda path: path.mkdir(), "no data set in this folder; looked for folders 'scene_00000'"),
             (lambda path: (path / "photos").mkdir(parents=True), r"'\*/plan.json' \(own data\)"),
         ],
     )
-    def test_anything_else_is_refused(self, tmp_path: Path, make: Any, reason: str) -> None:
+    def test_unknown_folder_is_refused(self, tmp_path: Path, make: Any, reason: str) -> None:
         path = tmp_path / "data"
         make(path)
         with pytest.raises(DatasetError, match=reason) as caught:
@@ -246,14 +246,14 @@ class TestOpening:
 
 
 class TestWorkedExample:
-    def test_is_a_data_set(self) -> None:
+    def test_worked_example_is_a_data_set(self) -> None:
         dataset = open_dataset(EXAMPLE)
         (scene,) = load_scenes(dataset, dataset.scenes("test"))
         assert len(scene.cameras) == 2
         for camera in scene.cameras:
             assert scene.photograph(camera, dataset.appearances[0]).image(128, 256).std() > 10.0
 
-    def test_is_a_part_of_the_example_flat(self) -> None:
+    def test_worked_example_matches_the_example_flat(self) -> None:
         truth = {pose.file: pose for pose in read_poses()}
         (scene,) = load_scenes(OwnData(EXAMPLE), ["flat"])
         assert (EXAMPLE / "flat" / "plan.json").read_bytes() == PLAN_PATH.read_bytes()
@@ -269,7 +269,7 @@ class TestWorkedExample:
 class TestDocumentation:
     page = (ROOT / "docs" / "datasets.md").read_text(encoding="utf-8")
 
-    def test_lists_every_bad_scene_with_its_reasons(self) -> None:
+    def test_page_lists_every_bad_scene(self) -> None:
         expected = []
         for split, excluded in EXCLUDED_BY_PAPER.items():
             for number in sorted(set(excluded) | {number for number in ERRATA if number in OFFICIAL[split]}):
@@ -278,7 +278,7 @@ class TestDocumentation:
                 expected.append(f"| {number} | {split} | {', '.join(sources)} | {effect} |")
         assert [line for line in self.page.splitlines() if re.match(r"\| \d", line)] == expected
 
-    def test_shows_an_error_as_it_is(self, tmp_path: Path) -> None:
+    def test_page_shows_the_actual_error(self, tmp_path: Path) -> None:
         shutil.copytree(EXAMPLE, tmp_path / "own_data")
         path = tmp_path / "own_data" / "flat" / "poses.csv"
         path.write_text(path.read_text().replace("7.1,2.2,250", "71,2.2,250"))
@@ -286,7 +286,9 @@ class TestDocumentation:
             open_dataset(tmp_path / "own_data").load("flat")
         assert str(caught.value).replace(str(tmp_path), "examples") in self.page
 
-    def test_has_a_program_that_runs(self, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_program_on_the_page_runs(
+        self, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         monkeypatch.chdir(ROOT)
         (program,) = re.findall(r"```python\n(.*?)```", self.page, re.DOTALL)
         exec(program, {})

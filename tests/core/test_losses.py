@@ -1,4 +1,4 @@
-"""Losses and distances in closed form, on tensors small enough to check by hand."""
+"""Losses and metrics in closed form, on small tensors."""
 
 from __future__ import annotations
 
@@ -23,15 +23,13 @@ def distances(seed: int, anchors: int = 3, neighbours: int = 6) -> tuple[torch.T
 class TestLogRatio:
     @pytest.mark.parametrize("all_pairs", [True, False])
     @given(seed=seeds(), scale=st.floats(0.05, 5.0))
-    def test_it_is_zero_where_latent_distance_is_proportional_to_structure(
-        self, all_pairs: bool, seed: int, scale: float
-    ) -> None:
+    def test_proportional_distances_have_zero_loss(self, all_pairs: bool, seed: int, scale: float) -> None:
         chamfer, _ = distances(seed)
         assert losses.log_ratio(scale * chamfer, chamfer, 2, all_pairs=all_pairs).item() < 1e-5
 
     @pytest.mark.parametrize("all_pairs", [True, False])
     @given(seed=seeds(), scale=st.floats(0.5, 5.0))
-    def test_it_does_not_depend_on_the_scale_of_either_distance(self, all_pairs: bool, seed: int, scale: float) -> None:
+    def test_loss_is_invariant_to_scale(self, all_pairs: bool, seed: int, scale: float) -> None:
         latent, chamfer = distances(seed)
         expected = losses.log_ratio(latent, chamfer, 2, all_pairs=all_pairs)
         torch.testing.assert_close(
@@ -41,30 +39,30 @@ class TestLogRatio:
             losses.log_ratio(latent, scale * chamfer, 2, all_pairs=all_pairs), expected, rtol=1e-3, atol=1e-4
         )
 
-    def test_each_positive_is_compared_with_each_negative(self) -> None:
+    def test_positives_are_compared_with_negatives(self) -> None:
         latent = torch.tensor([[0.5, 1.0, 2.0]])
         chamfer = torch.tensor([[0.5, 2.0, 1.0]])
         # Pairs (0, 1) and (0, 2): log(D0/Dj) - log(Ch0/Chj) = ±log 2.
         expected = math.log(2.0) ** 2
         assert losses.log_ratio(latent, chamfer, 1, all_pairs=False).item() == pytest.approx(expected, rel=1e-4)
 
-    def test_all_pairs_also_compares_negatives_with_one_another(self) -> None:
+    def test_all_pairs_compares_negatives_with_each_other(self) -> None:
         latent, chamfer = torch.tensor([[1.0, 1.0, 2.0]]), torch.tensor([[1.0, 1.0, 1.0]])
-        # Of the 9 ordered pairs, the 4 with the last neighbour differ by log 2.
+        # 4 of the 9 ordered pairs include the last neighbour and differ by log 2.
         expected = 4.0 / 9.0 * math.log(2.0) ** 2
         assert losses.log_ratio(latent, chamfer, 2, all_pairs=True).item() == pytest.approx(expected, rel=1e-4)
         order = torch.tensor([2, 0, 1])
         shuffled = losses.log_ratio(latent[:, order], chamfer[:, order], 1, all_pairs=True)
         assert shuffled.item() == pytest.approx(expected, rel=1e-4)
 
-    def test_coinciding_latents_give_finite_losses_and_gradients(self) -> None:
+    def test_coinciding_latents_have_finite_gradients(self) -> None:
         latent = torch.zeros(1, 3, requires_grad=True)
         loss = losses.log_ratio(latent, torch.ones(1, 3), 1, all_pairs=True)
         (loss + losses.log_ratio(latent, torch.tensor([[1.0, 0.0, 2.0]]), 1, all_pairs=False)).backward()
         assert latent.grad is not None
         assert bool(torch.isfinite(latent.grad).all())
 
-    def test_its_gradient_pushes_too_near_neighbours_away(self) -> None:
+    def test_gradient_pushes_close_neighbours_away(self) -> None:
         latent = torch.tensor([[1.0, 1.0]], requires_grad=True)
         losses.log_ratio(latent, torch.tensor([[1.0, 3.0]]), 1, all_pairs=False).backward()
         assert latent.grad is not None
@@ -72,22 +70,22 @@ class TestLogRatio:
 
 
 class TestOthers:
-    def test_the_scale_loss_fixes_latent_distance_per_metre(self) -> None:
+    def test_scale_loss_fixes_latent_distance_per_metre(self) -> None:
         _, chamfer = distances(0)
         assert losses.distance_scale(0.5 * chamfer, chamfer, 0.5).item() < 1e-6
         assert losses.distance_scale(chamfer, chamfer, 0.5).item() == pytest.approx(math.log(2.0) ** 2, rel=1e-3)
         assert losses.distance_scale(0.25 * chamfer, chamfer, 0.5).item() == pytest.approx(math.log(2.0) ** 2, rel=1e-3)
 
-    def test_decode_is_the_mean_absolute_error_in_metres(self) -> None:
+    def test_decode_is_the_mean_absolute_error(self) -> None:
         decoded = torch.tensor([[[1.0, 2.0], [3.0, 4.0]]])
         assert losses.decode(decoded, decoded + torch.tensor([[[1.0, -1.0], [0.0, 2.0]]])).item() == 1.0
 
-    def test_l2_is_the_distance_not_its_square(self) -> None:
+    def test_l2_is_not_squared(self) -> None:
         first = torch.tensor([[3.0, 0.0], [0.0, 0.0]])
         second = torch.tensor([[0.0, 4.0], [0.0, 1.0]])
         assert losses.l2(first, second).item() == 3.0
 
-    def test_ring_distillation_is_in_units_of_each_channel_s_spread(self) -> None:
+    def test_ring_distillation_is_normalised_by_channel(self) -> None:
         teacher = torch.randn(8, 3, 16, generator=torch.Generator().manual_seed(0))
         student = teacher + teacher.std(dim=(0, 2), keepdim=True) * torch.tensor([0.5, 1.0, 1.5])[None, :, None]
         assert losses.ring_distillation(student, teacher).item() == pytest.approx(1.0, rel=1e-4)
@@ -95,7 +93,7 @@ class TestOthers:
         assert losses.ring_distillation(student * stretch, teacher * stretch).item() == pytest.approx(1.0, rel=1e-4)
 
     @given(st.floats(-3.0, 1.0))
-    def test_the_laplace_likelihood_is_best_at_the_truth_with_the_true_scale(self, log_error: float) -> None:
+    def test_laplace_loss_is_minimal_at_the_truth(self, log_error: float) -> None:
         profile = torch.full((1, 4), 3.0)
         error = math.exp(log_error)
         log_profile = torch.log(profile) + error
@@ -103,16 +101,16 @@ class TestOthers:
         def loss(log_scale: float, shift: float = 0.0) -> float:
             return losses.laplace(log_profile + shift, torch.full((1, 4), log_scale), profile).item()
 
-        # Of all scales that of the error itself; of all profiles the true one.
+        # The loss is minimal at the scale of the error, and at the true profile.
         assert loss(log_error) < min(loss(log_error - 0.1), loss(log_error + 0.1))
         assert loss(log_error) == pytest.approx(1.0 + log_error, abs=1e-4)
         assert loss(log_error, shift=-error) == pytest.approx(log_error, abs=1e-4)
 
 
 class TestStructure:
-    """Losses on openings, ceiling and type of the room."""
+    """Losses on openings, ceiling and room type."""
 
-    def test_classes_weigh_by_their_share_as_the_balance_says(self) -> None:
+    def test_class_weights_follow_the_balance(self) -> None:
         logits, kind = torch.zeros(1, 4, 4), torch.tensor([[0, 0, 0, 1]])
         logits[..., 1] = -1.0
         share = torch.tensor([0.75, 0.25, 0.0, 0.0])
@@ -122,7 +120,7 @@ class TestStructure:
             torch.testing.assert_close(losses.opening(logits, kind, share, balance), expected)
 
     @pytest.mark.parametrize("balance", [0.0, 0.5, 1.0])
-    def test_the_best_constant_answer_is_the_prior_that_the_manifest_will_name(self, balance: float) -> None:
+    def test_prior_is_the_best_constant_prediction(self, balance: float) -> None:
         share = torch.tensor([0.7, 0.15, 0.1, 0.05])
         kind = torch.repeat_interleave(torch.arange(4), (share * 100).round().long())[None]
         prior = losses.opening_prior(share, balance)
@@ -131,7 +129,7 @@ class TestStructure:
         assert logits.grad is not None
         torch.testing.assert_close(logits.grad.sum(dim=1), torch.zeros(1, 4), atol=1e-6, rtol=0.0)
 
-    def test_what_is_not_known_does_not_count(self) -> None:
+    def test_unknown_classes_are_ignored(self) -> None:
         logits = torch.randn(2, 3, 4, requires_grad=True)
         share = torch.full((4,), 0.25)
         kind = torch.tensor([[1, -1, 2], [-1, -1, -1]])
@@ -145,47 +143,47 @@ class TestStructure:
         assert nothing.item() == 0.0
 
     @pytest.mark.parametrize("log_error", [-0.3, 0.0, 0.2])
-    def test_the_ceiling_is_most_likely_at_the_truth(self, log_error: float) -> None:
+    def test_ceiling_loss_is_minimal_at_the_truth(self, log_error: float) -> None:
         above = torch.tensor([0.8, 1.4])
-        told = (above.log() + log_error).requires_grad_()
-        loss = losses.ceiling(told, torch.full((2,), -2.0), above)
+        predicted = (above.log() + log_error).requires_grad_()
+        loss = losses.ceiling(predicted, torch.full((2,), -2.0), above)
         best = losses.ceiling(above.log(), torch.full((2,), -2.0), above)
         assert loss.item() >= best.item()
-        (gradient,) = torch.autograd.grad(loss, told)
+        (gradient,) = torch.autograd.grad(loss, predicted)
         assert torch.equal(gradient.sign(), torch.full((2,), log_error).sign())
 
-    def test_a_camera_at_the_ceiling_gives_a_finite_loss(self) -> None:
+    def test_camera_at_the_ceiling_has_a_finite_loss(self) -> None:
         assert torch.isfinite(losses.ceiling(torch.zeros(1), torch.zeros(1), torch.tensor([-0.1])))
 
-    def test_following_maps_asks_for_doors_and_windows_and_leaves_passages_free(self) -> None:
-        taught = torch.tensor([[[0.8, 0.1]]])
+    def test_teacher_openings_leave_passages_free(self) -> None:
+        target = torch.tensor([[[0.8, 0.1]]])
         for passage in (0.0, 0.05):
             probability = torch.tensor([[[0.1 - passage, 0.8, 0.1, passage]]])
             logits = (probability + 1e-12).log().requires_grad_()
-            (gradient,) = torch.autograd.grad(losses.teacher_openings(logits, taught), logits)
+            (gradient,) = torch.autograd.grad(losses.teacher_openings(logits, target), logits)
             torch.testing.assert_close(gradient, torch.zeros_like(gradient), atol=1e-6, rtol=0.0)
         without_door = torch.tensor([[[0.8, 0.1, 0.1, 1e-6]]]).log().requires_grad_()
-        (gradient,) = torch.autograd.grad(losses.teacher_openings(without_door, taught), without_door)
+        (gradient,) = torch.autograd.grad(losses.teacher_openings(without_door, target), without_door)
         assert gradient[0, 0, 1] < 0.0 < gradient[0, 0, 0]
 
-    def test_following_walls_goes_on_where_they_are_seen_and_stops_at_passages(self) -> None:
+    def test_teacher_walls_are_ignored_at_passages(self) -> None:
         log_profile = torch.zeros(1, 4, requires_grad=True)
-        taught = torch.tensor([[1.0, math.nan, 1.0, -1.0]])
-        # Wall, wall, passage, and a door that may be a passage.
+        target = torch.tensor([[1.0, math.nan, 1.0, -1.0]])
+        # Wall, wall, passage, and a door or passage.
         probability = torch.tensor(
             [[[0.9, 0.0, 0.0, 0.1], [0.9, 0.0, 0.0, 0.1], [0.1, 0.0, 0.0, 0.9], [0, 0.6, 0, 0.4]]]
         )
         logits = (probability + 1e-9).log().requires_grad_()
-        loss = losses.teacher_walls(log_profile, torch.zeros(1, 4), taught, logits)
-        gradient, of_logits = torch.autograd.grad(loss, [log_profile, logits], allow_unused=True)
+        loss = losses.teacher_walls(log_profile, torch.zeros(1, 4), target, logits)
+        gradient, logits_gradient = torch.autograd.grad(loss, [log_profile, logits], allow_unused=True)
         assert torch.equal(gradient.sign(), torch.tensor([[-1.0, 0.0, 0.0, 1.0]]))
-        # A student must not escape from a wall by calling it a passage.
-        assert of_logits is None
+        # The student must not reduce the loss by predicting a passage.
+        assert logits_gradient is None
 
 
 class TestChamfer:
     @given(seeds(), st.integers(1, 12), st.integers(1, 12))
-    def test_it_is_the_brute_force_sum_of_both_directions(self, seed: int, n: int, m: int) -> None:
+    def test_chamfer_distance_matches_brute_force(self, seed: int, n: int, m: int) -> None:
         rng = np.random.default_rng(seed)
         first, second = rng.normal(size=(2, n, 3)), rng.normal(size=(2, m, 3))
         for k in range(2):
@@ -194,7 +192,7 @@ class TestChamfer:
             assert chamfer_distance(first, second)[k] == pytest.approx(expected, abs=1e-6)
 
     @given(seeds())
-    def test_it_is_symmetric_zero_on_itself_and_the_same_in_torch(self, seed: int) -> None:
+    def test_chamfer_distance_is_symmetric_and_equal_in_torch(self, seed: int) -> None:
         rng = np.random.default_rng(seed)
         first, second = rng.normal(size=(2, 10, 3)), rng.normal(size=(2, 7, 3))
         distance = chamfer_distance(first, second)
@@ -205,7 +203,7 @@ class TestChamfer:
 
 
 class TestAccuracy:
-    def test_a_query_without_an_answer_is_a_miss_in_every_figure(self) -> None:
+    def test_missing_answers_count_as_misses(self) -> None:
         nan = float("nan")
         accuracy = Accuracy.from_errors(np.array([0.005, nan, 0.03, nan, 0.5]))
         assert accuracy.n == 5
@@ -215,7 +213,7 @@ class TestAccuracy:
         assert accuracy.median_cm == pytest.approx(50.0)
         assert Accuracy.from_errors(np.array([0.1, nan, nan])).median_cm == math.inf
 
-    def test_shares_are_strictly_below_their_limits(self) -> None:
+    def test_limits_are_exclusive(self) -> None:
         accuracy = Accuracy.from_errors(np.array([0.01, 0.05, 0.10, 1.0]))
         assert [accuracy.within_1cm, accuracy.within_5cm, accuracy.within_10cm, accuracy.within_1m] == [
             0.0,
@@ -225,7 +223,7 @@ class TestAccuracy:
         ]
 
     @given(st.lists(st.floats(0.0, 10.0) | st.just(float("nan")), min_size=1, max_size=30))
-    def test_wider_limits_hold_more(self, errors: list[float]) -> None:
+    def test_shares_grow_with_the_limit(self, errors: list[float]) -> None:
         figures = Accuracy.from_errors(np.array(errors)).to_dict()
         shares = [figures[f"within_{limit}"] for limit in ("1cm", "5cm", "10cm", "1m")]
         assert shares == sorted(shares)

@@ -1,4 +1,4 @@
-"""Photographs without labels, and lenses and files that pictures went through."""
+"""Unlabelled photographs with their segmenter, and simulated lens and file effects."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ has_runtime = importlib.util.find_spec("ai_edge_litert") is not None
 
 
 def by_colour(picture: np.ndarray) -> np.ndarray:
-    """A segmenter that reads the class from the red channel."""
+    """Segment a picture by its red channel."""
     return picture[..., 0].astype(int)
 
 
 def painted() -> np.ndarray:
-    """A door from the floor to above the horizon, a window about it, and a wall whose lower part is a door's colour."""
+    """Paint a door from the floor to above the horizon, a window, and a wall whose lower part has the door's class."""
     panorama = np.full((ROWS, COLUMNS, 3), WALL, dtype=np.uint8)
     row_of = lambda elevation_deg: round((0.5 - elevation_deg / 180.0) * ROWS)  # noqa: E731
     panorama[row_of(20) : row_of(-60), 200:320] = DOOR
@@ -40,28 +40,28 @@ def painted() -> np.ndarray:
 
 
 class TestMaps:
-    def test_every_direction_has_the_class_of_what_is_seen_there(self) -> None:
+    def test_class_map_matches_the_panorama(self) -> None:
         panorama = painted()
         elevation_deg = np.array([-30.0, -10.0, 10.0])
         kind = _class_map(panorama, by_colour, np.radians(elevation_deg), COLUMNS)
         row = np.floor((0.5 - elevation_deg / 180.0) * ROWS).astype(int)
-        # Nearest pixels of nearest pixels: edges may be off by one.
+        # Nearest-neighbour sampling happens twice, so edges may be off by one.
         assert (kind == panorama[row, :, 0]).mean() > 0.99
 
-    def test_shares_of_columns_serve_as_probabilities(self) -> None:
+    def test_column_shares_are_probabilities(self) -> None:
         seen = read_walls_and_openings(painted(), by_colour, WIDTH).openings
-        at = lambda column: seen[column * WIDTH // COLUMNS]  # noqa: E731
-        assert at(260).tolist() == [1.0, 0.0]
-        assert at(640).tolist() == [0.0, 1.0]
-        # A door's colour below -35 degrees is no door.
-        assert at(850).tolist() == [0.0, 0.0]
-        assert at(100).tolist() == [0.0, 0.0]
+        value = lambda column: seen[column * WIDTH // COLUMNS]  # noqa: E731
+        assert value(260).tolist() == [1.0, 0.0]
+        assert value(640).tolist() == [0.0, 1.0]
+        # The door's class below -35 degrees does not count.
+        assert value(850).tolist() == [0.0, 0.0]
+        assert value(100).tolist() == [0.0, 0.0]
         assert seen.dtype == np.float32
         assert (seen.sum(axis=1) <= 1.0 + 1e-6).all()
 
 
 def room(half_m: tuple[float, float], ceiling_m: float = 2.5) -> np.ndarray:
-    """A panorama of an empty rectangular room from its middle, in the teacher's classes."""
+    """Paint a panorama of an empty rectangular room in the teacher's classes, seen from its centre."""
     surfaces = painted_surfaces((2.0 * half_m[0], 2.0 * half_m[1]), half_m, ceiling_m=ceiling_m, rows=ROWS)
     return np.repeat(np.array([FLOOR, WALL, CEILING])[surfaces][..., None], 3, axis=2).astype(np.uint8)
 
@@ -73,23 +73,23 @@ def distances(azimuth: np.ndarray, half_m: tuple[float, float]) -> np.ndarray:
 class TestWalls:
     azimuth = ((np.arange(WIDTH) + 0.5) / WIDTH - 0.5) * 2.0 * np.pi
 
-    def test_where_floor_ends_at_a_wall_the_wall_stands(self) -> None:
+    def test_wall_distance_comes_from_the_floor_line(self) -> None:
         seen = read_walls_and_openings(room((2.0, 3.0)), by_colour, WIDTH).log_distance
         expected = np.log(distances(self.azimuth, (2.0, 3.0)) / 1.5)
         assert np.isfinite(seen).all()
         np.testing.assert_allclose(seen, expected, atol=0.05)
 
-    def test_behind_furniture_a_flat_ceiling_tells_the_distance(self) -> None:
+    def test_ceiling_line_replaces_a_hidden_floor_line(self) -> None:
         panorama = room((2.0, 3.0))
         panorama[ROWS // 2 + 20 :, 100:200] = SOFA
         seen = read_walls_and_openings(panorama, by_colour, WIDTH).log_distance
         expected = np.log(distances(self.azimuth, (2.0, 3.0)) / 1.5)
         np.testing.assert_allclose(seen, expected, atol=0.08)
 
-    def test_where_neither_is_seen_nothing_is_told(self) -> None:
+    def test_hidden_lines_give_nan(self) -> None:
         panorama = room((2.0, 3.0))
         panorama[:, 100:200] = SOFA
-        # A ceiling that is not flat tells no distances.
+        # A ceiling that is not flat gives no distances.
         sloped = room((2.0, 3.0))
         for number, ceiling_m in enumerate((2.9, 3.4), start=1):
             there = np.arange(COLUMNS) // 16 % 3 == number
@@ -102,7 +102,7 @@ class TestWalls:
 
 
 class TestStretching:
-    def test_a_stretched_room_is_seen_as_a_room_of_that_size(self) -> None:
+    def test_stretched_room_has_the_stretched_size(self) -> None:
         factors, half_m = torch.tensor([[1.5, 0.75]]), (2.0, 3.0)
         azimuth = ((np.arange(COLUMNS) + 0.5) / COLUMNS - 0.5) * 2.0 * np.pi
         marks = (np.abs(azimuth) < 0.3).astype(np.float32)
@@ -118,20 +118,20 @@ class TestStretching:
         edge = np.arctan(np.tan(0.3) * 1.5 / 0.75)
         np.testing.assert_array_equal(openings[0, :, 0], np.abs(azimuth) < edge)
 
-    def test_factors_of_one_change_nothing(self) -> None:
+    def test_unit_factors_change_nothing(self) -> None:
         panorama = torch.randint(0, 256, (1, 16, 32, 3), dtype=torch.uint8)
         images, _, _ = stretched(panorama, torch.zeros(1, 32, 2), torch.zeros(1, 32), torch.ones(1, 2))
         assert int((images.int() - panorama.int()).abs().max()) <= 1
 
 
 class TestDrawing:
-    def test_what_is_taught_is_turned_and_mirrored_with_the_picture(self) -> None:
+    def test_targets_are_rotated_with_the_picture(self) -> None:
         width, columns = 64, 32
-        # As bright as what is taught; a wave, since pictures are sampled between pixels.
+        # Brightness equals the target; a smooth wave, because pictures are interpolated.
         mark = (127.0 + 100.0 * torch.sin(2.0 * torch.pi * torch.arange(width) / width)).to(torch.uint8)
         images = mark[None, None, :, None].expand(1, 8, width, 3).contiguous()
-        taught = (mark.float() / 256.0)[None]
-        photographs = Photographs(images, taught[..., None].expand(1, width, 2).contiguous(), torch.zeros(1, width))
+        target = (mark.float() / 256.0)[None]
+        photographs = Photographs(images, target[..., None].expand(1, width, 2).contiguous(), torch.zeros(1, width))
         drawn = photographs.draw(32, columns, torch.Generator().manual_seed(0))
         expected = (drawn.images[:, 4, :, 0].float() / 256.0).unflatten(1, (columns, 2)).mean(dim=2)
         torch.testing.assert_close(drawn.openings, expected[..., None].expand(-1, -1, 2), atol=0.03, rtol=0.0)
@@ -143,20 +143,20 @@ class TestDrawing:
 
 
 class TestLoading:
-    def test_photographs_and_teacher_are_given_together(self, tmp_path: Path) -> None:
+    def test_photographs_need_a_teacher(self, tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match="together"):
             TrainingData(photographs=tmp_path).load_photographs(PRESETS["tiny-trunk"])
 
-    def test_an_architecture_without_openings_learns_nothing_from_them(self, tmp_path: Path) -> None:
-        with pytest.raises(ConfigError, match="'ring' tells no openings"):
+    def test_photographs_need_an_architecture_with_openings(self, tmp_path: Path) -> None:
+        with pytest.raises(ConfigError, match="'ring' predicts no openings"):
             TrainingData(photographs=tmp_path, segmenter=tmp_path / "t").load_photographs(PRESETS["tiny"])
 
-    def test_a_folder_without_photographs_is_named(self, tmp_path: Path) -> None:
+    def test_folder_without_photographs_is_refused(self, tmp_path: Path) -> None:
         with pytest.raises(DatasetError, match="no photographs"):
             load_photographs(tmp_path, tmp_path / "teacher.tflite", 32, 64)
 
     @pytest.mark.skipif(not has_runtime, reason="ai-edge-litert is not installed")
-    def test_a_teacher_that_is_none_is_named(self, tmp_path: Path) -> None:
+    def test_invalid_teacher_is_refused(self, tmp_path: Path) -> None:
         Image.new("RGB", (64, 32)).save(tmp_path / "room.png")
         (tmp_path / "teacher.tflite").write_bytes(b"no model")
         with pytest.raises(ConfigError, match=r"teacher\.tflite"):
@@ -167,11 +167,11 @@ class TestOptics:
     def pictures(self) -> torch.Tensor:
         return torch.rand(16, 16, 32, 3, generator=torch.Generator().manual_seed(2)) * 255.0
 
-    def test_nothing_changes_without_strength(self) -> None:
+    def test_zero_strength_changes_nothing(self) -> None:
         changed = optics(self.pictures(), 0.0, torch.Generator().manual_seed(0))
         torch.testing.assert_close(changed, self.pictures(), atol=1e-3, rtol=0.0)
 
-    def test_most_pictures_change_and_stay_pictures(self) -> None:
+    def test_optics_change_most_pictures(self) -> None:
         changed = optics(self.pictures(), 1.0, torch.Generator().manual_seed(0))
         again = optics(self.pictures(), 1.0, torch.Generator().manual_seed(0))
         assert torch.equal(changed, again)
@@ -180,11 +180,11 @@ class TestOptics:
         assert int(differs.sum()) > 8
 
     @pytest.mark.parametrize("columns", [1, 13])
-    def test_blur_goes_around_the_horizon(self, columns: int) -> None:
+    def test_blur_wraps_around_the_horizon(self, columns: int) -> None:
         pictures = self.pictures()
         torch.testing.assert_close(_blurred(pictures.roll(columns, 2)), _blurred(pictures).roll(columns, 2))
 
-    def test_lenses_darken_where_they_meet_and_leave_a_picture_without_them_alone(self) -> None:
+    def test_lens_seams_are_darker(self) -> None:
         seam = torch.tensor([0.5, 2.0])
         assert torch.equal(_lenses(64, torch.zeros(2), torch.zeros(2), seam), torch.ones(2, 1, 64, 1))
         gain = _lenses(64, torch.full((2,), 0.3), torch.zeros(2), seam)

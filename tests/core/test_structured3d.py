@@ -1,4 +1,4 @@
-"""Structured3D: plans, poses and pictures as the data set means them, and every way its files can be bad."""
+"""Structured3D reader: plans, poses and pictures, and refusal of bad files."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ STANDS = (Stand(room_index=0, x_m=1.1, y_m=0.9), Stand(room_index=2, x_m=3.2, y_
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """Scenes of small panoramas, with one test scene of two cameras."""
+    """Create scenes of small panoramas, with one test scene of two cameras."""
     write_synthetic(tmp_path)
     write_scene(tmp_path / NAME, crooked_flat(), STANDS, np.random.default_rng(1))
     return tmp_path
@@ -66,7 +66,7 @@ def annotation_of(folder: Path, document: dict[str, Any]) -> Annotation:
 
 
 def refused(root: Path, *reasons: str, room: str | None = None, name: str = NAME) -> DatasetError:
-    """The scene cannot be loaded, and the error names scene, room, file and reasons."""
+    """Check that loading fails with an error that names scene, room, file and reasons."""
     with pytest.raises(DatasetError) as caught:
         Structured3D(root).load(name)
     error = caught.value
@@ -80,37 +80,37 @@ def refused(root: Path, *reasons: str, room: str | None = None, name: str = NAME
 
 class TestRings:
     @given(st.integers(3, 12), seeds())
-    def test_shuffled_and_turned_lines_become_the_ring_again(self, count: int, seed: int) -> None:
+    def test_shuffled_lines_form_the_ring(self, count: int, seed: int) -> None:
         rng = np.random.default_rng(seed)
         ring = rng.permutation(100)[:count].tolist()
         lines = [(ring[k], ring[(k + 1) % count]) for k in rng.permutation(count)]
         (found,) = chain_rings([line if rng.random() < 0.5 else line[::-1] for line in lines])
         assert sorted(found) == sorted(ring)
         steps = {frozenset(line) for line in lines}
-        assert {frozenset((one, found[k - 1])) for k, one in enumerate(found)} == steps
+        assert {frozenset((junction, found[k - 1])) for k, junction in enumerate(found)} == steps
 
-    def test_several_rings_are_told_apart(self) -> None:
+    def test_several_rings_are_separated(self) -> None:
         rings = chain_rings([(0, 1), (5, 6), (1, 2), (6, 7), (2, 0), (7, 5)])
         assert [sorted(ring) for ring in rings] == [[0, 1, 2], [5, 6, 7]]
 
-    def test_two_lines_between_the_same_junctions_are_no_ring(self) -> None:
-        with pytest.raises(OpenRingError, match=r"2 junctions \[4, 5\], at least three"):
+    def test_two_parallel_lines_are_no_ring(self) -> None:
+        with pytest.raises(OpenRingError, match=r"2 junctions \[4, 5\]; the minimum is three"):
             chain_rings([(4, 5), (5, 4)])
 
     @pytest.mark.parametrize("lines", [[(0, 1), (1, 2)], [(0, 1), (1, 2), (2, 0), (2, 3)], [(4, 4)] * 2])
-    def test_an_open_or_branching_ring_names_its_junction(self, lines: list[tuple[int, int]]) -> None:
+    def test_open_ring_error_names_the_junction(self, lines: list[tuple[int, int]]) -> None:
         with pytest.raises(OpenRingError, match=r"junction \d joins \d of its lines"):
             chain_rings(lines)
 
     @given(room_polygons())
-    def test_the_area_of_a_ring_is_signed(self, polygon: list[list[float]]) -> None:
+    def test_ring_area_is_signed(self, polygon: list[list[float]]) -> None:
         ring = np.array(polygon)
         expected = shapely.Polygon(ring)
         sign = 1.0 if expected.exterior.is_ccw else -1.0
         assert signed_area(ring) == pytest.approx(sign * expected.area, rel=1e-9)
         assert signed_area(ring[::-1]) == pytest.approx(-sign * expected.area, rel=1e-9)
 
-    def test_a_spike_is_cut_off_and_a_bow_tie_is_half_lost(self) -> None:
+    def test_largest_simple_part_of_crossing_outlines(self) -> None:
         square = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 3.0], [0.0, 3.0]])
         assert largest_simple_part(square)[1] == 1.0
         spike = np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 3.0], [4.0, 5.0], [4.0, 3.0], [0.0, 3.0]])
@@ -126,7 +126,7 @@ class TestRings:
 class TestPlan:
     @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=40)
     @given(plans(), seeds(), st.floats(-3.0, 3.0))
-    def test_any_plan_comes_back(self, tmp_path: Path, plan: FloorPlan, seed: int, floor_m: float) -> None:
+    def test_plan_round_trip(self, tmp_path: Path, plan: FloorPlan, seed: int, floor_m: float) -> None:
         rng = np.random.default_rng(seed)
         annotation = annotation_of(tmp_path, drawing_of(plan, rng, floor_m).to_document(rng))
         assert len(annotation.plan.rooms) == len(plan.rooms)
@@ -143,7 +143,7 @@ class TestPlan:
         assert [room.name for room in plan.rooms] == ["living room 1007", "kitchen 1020", "bedroom 1033"]
         assert plan.name == NAME
 
-    def test_lines_of_a_door_on_the_floor_are_no_wall(self, tmp_path: Path) -> None:
+    def test_door_lines_on_the_floor_are_ignored(self, tmp_path: Path) -> None:
         drawing = drawing_of(crooked_flat(), np.random.default_rng(0))
         floor = next(plane for kind, plane in drawing.planes if kind == "floor")
         door = next(semantic for semantic in drawing.semantics if semantic["type"] == "door")
@@ -151,7 +151,7 @@ class TestPlan:
         annotation = annotation_of(tmp_path, drawing.to_document(np.random.default_rng(0)))
         assert same_ring(annotation.plan.rooms[0].polygon_m, crooked_flat().rooms[0].polygon_m, 1e-3)
 
-    def test_a_second_ring_in_a_floor_is_a_warning(self, tmp_path: Path) -> None:
+    def test_second_ring_in_a_floor_is_a_warning(self, tmp_path: Path) -> None:
         drawing = drawing_of(crooked_flat(), np.random.default_rng(0))
         pillar = [drawing.junction(x, y, 0.0) for x, y in ((900, 900), (1200, 900), (1200, 1200))]
         drawing.planes[0][1].extend(drawing.ring(pillar))
@@ -160,7 +160,7 @@ class TestPlan:
         assert "living room 1007" in plan.warnings[0]
         assert "2 rings" in plan.warnings[0]
 
-    def test_a_room_with_two_floors_is_two_rooms(self, tmp_path: Path) -> None:
+    def test_room_with_two_floors_becomes_two_rooms(self, tmp_path: Path) -> None:
         drawing = Drawing()
         planes = drawing.prism(1000.0 * np.array(rectangle(3.0, 3.0)), 0.0, 2500.0)
         planes += drawing.prism(1000.0 * np.array(rectangle(2.0, 3.0, at=(3.0, 0.0))), 300.0, 2500.0)[:1]
@@ -170,14 +170,14 @@ class TestPlan:
         assert [room.ceiling_height_m for room in annotation.plan.rooms] == pytest.approx([2.5, 2.2])
         assert [floor.z_m for floor in annotation.floors["4"]] == pytest.approx([0.0, 0.3])
 
-    def test_a_sloping_ceiling_is_a_warning(self, tmp_path: Path) -> None:
+    def test_sloping_ceiling_is_a_warning(self, tmp_path: Path) -> None:
         drawing = drawing_of(crooked_flat(), np.random.default_rng(0))
         drawing.junctions[len(crooked_flat().rooms[0].polygon_m)][2] += 600.0
         plan = annotation_of(tmp_path, drawing.to_document(np.random.default_rng(0))).plan
         assert plan.rooms[0].ceiling_height_m == pytest.approx(2.6)
-        assert "not level, it rises by 0.60 m" in plan.warnings[0]
+        assert "not level; its height varies by 0.60 m" in plan.warnings[0]
 
-    def test_a_tiny_room_is_left_out_with_a_warning(self, tmp_path: Path) -> None:
+    def test_tiny_room_is_left_out_with_a_warning(self, tmp_path: Path) -> None:
         plan = crooked_flat()
         drawing = drawing_of(plan, np.random.default_rng(0))
         planes = drawing.prism(np.array([[9000.0, 0.0], [9300.0, 0.0], [9300.0, 300.0], [9000.0, 300.0]]), 0, 2500)
@@ -189,13 +189,13 @@ class TestPlan:
         assert annotation.floors["5"] == ()
         assert annotation.floors[room_id(0)][0].room_index == 0
 
-    def test_a_slip_of_the_outline_is_repaired_with_a_warning(self, tmp_path: Path) -> None:
+    def test_crossing_outline_is_repaired_with_a_warning(self, tmp_path: Path) -> None:
         drawing = Drawing()
         outline = np.array([[0, 0], [4000, 0], [4000, 3000], [0, 2900], [0, 3000], [100, 2850]], dtype=float)
         drawing.semantics.append({"ID": 4, "type": "studio", "planeID": drawing.prism(outline, 0.0, 2500.0)})
         plan = annotation_of(tmp_path, drawing.to_document(np.random.default_rng(0))).plan
         assert plan.area_m2 == pytest.approx(abs(shapely.make_valid(shapely.Polygon(outline)).area) / 1e6, rel=0.1)
-        assert "crossed itself" in plan.warnings[0]
+        assert "crosses itself" in plan.warnings[0]
 
 
 def change_semantic(**changes: Any) -> Callable[[dict[str, Any]], None]:
@@ -223,7 +223,7 @@ def scaled(factor: float) -> Callable[[dict[str, Any]], None]:
 
 
 def spread(document: dict[str, Any]) -> None:
-    """Ten kilometres across, with ceilings as they are."""
+    """Scale the plan to 10 km without its ceilings."""
     for junction in document["junctions"]:
         x, y, z = junction["coordinate"]
         junction["coordinate"] = [2000.0 * x, 2000.0 * y, z]
@@ -242,18 +242,18 @@ def open_ring(document: dict[str, Any]) -> None:
 
 
 def branching_ring(document: dict[str, Any]) -> None:
-    """A line of another room joins the floor."""
+    """Add a line of another room to the floor."""
     upright = next(k for k, value in enumerate(document["planeLineMatrix"][2]) if value)
     row = document["planeLineMatrix"][0]
-    other = next(k for k, value in enumerate(document["planeLineMatrix"][2]) if value and not row[k])
-    row[other if row[upright] else upright] = 1
+    foreign = next(k for k, value in enumerate(document["planeLineMatrix"][2]) if value and not row[k])
+    row[foreign if row[upright] else upright] = 1
 
 
 def two_sided(document: dict[str, Any]) -> None:
-    """A floor of two lines between the same junctions."""
-    first, second, *others = (line for line, value in enumerate(document["planeLineMatrix"][0]) if value)
+    """Reduce the floor to two lines between the same junctions."""
+    first, second, *rest = (line for line, value in enumerate(document["planeLineMatrix"][0]) if value)
     document["lineJunctionMatrix"][second] = document["lineJunctionMatrix"][first]
-    for line in others:
+    for line in rest:
         document["planeLineMatrix"][0][line] = 0
 
 
@@ -288,7 +288,7 @@ def bow_tie(document: dict[str, Any]) -> None:
 
 
 def only_openings(document: dict[str, Any]) -> None:
-    document["semantics"] = [one for one in document["semantics"] if one["type"] in ("door", "outwall")]
+    document["semantics"] = [semantic for semantic in document["semantics"] if semantic["type"] in ("door", "outwall")]
 
 
 FIRST = "living room 1007"
@@ -312,11 +312,11 @@ class TestBadAnnotation:
             (change_semantic(planeID=[0, 2]), FIRST, ["no ceiling among its planes [0, 2]"]),
             (without("planes", 0, "type"), FIRST, ["plane 0 has no 'type'"]),
             (empty_first_plane, FIRST, ["floor plane 0 has no lines"]),
-            (open_ring, FIRST, ["does not close", "joins 1 of its lines, not exactly two", "floor plane 0"]),
+            (open_ring, FIRST, ["does not close", "joins 1 of its lines, not two", "floor plane 0"]),
             (branching_ring, FIRST, ["does not close", "junction"]),
-            (two_sided, FIRST, ["a ring has 2 junctions", "at least three"]),
-            (line_with_one_junction, FIRST, ["has 1 junctions, exactly two are needed"]),
-            (line_with_three_junctions, FIRST, ["has 3 junctions, exactly two are needed"]),
+            (two_sided, FIRST, ["a ring has 2 junctions", "the minimum is three"]),
+            (line_with_one_junction, FIRST, ["has 1 junctions; two are required"]),
+            (line_with_three_junctions, FIRST, ["has 3 junctions; two are required"]),
             (short_line_matrix, FIRST, ["'lineJunctionMatrix' has no entry"]),
             (bad_coordinate([0.0, 1.0]), FIRST, ["[0.0, 1.0]", "three numbers"]),
             (bad_coordinate([0.0, 1.0, float("nan")]), FIRST, ["nan", "three numbers"]),
@@ -328,7 +328,7 @@ class TestBadAnnotation:
             (scaled(1000.0), FIRST, ["ceiling_height_m is 2500", "read as millimetres"]),
         ],
     )
-    def test_is_refused_by_name(
+    def test_bad_annotation_is_refused(
         self, root: Path, change: Callable[[dict[str, Any]], None], room: str | None, reasons: list[str]
     ) -> None:
         document = read_document(root)
@@ -337,7 +337,7 @@ class TestBadAnnotation:
         error = refused(root, *reasons, room=room)
         assert error.path == root / NAME / "annotation_3d.json"
 
-    def test_the_cause_is_kept(self, root: Path) -> None:
+    def test_error_keeps_its_cause(self, root: Path) -> None:
         document = read_document(root)
         spread(document)
         write_annotation(root / NAME, document)
@@ -347,20 +347,20 @@ class TestBadAnnotation:
         ("content", "reason"),
         [(b"", "not valid JSON"), (b"[]", "must hold an object, not list"), (b"\xff\xfe{", "not valid JSON")],
     )
-    def test_a_file_that_is_none_is_refused(self, root: Path, content: bytes, reason: str) -> None:
+    def test_invalid_file_is_refused(self, root: Path, content: bytes, reason: str) -> None:
         (root / NAME / "annotation_3d.json").write_bytes(content)
         refused(root, reason)
 
-    def test_a_truncated_file_is_refused(self, root: Path) -> None:
+    def test_truncated_file_is_refused(self, root: Path) -> None:
         path = root / NAME / "annotation_3d.json"
         path.write_bytes(path.read_bytes()[:-500])
         refused(root, "not valid JSON", str(path))
 
-    def test_a_missing_file_is_refused(self, root: Path) -> None:
+    def test_missing_file_is_refused(self, root: Path) -> None:
         (root / NAME / "annotation_3d.json").unlink()
         refused(root, "cannot be read: No such file")
 
-    def test_problems_do_not_swallow_a_bad_plan(self, root: Path) -> None:
+    def test_bad_plan_is_raised_despite_problems(self, root: Path) -> None:
         (root / NAME / "annotation_3d.json").write_bytes(b"{}")
         problems: list[DatasetError] = []
         with pytest.raises(DatasetError):
@@ -370,7 +370,7 @@ class TestBadAnnotation:
 
 
 class TestCameras:
-    def test_stand_where_they_stood(self, root: Path) -> None:
+    def test_camera_poses_round_trip(self, root: Path) -> None:
         cameras = Structured3D(root).load(NAME).cameras
         assert [camera.name for camera in cameras] == [room_id(0), room_id(2)]
         for camera, stand in zip(cameras, STANDS, strict=True):
@@ -379,7 +379,7 @@ class TestCameras:
             assert camera.camera_height_m == pytest.approx(stand.height_m)
             assert camera.heading == 0.0
 
-    def test_heights_count_from_the_floor(self, tmp_path: Path) -> None:
+    def test_camera_height_is_above_the_floor(self, tmp_path: Path) -> None:
         write_synthetic(tmp_path)
         write_scene(tmp_path / NAME, crooked_flat(), STANDS, np.random.default_rng(1), floor_m=-2.2)
         cameras = Structured3D(tmp_path).load(NAME).cameras
@@ -387,7 +387,7 @@ class TestCameras:
 
     @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=10, deadline=None)
     @given(room_polygons(), seeds())
-    def test_measured_depth_is_the_layout_of_the_pose_at_heading_zero(
+    def test_depth_matches_the_layout_at_heading_zero(
         self, tmp_path_factory: pytest.TempPathFactory, polygon: list[list[float]], seed: int
     ) -> None:
         root = tmp_path_factory.mktemp("scenes")
@@ -406,11 +406,11 @@ class TestCameras:
         # A ray that grazes a corner may meet either wall.
         assert np.mean(np.abs(measured - expected) > 2e-3) <= 2.0 / WIDTH
 
-    def test_a_scene_of_annotations_only_has_none(self, root: Path) -> None:
+    def test_scene_without_renderings_has_no_camera(self, root: Path) -> None:
         write_scene(root / "scene_03251", crooked_flat(), [], np.random.default_rng(0))
         assert Structured3D(root).load("scene_03251").cameras == ()
 
-    def test_rooms_of_perspective_pictures_only_and_stray_files_are_passed_over(self, root: Path) -> None:
+    def test_rooms_without_panorama_are_skipped(self, root: Path) -> None:
         rendering = root / NAME / "2D_rendering"
         (rendering / "77" / "perspective").mkdir(parents=True)
         (rendering / ".cache").mkdir()
@@ -427,16 +427,16 @@ class TestCameras:
             (b"1 2 nan", ["nan"]),
             (b"1 2 inf", ["inf"]),
             (b"\xff\xfe", ["not a text file"]),
-            (b"-9000 900 1400", ["(-9.000, 0.900) m stands outside its room 'living room 1007', 9 m away"]),
+            (b"-9000 900 1400", ["(-9.000, 0.900) m is outside its room 'living room 1007', 9 m away"]),
             (b"1000 5000 1400", ["outside its room 'living room 1007'", "in 'bedroom 1033'"]),
-            (b"1.1 0.9 1.4", ["0.0014 m over the floor", "read as millimetres"]),
-            (b"1100 900 0", ["is 0 m over the floor, at least 0.1 m is needed"]),
-            (b"1100 900 -200", ["is -0.2 m over the floor"]),
+            (b"1.1 0.9 1.4", ["0.0014 m above the floor", "read as millimetres"]),
+            (b"1100 900 0", ["is 0 m above the floor; the minimum is 0.1 m"]),
+            (b"1100 900 -200", ["is -0.2 m above the floor"]),
             (b"1100 900 2500", ["must be below the ceiling (2.5 m)"]),
-            (b"1100 900 9000", ["is 9 m over the floor", "must be below the ceiling (2.5 m)"]),
+            (b"1100 900 9000", ["is 9 m above the floor", "must be below the ceiling (2.5 m)"]),
         ],
     )
-    def test_a_bad_place_is_refused_by_name_or_left_out(self, root: Path, content: bytes, reasons: list[str]) -> None:
+    def test_bad_camera_position_is_refused_or_left_out(self, root: Path, content: bytes, reasons: list[str]) -> None:
         path = panorama_of(root) / "camera_xyz.txt"
         path.write_bytes(content)
         error = refused(root, *reasons, room=room_id(0))
@@ -446,15 +446,15 @@ class TestCameras:
         assert [camera.name for camera in scene.cameras] == [room_id(2)]
         assert [str(problem) for problem in problems] == [str(error)]
 
-    def test_a_missing_place_is_refused(self, root: Path) -> None:
+    def test_missing_camera_position_is_refused(self, root: Path) -> None:
         (panorama_of(root) / "camera_xyz.txt").unlink()
         refused(root, "cannot be read: No such file", "camera_xyz.txt", room=room_id(0))
 
-    def test_a_folder_of_an_unknown_room_is_refused(self, root: Path) -> None:
+    def test_unknown_room_folder_is_refused(self, root: Path) -> None:
         (root / NAME / "2D_rendering" / room_id(0)).rename(root / NAME / "2D_rendering" / "4711")
         refused(root, "no room with this ID", room="4711")
 
-    def test_the_camera_of_a_tiny_room_is_refused(self, root: Path) -> None:
+    def test_camera_of_a_tiny_room_is_refused(self, root: Path) -> None:
         drawing = drawing_of(crooked_flat(), np.random.default_rng(0))
         planes = drawing.prism(np.array([[9000.0, 0.0], [9300.0, 0.0], [9300.0, 300.0], [9000.0, 300.0]]), 0, 2500)
         drawing.semantics.append({"ID": 5, "type": "store room", "planeID": planes})
@@ -462,11 +462,11 @@ class TestCameras:
         panorama = root / NAME / "2D_rendering" / "5" / "panorama"
         panorama.mkdir(parents=True)
         write_camera(panorama, 9150.0, 150.0, 1400.0)
-        refused(root, "too small for a camera", room="5")
+        refused(root, "below the minimum area", room="5")
 
 
 class TestPhotographs:
-    def test_are_listed_by_appearance_as_they_are_on_disk(self, tmp_path: Path) -> None:
+    def test_photographs_are_listed_by_appearance(self, tmp_path: Path) -> None:
         write_synthetic(tmp_path)
         looks = [("full", "warm"), ("full", "cold"), ("empty", "raw")]
         write_scene(tmp_path / NAME, crooked_flat(), STANDS[:1], np.random.default_rng(1), appearances=looks)
@@ -477,10 +477,10 @@ class TestPhotographs:
         (camera,) = scene.cameras
         assert set(camera.photographs) == {Appearance(*look) for look in looks}
         assert set(camera.photographs) <= set(dataset.appearances)
-        with pytest.raises(DatasetError, match="no photograph 'simple/warm', there are: empty/raw, full/cold, full/wa"):
+        with pytest.raises(DatasetError, match="no photograph 'simple/warm'; available: empty/raw, full/cold, full/w"):
             scene.photograph(camera, Appearance("simple", "warm"))
 
-    def test_give_their_pixels(self, root: Path) -> None:
+    def test_photographs_return_their_pixels(self, root: Path) -> None:
         scene = Structured3D(root).load(NAME)
         photograph = scene.photograph(scene.cameras[0], Appearance("full", "warm"))
         stored = np.asarray(Image.open(panorama_of(root) / "full" / "rgb_warmlight.png"))
@@ -488,7 +488,7 @@ class TestPhotographs:
         assert photograph.image(16, 32).shape == (16, 32, 3)
         np.testing.assert_array_equal(pickle.loads(pickle.dumps(photograph)).image(HEIGHT, WIDTH), stored)
 
-    def test_without_reading_depth_is_nan(self, root: Path) -> None:
+    def test_depth_without_reading_is_nan(self, root: Path) -> None:
         path = panorama_of(root) / "full" / "depth.png"
         depth = np.asarray(Image.open(path)).copy()
         depth[3, 4] = 0
@@ -498,12 +498,12 @@ class TestPhotographs:
         assert np.argwhere(np.isnan(measured)).tolist() == [[3, 4]]
         assert measured[5, 6] == depth[5, 6] / 1000.0
 
-    def test_of_the_data_set_itself_have_its_size(self, root: Path) -> None:
+    def test_photographs_of_another_size_are_refused(self, root: Path) -> None:
         (root / "synthetic.json").unlink()
         scene = Structured3D(root).load(NAME)
         photograph = scene.photograph(scene.cameras[0], Appearance("full", "warm"))
         for read in (lambda: photograph.image(HEIGHT, WIDTH), photograph.depth_m):
-            with pytest.raises(DatasetError, match="the picture is 64 x 32, this data set's are 1024 x 512"):
+            with pytest.raises(DatasetError, match="the picture is 64 x 32; this data set requires 1024 x 512"):
                 read()
 
     @pytest.mark.parametrize("file", ["rgb_warmlight.png", "depth.png"])
@@ -516,7 +516,7 @@ class TestPhotographs:
             (slice(0, -900), "damaged"),
         ],
     )
-    def test_that_are_bad_are_refused_by_name(
+    def test_bad_photographs_are_refused(
         self, root: Path, file: str, content: bytes | slice | None, reason: str
     ) -> None:
         scene = Structured3D(root).load(NAME)
@@ -530,16 +530,16 @@ class TestPhotographs:
             photograph.image(HEIGHT, WIDTH) if file.startswith("rgb") else photograph.depth_m()
         assert (caught.value.scene, caught.value.room, caught.value.path) == (NAME, room_id(0), path)
 
-    def test_depth_of_eight_bits_is_refused(self, root: Path) -> None:
+    def test_eight_bit_depth_is_refused(self, root: Path) -> None:
         path = panorama_of(root) / "full" / "depth.png"
         Image.fromarray(np.zeros((HEIGHT, WIDTH), dtype=np.uint8)).save(path)
         scene = Structured3D(root).load(NAME)
-        with pytest.raises(DatasetError, match="mode L, a 16-bit grey PNG is needed"):
+        with pytest.raises(DatasetError, match="mode L; a 16-bit grey PNG is required"):
             scene.photograph(scene.cameras[0], Appearance("full", "warm")).depth_m()
 
 
 class TestDataset:
-    def test_splits_are_those_of_the_paper(self) -> None:
+    def test_splits_match_the_paper(self) -> None:
         assert [len(scene_numbers(split)) for split in ("train", "validation", "test")] == [2979, 246, 249]
         assert [len(numbers) for numbers in OFFICIAL.values()] == [3000, 250, 250]
         for split, numbers in EXCLUDED_BY_PAPER.items():
@@ -550,7 +550,7 @@ class TestDataset:
         assert len(excluded) == 26
         assert sorted(set(ERRATA) - excluded) == [1155, 1714, 1816, 3398]
 
-    def test_lists_the_scenes_on_disk_by_split(self, tmp_path: Path) -> None:
+    def test_scenes_on_disk_are_listed_by_split(self, tmp_path: Path) -> None:
         for name in ("scene_02999", "scene_00278", "scene_00002", "scene_03249", "scene_03307", "scene_03499", "other"):
             (tmp_path / name).mkdir()
         (tmp_path / "scene_00003").write_text("a file")
@@ -560,10 +560,10 @@ class TestDataset:
         assert dataset.scenes("test") == ["scene_03499"]
 
     @pytest.mark.parametrize("name", ["scene_1", "../scene_03250", "scene_03250/..", "kitchen", ""])
-    def test_another_name_is_no_scene(self, root: Path, name: str) -> None:
+    def test_unknown_scene_name_is_refused(self, root: Path, name: str) -> None:
         refused(root, "names are like 'scene_03250'", name=name)
 
-    def test_synthetic_scenes_say_so(self, root: Path) -> None:
+    def test_synthetic_scenes_have_their_own_description(self, root: Path) -> None:
         dataset = Structured3D(root)
         assert dataset.description == "synthetic scenes (seed 5)"
         assert dataset.panorama_size == (HEIGHT, WIDTH)
@@ -581,13 +581,13 @@ class TestDataset:
             ({"homes": 3}, "no key 'homes'"),
         ],
     )
-    def test_a_bad_mark_is_refused(self, tmp_path: Path, changes: dict[str, Any], reason: str) -> None:
+    def test_bad_synthetic_file_is_refused(self, tmp_path: Path, changes: dict[str, Any], reason: str) -> None:
         write_synthetic(tmp_path, **changes)
         with pytest.raises(DatasetError, match=reason) as caught:
             _ = Structured3D(tmp_path).description
         assert caught.value.path == tmp_path / "synthetic.json"
 
-    def test_travels_to_other_processes(self, root: Path) -> None:
+    def test_data_set_can_be_pickled(self, root: Path) -> None:
         dataset = Structured3D(root)
         again = pickle.loads(pickle.dumps(dataset))
         assert again == dataset

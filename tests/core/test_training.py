@@ -1,4 +1,4 @@
-"""Training: the loop resumes exactly, the streams never leak homes, and both stages learn."""
+"""Training loop, checkpoints, batch streams, and the losses of all stages."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import csv
 import dataclasses
 import itertools
 import math
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -24,7 +25,7 @@ from lalaloc_core.learn.export.run import export_run
 from lalaloc_core.learn.metrics import chamfer_distance
 from lalaloc_core.learn.synth.homes.splits import TEST, TRAIN, VALIDATION, home_of
 from lalaloc_core.learn.training import batches, sources
-from lalaloc_core.learn.training import layout_stage as layout_module
+from lalaloc_core.learn.training import layout_stage as layout_stage_module
 from lalaloc_core.learn.training.batch_streams import LayoutBatches, PanoramaBatches
 from lalaloc_core.learn.training.batches import Batch, load_batches
 from lalaloc_core.learn.training.checkpoint import Checkpoint
@@ -52,12 +53,12 @@ TINY = PRESETS["tiny"]
 
 
 def layout_batches(config: TrainConfig = TINY, first: int = 0) -> Iterator[Batch]:
-    """Stage 1's batches of generated homes, made in this process."""
+    """Yield stage 1's batches of generated homes, made in this process."""
     return load_batches(LayoutBatches(config, GeneratedSource(config), first), 0)
 
 
 def panorama_batches(config: TrainConfig = TINY, *, neighbours: bool = False) -> Iterator[Batch]:
-    """Stage 2's batches of generated homes, made in this process."""
+    """Yield stage 2's batches of generated homes, made in this process."""
     return load_batches(PanoramaBatches(config, GeneratedSource(config), neighbours), 0)
 
 
@@ -99,7 +100,7 @@ class LineStage(TrainingStage):
 
 
 class StopAt:
-    """Stands in for a crash while the checkpoint of the n-th call is being validated."""
+    """Validation that simulates a crash at its n-th call."""
 
     def __init__(self, call: int) -> None:
         self.left = call
@@ -123,9 +124,7 @@ def same_weights(first: dict[str, dict[str, Tensor]], second: dict[str, dict[str
 class TestLoop:
     @pytest.mark.parametrize("kind", ["adamw", "sgd"])
     @pytest.mark.parametrize("ema_decay", [0.0, 0.9])
-    def test_an_interrupted_run_ends_where_an_uninterrupted_one_does(
-        self, tmp_path: Path, kind: Any, ema_decay: float
-    ) -> None:
+    def test_resumed_run_equals_an_uninterrupted_run(self, tmp_path: Path, kind: Any, ema_decay: float) -> None:
         settings = {"optimiser": OptimiserConfig(kind=kind, learning_rate=0.05), "ema_decay": ema_decay}
         straight = run_stage(LineStage(**settings), tmp_path / "straight", device=CPU)
         folder = tmp_path / "broken"
@@ -138,7 +137,7 @@ class TestLoop:
         assert same_weights(resumed.averaged, straight.averaged)
         assert bool(straight.averaged) == (ema_decay > 0.0)
 
-    def test_the_log_has_one_row_per_step_and_value_and_goes_on_after_a_resume(self, tmp_path: Path) -> None:
+    def test_log_has_a_row_per_value_and_continues(self, tmp_path: Path) -> None:
         first = LineStage(40)
         with pytest.raises(KeyboardInterrupt):
             run_stage(first, tmp_path, device=CPU, checkpoint_minutes=0.0, validate=StopAt(25))
@@ -148,26 +147,26 @@ class TestLoop:
         assert [row["step"] for row in rows if row["name"] == "val"][-1] == "40"
         assert all(float(row["seconds"]) >= 0.0 for row in rows)
 
-    def test_a_finished_run_resumes_to_itself(self, tmp_path: Path) -> None:
+    def test_finished_run_resumes_to_itself(self, tmp_path: Path) -> None:
         done = run_stage(LineStage(), tmp_path, device=CPU)
         again = run_stage(LineStage(), tmp_path, device=CPU, resume=True)
         assert again.step == done.step
         assert same_weights(again.weights, done.weights)
 
-    def test_a_checkpoint_of_another_configuration_is_not_resumed(self, tmp_path: Path) -> None:
+    def test_resuming_another_configuration_is_refused(self, tmp_path: Path) -> None:
         run_stage(LineStage(), tmp_path, device=CPU)
         with pytest.raises(CheckpointError, match="another configuration"):
             run_stage(LineStage(batch=64), tmp_path, device=CPU, resume=True)
 
-    def test_a_run_may_be_prolonged(self, tmp_path: Path) -> None:
+    def test_run_can_be_extended(self, tmp_path: Path) -> None:
         run_stage(LineStage(), tmp_path, device=CPU)
         assert run_stage(LineStage(15), tmp_path, device=CPU, resume=True).step == 15
 
-    def test_resuming_nothing_is_an_error(self, tmp_path: Path) -> None:
+    def test_resuming_without_a_checkpoint_is_refused(self, tmp_path: Path) -> None:
         with pytest.raises(CheckpointError, match="no checkpoint"):
             run_stage(LineStage(), tmp_path, device=CPU, resume=True)
 
-    def test_a_loss_that_is_not_finite_stops_the_run_and_keeps_the_last_checkpoint(self, tmp_path: Path) -> None:
+    def test_non_finite_loss_keeps_the_last_checkpoint(self, tmp_path: Path) -> None:
         stage = LineStage()
         healthy = stage.losses
 
@@ -182,12 +181,39 @@ class TestLoop:
         assert saved.step == 4
         assert all(bool(torch.isfinite(value).all()) for value in saved.weights["line"].values())
 
-    def test_a_time_budget_ends_the_run_whatever_the_steps(self, tmp_path: Path) -> None:
+    def test_time_budget_ends_the_run(self, tmp_path: Path) -> None:
         done = run_stage(LineStage(10**9, minutes=0.2 / 60.0), tmp_path, device=CPU)
         assert done.seconds >= 0.2
         assert done.step < 10**6
 
-    def test_averaged_weights_are_what_is_shipped(self, tmp_path: Path) -> None:
+    def test_progress_bar_counts_steps(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+        run_stage(LineStage(), tmp_path, device=CPU)
+        last = capsys.readouterr().err.splitlines()[-1]
+        assert "100%" in last
+        assert "12/12" in last
+
+    def test_progress_bar_counts_minutes_of_a_time_budget(
+        self, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        run_stage(LineStage(10**9, minutes=0.01), tmp_path, device=CPU)
+        last = re.split(r"[\r\n]", capsys.readouterr().err.strip())[-1]
+        assert "100%" in last
+        assert "0.01/0.01 min" in last
+        # A longer budget continues where the first one ended.
+        run_stage(LineStage(10**9, minutes=0.02), tmp_path, device=CPU, resume=True)
+        first, *_, last = re.split(r"[\r\n]", capsys.readouterr().err.strip())
+        assert "0.01/0.02 min" in first
+        assert "0.02/0.02 min" in last
+
+    def test_checkpoint_with_old_metric_names_resumes(self, tmp_path: Path) -> None:
+        checkpoint = run_stage(LineStage(), tmp_path, device=CPU)
+        checkpoint.metrics = {"val_nll": -1.0, "unfamiliar_within_1m": 0.5}
+        for name in ("line.pt", "line.best.pt"):
+            checkpoint.save(tmp_path / name)
+        resumed = run_stage(LineStage(14), tmp_path, device=CPU, resume=True, validate=lambda _: {"val_nll": -2.0})
+        assert (resumed.step, resumed.metrics) == (14, {"val_nll": -2.0})
+
+    def test_averaged_weights_are_shipped(self, tmp_path: Path) -> None:
         plain = run_stage(LineStage(), tmp_path / "plain", device=CPU)
         averaged = run_stage(LineStage(ema_decay=0.9), tmp_path / "averaged", device=CPU)
         assert plain.inference_weights is plain.weights
@@ -196,7 +222,7 @@ class TestLoop:
 
 
 class TestCheckpoint:
-    def test_it_comes_back_as_it_was_saved(self, tmp_path: Path) -> None:
+    def test_checkpoint_round_trip(self, tmp_path: Path) -> None:
         saved = run_stage(LineStage(ema_decay=0.9), tmp_path, device=CPU, validate=StopAt(99))
         loaded = Checkpoint.load(tmp_path / "line.pt", stage="line")
         assert (loaded.config, loaded.step, loaded.metrics) == (saved.config, 12, {"val": 1.0})
@@ -205,31 +231,31 @@ class TestCheckpoint:
         assert loaded.optimiser["state"].keys() == saved.optimiser["state"].keys()
         assert not list(tmp_path.glob("*.part"))
 
-    def test_another_stage_s_checkpoint_is_refused(self, tmp_path: Path) -> None:
+    def test_checkpoint_of_another_stage_is_refused(self, tmp_path: Path) -> None:
         run_stage(LineStage(), tmp_path, device=CPU)
-        with pytest.raises(CheckpointError, match="'layout' is wanted"):
+        with pytest.raises(CheckpointError, match="'layout' is required"):
             Checkpoint.load(tmp_path / "line.pt", stage="layout")
 
-    def test_damaged_files_are_refused(self, tmp_path: Path) -> None:
+    def test_damaged_checkpoint_is_refused(self, tmp_path: Path) -> None:
         run_stage(LineStage(), tmp_path, device=CPU)
         content = (tmp_path / "line.pt").read_bytes()
         (tmp_path / "line.pt").write_bytes(content[: len(content) // 2])
         with pytest.raises(CheckpointError, match="cannot read"):
             Checkpoint.load(tmp_path / "line.pt")
 
-    def test_nothing_in_a_checkpoint_is_executed(self, tmp_path: Path) -> None:
+    def test_loading_executes_no_code(self, tmp_path: Path) -> None:
         path = tmp_path / "evil.pt"
         torch.save({"stage": "layout", "config": TINY.to_dict(), "weights": {}, "metrics": _Evil()}, path)
         with pytest.raises(CheckpointError):
             Checkpoint.load(path)
         assert not _Evil.executed
 
-    def test_unknown_contents_are_refused(self, tmp_path: Path) -> None:
+    def test_unknown_configuration_key_is_refused(self, tmp_path: Path) -> None:
         torch.save({"stage": "layout", "config": {**TINY.to_dict(), "extra": 1}, "weights": {}}, tmp_path / "c.pt")
         with pytest.raises(CheckpointError, match="no key 'extra'"):
             Checkpoint.load(tmp_path / "c.pt")
 
-    def test_the_second_stage_and_the_export_say_what_is_missing(self, tmp_path: Path) -> None:
+    def test_missing_layout_checkpoint_is_reported(self, tmp_path: Path) -> None:
         with pytest.raises(CheckpointError, match="no checkpoint"):
             train_image(TINY, tmp_path, device=CPU)
         with pytest.raises(CheckpointError, match="no checkpoint"):
@@ -237,7 +263,7 @@ class TestCheckpoint:
 
 
 class _Evil:
-    """Runs code when it is unpickled."""
+    """Object that runs code when it is unpickled."""
 
     executed = False
 
@@ -246,18 +272,18 @@ class _Evil:
 
 
 class TestStreams:
-    def test_the_same_numbers_give_the_same_home(self) -> None:
+    def test_equal_seeds_generate_equal_homes(self) -> None:
         first, second = (home_of(TRAIN, 5, 17) for _ in range(2))
         assert first[0].plan.to_dict() == second[0].plan.to_dict()
         assert first[1].integers(1 << 30) == second[1].integers(1 << 30)
 
-    def test_training_validation_and_test_never_share_a_home(self) -> None:
+    def test_splits_share_no_home(self) -> None:
         plans = [home_of(split, 0, index)[0].plan for split in (TRAIN, VALIDATION, TEST) for index in range(15)]
         outlines = {np.concatenate([room.polygon_m for room in plan.rooms]).tobytes() for plan in plans}
         assert len({TRAIN, VALIDATION, TEST}) == 3
         assert len(outlines) == len(plans)
 
-    def test_a_layout_batch_is_anchors_with_their_neighbours(self) -> None:
+    def test_layout_batch_holds_anchors_with_neighbours(self) -> None:
         batch = next(layout_batches())
         stage = TINY.layout
         anchors = stage.homes_per_step * stage.anchors_per_home
@@ -270,20 +296,20 @@ class TestStreams:
         assert all(value.dtype == torch.float32 for value in batch.values())
         assert bool(torch.isfinite(batch["profile_m"]).all())
         assert bool((batch["camera_height_m"] < batch["ceiling_height_m"]).all())
-        # An anchor and its neighbours are seen from one height.
+        # An anchor and its neighbours have the same camera height.
         assert bool((batch["camera_height_m"] == batch["camera_height_m"][:, :1]).all())
 
-    def test_turned_negatives_are_other_headings_of_the_anchor_s_surroundings(self) -> None:
+    def test_turned_negatives_are_near_at_other_headings(self) -> None:
         layout = dataclasses.replace(TINY.layout, turned_share=0.5)
         batches = layout_batches(dataclasses.replace(TINY, layout=layout))
         profile = torch.cat([next(batches)["profile_m"] for _ in range(6)]).sort(dim=2).values
-        # Turning changes the order of the columns, not the distances: so near a place looks alike when sorted.
+        # Rotation permutes the columns, so sorted profiles of near positions are similar.
         change = (profile[:, 1:] - profile[:, :1]).abs().median(dim=2).values
         negatives = layout.triplets.positives
         far, turned = change[:, negatives : negatives + 2], change[:, negatives + 2 :]
         assert turned.median() < 0.5 * far.median()
 
-    def test_workers_share_the_homes_without_overlap(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_workers_use_distinct_homes(self, monkeypatch: pytest.MonkeyPatch) -> None:
         drawn: dict[int, list[int]] = {0: [], 1: []}
         for worker in (0, 1):
 
@@ -299,12 +325,12 @@ class TestStreams:
         assert all(index >= 100 and index % 2 == worker for worker, indices in drawn.items() for index in indices)
         assert not set(drawn[0]) & set(drawn[1])
 
-    def test_a_resumed_stage_goes_on_with_new_homes(self) -> None:
+    def test_resumed_stage_uses_new_homes(self) -> None:
         seen = list(itertools.islice(layout_stage().batches(0, 0), 2))
         resumed = next(layout_stage().batches(2, 0))
         assert not any(torch.equal(resumed["profile_m"], batch["profile_m"]) for batch in seen)
 
-    def test_a_panorama_batch_is_pictures_with_their_layouts(self) -> None:
+    def test_panorama_batch_holds_pictures_with_layouts(self) -> None:
         batch = next(panorama_batches())
         count, (height, width) = TINY.image.batch, TINY.image_size
         assert batch["image"].shape == (count, height, width, 3)
@@ -318,9 +344,7 @@ class TestStreams:
 
     @pytest.mark.parametrize("turns", get_args(Turns))
     @given(seed=seeds(), heading=st.floats(-7.0, 7.0), columns=st.sampled_from([16, 24, 48]))
-    def test_a_turned_panorama_and_its_layout_stay_together(
-        self, turns: Turns, seed: int, heading: float, columns: int
-    ) -> None:
+    def test_rotated_panorama_matches_its_layout(self, turns: Turns, seed: int, heading: float, columns: int) -> None:
         rng = np.random.default_rng(seed)
         plan, width = crooked_flat(), 48
         poses = random_poses(plan, 1, rng)
@@ -329,12 +353,12 @@ class TestStreams:
             heading_of = np.array([heading])
             return profiles_at(plan, poses.position_m, poses.room_index, heading_of, columns, np.float32)[0]
 
-        # A picture that shows the distance to the wall, so that its layout can be read off it.
+        # A picture of the wall distances contains its layout.
         image = np.repeat(seen(heading, width)[None, :, None], 3, axis=2)
         turn = sample_rotation(turns, heading, width, rng)
         shown = turn.picture(image)[0, :, 0]
         np.testing.assert_allclose(shown, turn.profile(seen(turn.heading, width)), rtol=1e-4)
-        # Profiles need not have as many columns as the picture: mirroring keeps every resolution together.
+        # Profiles and pictures can have different numbers of columns.
         coarse = turn.profile(seen(turn.heading, columns))
         unturned = seen(turn.heading, columns)
         np.testing.assert_array_equal(coarse[::-1] if turn.mirrored else coarse, unturned)
@@ -346,19 +370,19 @@ class TestStreams:
             assert not turn.mirrored
 
     @pytest.mark.parametrize(("turns", "count"), [("any", 16), ("quarters", 8), ("none", 1)])
-    def test_all_turns_and_both_hands_occur(self, turns: Turns, count: int) -> None:
+    def test_all_rotations_and_mirrorings_occur(self, turns: Turns, count: int) -> None:
         rng = np.random.default_rng(0)
         drawn = [sample_rotation(turns, 0.0, 8, rng) for _ in range(300)]
         assert len({(round(turn.heading % TWO_PI, 6), turn.mirrored) for turn in drawn}) == count
 
-    def test_neighbours_are_turned_and_mirrored_as_their_panorama_is(self) -> None:
+    def test_neighbours_are_rotated_like_their_panorama(self) -> None:
         batch = next(panorama_batches(neighbours=True))
         sampling = TINY.layout.triplets
         count = sampling.positives + sampling.negatives
         assert batch["neighbour_profile_m"].shape == (TINY.image.batch, count, TINY.profile_columns)
         assert batch["neighbour_ceiling_height_m"].shape == (TINY.image.batch, count)
         assert bool((batch["neighbour_ceiling_height_m"] > batch["camera_height_m"][:, None]).all())
-        # Layouts half a metre away look alike only when seen along the same heading and not in a mirror.
+        # Layouts half a metre apart are similar only at the same heading and without mirroring.
         own = batch["profile_m"][:, None].log()
         positives = batch["neighbour_profile_m"][:, : sampling.positives].log()
         matched = (positives - own).abs().median(dim=2).values
@@ -370,7 +394,7 @@ class TestStreams:
 
 class TestStages:
     def repeated(self, stage: TrainingStage, monkeypatch: pytest.MonkeyPatch) -> Batch:
-        """Let a stage see one batch over and over."""
+        """Make a stage repeat one batch."""
         batch = next(stage.batches(0, 0))
         monkeypatch.setattr(stage, "batches", lambda first_step, workers: itertools.repeat(batch))
         return batch
@@ -379,14 +403,14 @@ class TestStages:
         with torch.no_grad():
             return float(sum(stage.losses(batch).values()))
 
-    def test_the_layout_loss_falls_on_layouts_not_seen(self, tmp_path: Path) -> None:
+    def test_layout_loss_falls_on_unseen_layouts(self, tmp_path: Path) -> None:
         stage = layout_stage()
         unseen = next(stage.batches(1000, 0))
         before = self.total(stage, unseen)
         run_stage(stage, tmp_path, device=CPU, workers=0)
         assert self.total(stage, unseen) < 0.8 * before
 
-    def test_a_layout_stage_has_the_losses_it_is_asked_for(self) -> None:
+    def test_layout_stage_has_the_configured_losses(self) -> None:
         batch = next(layout_batches())
 
         def terms(**changes: Any) -> dict[str, Tensor]:
@@ -398,7 +422,7 @@ class TestStages:
         assert set(terms(decode_anchors_only=False, all_pairs=False)) == {"log_ratio", "scale", "decode"}
         assert all(term.ndim == 0 and bool(torch.isfinite(term)) for term in terms().values())
 
-    def test_the_image_encoder_learns_and_its_teacher_does_not(
+    def test_image_encoder_learns_and_teacher_stays_frozen(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         config = dataclasses.replace(
@@ -417,7 +441,7 @@ class TestStages:
         saved = Checkpoint.load(tmp_path / "image.pt", stage="image")
         assert set(saved.weights) == {"image_encoder"}
 
-    def test_a_perfect_image_encoder_has_no_latent_loss(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_perfect_image_encoder_has_zero_loss(self, monkeypatch: pytest.MonkeyPatch) -> None:
         teacher = build_layout_encoder(TINY)
         assert isinstance(teacher, RingLayoutEncoder)
         stage = image_stage(TINY, teacher)
@@ -429,7 +453,7 @@ class TestStages:
         monkeypatch.setattr(stage, "encoder", lambda image, height: perfect)
         assert all(abs(term.item()) < 1e-5 for term in stage.losses(batch).values())
 
-    def test_the_paper_s_image_loss_is_the_latent_distance_alone(self) -> None:
+    def test_paper_image_loss_is_the_latent_distance(self) -> None:
         config = small_paper()
         teacher = build_layout_encoder(config)
         stage = image_stage(config, teacher)
@@ -447,7 +471,7 @@ class TestStages:
             ({"kd_weight": 1.0}, {"l2", "kd"}),
         ],
     )
-    def test_an_image_stage_has_the_losses_it_is_asked_for(
+    def test_image_stage_has_the_configured_losses(
         self, architecture: Any, weights: dict[str, float], names: set[str]
     ) -> None:
         config = dataclasses.replace(small_paper(), ring=TINY.ring, architecture=architecture)
@@ -459,7 +483,7 @@ class TestStages:
         assert all(p.grad is None for p in stage.teacher.parameters())
         assert any(bool(p.grad.abs().sum() > 0) for p in stage.encoder.parameters() if p.grad is not None)
 
-    def test_the_image_losses_are_those_of_the_equations(self) -> None:
+    def test_image_losses_match_the_equations(self) -> None:
         config = small_paper()
         weights = {"l2_weight": 0.0, "log_ratio_weight": 0.5, "kd_weight": 0.25}
         config = dataclasses.replace(config, image=dataclasses.replace(config.image, **weights))
@@ -489,11 +513,11 @@ class TestStages:
         assert terms["log_ratio"].item() == pytest.approx(0.5 * np.mean(ratios), rel=1e-3)
         assert terms["kd"].item() == pytest.approx(0.25 * np.mean(distilled), rel=1e-3)
 
-    def test_losses_that_are_left_out_cost_nothing(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_disabled_losses_are_not_computed(self, monkeypatch: pytest.MonkeyPatch) -> None:
         def refused(*_: object) -> None:
-            raise AssertionError("the Chamfer distance was asked for")
+            raise AssertionError("the Chamfer distance was computed")
 
-        monkeypatch.setattr(layout_module, "chamfer_to_anchors", refused)
+        monkeypatch.setattr(layout_stage_module, "chamfer_to_anchors", refused)
         layout = dataclasses.replace(TINY.layout, log_ratio_weight=0.0, scale_weight=0.0, decode_weight=1.0)
         stage = layout_stage(dataclasses.replace(TINY, layout=layout))
         assert set(stage.losses(next(layout_batches()))) == {"decode"}
@@ -501,7 +525,7 @@ class TestStages:
         layout = dataclasses.replace(TINY.layout, decode_weight=0.0)
         assert set(layout_stage(dataclasses.replace(TINY, layout=layout)).modules) == {"layout_encoder"}
 
-    def test_end_to_end_the_layout_branch_learns_as_if_alone(self) -> None:
+    def test_end_to_end_branches_have_separate_gradients(self) -> None:
         config = small_paper()
         stage = EndToEndStage(config, GeneratedSource(config))
         batch = next(stage.batches(0, 0))
@@ -516,11 +540,11 @@ class TestStages:
         assert all(p.grad is None for p in stage.modules["image_encoder"].parameters())
         assert all(p.grad is not None for p in stage.modules["layout_encoder"].parameters())
 
-    def test_end_to_end_is_for_branches_without_a_shared_head(self) -> None:
+    def test_end_to_end_refuses_a_shared_head(self) -> None:
         with pytest.raises(ConfigError, match="'ring'"):
             EndToEndStage(TINY, GeneratedSource(TINY))
 
-    def test_end_to_end_exports_as_two_stages_do(self, tmp_path: Path) -> None:
+    def test_end_to_end_run_is_exported(self, tmp_path: Path) -> None:
         config = small_paper()
         config = dataclasses.replace(config, image=dataclasses.replace(config.image, steps=1))
         stage = EndToEndStage(config, GeneratedSource(config))
@@ -534,7 +558,7 @@ class TestStages:
 
 
 def small_paper() -> TrainConfig:
-    """The `paper` architecture at sizes a test can afford."""
+    """Return the `paper` architecture at small sizes."""
     paper = dataclasses.replace(
         PRESETS["paper"].paper,
         image_depth=18,

@@ -1,4 +1,4 @@
-"""Training from a data set on disk: what is drawn, in which order, and what happens to files that cannot be used."""
+"""Training from a data set on disk: sampling, order, and files that cannot be used."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from tests.strategies import crooked_flat
 
 CPU = torch.device("cpu")
 SCENES, CAMERAS, HEADING_DEG = 5, 3, 30.0
-# Small batches, and nothing turned, so that what is drawn can be told apart.
+# Small batches without rotation, so that samples can be identified.
 CONFIG = dataclasses.replace(
     PRESETS["tiny"],
     turns="none",
@@ -46,7 +46,7 @@ CONFIG = dataclasses.replace(
 
 @pytest.fixture
 def data(tmp_path: Path) -> OwnData:
-    """Scenes 0 to 4 for training and one more for validation; panorama k of scene s is grey number 40 s + 10 k."""
+    """Write scenes 0 to 4 for training and one for validation; panorama k of scene s has grey 40 s + 10 k."""
     root = tmp_path / "data"
     plan = crooked_flat()
     with_split = [(f"scene {number}", "train") for number in range(SCENES)] + [("scene v", "validation")]
@@ -70,14 +70,14 @@ def panoramas(source: SceneSource, *, neighbours: bool = False) -> Iterator[Batc
 
 
 def greys(batches: Iterator[Batch], count: int) -> list[int]:
-    """The panoramas of the first batches, by their grey."""
+    """Return the greys of the panoramas in the first batches."""
     return torch.cat([batch["image"][:, 0, 0, 0] for batch in itertools.islice(batches, count)]).tolist()
 
 
 class TestDrawing:
-    def test_a_panorama_comes_with_its_own_layout_at_its_heading(self, data: OwnData) -> None:
+    def test_panorama_has_its_layout_at_its_heading(self, data: OwnData) -> None:
         batch = next(panoramas(SceneSource(CONFIG, data)))
-        # "none" turns the pictures to heading 0, by whole pixels of 1/64 of a turn.
+        # "none" rotates the pictures to heading 0 by whole pixels of 1/64 turn.
         pixel = 2.0 * math.pi / CONFIG.image_size[1]
         heading = math.radians(HEADING_DEG) % pixel
         heading -= pixel * (heading > pixel / 2)
@@ -97,22 +97,22 @@ class TestDrawing:
             np.testing.assert_allclose(profile, expected, rtol=1e-4)
             assert height.item() == pytest.approx(camera.camera_height_m)
 
-    def test_every_epoch_visits_every_scene_once_in_an_order_of_its_own(self, data: OwnData) -> None:
+    def test_epochs_visit_every_scene_in_new_orders(self, data: OwnData) -> None:
         config = dataclasses.replace(CONFIG, image=dataclasses.replace(CONFIG.image, batch=SCENES))
         scenes = np.array(greys(panoramas(SceneSource(config, data)), 6)).reshape(6, SCENES) // 40
         assert all(sorted(epoch) == list(range(SCENES)) for epoch in scenes.tolist())
         assert len({tuple(epoch) for epoch in scenes.tolist()}) > 3
 
-    def test_every_camera_and_every_look_is_drawn_sooner_or_later(self, data: OwnData) -> None:
+    def test_every_camera_is_drawn(self, data: OwnData) -> None:
         drawn = set(greys(panoramas(SceneSource(CONFIG, data)), 40))
         assert drawn == {40 * scene + 10 * camera for scene in range(SCENES) for camera in range(CAMERAS)}
 
-    def test_the_same_seed_draws_the_same_and_another_one_does_not(self, data: OwnData) -> None:
+    def test_seed_determines_the_samples(self, data: OwnData) -> None:
         first, again = (greys(panoramas(SceneSource(CONFIG, data)), 5) for _ in range(2))
-        other = greys(panoramas(SceneSource(dataclasses.replace(CONFIG, seed=1), data)), 5)
-        assert first == again != other
+        different = greys(panoramas(SceneSource(dataclasses.replace(CONFIG, seed=1), data)), 5)
+        assert first == again != different
 
-    def test_workers_share_an_epoch_and_draw_what_one_process_draws(self, data: OwnData) -> None:
+    def test_samples_do_not_depend_on_the_worker(self, data: OwnData) -> None:
         alone = SceneSource(CONFIG, data)
         shared = [SceneSource(CONFIG, data) for _ in range(2)]
         for visit in range(12):
@@ -121,7 +121,7 @@ class TestDrawing:
                 np.asarray(view.image).tobytes() for view in theirs
             ]
 
-    def test_layout_anchors_are_the_cameras_at_their_heights(self, data: OwnData) -> None:
+    def test_layout_anchors_are_camera_poses(self, data: OwnData) -> None:
         source = SceneSource(CONFIG, data)
         batch = next(load_batches(LayoutBatches(CONFIG, source), 0))
         cameras = [camera for name in data.scenes("train") for camera in data.load(name).cameras]
@@ -141,8 +141,7 @@ class TestDrawing:
                 [cameras[int(distance.argmin())].camera_height_m] * len(heights), rel=1e-6
             )
 
-    def test_looks_are_drawn_anew_for_each_visit(self) -> None:
-        # Generated scenes serve as a data set as well; here each camera has one look per furniture level.
+    def test_generated_scenes_serve_as_a_data_set(self) -> None:
         levels = GeneratedScenes(homes=1, shots_per_home=1, furniture=None)
         views = SceneSource(CONFIG, levels).samples(0, 32, 64)
         assert [np.shape(np.asarray(view.image)) for view in views] == [(32, 64, 3)]
@@ -150,19 +149,19 @@ class TestDrawing:
 
 class TestBadFiles:
     def damaged(self, data: OwnData) -> set[str]:
-        """Damage a picture and a plan; what the errors will name."""
+        """Damage a picture and a plan; return the file names for the errors."""
         (data.root / "scene 1" / "2.png").write_bytes(b"no picture")
         (data.root / "scene 3" / "plan.json").write_text("{}", encoding="utf-8")
         return {"2.png", "plan.json"}
 
-    def test_the_first_bad_file_ends_training_by_its_name(self, data: OwnData) -> None:
+    def test_bad_file_ends_training(self, data: OwnData) -> None:
         named = self.damaged(data)
         with pytest.raises(DatasetError) as raised:
             greys(panoramas(SceneSource(CONFIG, data)), 40)
         assert raised.value.path is not None
         assert raised.value.path.name in named
 
-    def test_skipped_files_are_named_once_and_counted(self, data: OwnData, caplog: pytest.LogCaptureFixture) -> None:
+    def test_skipped_files_are_logged_once(self, data: OwnData, caplog: pytest.LogCaptureFixture) -> None:
         named = self.damaged(data)
         with caplog.at_level(logging.WARNING):
             drawn = set(greys(panoramas(SceneSource(CONFIG, data, skip_bad=True)), 60))
@@ -173,18 +172,18 @@ class TestBadFiles:
         assert all(sum(name in message for message in messages) == 1 for name in named)
         assert ["number 1" in messages[0], "number 2" in messages[1]] == [True, True]
 
-    def test_nothing_usable_is_an_error_rather_than_an_endless_search(self, data: OwnData) -> None:
+    def test_data_set_without_usable_scene_is_refused(self, data: OwnData) -> None:
         for number in range(SCENES):
             (data.root / f"scene {number}" / "plan.json").write_text("{}", encoding="utf-8")
         for stream in (LayoutBatches, PanoramaBatches):
             with pytest.raises(DatasetError, match="in a row"):
                 next(load_batches(stream(CONFIG, SceneSource(CONFIG, data, skip_bad=True)), 0))
 
-    def test_a_data_set_without_training_scenes_is_refused(self, tmp_path: Path) -> None:
+    def test_data_set_without_training_scenes_is_refused(self, tmp_path: Path) -> None:
         with pytest.raises(DatasetError, match="no training scenes"):
             SceneSource(CONFIG, OwnData(tmp_path))
 
-    def test_errors_of_worker_processes_arrive_whole(self, data: OwnData) -> None:
+    def test_worker_errors_keep_their_attributes(self, data: OwnData) -> None:
         (data.root / "scene 3" / "plan.json").write_text("{}", encoding="utf-8")
         with pytest.raises(DatasetError) as raised:
             for _ in itertools.islice(load_batches(LayoutBatches(CONFIG, SceneSource(CONFIG, data)), 1), 10):
@@ -194,7 +193,7 @@ class TestBadFiles:
 
 
 class TestRuns:
-    def test_the_checkpoint_says_what_it_was_trained_on_and_resumes_on_nothing_else(self, data: OwnData) -> None:
+    def test_resuming_on_other_data_is_refused(self, data: OwnData) -> None:
         folder = data.root.parent / "run"
         trained = train_layout(CONFIG, folder, device=CPU, data=TrainingData(dataset=data), workers=0)
         assert (
@@ -209,9 +208,7 @@ class TestRuns:
         with pytest.raises(CheckpointError, match="homes generated while training"):
             train_layout(CONFIG, folder, device=CPU, workers=0, resume=True)
 
-    def test_the_command_trains_and_ends_with_2_at_a_bad_file(
-        self, data: OwnData, capsys: pytest.CaptureFixture[str]
-    ) -> None:
+    def test_command_exits_with_2_at_a_bad_file(self, data: OwnData, capsys: pytest.CaptureFixture[str]) -> None:
         words = ["train", "layout", "--preset", "tiny", "--steps", "3", "--workers", "0", "--device", "cpu"]
         words += ["--data", str(data.root), "--out", str(data.root.parent / "run")]
         assert main(words) == 0
@@ -221,24 +218,22 @@ class TestRuns:
         assert main([*words, "--skip-bad"]) == 0
 
     @pytest.mark.parametrize("words", [["--skip-bad"], ["--data", "x", "--textures", "y"]])
-    def test_options_that_do_not_go_together_are_refused(
-        self, words: list[str], capsys: pytest.CaptureFixture[str]
-    ) -> None:
+    def test_conflicting_options_are_refused(self, words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
         assert main(["train", "layout", "--out", "nowhere", *words]) == 2
         assert words[0] in capsys.readouterr().err or "--textures" in words
 
 
 class TestValidation:
-    def test_generated_and_stored_scenes_validate_alike(self, data: OwnData) -> None:
+    def test_generated_and_stored_scenes_are_validated(self, data: OwnData) -> None:
         for training in (TrainingData(validation_scenes=2), TrainingData(dataset=data)):
             scenes = training.validation(CONFIG)
             modules: dict[str, torch.nn.Module] = {"layout_encoder": PerfectLayouts()}
             scores = LayoutValidation(CONFIG, scenes, CPU)(modules)
-            # An encoder that keeps the whole profile is beaten only by where the grid's poses happen to lie.
+            # The error of an encoder that keeps the whole profile comes only from the grid step.
             assert scores["val_within_1m"] >= 0.75
             assert scores["val_median_cm"] >= scores["val_oracle_median_cm"]
 
-    def test_photographs_that_cannot_be_read_are_left_out_of_validation(self, data: OwnData) -> None:
+    def test_unreadable_photographs_are_not_validated(self, data: OwnData) -> None:
         (data.root / "scene v" / "1.png").write_bytes(b"no picture")
         scenes = TrainingData(dataset=data).validation(CONFIG)
         with pytest.raises(DatasetError, match=r"1\.png"):
@@ -248,18 +243,18 @@ class TestValidation:
         assert [problem.room for problem in problems] == ["1.png"]
         assert len(validation.images) == len(validation.queries) == CAMERAS - 1
 
-    def test_generated_validation_tells_the_furniture_levels_apart(self) -> None:
+    def test_validation_covers_several_furniture_levels(self) -> None:
         validation = ImageValidation(CONFIG, TrainingData(validation_scenes=3).validation(CONFIG), None, CPU)
         assert set(validation.levels) <= {"empty", "simple", "full"}
         assert len(set(validation.levels)) > 1
 
 
 class PerfectLayouts(torch.nn.Module):
-    """Embeds a layout as itself."""
+    """Encoder whose latent is the layout itself."""
 
     def forward(self, profile_m: torch.Tensor, camera_m: torch.Tensor, ceiling_m: torch.Tensor) -> torch.Tensor:
         return torch.cat([profile_m, camera_m[:, None], ceiling_m[:, None]], dim=1)
 
 
-def test_configurations_of_the_tests_are_valid() -> None:
+def test_test_configuration_is_valid() -> None:
     assert TrainConfig.from_dict(CONFIG.to_dict()) == CONFIG

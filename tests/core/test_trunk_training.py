@@ -1,4 +1,4 @@
-"""Training the image encoder on a trunk: batches, losses, learning rates, and a run from start to bundle."""
+"""Training of the trunk image encoder: batches, losses, learning rates, and a run from start to bundle."""
 
 from __future__ import annotations
 
@@ -73,37 +73,37 @@ def plan(**changes: Any) -> FloorPlan:
 
 
 class TestLabels:
-    def test_openings_lie_where_they_are_seen(self) -> None:
+    def test_opening_kinds_match_the_plan(self) -> None:
         kind = opening_kinds(plan(), np.array([2.0, 2.0]), 0, 0.0, 1.5, 64)
         azimuth_deg = ((np.arange(64) + 0.5) / 64 - 0.5) * 360.0
-        # The window is a metre to either side, two metres ahead.
+        # The window reaches one metre to either side, two metres ahead.
         expected = np.where(np.abs(azimuth_deg) < np.degrees(np.arctan(0.5)), WINDOW, WALL)
         np.testing.assert_array_equal(kind, expected)
         np.testing.assert_array_equal(opening_kinds(plan(), np.array([2.0, 2.0]), 0, 0.0, 0.8, 64), WALL)
 
-    def test_walls_of_a_plan_that_does_not_show_all_openings_are_not_known(self) -> None:
+    def test_walls_are_unknown_in_plans_without_all_openings(self) -> None:
         kind = opening_kinds(plan(opening_kinds=["window"]), np.array([2.0, 2.0]), 0, 0.0, 1.5, 64)
         assert set(kind) == {UNKNOWN, WINDOW}
 
-    def test_batches_tell_openings_and_types(self, batch: dict[str, torch.Tensor]) -> None:
+    def test_batches_hold_openings_and_room_types(self, batch: dict[str, torch.Tensor]) -> None:
         kind = batch["opening_kind"]
         assert kind.shape == batch["profile_m"].shape
         assert set(kind.unique().tolist()) <= set(range(len(OPENING_CLASSES)))
         assert 0.3 < float((kind == WALL).float().mean()) < 0.95
-        # Generated rooms all have a type; the first code is that of rooms without.
+        # All generated rooms have a type; code 0 means no type.
         assert bool(((batch["room_type"] >= 1) & (batch["room_type"] < len(ROOM_TYPES))).all())
 
-    def test_other_architectures_are_not_told(self) -> None:
+    def test_other_architectures_have_no_class_labels(self) -> None:
         found: Any = next(iter(PanoramaBatches(PRESETS["tiny"], GeneratedSource(PRESETS["tiny"]))))
         assert not {"opening_kind", "room_type"} & set(found)
 
-    def test_a_mirrored_panorama_has_mirrored_openings(self) -> None:
+    def test_mirrored_panorama_has_mirrored_openings(self) -> None:
         kind = np.arange(8)
         assert Rotation(shift=0, heading=0.0, mirrored=True).profile(kind).tolist() == list(range(8))[::-1]
 
 
 class TestLosses:
-    def test_a_stage_has_the_losses_it_is_asked_for_and_every_head_learns(self, batch: dict[str, torch.Tensor]) -> None:
+    def test_every_head_gets_a_gradient(self, batch: dict[str, torch.Tensor]) -> None:
         stage = stage_of(photographs=some_photographs())
         terms = stage.losses(batch)
         assert set(terms) == {"ring", "profile", "l2", "opening", "ceiling", "room_type", "photographs"}
@@ -115,7 +115,7 @@ class TestLosses:
         assert heads | {"trunk", "squeezes", "join", "mixer", "norm"} == grown
         assert all(p.grad is None for p in stage.teacher.parameters())
 
-    def test_photographs_have_a_loss_of_their_own(self, batch: dict[str, torch.Tensor]) -> None:
+    def test_photographs_add_one_loss(self, batch: dict[str, torch.Tensor]) -> None:
         plain = dataclasses.replace(TINY, image=dataclasses.replace(TINY.image, optics=0.0, style_mixing=0.0))
         with_them = stage_of(plain, some_photographs()).losses(batch)
         without = stage_of(plain).losses(batch)
@@ -123,7 +123,7 @@ class TestLosses:
         for name, term in without.items():
             torch.testing.assert_close(with_them[name], term, rtol=1e-4, atol=1e-5)
 
-    def test_walls_and_openings_of_photographs_are_learnt(self, batch: dict[str, torch.Tensor]) -> None:
+    def test_photograph_weights_train_their_heads(self, batch: dict[str, torch.Tensor]) -> None:
         for weight, head in (("photograph_weight", "to_openings"), ("photograph_profile_weight", "to_profile")):
             alone = {"photograph_weight": 0.0, "photograph_profile_weight": 0.0} | {weight: 1.0}
             stage = stage_of(
@@ -135,7 +135,7 @@ class TestLosses:
             }
             assert {name for name in grown if name.startswith("to_")} == {head}
 
-    def test_a_stage_learns_a_batch(self, batch: dict[str, torch.Tensor]) -> None:
+    def test_losses_fall_on_a_repeated_batch(self, batch: dict[str, torch.Tensor]) -> None:
         stage = stage_of(dataclasses.replace(TINY, image=dataclasses.replace(TINY.image, optics=0.0)))
         optimiser = build_optimiser(stage.modules, OptimiserConfig(learning_rate=1e-2))
         history = []
@@ -148,7 +148,7 @@ class TestLosses:
         for name in ("profile", "opening", "ceiling", "room_type", "ring"):
             assert history[-1][name] < history[0][name], name
 
-    def test_the_trunk_learns_at_a_rate_of_its_own_or_not_at_all(self) -> None:
+    def test_trunk_has_its_own_learning_rate(self) -> None:
         stage = stage_of()
         settings = OptimiserConfig(learning_rate=1e-3, trunk_factor=0.1)
         optimiser = build_optimiser(stage.modules, settings)
@@ -164,7 +164,7 @@ class TestLosses:
 
 @pytest.fixture(scope="module")
 def folder(tiny_bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run that follows the layout encoder of a ring, resumed once, and its bundle."""
+    """Train against the layout encoder of a ring, resume once, and export a bundle."""
     folder = tmp_path_factory.mktemp("run")
     run.train_image(SHORT, folder, device=CPU, data=FEW, workers=0, layout_from=tiny_bundle)
     longer = dataclasses.replace(SHORT, image=dataclasses.replace(SHORT.image, steps=3))
@@ -174,7 +174,7 @@ def folder(tiny_bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class TestRuns:
-    def test_a_run_is_validated_resumed_and_served(self, folder: Path) -> None:
+    def test_run_is_validated_resumed_and_served(self, folder: Path) -> None:
         checkpoint = Checkpoint.load(folder / "image.pt", stage="image")
         assert checkpoint.step == 3
         assert 0.0 <= checkpoint.metrics["val_opening_accuracy"] <= 1.0
@@ -188,11 +188,11 @@ class TestRuns:
         expected = losses.opening_prior(checkpoint.averaged["image_encoder"]["opening_share"], 0.5)
         np.testing.assert_allclose(query.openings.prior, expected, rtol=1e-5)
 
-    def test_the_layout_encoder_of_a_ring_is_the_one_of_a_trunk(self, folder: Path) -> None:
+    def test_trunk_uses_a_ring_layout_encoder(self, folder: Path) -> None:
         assert Checkpoint.load(folder / "layout.pt").config.architecture == "ring"
         assert Bundle.open(folder / "bundle").manifest.architecture == "trunk"
 
-    def test_frozen_stages_of_the_trunk_and_its_statistics_stay(self, folder: Path) -> None:
+    def test_trunk_statistics_stay_frozen(self, folder: Path) -> None:
         torch.manual_seed(SHORT.seed + 1)
         begun = stage_of(SHORT)  # Another seed: only constants are alike.
         trained = Checkpoint.load(folder / "image.pt").weights["image_encoder"]
@@ -200,11 +200,11 @@ class TestRuns:
             if "_bn" in name:
                 assert torch.equal(trained[name], value), name
 
-    def test_it_does_not_begin_with_the_image_encoder_of_a_ring(self, tiny_bundle: Path, tmp_path: Path) -> None:
+    def test_starting_from_a_ring_image_encoder_is_refused(self, tiny_bundle: Path, tmp_path: Path) -> None:
         with pytest.raises(CheckpointError, match="was trained with architecture ring"):
             run.train_image(SHORT, tmp_path, device=CPU, data=FEW, workers=0, init_from=tiny_bundle)
 
-    def test_a_bundle_of_a_trunk_is_a_beginning(self, folder: Path) -> None:
+    def test_run_starts_from_a_trunk_bundle(self, folder: Path) -> None:
         start = load_warm_start(folder / "bundle", "image", TINY)
         encoder = build_image_encoder(TINY)
         start.load_into({"image_encoder": encoder})
@@ -224,8 +224,8 @@ class TestRuns:
             )
             assert len(loaded) == expected
 
-    def test_a_checkpoint_of_before_resumes_without_factors(self, tmp_path: Path) -> None:
-        """Groups of parameters of older checkpoints have none."""
+    def test_old_checkpoint_without_rate_factors_resumes(self, tmp_path: Path) -> None:
+        """Parameter groups of older checkpoints have no factor."""
         stage = stage_of(SHORT)
         checkpoint = run_stage(stage, tmp_path, device=CPU, workers=0)
         for group in checkpoint.optimiser["param_groups"]:
@@ -237,8 +237,8 @@ class TestRuns:
 
 class TestRefusals:
     @pytest.mark.parametrize("name", ["opening_weight", "ceiling_weight", "room_type_weight", "photograph_weight"])
-    def test_losses_that_an_architecture_has_no_output_for_are_refused(self, name: str) -> None:
-        with pytest.raises(ConfigError, match=rf"{name} is 0\.5, .*'ring'"):
+    def test_losses_without_output_are_refused(self, name: str) -> None:
+        with pytest.raises(ConfigError, match=rf"{name} is 0\.5; architecture 'ring' needs 0"):
             PRESETS["ring"].with_settings({f"image.{name}": 0.5})
 
     @pytest.mark.parametrize(
@@ -248,13 +248,13 @@ class TestRefusals:
         with pytest.raises(ConfigError, match=key):
             TINY.with_settings({f"image.{key}": value})
 
-    def test_end_to_end_training_changes_no_pictures(self) -> None:
+    def test_end_to_end_refuses_photometric_changes(self) -> None:
         config = PRESETS["paper"].with_settings({"image.optics": 0.5})
         with pytest.raises(ConfigError, match="optics"):
             EndToEndStage(config, GeneratedSource(config))
 
     @pytest.mark.parametrize("option", ["--photographs", "--teacher", "--layout-from"])
-    def test_options_of_the_image_stage_are_refused_elsewhere(
+    def test_image_stage_options_are_refused_elsewhere(
         self, option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ) -> None:
         words = ["train", "layout", "--preset", "tiny-trunk", "--out", str(tmp_path), option, str(tmp_path)]

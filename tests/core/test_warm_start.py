@@ -1,4 +1,4 @@
-"""Runs that begin with trained weights, the best checkpoint, and what manifests tell of both."""
+"""Runs that start from trained weights, the best checkpoint, image validation, and their manifest entries."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ def trained(folder: Path, init_from: Path, config: TrainConfig = SHORT) -> Check
 
 
 class TestWarmStart:
-    def test_a_bundle_begun_from_a_bundle_tells_its_ancestry(self, tiny_bundle: Path, tmp_path: Path) -> None:
+    def test_manifest_records_the_ancestry(self, tiny_bundle: Path, tmp_path: Path) -> None:
         parent = Bundle.open(tiny_bundle)
         run = tmp_path / "run"
         trained(run, tiny_bundle)
         child = export_run(run, tmp_path / "child", name="child", version="2")
-        told, before = child.manifest.training["image"], parent.manifest.training["image"]
-        assert told["begun_from"] == {
+        entry, before = child.manifest.training["image"], parent.manifest.training["image"]
+        assert entry["begun_from"] == {
             "name": "tiny",
             "version": "test",
             "sha256": parent.sha256,
@@ -55,27 +55,27 @@ class TestWarmStart:
             "panoramas_in_all": before["panoramas"],
         }
         batch = SHORT.image.batch
-        assert told["panoramas_in_all"] == before["panoramas"] + told["panoramas"]
-        assert told["panoramas"] == told["steps"] * batch
-        assert told["minutes_in_all"] >= before["minutes"]
-        # The layout encoder is the parent's, to the bit, and so is its decoder.
+        assert entry["panoramas_in_all"] == before["panoramas"] + entry["panoramas"]
+        assert entry["panoramas"] == entry["steps"] * batch
+        assert entry["minutes_in_all"] >= before["minutes"]
+        # The layout encoder and the decoder are bit-identical to the parent's.
         for name in ("layout_encoder.safetensors", "decoder.safetensors"):
             assert child.read(name) == parent.read(name)
         assert child.manifest.training["layout"]["steps"] == 0
-        # A grandchild counts everything.
+        # Totals of a grandchild include all ancestors.
         trained(tmp_path / "next", tmp_path / "child")
         grandchild = export_run(tmp_path / "next", tmp_path / "grandchild", name="grandchild", version="3")
         in_all = grandchild.manifest.training["image"]["panoramas_in_all"]
-        assert in_all == before["panoramas"] + told["panoramas"] + 2 * batch
+        assert in_all == before["panoramas"] + entry["panoramas"] + 2 * batch
 
-    def test_a_stage_begins_with_the_weights_it_is_given(self, tiny_bundle: Path) -> None:
+    def test_stage_starts_from_bundle_weights(self, tiny_bundle: Path) -> None:
         stage = ImageStage(TINY, GeneratedSource(TINY), build_layout_encoder(TINY))
         start = load_warm_start(tiny_bundle, "image", TINY)
         start.load_into(stage.modules)
         assert same_weights({"image_encoder": stage.encoder.state_dict()}, start.checkpoint.weights)
         assert all(value.dtype != torch.float16 for value in stage.encoder.state_dict().values())
 
-    def test_a_run_begins_with_the_best_of_another(self, tiny_bundle: Path, tmp_path: Path) -> None:
+    def test_run_starts_from_the_best_checkpoint_of_another(self, tiny_bundle: Path, tmp_path: Path) -> None:
         trained(tmp_path / "first", tiny_bundle)
         best = Checkpoint.load(tmp_path / "first" / "image.best.pt")
         start = load_warm_start(tmp_path / "first", "image", TINY)
@@ -88,9 +88,7 @@ class TestWarmStart:
         again = train_image(SHORT, tmp_path / "second", device=CPU, data=FEW, workers=0, resume=True)
         assert again.begun_from == second.begun_from
 
-    def test_the_layout_stage_begins_so_too_and_its_encoder_stays_the_teacher(
-        self, tiny_bundle: Path, tmp_path: Path
-    ) -> None:
+    def test_layout_stage_starts_from_a_bundle(self, tiny_bundle: Path, tmp_path: Path) -> None:
         layout = train_layout(SHORT, tmp_path, device=CPU, data=FEW, workers=0, init_from=tiny_bundle)
         assert layout.begun_from["name"] == "tiny"
         assert set(layout.begun_from) == {"name", "version", "sha256", "minutes_in_all"}
@@ -104,11 +102,11 @@ class TestWarmStart:
             trained(tmp_path, tiny_bundle, PRESETS["paper"])
         assert not (tmp_path / "layout.pt").exists()
 
-    def test_nothing_to_begin_with_is_an_error(self, tmp_path: Path) -> None:
+    def test_missing_initial_weights_are_refused(self, tmp_path: Path) -> None:
         with pytest.raises(CheckpointError, match="no checkpoint"):
             trained(tmp_path / "run", tmp_path)
 
-    def test_the_command_begins_and_says_what_does_not_go_together(self, tiny_bundle: Path, tmp_path: Path) -> None:
+    def test_command_starts_from_a_bundle(self, tiny_bundle: Path, tmp_path: Path) -> None:
         words = ["train", "image", "--preset", "tiny", "--workers", "0", "--device", "cpu", "--out", str(tmp_path)]
         words += ["--from", str(tiny_bundle), "--set", "image.uses_per_panorama=2", "--set", "image.batch=4"]
         words += ["--validation-homes", "1"]
@@ -122,7 +120,7 @@ class TestWarmStart:
 
 
 class Scores:
-    """Validates with accuracies that are given one after the other."""
+    """Validation with given accuracies, one per call."""
 
     def __init__(self, *within_1m: float, median_cm: float = 10.0) -> None:
         self.left = list(within_1m)
@@ -140,13 +138,13 @@ class TestBest:
         run_stage(LineStage(len(scores)), folder, device=CPU, checkpoint_minutes=0.0, validate=Scores(*scores), **more)
         return Checkpoint.load(folder / "line.best.pt", stage="line")
 
-    def test_the_best_is_kept_beside_the_last_and_ties_go_to_the_smaller_median(self, tmp_path: Path) -> None:
+    def test_best_checkpoint_is_kept_beside_the_last(self, tmp_path: Path) -> None:
         assert self.best_of(tmp_path / "a", 0.5, 0.7, 0.6).step == 2
         assert Checkpoint.load(tmp_path / "a" / "line.pt").step == 3
         assert self.best_of(tmp_path / "b", 0.5, 0.7, 0.7).step == 3
         assert not list(tmp_path.rglob("*.part"))
 
-    def test_likelihood_decides_where_there_is_one(self, tmp_path: Path) -> None:
+    def test_likelihood_ranks_checkpoints(self, tmp_path: Path) -> None:
         scores = Scores(0.5, 0.7, 0.6)
         likelihoods = iter((-1.0, -1.1, -1.2))
         run_stage(
@@ -158,19 +156,19 @@ class TestBest:
         )
         assert Checkpoint.load(tmp_path / "line.best.pt").step == 3
 
-    def test_a_resumed_run_scores_the_kept_one_anew(self, tmp_path: Path) -> None:
+    def test_resumed_run_scores_the_best_checkpoint_again(self, tmp_path: Path) -> None:
         first = self.best_of(tmp_path, 0.5, 0.7, 0.6)
-        # On the scenes of today the kept weights have 0.3.
+        # On the present scenes the kept weights score 0.3.
         again = Scores(0.3, 0.4, 0.35)
         run_stage(LineStage(5), tmp_path, device=CPU, checkpoint_minutes=0.0, validate=again, resume=True)
         assert same_weights({"line": again.seen[0]}, first.weights)
         assert Checkpoint.load(tmp_path / "line.best.pt").step == 4
 
-    def test_a_new_run_forgets_the_best_of_the_one_before(self, tmp_path: Path) -> None:
+    def test_new_run_deletes_the_previous_best(self, tmp_path: Path) -> None:
         self.best_of(tmp_path, 0.9)
         assert self.best_of(tmp_path, 0.1, 0.2).step == 2
 
-    def test_export_takes_the_best_unless_the_last_is_asked_for(self, tiny_bundle: Path, tmp_path: Path) -> None:
+    def test_export_uses_the_best_or_the_last(self, tiny_bundle: Path, tmp_path: Path) -> None:
         run = tmp_path / "run"
         shutil.copytree(tiny_bundle.parent, run, ignore=shutil.ignore_patterns("bundle"))
         last = Checkpoint.load(run / "image.pt")
@@ -179,14 +177,14 @@ class TestBest:
         steps = {}
         for chosen in (False, True):
             bundle = export_run(run, tmp_path / str(chosen), name="x", version="1", last=chosen)
-            told = bundle.manifest.training["image"]
-            steps[told["checkpoint"]] = told["steps"]
-            assert told["minutes_of_run"] == round(last.seconds / 60.0, 1)
+            entry = bundle.manifest.training["image"]
+            steps[entry["checkpoint"]] = entry["steps"]
+            assert entry["minutes_of_run"] == round(last.seconds / 60.0, 1)
         assert steps == {"best by validation": TINY.image.steps - 3, "last": TINY.image.steps}
 
 
 class TestValidation:
-    def test_it_reports_both_ways_to_retrieve_and_the_unfamiliar_by_level(self, tmp_path: Path) -> None:
+    def test_image_validation_reports_heldout_and_levels(self, tmp_path: Path) -> None:
         data = TrainingData(
             validation_scenes=3, heldout=GeneratedScenes(homes=2, shots_per_home=2, seed=5, furniture=None)
         )
@@ -203,12 +201,12 @@ class TestValidation:
         assert {"val_profile_within_1m_full", "val_median_cm_full"} <= set(found)
         assert all(np.isfinite(value) for value in found.values())
         assert {path.name for path in tmp_path.iterdir()} == {"validation.npz", "heldout.npz"}
-        # The second time the pictures come from the files.
+        # The second validation reads the pictures from the files.
         before = [path.stat().st_mtime_ns for path in sorted(tmp_path.iterdir())]
         assert scores() == found
         assert [path.stat().st_mtime_ns for path in sorted(tmp_path.iterdir())] == before
 
-    def test_pictures_are_made_again_when_their_file_is_damaged_or_of_others(self, tmp_path: Path) -> None:
+    def test_stale_or_damaged_picture_cache_is_rebuilt(self, tmp_path: Path) -> None:
         path, numbers = tmp_path / "kept.npz", itertools.count()
 
         def kept(*about: bytes) -> int:

@@ -1,4 +1,4 @@
-"""ZInD: homes written with a known answer come back, and its azimuths are understood."""
+"""ZInD reader: homes with known poses round-trip, and bad files are refused."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ FIRST = "partial_room_01_pano_0"
 
 @pytest.fixture
 def root(tmp_path: Path) -> Path:
-    """Three homes, one for each split."""
+    """Write three homes, one per split."""
     write_zind_homes(tmp_path, np.random.default_rng(3), (32, 64))
     return tmp_path
 
@@ -60,7 +60,7 @@ def moved(**changes: Any) -> Callable[[dict[str, Any]], None]:
 class TestRoundTrip:
     @settings(max_examples=25, deadline=None)
     @given(plans(), seeds())
-    def test_any_plan_and_poses_come_back(
+    def test_plan_and_pose_round_trip(
         self, tmp_path_factory: pytest.TempPathFactory, plan: FloorPlan, seed: int
     ) -> None:
         rng = np.random.default_rng(seed)
@@ -93,8 +93,8 @@ class TestRoundTrip:
             assert camera.camera_height_m == pytest.approx(true.height_m, abs=1e-9)
             assert rooms[camera.room_index] == true.room_index
 
-    def test_every_pixel_shows_the_wall_that_the_pose_faces(self, tmp_path: Path) -> None:
-        """The picture is painted in ZInD's own frame; here the same rays are cast in the plan frame."""
+    def test_pixels_show_the_wall_at_their_azimuth(self, tmp_path: Path) -> None:
+        """The picture is painted in ZInD's frame; the test casts the same rays in the plan frame."""
         plan = crooked_flat()
         write_home(tmp_path / "0002", plan, PANORAMAS, np.random.default_rng(8))
         scene = Zind(tmp_path).load(NAME)
@@ -103,13 +103,13 @@ class TestRoundTrip:
             expected = expected_pixels(
                 plan, camera.room_index, camera.position_m, camera.heading, camera.camera_height_m
             )
-            # Edges between walls, and what the JPEG smears around them.
+            # Edges between walls are blurred by JPEG.
             differing = np.abs(pixels - expected).max(axis=2) > 60
             assert differing.mean() < 0.05
             mirrored = np.abs(pixels[:, ::-1] - expected).max(axis=2) > 60
             assert mirrored.mean() > 0.15, "the picture would not tell a mirrored frame"
 
-    def test_the_module_writes_homes(self, tmp_path: Path) -> None:
+    def test_writer_module_writes_homes(self, tmp_path: Path) -> None:
         subprocess.run([sys.executable, "-m", "tests.zind_home", str(tmp_path)], check=True, capture_output=True)
         (name,) = Zind(tmp_path).scenes("test")
         assert len(Zind(tmp_path).load(name).cameras) == len(PANORAMAS)
@@ -118,7 +118,7 @@ class TestRoundTrip:
 def expected_pixels(
     plan: FloorPlan, room_index: int, position_m: np.ndarray, heading: float, camera_height_m: float
 ) -> np.ndarray:
-    """The panorama by this project's own conventions."""
+    """Render the panorama by this project's conventions."""
     room = plan.rooms[room_index]
     pixels = np.zeros((HEIGHT, WIDTH, 3), dtype=int)
     for column, azimuth in enumerate(heading + column_azimuths(WIDTH)):
@@ -134,7 +134,7 @@ def expected_pixels(
 
 
 class TestDataset:
-    def test_splits_are_those_of_the_partition(self, root: Path) -> None:
+    def test_splits_match_the_partition(self, root: Path) -> None:
         dataset = Zind(root)
         assert [dataset.scenes(split) for split in ("train", "validation", "test")] == [
             ["0000/floor_01"],
@@ -145,7 +145,7 @@ class TestDataset:
         assert dataset.appearances == (Appearance(),)
         assert pickle.loads(pickle.dumps(dataset)) == dataset
 
-    def test_homes_that_are_not_on_disk_are_passed_over(self, root: Path) -> None:
+    def test_missing_homes_are_skipped(self, root: Path) -> None:
         (root / "zind_partition.json").write_text('{"test": ["0001", "0099"]}')
         assert Zind(root).scenes("test") == ["0001/floor_01"]
         assert Zind(root).scenes("train") == []
@@ -158,10 +158,10 @@ class TestDataset:
             ('{"test": "0002"}', "'test' must be a list"),
             ('{"test": [2]}', "'test' must be a list"),
             ('{"test": ["../0002"]}', "'test' must be a list"),
-            ('{"dev": []}', "no split is called 'dev'"),
+            ('{"dev": []}', "unknown split 'dev'"),
         ],
     )
-    def test_a_bad_partition_is_refused(self, root: Path, content: str | None, reason: str) -> None:
+    def test_bad_partition_is_refused(self, root: Path, content: str | None, reason: str) -> None:
         path = root / "zind_partition.json"
         path.unlink()
         if content is not None:
@@ -170,14 +170,14 @@ class TestDataset:
             Zind(root).scenes("test")
         assert caught.value.path == path
 
-    def test_a_damaged_home_is_listed_and_refused_when_loaded(self, root: Path) -> None:
+    def test_damaged_home_is_refused_when_loaded(self, root: Path) -> None:
         (root / "0002" / "zind_data.json").write_text("{")
         assert Zind(root).scenes("test") == ["0002"]
         problems: list[DatasetError] = []
         assert list(load_scenes(Zind(root), ["0002"], problems)) == []
         assert "not valid JSON" in str(problems[0])
 
-    def test_a_floor_without_scale_is_a_problem(self, root: Path) -> None:
+    def test_floor_without_scale_is_a_problem(self, root: Path) -> None:
         change_home(root, lambda document: document["scale_meters_per_coordinate"].update(floor_01=None))
         assert Zind(root).scenes("test") == [NAME]
         problems: list[DatasetError] = []
@@ -186,15 +186,15 @@ class TestDataset:
         assert "no metric scale" in problems[0].reason
 
     @pytest.mark.parametrize("name", ["../0002/floor_01", "/0002", "0002/floor_01/x", ""])
-    def test_another_name_is_no_scene(self, root: Path, name: str) -> None:
+    def test_unknown_scene_name_is_refused(self, root: Path, name: str) -> None:
         with pytest.raises(DatasetError, match="names are like '0000/floor_01'"):
             Zind(root).load(name)
 
-    def test_an_unknown_floor_is_refused(self, root: Path) -> None:
-        with pytest.raises(DatasetError, match="no floor 'floor_07', there are: floor_01"):
+    def test_unknown_floor_is_refused(self, root: Path) -> None:
+        with pytest.raises(DatasetError, match="no floor 'floor_07'; available: floor_01"):
             Zind(root).load("0002/floor_07")
 
-    def test_pictures_need_not_be_there_until_they_are_read(self, root: Path) -> None:
+    def test_missing_picture_is_refused_when_read(self, root: Path) -> None:
         path = root / "0002" / "panos" / f"floor_01_{FIRST}.jpg"
         path.unlink()
         scene = Zind(root).load(NAME)
@@ -207,12 +207,12 @@ class TestDataset:
 
 
 class TestRooms:
-    def test_the_outline_is_of_a_primary_panorama(self, root: Path) -> None:
-        """Of the room's secondary panorama, the layout is not looked at."""
+    def test_outline_comes_from_a_primary_panorama(self, root: Path) -> None:
+        """The layout of a secondary panorama is ignored."""
         change_home(root, lambda document: panorama(document, 1, 1).update(layout_complete={"vertices": "none"}))
         assert len(Zind(root).load(NAME).plan.rooms) == 3
 
-    def test_the_first_primary_panorama_with_a_layout_counts(self, root: Path) -> None:
+    def test_first_primary_panorama_with_layout_is_used(self, root: Path) -> None:
         def change(document: dict[str, Any]) -> None:
             del panorama(document, 1, 0)["layout_complete"]
             panorama(document, 1, 1)["is_primary"] = True
@@ -222,7 +222,7 @@ class TestRooms:
         assert same_ring(scene.plan.rooms[0].polygon_m, crooked_flat().rooms[0].polygon_m, 1e-6)
         assert len(scene.cameras) == len(PANORAMAS)
 
-    def test_a_room_without_layout_is_not_in_the_plan_and_its_panoramas_are_problems(self, root: Path) -> None:
+    def test_room_without_layout_is_a_problem(self, root: Path) -> None:
         change_home(root, lambda document: panorama(document, 2, 2).pop("layout_complete"))
         problems: list[DatasetError] = []
         scene = Zind(root).load(NAME, problems)
@@ -236,12 +236,12 @@ class TestRooms:
         ("change", "reason"),
         [
             (changed(is_inside=False), "is_inside is false"),
-            (moved(translation=[99.0, 0.0]), "stands outside its room 'label 1 complete_room_01'"),
-            (moved(translation=[0.0]), r"translation is \[0.0\], two numbers"),
+            (moved(translation=[99.0, 0.0]), "is outside its room 'label 1 complete_room_01'"),
+            (moved(translation=[0.0]), r"translation is \[0.0\]; it must be two numbers"),
             (moved(translation=None), "translation is None"),
-            (moved(rotation="north"), "rotation is 'north', a number is needed"),
+            (moved(rotation="north"), "rotation is 'north'; it must be a number"),
             (moved(rotation=float("nan")), "rotation is nan"),
-            (moved(scale=0), "scale is 0, a number above 0 is needed"),
+            (moved(scale=0), "scale is 0; it must be a number above 0"),
             (changed(floor_plan_transformation=None), "no object 'floor_plan_transformation'"),
             (changed(camera_height=-1.0), "camera_height is -1.0"),
             (changed(camera_height=9.0), "must be below the ceiling"),
@@ -250,7 +250,7 @@ class TestRooms:
             (changed(image_path=7), "image_path is 7"),
         ],
     )
-    def test_a_bad_panorama_is_refused_by_name_or_left_out(
+    def test_bad_panorama_is_refused_or_left_out(
         self, root: Path, change: Callable[[dict[str, Any]], None], reason: str
     ) -> None:
         # Another primary panorama draws the room, so that this one is a camera only.
@@ -276,11 +276,11 @@ class TestRooms:
             (lambda document: document.update(scale_meters_per_coordinate={"floor_01": "big"}), "is 'big'"),
             (lambda document: document.update(scale_meters_per_coordinate={"floor_01": -1}), "is -1"),
             (lambda document: document["merger"].update(floor_01=[]), "no floor 'floor_01'"),
-            (lambda document: document["merger"].update(floor_01={}), "there is no room"),
+            (lambda document: document["merger"].update(floor_01={}), "the scene has no room"),
             (lambda document: document["merger"]["floor_01"].update(complete_room_01=[]), "must be an object"),
-            (changed(layout_complete={"vertices": [[0, 0], [1, 1]]}), "at least three 'vertices'"),
+            (changed(layout_complete={"vertices": [[0, 0], [1, 1]]}), "'vertices' of at least three points"),
             (changed(layout_complete={"vertices": [[0, 0], [1, 1], [1, "x"]]}), "vertex 2 is .1, 'x'."),
-            (changed(layout_complete=[]), "at least three 'vertices'"),
+            (changed(layout_complete=[]), "'vertices' of at least three points"),
             (changed(layout_complete={"vertices": [[0, 0], [2, 2], [2, 0], [0, 2]]}), "crosses itself"),
             (changed(ceiling_height="high"), "ceiling_height is 'high'"),
             (changed(ceiling_height=90.0), "ceiling_height_m is 135"),
@@ -288,7 +288,7 @@ class TestRooms:
             (lambda document: document.update(scale_meters_per_coordinate={"floor_01": 1e6}), "ceiling_height_m is"),
         ],
     )
-    def test_a_bad_floor_is_refused(self, root: Path, change: Callable[[dict[str, Any]], None], reason: str) -> None:
+    def test_bad_floor_is_refused(self, root: Path, change: Callable[[dict[str, Any]], None], reason: str) -> None:
         change_home(root, change)
         problems: list[DatasetError] = []
         with pytest.raises(DatasetError, match=reason) as caught:

@@ -44,7 +44,7 @@ def open_dataset(root: Path, dataset_format: str | None = None) -> Dataset:
             raise DatasetError(f"no {wanted} in this folder; found: {', '.join(found) or 'nothing known'}", path=root)
         return found[wanted]
     if len(found) > 1:
-        raise DatasetError(f"the folder holds several data sets ({', '.join(found)}); set the format", path=root)
+        raise DatasetError(f"the folder holds several data sets: {', '.join(found)}; name the format", path=root)
     if not found:
         raise DatasetError(
             "no data set in this folder; looked for folders 'scene_00000' (Structured3D), "
