@@ -3,8 +3,8 @@
     ROOT/<name>.json   outline of the room around the camera, in camera heights, and its openings
     ROOT/<name>.jpg    the panorama, named in the annotation
 
-docs/reference/datasets.md describes the format. A photograph does not change when room and camera height are scaled together, so
-lengths are converted for a camera `CAMERA_HEIGHT_M` above the floor.
+docs/reference/datasets.md describes the format. A photograph does not change when room and camera height are scaled
+together, so lengths are converted for a camera `CAMERA_HEIGHT_M` above the floor.
 """
 
 from __future__ import annotations

@@ -219,8 +219,8 @@ class TrainConfig:
             for name in _TRUNK_ONLY:
                 if getattr(image, name):
                     raise ConfigError(
-                        f"config.image.{name} is {getattr(image, name)}; architecture '{self.architecture}' needs "
-                        f"{False if name == 'pretrained' else 0}, only 'trunk' has this output"
+                        f"config.image.{name} is {getattr(image, name)}; only architecture 'trunk' supports it, "
+                        f"not '{self.architecture}'"
                     )
         if not 0.0 <= image.camera_height_error_m <= _MAX_HEIGHT_ERROR_M:
             raise ConfigError(

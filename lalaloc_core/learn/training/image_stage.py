@@ -122,7 +122,7 @@ class ImageStage(TrainingStage):
         openings_loss = losses.teacher_openings(logits, openings)
         walls_loss = losses.teacher_walls(features.log_profile[real], features.log_scale[real], log_distance, logits)
         total = stage.photograph_weight * openings_loss + stage.photograph_profile_weight * walls_loss
-        return first_of(features, len(image)), {"photographs": total}
+        return first_rows(features, len(image)), {"photographs": total}
 
     def _styles(self, rendered: int, photographs: int, device: torch.device) -> StyleMixing | None:
         """Draw style partners; every other partner is a photograph, because queries look like photographs."""
