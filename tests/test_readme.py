@@ -1,4 +1,4 @@
-"""The documentation holds: its commands exist, its links resolve, its tables and examples are those of the code."""
+"""The documentation agrees with the code: commands, links, generated parts and examples."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ TARGETS = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(encoding="
 
 
 def _blocks(language: str) -> list[tuple[str, str]]:
-    """(page, content) of every fenced block of a language."""
+    """Return (page, content) of every fenced block in a language."""
     pattern = re.compile(rf"```{language}\n(.*?)```", re.DOTALL)
     return [(page.name, block) for page in PAGES for block in pattern.findall(page.read_text(encoding="utf-8"))]
 
 
 def _commands() -> Iterator[list[str]]:
-    """Every command of every shell block, and every command in running text, as words."""
+    """Yield every command in shell blocks and in running text, as words."""
     for _, block in _blocks("sh"):
         lines = block.replace("\\\n", " ").splitlines()
         yield from (shlex.split(line, comments=True) for line in lines if line.strip())
@@ -43,33 +43,31 @@ def _commands() -> Iterator[list[str]]:
 COMMANDS = list(_commands())
 
 
-def test_every_make_command_is_a_target() -> None:
-    used = {word for command in COMMANDS if command[0] == "make" for word in command[1:] if "=" not in word}
-    assert used >= {"demo", "serve", "test", "setup"}
-    assert used <= TARGETS
+def test_make_commands_are_targets() -> None:
+    targets = {word for command in COMMANDS if command[0] == "make" for word in command[1:] if "=" not in word}
+    assert targets >= {"demo", "serve", "test", "setup"}
+    assert targets <= TARGETS
 
 
-def test_every_module_that_is_run_exists() -> None:
-    used = {command[command.index("-m") + 1] for command in COMMANDS if "python" in command[0] and "-m" in command}
-    assert [name for name in sorted(used) if importlib.util.find_spec(name) is None] == []
+def test_modules_in_commands_exist() -> None:
+    modules = {command[command.index("-m") + 1] for command in COMMANDS if "python" in command[0] and "-m" in command}
+    assert [name for name in sorted(modules) if importlib.util.find_spec(name) is None] == []
 
 
 @pytest.mark.parametrize(
     "command", [command for command in COMMANDS if command[0].endswith("lalaloc")], ids=lambda words: " ".join(words)
 )
-def test_every_lalaloc_command_has_the_options_it_is_shown_with(
-    command: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit) as ended:
-        # `plan` has commands of its own.
+def test_options_in_commands_exist(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as exit_info:
+        # `plan` has subcommands.
         lalaloc([*command[1 : 3 if command[1] == "plan" else 2], "--help"])
-    assert ended.value.code == 0
-    shown = capsys.readouterr().out
-    assert [word for word in command[2:] if word.startswith("--") and word not in shown] == []
+    assert exit_info.value.code == 0
+    output = capsys.readouterr().out
+    assert [word for word in command[2:] if word.startswith("--") and word not in output] == []
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_every_link_into_the_tree_resolves(page: Path) -> None:
+def test_local_links_resolve(page: Path) -> None:
     targets = re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8"))
     local = [target.partition("#")[0] for target in targets if "://" not in target]
     assert [target for target in local if target and not (page.parent / target).exists()] == []
@@ -80,7 +78,7 @@ def test_generated_parts_are_up_to_date() -> None:
     assert stale == [], "run `make docs`"
 
 
-def test_every_json_example_is_what_the_code_reads_or_writes(tmp_path: Path) -> None:
+def test_json_examples_are_valid(tmp_path: Path) -> None:
     kinds = set()
     for page, block in _blocks("json"):
         document = json.loads(block)

@@ -1,4 +1,4 @@
-// Builds the web pages into service/web, with the digest of what they were built from.
+// Builds the web pages into service/web, with the digest of their sources.
 import { createHash } from "node:crypto";
 import { copyFileSync, mkdirSync, readdirSync, readFileSync, rmSync, writeFileSync } from "node:fs";
 import { dirname, join, relative, sep } from "node:path";
@@ -9,7 +9,7 @@ import { build } from "esbuild";
 const here = dirname(fileURLToPath(import.meta.url));
 const root = dirname(here);
 const out = join(root, "service", "web");
-// What the first visitor sees without having anything at hand.
+// Shown on the first visit.
 const examples = ["flat.json", "living_room.jpg", "kitchen.jpg", "bedroom.jpg", "study.jpg"];
 
 function files(folder) {
@@ -22,7 +22,7 @@ function digest(path) {
   return createHash("sha256").update(readFileSync(path)).digest("hex");
 }
 
-// By name, so that a file that is renamed counts as changed; the names with slashes on every system.
+// Sorted by name, so that renaming a file changes the digest; with slashes on every system.
 const sources = [...files(join(here, "src")), ...["build.mjs", "package.json", "package-lock.json", "tsconfig.json"].map(
   (name) => join(here, name))].map((path) => relative(root, path).split(sep).join("/")).sort();
 const sum = createHash("sha256");

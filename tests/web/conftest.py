@@ -1,4 +1,4 @@
-"""Fixtures of the pages' tests: Chromium without a screen, on the production app."""
+"""Fixtures of the pages' tests: headless Chromium on the production app."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ DESKTOP = {"width": 1280, "height": 900}
 PHONE = {"width": 390, "height": 844}
 
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome")
-# Without a screen there is no graphics card either; what is drawn is computed.
+# WebGL in software, as there is no graphics card.
 _ARGUMENTS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
-_PATIENCE_MS = 30_000.0
+_TIMEOUT_MS = 30_000.0
 
 
 @dataclass
 class Visit:
-    """A page in the browser, with what went wrong in it."""
+    """A page in the browser, and its errors."""
 
     page: Page
     client: httpx.Client
-    faults: list[str] = field(default_factory=list)
+    errors: list[str] = field(default_factory=list)
 
     def open(self, path: str = "/") -> Page:
         """Load a page of the service."""
@@ -44,37 +44,37 @@ class Visit:
         return self.page
 
     def open_example(self) -> Page:
-        """The start page, when the example's photographs are there and one is shown."""
+        """Load the start page with the example's photographs."""
         page = self.open()
         expect(page.locator("#photo-strip li")).to_have_count(4)
-        # The viewer sets its shape when it has loaded the photograph.
+        # The viewer sets its shape after loading the photograph.
         expect(page.locator(".stage")).to_have_attribute("data-shape", re.compile("around|whole"))
         return page
 
     def find(self) -> Page:
-        """Ask about the photograph that is chosen, and wait for the answer."""
+        """Localise the chosen photograph and wait for the answer."""
         self.page.get_by_role("button", name="Find the place").click()
         expect(self.page.locator("#answer")).to_be_visible()
         return self.page
 
 
-# Not for the session: while it is there, no other test can run an event loop.
+# Not for the session: Playwright's event loop prevents other tests from running one.
 @pytest.fixture(scope="package")
 def browser() -> Iterator[Browser]:
-    """Chromium, as it is installed here."""
-    found = next(filter(None, map(shutil.which, _BROWSERS)), None)
-    if found is None:
-        pytest.skip("no browser is installed; on Debian and Ubuntu: apt-get install chromium")
-    expect.set_options(timeout=_PATIENCE_MS)
+    """Return the installed Chromium."""
+    path = next(filter(None, map(shutil.which, _BROWSERS)), None)
+    if path is None:
+        pytest.skip("Chromium is not installed; on Debian and Ubuntu: apt-get install chromium")
+    expect.set_options(timeout=_TIMEOUT_MS)
     with sync_playwright() as playwright:
-        launched = playwright.chromium.launch(executable_path=found, args=_ARGUMENTS)
+        launched = playwright.chromium.launch(executable_path=path, args=_ARGUMENTS)
         yield launched
         launched.close()
 
 
 @pytest.fixture(scope="module")
 def service(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:  # noqa: F811
-    """An app without plans, for the tests of a module."""
+    """Return an app without plans for the tests of a file."""
     with start_app(tmp_path_factory.mktemp("data")) as client:
         yield client
 
@@ -82,37 +82,39 @@ def service(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> It
 def _context(browser: Browser, **options: Any) -> BrowserContext:
     values: dict[str, Any] = {"viewport": DESKTOP} | options
     context = browser.new_context(**values)
-    context.set_default_timeout(_PATIENCE_MS)
+    context.set_default_timeout(_TIMEOUT_MS)
     return context
 
 
 def visit(browser: Browser, client: httpx.Client, **options: Any) -> Iterator[Visit]:
-    """A new visitor; what the browser complains about fails the test.
+    """Yield a visit; errors and warnings in the console fail the test.
 
     Args:
-        options: of the browser's context, such as `viewport` or `color_scheme`.
+        browser: running browser.
+        client: service to visit.
+        options: options of the browser context, such as `viewport` or `color_scheme`.
     """
     with _context(browser, **options) as context:
         visited = Visit(context.new_page(), client)
 
-        def heard(message: ConsoleMessage) -> None:
-            # Refused requests are told as errors as well; what they mean is shown on the page.
+        def record(message: ConsoleMessage) -> None:
+            # The browser also reports rejected requests, which the page handles.
             if message.type in ("error", "warning") and "Failed to load resource" not in message.text:
-                visited.faults.append(message.text)
+                visited.errors.append(message.text)
 
-        visited.page.on("console", heard)
-        visited.page.on("pageerror", lambda error: visited.faults.append(str(error)))
+        visited.page.on("console", record)
+        visited.page.on("pageerror", lambda error: visited.errors.append(str(error)))
         yield visited
-    assert [fault for fault in visited.faults if "GPU stall" not in fault and "swiftshader" not in fault.lower()] == []
+    assert [error for error in visited.errors if "GPU stall" not in error and "swiftshader" not in error.lower()] == []
 
 
 @pytest.fixture
 def desktop(browser: Browser, service: httpx.Client) -> Iterator[Visit]:
-    """A visitor at a desk."""
+    """Yield a visit with a desktop."""
     yield from visit(browser, service)
 
 
 @pytest.fixture
 def phone(browser: Browser, service: httpx.Client) -> Iterator[Visit]:
-    """A visitor with a phone."""
+    """Yield a visit with a phone."""
     yield from visit(browser, service, viewport=PHONE, has_touch=True, is_mobile=True, device_scale_factor=2)

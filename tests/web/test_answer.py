@@ -1,4 +1,4 @@
-"""The start page from the first visit to an answer, as people use it."""
+"""The start page from the first visit to an answer."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from tests.web.conftest import EXAMPLES, Visit, visit
 
 
 def _marker(page: Page) -> tuple[float, float]:
-    moved = page.locator("#marker").get_attribute("transform") or ""
-    x, y = re.findall(r"-?[\d.]+", moved)
+    transform = page.locator("#marker").get_attribute("transform") or ""
+    x, y = re.findall(r"-?[\d.]+", transform)
     return float(x), -float(y)
 
 
 def _assert_hottest_at(page: Page, x_m: float, y_m: float) -> None:
-    """The strongest colour of the heat map, that of the most probable place, lies where the answer does."""
+    """Check that the strongest colour of the heat map lies at a place."""
     places = page.evaluate(
         """async () => { const strongest = [];
         const ramp = getComputedStyle(document.documentElement).getPropertyValue('--heat-ramp');
-        const told = ramp.split(',').at(-1).trim();
-        const wanted = [1, 3, 5].map((at) => parseInt(told.slice(at, at + 2), 16));
+        const last = ramp.split(',').at(-1).trim();
+        const colour = [1, 3, 5].map((start) => parseInt(last.slice(start, start + 2), 16));
         for (const image of document.querySelectorAll('#plan .heat image')) {
             const shown = new Image(); shown.src = image.getAttribute('href'); await shown.decode();
             const canvas = document.createElement('canvas');
@@ -35,7 +35,7 @@ def _assert_hottest_at(page: Page, x_m: float, y_m: float) -> None:
             const pixels = context.getImageData(0, 0, width, height).data;
             const box = ['x', 'y', 'width', 'height'].map((name) => Number(image.getAttribute(name)));
             for (let i = 0; i < width * height; i++) {
-                const off = Math.max(...wanted.map((value, k) => Math.abs(value - pixels[4 * i + k])));
+                const off = Math.max(...colour.map((value, k) => Math.abs(value - pixels[4 * i + k])));
                 const [column, row] = [i % width, Math.floor(i / width)];
                 if (off <= 3 && pixels[4 * i + 3] > 200)
                     strongest.push([box[0] + (column + 0.5) / width * box[2], -box[1] - (row + 0.5) / height * box[3]]);
@@ -48,13 +48,13 @@ def _assert_hottest_at(page: Page, x_m: float, y_m: float) -> None:
 
 
 def _assert_accessible(page: Page) -> None:
-    found = Axe().run(page).response["violations"]
-    serious = [fault for fault in found if fault["impact"] in ("serious", "critical")]
-    told = [f"{fault['id']}: {node['html']}" for fault in serious for node in fault["nodes"]]
-    assert told == [], "\n".join(told)
+    violations = Axe().run(page).response["violations"]
+    serious = [violation for violation in violations if violation["impact"] in ("serious", "critical")]
+    messages = [f"{violation['id']}: {node['html']}" for violation in serious for node in violation["nodes"]]
+    assert messages == [], "\n".join(messages)
 
 
-def test_one_click_on_the_first_visit_shows_an_answer_with_its_layout_over_the_photograph(desktop: Visit) -> None:
+def test_first_visit_leads_to_an_answer_with_one_click(desktop: Visit) -> None:
     page = desktop.open_example()
     expect(page.locator("#plan .room")).to_have_count(7)
     _assert_accessible(page)
@@ -62,7 +62,7 @@ def test_one_click_on_the_first_visit_shows_an_answer_with_its_layout_over_the_p
     expect(page.locator("#answer .room")).not_to_be_empty()
     _assert_hottest_at(page, *_marker(page))
     expect(page.locator("#fit-state")).to_contain_text("Layout as seen from")
-    # The canvas over the photograph has lines in their colour.
+    # The canvas over the photograph has yellow lines.
     yellow = page.evaluate(
         """() => { const canvas = document.querySelector('canvas.overlay');
         const pixels = canvas.getContext('2d').getImageData(0, 0, canvas.width, canvas.height).data;
@@ -77,12 +77,11 @@ def test_one_click_on_the_first_visit_shows_an_answer_with_its_layout_over_the_p
     expect(page.locator(".stage")).to_have_attribute("data-shape", "whole")
 
 
-def test_dragging_the_marker_moves_the_layout_and_candidates_lead_back(desktop: Visit) -> None:
+def test_dragged_marker_moves_the_layout(desktop: Visit) -> None:
     page = desktop.open_example()
     desktop.find()
-    # Somewhere inside the living room first, whatever the answer was.
     expect(page.locator("#fit-state")).to_contain_text("Layout as seen from")
-    begin, told = _marker(page), page.locator("#fit-state").inner_text()
+    begin, state = _marker(page), page.locator("#fit-state").inner_text()
     grip = page.locator("#marker .dot").bounding_box()
     assert grip is not None
     page.mouse.move(grip["x"] + grip["width"] / 2, grip["y"] + grip["height"] / 2)
@@ -90,10 +89,10 @@ def test_dragging_the_marker_moves_the_layout_and_candidates_lead_back(desktop: 
     page.mouse.move(grip["x"] + 25, grip["y"] + 18, steps=4)
     page.mouse.up()
     assert _marker(page) != begin
-    expect(page.locator("#fit-state")).not_to_have_text(told)
+    expect(page.locator("#fit-state")).not_to_have_text(state)
     page.locator("[data-rank='0']").click()
     assert _marker(page) == pytest.approx(begin)
-    expect(page.locator("#fit-state")).to_have_text(told)
+    expect(page.locator("#fit-state")).to_have_text(state)
     second = page.locator("[data-rank='1']")
     second.click()
     expect(second).to_have_attribute("aria-pressed", "true")
@@ -176,7 +175,7 @@ def test_choosing_another_plan_aborts_the_query(desktop: Visit) -> None:
     expect(page.locator("#plan-name")).to_have_text("Chosen second")
 
 
-def test_an_error_is_told_at_its_field_and_the_previous_answer_goes_away(desktop: Visit) -> None:
+def test_error_marks_its_field_and_hides_the_answer(desktop: Visit) -> None:
     page = desktop.open_example()
     desktop.find()
     page.locator("#heading").fill("400")
@@ -196,7 +195,7 @@ def _copied(page: Page, button: str) -> str:
     return page.locator("#copied").inner_text()
 
 
-def test_a_photograph_that_is_none_is_refused_in_plain_words(desktop: Visit, tmp_path: Path) -> None:
+def test_other_files_than_photographs_are_rejected(desktop: Visit, tmp_path: Path) -> None:
     page = desktop.open_example()
     (tmp_path / "notes.txt").write_text("no picture")
     page.locator("#photo-file").set_input_files(tmp_path / "notes.txt")
@@ -209,7 +208,7 @@ def test_a_photograph_that_is_none_is_refused_in_plain_words(desktop: Visit, tmp
     expect(page.locator("#answer")).to_be_hidden()
 
 
-def test_a_phone_shows_all_of_it_without_scrolling_sideways(phone: Visit) -> None:
+def test_phone_needs_no_horizontal_scrolling(phone: Visit) -> None:
     page = phone.open_example()
     phone.find()
     assert page.evaluate("document.documentElement.scrollWidth <= document.documentElement.clientWidth")
@@ -228,7 +227,7 @@ def test_dark_mode_has_enough_contrast(browser: Browser, service: httpx.Client) 
         _assert_accessible(page)
 
 
-def test_without_webgl_the_whole_picture_is_shown(desktop: Visit) -> None:
+def test_flat_picture_without_webgl(desktop: Visit) -> None:
     desktop.page.add_init_script(
         "HTMLCanvasElement.prototype.getContext = ((original) => function (kind, ...rest) {"
         "return kind.startsWith('webgl') ? null : original.call(this, kind, ...rest); })"
@@ -238,11 +237,11 @@ def test_without_webgl_the_whole_picture_is_shown(desktop: Visit) -> None:
     expect(page.locator(".stage")).to_have_attribute("data-shape", "whole")
     expect(page.get_by_role("button", name="Look around")).to_be_disabled()
     desktop.find()
-    # What the viewer says about it is no fault.
-    desktop.faults.clear()
+    # The viewer reports the missing WebGL.
+    desktop.errors.clear()
 
 
-def test_the_examples_files_are_not_asked_for_where_there_are_other_plans(desktop: Visit) -> None:
+def test_stored_plan_is_shown_instead_of_the_example(desktop: Visit) -> None:
     desktop.client.post("/floorplans", json=FLAT)
     for plan in desktop.client.get("/floorplans", params={"name": "Example"}).json()["floorplans"]:
         desktop.client.delete(f"/floorplans/{plan['id']}")
@@ -253,7 +252,7 @@ def test_the_examples_files_are_not_asked_for_where_there_are_other_plans(deskto
     desktop.find()
 
 
-def test_several_photographs_are_found_with_one_click(desktop: Visit) -> None:
+def test_find_all_localises_every_photograph(desktop: Visit) -> None:
     page = desktop.open()
     page.locator("#photo-file").set_input_files([EXAMPLES / "kitchen.jpg", EXAMPLES / "study.jpg"])
     page.get_by_role("button", name="Find all").click()

@@ -1,4 +1,4 @@
-"""Drawing and correcting plans on the page."""
+"""Drawing and editing plans on the page."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from tests.web.test_answer import _assert_accessible
 
 
 def _click(page: Page, x_m: float, y_m: float) -> None:
-    """Click a place of the plan."""
+    """Click a place on the plan."""
     page.mouse.click(*_on_screen(page, x_m, y_m))
 
 
 def _on_screen(page: Page, x_m: float, y_m: float) -> tuple[float, float]:
     script = """([x, y]) => { const svg = document.getElementById('plan');
-        const at = new DOMPoint(x, -y).matrixTransform(svg.getScreenCTM()); return [at.x, at.y]; }"""
+        const point = new DOMPoint(x, -y).matrixTransform(svg.getScreenCTM()); return [point.x, point.y]; }"""
     x, y = page.evaluate(script, [x_m, y_m])
     return x, y
 
@@ -35,12 +35,12 @@ def _drag(page: Page, begin: tuple[float, float], end: tuple[float, float]) -> N
 
 
 def _stored(visited: Visit, name: str) -> dict[str, Any]:
-    (found,) = visited.client.get("/floorplans", params={"name": name}).json()["floorplans"]
-    return visited.client.get(f"/floorplans/{found['id']}").json()
+    (listed,) = visited.client.get("/floorplans", params={"name": name}).json()["floorplans"]
+    return visited.client.get(f"/floorplans/{listed['id']}").json()
 
 
 def _editing(visited: Visit, name: str) -> Page:
-    """The editor, open on a plan of this name."""
+    """Store a plan and open the editor on it."""
     upload(visited.client, FLAT | {"name": name})
     page = visited.open()
     expect(page.locator("#plan-name")).to_have_text(name)
@@ -48,7 +48,7 @@ def _editing(visited: Visit, name: str) -> Page:
     return page
 
 
-def test_a_plan_is_drawn_over_a_picture_to_scale_and_stored(desktop: Visit) -> None:
+def test_plan_is_drawn_to_scale_over_a_picture(desktop: Visit) -> None:
     page = desktop.open()
     page.get_by_role("button", name="Draw", exact=True).click()
     picture = Image.new("RGB", (600, 400), "white")
@@ -59,7 +59,7 @@ def test_a_plan_is_drawn_over_a_picture_to_scale_and_stored(desktop: Visit) -> N
         {"name": "scan.png", "mimeType": "image/png", "buffer": content.getvalue()}
     )
     expect(page.get_by_text("Set the scale next")).to_be_attached()
-    # 600 pixels are 12 m at first: the rectangle, 300 pixels wide, would be 6 m. It is 4.5 m.
+    # 600 pixels are 12 m by default, so the rectangle is 6 m wide; its real width is 4.5 m.
     _click(page, 2, 2)
     _click(page, 8, 2)
     page.locator("#known-distance").fill("4.5")
@@ -93,7 +93,7 @@ def test_a_plan_is_drawn_over_a_picture_to_scale_and_stored(desktop: Visit) -> N
     assert {opening["sill_m"] for opening in plan["openings"] if opening["kind"] == "window"} == {1.1}
 
 
-def test_corners_and_walls_are_dragged_and_every_step_can_be_undone(desktop: Visit) -> None:
+def test_dragging_can_be_undone(desktop: Visit) -> None:
     page = _editing(desktop, "Dragged")
     _click(page, 2, 1.5)
     _drag(page, (4, 3), (4.4, 3.4))
@@ -118,14 +118,15 @@ def test_corners_and_walls_are_dragged_and_every_step_can_be_undone(desktop: Vis
     ]
 
 
-def test_a_plan_is_changed_with_the_keyboard_alone(desktop: Visit) -> None:
+def test_plan_is_edited_with_the_keyboard_alone(desktop: Visit) -> None:
     page = _editing(desktop, "Typed")
     page.locator("#edit-room-0").focus()
     page.keyboard.press("Enter")
     page.locator("#edit-corner-1").focus()
     page.keyboard.press("Shift+ArrowRight")
     page.keyboard.press("ArrowUp")
-    assert page.evaluate("document.activeElement.id") == "edit-corner-1"
+    expect(page.locator("#edit-corner-1")).to_be_focused()
+    expect(page.locator("#edit-corner-1")).to_have_attribute("cx", "4.5")
     page.locator("#edit-wall-2").focus()
     page.keyboard.press("w")
     page.locator("#save").focus()
@@ -136,7 +137,7 @@ def test_a_plan_is_changed_with_the_keyboard_alone(desktop: Visit) -> None:
     assert [opening["kind"] for opening in plan["openings"]] == ["window"]
 
 
-def test_a_plan_that_somebody_else_changed_is_not_overwritten_and_nothing_is_lost(desktop: Visit) -> None:
+def test_plan_changed_by_somebody_else_is_not_overwritten(desktop: Visit) -> None:
     page = _editing(desktop, "Contended")
     page.locator("#plan-form-name").fill("Contended, mine")
     page.locator("#plan-form-name").press("Tab")
@@ -154,16 +155,16 @@ def test_a_plan_that_somebody_else_changed_is_not_overwritten_and_nothing_is_los
     assert _stored(desktop, "Contended")["name"] == "Contended, mine"
 
 
-def test_leaving_with_changes_asks_first_and_a_refused_plan_stays_open(desktop: Visit) -> None:
+def test_leaving_with_changes_asks_first(desktop: Visit) -> None:
     page = _editing(desktop, "Left")
     page.locator("#plan-form-ceiling").fill("-1")
     page.locator("#plan-form-ceiling").press("Tab")
     page.locator("#save").click()
     expect(page.locator("#plan-error")).to_contain_text("ceiling_height_m")
     page.locator("#stop").click()
-    page.get_by_role("button", name="Go on editing").click()
+    page.get_by_role("button", name="Continue editing").click()
     expect(page.locator("#save")).to_be_visible()
     page.locator("#stop").click()
-    page.get_by_role("button", name="Lose my changes").click()
+    page.get_by_role("button", name="Discard my changes").click()
     expect(page.locator("#save")).to_have_count(0)
     assert _stored(desktop, "Left")["revision_number"] == 1

@@ -1,4 +1,4 @@
-"""Hints of the place on the start page, and the picture of an answer."""
+"""Hints on the start page, and the picture of an answer."""
 
 from __future__ import annotations
 
@@ -13,20 +13,22 @@ from tests.web.conftest import Visit, visit
 from tests.web.test_answer import _assert_accessible, _copied
 
 
-def test_hints_are_set_on_the_plan_and_sent(desktop: Visit) -> None:
+def test_hints_are_set_and_sent(desktop: Visit) -> None:
     page = desktop.open_example()
     page.locator("#hints summary").click()
-    page.get_by_role("button", name="Mark it on the plan").click()
-    # The mark is there at once for the keyboard; a click puts it elsewhere.
+    page.get_by_role("button", name="Mark the place on the plan").click()
+    # The mark appears at once, for the keyboard; a click moves it.
     mark = page.locator(".hint-circle .grip")
     expect(mark).to_be_focused()
     before = float(mark.get_attribute("cx") or 0)
     page.keyboard.press("Shift+ArrowRight")
-    assert float(mark.get_attribute("cx") or 0) == pytest.approx(before + 1.0)
+    expect(mark).not_to_have_attribute("cx", str(before))
+    moved = mark.get_attribute("cx") or ""
+    assert float(moved) == pytest.approx(before + 1.0)
     plan = page.locator("#plan").bounding_box()
     assert plan is not None
     page.mouse.click(plan["x"] + 0.7 * plan["width"], plan["y"] + 0.65 * plan["height"])
-    assert float(mark.get_attribute("cx") or 0) != pytest.approx(before + 1.0)
+    expect(mark).not_to_have_attribute("cx", moved)
     page.locator("#hint-radius").fill("2.5")
     page.get_by_role("checkbox", name="kitchen").check()
     expect(page.locator("#hints-said")).to_contain_text("within 2.5 m of the mark, in one room")
@@ -37,7 +39,7 @@ def test_hints_are_set_on_the_plan_and_sent(desktop: Visit) -> None:
     code = _copied(page, "#copy-python")
     assert 'near={"x_m":' in code
     assert 'radius_m=2.5, rooms=["kitchen"]' in code
-    # Hints are of one photograph; and a wrong one is told at its field.
+    # Hints belong to one photograph; an invalid one marks its field.
     page.locator(".thumb").nth(1).click()
     expect(mark).to_have_count(0)
     page.locator(".thumb").first.click()
@@ -45,13 +47,13 @@ def test_hints_are_set_on_the_plan_and_sent(desktop: Visit) -> None:
     page.get_by_role("button", name="Find the place").click()
     expect(page.locator("#photo-error")).to_contain_text("radius_m")
     expect(page.locator("#hint-radius")).to_have_attribute("aria-invalid", "true")
-    page.get_by_role("button", name="Take the mark away").click()
+    page.get_by_role("button", name="Remove the mark").click()
     expect(mark).to_have_count(0)
     desktop.find()
 
 
-def test_the_service_s_picture_of_an_answer_is_saved(browser: Browser, start_app: StartApp, tmp_path: Path) -> None:
-    # Drawing takes a second of a core, which a busy machine may not have within the usual limits.
+def test_picture_of_an_answer_is_saved(browser: Browser, start_app: StartApp, tmp_path: Path) -> None:
+    # Drawing takes a second of CPU time; the timeouts allow for busy machines.
     with start_app(tmp_path / "data", request_deadline_s=100.0, decode_stall_s=90.0) as client:
         for visited in visit(browser, client):
             page = visited.open_example()

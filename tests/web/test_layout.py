@@ -1,4 +1,4 @@
-"""The layout that the browser computes is the one that the renderer does."""
+"""The browser computes the same layout as the renderer."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ HEIGHT_M = 1.37
 
 @pytest.fixture(scope="module")
 def flat() -> FloorPlan:
-    """The example flat, with a column and a stub of wall in its largest room."""
+    """Return the example flat with a column and a stub of wall in its largest room."""
     plan = FloorPlan.from_json((EXAMPLES / "flat.json").read_bytes()).to_dict()
     plan["name"] = "Flat with a column"
     plan["rooms"][0]["holes"] = [[[2.5, 1.0], [3.0, 1.0], [3.0, 1.4], [2.5, 1.4]]]
@@ -32,16 +32,16 @@ def flat() -> FloorPlan:
 
 @pytest.fixture(scope="module")
 def poses(flat: FloorPlan) -> list[tuple[int, float, float, float]]:
-    """Some poses in every room: room, x, y, heading in degrees."""
+    """Return poses in every room: room, x, y, heading in degrees."""
     random = np.random.default_rng(5)
-    found = []
+    poses = []
     for index, room in enumerate(flat.rooms):
         floor = room.free_floor(0.2)
         x_min, y_min, x_max, y_max = floor.bounds
         for x, y in random.uniform((x_min, y_min), (x_max, y_max), (4, 2)):
             if floor.buffer(-1e-6).contains(type(floor.representative_point())(x, y)):
-                found.append((index, float(x), float(y), float(random.uniform(0, 360))))
-    return found
+                poses.append((index, float(x), float(y), float(random.uniform(0, 360))))
+    return poses
 
 
 def _in_browser(desktop: Visit, flat: FloorPlan, poses: list[Any], function: str, extra: str) -> list[Any]:
@@ -60,7 +60,7 @@ def _rendered(flat: FloorPlan, poses: list[tuple[int, float, float, float]]) -> 
     return layout_view(np.stack([x, y], axis=1), np.radians(heading), room, flat.geometry, COLUMNS, HEIGHT_M)
 
 
-def test_distances_openings_and_elevations_are_the_renderers(
+def test_view_agrees_with_the_renderer(
     desktop: Visit, flat: FloorPlan, poses: list[tuple[int, float, float, float]]
 ) -> None:
     call = f"{{x_m: x, y_m: y, heading_deg: heading}}, rooms[room], {COLUMNS}, height"
@@ -81,7 +81,7 @@ def test_distances_openings_and_elevations_are_the_renderers(
     np.testing.assert_array_equal(on_wall, (elevation > low) & (elevation < high))
 
 
-def test_lines_lie_where_walls_meet_floor_and_ceiling(
+def test_lines_follow_floor_and_ceiling(
     desktop: Visit, flat: FloorPlan, poses: list[tuple[int, float, float, float]]
 ) -> None:
     drawn = _in_browser(desktop, flat, poses, "layoutLines", "x, y, rooms[room], height")
@@ -90,11 +90,11 @@ def test_lines_lie_where_walls_meet_floor_and_ceiling(
         along = [
             line["points"] for line in lines if line["kind"] == "edge" and line["points"][0][0] != line["points"][-1][0]
         ]
-        # Ends lie in corners, where a ray meets either wall.
+        # Ends lie in corners, where a ray can meet either wall.
         points = np.array([point for line in along for point in line[1:-1]])
         distance = cast_rays(np.array([[x, y]]), points[None, :, 0], room.walls_m[None])[0]
         bounds = np.arctan2([[-HEIGHT_M], [room.ceiling_height_m - HEIGHT_M]], distance)
         assert np.abs(bounds - points[None, :, 1]).min(axis=0).max() < 1e-9
-        # Floor and ceiling are drawn once around.
+        # The lines of floor and ceiling go around once.
         spans = [line[-1][0] - line[0][0] for line in along]
         assert sum(spans) == pytest.approx(2 * 2 * math.pi, abs=1e-6)

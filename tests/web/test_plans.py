@@ -1,4 +1,4 @@
-"""Plans on the start page: uploading, searching, deleting, progress, API keys; and the documentation."""
+"""Plans on the start page: upload, search, deletion, progress and API keys; API documentation."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def _overlapping() -> dict[str, object]:
     return {"name": "Overlap", "ceiling_height_m": 2.5, "rooms": rooms}
 
 
-def test_an_uploaded_plan_is_drawn_at_once_with_its_warnings(desktop: Visit, tmp_path: Path) -> None:
+def test_uploaded_plan_is_drawn_with_its_warnings(desktop: Visit, tmp_path: Path) -> None:
     page = desktop.open()
     (tmp_path / "overlap.json").write_text(json.dumps(_overlapping()))
     page.locator("#plan-file").set_input_files(tmp_path / "overlap.json")
@@ -34,7 +34,7 @@ def test_an_uploaded_plan_is_drawn_at_once_with_its_warnings(desktop: Visit, tmp
     expect(page.locator("#plan-warnings")).to_contain_text("overlap")
 
 
-def test_what_is_begun_while_the_page_is_loaded_is_not_replaced_by_the_example(desktop: Visit, tmp_path: Path) -> None:
+def test_late_example_does_not_replace_an_upload(desktop: Visit, tmp_path: Path) -> None:
     (tmp_path / "overlap.json").write_text(json.dumps(_overlapping() | {"name": "Early"}))
     page, held = desktop.page, list[Route]()
     page.route("**/web/example-flat.json", lambda route: held.append(route))
@@ -51,7 +51,7 @@ def test_what_is_begun_while_the_page_is_loaded_is_not_replaced_by_the_example(d
 
 
 def _scan() -> Image.Image:
-    """Two rooms with a door that is drawn without its swing between them, 7 by 5 m at a centimetre a pixel."""
+    """Draw two rooms with a door without a swing between them, 7 by 5 m at 1 cm per pixel."""
     scan = Image.new("RGB", (900, 700), "white")
     pen = ImageDraw.Draw(scan)
     pen.rectangle((100, 100, 800, 600), outline="black", width=14)
@@ -61,11 +61,11 @@ def _scan() -> Image.Image:
 
 
 def _drag_end(page: Page, index: int, x: float, y: float) -> None:
-    """Move an end of the line that measures a picture, to pixels of it."""
+    """Move an end of the line that measures a picture to a pixel."""
     end = page.locator(".measured circle").nth(index).bounding_box()
     assert end is not None
-    script = """([x, y]) => { const at = new DOMPoint(x, y).matrixTransform(
-        document.querySelector('svg.picture').getScreenCTM()); return [at.x, at.y]; }"""
+    script = """([x, y]) => { const point = new DOMPoint(x, y).matrixTransform(
+        document.querySelector('svg.picture').getScreenCTM()); return [point.x, point.y]; }"""
     to_x, to_y = page.evaluate(script, [x, y])
     page.mouse.move(end["x"] + end["width"] / 2, end["y"] + end["height"] / 2)
     page.mouse.down()
@@ -73,22 +73,22 @@ def _drag_end(page: Page, index: int, x: float, y: float) -> None:
     page.mouse.up()
 
 
-def test_a_picture_s_scale_is_set_on_it_and_what_was_read_is_corrected_over_it(desktop: Visit, tmp_path: Path) -> None:
+def test_imported_picture_is_scaled_and_corrected(desktop: Visit, tmp_path: Path) -> None:
     page = desktop.open()
     _scan().save(tmp_path / "scan.png")
     page.locator("#plan-file").set_input_files(tmp_path / "scan.png")
-    page.get_by_role("button", name="Read the picture").click()
-    expect(page.locator("#plan-error")).to_contain_text("how many metres apart")
-    # Across both rooms, from the middle of a wall to the middle of the other: 6.87 m.
+    page.get_by_role("button", name="Import the picture").click()
+    expect(page.locator("#plan-error")).to_contain_text("enter their distance in metres")
+    # Between the centre lines of the outer walls: 6.86 m.
     _drag_end(page, 0, 107, 350)
     _drag_end(page, 1, 793, 350)
     _assert_accessible(page)
-    page.get_by_label("metres apart").fill("6.86")
-    page.get_by_role("button", name="Read the picture").click()
+    page.get_by_label("Distance of the ends in metres").fill("6.86")
+    page.get_by_role("button", name="Import the picture").click()
     expect(page.locator("#plan-warnings")).to_contain_text("draft")
     expect(page.locator("#plan-facts")).to_contain_text("2 rooms, 31.")
     page.get_by_role("button", name="Edit", exact=True).click()
-    # The picture lies under what was read of it: as wide as it is.
+    # The picture lies under the plan to scale.
     picture = page.locator("#plan image")
     expect(picture).to_have_count(1)
     assert float(picture.get_attribute("width") or 0) == pytest.approx(9.0, rel=0.01)
@@ -103,7 +103,7 @@ def test_a_picture_s_scale_is_set_on_it_and_what_was_read_is_corrected_over_it(d
     assert [opening["kind"] for opening in plan["openings"]] == ["door"]
 
 
-def test_files_of_other_tools_are_read(desktop: Visit, tmp_path: Path) -> None:
+def test_files_of_other_tools_are_imported(desktop: Visit, tmp_path: Path) -> None:
     page = desktop.open()
     (tmp_path / "flat.dxf").write_bytes(export_plan(FloorPlan.from_dict(FLAT), "dxf"))
     page.locator("#plan-file").set_input_files(tmp_path / "flat.dxf")
@@ -114,21 +114,21 @@ def test_files_of_other_tools_are_read(desktop: Visit, tmp_path: Path) -> None:
     expect(page.locator("#plan .room")).to_have_count(0)
 
 
-def test_a_plan_that_is_refused_is_not_shown_as_if_it_were_there(desktop: Visit, tmp_path: Path) -> None:
+def test_rejected_plan_is_not_shown(desktop: Visit, tmp_path: Path) -> None:
     page = desktop.open()
     expect(page.locator("#plan .room").first).to_be_visible()
     crossing = {"rooms": [{"name": "bow", "polygon": [[0, 0], [4, 3], [4, 0], [0, 3]], "ceiling_height_m": 2.5}]}
     (tmp_path / "bow.json").write_text(json.dumps(crossing))
     page.locator("#plan-file").set_input_files(tmp_path / "bow.json")
     expect(page.locator("#plan-error")).to_contain_text("bow")
-    # What the file may lack can be said, and it is read again without being looked for again.
+    # The form imports the same file again with other options.
     page.get_by_label("Storey").fill("")
     with page.expect_request(lambda request: request.method == "POST" and request.url.endswith("/floorplans")):
-        page.get_by_role("button", name="Read it again").click()
+        page.get_by_role("button", name="Import again").click()
     expect(page.locator("#plan .room")).to_have_count(0)
 
 
-def test_plans_are_found_by_name_and_deleted_only_after_a_question(desktop: Visit) -> None:
+def test_deletion_of_a_plan_asks_first(desktop: Visit) -> None:
     for name in ("Attic of the mill", "Cellar of the mill"):
         upload(desktop.client, FLAT | {"name": name})
     page = desktop.open()
@@ -136,18 +136,16 @@ def test_plans_are_found_by_name_and_deleted_only_after_a_question(desktop: Visi
     page.locator("#plan-search").fill("MILL")
     expect(page.locator("#plan-list .plan")).to_have_count(2)
     page.get_by_role("button", name="Delete Attic of the mill").click()
-    page.get_by_role("button", name="Keep it").click()
+    page.get_by_role("button", name="Keep the plan").click()
     expect(page.locator("#plan-list .plan")).to_have_count(2)
     page.get_by_role("button", name="Delete Attic of the mill").click()
-    page.get_by_role("button", name="Delete it").click()
+    page.get_by_role("button", name="Delete the plan").click()
     expect(page.locator("#plan-list .plan")).to_have_count(1)
     names = [plan["name"] for plan in desktop.client.get("/floorplans").json()["floorplans"]]
     assert "Attic of the mill" not in names
 
 
-def test_a_plan_that_is_prepared_in_the_background_becomes_ready_on_the_page(
-    browser: Browser, start_app: StartApp, tmp_path: Path
-) -> None:
+def test_plan_becomes_ready_on_the_page(browser: Browser, start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path, inline_grid_poses=0) as client:
         for visited in visit(browser, client):
             page = visited.open_example()
@@ -157,9 +155,7 @@ def test_a_plan_that_is_prepared_in_the_background_becomes_ready_on_the_page(
 
 
 @pytest.mark.one_replica
-def test_with_keys_the_page_asks_for_one_and_goes_on(
-    browser: Browser, start_app: StartApp, database_of: DatabaseOf, tmp_path: Path
-) -> None:
+def test_page_asks_for_a_key(browser: Browser, start_app: StartApp, database_of: DatabaseOf, tmp_path: Path) -> None:
     with start_app(tmp_path, api_keys=True) as client:
         store = Store(database_of(tmp_path))
         secret = make_key(store)
@@ -171,7 +167,7 @@ def test_with_keys_the_page_asks_for_one_and_goes_on(
             _assert_accessible(page)
             page.locator("#key-field").fill("lalaloc_wrong")
             page.keyboard.press("Enter")
-            expect(page.locator("#key-why")).to_contain_text("refused")
+            expect(page.locator("#key-why")).to_contain_text("rejected")
             page.locator("#key-field").fill(secret)
             page.keyboard.press("Enter")
             expect(dialog).to_be_hidden()
@@ -201,9 +197,7 @@ def test_docs_page_shows_and_sends_operations(desktop: Visit) -> None:
     expect(operation.locator(".live-responses-table")).to_contain_text("Documented")
 
 
-def test_a_link_opens_an_answer_again_and_takes_its_photograph_back(
-    browser: Browser, start_app: StartApp, tmp_path: Path
-) -> None:
+def test_link_opens_an_answer_again(browser: Browser, start_app: StartApp, tmp_path: Path) -> None:
     with start_app(tmp_path, keep_answers_s=3600.0) as client:
         for visited in visit(browser, client):
             page = visited.open_example()

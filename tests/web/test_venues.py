@@ -1,4 +1,4 @@
-"""Venues on the start page: several plans that are asked about at once."""
+"""Venues on the start page: groups of plans that are searched together."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from tests.web.conftest import EXAMPLES, PHONE, visit
 from tests.web.test_answer import _assert_accessible
 
 
-def test_a_venue_is_chosen_and_its_answer_says_which_plan(browser: Browser, start_app: StartApp, tmp_path) -> None:
+def test_answer_of_a_venue_names_the_plan(browser: Browser, start_app: StartApp, tmp_path) -> None:
     with start_app(tmp_path, keep_answers_s=3600.0) as client:
         ids = [upload(client, FLAT | {"name": name}) for name in ("Flat below", "Flat above")]
         plans = [{"floorplan_id": plan_id, "level": level} for level, plan_id in enumerate(ids)]
@@ -30,11 +30,11 @@ def test_a_venue_is_chosen_and_its_answer_says_which_plan(browser: Browser, star
                 "Flat below, level 0" if "below" in plan_of.inner_text() else "Flat above, level 1"
             )
             found = plan_of.inner_text().split(",")[0]
-            # The plan of the answer is drawn, also after looking at another.
+            # Selecting the candidate returns to the plan of the answer.
             expect(page.locator("#plan-name")).to_have_text(found)
             expect(page.locator("#plan #marker")).to_have_count(1)
             other = next(name for name in ("Flat below", "Flat above") if name != found)
-            page.get_by_label("Shown is").select_option(label=f"{other}, level {int(other == 'Flat above')}")
+            page.get_by_label("Plan shown").select_option(label=f"{other}, level {int(other == 'Flat above')}")
             expect(page.locator("#plan-name")).to_have_text(other)
             expect(page.locator("#fit-state")).to_contain_text("another plan of the venue")
             page.locator("[data-rank='0']").click()
@@ -44,7 +44,7 @@ def test_a_venue_is_chosen_and_its_answer_says_which_plan(browser: Browser, star
             expect(page.locator("#copied")).to_contain_text("service.localise_in_venue(")
             page.locator("#copy-link").click()
             link = page.locator("#copied").inner_text()
-            page.get_by_role("button", name="Ask about this plan alone").click()
+            page.get_by_role("button", name="Search only this plan").click()
             expect(page.locator("#venue-bar")).to_be_hidden()
             expect(page.locator("#answer")).to_be_hidden()
             page.goto("about:blank")
@@ -53,17 +53,17 @@ def test_a_venue_is_chosen_and_its_answer_says_which_plan(browser: Browser, star
             expect(page.locator("#venue-bar")).to_contain_text("Mill")
 
 
-def test_a_venue_is_made_of_stored_plans_and_asked_about(browser: Browser, start_app: StartApp, tmp_path) -> None:
+def test_venue_is_created_and_searched(browser: Browser, start_app: StartApp, tmp_path) -> None:
     with start_app(tmp_path) as client:
         for name in ("Cellar", "Shop"):
             upload(client, FLAT | {"name": name})
         for visited in visit(browser, client, viewport=PHONE):
             page = visited.open()
             page.get_by_text("Plans", exact=True).click()
-            page.get_by_text("Make a venue").click()
-            make = page.get_by_role("button", name="Make the venue")
+            page.get_by_text("Create a venue").click()
+            make = page.get_by_role("button", name="Create the venue")
             make.click()
-            expect(page.locator("#venue-error")).to_contain_text("what the venue is called")
+            expect(page.locator("#venue-error")).to_contain_text("Enter a name for the venue")
             page.get_by_label("Name of the venue").fill("Mill Lane 12")
             add = page.get_by_role("button", name="Add", exact=True)
             for name in ("Cellar", "Shop"):
@@ -72,7 +72,7 @@ def test_a_venue_is_made_of_stored_plans_and_asked_about(browser: Browser, start
             expect(add).to_be_disabled()
             page.get_by_label("Level of Cellar").fill("")
             make.click()
-            expect(page.locator("#venue-error")).to_contain_text("Which level is Cellar on?")
+            expect(page.locator("#venue-error")).to_contain_text("Enter the level of Cellar")
             page.get_by_label("Level of Cellar").fill("-1")
             page.get_by_label("Level of Shop").fill("2000000")
             make.click()

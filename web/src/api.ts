@@ -1,11 +1,11 @@
-/** The service's API: every request of the pages goes through here, with the key where there is one. */
+/** Client of the service's API; every request of the pages adds the API key here. */
 
 import type { Answer, Fault, Layout, Plan, PlanDocument, PlanList, Problem, Venue, VenueList, VenuePlanDocument, VenuePlanList } from "./types";
 
 const KEY = "lalaloc-key";
 
-/** Why a request was refused, in the service's own words. */
-export class Refusal extends Error {
+/** Error answer of the service. */
+export class ServiceError extends Error {
   constructor(
     readonly status: number,
     readonly title: string,
@@ -18,22 +18,22 @@ export class Refusal extends Error {
   }
 }
 
-/** The API key, which is gone when the tab is closed. */
+/** API key, kept until the tab is closed. */
 export const key = {
   get: (): string | null => sessionStorage.getItem(KEY),
   set: (value: string): void => sessionStorage.setItem(KEY, value),
-  forget: (): void => sessionStorage.removeItem(KEY),
+  remove: (): void => sessionStorage.removeItem(KEY),
 };
 
-type AskForKey = (why: string) => Promise<boolean>;
+type AskForKey = (reason: string) => Promise<boolean>;
 let askForKey: AskForKey | null = null;
 
-/** Say who asks for a key when one is needed; the promise is false when none is given. */
+/** Register the dialog that asks for a key; its promise is false if the user gives none. */
 export function onKeyNeeded(ask: AskForKey): void {
   askForKey = ask;
 }
 
-/** Send a request; what needs a key is sent again once there is one. */
+/** Send a request; after 401, send it again with the key that the user gives. */
 export async function request(path: string, options: RequestInit = {}): Promise<Response> {
   for (;;) {
     const headers = new Headers(options.headers);
@@ -44,23 +44,23 @@ export async function request(path: string, options: RequestInit = {}): Promise<
       response = await fetch(path, { ...options, headers });
     } catch (error) {
       if (error instanceof DOMException && error.name === "AbortError") throw error;
-      throw new Refusal(0, "The service does not answer", "is it running, and is the network there? Try again.");
+      throw new ServiceError(0, "The service does not answer", "Check that it is running and that the network works, then try again.");
     }
     if (response.ok || response.status === 304) return response;
-    const refusal = await refusalOf(response);
-    const another = key.get() !== sent && key.get() !== null;
-    if (response.status !== 401 || askForKey === null || (!another && !(await askForKey(refusal.detail)))) throw refusal;
+    const failure = await errorOf(response);
+    const hasChanged = key.get() !== sent && key.get() !== null;
+    if (response.status !== 401 || askForKey === null || (!hasChanged && !(await askForKey(failure.detail)))) throw failure;
   }
 }
 
-async function refusalOf(response: Response): Promise<Refusal> {
+async function errorOf(response: Response): Promise<ServiceError> {
   const after = Number(response.headers.get("retry-after"));
   try {
     const problem: Problem = await response.json();
     const slug = String(problem.type ?? "").split(":").pop() ?? "";
-    return new Refusal(response.status, problem.title, problem.detail, problem.errors ?? [], slug, after || null);
+    return new ServiceError(response.status, problem.title, problem.detail, problem.errors ?? [], slug, after || null);
   } catch {
-    return new Refusal(response.status, `The service answered ${response.status}`, response.statusText);
+    return new ServiceError(response.status, `The service answered ${response.status}`, response.statusText);
   }
 }
 
@@ -73,7 +73,7 @@ async function planOf(response: Response): Promise<Plan> {
 }
 
 const path = (id: string): string => `/floorplans/${encodeURIComponent(id)}`;
-const at = (revision?: string): string => (revision ? `?revision=${encodeURIComponent(revision)}` : "");
+const revisionQuery = (revision?: string): string => (revision ? `?revision=${encodeURIComponent(revision)}` : "");
 
 function form(fields: Record<string, string>, name: string, file: File): FormData {
   const body = new FormData();
@@ -91,19 +91,19 @@ export const api = {
   },
 
   async plan(id: string, revision?: string): Promise<Plan> {
-    return planOf(await request(path(id) + at(revision)));
+    return planOf(await request(path(id) + revisionQuery(revision)));
   },
 
   async layout(id: string, revision?: string): Promise<Layout> {
-    return json(`${path(id)}/layout${at(revision)}`);
+    return json(`${path(id)}/layout${revisionQuery(revision)}`);
   },
 
-  /** Upload a plan as a file; `fields` are options of the import. */
+  /** Upload a plan as a file; `fields` are import options. */
   async uploadPlan(file: File, fields: Record<string, string> = {}): Promise<Plan> {
     return planOf(await request("/floorplans", { method: "POST", body: form(fields, "file", file) }));
   },
 
-  /** The file that a plan's revision was uploaded as. */
+  /** Return the uploaded file of a plan's current revision. */
   async original(id: string): Promise<Blob> {
     return (await request(`${path(id)}/original`)).blob();
   },
@@ -113,7 +113,7 @@ export const api = {
     return planOf(await request("/floorplans", { method: "POST", headers, body: JSON.stringify(document) }));
   },
 
-  /** Store a new revision; refused with 412 when the plan has another than that of `etag` by now. */
+  /** Store a new revision; fails with 412 if `etag` is not that of the latest one. */
   async replacePlan(id: string, document: PlanDocument, etag: string): Promise<Plan> {
     const headers = { "Content-Type": "application/json", "If-Match": etag };
     return planOf(await request(path(id), { method: "PUT", headers, body: JSON.stringify(document) }));
@@ -127,11 +127,11 @@ export const api = {
     return json("/localise", { method: "POST", body: form(fields, "panorama", panorama), signal });
   },
 
-  /** The answer to a question as the service draws it: the photograph with the layout, and the plan with the place. */
+  /** Return the answer to a query as a picture: the photograph with the layout, and the plan with the place. */
   async picture(fields: Record<string, string>, panorama: File): Promise<Blob> {
-    const { include: _, ...asked } = fields;
+    const { include: _, ...query } = fields;
     const response = await request("/localise", {
-      method: "POST", headers: { Accept: "image/png" }, body: form(asked, "panorama", panorama),
+      method: "POST", headers: { Accept: "image/png" }, body: form(query, "panorama", panorama),
     });
     return response.blob();
   },
@@ -151,7 +151,7 @@ export const api = {
     return json(`/venues/${encodeURIComponent(id)}`);
   },
 
-  /** The plans of a venue from the lowest level up, as many as fit on a page. */
+  /** Return the first page of a venue's plans, from the lowest level up. */
   async venuePlans(id: string): Promise<VenuePlanList> {
     return json(`/venues/${encodeURIComponent(id)}/plans?limit=500`);
   },

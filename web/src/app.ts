@@ -1,7 +1,7 @@
-/** The page at /: one plan, some photographs, and where they were taken. */
+/** Page at /: one plan, photographs, and where they were taken. */
 
-import { showAnswer, markLooked } from "./answer_panel";
-import { ellipse, rivals } from "./answer_overlay";
+import { showAnswer, markSelected } from "./answer_panel";
+import { ellipse, otherCandidates } from "./answer_overlay";
 import { api } from "./api";
 import { byId, download, h, s, show } from "./dom";
 import { Editor } from "./editor/editor";
@@ -20,7 +20,7 @@ import type { Answer, Layout, Plan, PlanDocument, Pose, Venue } from "./types";
 import { Venues } from "./venues";
 import { Viewport } from "./viewport";
 
-// For tests, which compare them with what the service computes.
+// For tests that compare them with the service's renderer.
 export { layoutLines, layoutView } from "./layout";
 
 const DEFAULT_CAMERA_HEIGHT_M = 1.5;
@@ -30,75 +30,75 @@ class Page {
   private readonly base = s("g");
   private readonly heat = s("g");
   private readonly names = s("g");
-  private readonly over = s("g");
+  private readonly overlay = s("g");
   private readonly marker = new PoseMarker(this.svg, (pose) => this.onMoved(pose));
   private readonly panorama = new PanoramaView(byId("photo-view"), (yaw, fov) => this.marker.look(yaw, fov));
-  private readonly venues = new Venues({ chosen: (venue) => this.onVenue(venue), look: (planId) => void this.plans.choose(planId) });
+  private readonly venues = new Venues({ chosen: (venue) => this.onVenue(venue), showPlan: (planId) => void this.plans.choose(planId) });
   private readonly plans = new Plans({
-    chosen: (plan) => this.onPlan(plan), begun: () => this.onBegun(), picked: () => this.venues.leave(),
+    chosen: (plan) => this.onPlan(plan), started: () => this.onStarted(), picked: () => this.venues.leave(),
     listed: (plans) => this.venues.offer(plans), searched: (name) => void this.venues.load(name),
   });
-  private readonly photos = new Photos((photo, isAnother) => this.onPhoto(photo, isAnother));
+  private readonly photos = new Photos((photo, isOther) => this.onPhoto(photo, isOther));
   private readonly hints = new HintForm(this.svg, (hints) => this.photos.setHints(hints));
   private readonly editor = new Editor(this.svg, {
     draw: (plan) => this.drawRooms(plan),
-    seen: () => this.viewport.current,
+    visible: () => this.viewport.current,
     fit: (box) => this.viewport.fit(box),
     ended: (stored) => this.onEdited(stored),
   });
-  private readonly viewport = new Viewport(this.svg, this.svg.parentElement!, () => this.onSeen());
+  private readonly viewport = new Viewport(this.svg, this.svg.parentElement!, () => this.onViewChanged());
   private readonly find = byId<HTMLButtonElement>("find");
   private plan: Plan | null = null;
-  /** What is drawn: a stored plan, or the example before it is stored. */
+  /** The drawn plan: a stored one, or the example before it is stored. */
   private document: PlanDocument | null = null;
   private layout: Layout | null = null;
   private box: Box = boxOf({ rooms: [] });
   private answer: Answer | null = null;
-  /** Which of its candidates is looked at. */
-  private looked = 0;
+  /** Index of the selected candidate. */
+  private selected = 0;
   /** The marker's pose after the user moved it away from the candidate. */
   private moved: Pose | null = null;
-  private asking: AbortController | null = null;
-  /** Whether somebody has begun with a plan of their own, which the example must not take the place of. */
-  private isBegun = false;
+  private query: AbortController | null = null;
+  /** True once the user has chosen a plan, which the example must not replace. */
+  private hasStarted = false;
 
   async start(): Promise<void> {
     connectKeyDialog();
-    this.svg.append(this.editor.under.element, this.base, this.heat, this.names, this.hints.element, this.over, ...this.editor.layers);
+    this.svg.append(this.editor.underlay.element, this.base, this.heat, this.names, this.hints.element, this.overlay, ...this.editor.layers);
     byId("edit-plan").addEventListener("click", () => this.edit(this.plan));
     byId("draw-plan").addEventListener("click", () => this.edit(null));
-    this.find.addEventListener("click", () => void this.ask());
-    byId("find-all").addEventListener("click", () => void this.askAll());
+    this.find.addEventListener("click", () => void this.localise());
+    byId("find-all").addEventListener("click", () => void this.localiseAll());
     addEventListener("hashchange", () => void this.open());
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.drawAnswer());
     await this.panorama.setPicture(null);
     const [stored] = await Promise.all([this.plans.load(), this.venues.load("")]);
     if (await this.open()) return;
     const example = await examplePlan();
-    // What was begun while all this was loaded stays: nobody waits for an example.
-    if (this.isBegun) return;
+    // The user may have chosen a plan while the example was loading.
+    if (this.hasStarted) return;
     const known = stored.find((plan) => plan.name === example.name);
     if (known !== undefined || stored.length === 0) {
       if (known === undefined) this.onExample(example);
       else await this.plans.choose(known.id);
       const files = await exampleFiles();
-      if (!this.isBegun && this.photos.list.length === 0) this.photos.add(files);
+      if (!this.hasStarted && this.photos.list.length === 0) this.photos.add(files);
     } else await this.plans.choose(stored[0]!.id);
   }
 
-  /** The user chose a plan, venue or answer: a running query would replace it. */
-  private onBegun(): void {
-    this.isBegun = true;
+  /** React to the choice of a plan, venue or answer, which a running query would replace. */
+  private onStarted(): void {
+    this.hasStarted = true;
     this.cancelQuery();
   }
 
   private cancelQuery(): void {
-    this.asking?.abort();
-    this.asking = null;
+    this.query?.abort();
+    this.query = null;
     this.find.removeAttribute("aria-busy");
   }
 
-  /** Show the answer that the address names, if it names one. */
+  /** Show the answer that the address names, if any. */
   private async open(): Promise<boolean> {
     const id = new URLSearchParams(location.hash.slice(1)).get("answer");
     if (id === null) return false;
@@ -121,13 +121,13 @@ class Page {
     this.document = example;
     this.hints.setRooms(example.rooms.map(({ name }, index) => ({ id: name ?? "", name: name ?? `room ${index + 1}` })));
     byId("plan-name").textContent = example.name ?? "";
-    byId("plan-facts").textContent = "example, stored with the first question";
+    byId("plan-facts").textContent = "example, stored with the first query";
     this.drawBase();
   }
 
   private onVenue(venue: Venue | null): void {
     if (venue === null) this.cancelQuery();
-    else this.onBegun();
+    else this.onStarted();
     byId("hints").hidden = venue !== null;
     this.photos.forgetHints();
     this.photos.forgetAnswers();
@@ -138,16 +138,16 @@ class Page {
 
   private onPlan(plan: Plan | null): void {
     const isSame = plan !== null && plan.revision === this.plan?.revision;
-    const wasOther = plan === null || (this.plan !== null && this.plan.id !== plan.id);
+    const isOther = plan === null || (this.plan !== null && this.plan.id !== plan.id);
     if (plan === null) this.cancelQuery();
     this.plan = plan;
     this.document = plan?.plan ?? null;
-    byId("plan-name").textContent = plan?.name ?? "No plan is chosen";
+    byId("plan-name").textContent = plan?.name ?? "No plan chosen";
     byId("plan-facts").textContent = plan === null ? "" :
       `${plan.rooms.length} rooms, ${plan.area_m2.toFixed(1)} m², revision ${plan.revision_number}`;
     byId("preparing").hidden = plan?.status !== "preparing";
     byId<HTMLProgressElement>("plan-progress").value = plan?.progress ?? 0;
-    if (plan?.status === "failed") showError(byId("plan-error"), new Error(`This plan cannot be used: ${plan.reason}`));
+    if (plan?.status === "failed") showError(byId("plan-error"), new Error(`The plan could not be prepared: ${plan.reason}`));
     const report = plan?.import_report;
     const draft = report?.is_draft ? [DRAFT] : [];
     showWarnings([...draft, ...(plan?.warnings ?? []), ...(report?.unsure ?? [])]);
@@ -157,7 +157,7 @@ class Page {
     if (plan !== null && this.venues.current !== null) this.venues.mark(plan.id);
     else {
       this.photos.forgetAnswers();
-      if (wasOther) this.photos.forgetHints();
+      if (isOther) this.photos.forgetHints();
       this.setAnswer(null);
     }
     this.hints.setRooms(plan?.rooms ?? []);
@@ -191,16 +191,16 @@ class Page {
     drawNames(this.names, plan, this.viewport.current);
   }
 
-  /** Handles are equally large however near one looks. */
-  private onSeen(): void {
+  /** Redraw handles and names, whose size on the screen is constant. */
+  private onViewChanged(): void {
     this.hints.draw(this.viewport.current);
     if (this.editor.isOpen) this.editor.redraw();
     else if (this.document !== null) drawNames(this.names, this.document, this.viewport.current);
   }
 
   private edit(plan: Plan | null): void {
-    this.onBegun();
-    this.plans.stay();
+    this.onStarted();
+    this.plans.discardPending();
     this.setAnswer(null);
     document.body.classList.add("editing");
     byId("plan-name").textContent = plan?.name ?? "New plan";
@@ -211,7 +211,7 @@ class Page {
     document.body.classList.remove("editing");
     if (stored === null) {
       this.drawBase();
-      byId("plan-name").textContent = this.document?.name ?? "No plan is chosen";
+      byId("plan-name").textContent = this.document?.name ?? "No plan chosen";
       this.setAnswer(this.photos.current?.answer ?? null, this.photos.current);
     } else {
       this.photos.forgetAnswers();
@@ -221,21 +221,21 @@ class Page {
     }
   }
 
-  private onPhoto(photo: Photo | null, isAnother: boolean): void {
+  private onPhoto(photo: Photo | null, isOther: boolean): void {
     clearError(byId("photo-error"), this.fields);
     byId("photo-none").hidden = photo !== null;
     this.find.disabled = photo === null;
-    if (isAnother) this.hints.show(photo?.hints ?? null);
-    if (isAnother) {
-      // A link shows an answer without its photograph; the one that is added to it is taken for that.
-      if (photo !== null && photo.answer === null && this.answer !== null && this.asked === null) photo.answer = this.answer;
+    if (isOther) this.hints.show(photo?.hints ?? null);
+    if (isOther) {
+      // A link shows an answer without its photograph; a photograph added to it is assumed to be the one.
+      if (photo !== null && photo.answer === null && this.answer !== null && this.answeredPhoto === null) photo.answer = this.answer;
       void this.panorama.setPicture(photo?.file ?? null).then(() => this.drawAnswer())
         .catch((error: unknown) => { if (this.photos.current === photo) showError(byId("photo-error"), error); });
     } else if (photo !== null) photo.answer = null;
     this.setAnswer(photo?.answer ?? null, photo);
   }
 
-  private asked: Photo | null = null;
+  private answeredPhoto: Photo | null = null;
 
   private get fields(): Record<string, HTMLElement> {
     return { ...this.photos.fields, ...this.hints.fields };
@@ -243,16 +243,16 @@ class Page {
 
   private setAnswer(answer: Answer | null, photo: Photo | null = null): void {
     this.answer = answer;
-    this.asked = photo;
-    this.looked = 0;
+    this.answeredPhoto = photo;
+    this.selected = 0;
     this.moved = null;
-    showAnswer(answer, photo, { look: (index) => this.look(index), save: (one) => this.savePicture(one) });
+    showAnswer(answer, photo, { select: (index) => this.select(index), save: (answered) => this.savePicture(answered) });
     this.drawAnswer();
-    // The answer to a question about a venue may lie in another of its plans.
-    if (answer !== null) this.look(0);
+    // The answer of a venue can lie in another plan than the one shown.
+    if (answer !== null) this.select(0);
   }
 
-  /** Draw what there is of the answer in the plan that is shown. */
+  /** Draw the parts of the answer that lie in the plan shown. */
   private drawAnswer(): void {
     const { answer, document: drawn, plan } = this;
     const isHere = answer !== null && answer.floorplan_id === plan?.id;
@@ -260,26 +260,26 @@ class Page {
     byId("heat-legend").hidden = posterior === null;
     show(this.heat, posterior && drawn && heatMap(posterior, drawn));
     const hasFocus = this.marker.element.contains(document.activeElement);
-    show(this.over);
-    const looked = answer?.candidates[this.looked];
-    if (answer === null || drawn === null || looked === undefined || looked.floorplan_id !== plan?.id) {
+    show(this.overlay);
+    const candidate = answer?.candidates[this.selected];
+    if (answer === null || drawn === null || candidate === undefined || candidate.floorplan_id !== plan?.id) {
       this.panorama.setLines([], 0);
-      byId("fit-state").textContent = answer === null ? "" : "The place that is looked at lies in another plan of the venue.";
+      byId("fit-state").textContent = answer === null ? "" : "The selected place lies in another plan of the venue.";
       return;
     }
-    show(this.over, isHere && ellipse(answer), rivals(answer, plan.id, this.box, (index) => this.look(index)), this.marker.element);
+    show(this.overlay, isHere && ellipse(answer), otherCandidates(answer, plan.id, this.box, (index) => this.select(index)), this.marker.element);
     if (hasFocus) this.marker.element.focus({ preventScroll: true });
-    if (this.moved === null) this.look(this.looked);
+    if (this.moved === null) this.select(this.selected);
     else this.drawLines(this.moved);
   }
 
-  /** Move the marker to one of the candidates. */
-  private look(index: number): void {
+  /** Move the marker to a candidate. */
+  private select(index: number): void {
     const candidate = this.answer?.candidates[index];
     if (candidate === undefined) return;
-    this.looked = index;
+    this.selected = index;
     this.moved = null;
-    markLooked(index);
+    markSelected(index);
     if (candidate.floorplan_id !== this.plan?.id) {
       void this.plans.choose(candidate.floorplan_id);
       return;
@@ -291,7 +291,7 @@ class Page {
   }
 
   private onMoved(pose: Pose): void {
-    markLooked(null);
+    markSelected(null);
     this.moved = pose;
     this.drawLines(pose);
   }
@@ -303,15 +303,15 @@ class Page {
     const height = this.answer?.camera_height_m ?? this.plan?.plan.camera_height_m ?? DEFAULT_CAMERA_HEIGHT_M;
     this.panorama.setLines(room === null ? [] : layoutLines(pose.x_m, pose.y_m, room, height), pose.heading_deg);
     const place = `x ${pose.x_m.toFixed(2)} m, y ${pose.y_m.toFixed(2)} m, heading ${pose.heading_deg.toFixed(0)}°`;
-    state.textContent = room === null ? "The marker is in a wall or outside: there is no layout to draw." :
-      this.asked === null ? "Add the photograph to see the layout over it." : `Layout as seen from ${room.name}, ${place}.`;
+    state.textContent = room === null ? "The marker is in a wall or outside the plan: no layout." :
+      this.answeredPhoto === null ? "Add the photograph to see the layout over it." : `Layout as seen from ${room.name}, ${place}.`;
   }
 
-  private async ask(): Promise<void> {
+  private async localise(): Promise<void> {
     const photo = this.photos.current;
     if (photo === null) return;
     this.cancelQuery();
-    const { signal } = (this.asking = new AbortController());
+    const { signal } = (this.query = new AbortController());
     photo.answer = null;
     this.setAnswer(null);
     clearError(byId("photo-error"), this.fields);
@@ -320,10 +320,10 @@ class Page {
       const venue = this.venues.current;
       photo.fields = fieldsOf(venue, venue === null ? this.plan ?? (await this.storeExample(signal)) : null, photo);
       if (signal.aborted) return;
-      const asked = venue === null ? { ...photo.fields, include: "posterior" } : photo.fields;
-      const answer = await api.localise(asked, photo.file, signal);
+      const fields = venue === null ? { ...photo.fields, include: "posterior" } : photo.fields;
+      const answer = await api.localise(fields, photo.file, signal);
       if (answer.floorplan_revision !== this.plan?.revision) await this.plans.choose(answer.floorplan_id, answer.floorplan_revision);
-      // Another plan may have been chosen in the meantime.
+      // The user may have chosen another plan in the meantime.
       if (signal.aborted) return;
       photo.answer = answer;
       if (this.photos.current === photo) this.setAnswer(answer, photo);
@@ -344,11 +344,11 @@ class Page {
     }
   }
 
-  /** One after the other; the first that is refused ends it. */
-  private async askAll(): Promise<void> {
+  /** Localise all photographs in turn, up to the first error. */
+  private async localiseAll(): Promise<void> {
     for (const photo of [...this.photos.list]) {
       this.photos.choose(photo);
-      await this.ask();
+      await this.localise();
       if (photo.answer === null) return;
     }
   }
@@ -362,14 +362,14 @@ class Page {
   }
 }
 
-const DRAFT = "This plan is a draft, guessed from a picture or lines alone: look at it, and correct it with “Edit”. When all doors or "
-  + "all windows are right, tick them there: then they count.";
-const MOST_WARNINGS = 4;
+const DRAFT = "This plan is a draft, derived from a picture or from lines: check it, and correct it with “Edit”. When all doors or "
+  + "all windows are right, tick them in the editor: only then the search uses them.";
+const MAX_WARNINGS = 4;
 
-/** Warnings about the plan; where there are many, the others are a click away. */
+/** Show warnings about the plan; the rest of a long list opens with a click. */
 function showWarnings(texts: string[]): void {
   const items = texts.map((text) => h("li", {}, text));
-  const rest = items.splice(MOST_WARNINGS);
+  const rest = items.splice(MAX_WARNINGS);
   show(byId("plan-warnings"), ...items,
     rest.length > 0 && h("li", {}, h("details", {}, h("summary", {}, `${rest.length} more`), h("ul", {}, ...rest))));
 }

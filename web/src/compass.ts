@@ -1,4 +1,4 @@
-/** A dial over the photograph that says which azimuth of the plan its centre looks along; unknown until it is turned. */
+/** Dial over the photograph that shows and sets the azimuth of its centre in the plan. */
 
 import { h, s } from "./dom";
 import { degrees } from "./layout";
@@ -18,7 +18,7 @@ export class Compass {
     });
     this.dial = s("svg", {
       viewBox: "-52 -52 104 104", class: "dial", tabindex: 0, role: "slider", id: "compass", "aria-valuemin": 0,
-      "aria-valuemax": 359, "aria-label": "Heading of the photograph: where its centre looks on the plan, degrees",
+      "aria-valuemax": 359, "aria-label": "Heading of the photograph: direction of its centre on the plan, degrees",
     }, s("circle", { class: "rim", r: 50 }), ...marks, this.north, this.needle, s("circle", { class: "hub", r: 3 }));
     this.dial.addEventListener("pointerdown", (event) => this.onPointer(event));
     this.dial.addEventListener("pointermove", (event) => { if (event.buttons > 0) this.onPointer(event); });
@@ -28,18 +28,18 @@ export class Compass {
     this.setNorth(null);
   }
 
-  /** Show a heading; null is unknown. */
+  /** Show a heading; null means unknown. */
   set(headingDeg: number | null): void {
     this.heading = headingDeg;
     this.element.classList.toggle("unknown", headingDeg === null);
     this.needle.setAttribute("transform", `rotate(${headingDeg ?? 0})`);
-    const told = headingDeg === null ? "unknown" : `${Math.round(headingDeg)}°`;
+    const text = headingDeg === null ? "unknown" : `${Math.round(headingDeg)}°`;
     this.dial.setAttribute("aria-valuenow", String(Math.round(headingDeg ?? 0)));
-    this.dial.setAttribute("aria-valuetext", told);
-    this.text.textContent = told;
+    this.dial.setAttribute("aria-valuetext", text);
+    this.text.textContent = text;
   }
 
-  /** Show where north is on the plan; null where it does not say. */
+  /** Show the direction of north on the plan; null means unknown. */
   setNorth(northDeg: number | null): void {
     this.north.toggleAttribute("hidden", northDeg === null);
     this.north.setAttribute("transform", `rotate(${northDeg ?? 0})`);

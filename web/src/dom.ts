@@ -1,4 +1,4 @@
-/** Making elements. Styles are classes or CSSOM, never attributes: the page's policy allows nothing inline. */
+/** Creation of elements. Styles are classes or CSSOM: the page's content security policy forbids inline styles. */
 
 type Child = Node | string | number | null | undefined | false;
 type Attributes = Record<string, string | number | boolean | null | undefined | EventListener>;
@@ -20,7 +20,7 @@ function present(children: Child[]): (Node | string)[] {
     .map((child) => (typeof child === "number" ? String(child) : child));
 }
 
-/** An HTML element; attributes whose name begins with "on" are listeners. */
+/** Create an HTML element; attributes that begin with "on" are listeners. */
 export function h<K extends keyof HTMLElementTagNameMap>(
   tag: K, attributes: Attributes = {}, ...children: Child[]
 ): HTMLElementTagNameMap[K] {
@@ -29,7 +29,7 @@ export function h<K extends keyof HTMLElementTagNameMap>(
   return element;
 }
 
-/** An SVG element. */
+/** Create an SVG element. */
 export function s<K extends keyof SVGElementTagNameMap>(
   tag: K, attributes: Attributes = {}, ...children: Child[]
 ): SVGElementTagNameMap[K] {
@@ -38,19 +38,34 @@ export function s<K extends keyof SVGElementTagNameMap>(
   return element;
 }
 
-/** The element of an id that the page is known to have. */
+/** Return an element of the page by its id. */
 export function byId<T extends HTMLElement = HTMLElement>(id: string): T {
   const element = document.getElementById(id);
   if (element === null) throw new Error(`the page has no #${id}`);
   return element as T;
 }
 
-/** Put these children in the place of all that an element has. */
+/** Replace the children of an element. */
 export function show(element: Element, ...children: Child[]): void {
   element.replaceChildren(...present(children));
 }
 
-/** Offer something as a file to keep. */
+/** Unit vectors of the arrow keys, with y up. */
+export const ARROWS: Record<string, [number, number]> = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
+
+/** Call `move` for every movement of the pointer until it is released. */
+export function followPointer(move: (event: PointerEvent) => void): void {
+  const end = (): void => {
+    removeEventListener("pointermove", move);
+    removeEventListener("pointerup", end);
+    removeEventListener("pointercancel", end);
+  };
+  addEventListener("pointermove", move);
+  addEventListener("pointerup", end);
+  addEventListener("pointercancel", end);
+}
+
+/** Offer a file for download. */
 export function download(content: Blob, name: string): void {
   const url = URL.createObjectURL(content);
   const link = h("a", { href: url, download: name });
@@ -59,7 +74,7 @@ export function download(content: Blob, name: string): void {
   setTimeout(() => URL.revokeObjectURL(url), 10_000);
 }
 
-/** A button that does something. */
+/** Create a button. */
 export function button(label: string, act: () => void, attributes: Attributes = {}): HTMLButtonElement {
   return h("button", { type: "button", ...attributes, onclick: () => act() }, label);
 }

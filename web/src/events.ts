@@ -1,20 +1,20 @@
-/** Server-sent events over fetch: the browser's own EventSource cannot send a key. */
+/** Server-sent events over fetch, because the browser's EventSource cannot send a key. */
 
 import { request } from "./api";
 import type { PlanEvent } from "./types";
 
-const ASK_AGAIN_MS = 2000;
+const RECONNECT_MS = 2000;
 
-/** Tell how far a plan is until it is in a final state or `signal` ends it. */
-export async function followPlan(id: string, tell: (event: PlanEvent) => void, signal: AbortSignal): Promise<void> {
+/** Report the progress of a plan until it is in a final state or `signal` aborts. */
+export async function followPlan(id: string, report: (event: PlanEvent) => void, signal: AbortSignal): Promise<void> {
   while (!signal.aborted) {
     const response = await request(`/floorplans/${encodeURIComponent(id)}/events`, { signal });
     for await (const event of eventsOf(response)) {
-      tell(event);
+      report(event);
       if (event.status !== "preparing") return;
     }
-    // The service ends streams after a while; whoever still wants to know asks anew.
-    await new Promise((done) => setTimeout(done, ASK_AGAIN_MS));
+    // The service ends streams after a while; reconnect.
+    await new Promise((done) => setTimeout(done, RECONNECT_MS));
   }
 }
 

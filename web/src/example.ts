@@ -1,15 +1,15 @@
-/** What the first visitor finds: a flat and photographs of it. */
+/** Example flat and its photographs, shown on the first visit. */
 
 import type { PlanDocument } from "./types";
 
 const PHOTOS = ["kitchen.jpg", "living_room.jpg", "bedroom.jpg", "study.jpg"];
 
-/** The plan of the example flat. */
+/** Return the plan of the example flat. */
 export async function examplePlan(): Promise<PlanDocument> {
   return (await fetch("/web/example-flat.json")).json();
 }
 
-/** Its photographs. */
+/** Return the photographs of the example flat. */
 export async function exampleFiles(): Promise<File[]> {
   return Promise.all(PHOTOS.map(async (name) => {
     const response = await fetch(`/web/example-${name}`);

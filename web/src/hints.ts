@@ -1,19 +1,18 @@
-/** What is known of where a photograph was taken: a circle on the plan, rooms; hints of the question, or fences. */
+/** Hints of the place of a photograph: a circle on the plan, and rooms. */
 
-import { byId, h, s, show } from "./dom";
+import { ARROWS, byId, followPointer, h, s, show } from "./dom";
 import { say } from "./notices";
 import { type Box, unitOf } from "./plan_drawing";
 import { placeOf } from "./pose_marker";
 import type { Hints, Point } from "./types";
 
-const USUAL_RADIUS_M = 3;
+const DEFAULT_RADIUS_M = 3;
 const STEP_M = 0.1;
 const FAR_STEP_M = 1;
-const ARROWS: Record<string, Point> = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
 
-export const NO_HINTS: Hints = { near: null, radius: USUAL_RADIUS_M, rooms: [], strict: false };
+export const NO_HINTS: Hints = { near: null, radius: DEFAULT_RADIUS_M, rooms: [], strict: false };
 
-/** Hints as fields of a query. */
+/** Return hints as fields of a query. */
 export function hintFields(hints: Hints): Record<string, string> {
   const fields: Record<string, string> = {};
   if (hints.near !== null) {
@@ -38,13 +37,13 @@ export class HintForm {
   private box: Box = { x: 0, y: 0, width: 1, height: 1 };
   private isMarking = false;
 
-  /** `changed` is told the hints when somebody changes them. */
+  /** `changed` is called when the user changes the hints. */
   constructor(private readonly svg: SVGSVGElement, private readonly changed: (hints: Hints) => void) {
     this.mark.addEventListener("click", () => this.setMarking(!this.isMarking));
     byId("hint-unmark").addEventListener("click", () => this.change({ near: null }));
     this.radius.addEventListener("input", () => this.change({ radius: this.radius.valueAsNumber }));
     this.strict.addEventListener("change", () => this.change({ strict: this.strict.checked }));
-    // Before the viewport, which would move what is seen.
+    // Capture runs before the viewport's listener, which would move the drawing.
     svg.addEventListener("pointerdown", (event) => this.onDown(event), { capture: true });
     addEventListener("keydown", (event) => { if (event.key === "Escape" && this.isMarking) this.setMarking(false); });
   }
@@ -53,7 +52,7 @@ export class HintForm {
     return { near: this.mark, radius_m: this.radius, rooms: this.rooms, strict: this.strict };
   }
 
-  /** The rooms that can be chosen from; those of a plan, or none. */
+  /** Offer the rooms of a plan. */
   setRooms(rooms: { id: string; name: string }[]): void {
     show(this.rooms, ...rooms.map(({ id, name }) => {
       const box = h("input", { type: "checkbox", value: id });
@@ -64,7 +63,7 @@ export class HintForm {
     this.show(this.hints);
   }
 
-  /** Show what is known of a photograph; null: there is none. */
+  /** Show the hints of a photograph; null if there is none. */
   show(hints: Hints | null): void {
     this.hints = hints ?? NO_HINTS;
     if (document.activeElement !== this.radius) this.radius.value = Number.isNaN(this.hints.radius) ? "" : String(this.hints.radius);
@@ -79,7 +78,7 @@ export class HintForm {
     this.draw(this.box);
   }
 
-  /** Draw the circle again, as after zooming. */
+  /** Redraw the circle for another visible part of the plan. */
   draw(box: Box): void {
     this.box = box;
     const { near, radius } = this.hints;
@@ -93,7 +92,7 @@ export class HintForm {
     const size = unitOf(this.box);
     return s("circle", {
       class: "grip", cx: x, cy: -y, r: 1.2 * size, tabindex: 0, role: "button",
-      "aria-label": `Mark at x ${x.toFixed(1)} m, y ${y.toFixed(1)} m; arrow keys move it, Delete takes it away`,
+      "aria-label": `Mark at x ${x.toFixed(1)} m, y ${y.toFixed(1)} m; arrow keys move it, Delete removes it`,
       onpointerdown: (event) => this.onDrag(event as PointerEvent),
       onkeydown: (event) => this.onKey(event as KeyboardEvent),
     });
@@ -115,11 +114,11 @@ export class HintForm {
     if (!isMarking) return;
     this.panel.open = true;
     if (this.hints.near === null) {
-      // In the middle of what is seen, for whoever has no pointer.
+      // Centre of the visible part, for users without a pointer.
       const { x, y, width, height } = this.box;
       this.change({ near: [x + 0.5 * width, -y - 0.5 * height] });
     }
-    say("Click the place on the plan, or move the mark with the arrow keys.");
+    say("Click the plan, or move the mark with the arrow keys.");
     this.element.querySelector<SVGElement>(".grip")?.focus({ preventScroll: true });
   }
 
@@ -134,15 +133,7 @@ export class HintForm {
   private onDrag(event: PointerEvent): void {
     event.preventDefault();
     event.stopPropagation();
-    const move = (moving: PointerEvent): void => this.change({ near: placeOf(this.svg, moving) });
-    const end = (): void => {
-      removeEventListener("pointermove", move);
-      removeEventListener("pointerup", end);
-      removeEventListener("pointercancel", end);
-    };
-    addEventListener("pointermove", move);
-    addEventListener("pointerup", end);
-    addEventListener("pointercancel", end);
+    followPointer((moving) => this.change({ near: placeOf(this.svg, moving) }));
   }
 
   private onKey(event: KeyboardEvent): void {

@@ -1,11 +1,11 @@
-/** What to say of a file that does not say it itself: its unit, scale, storey or page. */
+/** Form for facts that an uploaded file does not state: unit, scale, storey or page. */
 
 import { button, byId, h, show } from "./dom";
 import { showError } from "./notices";
 import { PictureScale } from "./picture_scale";
 
 const UNITS = ["m", "cm", "mm", "in", "ft"];
-// Fields of the upload, with what people call them.
+// Fields of the upload: name, label, placeholder.
 const FIELDS: [string, string, string][] = [
   ["level", "Storey", "name or number"],
   ["scale", "Scale on paper", "1:100"],
@@ -14,9 +14,9 @@ const FIELDS: [string, string, string][] = [
   ["layers", "Only these layers", "walls, doors"],
   ["ceiling_height_m", "Ceiling, m", "2.5"],
 ];
-// The others say nothing of a picture.
+// The other fields do not apply to pictures.
 const OF_PICTURES = ["metres_per_pixel", "scale", "ceiling_height_m"];
-const LONGEST_NAME = 200;
+const MAX_NAME_LENGTH = 200;
 const PICTURES = /^image\/(png|jpeg)$/;
 
 export class ImportForm {
@@ -24,19 +24,19 @@ export class ImportForm {
   private readonly picture = new PictureScale();
   private file: File | null = null;
 
-  /** `again` uploads the file with what was said of it. */
+  /** `again` uploads the file with the values of the form. */
   constructor(private readonly again: (file: File, fields: Record<string, string>) => void) {
-    this.inputs.set("units", h("select", {}, h("option", { value: "" }, "as in the file"), ...UNITS.map((unit) => h("option", {}, unit))));
+    this.inputs.set("units", h("select", {}, h("option", { value: "" }, "from the file"), ...UNITS.map((unit) => h("option", {}, unit))));
     for (const [name, , hint] of FIELDS) this.inputs.set(name, h("input", { type: "text", placeholder: hint, autocomplete: "off" }));
     this.picture.metres.addEventListener("keydown", (event) => { if (event.key === "Enter") this.send(); });
   }
 
-  /** The fields at fault are marked in these. */
+  /** Fields by name, for marking errors. */
   get fields(): Record<string, HTMLElement> {
     return { ...Object.fromEntries(this.inputs), known_distance: this.picture.metres };
   }
 
-  /** Ask about a file: what it has to be told to be read, or what one may want to correct of how it was. */
+  /** Show the form for a file, open if the file cannot be read without it. */
   ask(file: File, isNeeded: boolean): void {
     const isPicture = PICTURES.test(file.type);
     if (isPicture && file !== this.file) {
@@ -44,22 +44,22 @@ export class ImportForm {
     }
     this.file = file;
     const labels: [string, string][] = [["units", "Unit"], ...FIELDS.map(([name, label]): [string, string] => [name, label])];
-    const asked = labels.filter(([name]) => !isPicture || OF_PICTURES.includes(name)).map(([name, label]) => {
+    const shown = labels.filter(([name]) => !isPicture || OF_PICTURES.includes(name)).map(([name, label]) => {
       const input = this.inputs.get(name)!;
       input.id = `import-${name}`;
       return h("div", {}, h("label", { for: input.id }, label), input);
     });
-    const heading = !isNeeded ? `Read “${file.name}” again, with more said of it` :
-      isPicture ? `How large is “${file.name}”?` : `What “${file.name}” does not say of itself`;
+    const heading = !isNeeded ? `Import “${file.name}” again with other options` :
+      isPicture ? `Set the scale of “${file.name}”` : `Import options for “${file.name}”`;
     show(byId("import-form"), h("details", { open: isNeeded }, h("summary", {}, heading),
       isPicture && this.picture.element,
-      h("div", { class: "fields" }, isPicture && h("p", { class: "hint" }, "Or instead, and what else is known:"), ...asked),
+      h("div", { class: "fields" }, isPicture && h("p", { class: "hint" }, "Or enter the scale, and other facts:"), ...shown),
       h("div", { class: "ask" },
-        button(isPicture && isNeeded ? "Read the picture" : "Read it again", () => this.send(), { id: "import-again", class: isNeeded ? "primary" : null }),
+        button(isPicture && isNeeded ? "Import the picture" : "Import again", () => this.send(), { id: "import-again", class: isNeeded ? "primary" : null }),
         button("Cancel", () => this.close()))));
   }
 
-  /** Ask about nothing; what was said of the last file says nothing of the next. */
+  /** Close the form and forget its values. */
   close(): void {
     this.file = null;
     this.picture.close();
@@ -70,18 +70,18 @@ export class ImportForm {
   private send(): void {
     if (this.file === null) return;
     const isPicture = PICTURES.test(this.file.type);
-    const said = Object.fromEntries([...this.inputs].filter(([name]) => !isPicture || OF_PICTURES.includes(name))
+    const values = Object.fromEntries([...this.inputs].filter(([name]) => !isPicture || OF_PICTURES.includes(name))
       .map(([name, input]): [string, string] => [name, input.value.trim()]).filter(([, value]) => value !== ""));
     const distance = this.picture.knownDistance;
-    if (isPicture && distance !== null) said.known_distance = distance;
-    // Nothing else names what a picture shows.
-    if (isPicture) said.name = this.file.name.replace(/\.[^.]*$/, "").slice(0, LONGEST_NAME) || this.file.name;
-    if (isPicture && distance === null && said.metres_per_pixel === undefined && said.scale === undefined) {
-      showError(byId("plan-error"), new Error("A picture does not say how large it is: put the line’s ends on two points, and say how many metres apart they are."));
+    if (isPicture && distance !== null) values.known_distance = distance;
+    // A picture contains no name.
+    if (isPicture) values.name = this.file.name.replace(/\.[^.]*$/, "").slice(0, MAX_NAME_LENGTH) || this.file.name;
+    if (isPicture && distance === null && values.metres_per_pixel === undefined && values.scale === undefined) {
+      showError(byId("plan-error"), new Error("The scale of the picture is missing: put the ends of the line on two points and enter their distance in metres."));
       this.picture.metres.setAttribute("aria-invalid", "true");
       this.picture.metres.focus();
       return;
     }
-    this.again(this.file, said);
+    this.again(this.file, values);
   }
 }

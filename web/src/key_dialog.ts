@@ -1,13 +1,22 @@
-/** Asks for the API key where the service wants one. */
+/** Dialog for the API key. */
 
 import { key, onKeyNeeded } from "./api";
-import { byId } from "./dom";
+import { button, byId, h } from "./dom";
 
-/** Connect the dialog; it opens by itself when the service refuses a request for want of a key. */
+/** Connect the dialog, which opens when the service refuses a request without a valid key. */
 export function connectKeyDialog(): void {
-  const dialog = byId<HTMLDialogElement>("key-dialog");
-  const field = byId<HTMLInputElement>("key-field");
-  const why = byId("key-why");
+  const reason = h("p", { id: "key-why" });
+  const field = h("input", {
+    id: "key-field", type: "password", autocomplete: "off", spellcheck: "false", placeholder: "lalaloc_…", required: true,
+  });
+  const form = h("form", {}, h("h2", { id: "key-title" }, "API key"), reason,
+    h("label", { for: field.id }, "Key"), field, h("p", { class: "hint" }, "The key is kept in this tab until the tab is closed."),
+    h("div", { class: "ask" }, h("button", { class: "primary" }, "Use this key"), button("Remove the key", () => {
+      key.remove();
+      location.reload();
+    }), button("Cancel", () => dialog.close("cancel"))));
+  const dialog = h("dialog", { id: "key-dialog", "aria-labelledby": "key-title" }, form);
+  document.body.append(dialog);
   const opener = byId<HTMLButtonElement>("key-button");
   let waiting: ((given: boolean) => void)[] = [];
 
@@ -15,23 +24,18 @@ export function connectKeyDialog(): void {
     opener.hidden = key.get() === null && opener.dataset.needed !== "yes";
   };
   const open = (text: string): void => {
-    why.textContent = text;
+    reason.textContent = text;
     field.value = "";
     if (!dialog.open) dialog.showModal();
     field.focus();
   };
   onKeyNeeded((detail) => {
     opener.dataset.needed = "yes";
-    open(key.get() === null ? "This service wants an API key." : `That key was refused: ${detail}`);
+    open(key.get() === null ? "This service requires an API key." : `The key was rejected: ${detail}`);
     return new Promise((resolve) => waiting.push(resolve));
   });
-  opener.addEventListener("click", () => open("Another key takes the place of the one in use."));
-  byId("key-cancel").addEventListener("click", () => dialog.close("cancel"));
-  byId("key-forget").addEventListener("click", () => {
-    key.forget();
-    location.reload();
-  });
-  byId<HTMLFormElement>("key-form").addEventListener("submit", (event) => {
+  opener.addEventListener("click", () => open("A new key replaces the current one."));
+  form.addEventListener("submit", (event) => {
     event.preventDefault();
     const given = field.value.trim();
     if (given === "") return;
@@ -40,11 +44,11 @@ export function connectKeyDialog(): void {
   });
   dialog.addEventListener("close", () => {
     const given = dialog.returnValue === "given";
-    const asked = waiting;
+    const resolvers = waiting;
     waiting = [];
-    asked.forEach((resolve) => resolve(given));
+    resolvers.forEach((resolve) => resolve(given));
     showState();
-    if (given && asked.length === 0) location.reload();
+    if (given && resolvers.length === 0) location.reload();
     dialog.returnValue = "";
   });
   showState();

@@ -1,11 +1,11 @@
 /**
- * The bare layout around a pose, in closed form: what lalaloc_core/render computes, here for lines over a photograph.
+ * Bare layout around a pose in closed form, as in lalaloc_core/render, for lines over a photograph.
  * Angles are radians, azimuths clockwise from the plan's +y, elevations up from the horizon.
  */
 
 import type { OpeningKind, Point, Pose, RoomLayout } from "./types";
 
-// As in lalaloc_core/render/profile.py: a ray may miss both of two adjoining walls at their corner by rounding.
+// As in lalaloc_core/render/profile.py: rounding can make a ray miss both walls at a corner.
 const CORNER_TOLERANCE = 1e-5;
 const PARALLEL = 1e-12;
 const COLUMNS = 720;
@@ -21,7 +21,7 @@ export interface Hit {
   share: number;
 }
 
-/** The nearest of a room's walls along an azimuth; at infinity outside a closed room. */
+/** Return the nearest wall along an azimuth; at infinity if there is none. */
 export function castRay(x: number, y: number, azimuth: number, walls: RoomLayout["walls_m"]): Hit {
   const dx = Math.sin(azimuth), dy = Math.cos(azimuth);
   const nearest: Hit = { distance: Infinity, wall: -1, share: 0 };
@@ -37,12 +37,12 @@ export function castRay(x: number, y: number, azimuth: number, walls: RoomLayout
   return nearest;
 }
 
-/** Azimuth of each column's centre, relative to the heading. */
+/** Return the azimuth of each column's centre, relative to the heading. */
 export function columnAzimuths(columns: number): number[] {
   return Array.from({ length: columns }, (_, column) => ((column + 0.5) / columns - 0.5) * 2 * Math.PI);
 }
 
-/** Elevations of the lines where a wall meets the floor and the ceiling. */
+/** Return the elevations at which a wall meets floor and ceiling. */
 export function wallElevations(distance: number, cameraHeight: number, ceilingHeight: number): Point {
   return [-Math.atan2(cameraHeight, distance), Math.atan2(ceilingHeight - cameraHeight, distance)];
 }
@@ -54,7 +54,7 @@ export interface ColumnView {
   ceiling: number;
 }
 
-/** What a pose sees in each column of a panorama, at eye height. */
+/** Return the wall or opening that each column of a panorama shows at camera height. */
 export function layoutView(pose: Pose, room: RoomLayout, columns: number, cameraHeight: number): ColumnView[] {
   const heading = radians(pose.heading_deg);
   return columnAzimuths(columns).map((azimuth) => {
@@ -67,7 +67,7 @@ export function layoutView(pose: Pose, room: RoomLayout, columns: number, camera
   });
 }
 
-/** A line of the layout as directions from the camera: azimuth and elevation of each of its points. */
+/** Line of the layout as directions from the camera: azimuth and elevation of each point. */
 export interface LayoutLine {
   kind: "edge" | OpeningKind;
   points: Point[];
@@ -79,7 +79,7 @@ interface Piece {
   to: number;
 }
 
-/** All lines of a room that a camera sees: along floor and ceiling, in the corners, around openings. */
+/** Return all visible lines of a room: along floor and ceiling, in corners, around openings. */
 export function layoutLines(x: number, y: number, room: RoomLayout, cameraHeight: number): LayoutLine[] {
   const pieces = visiblePieces(x, y, room);
   const distanceAt = (wall: number, azimuth: number): number => toWall(x, y, azimuth, room.walls_m[wall]!);
@@ -116,7 +116,7 @@ function openingLines(x: number, y: number, piece: Piece, room: RoomLayout, came
     const along = sampled(from, to);
     const lower = along.map((azimuth): Point => [azimuth, elevations(azimuth)[0]]);
     const upper = along.map((azimuth): Point => [azimuth, elevations(azimuth)[1]]);
-    // One line around it; a side that another wall hides is left open.
+    // One line around the opening; a side that another wall hides stays open.
     const whole = sides[0] >= piece.from - 1e-9, closed = sides[1] <= piece.to + 1e-9;
     const points = [...upper.reverse(), ...lower];
     if (whole && closed) return [{ kind: opening.kind, points: [...points, upper[0]!] }];
@@ -126,7 +126,7 @@ function openingLines(x: number, y: number, piece: Piece, room: RoomLayout, came
   });
 }
 
-/** The pieces of walls that are seen, clockwise; together they go around once. */
+/** Return the visible pieces of walls, clockwise, once around. */
 function visiblePieces(x: number, y: number, room: RoomLayout): Piece[] {
   const wallAt = (azimuth: number): number => castRay(x, y, azimuth, room.walls_m).wall;
   const azimuths = columnAzimuths(COLUMNS);
@@ -165,12 +165,12 @@ function unwrapped(angle: number, near: number): number {
   return angle + 2 * Math.PI * Math.round((near - angle) / (2 * Math.PI));
 }
 
-/** The room that a point lies in, holes left out; none where it lies in a wall or outside. */
+/** Return the room that contains a point, null in walls and outside. */
 export function roomAt(rooms: RoomLayout[], x: number, y: number): RoomLayout | null {
   return rooms.find((room) => inside(room.polygon, x, y) && !room.holes.some((hole) => inside(hole, x, y))) ?? null;
 }
 
-/** Whether a point lies in a polygon, by the parity of crossings. */
+/** Test whether a polygon contains a point, by the parity of crossings. */
 export function inside(polygon: Point[], x: number, y: number): boolean {
   let odd = false;
   polygon.forEach(([x0, y0], index) => {

@@ -1,19 +1,19 @@
-/** Errors where they happen: in plain words, at the field that is at fault. */
+/** Messages: errors next to the fields that cause them, and short notices. */
 
-import { Refusal } from "./api";
+import { ServiceError } from "./api";
 import { h, show } from "./dom";
 
-/** Show what went wrong in an element with the role alert, and mark the fields that it is about. */
+/** Show an error in an element with the role alert and mark the fields that cause it. */
 export function showError(place: HTMLElement, error: unknown, fields: Record<string, HTMLElement> = {}): void {
   clearError(place, fields);
-  const refusal = error instanceof Refusal ? error : null;
+  const failure = error instanceof ServiceError ? error : null;
   const text = error instanceof Error ? error.message : String(error);
-  const faults = refusal?.faults ?? [];
+  const faults = failure?.faults ?? [];
   show(place,
-    h("strong", {}, refusal?.title ?? "Something went wrong"),
-    h("p", {}, plain(refusal) ?? refusal?.detail ?? text),
+    h("strong", {}, failure?.title ?? "Something went wrong"),
+    h("p", {}, plainText(failure) ?? failure?.detail ?? text),
     faults.length > 0 && h("ul", {}, ...faults.map((fault) => h("li", {}, h("code", {}, fault.field), ` ${fault.message}`))),
-    refusal?.retryAfterS ? h("p", {}, `Try again in ${refusal.retryAfterS} s.`) : null);
+    failure?.retryAfterS ? h("p", {}, `Try again in ${failure.retryAfterS} s.`) : null);
   place.hidden = false;
   place.scrollIntoView({ block: "nearest" });
   for (const fault of faults) {
@@ -24,7 +24,7 @@ export function showError(place: HTMLElement, error: unknown, fields: Record<str
   }
 }
 
-/** Take an error away, and its marks. */
+/** Remove an error and its marks. */
 export function clearError(place: HTMLElement, fields: Record<string, HTMLElement> = {}): void {
   place.hidden = true;
   show(place);
@@ -34,21 +34,21 @@ export function clearError(place: HTMLElement, fields: Record<string, HTMLElemen
   }
 }
 
-/** For what people run into by pressing buttons; the service's own words are for whoever writes the request. */
-function plain(refusal: Refusal | null): string | null {
-  if (refusal === null) return null;
+/** Return plain words for frequent errors; the service's own messages are written for developers. */
+function plainText(failure: ServiceError | null): string | null {
+  if (failure === null) return null;
   const words: Record<string, string> = {
-    "insufficient-scope": "Your API key is not good for this. Ask for one that is, or use another with the button “API key”.",
-    overloaded: "The service has too much to do at the moment.",
-    "plan-not-ready": "The plan is still being prepared. Wait until its bar is full, then ask again.",
+    "insufficient-scope": "Your API key lacks the required scope. Choose another key with the button “API key”.",
+    overloaded: "The service is overloaded.",
+    "plan-not-ready": "The plan is still being prepared. Try again when the progress bar is full.",
   };
-  const said = words[refusal.slug];
-  return said === undefined ? null : `${said} (${refusal.detail})`;
+  const text = words[failure.slug];
+  return text === undefined ? null : `${text} (${failure.detail})`;
 }
 
 let hide: number | undefined;
 
-/** A short message at the bottom of the page that screen readers tell, too. */
+/** Show a short notice at the bottom of the page. */
 export function say(text: string): void {
   const place = document.getElementById("toast");
   if (place === null) return;

@@ -1,14 +1,14 @@
-/** The photograph, to look around in or as a whole, with lines of the layout over it. */
+/** Photograph, in a panorama viewer or flat, with the lines of the layout over it. */
 
 import { button, h, show } from "./dom";
-import { degrees, type LayoutLine, radians } from "./layout";
+import { type LayoutLine, radians } from "./layout";
 import { equirectangular, type Gaze, perspective, type Size } from "./projection";
 import type { OpeningKind, Point } from "./types";
 
 type Sphere = import("./sphere").Sphere;
 type Shape = "around" | "whole";
 
-// Okabe and Ito's colours, apart for every kind of colour vision, and told apart by their dashes as well.
+// Colours by Okabe and Ito, distinct for every kind of colour vision; dashes differ as well.
 const STROKES: Record<"edge" | OpeningKind, { colour: string; dash: number[]; name: string }> = {
   edge: { colour: "#ffe14d", dash: [], name: "walls" },
   door: { colour: "#56b4e9", dash: [10, 4], name: "doors" },
@@ -29,13 +29,13 @@ export class PanoramaView {
   private sphere: Sphere | null = null;
   private shape: Shape = "around";
   private url: string | null = null;
-  /** Ends when the viewer has read the picture that it was given last, or has given up on it. */
+  /** Settles when the viewer has loaded its latest picture or failed to. */
   private loading: Promise<void> = Promise.resolve();
   private lines: LayoutLine[] = [];
   private heading = 0;
   private shown = true;
 
-  /** `gazed` hears where one looks: radians from the picture's centre, and how wide. */
+  /** `gazed` is called with the yaw from the picture's centre and the field of view, radians. */
   constructor(root: HTMLElement, private readonly gazed: (yaw: number, fov: number) => void) {
     this.shapes = {
       around: button("Look around", () => this.setShape("around"), { "aria-pressed": "true" }),
@@ -44,7 +44,7 @@ export class PanoramaView {
     const lines = h("input", { type: "checkbox", id: "lines-shown", checked: true });
     lines.addEventListener("change", () => { this.shown = lines.checked; this.draw(); });
     const bar = h("div", { class: "bar" },
-      h("div", { class: "segmented", role: "group", "aria-label": "How the photograph is shown" },
+      h("div", { class: "segmented", role: "group", "aria-label": "View of the photograph" },
         this.shapes.around, this.shapes.whole),
       h("label", { class: "inline" }, lines, "Layout"),
       legend());
@@ -55,7 +55,7 @@ export class PanoramaView {
     this.picture.addEventListener("load", () => this.draw());
   }
 
-  /** Show a photograph; null shows none. Refused where the file is no picture. */
+  /** Show a photograph; null shows none. Rejects if the file is not a picture. */
   async setPicture(file: Blob | null): Promise<void> {
     this.release(this.url);
     this.url = file === null ? null : URL.createObjectURL(file);
@@ -70,21 +70,16 @@ export class PanoramaView {
       await this.picture.decode();
     } catch {
       this.stage.classList.add("empty");
-      throw new Error("This file cannot be shown as a picture.");
+      throw new Error("The browser cannot show this file as a picture.");
     }
     await this.refresh();
   }
 
-  /** Lines of the layout, their azimuths clockwise from the plan's +y; `headingDeg` is where the centre looks. */
+  /** Set the lines of the layout, with azimuths clockwise from the plan's +y, and the heading of the centre. */
   setLines(lines: LayoutLine[], headingDeg: number): void {
     this.lines = lines;
     this.heading = radians(headingDeg);
     this.draw();
-  }
-
-  /** Look along a yaw from the picture's centre, level. */
-  lookAt(yaw: number): void {
-    this.sphere?.turnTo(yaw, 0);
   }
 
   private setShape(shape: Shape): void {
@@ -92,7 +87,7 @@ export class PanoramaView {
     void this.refresh();
   }
 
-  /** Give a picture's memory back once nothing loads it any more. */
+  /** Release a picture's memory after the viewer has loaded it. */
   private release(url: string | null): void {
     if (url === null) return;
     void this.loading.catch(() => undefined).then(() => URL.revokeObjectURL(url));
@@ -102,19 +97,19 @@ export class PanoramaView {
     if (this.shape === "around" && this.url !== null) {
       const url = this.url;
       try {
-        // The viewer is large, and only needed once there is a picture.
+        // The viewer is large, so it is loaded with the first picture.
         const { Sphere } = await import("./sphere");
-        // Another picture was chosen meanwhile, and is shown by its own call.
+        // A picture that was chosen in the meantime is shown by its own call.
         if (this.url !== url) return;
         this.sphere ??= new Sphere(this.holder, () => this.draw());
         this.loading = this.sphere.show(url);
         await this.loading;
       } catch (error) {
-        // Without WebGL there is no looking around, but everything else.
+        // Without WebGL the viewer is missing, and the flat picture is shown.
         if (this.url !== url) return;
         this.shape = "whole";
         this.shapes.around.disabled = true;
-        this.shapes.around.title = error instanceof Error ? error.message : "needs WebGL";
+        this.shapes.around.title = error instanceof Error ? error.message : "requires WebGL";
       }
     }
     this.stage.dataset.shape = this.shape;
@@ -171,12 +166,6 @@ export class PanoramaView {
 
   private gaze(): Gaze {
     return this.shape === "around" && this.sphere !== null ? this.sphere.gaze() : { yaw: 0, pitch: 0, verticalFov: 1 };
-  }
-
-  /** What there is to read of the state, for tests and screen readers. */
-  describe(): string {
-    return this.lines.length === 0 ? "No layout is drawn." : `The layout as seen from the marker, heading ${
-      degrees(this.heading).toFixed(0)}°, is drawn over the photograph.`;
   }
 }
 

@@ -1,4 +1,4 @@
-/** The photographs at hand, what is known of each, and its answer once there is one. */
+/** Photographs with their settings and answers. */
 
 import { Compass } from "./compass";
 import { byId, h, show } from "./dom";
@@ -14,13 +14,13 @@ export interface Photo {
   cameraHeight: number | null;
   hints: Hints;
   answer: Answer | null;
-  /** What was asked, for the snippets. */
+  /** Fields of the query, for code snippets. */
   fields: Record<string, string>;
 }
 
 const PICTURES = /^image\/(jpeg|png|webp)$/;
 
-/** The form of the chosen photograph, and the strip of all of them. */
+/** Form of the chosen photograph, and the strip of all photographs. */
 export class Photos {
   readonly compass: Compass;
   private readonly strip = byId("photo-strip");
@@ -31,8 +31,8 @@ export class Photos {
   private readonly all: Photo[] = [];
   private chosen: Photo | null = null;
 
-  /** `changed` is told when another photograph is chosen or what is known of it changes. */
-  constructor(private readonly changed: (photo: Photo | null, isAnother: boolean) => void) {
+  /** `changed` is called when another photograph is chosen or its settings change. */
+  constructor(private readonly changed: (photo: Photo | null, isOther: boolean) => void) {
     this.compass = new Compass((degrees) => {
       this.heading.value = degrees === null ? "" : String(degrees);
       this.read();
@@ -59,13 +59,13 @@ export class Photos {
     return { heading_deg: this.heading, heading_tolerance_deg: this.tolerance, camera_height_m: this.height };
   }
 
-  /** Take pictures in, and choose the first of them. */
+  /** Add pictures and choose the first of them. */
   add(files: File[], headings: (number | null)[] = []): void {
-    const others = files.filter((file) => !PICTURES.test(file.type));
+    const rejected = files.filter((file) => !PICTURES.test(file.type));
     clearError(this.error);
-    if (others.length > 0) {
-      const names = others.map((file) => `“${file.name}”`).join(", ");
-      showError(this.error, new Error(`${names}: a photograph is a JPEG, PNG or WebP, the full 360° and twice as wide as high.`));
+    if (rejected.length > 0) {
+      const names = rejected.map((file) => `“${file.name}”`).join(", ");
+      showError(this.error, new Error(`${names}: photographs must be JPEG, PNG or WebP files, full 360° and twice as wide as high.`));
     }
     const added = files.filter((file) => PICTURES.test(file.type)).map((file, index): Photo => ({
       file, url: URL.createObjectURL(file), heading: headings[index] ?? null, tolerance: 0, cameraHeight: null, hints: NO_HINTS,
@@ -87,18 +87,18 @@ export class Photos {
     this.changed(photo, true);
   }
 
-  /** Answers are of one plan: with another they are gone. */
+  /** Remove all answers, which belong to one plan. */
   forgetAnswers(): void {
     for (const photo of this.all) photo.answer = null;
     this.drawStrip();
   }
 
-  /** So are hints of the place. */
+  /** Remove all hints. */
   forgetHints(): void {
     for (const photo of this.all) photo.hints = NO_HINTS;
   }
 
-  /** Take over what is known of the place of the chosen photograph. */
+  /** Set the hints of the chosen photograph. */
   setHints(hints: Hints): void {
     if (this.chosen === null) return;
     this.chosen.hints = hints;
@@ -132,13 +132,13 @@ export class Photos {
         "aria-label": `Photograph ${name}${photo.answer === null ? "" : `, found in ${photo.answer.room}`}`,
         onclick: () => this.choose(photo),
       }, h("img", { src: photo.url, alt: "" }), h("span", {}, photo.answer === null ? name : `✓ ${photo.answer.room}`));
-      const remove = h("button", { type: "button", class: "remove", "aria-label": `Take ${name} away`, onclick: () => this.remove(photo) }, "×");
+      const remove = h("button", { type: "button", class: "remove", "aria-label": `Remove ${name}`, onclick: () => this.remove(photo) }, "×");
       return h("li", {}, choose, remove);
     }));
   }
 }
 
-/** Let files be dropped on an element. */
+/** Accept files dropped on an element. */
 export function acceptDrops(target: HTMLElement, take: (files: File[]) => void): void {
   for (const name of ["dragenter", "dragover"]) {
     target.addEventListener(name, (event) => {

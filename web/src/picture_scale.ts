@@ -1,12 +1,11 @@
-/** How large a picture is: two of its points, and how far apart they really are. */
+/** Scale of a picture: two points and the distance between them. */
 
-import { h, s, show } from "./dom";
+import { ARROWS, followPointer, h, s, show } from "./dom";
 import { unitOf } from "./plan_drawing";
 import { placeOf } from "./pose_marker";
 import type { Point } from "./types";
 import { Viewport } from "./viewport";
 
-const ARROWS: Record<string, Point> = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
 const FAR_STEPS = 20;
 
 export class PictureScale {
@@ -14,24 +13,24 @@ export class PictureScale {
   readonly metres = h("input", { type: "number", min: 0.01, step: "any", id: "picture-metres", placeholder: "4.2", inputmode: "decimal" });
   private readonly svg = s("svg", { class: "picture", role: "group", "aria-label": "The picture with the two ends of a known distance" });
   private readonly picture = s("g");
-  private readonly over = s("g", { class: "measured" });
+  private readonly overlay = s("g", { class: "measured" });
   private readonly viewport: Viewport;
   private url: string | null = null;
-  // As on a plan: y up, so that below the picture's upper edge it is negative.
+  // As on a plan, y points up: points below the picture's upper edge have a negative y.
   private ends: [Point, Point] = [[0, 0], [0, 0]];
 
   constructor() {
     const drawing = h("div", { class: "drawing" }, this.svg);
     this.element = h("div", { class: "picture-scale" },
-      h("p", { class: "hint" }, "Put both ends of the line on points whose distance you know, such as a wall with its measure."), drawing,
-      h("div", {}, h("label", { for: this.metres.id }, "These ends are so many metres apart"), this.metres));
-    this.svg.append(this.picture, this.over);
-    // Before the viewport, which would move what is seen.
+      h("p", { class: "hint" }, "Put both ends of the line on points with a known distance, such as the ends of a dimensioned wall."), drawing,
+      h("div", {}, h("label", { for: this.metres.id }, "Distance of the ends in metres"), this.metres));
+    this.svg.append(this.picture, this.overlay);
+    // Capture runs before the viewport's listener, which would move the drawing.
     this.svg.addEventListener("pointerdown", (event) => this.onDown(event));
     this.viewport = new Viewport(this.svg, drawing, () => this.draw());
   }
 
-  /** Show a picture; one that is there already stays as it is. Refused where the file is no picture. */
+  /** Show a picture. Rejects if the file is not one. */
   async open(file: File): Promise<void> {
     this.close();
     const url = URL.createObjectURL(file);
@@ -41,7 +40,7 @@ export class PictureScale {
       await picture.decode();
     } catch {
       URL.revokeObjectURL(url);
-      throw new Error(`“${file.name}” cannot be shown as a picture.`);
+      throw new Error(`The browser cannot show “${file.name}” as a picture.`);
     }
     this.url = url;
     const width = picture.naturalWidth, height = picture.naturalHeight;
@@ -55,10 +54,10 @@ export class PictureScale {
     this.url = null;
     this.metres.value = "";
     show(this.picture);
-    show(this.over);
+    show(this.overlay);
   }
 
-  /** `x0,y0,x1,y1,metres` in pixels from the upper left corner; null while the metres are not said. */
+  /** `x0,y0,x1,y1,metres` in pixels from the upper left corner; null without the distance. */
   get knownDistance(): string | null {
     if (this.url === null || this.metres.value.trim() === "") return null;
     return [...this.ends.flatMap(([x, y]) => [x.toFixed(1), (-y).toFixed(1)]), this.metres.value.trim()].join(",");
@@ -67,9 +66,9 @@ export class PictureScale {
   private draw(): void {
     if (this.url === null) return;
     const size = unitOf(this.viewport.current), [[ax, ay], [bx, by]] = this.ends;
-    const focused = [...this.over.children].indexOf(document.activeElement as Element);
-    show(this.over, s("line", { x1: ax, y1: -ay, x2: bx, y2: -by }), ...this.ends.map((end, index) => this.handle(end, index, size)));
-    if (focused > 0) (this.over.children[focused] as SVGElement).focus();
+    const focused = [...this.overlay.children].indexOf(document.activeElement as Element);
+    show(this.overlay, s("line", { x1: ax, y1: -ay, x2: bx, y2: -by }), ...this.ends.map((end, index) => this.handle(end, index, size)));
+    if (focused > 0) (this.overlay.children[focused] as SVGElement).focus();
   }
 
   private handle([x, y]: Point, index: number, size: number): SVGElement {
@@ -80,8 +79,8 @@ export class PictureScale {
         const key = event as KeyboardEvent, arrow = ARROWS[key.key];
         if (arrow === undefined) return;
         event.preventDefault();
-        const far = key.shiftKey ? FAR_STEPS : 1;
-        this.put(index, [x + far * arrow[0], y + far * arrow[1]]);
+        const steps = key.shiftKey ? FAR_STEPS : 1;
+        this.put(index, [x + steps * arrow[0], y + steps * arrow[1]]);
       },
     });
   }
@@ -91,24 +90,16 @@ export class PictureScale {
     this.draw();
   }
 
-  /** Whichever end is nearer comes along; the background is moved where neither is near. */
+  /** Drag the nearer end of the line; far from both, the viewport moves the picture. */
   private onDown(event: PointerEvent): void {
     if (event.button !== 0) return;
     const place = placeOf(this.svg, event), reach = 4 * unitOf(this.viewport.current);
-    const apart = this.ends.map(([x, y]) => Math.hypot(x - place[0], y - place[1]));
-    const index = apart[0]! <= apart[1]! ? 0 : 1;
-    if (apart[index]! > reach) return;
+    const distances = this.ends.map(([x, y]) => Math.hypot(x - place[0], y - place[1]));
+    const index = distances[0]! <= distances[1]! ? 0 : 1;
+    if (distances[index]! > reach) return;
     event.preventDefault();
     event.stopImmediatePropagation();
-    const move = (moving: PointerEvent): void => this.put(index, placeOf(this.svg, moving));
-    const end = (): void => {
-      removeEventListener("pointermove", move);
-      removeEventListener("pointerup", end);
-      removeEventListener("pointercancel", end);
-    };
-    addEventListener("pointermove", move);
-    addEventListener("pointerup", end);
-    addEventListener("pointercancel", end);
+    followPointer((moving) => this.put(index, placeOf(this.svg, moving)));
   }
 }
 

@@ -1,4 +1,4 @@
-/** A floor plan as SVG; one unit is one metre, y is turned over. */
+/** Floor plan as SVG: one unit is one metre, y is negated. */
 
 import { s, show } from "./dom";
 import { inside } from "./layout";
@@ -12,10 +12,10 @@ export interface Box {
 }
 
 const MARGIN = 0.06;
-// Half as thick as a wall between two rooms is drawn.
+// Half of the drawn thickness of a wall between two rooms.
 const WALL_M = 0.12;
 
-/** The part of the drawing that a plan takes up, with a margin. */
+/** Return the box around a plan, with a margin. */
 export function boxOf(plan: PlanDocument): Box {
   const points = plan.rooms.flatMap((room) => room.polygon);
   if (points.length === 0) return { x: -1, y: -9, width: 12, height: 10 };
@@ -29,7 +29,7 @@ export function boxOf(plan: PlanDocument): Box {
 export const path = (polygon: Point[]): string =>
   polygon.map(([x, y], index) => `${index === 0 ? "M" : "L"}${x} ${-y}`).join("") + "Z";
 
-/** The length that a text or a handle has so that it is equally large on every plan. */
+/** Return the unit for texts and handles, which have the same size on every plan. */
 export const unitOf = (box: Box): number => Math.max(box.width, box.height) / 100;
 
 /** Draw rooms and openings into a group. */
@@ -40,12 +40,12 @@ export function drawPlan(group: SVGGElement, plan: PlanDocument): void {
   });
   const walls = plan.rooms.flatMap((room) => (room.walls ?? []).map(([a, b]) =>
     s("line", { class: "wall", x1: a[0], y1: -a[1], x2: b[0], y2: -b[1] })));
-  // Walls stand around the floors that they enclose, those between rooms meet.
+  // Walls are strokes around floors; the strokes of adjacent rooms meet.
   const solid = s("path", { class: "solid", d: plan.rooms.map((room) => path(room.polygon)).join(""), "stroke-width": 2 * WALL_M });
   show(group, solid, ...rooms, ...walls, ...(plan.openings ?? []).map(openingShape));
 }
 
-/** Write names, north and a scale into a group that lies over everything that is drawn into the rooms. */
+/** Draw names, north arrow and scale bar into a group on top of the drawing. */
 export function drawNames(group: SVGGElement, plan: PlanDocument, box: Box): void {
   const unit = unitOf(box);
   show(group, ...plan.rooms.flatMap((room, index) => {
@@ -59,13 +59,13 @@ export function drawNames(group: SVGGElement, plan: PlanDocument, box: Box): voi
 function openingShape(opening: OpeningDocument): SVGGElement {
   const [[ax, ay], [bx, by]] = opening.line;
   const line = { x1: ax, y1: -ay, x2: bx, y2: -by };
-  // As wide as the wall in the colour of the floor first, so that the wall is interrupted.
+  // A wall-wide stroke in the colour of the floor interrupts the wall.
   return s("g", { class: `opening ${opening.kind}` }, s("line", { class: "gap", "stroke-width": 2.1 * WALL_M, ...line }), s("line", { class: "leaf", ...line }));
 }
 
 const RASTER = 24;
 
-/** The place in a room that is farthest from its walls, of those on a raster, and how far. */
+/** Return the raster point farthest from the walls of a room, and its distance to them. */
 export function labelPlace(polygon: Point[]): { place: Point; clearance: number } {
   const xs = polygon.map(([x]) => x), ys = polygon.map(([, y]) => y);
   const left = Math.min(...xs), low = Math.min(...ys);
@@ -76,7 +76,7 @@ export function labelPlace(polygon: Point[]): { place: Point; clearance: number 
       const place: Point = [left + (width * column) / RASTER, low + (height * row) / RASTER];
       if (!inside(polygon, ...place)) continue;
       const clearance = Math.min(...polygon.map((from, index) => distanceTo(place, from, polygon[(index + 1) % polygon.length]!)));
-      // Of places that are as good, the one in the middle.
+      // Prefer the centre among equally good points.
       const aside = Math.hypot(column / RASTER - 0.5, row / RASTER - 0.5);
       if (clearance * (1 - 0.1 * aside) > best.clearance) best = { place, clearance };
     }
@@ -84,7 +84,7 @@ export function labelPlace(polygon: Point[]): { place: Point; clearance: number 
   return best;
 }
 
-/** Distance of a point to a segment. */
+/** Return the distance of a point to a segment. */
 export function distanceTo([x, y]: Point, [ax, ay]: Point, [bx, by]: Point): number {
   const ex = bx - ax, ey = by - ay, square = ex * ex + ey * ey;
   const share = square === 0 ? 0 : Math.max(0, Math.min(1, ((x - ax) * ex + (y - ay) * ey) / square));

@@ -1,4 +1,4 @@
-/** The stored plans: a list to search and choose from, uploads, how far they are prepared, deleting. */
+/** Stored plans: list, search, upload, progress, deletion. */
 
 import { api } from "./api";
 import { button, byId, h, show } from "./dom";
@@ -8,22 +8,22 @@ import { clearError, say, showError } from "./notices";
 import { acceptDrops } from "./photos";
 import type { Plan, PlanSummary } from "./types";
 
-/** Whether nothing of a plan was guessed that one may want to correct. */
-const isSure = (plan: Plan): boolean => !plan.import_report?.is_draft && (plan.import_report?.unsure ?? []).length === 0;
+/** True if the import guessed nothing that the user may want to correct. */
+const isCertain = (plan: Plan): boolean => !plan.import_report?.is_draft && (plan.import_report?.unsure ?? []).length === 0;
 
 const SEARCH_AFTER_MS = 250;
 const PICTURES = /^image\/(png|jpeg)$/;
 
 export interface PlanActions {
-  /** A plan is to be shown; told again when it is prepared further. */
+  /** A plan is to be shown; called again when its progress changes. */
   chosen: (plan: Plan | null) => void;
-  /** These plans are listed now. */
+  /** The list shows these plans. */
   listed: (plans: PlanSummary[]) => void;
-  /** Somebody begins with a plan of their own. */
-  begun: () => void;
-  /** Somebody picked a plan of the list, or uploaded one. */
+  /** The user starts with a plan of their own. */
+  started: () => void;
+  /** The user picked a plan from the list or uploaded one. */
   picked: () => void;
-  /** Somebody looks for what has this in its name. */
+  /** The user searches for a name. */
   searched: (name: string) => void;
 }
 
@@ -37,8 +37,8 @@ export class Plans {
   private cursor: string | null = null;
   private current: Plan | null = null;
   private following: AbortController | null = null;
-  /** Counts what was asked to be shown: only the last of it is. */
-  private turn = 0;
+  /** Number of requests to show a plan; only the latest one counts. */
+  private requests = 0;
 
   constructor(private readonly actions: PlanActions) {
     let waiting: number | undefined;
@@ -58,7 +58,7 @@ export class Plans {
     acceptDrops(byId("plan-panel"), (files) => { if (files[0] !== undefined) this.begin(files[0]); });
   }
 
-  /** Fetch the list; with a cursor, its next page. Returns what is listed. */
+  /** Load the list, or with a cursor its next page; return the listed plans. */
   async load(cursor: string | null = null): Promise<PlanSummary[]> {
     try {
       const page = await api.plans(this.search.value.trim(), cursor);
@@ -76,23 +76,23 @@ export class Plans {
   async choose(id: string, revision?: string): Promise<Plan | null> {
     clearError(this.error, this.importing.fields);
     this.importing.close();
-    const turn = this.stay();
+    const request = this.discardPending();
     try {
       const plan = await api.plan(id, revision);
-      if (turn === this.turn) this.take(plan);
+      if (request === this.requests) this.take(plan);
       return this.current;
     } catch (error) {
-      if (turn === this.turn) showError(this.error, error);
+      if (request === this.requests) showError(this.error, error);
       return null;
     }
   }
 
-  /** Show nothing of what was asked for before. */
-  stay(): number {
-    return ++this.turn;
+  /** Ignore the results of earlier requests to show a plan. */
+  discardPending(): number {
+    return ++this.requests;
   }
 
-  /** Show a plan that was just stored or read. */
+  /** Show a plan. */
   take(plan: Plan | null): void {
     this.current = plan;
     this.actions.chosen(plan);
@@ -101,10 +101,10 @@ export class Plans {
     if (plan !== null && plan.status === "preparing") void this.follow(plan);
   }
 
-  /** A picture never says how large it is: that is asked first. */
+  /** Pictures do not state their scale, so the form asks for it first. */
   private begin(file: File): void {
-    this.actions.begun();
-    this.stay();
+    this.actions.started();
+    this.discardPending();
     clearError(this.error, this.importing.fields);
     if (PICTURES.test(file.type)) this.importing.ask(file, true);
     else void this.upload(file);
@@ -113,28 +113,28 @@ export class Plans {
   /** Upload a file as a new plan. */
   async upload(file: File, fields: Record<string, string> = {}): Promise<void> {
     clearError(this.error, this.importing.fields);
-    // What was asked about the last file is not about this one.
+    // The form of the previous file does not apply to this one.
     if (Object.keys(fields).length === 0) this.importing.close();
-    const turn = this.stay();
+    const request = this.discardPending();
     const state = byId("plan-state");
-    state.textContent = `Reading “${file.name}” …`;
+    state.textContent = `Importing “${file.name}” …`;
     try {
       const plan = await api.uploadPlan(file, fields);
-      if (turn === this.turn) {
+      if (request === this.requests) {
         this.actions.picked();
         this.take(plan);
-        if (isSure(plan)) this.importing.close();
+        if (isCertain(plan)) this.importing.close();
         else this.importing.ask(file, false);
       }
       await this.load();
       say(`“${plan.name}” is stored.`);
     } catch (error) {
-      // What is shown would be taken for what was refused.
-      if (turn === this.turn) this.take(null);
+      // A plan left on the screen would look like the rejected one.
+      if (request === this.requests) this.take(null);
       this.importing.ask(file, true);
       showError(this.error, error, this.importing.fields);
     } finally {
-      if (state.textContent.startsWith("Reading")) state.textContent = "";
+      if (state.textContent.startsWith("Importing")) state.textContent = "";
     }
   }
 
@@ -152,26 +152,26 @@ export class Plans {
     }
   }
 
-  /** Show how a plan is by now, unless another was asked for meanwhile. */
+  /** Load a plan again, unless the user has chosen another one. */
   private async renew(id: string): Promise<void> {
-    const turn = this.turn;
+    const request = this.requests;
     try {
       const plan = await api.plan(id);
-      if (turn === this.turn && this.current?.id === id) this.take(plan);
+      if (request === this.requests && this.current?.id === id) this.take(plan);
     } catch (error) {
-      if (turn === this.turn) showError(this.error, error);
+      if (request === this.requests) showError(this.error, error);
     }
     await this.load();
   }
 
   private pick(id: string): void {
-    this.actions.begun();
+    this.actions.started();
     this.actions.picked();
     void this.choose(id);
   }
 
   private async remove(plan: PlanSummary): Promise<void> {
-    if (!(await this.sure(plan))) return;
+    if (!(await this.confirm(plan))) return;
     clearError(this.error);
     try {
       await api.deletePlan(plan.id);
@@ -183,9 +183,9 @@ export class Plans {
     }
   }
 
-  private sure(plan: PlanSummary): Promise<boolean> {
+  private confirm(plan: PlanSummary): Promise<boolean> {
     const dialog = byId<HTMLDialogElement>("delete-dialog");
-    byId("delete-what").textContent = `Delete “${plan.name}” with all its revisions, for good?`;
+    byId("delete-what").textContent = `Delete “${plan.name}” with all its revisions? This cannot be undone.`;
     dialog.showModal();
     return new Promise((resolve) => dialog.addEventListener("close", () => {
       resolve(dialog.returnValue === "delete");

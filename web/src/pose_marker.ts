@@ -1,6 +1,6 @@
-/** The camera on the plan: dragged, or moved with the keyboard; what sees it is told at every step. */
+/** Camera marker on the plan, moved with pointer or keyboard. */
 
-import { s } from "./dom";
+import { followPointer, s } from "./dom";
 import { degrees, radians } from "./layout";
 import { type Box, unitOf } from "./plan_drawing";
 import type { Point, Pose } from "./types";
@@ -9,7 +9,7 @@ const STEP_M = 0.05;
 const FAR_STEP_M = 0.5;
 const TURN_DEG = 2;
 
-/** The place on a drawing, in its own units, that a pointer is over. */
+/** Return the point of a drawing under the pointer, in the drawing's units. */
 export function placeOf(svg: SVGSVGElement, event: PointerEvent | MouseEvent): Point {
   const matrix = svg.getScreenCTM();
   if (matrix === null) return [0, 0];
@@ -41,14 +41,14 @@ export class PoseMarker {
     this.element.addEventListener("keydown", (event) => this.onKey(event));
   }
 
-  /** Put the marker somewhere; the listener is not told. */
+  /** Set the pose without calling the listener. */
   place(pose: Pose, box: Box): void {
     this.pose = pose;
     this.unit = unitOf(box);
     this.draw();
   }
 
-  /** Which part of the photograph is looked at: yaw from its centre and field of view, radians. */
+  /** Show the visible part of the photograph: yaw from its centre and field of view, radians. */
   look(yaw: number, fov: number): void {
     this.view = { yaw, fov };
     this.draw();
@@ -62,7 +62,7 @@ export class PoseMarker {
     const tip = (azimuth: number, length: number): string =>
       `${(length * Math.sin(azimuth)).toFixed(4)} ${(-length * Math.cos(azimuth)).toFixed(4)}`;
     const heading = radians(heading_deg), middle = heading + this.view.yaw, half = 0.5 * Math.min(this.view.fov, 6.2);
-    // Whoever sees all around looks nowhere.
+    // A view all around has no direction.
     this.cone.classList.toggle("none", this.view.fov > Math.PI);
     const far = 16 * unit, large = half > Math.PI / 2 ? 1 : 0;
     this.cone.setAttribute("d", `M0 0L${tip(middle - half, far)}A${far} ${far} 0 ${large} 1 ${tip(middle + half, far)}Z`);
@@ -81,16 +81,10 @@ export class PoseMarker {
 
   private follow(handle: Element, poseAt: (place: Point) => Pose): void {
     handle.addEventListener("pointerdown", (event) => {
-      const pointer = event as PointerEvent;
-      pointer.preventDefault();
-      pointer.stopPropagation();
+      event.preventDefault();
+      event.stopPropagation();
       this.element.focus();
-      handle.setPointerCapture(pointer.pointerId);
-      const onMove = (moving: Event): void => this.move(poseAt(placeOf(this.svg, moving as PointerEvent)));
-      handle.addEventListener("pointermove", onMove);
-      const end = (): void => handle.removeEventListener("pointermove", onMove);
-      handle.addEventListener("pointerup", end, { once: true });
-      handle.addEventListener("pointercancel", end, { once: true });
+      followPointer((moving) => this.move(poseAt(placeOf(this.svg, moving))));
     });
   }
 

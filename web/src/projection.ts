@@ -1,8 +1,8 @@
-/** From directions in a panorama to points on the screen, for the picture as a whole and as seen by turning around. */
+/** Projection of directions in a panorama to the screen, for the viewer and the flat picture. */
 
 import type { Point } from "./types";
 
-/** Where a viewer looks: yaw from the picture's centre, pitch up, vertical field of view; radians. */
+/** Direction of the viewer: yaw from the picture's centre, pitch up, vertical field of view; radians. */
 export interface Gaze {
   yaw: number;
   pitch: number;
@@ -17,7 +17,7 @@ export interface Size {
 const NEAR = 0.02;
 type Vector = [number, number, number];
 
-/** Lines of directions (yaw, elevation) as a camera sees them; what is behind it is cut off. */
+/** Project lines of (yaw, elevation) as a camera sees them; parts behind it are cut off. */
 export function perspective(lines: Point[][], gaze: Gaze, size: Size): Point[][] {
   const focal = (0.5 * size.height) / Math.tan(0.5 * gaze.verticalFov);
   const sine = Math.sin(gaze.pitch), cosine = Math.cos(gaze.pitch);
@@ -51,7 +51,7 @@ function inFront(line: Vector[]): Vector[][] {
   return pieces;
 }
 
-/** The same lines on the whole picture, whose left edge is opposite to its centre; cut in two where they cross it. */
+/** Project the same lines to the flat picture; lines that cross its edge are cut in two. */
 export function equirectangular(lines: Point[][], size: Size): Point[][] {
   const place = ([yaw, elevation]: Point, turns: number): Point =>
     [((yaw - turns * 2 * Math.PI) / (2 * Math.PI) + 0.5) * size.width, (0.5 - elevation / Math.PI) * size.height];
@@ -61,7 +61,7 @@ export function equirectangular(lines: Point[][], size: Size): Point[][] {
     line.forEach((point, index) => {
       const turn = turnOf(point), previous = line[index - 1];
       if (previous !== undefined && turnOf(previous) !== turn) {
-        // To beyond the edge, where the canvas ends; the rest comes in from beyond the other one.
+        // Both parts continue beyond their edge of the canvas.
         pieces.at(-1)!.push(place(point, turnOf(previous)));
         pieces.push([place(previous, turn)]);
       }

@@ -1,17 +1,17 @@
-/** The same question for a terminal and for a program. */
+/** Code for the same query: curl and Python. */
 
 import { key } from "./api";
 
 const shell = (text: string): string => (/^[\w@./:=-]+$/.test(text) ? text : `'${text.replaceAll("'", "'\\''")}'`);
 const python = (text: string): string => JSON.stringify(text);
 
-/** A field's value in Python; objects and lists are written alike in JSON. */
+/** Return a field's value as a Python literal; objects and lists look the same in JSON. */
 function literal(name: string, value: string): string {
   if (value === "true") return "True";
   return name === "near" || name === "rooms" || /^-?[\d.]+$/.test(value) ? value : python(value);
 }
 
-/** The query with curl. */
+/** Return the query as a curl command. */
 export function curlSnippet(fields: Record<string, string>, file: string): string {
   const parts = [`curl ${shell(`${location.origin}/localise`)}`];
   if (key.get() !== null) parts.push(`-H "Authorization: Bearer $LALALOC_KEY"`);
@@ -20,7 +20,7 @@ export function curlSnippet(fields: Record<string, string>, file: string): strin
   return parts.join(" \\\n  ");
 }
 
-/** The query with the Python client. */
+/** Return the query as Python code. */
 export function pythonSnippet(fields: Record<string, string>, file: string): string {
   const { floorplan_id: plan, venue_id: venue, ...rest } = fields;
   const options = Object.entries(rest)

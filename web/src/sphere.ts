@@ -1,11 +1,11 @@
-/** Photo Sphere Viewer, kept in a file of its own that is loaded with the first picture. */
+/** Photo Sphere Viewer, in a file of its own that is loaded with the first picture. */
 
 import { Viewer } from "@photo-sphere-viewer/core";
 
 import { radians } from "./layout";
 import type { Gaze } from "./projection";
 
-/** A picture to look around in. */
+/** Panorama viewer. */
 export class Sphere {
   private readonly viewer: Viewer;
   private shown: string | null = null;
@@ -20,7 +20,7 @@ export class Sphere {
       maxFov: 85,
       moveInertia: false,
       loadingTxt: "",
-      // The picture's centre stays at yaw 0: its compass heading is the service's business. It is levelled as there.
+      // The picture's centre stays at yaw 0, as the service computes the heading; the horizon is levelled as in the service.
       panoData: (_image, xmp) => ({ ...xmp, poseHeading: 0 }) as never,
     });
     this.viewer.addEventListener("render", rendered);

@@ -1,4 +1,4 @@
-/** Making a venue: a name, and plans with the levels they are on. */
+/** Form for a new venue: a name, and plans with their levels. */
 
 import { api } from "./api";
 import { button, byId, h, show } from "./dom";
@@ -10,34 +10,34 @@ interface Row {
   level: HTMLInputElement;
 }
 
-const LONGEST_NAME = 200;
+const MAX_NAME_LENGTH = 200;
 
 export class VenueForm {
   private readonly error = h("div", { class: "error", id: "venue-error", role: "alert", hidden: true });
-  private readonly name = h("input", { id: "venue-form-name", type: "text", maxlength: LONGEST_NAME, autocomplete: "off" });
-  private readonly which = h("select", { id: "venue-form-plan" });
+  private readonly name = h("input", { id: "venue-form-name", type: "text", maxlength: MAX_NAME_LENGTH, autocomplete: "off" });
+  private readonly choice = h("select", { id: "venue-form-plan" });
   private readonly rows = h("ul", { "aria-label": "Plans of the new venue" });
   private readonly add = button("Add", () => this.take(), { id: "venue-form-add" });
   private listed: PlanSummary[] = [];
   private chosen: Row[] = [];
 
-  /** `made` is told of a venue that was just stored. */
+  /** `made` is called with the stored venue. */
   constructor(private readonly made: (venue: Venue) => void) {
     show(byId("venue-form"), this.error,
       h("div", {}, h("label", { for: this.name.id }, "Name of the venue"), this.name),
-      h("div", { class: "row" }, h("label", { class: "sr", for: this.which.id }, "Plan to add"), this.which, this.add),
-      this.rows, button("Make the venue", () => void this.send(), { class: "primary", id: "venue-form-make" }));
+      h("div", { class: "row" }, h("label", { class: "sr", for: this.choice.id }, "Plan to add"), this.choice, this.add),
+      this.rows, button("Create the venue", () => void this.send(), { class: "primary", id: "venue-form-make" }));
   }
 
-  /** Plans that may be added: those that are listed. */
+  /** Offer the listed plans. */
   offer(plans: PlanSummary[]): void {
     this.listed = plans;
     this.draw();
   }
 
-  /** Add a plan, one level above the last. */
+  /** Add a plan, one level above the last one. */
   private take(): void {
-    const plan = this.listed.find(({ id }) => id === this.which.value);
+    const plan = this.listed.find(({ id }) => id === this.choice.value);
     if (plan === undefined) return;
     const last = this.chosen.at(-1)?.level.valueAsNumber ?? -1;
     const level = h("input", { type: "number", step: "any", value: Number.isNaN(last) ? 0 : last + 1, "aria-label": `Level of ${plan.name}` });
@@ -50,9 +50,9 @@ export class VenueForm {
     clearError(this.error, fields);
     try {
       const missing = this.chosen.find(({ level }) => Number.isNaN(level.valueAsNumber));
-      if (this.name.value.trim() === "") throw new Error("Say what the venue is called.");
-      if (this.chosen.length === 0) throw new Error("Add the plans that are part of it.");
-      if (missing !== undefined) throw new Error(`Which level is ${missing.plan.name} on? A number: 0 is the ground floor.`);
+      if (this.name.value.trim() === "") throw new Error("Enter a name for the venue.");
+      if (this.chosen.length === 0) throw new Error("Add at least one plan.");
+      if (missing !== undefined) throw new Error(`Enter the level of ${missing.plan.name} as a number: 0 is the ground floor.`);
       const plans = this.chosen.map(({ plan, level }) => ({ floorplan_id: plan.id, level: level.valueAsNumber }));
       const venue = await api.createVenue(this.name.value.trim(), plans);
       this.name.value = "";
@@ -67,14 +67,14 @@ export class VenueForm {
 
   private draw(): void {
     const left = this.listed.filter(({ id }) => !this.chosen.some(({ plan }) => plan.id === id));
-    show(this.which, ...left.map((plan) => h("option", { value: plan.id }, plan.name)));
-    this.which.disabled = this.add.disabled = left.length === 0;
+    show(this.choice, ...left.map((plan) => h("option", { value: plan.id }, plan.name)));
+    this.choice.disabled = this.add.disabled = left.length === 0;
     show(this.rows, ...this.chosen.map(({ plan, level }, index) => h("li", {},
       h("span", { class: "name" }, plan.name), h("span", { "aria-hidden": "true" }, "level"), level,
-      h("button", { type: "button", class: "remove", "aria-label": `Leave ${plan.name} out`, onclick: () => this.leaveOut(index) }, "×"))));
+      h("button", { type: "button", class: "remove", "aria-label": `Remove ${plan.name}`, onclick: () => this.remove(index) }, "×"))));
   }
 
-  private leaveOut(index: number): void {
+  private remove(index: number): void {
     this.chosen.splice(index, 1);
     this.draw();
   }

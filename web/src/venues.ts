@@ -1,4 +1,4 @@
-/** Venues: several plans that are asked about at once, when it is not known which of them a photograph is of. */
+/** Venues: groups of plans that are searched together. */
 
 import { api } from "./api";
 import { byId, h, show } from "./dom";
@@ -7,26 +7,26 @@ import type { PlanSummary, Venue } from "./types";
 import { VenueForm } from "./venue_form";
 
 export interface VenueActions {
-  /** A venue was chosen, or none is any more. */
+  /** A venue was chosen, or null: none any more. */
   chosen: (venue: Venue | null) => void;
-  /** One of its plans is to be shown. */
-  look: (planId: string) => void;
+  /** One of the venue's plans is to be shown. */
+  showPlan: (planId: string) => void;
 }
 
-/** What a plan is called among those of a venue. */
+/** Return name and level of a plan of a venue. */
 export const planLabel = ({ name, level }: { name: string; level: number }): string => `${name}, level ${level}`;
 
 export class Venues {
   private readonly list = byId("venue-list");
   private readonly bar = byId("venue-bar");
-  private readonly which = byId<HTMLSelectElement>("venue-plan");
+  private readonly choice = byId<HTMLSelectElement>("venue-plan");
   private readonly error = byId("plan-error");
   private readonly form = new VenueForm((venue) => void this.onMade(venue));
   private found: Venue[] = [];
   private venue: Venue | null = null;
 
   constructor(private readonly actions: VenueActions) {
-    this.which.addEventListener("change", () => actions.look(this.which.value));
+    this.choice.addEventListener("change", () => actions.showPlan(this.choice.value));
     byId("venue-leave").addEventListener("click", () => this.leave());
   }
 
@@ -34,7 +34,7 @@ export class Venues {
     return this.venue;
   }
 
-  /** Plans that are listed: what a venue can be made of. */
+  /** Offer the listed plans for a new venue. */
   offer(plans: PlanSummary[]): void {
     byId("venue-make").hidden = plans.length === 0;
     this.form.offer(plans);
@@ -45,7 +45,7 @@ export class Venues {
     await Promise.all([this.load(""), this.choose(venue.id)]);
   }
 
-  /** Fetch the list of those with this in their name. */
+  /** Load the list of venues with a name. */
   async load(name: string): Promise<void> {
     try {
       this.found = (await api.venues(name)).venues;
@@ -55,7 +55,7 @@ export class Venues {
     }
   }
 
-  /** Choose a venue by its id, and show one of its plans: the first unless one is named; null shows none. */
+  /** Choose a venue by its id and show one of its plans: `planId`, by default the first; null shows none. */
   async choose(id: string, planId?: string | null): Promise<void> {
     clearError(this.error);
     try {
@@ -63,19 +63,19 @@ export class Venues {
       this.venue = venue;
       byId("venue-name").textContent = venue.name;
       byId("venue-facts").textContent = `${venue.plans} ${venue.plans === 1 ? "plan" : "plans"}`
-        + (more === null ? "" : `, the first ${plans.length} are listed`);
-      show(this.which, ...plans.map((plan) => h("option", { value: plan.floorplan_id }, planLabel(plan))));
+        + (more === null ? "" : `; the list shows the first ${plans.length}`);
+      show(this.choice, ...plans.map((plan) => h("option", { value: plan.floorplan_id }, planLabel(plan))));
       this.bar.hidden = false;
       this.draw();
       this.actions.chosen(venue);
       const first = planId === undefined ? plans[0]?.floorplan_id : planId;
-      if (first) this.actions.look(first);
+      if (first) this.actions.showPlan(first);
     } catch (error) {
       showError(this.error, error);
     }
   }
 
-  /** Ask about a single plan again. */
+  /** Search a single plan again. */
   leave(): void {
     if (this.venue === null) return;
     this.venue = null;
@@ -84,9 +84,9 @@ export class Venues {
     this.actions.chosen(null);
   }
 
-  /** Which of its plans is shown. */
+  /** Mark the plan that is shown. */
   mark(planId: string): void {
-    this.which.value = planId;
+    this.choice.value = planId;
   }
 
   private draw(): void {

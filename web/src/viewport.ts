@@ -1,17 +1,17 @@
-/** Which part of a drawing is seen: the wheel and two fingers zoom, dragging its background moves it. */
+/** Visible part of a drawing: wheel and pinch zoom, dragging the background moves it. */
 
-import { button, h } from "./dom";
+import { button, followPointer, h } from "./dom";
 import type { Box } from "./plan_drawing";
 import { placeOf } from "./pose_marker";
 import type { Point } from "./types";
 
-const MOST = 40;
+const MAX_ZOOM = 40;
 
 export class Viewport {
   private whole: Box = { x: 0, y: 0, width: 1, height: 1 };
   private box: Box = this.whole;
 
-  /** `changed` is told when another part is seen. */
+  /** `changed` is called when another part is visible. */
   constructor(private readonly svg: SVGSVGElement, place: HTMLElement, private readonly changed: () => void) {
     place.append(h("div", { class: "zoom", role: "group", "aria-label": "Zoom" },
       button("+", () => this.zoom(0.7), { "aria-label": "Zoom in" }), button("−", () => this.zoom(1 / 0.7), { "aria-label": "Zoom out" }),
@@ -27,7 +27,7 @@ export class Viewport {
     return this.box;
   }
 
-  /** Show all of a drawing. */
+  /** Show a whole drawing. */
   fit(whole: Box): void {
     this.whole = whole;
     this.show(whole);
@@ -41,26 +41,18 @@ export class Viewport {
 
   private zoom(factor: number, about: Point = [this.box.x + 0.5 * this.box.width, -this.box.y - 0.5 * this.box.height]): void {
     const width = this.box.width * factor;
-    if (width > 3 * this.whole.width || width < this.whole.width / MOST) return;
+    if (width > 3 * this.whole.width || width < this.whole.width / MAX_ZOOM) return;
     const [x, y] = [about[0], -about[1]];
     this.show({ x: x + (this.box.x - x) * factor, y: y + (this.box.y - y) * factor, width, height: this.box.height * factor });
   }
 
   private onPointer(event: PointerEvent): void {
-    // Whatever else is dragged stops the event first, or takes it when a tool is chosen.
+    // Handles stop this event, and tools prevent it.
     if (event.defaultPrevented || event.button !== 0) return;
     const from = placeOf(this.svg, event);
-    const move = (moving: PointerEvent): void => {
+    followPointer((moving) => {
       const to = placeOf(this.svg, moving);
       this.show({ ...this.box, x: this.box.x - (to[0] - from[0]), y: this.box.y + (to[1] - from[1]) });
-    };
-    const end = (): void => {
-      this.svg.removeEventListener("pointermove", move);
-      removeEventListener("pointerup", end);
-      removeEventListener("pointercancel", end);
-    };
-    this.svg.addEventListener("pointermove", move);
-    addEventListener("pointerup", end);
-    addEventListener("pointercancel", end);
+    });
   }
 }

@@ -2,14 +2,14 @@
 
 import type { Answer } from "./types";
 
-/** How sure an answer is, for people. */
+/** Describe a confidence. */
 export function confidenceWords(confidence: number | null): string {
-  if (confidence === null) return "No confidence is known for this model";
+  if (confidence === null) return "Unknown confidence: the model is not calibrated";
   if (confidence >= 0.95) return "Almost certainly here";
   if (confidence >= 0.8) return "Very likely here";
   if (confidence >= 0.5) return "Probably here";
-  if (confidence >= 0.2) return "Perhaps here, perhaps elsewhere";
-  return "A guess: this may be somewhere else, or not of this plan";
+  if (confidence >= 0.2) return "Possibly here";
+  return "Uncertain: possibly another place, or not in this plan";
 }
 
 export const percent = (share: number): string =>
@@ -18,7 +18,7 @@ export const percent = (share: number): string =>
 export const milliseconds = (duration: number): string =>
   duration >= 1000 ? `${(duration / 1000).toFixed(1)} s` : `${Math.round(duration)} ms`;
 
-/** How far off the position is, along the long axis of the ellipse. */
+/** Return the standard deviation of the position along the longer axis of the ellipse. */
 export function accuracyWords(answer: Answer): string | null {
   if (answer.covariance_m2 === null) return null;
   const [[xx, xy], [, yy]] = answer.covariance_m2;
@@ -26,16 +26,16 @@ export function accuracyWords(answer: Answer): string | null {
   return deviation < 1 ? `± ${Math.max(1, Math.round(100 * deviation))} cm` : `± ${deviation.toFixed(1)} m`;
 }
 
-/** Where a heading came from. */
+/** Origin of a heading. */
 export const HEADING_SOURCES: Record<Answer["heading_source"], string> = {
-  given: "as you said",
-  panorama: "from the photograph’s compass",
-  searched: "found from the picture",
+  given: "as given",
+  panorama: "from the photograph’s metadata",
+  searched: "estimated from the picture",
 };
 
-/** Answers without LPO or VDR are coarser than they could be. */
+/** Last stage of an answer; without LPO it is coarser. */
 export const STAGES: Record<Answer["stage"], string> = {
-  lpo: "optimised pose",
-  vdr: "dense sampling; the optimiser had no time",
-  retrieval: "nearest pose of the grid",
+  lpo: "refined pose (LPO)",
+  vdr: "dense sampling (VDR), not refined",
+  retrieval: "nearest pose of the pose grid, not refined",
 };

@@ -1,13 +1,13 @@
-/** Changes of a plan: each takes a plan and gives another; coordinates in metres, rounded to millimetres. */
+/** Changes of a plan: each returns a new plan; coordinates in metres, rounded to millimetres. */
 
 import { distanceTo } from "../plan_drawing";
 import type { OpeningDocument, OpeningKind, PlanDocument, Point, RoomDocument } from "../types";
 
-/** How far from a wall an opening still belongs to it. */
+/** Maximum distance of an opening from its wall. */
 export const NEAR_WALL_M = 0.35;
-const LEAST_WIDTH_M = 0.2;
-export const USUAL_WIDTHS_M: Record<OpeningKind, number> = { door: 0.9, window: 1.2, passage: 1 };
-const USUAL_HEIGHTS: Record<OpeningKind, { sill_m: number; head_m: number }> = {
+const MIN_WIDTH_M = 0.2;
+export const DEFAULT_WIDTHS_M: Record<OpeningKind, number> = { door: 0.9, window: 1.2, passage: 1 };
+const DEFAULT_HEIGHTS: Record<OpeningKind, { sill_m: number; head_m: number }> = {
   door: { sill_m: 0, head_m: 2 }, window: { sill_m: 0.9, head_m: 2.1 }, passage: { sill_m: 0, head_m: 2.1 },
 };
 
@@ -20,14 +20,14 @@ export interface WallRef {
   edge: number;
 }
 
-/** Both ends of a wall. */
+/** Return both ends of a wall. */
 export function wallOf(plan: PlanDocument, { room, edge }: WallRef): [Point, Point] {
   const polygon = plan.rooms[room]!.polygon;
   return [polygon[edge]!, polygon[(edge + 1) % polygon.length]!];
 }
 
 function withRoom(plan: PlanDocument, index: number, change: (room: RoomDocument) => RoomDocument): PlanDocument {
-  return { ...plan, rooms: plan.rooms.map((room, at) => (at === index ? change(room) : room)) };
+  return { ...plan, rooms: plan.rooms.map((room, position) => (position === index ? change(room) : room)) };
 }
 
 function withOutline(plan: PlanDocument, index: number, polygon: Point[]): PlanDocument {
@@ -37,7 +37,7 @@ function withOutline(plan: PlanDocument, index: number, polygon: Point[]): PlanD
   return { ...moved, openings: (plan.openings ?? []).map((opening) => carried(opening, before, polygon)) };
 }
 
-/** An opening on a wall that moves goes along with it. */
+/** Move an opening along with its wall. */
 function carried(opening: OpeningDocument, before: Point[], after: Point[]): OpeningDocument {
   const edge = before.findIndex((corner, index) => {
     const next = before[(index + 1) % before.length]!;
@@ -47,7 +47,7 @@ function carried(opening: OpeningDocument, before: Point[], after: Point[]): Ope
   const next = (edge + 1) % before.length;
   if (same(before[edge]!, after[edge]!) && same(before[next]!, after[next]!)) return opening;
   const along = frame(before[edge]!, before[next]!), to = frame(after[edge]!, after[next]!);
-  // As far along from the corner, and as far off the wall, as before.
+  // Keep the share along the wall and the distance to it.
   const line = opening.line.map((end): Point => {
     const share = along.length === 0 ? 0 : along.along(end) / along.length;
     return rounded(to.point(share * to.length, along.off(end)));
@@ -55,7 +55,7 @@ function carried(opening: OpeningDocument, before: Point[], after: Point[]): Ope
   return { ...opening, line: resized(line, opening.line, to.direction) };
 }
 
-/** The width of an opening stays: walls grow, doors do not. */
+/** Restore the width of an opening: walls grow, doors do not. */
 function resized(line: [Point, Point], before: [Point, Point], direction: Point): [Point, Point] {
   const width = Math.hypot(before[1][0] - before[0][0], before[1][1] - before[0][1]);
   const middle: Point = [0.5 * (line[0][0] + line[1][0]), 0.5 * (line[0][1] + line[1][1])];
@@ -80,25 +80,25 @@ function frame(from: Point, to: Point): {
 }
 
 export function moveCorner(plan: PlanDocument, room: number, corner: number, to: Point): PlanDocument {
-  return withOutline(plan, room, plan.rooms[room]!.polygon.map((point, at) => (at === corner ? rounded(to) : point)));
+  return withOutline(plan, room, plan.rooms[room]!.polygon.map((point, position) => (position === corner ? rounded(to) : point)));
 }
 
 /** Move both ends of a wall. */
 export function moveWall(plan: PlanDocument, { room, edge }: WallRef, by: Point): PlanDocument {
   const polygon = plan.rooms[room]!.polygon, next = (edge + 1) % polygon.length;
-  return withOutline(plan, room, polygon.map((point, at) => (at === edge || at === next ? plus(point, by) : point)));
+  return withOutline(plan, room, polygon.map((point, position) => (position === edge || position === next ? plus(point, by) : point)));
 }
 
-/** A new corner on a wall. */
-export function splitWall(plan: PlanDocument, { room, edge }: WallRef, at: Point): PlanDocument {
+/** Add a corner on a wall. */
+export function splitWall(plan: PlanDocument, { room, edge }: WallRef, corner: Point): PlanDocument {
   const polygon = plan.rooms[room]!.polygon;
-  return withOutline(plan, room, [...polygon.slice(0, edge + 1), rounded(at), ...polygon.slice(edge + 1)]);
+  return withOutline(plan, room, [...polygon.slice(0, edge + 1), rounded(corner), ...polygon.slice(edge + 1)]);
 }
 
-/** Without a corner; a triangle keeps all of its. */
+/** Remove a corner; triangles stay as they are. */
 export function removeCorner(plan: PlanDocument, room: number, corner: number): PlanDocument {
   const polygon = plan.rooms[room]!.polygon;
-  return polygon.length <= 3 ? plan : withOutline(plan, room, polygon.filter((_, at) => at !== corner));
+  return polygon.length <= 3 ? plan : withOutline(plan, room, polygon.filter((_, position) => position !== corner));
 }
 
 export function addRoom(plan: PlanDocument, polygon: Point[]): PlanDocument {
@@ -111,13 +111,13 @@ export function changeRoom(plan: PlanDocument, index: number, change: Partial<Ro
 }
 
 export function removeRoom(plan: PlanDocument, index: number): PlanDocument {
-  const gone = plan.rooms[index]?.id;
-  const openings = (plan.openings ?? []).map((opening) => (opening.rooms && gone ?
-    { ...opening, rooms: opening.rooms.filter((id) => id !== gone) } : opening));
-  return { ...plan, rooms: plan.rooms.filter((_, at) => at !== index), openings: openings.filter(({ rooms }) => rooms?.length !== 0) };
+  const removed = plan.rooms[index]?.id;
+  const openings = (plan.openings ?? []).map((opening) => (opening.rooms && removed ?
+    { ...opening, rooms: opening.rooms.filter((id) => id !== removed) } : opening));
+  return { ...plan, rooms: plan.rooms.filter((_, position) => position !== index), openings: openings.filter(({ rooms }) => rooms?.length !== 0) };
 }
 
-/** The wall that is nearest to a place, with how far off it is. */
+/** Return the wall nearest to a place, and its distance. */
 export function nearestWall(plan: PlanDocument, place: Point): { wall: WallRef; distance: number } | null {
   let best: { wall: WallRef; distance: number } | null = null;
   plan.rooms.forEach(({ polygon }, room) => polygon.forEach((corner, edge) => {
@@ -127,39 +127,39 @@ export function nearestWall(plan: PlanDocument, place: Point): { wall: WallRef; 
   return best;
 }
 
-/** A door, window or passage of usual size on a wall, as near to a place as it fits. */
+/** Add an opening of usual size on a wall, as near to a place as it fits. */
 export function addOpening(plan: PlanDocument, kind: OpeningKind, wall: WallRef, place: Point): PlanDocument {
   const [from, to] = wallOf(plan, wall), along = frame(from, to);
-  const width = Math.min(USUAL_WIDTHS_M[kind], 0.9 * along.length);
+  const width = Math.min(DEFAULT_WIDTHS_M[kind], 0.9 * along.length);
   const middle = clamp(along.along(place), 0.5 * width, along.length - 0.5 * width);
   const line: [Point, Point] = [rounded(along.point(middle - 0.5 * width, 0)), rounded(along.point(middle + 0.5 * width, 0))];
-  const opening: OpeningDocument = { kind, line, ...USUAL_HEIGHTS[kind] };
+  const opening: OpeningDocument = { kind, line, ...DEFAULT_HEIGHTS[kind] };
   const next = { ...plan, openings: [...(plan.openings ?? []), opening] };
-  // A plan that has shown none of a kind shows all of them with its first; one that has some says itself whether it does.
-  const isFirst = !(plan.openings ?? []).some((one) => one.kind === kind);
+  // The first opening of a kind makes the kind complete, unless the plan lists no complete kinds.
+  const isFirst = !(plan.openings ?? []).some((opening) => opening.kind === kind);
   return plan.opening_kinds && plan.opening_kinds.length > 0 && isFirst ? claimKind(next, kind, true) : next;
 }
 
-/** The kinds of openings that a plan shows completely, so that they count as evidence; those in it where it does not say. */
+/** Return the kinds of openings that a plan shows completely; by default those that occur in it. */
 export function claimedKinds(plan: PlanDocument): OpeningKind[] {
   return plan.opening_kinds ?? [...new Set((plan.openings ?? []).map(({ kind }) => kind))];
 }
 
-/** Say that a plan shows all openings of a kind, or that it does not. */
+/** Set whether a plan shows all openings of a kind. */
 export function claimKind(plan: PlanDocument, kind: OpeningKind, isComplete: boolean): PlanDocument {
-  const others = claimedKinds(plan).filter((one) => one !== kind);
-  return { ...plan, opening_kinds: isComplete ? [...others, kind] : others };
+  const otherKinds = claimedKinds(plan).filter((claimed) => claimed !== kind);
+  return { ...plan, opening_kinds: isComplete ? [...otherKinds, kind] : otherKinds };
 }
 
 export function changeOpening(plan: PlanDocument, index: number, change: Partial<OpeningDocument>): PlanDocument {
-  return { ...plan, openings: (plan.openings ?? []).map((opening, at) => (at === index ? { ...opening, ...change } : opening)) };
+  return { ...plan, openings: (plan.openings ?? []).map((opening, position) => (position === index ? { ...opening, ...change } : opening)) };
 }
 
 export function removeOpening(plan: PlanDocument, index: number): PlanDocument {
-  return { ...plan, openings: (plan.openings ?? []).filter((_, at) => at !== index) };
+  return { ...plan, openings: (plan.openings ?? []).filter((_, position) => position !== index) };
 }
 
-/** Slide an opening so that its middle is as near to a place as its direction allows. */
+/** Slide an opening along its direction, as near to a place as possible. */
 export function slideOpening(plan: PlanDocument, index: number, place: Point): PlanDocument {
   const line = plan.openings![index]!.line, along = frame(...line);
   const by = along.along(place) - 0.5 * along.length;
@@ -169,12 +169,12 @@ export function slideOpening(plan: PlanDocument, index: number, place: Point): P
 /** Move one end of an opening along its direction. */
 export function stretchOpening(plan: PlanDocument, index: number, end: 0 | 1, place: Point): PlanDocument {
   const line = plan.openings![index]!.line, along = frame(...line);
-  const at = along.along(place);
-  const [from, to] = end === 0 ? [Math.min(at, along.length - LEAST_WIDTH_M), along.length] : [0, Math.max(at, LEAST_WIDTH_M)];
+  const share = along.along(place);
+  const [from, to] = end === 0 ? [Math.min(share, along.length - MIN_WIDTH_M), along.length] : [0, Math.max(share, MIN_WIDTH_M)];
   return changeOpening(plan, index, { line: [rounded(along.point(from, 0)), rounded(along.point(to, 0))] });
 }
 
-/** Set the width of an opening about its middle. */
+/** Set the width of an opening about its centre. */
 export function widenOpening(plan: PlanDocument, index: number, width: number): PlanDocument {
   const line = plan.openings![index]!.line, along = frame(...line);
   const from = 0.5 * (along.length - width);
@@ -183,23 +183,23 @@ export function widenOpening(plan: PlanDocument, index: number, width: number): 
 
 export const widthOf = ({ line: [a, b] }: OpeningDocument): number => Math.hypot(b[0] - a[0], b[1] - a[1]);
 
-/** The whole plan in another scale; heights stay. */
+/** Scale the whole plan, except heights. */
 export function scaled(plan: PlanDocument, factor: number): PlanDocument {
   const all = (points: Point[]): Point[] => points.map(([x, y]) => rounded([factor * x, factor * y]));
-  const room = (one: RoomDocument): RoomDocument => ({
-    ...one, polygon: all(one.polygon),
-    ...(one.holes ? { holes: one.holes.map(all) } : {}),
-    ...(one.walls ? { walls: one.walls.map((wall) => all(wall) as [Point, Point]) } : {}),
+  const scaledRoom = (room: RoomDocument): RoomDocument => ({
+    ...room, polygon: all(room.polygon),
+    ...(room.holes ? { holes: room.holes.map(all) } : {}),
+    ...(room.walls ? { walls: room.walls.map((wall) => all(wall) as [Point, Point]) } : {}),
   });
   return {
-    ...plan, rooms: plan.rooms.map(room),
+    ...plan, rooms: plan.rooms.map(scaledRoom),
     openings: (plan.openings ?? []).map((opening) => ({ ...opening, line: all(opening.line) as [Point, Point] })),
   };
 }
 
 const clamp = (value: number, low: number, high: number): number => Math.max(low, Math.min(high, value));
 
-/** A place moved onto the lines of corners that it nearly lies on, so that walls become straight. */
+/** Snap a place to the coordinates of nearby corners, so that walls become straight. */
 export function snapped(plan: PlanDocument, place: Point, within: number, besides: Point | null = null): Point {
   const corners = plan.rooms.flatMap(({ polygon }) => polygon).filter((corner) => besides === null || !same(corner, besides));
   const nearest = (axis: 0 | 1): number => corners.reduce((best, corner) =>

@@ -1,6 +1,6 @@
-/** Editing a plan: a copy is changed, undone and redone, and stored as a new revision, or as a new plan. */
+/** Plan editor: changes a copy, with undo and redo, and stores it as a new revision or a new plan. */
 
-import { api, Refusal } from "../api";
+import { api, ServiceError } from "../api";
 import { button, byId, h, show } from "../dom";
 import { clearError, say, showError } from "../notices";
 import { type Box, boxOf, unitOf } from "../plan_drawing";
@@ -13,23 +13,23 @@ import { type Tool, Tools } from "./tools";
 import { Underlay } from "./underlay";
 
 export interface EditorHost {
-  /** Draw a plan that is being changed. */
+  /** Draw the edited plan. */
   draw: (plan: PlanDocument) => void;
-  /** What is seen now, in metres. */
-  seen: () => Box;
+  /** Return the visible part in metres. */
+  visible: () => Box;
   fit: (box: Box) => void;
-  /** Editing ended, with what was stored or without. */
+  /** Editing ended; null if nothing was stored. */
   ended: (stored: Plan | null) => void;
 }
 
 const EMPTY: PlanDocument = { name: "New plan", ceiling_height_m: 2.5, rooms: [], openings: [] };
-// How the importer tells that its coordinates are not those of the picture.
-const TURNED = /picture was turned/;
+// Note of the importer that its coordinates are not those of the picture.
+const TURNED = /\b(turned|rotated)\b/;
 const NEW_ROOM_M: Point = [4, 3];
 const TOOLS: [Tool, string][] = [["select", "Select"], ["room", "Draw a room"], ["door", "Door"], ["window", "Window"], ["passage", "Passage"], ["scale", "Scale"]];
 
 export class Editor {
-  readonly under = new Underlay();
+  readonly underlay = new Underlay();
   private readonly handles: Handles;
   private readonly tools: Tools;
   private readonly bar = byId("plan-tools");
@@ -53,13 +53,13 @@ export class Editor {
       },
       done: () => this.drawBar(),
       measured: (distance) => this.onMeasured(distance),
-      tell: (text) => { this.hint.textContent = text; },
+      instruct: (text) => { this.hint.textContent = text; },
     });
     addEventListener("keydown", (event) => this.onKey(event));
     addEventListener("beforeunload", (event) => { if (this.isChanged) event.preventDefault(); });
   }
 
-  /** What lies over the plan while it is edited. */
+  /** Layers over the plan while it is edited. */
   get layers(): SVGElement[] {
     return [this.handles.element, this.tools.element];
   }
@@ -72,13 +72,13 @@ export class Editor {
     return this.history !== null && this.history.now !== this.saved;
   }
 
-  /** Begin to change a stored plan, or a new one. */
+  /** Open a stored plan, or a new one. */
   open(plan: Plan | null): void {
     this.base = plan;
     this.saved = plan?.plan ?? EMPTY;
     this.history = new History(this.saved);
     this.selection = { kind: "none" };
-    this.under.remove();
+    this.underlay.remove();
     clearError(this.error);
     this.tools.choose(plan === null ? "room" : "select");
     this.host.fit(boxOf(this.saved));
@@ -87,22 +87,22 @@ export class Editor {
     if (plan !== null) void this.layOriginal(plan);
   }
 
-  /** The picture that a plan was read from lies under it, where that was not turned to be straight. */
+  /** Lay the picture that a plan was read from under it, unless the importer turned it. */
   private async layOriginal(plan: Plan): Promise<void> {
     const report = plan.import_report;
     if (report?.format !== "picture" || report.metres_per_unit == null || report.notes.some((note) => TURNED.test(note))) return;
     try {
       const original = await api.original(plan.id);
-      if (this.base?.revision === plan.revision) await this.under.lay(original, plan.name, report.metres_per_unit);
+      if (this.base?.revision === plan.revision) await this.underlay.lay(original, plan.name, report.metres_per_unit);
     } catch {
-      // It is a help, and no more.
+      // The picture is optional.
     }
   }
 
-  /** Draw again, as after zooming. */
+  /** Redraw, as after zooming. */
   redraw(): void {
     if (this.history === null) return;
-    const plan = this.history.now, unit = unitOf(this.host.seen());
+    const plan = this.history.now, unit = unitOf(this.host.visible());
     setFormPlan(plan);
     this.host.draw(plan);
     this.tools.update(plan, unit);
@@ -124,7 +124,7 @@ export class Editor {
   private close(stored: Plan | null): void {
     if (stored !== null) say(`“${stored.name}” is stored, revision ${stored.revision_number}.`);
     this.history = null;
-    this.under.remove();
+    this.underlay.remove();
     this.tools.choose("select");
     show(this.bar);
     show(this.form);
@@ -142,7 +142,7 @@ export class Editor {
     show(this.bar,
       h("div", { class: "tools", role: "toolbar", "aria-label": "Editing" }, ...TOOLS.map(tool),
         button("Add 4 × 3 m room", () => this.addRoom(), { id: "add-room" }),
-        h("label", { class: "file" }, picture, h("span", {}, "Picture to draw over")),
+        h("label", { class: "file" }, picture, h("span", {}, "Picture to trace")),
         button("Undo", () => this.step("undo"), { id: "undo" }), button("Redo", () => this.step("redo"), { id: "redo" })),
       this.measure, this.hint,
       h("div", { class: "ask" },
@@ -161,7 +161,7 @@ export class Editor {
 
   private step(way: "undo" | "redo"): void {
     this.history?.[way]();
-    // What was selected may be gone.
+    // The selected element may no longer exist.
     this.selection = { kind: "none" };
     this.redraw();
     this.drawUndo();
@@ -180,10 +180,10 @@ export class Editor {
   private async lay(file: File): Promise<void> {
     clearError(this.error);
     try {
-      await this.under.lay(file, file.name);
-      const { width, height } = this.under.box!;
+      await this.underlay.lay(file, file.name);
+      const { width, height } = this.underlay.box!;
       this.host.fit({ x: -0.5, y: -height - 0.5, width: width + 1, height: height + 1 });
-      say("Set the scale next: click two points whose distance you know.");
+      say("Set the scale next: click two points with a known distance.");
       this.tools.choose("scale");
       this.drawBar();
     } catch (error) {
@@ -196,24 +196,24 @@ export class Editor {
     const field = h("input", { type: "number", min: 0.01, step: "any", id: "known-distance", value: distance.toFixed(2) });
     const apply = (): void => this.applyScale(field.valueAsNumber);
     field.addEventListener("keydown", (event) => { if (event.key === "Enter") apply(); });
-    show(this.measure, h("label", { for: "known-distance" }, "These points are really so many metres apart:"), field, button("Set the scale", apply, { id: "apply-scale" }));
+    show(this.measure, h("label", { for: "known-distance" }, "Real distance of these points in metres:"), field, button("Set the scale", apply, { id: "apply-scale" }));
     this.measure.hidden = false;
     field.select();
   }
 
   private applyScale(distance: number): void {
     if (this.history === null || !(distance > 0) || !(this.measured > 0)) {
-      showError(this.error, new Error("The distance is a number of metres, more than 0, between two different points."));
+      showError(this.error, new Error("The distance must be more than 0 m, between two different points."));
       return;
     }
     clearError(this.error);
-    const factor = distance / this.measured, seen = this.host.seen();
+    const factor = distance / this.measured, seen = this.host.visible();
     this.measure.hidden = true;
-    this.under.scale(factor);
+    this.underlay.scale(factor);
     this.tools.choose("select");
     this.edit(change.scaled(this.history.now, factor), false);
     this.host.fit({ x: seen.x * factor, y: seen.y * factor, width: seen.width * factor, height: seen.height * factor });
-    say(`The plan is ${factor.toFixed(3)} times as large.`);
+    say(`The plan was scaled by ${factor.toFixed(3)}.`);
   }
 
   private async save(): Promise<void> {
@@ -234,31 +234,31 @@ export class Editor {
       await store(this.base!);
     } catch (error) {
       showError(this.error, error);
-      if (error instanceof Refusal && error.status === 412) this.offerWays();
+      if (error instanceof ServiceError && error.status === 412) this.offerResolutions();
     }
   }
 
-  /** Somebody else stored a revision meanwhile: say so, and lose nothing of either. */
-  private offerWays(): void {
-    show(this.error, h("strong", {}, "Somebody changed this plan since you began"),
-      h("p", {}, "Nothing of yours or theirs is lost. What shall become of your version?"),
+  /** Offer ways to keep both versions after somebody else stored a revision. */
+  private offerResolutions(): void {
+    show(this.error, h("strong", {}, "Somebody changed this plan while you were editing"),
+      h("p", {}, "Both versions are kept. Choose what to do with yours."),
       h("div", { class: "ask" },
-        button("Look at theirs", () => void this.takeTheirs(true), { id: "look-at-theirs" }),
-        button("Save mine over it", () => void this.takeTheirs(false), { id: "save-over" }),
+        button("Show their version", () => void this.loadTheirs(true), { id: "look-at-theirs" }),
+        button("Overwrite it with mine", () => void this.loadTheirs(false), { id: "save-over" }),
         button("Save mine as a new plan", () => void this.saveNew())));
   }
 
-  private async takeTheirs(look: boolean): Promise<void> {
+  private async loadTheirs(isShown: boolean): Promise<void> {
     await this.attempt(async (base) => {
       this.base = await api.plan(base.id);
-      if (!look) {
+      if (!isShown) {
         this.close(await api.replacePlan(base.id, this.history!.now, this.base.etag));
         return;
       }
-      // As one more step: undoing it leads back to what was drawn here.
+      // One more step of the history, so that undo returns to the user's version.
       this.selection = { kind: "none" };
       this.edit(this.base.plan, false);
-      this.hint.textContent = `This is their revision ${this.base.revision_number}. “Undo” brings yours back; saving it then makes it the newest.`;
+      this.hint.textContent = `This is their revision ${this.base.revision_number}. “Undo” returns to your version; saving makes it the latest.`;
     });
   }
 

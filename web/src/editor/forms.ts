@@ -1,4 +1,4 @@
-/** What is known of a room, an opening or the whole plan besides where it lies. */
+/** Forms for the properties of a room, an opening or the whole plan. */
 
 import { button, h, show } from "../dom";
 import type { OpeningDocument, OpeningKind, PlanDocument, RoomDocument } from "../types";
@@ -16,10 +16,10 @@ export interface FormActions {
   select: (selection: Selection) => void;
 }
 
-/** Show the form of what is selected. */
+/** Show the form of the selection. */
 export function showForm(place: HTMLElement, plan: PlanDocument, selection: Selection, actions: FormActions): void {
   if (place.contains(document.activeElement) && document.activeElement instanceof HTMLInputElement) {
-    // Being typed in: what is typed is already there.
+    // The form already shows the typed text.
     if (place.dataset.of === JSON.stringify(selection)) return;
   }
   place.dataset.of = JSON.stringify(selection);
@@ -32,7 +32,7 @@ export function showForm(place: HTMLElement, plan: PlanDocument, selection: Sele
 
 let current: PlanDocument = { rooms: [] };
 
-/** The plan that forms change: as it is when a field is left, not as it was when the form was made. */
+/** Set the plan that forms change: the current one when a field is left, not when the form was created. */
 export function setFormPlan(plan: PlanDocument): void {
   current = plan;
 }
@@ -45,19 +45,19 @@ function planForm(plan: PlanDocument, { edit }: FormActions): HTMLElement[] {
     number("plan-form-ceiling", "Ceiling, m", plan.ceiling_height_m, (value) => set({ ceiling_height_m: value })),
     number("plan-form-camera", "Camera height, m", plan.camera_height_m, (value) => set({ camera_height_m: value ?? undefined })),
     number("plan-form-north", "North, ° clockwise from up", plan.north_deg, (value) => set({ north_deg: value })),
-    claims(plan, edit),
-    h("p", { class: "hint" }, `${plan.rooms.length} rooms, ${(plan.openings ?? []).length} openings. Click one to change it.`),
+    completeKinds(plan, edit),
+    h("p", { class: "hint" }, `${plan.rooms.length} rooms, ${(plan.openings ?? []).length} openings. Click an element to change it.`),
   ];
 }
 
-/** Which kinds are shown completely: of these a photograph may also speak against the plan. */
-function claims(plan: PlanDocument, edit: FormActions["edit"]): HTMLElement {
+/** Checkboxes for the kinds that are shown completely, whose absence then counts as well. */
+function completeKinds(plan: PlanDocument, edit: FormActions["edit"]): HTMLElement {
   const claimed = change.claimedKinds(plan);
-  return h("fieldset", { class: "claims" }, h("legend", {}, "All of these are drawn, and count when photographs are compared"),
+  return h("fieldset", { class: "claims" }, h("legend", {}, "Complete in this plan, and used by the search"),
     ...OPENING_KINDS.map((kind) => {
       const box = h("input", { type: "checkbox", id: `plan-form-all-${kind}`, checked: claimed.includes(kind) });
       box.addEventListener("change", () => edit(change.claimKind(current, kind, box.checked)));
-      const count = (plan.openings ?? []).filter((one) => one.kind === kind).length;
+      const count = (plan.openings ?? []).filter((opening) => opening.kind === kind).length;
       return h("label", { class: "inline" }, box, `${count} ${kind}${count === 1 ? "" : "s"}`);
     }));
 }
@@ -97,7 +97,7 @@ function text(id: string, label: string, value: string, set: (value: string) => 
 }
 
 function number(id: string, label: string, value: number | null | undefined, set: (value: number | null) => void): HTMLElement {
-  const input = h("input", { type: "number", step: "any", placeholder: "not said", value: value == null ? null : String(Math.round(value * 1000) / 1000) });
+  const input = h("input", { type: "number", step: "any", placeholder: "unknown", value: value == null ? null : String(Math.round(value * 1000) / 1000) });
   input.addEventListener("change", () => set(input.value.trim() === "" ? null : input.valueAsNumber));
   return field(id, label, input);
 }

@@ -1,6 +1,6 @@
-/** What is taken hold of in a plan that is edited: corners, walls, openings; with pointer and keyboard. */
+/** Handles of corners, walls and openings, for pointer and keyboard. */
 
-import { s, show } from "../dom";
+import { ARROWS, followPointer, s, show } from "../dom";
 import { path } from "../plan_drawing";
 import { placeOf } from "../pose_marker";
 import type { OpeningKind, PlanDocument, Point } from "../types";
@@ -9,14 +9,13 @@ import * as change from "./changes";
 export type Selection = { kind: "none" } | { kind: "room"; index: number } | { kind: "opening"; index: number };
 
 export interface HandleActions {
-  /** Another plan; `goesOn` while something is dragged. */
+  /** Another plan; `goesOn` while the user drags. */
   edit: (plan: PlanDocument, goesOn: boolean) => void;
   select: (selection: Selection) => void;
 }
 
 const STEP_M = 0.05;
 const FAR_STEP_M = 0.5;
-const ARROWS: Record<string, Point> = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
 const KINDS: Record<string, OpeningKind> = { d: "door", w: "window", p: "passage" };
 const SNAP_UNITS = 1;
 
@@ -27,13 +26,13 @@ export class Handles {
 
   constructor(private readonly svg: SVGSVGElement, private readonly actions: HandleActions) {}
 
-  /** Draw the handles of what is selected; the focus stays where it was. */
+  /** Draw the handles of the selection and keep the focus. */
   draw(plan: PlanDocument, selection: Selection, unit: number): void {
     const focused = this.element.contains(document.activeElement) ? document.activeElement!.id : null;
     this.plan = plan;
     this.unit = unit;
     const room = selection.kind === "room" ? selection.index : -1;
-    const shapes: SVGElement[] = plan.rooms.map((one, index) => this.roomShape(one.polygon, index, index === room));
+    const shapes: SVGElement[] = plan.rooms.map(({ polygon }, index) => this.roomShape(polygon, index, index === room));
     if (room >= 0 && plan.rooms[room] !== undefined) shapes.push(...this.wallShapes(room), ...this.cornerShapes(room));
     (plan.openings ?? []).forEach((_, index) => shapes.push(...this.openingShapes(index, selection)));
     show(this.element, ...shapes);
@@ -81,7 +80,7 @@ export class Handles {
       const split = (): void => this.actions.edit(change.splitWall(this.plan, wall, middle), false);
       const line = s("line", {
         x1: ax, y1: -ay, x2: bx, y2: -by, class: "grab-wall", id: `edit-wall-${edge}`, tabindex: 0, role: "button",
-        "aria-label": `Wall ${edge + 1}, ${Math.hypot(bx - ax, by - ay).toFixed(2)} m. Arrow keys move it, Enter puts a corner in it, D, W and P a door, a window, a passage.`,
+        "aria-label": `Wall ${edge + 1}, ${Math.hypot(bx - ax, by - ay).toFixed(2)} m. Arrow keys move it, Enter adds a corner; D, W and P add a door, a window or a passage.`,
         ondblclick: split,
         onkeydown: (event) => {
           const kind = KINDS[(event as KeyboardEvent).key.toLowerCase()];
@@ -127,7 +126,7 @@ export class Handles {
     return [line, ...ends];
   }
 
-  /** Follow a pointer from its first movement on; what was redrawn meanwhile makes no difference. */
+  /** Follow a pointer from its first movement on, even if the handle is redrawn. */
   private drag(handle: SVGElement, to: (place: Point, goesOn: boolean) => void): void {
     handle.addEventListener("pointerdown", (event) => {
       if (event.button !== 0) return;
@@ -136,20 +135,12 @@ export class Handles {
       (handle as SVGElement & { focus(): void }).focus();
       const begin = placeOf(this.svg, event);
       let goesOn = false;
-      const move = (moving: PointerEvent): void => {
+      followPointer((moving) => {
         if (!goesOn && Math.hypot(moving.clientX - event.clientX, moving.clientY - event.clientY) < 3) return;
         if (!goesOn) to(begin, false);
         goesOn = true;
         to(placeOf(this.svg, moving), true);
-      };
-      const end = (): void => {
-        removeEventListener("pointermove", move);
-        removeEventListener("pointerup", end);
-        removeEventListener("pointercancel", end);
-      };
-      addEventListener("pointermove", move);
-      addEventListener("pointerup", end);
-      addEventListener("pointercancel", end);
+      });
     });
   }
 

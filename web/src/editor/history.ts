@@ -1,6 +1,6 @@
-/** What was done and can be undone. */
+/** History of changes, for undo and redo. */
 
-const MOST = 200;
+const MAX_STEPS = 200;
 
 export class History<T> {
   private past: T[] = [];
@@ -20,12 +20,12 @@ export class History<T> {
     return this.future.length > 0;
   }
 
-  /** Another state; `goesOn` where it goes on with the last change, as dragging does. */
+  /** Add a state; with `goesOn` it replaces the last one, as while dragging. */
   push(next: T, goesOn = false): void {
     if (next === this.present) return;
     if (!goesOn) {
       this.past.push(this.present);
-      if (this.past.length > MOST) this.past.shift();
+      if (this.past.length > MAX_STEPS) this.past.shift();
     }
     this.future = [];
     this.present = next;

@@ -1,4 +1,4 @@
-/** Tools that take points on the plan: drawing a room, putting openings on walls, measuring for the scale. */
+/** Tools that take points on the plan: drawing rooms, placing openings, measuring. */
 
 import { s, show } from "../dom";
 import { path } from "../plan_drawing";
@@ -10,24 +10,24 @@ export type Tool = "select" | "room" | OpeningKind | "scale";
 
 export interface ToolActions {
   edit: (plan: PlanDocument) => void;
-  /** The tool has done what it is for. */
+  /** The tool has finished. */
   done: () => void;
-  /** Two points were clicked for the scale; their distance as drawn. */
+  /** Two points were clicked; their distance as drawn. */
   measured: (distance: number) => void;
-  /** What to do next, in words. */
-  tell: (text: string) => void;
+  /** Show an instruction. */
+  instruct: (text: string) => void;
 }
 
 const HINTS: Record<Tool, string> = {
   select: "Drag corners, walls and openings; double-click a wall for a new corner, a corner to remove it.",
-  room: "Click the corners of the room along the inner faces of its walls; click the first one again to close it. Escape gives up.",
+  room: "Click the corners of the room along the inner faces of its walls; click the first corner again to close the room. Escape cancels.",
   door: "Click a wall where the door is.",
   window: "Click a wall where the window is.",
   passage: "Click a wall where the passage is.",
-  scale: "Click two points whose distance you know.",
+  scale: "Click two points with a known distance.",
 };
 const CLOSE_UNITS = 2;
-const MOST_OFF_UNITS = 4;
+const MAX_OFFSET_UNITS = 4;
 
 export class Tools {
   readonly element = s("g", { class: "tool" });
@@ -37,7 +37,7 @@ export class Tools {
   private plan: PlanDocument = { rooms: [] };
 
   constructor(private readonly svg: SVGSVGElement, private readonly actions: ToolActions) {
-    // Before handles and viewport, which would take hold of what lies there.
+    // Capture runs before the listeners of handles and viewport.
     svg.addEventListener("pointerdown", (event) => this.onDown(event), { capture: true });
     svg.addEventListener("pointermove", (event) => { if (this.points.length > 0) this.draw(this.snap(placeOf(svg, event))); });
     addEventListener("keydown", (event) => {
@@ -56,7 +56,7 @@ export class Tools {
     this.tool = tool;
     this.points = [];
     this.svg.classList.toggle("pointing", tool !== "select");
-    this.actions.tell(HINTS[tool]);
+    this.actions.instruct(HINTS[tool]);
     this.draw(null);
     if (wasOther && tool === "select") this.actions.done();
   }
@@ -70,7 +70,7 @@ export class Tools {
     const previous = this.points.at(-1);
     const within = this.unit;
     const to = change.snapped(this.plan, place, within);
-    // Walls are mostly parallel to the axes: nearly straight is straight.
+    // Snap nearly straight walls, as most are parallel to the axes.
     if (this.tool !== "room" || previous === undefined) return to;
     const first = this.points[0]!;
     const align = (axis: 0 | 1): number => [previous[axis], first[axis]].find((value) => Math.abs(value - place[axis]) < within) ?? to[axis];
@@ -114,8 +114,8 @@ export class Tools {
 
   private putOpening(kind: OpeningKind, place: Point): void {
     const nearest = change.nearestWall(this.plan, place);
-    if (nearest === null || nearest.distance > Math.max(MOST_OFF_UNITS * this.unit, change.NEAR_WALL_M)) {
-      this.actions.tell(`There is no wall near enough. ${HINTS[kind]}`);
+    if (nearest === null || nearest.distance > Math.max(MAX_OFFSET_UNITS * this.unit, change.NEAR_WALL_M)) {
+      this.actions.instruct(`No wall is close enough. ${HINTS[kind]}`);
       return;
     }
     this.actions.edit(change.addOpening(this.plan, kind, nearest.wall, place));

@@ -1,4 +1,4 @@
-/** A picture of a plan to draw over: it lies under the rooms, from the plan's origin to the right and up. */
+/** Picture under the rooms to draw over, from the plan's origin to the right and up. */
 
 import { s, show } from "../dom";
 
@@ -14,7 +14,7 @@ export class Underlay {
     return this.url === null ? null : { width: this.size.width * this.metresPerPixel, height: this.size.height * this.metresPerPixel };
   }
 
-  /** Lay a picture under the plan, 12 m wide until its scale is set, if it is not known. Refused where it is no picture. */
+  /** Lay a picture under the plan, 12 m wide if its scale is unknown. Rejects if the file is not a picture. */
   async lay(file: Blob, name: string, metresPerPixel: number | null = null): Promise<void> {
     const url = URL.createObjectURL(file);
     const picture = new Image();
@@ -23,7 +23,7 @@ export class Underlay {
       await picture.decode();
     } catch {
       URL.revokeObjectURL(url);
-      throw new Error(`“${name}” cannot be shown as a picture. PNG and JPEG can.`);
+      throw new Error(`The browser cannot show “${name}” as a picture. Use a PNG or JPEG file.`);
     }
     this.remove();
     this.url = url;
