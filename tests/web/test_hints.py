@@ -31,7 +31,7 @@ def test_hints_are_set_and_sent(desktop: Visit) -> None:
     expect(mark).not_to_have_attribute("cx", moved)
     page.locator("#hint-radius").fill("2.5")
     page.get_by_role("checkbox", name="kitchen").check()
-    expect(page.locator("#hints-said")).to_contain_text("within 2.5 m of the mark, in one room")
+    expect(page.locator("#hints-summary")).to_contain_text("within 2.5 m of the mark, in one room")
     _assert_accessible(page)
     desktop.find()
     sent = _copied(page, "#copy-curl")

@@ -71,7 +71,7 @@ export class HintForm {
     for (const box of this.rooms.querySelectorAll("input")) box.checked = this.hints.rooms.includes(box.value);
     byId("hint-unmark").hidden = this.hints.near === null;
     const { near, radius, rooms } = this.hints;
-    byId("hints-said").textContent = [
+    byId("hints-summary").textContent = [
       near === null ? "" : `within ${Number.isNaN(radius) ? "?" : radius} m of the mark`,
       rooms.length === 0 ? "" : `in ${rooms.length === 1 ? "one room" : `${rooms.length} rooms`}`,
     ].filter(Boolean).join(", ");
