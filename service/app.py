@@ -25,7 +25,7 @@ from service.http.middleware import (
     SecurityHeadersMiddleware,
     TelemetryMiddleware,
 )
-from service.http.parameters import check_parameters
+from service.http.fields import check_parameters
 from service.http.problems import install_problem_handlers
 from service.problem_kinds import HTTP_PROBLEMS, PROBLEMS
 from service.routes import ROUTERS

@@ -1,9 +1,9 @@
-"""What stands between the socket and a route: slots for requests, uploads, idempotency, events, errors, headers.
+"""HTTP layer between the socket and the routes: slots, uploads, idempotency, events, errors, headers.
 
-Begin with `admission_control.py`, which says how much may be in work, and `middleware/`, which every request passes.
-Routes use `uploads.py` for bodies, `conditional.py`, `cursors.py` and `idempotent_request.py` for what their headers
-and parameters ask, `events.py` for streams, `problems.py` and `faults.py` for errors; `parameters.py` refuses what they
-do not know. `server.py` runs the app, `api_description.py` describes it.
+Begin with `admission_control.py`, which limits the requests in work, and `middleware/`, which every request passes.
+Routes read bodies with `uploads.py` and `fields.py`, handle headers and cursors with `accept.py`, `conditional.py`,
+`cursors.py` and `idempotent_request.py`, and stream with `events.py`; `problems.py` answers errors. `server.py` runs
+the app, `api_description.py` describes it.
 """
 
 from service.http.admission_control import Admission, AdmissionLimits

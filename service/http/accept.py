@@ -1,4 +1,4 @@
-"""Which of several representations a client would rather have (`Accept`, RFC 9110, section 12.5.1)."""
+"""Content negotiation by `Accept` (RFC 9110, section 12.5.1)."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from starlette.requests import Request
 
 
 def preferred(request: Request, offered: tuple[str, ...]) -> str:
-    """The media type that the request prefers; of several alike, and where it accepts none of them, the first."""
+    """Return the offered media type that the request prefers; the first one if several tie or none is accepted."""
     wanted = ",".join(request.headers.getlist("accept"))
     ranges = [_range(part) for part in wanted.split(",") if part.strip()]
     if not ranges:
@@ -15,7 +15,7 @@ def preferred(request: Request, offered: tuple[str, ...]) -> str:
 
 
 def _range(text: str) -> tuple[str, float]:
-    """A media range and its weight; other parameters do not matter here."""
+    """Return a media range and its weight; other parameters are ignored."""
     media, *parameters = (part.strip().lower() for part in text.split(";"))
     for parameter in parameters:
         name, _, value = parameter.partition("=")
@@ -28,7 +28,7 @@ def _range(text: str) -> tuple[str, float]:
 
 
 def _quality(media: str, ranges: list[tuple[str, float]]) -> float:
-    """The weight of the most specific range that a media type is in."""
+    """Return the weight of the most specific range that contains a media type."""
     kind = media.split("/")[0]
     for pattern in (media, f"{kind}/*", "*/*"):
         found = [weight for accepted, weight in ranges if accepted == pattern]

@@ -1,8 +1,7 @@
-"""How many requests may be in work: slots for each kind of them, and refusal at once when all are in use.
+"""Admission control: slots for each kind of request, and immediate refusal when all are in use.
 
-Every request but those to health and metrics holds a slot from its first byte to its last, be its body read, its
-query computed, or its answer sent. A query that is uploaded waits for a slot of its own, in a short queue; nothing else
-is waited for, so nothing behind the slots has more waiting than slots.
+Every request, except those for health and metrics, holds a slot from its first byte to its last. An uploaded query also
+waits in a short queue for a slot to be computed. No other request waits, so the queues behind the slots stay bounded.
 """
 
 from __future__ import annotations
@@ -20,35 +19,36 @@ from service.settings import Settings
 from service.telemetry import Telemetry
 
 EXEMPT = frozenset({"/healthz", "/readyz", "/metrics"})
-# What every other request may be refused with, or end with.
+# Errors that every other request can end with.
 REFUSALS = (OverloadedError, StoppingError, DeadlineExceededError)
 _READING = frozenset({"GET", "HEAD", "OPTIONS"})
 _QUERIES = frozenset({"/localise", "/localise/sequence", "/geopose"})
 _STREAMS = "/events"
 _READS_AT_A_TIME = 4
-# How much the last request counts in the mean that Retry-After is told by.
+# Weight of the last request in the running mean behind Retry-After.
 _NEWEST = 0.1
 _MAX_RETRY_AFTER_S = 30
 
 
 def is_read(method: str, path: str) -> bool:
-    """Whether the request changes nothing, and its answer has an end."""
+    """Return True for a read-only request whose answer ends by itself."""
     return method in _READING and not path.endswith(_STREAMS)
 
 
 def is_stream(method: str, path: str) -> bool:
-    """Whether the answer goes on for as long as its client listens."""
+    """Return True for an event stream."""
     return method in _READING and path.endswith(_STREAMS)
 
 
 class Slots:
-    """How many requests of one kind may be in work, and of these of one client (`Shares`); for one event loop."""
+    """Slots for requests of one kind, shared between clients (`Shares`); for one event loop.
+
+    Args:
+        limit: number of slots.
+        max_waiting: number of requests that can wait for a slot in `wait_and_hold`, shared between clients as well.
+    """
 
     def __init__(self, limit: int, max_waiting: int = 0) -> None:
-        """Args:
-        limit: how many may be in work.
-        max_waiting: how many more may wait for that, in `wait_and_hold`; clients share these places as well.
-        """
         self._shares = Shares(limit)
         self._places = Shares(max_waiting)
         self._waiting: FairQueue[asyncio.Future[None]] = FairQueue()
@@ -56,12 +56,12 @@ class Slots:
 
     @property
     def in_use(self) -> int:
-        """How many are in work."""
+        """Number of slots in use."""
         return self._shares.in_use
 
     @property
     def waiting(self) -> int:
-        """How many wait for a slot."""
+        """Number of requests that wait for a slot."""
         return self._places.in_use
 
     @contextmanager
@@ -69,7 +69,7 @@ class Slots:
         """Hold a slot.
 
         Raises:
-            OverloadedError: all are in use, or all that the client may have.
+            OverloadedError: all slots, or the client's share of them, are in use.
         """
         if not self._shares.may_take(client):
             raise self._refusal(client)
@@ -79,13 +79,14 @@ class Slots:
 
     @asynccontextmanager
     async def wait_and_hold(self, client: str, deadline: float) -> AsyncIterator[None]:
-        """Hold a slot as soon as one is free; clients take turns.
+        """Wait for a slot and hold it; clients take turns.
 
         Args:
-            deadline: until when (`monotonic`) it is worth waiting.
+            client: tenant or client address.
+            deadline: end of the wait (`monotonic`).
 
         Raises:
-            OverloadedError: as many wait already as may, or as many of the client, or none was free in time.
+            OverloadedError: the queue, or the client's share of it, is full, or no slot became free in time.
         """
         await self._take_turn(client, deadline)
         with self._held(client):
@@ -93,18 +94,19 @@ class Slots:
 
     @contextmanager
     def released(self, client: str) -> Iterator[None]:
-        """Lend the slot that one holds to others while the block only waits."""
+        """Give up the held slot while the block waits, and take it again afterwards."""
         self._give_back(client)
         try:
             yield
         finally:
-            # Whoever was let in is not sent away again: for a while there may be more than the limit.
+            # Taken without asking, so for a while more slots than the limit can be in use.
             self._shares.take(client)
 
     def check(self, client: str) -> None:
-        """Raises:
-        OverloadedError: all are in use, or all that the client may have, and there is no place to wait for one either;
-            by the time it says, those that are before it will be through.
+        """Check that the client could get a slot or wait for one.
+
+        Raises:
+            OverloadedError: no slot and no place in the queue is free for the client.
         """
         if not self._shares.may_take(client) and not self._places.may_take(client):
             raise self._refusal(client)
@@ -119,7 +121,7 @@ class Slots:
             self._give_back(client)
 
     async def _take_turn(self, client: str, deadline: float) -> None:
-        # Whoever waits is of a client that may take none.
+        # Clients that are waiting already cannot take a slot.
         if self._shares.may_take(client):
             self._shares.take(client)
             return
@@ -132,9 +134,9 @@ class Slots:
             async with asyncio.timeout(max(deadline - monotonic(), 0.0)):
                 await turn
         except (TimeoutError, asyncio.CancelledError) as error:
-            self._waiting.drop(lambda other: other is turn)
+            self._waiting.drop(lambda waiting: waiting is turn)
             if turn.done() and not turn.cancelled():
-                # It came at the very moment when nobody waited any more.
+                # The slot came at the moment when the wait ended.
                 self._give_back(client)
             if isinstance(error, TimeoutError):
                 raise self._refusal(client) from error
@@ -160,15 +162,15 @@ class Slots:
 
 @dataclass(frozen=True)
 class AdmissionLimits:
-    """How much may be in work.
+    """Limits of requests in work.
 
     Attributes:
-        requests: uploads and queries, from the first byte of the body on.
-        queries: of these, queries that are uploaded and being computed or waiting for a thread.
-        waiting_queries: more of these, that wait for one of the former to end.
-        reads: requests that change nothing.
-        streams: answers that go on for as long as their client listens.
-        deadline_s: longest that a request may take, of whatever kind but streams; a last resort.
+        requests: uploads and queries, from the first byte of the body.
+        queries: queries that are computed or wait for a thread.
+        waiting_queries: queries that wait for a slot.
+        reads: read-only requests.
+        streams: event streams.
+        deadline_s: timeout of any request except streams, as a last resort.
     """
 
     requests: int
@@ -180,14 +182,14 @@ class AdmissionLimits:
 
     @classmethod
     def of(cls, settings: Settings) -> AdmissionLimits:
-        """The limits that the settings give."""
+        """Return the limits in the settings."""
         return cls(
             requests=settings.pending_limit,
             queries=settings.query_limit,
             waiting_queries=settings.requests.max_waiting_queries,
             reads=settings.requests.max_reads,
             streams=settings.requests.max_streams,
-            # An upload, its query or its conversion, and a slow reader's time to take the answer.
+            # Upload, query or conversion, and sending the answer to a slow reader.
             deadline_s=settings.uploads.deadline_s
             + max(settings.requests.request_deadline_s, settings.plans.import_deadline_s)
             + settings.requests.request_deadline_s,
@@ -195,7 +197,7 @@ class AdmissionLimits:
 
 
 class Admission:
-    """The slots of one running app."""
+    """Slots of one running app."""
 
     def __init__(self, limits: AdmissionLimits, telemetry: Telemetry) -> None:
         self.limits = limits
@@ -203,42 +205,40 @@ class Admission:
         self.queries = Slots(limits.queries, limits.waiting_queries)
         self.reads = Slots(limits.reads)
         self.streams = Slots(limits.streams)
-        # Reads compute a few at a time: more threads would only take the interpreter from queries.
+        # More threads for reads would only take the interpreter from queries.
         self.reading = FairSemaphore(_READS_AT_A_TIME)
         self.draining = False
         self.stopping = False
-        telemetry.gauge(
-            "lalaloc_requests_in_flight", "Uploads and queries not yet answered.", lambda: self.requests.in_use
-        )
+        telemetry.gauge("lalaloc_requests_in_flight", "Uploads and queries in work.", lambda: self.requests.in_use)
         telemetry.gauge(
             "lalaloc_queries_in_work",
-            "Queries computed or waiting for it, besides those that wait for a grid.",
+            "Queries computed, not counting those that wait for a pose grid.",
             lambda: self.queries.in_use,
         )
-        telemetry.gauge("lalaloc_queries_waiting", "Queries that wait for others to end.", lambda: self.queries.waiting)
-        telemetry.gauge("lalaloc_reads_in_flight", "Requests that change nothing.", lambda: self.reads.in_use)
-        telemetry.gauge("lalaloc_streams", "Clients that follow events.", lambda: self.streams.in_use)
+        telemetry.gauge("lalaloc_queries_waiting", "Queries that wait for a slot.", lambda: self.queries.waiting)
+        telemetry.gauge("lalaloc_reads_in_flight", "Read-only requests in work.", lambda: self.reads.in_use)
+        telemetry.gauge("lalaloc_streams", "Open event streams.", lambda: self.streams.in_use)
 
     def drain(self) -> None:
-        """Say that the service is about to stop, and go on for now. May be called by a signal handler."""
+        """Report that the service is about to stop. Safe to call in a signal handler."""
         self.draining = True
 
     def stop(self) -> None:
-        """Refuse every request from now on; those in work go on. May be called by a signal handler."""
+        """Refuse new requests; those in work go on. Safe to call in a signal handler."""
         self.draining = self.stopping = True
 
     @property
     def idle(self) -> bool:
-        """Whether nothing is in work that is worth waiting for."""
+        """True if nothing is in work except streams."""
         return self.requests.in_use == self.reads.in_use == 0
 
     @contextmanager
     def slot_for(self, client: str, method: str, path: str) -> Iterator[None]:
-        """Hold a slot for a request of a client whose head has arrived.
+        """Hold a slot for a request whose head has arrived.
 
         Raises:
-            StoppingError: no more requests are taken.
-            OverloadedError: all slots of its kind are in use, or all that the client may have.
+            StoppingError: the service is stopping.
+            OverloadedError: all slots of its kind, or the client's share of them, are in use.
         """
         if self.stopping:
             raise StoppingError()
@@ -249,7 +249,7 @@ class Admission:
         else:
             slots = self.requests
             if path in _QUERIES:
-                # A body that nobody could do anything with is not worth reading.
+                # Refuse before the body is read.
                 self.queries.check(client)
         with slots.hold(client):
             yield

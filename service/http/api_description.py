@@ -1,4 +1,4 @@
-"""The API description: what the framework knows of the routes, with what middlewares and hand-written parts add."""
+"""OpenAPI document: the framework's description of the routes, completed by hand-written schemas, errors and scopes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from service.security import access_control
 from service.security.permissions import NEEDED
 
 _KEY = "api_key"
-# Models that only hand-written parts of the description refer to.
+# Models that only hand-written parts of the description use.
 _BY_HAND = (
     EarthPoint,
     FloorPlanDocument,
@@ -39,7 +39,7 @@ _BY_HAND = (
 
 
 def describe_api(app: FastAPI) -> dict[str, Any]:
-    """The OpenAPI document of the app, made once."""
+    """Return the OpenAPI document of the app; it is built once."""
     if app.openapi_schema is None:
         document = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
         schemas = document["components"]["schemas"]
@@ -58,15 +58,14 @@ def describe_api(app: FastAPI) -> dict[str, Any]:
 
 
 def _describe_keys(document: dict[str, Any]) -> None:
-    """Add what each operation needs while keys are on, and how it refuses."""
+    """Add the scope of each operation, and its errors about keys."""
     document["components"]["securitySchemes"] = {
         _KEY: {
             "type": "http",
             "scheme": "bearer",
             "bearerFormat": "lalaloc_<id>_<secret>",
-            "description": "An API key, where they are switched on (`LALALOC_API_KEYS`). Operations name the scope "
-            "that the key needs: `read`, `localise` or `write`. Floor plans belong to the key's tenant; those of "
-            "another are as if they did not exist.",
+            "description": "API key, required if `LALALOC_API_KEYS=on`. Each operation names the scope that the key "
+            "needs: `read`, `localise` or `write`. A key sees the floor plans of its own tenant only.",
         }
     }
     for path, operations in document["paths"].items():

@@ -1,4 +1,4 @@
-"""Places in a listing as callers get them: opaque text, and exactly one for each place."""
+"""Cursors: places in a list as opaque text, one text per place."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ _LAST = (datetime.max.replace(tzinfo=UTC) - _EPOCH) // _MICROSECOND
 
 
 def cursor_text(cursor: Cursor) -> str:
-    """A place as text."""
+    """Return the cursor of a place in a list of plans or venues."""
     moment = (cursor.created_at - _EPOCH) // _MICROSECOND
     return base64.urlsafe_b64encode(_LAYOUT.pack(moment, bytes.fromhex(cursor.id))).decode("ascii")
 
 
 def parse_cursor(text: str) -> Cursor:
-    """The place that a text stands for.
+    """Return the place of a cursor.
 
     Raises:
-        InvalidRequestError: it is not one that `cursor_text` makes.
+        InvalidRequestError: not a cursor of `cursor_text`.
     """
     if _TEXT.fullmatch(text):
         moment, plan_id = _LAYOUT.unpack(base64.urlsafe_b64decode(text))
@@ -41,15 +41,15 @@ def parse_cursor(text: str) -> Cursor:
 
 
 def venue_cursor_text(place: VenuePlace) -> str:
-    """A place in the plans of a venue as text."""
+    """Return the cursor of a place in the plans of a venue."""
     return base64.urlsafe_b64encode(_VENUE_LAYOUT.pack(place.level, bytes.fromhex(place.plan_id))).decode("ascii")
 
 
 def parse_venue_cursor(text: str) -> VenuePlace:
-    """The place in the plans of a venue that a text stands for.
+    """Return the place of a cursor in the plans of a venue.
 
     Raises:
-        InvalidRequestError: it is not one that `venue_cursor_text` makes.
+        InvalidRequestError: not a cursor of `venue_cursor_text`.
     """
     if _TEXT.fullmatch(text):
         level, plan_id = _VENUE_LAYOUT.unpack(base64.urlsafe_b64decode(text))
@@ -59,4 +59,4 @@ def parse_venue_cursor(text: str) -> VenuePlace:
 
 
 def _no_cursor(text: str) -> InvalidRequestError:
-    return InvalidRequestError([("cursor", f"is '{text[:100]}', not the next_cursor of a listing")])
+    return InvalidRequestError([("cursor", f"is '{text[:100]}'; give the next_cursor of a list")])

@@ -25,9 +25,9 @@ from service.threads import BoundedReads
 
 _POLL_INTERVAL_S = 0.25
 HEARTBEAT_S = 15.0
-# How long a browser waits before it asks again after a stream has ended.
+# Delay before a browser reconnects.
 _ASK_AGAIN_MS = 3000
-# A reader so slow that even the end of its stream does not get through is left after this.
+# Timeout for sending the end of a stream to a slow reader.
 _LAST_BYTES_S = 5.0
 _FINAL = frozenset({"ready", "failed", "deleted"})
 
@@ -40,18 +40,18 @@ async def _always() -> bool:
 
 
 class EventStream(StreamingResponse):
-    """A stream that ends in bounded time, whether or not its client reads."""
+    """Stream that ends in bounded time, even if its client does not read."""
 
     media_type = "text/event-stream"
 
     def __init__(self, events: AsyncGenerator[bytes], max_s: float) -> None:
-        # Proxies must pass each event on as it comes.
+        # Proxies must not buffer events.
         super().__init__(events, headers={"Cache-Control": "no-store", "X-Accel-Buffering": "no"})
         self._events = events
         self._max_s = max_s
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Send it."""
+        """Send the stream."""
         try:
             with suppress(TimeoutError):
                 async with asyncio.timeout(self._max_s + _LAST_BYTES_S):
@@ -61,7 +61,16 @@ class EventStream(StreamingResponse):
 
 
 class PlanEvents:
-    """Tells followers how far plans are; for one event loop."""
+    """Event streams about the progress of plans; for one event loop.
+
+    Args:
+        store: the store.
+        grids: states of pose grids.
+        admission: tells when the service stops.
+        reads: threads for reading the store.
+        max_s: timeout of a stream.
+        heartbeat_s: interval of comments on an idle stream, and of checking that its caller is still authorised.
+    """
 
     def __init__(
         self,
@@ -73,12 +82,6 @@ class PlanEvents:
         max_s: float,
         heartbeat_s: float,
     ) -> None:
-        """Args:
-        reads: where the store is asked how far plans are.
-        max_s: how long a stream lasts at most.
-        heartbeat_s: how often something is sent when there is nothing to tell, so that nobody takes it for dead,
-            and how often it is asked whether a caller is still authorised.
-        """
         self._store = store
         self._grids = grids
         self._admission = admission
@@ -89,19 +92,15 @@ class PlanEvents:
         self._watch: asyncio.Task[None] | None = None
 
     def event_stream(self, plan_id: str, still_authorised: StillAuthorised = _always) -> EventStream:
-        """The stream of a plan that there is.
-
-        Args:
-            still_authorised: asked after every heartbeat's time whether the caller, authorised once, still is.
-        """
+        """Return the stream of an existing plan; `still_authorised` is called at every heartbeat."""
         return EventStream(self.stream(plan_id, still_authorised), self._max_s)
 
     async def stream(self, plan_id: str, still_authorised: StillAuthorised = _always) -> AsyncGenerator[bytes]:
-        """Events as they go over the wire, until the plan is in a final state, time is up, or the service stops."""
+        """Yield encoded events until the plan reaches a final state, the timeout passes, or the service stops."""
         subscriber = _Subscriber(plan_id)
         self._subscribers.add(subscriber)
         if self._watch is None or self._watch.done():
-            # It outlives the request that it begins with, and must not log as that.
+            # The task outlives this request, so it must not log under its ids.
             self._watch = asyncio.create_task(self._poll_all(), context=Context())
         try:
             yield f"retry: {_ASK_AGAIN_MS}\n\n".encode()
@@ -128,19 +127,19 @@ class PlanEvents:
 
     async def _poll_all(self) -> None:
         while self._subscribers:
-            asked = list(self._subscribers)
+            subscribers = list(self._subscribers)
             try:
-                found = await self._reads.run(self._look, {subscriber.plan_id for subscriber in asked})
-                for subscriber in asked:
-                    subscriber.tell(found.get(subscriber.plan_id, PlanEvent(status="deleted")))
+                found = await self._reads.run(self._look, {subscriber.plan_id for subscriber in subscribers})
+                for subscriber in subscribers:
+                    subscriber.put(found.get(subscriber.plan_id, PlanEvent(status="deleted")))
             except StoreUnavailableError:
-                # Followers go on waiting.
+                # Retried in the next round.
                 pass
             except Exception:
-                logging.getLogger(LOGGER_NAME).exception("looking after followed plans failed")
+                logging.getLogger(LOGGER_NAME).exception("reading the state of plans for event streams failed")
             if self._admission.stopping:
                 for subscriber in list(self._subscribers):
-                    subscriber.tell(None)
+                    subscriber.put(None)
             await asyncio.sleep(_POLL_INTERVAL_S)
 
     def _look(self, plan_ids: set[str]) -> dict[str, PlanEvent]:
@@ -158,21 +157,21 @@ class PlanEvents:
 
 
 class _Subscriber:
-    """One stream; what it was not told yet is overtaken by what comes after."""
+    """One stream; a new event replaces one that was not sent yet."""
 
     def __init__(self, plan_id: str) -> None:
         self.plan_id = plan_id
         self._event: PlanEvent | None = None
         self._changed = asyncio.Event()
 
-    def tell(self, event: PlanEvent | None) -> None:
-        """Pass on what changed; None ends the stream."""
+    def put(self, event: PlanEvent | None) -> None:
+        """Set the next event; None ends the stream."""
         if event is None or event != self._event:
             self._event = event
             self._changed.set()
 
     async def next(self) -> PlanEvent | None:
-        """Wait for the next change."""
+        """Wait for the next event."""
         await self._changed.wait()
         self._changed.clear()
         return self._event

@@ -1,8 +1,8 @@
-"""`Idempotency-Key`: a request that is sent twice is carried out once, and answered alike both times.
+"""`Idempotency-Key`: a request that is sent twice is executed once, and both get the same answer.
 
-What is kept for a day is the answer, be it a refusal for good; what may end otherwise next time is not, and then the
-next one is carried out under the same token. While the first one is in work, the second is refused; if the process that
-works on it dies, the next one takes over, under the same token, once its lease has run out.
+The answer is kept for a day, permanent errors included. After an error that may be temporary, the next attempt executes
+the request again under the same token. While one attempt is running, others are refused. If its process dies, the next
+attempt takes over under the same token once the lease has expired.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from service.threads import BoundedReads
 HEADER, REPLAYED = "Idempotency-Key", "Idempotency-Replayed"
 MAX_KEY_CHARACTERS = 255
 _KEY = re.compile(rf"[\x21-\x7e]{{1,{MAX_KEY_CHARACTERS}}}")
-# What the request itself is to blame for, and will be tomorrow. Others are not kept, whatever their status.
+# Errors of the request itself, which are kept. Others are not kept, whatever their status.
 _PERMANENT_ERRORS = (
     InvalidFloorPlanError,
     InvalidHintError,
@@ -54,32 +54,36 @@ _PERMANENT_ERRORS = (
 
 
 class IdempotentRequest:
-    """One request, with a key or without."""
+    """Request with or without an idempotency key.
+
+    Args:
+        claims: stored keys.
+        request: the request.
+        tenant: tenant of the request; keys of different tenants and routes are independent.
+        route: method and path of the route.
+
+    Raises:
+        InvalidRequestError: an invalid key.
+    """
 
     def __init__(self, claims: IdempotencyKeys, request: Request, tenant: str, route: str) -> None:
-        """Args:
-            tenant: whose key it is; the same key of another tenant, or for another route, is another key.
-
-        Raises:
-            InvalidRequestError: a key that is none.
-        """
         self._claims = claims
         self._request = request
         self._place = (tenant, route)
         self._key = _key_of(request)
 
     def run(self, parts: Parts, work: Callable[[str], Response]) -> Response:
-        """Carry the request out, unless that has happened; runs to its end whether or not its caller waits.
+        """Execute the request unless it was executed before; runs to the end even if the client leaves.
 
         Args:
-            parts: what was sent.
-            work: gives the answer; takes a token of 32 hexadecimal digits, the same for every attempt at the request.
+            parts: content of the request.
+            work: makes the answer from a token of 32 hexadecimal digits, the same for every attempt.
 
         Raises:
-            IdempotencyKeyReusedError: something else was sent with this key before.
-            IdempotencyInProgressError: it is being carried out at this moment.
+            IdempotencyKeyReusedError: the key was used with other content.
+            IdempotencyInProgressError: another attempt is running.
             StoreUnavailableError: the database is away.
-            LaLaLocError: what `work` raised.
+            LaLaLocError: raised by `work`.
         """
         token = self._begin(parts)
         if isinstance(token, Response):
@@ -92,13 +96,14 @@ class IdempotentRequest:
             return refusal
 
     async def run_async(self, parts: Parts, work: Callable[[], Awaitable[Response]], reads: BoundedReads) -> Response:
-        """As `run`, for work that is dropped when its caller goes, and leaves nothing behind.
+        """Execute the request as `run` does, for work without side effects that is cancelled if the client leaves.
 
         Args:
-            reads: where the database is asked, and not waited for when it is silent.
+            parts: content of the request.
+            work: makes the answer.
+            reads: threads for database access, with a timeout.
         """
         if self._key is None:
-            # Without a key there is nothing to ask the database.
             return await work()
         waiting = _Waiting()
         try:
@@ -151,15 +156,15 @@ class IdempotentRequest:
             kept = StoredAnswer(answer.status_code, headers, bytes(answer.body))
             self._claims.finish(*self._place, self._key, token, kept)
         except StoreUnavailableError:
-            # What was done is done; once the lease has run out, the next one finds it under the token.
+            # The work is done; after the lease, the next attempt finds it under the token.
             logging.getLogger(LOGGER_NAME).warning("the answer to an idempotent request was not kept")
         return answer
 
     def _fail(self, token: str, error: BaseException) -> Response | None:
-        """The refusal, if it is one for good and kept; None when the error is to go its way."""
+        """Return the answer to a permanent error, which is kept; None for other errors."""
         if self._key is None:
             return None
-        # A picture that decoders were lost over may have had bad luck.
+        # A lost decoder may not be the picture's fault.
         if isinstance(error, _PERMANENT_ERRORS) and not isinstance(error.__cause__, JobLostError):
             return self._keep(token, problem_answer(self._request, error))
         self._abandon(token)
@@ -175,7 +180,7 @@ class IdempotentRequest:
 
 
 class _Waiting:
-    """Who waits for a claim; when they leave before they have it, it must not stay for its lease."""
+    """Handover of a claim to a waiting request; a request that has left must not keep the claim."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -183,25 +188,25 @@ class _Waiting:
         self._token: str | None = None
 
     def give(self, token: str) -> bool:
-        """Hand the claim over; False when nobody waits any more."""
+        """Hand the claim over; return False if the request has left."""
         with self._lock:
             self._token = token
             return not self._left
 
     def leave(self) -> str | None:
-        """Wait no longer; the claim if it has been handed over already."""
+        """Stop waiting; return the claim if it was handed over already."""
         with self._lock:
             self._left = True
             return self._token
 
 
 def parts_sha256(parts: Parts) -> str:
-    """Digest of what was sent, whatever the boundaries of its parts and their order."""
+    """Return the digest of the parts, independent of multipart boundaries and order."""
     digest = hashlib.sha256()
     for kind, named in (("field", parts.fields), ("file", parts.files)):
         for name, value in sorted(named.items()):
             content = value.encode("utf-8", "surrogatepass") if isinstance(value, str) else value
-            # With their lengths, so that no two lists of parts read the same.
+            # Lengths make the encoding unambiguous.
             digest.update(json.dumps([kind, name, len(content)]).encode("ascii"))
             digest.update(content)
     return digest.hexdigest()
@@ -212,6 +217,6 @@ def _key_of(request: Request) -> str | None:
     if not values:
         return None
     if len(values) > 1 or not _KEY.fullmatch(values[0]):
-        fault = f"is '{', '.join(values)[:100]}', not one key of 1 to {MAX_KEY_CHARACTERS} visible ASCII characters"
+        fault = f"is '{', '.join(values)[:100]}'; give one key of 1 to {MAX_KEY_CHARACTERS} visible ASCII characters"
         raise InvalidRequestError([(HEADER, fault)])
     return values[0]

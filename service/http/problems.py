@@ -1,4 +1,4 @@
-"""Every error answer is `application/problem+json` as of RFC 9457; no stack trace leaves the service."""
+"""Error answers: `application/problem+json` (RFC 9457), without stack traces."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from service.errors import (
     UnsupportedEncodingError,
     UnsupportedMediaError,
 )
-from service.http.faults import describe_fault
+from service.http.fields import describe_fault
 from service.problem_kinds import HTTP_PROBLEMS, INTERNAL, PROBLEMS, ProblemKind, problem_kind
 from service.schemas import Fault, Problem
 from service.security.access_control import routed_path
@@ -26,7 +26,7 @@ from service.security.permissions import permissions_needed
 from service.telemetry import add_log_fields, request_id_of
 
 PROBLEM_JSON = "application/problem+json"
-_HIDDEN = "something went wrong in the service; its log has the details under this request_id"
+_HIDDEN = "internal error; the service's log has the details under this request_id"
 
 
 def install_problem_handlers(app: FastAPI) -> None:
@@ -38,7 +38,7 @@ def install_problem_handlers(app: FastAPI) -> None:
 
 
 def problem_responses(*errors: type[Exception]) -> dict[int | str, dict[str, Any]]:
-    """OpenAPI descriptions of the problems that a route answers with."""
+    """Return the OpenAPI responses for the errors of a route."""
     titles: dict[int, list[str]] = {}
     for kind in (*(PROBLEMS[error] for error in errors), INTERNAL):
         line = f"{kind.title} (`{kind.type}`)"
@@ -52,7 +52,7 @@ def problem_responses(*errors: type[Exception]) -> dict[int | str, dict[str, Any
 
 
 def add_problems(operation: dict[str, Any], *errors: type[Exception]) -> None:
-    """Add problems to those that an operation of an OpenAPI document answers with already."""
+    """Add errors to the responses of an operation in an OpenAPI document."""
     responses = operation["responses"]
     for status, added in problem_responses(*errors).items():
         response = responses.setdefault(str(status), added)
@@ -63,7 +63,7 @@ def add_problems(operation: dict[str, Any], *errors: type[Exception]) -> None:
 
 
 def problem_answer(request: Request, error: Exception) -> JSONResponse:
-    """What is answered to an error that has a row in the table."""
+    """Return the problem document of an error."""
     kind = problem_kind(error)
     headers = {}
     if isinstance(error, ServiceError) and error.retry_after_s is not None:
@@ -86,7 +86,7 @@ def problem_answer(request: Request, error: Exception) -> JSONResponse:
 
 
 def http_problem_answer(request: Request, error: Exception) -> JSONResponse:
-    """What is answered to an error of the framework, such as a route that there is not."""
+    """Return the problem document of an error of the framework, such as an unknown route."""
     assert isinstance(error, HTTPException)
     kind = HTTP_PROBLEMS.get(error.status_code, ProblemKind(error.status_code, "http-error", "HTTP error"))
     detail = f"{request.method} {request.url.path[:200]}: {error.detail}"
@@ -132,7 +132,7 @@ def _answer(
 
 
 class _ProblemResponse(JSONResponse):
-    """Plain ASCII JSON: details quote what callers sent, and not all of that is encodable as UTF-8."""
+    """Answer in ASCII JSON: details quote client input, which is not always encodable as UTF-8."""
 
     media_type = PROBLEM_JSON
 

@@ -1,13 +1,15 @@
-"""The HTTP server around the app: bounded connections, and a stop that finishes what is in work.
+"""HTTP server of the app, with bounded connections and a stop that finishes requests in work.
 
-Running the app under another ASGI server works as well; what stands here is then that server's to do.
+The app also runs under other ASGI servers, which then have to bound connections and stop by themselves.
 """
 
 from __future__ import annotations
 
 import asyncio
+import logging
 import math
 import os
+import resource
 import socket
 import threading
 from time import monotonic
@@ -18,39 +20,45 @@ import uvicorn
 from fastapi import FastAPI
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from lalaloc_core.errors import ConfigError
 from service.http.admission_control import Admission, AdmissionLimits
-from service.http.descriptors import max_connections_of
 from service.settings import Settings
+from service.telemetry import LOGGER_NAME
 
 # Heads of requests; larger ones get a 400.
 _MAX_HEAD_BYTES = 16 * 1024
 # Timeout for the head of a request, and for the rest of a refused body.
 _HEAD_DEADLINE_S = 10.0
-# Shares of the time for stopping: for requests in work, and then for connections to close. The rest is for workers,
-# background threads and the store.
+# Fractions of the stop deadline: for requests in work, then for closing connections. The rest is for workers, threads
+# and the store.
 _FOR_REQUESTS, _FOR_CONNECTIONS = 0.6, 0.1
+# Descriptors for pipes of workers, listeners, files of the model and of the interpreter.
+_OTHERS = 192
+# SQLite opens the database, its log and its index.
+_PER_DATABASE_CONNECTION = 3
+_MIN_CONNECTIONS = 16
 
 
 def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
-    """How the app is served.
+    """Return the server's configuration.
 
     Raises:
         ConfigError: the system allows too few file descriptors.
     """
     limits = AdmissionLimits.of(settings)
-    # The server's own refusal is plain text; ours comes first.
+    # More than all slots, so that this service's refusals come before the server's own.
     least = limits.requests + limits.reads + limits.streams + 1
     max_connections = max_connections_of(max(settings.requests.max_connections, least), settings)
     return uvicorn.Config(
         app,
         http=bounded_protocol(_HEAD_DEADLINE_S, max_connections),
-        # Not another one where it happens to be installed, as with the extra `ray`.
+        # Not uvloop, even if it is installed, as with the extra `ray`.
         loop="asyncio",
         ws="none",
         log_level="warning",
-        # Connections make room for others before; this is for when all of them have a request in work.
+        # Idle connections make room first; this applies if all of them have a request in work.
         limit_concurrency=max_connections + 1,
-        # uvicorn would believe whoever connects from this machine what address they come from.
+        # By default uvicorn trusts `X-Forwarded-For` of all clients on this machine.
         proxy_headers="FORWARDED_ALLOW_IPS" in os.environ,
         timeout_keep_alive=math.ceil(settings.requests.keep_alive_s),
         timeout_graceful_shutdown=math.ceil(_FOR_CONNECTIONS * settings.requests.stop_deadline_s),
@@ -59,7 +67,7 @@ def server_config(app: FastAPI, settings: Settings) -> uvicorn.Config:
 
 
 class Server(uvicorn.Server):
-    """Stops in steps: it says so, then refuses requests while those in work are finished, then closes the listener."""
+    """Server that stops in steps: reports that it stops, refuses new requests, finishes those in work, closes."""
 
     def __init__(self, config: uvicorn.Config, app: FastAPI, settings: Settings) -> None:
         super().__init__(config)
@@ -68,11 +76,11 @@ class Server(uvicorn.Server):
         self._stopping_since: float | None = None
 
     def handle_exit(self, sig: int, frame: FrameType | None) -> None:
-        """The first signal begins to stop, the second ends the process; workers notice and follow."""
+        """Begin to stop at the first signal; end the process at the second."""
         if self._stopping_since is not None:
             os._exit(1)
         self._stopping_since = monotonic()
-        # Whatever hangs, a thread or a disk, ends then.
+        # Ends the process even if a thread or a disk hangs.
         last_resort = threading.Timer(self._settings.requests.stop_deadline_s, os._exit, [1])
         last_resort.daemon = True
         last_resort.start()
@@ -80,13 +88,13 @@ class Server(uvicorn.Server):
         if admission is None:
             self.should_exit = True
         elif self._settings.requests.stop_notice_s > 0.0:
-            # Load balancers go on sending until they have noticed.
+            # Load balancers need time to notice.
             admission.drain()
         else:
             admission.stop()
 
     async def on_tick(self, counter: int) -> bool:
-        """Called ten times a second; true when it is time to close the listener."""
+        """Return True when it is time to close the listener; called ten times a second."""
         ended = await super().on_tick(counter)
         if ended or self._stopping_since is None:
             return ended
@@ -102,17 +110,17 @@ class Server(uvicorn.Server):
 
     @property
     def _admission(self) -> Admission | None:
-        """None before the app has started."""
+        """Admission of the running app; None before it has started."""
         return getattr(self._app.state, "admission", None)
 
 
 def bounded_protocol(head_deadline_s: float, max_connections: int) -> type[asyncio.Protocol]:
-    """HTTP/1.1 with a limit on what the server alone sees: connections, heads of requests, bodies of refused ones."""
+    """Return an HTTP/1.1 protocol that bounds connections, request heads and bodies of refused requests."""
 
     class BoundedProtocol(H11Protocol):
-        """Ends a connection that is longer without a request in work than being idle and sending a head may take.
+        """Protocol that ends a connection which has no request in work for too long.
 
-        Idle connections end earlier, by the server's own clock; but that stops with the first byte that comes.
+        The server's own keep-alive timer stops at the first byte of a head; this one does not.
         """
 
         _limit: asyncio.TimerHandle | None = None
@@ -139,13 +147,13 @@ def bounded_protocol(head_deadline_s: float, max_connections: int) -> type[async
             self._unwatch()
 
         def _make_room(self) -> None:
-            """End the connection that is idle for longest if there are too many: another one is in use."""
+            """Close the connection that is idle the longest if there are too many."""
             if len(self.connections) <= max_connections:
                 return
-            idle = [one for one in self.connections if isinstance(one, BoundedProtocol) and not one._in_work]
-            oldest = min(idle, key=lambda one: one._idle_since, default=self)
+            idle = [peer for peer in self.connections if isinstance(peer, BoundedProtocol) and not peer._in_work]
+            oldest = min(idle, key=lambda peer: peer._idle_since, default=self)
             if oldest is not self:
-                # Its end is noted in the loop's next round; until then it must not be chosen once more.
+                # Removed now, because its end is only noted in the loop's next round.
                 self.connections.discard(oldest)
                 oldest.transport.abort()
 
@@ -170,10 +178,44 @@ def bounded_protocol(head_deadline_s: float, max_connections: int) -> type[async
 
 
 def _send_at_once(transport: asyncio.Transport) -> None:
-    """Let the body of an answer not wait until its head is acknowledged, which clients put off by 40 ms.
+    """Disable Nagle's algorithm, which delays bodies by up to 40 ms.
 
-    asyncio sees to that only where it made the listening socket itself.
+    asyncio does so only for listening sockets that it created itself.
     """
     connection = transport.get_extra_info("socket")
     if connection is not None and connection.family in (socket.AF_INET, socket.AF_INET6):
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+
+
+def max_connections_of(wanted: int, settings: Settings) -> int:
+    """Raise the limit of file descriptors, and return the number of connections that fit.
+
+    Args:
+        wanted: desired number of connections.
+        settings: settings of the service.
+
+    Raises:
+        ConfigError: the system allows too few descriptors.
+    """
+    others = _OTHERS + _PER_DATABASE_CONNECTION * settings.database.connections
+    allowed = _raised_to(wanted + others)
+    if allowed - others < _MIN_CONNECTIONS:
+        raise ConfigError(
+            f"the system allows {allowed} file descriptors; at least {others + _MIN_CONNECTIONS} are needed. Raise "
+            "`ulimit -n`"
+        )
+    if allowed - others < wanted:
+        fields = {"max_connections": allowed - others, "wanted": wanted, "descriptors": allowed}
+        logging.getLogger(LOGGER_NAME).warning("fewer connections than set", extra={"fields": fields})
+    return min(wanted, allowed - others)
+
+
+def _raised_to(needed: int) -> int:
+    """Raise the limit of file descriptors as far as needed and allowed, and return it."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if soft == resource.RLIM_INFINITY:
+        return needed
+    if soft < needed:
+        soft = needed if hard == resource.RLIM_INFINITY else min(needed, hard)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+    return soft

@@ -1,4 +1,4 @@
-"""Reading request bodies: bounded in bytes while they stream in, bounded in time, and with every part accounted for."""
+"""Reading request bodies, with limits on size and time, and checks of every part."""
 
 from __future__ import annotations
 
@@ -27,33 +27,33 @@ from service.errors import (
     UploadTimeoutError,
     UploadTooLargeError,
 )
-from service.http.faults import describe_fault
+from service.http.fields import describe_fault
 from service.settings import Settings
 
 JSON = "application/json"
 GEOJSON = "application/geo+json"
 MULTIPART = "multipart/form-data"
-# Boundaries and part headers come on top of the file that the limit is meant for.
+# Boundaries and part headers, which do not count towards the limit.
 _ENVELOPE_BYTES = 16 * 1024
 _MAX_PARTS = 20
 _MAX_FIELD_BYTES = 4096
 _UTF_8 = b"utf-8"
 
-# Settings of what an upload may have.
+# Settings that limit an upload.
 Settable = Literal["max_plan_bytes", "max_panorama_bytes", "max_sequence_bytes", "max_venue_bytes"]
 Model = TypeVar("Model", bound=BaseModel)
 
 
 @dataclass(frozen=True, kw_only=True)
 class UploadLimits:
-    """What an upload may be.
+    """Limits of an upload.
 
     Attributes:
-        max_bytes: of the uploaded file.
-        name: of the setting that `max_bytes` comes from, for the error.
-        deadline_s: for the whole upload.
-        idle_s: the longest wait for the next bytes; also how far the upload may be behind `bytes_per_s`.
-        bytes_per_s: how fast it must come at least.
+        max_bytes: size of the file.
+        name: setting that `max_bytes` comes from.
+        deadline_s: timeout of the whole upload.
+        idle_s: timeout for the next bytes; also the tolerated lag behind `bytes_per_s`.
+        bytes_per_s: minimum rate.
     """
 
     max_bytes: int
@@ -64,7 +64,7 @@ class UploadLimits:
 
     @classmethod
     def of(cls, settings: Settings, name: Settable) -> Self:
-        """As set for one kind of upload."""
+        """Return the limits of one kind of upload."""
         return cls(
             max_bytes=settings.values()[name],
             name=name,
@@ -76,13 +76,13 @@ class UploadLimits:
 
 @dataclass(frozen=True)
 class Parts:
-    """A multipart body: plain fields, and the bytes of files; those that may be repeated as `name[0]`, `name[1]`..."""
+    """Multipart body: fields, and bytes of files; repeated files are `name[0]`, `name[1]`..."""
 
     fields: dict[str, str]
     files: dict[str, bytes]
 
     def repeated(self, name: str) -> list[bytes]:
-        """The files of one name, in order."""
+        """Return the repeated files of a name, in order."""
         count = sum(key.startswith(f"{name}[") for key in self.files)
         return [self.files[f"{name}[{index}]"] for index in range(count)]
 
@@ -95,11 +95,11 @@ def _no_fields(_fields: Mapping[str, str]) -> list[tuple[str, str]]:
 
 
 def media_type(request: Request, accepted: tuple[str, ...]) -> str:
-    """The body's media type without parameters.
+    """Return the body's media type without parameters.
 
     Raises:
-        UnsupportedMediaError: it is none of those accepted.
-        UnsupportedEncodingError: it is compressed.
+        UnsupportedMediaError: the type is not accepted.
+        UnsupportedEncodingError: the body is compressed.
     """
     for encoding in request.headers.getlist("content-encoding"):
         if encoding.strip().lower() not in ("", "identity"):
@@ -112,10 +112,10 @@ def media_type(request: Request, accepted: tuple[str, ...]) -> str:
 
 
 async def read_body(request: Request, limits: UploadLimits) -> bytes:
-    """The whole body.
+    """Read the whole body.
 
     Raises:
-        UploadTooLargeError, UploadTimeoutError: see the limits.
+        UploadTooLargeError, UploadTimeoutError: a limit is exceeded.
     """
     async with _in_time(limits):
         return b"".join([chunk async for chunk in _counted(request, limits)])
@@ -130,18 +130,21 @@ async def read_parts(
     check: Check = _no_fields,
     repeated: Mapping[str, tuple[int, int]] = MappingProxyType({}),
 ) -> Parts:
-    """A multipart body that must have every one of `files`, and no parts other than `files` and `fields`.
+    """Read a multipart body.
 
     Args:
-        check: gives what is wrong with the values of fields, which is then told with the rest.
-        repeated: the files that may be given several times, and how often at least and at most.
+        request: the request.
+        limits: limits of the upload.
+        files: names of required files.
+        fields: names of optional fields.
+        check: returns (field, message) for invalid values of fields.
+        repeated: files that can be repeated, with the smallest and largest number of them.
 
     Raises:
-        UploadTooLargeError, UploadTimeoutError: see the limits.
+        UploadTooLargeError, UploadTimeoutError: a limit is exceeded.
         MalformedRequestError: not valid multipart.
-        UnsupportedMediaError: in another charset than UTF-8.
-        InvalidRequestError: a part is missing, unknown, given twice, or a field where a file belongs; with what
-            `check` says.
+        UnsupportedMediaError: a charset other than UTF-8.
+        InvalidRequestError: a part is missing, unknown, duplicate or of the wrong kind, or `check` found a fault.
     """
     stated = request.headers.get("content-type", "")
     charset = parse_options_header(stated)[1].get(b"charset", _UTF_8)
@@ -154,7 +157,7 @@ async def read_parts(
         max_fields=_MAX_PARTS,
         max_part_size=_MAX_FIELD_BYTES,
     )
-    # Files stay in memory, which they are bounded for: a disk may be full, and is to have nothing of a panorama.
+    # Files stay in memory, within the limit: panoramas are never written to disk.
     parser.spool_max_size = limits.max_bytes + _ENVELOPE_BYTES
     try:
         async with _in_time(limits):
@@ -170,13 +173,10 @@ async def read_parts(
 
 
 def validate_fields(model: type[Model], fields: Mapping[str, str], context: Mapping[str, object]) -> Model:
-    """Fields of a form as a model; empty ones count as left out.
-
-    Args:
-        context: what the model's own checks go by.
+    """Return the fields of a form as a model; empty fields count as left out.
 
     Raises:
-        InvalidRequestError: names every field at fault, its value and the limit.
+        InvalidRequestError: names every faulty field, its value and the limit.
     """
     try:
         return model.model_validate({name: value for name, value in fields.items() if value.strip()}, context=context)
@@ -187,7 +187,7 @@ def validate_fields(model: type[Model], fields: Mapping[str, str], context: Mapp
 def faults_of(
     model: type[BaseModel], fields: Mapping[str, str], context: Mapping[str, object]
 ) -> list[tuple[str, str]]:
-    """What `validate_fields` would refuse."""
+    """Return the faults for which `validate_fields` would raise."""
     try:
         validate_fields(model, fields, context)
     except InvalidRequestError as error:
@@ -207,19 +207,19 @@ async def _sort(
     found = Parts({}, {})
     files, counts = files | repeated.keys(), Counter[str]()
     for part, value in items:
-        shown, name = part[:50], part
+        label, name = part[:50], part
         if part not in files | fields:
             known = ", ".join(sorted(files | fields))
-            faults.append((shown, f"unknown part, known are {known}"))
+            faults.append((label, f"unknown part; known are {known}"))
             continue
         if part in repeated:
             name = f"{part}[{counts[part]}]"
             counts[part] += 1
         if name in found.fields or name in found.files:
-            faults.append((shown, "given more than once"))
+            faults.append((label, "given more than once"))
         elif part in fields:
             if isinstance(value, UploadFile):
-                faults.append((shown, "must be a plain field, not a file"))
+                faults.append((label, "must be a plain field, not a file"))
             else:
                 found.fields[name] = value
         elif isinstance(value, UploadFile):
@@ -228,7 +228,7 @@ async def _sort(
                 raise UploadTooLargeError(limits.name, limits.max_bytes, len(content))
             found.files[name] = content
         else:
-            faults.append((shown, "must be a file (a part with a file name)"))
+            faults.append((label, "must be a file (a part with a file name)"))
     given = {name for name, _ in items}
     faults.extend((name, "is missing") for name in sorted(files - given))
     for name, (low, high) in repeated.items():
@@ -241,11 +241,11 @@ async def _sort(
 
 
 async def _counted(request: Request, limits: UploadLimits, *, envelope_bytes: int = 0) -> AsyncGenerator[bytes, None]:
-    """The body as it arrives, as long as it is neither too large nor too slow."""
-    most = limits.max_bytes + envelope_bytes
+    """Yield the body as it arrives, while it is neither too large nor too slow."""
+    max_bytes = limits.max_bytes + envelope_bytes
     stated = request.headers.get("content-length", "")
-    # What is too large by its own account is not even begun.
-    if stated.isdecimal() and int(stated) > most:
+    # Refuse before reading if the stated length is too large.
+    if stated.isdecimal() and int(stated) > max_bytes:
         raise UploadTooLargeError(limits.name, limits.max_bytes, int(stated))
     received, begin = 0, monotonic()
     chunks = request.stream()
@@ -255,20 +255,20 @@ async def _counted(request: Request, limits: UploadLimits, *, envelope_bytes: in
         if chunk is None:
             return
         received += len(chunk)
-        if received > most:
+        if received > max_bytes:
             raise UploadTooLargeError(limits.name, limits.max_bytes)
         yield chunk
 
 
 async def _next_chunk(chunks: AsyncGenerator[bytes, None], patience_s: float, limits: UploadLimits) -> bytes | None:
-    """The next bytes of a body, None at its end."""
+    """Return the next bytes of a body, None at its end."""
     try:
         async with asyncio.timeout(max(patience_s, 0.0)):
             return await anext(chunks, None)
     except TimeoutError as error:
         raise UploadTimeoutError(
-            f"the upload stopped for {limits.idle_s:g} s (upload_idle_s), or was so far behind {limits.bytes_per_s:g} "
-            "bytes/s (upload_bytes_per_s)"
+            f"the upload stopped for {limits.idle_s:g} s (upload_idle_s), or lagged that far behind "
+            f"{limits.bytes_per_s:g} bytes/s (upload_bytes_per_s)"
         ) from error
     except ClientDisconnect as error:
         raise MalformedRequestError("the connection was closed before the whole body arrived") from error

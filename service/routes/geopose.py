@@ -19,7 +19,7 @@ from service.errors import (
     VenueUnsearchableError,
 )
 from service.http import IdempotentRequest
-from service.http.json_body import parse_document
+from service.http.fields import parse_document
 from service.http.problems import problem_responses
 from service.http.uploads import JSON, Parts, UploadLimits, media_type, read_body
 from service.query import PanoramaQuery, QueryContext

@@ -77,8 +77,8 @@ async def localise(
         Picture | None,
         Query(
             description="Content of the picture: the `plan` with the posterior as a heat map, the answer, its "
-            "covariance ellipse and the other candidates; the `photograph` with the layout drawn in; or `both` (default). "
-            "Needs `Accept: image/png` or `Accept: image/svg+xml`."
+            "covariance ellipse and the other candidates; the `photograph` with the layout drawn in; or `both` (the "
+            "default). Needs `Accept: image/png` or `Accept: image/svg+xml`."
         ),
     ] = None,
 ) -> Response:

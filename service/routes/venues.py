@@ -26,7 +26,7 @@ from service.errors import (
 from service.http import IdempotentRequest
 from service.http.conditional import conditional_answer, expected_revision
 from service.http.cursors import cursor_text, parse_cursor, parse_venue_cursor, venue_cursor_text
-from service.http.json_body import parse_document
+from service.http.fields import parse_document
 from service.http.problems import problem_responses
 from service.http.uploads import JSON, Parts, UploadLimits, media_type, read_body
 from service.routes.dependencies import (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
@@ -9,10 +10,11 @@ from enum import StrEnum
 from starlette.routing import compile_path
 from starlette.types import Scope
 
-from service.security.client_network import network_of
 from service.storage.records import DEFAULT_TENANT
 
 _SCOPE_KEY = "lalaloc.caller"
+# Who has one IPv6 address commonly has all that begin like it.
+_IPV6_NETWORK_BITS = 64
 
 
 class Permission(StrEnum):
@@ -107,3 +109,16 @@ def put_caller(scope: Scope, caller: Caller) -> None:
 def caller_of(scope: Scope) -> Caller:
     """The caller of a request that was let in."""
     return scope[_SCOPE_KEY]
+
+
+def network_of(client: str) -> str:
+    """The network that a client address stands for: itself, or the /64 of an IPv6 address."""
+    try:
+        address = ipaddress.ip_address(client)
+    except ValueError:
+        # A Unix socket has none, and proxies may state anything.
+        return client
+    if address.version == 4:
+        return client
+    mapped = address.ipv4_mapped
+    return str(mapped or ipaddress.ip_network((int(address), _IPV6_NETWORK_BITS), strict=False))

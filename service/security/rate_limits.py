@@ -10,7 +10,7 @@ from limits.aio.storage import MemoryStorage
 from limits.aio.strategies import SlidingWindowCounterRateLimiter
 
 from service.errors import RateLimitedError, TooManyRefusedKeysError
-from service.security.client_network import network_of
+from service.security.permissions import network_of
 from service.settings import Settings
 from service.storage.records import ApiKey
 

@@ -16,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.fair_share import FairQueue, FairSemaphore, Shares, max_per_client, with_headroom
-from service.security.client_network import network_of
+from service.security.permissions import network_of
 from service.threads import Threads
 from tests.service.conftest import FLAT, StartApp, assert_problem, localise, upload, wait_for
 

@@ -140,7 +140,7 @@ def test_every_part_of_a_form_is_accounted_for(client: httpx.Client) -> None:
     )
     (fault,) = extra["errors"]
     assert fault["field"] == "colour"
-    assert fault["message"].startswith("unknown part, known are ceiling_height_m, file, known_distance, layers")
+    assert fault["message"].startswith("unknown part; known are ceiling_height_m, file, known_distance, layers")
     missing = assert_problem(client.post("/floorplans", files={"plan": file}), 422, "invalid-request")
     assert {"field": "file", "message": "is missing"} in missing["errors"]
     twice = client.post("/floorplans", files=[("file", file), ("file", file)])

@@ -37,7 +37,7 @@ def test_unknown_routes_and_methods_are_problems_too(client: httpx.Client) -> No
         ("GET", "/floorplans?offset=2&page=1", {"offset": "known are cursor, limit, name", "page": "unknown"}),
         ("GET", "/floorplans?limit=1&limit=2", {"limit": "given more than once"}),
         pytest.param("GET", f"/floorplans?limit={'9' * 5000}", {"limit": "too many digits"}, id="digits"),
-        ("POST", "/floorplans?name=x", {"name": "unknown query parameter, there are none"}),
+        ("POST", "/floorplans?name=x", {"name": "unknown query parameter; this route has none"}),
         ("POST", "/localise?heading_deg=100", {"heading_deg": "unknown query parameter"}),
         ("DELETE", "/floorplans/PLAN?force=1", {"force": "unknown"}),
         ("GET", "/floorplans/PLAN/preview.svg?heading_deg=20", {"heading_deg": "needs x_m and y_m"}),

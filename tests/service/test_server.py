@@ -126,7 +126,7 @@ def test_the_limit_of_descriptors_is_raised_and_connections_stay_below_it() -> N
         "import resource, sys\n"
         "resource.setrlimit(resource.RLIMIT_NOFILE, (int(sys.argv[1]), int(sys.argv[2])))\n"
         "from lalaloc_core.errors import ConfigError\n"
-        "from service.http.descriptors import max_connections_of\n"
+        "from service.http.server import max_connections_of\n"
         "from service.settings import Settings\n"
         "try:\n"
         "    print(max_connections_of(1024, Settings()), resource.getrlimit(resource.RLIMIT_NOFILE)[0])\n"
@@ -141,4 +141,4 @@ def test_the_limit_of_descriptors_is_raised_and_connections_stay_below_it() -> N
     assert told(256, 4096) == "1024 1240"
     assert told(256, 1024) == "808 1024"
     assert told(2048, 4096) == "1024 2048"
-    assert "128 file descriptors, at least 232 are needed" in told(128, 128)
+    assert "128 file descriptors; at least 232 are needed" in told(128, 128)

@@ -1,14 +1,14 @@
-"""The app's own middlewares, outermost first: what happens to every request before its route, and to every answer.
+"""Middlewares of the app, outermost first.
 
-telemetry         ids, metrics, log line, span
-security_headers  what browsers may do with an answer
-cors              which pages of other sites may ask, where the settings name any
-framing           one length of a body, or 400
+telemetry         request ids, metrics, log line, span
+security_headers  security headers of answers
+cors              cross-origin requests of allowed pages
+framing           400 for a request with two body lengths
 head              HEAD as GET without a body
-authorisation     a caller with a tenant, or 401 and 403
-admission         a slot of what tenants share, or 503 at once
+authorisation     caller and tenant, or 401 and 403
+admission         slot for the request, or 503
 
-Begin with `telemetry.py`. `service.app` stacks them. What they decide by stands in `service.telemetry`,
+Begin with `telemetry.py`. `service.app` stacks them; their rules are in `service.telemetry`,
 `service.http.admission_control` and `service.security`.
 """
 

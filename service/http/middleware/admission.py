@@ -1,4 +1,4 @@
-"""Gives every request that was let in its slot, or refuses it, and notices when its client hangs up."""
+"""Slots for requests, and cancellation of requests whose client disconnects."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from service.security.permissions import caller_of
 
 
 class AdmissionMiddleware:
-    """Gives a slot to a request, or refuses it before its body is read; lets go when its client hangs up."""
+    """Middleware that holds a slot for a request, or refuses it before its body is read."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handle one request."""
-        # An app that has not been started, or is used without its lifespan, has no slots.
+        # Without its lifespan an app has no slots.
         admission: Admission | None = getattr(scope["app"].state, "admission", None)
         if scope["type"] != "http" or admission is None or (path := routed_path(scope)) in EXEMPT:
             await self._app(scope, receive, send)
@@ -47,7 +47,7 @@ class AdmissionMiddleware:
                 connection.on_answer = permit.end
                 await self._app(scope, connection.receive, connection.send)
         except asyncio.CancelledError:
-            # The server, stopping, ends what did not finish in time.
+            # The stopping server cancels requests that did not finish in time.
             if not admission.stopping or connection.answered:
                 raise
             await problem_answer(Request(scope), StoppingError())(scope, receive, send)
@@ -58,7 +58,7 @@ class AdmissionMiddleware:
 
 
 class _Permit:
-    """A client's permit to compute an answer, held until the answer begins: what is sent may take its time."""
+    """Permit to compute an answer, held until the answer begins to be sent."""
 
     def __init__(self, semaphore: FairSemaphore | None, client: str) -> None:
         self._semaphore = semaphore
@@ -75,14 +75,14 @@ class _Permit:
         self.end()
 
     def end(self) -> None:
-        """Give it back, once."""
+        """Give the permit back, once."""
         if self._held and self._semaphore is not None:
             self._held = False
             self._semaphore.release(self._client)
 
 
 class _Connection:
-    """The other end of a request. Once its body is there, a hang-up cancels whoever works on the answer."""
+    """Connection of a request. Once the body is read, a disconnect cancels the work on the answer."""
 
     def __init__(self, receive: Receive, send: Send) -> None:
         self.answered = False
@@ -104,30 +104,30 @@ class _Connection:
                 await self._watch
         if kind is not None and issubclass(kind, asyncio.CancelledError) and self._gone.is_set():
             assert self._worker is not None
-            # Ours, unless somebody else cancelled it as well.
+            # False if another party cancelled it as well.
             return self._worker.uncancel() == 0
         return False
 
     async def receive(self) -> Message:
-        """The next part of the body; after the last, the hang-up."""
+        """Return the next part of the body; after the last, the disconnect."""
         if self._watch is not None:
             await self._gone.wait()
             return {"type": "http.disconnect"}
         message = await self._receive()
         if message["type"] == "http.request" and not message.get("more_body", False):
-            self._watch = asyncio.create_task(self._wait_for_hang_up())
+            self._watch = asyncio.create_task(self._wait_for_disconnect())
         return message
 
     async def send(self, message: Message) -> None:
-        """Pass a part of the answer on."""
+        """Send a part of the answer."""
         self.answered = True
         self.on_answer()
         await self._send(message)
 
-    async def _wait_for_hang_up(self) -> None:
+    async def _wait_for_disconnect(self) -> None:
         while (await self._receive())["type"] != "http.disconnect":
             pass
         self._gone.set()
-        # With the answer on its way there is nothing left to save, and the server knows that nobody reads it.
+        # An answer that is being sent needs no cancelling.
         if not self.answered and self._worker is not None:
             self._worker.cancel()

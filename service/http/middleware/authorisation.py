@@ -1,4 +1,4 @@
-"""Asks about every request who sends it and whether they may, before its body is read."""
+"""Authorisation of requests, before their body is read."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from service.security.permissions import OPEN_PATHS, put_caller
 
 
 class AuthorisationMiddleware:
-    """Asks the running app's `AccessControl` about every request, and tells the routes who called."""
+    """Middleware that authorises requests with the app's `AccessControl` and attaches the caller."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Handle one request."""
-        # An app that has not been started, or is used without its lifespan, has nothing to guard.
+        # Without its lifespan an app has nothing to guard.
         access: AccessControl | None = getattr(scope["app"].state, "access_control", None)
         if scope["type"] == "http" and access is not None and routed_path(scope) not in OPEN_PATHS:
             request = Request(scope)

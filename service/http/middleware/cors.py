@@ -1,4 +1,4 @@
-"""CORS: which pages of other sites may ask from a browser, where the settings name any."""
+"""CORS: cross-origin requests of the pages that the settings allow."""
 
 from __future__ import annotations
 
@@ -20,10 +20,9 @@ _PREFLIGHT_KEPT_S = 600
 
 
 class CorsMiddleware:
-    """The framework's own, once the running app has settings that say for whom.
+    """Framework's CORS middleware, with the origins in the running app's settings.
 
-    Never with credentials: keys are sent as a header by whoever has them, and there are no cookies that a browser could
-    add by itself.
+    Credentials are never allowed: keys are sent in a header, and there are no cookies.
     """
 
     def __init__(self, app: ASGIApp) -> None:

@@ -1,4 +1,4 @@
-"""Refuses requests whose body's length is told in two ways."""
+"""Refusal of requests that state the length of their body twice."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from service.http.problems import problem_answer
 
 
 class FramingMiddleware:
-    """Answers 400 where a proxy before the service may have believed the other of two lengths (RFC 9112, 6.1)."""
+    """Middleware that answers 400 if a proxy could have used the other of two lengths (RFC 9112, 6.1)."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
@@ -20,9 +20,9 @@ class FramingMiddleware:
         if scope["type"] != "http" or not _framed_twice(scope):
             await self._app(scope, receive, send)
             return
-        error = MalformedRequestError("the request has both Content-Length and Transfer-Encoding, it must have one")
+        error = MalformedRequestError("the request has both Content-Length and Transfer-Encoding; send one of them")
         answer = problem_answer(Request(scope), error)
-        # Where the body ends is not agreed on, so nothing that follows on this connection is another request.
+        # The end of the body is ambiguous, so bytes that follow must not be read as a request.
         answer.headers["Connection"] = "close"
         await answer(scope, receive, send)
 

@@ -1,4 +1,4 @@
-"""HEAD: whatever is answered to GET, without its body."""
+"""HEAD requests: the answer to GET without its body."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 
 class HeadMiddleware:
-    """Hands HEAD on as GET, and lets go of the answer as soon as its head is there."""
+    """Middleware that handles HEAD as GET and drops the answer after its head."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
@@ -26,7 +26,7 @@ class HeadMiddleware:
                 answered = True
                 await send(message)
                 await send({"type": "http.response.body", "body": b""})
-                # A stream of events would otherwise go on for as long as its client stays connected.
+                # An event stream would not end by itself.
                 work.cancel()
 
         work = asyncio.ensure_future(self._app({**scope, "method": "GET"}, receive, send_head))

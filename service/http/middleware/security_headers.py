@@ -1,4 +1,4 @@
-"""Security headers on every answer; what a route sets itself is left as it is."""
+"""Security headers of answers; headers that a route sets itself are kept."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from urllib.parse import urlsplit, urlunsplit
 from starlette.datastructures import MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-# Answers are data: nothing in them may run, load or be framed. The pages set a policy of their own.
+# Answers are data: nothing in them can run, load or be framed. The pages set their own policy.
 _ALWAYS = {
     "X-Content-Type-Options": "nosniff",
     "X-Frame-Options": "DENY",
@@ -20,7 +20,7 @@ _ONE_YEAR_S = 365 * 24 * 3600
 
 
 class SecurityHeadersMiddleware:
-    """Adds the headers that an answer does not have yet, and over https that browsers shall stay with https."""
+    """Middleware that adds missing security headers, and HSTS over https."""
 
     def __init__(self, app: ASGIApp) -> None:
         self._app = app
@@ -35,7 +35,7 @@ class SecurityHeadersMiddleware:
                     headers.setdefault(name, value)
                 if (target := headers.get("location")) is not None:
                     headers["location"] = _without_host(target)
-                # Behind a proxy the server takes the scheme from X-Forwarded-Proto of proxies that it trusts.
+                # The server takes the scheme from X-Forwarded-Proto of trusted proxies.
                 if scope["scheme"] == "https":
                     headers.setdefault("Strict-Transport-Security", f"max-age={_ONE_YEAR_S}")
             await send(message)
@@ -44,5 +44,5 @@ class SecurityHeadersMiddleware:
 
 
 def _without_host(target: str) -> str:
-    """A redirect within the service: the framework's name the host that the request named, whoever made that up."""
+    """Return a redirect without the host, which the framework takes from the request and a client can forge."""
     return urlunsplit(urlsplit(target)._replace(scheme="", netloc=""))

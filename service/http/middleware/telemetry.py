@@ -1,4 +1,4 @@
-"""Gives every request its ids, and when it is over counts, times and logs it: one line for each."""
+"""Request ids, metrics, and one log line and span per request."""
 
 from __future__ import annotations
 
@@ -22,22 +22,24 @@ from service.telemetry.tracing import OpenSpan
 _METHODS = {"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"}
 _REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
 _PLAN_ID = re.compile(r"[0-9a-f]{32}")
-# Asked every few seconds for as long as the service runs, whatever they answer.
+# Polled every few seconds, so logged at debug level only.
 _PROBES = frozenset({"/healthz", "/readyz", "/metrics"})
-# What nginx logs for a client that closed the connection before there was any answer.
+# nginx's status for a client that disconnected before the answer.
 _CLIENT_CLOSED = 499
 
 
 class TelemetryMiddleware:
-    """The outermost layer of the app: even the answers to unexpected errors pass through here.
+    """Outermost middleware, which sees even the answers to unexpected errors.
 
-    A caller's `X-Request-ID` is kept if it is a sane one, and its `traceparent` if it is valid; both are answered.
+    A valid `X-Request-ID` or `traceparent` of the client is kept; both are returned.
+
+    Args:
+        app: the app.
+        telemetry: metrics and tracing.
+        routes: routes, to name requests that are refused before routing.
     """
 
     def __init__(self, app: ASGIApp, telemetry: Telemetry, routes: Sequence[Route]) -> None:
-        """Args:
-        routes: name requests that are refused before it is looked at where they lead.
-        """
         self._app = app
         self._telemetry = telemetry
         self._routes = tuple(routes)
@@ -56,7 +58,7 @@ class TelemetryMiddleware:
             await self._app(scope, exchange.receive, exchange.send)
         except Exception:
             logging.getLogger(LOGGER_NAME).exception("unexpected error")
-            # The answer says what there is to say, and the server's log would have the same trace without any ids.
+            # After a complete answer, re-raising would only log the trace again, without ids.
             if not exchange.complete:
                 raise
         finally:
@@ -64,8 +66,8 @@ class TelemetryMiddleware:
             current_log_fields.reset(token)
 
     def _begin(self, headers: Headers) -> tuple[RequestLogFields, OpenSpan | None]:
-        given = headers.get("x-request-id", "")
-        request_id = given if _REQUEST_ID.fullmatch(given) else uuid.uuid4().hex
+        sent = headers.get("x-request-id", "")
+        request_id = sent if _REQUEST_ID.fullmatch(sent) else uuid.uuid4().hex
         parent = parse_traceparent(headers.getlist("traceparent"))
         tracing, opened = self._telemetry.tracing, None
         if tracing is None:
@@ -112,7 +114,7 @@ class TelemetryMiddleware:
         logging.getLogger(LOGGER_NAME).log(level, "request", extra={"fields": fields})
 
     def _template(self, scope: Scope) -> str:
-        """The route's template: real paths would make a new time series per floor plan."""
+        """Return the route's template; real paths would make a time series per floor plan."""
         if "route" in scope:
             return getattr(scope["route"], "path", "unmatched")
         found = (route.path for route in self._routes if route.path_regex.match(scope["path"]))
@@ -120,7 +122,7 @@ class TelemetryMiddleware:
 
 
 class _Exchange:
-    """Watches what goes in and out of one request."""
+    """Observer of the bytes received and sent for one request."""
 
     def __init__(self, log_fields: RequestLogFields, receive: Receive, send: Send) -> None:
         self._log_fields = log_fields
@@ -131,13 +133,13 @@ class _Exchange:
 
     @property
     def status(self) -> int:
-        """The status that was answered, or stands for why there was no answer."""
+        """Status of the answer; 499 or 500 if there was none."""
         if self._status is not None:
             return self._status
         return _CLIENT_CLOSED if self._log_fields.gave_up else 500
 
     async def receive(self) -> Message:
-        """The next part of the body, counted."""
+        """Return the next part of the body, and count its bytes."""
         message = await self._receive()
         if message["type"] == "http.request":
             self._log_fields.bytes_in += len(message.get("body", b""))
@@ -146,7 +148,7 @@ class _Exchange:
         return message
 
     async def send(self, message: Message) -> None:
-        """Pass a part of the answer on, the first with the request's ids."""
+        """Send a part of the answer; its head gets the request's ids."""
         if message["type"] == "http.response.start":
             self._status = message["status"]
             headers = MutableHeaders(scope=message)
@@ -158,6 +160,6 @@ class _Exchange:
 
 
 def _plan_in_path(scope: Scope) -> str | None:
-    """The id of the floor plan that the path names, if it looks like one."""
-    given = scope.get("path_params", {}).get("floorplan_id", "")
-    return given if _PLAN_ID.fullmatch(given) else None
+    """Return the floor plan id in the path, if it is well-formed."""
+    plan_id = scope.get("path_params", {}).get("floorplan_id", "")
+    return plan_id if _PLAN_ID.fullmatch(plan_id) else None

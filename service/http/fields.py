@@ -1,0 +1,121 @@
+"""Checks of request fields: faults in plain words, JSON bodies, and query parameters."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+from fastapi import Request
+from fastapi.dependencies.models import Dependant
+from fastapi.routing import APIRoute
+from pydantic import BaseModel, ValidationError
+
+from lalaloc_core.errors import InvalidFloorPlanError
+from lalaloc_core.floorplan.json_text import read_json
+from service.errors import InvalidRequestError
+
+_MAX_SHOWN = 100
+
+
+def _number(value: object) -> str:
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+# Messages by pydantic's error type; other types keep pydantic's message.
+_WORDS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
+    "float_parsing": lambda _: "not a number",
+    "float_type": lambda _: "not a number",
+    "int_parsing": lambda _: "not a whole number",
+    "int_type": lambda _: "not a whole number",
+    "int_from_float": lambda _: "not a whole number",
+    "int_parsing_size": lambda _: "too many digits",
+    "bool_parsing": lambda _: "must be true or false",
+    "finite_number": lambda _: "must be finite",
+    "greater_than_equal": lambda context: f"must be at least {_number(context['ge'])}",
+    "greater_than": lambda context: f"must be more than {_number(context['gt'])}",
+    "less_than_equal": lambda context: f"must be at most {_number(context['le'])}",
+    "less_than": lambda context: f"must be less than {_number(context['lt'])}",
+    "literal_error": lambda context: f"must be {context['expected']}",
+    "string_too_short": lambda context: f"must have at least {context['min_length']} characters",
+    "string_too_long": lambda context: f"must have at most {context['max_length']} characters",
+    "string_pattern_mismatch": lambda _: "has characters that are not allowed",
+    "value_error": lambda context: str(context["error"]),
+}
+
+
+def describe_fault(fault: Mapping[str, Any]) -> tuple[str, str]:
+    """Return (field, message) of a pydantic error; the message states the value."""
+    parts = [str(part) for part in fault.get("loc", ())]
+    if parts and parts[0] in ("body", "query", "path"):
+        parts = parts[1:]
+    kind, context = fault.get("type", ""), fault.get("ctx", {})
+    field = ".".join(parts) or "body"
+    if kind == "missing":
+        return field, "is missing"
+    if kind in ("too_short", "too_long"):
+        wanted = context.get("min_length", context.get("max_length"))
+        return field, f"is given {context.get('actual_length')} times, {wanted} are needed"
+    words = _WORDS[kind](context) if kind in _WORDS else str(fault.get("msg", "invalid"))
+    value = fault.get("input")
+    shown = f"is '{str(value)[:_MAX_SHOWN]}': " if isinstance(value, str | int | float) else ""
+    return field, shown + words
+
+
+Model = TypeVar("Model", bound=BaseModel)
+
+_MAX_DEPTH = 8
+_MAX_FAULTS = 20
+
+
+def parse_document(model: type[Model], content: bytes) -> Model:
+    """Parse a JSON text as a model.
+
+    Raises:
+        InvalidRequestError: not JSON, a duplicate key, or faulty fields, of which the first twenty are named.
+    """
+    try:
+        value = read_json(content, _MAX_DEPTH)
+    except InvalidFloorPlanError as error:
+        # `read_json` is the reader of plans; only its error type is specific to them.
+        raise InvalidRequestError([("body", str(error))]) from error
+    try:
+        return model.model_validate(value)
+    except ValidationError as error:
+        raise InvalidRequestError([describe_fault(fault) for fault in error.errors()[:_MAX_FAULTS]]) from error
+
+
+async def check_parameters(request: Request) -> None:
+    """Refuse unknown query parameters; a dependency of every route.
+
+    Raises:
+        InvalidRequestError: unknown parameters, or a parameter given more than once.
+    """
+    given = Counter(name for name, _ in request.query_params.multi_items())
+    if not given:
+        return
+    known = _parameters_of(request.scope.get("route"))
+    faults = [(name[:50], _unknown(known)) for name in given if name not in known]
+    once = [name for name, repeatable in known.items() if not repeatable]
+    faults += [(name, "given more than once") for name in once if given[name] > 1]
+    if faults:
+        raise InvalidRequestError(faults)
+
+
+def _parameters_of(route: object) -> dict[str, bool]:
+    """Return the query parameters of a route; True for those that can be repeated."""
+    if not isinstance(route, APIRoute):
+        return {}
+    found: dict[str, bool] = {}
+    waiting: list[Dependant] = [route.dependant]
+    while waiting:
+        dependant = waiting.pop()
+        waiting += dependant.dependencies
+        found |= {field.alias: "list[" in str(field.field_info.annotation) for field in dependant.query_params}
+    return found
+
+
+def _unknown(known: dict[str, bool]) -> str:
+    if not known:
+        return "unknown query parameter; this route has none"
+    return f"unknown query parameter; known are {', '.join(sorted(known))}"
