@@ -1,4 +1,4 @@
-"""The out-of-family homes: written apart from the training generator (`synth`), for nothing but reporting.
+"""Out-of-distribution homes, written apart from the training generator (`synth`), for reporting only.
 
 Other room shapes, furniture, materials and light, real triangle meshes traced by embree: what a model scores here and
 not only on the generator's own test homes it has not learnt by heart. Nothing may be trained or tuned on them, and

@@ -1,4 +1,4 @@
-"""Furniture that stores, cooks, washes and grows; lamps and hangings. Local frame as in `seats`."""
+"""Furniture for storage, cooking and washing, plants, lamps and hangings. The local frame is that of `seats`."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def _wood(rng: np.random.Generator) -> str:
 
 
 def bookcase(rng: np.random.Generator) -> Piece:
-    """Boards with books of many heights, some leaning, and a vase here and there."""
+    """Return shelves with books of many heights, some leaning, and a few vases."""
     width, height, depth, wood = rng.uniform(0.6, 1.8), rng.uniform(0.9, 2.2), rng.uniform(0.24, 0.36), _wood(rng)
     parts = [
         slab(wood, shapely.box(x - 0.012, 0, x + 0.012, depth), 0, height)
@@ -57,7 +57,7 @@ def _books(width: float, depth: float, low: float, room: float, rng: np.random.G
 
 
 def wardrobe(rng: np.random.Generator) -> Piece:
-    """A tall cupboard with a bowed front and door gaps."""
+    """Return a tall cupboard with a bowed front and door gaps."""
     width, depth, height, wood = rng.uniform(0.8, 2.4), rng.uniform(0.5, 0.64), rng.uniform(1.8, 2.3), _wood(rng)
     body = rounded(width, depth, rng.choice([0.02, 0.1, 0.2]), 4)
     doors = max(2, round(width / 0.5))
@@ -70,7 +70,7 @@ def wardrobe(rng: np.random.Generator) -> Piece:
 
 
 def sideboard(rng: np.random.Generator) -> Piece:
-    """A low cupboard on slanted legs with things on it, perhaps a screen."""
+    """Return a low cupboard on slanted legs with objects on it, sometimes a screen."""
     width, depth, wood = rng.uniform(0.9, 2.0), rng.uniform(0.35, 0.45), _wood(rng)
     low, top = rng.uniform(0.12, 0.2), rng.uniform(0.45, 0.8)
     parts = [slab(wood, rounded(width, depth, 0.05), low, top)]
@@ -91,7 +91,7 @@ def sideboard(rng: np.random.Generator) -> Piece:
 
 
 def desk(rng: np.random.Generator) -> Piece:
-    """A desk on trestles with a screen and a chair."""
+    """Return a desk on trestles with a screen and a chair."""
     width, depth, wood = rng.uniform(1.0, 1.6), rng.uniform(0.55, 0.75), _wood(rng)
     parts = [slab(wood, rounded(width, depth, 0.04), 0.71, 0.74)]
     for x in (-width / 2 + 0.15, width / 2 - 0.15):
@@ -108,7 +108,7 @@ def desk(rng: np.random.Generator) -> Piece:
 
 
 def kitchen_run(rng: np.random.Generator, width: float | None = None) -> Piece:
-    """Counter with a recessed plinth, tap, hob, wall units and a hood."""
+    """Return a counter with a recessed plinth, tap, hob, wall units and a hood."""
     width = float(width or rng.uniform(1.6, 3.2))
     front, depth = str(rng.choice(["white", "wood a", "accent", "fabric c"])), 0.62
     base = shapely.Polygon(
@@ -139,7 +139,7 @@ def kitchen_run(rng: np.random.Generator, width: float | None = None) -> Piece:
 
 
 def fridge(rng: np.random.Generator) -> Piece:
-    """A round-shouldered refrigerator."""
+    """Return a refrigerator with round shoulders."""
     height = rng.uniform(1.4, 2.0)
     front = shapely.box(-0.3, 0.02, 0.3, height).buffer(-0.08).buffer(0.08)
     body = slab(str(rng.choice(["white", "metal", "accent"])), front, 0.0, 0.62).mapped(lambda v: v[:, [0, 2, 1]])
@@ -148,7 +148,7 @@ def fridge(rng: np.random.Generator) -> Piece:
 
 
 def island(rng: np.random.Generator) -> Piece:
-    """A kitchen island with bar stools."""
+    """Return a kitchen island with bar stools."""
     width, depth = rng.uniform(1.3, 2.2), rng.uniform(0.7, 0.9)
     parts = [
         slab("accent", rounded(width - 0.1, depth - 0.1, 0.1), 0.0, 0.88),
@@ -166,7 +166,7 @@ def island(rng: np.random.Generator) -> Piece:
 
 
 def bathtub(rng: np.random.Generator) -> Piece:
-    """A tub with a hollow."""
+    """Return a hollow tub."""
     long, deep = rng.uniform(1.5, 1.8), rng.uniform(0.7, 0.82)
     outer = rounded(long, deep, rng.choice([0.08, 0.34]), 5)
     hollow = affinity.translate(rounded(long - 0.16, deep - 0.16, 0.28, 5), 0, 0.08)
@@ -176,7 +176,7 @@ def bathtub(rng: np.random.Generator) -> Piece:
 
 
 def toilet(rng: np.random.Generator) -> Piece:
-    """A turned bowl and its cistern."""
+    """Return a turned bowl and its cistern."""
     bowl = lathe("ceramic", [(0.12, 0), (0.11, 0.1), (0.19, 0.36), (0.2, 0.41), (0.15, 0.41), (0.0, 0.3)], 16).scaled(
         0.95, 1.3, 1.0
     )
@@ -185,7 +185,7 @@ def toilet(rng: np.random.Generator) -> Piece:
 
 
 def basin(rng: np.random.Generator) -> Piece:
-    """A wash-basin on a pedestal under a mirror."""
+    """Return a wash-basin on a pedestal under a mirror."""
     bowl = lathe(
         "ceramic", [(0.09, 0), (0.07, 0.3), (0.09, 0.68), (0.26, 0.82), (0.27, 0.86), (0.22, 0.86), (0.0, 0.76)], 16
     )
@@ -201,7 +201,7 @@ def basin(rng: np.random.Generator) -> Piece:
 
 
 def washer(rng: np.random.Generator) -> Piece:
-    """A washing machine."""
+    """Return a washing machine."""
     door = (
         lathe("dark", [(0.17, 0), (0.17, 0.03), (0.1, 0.05), (0, 0.055)], 16).turned(-np.pi / 2, 0).moved(0, 0.6, 0.42)
     )
@@ -210,15 +210,15 @@ def washer(rng: np.random.Generator) -> Piece:
 
 
 def plant(rng: np.random.Generator) -> Piece:
-    """A pot with a bush, a small tree, or long leaves."""
+    """Return a pot with a bush, a small tree, or long leaves."""
     r, h = rng.uniform(0.12, 0.22), rng.uniform(0.2, 0.4)
     parts = [lathe("ceramic", [(0, 0), (0.75 * r, 0), (r, h), (0.9 * r, h), (0.85 * r, 0.85 * h), (0, 0.85 * h)], 14)]
     tall = rng.uniform(0.3, 1.2)
     if rng.random() < 0.6:
         parts.append(tube("wood b", (0, 0, 0.8 * h), (0.03, 0.02, h + tall), 0.018, 6))
         for _ in range(rng.integers(4, 10)):
-            at = rng.normal(0, 0.13, 3) + np.array([0, 0, h + tall * rng.uniform(0.7, 1.15)])
-            parts.append(crumpled(blob("leaf", rng.uniform(0.08, 0.2, 3).tolist()), 0.14, rng).moved(*at))
+            leaf_m = rng.normal(0, 0.13, 3) + np.array([0, 0, h + tall * rng.uniform(0.7, 1.15)])
+            parts.append(crumpled(blob("leaf", rng.uniform(0.08, 0.2, 3).tolist()), 0.14, rng).moved(*leaf_m))
     else:
         for _ in range(rng.integers(8, 16)):
             a, long = rng.uniform(0, 6.28), rng.uniform(0.4, 0.6 + tall / 2)
@@ -229,7 +229,7 @@ def plant(rng: np.random.Generator) -> Piece:
 
 
 def floor_lamp(rng: np.random.Generator) -> Piece:
-    """A standing lamp with a turned shade."""
+    """Return a standing lamp with a turned shade."""
     h = rng.uniform(1.35, 1.7)
     parts = [
         lathe("metal", [(0, 0), (0.14, 0), (0.13, 0.02), (0.012, 0.03), (0.012, h)], 12),
@@ -239,14 +239,14 @@ def floor_lamp(rng: np.random.Generator) -> Piece:
 
 
 def rug(rng: np.random.Generator) -> Piece:
-    """A carpet: flat, so that furniture may stand on it."""
+    """Return a flat carpet that furniture can stand on."""
     r = rng.uniform(0.7, 1.3)
     shape = disc(r, 8) if rng.random() < 0.5 else affinity.translate(rounded(2.2 * r, 1.5 * r, 0.2), 0, -0.75 * r)
     return Piece((slab("rug", shape, 0.0, 0.012),), None)
 
 
 def radiator(rng: np.random.Generator) -> Piece:
-    """A ribbed radiator."""
+    """Return a ribbed radiator."""
     width, high = rng.uniform(0.6, 1.3), 0.42
     parts = [
         tube("white", (x, 0.07, 0.12), (x, 0.07, 0.12 + high), 0.028, 6)
@@ -256,7 +256,7 @@ def radiator(rng: np.random.Generator) -> Piece:
 
 
 def picture(rng: np.random.Generator) -> Piece:
-    """A framed picture, round, six-sided or square, or a mirror."""
+    """Return a round, six-sided or square framed picture, or a mirror."""
     r = rng.uniform(0.18, 0.5)
     shape = disc(r, int(rng.choice([2, 6]))) if rng.random() < 0.5 else shapely.box(-r, -0.7 * r, r, 0.7 * r)
     inner = str(rng.choice(["rug", "accent", "mirror"], p=[0.5, 0.3, 0.2]))
@@ -266,14 +266,14 @@ def picture(rng: np.random.Generator) -> Piece:
 
 
 def curtain(rng: np.random.Generator, width: float, top: float) -> Part:
-    """One cloth of a pair of curtains, from x = 0 on."""
+    """Return one cloth of a pair of curtains, starting at x = 0."""
     low_m = rng.choice([0.03, 0.6], p=[0.8, 0.2])
     cloth = folded_sheet("curtain", width_m=width, low_m=low_m, high_m=top, folds=width / 0.13, depth_m=0.035)
     return cloth.moved(y_m=0.09)
 
 
 def pendant(rng: np.random.Generator, ceiling_m: float, drop_m: float) -> tuple[Part, ...]:
-    """A hanging lamp, or for no drop a flush one, about the origin."""
+    """Return a hanging lamp about the origin; with no drop a flush lamp."""
     low = ceiling_m - drop_m
     if drop_m < 0.2:
         return (

@@ -1,4 +1,4 @@
-"""Setting furniture into rooms: along walls or in the middle, clear of doors and of one another."""
+"""Placement of furniture along walls or in the middle of rooms, clear of doors and other furniture."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from lalaloc_core.learn.heldout.seats import Piece
 Level = Literal["empty", "simple", "full"]
 LEVELS: tuple[Level, ...] = get_args(Level)
 _Maker = Callable[[np.random.Generator], Piece]
-# What a room needs, at every level but "empty"; and what may be added in "full" ones.
+# Pieces that each room needs at every level except "empty", and pieces added in "full" rooms.
 _NEEDED: Mapping[RoomKind, Sequence[_Maker]] = {
     "living": (seats.sofa, seats.dining_set, fixtures.sideboard),
     "bedroom": (seats.bed, fixtures.wardrobe),
@@ -85,7 +85,7 @@ _FULLEST_SHARE = 0.5
 
 
 class Furnishing:
-    """The furniture of a home: `parts` with their rooms, and per room the floor it takes."""
+    """Furniture of a home: `parts` with their rooms, and the floor that it covers per room."""
 
     def __init__(self, plan: HeldoutPlan, openings: Sequence[Opening], level: Level, rng: np.random.Generator) -> None:
         self.parts: list[tuple[int, Part]] = []
@@ -93,7 +93,7 @@ class Furnishing:
         self._doorways = _doorways(openings)
         self._openings = openings
         for index, kind in enumerate(plan.kinds):
-            # Each room has its own randomness, and what is needed comes first: simple rooms are full ones with less.
+            # Each room has its own generator and places needed pieces first, so simple rooms are subsets of full ones.
             room_rng = np.random.default_rng(rng.integers(1 << 62))
             self._hang_lamp(plan, index, room_rng)
             if level == "empty":
@@ -119,11 +119,11 @@ class Furnishing:
                 self._lay_rug(index, rng)
 
     def _place(self, index: int, maker: _Maker, rng: np.random.Generator) -> None:
-        """Try some places; where a piece fits nowhere, the room goes without."""
+        """Try several places for a piece; skip it if none fits."""
         piece = maker(rng)
         for attempt in range(_TRIES):
             if attempt == _TRIES // 2:
-                # Another one, perhaps smaller.
+                # Draw another size.
                 piece = maker(rng)
             assert piece.footprint is not None
             free = maker in _FREE and rng.random() < 0.7
@@ -150,14 +150,14 @@ class Furnishing:
             return None, 0.0
         wall = roomy[rng.integers(len(roomy))]
         low, high = -left + 0.01, wall.length_m - right - 0.01
-        at = rng.choice([low, high, rng.uniform(min(low, high), max(low, high))])
-        return wall.point_m(at, -rng.uniform(0.012, 0.06)), float(np.arctan2(wall.along[1], wall.along[0]))
+        along_m = rng.choice([low, high, rng.uniform(min(low, high), max(low, high))])
+        return wall.point_m(along_m, -rng.uniform(0.012, 0.06)), float(np.arctan2(wall.along[1], wall.along[0]))
 
     def _add(self, index: int, piece: Piece, move: np.ndarray, turn: float) -> None:
         self.parts += [(index, part.turned(turn).moved(float(move[0]), float(move[1]))) for part in piece.parts]
 
     def _hang_lamp(self, plan: HeldoutPlan, index: int, rng: np.random.Generator) -> None:
-        """A lamp in the middle of each room, whatever the level."""
+        """Hang a lamp in the middle of each room, at every level."""
         room = plan.plan.rooms[index]
         middle = lamp_place(room.shape)
         drop = float(rng.choice([0.09, 0.35, min(0.7, room.ceiling_height_m - 2.0)], p=[0.4, 0.4, 0.2]))
@@ -180,12 +180,12 @@ class Furnishing:
     def _hang_pictures(self, index: int, rng: np.random.Generator) -> None:
         for wall in self._walls:
             if wall.length_m > 1.2 and rng.random() < 0.45:
-                at = rng.uniform(0.5, wall.length_m - 0.5)
+                along_m = rng.uniform(0.5, wall.length_m - 0.5)
                 spans = [(o.left_m, o.right_m) for o in self._openings if _same(o.wall, wall)]
                 spans += [span_behind(o) for o in self._openings if o.behind is not None and _same(o.behind, wall)]
                 if all(at + 0.6 < low or at - 0.6 > high for low, high in spans):
                     turn = float(np.arctan2(wall.along[1], wall.along[0]))
-                    self._add(index, fixtures.picture(rng), wall.point_m(at), turn)
+                    self._add(index, fixtures.picture(rng), wall.point_m(along_m), turn)
 
     def _lay_rug(self, index: int, rng: np.random.Generator) -> None:
         middle = np.array(shapely.maximum_inscribed_circle(self._shape, 0.05).coords[0])
@@ -198,7 +198,7 @@ class Furnishing:
 
 
 def lamp_place(shape: shapely.Polygon) -> np.ndarray:
-    """Where a room's lamp hangs: the middle of its widest part."""
+    """Return the position of a room's lamp: the middle of its widest part."""
     return np.array(shapely.maximum_inscribed_circle(shape, 0.05).coords[0])
 
 
@@ -211,7 +211,7 @@ def _set(footprint: BaseGeometry, move: np.ndarray, turn: float) -> BaseGeometry
 
 
 def _doorways(openings: Sequence[Opening]) -> BaseGeometry:
-    """The floor to be kept free before and behind doors, leaves included."""
+    """Return the floor that doors and their leaves need."""
     ways = []
     for o in openings:
         if o.kind == "window" and o.sill_m > 0.3:

@@ -1,6 +1,6 @@
-"""Triangle meshes in pieces: turned, extruded, bent and blown shapes, and their union for the tracer.
+"""Triangle meshes of turned, extruded, bent and inflated shapes, and their union for the tracer.
 
-Every part carries the name of the surface it is covered with; which material that is, is the home's choice.
+Every part has the name of its surface; the home chooses the material of each surface.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ import trimesh
 from jaxtyping import Float, Int
 from shapely.geometry.base import BaseGeometry
 
-# What lengths and angles may be written as: 0 as well as 0.0.
+# Lengths and angles can be integers.
 Number = float | int
 
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """A mesh of one surface.
+    """A mesh with one surface.
 
     Attributes:
         surface: name of what covers it.
@@ -34,26 +34,26 @@ class Part:
     smooth: bool = False
 
     def mapped(self, function: Callable[[np.ndarray], np.ndarray]) -> Part:
-        """The part with its vertices moved."""
+        """Return the part with its vertices mapped by a function."""
         return replace(self, vertices_m=function(self.vertices_m))
 
     def moved(self, x_m: Number = 0.0, y_m: Number = 0.0, z_m: Number = 0.0) -> Part:
-        """The part elsewhere."""
+        """Return the part translated."""
         return self.mapped(lambda v: v + np.array([x_m, y_m, z_m]))
 
     def turned(self, angle: Number, axis: int = 2) -> Part:
-        """The part turned about an axis through the origin, counter-clockwise by radians."""
+        """Return the part turned about an axis through the origin, counter-clockwise by radians."""
         a, b = (axis + 1) % 3, (axis + 2) % 3
         rotation = np.eye(3)
         rotation[[a, a, b, b], [a, b, a, b]] = np.cos(angle), -np.sin(angle), np.sin(angle), np.cos(angle)
         return self.mapped(lambda v: v @ rotation.T)
 
     def scaled(self, x: Number, y: Number, z: Number) -> Part:
-        """The part stretched about the origin."""
+        """Return the part stretched about the origin."""
         return self.mapped(lambda v: v * np.array([x, y, z]))
 
     def corner_normals(self) -> Float[np.ndarray, "m 3 3"]:
-        """Unit normal at each corner of each face; where a face has no area, upward."""
+        """Return the unit normal at each corner of each face; upward for faces without area."""
         corners = self.vertices_m[self.faces]
         crossed = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         if not self.smooth:
@@ -70,13 +70,13 @@ def _unit(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
 
 
 def triangles_of(polygon: shapely.Polygon) -> tuple[Float[np.ndarray, "n 2"], Int[np.ndarray, "m 3"]]:
-    """A polygon, with holes or not, as triangles."""
+    """Triangulate a polygon, with or without holes."""
     vertices, faces = trimesh.creation.triangulate_polygon(polygon, engine="earcut")
     return np.asarray(vertices, dtype=np.float64), np.asarray(faces, dtype=np.int64)
 
 
 def slab(surface: str, shape: BaseGeometry, low_m: Number, high_m: Number) -> Part:
-    """A footprint, one polygon, raised from one height to another."""
+    """Extrude a footprint, one polygon, from one height to another."""
     assert isinstance(shape, shapely.Polygon)
     flat, cap = triangles_of(shape)
     low, high = (np.concatenate([flat, np.full((len(flat), 1), z)], axis=1) for z in (low_m, high_m))
@@ -94,13 +94,13 @@ def slab(surface: str, shape: BaseGeometry, low_m: Number, high_m: Number) -> Pa
 
 
 def section(surface: str, shape: BaseGeometry, left_m: Number, right_m: Number) -> Part:
-    """A shape in the (y, z) plane drawn out along x: what has the same section everywhere, such as a sofa."""
+    """Extrude a shape of the (y, z) plane along x, such as the section of a sofa."""
     part = slab(surface, shape, left_m, right_m)
     return part.mapped(lambda v: v[:, [2, 0, 1]])
 
 
 def lathe(surface: str, outline_m: Sequence[tuple[Number, Number]], sides: int = 18) -> Part:
-    """A turned shape about the z axis: (radius, height) from bottom to top, closed where the radius is 0."""
+    """Return a solid of revolution about z from (radius, height) points, from bottom to top; radius 0 closes it."""
     profile = np.array(outline_m, dtype=np.float64)
     angle = np.arange(sides) / sides * 2 * np.pi
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -114,7 +114,7 @@ def lathe(surface: str, outline_m: Sequence[tuple[Number, Number]], sides: int =
 
 
 def tube(surface: str, start_m: Sequence[Number], end_m: Sequence[Number], radius_m: Number, sides: int = 8) -> Part:
-    """A round bar with round ends."""
+    """Return a round bar with round ends."""
     start, end = np.array(start_m, dtype=np.float64), np.array(end_m, dtype=np.float64)
     length = float(np.linalg.norm(end - start))
     bend = [(radius_m * np.cos(a), radius_m * np.sin(a)) for a in np.radians([0, 50, 90])]
@@ -124,7 +124,7 @@ def tube(surface: str, start_m: Sequence[Number], end_m: Sequence[Number], radiu
 
 
 def blob(surface: str, radii_m: Sequence[Number], detail: int = 2) -> Part:
-    """An ellipsoid about the origin."""
+    """Return an ellipsoid about the origin."""
     vertices, faces = _sphere(detail)
     return Part(surface, vertices, faces, smooth=True).scaled(*radii_m)
 
@@ -136,7 +136,7 @@ def _sphere(detail: int) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "m 3
 
 
 def crumpled(part: Part, depth: Number, rng: np.random.Generator) -> Part:
-    """The part with soft dents and bulges, up to `depth` of its size: cushions, bushes."""
+    """Return the part with soft dents and bulges up to `depth` of its size, for cushions and bushes."""
     waves = rng.normal(size=(6, 3)) * 4.0
     phase = rng.uniform(0, 6, 6)
 
@@ -157,7 +157,7 @@ def folded_sheet(
     depth_m: Number,
     phase: Number = 0.0,
 ) -> Part:
-    """A hanging cloth along x with folds like a sine."""
+    """Return a hanging cloth along x with sinusoidal folds."""
     columns = max(int(folds * 10), 4)
     x = np.linspace(0.0, width_m, columns + 1)
     y = depth_m * np.sin(x / width_m * folds * 2 * np.pi + phase)
@@ -170,12 +170,12 @@ def folded_sheet(
 
 
 def rounded(width_m: Number, depth_m: Number, radius_m: Number, segments: int = 3) -> shapely.Polygon:
-    """A footprint with round corners: x from -width/2 to width/2, y from 0 to depth."""
+    """Return a footprint with round corners: x from -width/2 to width/2, y from 0 to depth."""
     r = min(radius_m, 0.49 * width_m, 0.49 * depth_m)
     core = shapely.box(-width_m / 2 + r, r, width_m / 2 - r, depth_m - r)
     return core.buffer(r, quad_segs=segments)
 
 
 def disc(radius_m: Number, segments: int = 6) -> shapely.Polygon:
-    """A round footprint about the origin."""
+    """Return a round footprint about the origin."""
     return shapely.Point(0.0, 0.0).buffer(radius_m, quad_segs=segments)

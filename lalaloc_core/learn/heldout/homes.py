@@ -1,4 +1,4 @@
-"""Homes by seed: plan, openings, materials, and for each furniture level the mesh and the room for cameras."""
+"""Homes by seed: plan, openings, materials, and the mesh and camera space of each furniture level."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from lalaloc_core.learn.heldout.shell import shell_parts
 from lalaloc_core.learn.heldout.surfaces import Materials, Noise
 from lalaloc_core.learn.heldout.tracing import Tracer
 
-# Keeps these seeds apart from any other generator's.
+# Separates these seeds from those of other generators.
 _FAMILY = 0x0DD
 WALL_MARGIN_M = 0.25
 _FURNITURE_MARGIN_M = 0.12
@@ -28,14 +28,14 @@ _MIN_CAMERA_M, _MAX_CAMERA_M = 1.1, 1.8
 
 @dataclass(frozen=True)
 class HomeKey:
-    """Which home: equal keys give equal homes."""
+    """Key of a home: equal keys give equal homes."""
 
     split: int
     seed: int
     index: int
 
     def rng(self, *purpose: int) -> np.random.Generator:
-        """Randomness of this home for one purpose."""
+        """Return the random generator of this home for one purpose."""
         return np.random.default_rng([_FAMILY, self.split, self.seed, self.index, *purpose])
 
 
@@ -64,7 +64,7 @@ class TracedHome:
 
 @dataclass(frozen=True, eq=False)
 class Stand:
-    """Where a camera stands."""
+    """Pose of a camera."""
 
     position_m: Float[np.ndarray, "2"]
     room_index: int
@@ -74,7 +74,7 @@ class Stand:
 
 @lru_cache(maxsize=4)
 def home_of(key: HomeKey) -> HeldoutHome:
-    """The home of a key."""
+    """Build the home of a key."""
     rng = key.rng(0)
     plan = sample_plan(rng, f"heldout {key.index}")
     openings = sample_openings(plan, rng)
@@ -89,7 +89,7 @@ def _furnishing(key: HomeKey, level: Level) -> Furnishing:
 
 @lru_cache(maxsize=4)
 def traced_home(key: HomeKey, level: Level) -> TracedHome:
-    """The home of a key with its furniture."""
+    """Build the home of a key with its furniture."""
     home, rng = home_of(key), key.rng(2)
     tracer = Tracer([*home.shell, *_furnishing(key, level).parts])
     rooms, things = room_surfaces(home.plan.kinds, rng), thing_surfaces(rng)
@@ -107,7 +107,7 @@ def traced_home(key: HomeKey, level: Level) -> TracedHome:
 
 
 def stands_of(key: HomeKey, count: int) -> list[Stand]:
-    """Cameras uniform over the floor that is free when the home is full, so that they fit every level."""
+    """Draw cameras uniformly over the floor that is free in the full home, so that they suit every level."""
     home, rng = home_of(key), key.rng(3)
     leaves = [_leaf(opening) for opening in home.openings if opening.kind == "open door"]
     taken = _furnishing(key, "full").taken
@@ -131,7 +131,7 @@ def stands_of(key: HomeKey, count: int) -> list[Stand]:
 
 
 def _leaf(opening: Opening) -> shapely.Polygon:
-    """The floor around an open door's leaf."""
+    """Return the floor that an open door's leaf covers."""
     wall, width = opening.wall, opening.right_m - opening.left_m
     hinge = wall.point_m(opening.left_m)
     end = hinge + width * (np.cos(opening.swing) * wall.along - np.sin(opening.swing) * wall.outward)

@@ -19,7 +19,7 @@ from lalaloc_core.learn.heldout.tracing import OFFSET_M, Tracer
 _LAMP_DROP_M = 0.75
 _LAMP_RADIUS_M = 0.22
 _MEAN_REFLECTANCE = 0.6
-# Corners are darker than the one bounce says: light from nearer than about this is held back.
+# Light from nearer than this (m) is attenuated, because one bounce makes corners too bright.
 _NEAR_M = 0.25
 _MAX_BRIGHTNESS = 2.0
 
@@ -50,7 +50,7 @@ class Lights:
 
     @classmethod
     def sample(cls, plan: FloorPlan, openings: Sequence[Opening], sky: Sky, rng: np.random.Generator) -> Lights:
-        """Light the rooms: by day lamps are often off, in rooms without windows never."""
+        """Light the rooms: lamps are often off by day, never in rooms without windows."""
         windows = sorted((o for o in openings if o.kind == "window"), key=lambda o: o.wall.room)
         count = np.bincount([o.wall.room for o in windows], minlength=len(plan.rooms))
         bright = float(sky.mean().mean())
@@ -95,11 +95,16 @@ class Lights:
         normal: Float[np.ndarray, "n 3"],
         rng: np.random.Generator,
     ) -> Float[np.ndarray, "n 3"]:
-        """Light that falls on each point from lamps, windows and surfaces, by one random ray to each kind.
+        """Return the light on each point from lamps, windows and surfaces, with one random ray to each kind.
 
         Args:
-            number: per face, its material.
-            room: the room of each point.
+            tracer: the home's mesh.
+            materials: its surfaces.
+            number: material per face.
+            room: room of each point.
+            point_m: (n, 3) points.
+            normal: (n, 3) unit normals.
+            rng: random generator of the rays.
         """
         start = point_m + OFFSET_M * normal
         return (
@@ -111,7 +116,7 @@ class Lights:
     def sunlight(
         self, tracer: Tracer, point_m: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, "n 3"]
     ) -> Float[np.ndarray, "n 3"]:
-        """Sunlight that falls on each point."""
+        """Return the sunlight on each point."""
         out = np.zeros_like(point_m, dtype=np.float32)
         slope = normal @ self.sky.sun
         lit = np.flatnonzero(slope > 0.0)
@@ -129,7 +134,7 @@ class Lights:
         slope = np.sum(ray * normal, axis=1)
         out = np.zeros((len(room), 3), np.float32)
         lit = np.flatnonzero((slope > 0.0) & (self.lamp[room].max(axis=1) > 0.0))
-        # The lamp's own shade is not in its way.
+        # Skip the lamp's own shade.
         reach = np.maximum(distance[lit] - 2.2 * _LAMP_RADIUS_M, 1e-3)
         free = ~tracer.blocked(start[lit], ray[lit], reach)
         out[lit] = (slope[lit] * free / np.maximum(distance[lit], 0.4) ** 2)[:, None] * self.lamp[room[lit]]
@@ -169,12 +174,12 @@ class Lights:
         ray = normal + 0.999 * _on_sphere(len(start), rng)
         ray /= np.linalg.norm(ray, axis=1, keepdims=True)
         hits = tracer.first(start, ray)
-        # What comes in from outdoors is counted with the windows.
+        # Light from outdoors is counted with the windows.
         met = hits.face >= 0
         ambient = self.ambient[tracer.room[hits.face]] / _MEAN_REFLECTANCE
         distance = np.where(met, hits.distance_m, 0.0)
         light = materials.mean(number[hits.face]) * ambient * (distance / (distance + _NEAR_M))[:, None]
-        # A few bright rays out of few would show as spots.
+        # Clip, because few bright rays would show as spots.
         return np.minimum(light, _MAX_BRIGHTNESS * self.ambient[room]).astype(np.float32)
 
 
@@ -188,7 +193,7 @@ class _Pane(NamedTuple):
 
 
 def _pane(opening: Opening) -> _Pane:
-    """A window in the face of its wall."""
+    """Return the pane of a window in the face of its wall."""
     wall = opening.wall
     middle = wall.point_m((opening.left_m + opening.right_m) / 2)
     centre = np.array([*middle, (opening.sill_m + opening.top_m) / 2])

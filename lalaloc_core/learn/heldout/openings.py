@@ -1,4 +1,4 @@
-"""Doors, passages and windows: holes in walls, with what stands in them."""
+"""Doors, passages and windows: holes in walls and their fillings."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lalaloc_core.floorplan import FloorPlan, Room
 from lalaloc_core.learn.heldout.plans import HeldoutPlan
 
 OpeningKind = Literal["open door", "shut door", "arch", "passage", "front door", "window"]
-# Per room and edge, the stretches where there is an opening already.
+# Occupied stretches per room and edge.
 _Taken = dict[tuple[int, int], list[tuple[float, float]]]
 _CORNER_M = 0.1
 _OUTLOOK_M = 1.6
@@ -32,7 +32,7 @@ _PLAN_KINDS = {
 
 @dataclass(frozen=True, eq=False)
 class Wall:
-    """One edge of a room: it starts at `start_m`, runs along the unit vector `along`; `outward` leaves the room."""
+    """Edge of a room: starts at `start_m`, runs along the unit vector `along`; `outward` points out of the room."""
 
     room: int
     edge: int
@@ -42,10 +42,11 @@ class Wall:
 
     @property
     def outward(self) -> Float[np.ndarray, "2"]:
+        """Unit normal out of the room."""
         return np.array([self.along[1], -self.along[0]])
 
     def point_m(self, along_m: float, out_m: float = 0.0) -> Float[np.ndarray, "2"]:
-        """The place `along_m` from the start and `out_m` behind the wall's face."""
+        """Return the point `along_m` from the start and `out_m` behind the wall's face."""
         return self.start_m + along_m * self.along + out_m * self.outward
 
 
@@ -74,11 +75,12 @@ class Opening:
 
     @property
     def arched(self) -> bool:
+        """True for a passage with an arch."""
         return self.kind == "arch"
 
 
 def walls_of(room: Room, index: int) -> list[Wall]:
-    """The walls of room number `index`."""
+    """Return the walls of room number `index`."""
     edges = room.walls_m[:, 2:] - room.walls_m[:, :2]
     lengths = np.linalg.norm(edges, axis=1)
     return [
@@ -87,7 +89,7 @@ def walls_of(room: Room, index: int) -> list[Wall]:
 
 
 def sample_openings(plan: HeldoutPlan, rng: np.random.Generator) -> list[Opening]:
-    """Doors that join all rooms, a front door, and windows where nothing stands in front of them."""
+    """Draw doors that connect all rooms, a front door, and windows in outer walls."""
     rooms = plan.plan.rooms
     walls = [wall for index, room in enumerate(rooms) for wall in walls_of(room, index)]
     taken: _Taken = {}
@@ -96,12 +98,12 @@ def sample_openings(plan: HeldoutPlan, rng: np.random.Generator) -> list[Opening
     fronts = [wall for wall in outer if wall.length_m > 1.3 and plan.kinds[wall.room] in ("living", "corridor")]
     if fronts:
         front = fronts[rng.integers(len(fronts))]
-        at = rng.uniform(0.15, front.length_m - 1.15)
+        left_m = rng.uniform(0.15, front.length_m - 1.15)
         openings.append(
             _opening(
                 "front door",
                 front,
-                span_m=(at, at + 0.95),
+                span_m=(left_m, left_m + 0.95),
                 heights_m=(0.0, 2.1),
                 depth_m=_OUTER_WALL_M,
                 rooms=rooms,
@@ -114,12 +116,12 @@ def sample_openings(plan: HeldoutPlan, rng: np.random.Generator) -> list[Opening
 
 
 def with_openings(plan: HeldoutPlan, openings: Sequence[Opening]) -> HeldoutPlan:
-    """The plan with its openings drawn in."""
+    """Return the plan with its openings."""
     rooms = plan.plan.rooms
     entries = [
         {
             "kind": _PLAN_KINDS[opening.kind],
-            "line": [opening.wall.point_m(at).tolist() for at in (opening.left_m, opening.right_m)],
+            "line": [opening.wall.point_m(along_m).tolist() for along_m in (opening.left_m, opening.right_m)],
             "sill_m": opening.sill_m,
             "head_m": opening.top_m,
             "rooms": [rooms[wall.room].id for wall in (opening.wall, opening.behind) if wall is not None],
@@ -147,7 +149,7 @@ def _sample_doors(plan: HeldoutPlan, walls: list[Wall], taken: _Taken, rng: np.r
     waiting = [contacts[k] for k in rng.permutation(len(contacts))]
     pairs: set[tuple[int, int]] = set()
     while waiting:
-        # Doors that join a room to the ones reached so far come first, then some that make rounds.
+        # Doors that connect a new room come first, then some that close loops.
         index = next((k for k, c in enumerate(waiting) if (c[0].room in joined) != (c[1].room in joined)), 0)
         first, second, low, high, depth = waiting.pop(index)
         new = (first.room in joined) != (second.room in joined)
@@ -237,7 +239,7 @@ def _opening(
     behind: Wall | None = None,
     swing: float = 0.0,
 ) -> Opening:
-    """An opening from left to right along a wall and from its sill up, whose place on the wall is now taken."""
+    """Return an opening, and mark its stretch of the wall as taken."""
     (left, right), (sill, top) = span_m, heights_m
     taken.setdefault((wall.room, wall.edge), []).append((left, right))
     if behind is not None:
@@ -257,13 +259,13 @@ def _opening(
 
 
 def span_behind(opening: Opening) -> tuple[float, float]:
-    """Where the opening begins and ends along the wall behind."""
+    """Return the ends of the opening along the wall behind."""
     assert opening.behind is not None
     return _seen_from(opening.behind, opening.wall, opening.left_m, opening.right_m)
 
 
 def _seen_from(behind: Wall, wall: Wall, left: float, right: float) -> tuple[float, float]:
-    ends = [float((wall.point_m(at) - behind.start_m) @ behind.along) for at in (right, left)]
+    ends = [float((wall.point_m(along_m) - behind.start_m) @ behind.along) for along_m in (right, left)]
     return ends[0], ends[1]
 
 
@@ -272,7 +274,7 @@ def _is_free(taken: _Taken, wall: Wall, left: float, right: float) -> bool:
 
 
 def _contact(first: Wall, second: Wall) -> list[tuple[Wall, Wall, float, float, float]]:
-    """Where two walls stand back to back: from, to (along `first`) and how far apart; none or one."""
+    """Return where two walls stand back to back: from, to (along `first`) and distance; at most one entry."""
     if first.along @ second.along > -0.99999:
         return []
     apart = float((second.start_m - first.start_m) @ first.outward)

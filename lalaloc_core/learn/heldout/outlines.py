@@ -22,7 +22,7 @@ AREAS_M2: Mapping[RoomKind, tuple[float, float]] = {
     "closet": (2.0, 4.2),
     "study": (6.0, 13.0),
 }
-# Edges shorter than this are no wall anybody would build, and a room must hold a disc of this radius.
+# Minimum edge length (m), and radius (m) of a disc that must fit into a room.
 _MIN_EDGE_M = 0.18
 _INNER_RADIUS_M = 0.42
 
@@ -87,7 +87,7 @@ def _rotunda(rng: np.random.Generator) -> BaseGeometry:
 
 
 def _alcoved(rng: np.random.Generator) -> BaseGeometry:
-    """A rectangle with niches let into its walls and pillars standing out of them."""
+    """Return a rectangle with niches and pillars in its walls."""
     width = rng.uniform(1.1, 1.7)
     shape: BaseGeometry = shapely.box(0, 0, width, 1)
     for y in rng.permutation([0.0, 1.0])[: rng.integers(1, 3)]:
@@ -98,7 +98,7 @@ def _alcoved(rng: np.random.Generator) -> BaseGeometry:
 
 
 def _open_plan(rng: np.random.Generator) -> BaseGeometry:
-    """Spaces that run into one another, one of them turned."""
+    """Return connected spaces, one of them turned."""
     first, second = (
         shapely.box(0, 0, rng.uniform(1.0, 1.4), 1),
         shapely.box(0, 0, rng.uniform(0.7, 1.1), rng.uniform(0.6, 0.9)),
@@ -109,13 +109,13 @@ def _open_plan(rng: np.random.Generator) -> BaseGeometry:
     )
     shape = first | second
     if rng.random() < 0.5:
-        at = rng.uniform(0.1, 0.6)
-        shape = shape | shapely.box(at, -0.18, at + rng.uniform(0.3, 0.6), 0.1)
+        niche_m = rng.uniform(0.1, 0.6)
+        shape = shape | shapely.box(niche_m, -0.18, niche_m + rng.uniform(0.3, 0.6), 0.1)
     return shape
 
 
 def _bent(rng: np.random.Generator) -> BaseGeometry:
-    """A corridor around one to three bends."""
+    """Return a corridor around one to three bends."""
     points, direction = [np.zeros(2)], 0.0
     for _ in range(rng.integers(2, 5)):
         step = rng.uniform(1.5, 3.4)
@@ -137,7 +137,7 @@ _MAKERS: Mapping[RoomKind, tuple[_Maker, ...]] = {
 
 
 def sample_outline(kind: RoomKind, rng: np.random.Generator) -> shapely.Polygon:
-    """The outline of one room (metres, anywhere, counter-clockwise), without walls too short or corners too tight."""
+    """Draw a counter-clockwise room outline (m) without short walls or tight corners."""
     while True:
         maker = _MAKERS[kind][rng.integers(len(_MAKERS[kind]))]
         shape = maker(rng)

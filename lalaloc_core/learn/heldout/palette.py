@@ -1,4 +1,4 @@
-"""Which materials a home has."""
+"""Materials of a home."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def _wall(kind: RoomKind, rng: np.random.Generator) -> Surface:
         )
     )
     pale = rng.random() < 0.65
-    # Most walls are warm, a few of any colour.
+    # Most walls have warm colours.
     hue = rng.uniform(0.02, 0.17) if rng.random() < 0.6 else rng.random()
     colour = _hsv(
         hue,
@@ -64,7 +64,7 @@ def _wall(kind: RoomKind, rng: np.random.Generator) -> Surface:
 
 
 def room_surfaces(kinds: Sequence[RoomKind], rng: np.random.Generator) -> list[dict[str, Surface]]:
-    """Floor, wall and ceiling of each room; many homes have one wall and one floor nearly everywhere."""
+    """Draw floor, wall and ceiling of each room; many homes repeat one wall and one floor."""
     shared_floor, shared_wall = _floor("living", rng), _wall("living", rng)
     uniform = rng.random() < 0.4
     white = _hsv(0.1, rng.uniform(0.0, 0.06), rng.uniform(0.88, 0.97))
@@ -85,7 +85,7 @@ def room_surfaces(kinds: Sequence[RoomKind], rng: np.random.Generator) -> list[d
 
 
 def thing_surfaces(rng: np.random.Generator) -> dict[str, Surface]:
-    """What furniture, doors and frames are made of, by the names that their parts carry."""
+    """Draw the materials of furniture, doors and frames, by the surface names of their parts."""
 
     def cloth() -> Surface:
         colour = _hsv(rng.random(), rng.uniform(0.0, 0.6), rng.uniform(0.25, 0.9))

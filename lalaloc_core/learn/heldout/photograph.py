@@ -1,4 +1,4 @@
-"""Photographs: rays through every pixel, four to each, then a film's answer to the light."""
+"""Photographs: four rays per pixel and the response of a film."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from lalaloc_core.learn.heldout.sky import Sky
 from lalaloc_core.learn.heldout.tracing import OFFSET_M
 
 _GLOW = 4.0
-# Of a pixel, for smoothing: a disc of radius 2.
+# Neighbours of a pixel for smoothing: a disc of radius 2.
 _NEIGHBOURS = [(i, j) for i in range(-2, 3) for j in range(-2, 3) if 0 < i * i + j * j <= 5]
 
 
 @dataclass(frozen=True, eq=False)
 class HeldoutShot:
-    """One photograph: which home, how full, where, and the number that its light and noise come from."""
+    """One photograph: home, furniture level, camera, and the seed of its light and noise."""
 
     key: HomeKey
     furniture: Level
@@ -30,7 +30,7 @@ class HeldoutShot:
 
 
 def render(shot: HeldoutShot, height: int, width: int) -> UInt8[np.ndarray, "{height} {width} 3"]:
-    """The photograph at a size."""
+    """Render the photograph at a size."""
     rng = shot.key.rng(4, shot.number)
     traced = traced_home(shot.key, shot.furniture)
     plan = traced.home.plan.plan
@@ -41,7 +41,7 @@ def render(shot: HeldoutShot, height: int, width: int) -> UInt8[np.ndarray, "{he
 
 
 def depth_m(shot: HeldoutShot, height: int, width: int) -> Float[np.ndarray, "{height} {width}"]:
-    """Distance (m) along each pixel's ray to what is seen; NaN for the sky."""
+    """Return the distance (m) along each pixel's ray; NaN for the sky."""
     rays = _rays(shot.stand, height, width)
     hits = traced_home(shot.key, shot.furniture).tracer.first(_eye(shot.stand, len(rays)), rays)
     return np.where(hits.face < 0, np.nan, hits.distance_m).reshape(height, width)
@@ -52,7 +52,7 @@ def _eye(stand: Stand, count: int) -> np.ndarray:
 
 
 def _rays(stand: Stand, height: int, width: int) -> Float[np.ndarray, "n 3"]:
-    """Unit directions of all pixels, row by row."""
+    """Return unit directions of all pixels, row by row."""
     azimuth, elevation = stand.heading + column_azimuths(width)[None, :], row_elevations(height)[:, None]
     flat = np.cos(elevation)
     up = np.broadcast_to(np.sin(elevation), (height, width))
@@ -62,7 +62,7 @@ def _rays(stand: Stand, height: int, width: int) -> Float[np.ndarray, "n 3"]:
 def _radiance(
     traced: TracedHome, lights: Lights, stand: Stand, height: int, width: int, rng: np.random.Generator
 ) -> Float[np.ndarray, "{height} {width} 3"]:
-    """Linear light of every pixel: colour and outlines from four rays, soft light from two of them."""
+    """Return linear radiance of every pixel: colour from four rays, soft light from two of them."""
     tracer, materials = traced.tracer, traced.materials
     rays = _rays(stand, 2 * height, 2 * width)
     eye = _eye(stand, len(rays))
@@ -103,7 +103,7 @@ def _reflected(
     point: np.ndarray,
     normal: np.ndarray,
 ) -> np.ndarray:
-    """Mirror images in mirrors and polished floors, stronger at grazing angles; `number` is -1 for the sky."""
+    """Return reflections in mirrors and polished floors, stronger at grazing angles; `number` is -1 for the sky."""
     tracer, materials = traced.tracer, traced.materials
     gloss = np.where(number < 0, 0.0, materials.gloss[number])
     shiny = np.flatnonzero(gloss > 0.0)
@@ -129,7 +129,7 @@ def _reflected(
 def _smoothed(
     light: Float[np.ndarray, "h w 3"], point_m: Float[np.ndarray, "h w 3"], normal: Float[np.ndarray, "h w 3"]
 ) -> Float[np.ndarray, "h w 3"]:
-    """Light averaged over neighbours that lie in the same plane: takes the grain out of few random rays."""
+    """Average light over coplanar neighbours to remove the noise of few rays."""
     for stride in (1, 3):
         total, weight = light.copy(), np.ones((*light.shape[:2], 1), np.float32)
         for i, j in _NEIGHBOURS:
@@ -150,7 +150,7 @@ def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, kw_only=True)
 class _Film:
-    """How a camera answers to light.
+    """Response of a camera to light.
 
     Attributes:
         stops: over- or under-exposure.
@@ -177,7 +177,7 @@ class _Film:
         )
 
     def develop(self, light: Float[np.ndarray, "h w 3"], rng: np.random.Generator) -> UInt8[np.ndarray, "h w 3"]:
-        """Bytes of a picture in linear light: exposure, balance, a filmic curve, grain that grows in the dark."""
+        """Convert linear light to bytes: exposure, balance, a filmic curve, and grain that grows in the dark."""
         height = len(light)
         middle = light[height // 5 : -height // 5].reshape(-1, 3)
         tint = np.exp(np.log(middle + 1e-3).mean(axis=0))

@@ -1,4 +1,4 @@
-"""Floor plans that grow: each room is set against a wall of one already standing, whatever way that wall runs."""
+"""Floor plans that grow: each room is placed against a wall of a standing one, at any angle."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lalaloc_core.learn.heldout.outlines import RoomKind, sample_outline
 
 MIN_ROOMS, MAX_ROOMS = 3, 9
 MIN_AREA_M2, MAX_AREA_M2 = 40.0, 160.0
-# Rooms meet along at least this much wall, so that a door fits.
+# Minimum shared wall (m), so that a door fits.
 MIN_CONTACT_M = 1.15
 _PLACEMENTS = 40
 _KINDS: tuple[RoomKind, ...] = ("bedroom", "kitchen", "bathroom", "corridor", "closet", "study")
@@ -24,7 +24,7 @@ _KIND_SHARES = (0.32, 0.12, 0.18, 0.14, 0.12, 0.12)
 
 @dataclass(frozen=True, eq=False)
 class HeldoutPlan:
-    """A floor plan with what each of its rooms is for.
+    """A floor plan with the use of each room.
 
     Attributes:
         plan: the rooms; no two overlap, and each has a wall in common with another.
@@ -65,7 +65,7 @@ def sample_plan(rng: np.random.Generator, name: str) -> HeldoutPlan:
 
 
 def _grow(kinds: list[RoomKind], wall_m: float, rng: np.random.Generator) -> list[shapely.Polygon] | None:
-    """Rooms in the order of `kinds`; None where one found no place."""
+    """Return the rooms in the order of `kinds`; None if one found no place."""
     shapes = [sample_outline(kinds[0], rng)]
     for kind in kinds[1:]:
         standing = shapely.union_all(shapes)
@@ -74,7 +74,7 @@ def _grow(kinds: list[RoomKind], wall_m: float, rng: np.random.Generator) -> lis
             placed = _against(shapes[rng.integers(len(shapes))], sample_outline(kind, rng), wall_m, rng)
             if placed is None or placed.distance(standing) < wall_m - 1e-6:
                 continue
-            # The most compact of several places: what a builder would choose.
+            # Choose the most compact of several places.
             size = shapely.union(standing, placed).convex_hull.length / math.sqrt(standing.area + placed.area)
             if size < best_size:
                 best, best_size = placed, size
@@ -87,14 +87,14 @@ def _grow(kinds: list[RoomKind], wall_m: float, rng: np.random.Generator) -> lis
 def _against(
     host: shapely.Polygon, guest: shapely.Polygon, wall_m: float, rng: np.random.Generator
 ) -> shapely.Polygon | None:
-    """`guest` moved so that one of its walls lies along one of `host`, a wall's thickness away."""
+    """Return `guest` with one wall along a wall of `host`, a wall thickness away."""
     start, along, length = _random_wall(host, rng)
     guest_start, guest_along, guest_length = _random_wall(guest, rng)
     if min(length, guest_length) < MIN_CONTACT_M:
         return None
     # The guest's wall runs the other way round, as both outlines are counter-clockwise.
     turn = math.atan2(-along[1], -along[0]) - math.atan2(guest_along[1], guest_along[0])
-    # Its start lands between the places where it hardly touches; ends are often flush.
+    # Its start is between the positions that barely touch; ends are often flush.
     slide = rng.choice([length, guest_length, rng.uniform(MIN_CONTACT_M, length + guest_length - MIN_CONTACT_M)])
     target = start + along * slide + wall_m * np.array([along[1], -along[0]])
     turned = affinity.rotate(guest, turn, origin=tuple(guest_start), use_radians=True)
@@ -104,7 +104,7 @@ def _against(
 def _random_wall(
     shape: shapely.Polygon, rng: np.random.Generator
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"], float]:
-    """Start, unit direction and length of a wall."""
+    """Return start, unit direction and length of a random wall."""
     corners = np.array(shape.exterior.coords)
     index = rng.integers(len(corners) - 1)
     edge = corners[index + 1] - corners[index]

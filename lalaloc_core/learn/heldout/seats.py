@@ -1,4 +1,4 @@
-"""Furniture to sit and lie on. Local frame: x along the wall, y from it (the back is at 0), z up, metres."""
+"""Furniture to sit and lie on. Local frame: x along the wall, y away from it (back at 0), z up, metres."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def _wood(rng: np.random.Generator) -> str:
 
 
 def sofa(rng: np.random.Generator) -> Piece:
-    """A sofa drawn out of one slanted, rounded section, with armrests and cushions."""
+    """Return a sofa extruded from one slanted, rounded section, with armrests and cushions."""
     width, depth, cloth = rng.uniform(1.5, 2.5), rng.uniform(0.82, 1.0), _fabric(rng)
     seat, back, lean = rng.uniform(0.38, 0.46), rng.uniform(0.72, 0.95), rng.uniform(0.05, 0.18)
     outline = shapely.Polygon(
@@ -57,7 +57,7 @@ def sofa(rng: np.random.Generator) -> Piece:
 
 
 def curved_sofa(rng: np.random.Generator) -> Piece:
-    """A sofa bent around its middle."""
+    """Return a sofa bent around its middle."""
     radius, cloth = rng.uniform(1.3, 1.9), _fabric(rng)
     span = np.radians(rng.uniform(40, 62))
     angle = np.linspace(np.pi / 2 - span, np.pi / 2 + span, 15)
@@ -74,7 +74,7 @@ def curved_sofa(rng: np.random.Generator) -> Piece:
 
 
 def armchair(rng: np.random.Generator) -> Piece:
-    """A tub chair: a round seat inside a bent back."""
+    """Return a tub chair: a round seat inside a bent back."""
     radius, cloth = rng.uniform(0.36, 0.46), _fabric(rng)
     angle = np.linspace(np.radians(-20), np.radians(200), 12)
     rim = shapely.LineString(np.stack([radius * np.cos(angle), -radius * np.sin(angle)], axis=1)).buffer(
@@ -94,7 +94,7 @@ def armchair(rng: np.random.Generator) -> Piece:
 
 
 def chair_parts(rng: np.random.Generator, wood: str) -> list[Part]:
-    """A chair about the origin that looks along +y: splayed legs and a slanted back."""
+    """Return a chair about the origin that faces +y, with splayed legs and a slanted back."""
     seat = 0.45
     legs = [tube(wood, (x, y, seat), (1.25 * x, 1.25 * y, 0.0), 0.018, 6) for x in (-0.17, 0.17) for y in (-0.17, 0.17)]
     back = shapely.Polygon([(-0.2, seat), (-0.17, seat), (-0.27, 0.86), (-0.3, 0.86)])
@@ -103,7 +103,7 @@ def chair_parts(rng: np.random.Generator, wood: str) -> list[Part]:
 
 
 def dining_set(rng: np.random.Generator) -> Piece:
-    """A round or oval table on a turned foot, or on slanted legs, with chairs around it."""
+    """Return a round or oval table with chairs around it."""
     long, short, wood = rng.uniform(0.5, 0.95), rng.uniform(0.45, 0.55), _wood(rng)
     top = affinity.scale(disc(1.0, 8), max(long, short), short)
     parts = [slab(wood, top, 0.72, 0.755)]
@@ -127,7 +127,7 @@ def dining_set(rng: np.random.Generator) -> Piece:
 
 
 def vase(rng: np.random.Generator) -> Part:
-    """A turned vase about the origin."""
+    """Return a turned vase about the origin."""
     h, r = rng.uniform(0.15, 0.4), rng.uniform(0.05, 0.1)
     waist = rng.uniform(0.4, 1.0)
     return lathe(
@@ -136,7 +136,7 @@ def vase(rng: np.random.Generator) -> Part:
 
 
 def bed(rng: np.random.Generator) -> Piece:
-    """A rounded mattress on a frame, a quilt that sags, pillows, and a headboard."""
+    """Return a rounded mattress on a frame, a sagging quilt, pillows, and a headboard."""
     width, long = rng.choice([0.9, 1.2, 1.4, 1.6, 1.8]), rng.uniform(1.95, 2.1)
     top, wood = rng.uniform(0.42, 0.6), _wood(rng)
     parts = [
@@ -166,7 +166,7 @@ def bed(rng: np.random.Generator) -> Piece:
 
 
 def bean_bag(rng: np.random.Generator) -> Piece:
-    """A bean bag."""
+    """Return a bean bag."""
     r = rng.uniform(0.36, 0.5)
     part = crumpled(blob(_fabric(rng), (r, r, 0.75 * r), 3), 0.07, rng)
     return Piece(
@@ -176,7 +176,7 @@ def bean_bag(rng: np.random.Generator) -> Piece:
 
 
 def ottoman(rng: np.random.Generator) -> Piece:
-    """A round stool, or a coffee table turned from wood."""
+    """Return a round stool, or a coffee table turned from wood."""
     r, h = rng.uniform(0.25, 0.45), rng.uniform(0.32, 0.45)
     cover = _fabric(rng) if rng.random() < 0.5 else _wood(rng)
     part = lathe(cover, [(0, 0), (0.8 * r, 0), (0.95 * r, 0.3 * h), (r, 0.8 * h), (0.92 * r, h), (0, h)], 20)

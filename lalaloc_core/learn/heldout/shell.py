@@ -1,4 +1,4 @@
-"""The building itself as meshes: floors, walls with holes, reveals, door leaves, window frames."""
+"""Meshes of the building: floors, walls with holes, reveals, door leaves, window frames."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _ARCH_SEGMENTS = 10
 
 
 def shell_parts(plan: FloorPlan, openings: list[Opening], rng: np.random.Generator) -> list[tuple[int, Part]]:
-    """Every part of the bare building with the room it belongs to."""
+    """Return every part of the bare building with its room."""
     holes: dict[tuple[int, int], list[shapely.Polygon]] = {}
     parts: list[tuple[int, Part]] = []
     for opening in openings:
@@ -44,7 +44,7 @@ def _polygons(shape: shapely.Geometry) -> list[shapely.Polygon]:
 
 
 def _on_wall(surface: str, wall: Wall, shape: shapely.Polygon, out_m: float = 0.0) -> Part:
-    """A flat shape (along the wall, height) on a wall's face, looking into the room."""
+    """Return a flat shape (along the wall, height) on a wall's face, looking into the room."""
     vertices, faces = triangles_of(shape)
     return Part(surface, _in_room(wall, vertices, out_m), faces[:, ::-1])
 
@@ -55,7 +55,7 @@ def _in_room(wall: Wall, points: Float[np.ndarray, "n 2"], out_m: float) -> Floa
 
 
 def _outline(opening: Opening, span_m: tuple[float, float] | None = None) -> shapely.Polygon:
-    """The hole in (along the wall, height)."""
+    """Return the hole in coordinates (along the wall, height)."""
     left, right = span_m or (opening.left_m, opening.right_m)
     if not opening.arched:
         return shapely.box(left, opening.sill_m, right, opening.top_m)
@@ -67,7 +67,7 @@ def _outline(opening: Opening, span_m: tuple[float, float] | None = None) -> sha
 
 
 def _fill(opening: Opening, rng: np.random.Generator) -> list[Part]:
-    """The reveal around the hole, and the leaf or the frame in it."""
+    """Return the reveal around the hole, and its leaf or frame."""
     wall, depth = opening.wall, opening.depth_m
     corners = np.array(_outline(opening).exterior.coords)
     parts = []
@@ -87,7 +87,7 @@ def _fill(opening: Opening, rng: np.random.Generator) -> list[Part]:
 
 
 def _casing(opening: Opening) -> list[Part]:
-    """Trim around the hole, in front of the wall's face."""
+    """Return trim around the hole, in front of the wall's face."""
     outline = _outline(opening)
     trim = outline.buffer(0.07, join_style="mitre").difference(outline).intersection(shapely.box(-99, 0, 99, 99))
     trim = trim.intersection(shapely.box(0.0, 0.0, opening.wall.length_m, 99.0))
@@ -101,7 +101,7 @@ def _casing(opening: Opening) -> list[Part]:
 
 
 def _leaf(opening: Opening, rng: np.random.Generator) -> list[Part]:
-    """A door leaf with raised panels and handles, hinged at the left end and opening into the room of `wall`."""
+    """Return a panelled door leaf with handles, hinged at the left end and opening into the room of `wall`."""
     wall, width = opening.wall, opening.right_m - opening.left_m - 0.02
     high = opening.top_m - 0.01
     parts = [slab("door", shapely.box(0.0, -_LEAF_M, width, 0.0), 0.008, high)]
@@ -118,7 +118,7 @@ def _leaf(opening: Opening, rng: np.random.Generator) -> list[Part]:
 
 
 def _glazing(opening: Opening, rng: np.random.Generator) -> list[Part]:
-    """Frame and bars of a window; the panes themselves let everything through."""
+    """Return frame and bars of a window; panes are fully transparent."""
     outline = _outline(opening)
     back = opening.depth_m * 0.6
     rim = outline.difference(outline.buffer(-0.05, join_style="mitre"))
@@ -134,8 +134,8 @@ def _glazing(opening: Opening, rng: np.random.Generator) -> list[Part]:
     parts = [_on_wall("frame", opening.wall, piece, back) for piece in _polygons(frame)]
     if opening.sill_m > 0.3:
         ends = [
-            opening.wall.point_m(at, out)
-            for at, out in (
+            opening.wall.point_m(along_m, out_m)
+            for along_m, out_m in (
                 (opening.left_m - 0.05, 0.0),
                 (opening.right_m + 0.05, 0.0),
                 (opening.right_m + 0.05, -0.1),

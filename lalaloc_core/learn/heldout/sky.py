@@ -1,4 +1,4 @@
-"""What lies outside the windows: a graded sky with the sun, ground, and the silhouettes of hills, trees and houses."""
+"""The outdoors behind windows: a graded sky with the sun, ground, and silhouettes of hills, trees and houses."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Sky:
 
     @classmethod
     def sample(cls, rng: np.random.Generator) -> Sky:
-        """Mostly day, clear or covered; sometimes dusk, sometimes night."""
+        """Draw a sky: mostly day, clear or covered; sometimes dusk or night."""
         weather = rng.choice(["clear", "covered", "dusk", "night"], p=[0.45, 0.35, 0.1, 0.1])
         height, around = np.radians(rng.uniform(8, 60)), rng.uniform(0, 2 * np.pi)
         sun = np.array([np.cos(height) * np.sin(around), np.cos(height) * np.cos(around), np.sin(height)])
@@ -54,7 +54,7 @@ class Sky:
         )
 
     def colour(self, direction: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Radiance along each direction."""
+        """Return the radiance along each direction."""
         up = direction[:, 2:]
         azimuth = np.arctan2(direction[:, 0], direction[:, 1])
         sky = self.horizon + (self.zenith - self.horizon) * np.clip(up, 0, 1) ** 0.5
@@ -69,5 +69,5 @@ class Sky:
         return np.where(up < 0.0, self.ground * (1.0 - 0.5 * np.clip(-up, 0, 1)), colour)
 
     def mean(self) -> Float[np.ndarray, "3"]:
-        """Radiance that a window shows on the whole."""
+        """Return the mean radiance of a window."""
         return 0.45 * self.horizon + 0.3 * self.zenith + 0.25 * self.ground

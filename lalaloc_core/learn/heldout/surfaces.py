@@ -1,4 +1,4 @@
-"""Materials as functions of place: planks, tiles, brick, stripes, marble, wood and cloth, without any picture."""
+"""Procedural materials: planks, tiles, brick, stripes, marble, wood and cloth."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Noise:
         self._table = rng.random((_TABLE, _TABLE, _TABLE), dtype=np.float32).ravel()
 
     def __call__(self, point: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-        """Values in 0 to 1; features are about one unit wide."""
+        """Return values in 0 to 1; features are about one unit wide."""
         cell = np.floor(point).astype(np.int32)
         t = (point - cell).astype(np.float32)
         t = t * t * (3 - 2 * t)
@@ -62,7 +62,7 @@ class Noise:
         return front + (back - front) * t[:, 0]
 
     def of_cell(self, i: Int[np.ndarray, "n"], j: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-        """A random number in 0 to 1 for each cell of a pattern."""
+        """Return a random number in 0 to 1 for each cell of a pattern."""
         return self._table[(i * 7919 + j * 104729) % len(self._table)]
 
 
@@ -172,22 +172,22 @@ PATTERNS: Mapping[str, _Pattern] = {
 
 
 class Materials:
-    """The surfaces of a home, by number."""
+    """Surfaces of a home, by number."""
 
     def __init__(self, surfaces: list[Surface], noise: Noise) -> None:
         self._surfaces, self._noise = surfaces, noise
         self.gloss = np.array([surface.gloss for surface in surfaces], np.float32)
         self.glow = np.array([surface.glow for surface in surfaces], np.float32)
-        self._means = np.stack([0.8 * one.colour + 0.2 * one.second for one in surfaces]).astype(np.float32)
+        self._means = np.stack([0.8 * surface.colour + 0.2 * surface.second for surface in surfaces]).astype(np.float32)
 
     def mean(self, number: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n 3"]:
-        """About the colour of a surface as a whole."""
+        """Return the mean colour of each surface."""
         return self._means[number]
 
     def colour(
         self, number: Int[np.ndarray, "n"], point_m: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, "n 3"]
     ) -> Float[np.ndarray, "n 3"]:
-        """Share of light (linear RGB) given back at each point."""
+        """Return the albedo (linear RGB) at each point."""
         out = np.zeros((len(number), 3), np.float32)
         order = np.argsort(number, kind="stable")
         bounds = np.searchsorted(number[order], np.arange(len(self._surfaces) + 1))

@@ -1,4 +1,4 @@
-"""Rays against triangles, by embree."""
+"""Ray tracing against triangles by embree."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ except ImportError as error:  # pragma: no cover
         "heldout homes are traced by embree: install the extra `oracle` (embreex), as `make setup` does"
     ) from error
 
-# Rays start this far off the surface they leave, so as not to hit it.
+# Rays start this far (m) from their surface, so that they do not hit it.
 OFFSET_M = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """What rays met first; `face` is -1 and `distance_m` inf where nothing."""
+    """First hits of rays; `face` is -1 and `distance_m` inf for a miss."""
 
     face: Int[np.ndarray, "n"]
     distance_m: Float[np.ndarray, "n"]
@@ -56,7 +56,7 @@ class Tracer:
         self._mesh = TriangleMesh(self._scene, vertices, faces)
 
     def first(self, origin_m: Float[np.ndarray, "n 3"], direction: Float[np.ndarray, "n 3"]) -> Hits:
-        """What each ray meets first."""
+        """Return the first hit of each ray."""
         found = self._scene.run(_single(origin_m), _single(direction), output=True)
         missed = found["primID"] < 0
         distance = np.where(missed, np.float32(np.inf), found["tfar"])
@@ -68,12 +68,12 @@ class Tracer:
         direction: Float[np.ndarray, "n 3"],
         within_m: Float[np.ndarray, "n"],
     ) -> Bool[np.ndarray, "n"]:
-        """Whether something stands nearer than `within_m` along each ray."""
+        """Return for each ray if an obstacle is nearer than `within_m`."""
         reach = np.ascontiguousarray(within_m, dtype=np.float32)
         return self._scene.run(_single(origin_m), _single(direction), reach, query="OCCLUDED") != -1
 
     def normals(self, hits: Hits, direction: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-        """Unit normals where rays met something, on the side they came from; of the rest, against the ray."""
+        """Return unit normals of the hits on the incoming side; for misses, against the ray."""
         corners = self.corner_normals[hits.face]
         u, v = hits.u[:, None], hits.v[:, None]
         normal = corners[:, 0] * (1 - u - v) + corners[:, 1] * u + corners[:, 2] * v

@@ -1,4 +1,4 @@
-"""Records whose columns have names: rows of numbers that stack, travel and lie on a device as one array."""
+"""Records with named columns: rows of numbers that stack, travel and live on a device as one array."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ Row = Float[np.ndarray, "width"]
 
 
 class Column:
-    """One column of records, or `width` neighbouring ones, which keep an axis; a view, which may be assigned to.
+    """One column of records, or `width` adjacent columns that keep an axis; a view that can be assigned to.
 
     Attributes:
-        index: of the columns among all; given by the order in which a class of `Records` names them.
+        index: position among all columns, in the order in which a class of `Records` names them.
     """
 
     index: int | slice
@@ -38,7 +38,7 @@ class Column:
 
 
 class Joined(Column):
-    """Columns that follow each other, by one more name: that of all of them together."""
+    """Several adjacent columns under one more name."""
 
     def __init__(self, *columns: Column) -> None:
         super().__init__(sum(column.width or 1 for column in columns))
@@ -68,16 +68,16 @@ class Records:
             raise ValueError(f"rows of {type(self).__name__} have {self.WIDTH} columns, not {self.rows.shape[-1]}")
 
     def __getitem__(self, index: Any) -> Any:
-        """The records at an index into the leading axes."""
+        """Return the records at an index into the leading axes."""
         return type(self)(self.rows[index])
 
     def copy(self) -> Any:
-        """Records with rows of their own (numpy)."""
+        """Return records with rows of their own (numpy)."""
         return type(self)(self.rows.copy())
 
     @classmethod
     def row(cls, **columns: Any) -> Row:
-        """One row with columns by name, 0 where they are not given; an unknown name is a `KeyError`."""
+        """Return one row with columns by name, 0 where missing; an unknown name is a `KeyError`."""
         row, known = np.zeros(cls.WIDTH), vars(cls)
         for name, value in columns.items():
             row[known[name].index] = value
@@ -85,12 +85,12 @@ class Records:
 
     @classmethod
     def stacked(cls, rows: list[Row]) -> Any:
-        """Records (n, width) of single rows."""
+        """Stack single rows to records (n, width)."""
         return cls(np.array(rows, dtype=float).reshape(-1, cls.WIDTH))
 
 
 def _together(parts: list[int | slice]) -> slice:
-    """The columns of several indices that follow each other."""
+    """Return the slice of adjacent columns."""
     spans = [slice(part, part + 1) if isinstance(part, int) else part for part in parts]
     if any(one.stop != following.start for one, following in pairwise(spans)):
         raise ValueError(f"columns {spans} are joined, but are not neighbours")

@@ -1,5 +1,4 @@
 """Random changes of finished panoramas, rendered or photographed.
 
-Begin with `photometric.py`, what another camera, lens, film or file would have made of them; `stretching.py` draws
-rooms out.
+Begin with `photometric.py`, effects of camera, lens, film and file; `stretching.py` stretches rooms.
 """

@@ -1,4 +1,4 @@
-"""Cheap random changes of what camera, lens and file make of a picture, for a whole batch on its device."""
+"""Photometric augmentation: cheap random effects of camera, lens and file for a whole batch on its device."""
 
 from __future__ import annotations
 
@@ -17,10 +17,11 @@ _JPEG_SHARE = 0.25
 
 
 def jittered(image: UInt8[Tensor, "b h w 3"], strength: float, generator: torch.Generator) -> Float[Tensor, "b h w 3"]:
-    """Panoramas (0 to 255) as another camera or another hour would have shown them.
+    """Change exposure, colour and noise of panoramas at random.
 
     Args:
-        strength: 0 changes nothing, 1 by up to a third of the exposure or so.
+        image: (b, h, w, 3) pictures, 0 to 255.
+        strength: 0 changes nothing, 1 changes the exposure by about a third.
         generator: source of randomness, on the pictures' device.
     """
 
@@ -40,13 +41,14 @@ def jittered(image: UInt8[Tensor, "b h w 3"], strength: float, generator: torch.
 
 
 def optics(image: Float[Tensor, "b h w 3"], strength: float, generator: torch.Generator) -> Float[Tensor, "b h w 3"]:
-    """Panoramas (0 to 255) as another lens, film or file would have shown them.
+    """Apply random effects of lens, film or file to panoramas.
 
-    Blur, vignetting of two lenses and a step in brightness between them, clipped highlights, lifted shadows, pale or
-    strong colours, JPEG; each of them for a share of the pictures.
+    Blur, vignetting of two lenses and a brightness step between them, clipped highlights, lifted shadows, pale or strong
+    colours, JPEG; each for a share of the pictures.
 
     Args:
-        strength: 0 changes nothing, 1 changes most pictures in some way.
+        image: (b, h, w, 3) pictures, 0 to 255.
+        strength: 0 changes nothing, 1 changes most pictures.
         generator: source of randomness, on the pictures' device.
     """
     count, device = len(image), image.device
@@ -84,14 +86,14 @@ def optics(image: Float[Tensor, "b h w 3"], strength: float, generator: torch.Ge
 def _lenses(
     columns: int, vignette: Float[Tensor, "b"], step: Float[Tensor, "b"], seam: Float[Tensor, "b"]
 ) -> Float[Tensor, "b 1 w 1"]:
-    """Factor on the brightness of each column: darker towards the seams of two lenses, of which one is brighter."""
+    """Return the gain of each column: darker towards the seams of two lenses, one lens brighter than the other."""
     azimuth = (torch.arange(columns, device=seam.device) + 0.5) * (TWO_PI / columns) + seam[:, None]
     gain = (1.0 - vignette[:, None] * azimuth.cos().abs() ** 3) * (1.0 + step[:, None] * azimuth.cos().sign())
     return gain[:, None, :, None]
 
 
 def _blurred(pixels: Float[Tensor, "b h w 3"]) -> Float[Tensor, "b h w 3"]:
-    """The mean of 3 x 3 pixels, around the horizon."""
+    """Return the mean of 3 x 3 pixels, wrapped around the horizon."""
     around = torch.cat([pixels[:, :, -1:], pixels, pixels[:, :, :1]], dim=2)
     wide = around[:, :, :-2] + around[:, :, 1:-1] + around[:, :, 2:]
     over = torch.cat([wide[:, :1], wide, wide[:, -1:]], dim=1)

@@ -1,4 +1,4 @@
-"""Panoramas of rooms drawn out along two horizontal axes, as HorizonNet's "pano stretch" (Sun et al., CVPR 2019)."""
+"""Panoramas of rooms stretched along two horizontal axes: "pano stretch" of HorizonNet (Sun et al., CVPR 2019)."""
 
 from __future__ import annotations
 
@@ -18,9 +18,12 @@ def stretched(
     log_distance: Float[Tensor, "n w"],
     factors: Float[Tensor, "n 2"],
 ) -> tuple[UInt8[Tensor, "n h w 3"], Float[Tensor, "n w k"], Float[Tensor, "n w"]]:
-    """Panoramas, and what is known by column, as if what they show were wider and deeper about the camera.
+    """Stretch panoramas and their labels per column about the camera.
 
     Args:
+        images: (n, h, w, 3) panoramas.
+        openings: (n, w, k) labels of openings per column.
+        log_distance: (n, w) log distances of walls per column.
         factors: (a, b), across and along the direction of the central column.
     """
     width = images.shape[2]
@@ -31,7 +34,7 @@ def stretched(
 
 
 def stretched_images(images: UInt8[Tensor, "n h w 3"], factors: Float[Tensor, "n 2"]) -> UInt8[Tensor, "n h w 3"]:
-    """Panoramas alone, as by `stretched`."""
+    """Stretch panoramas only, as `stretched`."""
     height, width = images.shape[1:3]
     column, reach = _seen_at(width, factors)
     tangent = torch.tan((0.5 - (torch.arange(height) + 0.5) / height) * math.pi)
@@ -40,10 +43,9 @@ def stretched_images(images: UInt8[Tensor, "n h w 3"], factors: Float[Tensor, "n
 
 
 def _seen_at(width: int, factors: Float[Tensor, "n 2"]) -> tuple[Float[Tensor, "n w"], Float[Tensor, "n w"]]:
-    """In which column what is to be seen in each column was seen, and what part of its distance it had then.
+    """Return the source column of each column, and the source share of its distance.
 
-    A point (x, y, z) comes to lie at (a x, b y, z), so what is seen in direction (u, v, t) was seen in
-    (u / a, v / b, t).
+    A point (x, y, z) moves to (a x, b y, z), so direction (u, v, t) shows the source direction (u / a, v / b, t).
     """
     azimuth = ((torch.arange(width) + 0.5) / width - 0.5) * TWO_PI
     across, along = torch.sin(azimuth) / factors[:, :1], torch.cos(azimuth) / factors[:, 1:]
@@ -53,7 +55,7 @@ def _seen_at(width: int, factors: Float[Tensor, "n 2"]) -> tuple[Float[Tensor, "
 def _sampled(
     images: UInt8[Tensor, "n h w 3"], row: Float[Tensor, "n h w"], column: Float[Tensor, "n w"]
 ) -> UInt8[Tensor, "n h w 3"]:
-    """Pixels between pixels, linearly, around the horizon."""
+    """Sample pixels bilinearly, wrapped around the horizon."""
     height, width = images.shape[1:3]
     around = torch.cat([images[:, :, -1:], images, images[:, :, :1]], dim=2).permute(0, 3, 1, 2).float()
     # The first column of `around` is the last of the picture, and -1 to 1 reach from the edges of its edge pixels.

@@ -1,6 +1,6 @@
-"""What a camera makes of the light that falls into it: exposure, lenses, stitching, patches at the poles, compression.
+"""Camera model: exposure, lenses, stitching, patches at the poles, compression.
 
-Begin with `develop.py`, which turns radiance into bytes; `exposure.py` has the settings and samples them.
+Begin with `develop.py`, which turns radiance into bytes; `exposure.py` defines and samples the settings.
 """
 
 from lalaloc_core.learn.synth.camera.exposure import Exposure

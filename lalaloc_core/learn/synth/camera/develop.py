@@ -1,4 +1,4 @@
-"""From radiance to an 8-bit picture: exposure, white balance, lenses, tone curve, blur, noise, patches, compression."""
+"""Radiance to an 8-bit picture: exposure, white balance, lenses, tone curve, blur, noise, patches, compression."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ def develop(
     """Expose linear radiance and encode it as sRGB-like bytes.
 
     Args:
-        radiance: linear light.
+        radiance: (b, h, w, 3) linear light.
         exposure: camera settings per picture, sampled by `sample_exposure`.
-        noise: unit noise, at least as large as a picture; every picture takes its own rolled part of it.
+        noise: unit noise, at least as large as a picture; every picture uses its own rolled part.
     """
     luma = radiance @ radiance.new_tensor(_LUMA)
     # The mean of the logarithm weighs a dark room more than the bright window in it, as a light meter does.
@@ -65,14 +65,14 @@ def _replace(
     wanted: Bool[Tensor, "b"],
     change: Callable[[Tensor, Exposure], Tensor],
 ) -> None:
-    """Change some of the pictures in place."""
+    """Change the selected pictures in place."""
     chosen = wanted.nonzero(as_tuple=True)[0]
     if len(chosen):
         picture[chosen] = change(picture[chosen], exposure[chosen])
 
 
 def _blur(picture: Float[Tensor, "b h w 3"], sigma: Float[Tensor, "b"]) -> Float[Tensor, "b h w 3"]:
-    """A separable three-tap blur, around the seam too."""
+    """Blur with a separable three-tap kernel, wrapped around the seam."""
     side = (0.5 * sigma**2 / (1.0 + sigma**2))[:, None, None, None]
     across = picture.roll(1, 2).add_(picture.roll(-1, 2)).mul_(side)
     picture = across.add_(picture * (1.0 - 2.0 * side))

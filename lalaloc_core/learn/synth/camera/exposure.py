@@ -1,4 +1,4 @@
-"""Drawing the settings of the camera: exposure, colour, lenses, stitching, what hides its stand, compression."""
+"""Random camera settings: exposure, colour, lenses, stitching, patch over the stand, compression."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ _MAX_TILT_DEG = 2.0
 
 
 class Exposure(Records):
-    """How a camera turns light into a picture.
+    """Settings that turn light into a picture.
 
     Attributes:
-        target: brightness that the mean is exposed to.
+        target: mean brightness of the exposed picture.
         red_gain, tint, blue_gain: white balance, factors on the three channels.
         contrast, saturation: factors.
         noise: standard deviation.
-        blur: of the lens, standard deviation in pixels.
-        nadir, nadir_tone, nadir_kind, nadir_turn: radius (radians, 0 for none) and tone of what covers the nadir, which
-            of the kinds below it is, and how it is turned.
-        noise_seed: which part of the noise is taken.
-        shoulder: how softly highlights roll off.
-        flatness: how far the range of brightness is compressed.
+        blur: standard deviation of the lens blur, pixels.
+        nadir, nadir_tone, nadir_kind, nadir_turn: radius (radians, 0 for none), tone, kind and rotation of the patch over
+            the nadir.
+        noise_seed: part of the noise that is used.
+        shoulder: softness of the roll-off of highlights.
+        flatness: compression of the range of brightness.
         vignette: darkening towards the rims of the two lenses.
-        seam, seam_step, seam_shift: azimuth of the seam between them relative to the picture's centre, the step in
+        seam, seam_step, seam_shift: azimuth of the seam between the lenses relative to the picture's centre, the step in
             brightness and the shift in elevation (radians) across it.
-        roll, pitch: tilt about the axis ahead and about the axis to the right, radians.
+        roll, pitch: tilt about the forward axis and about the axis to the right, radians.
         jpeg: quality of compression, 0 for none.
-        zenith, zenith_tone: radius (radians, 0 for none) and tone of what covers the zenith.
+        zenith, zenith_tone: radius (radians, 0 for none) and tone of the patch over the zenith.
     """
 
     target = Column()
@@ -64,11 +64,11 @@ class Exposure(Records):
 
 
 def sample_exposure(rng: np.random.Generator, *, bright: bool = False) -> Exposure:
-    """How the camera turns light into a picture; see `Exposure`.
+    """Sample camera settings.
 
     Args:
         rng: source of randomness.
-        bright: exposed as pictures of homes for sale are: light, and with compressed contrasts.
+        bright: expose like pictures of homes for sale: light, with compressed contrasts.
     """
     exposure = Exposure(np.zeros(Exposure.WIDTH))
     exposure.target = math.exp(rng.normal(math.log(0.42), 0.42))
@@ -90,7 +90,7 @@ def sample_exposure(rng: np.random.Generator, *, bright: bool = False) -> Exposu
 
 
 def sample_staged_exposure(rng: np.random.Generator) -> Exposure:
-    """As `sample_exposure`, for the rendered pictures of one data set: alike, level, without seams and tripods."""
+    """Sample settings for rendered pictures of one data set: similar, level, without seams and tripods."""
     exposure = sample_exposure(rng)
     exposure.target = math.sqrt(0.5 * exposure.target)
     exposure.saturation = 0.5 + 0.5 * exposure.saturation

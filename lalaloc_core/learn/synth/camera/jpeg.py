@@ -1,4 +1,4 @@
-"""The losses of JPEG compression: 8 x 8 blocks of cosines, rounded as the standard's tables say (ITU T.81, annex K)."""
+"""Losses of JPEG compression: 8 x 8 cosine blocks, quantised by the tables of ITU T.81, annex K."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _TO_YCC = ((0.299, 0.587, 0.114), (-0.168736, -0.331264, 0.5), (0.5, -0.418688, 
 
 
 def compress(picture: Float[Tensor, "b h w 3"], quality: Float[Tensor, "b"]) -> Float[Tensor, "b h w 3"]:
-    """What is left of pictures in 0..1 after compression at a `quality` of 1 to 100, without sub-sampled colours."""
+    """Compress pictures in 0..1 at a `quality` of 1 to 100, without chroma sub-sampling."""
     rows, columns = picture.shape[1:3]
     matrix = picture.new_tensor(_TO_YCC)
     planes = (picture * 255.0 - 128.0) @ matrix.T
@@ -41,7 +41,7 @@ def compress(picture: Float[Tensor, "b h w 3"], quality: Float[Tensor, "b"]) -> 
 
 
 def _cosines(like: Tensor) -> Float[Tensor, "64 64"]:
-    """The orthonormal discrete cosine transform of flattened blocks."""
+    """Return the orthonormal discrete cosine transform of flattened blocks."""
     k = torch.arange(_BLOCK, device=like.device, dtype=like.dtype)
     table = torch.cos((k[None] + 0.5) * k[:, None] * (math.pi / _BLOCK)) * math.sqrt(2.0 / _BLOCK)
     table[0] *= math.sqrt(0.5)

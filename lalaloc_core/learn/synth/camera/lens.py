@@ -1,4 +1,4 @@
-"""What two stitched lenses do to a panorama: rims that are darker, a seam, and a horizon that is not quite level."""
+"""Two stitched lenses: darker rims, a seam, and a tilted horizon."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _BLEND = 0.05
 
 
 def lens_gain(exposure: Exposure, rows: int, columns: int) -> Float[Tensor, "b h w"]:
-    """Factor on the light of each pixel: darker towards the rims of the lenses, one lens brighter than the other."""
+    """Return the gain of each pixel: darker towards the rims, one lens brighter than the other."""
     azimuth, elevation = _angles(rows, columns, exposure.rows)
     from_seam = azimuth - exposure.seam[:, None]
     # The axes of the lenses lie at right angles to the seam.
@@ -26,7 +26,7 @@ def lens_gain(exposure: Exposure, rows: int, columns: int) -> Float[Tensor, "b h
 
 
 def tilt(picture: Float[Tensor, "b h w 3"], exposure: Exposure) -> Float[Tensor, "b h w 3"]:
-    """The picture of a camera with roll and pitch, whose second lens is shifted, resampled."""
+    """Resample the picture for a camera with roll and pitch whose second lens is shifted."""
     rows, columns = picture.shape[1:3]
     azimuth, elevation = _angles(rows, columns, exposure.rows)
     shift = exposure.seam_shift[:, None] * _second_lens(azimuth - exposure.seam[:, None])
@@ -47,12 +47,12 @@ def tilt(picture: Float[Tensor, "b h w 3"], exposure: Exposure) -> Float[Tensor,
 
 
 def _angles(rows: int, columns: int, like: Tensor) -> tuple[Float[Tensor, "w"], Float[Tensor, "h"]]:
-    """Azimuth of the columns relative to the picture's centre, and elevation of the rows."""
+    """Return the azimuth of the columns relative to the picture's centre, and the elevation of the rows."""
     column = torch.arange(columns, device=like.device, dtype=like.dtype)
     row = torch.arange(rows, device=like.device, dtype=like.dtype)
     return ((column + 0.5) / columns - 0.5) * TWO_PI, (0.5 - (row + 0.5) / rows) * math.pi
 
 
 def _second_lens(from_seam: Float[Tensor, "b w"]) -> Float[Tensor, "b w"]:
-    """1 where the second lens looks, 0 where the first does."""
+    """Return 1 where the second lens looks, 0 where the first does."""
     return torch.sigmoid(from_seam.sin() * (4.0 / _BLEND))

@@ -1,4 +1,4 @@
-"""What covers the poles of a panorama: discs, logos, a mirrored ball, the legs of a tripod, the photographer."""
+"""Patches over the poles of a panorama: discs, logos, a mirrored ball, tripod legs, the photographer."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lalaloc_core.learn.synth.camera.exposure import Exposure
 
 
 def cover_poles(picture: Float[Tensor, "b h w 3"], exposure: Exposure) -> Float[Tensor, "b h w 3"]:
-    """Lay the patches of `exposure` over nadir and zenith of encoded pictures; those without one stay as they are."""
+    """Lay the patches of `exposure` over nadir and zenith of encoded pictures."""
     covered = ((exposure.nadir > 0.0) | (exposure.zenith > 0.0)).nonzero(as_tuple=True)[0]
     if len(covered):
         picture[covered] = _cover(picture[covered], exposure[covered])
@@ -61,7 +61,7 @@ def _cover(picture: Float[Tensor, "b h w 3"], exposure: Exposure) -> Float[Tenso
 
 
 def _ball(picture: Float[Tensor, "b h w 3"], share: Float[Tensor, "b h 1"]) -> Float[Tensor, "b h w 3"]:
-    """What a mirrored ball below the camera shows: the ceiling in its middle, the room towards its rim."""
+    """Return the reflection in a mirrored ball below the camera: ceiling in the middle, room towards the rim."""
     rows = picture.shape[1]
     from_zenith = 2.0 * torch.asin(share.clamp(max=1.0)) / math.pi
     row = (from_zenith * rows).long().clamp(max=rows - 1)

@@ -1,8 +1,8 @@
-"""What stands in the rooms of a home: pieces of furniture, and finding room for them.
+"""Furniture of rooms: pieces, and their placement.
 
-Begin with `furnish.py`, which furnishes a room. `pieces.py` says what a piece is, `pieces_living.py` and
-`pieces_service.py` make them, `catalogue.py` says what belongs where, `built_in.py` has what stays when the furniture
-goes. Needs no torch.
+Begin with `furnish.py`, which furnishes a room. `pieces.py` defines a piece, `pieces_living.py` and
+`pieces_service.py` make them, `catalogue.py` lists the pieces of each kind of room, `built_in.py` has fixed furniture.
+Needs no torch.
 """
 
 from lalaloc_core.learn.synth.furniture.furnish import FURNITURE_LEVELS, FurnitureLevel, furnish

@@ -1,6 +1,6 @@
-"""What is built into a room and stays when the furniture goes: kitchens, wardrobes from wall to wall, sanitary ware.
+"""Built-in furniture that stays in empty rooms: kitchens, wall-to-wall wardrobes, sanitary ware.
 
-All of it stands along walls and hides their foot, and is easily taken for the wall itself.
+It stands along walls, hides their foot, and is easily mistaken for the wall.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _TALL_UNIT_M = 0.6
 
 
 class Stretch(NamedTuple):
-    """A part of a wall without doors: wall, start and end along it (m), and whether a window is above a worktop."""
+    """A stretch of wall without doors: wall, start and end along it (m), and if a window is above worktop height."""
 
     wall: int
     start_m: float
@@ -41,7 +41,7 @@ class Stretch(NamedTuple):
 
 
 class Placed(NamedTuple):
-    """A piece with its back to a wall: how far along the wall its middle lies, and its back from the wall (m)."""
+    """A piece with its back to a wall: position of its middle along the wall, and distance of its back (m)."""
 
     piece: Piece
     wall: int
@@ -52,11 +52,11 @@ class Placed(NamedTuple):
 def kitchen(
     stretches: list[Stretch], lengths_m: Float[np.ndarray, "n"], ceiling_m: float, rng: np.random.Generator
 ) -> list[Placed]:
-    """A run of units along a wall, at times around a corner, with tall units, an island or a peninsula.
+    """Return a run of units along a wall, sometimes around a corner, with tall units, an island or a peninsula.
 
     Args:
-        stretches: where there is room along the walls.
-        lengths_m: of the room's walls, in order around it.
+        stretches: free stretches of wall.
+        lengths_m: lengths of the room's walls, in order.
         ceiling_m: height of the ceiling.
         rng: source of randomness.
     """
@@ -98,7 +98,7 @@ def kitchen(
 
 
 def wardrobes(stretches: list[Stretch], ceiling_m: float, rng: np.random.Generator) -> list[Placed]:
-    """Wardrobes that fill a wall from end to end, usually up to the ceiling."""
+    """Return wardrobes that fill a wall from end to end, usually up to the ceiling."""
     usable = [stretch for stretch in stretches if 0.9 < stretch.length_m < 5.0 and not stretch.has_window]
     if not usable:
         return []
@@ -110,7 +110,7 @@ def wardrobes(stretches: list[Stretch], ceiling_m: float, rng: np.random.Generat
 
 
 def sanitary(rng: np.random.Generator) -> list[Piece]:
-    """What a bathroom keeps."""
+    """Return the sanitary ware of a bathroom."""
     pieces = [washbasin(rng), toilet(rng)]
     return [*pieces, bathtub(rng) if rng.random() < 0.5 else shower(rng)]
 
@@ -124,7 +124,7 @@ def _around_the_corner(
     body: Finish,
     rng: np.random.Generator,
 ) -> list[Placed]:
-    """The run goes on along the next wall where it reaches a corner."""
+    """Continue the run along the next wall if it reaches a corner."""
     if rng.random() > 0.6 or run_m[1] < lengths_m[main.wall] - 0.1:
         return []
     following = (main.wall + 1) % len(lengths_m)
@@ -150,7 +150,7 @@ def _tall_unit(body: Finish, height: float) -> Piece:
 
 
 def _block(width: float, depth: float, height: float, body: Finish) -> Piece:
-    """Base units under a worktop that can be walked around."""
+    """Return free-standing base units under a worktop."""
     hx, hy = 0.5 * width, 0.5 * depth
     parts = [
         box(at=(0.0, 0.0), half=(hx - 0.05, hy - 0.05), z=(0.0, 0.1), finish="dark"),

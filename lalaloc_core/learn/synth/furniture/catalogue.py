@@ -1,4 +1,4 @@
-"""Which furniture stands in which kind of room."""
+"""Furniture by kind of room."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Furnishing a room: pieces of the catalogue placed along its walls and on its floor, as prisms in the plan frame."""
+"""Furnishing of a room: catalogue pieces placed along walls and on the floor, as prisms in the plan frame."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ class Prism(NamedTuple):
 
     Attributes:
         x, y: centre, metres.
-        axis_x, axis_y: unit vector of its first axis; the second is that turned by +90°.
+        axis_x, axis_y: unit vector of its first axis; the second is the first turned by +90°.
         half_a, half_b: half extents along the two axes, metres.
-        z0, z1: lower and upper end over the floor, metres.
-        finish: what it is made of.
-        piece: number of the piece of furniture that it is part of.
-        is_round: whether it is a cylinder.
-        label: of the piece, see `pieces`.
+        z0, z1: lower and upper end above the floor, metres.
+        finish: its material.
+        piece: number of its piece of furniture.
+        is_round: true for a cylinder.
+        label: label of the piece, see `pieces`.
     """
 
     x: float
@@ -63,7 +63,7 @@ class Prism(NamedTuple):
 
 
 class _Floor:
-    """The free floor of a room while it is being furnished."""
+    """Free floor of a room while it is furnished."""
 
     def __init__(self, room: Room, openings: Sequence[Opening], keep_clear: Sequence[shapely.Polygon]) -> None:
         self.room = room
@@ -78,12 +78,12 @@ class _Floor:
         self._along = along / self._length[:, None]
 
     def find(self, piece: Piece, rng: np.random.Generator) -> Pose | None:
-        """A free place for a piece, which is then taken; None if several tries found none."""
+        """Find and take a free place for a piece; None if several tries found none."""
         pose = self._along_walls(piece, rng) if piece.against_wall else self._anywhere(rng)
         return None if pose is None else self._take(piece, *pose)
 
     def fit(self, placed: Placed) -> Pose | None:
-        """The pose of a piece whose place is given, which is then taken; None if it is not free."""
+        """Take the given place of a piece and return its pose; None if it is not free."""
         axis, wall = self._along[placed.wall], placed.wall
         inwards = np.array([-axis[1], axis[0]])
         from_wall = placed.from_wall_m + 0.5 * placed.piece.depth_m + _WALL_GAP_M
@@ -91,7 +91,7 @@ class _Floor:
         return self._take(placed.piece, centre[None], axis[None])
 
     def stretches(self) -> tuple[list[Stretch], Float[np.ndarray, "n"]]:
-        """The stretches of wall without doors and low windows, and the length of every wall."""
+        """Return the stretches of wall without doors and low windows, and the length of every wall."""
         found = []
         for wall, length in enumerate(self._length):
             holes = [opening for opening in self._openings if opening.wall == wall]
@@ -106,7 +106,7 @@ class _Floor:
         return found, self._length
 
     def _take(self, piece: Piece, centre: Float[np.ndarray, "n 2"], axis: Float[np.ndarray, "n 2"]) -> Pose | None:
-        """The first of several poses that is free, if any."""
+        """Take the first free pose of several, if any."""
         footprints = _rectangles(centre, axis, 0.5 * piece.width_m - 1e-3, 0.5 * piece.depth_m - 1e-3)
         free = shapely.contains_properly(self._shape, footprints)
         if self._taken:
@@ -118,13 +118,13 @@ class _Floor:
         return centre[chosen], axis[chosen]
 
     def lay(self, half_a: float, half_b: float, rng: np.random.Generator) -> Pose | None:
-        """A place for something flat, on which furniture may stand."""
+        """Return a place for something flat that furniture can stand on."""
         centre, axis = self._anywhere(rng)
         inside = shapely.contains_properly(self._shape, _rectangles(centre, axis, half_a, half_b))
         return (centre[inside.argmax()], axis[inside.argmax()]) if inside.any() else None
 
     def _along_walls(self, piece: Piece, rng: np.random.Generator) -> Pose | None:
-        """Poses (n, 2) with the back to a wall that is long enough and whose windows stay uncovered."""
+        """Return poses (n, 2) with the back to a wall that is long enough and whose windows stay uncovered."""
         walls = np.flatnonzero(self._length >= piece.width_m)
         if not len(walls):
             return None
@@ -143,7 +143,7 @@ class _Floor:
         return self._start[wall] + axis * (at + 0.5 * piece.width_m)[:, None] + inwards * from_wall, axis
 
     def _anywhere(self, rng: np.random.Generator) -> Pose:
-        """Poses (n, 2) anywhere on the floor, parallel or at right angles to a wall."""
+        """Return poses (n, 2) anywhere on the floor, parallel or perpendicular to a wall."""
         x_min, y_min, x_max, y_max = self.room.shape.bounds
         centre = rng.uniform((x_min, y_min), (x_max, y_max), (_TRIES, 2))
         along = self._along[rng.integers(len(self._along), size=_TRIES)]
@@ -163,12 +163,12 @@ def furnish(
     """Furnish one room.
 
     Args:
-        room: the room; its name decides what stands in it.
-        openings: the openings in its walls; the floor before doors stays free, and so do windows above the sill.
-        level: how much.
+        room: the room; its name decides its furniture.
+        openings: the openings in its walls; the floor before doors and windows above the sill stay free.
+        level: amount of furniture.
         rng: source of randomness.
-        camera_m: nothing comes closer to this position than `CAMERA_CLEARANCE_M`.
-        built_in: whether kitchens, bathrooms and wardrobes are built in where they belong, in empty rooms too.
+        camera_m: position that everything keeps `CAMERA_CLEARANCE_M` away from.
+        built_in: build kitchens, bathrooms and wardrobes in where they belong, in empty rooms too.
     """
     most = _MAX_PIECES[level]
     if most == 0 and not built_in:
@@ -199,7 +199,7 @@ def furnish(
 
 
 def _build_in(floor: _Floor, room: Room, rng: np.random.Generator) -> list[Prism]:
-    """What is built into a room by its kind; the pieces of one kitchen share a number, and so their looks."""
+    """Return the built-in furniture of a room; pieces of one kitchen share a number, hence their looks."""
     kind = room.name.split()[0]
     stretches, lengths = floor.stretches()
     groups: list[list[Placed]] = []
@@ -221,7 +221,7 @@ def _build_in(floor: _Floor, room: Room, rng: np.random.Generator) -> list[Prism
 
 
 def place(piece: Piece, centre_m: Float[np.ndarray, "2"], axis: Float[np.ndarray, "2"], number: int) -> list[Prism]:
-    """The parts of a piece whose width lies along the unit vector `axis`, its back to the right of it."""
+    """Return the parts of a piece whose width lies along the unit vector `axis`, its back to the right of it."""
     ax, ay = float(axis[0]), float(axis[1])
     cx, cy = float(centre_m[0]), float(centre_m[1])
     return [
@@ -244,7 +244,7 @@ def place(piece: Piece, centre_m: Float[np.ndarray, "2"], axis: Float[np.ndarray
 
 
 def rectangle(centre_m: np.ndarray, axis: np.ndarray, half_a: float, half_b: float) -> shapely.Polygon:
-    """An oriented rectangle."""
+    """Return an oriented rectangle."""
     a, b = axis * half_a, np.array([-axis[1], axis[0]]) * half_b
     return shapely.Polygon([centre_m - a - b, centre_m + a - b, centre_m + a + b, centre_m - a + b])
 
@@ -267,7 +267,7 @@ def _door_zone(room: Room, opening: Opening) -> shapely.Polygon:
 
 
 def wall_frame(room: Room, wall: int) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-    """(first vertex, unit vector along the wall, unit normal into the room)."""
+    """Return (first vertex, unit vector along the wall, unit normal into the room)."""
     x0, y0, x1, y1 = room.walls_m[wall]
     along = np.array([x1 - x0, y1 - y0])
     along /= np.hypot(*along)
@@ -288,7 +288,7 @@ def _rugs(floor: _Floor, rng: np.random.Generator, first_number: int) -> list[Pr
 
 
 def _rectangles(centre_m: np.ndarray, axis: np.ndarray, half_a: float, half_b: float) -> np.ndarray:
-    """Oriented rectangles (n,) as shapely geometries."""
+    """Return oriented rectangles (n,) as shapely geometries."""
     a, b = axis * half_a, np.stack([-axis[:, 1], axis[:, 0]], axis=1) * half_b
     corners = np.stack([centre_m - a - b, centre_m + a - b, centre_m + a + b, centre_m - a + b], axis=1)
     return np.asarray(shapely.polygons(corners))

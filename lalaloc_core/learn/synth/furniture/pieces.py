@@ -1,7 +1,7 @@
-"""What a piece of furniture is: textured boxes and cylinders in a frame of their own.
+"""Definition of a piece of furniture: textured boxes and cylinders in a local frame.
 
-Frame of a piece: x along its width, y from its back (negative, the wall's side) to its front, z up; the origin lies
-on the floor in the middle of its footprint. A part is a `box` or a `cylinder`: centre, half extents and z-range.
+Local frame: x along the width, y from the back (negative, at the wall) to the front, z up; the origin is on the floor
+in the middle of the footprint. A part is a `box` or a `cylinder`: centre, half extents and z-range.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ Label = Literal["", "counter"]
 
 
 class Part(NamedTuple):
-    """A vertical box, or an elliptic cylinder when `is_round`; metres. Made by `box` and `cylinder`."""
+    """A vertical box, or an elliptic cylinder if `is_round`; metres. Made by `box` and `cylinder`."""
 
     x: float
     y: float
@@ -31,18 +31,18 @@ class Part(NamedTuple):
 
 
 def box(*, at: tuple[float, float], half: tuple[float, float], z: tuple[float, float], finish: Finish) -> Part:
-    """A box with its centre `at` (x, y), half extents along x and y, and lower and upper end `z`; metres."""
+    """Return a box with its centre `at` (x, y), half extents along x and y, and lower and upper end `z`; metres."""
     return Part(*at, *half, *z, finish, is_round=False)
 
 
 def cylinder(*, at: tuple[float, float], half: tuple[float, float], z: tuple[float, float], finish: Finish) -> Part:
-    """An elliptic cylinder, given as a `box` is, whose footprint it fills."""
+    """Return an elliptic cylinder that fills the footprint of the `box` with these arguments."""
     return Part(*at, *half, *z, finish, is_round=True)
 
 
 @dataclass(frozen=True)
 class Piece:
-    """A piece of furniture with its footprint (width, depth) in metres; `label` names what is reported of a shot."""
+    """A piece of furniture with its footprint (width, depth) in metres; `label` is its name in reports of a shot."""
 
     width_m: float
     depth_m: float
@@ -60,7 +60,7 @@ Maker = Callable[[np.random.Generator], Piece]
 
 
 def square_legs(hx: float, hy: float, thickness: float, height: float, finish: Finish) -> list[Part]:
-    """Four square legs under a rectangle of half extents (hx, hy)."""
+    """Return four square legs under a rectangle of half extents (hx, hy)."""
     half = 0.5 * thickness
     return [
         box(at=(sx * (hx - half), sy * (hy - half)), half=(half, half), z=(0.0, height), finish=finish)

@@ -1,4 +1,4 @@
-"""Furniture to sit, lie, eat and work at, and to keep things in; see `pieces` for the frame."""
+"""Furniture for sitting, sleeping, eating, working and storage; see `pieces` for the frame."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from lalaloc_core.learn.synth.furniture.pieces import Finish, Part, Piece, box, 
 
 
 def bed(rng: np.random.Generator) -> Piece:
-    """Frame, mattress, duvet, pillows and usually a headboard."""
+    """Return a bed: frame, mattress, duvet, pillows and usually a headboard."""
     width, depth, height = rng.uniform(0.9, 1.9), rng.uniform(1.95, 2.15), rng.uniform(0.35, 0.6)
     hx, hy = 0.5 * width, 0.5 * depth
     linen: Finish = "white" if rng.random() < 0.6 else "fabric"
@@ -29,7 +29,7 @@ def bed(rng: np.random.Generator) -> Piece:
 
 
 def sofa(rng: np.random.Generator) -> Piece:
-    """Seat, back, arms and cushions; an armchair when narrow."""
+    """Return a sofa with seat, back, arms and cushions; an armchair when narrow."""
     width, depth = rng.uniform(0.75, 2.6), rng.uniform(0.8, 1.0)
     hx, hy, seat, back = 0.5 * width, 0.5 * depth, rng.uniform(0.38, 0.46), rng.uniform(0.7, 0.95)
     parts = [
@@ -45,7 +45,7 @@ def sofa(rng: np.random.Generator) -> Piece:
 
 
 def _chair_parts(x: float, y: float, facing: int, finish: Finish) -> list[Part]:
-    """A chair at (x, y) whose back stands on the side of `facing` (+1 or -1 along y)."""
+    """Return a chair at (x, y) with its back on the side of `facing` (+1 or -1 along y)."""
     legs = [part._replace(x=part.x + x, y=part.y + y) for part in square_legs(0.21, 0.21, 0.04, 0.44, "wood")]
     seat = box(at=(x, y), half=(0.22, 0.22), z=(0.43, 0.48), finish=finish)
     back = box(at=(x, y + facing * 0.2), half=(0.21, 0.02), z=(0.48, 0.92), finish=finish)
@@ -53,7 +53,7 @@ def _chair_parts(x: float, y: float, facing: int, finish: Finish) -> list[Part]:
 
 
 def dining_table(rng: np.random.Generator) -> Piece:
-    """A table with chairs on its two long sides."""
+    """Return a table with chairs on its two long sides."""
     width, depth, height = rng.uniform(0.8, 2.2), rng.uniform(0.75, 1.0), rng.uniform(0.72, 0.78)
     hx, hy = 0.5 * width, 0.5 * depth
     if rng.random() < 0.25:
@@ -85,7 +85,7 @@ def dining_table(rng: np.random.Generator) -> Piece:
 
 
 def low_table(rng: np.random.Generator) -> Piece:
-    """A coffee table, round or on four legs, sometimes with something on it."""
+    """Return a coffee table, round or on four legs, sometimes with an object on it."""
     width, depth, height = rng.uniform(0.5, 1.3), rng.uniform(0.45, 0.7), rng.uniform(0.32, 0.5)
     hx, hy, is_round = 0.5 * width, 0.5 * depth, bool(rng.random() < 0.3)
     top = (cylinder if is_round else box)(at=(0.0, 0.0), half=(hx, hy), z=(height - 0.04, height), finish="wood")
@@ -104,7 +104,7 @@ def low_table(rng: np.random.Generator) -> Piece:
 
 
 def desk(rng: np.random.Generator) -> Piece:
-    """A desk with a screen, and a chair before it."""
+    """Return a desk with a screen and a chair."""
     width, depth, height = rng.uniform(0.9, 1.8), rng.uniform(0.55, 0.8), rng.uniform(0.7, 0.78)
     hx, hy = 0.5 * width, 0.5 * depth
     back = 0.25
@@ -121,13 +121,13 @@ def desk(rng: np.random.Generator) -> Piece:
 
 
 def wardrobe(rng: np.random.Generator) -> Piece:
-    """A tall box with doors and handles, as high as the ceiling at times."""
+    """Return a tall box with doors and handles, sometimes up to the ceiling."""
     width = int(rng.integers(1, 6)) * rng.uniform(0.45, 0.62)
     return wardrobe_run(rng, width, rng.uniform(1.7, 2.6))
 
 
 def wardrobe_run(rng: np.random.Generator, width: float, height: float) -> Piece:
-    """A wardrobe as wide and high (m) as asked for; its doors have handles unless they are sliding ones."""
+    """Return a wardrobe of a width and height (m); its doors have handles unless they slide."""
     doors = max(1, round(width / rng.uniform(0.45, 0.62)))
     depth, body = rng.uniform(0.35, 0.65), cast(Finish, "white" if rng.random() < 0.5 else "wood")
     has_handles, front = rng.random() < 0.75, 0.5 * depth
@@ -150,7 +150,7 @@ def wardrobe_run(rng: np.random.Generator, width: float, height: float) -> Piece
 
 
 def bookcase(rng: np.random.Generator) -> Piece:
-    """Uprights, boards and books."""
+    """Return uprights, boards and books."""
     width, depth, height = rng.uniform(0.6, 1.8), rng.uniform(0.25, 0.4), rng.uniform(0.8, 2.3)
     hx, hy = 0.5 * width, 0.5 * depth
     parts = [box(at=(0.0, -hy + 0.01), half=(hx, 0.01), z=(0.0, height), finish="wood")]
@@ -175,7 +175,7 @@ def bookcase(rng: np.random.Generator) -> Piece:
 
 
 def sideboard(rng: np.random.Generator) -> Piece:
-    """A low cabinet or chest of drawers, often under a television."""
+    """Return a low cabinet or chest of drawers, often under a television."""
     width, depth, height = rng.uniform(0.5, 2.2), rng.uniform(0.35, 0.5), rng.uniform(0.35, 1.0)
     hy = 0.5 * depth
     finish: Finish = "white" if rng.random() < 0.4 else "wood"
@@ -201,7 +201,7 @@ def sideboard(rng: np.random.Generator) -> Piece:
 
 
 def nightstand(rng: np.random.Generator) -> Piece:
-    """A small chest with a lamp."""
+    """Return a small chest with a lamp."""
     width, height = rng.uniform(0.35, 0.55), rng.uniform(0.4, 0.6)
     half = 0.5 * width
     parts = (
@@ -214,7 +214,7 @@ def nightstand(rng: np.random.Generator) -> Piece:
 
 
 def plant(rng: np.random.Generator) -> Piece:
-    """A pot and a few leafy blobs."""
+    """Return a pot and a few leafy blobs."""
     pot, height = rng.uniform(0.1, 0.22), rng.uniform(0.5, 1.9)
     parts = [
         cylinder(at=(0.0, 0.0), half=(pot, pot), z=(0.0, 1.6 * pot), finish="accent"),
@@ -230,7 +230,7 @@ def plant(rng: np.random.Generator) -> Piece:
 
 
 def floor_lamp(rng: np.random.Generator) -> Piece:
-    """Foot, pole and shade."""
+    """Return a lamp with foot, pole and shade."""
     height, radius = rng.uniform(1.3, 1.8), rng.uniform(0.12, 0.25)
     parts = (
         cylinder(at=(0.0, 0.0), half=(0.14, 0.14), z=(0.0, 0.03), finish="dark"),
@@ -241,7 +241,7 @@ def floor_lamp(rng: np.random.Generator) -> Piece:
 
 
 def carton(rng: np.random.Generator) -> Piece:
-    """Boxes, bags and appliances: clutter without a name."""
+    """Return clutter: boxes, bags and appliances."""
     width, depth, height = rng.uniform(0.2, 0.8, 3)
     finish: Finish = ("wood", "accent", "fabric", "dark", "white", "metal")[int(rng.integers(6))]
     shape = cylinder if rng.random() < 0.2 else box
@@ -259,7 +259,7 @@ def carton(rng: np.random.Generator) -> Piece:
 
 
 def bench(rng: np.random.Generator) -> Piece:
-    """A bench or a shoe rack under a row of hooks."""
+    """Return a bench or a shoe rack under a row of hooks."""
     width = rng.uniform(0.6, 1.4)
     hx = 0.5 * width
     parts = (

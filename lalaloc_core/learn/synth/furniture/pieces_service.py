@@ -11,14 +11,14 @@ _UNIT_M = 0.6
 
 
 def counter(rng: np.random.Generator) -> Piece:
-    """A run of kitchen units: base units, worktop, backsplash, hob, sink and wall units."""
+    """Return a run of kitchen units: base units, worktop, backsplash, hob, sink and wall units."""
     body: Finish = ("white", "wood", "paint")[int(rng.integers(3))]
     width = _UNIT_M * int(rng.integers(2, 7))
     return counter_run(rng, width, rng.uniform(0.85, 0.95), body, wall_units=bool(rng.random() < 0.75))
 
 
 def counter_run(rng: np.random.Generator, width: float, height: float, body: Finish, *, wall_units: bool) -> Piece:
-    """A run of kitchen units, as wide and high (m) as asked for."""
+    """Return a run of kitchen units of a width and height (m)."""
     units = max(1, round(width / _UNIT_M))
     unit, depth = width / units, COUNTER_DEPTH_M
     hx, hy = 0.5 * width, 0.5 * depth
@@ -54,7 +54,7 @@ def counter_run(rng: np.random.Generator, width: float, height: float, body: Fin
 
 
 def island(rng: np.random.Generator) -> Piece:
-    """A kitchen island with stools, or half a wall with a worktop."""
+    """Return a kitchen island with stools, or a half-height wall with a worktop."""
     width, depth, height = rng.uniform(1.0, 2.6), rng.uniform(0.5, 1.1), rng.uniform(0.88, 1.1)
     body: Finish = ("white", "wood", "paint")[int(rng.integers(3))]
     hx, hy = 0.5 * width, 0.5 * depth
@@ -70,7 +70,7 @@ def island(rng: np.random.Generator) -> Piece:
 
 
 def fridge(rng: np.random.Generator) -> Piece:
-    """A tall box with two doors."""
+    """Return a tall box with two doors."""
     width, height, split = rng.uniform(0.55, 0.9), rng.uniform(1.5, 2.05), rng.uniform(0.5, 1.3)
     finish: Finish = "white" if rng.random() < 0.5 else "metal"
     parts = (
@@ -83,7 +83,7 @@ def fridge(rng: np.random.Generator) -> Piece:
 
 
 def bathtub(rng: np.random.Generator) -> Piece:
-    """A tub with a dark-rimmed hollow that reads as one from above."""
+    """Return a tub whose dark-rimmed hollow is visible from above."""
     width, depth, height = rng.uniform(1.4, 1.8), rng.uniform(0.7, 0.8), rng.uniform(0.5, 0.62)
     hx, hy, rim = 0.5 * width, 0.5 * depth, 0.06
     parts = [
@@ -99,7 +99,7 @@ def bathtub(rng: np.random.Generator) -> Piece:
 
 
 def toilet(rng: np.random.Generator) -> Piece:
-    """Bowl, seat and cistern."""
+    """Return bowl, seat and cistern."""
     parts = (
         cylinder(at=(0.0, 0.1), half=(0.13, 0.2), z=(0.0, 0.36), finish="ceramic"),
         cylinder(at=(0.0, 0.08), half=(0.19, 0.25), z=(0.36, 0.41), finish="white"),
@@ -111,7 +111,7 @@ def toilet(rng: np.random.Generator) -> Piece:
 
 
 def washbasin(rng: np.random.Generator) -> Piece:
-    """A basin on a cabinet or a pedestal, with a mirror above."""
+    """Return a basin on a cabinet or a pedestal, with a mirror above."""
     width = rng.uniform(0.45, 1.3)
     hx = 0.5 * width
     below = (
@@ -129,7 +129,7 @@ def washbasin(rng: np.random.Generator) -> Piece:
 
 
 def shower(rng: np.random.Generator) -> Piece:
-    """A tray with one or two screens."""
+    """Return a tray with one or two screens."""
     side = rng.uniform(0.75, 1.1)
     half = 0.5 * side
     parts = [

@@ -1,6 +1,6 @@
-"""Large buildings: generated homes side by side in wings, corridors between the wings, and halls full of columns.
+"""Large buildings: generated homes side by side in wings, corridors between wings, and halls with columns.
 
-What hospitals, offices and malls ask of the search: hundreds of rooms that look alike, corridors with a door every few
+They test the search as hospitals, offices and malls do: hundreds of similar rooms, corridors with a door every few
 metres, and single rooms with hundreds of walls.
 """
 
@@ -34,9 +34,9 @@ class Building:
     """A large building as one plan.
 
     Attributes:
-        homes: those that stand in it, whose photographs are photographs of the building.
-        shift_m: (h, 2) what each was moved by.
-        first_room: (h,) the index that the first room of each has in the plan.
+        homes: its homes; their photographs are photographs of the building.
+        shift_m: (h, 2) translation of each home.
+        first_room: (h,) index of the first room of each home in the plan.
     """
 
     plan: FloorPlan
@@ -46,17 +46,19 @@ class Building:
 
 
 def building_of(split: int, seed: int, area_m2: float, *, hall_share: float = 0.2) -> Building:
-    """A building with at least so much floor.
+    """Return a building with at least this floor area.
 
     Args:
-        split: which homes it is made of, see `synth.homes.splits`.
-        hall_share: how much of its floor is in halls.
+        split: split of its homes, see `synth.homes.splits`.
+        seed: seed of its homes.
+        area_m2: minimum floor area.
+        hall_share: share of the floor in halls.
     """
     return _Builder(split, seed, area_m2, hall_share).build()
 
 
 class _Builder:
-    """Lays out wing by wing, each a row of homes or halls with a corridor along it."""
+    """Lays out wings, each a row of homes or halls with a corridor along it."""
 
     def __init__(self, split: int, seed: int, area_m2: float, hall_share: float) -> None:
         self._split, self._seed = split, seed
@@ -86,7 +88,7 @@ class _Builder:
         return Building(plan, tuple(self._homes), np.array(self._shift_m), tuple(self._first_room))
 
     def _wing(self, y_m: float) -> float:
-        """Homes and halls from the left to the right; returns where the wing ends."""
+        """Place homes and halls from left to right; return the end of the wing."""
         x_m, depth_m = 0.0, 0.0
         while x_m < self._length_m and self._floor_m2 < self._area_m2:
             if self._halls_m2 + _HALL_M2 < self._hall_share * self._floor_m2:
@@ -132,7 +134,7 @@ class _Builder:
         return width, depth
 
     def _corridors(self, y_m: float) -> float:
-        """Corridors one after the other along a wing that has ended; returns where they end."""
+        """Place corridors along a finished wing; return their end."""
         count = math.ceil(self._length_m / _MAX_CORRIDOR_M)
         length_m = self._length_m / count - _GAP_M
         for x_m in (np.arange(count) * (length_m + _GAP_M)).tolist():

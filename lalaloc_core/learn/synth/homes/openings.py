@@ -1,4 +1,4 @@
-"""Doors, wide openings and windows: where rooms face each other or the outdoors."""
+"""Doors, wide openings and windows between rooms and to the outdoors."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ _WINDOWLESS = ("corridor", "closet", "storage")
 
 @dataclass(frozen=True, kw_only=True)
 class Opening:
-    """A hole in one wall of one room, as that room sees it; a door between two rooms is two openings.
+    """A hole in one wall of one room, as seen from that room; a door between two rooms is two openings.
 
     Attributes:
         room: index of the room.
         wall: index of the edge of the room's `polygon_m`.
-        start_m: where it begins, along the wall from the wall's first vertex.
-        end_m: where it ends.
-        sill_m: height of its lower edge over the floor.
+        start_m: start along the wall, from its first vertex.
+        end_m: end along the wall.
+        sill_m: height of its lower edge above the floor.
         head_m: height of its upper edge.
-        kind: what it is; one looks through an open door, a wide opening and a window.
-        neighbour: index of the room behind it, -1 for the outdoors or a room that is not part of the plan.
+        kind: kind of opening; open doors, wide openings and windows are see-through.
+        neighbour: index of the room behind it, -1 for the outdoors or a room outside the plan.
     """
 
     room: int
@@ -48,7 +48,7 @@ class Opening:
 
     @property
     def is_see_through(self) -> bool:
-        """Whether one looks through it into another room of the plan."""
+        """True if another room of the plan is visible through it."""
         return self.kind in ("door_open", "opening") and self.neighbour >= 0
 
 
@@ -66,7 +66,7 @@ class _Facing(NamedTuple):
 
 
 class _Walls:
-    """The edges of all rooms in one table, and which stretches of them are already taken."""
+    """Edges of all rooms in one table, and their occupied stretches."""
 
     def __init__(self, polygons_m: Sequence[Float[np.ndarray, "_ 2"]]) -> None:
         self.owner = [(room, edge) for room, polygon in enumerate(polygons_m) for edge in range(len(polygon))]
@@ -83,7 +83,7 @@ class _Walls:
         self._taken.setdefault(wall, []).append((start, end))
 
     def facing(self, max_gap_m: float) -> list[_Facing]:
-        """All pairs of walls of different rooms that face each other over at least the width of a door."""
+        """Return all pairs of walls of different rooms that face each other over at least the width of a door."""
         normal = np.stack([-self.along[:, 1], self.along[:, 0]], axis=1)
         offset = self.start[None, :] - self.start[:, None]
         # A room lies to the left of its walls, so a facing wall lies to the right: negative along the normal.
@@ -111,14 +111,14 @@ def place_openings(
     *,
     french_window_share: float,
 ) -> tuple[Opening, ...]:
-    """Furnish the walls of a home with doors, openings and windows that do not touch each other.
+    """Place doors, openings and windows that do not touch each other.
 
     Args:
-        names: room names, which decide where windows and wide openings make sense.
+        names: room names, which decide the places of windows and wide openings.
         polygons_m: inner outlines, counter-clockwise.
         ceilings_m: ceiling heights.
-        cells_m: the gross cells; whatever lies outside all of them is outdoors.
-        max_gap_m: largest distance of two walls that share a door.
+        cells_m: gross cells; everything outside them is outdoors.
+        max_gap_m: maximum distance of two walls that share a door.
         rng: source of randomness.
         french_window_share: share of windows that reach down to the floor.
     """
@@ -132,7 +132,7 @@ def place_openings(
 def _connect_rooms(
     walls: _Walls, names: Sequence[str], ceilings_m: Sequence[float], max_gap_m: float, rng: np.random.Generator
 ) -> list[Opening]:
-    """A spanning tree of doors, and a few more."""
+    """Return a spanning tree of doors, and a few more."""
     group = list(range(len(names)))
     openings: list[Opening] = []
     facings = walls.facing(max_gap_m)
@@ -242,7 +242,7 @@ def _windows(
 
 
 def _blind_doors(walls: _Walls, connected: set[int], rng: np.random.Generator) -> list[Opening]:
-    """Shut doors to where the plan does not go: entrances, built-in cupboards, and rooms that got no other door."""
+    """Return closed doors that lead outside the plan: entrances, cupboards, and the door of an unconnected room."""
     openings = []
     without_door = {room for room, _ in walls.owner} - connected
     for index in rng.permutation(len(walls.owner)):

@@ -1,8 +1,8 @@
-"""Cutting a home's footprint into gross cells, and turning cells into the inner outlines of rooms.
+"""Partition of a footprint into gross cells, and of cells into inner outlines of rooms.
 
-A gross cell reaches to the middle of the walls around it. Shrinking every cell by half a wall gives rooms that
-never overlap and face each other across a wall of constant thickness; whatever is done to an outline after that
-only takes floor away, so it stays that way.
+A gross cell extends to the middle of the walls around it. Shrinking each cell by half a wall thickness gives rooms
+that never overlap and face each other across a wall of constant thickness. Later changes of an outline only remove
+floor, so this stays true.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _TRIES = 4
 
 @dataclass(frozen=True)
 class Cell:
-    """A gross cell: counter-clockwise outline (n, 2) in metres, and whether it was laid out as a corridor."""
+    """A gross cell: counter-clockwise outline (n, 2) in metres, and if it is a corridor."""
 
     outline_m: Float[np.ndarray, "n 2"]
     corridor: bool = False
@@ -84,7 +84,7 @@ def reshape_room(
 
 
 def with_wing_wall(polygon_m: Float[np.ndarray, "n 2"], rng: np.random.Generator) -> Float[np.ndarray, "m 2"]:
-    """A thin wall that ends in the middle of the room, as in open-plan homes; as it was where there is no space."""
+    """Add a thin wall that ends in the middle of the room; return the outline unchanged if there is no space."""
     for _ in range(_TRIES):
         edge = int(rng.integers(len(polygon_m)))
         changed = _bump(polygon_m, edge, rng, width_m=_WING_WALL_M, depth_m=_WING_REACH_M)
@@ -99,7 +99,7 @@ def _rectangle(rect: Rect) -> Float[np.ndarray, "4 2"]:
 
 
 def _split(rect: Rect, parts: int, rng: np.random.Generator) -> list[Rect]:
-    """Guillotine cuts across the longer side; stops early where a part would become too narrow."""
+    """Cut guillotine-wise across the longer side; stop early when a part would become too narrow."""
     if parts <= 1:
         return [rect]
     x0, y0, x1, y1 = rect
@@ -121,7 +121,7 @@ def _split(rect: Rect, parts: int, rng: np.random.Generator) -> list[Rect]:
 
 
 def _along_corridor(rect: Rect, rooms: int, rng: np.random.Generator, width_m: float) -> list[Cell]:
-    """A corridor through the footprint with rooms on both sides, sometimes ending in a room, sometimes L-shaped."""
+    """Return a corridor through the footprint with rooms on both sides, sometimes ending in a room or L-shaped."""
     x0, y0, x1, y1 = rect
     below = y0 + (y1 - y0 - width_m) * rng.uniform(0.35, 0.65)
     above = below + width_m
@@ -182,7 +182,7 @@ def _carve_corners(cells: list[Cell], wanted: int, rng: np.random.Generator) -> 
 
 
 def _edge(polygon_m: np.ndarray, index: int) -> tuple[np.ndarray, np.ndarray, float]:
-    """(start vertex, unit direction, length) of an edge."""
+    """Return (start vertex, unit direction, length) of an edge."""
     start = polygon_m[index]
     along = polygon_m[(index + 1) % len(polygon_m)] - start
     length = float(np.linalg.norm(along))
@@ -196,7 +196,7 @@ def _is_convex_corner(polygon_m: np.ndarray, index: int) -> bool:
 
 
 def _replace(polygon_m: np.ndarray, index: int, vertices: list[np.ndarray]) -> np.ndarray:
-    """Vertex `index` replaced by others."""
+    """Return the polygon with vertex `index` replaced by others."""
     return np.concatenate([polygon_m[:index], np.array(vertices), polygon_m[index + 1 :]])
 
 
@@ -233,7 +233,7 @@ def _slant_wall(polygon_m: np.ndarray, index: int, rng: np.random.Generator) -> 
 def _bump(
     polygon_m: np.ndarray, index: int, rng: np.random.Generator, width_m: Range, depth_m: Range
 ) -> np.ndarray | None:
-    """A box standing out from the wall: a pillar or chimney, or, when wide, the wall beside a recess."""
+    """Return a box standing out from the wall: a pillar, a chimney, or the wall beside a recess."""
     start, along, length = _edge(polygon_m, index)
     width, depth = rng.uniform(*width_m), rng.uniform(*depth_m)
     if width + 0.2 > length or width > 0.6 * length:
@@ -245,7 +245,7 @@ def _bump(
 
 
 def _is_roomy(polygon_m: np.ndarray) -> bool:
-    """Whether a person fits through every part of the room."""
+    """Return true if a person fits through every part of the room."""
     shape = shapely.Polygon(polygon_m)
     if not shape.is_valid or shape.area < 1.2:
         return False

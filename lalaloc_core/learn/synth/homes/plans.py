@@ -1,4 +1,4 @@
-"""Procedural homes: a floor plan, and what its photographs need to know of doors and windows beyond it."""
+"""Procedural homes: a floor plan, and the doors and windows that its photographs need."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ VARIED_HOMES = HomeConfig(
 
 @dataclass(frozen=True, eq=False)
 class Home:
-    """A floor plan, with the openings in its walls as each room sees them; the plan has them, too."""
+    """A floor plan, with the openings in its walls as seen from each room; the plan contains them too."""
 
     plan: FloorPlan
     openings: tuple[Opening, ...]
@@ -99,13 +99,13 @@ def generate_home(rng: np.random.Generator, config: HomeConfig = HomeConfig()) -
 
 
 def _area(polygon_m: Float[np.ndarray, "n 2"]) -> float:
-    """Shoelace formula."""
+    """Return the area by the shoelace formula."""
     x, y = polygon_m.T
     return 0.5 * float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)))
 
 
 def _name_rooms(areas_m2: Sequence[float], corridors: Sequence[bool], rng: np.random.Generator) -> list[str]:
-    """Kinds by size, numbered where one occurs twice: "bedroom 1"."""
+    """Return kinds of rooms by size, numbered where one repeats: "bedroom 1"."""
     kinds = [""] * len(areas_m2)
     has_kitchen = False
     for rank, index in enumerate(np.argsort(areas_m2)[::-1]):
@@ -146,7 +146,7 @@ def _ceilings(names: Sequence[str], config: HomeConfig, rng: np.random.Generator
 def _place_in_frame(
     polygons_m: Sequence[Float[np.ndarray, "_ 2"]], config: HomeConfig, rng: np.random.Generator
 ) -> list[Float[np.ndarray, "_ 2"]]:
-    """Turn and move a home: plans are not anchored at the origin, and need not follow the axes."""
+    """Rotate and translate a home, because real plans are neither anchored at the origin nor axis-aligned."""
     angle = 0.5 * np.pi * int(rng.integers(4))
     if rng.random() < config.rotated_share:
         angle = rng.uniform(0.0, 2.0 * np.pi)
@@ -190,7 +190,7 @@ def _plan(
 
 
 def _line(opening: Opening, polygon_m: Float[np.ndarray, "n 2"]) -> list[list[float]]:
-    """Both ends of an opening on the wall of its room."""
+    """Return both ends of an opening on the wall of its room."""
     start = polygon_m[opening.wall]
     along = polygon_m[(opening.wall + 1) % len(polygon_m)] - start
     along = along / np.linalg.norm(along)

@@ -1,6 +1,6 @@
 """Seeded homes for training, validation and test: home number i of a split is `default_rng([split, seed, i])`.
 
-Those for training are `VARIED_HOMES`.
+Training homes are `VARIED_HOMES`.
 """
 
 from __future__ import annotations
@@ -14,6 +14,6 @@ TRAIN, VALIDATION, TEST = 0, 1, 2
 
 
 def home_of(split: int, seed: int, index: int) -> tuple[Home, np.random.Generator]:
-    """Home number `index` of a split, and the generator for whatever else is drawn for it."""
+    """Return home number `index` of a split, and the generator for everything else that is drawn for it."""
     rng = np.random.default_rng([split, seed, index])
     return generate_home(rng, VARIED_HOMES if split == TRAIN else HomeConfig()), rng
