@@ -43,9 +43,9 @@ def photograph(scenes: HeldoutScenes, name: str, camera: int) -> HeldoutPhotogra
     return one
 
 
-class TestApart:
+class TestIndependence:
     @pytest.mark.parametrize("path", sorted(PACKAGE.glob("*.py")), ids=lambda path: path.stem)
-    def test_nothing_of_the_training_generator_is_used(self, path: Path) -> None:
+    def test_heldout_imports_nothing_of_the_training_generator(self, path: Path) -> None:
         tree = ast.parse(path.read_text(encoding="utf-8"))
         imported = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
         ours = {name for name in imported if name is not None and name.startswith("lalaloc_core")}
@@ -54,7 +54,7 @@ class TestApart:
 
 
 class TestPlans:
-    def test_rooms_never_overlap_and_homes_keep_their_limits(self) -> None:
+    def test_rooms_do_not_overlap_and_homes_respect_limits(self) -> None:
         for key in keys():
             plan = home_of(key).plan.plan
             assert MIN_ROOMS <= len(plan.rooms) <= MAX_ROOMS
@@ -63,7 +63,7 @@ class TestPlans:
                 assert first.shape.distance(second.shape) >= home_of(key).plan.wall_m - 1e-5
 
     @pytest.mark.parametrize("kind", AREAS_M2)
-    def test_outlines_are_simple_rings_of_the_wanted_size(self, kind: str) -> None:
+    def test_outlines_are_simple_rings_of_the_requested_size(self, kind: str) -> None:
         rng = np.random.default_rng(0)
         for _ in range(20):
             shape = sample_outline(kind, rng)  # pyright: ignore[reportArgumentType]
@@ -71,7 +71,7 @@ class TestPlans:
             assert shape.exterior.is_ccw
             assert AREAS_M2[kind][0] - 1e-6 <= shape.area <= AREAS_M2[kind][1] + 1e-6  # pyright: ignore[reportArgumentType]
 
-    def test_many_walls_meet_at_other_than_right_angles(self) -> None:
+    def test_many_walls_meet_at_oblique_angles(self) -> None:
         oblique = []
         for key in keys():
             for room in home_of(key).plan.plan.rooms:
@@ -81,7 +81,7 @@ class TestPlans:
                 oblique.append(bool((off > np.radians(5)).any()))
         assert np.mean(oblique) > 0.3
 
-    def test_every_room_can_be_reached_through_doors(self) -> None:
+    def test_every_room_is_reachable_through_doors(self) -> None:
         for key in keys():
             home = home_of(key)
             reached, before = {0}, 0
@@ -92,7 +92,7 @@ class TestPlans:
                         reached |= {opening.wall.room, opening.behind.room}
             assert reached == set(range(len(home.plan.kinds)))
 
-    def test_openings_lie_within_their_walls_and_apart(self) -> None:
+    def test_openings_lie_within_walls_without_overlap(self) -> None:
         for key in keys():
             by_wall: dict[tuple[int, int], list[tuple[float, float]]] = {}
             for opening in home_of(key).openings:
@@ -113,7 +113,7 @@ class TestTruth:
         return plan, Tracer(shell_parts(plan, [], rng))
 
     @pytest.mark.parametrize("seed", range(3))
-    def test_the_traced_horizon_of_a_closed_empty_room_is_its_wall_profile(self, seed: int) -> None:
+    def test_traced_horizon_matches_the_wall_profile(self, seed: int) -> None:
         plan, tracer = self.closed(seed)
         columns = 512
         for room in plan.rooms:
@@ -124,7 +124,7 @@ class TestTruth:
             profile = wall_profile(position[None], np.array([0.7]), room.walls_m[None], columns)[0]
             np.testing.assert_allclose(traced, profile, atol=0.01)
 
-    def test_an_empty_photograph_shows_the_layout_wherever_there_is_no_opening(self) -> None:
+    def test_empty_photograph_shows_the_layout_except_openings(self) -> None:
         scenes = HeldoutScenes(homes=3, shots_per_home=2, furniture="empty")
         for name in scenes.scenes("validation"):
             scene = scenes.load(name)
@@ -138,7 +138,7 @@ class TestTruth:
                 # Leaves, frames and the lamp stand before walls, and openings let through.
                 assert np.mean(np.abs(seen - truth) < 0.02) > 0.7
 
-    def test_every_camera_stands_in_its_room_clear_of_walls_and_furniture(self) -> None:
+    def test_camera_stands_in_its_room_clear_of_obstacles(self) -> None:
         scenes = HeldoutScenes(homes=3, shots_per_home=4)
         for name in scenes.scenes("validation"):
             scene = scenes.load(name)
@@ -152,7 +152,7 @@ class TestTruth:
 
 
 class TestFurniture:
-    def test_simple_rooms_have_some_and_full_ones_more(self) -> None:
+    def test_full_rooms_have_more_furniture_than_simple_ones(self) -> None:
         for key in keys():
             home = home_of(key)
             taken = {level: self.area(home, key, level) for level in LEVELS}
@@ -163,7 +163,7 @@ class TestFurniture:
         furnishing = Furnishing(home.plan, home.openings, level, key.rng(1))  # pyright: ignore[reportArgumentType]
         return sum(float(shapely.area(shape)) for shape in furnishing.taken)
 
-    def test_what_a_simple_room_has_stands_in_the_full_one_too(self) -> None:
+    def test_full_room_contains_the_simple_furniture(self) -> None:
         key = keys()[0]
         home = home_of(key)
         simple, full = (Furnishing(home.plan, home.openings, level, key.rng(1)) for level in ("simple", "full"))
@@ -179,7 +179,7 @@ class TestFurniture:
 
 
 class TestScenes:
-    def test_the_same_scene_is_always_the_same_and_splits_differ(self) -> None:
+    def test_scenes_are_deterministic_and_splits_differ(self) -> None:
         scenes = HeldoutScenes(homes=2, shots_per_home=1)
         assert isinstance(scenes, Dataset)
         first = scenes.load("test-00001")
@@ -192,23 +192,23 @@ class TestScenes:
         other = scenes.load("validation-00001")
         assert other.plan.to_dict() != first.plan.to_dict()
 
-    def test_the_levels_are_asked_at_the_same_places(self) -> None:
+    def test_levels_share_camera_positions(self) -> None:
         places = [HeldoutScenes(homes=1, furniture=level).load("test-00000").cameras for level in LEVELS]
         for cameras in zip(*places, strict=True):
             assert len({tuple(camera.position_m) for camera in cameras}) == 1
 
-    def test_a_picture_has_the_wanted_size_and_contrast(self) -> None:
+    def test_picture_has_the_requested_size_and_contrast(self) -> None:
         picture = photograph(HeldoutScenes(homes=1), "validation-00000", 0).image(64, 128)
         assert picture.shape == (64, 128, 3)
         assert picture.std() > 10
 
-    def test_without_a_level_each_camera_has_its_own(self) -> None:
+    def test_missing_level_is_drawn_per_camera(self) -> None:
         scenes = HeldoutScenes(homes=2, shots_per_home=6, furniture=None)
         assert scenes.appearances == (Appearance(None),)
         levels = {photograph(scenes, name, k).shot.furniture for name in scenes.scenes("test") for k in range(6)}
         assert len(levels) > 1
 
-    def test_there_is_nothing_to_train_on(self) -> None:
+    def test_training_split_is_refused(self) -> None:
         assert list(HeldoutScenes(homes=3).scenes("train")) == []
         with pytest.raises(DatasetError, match="no such out-of-family scene"):
             HeldoutScenes(homes=3).load("train-00000")
@@ -221,7 +221,7 @@ class TestScenes:
             ({"homes": 1, "seed": -2}, "seed is -2, it must be at least 0"),
         ],
     )
-    def test_what_cannot_be_is_refused(self, wrong: dict, message: str) -> None:
+    def test_invalid_arguments_are_refused(self, wrong: dict, message: str) -> None:
         with pytest.raises(InvalidInputError, match=message):
             build_dataset(asked(wrong))
 
@@ -237,8 +237,8 @@ def asked(generated: dict) -> RunInfo:
     )
 
 
-class TestAsking:
-    def test_a_run_can_ask_for_them(self) -> None:
+class TestRuns:
+    def test_run_uses_heldout_homes(self) -> None:
         dataset = build_dataset(asked({"homes": 2, "furniture": "empty"}))
         assert dataset == HeldoutScenes(homes=2, furniture="empty")
         assert dataset.description == "out-of-family homes (seed 0)"
@@ -251,7 +251,7 @@ class TestAsking:
             (["--data", "somewhere"], "not for --data"),
         ],
     )
-    def test_options_that_contradict_are_refused(self, options: list[str], message: str) -> None:
+    def test_contradictory_options_are_refused(self, options: list[str], message: str) -> None:
         parser = argparse.ArgumentParser()
         add_commands(parser.add_subparsers())
         arguments = parser.parse_args(["evaluate", "--generator", "heldout", "--method", "oracle", *options])
@@ -259,7 +259,7 @@ class TestAsking:
             arguments.run(arguments)
 
 
-def test_the_same_seed_draws_the_same_openings() -> None:
+def test_seed_determines_the_openings() -> None:
     first, second = (
         sample_openings(sample_plan(rng, "x"), rng) for rng in (np.random.default_rng(3) for _ in range(2))
     )

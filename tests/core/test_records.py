@@ -16,7 +16,7 @@ class Points(Records):
     colour = Column(3)
 
 
-def test_columns_lie_in_the_order_in_which_they_are_named() -> None:
+def test_columns_follow_the_order_of_their_names() -> None:
     points = Points.stacked([Points.row(weight=1.0, x_m=2.0, y_m=3.0, colour=(4.0, 5.0, 6.0))])
     np.testing.assert_array_equal(points.rows, [[1.0, 2.0, 3.0, 4.0, 5.0, 6.0]])
     assert Points.WIDTH == 6
@@ -31,7 +31,7 @@ def test_joined_columns_are_a_view_of_their_parts() -> None:
     assert not points.weight.any()
 
 
-def test_columns_that_are_not_neighbours_cannot_be_joined() -> None:
+def test_columns_that_are_not_adjacent_cannot_be_joined() -> None:
     with pytest.raises(ValueError, match="not neighbours"):
 
         class Scattered(Records):
@@ -41,7 +41,7 @@ def test_columns_that_are_not_neighbours_cannot_be_joined() -> None:
             ends = Joined(first, third)
 
 
-def test_rows_of_another_width_and_unknown_columns_are_refused() -> None:
+def test_wrong_width_and_unknown_columns_are_refused() -> None:
     with pytest.raises(ValueError, match="have 6 columns, not 5"):
         Points(np.zeros(5))
     with pytest.raises(KeyError, match="height"):

@@ -58,7 +58,7 @@ def shut(home: Home) -> Home:
 
 @given(seed=seeds)
 @settings(max_examples=40, deadline=None)
-def test_homes_are_valid_plans_of_the_promised_size(seed: int) -> None:
+def test_homes_are_valid_plans_within_their_size_range(seed: int) -> None:
     plan = home_of(seed).plan
     assert plan.warnings == ()
     assert 3 <= len(plan.rooms) <= 10
@@ -70,7 +70,7 @@ def test_homes_are_valid_plans_of_the_promised_size(seed: int) -> None:
 
 @given(seed=seeds)
 @settings(max_examples=40, deadline=None)
-def test_openings_lie_in_their_walls_apart_from_each_other(seed: int) -> None:
+def test_openings_lie_in_their_walls_without_overlap(seed: int) -> None:
     home = home_of(seed)
     taken: dict[tuple[int, int], list[tuple[float, float]]] = {}
     for opening in home.openings:
@@ -86,7 +86,7 @@ def test_openings_lie_in_their_walls_apart_from_each_other(seed: int) -> None:
 
 @given(seed=seeds)
 @settings(max_examples=20, deadline=None)
-def test_a_door_is_at_the_same_place_from_both_of_its_rooms(seed: int) -> None:
+def test_door_has_one_place_in_both_rooms(seed: int) -> None:
     home = home_of(seed)
 
     def middle(opening):
@@ -105,14 +105,14 @@ def test_a_door_is_at_the_same_place_from_both_of_its_rooms(seed: int) -> None:
         assert nearest.kind == opening.kind
 
 
-def test_the_same_seed_gives_the_same_home_and_others_differ() -> None:
+def test_seed_determines_the_home() -> None:
     first, again, other = home_of(1), home_of(1), home_of(2)
     assert first.plan.to_dict() == again.plan.to_dict()
     assert first.openings == again.openings
     assert first.plan.to_dict() != other.plan.to_dict()
 
 
-def test_homes_to_learn_from_are_more_varied_than_those_to_measure_on() -> None:
+def test_training_homes_are_more_varied_than_test_homes() -> None:
     varied, usual = ([home_of_split(split, 0, index)[0] for index in range(40)] for split in (TRAIN, TEST))
 
     def highest(homes: list[Home]) -> float:
@@ -138,7 +138,7 @@ def test_homes_to_learn_from_are_more_varied_than_those_to_measure_on() -> None:
     assert wing_walls(varied) > 2 * wing_walls(usual)
 
 
-def test_at_night_windows_are_dark_and_lamps_are_on() -> None:
+def test_night_has_dark_windows_and_lit_lamps() -> None:
     home, rng = home_of(3), np.random.default_rng(3)
     materials = MaterialLibrary.create(np.random.default_rng(0))
     assert not any(shot.is_night for shot in sample_shots(home, 8, rng))
@@ -172,7 +172,7 @@ def test_homes_are_varied() -> None:
 
 @given(seed=seeds)
 @settings(max_examples=25, deadline=None)
-def test_an_empty_shut_room_shows_exactly_its_layout(renderer: PanoramaRenderer, seed: int) -> None:
+def test_empty_closed_room_shows_its_layout(renderer: PanoramaRenderer, seed: int) -> None:
     rng = np.random.default_rng(seed)
     home = shut(generate_home(rng))
     shots = sample_shots(home, 3, rng, "empty")
@@ -191,7 +191,7 @@ def test_an_empty_shut_room_shows_exactly_its_layout(renderer: PanoramaRenderer,
 
 @given(seed=seeds)
 @settings(max_examples=10, deadline=None)
-def test_one_sees_no_further_than_the_walls_unless_through_an_opening(renderer: PanoramaRenderer, seed: int) -> None:
+def test_rays_end_at_walls_except_through_openings(renderer: PanoramaRenderer, seed: int) -> None:
     rng = np.random.default_rng(seed)
     home = generate_home(rng)
     (shot,) = sample_shots(home, 1, rng, "empty")
@@ -204,7 +204,7 @@ def test_one_sees_no_further_than_the_walls_unless_through_an_opening(renderer: 
     assert hits.distance_m.isfinite().all()
 
 
-def test_same_seed_same_picture_in_any_batch(renderer: PanoramaRenderer) -> None:
+def test_picture_does_not_depend_on_its_batch(renderer: PanoramaRenderer) -> None:
     rng = np.random.default_rng(3)
     shots = [shot for seed in range(4) for shot in sample_shots(home_of(seed), 2, rng)]
     together = renderer.render(shots)
@@ -217,7 +217,7 @@ def test_same_seed_same_picture_in_any_batch(renderer: PanoramaRenderer) -> None
     assert not torch.equal(together[:1], reseeded)
 
 
-def test_pictures_are_exposed_neither_black_nor_white(renderer: PanoramaRenderer) -> None:
+def test_pictures_are_well_exposed(renderer: PanoramaRenderer) -> None:
     rng = np.random.default_rng(4)
     shots = [shot for seed in range(20) for shot in sample_shots(home_of(seed), 2, rng)]
     mean = renderer.render(shots).float().mean(dim=(1, 2, 3))
@@ -226,7 +226,7 @@ def test_pictures_are_exposed_neither_black_nor_white(renderer: PanoramaRenderer
     assert float(mean.std()) > 10.0
 
 
-def test_turning_the_camera_rolls_what_it_sees(renderer: PanoramaRenderer) -> None:
+def test_turned_camera_rolls_the_picture(renderer: PanoramaRenderer) -> None:
     (shot,) = sample_shots(home_of(5), 1, np.random.default_rng(5), "full")
     turned = dataclasses.replace(shot, heading=shot.heading + 2.0 * np.pi * 32 / COLUMNS)
     hits = renderer.hits([shot, turned])
@@ -234,7 +234,7 @@ def test_turning_the_camera_rolls_what_it_sees(renderer: PanoramaRenderer) -> No
     assert ((rolled - hits.distance_m[1]).abs() < 1e-2).float().mean() > 0.99
 
 
-def test_fuller_rooms_hide_more_of_the_layout(renderer: PanoramaRenderer) -> None:
+def test_furniture_hides_the_layout(renderer: PanoramaRenderer) -> None:
     shares = []
     for level in FURNITURE_LEVELS:
         rng = np.random.default_rng(6)
@@ -246,7 +246,7 @@ def test_fuller_rooms_hide_more_of_the_layout(renderer: PanoramaRenderer) -> Non
 
 @given(seed=seeds)
 @settings(max_examples=20, deadline=None)
-def test_pieces_keep_to_their_footprints(seed: int) -> None:
+def test_pieces_stay_within_their_footprints(seed: int) -> None:
     rng = np.random.default_rng(seed)
     for makers in ROOM_PIECES.values():
         for maker, _ in makers:
@@ -258,7 +258,7 @@ def test_pieces_keep_to_their_footprints(seed: int) -> None:
 
 @given(seed=seeds)
 @settings(max_examples=25, deadline=None)
-def test_furniture_stands_in_its_room_clear_of_the_camera(seed: int) -> None:
+def test_furniture_stays_in_its_room_clear_of_the_camera(seed: int) -> None:
     rng = np.random.default_rng(seed)
     home = generate_home(rng)
     for shot in sample_shots(home, 2, rng, "full"):
@@ -277,7 +277,7 @@ def test_furniture_stands_in_its_room_clear_of_the_camera(seed: int) -> None:
 
 @given(seed=seeds)
 @settings(max_examples=25, deadline=None)
-def test_the_camera_is_inside_nothing(materials: MaterialLibrary, seed: int) -> None:
+def test_camera_is_outside_all_objects(materials: MaterialLibrary, seed: int) -> None:
     rng = np.random.default_rng(seed)
     for shot in sample_shots(generate_home(rng), 2, rng, "full"):
         scene = build_scene(shot, materials)
@@ -287,7 +287,7 @@ def test_the_camera_is_inside_nothing(materials: MaterialLibrary, seed: int) -> 
         assert not inside.any()
 
 
-def test_shots_keep_their_distance_to_walls_and_ceiling() -> None:
+def test_shots_keep_clear_of_walls_and_ceiling() -> None:
     rng = np.random.default_rng(7)
     home = home_of(7)
     shots = sample_shots(home, 200, rng, by_room_share=0.5)
@@ -299,7 +299,7 @@ def test_shots_keep_their_distance_to_walls_and_ceiling() -> None:
     assert {shot.furniture for shot in shots} == set(FURNITURE_LEVELS)
 
 
-def test_materials_work_without_and_with_a_folder_of_pictures(tmp_path: Path, materials: MaterialLibrary) -> None:
+def test_materials_work_with_and_without_textures(tmp_path: Path, materials: MaterialLibrary) -> None:
     assert materials.pictures.shape[1:] == (128, 128, 3)
     assert float(materials.pictures.min()) >= 0.0
     assert float(materials.pictures.max()) <= 1.0
@@ -314,17 +314,17 @@ def test_materials_work_without_and_with_a_folder_of_pictures(tmp_path: Path, ma
     np.testing.assert_allclose(library.mean_colours[min(photographs)], [1.0, 0.0, 0.0], atol=0.02)
 
 
-def test_a_folder_without_pictures_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InvalidInputError, match="no <category>"):
+def test_textures_folder_without_pictures_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInputError, match="contains no pictures"):
         MaterialLibrary.create(np.random.default_rng(0), tmp_path)
 
 
-def test_an_odd_number_of_rows_is_refused(materials: MaterialLibrary) -> None:
+def test_odd_height_is_refused(materials: MaterialLibrary) -> None:
     with pytest.raises(InvalidInputError, match="even"):
         PanoramaRenderer(materials, height=63, width=128)
 
 
-def test_the_contact_sheet_shows_sixteen_panoramas(tmp_path: Path) -> None:
+def test_contact_sheet_shows_sixteen_panoramas(tmp_path: Path) -> None:
     path = tmp_path / "sheet.png"
     contact_sheet(path, np.random.default_rng(0), height=16)
     with Image.open(path) as sheet:

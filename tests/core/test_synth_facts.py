@@ -45,7 +45,7 @@ def known() -> list[tuple[Shot, frozenset[str]]]:
     return [(shot, facts_of(shot)) for shot in shots_of(60)]
 
 
-def test_hard_places_are_in_openings_as_well_and_clear_of_walls() -> None:
+def test_hard_places_include_openings_and_clear_walls() -> None:
     """Within `POSE_MARGIN_M` of a room's outline only where it is open, and never on it."""
     inside = 0
     for index in range(40):
@@ -67,14 +67,14 @@ def test_hard_places_are_in_openings_as_well_and_clear_of_walls() -> None:
     assert 0.05 < inside / (8 * 40) < 0.2
 
 
-def test_every_hard_case_occurs_and_none_always(known: list[tuple[Shot, frozenset[str]]]) -> None:
+def test_each_fact_occurs_sometimes(known: list[tuple[Shot, frozenset[str]]]) -> None:
     for fact in FACTS:
         share = sum(fact in facts for _, facts in known) / len(known)
         assert 0.02 < share < 0.9, fact
     assert set().union(*(facts for _, facts in known)) <= set(FACTS)
 
 
-def test_facts_are_true_of_the_scene(known: list[tuple[Shot, frozenset[str]]], materials: MaterialLibrary) -> None:
+def test_facts_match_the_scene(known: list[tuple[Shot, frozenset[str]]], materials: MaterialLibrary) -> None:
     for shot, facts in known:
         scene, room = build_scene(shot, materials), shot.home.plan.rooms[shot.room_index]
         assert ("nadir_patch" in facts) == (scene.exposure.nadir > 0.0)
@@ -114,7 +114,7 @@ def test_sun_patches_are_lit(known: list[tuple[Shot, frozenset[str]]], materials
     assert differs >= 0.8 * seen
 
 
-def test_shapes_do_not_depend_on_the_pictures_of_materials(materials: MaterialLibrary) -> None:
+def test_shapes_do_not_depend_on_materials(materials: MaterialLibrary) -> None:
     other = MaterialLibrary.create(np.random.default_rng(9))
     for shot in shots_of(6):
         first, second = build_scene(shot, materials), build_scene(shot, other)
@@ -125,7 +125,7 @@ def test_shapes_do_not_depend_on_the_pictures_of_materials(materials: MaterialLi
         assert first.facts == second.facts
 
 
-def test_staged_rooms_have_neither_mirrors_nor_fittings_when_empty(materials: MaterialLibrary) -> None:
+def test_empty_staged_rooms_have_no_mirrors_or_fittings(materials: MaterialLibrary) -> None:
     for seed in range(8):
         rng = np.random.default_rng(seed)
         for shot in stage_rooms(generate_home(rng), rng):
@@ -136,7 +136,7 @@ def test_staged_rooms_have_neither_mirrors_nor_fittings_when_empty(materials: Ma
 
 @given(seed=seeds)
 @settings(max_examples=25, deadline=None)
-def test_what_is_built_in_keeps_to_its_room_and_clear_of_doors(seed: int) -> None:
+def test_built_in_furniture_stays_in_its_room_clear_of_doors(seed: int) -> None:
     rng = np.random.default_rng(seed)
     home = generate_home(rng)
     for index, room in enumerate(home.plan.rooms):
@@ -153,7 +153,7 @@ def test_what_is_built_in_keeps_to_its_room_and_clear_of_doors(seed: int) -> Non
                 assert opening.kind == "window" or not footprint.contains(shapely.Point(before))
 
 
-def test_leaves_stand_in_their_rooms_at_every_angle() -> None:
+def test_leaves_stay_in_their_rooms_at_every_angle() -> None:
     angles, own, none, doors = [], 0, 0, 0
     for seed in range(40):
         rng = np.random.default_rng(seed)
@@ -177,7 +177,7 @@ def test_leaves_stand_in_their_rooms_at_every_angle() -> None:
     assert 0.05 < none / doors < 0.5
 
 
-def test_a_glazed_leaf_can_be_looked_through() -> None:
+def test_glazed_leaf_is_transparent() -> None:
     middle = [board for board in boards(0.4, 2.0, glazed=True) if abs(board.along_m) <= board.half_a]
     assert not any(board.z0 < 1.0 < board.z1 for board in middle)
     assert any(board.z0 < 1.0 < board.z1 for board in boards(0.4, 2.0, glazed=False))
@@ -185,7 +185,7 @@ def test_a_glazed_leaf_can_be_looked_through() -> None:
 
 @given(seed=seeds)
 @settings(max_examples=25, deadline=None)
-def test_reflecting_twice_changes_nothing_and_the_mirror_itself_stays(seed: int) -> None:
+def test_reflection_is_an_involution_that_fixes_the_mirror(seed: int) -> None:
     rng = np.random.default_rng(seed)
     mirror, wall = rng.uniform(-5.0, 5.0, 4), rng.uniform(-5.0, 5.0, 4)
     reflection = Reflection(mirror)

@@ -43,14 +43,14 @@ def noise_picture(seed: int = 0) -> torch.Tensor:
 
 @given(seed=seeds)
 @settings(max_examples=10, deadline=None)
-def test_a_level_camera_with_one_lens_changes_nothing(seed: int) -> None:
+def test_level_camera_with_one_lens_keeps_the_picture(seed: int) -> None:
     picture = noise_picture(seed)
     assert torch.allclose(tilt(picture, camera(seam=seed % 6)), picture, atol=1e-9)
     assert torch.equal(lens_gain(camera(seam=seed % 6), ROWS, COLUMNS), torch.ones(1, ROWS, COLUMNS).double())
 
 
 @pytest.mark.parametrize(("axis", "column"), [("pitch", 64), ("roll", 96)])
-def test_a_tilt_raises_what_is_seen_along_one_direction_and_lowers_it_opposite(axis: str, column: int) -> None:
+def test_tilt_raises_one_side_and_lowers_the_other(axis: str, column: int) -> None:
     elevation = ((0.5 - (torch.arange(ROWS) + 0.5) / ROWS) * math.pi).double()
     picture = elevation[None, :, None, None].expand(1, ROWS, COLUMNS, 3).clone()
     angle = math.radians(2.0)
@@ -63,7 +63,7 @@ def test_a_tilt_raises_what_is_seen_along_one_direction_and_lowers_it_opposite(a
     assert abs(float(change[(column + COLUMNS // 4) % COLUMNS])) < 0.05 * angle
 
 
-def test_a_turned_seam_moves_with_the_picture() -> None:
+def test_seam_turns_with_the_picture() -> None:
     straight = lens_gain(camera(seam_step=0.2, vignette=0.3), ROWS, COLUMNS)
     turned = lens_gain(camera(seam_step=0.2, vignette=0.3, seam=math.pi / 2.0), ROWS, COLUMNS)
     assert torch.allclose(straight.roll(COLUMNS // 4, dims=2), turned, atol=1e-6)
@@ -75,7 +75,7 @@ def test_a_turned_seam_moves_with_the_picture() -> None:
 
 @pytest.mark.parametrize("kind", range(6))
 @pytest.mark.parametrize("radius_deg", [12.0, 30.0])
-def test_a_patch_stays_below_its_reach(kind: int, radius_deg: float) -> None:
+def test_patch_stays_within_its_radius(kind: int, radius_deg: float) -> None:
     picture = noise_picture()
     stand = camera(nadir=math.radians(radius_deg), nadir_kind=kind, nadir_tone=0.05, nadir_turn=1.0)
     covered = cover_poles(picture.clone(), stand)
@@ -84,7 +84,7 @@ def test_a_patch_stays_below_its_reach(kind: int, radius_deg: float) -> None:
     assert not torch.equal(covered[:, -2:], picture[:, -2:])
 
 
-def test_without_a_patch_nothing_is_covered() -> None:
+def test_no_patch_covers_nothing() -> None:
     picture = noise_picture()
     assert torch.equal(cover_poles(picture.clone(), camera()), picture)
 
@@ -94,7 +94,7 @@ def test_without_a_patch_nothing_is_covered() -> None:
 
 @pytest.mark.parametrize("quality", [50, 80, 95])
 @pytest.mark.parametrize("rows", [ROWS, ROWS - 6])
-def test_compression_loses_about_what_a_jpeg_file_loses(quality: int, rows: int) -> None:
+def test_compression_error_matches_jpeg_files(quality: int, rows: int) -> None:
     picture = noise_picture(3)[:, :rows]
     picture = (picture + 0.05 * torch.rand(picture.shape, generator=torch.Generator().manual_seed(1)).double()).clamp(
         0, 1
@@ -113,7 +113,7 @@ def test_compression_loses_about_what_a_jpeg_file_loses(quality: int, rows: int)
 
 @given(seed=seeds)
 @settings(max_examples=30, deadline=None)
-def test_cameras_stay_within_their_limits_and_staged_ones_have_no_flaws(seed: int) -> None:
+def test_staged_cameras_have_no_flaws(seed: int) -> None:
     drawn = sample_exposure(np.random.default_rng(seed), bright=seed % 2 == 0)
     assert max(abs(drawn.roll), abs(drawn.pitch)) <= math.radians(2.0) + 1e-9
     assert drawn.jpeg == 0.0 or 50.0 <= drawn.jpeg <= 95.0
@@ -125,7 +125,7 @@ def test_cameras_stay_within_their_limits_and_staged_ones_have_no_flaws(seed: in
 
 @given(seed=seeds)
 @settings(max_examples=10, deadline=None)
-def test_a_picture_is_developed_alike_in_any_batch(seed: int) -> None:
+def test_developed_picture_does_not_depend_on_its_batch(seed: int) -> None:
     rng = np.random.default_rng(seed)
     cameras = Exposure(torch.from_numpy(np.stack([sample_exposure(rng).rows for _ in range(4)])).float())
     radiance = torch.rand(4, ROWS, COLUMNS, 3, generator=torch.Generator().manual_seed(seed % 1000))
@@ -145,7 +145,7 @@ def materials() -> MaterialLibrary:
 
 
 @pytest.mark.parametrize("rays", [(2, 1), (1, 2), (2, 2)])
-def test_more_rays_per_pixel_show_the_same_picture(materials: MaterialLibrary, rays: tuple[int, int]) -> None:
+def test_supersampling_keeps_the_picture(materials: MaterialLibrary, rays: tuple[int, int]) -> None:
     rng = np.random.default_rng(11)
     shots = [shot for _ in range(3) for shot in sample_shots(generate_home(rng), 2, rng, "empty")]
     few = PanoramaRenderer(materials, height=ROWS, width=COLUMNS).render(shots).float()
@@ -157,7 +157,7 @@ def test_more_rays_per_pixel_show_the_same_picture(materials: MaterialLibrary, r
     assert rays[0] == 1 or steps[1] < steps[0]
 
 
-def test_one_number_of_rays_counts_for_both_axes(materials: MaterialLibrary) -> None:
+def test_single_supersample_applies_to_both_axes(materials: MaterialLibrary) -> None:
     shots = sample_shots(generate_home(np.random.default_rng(1)), 1, np.random.default_rng(1))
     first, second = (
         PanoramaRenderer(materials, height=32, width=64, supersample=rays).render(shots) for rays in (2, (2, 2))
@@ -165,6 +165,6 @@ def test_one_number_of_rays_counts_for_both_axes(materials: MaterialLibrary) -> 
     assert torch.equal(first, second)
 
 
-def test_less_than_one_ray_per_pixel_is_refused(materials: MaterialLibrary) -> None:
+def test_supersample_below_one_is_refused(materials: MaterialLibrary) -> None:
     with pytest.raises(InvalidInputError, match="at least 1"):
         PanoramaRenderer(materials, supersample=(0, 1))

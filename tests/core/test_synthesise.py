@@ -138,7 +138,7 @@ def test_lines_have_two_ends_and_lie_in_their_planes(seed: int) -> None:
 
 @given(seed=seeds)
 @settings(max_examples=15, deadline=None)
-def test_rooms_close_and_are_the_plans(seed: int) -> None:
+def test_rooms_are_closed_and_match_the_plan(seed: int) -> None:
     home, found = annotation_of(seed)
     assert len(found.rooms) == len(home.plan.rooms)
     for semantic, room in zip(found.rooms, home.plan.rooms, strict=True):
@@ -154,7 +154,7 @@ def test_rooms_close_and_are_the_plans(seed: int) -> None:
 
 @given(seed=seeds)
 @settings(max_examples=15, deadline=None)
-def test_normals_point_into_the_empty_space(seed: int) -> None:
+def test_normals_point_into_free_space(seed: int) -> None:
     home, found = annotation_of(seed)
     outline = shapely.union_all([room.shape for room in home.plan.rooms]).buffer(1e-9)
     for semantic in found.document["semantics"]:
@@ -173,7 +173,7 @@ def test_normals_point_into_the_empty_space(seed: int) -> None:
 
 @given(seed=seeds)
 @settings(max_examples=15, deadline=None)
-def test_doors_and_windows_are_boxes_that_make_holes_in_walls(seed: int) -> None:
+def test_doors_and_windows_are_boxes_in_holes_of_walls(seed: int) -> None:
     home, found = annotation_of(seed)
     doors = [opening for opening in home.openings if opening.kind != "window"]
     between_rooms = sum(door.neighbour >= 0 for door in doors)
@@ -191,7 +191,7 @@ def test_doors_and_windows_are_boxes_that_make_holes_in_walls(seed: int) -> None
     assert holes[1] == len(home.openings) - between_rooms
 
 
-def test_the_outer_wall_is_around_the_home_as_the_data_sets_own_tools_look_for_it() -> None:
+def test_outer_wall_surrounds_the_home_as_official_tools_expect() -> None:
     home, found = annotation_of(3)
     (outwall,) = found.semantics("outwall")
     on_floor = np.isclose(found.points[:, 2], 0.0)
@@ -205,7 +205,7 @@ def test_the_outer_wall_is_around_the_home_as_the_data_sets_own_tools_look_for_i
         assert outline.contains(shapely.Polygon(1000.0 * room.polygon_m))
 
 
-def test_outer_walls_have_no_edge_without_a_direction() -> None:
+def test_outer_walls_have_no_zero_length_edge() -> None:
     home, _ = home_of(TRAIN, 0, 59)
     outside = shapely.union_all([room.shape.buffer(0.2, join_style="mitre") for room in home.plan.rooms])
     steps = np.diff(shapely.get_coordinates(outside), axis=0)
@@ -216,14 +216,14 @@ def test_outer_walls_have_no_edge_without_a_direction() -> None:
     assert np.isfinite([line["direction"] for line in found.document["lines"]]).all()
 
 
-def test_rooms_have_the_data_sets_types() -> None:
+def test_rooms_have_structured3d_types() -> None:
     names = ("bedroom 2", "living room", "closet 1", "storage", "dining room 12", "wine cellar")
     assert [room_type(name) for name in names] == [
         *("bedroom", "living room", "store room", "store room", "dining room", "undefined"),
     ]
 
 
-def test_what_is_written_is_read_back(root: Path) -> None:
+def test_written_scene_is_read_back(root: Path) -> None:
     dataset = Structured3D(root)
     assert dataset.panorama_size == (HEIGHT, 2 * HEIGHT)
     assert dataset.scenes("test") == ["scene_03250", "scene_03251"]
@@ -248,7 +248,7 @@ def test_what_is_written_is_read_back(root: Path) -> None:
 
 @given(seed=seeds)
 @settings(max_examples=25, deadline=None)
-def test_every_room_has_one_camera_and_a_home_one_camera_height(seed: int) -> None:
+def test_each_room_has_one_camera_at_the_home_s_height(seed: int) -> None:
     rng = np.random.default_rng(seed)
     home = generate_home(rng)
     shots = stage_rooms(home, rng)
@@ -265,7 +265,7 @@ def test_every_room_has_one_camera_and_a_home_one_camera_height(seed: int) -> No
 
 @given(seed=seeds)
 @settings(max_examples=25, deadline=None)
-def test_layout_pixels_lead_back_to_the_corners_that_the_camera_sees(seed: int) -> None:
+def test_layout_pixels_match_visible_corners(seed: int) -> None:
     rng = np.random.default_rng(seed)
     home = generate_home(rng)
     shot = stage_rooms(home, rng)[int(rng.integers(len(home.plan.rooms)))]
@@ -314,7 +314,7 @@ def test_every_room_has_nine_panoramas_and_three_depths(root: Path) -> None:
                         assert image.mode == ("I;16" if name == "depth.png" else "RGB")
 
 
-def test_depth_of_an_empty_room_is_that_of_its_layout_but_for_doors_and_fittings(root: Path) -> None:
+def test_empty_depth_matches_the_layout_except_doors_and_fittings(root: Path) -> None:
     for folder, home, shots in homes_of(root):
         for shot in shots:
             panorama = folder / "2D_rendering" / str(shot.room_index) / "panorama"
@@ -339,7 +339,7 @@ def test_depth_of_an_empty_room_is_that_of_its_layout_but_for_doors_and_fittings
             assert depth_m.min() > 0.1
 
 
-def test_furniture_hides_the_layout_and_moves_nothing_else(root: Path) -> None:
+def test_furniture_only_shortens_depth(root: Path) -> None:
     hidden = []
     for folder, _, shots in homes_of(root):
         for shot in shots:
@@ -364,7 +364,7 @@ def test_light_changes_colours(root: Path) -> None:
             assert blueness[0] - 0.05 > blueness[1] > blueness[2] + 0.05
 
 
-def test_pictures_in_several_lights_are_the_same_as_one_by_one() -> None:
+def test_pictures_in_several_lights_match_single_ones() -> None:
     home, rng = home_of(TEST, SEED, 3250)
     shot = stage_rooms(home, rng)[0]
     renderer = split_renderer_cache(TEST, SEED, None).renderer(HEIGHT, 2 * HEIGHT)
@@ -381,7 +381,7 @@ def floors_and_ceilings(scene: RenderScene) -> np.ndarray:
     return scene.surfaces.rows[used]
 
 
-def test_materials_are_the_same_however_a_room_is_furnished_and_lit(materials: MaterialLibrary) -> None:
+def test_materials_do_not_depend_on_furniture_and_light(materials: MaterialLibrary) -> None:
     home, rng = home_of(TEST, SEED, 3250)
     for shot in stage_rooms(home, rng):
         seen = []
@@ -394,7 +394,7 @@ def test_materials_are_the_same_however_a_room_is_furnished_and_lit(materials: M
                 np.testing.assert_array_equal(first, second)
 
 
-def test_a_room_has_the_same_materials_from_the_next_room(materials: MaterialLibrary) -> None:
+def test_room_has_the_same_materials_from_the_next_room(materials: MaterialLibrary) -> None:
     home, rng = home_of(TEST, SEED, 3250)
     shots = stage_rooms(home, rng)
     scenes = [build_scene(shot, materials) for shot in shots]
@@ -411,7 +411,7 @@ def test_a_room_has_the_same_materials_from_the_next_room(materials: MaterialLib
     assert pairs > 1
 
 
-def test_depth_out_of_range_is_no_reading(tmp_path: Path) -> None:
+def test_depth_out_of_range_is_zero(tmp_path: Path) -> None:
     write_depth(tmp_path / "depth.png", np.array([[1.2345, 65.535, 65.536, np.inf, np.nan]]))
     assert np.asarray(Image.open(tmp_path / "depth.png")).tolist() == [[1234, 65535, 0, 0, 0]]
 
@@ -419,7 +419,7 @@ def test_depth_out_of_range_is_no_reading(tmp_path: Path) -> None:
 # Runs
 
 
-def test_an_interrupted_run_leaves_whole_scenes_and_goes_on(
+def test_interrupted_run_leaves_whole_scenes_and_resumes(
     root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rooms_of_first = len(home_of(TEST, SEED, 3250)[0].plan.rooms)
@@ -446,14 +446,12 @@ def test_an_interrupted_run_leaves_whole_scenes_and_goes_on(
     assert synthesise(Synthesis(root=out, seed=SEED, height=HEIGHT), NUMBERS) == 0
 
 
-def test_any_number_of_workers_writes_the_same_files(root: Path, tmp_path: Path) -> None:
+def test_files_do_not_depend_on_the_number_of_workers(root: Path, tmp_path: Path) -> None:
     assert synthesise(Synthesis(root=tmp_path / "data", seed=SEED, height=HEIGHT), NUMBERS, workers=2) == 2
     assert content(tmp_path / "data") == content(root)
 
 
-def test_a_full_disk_is_a_named_error_and_leaves_nothing_half_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_full_disk_is_an_error_without_partial_scenes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(path: Path, *_: Any) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(path))
 
@@ -467,7 +465,7 @@ def test_a_full_disk_is_a_named_error_and_leaves_nothing_half_written(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
-def test_an_ended_command_leaves_whole_scenes_and_no_process(tmp_path: Path, how: signal.Signals) -> None:
+def test_ended_command_leaves_whole_scenes_and_no_process(tmp_path: Path, how: signal.Signals) -> None:
     program = "import sys; from lalaloc_core.cli import main; sys.exit(main(sys.argv[1:]))"
     arguments = ["synth", "--scenes", "40", "--split", "test", "--out", str(tmp_path), "--height", "64"]
     process = subprocess.Popen(
@@ -506,7 +504,7 @@ def group_exists(group: int) -> bool:
 # The command
 
 
-def test_scenes_are_shared_out_like_the_official_splits() -> None:
+def test_scenes_are_divided_like_the_official_splits() -> None:
     assert {split: len(found) for split, found in share_out(140, "all").items()} == {
         "train": 120,
         "validation": 10,
@@ -523,12 +521,12 @@ def test_scenes_are_shared_out_like_the_official_splits() -> None:
 
 
 @pytest.mark.parametrize(("scenes", "split"), [(250, "test"), (3475, "all"), (0, "all"), (-1, "train")])
-def test_more_scenes_than_a_split_has_are_refused(scenes: int, split: Any) -> None:
+def test_too_many_scenes_for_a_split_are_refused(scenes: int, split: Any) -> None:
     with pytest.raises(InvalidInputError, match=rf"^{scenes} scenes asked for, from 1 to \d+ are possible"):
         share_out(scenes, split)
 
 
-def test_the_command_writes_adds_and_says_so(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_command_writes_and_extends_scenes(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "data"
     common = ["synth", "--out", str(out), "--height", str(HEIGHT), "--seed", str(SEED)]
     assert main([*common, "--scenes", "1", "--split", "test"]) == 0
@@ -556,7 +554,7 @@ def test_the_command_writes_adds_and_says_so(root: Path, tmp_path: Path, capsys:
         (["--scenes", "1", "--textures", "nowhere"], "no <category>/<material>/*.jpg below 'nowhere'"),
     ],
 )
-def test_what_cannot_be_is_refused_before_anything_is_written(
+def test_invalid_options_are_refused_before_writing(
     arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["synth", "--out", str(tmp_path / "data"), *arguments]) == 2
@@ -564,7 +562,7 @@ def test_what_cannot_be_is_refused_before_anything_is_written(
     assert not (tmp_path / "data").exists()
 
 
-def test_a_folder_of_other_scenes_is_left_alone(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_folder_with_other_scenes_is_refused(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = content(root)
     assert main(["synth", "--scenes", "3", "--out", str(root), "--height", "64", "--seed", str(SEED)]) == 2
     message = capsys.readouterr().err

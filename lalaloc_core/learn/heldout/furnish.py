@@ -183,7 +183,7 @@ class Furnishing:
                 along_m = rng.uniform(0.5, wall.length_m - 0.5)
                 spans = [(o.left_m, o.right_m) for o in self._openings if _same(o.wall, wall)]
                 spans += [span_behind(o) for o in self._openings if o.behind is not None and _same(o.behind, wall)]
-                if all(at + 0.6 < low or at - 0.6 > high for low, high in spans):
+                if all(along_m + 0.6 < low or along_m - 0.6 > high for low, high in spans):
                     turn = float(np.arctan2(wall.along[1], wall.along[0]))
                     self._add(index, fixtures.picture(rng), wall.point_m(along_m), turn)
 

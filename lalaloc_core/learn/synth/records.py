@@ -92,6 +92,6 @@ class Records:
 def _together(parts: list[int | slice]) -> slice:
     """Return the slice of adjacent columns."""
     spans = [slice(part, part + 1) if isinstance(part, int) else part for part in parts]
-    if any(one.stop != following.start for one, following in pairwise(spans)):
+    if any(first.stop != second.start for first, second in pairwise(spans)):
         raise ValueError(f"columns {spans} are joined, but are not neighbours")
     return slice(spans[0].start, spans[-1].stop)

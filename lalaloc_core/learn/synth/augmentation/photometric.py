@@ -12,7 +12,7 @@ from lalaloc_core.learn.synth.camera.jpeg import compress
 # Spreads (normal) of the logarithms at full strength, and of the noise's standard deviation (share of the range).
 _GAIN, _GAMMA, _BALANCE, _CONTRAST = 0.12, 0.15, 0.04, 0.12
 _NOISE = 0.01
-# Compression costs more than everything else together.
+# Share of compressed pictures: compression is the most expensive effect.
 _JPEG_SHARE = 0.25
 
 
@@ -43,8 +43,8 @@ def jittered(image: UInt8[Tensor, "b h w 3"], strength: float, generator: torch.
 def optics(image: Float[Tensor, "b h w 3"], strength: float, generator: torch.Generator) -> Float[Tensor, "b h w 3"]:
     """Apply random effects of lens, film or file to panoramas.
 
-    Blur, vignetting of two lenses and a brightness step between them, clipped highlights, lifted shadows, pale or strong
-    colours, JPEG; each for a share of the pictures.
+    Blur, vignetting of two lenses and a brightness step between them, clipped highlights, lifted shadows, pale or
+    strong colours, JPEG; each for a share of the pictures.
 
     Args:
         image: (b, h, w, 3) pictures, 0 to 255.
@@ -63,7 +63,7 @@ def optics(image: Float[Tensor, "b h w 3"], strength: float, generator: torch.Ge
         return value[:, None, None, None]
 
     pixels = image / 255.0
-    # A tone curve with a knee: what lies above it is spread or clipped.
+    # A tone curve with a knee: values above it are spread or clipped.
     gain = torch.exp(chance(0.3) * uniform(-0.7, 0.7))
     pixels = (pixels * by_picture(gain)).clamp(max=1.0)
     lift = chance(0.3) * uniform(0.0, 0.25)

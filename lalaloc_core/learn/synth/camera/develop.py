@@ -28,7 +28,7 @@ def develop(
         noise: unit noise, at least as large as a picture; every picture uses its own rolled part.
     """
     luma = radiance @ radiance.new_tensor(_LUMA)
-    # The mean of the logarithm weighs a dark room more than the bright window in it, as a light meter does.
+    # Like a light meter, the mean of logarithms weighs a dark room more than its bright window.
     luma = luma.clamp_(1e-3, 20.0).log_()
     mean = luma.mean(dim=(1, 2))
     level = mean.exp()

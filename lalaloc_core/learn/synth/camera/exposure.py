@@ -24,14 +24,14 @@ class Exposure(Records):
         contrast, saturation: factors.
         noise: standard deviation.
         blur: standard deviation of the lens blur, pixels.
-        nadir, nadir_tone, nadir_kind, nadir_turn: radius (radians, 0 for none), tone, kind and rotation of the patch over
-            the nadir.
+        nadir, nadir_tone, nadir_kind, nadir_turn: radius (radians, 0 for none), tone, kind and rotation of the patch
+            over the nadir.
         noise_seed: part of the noise that is used.
         shoulder: softness of the roll-off of highlights.
         flatness: compression of the range of brightness.
         vignette: darkening towards the rims of the two lenses.
-        seam, seam_step, seam_shift: azimuth of the seam between the lenses relative to the picture's centre, the step in
-            brightness and the shift in elevation (radians) across it.
+        seam, seam_step, seam_shift: azimuth of the seam between the lenses relative to the picture's centre, the step
+            in brightness and the shift in elevation (radians) across it.
         roll, pitch: tilt about the forward axis and about the axis to the right, radians.
         jpeg: quality of compression, 0 for none.
         zenith, zenith_tone: radius (radians, 0 for none) and tone of the patch over the zenith.

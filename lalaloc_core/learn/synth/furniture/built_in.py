@@ -37,6 +37,7 @@ class Stretch(NamedTuple):
 
     @property
     def length_m(self) -> float:
+        """Length of the stretch (m)."""
         return self.end_m - self.start_m
 
 

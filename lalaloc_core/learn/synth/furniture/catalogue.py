@@ -28,7 +28,7 @@ from lalaloc_core.learn.synth.furniture.pieces_service import (
     washbasin,
 )
 
-# What stands in a kind of room, most characteristic first, with the chance of each.
+# Pieces of each kind of room, most characteristic first, with their probabilities.
 ROOM_PIECES: dict[str, tuple[tuple[Maker, float], ...]] = {
     "living": (
         (sofa, 0.95),

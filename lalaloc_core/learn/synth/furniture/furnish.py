@@ -30,7 +30,7 @@ _KITCHEN_CHANCE = {"kitchen": 0.85, "living": 0.3, "dining": 0.2}
 _WARDROBE_CHANCE = {"bedroom": 0.4, "corridor": 0.2, "closet": 0.3, "storage": 0.3, "study": 0.2}
 
 
-# Centres and unit axes, of one piece or of several tries.
+# Centres and unit axes of one or several candidate poses.
 Pose = tuple[Float[np.ndarray, "*n 2"], Float[np.ndarray, "*n 2"]]
 
 
@@ -209,10 +209,10 @@ def _build_in(floor: _Floor, room: Room, rng: np.random.Generator) -> list[Prism
         groups.append(wardrobes(stretches, room.ceiling_height_m, rng))
     prisms: list[Prism] = []
     for number, group in enumerate(groups):
-        for one in group:
-            pose = floor.fit(one)
+        for placed in group:
+            pose = floor.fit(placed)
             if pose is not None:
-                prisms += place(one.piece, *pose, number)
+                prisms += place(placed.piece, *pose, number)
     if kind == "bathroom" and rng.random() < 0.7:
         for number, piece in enumerate(sanitary(rng), start=len(groups)):
             pose = floor.find(piece, rng)
@@ -254,7 +254,7 @@ def _wanted(room: Room, level: FurnitureLevel, rng: np.random.Generator) -> list
     wanted = list(ROOM_PIECES.get(kind, ROOM_PIECES["living"]))
     if level == "simple":
         return [(maker, 0.75 * chance) for maker, chance in wanted]
-    # Larger rooms have a second and a third helping.
+    # Larger rooms get the catalogue a second and a third time.
     for _ in range(int(room.area_m2 > 12.0) + int(room.area_m2 > 26.0)):
         wanted += [wanted[index] for index in rng.permutation(len(wanted))]
     return [(maker, min(1.0, 1.25 * chance)) for maker, chance in wanted]

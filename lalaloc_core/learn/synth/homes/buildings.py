@@ -25,7 +25,7 @@ _HALL_M2, _COLUMNS_EVERY_M, _COLUMN_M = 900.0, 5.0, 0.5
 _CEILING_M = 3.0
 # Floor by length of the wings (m); gaps and courtyards make buildings more than twice as deep.
 _MAX_DEPTH_M = 350.0
-# Buildings are larger than what one may upload.
+# Buildings can exceed the upload limits.
 _LIMITS = PlanLimits(max_rooms=10**6, max_plan_vertices=10**7, max_openings=10**6)
 
 
@@ -63,7 +63,7 @@ class _Builder:
     def __init__(self, split: int, seed: int, area_m2: float, hall_share: float) -> None:
         self._split, self._seed = split, seed
         self._area_m2, self._hall_share = area_m2, hall_share
-        # Nearly square; large ones are wider, as a wing is as deep as its deepest home and they would be too long.
+        # Nearly square; large ones are wider, because a wing is as deep as its deepest home.
         self._length_m = max(1.1 * math.sqrt(area_m2), area_m2 / _MAX_DEPTH_M)
         self._rooms: list[dict[str, Any]] = []
         self._openings: list[dict[str, Any]] = []

@@ -16,7 +16,7 @@ _CORNER_CLEARANCE_M = 0.06
 _MIN_DOOR_M = 0.65
 _MAX_OPENING_M = 5.0
 _WIDE_M = 1.2
-# Share of open doors, by home, and how often a home has it: shut, as usual, all open.
+# Shares of open doors per home (closed, usual, all open), and the probability of each.
 _OPEN_SHARES, _OPEN_SHARE_SHARES = (0.3, 0.65, 0.95), (0.2, 0.4, 0.4)
 _PUBLIC = ("living", "kitchen", "corridor", "dining", "hall")
 _WINDOWLESS = ("corridor", "closet", "storage")

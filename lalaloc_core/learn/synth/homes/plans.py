@@ -45,8 +45,8 @@ class HomeConfig:
     offset_m: float = 10.0
 
 
-# What networks learn from is more varied than what they are measured on, as real homes are: high rooms, walls that end
-# in the middle of a room, open plans, windows that one may take for doors.
+# Training homes are more varied than test homes, like real ones: high rooms, walls that end in the middle of a room,
+# open plans, windows that resemble doors.
 VARIED_HOMES = HomeConfig(
     ceiling_height_m=(2.1, 4.8), wing_wall_share=0.2, open_plan_share=0.2, french_window_share=0.4
 )

@@ -1,7 +1,7 @@
-"""Rendering scenes as panoramas: a batched ray caster in torch, and light on what the rays hit.
+"""Rendering of scenes as panoramas: a batched ray caster in torch, and shading.
 
 Begin with `panorama.py`, the panorama renderer. `cast.py` and `prisms.py` cast rays against walls and furniture,
-`shading.py` lights what they hit, `outdoors.py` is what one sees through windows; `contact_sheet.py` is to look at.
+`shading.py` shades the hits, `outdoors.py` is the view through windows; `contact_sheet.py` shows examples.
 """
 
 from lalaloc_core.learn.synth.rendering.panorama import PanoramaRenderer

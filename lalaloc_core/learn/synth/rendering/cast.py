@@ -1,6 +1,6 @@
-"""Casting the rays of panoramas against batches of scenes, column by column.
+"""Ray casting of panoramas against batches of scenes, column by column.
 
-All tensors are laid out (b, c, h): batch, azimuth column, image row. A column's rays lie in one vertical plane, so
+All tensors are laid out (b, c, h): batch, azimuth column, image row. The rays of a column lie in one vertical plane, so
 walls and prisms are intersected once per column in 2-D, and a row only compares heights.
 """
 
@@ -31,24 +31,24 @@ class SceneBatch(SceneRecords):
     wall_surface: Int[Tensor, "b n"]
 
     def __getitem__(self, index: Tensor) -> SceneBatch:
-        """A batch of some of the scenes."""
+        """Return a batch of some of the scenes."""
         return SceneBatch(**{name: getattr(self, name)[index] for name in SceneBatch.__dataclass_fields__})
 
 
 @dataclass(frozen=True, eq=False)
 class Hits:
-    """What each pixel sees.
+    """Visible surface of each pixel.
 
     Attributes:
-        distance_m: horizontal distance to it.
+        distance_m: horizontal distance.
         surface: row of the scene's surfaces.
-        slot: room it lies in (0 for all furniture seen through the own room).
+        slot: its room (0 for all furniture seen through the own room).
         normal: unit normal, facing the camera.
-        furniture: whether it is a prism.
-        gap_m: distance in the column's plane to the next piece of furniture behind
-            the hit that stands on the floor, inf if there is none; for contact shadows.
-        wall_gap_m: on floors and ceilings, distance to the wall that the column ends at; large elsewhere.
-        column_end_m: distance of the wall that each column ends at.
+        furniture: true for a prism.
+        gap_m: distance in the column's plane to the next piece of furniture behind the hit that stands on the floor,
+            inf if there is none; for contact shadows.
+        wall_gap_m: on floors and ceilings, distance to the wall at the end of the column; large elsewhere.
+        column_end_m: distance of the wall at the end of each column.
     """
 
     distance_m: Float[Tensor, "b c h"]
@@ -63,7 +63,7 @@ class Hits:
 
 @dataclass(frozen=True, eq=False)
 class _Crossings:
-    """Per column and wall: distance (inf: missed), metres along the wall, and whether the ray leaves the room there."""
+    """Per column and wall: distance (inf for a miss), metres along the wall, and if the ray leaves the room there."""
 
     distance_m: Float[Tensor, "b c n"]
     along_m: Float[Tensor, "b c n"]
@@ -83,14 +83,14 @@ class _WallHits:
 
 @dataclass(frozen=True, eq=False)
 class _ShellHits:
-    """What the rays hit of walls, floors and ceilings, before furniture; (b, c, h) unless said otherwise.
+    """Hits on walls, floors and ceilings, before furniture; (b, c, h) unless noted.
 
     Attributes:
         vertical: z of the normal, 0 on walls.
-        is_beyond: 1 for what is seen through a hole, whose walls have the normals `beyond_normal`; else 0.
+        is_beyond: 1 for pixels seen through a hole, whose walls have the normals `beyond_normal`; else 0.
         own: walls of the own room.
-        beyond_normal: (b, c, 2) of the walls that columns with a hole end at.
-        end_m: (b, c) horizontal distance at which each column ends.
+        beyond_normal: (b, c, 2) normals of the walls at the end of columns with a hole.
+        end_m: (b, c) horizontal distance at the end of each column.
     """
 
     distance_m: Tensor
@@ -118,7 +118,7 @@ def trace(batch: SceneBatch, direction: Float[Tensor, "b c 2"], slope: Float[Ten
 def cast_own_walls(
     walls_m: Float[Tensor, "b n 4"], owner: Int[Tensor, "b n"], direction: Float[Tensor, "b c 2"]
 ) -> Float[Tensor, "b c"]:
-    """Horizontal distance to the walls of the camera's own room."""
+    """Return the horizontal distance to the walls of the camera's own room."""
     distance = _cross_walls(walls_m, direction).distance_m
     return torch.where((owner == 0)[:, None], distance, torch.inf).min(dim=2).values
 
@@ -155,7 +155,7 @@ def _trace_shell(batch: SceneBatch, direction: Float[Tensor, "b c 2"], slope: Fl
 
 
 def _put_beyond(shell: _ShellHits, columns: tuple[Tensor, Tensor], beyond: _Beyond) -> None:
-    """Replace what columns hit by what they see through their holes, in place."""
+    """Replace the hits of columns by those seen through their holes, in place."""
     for whole, part in (
         (shell.distance_m, beyond.distance_m),
         (shell.surface, beyond.surface),
@@ -171,7 +171,7 @@ def _put_beyond(shell: _ShellHits, columns: tuple[Tensor, Tensor], beyond: _Beyo
 def _before(
     batch: SceneBatch, shell: _ShellHits, prisms: PrismHits, direction: Float[Tensor, "b c 2"], slope: Tensor
 ) -> Hits:
-    """The prisms before what was hit so far."""
+    """Return the hits with prisms in front of the shell."""
     own_m, own_normal = shell.own.distance_m[:, :, None], shell.own.normal
     hit_m, nearest = resolve_prisms(prisms, shell.distance_m, slope, batch.camera_height_m)
     furniture = nearest >= 0
@@ -241,7 +241,7 @@ def _facing_normal(walls_m: Tensor, wall: Tensor, direction: Tensor) -> Tensor:
 
 
 def _decals_at(batch: SceneBatch, wall: Tensor, along_m: Tensor) -> Int[Tensor, "b c k"]:
-    """Indices of the decals that a column's wall hit may meet, in painting order; -1 pads."""
+    """Return the indices of decals that a column's wall hit may meet, in painting order; -1 pads."""
     decals = batch.decals[:, None]
     on = (decals.wall == wall[:, :, None]) & (decals.s0_m <= along_m[:, :, None]) & (decals.s1_m >= along_m[:, :, None])
     order = torch.where(on, torch.arange(on.shape[2], device=on.device), -1)
@@ -252,7 +252,7 @@ def _decals_at(batch: SceneBatch, wall: Tensor, along_m: Tensor) -> Int[Tensor, 
 def _paint(
     batch: SceneBatch, decal: Tensor, z: Tensor, is_wall: Tensor, surface: Tensor
 ) -> tuple[Int[Tensor, "b c h"], Int[Tensor, "b c h"]]:
-    """Paint decals onto wall pixels; returns the surface and, where the wall has a hole, the decal that makes it."""
+    """Paint decals onto wall pixels; return the surface and, where the wall has a hole, its decal."""
     hole = torch.full_like(surface, -1)
     for k in range(decal.shape[2]):
         index = decal[:, :, k]
@@ -267,7 +267,7 @@ def _paint(
 
 @dataclass(frozen=True, eq=False)
 class _Beyond:
-    """What the columns with a hole see through it, (m, h) unless said otherwise."""
+    """Hits of the columns with a hole through it, (m, h) unless noted."""
 
     hole: Tensor
     distance_m: Tensor

@@ -1,4 +1,4 @@
-"""What stands outside the windows: sky above an outline of trees or houses."""
+"""View through windows: sky above an outline of trees or houses."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _SIZE = 256
 
 
 class Outdoors:
-    """A mottled pattern that all backdrops share; each scene colours it in its own way."""
+    """A mottled pattern shared by all backdrops; each scene colours it."""
 
     def __init__(self, device: torch.device) -> None:
         rng = np.random.default_rng(0)
@@ -31,7 +31,7 @@ class Outdoors:
     def colour(
         self, backdrop: Backdrop, direction: Float[Tensor, "n 2"], slope: Float[Tensor, "n"]
     ) -> Float[Tensor, "n 3"]:
-        """Colour seen along rays; `backdrop` has one row per ray."""
+        """Return the colour along rays; `backdrop` has one row per ray."""
         azimuth = torch.atan2(direction[:, 0], direction[:, 1]) / TWO_PI
         turn = azimuth + backdrop.turn
         column = (turn.remainder(1.0) * _SIZE).long().clamp(max=_SIZE - 1)

@@ -29,7 +29,7 @@ __all__ = ["PanoramaRenderer", "Shot", "sample_shots"]
 # Small batches stay in a CPU's caches, large ones fill a GPU.
 _BATCH_PIXELS = {"cpu": 1 << 17}
 _BATCH_PIXELS_ELSEWHERE = 1 << 21
-# What tables are padded with: walls of no room, decals on no wall, and a small box far away.
+# Padding of tables: walls of no room, decals on no wall, and a small box far away.
 _NO_ROOM = -(10**6)
 _PADDING = {
     "decals": Decals.row(wall=-1.0),
@@ -44,7 +44,7 @@ class PanoramaRenderer:
         materials: pictures of materials.
         height: rows of a panorama, even.
         width: columns.
-        device: where to render.
+        device: device that renders.
         supersample: rays per pixel along a column and along a row, or one number for both. Photographs average over
             their pixels; (2, 1) smooths the edges of floor and ceiling, 2 those of doors too.
 
@@ -76,7 +76,7 @@ class PanoramaRenderer:
         self._batch_size = max(1, pixels // (rows * columns))
         self._slope = self._tensor(np.tan(row_elevations(rows)))
         self._azimuth = self._tensor(column_azimuths(columns))
-        # Pictures take differently rolled parts of one field of noise: drawing new noise would cost more than the rays.
+        # Pictures use differently rolled parts of one noise field, because new noise would cost more than the rays.
         self._noise = self._tensor(np.random.default_rng(0).normal(size=(height + 64, width + 64, 3)))
 
     def render(self, shots: Sequence[Shot]) -> UInt8[Tensor, "b h w 3"]:
@@ -85,7 +85,7 @@ class PanoramaRenderer:
 
     @torch.no_grad()
     def render_scenes(self, scenes: Sequence[RenderScene]) -> UInt8[Tensor, "b h w 3"]:
-        """Photograph scenes that were built elsewhere, such as in worker processes, with the same materials."""
+        """Photograph scenes that were built elsewhere with the same materials, such as in worker processes."""
         step = self._batch_size
         return torch.cat([self._render_batch(scenes[k : k + step]) for k in range(0, len(scenes), step)])
 
@@ -114,13 +114,13 @@ class PanoramaRenderer:
 
     @torch.no_grad()
     def hits(self, shots: Sequence[Shot]) -> Hits:
-        """What every ray hits, laid out (b, w, h): distances, surfaces, normals."""
+        """Return the hit of every ray, laid out (b, w, h): distances, surfaces, normals."""
         batch = stack_scenes([build_scene(shot, self._materials) for shot in shots], self._device)
         return trace(batch, self._directions(batch), self._slope)
 
     @torch.no_grad()
     def depth_m(self, shots: Sequence[Shot]) -> Float[Tensor, "b h w"]:
-        """Range (m) along each pixel's ray to whatever it sees, furniture included; at least as large as a panorama."""
+        """Return the range (m) along each pixel's ray, furniture included; at least as large as a panorama."""
         return self._range_m(self.hits(shots))
 
     def _photograph(self, batch: SceneBatch, hits: Hits, direction: Float[Tensor, "b c 2"]) -> UInt8[Tensor, "b h w 3"]:
@@ -141,7 +141,7 @@ class PanoramaRenderer:
 
 
 def _shrink(radiance: Float[Tensor, "b h w 3"], factor: tuple[int, int]) -> Float[Tensor, "b h2 w2 3"]:
-    """Average blocks of rays; what is much brighter than the rest is clipped first, as on a sensor."""
+    """Average blocks of rays; clip outliers first, as a sensor does."""
     planes = radiance.clamp(max=8.0).permute(0, 3, 1, 2)
     return torch.nn.functional.avg_pool2d(planes, factor).permute(0, 2, 3, 1)
 
@@ -158,7 +158,7 @@ def stack_scenes(scenes: Sequence[RenderScene], device: torch.device) -> SceneBa
 
     def stack_records(name: str) -> Any:
         records = [getattr(scene, name) for scene in scenes]
-        return type(records[0])(stack([one.rows for one in records], padding=_PADDING.get(name, 0)))
+        return type(records[0])(stack([record.rows for record in records], padding=_PADDING.get(name, 0)))
 
     return SceneBatch(
         camera_height_m=torch.tensor([scene.camera_height_m for scene in scenes], dtype=torch.float32, device=device),
@@ -166,5 +166,5 @@ def stack_scenes(scenes: Sequence[RenderScene], device: torch.device) -> SceneBa
         walls_m=stack([scene.walls_m for scene in scenes]),
         wall_owner=stack([scene.wall_owner for scene in scenes], torch.long, _NO_ROOM),
         wall_surface=stack([scene.wall_surface for scene in scenes], torch.long),
-        **{one.name: stack_records(one.name) for one in dataclasses.fields(SceneRecords)},
+        **{field.name: stack_records(field.name) for field in dataclasses.fields(SceneRecords)},
     )

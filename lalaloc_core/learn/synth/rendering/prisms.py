@@ -1,4 +1,4 @@
-"""Casting rays against vertical boxes and elliptic cylinders, column by column; see `cast` for the layout."""
+"""Ray casting against vertical boxes and elliptic cylinders, column by column; see `cast` for the layout."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _MAX_PRISMS_PER_COLUMN = 16
 
 @dataclass(frozen=True, eq=False)
 class PrismHits:
-    """Per column the nearest prisms: entry and exit distance, z-range, index, normal of the side that is entered."""
+    """Nearest prisms per column: entry and exit distance, z-range, index, normal of the entered side."""
 
     enter_m: Float[Tensor, "b c k"]
     leave_m: Float[Tensor, "b c k"]
@@ -41,7 +41,7 @@ def cross_prisms(prisms: Prisms, direction: Float[Tensor, "b c 2"], limit_m: Flo
     enter, leave = torch.where(is_round, disc_enter, box_enter), torch.where(is_round, disc_leave, box_leave)
     valid = (enter < leave) & (leave > 0.0) & (enter < limit_m[:, :, None])
     most = min(max(int(valid.sum(dim=2).max()), 1), _MAX_PRISMS_PER_COLUMN)
-    # Where two prisms are entered at once, as those of one piece often are, the first one counts.
+    # If a ray enters two prisms at once, as in one piece of furniture, the first one counts.
     order = torch.where(valid, enter + _TIE_M * torch.arange(enter.shape[2], device=enter.device), torch.inf)
     index = order.topk(most, dim=2, largest=False).indices
     enter = torch.where(valid, enter, torch.inf).gather(2, index)
@@ -67,7 +67,7 @@ def cross_prisms(prisms: Prisms, direction: Float[Tensor, "b c 2"], limit_m: Flo
 
 
 def _cross_square(u: Tensor, v: Tensor, du: Tensor, dv: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Entry and exit of the unit square, and whether it is entered through a side of constant u."""
+    """Return entry and exit of the unit square, and if it is entered through a side of constant u."""
     iu, iv = 1.0 / torch.where(du.abs() < _TINY, _TINY, du), 1.0 / torch.where(dv.abs() < _TINY, _TINY, dv)
     mid_u, half_u = -u * iu, iu.abs()
     mid_v, half_v = -v * iv, iv.abs()
@@ -76,7 +76,7 @@ def _cross_square(u: Tensor, v: Tensor, du: Tensor, dv: Tensor) -> tuple[Tensor,
 
 
 def _cross_disc(u: Tensor, v: Tensor, du: Tensor, dv: Tensor) -> tuple[Tensor, Tensor]:
-    """Entry and exit of the unit disc; entry after exit where it is missed."""
+    """Return entry and exit of the unit disc; entry after exit for a miss."""
     square = du**2 + dv**2
     mid = -(u * du + v * dv) / square
     discriminant = 1.0 - (u * dv - v * du) ** 2 / square
@@ -114,7 +114,7 @@ def resolve_prisms(
 
 
 def gap_behind(prisms: PrismHits, limit_m: Float[Tensor, "b c h"]) -> Float[Tensor, "b c h"]:
-    """Distance from a point on the floor to the next piece of furniture behind it that stands on the floor."""
+    """Return the distance from a point on the floor to the next piece of furniture that stands behind it."""
     stands = (prisms.z0_m < 0.12) & (prisms.z1_m > 0.05)
     enter = torch.where(stands, prisms.enter_m, torch.inf).sort(dim=2).values
     enter = torch.nn.functional.pad(enter, (0, 1), value=torch.inf)

@@ -1,4 +1,4 @@
-"""Light and colour of what the rays hit. Tensors are laid out (b, c, h) as in `cast`."""
+"""Light and colour of the hits. Tensors are laid out (b, c, h) as in `cast`."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class Atlas:
         self._offset_table = torch.tensor(self._offsets, device=device)
 
     def sample(self, picture: Int[Tensor, "*n"], u: Tensor, v: Tensor, texels_per_pixel: Tensor) -> Tensor:
-        """Linear colour (*n, 3) at picture coordinates (u, v), averaged over about `texels_per_pixel`."""
+        """Return linear colour (n..., 3) at picture coordinates (u, v), averaged over about `texels_per_pixel`."""
         level = texels_per_pixel.clamp(min=1.0).log2().round().clamp(max=_LEVELS - 1).int()
         size = PICTURE_SIZE >> level
         x = ((u - u.floor()) * size).int().clamp(max=PICTURE_SIZE - 1)
@@ -60,7 +60,7 @@ def shade(
     atlas: Atlas,
     outdoors: Outdoors,
 ) -> Float[Tensor, "b c h 3"]:
-    """Linear radiance of every pixel."""
+    """Return the linear radiance of every pixel."""
     d = hits.distance_m
     x, y = direction[:, :, None, 0] * d, direction[:, :, None, 1] * d
     z = slope * d + batch.camera_height_m[:, None, None]
@@ -79,7 +79,7 @@ def shade(
 
 
 def _surface_of(surfaces: Surfaces, index: Int[Tensor, "b c h"]) -> Surfaces:
-    """The surface of every pixel: rows (b, c, h, 12)."""
+    """Return the surface of every pixel: rows (b, c, h, 12)."""
     batch, size, width = surfaces.rows.shape
     flat = index + (torch.arange(batch, device=index.device) * size)[:, None, None]
     return Surfaces(surfaces.rows.reshape(-1, width)[flat.reshape(-1)].reshape(*index.shape, width))
@@ -99,9 +99,9 @@ def _albedo(
         scale * (sine * u + cosine * v) + surface.shift_v,
     )
     distance = hits.distance_m * torch.sqrt(1.0 + slope**2)
-    # How much of the surface a pixel covers grows with distance and where it is seen at a grazing angle.
+    # The footprint of a pixel grows with distance and at grazing angles.
     grazing = torch.where(flat, (slope.abs() / torch.sqrt(1.0 + slope**2)), 1.0).clamp(min=0.1)
-    # Rays may be denser along one axis than along the other: their mean density counts.
+    # Use the mean ray density of both axes.
     pitch = math.pi * math.sqrt(2.0 / (slope.shape[0] * hits.distance_m.shape[1]))
     footprint = distance * scale * (PICTURE_SIZE * pitch) / torch.sqrt(grazing)
     colour = atlas.sample(surface.picture.int(), u, v, footprint)
@@ -143,7 +143,7 @@ def _light_beyond(
 
 
 def _shadow_maps(batch: SceneBatch) -> Float[Tensor, "b l 2 rows columns"]:
-    """Mean and mean square of the distance that light travels from each lamp (variance shadow maps)."""
+    """Return mean and mean square of the distance of light from each lamp (variance shadow maps)."""
     count, lights = batch.lights.rows.shape[:2]
     device = batch.lights.rows.device
     azimuth = torch.tensor(column_azimuths(_SHADOW_COLUMNS), dtype=torch.float32, device=device)
@@ -155,7 +155,7 @@ def _shadow_maps(batch: SceneBatch) -> Float[Tensor, "b l 2 rows columns"]:
     owner = batch.wall_owner.repeat_interleave(lights, 0)
     prisms = Prisms(batch.prisms.rows.repeat_interleave(lights, 0).clone())
     prisms.centre_m -= position[:, None]
-    # What casts no shadow is moved out of the way.
+    # Move prisms without shadows out of the way.
     prisms.x_m += torch.where(prisms.is_opaque > 0.5, 0.0, 1e6)
     wall_m = cast_own_walls(walls, owner, direction)
     height = batch.lights.z_m.reshape(-1)
@@ -175,7 +175,7 @@ def _shadow_maps(batch: SceneBatch) -> Float[Tensor, "b l 2 rows columns"]:
 def _visibility(
     moments: Float[Tensor, "b 2 rows columns"], to_light: list[Tensor], distance: Tensor
 ) -> Float[Tensor, "b c h"]:
-    """Share of a lamp that a point sees (Chebyshev's bound on the shadow map)."""
+    """Return the visible share of a lamp from a point (Chebyshev's bound on the shadow map)."""
     azimuth = torch.atan2(-to_light[0], -to_light[1])
     elevation = torch.asin((-to_light[2] / distance).clamp(-1.0, 1.0))
     width = _SHADOW_COLUMNS + 2
@@ -193,7 +193,7 @@ def _visibility(
 def _add_sunlight(
     batch: SceneBatch, hits: Hits, point: tuple[Tensor, Tensor, Tensor], light: Float[Tensor, "b c h 3"]
 ) -> None:
-    """Add the patch of sun that a window throws."""
+    """Add the patch of sun of a window."""
     sun = batch.sun[:, None, None]
     (start_x, start_y), (ax, ay) = sun.wall_start_m.unbind(-1), sun.wall_along.unbind(-1)
     toward_x, toward_y, rise = sun.direction.unbind(-1)
@@ -210,7 +210,7 @@ def _add_sunlight(
 
 
 def _ambient(batch: SceneBatch, hits: Hits, point: tuple[Tensor, Tensor, Tensor]) -> Float[Tensor, "b c h 3"]:
-    """Light from everywhere, less of it in corners and beside furniture."""
+    """Return ambient light, reduced in corners and beside furniture."""
     beyond = hits.slot.nonzero(as_tuple=True)
     room = batch.rooms[beyond[0], hits.slot[beyond]]
     z, nz = point[2], hits.normal[..., 2]
@@ -235,7 +235,7 @@ def _ambient(batch: SceneBatch, hits: Hits, point: tuple[Tensor, Tensor, Tensor]
 def _add_reflections(
     batch: SceneBatch, hits: Hits, radiance: Tensor, gloss: Tensor, slope: Tensor
 ) -> Float[Tensor, "b c h 3"]:
-    """Glossy floors mirror what the same column shows higher up."""
+    """Add reflections of the same column in glossy floors."""
     is_floor = (gloss > 0.0) & (hits.normal[..., 2] > 0.0) & ~hits.furniture & (hits.slot == 0)
     item, column, row = is_floor.nonzero(as_tuple=True)
     rows = slope.shape[0]

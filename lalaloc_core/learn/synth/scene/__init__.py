@@ -1,7 +1,7 @@
-"""What one camera sees of a home, as arrays to render: walls and what is on them, furniture, materials, light.
+"""Scenes: the view of one camera in a home, as arrays to render: walls, decals, furniture, materials, light.
 
-Begin with `build.py`, which builds the `RenderScene` (`render_scene.py`) of a `Shot` (`shots.py`); `facts.py` tells
-what makes a shot hard.
+Begin with `build.py`, which builds the `RenderScene` (`render_scene.py`) of a `Shot` (`shots.py`); `facts.py` lists
+properties that make a shot hard.
 """
 
 from lalaloc_core.learn.synth.scene.materials import MaterialLibrary

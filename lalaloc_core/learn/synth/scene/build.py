@@ -1,4 +1,4 @@
-"""Building a shot's scene: which parts it has, and in which order they are drawn."""
+"""Construction of a shot's scene: its parts, and the order in which they are drawn."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from lalaloc_core.learn.synth.scene.windows import add_curtains, add_radiator, a
 
 
 def build_scene(shot: Shot, materials: MaterialLibrary) -> RenderScene:
-    """The scene that a shot sees, everything that is random about it drawn from the shot's seed."""
+    """Build the scene of a shot; the shot's seed determines everything random."""
     scene = _Builder(shot, materials).build()
     return scene if shot.lighting is None else relit(scene, shot.lighting)
 
 
 class _Builder:
-    """Builds one scene, once: what every part draws depends on what was drawn before it."""
+    """Builds one scene, once: the random draws of a part depend on the parts before it."""
 
     def __init__(self, shot: Shot, materials: MaterialLibrary) -> None:
         self._shot, self._home = shot, shot.home
@@ -84,14 +84,14 @@ class _Builder:
         return [opening for opening in self._home.openings if opening.room == room_index]
 
     def _add_room(self, slot: int, room_index: int, lighting: Lighting) -> None:
-        """Shell, openings and furniture of a room."""
+        """Add shell, openings and furniture of a room."""
         first = self._shells.add(slot, room_index, self._home.plan.rooms[room_index], lighting)
         for opening in self._openings_of(room_index):
             self._add_opening(first + opening.wall, opening, is_own=slot == 0)
         self._furnish(room_index, is_own=slot == 0)
 
     def _add_opening(self, wall: int, opening: Opening, *, is_own: bool) -> None:
-        """A window, or a door, which in the camera's own room one may look through."""
+        """Add a window, or a door that is see-through in the camera's own room."""
         tables, style, rng = self._tables, self._style, self._rng
         number = self._home.openings.index(opening)
         self._streams.begin(ScenePart.OPENING, number)
@@ -106,7 +106,7 @@ class _Builder:
             add_radiator(tables, style, self._room, opening, rng)
 
     def _furnish(self, room_index: int, *, is_own: bool) -> None:
-        """Furniture, sparse in rooms beyond the camera's own; facts are of the own room only."""
+        """Add furniture, less in other rooms than the camera's own; facts cover the own room only."""
         self._streams.begin(ScenePart.FURNITURE, room_index)
         level: FurnitureLevel = self._shot.furniture if is_own or self._is_bare else "simple"
         camera = self._tables.camera_m if is_own else None

@@ -1,4 +1,4 @@
-"""Doors and wide openings: their frames, what closes them, and the holes through which one sees the next room."""
+"""Doors and wide openings: frames, leaves, and the holes into the next room."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from lalaloc_core.learn.synth.scene.leaves import DOUBLE_FROM_M, boards, hang_le
 from lalaloc_core.learn.synth.scene.style import HouseStyle
 from lalaloc_core.learn.synth.scene.tables import SceneTables
 
-# What is no wall's thickness between two rooms is taken for the usual one.
+# Implausible wall thicknesses between two rooms are replaced by the usual one.
 _USUAL_DEPTH_M, _MAX_DEPTH_M = 0.12, 0.6
 # Leaves and holes begin below the floor: no crack is seen.
 _BELOW_M = -1.0
@@ -34,12 +34,12 @@ def add_door(
     """Add a door or a wide opening.
 
     Args:
-        tables: of the scene.
-        style: the house's.
+        tables: tables of the scene.
+        style: style of the house.
         home: the home.
         opening: the opening, not a window.
         wall: its wall in the tables.
-        slot_behind: slot of the room that one sees through it; with None it is shut or dark.
+        slot_behind: slot of the room behind it; None for a closed or dark opening.
         rng: source of randomness.
     """
     room = home.plan.rooms[opening.room]
@@ -63,7 +63,7 @@ def add_door(
 
 
 def _hole_depth(room: Room, neighbour: Room, opening: Opening) -> float:
-    """Distance to the facing wall of the room behind."""
+    """Return the distance to the facing wall of the room behind."""
     middle, _, inwards = _frame_of(room, opening)
     ray = shapely.LineString([middle, middle - inwards])
     depth = float(shapely.distance(shapely.Point(middle), shapely.intersection(ray, neighbour.shape)))
@@ -73,7 +73,7 @@ def _hole_depth(room: Room, neighbour: Room, opening: Opening) -> float:
 def _frame_of(
     room: Room, opening: Opening
 ) -> tuple[Float[np.ndarray, "2"], Float[np.ndarray, "2"], Float[np.ndarray, "2"]]:
-    """(middle of an opening, unit vector along its wall, unit normal into the room)."""
+    """Return (middle of an opening, unit vector along its wall, unit normal into the room)."""
     start, along, inwards = wall_frame(room, opening.wall)
     return start + along * 0.5 * (opening.start_m + opening.end_m), along, inwards
 
@@ -81,7 +81,7 @@ def _frame_of(
 def _add_shut_door(
     tables: SceneTables, style: HouseStyle, wall: int, opening: Opening, rng: np.random.Generator
 ) -> None:
-    """One leaf or two, with up to three panels or panes and a handle."""
+    """Add one or two closed leaves with up to three panels or panes and a handle."""
     s0, s1, head = opening.start_m, opening.end_m, opening.head_m
     middle, is_double = 0.5 * (s0 + s1), s1 - s0 > DOUBLE_FROM_M
     tables.add_decal(wall, s_m=(s0, s1), z_m=(_BELOW_M, head), surface=style.door)
@@ -107,7 +107,7 @@ def _add_leaves(
     depth_m: float,
     rng: np.random.Generator,
 ) -> None:
-    """The leaves of an open door, with their handles."""
+    """Add the leaves of an open door, with their handles."""
     for leaf in hang_leaves(opening, room, neighbour, depth_m, tables.camera_m, rng):
         for board in boards(leaf.half_width_m, opening.head_m, glazed=style.doors_are_glazed):
             centre = leaf.centre_m + leaf.axis * board.along_m
@@ -121,7 +121,7 @@ def _add_leaves(
 def _add_threshold(
     tables: SceneTables, style: HouseStyle, room: Room, opening: Opening, depth_m: float, rng: np.random.Generator
 ) -> None:
-    """At times a strip in the doorway."""
+    """Add a strip in some doorways."""
     if rng.random() > 0.2:
         return
     middle, along, inwards = _frame_of(room, opening)

@@ -1,4 +1,4 @@
-"""What is special about a shot, so that figures can be reported for each hard case by itself."""
+"""Properties of a shot, so that figures can be reported for each hard case."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ _SUN_SAMPLES = 5
 
 
 def facts_of(shot: Shot) -> frozenset[Fact]:
-    """What holds for a shot's room, its camera's place and the picture.
+    """Return the facts about the room, the camera and the picture of a shot.
 
-    `open_door`, `wide_opening` (from 1.2 m) and `wall_stub` (what is left of a wall beside an opening), `corridor` (up
-    to 1.5 m wide), `closet` (below 3 m²) and `large_room` (above 30 m²) are of the own room; `near_wall` (below 0.4 m)
-    and `threshold` (below 0.6 m from an open door or wide opening) of the camera; `counter`, `mirror`, `sun_patch` (in
-    sight of the camera), `nadir_patch` and `bare_bright` (unfurnished, in daylight) of what is drawn.
+    `open_door`, `wide_opening` (from 1.2 m) and `wall_stub` (rest of a wall beside an opening), `corridor` (up to 1.5 m
+    wide), `closet` (below 3 m²) and `large_room` (above 30 m²) describe the own room; `near_wall` (below 0.4 m) and
+    `threshold` (below 0.6 m from an open door or wide opening) the camera; `counter`, `mirror`, `sun_patch` (visible),
+    `nadir_patch` and `bare_bright` (unfurnished, in daylight) the picture.
     """
-    # What is drawn does not depend on the pictures of materials.
+    # Facts do not depend on the pictures of materials.
     scene = build_scene(shot, _blank_materials())
     return frozenset({*_facts_of_place(shot), *scene.facts, *_facts_of_picture(shot, scene)})
 
@@ -81,7 +81,7 @@ def _segment(shot: Shot, opening: Opening) -> shapely.LineString:
 
 
 def _sees_sun(shot: Shot, sun: Sun) -> bool:
-    """Whether some of the sunlight that falls through the window lands where the camera sees it, furniture aside."""
+    """Return true if some sunlight of the window lands in view of the camera, ignoring furniture."""
     if not sun.colour.any():
         return False
     room = shot.home.plan.rooms[shot.room_index].shape
@@ -98,7 +98,7 @@ def _sees_sun(shot: Shot, sun: Sun) -> bool:
 
 
 def _end_inside(room: shapely.Polygon, start: np.ndarray, end: np.ndarray) -> shapely.Point:
-    """The end of a segment that starts on a wall, or where it leaves the room before."""
+    """Return the end of a segment that starts on a wall, or the point where it leaves the room before."""
     along = end - start
     inside = room.intersection(shapely.LineString([start + 1e-3 * along, end]))
     parts: Sequence[shapely.Geometry] = [part for part in shapely.get_parts(inside) if part.length > 0.0]
@@ -108,7 +108,7 @@ def _end_inside(room: shapely.Polygon, start: np.ndarray, end: np.ndarray) -> sh
 
 @lru_cache(maxsize=1)
 def _blank_materials() -> MaterialLibrary:
-    """One grey picture for everything."""
+    """Return a library with one grey picture for everything."""
     grey = torch.full((1, PICTURE_SIZE, PICTURE_SIZE, 3), 0.5)
     first = np.zeros(1, dtype=np.int64)
     return MaterialLibrary(grey, dict.fromkeys(CATEGORIES, first), dict.fromkeys(CATEGORIES, ()), first)

@@ -1,4 +1,4 @@
-"""Leaves of open doors: at any angle, in either room, folded back against the wall, or none at all."""
+"""Leaves of open doors: at any angle, in either room, folded back against the wall, or missing."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _HALF_THICKNESS_M = 0.018
 _HINGE_GAP_M = 0.03
 _STILE_M = 0.055
 
-# What share of leaves stands ajar, at about a right angle, and flat against the wall, and at which angles (degrees).
+# Shares and angles (degrees) of leaves that are ajar, at about a right angle, and flat against the wall.
 _ANGLES_DEG = ((15.0, 55.0), (55.0, 120.0), (120.0, 168.0), (168.0, 177.0))
 _ANGLE_SHARES = (0.15, 0.4, 0.15, 0.3)
 
@@ -31,7 +31,7 @@ class Leaf(NamedTuple):
         centre_m: middle of the leaf.
         axis: unit vector from the hinge to the handle.
         half_width_m: half its length.
-        in_own_room: whether it stands in the room that the opening belongs to.
+        in_own_room: true if it stands in the room of the opening.
     """
 
     centre_m: Float[np.ndarray, "2"]
@@ -58,14 +58,14 @@ def hang_leaves(
     camera_m: Float[np.ndarray, "2"],
     rng: np.random.Generator,
 ) -> list[Leaf]:
-    """Open a door; there is no leaf where none has space clear of walls and camera, and at times for no reason.
+    """Open a door; leaves without space clear of walls and camera, and a random share, are missing.
 
     Args:
         opening: the open door.
-        room: the room that it belongs to.
-        neighbour: the room behind it.
+        room: room of the opening.
+        neighbour: room behind it.
         depth_m: thickness of the wall between them.
-        camera_m: no leaf comes closer to this position than `CAMERA_CLEARANCE_M`.
+        camera_m: position that leaves keep `CAMERA_CLEARANCE_M` away from.
         rng: source of randomness.
     """
     if rng.random() < 0.15:
@@ -100,7 +100,7 @@ def hang_leaves(
 
 
 def boards(half_width_m: float, head_m: float, *, glazed: bool) -> list[Board]:
-    """The wood of a leaf: one board, or the frame around a pane, through which one looks."""
+    """Return the wood of a leaf: one board, or the frame around a transparent pane."""
     bottom, top = 0.01, head_m - 0.01
     if not glazed:
         return [Board(0.0, half_width_m, _HALF_THICKNESS_M, bottom, top)]

@@ -1,4 +1,4 @@
-"""Drawing the light of a scene."""
+"""Random light of a scene."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _FRAME_M = 0.06
 # Lamps are no piece of furniture.
 _NO_PIECE = -2
 
-# What a mood multiplies the neutral light of lamps and of the sky with.
+# Factors of each mood on the neutral light of lamps and of the sky.
 _LAMP_TINTS: dict[Mood, tuple[float, float, float]] = {
     "cold": (0.62, 0.85, 1.15),
     "raw": (1.0, 1.0, 1.0),
@@ -42,7 +42,7 @@ _SKY_TINTS: dict[Mood, tuple[float, float, float]] = {
 
 
 class RoomLight(NamedTuple):
-    """Position (m) and colour of the one lamp of a room that is seen through a door, and its ambient light."""
+    """Position (m) and colour of the one lamp of a room seen through a door, and its ambient light."""
 
     position_m: Float[np.ndarray, "3"]
     colour: Float[np.ndarray, "3"]
@@ -50,12 +50,12 @@ class RoomLight(NamedTuple):
 
 
 class Lighting:
-    """The mood shared by all lights of a scene: daylight or evening, warm or cold lamps.
+    """Mood shared by all lights of a scene: daylight or evening, warm or cold lamps.
 
     Args:
         rng: source of randomness.
-        neutral: lamps are on and hardly coloured, for a scene that is to be `relit`.
-        bright: strong daylight that pale walls throw everywhere.
+        neutral: lamps are on and nearly white, for a scene that `relit` changes later.
+        bright: strong daylight reflected by pale walls.
     """
 
     def __init__(self, rng: np.random.Generator, *, neutral: bool = False, bright: bool = False) -> None:
@@ -73,16 +73,16 @@ class Lighting:
             self.ambient = math.exp(rng.uniform(math.log(0.4), math.log(1.1)))
 
     def fall_dark(self) -> None:
-        """Make it night: nothing but lamps gives light."""
+        """Make it night: only lamps give light."""
         self.daylight, self.lamps_on = 0.0, True
 
     def of_room_beyond(self, room: Room, origin_m: np.ndarray) -> RoomLight:
-        """The one lamp of a neighbouring room, and its ambient light."""
+        """Return the one lamp of a neighbouring room, and its ambient light."""
         rng = self.rng
         centre = np.array(room.shape.representative_point().coords[0]) - origin_m
         strength = math.exp(rng.uniform(math.log(0.1), math.log(3.5)))
         tint = self.lamp_colour if rng.random() < 0.5 else self.sky_colour
-        # Seen from a room, the next one may lie in the dark or be flooded with light.
+        # The next room can be dark or very bright.
         low, high = (-0.7, 0.6) if self._bright else (-2.4, 1.1)
         ambient = self.ambient * math.exp(rng.uniform(low, high)) * (0.5 + 0.5 * tint)
         return RoomLight(np.append(centre, room.ceiling_height_m - 0.3), strength * tint, ambient)
@@ -91,7 +91,14 @@ class Lighting:
 def light_room(
     room: Room, openings: Sequence[Opening], origin_m: np.ndarray, lighting: Lighting, rng: np.random.Generator
 ) -> tuple[Lights, list[Prism], Sun]:
-    """Lamps and windows of the camera's room.
+    """Return lamps and windows of the camera's room.
+
+    Args:
+        room: the room.
+        openings: its openings.
+        origin_m: camera position in the plan frame.
+        lighting: mood of the scene.
+        rng: source of randomness.
 
     Returns:
         the scene's lights, the lamps as prisms, and the sun.
@@ -109,14 +116,14 @@ def light_room(
 
 
 def relit(scene: RenderScene, mood: Mood) -> RenderScene:
-    """The same scene, shape and materials, in another light; `raw` is the neutral light that it was built with."""
+    """Return the scene in another light; `raw` is the neutral light that it was built with."""
     lamp, sky = np.array(_LAMP_TINTS[mood]), np.array(_SKY_TINTS[mood])
     lights, rooms, surfaces = scene.lights.copy(), scene.rooms.copy(), scene.surfaces.copy()
     sun, backdrop = scene.sun.copy(), scene.backdrop.copy()
     is_lamp = ~lights.normal.any(axis=1, keepdims=True)
     lights.colour *= np.where(is_lamp, lamp, sky)
     rooms.light_colour *= lamp
-    # What light is left after many bounces comes from both.
+    # Ambient light comes from both.
     rooms.ambient *= np.sqrt(lamp * sky)
     glowing = (surfaces.glow > 0.0) & (surfaces.is_outdoors == 0.0)
     surfaces.tint[glowing] *= lamp
@@ -138,7 +145,7 @@ def _window_light(room: Room, window: Opening, origin_m: np.ndarray, lighting: L
 def _lamps(
     room: Room, origin_m: np.ndarray, lighting: Lighting, lit: bool, rng: np.random.Generator
 ) -> tuple[list[Row], list[Prism]]:
-    """One lamp in the middle of the room, a second one in a large room or on a wall; or a ceiling of downlights."""
+    """Return one lamp in the middle of the room, a second in a large room or on a wall; or a ceiling of downlights."""
     spots = [np.array(room.shape.representative_point().coords[0])]
     if room.area_m2 > 18.0:
         x_min, y_min, x_max, y_max = room.shape.bounds
@@ -164,7 +171,7 @@ def _lamps(
             z0 = z1 - (rng.uniform(0.12, 0.3) if drop else thickness)
             prisms.append(_hanging(spot, radius, (z0, z1), finish, is_round=style != 2))
         if lit:
-            # Lamps of one room need not have one colour.
+            # Lamps of one room can differ in colour.
             colour = lighting.lamp_colour * np.exp(rng.normal(0.0, 0.08, 3))
             rows.append(Lights.row(xy_m=spot - origin_m, z_m=ceiling - drop - 0.2, colour=power * colour))
     if lit and len(rows) == 1 and rng.random() < 0.15:
@@ -177,7 +184,7 @@ def _lamps(
 def _hanging(
     spot_m: np.ndarray, radius_m: float, z_m: tuple[float, float], finish: Finish, *, is_round: bool = True
 ) -> Prism:
-    """A part of a lamp below the ceiling."""
+    """Return a part of a lamp below the ceiling."""
     return Prism(
         x=float(spot_m[0]),
         y=float(spot_m[1]),
@@ -194,7 +201,7 @@ def _hanging(
 
 
 def _downlights(room: Room, finish: Finish, rng: np.random.Generator) -> list[Prism]:
-    """Small round lamps in a grid, flush with the ceiling."""
+    """Return small round lamps in a grid, flush with the ceiling."""
     x_min, y_min, x_max, y_max = room.shape.bounds
     step, radius = rng.uniform(0.9, 2.0), rng.uniform(0.035, 0.08)
     xs, ys = np.arange(x_min + 0.4, x_max, step), np.arange(y_min + 0.4, y_max, step)
@@ -205,7 +212,7 @@ def _downlights(room: Room, finish: Finish, rng: np.random.Generator) -> list[Pr
 
 
 def _wall_lamp(room: Room, origin_m: np.ndarray, lighting: Lighting, rng: np.random.Generator) -> tuple[Row, Prism]:
-    """A lamp on the longest wall, which it washes with light."""
+    """Return a lamp that lights the longest wall."""
     lengths = np.hypot(*(room.walls_m[:, 2:] - room.walls_m[:, :2]).T)
     wall = int(lengths.argmax())
     start, along, inwards = wall_frame(room, wall)
@@ -230,7 +237,7 @@ def _wall_lamp(room: Room, origin_m: np.ndarray, lighting: Lighting, rng: np.ran
 
 
 def _sun(room: Room, window: Opening, origin_m: np.ndarray, rng: np.random.Generator) -> Sun:
-    """Sunlight falling through a window."""
+    """Return sunlight falling through a window."""
     start, along, inwards = wall_frame(room, window.wall)
     side, elevation = rng.uniform(-1.0, 1.0), math.radians(rng.uniform(15.0, 55.0))
     toward = math.cos(side) * -inwards + math.sin(side) * along
@@ -250,7 +257,7 @@ def _sun(room: Room, window: Opening, origin_m: np.ndarray, rng: np.random.Gener
 
 
 def sample_backdrop(rng: np.random.Generator) -> Backdrop:
-    """The outdoors: sky, ground or foliage, the height of what stands before the sky, and its outline."""
+    """Draw the outdoors: sky, ground or foliage, and the height and outline of objects before the sky."""
     sky = rng.uniform(0.7, 1.0) * np.array([rng.uniform(0.7, 1.0), rng.uniform(0.85, 1.0), 1.0])
     ground = rng.uniform(0.05, 0.5) * np.array([rng.uniform(0.6, 1.1), 1.0, rng.uniform(0.4, 1.0)])
     horizon, ruggedness = rng.uniform(-0.15, 0.6), rng.uniform(0.02, 0.25)

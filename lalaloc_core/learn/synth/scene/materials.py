@@ -31,8 +31,8 @@ class MaterialLibrary:
     Attributes:
         pictures: (m, 128, 128, 3), linear-light colour in 0..1.
         procedural: per category, indices of the generated pictures.
-        photographs: per category and material, indices of the pictures read from a folder; may be empty.
-        plain: indices of pictures with hardly any structure, for paint, plastic and metal.
+        photographs: per category and material, indices of the pictures read from a folder; can be empty.
+        plain: indices of pictures with little structure, for paint, plastic and metal.
     """
 
     pictures: Float[torch.Tensor, "m 128 128 3"]
@@ -60,18 +60,20 @@ class MaterialLibrary:
                     photographs[category].append(np.arange(len(pictures), len(pictures) + len(found)))
                     pictures += found
         if textures is not None and not any(photographs.values()):
-            raise InvalidInputError(f"no <category>/<material>/*.jpg below '{textures}'")
+            raise InvalidInputError(
+                f"'{textures}' contains no pictures; a textures folder has <category>/<material>/*.jpg"
+            )
         plain = np.arange(len(pictures), len(pictures) + _PLAIN_COUNT)
         pictures += [patterns.plain(PICTURE_SIZE, rng) for _ in range(_PLAIN_COUNT)]
         return cls(torch.from_numpy(np.stack(pictures).astype(np.float32)), procedural, photographs, plain)
 
     @cached_property
     def mean_colours(self) -> Float[np.ndarray, "m 3"]:
-        """Mean linear colour of every picture."""
+        """Return the mean linear colour of every picture."""
         return self.pictures.mean(dim=(1, 2)).numpy().astype(np.float64)
 
     def sample(self, category: MaterialCategory, rng: np.random.Generator) -> int:
-        """Index of a random picture: a generated one or, where there are any, a photograph with even chances."""
+        """Return the index of a random picture: generated or, with even chances, a photograph if there are any."""
         photographs = self.photographs[category]
         source = self.procedural[category]
         if photographs and rng.random() < 0.5:
@@ -80,7 +82,7 @@ class MaterialLibrary:
         return int(source[rng.integers(len(source))])
 
     def sample_plain(self, rng: np.random.Generator) -> int:
-        """Index of a random picture with hardly any structure."""
+        """Return the index of a random picture with little structure."""
         return int(self.plain[rng.integers(len(self.plain))])
 
 

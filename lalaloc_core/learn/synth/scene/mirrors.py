@@ -1,4 +1,4 @@
-"""Mirrors on walls: holes through which one sees a reflected copy of the room, with all that stands in it."""
+"""Mirrors on walls: holes that show a reflected copy of the room and its furniture."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lalaloc_core.learn.synth.scene.render_scene import Lights, Prisms, VisibleR
 from lalaloc_core.learn.synth.scene.style import HouseStyle
 from lalaloc_core.learn.synth.scene.tables import SceneTables
 
-# How likely a room of a kind has a large mirror.
+# Probability of a large mirror by kind of room.
 _CHANCE = {"bathroom": 0.4, "corridor": 0.22, "bedroom": 0.25, "living": 0.15, "dining": 0.12, "closet": 0.12}
 _OTHERS = 0.05
 _BARE_SHARE = 0.4
@@ -25,7 +25,7 @@ _DEPTH_M = 0.004
 
 
 class Mirror(NamedTuple):
-    """Where a mirror hangs: wall, start and end along it, lower and upper edge (m)."""
+    """Place of a mirror: wall, start and end along it, lower and upper edge (m)."""
 
     wall: int
     s0_m: float
@@ -35,7 +35,7 @@ class Mirror(NamedTuple):
 
 
 def sample_mirror(room: Room, openings: Sequence[Opening], rng: np.random.Generator, *, is_bare: bool) -> Mirror | None:
-    """Where a mirror hangs between the openings; None for no mirror."""
+    """Draw the place of a mirror between the openings; None for no mirror."""
     chance = _CHANCE.get(room.name.split()[0], _OTHERS) * (_BARE_SHARE if is_bare else 1.0)
     if rng.random() > chance:
         return None
@@ -69,15 +69,15 @@ def add_mirror(
     lights: Lights,
     rng: np.random.Generator,
 ) -> None:
-    """Hang a mirror, behind which the room is built once more, reflected; its doors are dark.
+    """Hang a mirror: build the reflected room behind it, with dark doors.
 
     Args:
-        tables: of the scene, whose first walls are those of the room.
-        style: the house's.
-        mirror: where it hangs, see `sample_mirror`.
+        tables: tables of the scene, whose first walls are those of the room.
+        style: style of the house.
+        mirror: place of the mirror, see `sample_mirror`.
         room: the own room.
-        prisms: what stands and hangs in it, rows of `tables.prisms`.
-        lights: its lamps and windows, of which the brightest shines in the reflected room.
+        prisms: furniture of the room, rows of `tables.prisms`.
+        lights: lamps and windows; the brightest shines in the reflected room.
         rng: source of randomness.
     """
     wall, s0, s1, z0, z1 = mirror
@@ -104,7 +104,7 @@ def add_mirror(
 
 
 def _reflected_room(own: Row, lights: Lights, relative: Reflection) -> Row:
-    """The room with its brightest light where the mirror shows it."""
+    """Return the room with its brightest light at the reflected position."""
     room = VisibleRooms(own.copy())
     if len(lights.rows):
         brightest = lights[lights.colour.sum(axis=1).argmax()]
@@ -117,7 +117,7 @@ class Reflection:
     """Reflection in the vertical plane through a wall.
 
     Args:
-        wall_m: the wall's ends (x0, y0, x1, y1).
+        wall_m: ends of the wall (x0, y0, x1, y1).
     """
 
     def __init__(self, wall_m: Float[np.ndarray, "4"]) -> None:
@@ -127,15 +127,15 @@ class Reflection:
         self._offset = wall_m[:2] - self._matrix @ wall_m[:2]
 
     def point(self, point_m: Float[np.ndarray, "2"]) -> Float[np.ndarray, "2"]:
-        """Where a point is seen."""
+        """Return the reflected point."""
         return self._matrix @ point_m + self._offset
 
     def wall(self, ends_m: Float[np.ndarray, "4"]) -> Float[np.ndarray, "4"]:
-        """Where a wall is seen; its ends change places, so that the room stays on its left."""
+        """Return the reflected wall with swapped ends, so that the room stays on its left."""
         return np.concatenate([self.point(ends_m[2:]), self.point(ends_m[:2])])
 
     def prism(self, prism: Prisms) -> Prisms:
-        """Where a prism (a single row) is seen; it casts no shadow."""
+        """Return the reflected prism (a single row), which casts no shadow."""
         seen = prism.copy()
         seen.centre_m = self.point(seen.centre_m)
         seen.axis = self._matrix @ seen.axis

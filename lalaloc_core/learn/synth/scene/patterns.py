@@ -9,7 +9,7 @@ Picture = Float[np.ndarray, "size size 3"]
 
 
 def draw(category: str, size: int, rng: np.random.Generator) -> Picture:
-    """A random picture fit for a category of surfaces."""
+    """Return a random picture for a category of surfaces."""
     choices = {
         "floor": (_planks, _planks, _tiles, _tiles, _carpet, _marble),
         "wall": (_plaster, _plaster, _plaster, _wallpaper, _tiles, _bricks),
@@ -21,12 +21,12 @@ def draw(category: str, size: int, rng: np.random.Generator) -> Picture:
 
 
 def plain(size: int, rng: np.random.Generator) -> Picture:
-    """Almost uniform: paint, plastic, metal."""
+    """Return a nearly uniform picture: paint, plastic, metal."""
     return _shade(0.6 * np.ones(3), 0.008 * smooth_noise(size, rng, 1.5) + 0.012 * smooth_noise(size, rng, 14.0))
 
 
 def smooth_noise(size: int, rng: np.random.Generator, scale: float, stretch: float = 1.0) -> Float[np.ndarray, "s s"]:
-    """Periodic noise, zero mean and unit deviation, with blobs of about `scale` pixels, longer along y by `stretch`."""
+    """Return periodic noise of unit deviation, with blobs of `scale` pixels, longer along y by `stretch`."""
     spectrum = np.fft.rfft2(rng.normal(size=(size, size)))
     fy, fx = np.fft.fftfreq(size)[:, None] * stretch, np.fft.rfftfreq(size)[None]
     spectrum = spectrum * np.exp(-2.0 * (scale**2) * (fx**2 + fy**2))
@@ -36,7 +36,7 @@ def smooth_noise(size: int, rng: np.random.Generator, scale: float, stretch: flo
 
 
 def _tone(rng: np.random.Generator, low: float, high: float, colourful: float = 0.1) -> Float[np.ndarray, "3"]:
-    """A colour of a given brightness, warm rather than cold."""
+    """Return a mostly warm colour of a given brightness."""
     level = rng.uniform(low, high)
     warmth = rng.normal(0.3, 0.6) * colourful
     green = rng.normal(0.0, 0.3) * colourful

@@ -1,6 +1,6 @@
-"""One shot's scene as arrays: walls, decals on walls, prisms, surfaces, lights, and how the camera exposes.
+"""A shot's scene as arrays: walls, decals on walls, prisms, surfaces, lights, and camera settings.
 
-Lengths are metres relative to the camera's position in the plan (so that single precision suffices); heights are
+Lengths are metres relative to the camera's position in the plan, so that single precision suffices; heights are
 relative to the floor. The camera's own room has slot 0; rooms seen through its doors follow.
 """
 
@@ -39,10 +39,10 @@ class Decals(Records):
     Attributes:
         wall: index of the wall, -1 for none.
         s0_m, s1_m: start and end along it.
-        z0_m, z1_m: lower and upper edge over the floor.
-        surface: row of the surfaces; of a hole, what its cheeks are made of.
+        z0_m, z1_m: lower and upper edge above the floor.
+        surface: row of the surfaces; of a hole, the surface of its reveals.
         slot: room behind it if it is a hole, else -1.
-        depth_m: of a hole.
+        depth_m: depth of a hole.
     """
 
     wall = Column()
@@ -60,12 +60,12 @@ class Prisms(Records):
 
     Attributes:
         x_m, y_m: centre; both as `centre_m`.
-        axis_x, axis_y: unit vector of the first axis, both as `axis`; the second is that turned by +90°.
+        axis_x, axis_y: unit vector of the first axis, both as `axis`; the second is the first turned by +90°.
         half_a_m, half_b_m: half extents along the two axes.
-        z0_m, z1_m: lower and upper end over the floor.
+        z0_m, z1_m: lower and upper end above the floor.
         is_round: 1 for a cylinder.
         surface: row of the surfaces.
-        is_opaque: 1 for what casts shadows.
+        is_opaque: 1 for prisms that cast shadows.
     """
 
     x_m = Column()
@@ -84,13 +84,13 @@ class Prisms(Records):
 
 
 class VisibleRooms(Records):
-    """Rooms: that of the camera, then those seen through its doors.
+    """Room of the camera, then rooms seen through its doors.
 
     Attributes:
         ceiling_m: height of the ceiling.
         floor_surface, ceiling_surface: rows of the surfaces.
-        light_m, light_colour: position, and colour times power, of the one lamp of a room that is seen through a door.
-        ambient: light from everywhere.
+        light_m, light_colour: position, and colour times power, of the one lamp of a room seen through a door.
+        ambient: ambient light.
     """
 
     ceiling_m = Column()
@@ -106,7 +106,7 @@ class Lights(Records):
 
     Attributes:
         position_m: all three coordinates; `xy_m` and `z_m` are parts of it.
-        colour: times the power.
+        colour: colour times power.
         normal: horizontal unit normal of a window; (0, 0) for a lamp, which shines everywhere.
     """
 
@@ -125,7 +125,7 @@ class Sun(Records):
         wall_start_m, wall_along: a point of the window's wall and the unit vector along it.
         s0_m, s1_m: start and end of the window along the wall.
         z0_m, z1_m: its lower and upper edge.
-        colour: times the power.
+        colour: colour times power.
     """
 
     direction = Column(3)
@@ -143,9 +143,9 @@ class Backdrop(Records):
 
     Attributes:
         sky, ground: colours.
-        horizon: slope (tangent of the elevation) of the mean outline of what stands before the sky.
-        ruggedness: how far the outline rises and falls, as a slope.
-        turn, lift: shares of a full turn by which outline and mottle are shifted.
+        horizon: slope (tangent of the elevation) of the mean outline before the sky.
+        ruggedness: amplitude of the outline, as a slope.
+        turn, lift: shifts of outline and mottle as shares of a full turn.
     """
 
     sky = Column(3)
@@ -158,7 +158,7 @@ class Backdrop(Records):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SceneRecords:
-    """What a scene has as records, and a batch of scenes as records with one axis more.
+    """Records of a scene; a batch of scenes has one more axis.
 
     Attributes:
         rooms: that of the camera, then those seen through its doors: the row of a room is its slot.
@@ -177,15 +177,15 @@ class SceneRecords:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class RenderScene(SceneRecords):
-    """Everything that one picture is made of.
+    """All contents of one picture.
 
     Attributes:
-        camera_height_m: of the camera over the floor.
+        camera_height_m: height of the camera above the floor.
         heading: azimuth of the centre column, radians.
         walls_m: segments (x0, y0, x1, y1), room interior to their left.
-        wall_owner: slot of the room that a wall belongs to; -1 - d for the jambs of the hole that is decal d.
+        wall_owner: slot of the wall's room; -1 - d for the jambs of the hole that is decal d.
         wall_surface: row of `surfaces`.
-        facts: what was drawn of what is worth knowing about a picture; `facts` knows more.
+        facts: facts known from drawing; `facts` adds others.
     """
 
     camera_height_m: float

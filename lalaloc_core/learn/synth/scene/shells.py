@@ -1,4 +1,4 @@
-"""The shell of a room: floor, ceiling and walls, and what is fixed to the walls without hiding where they end."""
+"""Shell of a room: floor, ceiling and walls, and wall decorations that do not hide its edges."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ class Shells:
     """Builds the shells of a scene's rooms, one after the other.
 
     Args:
-        tables: where they are added.
-        style: the house's.
+        tables: tables that receive them.
+        style: style of the house.
         streams: source of randomness.
-        is_bright: whether the home is for sale: pale, with a plain floor.
-        is_bare: whether most walls have neither pictures nor switches.
+        is_bright: true for a home for sale: pale, with a plain floor.
+        is_bare: true if most walls have neither pictures nor switches.
     """
 
     def __init__(
@@ -39,7 +39,7 @@ class Shells:
         self._floor: int | None = None
 
     def add(self, slot: int, room_index: int, room: Room, lighting: Lighting) -> int:
-        """Build the next room, which has its lamp from `lighting`; returns the index of its first wall."""
+        """Build the next room with its lamp from `lighting`; return the index of its first wall."""
         tables, streams, rng = self._tables, self._streams, self._streams.shapes
         streams.begin(ScenePart.ROOM, room_index)
         colour = pale(rng) if self._is_bright else paint(rng)
@@ -69,10 +69,10 @@ class Shells:
         return first
 
     def _floor_of(self, room_index: int, room: Room, colour: Colour) -> int:
-        """Surface of a room's floor; many homes have one floor throughout."""
+        """Return the surface of a room's floor; many homes have one floor throughout."""
         streams = self._streams
         if streams.is_staged:
-            # Every room draws its floor, those without one of their own the same: so it looks alike from any room.
+            # Rooms without a floor of their own draw the same one, so that it looks the same from every room.
             streams.begin(ScenePart.FLOOR, *([room_index] if streams.shapes.random() < _NEW_FLOOR_SHARE else []))
         elif self._floor is not None and streams.shapes.random() >= _NEW_FLOOR_SHARE:
             return self._floor
@@ -85,7 +85,7 @@ class Shells:
 def _dress_wall(
     tables: SceneTables, style: HouseStyle, wall: int, ceiling_m: float, rng: np.random.Generator, *, is_bare: bool
 ) -> None:
-    """Baseboard, crown moulding, pictures and switches."""
+    """Add baseboard, crown moulding, pictures and switches."""
     length = tables.wall_length_m(wall)
     start, end = -_BEYOND_M, length + _BEYOND_M
     if style.baseboard_m > 0.0:
@@ -104,7 +104,7 @@ def _dress_wall(
 
 
 def _hang_picture(tables: SceneTables, wall: int, length_m: float, rng: np.random.Generator) -> None:
-    """A picture or a screen in a dark frame, where the wall is long enough for it."""
+    """Add a picture or a screen in a dark frame to a wall that is long enough."""
     half_width, half_height = rng.uniform(0.12, 0.6), rng.uniform(0.12, 0.5)
     if 2 * half_width >= length_m - 0.2:
         return

@@ -1,4 +1,4 @@
-"""Where the camera of a synthetic photograph stands."""
+"""Cameras of synthetic photographs."""
 
 from __future__ import annotations
 
@@ -28,18 +28,18 @@ _TRIES = 8
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Shot:
-    """One photograph: where and how it is taken, and the seed of all that is random about it.
+    """One photograph: camera, furniture, and the seed of everything random.
 
     Attributes:
         home: the home.
         position_m: camera position (2,) in the plan frame.
-        room_index: the room it stands in.
+        room_index: its room.
         heading: azimuth of the centre column, radians.
-        camera_height_m: over the floor.
-        furniture: how full the rooms are.
+        camera_height_m: height above the floor.
+        furniture: amount of furniture.
         seed: decides materials, furniture, light and camera settings.
-        lighting: the colour of all light; None draws one. With it the shot is *staged*: shots of one home that have
-            the same seed show the same materials, whatever their furniture and lighting, and there is no tripod.
+        lighting: colour of all light; None draws one. A shot with lighting is *staged*: shots of one home with the same
+            seed show the same materials, whatever their furniture and lighting, and there is no tripod.
         is_night: dark outdoors, and lamps on.
     """
 
@@ -65,17 +65,17 @@ def sample_shots(
     unusual_heights_m: tuple[float, float] = (1.0, 1.9),
     night_share: float = 0.0,
 ) -> list[Shot]:
-    """Draw shots uniform over a home's floor.
+    """Draw shots uniformly over a home's floor.
 
     Args:
         home: the home.
-        count: how many.
+        count: number of shots.
         rng: source of randomness.
-        level: how full the rooms are; None draws it for every shot.
-        by_room_share: share of shots whose room is drawn first, all rooms alike: more of closets and corridors.
-        hard_share: share of shots from places that are rare on the floor and hard to localise: close to a wall, on
-            the threshold of an open door or in it, in the narrowest rooms.
-        unusual_heights_m: camera heights, evenly between, of the quarter that is not taken from 1.3 to 1.7 m.
+        level: amount of furniture; None draws it for every shot.
+        by_room_share: share of shots whose room is drawn uniformly first, which favours closets and corridors.
+        hard_share: share of shots from rare places that are hard to localise: close to a wall, on the threshold of an
+            open door or in it, in the narrowest rooms.
+        unusual_heights_m: range of camera heights of the quarter that is not taken from 1.3 to 1.7 m.
         night_share: share of shots at night, with black windows.
     """
     poses = random_poses(home.plan, count, rng, POSE_MARGIN_M)
@@ -107,7 +107,7 @@ def sample_shots(
 
 
 def stage_rooms(home: Home, rng: np.random.Generator) -> list[Shot]:
-    """One staged shot of every room, all from the same height over the floor and looking along +y.
+    """Return one staged shot of every room, all from the same height above the floor and looking along +y.
 
     Cameras keep `POSE_MARGIN_M` from the walls; in a room too narrow for that they stand in its middle.
     """
@@ -131,7 +131,7 @@ def stage_rooms(home: Home, rng: np.random.Generator) -> list[Shot]:
 
 
 def _is_roomy(room: Room) -> bool:
-    """Whether some place of the room keeps `POSE_MARGIN_M` from its walls, and not just a sliver."""
+    """Return true if more than a sliver of the room keeps `POSE_MARGIN_M` from its walls."""
     return room.shape.buffer(-POSE_MARGIN_M).area > 1e-2
 
 
@@ -140,7 +140,7 @@ def _middle_of(room: Room) -> Float[np.ndarray, "2"]:
 
 
 def _hard_place(home: Home, rng: np.random.Generator) -> tuple[Float[np.ndarray, "2"], int]:
-    """A position and its room: on a threshold or in an opening, beside a wall, in a corridor or another narrow room."""
+    """Draw a position and its room: on a threshold or in an opening, beside a wall, in a corridor or narrow room."""
     rooms = home.plan.rooms
     kind = rng.random()
     see_through = [opening for opening in home.openings if opening.is_see_through]
@@ -164,7 +164,7 @@ def _hard_place(home: Home, rng: np.random.Generator) -> tuple[Float[np.ndarray,
 
 
 def _on_threshold(room: Room, opening: Opening, rng: np.random.Generator) -> Float[np.ndarray, "2"] | None:
-    """A position in front of an opening or, as often, in it, clear of the walls beside it; None if none is found."""
+    """Draw a position in front of an opening or in it, clear of the walls beside it; None if none is found."""
     start, along, inwards = wall_frame(room, opening.wall)
     ends = shapely.LineString([start + along * opening.start_m, start + along * opening.end_m])
     # A hair wider than the opening itself, so that nothing of it is left.
@@ -178,7 +178,7 @@ def _on_threshold(room: Room, opening: Opening, rng: np.random.Generator) -> Flo
 
 
 def _position_in(room: Room, rng: np.random.Generator) -> Float[np.ndarray, "2"]:
-    """A position uniform over a room's floor, `POSE_MARGIN_M` from its walls."""
+    """Draw a position uniformly over a room's floor, `POSE_MARGIN_M` from its walls."""
     inner = room.shape.buffer(-POSE_MARGIN_M)
     x_min, y_min, x_max, y_max = inner.bounds
     while True:

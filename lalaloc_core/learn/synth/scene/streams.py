@@ -1,4 +1,4 @@
-"""The random numbers that a scene is drawn from: one stream for shapes, one for materials."""
+"""Random streams of a scene: one for shapes, one for materials."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 
 class ScenePart(IntEnum):
-    """Parts of a scene that draw from streams of their own where the scene is staged."""
+    """Parts of a scene that have streams of their own in a staged scene."""
 
     MOOD = 0
     ROOM = 1
@@ -24,15 +24,15 @@ class ScenePart(IntEnum):
 
 
 class Streams:
-    """The streams of one scene.
+    """Random streams of one scene.
 
     Args:
-        seed: of the shot.
-        is_staged: whether every part begins anew, see `begin`.
+        seed: seed of the shot.
+        is_staged: true if every part restarts its stream, see `begin`.
 
     Attributes:
-        shapes: decides everything but materials.
-        materials: has its own stream because shapes must not depend on what pictures there are.
+        shapes: decides everything except materials.
+        materials: separate, because shapes must not depend on the available pictures.
     """
 
     def __init__(self, seed: int, *, is_staged: bool) -> None:
@@ -41,10 +41,10 @@ class Streams:
         self.materials = np.random.default_rng([seed, ScenePart.MATERIALS])
 
     def begin(self, part: ScenePart, *which: int) -> None:
-        """In a staged scene what a part draws must not depend on what was drawn before it: furniture, for one.
+        """Restart the streams for a part, so that in a staged scene it does not depend on the parts before it.
 
         Args:
-            part: what is drawn next.
+            part: the next part.
             which: number of the room or opening, if there are several.
         """
         if self.is_staged:

@@ -1,4 +1,4 @@
-"""The style of a house: what all its doors, windows and trims have in common."""
+"""Style of a house: common properties of its doors, windows and trims."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ class HouseStyle:
     Attributes:
         trim: surface of frames, baseboards and mouldings.
         door: surface of doors.
-        door_panel: surface of the panels on shut doors.
+        door_panel: surface of the panels on closed doors.
         handle: surface of metal.
-        outdoors: the view through windows.
-        gloom: surface of what lies behind the doors of rooms that are seen through doors, and behind panes.
-        doors_are_glazed: whether doors have panes.
+        outdoors: view through windows.
+        gloom: surface behind the doors of rooms that are seen through doors, and behind panes.
+        doors_are_glazed: true if doors have panes.
         baseboard_m: height of the baseboards, 0 for none.
         crown_m: height of the mouldings below the ceiling, 0 for none.
     """

@@ -1,4 +1,4 @@
-"""What surfaces look like: rows of a table that name a picture, its scale and turn, a tint, gloss and glow."""
+"""Appearance of surfaces: rows of a table with picture, scale, rotation, tint, gloss and glow."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ _PLAIN_FINISHES: tuple[Finish, ...] = ("white", "metal", "dark", "ceramic", "glo
 
 
 class Surfaces(Records):
-    """What the surfaces of a scene look like.
+    """Appearance of the surfaces of a scene.
 
     Attributes:
         picture: number of the material's picture.
         scale: pictures per metre.
-        cosine, sine: of the angle by which the picture is turned.
+        cosine, sine: cosine and sine of the picture's rotation.
         tint: factor on its colours.
         gloss: share of light reflected like a mirror.
-        glow: when positive the surface emits its colour times this instead of reflecting light.
+        glow: if positive, the surface emits its colour times this instead of reflecting light.
         is_outdoors: 1 for the view through a window.
-        shift_u, shift_v: by which the picture is moved, as shares of it.
+        shift_u, shift_v: translation of the picture, as shares of it.
     """
 
     picture = Column()
@@ -44,7 +44,7 @@ class Surfaces(Records):
 
 
 class SurfaceTable:
-    """Collects the surfaces of one scene; every method returns the index of the row it added."""
+    """Table of the surfaces of one scene; every method returns the index of the row it added."""
 
     def __init__(self, materials: MaterialLibrary, mean_colours: Float[np.ndarray, "m 3"], rng: np.random.Generator):
         self._materials = materials
@@ -62,15 +62,15 @@ class SurfaceTable:
         gloss: float = 0.0,
         glow: float = 0.0,
     ) -> int:
-        """A surface with a random picture of a category, tinted to a mean `colour` if one is given.
+        """Add a surface with a random picture of a category, tinted to a mean `colour` if one is given.
 
         Args:
-            category: where the picture is taken from.
+            category: category of the picture.
             colour: mean linear colour; None keeps the picture's own, varied a little.
             scale: pictures per metre.
-            angle: turn of the picture, radians.
+            angle: rotation of the picture, radians.
             gloss: share of light reflected like a mirror.
-            glow: when positive the surface emits its colour times this instead of reflecting light.
+            glow: if positive, the surface emits its colour times this instead of reflecting light.
         """
         picture = self._materials.sample(category, self._rng)
         if colour is None:
@@ -80,7 +80,7 @@ class SurfaceTable:
         return self._append(picture, tint, scale=scale, angle=angle, gloss=gloss, glow=glow)
 
     def add_plain(self, colour: Colour, *, gloss: float = 0.0, glow: float = 0.0) -> int:
-        """A surface of one colour; see `add`."""
+        """Add a surface of one colour; see `add`."""
         picture = self._materials.sample_plain(self._rng)
         return self._append(picture, colour / self._means[picture], scale=0.5, angle=0.0, gloss=gloss, glow=glow)
 
@@ -101,7 +101,7 @@ class SurfaceTable:
         return len(self.rows) - 1
 
     def add_outdoors(self, glow: float) -> int:
-        """The view through a window."""
+        """Add the view through a window."""
         self.rows.append(Surfaces.row(scale=1.0, cosine=1.0, tint=1.0, glow=glow, is_outdoors=1.0))
         return len(self.rows) - 1
 
@@ -110,7 +110,7 @@ class SurfaceTable:
         Surfaces(self.rows[index]).glow = math.exp(self._rng.uniform(math.log(0.004), math.log(0.12)))
 
     def add_floor(self, walls: Colour, direction: float, *, plain: bool = False) -> int:
-        """A floor: mostly with a picture's own colours, sometimes as the walls; laid along `direction` (radians).
+        """Add a floor along `direction` (radians): mostly with a picture's own colours, sometimes like the walls.
 
         A `plain` one is wooden, beige or grey.
         """
@@ -125,20 +125,20 @@ class SurfaceTable:
         return self.add("floor", colour, scale=math.exp(self._rng.uniform(-0.9, 0.6)), angle=angle, gloss=gloss)
 
     def add_wall(self, colour: Colour) -> int:
-        """A painted wall, or one with a picture's own colours."""
+        """Add a wall: painted, or with a picture's own colours."""
         kind = self._rng.random()
         if kind < 0.68:
             return self.add_plain(colour)
         return self.add("wall", None if kind > 0.9 else colour, scale=math.exp(self._rng.uniform(-0.7, 0.7)))
 
     def add_ceiling(self, colour: Colour) -> int:
-        """A ceiling: mostly painted, sometimes panelled."""
+        """Add a ceiling: mostly painted, sometimes panelled."""
         if self._rng.random() < 0.8:
             return self.add_plain(colour)
         return self.add("ceiling", colour, scale=self._rng.uniform(0.4, 1.2))
 
     def add_finish(self, finish: Finish) -> int:
-        """A surface of furniture."""
+        """Add a surface of furniture."""
         colour, gloss, glow = _finish(finish, self._rng)
         if colour is not None and finish in _PLAIN_FINISHES:
             return self.add_plain(colour, gloss=gloss, glow=glow)
@@ -149,7 +149,7 @@ class SurfaceTable:
 
 
 def paint(rng: np.random.Generator) -> Colour:
-    """A wall paint: mostly near white, at times coloured or dark."""
+    """Draw a wall paint: mostly near white, sometimes coloured or dark."""
     kind = rng.random()
     if kind < 0.62:
         level, strength = rng.uniform(0.5, 0.88), 0.06
@@ -162,29 +162,29 @@ def paint(rng: np.random.Generator) -> Colour:
 
 
 def pale(rng: np.random.Generator) -> Colour:
-    """White, beige, light grey: the walls of a home for sale."""
+    """Draw white, beige or light grey, as in a home for sale."""
     warm = rng.uniform(-0.01, 0.09)
     return rng.uniform(0.5, 0.88) * np.array([1.0 + 0.5 * warm, 1.0, 1.0 - warm])
 
 
 def bright(rng: np.random.Generator) -> Colour:
-    """Ceilings, trims and doors that are painted white."""
+    """Draw the white of painted ceilings, trims and doors."""
     return rng.uniform(0.55, 0.9) * np.array([1.0, 1.0 - rng.uniform(0, 0.03), 1.0 - rng.uniform(0, 0.08)])
 
 
 def wood_tone(rng: np.random.Generator) -> Colour:
-    """Brown, from ebony to birch."""
+    """Draw a brown, from ebony to birch."""
     level, warmth = math.exp(rng.uniform(math.log(0.03), math.log(0.45))), rng.uniform(0.1, 0.5)
     return level * np.array([1.0 + warmth, 1.0, 1.0 - warmth])
 
 
 def vivid(rng: np.random.Generator) -> Colour:
-    """Any colour at all."""
+    """Draw any colour."""
     return math.exp(rng.uniform(math.log(0.05), math.log(0.6))) * np.clip(1.0 + rng.normal(0.0, 0.45, 3), 0.1, 2.0)
 
 
 def _finish(finish: Finish, rng: np.random.Generator) -> tuple[Colour | None, float, float]:
-    """(mean colour, gloss, glow)."""
+    """Return (mean colour, gloss, glow)."""
     if finish == "wood":
         return (wood_tone(rng) if rng.random() < 0.6 else None), 0.0, 0.0
     if finish == "fabric":

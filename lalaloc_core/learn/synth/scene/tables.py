@@ -1,4 +1,4 @@
-"""The tables of a scene while it is being built."""
+"""Tables of a scene under construction."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from lalaloc_core.learn.synth.scene.render_scene import (
 from lalaloc_core.learn.synth.scene.shots import Shot
 from lalaloc_core.learn.synth.scene.surfaces import Surfaces, SurfaceTable
 
-# How far a jamb reaches beyond both ends of its hole.
+# Overhang of a jamb at both ends of its hole.
 _JAMB_OVERLAP_M = 1e-4
 
 
@@ -42,11 +42,11 @@ class Decal(NamedTuple):
 
 
 class SceneTables:
-    """Collects the tables of one scene; see `RenderScene` for their rows.
+    """Tables of one scene; see `RenderScene` for their rows.
 
     Args:
         camera_m: camera position (2,) in the plan frame.
-        surfaces: the table of surfaces, which decals, prisms and walls refer to.
+        surfaces: table of surfaces that decals, prisms and walls refer to.
 
     Attributes:
         walls_m: ends of the walls in the plan frame; those of the own room come first.
@@ -67,14 +67,14 @@ class SceneTables:
         self.rooms: list[Row] = []
 
     def add_wall(self, ends_m: Float[np.ndarray, "4"], owner: int, surface: int) -> int:
-        """A wall, with its row of `RenderScene.wall_owner`; returns its index."""
+        """Add a wall with its row of `RenderScene.wall_owner`; return its index."""
         self.walls_m.append(ends_m)
         self._wall_owners.append(owner)
         self.wall_surfaces.append(surface)
         return len(self.walls_m) - 1
 
     def wall_length_m(self, wall: int) -> float:
-        """Length of a wall."""
+        """Return the length of a wall."""
         ends = self.walls_m[wall]
         return float(np.hypot(*(ends[2:] - ends[:2])))
 
@@ -88,9 +88,9 @@ class SceneTables:
         slot: int = -1,
         depth_m: float = 0.0,
     ) -> None:
-        """A rectangle on a wall: from where to where along it, and up it.
+        """Add a rectangle on a wall: its interval along the wall, and its interval of height.
 
-        With a `slot` it is a hole of some depth through which one sees that room.
+        With a `slot` it is a hole of some depth that shows that room.
         """
         decal = Decal(
             wall=wall, s0_m=s_m[0], s1_m=s_m[1], z0_m=z_m[0], z1_m=z_m[1], surface=surface, slot=slot, depth_m=depth_m
@@ -98,7 +98,7 @@ class SceneTables:
         self.decals.append(decal)
 
     def add_prism(self, prism: Prism, surface: int, *, opaque: bool = True) -> None:
-        """A box or cylinder with a surface of its finish; an `opaque` one casts shadows."""
+        """Add a box or cylinder with a surface of its finish; an `opaque` one casts shadows."""
         x, y = self.camera_m
         row = Prisms.row(
             x_m=prism.x - x,
@@ -124,7 +124,7 @@ class SceneTables:
         z_m: tuple[float, float],
         surface: int,
     ) -> None:
-        """A box that casts shadows; centre in the plan frame, half extents along `axis` and across it."""
+        """Add a box that casts shadows; centre in the plan frame, half extents along `axis` and across it."""
         row = Prisms.row(
             centre_m=centre_m - self.camera_m,
             axis=axis,
@@ -138,7 +138,7 @@ class SceneTables:
         self.prisms.append(row)
 
     def add_pieces(self, prisms: Iterable[Prism]) -> None:
-        """Furniture; the parts of a piece that have one finish share a surface."""
+        """Add furniture; the parts of a piece with the same finish share a surface."""
         known: dict[tuple[int, str], int] = {}
         for prism in prisms:
             key = (prism.piece, prism.finish)
@@ -147,7 +147,7 @@ class SceneTables:
             self.add_prism(prism, known[key], opaque=prism.finish != "glow")
 
     def add_jambs(self) -> None:
-        """The cheeks of every hole: walls from one room to the next."""
+        """Add the reveals of every hole: walls from one room to the next."""
         for index, hole in enumerate(self.decals):
             if hole.slot < 0:
                 continue
@@ -156,7 +156,7 @@ class SceneTables:
             outward = np.array([along[1], -along[0]])
             for s in (hole.s0_m, hole.s1_m):
                 near = ends[:2] + along * s
-                # Reaching back into the room a little closes the gap that rounding may leave.
+                # A small overlap into the room closes gaps from rounding.
                 back, front = near - outward * _JAMB_OVERLAP_M, near + outward * (hole.depth_m + _JAMB_OVERLAP_M)
                 self.add_wall(np.concatenate([back, front]), -1 - index, hole.surface)
 
@@ -170,7 +170,7 @@ class SceneTables:
         exposure: Exposure,
         facts: Iterable[Fact],
     ) -> RenderScene:
-        """The finished scene; see `RenderScene` for what it has besides the tables."""
+        """Return the finished scene; see `RenderScene` for the other arguments."""
         return RenderScene(
             camera_height_m=shot.camera_height_m,
             heading=shot.heading,

@@ -1,4 +1,4 @@
-"""Windows, and what is before them: blinds, curtains, radiators."""
+"""Windows with blinds, curtains and radiators."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _MIN_HALF_WIDTH_M = 0.02
 
 
 def add_window(tables: SceneTables, style: HouseStyle, wall: int, window: Opening, rng: np.random.Generator) -> None:
-    """Frame, panes and bars of a window in a wall of the tables, at times with a blind or a sheer curtain."""
+    """Add frame, panes and bars of a window, sometimes with a blind or a sheer curtain."""
     s0, s1, z0, z1 = window.start_m, window.end_m, window.sill_m, window.head_m
     border = rng.uniform(0.04, 0.09)
     tables.add_decal(wall, s_m=(s0 - 0.03, s1 + 0.03), z_m=(z0 - 0.03, z1 + 0.03), surface=style.trim)
@@ -44,7 +44,7 @@ def add_window(tables: SceneTables, style: HouseStyle, wall: int, window: Openin
 
 
 def add_curtains(tables: SceneTables, room: Room, window: Opening, rng: np.random.Generator, *, is_bare: bool) -> None:
-    """At times, in a bare home rarely, a curtain on both sides of a window."""
+    """Add curtains on both sides of a window, rarely in a bare home."""
     if rng.random() >= (0.1 if is_bare else 0.45):
         return
     cloth = tables.surfaces.add("furniture", np.clip(paint(rng), 0.03, 0.85), scale=rng.uniform(1.5, 4.0))
@@ -64,7 +64,7 @@ def add_curtains(tables: SceneTables, room: Room, window: Opening, rng: np.rando
 
 
 def add_radiator(tables: SceneTables, style: HouseStyle, room: Room, window: Opening, rng: np.random.Generator) -> None:
-    """At times a radiator below a window."""
+    """Add a radiator below some windows."""
     if window.sill_m > 0.45 and rng.random() < 0.35:
         middle, half = 0.5 * (window.start_m + window.end_m), 0.4 * (window.end_m - window.start_m)
         z_m = (0.1, min(0.7, window.sill_m - 0.05))
@@ -91,17 +91,17 @@ def _hang(
     z_m: tuple[float, float],
     surface: int,
 ) -> None:
-    """A flat box before a wall, narrower where the wall ends, and only where it stays in the room, off the camera.
+    """Add a flat box before a wall, narrower at the wall's end, if it stays in the room and off the camera.
 
     Args:
-        tables: of the scene.
+        tables: tables of the scene.
         room: the own room.
         wall: number of its wall.
-        at_m: where along the wall the middle of the box is.
+        at_m: position of the box's middle along the wall.
         half_m: half its width.
-        from_wall_m: how far its middle is from the wall.
-        z_m: its lower and upper end over the floor.
-        surface: what it is made of.
+        from_wall_m: distance of its middle from the wall.
+        z_m: its lower and upper end above the floor.
+        surface: its surface.
     """
     start, along, inwards = wall_frame(room, wall)
     length = float(np.hypot(*(room.walls_m[wall, 2:] - room.walls_m[wall, :2])))
