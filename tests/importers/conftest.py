@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import json
+import struct
+import zipfile
+import zlib
+from collections.abc import Mapping
+from typing import Any
 
 import pytest
 import shapely
@@ -34,6 +40,41 @@ FLAT = {
 @pytest.fixture
 def flat() -> FloorPlan:
     return FloorPlan.from_dict(json.loads(json.dumps(FLAT)))
+
+
+# Payloads of tests of hostile files.
+_SVG = '<svg xmlns="http://www.w3.org/2000/svg"><text>&x;</text></svg>'
+_ENTITIES = "".join(f'<!ENTITY l{i} "{f"&l{i - 1};" * 10}">' for i in range(1, 10))
+NESTED_ENTITIES = f'<!DOCTYPE svg [<!ENTITY l0 "lol">{_ENTITIES}<!ENTITY x "&l9;">]>{_SVG}'.encode()
+EXTERNAL_ENTITY = f'<!DOCTYPE svg [<!ENTITY x SYSTEM "file:///etc/passwd">]>{_SVG}'.encode()
+
+
+def zip_file(files: Mapping[str, bytes | str]) -> bytes:
+    """Return a zip archive of files by name."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in files.items():
+            archive.writestr(name, content)
+    return stream.getvalue()
+
+
+def dxf_file(document: Any) -> bytes:
+    """Return a document of ezdxf as the bytes of a file."""
+    text = io.StringIO()
+    document.write(text)
+    return text.getvalue().encode()
+
+
+def large_picture(side_px: int) -> bytes:
+    """Return a PNG picture whose header claims a size that its data does not have."""
+    chunks = ((b"IHDR", struct.pack(">IIBBBBB", side_px, side_px, 8, 0, 0, 0, 0)), (b"IEND", b""))
+    parts = [
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
+    ]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(parts)
+
+
+ZIP_BOMB = zip_file({"unit.geojson": b" " * 3_000_000})
 
 
 def shapes(document: dict) -> list[shapely.Polygon]:

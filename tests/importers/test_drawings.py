@@ -6,7 +6,6 @@ import io
 from itertools import pairwise
 
 import pytest
-from ezdxf.filemanagement import new as new_dxf
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers import ImportOptions, import_plan
@@ -14,7 +13,7 @@ from lalaloc_core.importers.common.limits import Budget
 from lalaloc_core.importers.common.report import ReportBuilder
 from lalaloc_core.importers.common.vocabulary import role_of, type_of_room
 from lalaloc_core.importers.formats import dxf
-from tests.importers.conftest import lines, shapes
+from tests.importers.conftest import dxf_file, lines, shapes
 
 CUBICASA = b"""<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 1000 600"><g id="Model"><g class="Floor">
 <g id="Wall" class="Wall External"><polygon points="0,0 1000,0 1000,20 0,20"/>
@@ -69,12 +68,6 @@ def test_layers_option_selects_layers():
     assert "openings" not in plan.document
 
 
-def _dxf(document) -> bytes:
-    text = io.StringIO()
-    document.write(text)
-    return text.getvalue().encode()
-
-
 def _german_walls(insunits: int = 4):
     """Draw both faces of walls in millimetres, a door with its swing, and a window of three lines."""
     document = new_dxf()
@@ -99,7 +92,7 @@ def _german_walls(insunits: int = 4):
 
 
 def test_german_wall_lines_become_rooms():
-    plan = import_plan(_dxf(_german_walls()))
+    plan = import_plan(dxf_file(_german_walls()))
     assert {(room["name"], room["type"]) for room in plan.document["rooms"]} == {
         ("Küche", "kitchen"),
         ("Wohnen", "living"),
@@ -116,20 +109,20 @@ def test_unknown_layers_are_rejected_with_the_known_ones():
     with pytest.raises(
         InvalidFloorPlanError, match=r"layers is walls, but the drawing has nothing on them; .*'Fenster', .*'WAND'"
     ):
-        import_plan(_dxf(_german_walls()), ImportOptions(layers=("walls",)))
+        import_plan(dxf_file(_german_walls()), ImportOptions(layers=("walls",)))
 
 
 def test_dxf_without_unit_is_rejected_with_the_likely_one():
     with pytest.raises(InvalidFloorPlanError, match=r"\$INSUNITS is 0.*looks like mm: units=mm"):
-        import_plan(_dxf(_german_walls(insunits=0)))
-    assert len(import_plan(_dxf(_german_walls(insunits=0)), ImportOptions(units="mm")).document["rooms"]) == 2
+        import_plan(dxf_file(_german_walls(insunits=0)))
+    assert len(import_plan(dxf_file(_german_walls(insunits=0)), ImportOptions(units="mm")).document["rooms"]) == 2
 
 
 def test_wrong_unit_gives_a_warning():
     with pytest.raises(InvalidFloorPlanError):
-        import_plan(_dxf(_german_walls(insunits=6)))  # A plan of ten kilometres.
+        import_plan(dxf_file(_german_walls(insunits=6)))  # A plan of ten kilometres.
     document = _german_walls(insunits=5)
-    (warning,) = import_plan(_dxf(document)).report.warnings
+    (warning,) = import_plan(dxf_file(document)).report.warnings
     assert "the side of a typical room is 7" in warning
 
 
@@ -179,7 +172,7 @@ def test_french_polylines_and_blocks_in_feet():
     space.add_blockref("PORTE_90", (12.25, 3), dxfattribs={"rotation": 90})
     space.add_blockref("FENETRE", (3, -0.6))
     space.add_text("Chambre 1", dxfattribs={"layer": "PIÈCES"}).set_placement((4, 4))
-    plan = import_plan(_dxf(document))
+    plan = import_plan(dxf_file(document))
     assert plan.document["rooms"][0]["type"] == "bedroom"
     assert shapes(plan.document)[0].area == pytest.approx(120 * 0.3048**2, rel=1e-3)
     (leaf,), (pane,) = lines(plan.document, "door"), lines(plan.document, "window")

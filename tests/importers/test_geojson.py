@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import json
-import zipfile
 
 import numpy as np
 import pyproj
@@ -13,7 +11,7 @@ import pytest
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.floorplan.earth import LocalFrame
 from lalaloc_core.importers import ImportLimits, ImportOptions, import_plan, import_plans
-from tests.importers.conftest import lines, shapes
+from tests.importers.conftest import lines, shapes, zip_file
 
 PLACE = LocalFrame(longitude=-0.1276, latitude=51.5072)
 
@@ -86,18 +84,13 @@ def test_imdf_kiosks_are_holes_and_windows_are_kept():
     shaft = _feature([[1, 1], [1.5, 1], [1.5, 1.5], [1, 1.5]], feature_type="kiosk", level_id="L")
     unit = _feature([[0, 0], [4, 0], [4, 3], [0, 3]], feature_type="unit", category="restroom",
                     name={"de": "Bad", "en": "Bath"}, level_id="L")  # fmt: skip
-    way = _feature([[1, 0], [2, 0]], "LineString", feature_type="opening", door=None, level_id="L")
+    passage = _feature([[1, 0], [2, 0]], "LineString", feature_type="opening", door=None, level_id="L")
     window = _feature([[2.5, 0], [3.5, 0]], "LineString", feature_type="opening", kind="window", level_id="L")
     third = {"ordinal": 3, "name": {"en": "Third"}}
     levels = [{"id": "L", "type": "Feature", "geometry": None, "properties": third}]
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w") as archive:
-        archive.writestr("manifest.json", "{}")
-        archive.writestr("venue/level.geojson", _collection(*levels))
-        archive.writestr("venue/unit.geojson", _collection(unit))
-        archive.writestr("venue/kiosk.geojson", _collection(shaft))
-        archive.writestr("venue/opening.geojson", _collection(way, window))
-    plan = import_plan(stream.getvalue())
+    features = {"level": levels, "unit": [unit], "kiosk": [shaft], "opening": [passage, window]}
+    files = {f"venue/{kind}.geojson": _collection(*members) for kind, members in features.items()}
+    plan = import_plan(zip_file({"manifest.json": "{}"} | files))
     assert (plan.level.name, plan.level.number) == ("Third", 3.0)  # type: ignore[union-attr]
     (room,) = plan.document["rooms"]
     assert (room["name"], room["type"], len(room["holes"])) == ("Bath", "bathroom", 1)
@@ -131,8 +124,5 @@ def test_too_many_vertices_are_rejected():
 def test_archive_without_units_is_rejected_with_its_files():
     cases = (("readme.txt", "", "no GeoJSON at all"), ("venue/level.geojson", _collection(), "venue/level.geojson"))
     for name, content, listed in cases:
-        stream = io.BytesIO()
-        with zipfile.ZipFile(stream, "w") as archive:
-            archive.writestr(name, content)
         with pytest.raises(InvalidFloorPlanError, match=f"no unit.geojson, it has {listed}"):
-            import_plan(stream.getvalue())
+            import_plan(zip_file({name: content}))

@@ -7,8 +7,6 @@ import itertools
 import json
 import pickle
 import struct
-import zipfile
-import zlib
 from dataclasses import fields
 from importlib import import_module
 
@@ -18,7 +16,15 @@ from PIL import Image
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers import EXPORT_FORMATS, FORMATS, ImportLimits, ImportOptions, detect_format, import_plans
-from tests.importers.conftest import FLAT
+from tests.importers.conftest import (
+    EXTERNAL_ENTITY,
+    FLAT,
+    NESTED_ENTITIES,
+    ZIP_BOMB,
+    dxf_file,
+    large_picture,
+    zip_file,
+)
 
 SVG = '<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink">{}</svg>'
 
@@ -29,15 +35,11 @@ def _assert_rejected(content: bytes, message: str, **limits: object) -> None:
 
 
 def test_nested_xml_entities():
-    lol = "".join(f'<!ENTITY l{i} "{f"&l{i - 1};" * 10}">' for i in range(1, 10))
-    _assert_rejected(
-        f'<!DOCTYPE svg [<!ENTITY l0 "lol">{lol}]>{SVG.format("<text>&l9;</text>")}'.encode(), "declares entities"
-    )
+    _assert_rejected(NESTED_ENTITIES, "declares entities")
 
 
 def test_external_xml_entities():
-    document = f'<!DOCTYPE svg [<!ENTITY x SYSTEM "file:///etc/passwd">]>{SVG.format("<text>&x;</text>")}'
-    _assert_rejected(document.encode(), "entities")
+    _assert_rejected(EXTERNAL_ENTITY, "entities")
 
 
 def test_external_doctype():
@@ -64,32 +66,18 @@ def test_deeply_nested_json():
 
 
 def test_zip_above_the_unpacked_limit():
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("unit.geojson", b" " * 3_000_000)
-    assert len(stream.getvalue()) < 10_000
-    _assert_rejected(stream.getvalue(), "unpacks to more than", max_unpacked_bytes=1_000_000)
+    assert len(ZIP_BOMB) < 10_000
+    _assert_rejected(ZIP_BOMB, "unpacks to more than", max_unpacked_bytes=1_000_000)
 
 
 def test_zip_with_forged_sizes():
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("unit.geojson", b" " * 3_000_000)
-    content = stream.getvalue().replace(struct.pack("<I", 3_000_000), struct.pack("<I", 10))
+    content = ZIP_BOMB.replace(struct.pack("<I", 3_000_000), struct.pack("<I", 10))
     _assert_rejected(content, "damaged|unpacks|JSON", max_unpacked_bytes=1_000_000)
 
 
 def test_zip_with_too_many_files_or_a_password():
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w") as archive:
-        for number in range(300):
-            archive.writestr(f"{number}.geojson", b"{}")
-    _assert_rejected(stream.getvalue(), "300 files")
-    content = bytearray()
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w") as archive:
-        archive.writestr("unit.geojson", b"{}")
-    content += stream.getvalue()
+    _assert_rejected(zip_file({f"{number}.geojson": b"{}" for number in range(300)}), "300 files")
+    content = bytearray(zip_file({"unit.geojson": b"{}"}))
     # Set the encryption bit in the file's header and in the directory.
     content[6] |= 1
     content[content.index(b"PK\x01\x02") + 8] |= 1
@@ -104,16 +92,11 @@ def test_nested_blocks():
         for x in range(10):
             block.add_blockref(f"B{level - 1}", (x, 0))
     document.modelspace().add_blockref("B7", (0, 0), dxfattribs={"row_count": 100, "column_count": 100})
-    text = io.StringIO()
-    document.write(text)
-    _assert_rejected(text.getvalue().encode(), "entities")
+    _assert_rejected(dxf_file(document), "entities")
 
 
 def test_picture_with_too_many_pixels():
-    header = struct.pack(">IIBBBBB", 100_000, 100_000, 8, 0, 0, 0, 0)
-    chunk = b"IHDR" + header
-    content = b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + chunk + struct.pack(">I", zlib.crc32(chunk))
-    _assert_rejected(content, "pixels|cannot be read")
+    _assert_rejected(large_picture(100_000), "pixels|cannot be read")
 
 
 def test_truncated_picture():

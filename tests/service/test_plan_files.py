@@ -7,9 +7,6 @@ import json
 import multiprocessing
 import os
 import signal
-import struct
-import zipfile
-import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -24,6 +21,7 @@ from benchmarks.plan_drawing import draw_plan
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.importers import Anchor, export_plan
 from service.conversion import converter
+from tests.importers.conftest import EXTERNAL_ENTITY, NESTED_ENTITIES, ZIP_BOMB, dxf_file, large_picture
 from tests.importers.conftest import FLAT as PLAN
 from tests.importers.test_ifc import DUPLEX, ifc_flat
 from tests.importers.test_pictures import vector_pdf
@@ -31,7 +29,6 @@ from tests.service.conftest import StartApp, assert_problem, localise, wait_for
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 ANCHOR = Anchor(latitude=48.1372, longitude=11.5756, north_deg=25.0)
-SVG = '<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink">{}</svg>'
 
 
 def send_plan(client: httpx.Client, content: bytes, **options: Any) -> httpx.Response:
@@ -142,9 +139,7 @@ def test_y_axis_down_gives_a_warning(client: httpx.Client) -> None:
     document.header["$UCSYDIR"] = (0, -1, 0)
     room = document.modelspace().add_lwpolyline([(0, 0), (4, 0), (4, 3), (0, 3)], dxfattribs={"layer": "ROOM"})
     room.close()
-    text = io.StringIO()
-    document.write(text)
-    assert any("y" in line and "down" in line for line in store_plan(client, text.getvalue().encode())["warnings"])
+    assert any("y" in line and "down" in line for line in store_plan(client, dxf_file(document))["warnings"])
 
 
 def test_file_as_body_is_detected_by_content(client: httpx.Client) -> None:
@@ -273,31 +268,20 @@ class TestHostileFiles:
         assert store_plan(client, plan_file("svg"))["rooms"]
 
     def test_zip_above_the_unpacked_limit(self, strict: httpx.Client) -> None:
-        stream = io.BytesIO()
-        with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
-            archive.writestr("unit.geojson", b" " * 3_000_000)
-        self.assert_rejected(strict, stream.getvalue(), "more than 1000000 bytes (max_unpacked_bytes)")
+        self.assert_rejected(strict, ZIP_BOMB, "more than 1000000 bytes (max_unpacked_bytes)")
 
     def test_nested_and_external_xml_entities(self, strict: httpx.Client) -> None:
-        lol = "".join(f'<!ENTITY l{i} "{f"&l{i - 1};" * 10}">' for i in range(1, 10))
-        bomb = f'<!DOCTYPE svg [<!ENTITY l0 "lol">{lol}]>{SVG.format("<text>&l9;</text>")}'
-        self.assert_rejected(strict, bomb.encode(), "declares entities")
-        outside = f'<!DOCTYPE svg [<!ENTITY x SYSTEM "file:///etc/passwd">]>{SVG.format("<text>&x;</text>")}'
-        self.assert_rejected(strict, outside.encode(), "entities")
+        self.assert_rejected(strict, NESTED_ENTITIES, "declares entities")
+        self.assert_rejected(strict, EXTERNAL_ENTITY, "entities")
 
     def test_drawing_with_too_many_lines(self, strict: httpx.Client) -> None:
         document = new_dxf()
         for x in range(4000):
             document.modelspace().add_line((x, 0), (x, 1))
-        text = io.StringIO()
-        document.write(text)
-        self.assert_rejected(strict, text.getvalue().encode(), "more than 3000 entities (max_entities)")
+        self.assert_rejected(strict, dxf_file(document), "more than 3000 entities (max_entities)")
 
     def test_picture_with_too_many_pixels(self, strict: httpx.Client) -> None:
-        header = b"IHDR" + struct.pack(">IIBBBBB", 30_000, 30_000, 8, 0, 0, 0, 0)
-        chunk = struct.pack(">I", 13) + header + struct.pack(">I", zlib.crc32(header))
-        picture = b"\x89PNG\r\n\x1a\n" + chunk + struct.pack(">I", 0) + b"IEND" + struct.pack(">I", zlib.crc32(b"IEND"))
-        self.assert_rejected(strict, picture, "pixels")
+        self.assert_rejected(strict, large_picture(30_000), "pixels")
 
     def test_deep_and_large_json(self, strict: httpx.Client) -> None:
         self.assert_rejected(strict, b'{"type": "FeatureCollection", "features": ' + b"[" * 1_000_000, "nested")

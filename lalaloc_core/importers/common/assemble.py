@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import unicodedata
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -168,8 +168,7 @@ def _near_origin(rooms: list[SketchedRoom], builder: ReportBuilder) -> tuple[lis
         return rooms, (0.0, 0.0)
     dx, dy = -math.floor(x0), -math.floor(y0)
     builder.notes.append(f"the plan was moved by ({dx}, {dy}) m to lie near its origin")
-    moved = [SketchedRoom(affinity.translate(r.shape, dx, dy), r.name, r.type, r.ceiling_height_m, r.id) for r in rooms]
-    return moved, (dx, dy)
+    return [replace(room, shape=affinity.translate(room.shape, dx, dy)) for room in rooms], (dx, dy)
 
 
 def _shifted_anchor(anchor: Anchor | None, shift: tuple[float, float], builder: ReportBuilder) -> Anchor | None:
@@ -188,8 +187,7 @@ def _shifted_anchor(anchor: Anchor | None, shift: tuple[float, float], builder: 
 
 def _shifted(opening: SketchedOpening, shift: tuple[float, float]) -> SketchedOpening:
     (x0, y0), (x1, y1), (dx, dy) = opening.start, opening.end, shift
-    ends = (x0 + dx, y0 + dy), (x1 + dx, y1 + dy)
-    return SketchedOpening(opening.kind, *ends, opening.name, opening.sill_m, opening.head_m)
+    return replace(opening, start=(x0 + dx, y0 + dy), end=(x1 + dx, y1 + dy))
 
 
 def _usual_ceiling(rooms: list[SketchedRoom], options: ImportOptions, builder: ReportBuilder) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 # Limits the size of the report on a file full of mistakes.
@@ -45,16 +45,7 @@ class ImportReport:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the report as plain JSON data."""
-        return {
-            "format": self.format,
-            "metres_per_unit": self.metres_per_unit,
-            "scale_source": self.scale_source,
-            "is_draft": self.is_draft,
-            "layers": [{"layer": use.layer, "entities": use.entities, "used_as": use.used_as} for use in self.layers],
-            "notes": list(self.notes),
-            "warnings": list(self.warnings),
-            "unsure": list(self.unsure),
-        }
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
 
 
 @dataclass

@@ -29,32 +29,13 @@ from lalaloc_core.importers.common.sketch import Level, Sketch, SketchedOpening,
 from lalaloc_core.importers.common.vocabulary import Role, role_of, type_of_room
 
 _FEATURE_TYPES: Mapping[str, Role] = {
-    "unit": "room",
-    "room": "room",
-    "opening": "door",
-    "fixture": "obstacle",
-    "kiosk": "obstacle",
-    "corridor": "room",
-    "area": "room",
-    "wall": "wall",
+    "unit": "room", "room": "room", "corridor": "room", "area": "room", "opening": "door", "door": "door",
+    "window": "window", "passage": "passage", "wall": "wall", "fixture": "obstacle", "kiosk": "obstacle",
     "column": "obstacle",
-    "door": "door",
-    "window": "window",
-    "passage": "passage",
-}
+}  # fmt: skip
 # Feature types of IMDF that are not part of a plan, and categories of units without a floor.
-_IGNORED_TYPES = {
-    "venue",
-    "building",
-    "footprint",
-    "level",
-    "address",
-    "section",
-    "geofence",
-    "anchor",
-    "occupant",
-    "amenity",
-}
+_IGNORED_TYPES = {"venue", "building", "footprint", "level", "address", "section", "geofence", "anchor", "occupant",
+                  "amenity"}  # fmt: skip
 _NO_FLOOR = {"opentobelow", "structure", "column", "elevator", "escalator", "movingwalkway"}
 _MAX_REACH_M = 5000.0
 # Decimals of exported degrees; the ninth is a tenth of a millimetre.

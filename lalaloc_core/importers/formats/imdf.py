@@ -26,16 +26,9 @@ _FEATURE_TYPES = ("unit", "opening", "fixture", "kiosk")
 # Exported archives carry no time, so that equal plans give equal bytes.
 _EPOCH = (2000, 1, 1, 0, 0, 0)
 _NAMESPACE = uuid.UUID("2f6c1d58-2d0e-5c7e-9a41-6b0f6f1e7c11")
-_CATEGORIES = {
-    "corridor": "walkway",
-    "bathroom": "restroom",
-    "stairs": "stairs",
-    "office": "office",
-    "kitchen": "kitchen",
-    "meeting": "conferenceroom",
-    "storage": "storage",
-    "entrance": "lobby",
-}
+_CATEGORIES = {"corridor": "walkway", "bathroom": "restroom", "stairs": "stairs", "office": "office",
+               "kitchen": "kitchen", "meeting": "conferenceroom", "storage": "storage",
+               "entrance": "lobby"}  # fmt: skip
 
 
 def read_archive(content: bytes, limits: ImportLimits, *, suffixes: tuple[str, ...]) -> dict[str, bytes]:
