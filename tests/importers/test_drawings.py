@@ -6,6 +6,7 @@ import io
 from itertools import pairwise
 
 import pytest
+from ezdxf.filemanagement import new as new_dxf
 
 from lalaloc_core.errors import InvalidFloorPlanError
 from lalaloc_core.importers import ImportOptions, import_plan
