@@ -42,7 +42,7 @@ _MIN_CLEARANCE_M = 0.05
 # Logarithms are dear: of so many factors, none above the limit, the product is taken before.
 _FACTORS, _MAX_FACTOR = 4, 1e9
 # Poses whose openings are compared at a time, to bound memory; pairs, few enough to stay in the processor's cache.
-_CHUNK, _PAIRS = 4096, 512
+_CHUNK = 512
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -101,6 +101,17 @@ class Terms(NamedTuple):
         )
 
 
+class _Shown(NamedTuple):
+    log_profile: Float[np.ndarray, "m w"]
+    room_index: Int[np.ndarray, "m"]
+    kind_at: Int[np.ndarray, "m w"] | None
+    row: Int[np.ndarray, "e"]
+    column: Int[np.ndarray, "e"]
+    log_behind: Float[np.ndarray, "e"]
+    odds: Float[np.ndarray, "e"]
+    place: Int[np.ndarray, "e"]
+
+
 class MatchingCost:
     """Compares poses of one plan with one query.
 
@@ -129,41 +140,35 @@ class MatchingCost:
     def costs(
         self, layouts: Layouts, hypotheses: Int[np.ndarray, "k"] | None = None
     ) -> tuple[Float[np.ndarray, "k n"], Float[np.ndarray, "k n"]]:
-        """Cost of every pose under some hypotheses of how the panorama is turned (all), and the δ that gives it."""
+        """Return the cost of every pose under some hypotheses of the heading (all), and the δ that gives it."""
         hypotheses = np.arange(self.hypotheses) if hypotheses is None else hypotheses
         layouts = layouts.thinned(self._stride) if self._stride > 1 else layouts
-        layouts = replace(layouts, log_profile=layouts.log_profile.astype(np.float32, copy=False))
-        shared = self.by_room()
-        best = np.full((len(hypotheses), len(layouts)), np.inf, np.float32)
-        chosen = np.zeros(best.shape, np.intp)
-        for row, hypothesis in enumerate(hypotheses):
-            for j, offset in enumerate(self.offsets):
-                cost = self._walls(layouts, int(hypothesis), float(offset)) + shared[j, layouts.room_index]
-                chosen[row, cost < best[row]] = j
-                np.minimum(best[row], cost, out=best[row])
-        best += self._weights.openings * self._openings(layouts, hypotheses)
-        return best, self.offsets[chosen]
+        cost = np.empty((len(hypotheses), len(layouts)), np.float32)
+        chosen = np.empty(cost.shape, np.intp)
+        for first in range(0, len(layouts), _CHUNK):
+            part = slice(first, first + _CHUNK)
+            shown = self._shown(layouts, np.arange(len(layouts))[part])
+            for row, hypothesis in enumerate(hypotheses):
+                cost[row, part], chosen[row, part] = self._best(shown, hypothesis[None])
+        return cost, self.offsets[chosen]
 
     def pairs(
         self, layouts: Layouts, pose: Int[np.ndarray, "m"], hypothesis: Int[np.ndarray, "m"]
     ) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m"]]:
-        """As `costs`, of some pairs of a pose and a hypothesis alone: the cost, and the δ that gives it."""
-        shared, cost, chosen = self.by_room(), np.empty(len(pose), np.float32), np.empty(len(pose), np.intp)
-        for first in range(0, len(pose), _PAIRS):
-            part = slice(first, first + _PAIRS)
-            walls = self._walls_of(layouts, pose[part], hypothesis[part], self.offsets)
-            walls += shared[:, layouts.room_index[pose[part]]]
-            chosen[part] = walls.argmin(axis=0)
-            cost[part] = walls.min(axis=0)
-            cost[part] += self._weights.openings * self._openings_of(layouts, pose[part], hypothesis[part])
+        """Return the cost of some pairs of a pose and a hypothesis, and the δ that gives it."""
+        cost, chosen = np.empty(len(pose), np.float32), np.empty(len(pose), np.intp)
+        for first in range(0, len(pose), _CHUNK):
+            part = slice(first, first + _CHUNK)
+            cost[part], chosen[part] = self._best(self._shown(layouts, pose[part]), hypothesis[part])
         return cost, self.offsets[chosen]
 
     def terms(self, layouts: Layouts, hypothesis: Int[np.ndarray, "n"], offset: Float[np.ndarray, "n"]) -> Terms:
         """What each term says of poses that each have their own hypothesis and δ."""
         every = np.arange(len(layouts))
+        shown = self._shown(layouts, every)
         return Terms(
-            walls=self._walls_of(layouts, every, hypothesis, offset[None])[0].astype(np.float64),
-            openings=self._openings_of(layouts, every, hypothesis).astype(np.float64),
+            walls=self._walls(shown, hypothesis, offset[None])[0].astype(np.float64),
+            openings=self._openings(shown, hypothesis).astype(np.float64),
             ceiling=self._ceilings(offset)[every, layouts.room_index],
             room_type=self._room_types[layouts.room_index],
             height=self._query.camera_height.penalty(offset),
@@ -178,6 +183,10 @@ class MatchingCost:
     def offsets(self) -> Float[np.ndarray, "j"]:
         """The δ that are tried."""
         return self._query.camera_height.offsets
+
+    @cached_property
+    def _room_costs(self) -> Float[np.ndarray, "j r"]:
+        return self.by_room()
 
     def by_room(self) -> Float[np.ndarray, "j r"]:
         """What δ and the room alone cost: the height's penalty, the ceiling and the room's type."""
@@ -209,83 +218,72 @@ class MatchingCost:
         share[at] = shut / (shut + opened)
         return share
 
-    def _walls(self, layouts: Layouts, hypothesis: int, offset: float) -> Float[np.ndarray, "n"]:
-        centre, precision = self._centre[hypothesis] + np.float32(offset), self._precision[hypothesis]
-        factor = layouts.log_profile - centre
-        factor *= precision
-        np.square(factor, out=factor)
-        factor += 1.0
-        seen = layouts.seen
-        if seen is not None and self._config.use_see_through:
-            behind = np.square((seen.log_behind - centre[seen.column]) * precision[seen.column]) + 1.0
-            shut = factor[seen.row, seen.column]
-            # Where the wall fits, its being shut in a door costs nothing: networks learn to see the wall there.
-            factor[seen.row, seen.column] = np.maximum(1.0 / (1.0 / shut + self._open_odds(seen.kind) / behind), 1.0)
-        return mean_log(factor)
-
-    def _walls_of(
-        self,
-        layouts: Layouts,
-        pose: Int[np.ndarray, "m"],
-        hypothesis: Int[np.ndarray, "m"],
-        offset: Float[np.ndarray, "j n"] | Float[np.ndarray, "j"],
-    ) -> Float[np.ndarray, "j m"]:
-        """Cost of the walls of pairs at each δ, which is one for all pairs, or each pair's own."""
-        centre, precision = self._centre[hypothesis], self._precision[hypothesis]
-        apart = layouts.log_profile[pose].astype(np.float32) - centre
-        apart *= precision
-        offset = offset.astype(np.float32)
-        offset = offset[:, None, None] if offset.ndim == 1 else offset[:, :, None]
+    def _shown(self, layouts: Layouts, pose: Int[np.ndarray, "m"]) -> _Shown:
         seen = layouts.seen if self._config.use_see_through else None
+        row = column = np.empty(0, int)
+        log_behind = odds = np.empty(0, np.float32)
         if seen is not None:
-            pair, entry = seen.of(pose)
-            row, column = pair, seen.column[entry]
-            sharp, odds = precision[row, column], self._open_odds(seen.kind[entry])
-            behind = (seen.log_behind[entry] - centre[row, column]) * sharp
-        cost = np.empty((len(offset), len(pose)), np.float32)
-        for j, one in enumerate(offset):
-            factor = apart - one * precision
+            row, entry = seen.of(pose)
+            column, log_behind, odds = seen.column[entry], seen.log_behind[entry], self._open_odds(seen.kind[entry])
+        return _Shown(
+            log_profile=layouts.log_profile[pose].astype(np.float32, copy=False),
+            room_index=layouts.room_index[pose],
+            kind_at=None
+            if layouts.kind is None
+            else layouts.kind[pose] + np.arange(layouts.kind.shape[1]) * len(OPENING_CLASSES),
+            row=row,
+            column=column,
+            log_behind=log_behind,
+            odds=odds,
+            place=row * layouts.log_profile.shape[1] + column,
+        )
+
+    def _best(
+        self, shown: _Shown, hypothesis: Int[np.ndarray, "#m"]
+    ) -> tuple[Float[np.ndarray, "m"], Int[np.ndarray, "m"]]:
+        """Return the cost of poses, each under one hypothesis, at the best δ, and the number of that δ."""
+        cost = self._walls(shown, hypothesis, self.offsets[:, None])
+        cost += self._room_costs[:, shown.room_index]
+        return cost.min(axis=0) + self._weights.openings * self._openings(shown, hypothesis), cost.argmin(axis=0)
+
+    def _walls(
+        self, shown: _Shown, hypothesis: Int[np.ndarray, "#m"], offset: Float[np.ndarray, "j #m"]
+    ) -> Float[np.ndarray, "j m"]:
+        precision, offset = self._precision[hypothesis], offset.astype(np.float32)
+        apart = shown.log_profile - self._centre[hypothesis]
+        apart *= precision
+        columns = apart.shape[1]
+        at = np.broadcast_to(hypothesis * columns, len(apart))[shown.row] + shown.column
+        sharp = self._precision.take(at)
+        behind = (shown.log_behind - self._centre.take(at)) * sharp
+        seen_offset = offset if offset.shape[1] == 1 else offset[:, shown.row]
+        cost = np.empty((len(offset), len(apart)), np.float32)
+        for j in range(len(offset)):
+            # The last δ overwrites the differences.
+            factor = np.subtract(apart, offset[j][:, None] * precision, out=apart if j == len(offset) - 1 else None)
             np.square(factor, out=factor)
             factor += 1.0
-            if seen is not None:
-                shift = one if one.shape[0] == 1 else one[row]
-                beyond = np.square(behind - shift[:, 0] * sharp) + 1.0
-                shut = factor[row, column]
-                factor[row, column] = np.maximum(1.0 / (1.0 / shut + odds / beyond), 1.0)
+            if len(shown.place):
+                beyond = np.square(behind - seen_offset[j] * sharp) + 1.0
+                # A wall that fits costs nothing, even if it is a door: networks learn to see the wall there.
+                either = np.maximum(1.0 / (1.0 / factor.take(shown.place) + shown.odds / beyond), 1.0)
+                factor.put(shown.place, either)
             cost[j] = mean_log(factor)
         return cost
 
-    def _openings_of(
-        self, layouts: Layouts, pose: Int[np.ndarray, "m"], hypothesis: Int[np.ndarray, "m"]
-    ) -> Float[np.ndarray, "m"]:
-        """Cost of the openings of pairs."""
+    def _openings(self, shown: _Shown, hypothesis: Int[np.ndarray, "#m"]) -> Float[np.ndarray, "m"]:
         loss = self._claimed_loss
-        if loss is None or layouts.kind is None:
-            return np.zeros(len(pose), np.float32)
+        if loss is None or shown.kind_at is None:
+            return np.zeros(len(shown.room_index), np.float32)
         columns, classes = loss.shape[1:]
-        at = (hypothesis[:, None] * columns + np.arange(columns)) * classes + layouts.kind[pose]
-        return loss.ravel()[at].mean(axis=1)
+        at = hypothesis[:, None] * (columns * classes) + shown.kind_at
+        return loss.take(at).mean(axis=1)
 
     def _open_odds(self, kind: UInt8[np.ndarray, "m"]) -> Float[np.ndarray, "m"]:
         """Odds that one looks through openings of some kinds."""
         is_passage = kind == PASSAGE_CODE
         open_share = np.where(is_passage, self._config.open_passage, self._config.open_door).astype(np.float32)
         return open_share / (1.0 - open_share)
-
-    def _openings(self, layouts: Layouts, hypotheses: Int[np.ndarray, "k"]) -> Float[np.ndarray, "k n"]:
-        """Cost of the openings of every pose under some hypotheses."""
-        loss = self._opening_loss(hypotheses)
-        cost = np.zeros((len(hypotheses), len(layouts)), np.float32)
-        if loss is None or layouts.kind is None:
-            return cost
-        wall = loss[:, :, WALL_CODE]
-        for first in range(0, len(layouts), _CHUNK):
-            kind = layouts.kind[first : first + _CHUNK]
-            part = cost[:, first : first + _CHUNK]
-            part += wall.sum(axis=1)[:, None]
-            for code in self._claimed:
-                part += (loss[:, :, code] - wall) @ (kind == code).T.astype(np.float32)
-        return cost / loss.shape[1]
 
     @cached_property
     def _claimed(self) -> list[int]:
@@ -315,7 +313,7 @@ class MatchingCost:
         possible = [WALL_CODE, *self._claimed]
         loss = -np.log(self._config.floor + (1.0 - self._config.floor) * probability / prior)
         loss -= loss[..., possible].min(axis=-1, keepdims=True)
-        return loss[:, :: self._stride].astype(np.float32)
+        return np.ascontiguousarray(loss[:, :: self._stride], np.float32)
 
     @property
     def _spread(self) -> float:

@@ -15,8 +15,8 @@ from scipy.sparse import csr_array
 
 from lalaloc_core.localise.sequence.motion import Transition
 
-# Pairs of places times headings that are compared at a time, to bound memory.
-_COMPARED = 4_000_000
+# Pairs of places and headings compared at a time, few enough to stay in the processor's cache.
+_COMPARED = 100_000
 
 
 @dataclass(frozen=True, eq=False)
