@@ -27,7 +27,8 @@ from lalaloc_core.learn.synth.scene.shots import Shot, sample_shots
 from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.pipeline import Localisation, localise, panorama_heading
+from lalaloc_core.localise.pipeline import Localisation, localise
+from lalaloc_core.localise.ranking import panorama_heading
 from lalaloc_core.localise.retrieval import build_grid
 from lalaloc_core.localise.sequence import Motion
 from lalaloc_core.localise.sequence.joint import refine_sequence
@@ -150,7 +151,8 @@ def main() -> None:
                 ).pictures
             spent_s = (time.perf_counter() - begin) / (1 if directed is not None else len(shots))
             for shot, answer in zip(shots, answers, strict=True):
-                note(tallies[name], shot, answer, None if model is None else answer.confidence(model), spent_s)
+                confidence = answer.confidence(model)
+                note(tallies[name], shot, answer, None if confidence is None else confidence.position, spent_s)
             far = sum(error >= 1.0 for error in tallies[name].errors_m[-len(shots) :])
             print(f"  walk {done}, {home.plan.area_m2:.0f} m², {name}: {far} of {len(shots)} beyond 1 m", flush=True)
     for name, tally in tallies.items():

@@ -135,12 +135,13 @@ def _answers(arguments: argparse.Namespace, plan: FloorPlan, contents: list[byte
         query = encoders.query(panorama.pixels, known.heading, height, heading_tolerance=known.tolerance)
         found = localise(plan, grid, encoders, query, refiner=refiner)
         drawn = drawn_answer(plan, grid, found, model, _SOURCES[known.source])
+        confidence = found.confidence(model)
         source = "searched" if found.heading_contradicted else known.source
         warnings = ["the photograph contradicts the heading, which was estimated instead"]
         details = {
             "stage": found.stage,
             "heading_source": source,
-            "heading_confidence": None if model is None else found.heading_confidence(model),
+            "heading_confidence": None if confidence is None else confidence.heading,
             "warnings": warnings if found.heading_contradicted else [],
             "model": {"name": bundle.manifest.name, "version": bundle.manifest.version, "sha256": bundle.sha256},
         }

@@ -20,9 +20,10 @@ from lalaloc_core.draw.plan import ELLIPSE_STDS, Marker, draw_camera, extent_m, 
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.bundle import ConfidenceModel
 from lalaloc_core.localise.covariance import pose_uncertainty
-from lalaloc_core.localise.pipeline import Localisation, panorama_heading
+from lalaloc_core.localise.pipeline import Localisation
 from lalaloc_core.localise.poses import Candidate, PoseGrid, Query
 from lalaloc_core.localise.probability_map import probability_map
+from lalaloc_core.localise.ranking import panorama_heading
 
 Picture = Literal["both", "plan", "photograph"]
 PICTURES: tuple[Picture, ...] = get_args(Picture)
@@ -101,7 +102,7 @@ def drawn_answer(
         heading_source: origin of the heading, in a word or two.
         truth: true pose, if known.
     """
-    fits = None if model is None else found.fit_probability(model)
+    confidence = found.confidence(model)
     best, *others = found.candidates
     spread = None
     if model is not None and best.information is not None:
@@ -116,9 +117,9 @@ def drawn_answer(
             candidate.y_m,
             _heading_deg(found.query, candidate),
             plan.rooms[candidate.room_index].name,
-            None if fits is None else fits * share,
+            None if confidence is None else confidence.candidates[index],
         )
-        for candidate, share in zip(others, found.posterior.candidate[1:], strict=True)
+        for index, candidate in enumerate(others, start=1)
     ]
     return DrawnAnswer(
         plan=plan,
@@ -128,7 +129,7 @@ def drawn_answer(
         room_index=best.room_index,
         camera_height_m=found.camera_height_m,
         heading_source="estimated" if found.heading_contradicted else heading_source,
-        confidence=None if model is None else found.confidence(model),
+        confidence=None if confidence is None else confidence.position,
         rivals=tuple(rivals),
         heat=posterior_map(plan, probability_map(plan, grid.poses, found.posterior), grid.step_m),
         truth=truth,

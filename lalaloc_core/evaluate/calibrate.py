@@ -26,7 +26,8 @@ from lalaloc_core.learn.metrics import Accuracy
 from lalaloc_core.localise.bundle import COHORT, Bundle, ConfidenceModel, LogisticModel, MatchingWeights, write_manifest
 from lalaloc_core.localise.cohort import Cohort
 from lalaloc_core.localise.covariance import marginal_information
-from lalaloc_core.localise.posterior import HEADING_SEPARATION, RIGHT_WITHIN_M
+from lalaloc_core.localise.posterior import RIGHT_WITHIN_M
+from lalaloc_core.localise.ranking import HEADING_SEPARATION
 
 # Of all that is fitted on, photographs of something else than the plan's home weigh so much: with it they are believed
 # as seldom as by a fit without disturbed ones, and answers about the home itself look about as sure as they are.

@@ -21,7 +21,7 @@ from lalaloc_core.errors import BundleError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.binned_layouts import BinnedLayouts
 from lalaloc_core.localise.bundle import COHORT, Bundle, MatchingWeights
-from lalaloc_core.localise.coarse_pass import first_costs
+from lalaloc_core.localise.coarse_pass import coarse_costs
 from lalaloc_core.localise.layouts import Layouts, layouts_at
 from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost
 from lalaloc_core.localise.poses import Query
@@ -118,13 +118,13 @@ def cost_by_chance(
     """
     if cohort is None or not config.compares_profiles(query):
         return None
-    # What is particular to a room is no matter of chance.
-    alone = replace(config, use_ceiling=False, use_room_type=False, use_see_through=False)
-    evidence = MatchingCost(plan, query, reach_m, weights, alone)
-    rough = np.concatenate([part for _, part in first_costs(cohort.binned, evidence, cohort.layouts.room_index)])
-    hypothesis = rough.argmin(axis=1)
-    pose = np.argsort(rough[np.arange(len(rough)), hypothesis], kind="stable")[:_COMPARED]
-    by_chance, _ = evidence.pairs(cohort.layouts, pose, hypothesis[pose])
+    # A fit by chance does not depend on what is specific to one room.
+    general = replace(config, use_ceiling=False, use_room_type=False, use_see_through=False)
+    matching_cost = MatchingCost(plan, query, reach_m, weights, general)
+    coarse = coarse_costs(cohort.binned, matching_cost, cohort.layouts.room_index)
+    hypothesis = coarse.argmin(axis=1)
+    pose = np.argsort(coarse[np.arange(len(coarse)), hypothesis], kind="stable")[:_COMPARED]
+    by_chance, _ = matching_cost.pairs(cohort.layouts, pose, hypothesis[pose])
     return float(np.sort(by_chance)[:_BEST].mean())
 
 

@@ -1,38 +1,37 @@
-"""How sure an answer is: the posterior within 1 m of it, times the probability that the picture fits the plan at all.
+"""Confidence of an answer: the posterior within 1 m of it, times the probability that the photograph fits the plan.
 
-Whether it fits is judged by signals that do not compare places: how badly the best one fits, also in units of how
-badly places of other homes do (`localise.cohort`), how sure the image encoder is, and how far the latents are apart.
-How these become a probability is fitted on validation queries and on photographs of something else
-(`lalaloc_core.evaluate.calibrate`), and travels with the model (`bundle.ConfidenceModel`).
+The fit is judged by signals that do not compare places: the cost of the best place, also relative to the cost of places
+in other homes (`localise.cohort`), the uncertainty that the image encoder predicts, and the latent distance. A logistic
+model of the signals (`bundle.ConfidenceModel`) is fitted on validation queries and on photographs of unknown places
+(`lalaloc_core.evaluate.calibrate`), and is part of the bundle.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
+from lalaloc_core.localise.bundle import ConfidenceModel
 from lalaloc_core.localise.cohort import log_cost_to_chance
 from lalaloc_core.localise.poses import Candidate, Query
-from lalaloc_core.localise.posterior import RIGHT_WITHIN_M, Posterior
+from lalaloc_core.localise.posterior import Posterior
 
-__all__ = ["RIGHT_WITHIN_M", "Signals", "signals_of"]
-
-# No posterior is surer than this, either way.
+# Limit of the posterior's log odds, either way.
 _MAX_LOG_ODDS = 6.0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Signals:
-    """What speaks for an answer and against it.
+    """Signals of an answer's confidence.
 
     Attributes:
         log_odds: of the camera being within 1 m of the answer, by the posterior.
-        cost: how badly the answer fits.
-        uncertainty: mean log of the scales that the image encoder predicts; 0 where it predicts none.
-        latent_distance: of the answer. Pictures of no room at all fit anywhere, as nothing is predicted of them with
-            any certainty, but their latents are like no layout's.
-        cost_to_chance: log of the cost of the plan's best grid pose in units of what fits by chance.
-        answer_to_chance: the same of the answer, whose cost refinement has lowered, most of all at the right place.
+        cost: the answer's matching cost.
+        uncertainty: mean log of the scales that the image encoder predicts; 0 if it predicts none.
+        latent_distance: of the answer. Pictures without a room fit anywhere, as their predictions are uncertain, but
+            their latents are far from every layout's.
+        cost_to_chance: log of the cost of the plan's best grid pose over the cost of a fit by chance.
+        answer_to_chance: the same for the answer, whose cost refinement has lowered, most of all at the right place.
     """
 
     log_odds: float
@@ -43,14 +42,34 @@ class Signals:
     answer_to_chance: float
 
 
+@dataclass(frozen=True)
+class Confidence:
+    """Calibrated probabilities of an answer.
+
+    Attributes:
+        fit: the photograph is of the plans that were searched.
+        position: the answer is right within 1 m.
+        heading: its heading is right within 5°.
+        candidates: each candidate is right within 1 m, with its heading; at most `fit` in sum.
+    """
+
+    fit: float
+    position: float
+    heading: float
+    candidates: tuple[float, ...]
+
+
 def signals_of(
     query: Query, answer: Candidate, posterior: Posterior, grid_cost: float, by_chance: float | None
 ) -> Signals:
-    """Signals of an answer, the first candidate of the posterior.
+    """Return the signals of an answer.
 
     Args:
-        grid_cost: of the best pose of the plan's grid.
-        by_chance: what fits the query by chance, see `localise.cohort`.
+        query: the encoded panorama.
+        answer: the first candidate of the posterior.
+        posterior: the posterior with the answer's probability.
+        grid_cost: cost of the best pose of the plan's grid.
+        by_chance: cost of a fit by chance, see `localise.cohort`.
     """
     mass = min(max(posterior.position, 1e-9), 1.0 - 1e-9)
     log_odds = math.log(mass / (1.0 - mass))
@@ -61,4 +80,35 @@ def signals_of(
         latent_distance=answer.latent_distance,
         cost_to_chance=log_cost_to_chance(grid_cost, by_chance),
         answer_to_chance=log_cost_to_chance(answer.cost, by_chance),
+    )
+
+
+def confidence_of(
+    model: ConfidenceModel | None,
+    stage: str,
+    signals: Signals,
+    posterior: Posterior,
+    *,
+    heading_known: bool,
+    share: float = 1.0,
+) -> Confidence | None:
+    """Return the confidence of an answer; None without a model, or if the model was not fitted on the stage.
+
+    Args:
+        model: fitted model of the bundle.
+        stage: last stage that ran ("retrieval", "vdr" or "lpo").
+        signals: signals of the answer after that stage.
+        posterior: posterior with the probabilities of the answer's candidates.
+        heading_known: whether the heading was given exactly.
+        share: probability that the place is among those that were searched.
+    """
+    fit = None if model is None else model.fit_probability(stage, asdict(signals), heading_known=heading_known)
+    if fit is None:
+        return None
+    fit = fit * share
+    return Confidence(
+        fit=fit,
+        position=fit * posterior.position,
+        heading=fit * min(posterior.heading, 1.0),
+        candidates=tuple(fit * probability for probability in posterior.candidate),
     )

@@ -153,8 +153,8 @@ class Hints:
         return self.near is None and self.rooms is None and self.level is None
 
     @property
-    def doubted(self) -> Hints:
-        """The same hints, if they were no fences."""
+    def relaxed(self) -> Hints:
+        """The same hints, not strict."""
         return replace(self, strict=False)
 
     def _inside(

@@ -1,4 +1,4 @@
-"""What a plan shows at some poses, in the form that evidence is weighed in."""
+"""Layouts of poses: what the plan shows there, in the form that the matching cost compares."""
 
 from __future__ import annotations
 
@@ -16,7 +16,14 @@ from lalaloc_core.render.sweep import profiles_at, swept_views
 
 @dataclass(frozen=True, eq=False)
 class SeenThrough:
-    """Where one may look through an opening: pose (rising), azimuth column, kind, and log distance (m) behind it."""
+    """Views through openings.
+
+    Attributes:
+        row: (m,) numbers of the poses, rising.
+        column: (m,) azimuth columns.
+        kind: (m,) codes of the openings.
+        log_behind: (m,) log distances (m) of the walls behind.
+    """
 
     row: Int[np.ndarray, "m"]
     column: Int[np.ndarray, "m"]
@@ -25,26 +32,26 @@ class SeenThrough:
 
     @property
     def nbytes(self) -> int:
-        """Memory that the arrays take."""
+        """Bytes of the arrays."""
         return self.row.nbytes + self.column.nbytes + self.kind.nbytes + self.log_behind.nbytes
 
-    def of(self, pose: Int[np.ndarray, "k"]) -> tuple[Int[np.ndarray, "e"], Int[np.ndarray, "e"]]:
-        """What some poses see through: for each entry which of them it is of, and its place here."""
+    def entries(self, pose: Int[np.ndarray, "k"]) -> tuple[Int[np.ndarray, "e"], Int[np.ndarray, "e"]]:
+        """Return the entries of some poses: for each entry the place of its pose in `pose`, and its number."""
         begin = np.searchsorted(self.row, pose)
         count = np.searchsorted(self.row, pose, side="right") - begin
-        of = np.repeat(np.arange(len(pose)), count)
-        return of, np.arange(len(of)) - np.repeat(np.cumsum(count) - count - begin, count)
+        place = np.repeat(np.arange(len(pose)), count)
+        return place, np.arange(len(place)) - np.repeat(np.cumsum(count) - count - begin, count)
 
 
 @dataclass(frozen=True, eq=False)
 class Layouts:
-    """Layouts of n poses, in single precision; those of grids that have no latents in half.
+    """Layouts of n poses, in single precision; in half precision for grids without latents.
 
     Attributes:
         log_profile: (n, w) log wall profiles (m).
         room_index: (n,) rooms.
-        kind: (n, w) codes as in `conventions.OPENING_CLASSES`; None where the plan has no openings.
-        seen: where one may look through; None where nowhere.
+        kind: (n, w) codes as in `conventions.OPENING_CLASSES`; None if the plan has no openings.
+        seen: views through openings; None without any.
     """
 
     log_profile: Float[np.ndarray, "n w"]
@@ -57,12 +64,12 @@ class Layouts:
 
     @property
     def nbytes(self) -> int:
-        """Memory that the arrays take."""
+        """Bytes of the arrays."""
         kind = 0 if self.kind is None else self.kind.nbytes
         return self.log_profile.nbytes + self.room_index.nbytes + kind + (0 if self.seen is None else self.seen.nbytes)
 
     def rows(self, index: Int[np.ndarray, "m"]) -> Layouts:
-        """The layouts of some poses, in rising order, alone."""
+        """Return the layouts of some poses, by their numbers in rising order."""
         seen = self.seen
         if seen is not None:
             place = np.searchsorted(index, seen.row)
@@ -72,7 +79,7 @@ class Layouts:
         return Layouts(self.log_profile[index], self.room_index[index], kind, seen)
 
     def thinned(self, stride: int) -> Layouts:
-        """Every `stride`th azimuth alone."""
+        """Return the layouts with every `stride`th azimuth alone."""
         seen = self.seen
         if seen is not None:
             kept = np.flatnonzero(seen.column % stride == 0)
@@ -82,7 +89,7 @@ class Layouts:
 
 
 def layouts_at(plan: FloorPlan, poses: PoseSet, heading: Float[np.ndarray, "n"], columns: int) -> Layouts:
-    """Render the layouts of some poses; openings count as the plan's own camera height sees them."""
+    """Render the layouts of poses at some headings (radians); openings are seen from the plan's camera height."""
     if not plan.opening_faces:
         profile_m = profiles_at(plan, poses.position_m, poses.room_index, heading, columns, np.float32)
         return Layouts(np.log(profile_m), poses.room_index)
@@ -93,7 +100,7 @@ def layouts_at(plan: FloorPlan, poses: PoseSet, heading: Float[np.ndarray, "n"],
 
 
 def joined_layouts(parts: Sequence[Layouts], room_index: Int[np.ndarray, "n"]) -> Layouts:
-    """Layouts that were rendered in parts, one after the other; rooms get other numbers."""
+    """Concatenate layouts, with new room numbers."""
     log_profile = np.concatenate([part.log_profile for part in parts])
     if all(part.kind is None for part in parts):
         return Layouts(log_profile, room_index)
@@ -108,6 +115,6 @@ def joined_layouts(parts: Sequence[Layouts], room_index: Int[np.ndarray, "n"]) -
     if not seen:
         return Layouts(log_profile, room_index, kind)
     through = SeenThrough(
-        *(np.concatenate([getattr(one, name) for one in seen]) for name in ("row", "column", "kind", "log_behind"))
+        *(np.concatenate([getattr(part, name) for part in seen]) for name in ("row", "column", "kind", "log_behind"))
     )
     return Layouts(log_profile, room_index, kind, through)

@@ -1,6 +1,6 @@
-"""The path of a query: retrieve, re-sample on the Vogel disc, optimise the pose, rank.
+"""Path of a query: retrieve, re-sample on the Vogel disc (VDR), refine the pose (LPO), rank.
 
-The same code answers over HTTP and in evaluation; only `refine`, who runs the optimiser, differs.
+The same code answers over HTTP and in evaluation; only the refiner, which runs pose refinement, differs.
 """
 
 from __future__ import annotations
@@ -9,48 +9,48 @@ import math
 import time
 from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field, replace
-from operator import attrgetter
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
-import numpy as np
-
-from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.bundle import ConfidenceModel
 from lalaloc_core.localise.cohort import cost_by_chance
-from lalaloc_core.localise.confidence import Signals, signals_of
+from lalaloc_core.localise.confidence import Confidence, Signals, confidence_of, signals_of
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.hints import NO_HINTS, HintName, Hints
 from lalaloc_core.localise.matching_cost import MatchingConfig
 from lalaloc_core.localise.poses import Candidate, PoseGrid, Query, RefinementJob, RefinementResult
 from lalaloc_core.localise.posterior import Posterior, area_shares, posterior_of
+from lalaloc_core.localise.ranking import distinct, ranked
 from lalaloc_core.localise.refinement import refined, refinement_job, with_latents
-from lalaloc_core.localise.retrieval import contradicted, grid_costs, missed_hints, retrieve, suppress
+from lalaloc_core.localise.retrieval import contradicted, grid_costs, missed_hints, retrieve
 from lalaloc_core.localise.steps import run_steps
 from lalaloc_core.localise.vogel import resample
 
 SearchStage = Literal["retrieval", "vdr", "lpo"]
 Refine = Literal["none", "vdr", "lpo"]
-# Runs pose optimisation; None when it could not answer (in time).
+# Runs pose refinement; None if it has no result (in time).
 Refiner = Callable[[RefinementJob], RefinementResult | None]
 
 
 @dataclass(frozen=True, kw_only=True)
 class LocaliseConfig:
-    """Settings of the search; the defaults are the paper's where it names them (section 5).
+    """Settings of the search; the defaults are the paper's for those that the paper states (section 5).
 
     Attributes:
-        vdr_candidates: how many of the candidates are re-sampled; 0: no VDR.
-        lpo_candidates: how many are optimised in the latent space; the paper refines the first alone.
-        profile_candidates: how many are optimised by their wall profiles, which is cheaper.
-        profile_candidates_turned: the same where the heading is searched: rooms look alike from several sides.
-        alike_margin, max_candidates: as many more, up to this number in all, as cost less than this more than the best:
-            places that look alike must all be refined to share what is probable.
-        separation_m: candidates nearer than this to a better one are dropped; retrieval keeps those turned otherwise.
-        every_stage: tell what every stage found, even where a later one is reached. Where walls are compared the
-            optimiser begins with the grid's candidates; VDR is then worth its time only where LPO has no result.
-        by_probability: rank the answers by how probable they are instead of by cost, as places of several plans are.
+        vdr_samples: poses of a Vogel disc.
+        vdr_radius_steps: radius of the disc, in units of the grid's step.
+        vdr_candidates: number of candidates that are re-sampled; 0 omits VDR.
+        lpo_candidates: number of candidates refined by their latents; the paper refines the first alone.
+        profile_candidates: number of candidates refined by their wall profiles, which is faster.
+        profile_candidates_turned: the same if the heading is searched, as rooms look alike from several sides.
+        alike_margin: candidates that cost less than this more than the best are refined as well, up to
+            `max_candidates`, as places that look alike must all be refined to share the probability.
+        max_candidates: maximum number of refined candidates.
+        separation_m: smallest distance (m) between candidates at about one heading.
+        every_stage: run and record every stage. Otherwise, if wall profiles are compared, refinement begins with the
+            grid's candidates, and VDR runs only if LPO has no result.
+        by_probability: rank candidates by probability instead of cost, as for places of several plans.
         matching: settings of the matching cost.
     """
 
@@ -67,33 +67,34 @@ class LocaliseConfig:
     by_probability: bool = False
     matching: MatchingConfig = field(default_factory=MatchingConfig)
 
-    def least_starts(self, query: Query) -> int:
-        """How many candidates of a query are optimised at least."""
+    def min_starts(self, query: Query) -> int:
+        """Return the minimum number of candidates of a query that are refined."""
         if not self.matching.compares_profiles(query):
             return self.lpo_candidates
         return self.profile_candidates if query.heading_known else self.profile_candidates_turned
 
     def starts(self, query: Query, modes: list[Candidate]) -> int:
-        """How many of the modes of a query's posterior, the best first, are optimised."""
-        least = self.least_starts(query)
+        """Return the number of modes of a query's posterior, sorted by cost, that are refined."""
+        minimum = self.min_starts(query)
         if not self.matching.compares_profiles(query):
-            return least
+            return minimum
         alike = sum(mode.total_cost < modes[0].total_cost + self.alike_margin for mode in modes)
-        return max(least, min(alike, self.max_candidates))
+        return max(minimum, min(alike, self.max_candidates))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Localisation:
-    """Distinct candidates, best first, and how they came about.
+    """Distinct candidates, best first, and the evidence for them.
 
     Attributes:
-        query: what was searched for: the query, or it with an unknown heading where the picture contradicts it.
-        posterior: how probable all places of the grid and the candidates are, given that the picture is of the plan.
+        query: the query, with an unknown heading if the picture contradicts the given one.
+        candidates: poses, best first.
+        posterior: probability of all places of the grid and of the candidates, given that the picture is of the plan.
         stage: the last stage that ran.
+        signals: signals of the best candidate's confidence after each stage that ran, in order.
+        heading_contradicted: whether a heading was given that the picture contradicts.
+        hints_missed: hints that do not hold at the answer; of strict hints, those that the picture contradicts.
         best: the best candidate after each stage that ran, in order.
-        signals: what the confidence of the best candidate after each stage is judged by.
-        heading_contradicted: whether the heading was said, and is not what the picture shows.
-        hints_missed: hints that do not hold at the answer; of strict ones, those that the picture contradicts.
         timings_ms: milliseconds per stage.
     """
 
@@ -109,24 +110,19 @@ class Localisation:
 
     @property
     def camera_height_m(self) -> float:
-        """The camera height that fits the answer best."""
-        stated = self.query.camera_height.height_m
-        return stated * math.exp(self.candidates[0].height_offset)
+        """Camera height that fits the answer best."""
+        return self.query.camera_height.height_m * math.exp(self.candidates[0].height_offset)
 
-    def fit_probability(self, model: ConfidenceModel) -> float | None:
-        """Probability that the picture is of the plan at all."""
+    def confidence(self, model: ConfidenceModel | None, share: float = 1.0) -> Confidence | None:
+        """Return the answer's confidence; None without a model, or if the model was not fitted on the last stage.
+
+        Args:
+            model: fitted model of the bundle.
+            share: probability that the place is among those that were searched.
+        """
         known = self.query.heading_known
-        return model.fit_probability(self.stage, asdict(self.signals[self.stage]), heading_known=known)
-
-    def confidence(self, model: ConfidenceModel) -> float | None:
-        """Probability that the answer is right within 1 m; None where the model does not know its stage."""
-        fits = self.fit_probability(model)
-        return None if fits is None else fits * self.posterior.position
-
-    def heading_confidence(self, model: ConfidenceModel) -> float | None:
-        """Probability that the answer's heading is right within 5°."""
-        fits = self.fit_probability(model)
-        return None if fits is None else fits * min(self.posterior.heading, 1.0)
+        signals = self.signals[self.stage]
+        return confidence_of(model, self.stage, signals, self.posterior, heading_known=known, share=share)
 
 
 Steps = Generator[RefinementJob, RefinementResult | None, Localisation]
@@ -150,7 +146,7 @@ class StageClock:
             self.timings_ms[name] = (time.perf_counter() - begin) * 1e3
 
     def spans(self) -> dict[str, tuple[float, float]]:
-        """When each finished stage began, on the clock of `time.perf_counter`, and how long it took; both seconds."""
+        """Return the begin (on the clock of `time.perf_counter`) and the duration of each finished stage, in seconds."""
         return {name: (self._begun_s[name], spent_ms / 1e3) for name, spent_ms in dict(self.timings_ms).items()}
 
 
@@ -167,17 +163,22 @@ def localise(
     clock: StageClock | None = None,
     hints: Hints = NO_HINTS,
 ) -> Localisation:
-    """Find an encoded panorama in a plan.
+    """Localise an encoded panorama in a plan.
 
     Args:
-        grid: the plan's latent grid; its camera height is the query's.
-        refine: how far to go; "lpo" without a `refiner`, or with one that returns None, ends at "vdr".
-        top_k: how many distinct candidates to return.
-        clock: times the stages; by default one of their own.
-        hints: what is known of the place beforehand; strict ones forbid doubts of a known heading, too.
+        plan: the floor plan.
+        grid: the plan's pose grid, made for the query's camera height.
+        encoders: networks of the model.
+        query: the encoded panorama.
+        refine: last stage; "lpo" without a `refiner`, or with one that returns None, ends at "vdr".
+        top_k: maximum number of candidates.
+        refiner: runs pose refinement.
+        config: settings of the search.
+        clock: times the stages; by default a new one.
+        hints: priors of the place. With strict hints, a known heading is not doubted.
 
     Raises:
-        InvalidHintError: the hints cannot be meant for the plan, or strict ones leave nothing of it.
+        InvalidHintError: the hints do not fit the plan, or strict hints exclude all of it.
     """
     if refiner is None and refine == "lpo":
         refine = "vdr"
@@ -199,33 +200,33 @@ def localise_steps(
     clock: StageClock | None = None,
     hints: Hints = NO_HINTS,
 ) -> Steps:
-    """`localise` for who waits for the optimiser elsewhere: stops where poses are to be optimised; see `steps`."""
+    """Run `localise` for callers that refine poses elsewhere: yield refinement jobs, see `steps.py`."""
     config, clock = config or LocaliseConfig(), clock or StageClock()
     hints.check(plan)
     search = _Search(plan, grid, encoders, query, config=config, clock=clock, hints=hints, top_k=top_k)
     resampling = refine != "none" and config.vdr_candidates > 0
     if refine != "lpo":
-        return search.answer(search.without_lpo(resampling=resampling))
-    # Where walls are compared the optimiser begins with the grid's candidates, and what comes before is told at need.
-    early = None
+        return search.localisation(search.without_lpo(resampling=resampling))
+    # If walls are compared, refinement begins with the grid's candidates, and VDR runs on demand.
+    unrefined = None
     if config.every_stage or not search.by_walls:
-        early = search.without_lpo(resampling=resampling)
-    begun = search.modes if search.by_walls or early is None else early
+        unrefined = search.without_lpo(resampling=resampling)
+    begun = search.modes if search.by_walls or unrefined is None else unrefined
     with clock.stage("lpo"):
         result = yield search.job(begun)
-        refined = None if result is None else search.refined(begun, result)
-    if refined is not None:
-        return search.answer(refined)
-    return search.answer(search.without_lpo(resampling=resampling) if early is None else early)
+        ended = None if result is None else search.refined(begun, result)
+    if ended is not None:
+        return search.localisation(ended)
+    return search.localisation(search.without_lpo(resampling=resampling) if unrefined is None else unrefined)
 
 
 class _Search:
-    """One query in one plan: its candidates, and what its stages tell of them.
+    """One query in one plan: its candidates and the results of its stages.
 
     Attributes:
-        query: it, or it with an unknown heading where the picture contradicts what is said of the heading.
+        query: the query, with an unknown heading if the picture contradicts the given one.
         by_walls: whether poses are compared by their wall profiles.
-        modes: of the grid's posterior, the best first.
+        modes: modes of the grid's posterior, best first.
     """
 
     def __init__(
@@ -240,44 +241,48 @@ class _Search:
         hints: Hints,
         top_k: int,
     ) -> None:
-        """Retrieve candidates."""
+        """Retrieve the modes."""
         self._plan, self._grid, self._encoders, self._config = plan, grid, encoders, config
         self._clock, self._hints, self._top_k = clock, hints, top_k
-        weights, evidence = encoders.manifest.evidence, config.matching
+        weights, matching = encoders.manifest.evidence, config.matching
         with clock.stage("retrieve"):
-            self._doubted = not hints.strict and contradicted(plan, grid, query, weights, evidence)
+            self._doubted = not hints.strict and contradicted(plan, grid, query, weights, matching)
             self.query = query = query.searched if self._doubted and query.searched is not None else query
-            self._costs = costs = grid_costs(plan, grid, query, weights, evidence, hints)
-            # Refined candidates may meet and become one; spare ones then take the free places.
-            least = config.least_starts(query)
+            self._costs = costs = grid_costs(plan, grid, query, weights, matching, hints)
+            # Refined candidates can meet and become one; spare ones then take their places.
+            minimum = config.min_starts(query)
             self.modes = retrieve(
                 costs,
                 grid,
                 query,
-                top_k=max(top_k, least) + least,
+                top_k=max(top_k, minimum) + minimum,
                 separation_m=config.separation_m,
                 margin=config.alike_margin,
                 limit=config.max_candidates + top_k,
             )
             self._starts = config.starts(query, self.modes)
-            reach_m = evidence.grid_reach * grid.step_m
             self._grid_cost = float(costs.cost.min())
-            self._by_chance = cost_by_chance(encoders.cohort, plan, query, reach_m, weights, evidence)
-        self.by_walls = evidence.compares_profiles(query)
+            reach_m = matching.grid_reach * grid.step_m
+            self._by_chance = cost_by_chance(encoders.cohort, plan, query, reach_m, weights, matching)
+        self.by_walls = matching.compares_profiles(query)
         self._prior = area_shares(grid.poses, plan.areas_m2)
-        self._ends = list[Candidate]()
+        # Modes in the order of the candidates of `without_lpo`.
+        self._unrefined_modes = self.modes
+        # Modes that were refined, and the candidates that they became.
+        self._refined_modes, self._ends = list[Candidate](), list[Candidate]()
         self._best = dict[SearchStage, Candidate]()
         self._signals = dict[SearchStage, Signals]()
         self._stage: SearchStage = "retrieval"
 
     def without_lpo(self, *, resampling: bool) -> list[Candidate]:
-        """The candidates after retrieval and, with `resampling`, after VDR; tells what these stages found."""
+        """Return the candidates after retrieval and, with `resampling`, after VDR; record both stages."""
         config, camera_height_m = self._config, self._grid.camera_height_m
         first = with_latents(self._plan, self._encoders, self.query, self.modes[:1], camera_height_m)
         candidates = first + self.modes[1:]
-        self._tell("retrieval", first[0], self._posterior(first))
+        self._record("retrieval", first[0], self._posterior(first))
         if not resampling:
             return candidates
+        count = config.vdr_candidates
         with self._clock.stage("vdr"):
             resampled = [
                 resample(
@@ -288,30 +293,33 @@ class _Search:
                     camera_height_m=camera_height_m,
                     samples=config.vdr_samples,
                     radius_m=config.vdr_radius_steps * self._grid.step_m,
-                    evidence=config.matching,
+                    matching=config.matching,
                     hints=self._hints,
                 )
-                for candidate in candidates[: config.vdr_candidates]
+                for candidate in candidates[:count]
             ]
-        resampled.sort(key=attrgetter("total_cost"))
-        self._tell("vdr", resampled[0], self._posterior(resampled[:1]))
-        return resampled + candidates[config.vdr_candidates :]
+        order = ranked(resampled, self.query)
+        self._unrefined_modes = [self.modes[index] for index in order] + self.modes[count:]
+        resampled = [resampled[index] for index in order]
+        self._record("vdr", resampled[0], self._posterior(resampled[:1]))
+        return resampled + candidates[count:]
 
     def job(self, begun: list[Candidate]) -> RefinementJob:
-        """What is to be optimised of candidates."""
-        weights, evidence = self._encoders.manifest.evidence, self._config.matching
+        """Return the refinement job of the first candidates."""
+        weights, matching = self._encoders.manifest.evidence, self._config.matching
         first = begun[: self._starts]
-        return refinement_job(self._plan, self.query, first, self._grid.camera_height_m, weights, evidence)
+        return refinement_job(self._plan, self.query, first, self._grid.camera_height_m, weights, matching)
 
     def refined(self, begun: list[Candidate], result: RefinementResult) -> list[Candidate]:
-        """The candidates after LPO, the best first."""
-        evidence, first, rest = self._config.matching, begun[: self._starts], begun[self._starts :]
-        self._ends = refined(self._plan, self._encoders, self.query, first, result, evidence, self._hints)
+        """Return the candidates after LPO, best first, followed by those that were not refined."""
+        matching, first, rest = self._config.matching, begun[: self._starts], begun[self._starts :]
+        self._refined_modes = (self.modes if self.by_walls else self._unrefined_modes)[: self._starts]
+        self._ends = refined(self._plan, self._encoders, self.query, first, result, matching, self._hints)
         self._stage = "lpo"
-        return sorted(self._ends, key=attrgetter("total_cost")) + rest
+        return [self._ends[index] for index in ranked(self._ends, self.query)] + rest
 
-    def answer(self, candidates: list[Candidate]) -> Localisation:
-        """The distinct ones of the candidates of the last stage, and how they came about."""
+    def localisation(self, candidates: list[Candidate]) -> Localisation:
+        """Return the distinct candidates of the last stage, best first, with everything that was recorded."""
         config, hints, camera_height_m = self._config, self._hints, self._grid.camera_height_m
         wanted = max(self._top_k, self._starts) if config.by_probability else self._top_k
         answers = distinct(candidates, self.query, config.separation_m, wanted)
@@ -321,7 +329,7 @@ class _Search:
         if self.by_walls:
             answers = with_latents(self._plan, self._encoders, self.query, answers, camera_height_m)
         if self._stage == "lpo" or config.by_probability:
-            self._tell(self._stage, answers[0], found)
+            self._record(self._stage, answers[0], found)
         missed = hints.missed(answers[0].position_m, answers[0].room_index)
         if hints.strict:
             missed = missed_hints(self._plan, self._costs, self._encoders.manifest.evidence, hints)
@@ -337,49 +345,33 @@ class _Search:
             timings_ms=self._clock.timings_ms,
         )
 
-    def _posterior(self, first: list[Candidate]) -> Posterior:
-        """The posterior by what is known by now, with the probabilities of some candidates."""
+    def _posterior(self, candidates: list[Candidate]) -> Posterior:
+        """Return the posterior after the stages so far, with the probabilities of some candidates."""
         return posterior_of(
             self._costs,
             self._prior,
             self.query,
-            starts=self.modes[: len(self._ends)],
+            starts=self._refined_modes,
             ends=self._ends,
-            candidates=first,
+            candidates=candidates,
             temperature=self._encoders.manifest.evidence.temperature,
             separation_m=self._config.separation_m,
         )
 
-    def _tell(self, stage: SearchStage, candidate: Candidate, found: Posterior) -> None:
+    def _record(self, stage: SearchStage, candidate: Candidate, found: Posterior) -> None:
         self._stage, self._best[stage] = stage, candidate
         self._signals[stage] = signals_of(self.query, candidate, found, self._grid_cost, self._by_chance)
-
-
-def panorama_heading(query: Query, candidate: Candidate) -> float:
-    """Azimuth (radians) of the panorama's centre column that a candidate implies."""
-    return float(wrap_angle(query.roll[candidate.hypothesis] + candidate.frame_heading))
 
 
 def _by_probability(
     answers: list[Candidate], found: Posterior, top_k: int, posterior: Callable[[list[Candidate]], Posterior]
 ) -> tuple[list[Candidate], Posterior]:
-    """The most probable answers, the most probable first, with the posterior that they were ranked by."""
+    """Return the `top_k` most probable candidates, most probable first, and their posterior."""
     shares = found.candidate
-    order = sorted(range(len(answers)), key=lambda index: -shares[index])[:top_k]
-    ranked = [answers[index] for index in order]
-    # Place and heading are those of the first one.
-    first = posterior(ranked[:1])
-    ordered = tuple(shares[index] for index in order)
-    return ranked, replace(found, position=first.position, candidate=ordered, heading=first.heading)
-
-
-def distinct(candidates: list[Candidate], query: Query, separation_m: float, top_k: int) -> list[Candidate]:
-    """The first candidates of which no two are at one place and turned alike."""
-    kept = suppress(
-        np.stack([candidate.position_m for candidate in candidates]),
-        np.arange(len(candidates), dtype=float),
-        separation_m=separation_m,
-        limit=top_k,
-        heading=np.array([panorama_heading(query, candidate) for candidate in candidates]),
-    )
-    return [candidates[index] for index in kept]
+    # Probabilities that differ by rounding alone are equal, and keep the order by cost.
+    order = sorted(range(len(answers)), key=lambda index: -float(f"{shares[index]:.9g}"))[:top_k]
+    ordered = [answers[index] for index in order]
+    # The probabilities of place and heading are the first candidate's.
+    first = posterior(ordered[:1])
+    shares = tuple(shares[index] for index in order)
+    return ordered, replace(found, position=first.position, candidate=shares, heading=first.heading)

@@ -1,10 +1,11 @@
-"""How probable places are: the posterior over all grid poses and all ways in which the panorama may be turned.
+"""Posterior probability of every pose of the grid under every hypothesis of the heading.
 
-Each pair of a pose and a hypothesis has the likelihood `exp(-T cost)`, with the temperature T fitted on validation
-queries, and a prior uniform over floor area and over the headings that are searched, times that of hints, which costs
-contain here. Candidates are the modes of the posterior. The optimiser tells how far down the cost of a mode goes, which
-the grid, whose poses are off, cannot: a mode's pairs are shifted by what its candidate gained, all others by what
-candidates gain usually. Candidates that end at one place are one mode, and refined modes count as equally wide.
+A pair of a pose and a hypothesis has the likelihood `exp(-T cost)`, with the temperature T fitted on validation queries.
+The prior is uniform over floor area and over the headings that are searched; the costs here include that of hints.
+
+Candidates are the modes of the posterior. The grid's poses are off the mode's minimum, and refinement finds its depth: a
+mode's pairs are shifted by the gain of its candidate, all others by the median gain. Candidates that end at one place
+are one mode, and refined modes count as equally wide.
 """
 
 from __future__ import annotations
@@ -18,30 +19,29 @@ from jaxtyping import Bool, Float, Int
 
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.localise.poses import Candidate, Query
+from lalaloc_core.localise.ranking import HEADING_SEPARATION, TIED, ranking
 from lalaloc_core.render.sampling import PoseSet
 
 # An answer is right within this distance, and its heading within this angle (radians).
 RIGHT_WITHIN_M = 1.0
 HEADING_WITHIN = np.radians(5.0)
-# Two poses at one place are of different modes if they are turned against each other by this much (radians).
-HEADING_SEPARATION = np.radians(25.0)
-# Pairs that are less likely than the best by this factor's logarithm weigh nothing.
+# Pairs whose log likelihood is this far below the best are left out.
 NEGLIGIBLE = 12.0
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class GridCosts:
-    """What retrieval found for pairs of a grid's pose and a hypothesis.
+    """Costs of m pairs of a grid pose and a hypothesis; pairs left out are improbable.
 
     Attributes:
         poses: all poses of the grid.
-        pose: (m,) which of them each pair is of. Pairs that are missing are improbable.
-        hypothesis: (m,) how it is turned.
-        cost: (m,) what it costs.
+        pose: (m,) number of each pair's pose.
+        hypothesis: (m,) number of each pair's hypothesis.
+        cost: (m,) matching cost.
         offset: (m,) the height offset δ that gives it.
-        hint_cost: (m,) what hints have against the pose, in units of the cost; None where there are no hints.
-        compared: the first so many were compared in full, and are what candidates may be; of the others, which share
-            the probability with them, the cost is estimated.
+        hint_cost: (m,) cost of the hints at the pose; None without hints.
+        compared: number of pairs that were compared in full, which come first; candidates are among these. The cost of
+            the other pairs, which share the probability, is estimated.
     """
 
     poses: PoseSet
@@ -60,33 +60,32 @@ class GridCosts:
         offset: Float[np.ndarray, "k n"],
         hint_cost: Float[np.ndarray, "n"] | None = None,
     ) -> GridCosts:
-        """Of every pose under every hypothesis."""
+        """Return the costs of all poses under all hypotheses, compared in full."""
         hypothesis, pose = np.indices(cost.shape).reshape(2, -1)
-        against = None if hint_cost is None else hint_cost[pose]
         return cls(
             poses=poses,
             pose=pose,
             hypothesis=hypothesis,
             cost=cost.ravel(),
             offset=offset.ravel(),
-            hint_cost=against,
+            hint_cost=None if hint_cost is None else hint_cost[pose],
             compared=cost.size,
         )
 
     @cached_property
     def total(self) -> Float[np.ndarray, "m"]:
-        """What pairs are ranked by: the cost with that of hints."""
+        """Cost that pairs are ranked by: the matching cost plus that of hints."""
         return self.cost if self.hint_cost is None else self.cost + self.hint_cost
 
 
 @dataclass(frozen=True, eq=False)
 class Support:
-    """Where the probability lies once candidates are refined, which moves what stands around them along with them.
+    """Places with their probability, moved along with the candidates that refinement moved.
 
     Attributes:
-        pose: (m,) the grid pose that each place comes from.
-        position_m: (m, 2) where it lies now, which may be outside of its room.
-        weight: (m,) its probability; they sum to one.
+        pose: (m,) number of the grid pose that each place comes from.
+        position_m: (m, 2) the place, which refinement can have moved out of its room.
+        weight: (m,) probability; the sum is one.
     """
 
     pose: Int[np.ndarray, "m"]
@@ -96,15 +95,15 @@ class Support:
 
 @dataclass(frozen=True, eq=False)
 class Posterior:
-    """Probabilities, given that the picture was taken in the plan at all.
+    """Probabilities, given that the picture was taken in the plan.
 
     Attributes:
-        pose: (n,) probability of every grid pose; they sum to one.
-        position: probability of being within 1 m of the first candidate, however turned.
-        candidate: probability of being within 1 m of each candidate, turned like it, and at none before it; at most one
-            in sum.
+        pose: (n,) probability of every grid pose; the sum is one.
+        position: probability of being within 1 m of the first candidate, at any heading.
+        candidate: probability of being within 1 m of each candidate at about its heading, and at no candidate before
+            it; at most one in sum.
         heading: probability that the heading of the first candidate is right within 5°.
-        support: the same probability, at the places that refinement found; `probability_map.py` makes a map of it.
+        support: the same probability at the refined places; see `probability_map.py`.
     """
 
     pose: Float[np.ndarray, "n"]
@@ -115,7 +114,7 @@ class Posterior:
 
 
 def area_shares(poses: PoseSet, areas_m2: Float[np.ndarray, "r"]) -> Float[np.ndarray, "n"]:
-    """Log prior of every pose of a grid: its room's area, shared by the room's poses."""
+    """Return the log prior of every pose of a grid: its room's area, shared by the room's poses."""
     count = np.bincount(poses.room_index, minlength=len(areas_m2))
     return np.log(areas_m2[poses.room_index] / count[poses.room_index])
 
@@ -131,13 +130,17 @@ def posterior_of(
     temperature: float,
     separation_m: float,
 ) -> Posterior:
-    """The posterior once some modes of the grid are refined.
+    """Return the posterior after some modes of the grid were refined.
 
     Args:
+        grid: costs of the grid's pairs.
         prior: (n,) log prior of every pose of the grid, up to a constant.
-        starts: candidates as the grid has them.
-        ends: the same after refinement.
-        candidates: what probabilities are wanted of, the answer first.
+        query: the encoded panorama.
+        starts: the modes that were refined, as the grid has them.
+        ends: the same after refinement, in the same order.
+        candidates: the candidates whose probability is wanted, the answer first.
+        temperature: T.
+        separation_m: radius (m) of a mode.
     """
     lowest = float(grid.total.min())
     gains = [start.total_cost - end.total_cost for start, end in zip(starts, ends, strict=True)]
@@ -155,53 +158,24 @@ def posterior_of(
         position[member] += end.position_m - start.position_m
         heading[member] += end.frame_heading - start.frame_heading
     log_weight = -temperature * (cost - gain) + prior[pose]
+    counted = position, heading
     if ends:
         mode = np.append(_merged(ends, query, separation_m), -1)[mode]
-        log_weight += _width_corrections(log_weight, mode, temperature * np.array([end.total_cost for end in ends]))
+        depth = np.array([end.total_cost for end in ends])
+        log_weight += _width_corrections(log_weight, mode, depth, temperature)
+        counted = _ties_at_their_ends(position, heading, mode, ends, query)
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
     return posterior_from_weights(
-        query, candidates, pose=pose, position=position, heading=heading, weight=weight, poses=len(grid.poses)
+        query,
+        candidates,
+        pose=pose,
+        position=position,
+        heading=heading,
+        weight=weight,
+        poses=len(grid.poses),
+        counted=counted,
     )
-
-
-def _width_corrections(
-    log_weight: Float[np.ndarray, "m"], mode: Int[np.ndarray, "m"], nll: Float[np.ndarray, "r"]
-) -> Float[np.ndarray, "m"]:
-    """What makes refined modes as wide as the deepest of them.
-
-    How many poses of a mode fit well is a matter of where the grid's lattice happens to lie: copies of one room would
-    differ in it.
-
-    Args:
-        nll: (r,) negative log likelihood of each refined mode at its end.
-    """
-    correction, members = np.zeros(len(log_weight)), [mode == index for index in range(len(nll))]
-    width = {
-        index: np.logaddexp.reduce(log_weight[member]) + nll[index]
-        for index, member in enumerate(members)
-        if member.any()
-    }
-    if width:
-        deepest = width[min(width, key=lambda index: nll[index])]
-        for index in width:
-            correction[members[index]] = deepest - width[index]
-    return correction
-
-
-def _merged(ends: Sequence[Candidate], query: Query, separation_m: float) -> Int[np.ndarray, "r"]:
-    """For each refined candidate the best one that ended where it did, and turned alike; itself where it is that."""
-    head = np.arange(len(ends))
-    position = np.stack([end.position_m for end in ends])
-    heading = np.array([query.roll[end.hypothesis] + end.frame_heading for end in ends])
-    left = np.ones(len(ends), bool)
-    for index in np.argsort([end.total_cost for end in ends], kind="stable"):
-        if left[index]:
-            here = left & (np.linalg.norm(position - position[index], axis=1) < separation_m)
-            here &= _turned_alike(heading, query, ends[index])
-            head[here] = index
-            left &= ~here
-    return head
 
 
 def _modes(
@@ -211,12 +185,82 @@ def _modes(
     query: Query,
     separation_m: float,
 ) -> Int[np.ndarray, "m"]:
-    """The first candidate that is near each pair and turned alike; -1 where there is none."""
+    """Return the first candidate near each pair and at about its heading; -1 for none."""
     mode = np.full(len(position), -1)
     for index, start in reversed(list(enumerate(starts))):
         near = np.linalg.norm(position - start.position_m, axis=1) < separation_m
         mode[near & _turned_alike(heading, query, start)] = index
     return mode
+
+
+def _merged(ends: Sequence[Candidate], query: Query, separation_m: float) -> Int[np.ndarray, "r"]:
+    """Return for each refined candidate the best one that ended at its place and heading, which can be itself."""
+    head = np.arange(len(ends))
+    position = np.stack([end.position_m for end in ends])
+    heading = np.array([query.roll[end.hypothesis] + end.frame_heading for end in ends])
+    left = np.ones(len(ends), bool)
+    for index in ranking(np.array([end.total_cost for end in ends]), position, heading):
+        if left[index]:
+            same = left & (np.linalg.norm(position - position[index], axis=1) < separation_m)
+            same &= _turned_alike(heading, query, ends[index])
+            head[same] = index
+            left &= ~same
+    return head
+
+
+def _width_corrections(
+    log_weight: Float[np.ndarray, "m"],
+    mode: Int[np.ndarray, "m"],
+    depth: Float[np.ndarray, "r"],
+    temperature: float,
+) -> Float[np.ndarray, "m"]:
+    """Return log factors that make refined modes as wide as the deepest, of ties as the widest.
+
+    The number of poses that fit a mode well depends on the position of the grid's lattice, and differs between copies of
+    one room.
+
+    Args:
+        log_weight: (m,) log weight of each pair.
+        mode: (m,) refined candidate of each pair, -1 for none.
+        depth: (r,) cost of each refined candidate.
+        temperature: T.
+    """
+    correction, members = np.zeros(len(log_weight)), [mode == index for index in range(len(depth))]
+    width = {
+        index: np.logaddexp.reduce(log_weight[member]) + temperature * depth[index]
+        for index, member in enumerate(members)
+        if member.any()
+    }
+    if width:
+        deepest = min(depth[index] for index in width)
+        target = max(width[index] for index in width if depth[index] < deepest + TIED)
+        for index in width:
+            correction[members[index]] = target - width[index]
+    return correction
+
+
+def _ties_at_their_ends(
+    position: Float[np.ndarray, "m 2"],
+    heading: Float[np.ndarray, "m"],
+    mode: Int[np.ndarray, "m"],
+    ends: Sequence[Candidate],
+    query: Query,
+) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m"]]:
+    """Return positions and headings, those of modes that tie for the best replaced by those of the mode's end.
+
+    Modes have the width of the grid's steps, and those of a small square room overlap: the probability within 1 m of the
+    answer would include parts of the others, and depend on which of the equals is first.
+    """
+    found = np.unique(mode[mode >= 0])
+    cost = np.array([ends[index].total_cost for index in found])
+    tied = found[cost < cost.min(initial=np.inf) + TIED]
+    if len(tied) < 2:
+        return position, heading
+    position, heading = position.copy(), heading.copy()
+    for index in tied:
+        position[mode == index] = ends[index].position_m
+        heading[mode == index] = query.roll[ends[index].hypothesis] + ends[index].frame_heading
+    return position, heading
 
 
 def _turned_alike(heading: Float[np.ndarray, "m"], query: Query, candidate: Candidate) -> Bool[np.ndarray, "m"]:
@@ -233,18 +277,26 @@ def posterior_from_weights(
     heading: Float[np.ndarray, "m"],
     weight: Float[np.ndarray, "m"],
     poses: int,
+    counted: tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m"]] | None = None,
 ) -> Posterior:
-    """What weights of places, which sum to one, say of candidates.
+    """Return the posterior of weighted places.
 
     Args:
-        pose: (m,) the grid pose of each weight, of so many poses.
-        heading: (m,) of the panorama, radians.
+        query: the encoded panorama.
+        candidates: the candidates whose probability is wanted, the answer first.
+        pose: (m,) number of each place's grid pose.
+        position: (m, 2) the places (m).
+        heading: (m,) heading of the panorama (radians).
+        weight: (m,) probabilities; the sum is one.
+        poses: number of grid poses.
+        counted: positions and headings by which candidates count the places, if other than `position` and `heading`.
     """
-    near = np.linalg.norm(position - candidates[0].position_m, axis=1) < RIGHT_WITHIN_M
+    counted_position, counted_heading = (position, heading) if counted is None else counted
+    near = np.linalg.norm(counted_position - candidates[0].position_m, axis=1) < RIGHT_WITHIN_M
     return Posterior(
         pose=np.bincount(pose, weight, minlength=poses),
         position=min(float(weight[near].sum()), 1.0),
-        candidate=_shares(position, heading, weight, query, candidates),
+        candidate=_shares(counted_position, counted_heading, weight, query, candidates),
         heading=_heading_share(heading, weight, query, candidates),
         support=Support(pose, position, weight),
     )
@@ -270,6 +322,6 @@ def _heading_share(
     heading: Float[np.ndarray, "m"], weight: Float[np.ndarray, "m"], query: Query, candidates: Sequence[Candidate]
 ) -> float:
     answer = query.roll[candidates[0].hypothesis] + candidates[0].frame_heading
-    # Hypotheses are sectors: one stands for the headings up to half a sector from it.
+    # A hypothesis stands for the headings up to half a sector from it.
     half = 0.5 * query.sector
     return float(weight[np.abs(wrap_angle(heading - answer)) <= HEADING_WITHIN + half].sum())

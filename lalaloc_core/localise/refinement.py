@@ -1,4 +1,4 @@
-"""What goes to the optimiser, and what comes back: candidates with all the evidence weighed at their new poses."""
+"""Pose refinement from the search's side: jobs for the refiner, and candidates from its results."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ def refinement_job(
     candidates: list[Candidate],
     camera_height_m: float,
     weights: MatchingWeights,
-    evidence: MatchingConfig,
+    matching: MatchingConfig,
 ) -> RefinementJob:
-    """What the optimiser needs to refine these candidates, each within its own room.
+    """Return the job that refines candidates, each within its own room.
 
-    It moves poses by their walls alone. An azimuth at which one rather looks through an opening counts as little as it
-    is probable that one sees the wall there.
+    The refiner moves poses by their walls alone. An azimuth with a view through an opening counts by the probability
+    that the prediction is of the pose's own wall.
     """
     rooms = np.array([candidate.room_index for candidate in candidates])
     hypotheses = np.array([candidate.hypothesis for candidate in candidates])
@@ -41,24 +41,24 @@ def refinement_job(
         camera_height_m=np.full(len(rooms), camera_height_m),
         ceiling_height_m=plan.ceiling_heights_m[rooms],
         optimise_heading=not query.heading_known,
-        latent_weight=evidence.latent_weight,
+        latent_weight=matching.latent_weight,
     )
-    if not evidence.compares_profiles(query):
+    if not matching.compares_profiles(query):
         return job
     assert query.profile is not None
     offsets, height = np.array([candidate.height_offset for candidate in candidates]), query.camera_height
     columns = query.profile.log_m.shape[1]
     layouts = layouts_at(plan, PoseSet(job.position_m, rooms), job.heading, columns)
-    compared = MatchingCost(plan, query, evidence.fine_reach_m, weights, evidence)
-    shut = [compared.shut_share(layouts, k, one.hypothesis, one.height_offset) for k, one in enumerate(candidates)]
-    # The optimiser sums over azimuths what the evidence averages, so the prior is as much stiffer.
+    matching_cost = MatchingCost(plan, query, matching.fine_reach_m, weights, matching)
+    wall_shares = matching_cost.wall_shares(layouts, hypotheses, offsets)
+    # The refiner sums over azimuths what the matching cost averages, so the height's prior is stiffer by the same factor.
     stiffness = 0.0
     if not (height.is_exact or height.is_unknown):
         stiffness = math.sqrt(0.5 * columns / weights.temperature) / height.log_std
     return replace(
         job,
         log_profile=query.profile.log_m[hypotheses],
-        precision=precisions(query, evidence.fine_reach_m, evidence)[hypotheses] * np.sqrt(np.stack(shut)),
+        precision=precisions(query, matching.fine_reach_m, matching)[hypotheses] * np.sqrt(wall_shares),
         height_offset=None if height.is_exact else offsets,
         height_stiffness=stiffness,
         height_bounds=height.bounds,
@@ -71,31 +71,31 @@ def refined(
     query: Query,
     starts: list[Candidate],
     result: RefinementResult,
-    evidence: MatchingConfig,
+    matching: MatchingConfig,
     hints: Hints = NO_HINTS,
 ) -> list[Candidate]:
-    """Candidates where the optimiser took them, with what all the evidence says of them there.
+    """Return candidates at their refined poses, with every term of the matching cost there.
 
-    One that left what strict hints allow stays where it was.
+    A candidate that left the region of strict hints stays at its start.
     """
-    temperature = encoders.manifest.evidence.temperature
+    weights = encoders.manifest.evidence
     rooms = np.array([start.room_index for start in starts])
     result, left = _kept_inside(starts, result, ~np.isfinite(hints.penalty(plan, result.position_m, rooms)))
-    against = hints.penalty(plan, result.position_m, rooms) / temperature
+    hint_cost = hints.penalty(plan, result.position_m, rooms) / weights.temperature
     offsets = result.height_offset
     offsets = np.array([start.height_offset for start in starts]) if offsets is None else offsets
     distance = result.latent_distance
     if distance is None:
         distance = np.array([start.latent_distance for start in starts])
     cost, terms = result.cost, [{} for _ in starts]
-    if evidence.compares_profiles(query):
+    if matching.compares_profiles(query):
         hypotheses = np.array([start.hypothesis for start in starts])
-        columns, weights = encoders.manifest.profile_columns, encoders.manifest.evidence
+        columns = encoders.manifest.profile_columns
         layouts = layouts_at(plan, PoseSet(result.position_m, rooms), result.heading, columns)
-        found = MatchingCost(plan, query, evidence.fine_reach_m, weights, evidence).terms(layouts, hypotheses, offsets)
+        found = MatchingCost(plan, query, matching.fine_reach_m, weights, matching).terms(layouts, hypotheses, offsets)
         cost = found.total(weights)
-        if evidence.latent_weight:
-            cost = cost + evidence.latent_weight * distance
+        if matching.latent_weight:
+            cost = cost + matching.latent_weight * distance
         terms = [{name: float(values[k]) for name, values in found._asdict().items()} for k in range(len(starts))]
     return [
         replace(
@@ -106,7 +106,7 @@ def refined(
             cost=float(cost[k]),
             latent_distance=float(distance[k]),
             height_offset=float(offsets[k]),
-            hint_cost=float(against[k]),
+            hint_cost=float(hint_cost[k]),
             terms=terms[k],
             information=None if left[k] else result.information[k],
         )
@@ -115,38 +115,42 @@ def refined(
 
 
 def _kept_inside(
-    starts: list[Candidate], result: RefinementResult, left: Bool[np.ndarray, "k"]
+    starts: list[Candidate], result: RefinementResult, excluded: Bool[np.ndarray, "k"]
 ) -> tuple[RefinementResult, Bool[np.ndarray, "k"]]:
-    """The result with those that have left what is allowed where they began, and which these are."""
-    if not left.any():
-        return result, left
-    began = np.stack([start.position_m for start in starts])
+    """Return the result with excluded poses put back to their starts, and `excluded`."""
+    if not excluded.any():
+        return result, excluded
+    begun = np.stack([start.position_m for start in starts])
     heading = np.array([start.frame_heading for start in starts])
     cost = np.array([start.cost for start in starts])
     distance, offset = result.latent_distance, result.height_offset
     if distance is not None:
-        distance = np.where(left, [start.latent_distance for start in starts], distance)
+        distance = np.where(excluded, [start.latent_distance for start in starts], distance)
     if offset is not None:
-        offset = np.where(left, [start.height_offset for start in starts], offset)
+        offset = np.where(excluded, [start.height_offset for start in starts], offset)
     kept = replace(
         result,
-        position_m=np.where(left[:, None], began, result.position_m),
-        heading=np.where(left, heading, result.heading),
-        cost=np.where(left, cost, result.cost),
+        position_m=np.where(excluded[:, None], begun, result.position_m),
+        heading=np.where(excluded, heading, result.heading),
+        cost=np.where(excluded, cost, result.cost),
         latent_distance=distance,
         height_offset=offset,
     )
-    return kept, left
+    return kept, excluded
 
 
 def with_latents(
     plan: FloorPlan, encoders: Encoders, query: Query, candidates: list[Candidate], camera_height_m: float
 ) -> list[Candidate]:
-    """Candidates with the latent distances of where they are now, for those that nobody knows them of.
+    """Return candidates with the latent distances at their poses.
 
-    These are those that were moved by their walls alone, and those of a grid without latents.
+    Distances are computed for candidates that were moved by their walls alone, or come from a grid without latents.
     """
-    moved = [k for k, one in enumerate(candidates) if one.information is not None or math.isnan(one.latent_distance)]
+    moved = [
+        k
+        for k, candidate in enumerate(candidates)
+        if candidate.information is not None or math.isnan(candidate.latent_distance)
+    ]
     if not moved:
         return candidates
     poses = PoseSet(
@@ -156,7 +160,7 @@ def with_latents(
     latents, _ = encoders.poses(plan, poses, heading, camera_height_m)
     targets = query.latents[[candidates[k].hypothesis for k in moved]]
     distance = np.linalg.norm(latents - targets, axis=1)
-    told = list(candidates)
+    completed = list(candidates)
     for row, k in enumerate(moved):
-        told[k] = replace(candidates[k], latent_distance=float(distance[row]))
-    return told
+        completed[k] = replace(candidates[k], latent_distance=float(distance[row]))
+    return completed

@@ -1,4 +1,4 @@
-"""Coarse retrieval: the poses of the plan's grid that fit a query best (paper, section 4.1)."""
+"""Retrieval: the poses of the plan's grid that fit a query best (paper, section 4.1)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.errors import InvalidHintError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.bundle import MatchingWeights
@@ -18,28 +17,28 @@ from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.hints import NO_HINTS, HintName, Hints
 from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost, latent_distances
 from lalaloc_core.localise.poses import Candidate, PoseGrid, Query, grid_candidate
-from lalaloc_core.localise.posterior import HEADING_SEPARATION, NEGLIGIBLE, GridCosts
+from lalaloc_core.localise.posterior import NEGLIGIBLE, GridCosts
+from lalaloc_core.localise.ranking import suppress
 from lalaloc_core.render.sampling import PoseSet, pose_grid
 
-# Pairs of a pose and a hypothesis that are compared in full: so many, and up to so many of those that may be probable.
+# Limits of the number of pairs of a pose and a hypothesis that are compared in full.
 _MIN_COMPARED, _MAX_COMPARED = 1024, 4096
-# Where there are no more than that, all of them, as in a single room.
+# Up to this number of pairs, as in a single room, all are compared in full.
 _ALL_COMPARED = 2560
-# Of so many the cost is estimated by the first look, as they share what is probable.
+# Maximum number of pairs whose cost the coarse pass estimates.
 _ESTIMATED = 65_536
-# What refinement gains and the first look errs at most: pairs that cost so much more than what is negligible weigh
-# nothing.
+# Largest gain of refinement plus error of the coarse pass, in units of the cost.
 _MARGIN = 0.35
-# The last so many of those compared in full tell how the first look errs about those that were not.
+# The last of the pairs compared in full, which calibrate the coarse pass for those that were not.
 _CALIBRATING = 256
-# The best pairs, which are looked at for distinct candidates; more if they hold too few.
+# Best pairs that are searched for distinct candidates at first.
 _FIRST_RANKED = 1024
 
 
 def build_grid(
     plan: FloorPlan, encoders: Encoders, *, step_m: float, camera_height_m: float, latents: bool = True
 ) -> PoseGrid:
-    """Sample the plan's pose grid, render every layout and, with `latents`, embed it: dear, and often not needed."""
+    """Return the plan's pose grid with every layout rendered and, with `latents`, encoded, which is slow."""
     poses = pose_grid(plan, step_m)
     if not latents:
         return PoseGrid.without_latents(poses, encoders.rendered(plan, poses), step_m, camera_height_m)
@@ -55,123 +54,124 @@ def grid_costs(
     config: MatchingConfig,
     hints: Hints = NO_HINTS,
 ) -> GridCosts:
-    """Costs of the pairs of a pose of the grid and a hypothesis that may be the best, or are probable.
+    """Return the costs of the best and all probable pairs of a grid pose and a hypothesis.
 
-    All pairs get a first look (`coarse_pass.py`), and those that are the best by that are compared in full.
+    The coarse pass (`coarse_pass.py`) compares all pairs; its best are compared in full.
 
     Raises:
-        InvalidHintError: no pose of the grid is left.
-        InvalidInputError: latents are compared, and the grid was made without.
+        InvalidHintError: strict hints exclude every pose of the grid.
+        InvalidInputError: latents are compared, and the grid has none.
     """
-    against = _hint_costs(plan, grid, weights, hints)
+    hint_cost = _hint_cost(plan, grid, weights, hints)
     if not config.compares_profiles(query):
         distance = latent_distances(grid.known_latents, query.latents)
-        return GridCosts.of_all(grid.poses, distance, np.zeros_like(distance), against)
-    evidence = MatchingCost(plan, query, config.grid_reach * grid.step_m, weights, config)
-    doubted = _hint_costs(plan, grid, weights, hints.doubted) if hints.strict else None
-    chosen = _chosen(plan, grid, evidence, weights.temperature, against, doubted)
+        return GridCosts.of_all(grid.poses, distance, np.zeros_like(distance), hint_cost)
+    matching_cost = MatchingCost(plan, query, config.grid_reach * grid.step_m, weights, config)
+    relaxed = _hint_cost(plan, grid, weights, hints.relaxed) if hints.strict else None
+    chosen = _choose(plan, grid, matching_cost, weights.temperature, hint_cost, relaxed)
     pose, hypothesis = np.divmod(chosen.pair, len(query.roll))
-    cost, offset = evidence.pairs(grid.layouts(plan), pose[: chosen.compared], hypothesis[: chosen.compared])
+    cost, offset = matching_cost.pairs(grid.layouts(plan), pose[: chosen.compared], hypothesis[: chosen.compared])
     if config.latent_weight:
         latents, targets = grid.known_latents[pose[: len(cost)]], query.latents[hypothesis[: len(cost)]]
         cost += config.latent_weight * np.linalg.norm(latents - targets, axis=1)
-    estimated = np.maximum(chosen.estimate + chosen.error(cost, weights.temperature), cost.min())
-    cost, offset = np.append(cost, estimated), np.append(offset, np.zeros(len(estimated)))
+    estimate = np.maximum(chosen.estimate + chosen.error(cost, weights.temperature), cost.min())
     return GridCosts(
         poses=grid.poses,
         pose=pose,
         hypothesis=hypothesis,
-        cost=cost,
-        offset=offset,
-        hint_cost=None if against is None else against[pose],
+        cost=np.append(cost, estimate),
+        offset=np.append(offset, np.zeros(len(estimate))),
+        hint_cost=None if hint_cost is None else hint_cost[pose],
         compared=chosen.compared,
     )
 
 
 class _Chosen(NamedTuple):
-    """What the first look leaves.
+    """Pairs that the coarse pass leaves.
 
     Attributes:
-        pair: pose times the number of hypotheses, plus hypothesis: those to be compared in full, then the others.
-        compared: how many are to be compared in full.
-        seen: what the first ones cost at first look.
-        estimate: what the others cost at first look.
+        pair: pose times the number of hypotheses, plus hypothesis: the pairs to compare in full, then the others.
+        compared: number of pairs to compare in full.
+        coarse: coarse costs of the first of these.
+        estimate: coarse costs of the others.
     """
 
     pair: Int[np.ndarray, "m"]
     compared: int
-    seen: Float[np.ndarray, "c"]
+    coarse: Float[np.ndarray, "c"]
     estimate: Float[np.ndarray, "e"]
 
     def error(self, cost: Float[np.ndarray, "c"], temperature: float) -> float:
-        """What the first look is to be corrected by, so that what pairs weigh together is right.
+        """Return the correction of the estimates that makes their total probability right.
 
-        Those that were only just compared in full are most like those that were not.
+        The last pairs compared in full are the most similar to the estimated ones.
         """
         if not len(self.estimate):
             return 0.0
-        last = slice(max(len(self.seen) - _CALIBRATING, 0), len(self.seen))
-        weight = -temperature * (cost[: len(self.seen)][last] - self.seen[last]).astype(np.float64)
+        last = slice(max(len(self.coarse) - _CALIBRATING, 0), len(self.coarse))
+        weight = -temperature * (cost[: len(self.coarse)][last] - self.coarse[last]).astype(np.float64)
         return float(np.log(len(weight)) - np.logaddexp.reduce(weight)) / temperature
 
 
-def _chosen(
+def _choose(
     plan: FloorPlan,
     grid: PoseGrid,
-    evidence: MatchingCost,
+    matching_cost: MatchingCost,
     temperature: float,
-    against: Float[np.ndarray, "n"] | None,
-    doubted: Float[np.ndarray, "n"] | None,
+    hint_cost: Float[np.ndarray, "n"] | None,
+    relaxed: Float[np.ndarray, "n"] | None,
 ) -> _Chosen:
-    """The pairs that are worth more than a first look.
+    """Choose the pairs to compare in full and to estimate.
 
     Args:
-        against: what hints have against every pose.
-        doubted: the same if they were no fences, where they are: what would be the best then is compared as well.
+        plan: the plan.
+        grid: its pose grid.
+        matching_cost: of the plan and the query.
+        temperature: T.
+        hint_cost: (n,) cost of the hints at every pose.
+        relaxed: (n,) the same if strict hints were not; the best pairs by that are compared as well.
     """
-    pairs, nothing = len(grid.poses) * evidence.hypotheses, np.empty(0, np.float32)
+    pairs, nothing = len(grid.poses) * matching_cost.hypotheses, np.empty(0, np.float32)
     if pairs <= _ALL_COMPARED:
         return _Chosen(np.arange(pairs), pairs, nothing, nothing)
     window = _MARGIN + NEGLIGIBLE / temperature
     binned, room_index = grid.binned(plan), grid.poses.room_index
-    wanted = PairLimits(at_most=_ESTIMATED, at_least=_MIN_COMPARED, window=window)
-    total, pair = likeliest(binned, evidence, room_index, wanted, against)
+    limits = PairLimits(at_most=_ESTIMATED, at_least=_MIN_COMPARED, window=window)
+    total, pair = likeliest(binned, matching_cost, room_index, limits, hint_cost)
     probable = int(np.searchsorted(total, total[0] + window))
     compared = min(max(probable, _MIN_COMPARED), _MAX_COMPARED, len(pair))
-    cost = total if against is None else total - against[pair // evidence.hypotheses]
-    seen, estimate = cost[:compared], cost[compared:probable]
+    cost = total if hint_cost is None else total - hint_cost[pair // matching_cost.hypotheses]
     first, others = pair[:compared], pair[compared:probable]
-    if doubted is not None:
-        wanted = PairLimits(at_most=_MIN_COMPARED, at_least=_MIN_COMPARED)
-        beyond = likeliest(binned, evidence, room_index, wanted, doubted)[1]
-        first = np.append(first, np.setdiff1d(beyond, pair[:probable]))
-    return _Chosen(np.append(first, others), len(first), seen, estimate)
+    if relaxed is not None:
+        limits = PairLimits(at_most=_MIN_COMPARED, at_least=_MIN_COMPARED)
+        excluded = likeliest(binned, matching_cost, room_index, limits, relaxed)[1]
+        first = np.append(first, np.setdiff1d(excluded, pair[:probable]))
+    return _Chosen(np.append(first, others), len(first), cost[:compared], cost[compared:probable])
 
 
 def missed_hints(plan: FloorPlan, costs: GridCosts, weights: MatchingWeights, hints: Hints) -> tuple[HintName, ...]:
-    """The hints that would not hold where the picture fits best, if they were no fences."""
-    doubted = _penalties(plan, costs.poses, weights, hints.doubted)[costs.pose]
-    pose = costs.pose[int((costs.cost + doubted)[: costs.compared].argmin())]
+    """Return the hints that would not hold at the best place if they were not strict."""
+    relaxed = _penalties(plan, costs.poses, weights, hints.relaxed)[costs.pose]
+    pose = costs.pose[int((costs.cost + relaxed)[: costs.compared].argmin())]
     return hints.missed(costs.poses.position_m[pose], int(costs.poses.room_index[pose]))
 
 
 def _penalties(plan: FloorPlan, poses: PoseSet, weights: MatchingWeights, hints: Hints) -> Float[np.ndarray, "n"]:
-    """What hints have against poses, in units of the cost."""
+    """Return the cost of the hints at poses."""
     return hints.penalty(plan, poses.position_m, poses.room_index) / weights.temperature
 
 
-def _hint_costs(
+def _hint_cost(
     plan: FloorPlan, grid: PoseGrid, weights: MatchingWeights, hints: Hints
 ) -> Float[np.ndarray, "n"] | None:
     if hints.are_none:
         return None
-    against = _penalties(plan, grid.poses, weights, hints)
-    if np.isfinite(against).any():
-        return against
+    cost = _penalties(plan, grid.poses, weights, hints)
+    if np.isfinite(cost).any():
+        return cost
     raise InvalidHintError(
         "strict",
-        f"none of the {len(against)} places that are compared, {grid.step_m:g} m apart, is where all hints hold: "
-        "allow for more, or leave strict out",
+        f"none of the {len(cost)} grid poses, {grid.step_m:g} m apart, meets all hints: widen the hints or omit strict",
     )
 
 
@@ -185,10 +185,16 @@ def retrieve(
     margin: float = 0.0,
     limit: int = 0,
 ) -> list[Candidate]:
-    """The `top_k` best grid poses, best first, no two closer than `separation_m` and turned alike.
+    """Return the `top_k` best grid poses, best first, no two closer than `separation_m` at about one heading.
 
     Args:
-        margin, limit: up to `limit` of them where they cost less than this more than the best.
+        costs: costs of the grid's pairs.
+        grid: the pose grid.
+        query: the encoded panorama.
+        top_k: number of candidates.
+        separation_m: smallest distance (m) between candidates at one heading.
+        margin: up to `limit` candidates are returned if they cost less than this more than the best.
+        limit: see `margin`.
     """
     total = costs.total[: costs.compared]
     ranked, ranks = np.argsort(total, kind="stable"), max(_FIRST_RANKED, top_k)
@@ -207,7 +213,7 @@ def retrieve(
         )
         if len(kept) >= top_k or ranks >= len(ranked):
             break
-        # On a fine grid the best pairs may all be of a few places.
+        # On a fine grid the best pairs can all be of a few places.
         ranks *= 4
     return [_candidate(costs, query, grid, int(pair[index])) for index in kept]
 
@@ -227,53 +233,22 @@ def _candidate(costs: GridCosts, query: Query, grid: PoseGrid, pair: int) -> Can
 def contradicted(
     plan: FloorPlan, grid: PoseGrid, query: Query, weights: MatchingWeights, config: MatchingConfig
 ) -> bool:
-    """Whether the picture fits another heading so much better that the one that was said must be wrong.
+    """Return whether the picture fits another heading so much better that the given one must be wrong.
 
-    It is wrong with the probability `heading_doubt`, and then may be any of those that can be searched.
+    A given heading is wrong with the probability `heading_doubt`; then every heading that is searched is as likely.
     """
     searched = query.searched
     if searched is None or not config.compares_profiles(query) or not config.heading_doubt:
         return False
     doubt = np.log((1.0 - config.heading_doubt) / config.heading_doubt * len(searched.roll)) / weights.temperature
-    said = grid_costs(plan, grid, query, weights, config)
-    best = int(said.cost[: said.compared].argmin())
-    if said.cost[best] <= doubt:
-        # Nothing costs less than nothing.
+    given = grid_costs(plan, grid, query, weights, config)
+    best = int(given.cost[: given.compared].argmin())
+    if given.cost[best] <= doubt:
+        # Costs are non-negative, so no heading is better by more.
         return False
-    # The height that is best at the heading that was said is good enough for a doubt.
-    offset = float(said.offset[best])
+    # One camera height, the best at the given heading, is accurate enough to compare headings.
+    offset = float(given.offset[best])
     height_m = query.camera_height.height_m * float(np.exp(offset))
     exact = replace(searched.scaled(offset), camera_height=CameraHeight(height_m, 0.0))
     any_heading = grid_costs(plan, grid, exact, weights, config)
-    return bool(said.cost[best] - any_heading.cost[: any_heading.compared].min() > doubt)
-
-
-def suppress(
-    position_m: Float[np.ndarray, "n 2"],
-    cost: Float[np.ndarray, "n"],
-    *,
-    separation_m: float,
-    limit: int,
-    heading: Float[np.ndarray, "n"] | None = None,
-    ceiling: float = -np.inf,
-    limit_below: int = 0,
-) -> list[int]:
-    """Non-maximum suppression: indices by rising cost, skipping what lies within `separation_m` of a kept one.
-
-    Args:
-        heading: radians; with it, poses at one place are kept if they are turned against each other.
-        ceiling, limit_below: as many as `limit_below` are kept of those that cost less than the ceiling.
-    """
-    remaining: Int[np.ndarray, "m"] = np.argsort(cost, kind="stable")
-    kept: list[int] = []
-    while len(remaining) and len(kept) < max(limit, limit_below):
-        index = int(remaining[0])
-        if len(kept) >= limit and not cost[index] < ceiling:
-            break
-        kept.append(index)
-        apart = np.linalg.norm(position_m[remaining] - position_m[index], axis=1) >= separation_m
-        if heading is not None:
-            apart |= np.abs(wrap_angle(heading[remaining] - heading[index])) > HEADING_SEPARATION
-            apart[0] = False
-        remaining = remaining[apart]
-    return kept
+    return bool(given.cost[best] - any_heading.cost[: any_heading.compared].min() > doubt)

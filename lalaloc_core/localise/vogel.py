@@ -1,4 +1,4 @@
-"""Vogel disc re-sampling (VDR): denser poses around a candidate, again by retrieval (paper, sections 4.2 and A.2)."""
+"""Vogel disc re-sampling (VDR): compare denser poses around a candidate (paper, sections 4.2 and A.2)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _GOLDEN_RATIO = (1.0 + math.sqrt(5.0)) / 2.0
 
 
 def vogel_disc(samples: int) -> Float[np.ndarray, "samples 2"]:
-    """Nearly even points on the unit disc: `r_i = sqrt(i / N)`, `θ_i = i 2π (1 - 1/φ)`.
+    """Return nearly even points on the unit disc: `r_i = sqrt(i / N)`, `θ_i = i 2π (1 - 1/φ)`.
 
     The paper's appendix prints the angle without its index i, which would put all points on one ray.
     """
@@ -34,7 +34,7 @@ def vogel_disc(samples: int) -> Float[np.ndarray, "samples 2"]:
 def disc_poses(
     plan: FloorPlan, centre_m: Float[np.ndarray, "2"], *, samples: int, radius_m: float
 ) -> tuple[PoseSet, Int[np.ndarray, "k"]]:
-    """The poses of a Vogel disc around a place that lie in some room, and their numbers on the disc."""
+    """Return the poses of a Vogel disc around a place that lie in rooms, and their numbers on the disc."""
     position = centre_m + radius_m * vogel_disc(samples)
     room_index = plan.room_index_at(position)
     kept = np.flatnonzero(room_index >= 0)
@@ -50,43 +50,44 @@ def resample(
     camera_height_m: float,
     samples: int,
     radius_m: float,
-    evidence: MatchingConfig | None = None,
+    matching: MatchingConfig | None = None,
     hints: Hints = NO_HINTS,
 ) -> Candidate:
-    """The best pose of a Vogel disc around `candidate`, clipped to the rooms; the candidate itself if none is better.
+    """Return the best pose of a Vogel disc around a candidate; the candidate itself if none is better.
 
-    With an unknown heading the samples also cover the sector of headings that the hypothesis stands for.
+    If the heading is searched, the samples also cover the sector of headings of the candidate's hypothesis.
     """
-    evidence = evidence or MatchingConfig()
+    matching = matching or MatchingConfig()
     disc, number = disc_poses(plan, candidate.position_m, samples=samples, radius_m=radius_m)
-    # The candidate first, so that of equals it is kept.
+    # The candidate comes first, so that it is kept if others cost the same.
     poses = PoseSet(
         np.concatenate([candidate.position_m[None], disc.position_m]),
         np.concatenate([[candidate.room_index], disc.room_index]),
     )
     heading = np.full(len(poses), candidate.frame_heading)
     if not query.heading_known:
-        # A second low-discrepancy sequence, so that headings and positions are covered together.
+        # A second low-discrepancy sequence covers headings and positions together.
         sequence = (number * (math.sqrt(2.0) - 1.0)) % 1.0
         heading[1:] += (sequence - 0.5) * query.sector
     latents: Float[np.ndarray, "n d"] | None = None
     target = query.latents[candidate.hypothesis][None]
-    if not evidence.compares_profiles(query) or evidence.latent_weight:
+    by_walls = matching.compares_profiles(query)
+    if not by_walls or matching.latent_weight:
         latents, _ = encoders.poses(plan, poses, heading, camera_height_m)
     offset = np.full(len(poses), candidate.height_offset)
     cost = np.zeros(len(poses)) if latents is None else latent_distances(latents, target)[0]
-    if evidence.compares_profiles(query):
+    if by_walls:
         layouts = layouts_at(plan, poses, heading, encoders.manifest.profile_columns)
-        compared = MatchingCost(plan, query, evidence.fine_reach_m, encoders.manifest.evidence, evidence)
-        of_layouts, offsets = compared.costs(layouts, np.array([candidate.hypothesis]))
-        cost, offset = of_layouts[0] + evidence.latent_weight * cost, offsets[0]
-    against = np.zeros(len(poses))
+        matching_cost = MatchingCost(plan, query, matching.fine_reach_m, encoders.manifest.evidence, matching)
+        layout_cost, offsets = matching_cost.costs(layouts, np.array([candidate.hypothesis]))
+        cost, offset = layout_cost[0] + matching.latent_weight * cost, offsets[0]
+    hint_cost = np.zeros(len(poses))
     if not hints.are_none:
-        against = hints.penalty(plan, poses.position_m, poses.room_index) / encoders.manifest.evidence.temperature
-    index = int((cost + against).argmin())
+        hint_cost = hints.penalty(plan, poses.position_m, poses.room_index) / encoders.manifest.evidence.temperature
+    index = int((cost + hint_cost).argmin())
     chosen = PoseSet(poses.position_m[[index]], poses.room_index[[index]])
     if latents is None:
-        # Dear, and here only told.
+        # The latent of one pose is cheap, and is reported with the answer.
         latents, _ = encoders.poses(plan, chosen, heading[[index]], camera_height_m)
     else:
         latents = latents[[index]]
@@ -99,5 +100,5 @@ def resample(
         cost=float(cost[index]),
         latent_distance=float(latent_distances(latents, target)[0, 0]),
         height_offset=float(offset[index]),
-        hint_cost=float(against[index]),
+        hint_cost=float(hint_cost[index]),
     )

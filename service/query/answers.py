@@ -11,10 +11,11 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.floorplan.earth import Anchor
 from lalaloc_core.localise.bundle import Bundle, ConfidenceModel
 from lalaloc_core.localise.covariance import pose_uncertainty
-from lalaloc_core.localise.pipeline import Localisation, panorama_heading
+from lalaloc_core.localise.pipeline import Localisation
 from lalaloc_core.localise.poses import Candidate, PoseGrid, Query
 from lalaloc_core.localise.posterior import Posterior
 from lalaloc_core.localise.probability_map import probability_map
+from lalaloc_core.localise.ranking import panorama_heading
 from lalaloc_core.localise.sequence import Motion
 from lalaloc_core.localise.sequence.search import SequenceLocalisation
 from lalaloc_core.localise.stated_camera import KnownHeading
@@ -92,11 +93,10 @@ def compose_answer(
     if model is not None and answer.information is not None:
         placed = locate(answer)
         spread = pose_uncertainty(answer.information, placed.plan.rooms[placed.candidate.room_index], model)
-    fits = None if model is None else found.fit_probability(model)
-    fits = None if fits is None else fits * share
+    confidence = found.confidence(model, share)
     candidates = [
-        _candidate(locate(candidate), found.query, None if fits is None else fits * probability)
-        for candidate, probability in zip(found.candidates, found.posterior.candidate, strict=True)
+        _candidate(locate(candidate), found.query, None if confidence is None else confidence.candidates[index])
+        for index, candidate in enumerate(found.candidates)
     ]
     best, place = candidates[0], locate(found.candidates[0])
     return LocaliseAnswer(
@@ -108,8 +108,8 @@ def compose_answer(
         heading_source="searched" if found.heading_contradicted else known.source,
         room=best.room,
         room_id=best.room_id,
-        confidence=None if fits is None else fits * found.posterior.position,
-        heading_confidence=None if fits is None else fits * min(found.posterior.heading, 1.0),
+        confidence=None if confidence is None else confidence.position,
+        heading_confidence=None if confidence is None else confidence.heading,
         warnings=[*heading_warnings(found, known), *warnings],
         covariance_m2=None if spread is None else spread.position_m2.tolist(),
         heading_std_deg=None if spread is None or spread.heading_std is None else math.degrees(spread.heading_std),
@@ -176,8 +176,6 @@ def compose_sequence_answer(
         model: the confidence model; None for a bundle without one.
     """
     first = answers[0]
-    fits = [None if model is None else picture.fit_probability(model) for picture in found.pictures]
-    known = [fit for fit in fits if fit is not None]
     return SequenceAnswer(
         floorplan_id=first.floorplan_id,
         floorplan_revision=first.floorplan_revision,
@@ -185,7 +183,7 @@ def compose_sequence_answer(
             SequencePoseAnswer(**{name: getattr(answer, name) for name in SequencePoseAnswer.model_fields})
             for answer in answers
         ],
-        confidence=min(known) * min(found.path_probability, 1.0) if len(known) == len(fits) else None,
+        confidence=found.confidence(model),
         warnings=[_motion_warning(index, motions[index]) for index in found.motions_contradicted],
         stage=found.stage,
         camera_height_m=found.camera_height_m,

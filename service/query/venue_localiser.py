@@ -282,15 +282,14 @@ class VenueLocaliser:
         self, rows: Sequence[Row[Any]], found: Localisation, share: float, probability: Float[np.ndarray, "m"]
     ) -> list[PlanProbability]:
         """Return the searched plans, most probable first; `share` and `probability` as in `_Searched.shares`."""
-        model = self._bundle.manifest.confidence
-        fits = None if model is None else found.fit_probability(model)
+        confidence = found.confidence(self._bundle.manifest.confidence, share)
         ranked = sorted(zip(probability.tolist(), rows, strict=True), key=lambda entry: -entry[0])
         return [
             PlanProbability(
                 floorplan_id=row.plan_id,
                 level=row.level,
                 name=row.name,
-                probability=None if fits is None else min(fits * share * plan_probability, 1.0),
+                probability=None if confidence is None else min(confidence.fit * plan_probability, 1.0),
             )
             for plan_probability, row in ranked
         ]

@@ -11,7 +11,7 @@ from lalaloc_core.learn.synth.homes.buildings import Building, building_of
 from lalaloc_core.learn.synth.homes.splits import VALIDATION
 from lalaloc_core.localise.bundle import MatchingWeights
 from lalaloc_core.localise.camera_height import CameraHeight
-from lalaloc_core.localise.coarse_pass import LowestCosts, PairLimits, _bounds, _table, first_costs, likeliest
+from lalaloc_core.localise.coarse_pass import LowestCosts, PairLimits, _bounds, _table, coarse_costs, likeliest
 from lalaloc_core.localise.layouts import layouts_at
 from lalaloc_core.localise.matching_cost import MatchingConfig, MatchingCost
 from lalaloc_core.localise.poses import PoseGrid, PredictedOpenings, PredictedProfile, Query, rolled
@@ -137,7 +137,7 @@ def test_the_likeliest_pairs_are_those_of_a_first_look_at_all(
         against = np.where(rng.random(len(grid.poses)) < 0.5, np.inf, 0.1) if hinted else None
         evidence = MatchingCost(building.plan, query, CONFIG.grid_reach * STEP_M, WEIGHTS, CONFIG)
         binned, room_index = grid.binned(building.plan), grid.poses.room_index
-        every = np.concatenate([cost for _, cost in first_costs(binned, evidence, room_index)])
+        every = coarse_costs(binned, evidence, room_index)
         every = every if against is None else every + against[:, None]
         found, place = likeliest(binned, evidence, room_index, wanted, against)
         count = int((every <= every.min() + wanted.window).sum())
@@ -154,9 +154,9 @@ def test_no_pose_costs_less_than_its_bound(building: Building, grid: PoseGrid, q
     for query in queries[:8]:
         evidence = MatchingCost(building.plan, query, CONFIG.grid_reach * STEP_M, WEIGHTS, CONFIG)
         binned, room_index = grid.binned(building.plan), grid.poses.room_index
-        every = np.concatenate([cost for _, cost in first_costs(binned, evidence, room_index)])
+        every = coarse_costs(binned, evidence, room_index)
         table = _table(binned, evidence).reshape(-1, len(evidence.offsets), evidence.hypotheses)
-        bound = _bounds(binned, table) + evidence.by_room().min(axis=0)[room_index]
+        bound = _bounds(binned, table) + evidence.room_costs.min(axis=0)[room_index]
         least = every.min(axis=1)
         assert (bound <= least).all()
         ranks.append((bound < bound[least.argmin()]).mean())

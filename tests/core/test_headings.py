@@ -23,7 +23,8 @@ from lalaloc_core.localise.bundle import Bundle
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.optimise import PoseRefiner
-from lalaloc_core.localise.pipeline import localise, panorama_heading
+from lalaloc_core.localise.pipeline import localise
+from lalaloc_core.localise.ranking import panorama_heading
 from lalaloc_core.localise.retrieval import build_grid
 from lalaloc_core.nets.layout_encoder import RingLayoutEncoder
 from lalaloc_core.nets.ring_image_encoder import RingImageEncoder

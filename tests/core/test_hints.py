@@ -131,7 +131,7 @@ class TestAnswers:
         assert ask(query, wrong).candidates[0].cost == pytest.approx(ask(query).candidates[0].cost, abs=1e-4)
 
     def test_strict_hints_that_leave_no_place_are_an_error(self, ask: Ask, query: Query) -> None:
-        with pytest.raises(InvalidHintError, match=r"none of the \d+ places.*0.5 m apart.*leave strict out"):
+        with pytest.raises(InvalidHintError, match=r"none of the \d+ grid poses, 0.5 m apart.*omit strict"):
             ask(query, Hints(near=Near(5.0, 1.5, 1.05), rooms=frozenset({2}), strict=True))
 
 

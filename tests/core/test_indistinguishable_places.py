@@ -16,8 +16,9 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.optimise import PoseRefiner
-from lalaloc_core.localise.pipeline import Localisation, localise, panorama_heading
+from lalaloc_core.localise.pipeline import Localisation, localise
 from lalaloc_core.localise.poses import PredictedProfile, Query
+from lalaloc_core.localise.ranking import panorama_heading
 from lalaloc_core.localise.retrieval import build_grid
 from lalaloc_core.render.sampling import PoseSet
 from tests.strategies import crooked_flat, plan_of, rectangle

@@ -16,7 +16,7 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.optimise import PoseRefiner
-from lalaloc_core.localise.pipeline import Localisation, LocaliseConfig, Refine, StageClock, localise, panorama_heading
+from lalaloc_core.localise.pipeline import Localisation, LocaliseConfig, Refine, StageClock, localise
 from lalaloc_core.localise.poses import (
     Candidate,
     PoseGrid,
@@ -25,7 +25,7 @@ from lalaloc_core.localise.poses import (
     RefinementJob,
     RefinementResult,
 )
-from lalaloc_core.localise.posterior import HEADING_SEPARATION
+from lalaloc_core.localise.ranking import HEADING_SEPARATION, panorama_heading
 from lalaloc_core.localise.retrieval import build_grid
 from lalaloc_core.render.sampling import PoseSet, random_poses
 from tests.strategies import crooked_flat, plan_of, rectangle, seeds
@@ -258,6 +258,20 @@ class TestStages:
         found = localise(flat, grid, encoders, query, top_k=5, refiner=refiner)
         places = np.stack([candidate.position_m for candidate in found.candidates])
         assert np.linalg.norm(places[1:] - places[0], axis=1).min(initial=9.0) >= 1.0
+
+    def test_posterior_pairs_each_refined_candidate_with_its_mode(
+        self, flat: FloorPlan, grid: PoseGrid, encoders: Encoders
+    ) -> None:
+        def unmoved(job: RefinementJob) -> RefinementResult:
+            return _result(job, position_m=job.position_m, cost=np.linspace(0.1, 0.2, len(job.position_m)))
+
+        config = LocaliseConfig(vdr_candidates=5)
+        for seed in range(5):
+            query = layout_query(encoders, flat, some_pose(flat, seed))
+            support = localise(flat, grid, encoders, query, refiner=unmoved, config=config).posterior.support
+            # Re-sampling moved the modes by at most the radius of the disc, and so their places.
+            moved_m = np.linalg.norm(support.position_m - grid.poses.position_m[support.pose], axis=1)
+            assert moved_m.max() <= config.vdr_radius_steps * grid.step_m
 
     def test_the_clock_counts_a_stage_that_fails(self) -> None:
         clock = StageClock()

@@ -18,7 +18,8 @@ from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.matching_cost import MatchingConfig, latent_distances, precisions
 from lalaloc_core.localise.poses import Candidate, PoseGrid, PredictedProfile, Query
-from lalaloc_core.localise.retrieval import contradicted, grid_costs, retrieve, suppress
+from lalaloc_core.localise.ranking import suppress
+from lalaloc_core.localise.retrieval import contradicted, grid_costs, retrieve
 from lalaloc_core.localise.vogel import resample, vogel_disc
 from lalaloc_core.render.sampling import PoseSet
 from tests.strategies import plan_of, rectangle, seeds

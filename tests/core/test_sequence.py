@@ -15,8 +15,9 @@ from lalaloc_core.errors import InvalidMotionError
 from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.pipeline import localise, panorama_heading
+from lalaloc_core.localise.pipeline import localise
 from lalaloc_core.localise.poses import PoseGrid, PredictedProfile, Query
+from lalaloc_core.localise.ranking import panorama_heading
 from lalaloc_core.localise.retrieval import build_grid
 from lalaloc_core.localise.sequence.chain import best_paths, forward_backward
 from lalaloc_core.localise.sequence.joint import motion_residuals, refine_sequence

@@ -107,7 +107,7 @@ class LaLaLoc:
         }
         # The confidence model is fitted on photographs and the default matching cost.
         calibrated = question.kind == "panorama" and self._config.matching == MatchingConfig()
-        model = self.encoders.manifest.confidence if calibrated else None
+        confidence = found.confidence(self.encoders.manifest.confidence) if calibrated else None
         return Answer(
             stages={stage: found_pose(found.query, candidate) for stage, candidate in found.best.items()},
             candidates=tuple(
@@ -117,8 +117,8 @@ class LaLaLoc:
             retrieved=grid_index(grid, found.best["retrieval"]),
             signals=signals,
             information=found.best[found.stage].information,
-            confidence=None if model is None else found.confidence(model),
-            heading_confidence=None if model is None else found.heading_confidence(model),
+            confidence=None if confidence is None else confidence.position,
+            heading_confidence=None if confidence is None else confidence.heading,
             camera_height_m=found.camera_height_m,
             timings_ms={**clock.timings_ms, **found.timings_ms},
         )

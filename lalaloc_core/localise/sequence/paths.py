@@ -16,7 +16,8 @@ from jaxtyping import Float
 
 from lalaloc_core.conventions import wrap_angle
 from lalaloc_core.localise.poses import Candidate, Query
-from lalaloc_core.localise.posterior import HEADING_SEPARATION, Posterior, posterior_from_weights
+from lalaloc_core.localise.posterior import Posterior, posterior_from_weights
+from lalaloc_core.localise.ranking import HEADING_SEPARATION
 from lalaloc_core.localise.sequence.chain import Marginals, forward_backward
 from lalaloc_core.localise.sequence.motion import States, Transition
 from lalaloc_core.render.sampling import PoseSet

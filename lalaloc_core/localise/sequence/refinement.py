@@ -15,8 +15,9 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.floorplan.geometry import pad_walls
 from lalaloc_core.localise.bundle import MatchingWeights
 from lalaloc_core.localise.encoders import Encoders
-from lalaloc_core.localise.pipeline import LocaliseConfig, panorama_heading
+from lalaloc_core.localise.pipeline import LocaliseConfig
 from lalaloc_core.localise.poses import Candidate, PoseGrid, RefinementJob, RefinementResult
+from lalaloc_core.localise.ranking import panorama_heading
 from lalaloc_core.localise.refinement import refined, refinement_job
 from lalaloc_core.localise.sequence.joint import SequenceJob, SequenceResult, motion_costs
 from lalaloc_core.localise.sequence.motion import FLOOR, Motion, Transition

@@ -13,22 +13,18 @@ from jaxtyping import Float
 
 from lalaloc_core.errors import InvalidMotionError
 from lalaloc_core.floorplan import FloorPlan
-from lalaloc_core.localise.bundle import MatchingWeights
+from lalaloc_core.localise.bundle import ConfidenceModel, MatchingWeights
 from lalaloc_core.localise.camera_height import CameraHeight
 from lalaloc_core.localise.cohort import cost_by_chance
 from lalaloc_core.localise.confidence import Signals, signals_of
 from lalaloc_core.localise.encoders import Encoders
 from lalaloc_core.localise.matching_cost import MatchingCost, latent_distances
-from lalaloc_core.localise.pipeline import (
-    Localisation,
-    LocaliseConfig,
-    StageClock,
-    distinct,
-)
+from lalaloc_core.localise.pipeline import Localisation, LocaliseConfig, StageClock
 from lalaloc_core.localise.poses import Candidate, PoseGrid, Query, grid_candidate
-from lalaloc_core.localise.posterior import HEADING_SEPARATION, Posterior, area_shares
+from lalaloc_core.localise.posterior import Posterior, area_shares
+from lalaloc_core.localise.ranking import HEADING_SEPARATION, distinct, suppress
 from lalaloc_core.localise.refinement import with_latents
-from lalaloc_core.localise.retrieval import contradicted, suppress
+from lalaloc_core.localise.retrieval import contradicted
 from lalaloc_core.localise.sequence.chain import best_paths, forward_backward
 from lalaloc_core.localise.sequence.joint import SequenceJob, SequenceResult
 from lalaloc_core.localise.sequence.motion import FLOOR, Motion, States, Transition, transition
@@ -65,8 +61,14 @@ class SequenceLocalisation:
 
     @property
     def camera_height_m(self) -> float:
-        """The camera height that fits all pictures best."""
+        """Camera height that fits all pictures best."""
         return self.pictures[0].camera_height_m
+
+    def confidence(self, model: ConfidenceModel | None) -> float | None:
+        """Return the probability that all pictures are of the plan and all answers right; None as for one picture."""
+        alone = [picture.confidence(model) for picture in self.pictures]
+        fits = [confidence.fit for confidence in alone if confidence is not None]
+        return min(fits) * min(self.path_probability, 1.0) if len(fits) == len(alone) else None
 
 
 SequenceSteps = Generator[SequenceJob, SequenceResult | None, SequenceLocalisation]

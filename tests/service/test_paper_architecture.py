@@ -1,0 +1,60 @@
+"""A bundle of architecture `paper` is served through all stages: latent grid, retrieval, VDR and LPO on latents."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+
+import httpx
+import pytest
+
+from lalaloc_core.floorplan import FloorPlan
+from lalaloc_core.learn.export.bundle_export import export_bundle
+from lalaloc_core.learn.training.presets import PRESETS
+from lalaloc_core.learn.training.stages import build_image_encoder, build_layout_encoder
+from lalaloc_core.nets.paper_encoders import PaperConfig
+from tests.service.conftest import FLAT, StartApp, localise, upload
+
+# Seconds of LPO on the small networks, even on a busy machine.
+LPO_DEADLINE_S = 60.0
+
+
+@pytest.fixture(scope="module")
+def client(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+    """An app with one LPO worker, on untrained networks of the paper's architecture."""
+    sizes = PaperConfig(
+        width=8, image_depth=18, layout_height=32, profile_columns=64, image_height=64, image_width=128
+    )
+    config = dataclasses.replace(PRESETS["paper"], paper=sizes)
+    folder = tmp_path_factory.mktemp("paper")
+    networks = build_layout_encoder(config), build_image_encoder(config)
+    export_bundle(folder, config, *networks, name="paper", version="test")
+    with start_app(tmp_path_factory.mktemp("data"), bundle=folder, workers=1, lpo_deadline_s=LPO_DEADLINE_S) as started:
+        yield started
+
+
+@pytest.mark.parametrize("heading", [None, 90.0])
+@pytest.mark.parametrize(("refine", "stage"), [("none", "retrieval"), ("vdr", "vdr"), ("lpo", "lpo")])
+def test_query_reaches_each_stage(
+    client: httpx.Client, panorama: bytes, refine: str, stage: str, heading: float | None
+) -> None:
+    plan_id = upload(client)
+    fields = {} if heading is None else {"heading_deg": heading}
+    response = localise(client, plan_id, panorama, refine=refine, **fields)
+    assert response.status_code == 200, response.text
+    answer = response.json()
+    assert answer["stage"] == stage
+    # The cost of a model without wall profiles is the latent distance.
+    assert answer["cost"] == pytest.approx(answer["latent_distance"], abs=2e-3)
+    plan = FloorPlan.from_dict(FLAT)
+    for candidate in answer["candidates"]:
+        position = [[candidate["position"]["x_m"], candidate["position"]["y_m"]]]
+        assert plan.rooms[int(plan.room_index_at(position)[0])].name == candidate["room"]
+
+
+def test_sequence_ends_at_retrieval(client: httpx.Client, panorama: bytes) -> None:
+    files = [("panorama", ("p.jpg", panorama, "image/jpeg"))] * 2
+    response = client.post("/localise/sequence", data={"floorplan_id": upload(client)}, files=files)
+    assert response.status_code == 200, response.text
+    assert response.json()["stage"] == "retrieval"
+    assert len(response.json()["poses"]) == 2
