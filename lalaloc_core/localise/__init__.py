@@ -1,10 +1,10 @@
-"""The search: from an encoded panorama to a pose. The same code serves and is evaluated.
+"""The search: from an encoded panorama to a pose. Service and evaluation run the same code.
 
-Begin with `pipeline.py`, the path of a query: `retrieval.py` compares it with the plan's grid, `vogel.py` samples more
-poses around the best, `optimise/` moves them (LPO, all here that imports torch), `confidence.py` and
-`covariance.py` say how sure the answer is. `matching_cost.py` is what poses are compared by, `encoders.py` runs the networks
-on onnxruntime. `venue/` searches several plans as one, `sequence/` answers several photographs jointly. Worker
-processes load parts of this, so only plain values are re-exported.
+Begin with `pipeline.py`, the path of a query: `retrieval.py` compares it with the plan's pose grid, `vogel.py` samples
+more poses around the best, `optimise/` refines them (LPO, the only part that imports torch), and `posterior.py`,
+`confidence.py` and `covariance.py` state the answer's uncertainty. `matching_cost.py` is the cost by which poses are
+compared; `encoders.py` runs the networks on onnxruntime. `venue/` searches several plans as one, `sequence/` localises
+several photographs jointly. Worker processes load parts of this package, so only plain values are re-exported.
 """
 
 from lalaloc_core.localise.matching_cost import MatchingConfig

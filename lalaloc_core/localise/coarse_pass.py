@@ -5,9 +5,9 @@ pose at an azimuth is one row of
 
     table[azimuth, bin] = log(1 + r²) for every δ and hypothesis, over the number of azimuths
 
-and its cost under all δ and hypotheses is the sum of its rows: the product of a sparse matrix, which depends on the plan,
-with the table, which depends on the query. This takes a tenth of the time per azimuth, and there are fewer azimuths.
-Openings have rows as well; views through them are left to the full comparison.
+and its cost under all δ and hypotheses is the sum of its rows: the product of a sparse matrix, made from the plan, with
+the table, made from the query. This takes a tenth of the time per azimuth, and there are fewer azimuths. Openings have
+rows as well; views through them are left to the full comparison.
 
 In large plans most poses are excluded before that, by a lower bound of their cost over all δ and some neighbouring
 hypotheses. The bounds come from a table of minima in short integers, which stays in the cache. Poses are compared by
@@ -98,7 +98,7 @@ def likeliest(
     limits: PairLimits,
     hint_cost: Float[np.ndarray, "n"] | None = None,
 ) -> tuple[Float[np.ndarray, "m"], Int[np.ndarray, "m"]]:
-    """Return the coarse costs, rising, and the pairs (pose times the number of hypotheses, plus hypothesis) of the best.
+    """Return the coarse costs, rising, of the best pairs, and the pairs: pose times number of hypotheses, plus hypothesis.
 
     The result equals the best of all `coarse_costs`; some pairs beyond the limits can follow.
 

@@ -1,9 +1,9 @@
-"""What fits a picture by chance: how well it fits places of homes that it cannot be of.
+"""Cost of a fit by chance: the cost of a picture at places of other homes.
 
-A photograph of a dim or cluttered room fits its own place badly, and one of another building fits some place quite
-well, so how badly the best place fits does not tell the two apart. How badly it fits *in units of what a cohort of
-strangers gives* does; speaker verification normalises its scores so (Auckenthaler, Carey and Lloyd-Thomas, 2000). The
-cohort are poses of training homes. It is made when a model is calibrated, and travels in its bundle.
+A photograph of a dim or cluttered room has a high cost at its own place, and a photograph of another building a low cost
+at some place, so the cost alone does not separate the two. The cost relative to that at a cohort of unrelated places
+does; speaker verification normalises its scores in this way (Auckenthaler, Carey and Lloyd-Thomas, 2000). The cohort
+consists of poses of training homes. It is made when a model is calibrated, and is part of its bundle.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ from lalaloc_core.localise.poses import Query
 from lalaloc_core.render.sampling import pose_grid
 
 SIZE = 2048
-# Of the grids that poses are drawn from.
+# Step of the grids that poses are drawn from.
 _STEP_M = 0.5
-# So many that are the best at first look are compared in full. What fits by chance costs what the mean of so many of
-# these does, as the very best is a matter of luck.
+# Number of poses, the best by the coarse pass, that are compared in full, and of the best of these, whose mean cost is
+# that of a fit by chance: the cost of the very best varies too much.
 _COMPARED, _BEST = 64, 8
-# Costs are compared above this: it is what the best of pictures costs.
+# Cost of the best pictures, added to both sides of ratios.
 _MIN_COST = 0.01
 
 
 @dataclass(frozen=True, eq=False)
 class Cohort:
-    """Poses of strangers.
+    """Poses of other homes.
 
     Attributes:
         log_profile: (n, w) log wall profiles (m), in half precision.
-        kind: (n, w) codes of what is met, as in `conventions.OPENING_CLASSES`.
+        kind: (n, w) codes as in `conventions.OPENING_CLASSES`.
     """
 
     log_profile: Float[np.ndarray, "n w"]
@@ -51,26 +51,26 @@ class Cohort:
 
     @cached_property
     def layouts(self) -> Layouts:
-        """The poses as evidence is weighed of them, all as of one room."""
+        """Layouts of the poses, all in one room."""
         return Layouts(self.log_profile, np.zeros(len(self.kind), dtype=np.int64), self.kind)
 
     @cached_property
     def binned(self) -> BinnedLayouts:
-        """What the first look sees of them."""
+        """Layouts as the coarse pass compares them."""
         return BinnedLayouts.of(self.layouts)
 
     def to_bytes(self) -> bytes:
-        """A file of it."""
+        """Return the content of the bundle's file."""
         buffer = io.BytesIO()
         np.savez_compressed(buffer, log_profile=self.log_profile, kind=self.kind)
         return buffer.getvalue()
 
     @classmethod
     def of_bundle(cls, bundle: Bundle) -> Cohort | None:
-        """The cohort of a model; None where it has none.
+        """Read the cohort of a bundle; None if it has none.
 
         Raises:
-            BundleError: the file was altered, or does not hold one.
+            BundleError: the file was altered, or is not a cohort.
         """
         if COHORT not in bundle.manifest.files:
             return None
@@ -78,15 +78,17 @@ class Cohort:
             with np.load(io.BytesIO(bundle.read(COHORT)), allow_pickle=False) as arrays:
                 found = cls(arrays["log_profile"], arrays["kind"])
         except (ValueError, KeyError, OSError) as error:
-            raise BundleError(f"bundle '{bundle.folder}': '{COHORT}' holds no cohort: {error}") from error
+            raise BundleError(f"bundle '{bundle.folder}': '{COHORT}' is no cohort: {error}") from error
         columns = bundle.manifest.profile_columns
         if found.log_profile.shape[1:] != (columns,) or found.kind.shape != found.log_profile.shape:
-            raise BundleError(f"'{COHORT}' is of {found.log_profile.shape[1:]} columns, the model has {columns}")
+            raise BundleError(
+                f"'{COHORT}' has {found.log_profile.shape[1:]} columns, the model {columns}: calibrate again"
+            )
         return found
 
 
 def cohort_of(plans: Iterable[FloorPlan], columns: int, seed: int) -> Cohort:
-    """`SIZE` poses of some plans, fewer if they have not so many, drawn at random."""
+    """Draw `SIZE` random poses of some plans, or all if there are fewer."""
     profiles, kinds = [], []
     for plan in plans:
         poses = pose_grid(plan, _STEP_M)
@@ -107,14 +109,15 @@ def cost_by_chance(
     weights: MatchingWeights,
     config: MatchingConfig,
 ) -> float | None:
-    """What a plan costs that fits a picture by chance.
+    """Return the cost of a fit by chance; None without a cohort, or if poses are compared by their latents.
 
     Args:
-        plan: says which openings count.
-        reach_m: how far the poses of the plan's grid may lie from the camera.
-
-    Returns:
-        None without a cohort, or where poses are compared by their latents.
+        cohort: poses of other homes.
+        plan: the plan that is searched, which determines the openings that count.
+        query: the encoded panorama.
+        reach_m: reach (m) of the poses of the plan's grid.
+        weights: weights of the matching cost.
+        config: settings of the matching cost.
     """
     if cohort is None or not config.compares_profiles(query):
         return None
@@ -129,5 +132,5 @@ def cost_by_chance(
 
 
 def log_cost_to_chance(cost: float, by_chance: float | None) -> float:
-    """Log of a cost in units of what fits by chance: below 0 it fits better. 0 where that is not known."""
+    """Return the log of a cost over that of a fit by chance; below 0 it fits better, 0 if that is unknown."""
     return 0.0 if by_chance is None else math.log((cost + _MIN_COST) / (by_chance + _MIN_COST))

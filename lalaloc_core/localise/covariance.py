@@ -1,8 +1,8 @@
-"""How far off a refined answer may be: from the curvature of the cost at its pose to a covariance.
+"""Covariance of a refined answer, from the curvature of the cost at its pose.
 
 Near its minimum the cost is a parabola, and the inverse of its curvature (`Candidate.information`) is the covariance
-but for a factor, which is fitted on validation queries (`lalaloc_core.evaluate.calibrate`). Where the heading was searched as
-well, each is told with the other integrated out.
+up to a factor, which is fitted on validation queries (`lalaloc_core.evaluate.calibrate`). If the heading was
+searched, position and heading are each reported with the other integrated out.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ from jaxtyping import Float
 from lalaloc_core.floorplan import Room
 from lalaloc_core.localise.bundle import ConfidenceModel
 
-# Curvatures are single precision: what is smaller than this share of the largest is no information.
+# Curvatures are single precision; eigenvalues below this share of the largest are rounding errors.
 _PRECISION = 1e-6
-# Standard deviation (radians) of a heading of which nothing is known.
+# Standard deviation (radians) of an unknown heading.
 _ANY_HEADING_STD = math.pi / math.sqrt(3.0)
 
 
 @dataclass(frozen=True, eq=False)
 class PoseUncertainty:
-    """How sure a pose is.
+    """Uncertainty of a pose.
 
     Attributes:
         position_m2: covariance of (x, y) in m², plan frame.
-        heading_std: standard deviation of the heading (radians); None where it was given.
+        heading_std: standard deviation of the heading (radians); None if the heading was given.
     """
 
     position_m2: Float[np.ndarray, "2 2"]
@@ -38,11 +38,10 @@ class PoseUncertainty:
 def pose_uncertainty(
     information: Float[np.ndarray, "p p"], room: Room, model: ConfidenceModel
 ) -> PoseUncertainty | None:
-    """The uncertainty of a pose in a room; None where the model has no factors for it.
+    """Return the uncertainty of a pose in a room; None if the model has no factors for it.
 
-    A direction that the picture says nothing of, as along a corridor without ends, is no more uncertain than a place
-    anywhere in the room is: its standard deviation is at most the room's longest extent over √12. That of a heading is
-    at most π/√3.
+    Standard deviations are limited to those of a uniform distribution: over the room's longest extent (its length over
+    √12), as along a corridor without visible ends, and over all headings (π/√3).
     """
     searched = len(information) == 3
     factor = model.position_factor_searched if searched else model.position_factor
@@ -62,12 +61,12 @@ def pose_uncertainty(
 def marginal_information(
     information: Float[np.ndarray, "p p"],
 ) -> tuple[Float[np.ndarray, "2 2"], float | None]:
-    """Information about the position with the heading integrated out, and about the heading with the position.
+    """Return the information about the position with the heading integrated out, and about the heading likewise.
 
     Both are inverses of blocks of the inverse (Schur complements), and exist where that does not.
 
     Args:
-        information: by x, y (m) and, where it was searched, the heading (radians).
+        information: by x, y (m) and, if it was searched, the heading (radians).
     """
     full = np.asarray(information, dtype=np.float64)
     by_position = full[:2, :2]
@@ -82,5 +81,5 @@ def marginal_information(
 
 
 def _heading_std(information: float, factor: float) -> float:
-    """Standard deviation (radians) of a heading, also one of which nothing is known."""
+    """Return the standard deviation (radians) of a heading."""
     return min(math.sqrt(factor / information), _ANY_HEADING_STD) if information > 0.0 else _ANY_HEADING_STD

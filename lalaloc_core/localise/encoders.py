@@ -1,4 +1,4 @@
-"""The exported encoders on onnxruntime: layouts and panoramas to latents. Never imports torch."""
+"""The exported encoders on onnxruntime: layouts and panoramas to latents. This module never imports torch."""
 
 from __future__ import annotations
 
@@ -28,32 +28,40 @@ from lalaloc_core.localise.poses import (
 from lalaloc_core.render.sampling import PoseSet
 from lalaloc_core.render.sweep import profiles_at
 
-# Larger batches fall out of the cache and gain nothing.
+# Larger batches do not fit the cache, and are no faster.
 _LAYOUT_BATCH = 256
-# An architecture without a ring has to see the panorama turned, once per heading.
+# Headings at which an architecture without a ring encodes the panorama, one pass each.
 _HEADINGS_WITHOUT_RING = 32
 _PROFILE_OUTPUTS = ["log_profile", "log_scale"]
 _STRUCTURE_OUTPUTS = ["opening_logits", "log_ceiling", "log_ceiling_scale", "room_type_logits"]
-# These have a value for every azimuth column.
+# Outputs with a value for every azimuth column.
 _BY_COLUMN = ("log_profile", "log_scale", "opening_logits")
 
 
 class Encoders:
-    """Both branches of one bundle, ready to run; safe to share between threads."""
+    """Both encoders of one bundle, ready to run; safe to share between threads.
+
+    Attributes:
+        manifest: the bundle's manifest.
+        cohort: poses of other homes; None if the bundle has none.
+        predicts_profile: whether the image encoder predicts a wall profile.
+        predicts_structure: whether it predicts openings, ceiling and room type.
+    """
 
     def __init__(self, bundle: Bundle, *, threads: int = 0) -> None:
         """Create the onnxruntime sessions.
 
         Args:
+            bundle: the model bundle.
             threads: intra-op threads per session, 0 for one per core.
 
         Raises:
-            BundleError: a file is missing or altered, or the model knows other classes of openings or types of rooms.
+            BundleError: a file is missing or altered, or the model has other opening classes or room types.
         """
         self.manifest = bundle.manifest
         self.cohort = Cohort.of_bundle(bundle)
         self._layout = _session(bundle.read(LAYOUT_ONNX), threads)
-        # A bundle of the layout branch alone answers layout queries only.
+        # A bundle without an image encoder serves layout queries only.
         image = bundle.read(IMAGE_ONNX) if IMAGE_ONNX in self.manifest.files else None
         self._image = None if image is None else _session(image, threads)
         inputs = [] if self._image is None else self._image.get_inputs()
@@ -71,7 +79,7 @@ class Encoders:
         camera_height_m: Float[np.ndarray, "b"],
         ceiling_height_m: Float[np.ndarray, "b"],
     ) -> Float[np.ndarray, "b d"]:
-        """Latents of layouts given by their wall profiles and heights (m)."""
+        """Encode layouts, given by their wall profiles and heights (m)."""
         inputs = {
             "profile_m": np.ascontiguousarray(profile_m, dtype=np.float32),
             "camera_height_m": np.asarray(camera_height_m, dtype=np.float32),
@@ -86,17 +94,17 @@ class Encoders:
     def poses(
         self, plan: FloorPlan, poses: PoseSet, heading: Float[np.ndarray, "b"], camera_height_m: float
     ) -> tuple[Float[np.ndarray, "b d"], Float[np.ndarray, "b c"]]:
-        """Render the layout of every pose of a plan; latents and wall profiles (m)."""
+        """Render and encode the layout of every pose of a plan; return latents and wall profiles (m)."""
         profile_m = self.profiles(plan, poses, heading)
         heights = np.full(len(poses), camera_height_m)
         return self.layouts(profile_m, heights, plan.ceiling_heights_m[poses.room_index]), profile_m
 
     def rendered(self, plan: FloorPlan, poses: PoseSet) -> Layouts:
-        """The layouts of poses of a grid, at heading 0, as wide as the networks take them."""
+        """Render the layouts of grid poses at heading 0, with the networks' number of columns."""
         return layouts_at(plan, poses, np.zeros(len(poses)), self.manifest.profile_columns)
 
     def profiles(self, plan: FloorPlan, poses: PoseSet, heading: Float[np.ndarray, "b"]) -> Float[np.ndarray, "b c"]:
-        """Wall profiles (m) of poses of a plan, as wide as the layout encoder takes them."""
+        """Render wall profiles (m) of poses of a plan, with the layout encoder's number of columns."""
         columns = self.manifest.profile_columns
         return profiles_at(plan, poses.position_m, poses.room_index, heading, columns, np.float32)
 
@@ -111,11 +119,12 @@ class Encoders:
         """Encode a panorama of the bundle's input size.
 
         Args:
+            image: pixels of the panorama.
+            heading: azimuth of the centre column (radians); None if unknown, with one hypothesis per sector of the
+                ring.
             camera_height: gives the picture its metric scale.
-            heading: azimuth of the centre column (radians); None when unknown, then there is one hypothesis per
-                sector of the ring.
-            heading_tolerance: how far (radians) the true heading may be from `heading`; with it there are hypotheses
-                for the sectors within that, and the heading is refined.
+            heading_tolerance: largest error of `heading` (radians); if it is not 0, there are hypotheses for the
+                sectors within it, and the heading is refined.
         """
         turned, rolled_away, frame_heading = (image, 0.0, 0.0) if heading is None else _undo_heading(image, heading)
         steps = self.manifest.ring_sectors or _HEADINGS_WITHOUT_RING
@@ -127,22 +136,22 @@ class Encoders:
             latents = self._turned_latents(turned, camera_height.height_m, shifts, steps)
             roll = rolled_away + shifts * (TWO_PI / steps)
             return Query(latents, roll, frame_heading, exact, camera_height)
-        # One forward of the image, then roll its ring: rolling a ring is turning the camera.
-        seen = self._seen(turned, camera_height.height_m)
-        query = self._hypotheses(seen, shifts, rolled_away, camera_height)
+        # Rolling the ring is turning the camera, so the image is encoded once.
+        outputs = self._outputs(turned, camera_height.height_m)
+        query = self._hypotheses(outputs, shifts, rolled_away, camera_height)
         searched = None
         if heading is not None and self.predicts_profile:
-            searched = self._hypotheses(seen, every, rolled_away, camera_height)
+            searched = self._hypotheses(outputs, every, rolled_away, camera_height)
         return replace(query, frame_heading=frame_heading, heading_known=exact, searched=searched)
 
     def profile(
         self, image: UInt8[np.ndarray, "h w 3"], heading: float, camera_height_m: float
     ) -> tuple[Float[np.ndarray, "columns"], float]:
-        """The wall profile (m) that the image encoder predicts from a panorama of the bundle's input size.
+        """Predict the wall profile (m) of a panorama of the bundle's input size.
 
         Returns:
-            the profile with the heading undone by whole pixels, and what is left over: the heading (radians) at which
-            layouts are to be rendered to compare with it.
+            The profile with the heading undone by whole pixels, and the rest: the heading (radians) of the layouts to
+            compare it with.
 
         Raises:
             BundleError: the bundle's image encoder predicts no wall profile.
@@ -158,55 +167,62 @@ class Encoders:
     def _turned_latents(
         self, image: UInt8[np.ndarray, "h w 3"], camera_height_m: float, shifts: Int[np.ndarray, "k"], steps: int
     ) -> Float[np.ndarray, "k d"]:
-        """Latents of a panorama turned to the right by each of some numbers of `steps`, for want of a ring."""
+        """Encode a panorama turned to the right by some numbers of `steps`, for architectures without a ring."""
         width = image.shape[1]
         turned = (np.roll(image, int(shift) * width // steps, axis=1) for shift in shifts)
         return np.concatenate([self._run_image(view[None], camera_height_m, ["latent"])[0] for view in turned])
 
     def _hypotheses(
-        self, seen: dict[str, np.ndarray], shifts: Int[np.ndarray, "k"], rolled_away: float, camera_height: CameraHeight
+        self,
+        outputs: dict[str, np.ndarray],
+        shifts: Int[np.ndarray, "k"],
+        rolled_away: float,
+        camera_height: CameraHeight,
     ) -> Query:
-        """A query with an unknown heading for a panorama that is turned to the right by some numbers of sectors."""
+        """Return a query with an unknown heading, of a panorama turned to the right by some numbers of sectors."""
         assert self._head is not None
-        steps = seen["ring"].shape[1]
-        ring = np.ascontiguousarray(rolled(seen["ring"].T, shifts).transpose(0, 2, 1))
+        steps = outputs["ring"].shape[1]
+        ring = np.ascontiguousarray(rolled(outputs["ring"].T, shifts).transpose(0, 2, 1))
         latents = _array(self._head.run(["latent"], {"ring": ring})[0])
-        told = self._told(seen, shifts, steps) if self.predicts_profile else {}
-        return Query(latents, rolled_away + shifts * (TWO_PI / steps), 0.0, False, camera_height, **told)
+        predictions = self._predictions(outputs, shifts, steps) if self.predicts_profile else {}
+        return Query(latents, rolled_away + shifts * (TWO_PI / steps), 0.0, False, camera_height, **predictions)
 
-    def _seen(self, image: UInt8[np.ndarray, "h w 3"], camera_height_m: float) -> dict[str, np.ndarray]:
-        """The outputs of the image encoder for a panorama: its ring (c, s), and everything else by its name.
+    def _outputs(self, image: UInt8[np.ndarray, "h w 3"], camera_height_m: float) -> dict[str, np.ndarray]:
+        """Run the image encoder on a panorama; return its ring (c, s) and all other outputs by name.
 
-        All but the ring are averaged with what is predicted of the mirrored panorama: two views of one room err less
-        than one. What has azimuth columns is mirrored back.
+        All but the ring are averages over the panorama and its mirror image, which are more accurate.
         """
         if not self.predicts_profile:
             return {"ring": self._run_image(image[None], camera_height_m, ["ring"])[0][0]}
         names = [*_PROFILE_OUTPUTS, *(_STRUCTURE_OUTPUTS if self.predicts_structure else [])]
-        ring, *others = self._run_image(np.stack([image, image[:, ::-1]]), camera_height_m, ["ring", *names])
+        ring, *outputs = self._run_image(np.stack([image, image[:, ::-1]]), camera_height_m, ["ring", *names])
         averaged = {}
-        for name, (value, mirrored) in zip(names, others, strict=True):
+        for name, (value, mirrored) in zip(names, outputs, strict=True):
             averaged[name] = 0.5 * (value + (mirrored[::-1] if name in _BY_COLUMN else mirrored))
         return {"ring": ring[0], **averaged}
 
-    def _told(self, seen: dict[str, np.ndarray], shifts: Int[np.ndarray, "k"], steps: int) -> dict[str, Any]:
-        """What a query says of the layout, for panoramas turned to the right by each of some numbers of `steps`."""
-        columns = shifts * (len(seen["log_profile"]) // steps)
-        told: dict[str, Any] = {"profile": PredictedProfile.rolled(seen["log_profile"], seen["log_scale"], columns)}
+    def _predictions(self, outputs: dict[str, np.ndarray], shifts: Int[np.ndarray, "k"], steps: int) -> dict[str, Any]:
+        """Return the predictions of a query, for panoramas turned to the right by some numbers of `steps`."""
+        columns = shifts * (len(outputs["log_profile"]) // steps)
+        profile = PredictedProfile.rolled(outputs["log_profile"], outputs["log_scale"], columns)
+        predictions: dict[str, Any] = {"profile": profile}
         if self.predicts_structure:
-            openings = rolled(_log_softmax(seen["opening_logits"]), columns)
-            told["openings"] = PredictedOpenings(openings, np.array(self.manifest.opening_prior))
-            told["ceiling"] = PredictedCeiling(float(seen["log_ceiling"]), float(seen["log_ceiling_scale"]))
-            types = _log_softmax(seen["room_type_logits"])
-            told["room_type"] = PredictedRoomType(types, np.array(self.manifest.room_type_prior))
-        return told
+            openings = rolled(_log_softmax(outputs["opening_logits"]), columns)
+            predictions["openings"] = PredictedOpenings(openings, np.array(self.manifest.opening_prior))
+            ceiling = float(outputs["log_ceiling"]), float(outputs["log_ceiling_scale"])
+            predictions["ceiling"] = PredictedCeiling(*ceiling)
+            types = _log_softmax(outputs["room_type_logits"])
+            predictions["room_type"] = PredictedRoomType(types, np.array(self.manifest.room_type_prior))
+        return predictions
 
     def _run_image(
         self, images: UInt8[np.ndarray, "b h w 3"], camera_height_m: float, outputs: list[str]
     ) -> list[np.ndarray]:
-        """Some outputs of the image encoder for a batch."""
+        """Run the image encoder on a batch; return some outputs."""
         if self._image is None:
-            raise BundleError(f"model '{self.manifest.name}' has no image encoder; it answers layout queries only")
+            raise BundleError(
+                f"model '{self.manifest.name}' has no image encoder ({IMAGE_ONNX}); it serves layout queries only"
+            )
         inputs = {"image": np.ascontiguousarray(images)}
         if self._image_takes_height:
             inputs["camera_height_m"] = np.full(len(images), camera_height_m, dtype=np.float32)
@@ -214,7 +230,7 @@ class Encoders:
 
 
 def _undo_heading(image: UInt8[np.ndarray, "h w 3"], heading: float) -> tuple[UInt8[np.ndarray, "h w 3"], float, float]:
-    """The panorama rolled so that its centre looks almost along azimuth 0, the angle rolled away, and what is left."""
+    """Roll a panorama until its centre looks almost along azimuth 0; return it, the angle rolled away, and the rest."""
     pixel = TWO_PI / image.shape[1]
     shift = round(heading / pixel)
     # Column j of the result is column j - shift of the input, which looks `shift` pixels more to the left.
@@ -223,14 +239,14 @@ def _undo_heading(image: UInt8[np.ndarray, "h w 3"], heading: float) -> tuple[UI
 
 
 def _check_classes(manifest: Manifest) -> None:
-    """Codes mean the same everywhere, so a model must have been trained with them."""
-    for name, mine in (("opening_classes", OPENING_CLASSES), ("room_types", ROOM_TYPES)):
-        theirs = getattr(manifest, name)
-        if theirs != list(mine):
-            raise BundleError(f"model '{manifest.name}' has the {name} {theirs}, this code knows {list(mine)}")
+    """Check that the model was trained with the class codes of this version."""
+    for name, expected in (("opening_classes", OPENING_CLASSES), ("room_types", ROOM_TYPES)):
+        stated = getattr(manifest, name)
+        if stated != list(expected):
+            raise BundleError(f"model '{manifest.name}' has the {name} {stated}; this version needs {list(expected)}")
     for name, classes in (("opening_prior", OPENING_CLASSES), ("room_type_prior", ROOM_TYPES)):
         if len(getattr(manifest, name)) != len(classes):
-            raise BundleError(f"model '{manifest.name}': {name} has not one value for each of {list(classes)}")
+            raise BundleError(f"model '{manifest.name}': {name} needs one value for each of {list(classes)}")
 
 
 def _log_softmax(logits: Float[np.ndarray, "*n c"]) -> Float[np.ndarray, "*n c"]:
@@ -239,7 +255,7 @@ def _log_softmax(logits: Float[np.ndarray, "*n c"]) -> Float[np.ndarray, "*n c"]
 
 
 def _array(value: object) -> np.ndarray:
-    """What a network returned; onnxruntime also knows outputs that are no arrays."""
+    """Return a network's output, which onnxruntime types as any object, as an array."""
     assert isinstance(value, np.ndarray)
     return value
 
@@ -248,6 +264,6 @@ def _session(model: bytes, threads: int) -> onnxruntime.InferenceSession:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     options.log_severity_level = 3
-    # Idle threads that spin would steal the cores from the LPO workers.
+    # Spinning idle threads would take the cores of the LPO workers.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])

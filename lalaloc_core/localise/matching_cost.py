@@ -1,19 +1,20 @@
 """Matching cost: how badly a pose fits a panorama, by its walls, openings, ceiling and room type.
 
-Every term is a negative log likelihood per azimuth, up to constants, and close to 0 for a perfect fit. Neighbouring
-azimuths err alike, so each term has a weight, fitted on validation queries (`lalaloc_core.evaluate.calibrate`), in units
-of the walls':
+Every term is a negative log likelihood per azimuth, up to constants, and close to 0 for a perfect fit. The errors of
+neighbouring azimuths are correlated, so each term has a weight in units of the walls', fitted on validation queries
+(`lalaloc_core.evaluate.calibrate`):
 
     cost(pose, δ) = walls + β_o openings + β_c ceiling + β_t room type + penalty(δ) / T
 
-* **Walls.** The image encoder predicts a log wall profile μ and, for every azimuth w, a scale b. With the heavy tails of
-  a Cauchy distribution `mean_w log(1 + r_w²)`, `r_w = (log d_w - μ_w - δ) / (κ s_w)`, `s_w² = b_w² + (reach / exp μ_w)²`.
-  κ is the tail factor, δ the log of true over stated camera height, and `reach` the distance (m) from the camera within
-  which the best of the compared poses lies. At a door or passage, 1 / (1 + r²) is the sum of that for the distance to
-  the opening and that for the wall behind it times the odds that the prediction is of that wall, and at most 1.
-* **Openings.** `mean_w log(max_c q_w(c) / q_w(c_w))`, `q_w(c) = ε + (1 - ε) p_w(c) / π(c)`: the predicted probability of
-  the class c_w that the plan shows, over the frequency π of that class. Kinds that the plan does not claim to show
-  completely count as wall.
+* **Walls.** The image encoder predicts a log wall profile μ and a scale b for every azimuth w. The term has the heavy
+  tails of a Cauchy distribution: `mean_w log(1 + r_w²)`, with `r_w = (log d_w - μ_w - δ) / (κ s_w)` and
+  `s_w² = b_w² + (reach / exp μ_w)²`. κ is the tail factor, δ the log of true over stated camera height, and `reach` the
+  distance (m) from the camera within which the best of the compared poses lies. At a door or passage, 1 / (1 + r²) is
+  the sum of that for the opening and that for the wall behind it times the odds that the prediction is of that wall, at
+  most 1.
+* **Openings.** `mean_w log(max_c q_w(c) / q_w(c_w))`, with `q_w(c) = ε + (1 - ε) p_w(c) / π(c)`: the predicted
+  probability p of the class c_w that the plan shows, over the frequency π of that class. Kinds that the plan does not
+  claim to show completely count as wall.
 * **Ceiling.** `log(1 + r²)` of the log height of the room's ceiling above the camera.
 * **Room type.** As openings, once per room.
 

@@ -146,7 +146,7 @@ class StageClock:
             self.timings_ms[name] = (time.perf_counter() - begin) * 1e3
 
     def spans(self) -> dict[str, tuple[float, float]]:
-        """Return the begin (on the clock of `time.perf_counter`) and the duration of each finished stage, in seconds."""
+        """Return the begin (by `time.perf_counter`) and the duration of each finished stage, in seconds."""
         return {name: (self._begun_s[name], spent_ms / 1e3) for name, spent_ms in dict(self.timings_ms).items()}
 
 

@@ -1,4 +1,4 @@
-"""What the stages of localisation hand to one another. Plain numpy, so that it crosses process borders."""
+"""Values that the stages of localisation exchange, in plain numpy so that they can cross process borders."""
 
 from __future__ import annotations
 
@@ -18,10 +18,14 @@ from lalaloc_core.render.sampling import PoseSet
 
 @dataclass(frozen=True, eq=False)
 class PoseGrid:
-    """Poses, latents and wall profiles of one plan for one model, one camera height and one grid step; heading 0.
+    """Grid of poses of one plan at heading 0, with wall profiles, and latents for one model and camera height.
 
-    Only latents depend on the camera height: wall profiles serve queries of any. Where poses are compared by their wall
-    profiles, nobody asks for latents of a whole grid, and `latents` is None.
+    Attributes:
+        poses: positions and rooms.
+        latents: (n, d) latents of the layouts; None for models that compare wall profiles.
+        profile_m: (n, w) wall profiles (m), which serve queries of any camera height.
+        step_m: distance (m) between neighbouring poses.
+        camera_height_m: camera height (m) of the latents.
     """
 
     poses: PoseSet
@@ -42,50 +46,50 @@ class PoseGrid:
         camera_height_m: float,
         layouts: Layouts,
     ) -> PoseGrid:
-        """A grid whose layouts are rendered already."""
+        """Return a grid with layouts that are rendered already."""
         grid = cls(poses, latents, profile_m, step_m, camera_height_m)
         grid._layouts.append(layouts)
         return grid
 
     @classmethod
     def without_latents(cls, poses: PoseSet, layouts: Layouts, step_m: float, camera_height_m: float) -> PoseGrid:
-        """A grid of rendered layouts whose poses are compared by these alone; distances in half precision."""
+        """Return a grid of rendered layouts without latents, with distances in half precision."""
         profile_m = np.exp(layouts.log_profile).astype(np.float16)
-        # The logs of what is kept of the profile, so that a grid which is read again answers the same.
+        # Logs of the rounded profile, so that a grid read from storage gives the same answers.
         kept = replace(layouts, log_profile=np.log(profile_m.astype(np.float32)).astype(np.float16))
         return cls.with_layouts(poses, None, profile_m, step_m, camera_height_m, kept)
 
     def layouts(self, plan: FloorPlan) -> Layouts:
-        """What the plan shows at the poses; rendered at first use, since grids are stored without openings."""
+        """Return the layouts of the poses; rendered at first use, since grids are stored without openings."""
         if not self._layouts:
-            # Two threads that meet here do the same work twice, and no harm.
+            # Two threads can render at once; both results are the same.
             self._layouts.append(self._rendered(plan))
         return self._layouts[0]
 
     def binned(self, plan: FloorPlan) -> BinnedLayouts:
-        """The poses as the first look of a search sees them; made at first use."""
+        """Return the layouts as the coarse pass compares them; made at first use."""
         if not self._binned:
             self._binned.append(BinnedLayouts.of(self.layouts(plan)))
         return self._binned[0]
 
     @property
     def known_latents(self) -> Float[np.ndarray, "n d"]:
-        """The latents.
+        """Latents of the poses.
 
         Raises:
-            InvalidInputError: the grid was made without.
+            InvalidInputError: the grid has none.
         """
         if self.latents is None:
-            raise InvalidInputError("the grid was made without latents, which poses are to be compared by")
+            raise InvalidInputError("the pose grid has no latents, and the model compares latents: make the grid again")
         return self.latents
 
     def latent_distance(self, pose: int, target: Float[np.ndarray, "d"]) -> float:
-        """Distance of a pose's latent to another; NaN where there are none."""
+        """Return the distance of a pose's latent to a target; NaN without latents."""
         return math.nan if self.latents is None else float(np.linalg.norm(self.latents[pose] - target))
 
     @property
     def nbytes(self) -> int:
-        """Memory that it takes, with what was made of it at first use."""
+        """Bytes of the arrays, with those made at first use."""
         arrays = [self.poses.position_m, self.poses.room_index, self.profile_m]
         arrays += [] if self.latents is None else [self.latents]
         return sum(part.nbytes for part in (*arrays, *self._layouts, *self._binned))
@@ -101,11 +105,11 @@ class PoseGrid:
 
 @dataclass(frozen=True, eq=False)
 class PredictedProfile:
-    """Laplace distributions of the log wall profile (m), for every hypothesis of how the panorama is turned.
+    """Laplace distributions of the log wall profile (m), for every hypothesis of the heading.
 
     Attributes:
-        log_m: (k, w) their centres.
-        log_scale: (k, w) logs of their scales.
+        log_m: (k, w) centres.
+        log_scale: (k, w) logs of the scales.
     """
 
     log_m: Float[np.ndarray, "k w"]
@@ -115,24 +119,24 @@ class PredictedProfile:
     def rolled(
         cls, log_m: Float[np.ndarray, "w"], log_scale: Float[np.ndarray, "w"], shifts: Int[np.ndarray, "k"]
     ) -> PredictedProfile:
-        """One prediction, moved to the right by so many columns for each hypothesis."""
+        """Return one prediction, moved to the right by a number of columns for each hypothesis."""
         return cls(rolled(log_m, shifts), rolled(log_scale, shifts))
 
 
 def rolled(values: Float[np.ndarray, "w *c"], shifts: Int[np.ndarray, "k"]) -> Float[np.ndarray, "k w *c"]:
-    """What was said of the azimuth columns, moved to the right by so many columns for each hypothesis."""
+    """Return values by azimuth column, moved to the right by a number of columns for each hypothesis."""
     columns = len(values)
     return values[(np.arange(columns)[None, :] - shifts[:, None]) % columns]
 
 
 @dataclass(frozen=True, eq=False)
 class PredictedOpenings:
-    """What is met at each azimuth at eye height, for every hypothesis of how the panorama is turned.
+    """Opening class at each azimuth at eye height, for every hypothesis of the heading.
 
     Attributes:
         log_probability: (k, w, c) by class, in the order of `conventions.OPENING_CLASSES`.
-        prior: (c,) the shares of the classes that the probabilities presume; dividing by them leaves likelihoods but
-            for a factor.
+        prior: (c,) frequencies of the classes that the probabilities presume; probabilities over these are likelihoods
+            up to a factor.
     """
 
     log_probability: Float[np.ndarray, "k w c"]
@@ -141,7 +145,7 @@ class PredictedOpenings:
 
 @dataclass(frozen=True)
 class PredictedCeiling:
-    """Laplace distribution of the log of the ceiling's height above the camera (m): its centre and log scale."""
+    """Laplace distribution of the log of the ceiling's height (m) above the camera: centre and log scale."""
 
     log_m: float
     log_scale: float
@@ -149,11 +153,11 @@ class PredictedCeiling:
 
 @dataclass(frozen=True, eq=False)
 class PredictedRoomType:
-    """What the room is for.
+    """Type of the room.
 
     Attributes:
         log_probability: (t,) by type, in the order of `conventions.ROOM_TYPES`.
-        prior: (t,) the shares of the types that the probabilities presume.
+        prior: (t,) frequencies of the types that the probabilities presume.
     """
 
     log_probability: Float[np.ndarray, "t"]
@@ -162,21 +166,21 @@ class PredictedRoomType:
 
 @dataclass(frozen=True, eq=False)
 class Query:
-    """An encoded panorama: one latent per hypothesis of how it is turned.
+    """An encoded panorama, with one latent per hypothesis of the heading.
 
-    The layout encoder sees a panorama in its *frame*: rolled by whole pixels or ring sectors so that its centre
-    column looks (almost) along azimuth 0. A hypothesis k assumes a panorama heading of
-    `roll[k] + frame_heading`, and its latent is to be compared with layouts rendered at `frame_heading`.
+    A panorama is compared in its *frame*: rolled by whole pixels or ring sectors so that its centre column looks
+    (almost) along azimuth 0. Hypothesis k assumes a panorama heading of `roll[k] + frame_heading`, and its latent is
+    compared with layouts rendered at `frame_heading`.
 
     Attributes:
         latents: (k, d), L2-normalised.
-        roll: (k,) radians, what was rolled away.
-        frame_heading: radians; what whole-pixel rolling could not remove, 0 when the heading is unknown.
-        heading_known: whether the heading was given exactly; if not, it is searched over and refined.
-        camera_height: what was stated of it; predictions are in metres for just that height.
-        profile: what the image encoder says of the walls; None where it predicts no wall profile.
-        openings, ceiling, room_type: what it says of those, None where it does not.
-        searched: where the heading is known, the same panorama as if it were not, to doubt what was said.
+        roll: (k,) angle (radians) that was rolled away.
+        frame_heading: rest (radians) that rolling by whole pixels leaves; 0 if the heading is unknown.
+        heading_known: whether the heading was given exactly; otherwise it is searched and refined.
+        camera_height: stated camera height, which predictions in metres refer to.
+        profile: predicted wall profile; None if the image encoder predicts none.
+        openings, ceiling, room_type: other predictions; None if the image encoder does not make them.
+        searched: the same panorama with an unknown heading, to doubt a given one; None if the heading is unknown.
     """
 
     latents: Float[np.ndarray, "k d"]
@@ -191,7 +195,7 @@ class Query:
     searched: Query | None = None
 
     def scaled(self, offset: float) -> Query:
-        """What the panorama says if the camera stood higher by the factor `exp(offset)`."""
+        """Return the query if the camera stood higher by the factor `exp(offset)`."""
         profile, ceiling = self.profile, self.ceiling
         return replace(
             self,
@@ -201,26 +205,27 @@ class Query:
 
     @property
     def sector(self) -> float:
-        """Angle (radians) between neighbouring hypotheses; 0 where there is one."""
+        """Angle (radians) between neighbouring hypotheses; 0 for a single one."""
         return float(self.roll[1] - self.roll[0]) if len(self.roll) > 1 else 0.0
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """One answer: a pose and how badly its layout fits the query.
+    """A pose and its cost.
 
     Attributes:
-        frame_heading: heading (radians) of the layout in the frame of `Query` hypothesis number `hypothesis`;
-            the panorama's heading is `query.roll[hypothesis] + frame_heading`.
-        cost: how badly the layout fits, see `localise.matching_cost`; the latent distance where the model predicts no wall
-            profile.
-        latent_distance: from the latent of its layout to the query's; NaN where nobody has looked, which of answers is
-            done in the end.
+        x_m, y_m: position (m).
+        room_index: number of the room.
+        frame_heading: heading (radians) of the layout in the frame of the hypothesis; the panorama's heading is
+            `query.roll[hypothesis] + frame_heading`.
+        hypothesis: number of the query's hypothesis.
+        cost: matching cost; the latent distance if the model predicts no wall profile.
+        latent_distance: distance of the layout's latent to the query's; NaN until computed, as it is for answers.
         height_offset: log of true over stated camera height that fits best.
-        hint_cost: what hints have against the place, in units of the cost; see `localise.hints`.
-        terms: what each term of the evidence says of it, by name; empty where poses are compared by latents.
-        information: (p, p) curvature of the cost by x, y (m) and, where it was searched, the heading (radians); set by
-            the optimiser. Its inverse is the covariance but for a factor.
+        hint_cost: cost of the hints at the place, in units of the cost; see `localise.hints`.
+        terms: terms of the matching cost by name; empty if poses are compared by latents.
+        information: (p, p) curvature of the cost by x, y (m) and, if it was searched, the heading (radians), from pose
+            refinement. Its inverse is the covariance up to a factor.
     """
 
     x_m: float
@@ -242,7 +247,7 @@ class Candidate:
 
     @property
     def total_cost(self) -> float:
-        """What candidates are ranked by: the cost, and what hints have against the place."""
+        """Cost that candidates are ranked by: the matching cost plus that of hints."""
         return self.cost + self.hint_cost
 
 
@@ -256,7 +261,7 @@ def grid_candidate(
     height_offset: float = 0.0,
     hint_cost: float = 0.0,
 ) -> Candidate:
-    """A pose of a grid under one of the hypotheses of a query, by their numbers."""
+    """Return a grid pose under a hypothesis of a query, by their numbers, as a candidate."""
     return Candidate(
         x_m=float(grid.poses.position_m[pose, 0]),
         y_m=float(grid.poses.position_m[pose, 1]),
@@ -272,16 +277,21 @@ def grid_candidate(
 
 @dataclass(frozen=True, eq=False)
 class RefinementJob:
-    """Starting poses for pose optimisation, each with its own targets and room.
+    """Starting poses for pose refinement, each with its own targets and room.
 
     Attributes:
-        targets: (k, d) what the layouts' embeddings, or latents, are compared with.
+        targets: (k, d) latents or other embeddings that those of the layouts are compared with.
+        position_m: (k, 2) positions (m).
+        heading: (k,) headings (radians) in the frame.
+        walls_m: (k, n, 4) walls of each pose's room (m), padded.
+        camera_height_m, ceiling_height_m: (k,) heights (m).
+        optimise_heading: whether the heading is refined as well.
         log_profile: (k, w) centres of the predicted log wall profiles (m); None compares latents alone.
         precision: (k, w) factors that turn differences of log distance into residuals.
-        latent_weight: weight of the latent distance in the cost of what was optimised by its profile.
-        height_offset: (k,) where to begin with the log of true over stated camera height; None leaves it at 0.
-        height_stiffness: factor that turns that log into a residual, among those of the profile's columns.
-        height_bounds: the least and largest log there is.
+        latent_weight: weight of the latent distance in the cost of poses that were refined by their profiles.
+        height_offset: (k,) start of the log of true over stated camera height; None keeps it at 0.
+        height_stiffness: factor that turns that log into a residual among those of the profile's columns.
+        height_bounds: smallest and largest log.
     """
 
     targets: Float[np.ndarray, "k d"]
@@ -301,13 +311,17 @@ class RefinementJob:
 
 @dataclass(frozen=True, eq=False)
 class RefinementResult:
-    """Where the optimisation ended: poses inside the same rooms, how well they fit, and what it took.
+    """Refined poses, inside the rooms of their starts.
 
     Attributes:
-        cost: (k,) what was minimised: of profiles as in `localise.matching_cost`, else the distance of the embeddings.
-        latent_distance: (k,) distance of the embeddings; None where it is no part of the cost.
+        position_m: (k, 2) positions (m).
+        heading: (k,) headings (radians) in the frame.
+        cost: (k,) minimised cost: of profiles the walls' term of the matching cost, else the distance of the embeddings.
+        latent_distance: (k,) distance of the embeddings; None if it is no part of the cost.
         information: (k, p, p) curvature of the cost by position and heading, the camera height integrated out.
-        height_offset: (k,) log of true over stated camera height; None where it was not solved for.
+        converged: (k,) whether the poses converged.
+        evaluations: (k,) number of evaluations.
+        height_offset: (k,) log of true over stated camera height; None if it was not solved for.
     """
 
     position_m: Float[np.ndarray, "k 2"]

@@ -1,9 +1,9 @@
 """Posterior probability of every pose of the grid under every hypothesis of the heading.
 
-A pair of a pose and a hypothesis has the likelihood `exp(-T cost)`, with the temperature T fitted on validation queries.
-The prior is uniform over floor area and over the headings that are searched; the costs here include that of hints.
+A pair of a pose and a hypothesis has the likelihood `exp(-T cost)`, with the temperature T fitted on validation
+queries. The prior is uniform over floor area and over the headings that are searched; costs include that of hints.
 
-Candidates are the modes of the posterior. The grid's poses are off the mode's minimum, and refinement finds its depth: a
+Candidates are the modes of the posterior. The grid's poses miss a mode's minimum, and refinement finds its depth: a
 mode's pairs are shifted by the gain of its candidate, all others by the median gain. Candidates that end at one place
 are one mode, and refined modes count as equally wide.
 """
@@ -216,8 +216,7 @@ def _width_corrections(
 ) -> Float[np.ndarray, "m"]:
     """Return log factors that make refined modes as wide as the deepest, of ties as the widest.
 
-    The number of poses that fit a mode well depends on the position of the grid's lattice, and differs between copies of
-    one room.
+    The number of grid poses that fit a mode depends on where the lattice lies, and differs between copies of one room.
 
     Args:
         log_weight: (m,) log weight of each pair.
@@ -248,7 +247,7 @@ def _ties_at_their_ends(
 ) -> tuple[Float[np.ndarray, "m 2"], Float[np.ndarray, "m"]]:
     """Return positions and headings, those of modes that tie for the best replaced by those of the mode's end.
 
-    Modes have the width of the grid's steps, and those of a small square room overlap: the probability within 1 m of the
+    Modes are as wide as the grid's steps, and those of a small square room overlap: the probability within 1 m of the
     answer would include parts of the others, and depend on which of the equals is first.
     """
     found = np.unique(mode[mode >= 0])
@@ -289,7 +288,7 @@ def posterior_from_weights(
         heading: (m,) heading of the panorama (radians).
         weight: (m,) probabilities; the sum is one.
         poses: number of grid poses.
-        counted: positions and headings by which candidates count the places, if other than `position` and `heading`.
+        counted: positions and headings by which candidates count the places; default: `position` and `heading`.
     """
     counted_position, counted_heading = (position, heading) if counted is None else counted
     near = np.linalg.norm(counted_position - candidates[0].position_m, axis=1) < RIGHT_WITHIN_M

@@ -1,7 +1,7 @@
-"""How probable the places of a plan are, for maps: the posterior where refinement moved it to.
+"""Probability of the places of a plan, for maps: the posterior at the refined places.
 
-A grid pose stands for what lies around it, and what is refined from it ends elsewhere: candidates that end at one place
-have begun up to a metre from it. A map of the grid's poses would be dark where they began, and pale at the answer.
+Candidates that end at one place can begin up to a metre from it, so a map of the grid's poses would show the probability
+beside the answer.
 """
 
 from __future__ import annotations
@@ -15,17 +15,18 @@ from lalaloc_core.floorplan import FloorPlan
 from lalaloc_core.localise.posterior import Posterior
 from lalaloc_core.render.sampling import PoseSet
 
-# Places that are nearer to each other than this are told as one.
-_APART_M = 0.01
+# Places are merged on a lattice of this step.
+_STEP_M = 0.01
 
 
 @dataclass(frozen=True, eq=False)
 class ProbabilityMap:
-    """Places of rooms with their probabilities, which sum to one.
+    """Places with their probabilities.
 
     Attributes:
-        position_m: (k, 2) x and y.
-        room_index: (k,) the room that each lies in.
+        position_m: (k, 2) positions (m).
+        room_index: (k,) rooms.
+        probability: (k,) probabilities; the sum is one.
     """
 
     position_m: Float[np.ndarray, "k 2"]
@@ -34,12 +35,12 @@ class ProbabilityMap:
 
 
 def probability_map(plan: FloorPlan, poses: PoseSet, posterior: Posterior) -> ProbabilityMap:
-    """The places that a posterior over the grid `poses` of a plan weighs.
+    """Return the places of a posterior over the grid `poses` of a plan.
 
-    What was moved out of its room is left out: no camera stands in a wall.
+    Places that refinement moved out of their rooms are left out, unless all were.
     """
     support = posterior.support
-    key = np.concatenate([support.pose[:, None], np.rint(support.position_m / _APART_M).astype(np.int64)], axis=1)
+    key = np.concatenate([support.pose[:, None], np.rint(support.position_m / _STEP_M).astype(np.int64)], axis=1)
     _, first, which = np.unique(key, axis=0, return_index=True, return_inverse=True)
     weight = np.bincount(which.ravel(), support.weight, minlength=len(first))
     position_m, room = support.position_m[first], poses.room_index[support.pose[first]]

@@ -1,7 +1,7 @@
 """Order of poses by cost, and which of them are distinct.
 
-Copies of a flat or the headings of a square room cost the same but for rounding, which differs between processors. Costs
-that differ by less than `TIED` are a tie, and ties are ordered by position and heading.
+Copies of a flat, or the headings of a square room, cost the same up to rounding, which differs between processors.
+Costs that differ by less than `TIED` are a tie, and ties are ordered by position and heading.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from lalaloc_core.localise.poses import Candidate, Query
 TIED = 1e-6
 # Two poses at one place are distinct if their headings differ by more than this (radians).
 HEADING_SEPARATION = np.radians(25.0)
-# Ties are ordered along a direction oblique to walls, mirror axes and rows of copies, so that the keys do not tie again.
+# Ties are ordered along a direction oblique to walls, mirror axes and rows of copies, so that keys do not tie.
 _OBLIQUE = np.array([1.0, 0.6180, 0.2719, 0.1133])
 
 

@@ -51,7 +51,7 @@ def refinement_job(
     layouts = layouts_at(plan, PoseSet(job.position_m, rooms), job.heading, columns)
     matching_cost = MatchingCost(plan, query, matching.fine_reach_m, weights, matching)
     wall_shares = matching_cost.wall_shares(layouts, hypotheses, offsets)
-    # The refiner sums over azimuths what the matching cost averages, so the height's prior is stiffer by the same factor.
+    # The refiner sums over azimuths, the matching cost averages: the height's prior is stiffer by the same factor.
     stiffness = 0.0
     if not (height.is_exact or height.is_unknown):
         stiffness = math.sqrt(0.5 * columns / weights.temperature) / height.log_std

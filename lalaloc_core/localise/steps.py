@@ -1,4 +1,4 @@
-"""Searches that stop where poses are to be optimised, so that who asks may have that done elsewhere."""
+"""Searches as generators: they yield refinement jobs, which callers run in this process or another."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ FoundT = TypeVar("FoundT")
 
 
 def next_step(steps: Generator[JobT, ResultT | None, FoundT], result: ResultT | None) -> JobT | FoundT:
-    """Go on with a search: what is to be refined next, or what was found.
+    """Continue a search; return its next job or its result.
 
     Args:
-        result: of the job that the last step gave; None at first, and where nobody could refine it (in time).
+        steps: the search.
+        result: result of the last job; None at first, and if there is no result (in time).
     """
     try:
         return steps.send(result)
@@ -25,10 +26,11 @@ def next_step(steps: Generator[JobT, ResultT | None, FoundT], result: ResultT | 
 def run_steps(
     steps: Generator[JobT, ResultT | None, FoundT], refiner: Callable[[JobT], ResultT | None] | None
 ) -> FoundT:
-    """Go through a whole search here.
+    """Run a whole search in this process.
 
     Args:
-        refiner: optimises poses, None where it cannot (in time); may be missing for searches that ask for none.
+        steps: the search.
+        refiner: runs a job; returns None if it has no result (in time). It can be None for searches without jobs.
     """
     result: ResultT | None = None
     while True:

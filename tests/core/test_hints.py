@@ -170,10 +170,10 @@ class TestChecks:
     @pytest.mark.parametrize(
         ("near", "message"),
         [
-            (Near(1.0, 1.0, 0.05), "radius_m: 0.05 m, it must be between 0.1 and 1000 m"),
-            (Near(1.0, 1.0, 2e3), "radius_m: 2000 m"),
-            (Near(math.nan, 1.0, 1.0), "near: .* is no point"),
-            (Near(-6.0, 1.0, 5.0), r"near: \(-6, 1\) is 6 m from the nearest room of the plan, farther than radius_m"),
+            (Near(1.0, 1.0, 0.05), "radius_m: it is 0.05 m; it must be between 0.1 and 1000 m"),
+            (Near(1.0, 1.0, 2e3), "radius_m: it is 2000 m"),
+            (Near(math.nan, 1.0, 1.0), "near: .* is not a point"),
+            (Near(-6.0, 1.0, 5.0), r"near: \(-6, 1\) is 6 m from the nearest room of the plan; the limit is radius_m"),
         ],
     )
     def test_what_cannot_be_meant_is_refused(self, plan: FloorPlan, near: Near, message: str) -> None:
@@ -181,7 +181,7 @@ class TestChecks:
             Hints(near=near).check(plan)
 
     def test_no_room_at_all_is_refused(self, plan: FloorPlan) -> None:
-        with pytest.raises(InvalidHintError, match="rooms: none is named"):
+        with pytest.raises(InvalidHintError, match="rooms: no room is named"):
             Hints(rooms=frozenset()).check(plan)
 
     def test_rooms_go_by_id_first_and_then_by_name(self, plan: FloorPlan) -> None:
@@ -189,7 +189,7 @@ class TestChecks:
         assert rooms_named(plan, ["bedroom-2"]) == {1}
         assert rooms_named(plan, ["Bedroom"]) == {0, 1}
         assert rooms_named(plan, ["bedroom", " HALL "]) == {0, 2}
-        with pytest.raises(InvalidHintError, match="no room 'attic', it has 'bedroom', 'bedroom-2', 'hall'"):
+        with pytest.raises(InvalidHintError, match="no room 'attic'; its rooms are 'bedroom', 'bedroom-2', 'hall'"):
             rooms_named(plan, ["hall", "attic"])
 
     def test_no_hints_leave_everything_as_it_is(self, plan: FloorPlan) -> None:

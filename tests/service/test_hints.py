@@ -97,7 +97,7 @@ def test_hints_that_are_none_are_told(
 @pytest.mark.parametrize(
     ("fields", "detail"),
     [
-        ({"rooms": "attic"}, "rooms: the plan has no room 'attic', it has 'bedroom', 'bedroom-2', 'hall'"),
+        ({"rooms": "attic"}, "rooms: the plan has no room 'attic'; its rooms are 'bedroom', 'bedroom-2', 'hall'"),
         ({"near": '{"x_m": -7, "y_m": 1}', "radius_m": 3}, "near: (-7, 1) is 7 m from the nearest room of the plan"),
         ({"near": '{"x_m": 4.5, "y_m": 1}', "radius_m": 0.51, "strict": "true"}, "strict: none of the"),
     ],

@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Iterator
 
 import httpx
+import numpy as np
 import pytest
 
 from lalaloc_core.floorplan import FloorPlan
@@ -22,9 +23,7 @@ LPO_DEADLINE_S = 60.0
 @pytest.fixture(scope="module")
 def client(start_app: StartApp, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
     """An app with one LPO worker, on untrained networks of the paper's architecture."""
-    sizes = PaperConfig(
-        width=8, image_depth=18, layout_height=32, profile_columns=64, image_height=64, image_width=128
-    )
+    sizes = PaperConfig(width=8, image_depth=18, layout_height=32, profile_columns=64, image_height=64, image_width=128)
     config = dataclasses.replace(PRESETS["paper"], paper=sizes)
     folder = tmp_path_factory.mktemp("paper")
     networks = build_layout_encoder(config), build_image_encoder(config)
@@ -48,7 +47,7 @@ def test_query_reaches_each_stage(
     assert answer["cost"] == pytest.approx(answer["latent_distance"], abs=2e-3)
     plan = FloorPlan.from_dict(FLAT)
     for candidate in answer["candidates"]:
-        position = [[candidate["position"]["x_m"], candidate["position"]["y_m"]]]
+        position = np.array([[candidate["position"]["x_m"], candidate["position"]["y_m"]]])
         assert plan.rooms[int(plan.room_index_at(position)[0])].name == candidate["room"]
 
 
