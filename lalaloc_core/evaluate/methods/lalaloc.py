@@ -27,9 +27,9 @@ from lalaloc_core.localise.pipeline import (
     Refiner,
     StageClock,
     localise,
-    panorama_heading,
 )
 from lalaloc_core.localise.poses import Candidate, PoseGrid, PredictedProfile, Query
+from lalaloc_core.localise.ranking import panorama_heading
 from lalaloc_core.render.sampling import PoseSet
 
 # Heading hypotheses of a layout query with unknown heading, for models without a ring.
